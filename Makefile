@@ -1,0 +1,90 @@
+# make build    ROS 2 Jazzy (the sourced one, else its wheels in .venv) and the package in install/
+# make demo     the main job on a simulated sensor: a table, and plots in demo_output/
+# make test     every test         (make test ARGS='-k fit')
+# make bench    rate, missing samples, latency and CPU of the live nodes
+# make lint     the linters alone
+# make clean    remove what these made
+
+.PHONY: build demo test bench lint clean FORCE
+.DEFAULT_GOAL := build
+
+# The first Python that can run the line $1.
+pythons := $(PYTHON) python3 python3.13 python3.12 python3.11 python3.10 /usr/bin/python3
+first_python = $(shell for p in $(pythons); do \
+    "$$p" -c '$1' >/dev/null 2>&1 && { echo "$$p"; break; }; done)
+fits := import ensurepip, sys; v = sys.version_info[:2]; \
+    assert sys.implementation.name == "cpython" and (3, 10) <= v <= (3, 13)
+
+ifeq ($(ROS_DISTRO),jazzy)
+ros_python := $(call first_python,import rclpy)
+endif
+ifdef ros_python
+mode := ros
+base_python = $(ros_python)
+requirements := $(patsubst %,requirements/%.txt,build core extras test)
+else
+mode := wheels
+base_python = $(call first_python,$(fits))
+requirements := $(patsubst %,requirements/%.txt,ros build core extras test)
+ifdef ROS_DISTRO
+# Another ROS that is sourced must not mix with the wheels.
+unexport ROS_DISTRO PYTHONPATH LD_LIBRARY_PATH AMENT_PREFIX_PATH
+endif
+endif
+# The wheels' Python sets LD_LIBRARY_PATH for its venv and tells its children that this is done;
+# our venv may be another one.
+unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
+
+# .venv/.ready says what the venv was made for. If that was another ROS or place, or if it is
+# missing because an installation was cut short, the venv is made anew.
+made_for := $(mode) $(CURDIR)
+ifneq ($(made_for),$(shell test -x .venv/bin/python && cat .venv/.ready 2>/dev/null))
+.venv/.ready: FORCE
+endif
+
+.venv/.ready: $(requirements)
+	@if [ "$$(cat $@ 2>/dev/null)" != '$(made_for)' ] || [ ! -x .venv/bin/python ]; then \
+	    python='$(base_python)'; \
+	    [ -n "$$python" ] || { echo 'make: no CPython 3.10 to 3.13 with venv found: install' \
+	        'python3 and python3-venv, or say make PYTHON=/path/to/python' >&2; exit 1; }; \
+	    echo "making .venv with $$python, ROS 2 from: $(mode)"; \
+	    rm -rf .venv && \
+	    "$$python" -m venv $(if $(ros_python),--system-site-packages) .venv && \
+	    { .venv/bin/python -m pip freeze | grep -E '^(numpy|scipy|pytest)==' > .venv/constraints.txt || :; } \
+	fi
+	@rm -f $@
+	@echo 'installing into .venv: $(requirements)'
+	@.venv/bin/python -m pip install --quiet --disable-pip-version-check \
+	    --constraint .venv/constraints.txt $(requirements:%=--requirement %)
+	@echo '$(made_for)' > $@
+
+# Directories count, too: their time changes when a file in them is removed.
+sources := package.xml setup.py setup.cfg \
+    $(shell find adxl_ros launch params resource -name __pycache__ -prune -o -print)
+
+build: install/.built
+
+# Made from nothing, so that a module that is gone from the sources is gone from install/.
+install/.built: .venv/.ready $(sources)
+	@rm -rf build install
+	@.venv/bin/python -m colcon build --paths .
+	@test -e install/adxl_ros/share/adxl_ros/hook/ament_prefix_path.sh || { echo 'make: colcon' \
+	    'did not build an ament package: does package.xml validate?' >&2; exit 1; }
+	@touch $@
+
+demo: build
+	./run demo -o demo_output
+
+# In test/, so that Python imports the installed package and not the sources beside it.
+test: build
+	cd test && ../run --exec python -m pytest $(ARGS)
+
+lint: build
+	cd test && ../run --exec python -m pytest -q test_linters.py test_layering.py
+
+bench: build
+	./run bench
+
+clean:
+	rm -rf .venv build install log demo_output .*_cache .hypothesis
+	find adxl_ros launch test -name __pycache__ -prune -exec rm -rf {} +

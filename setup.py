@@ -1,0 +1,61 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Install the package, its executables, launch files and parameter files."""
+
+from glob import glob
+from pathlib import Path
+
+from setuptools import find_packages, setup
+
+PACKAGE = 'adxl_ros'
+REQUIREMENTS = Path(__file__).resolve().parent / 'requirements'
+
+
+def requirements(name: str) -> list[str]:
+    """Read the lines of requirements/NAME.txt, which `make build` gives to pip, too."""
+    lines = (REQUIREMENTS / f'{name}.txt').read_text(encoding='utf-8').splitlines()
+    return [line for line in lines if line and not line.startswith('#')]
+
+
+def scripts(package: str, names: tuple[str, ...]) -> list[str]:
+    """Name the executables whose modules in `package` have a main()."""
+    return [f'{name} = {PACKAGE}.{package}.{name}:main' for name in names]
+
+
+setup(
+    name=PACKAGE,
+    version='0.1.0',
+    packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*']),
+    data_files=[
+        ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
+        (f'share/{PACKAGE}', ['package.xml']),
+        (f'share/{PACKAGE}/launch', glob('launch/*.launch.py')),
+        (f'share/{PACKAGE}/params', glob('params/*.yaml')),
+    ],
+    python_requires='>=3.10',
+    install_requires=['setuptools', *requirements('core')],
+    extras_require={name: requirements(name) for name in ('extras', 'test')},
+    zip_safe=True,
+    maintainer='the adxl_ros authors',
+    maintainer_email='maintainers@example.org',
+    description='Driver, calibration and compensation of low-g analog MEMS accelerometers',
+    license='Apache-2.0',
+    entry_points={
+        'console_scripts': [
+            *scripts('nodes', ('driver', 'stage', 'calibration', 'compensation', 'demo', 'bench')),
+            *scripts('tools', ('simulate', 'fit', 'apply')),
+        ],
+    },
+)
