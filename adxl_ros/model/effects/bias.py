@@ -1,0 +1,35 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Zero-g of this unit beside the datasheet's (B of equation 2)."""
+
+from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
+
+
+def apply(signals: Signals, p: Parameters) -> None:
+    """Add the offset to the zero-g output, V."""
+    for d, offset in enumerate(p['offset_v']):
+        signals.zero_g_v[d] = signals.zero_g_v[d] + offset
+
+
+EFFECT = Effect(
+    name='bias',
+    place=Place.ELECTRONICS,
+    parameters=(
+        Parameter('offset_v', 'V', -2.0, 2.0, 0.1, 'ADXL203 datasheet: zero-g 2.4 to 2.6 V',
+                  'zero-g output minus the nominal one'),
+    ),
+    apply=apply,
+    cause='The zero-g output of this unit is not the nominal one; calibrate the unit.',
+)

@@ -1,0 +1,38 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Bias from the out-of-plane axis: h(V_z) of equations 12 and 13, centred and in g."""
+
+from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
+
+
+def apply(signals: Signals, p: Parameters) -> None:
+    """Add q1·A_z + q2·A_z² to the x and y axes."""
+    az = signals.sensed[2]
+    for d, (q1, q2) in enumerate(zip(p['linear'][:2], p['quadratic_per_g'][:2])):
+        signals.output[d] = signals.output[d] + (q1 + q2 * az) * az
+
+
+EFFECT = Effect(
+    name='cross_axis_z',
+    place=Place.ELEMENT,
+    parameters=(
+        Parameter('linear', 'g/g', -0.3, 0.3, 0.015, 'ADXL203 datasheet: cross-axis 1.5 %',
+                  'q1 of equation 13; to first order the same as a misalignment', 'xy'),
+        Parameter('quadratic_per_g', '1/g', -0.3, 0.3, 0.01, 'paper, figure 6',
+                  'q2 of equation 13', 'xy'),
+    ),
+    apply=apply,
+    cause='The out-of-plane axis shifts the bias; calibrate with several planes alpha.',
+)

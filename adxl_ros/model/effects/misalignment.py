@@ -1,0 +1,56 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Directions of the sensing axes in the case: equations 18 and 19, and the same for z."""
+
+from functools import lru_cache
+from math import cos, sin
+
+from adxl_ros.model.effects.base import Components, Effect, Parameter, Parameters, Place, Signals
+
+
+def apply(signals: Signals, p: Parameters) -> None:
+    """Project the specific force in the case frame on the sensing axes."""
+    force = list(signals.sensed)
+    for d, angles in enumerate(zip(p['alpha_rad'], p['beta_rad'])):
+        tx, ty, tz = direction(d, *angles)
+        signals.sensed[d] = tx * force[0] + ty * force[1] + tz * force[2]
+
+
+@lru_cache(maxsize=64)
+def direction(axis: int, alpha_rad: float, beta_rad: float) -> Components:
+    """
+    Return the unit vector of one sensing axis in the case frame.
+
+    Θx = R_y(α)·R_z(β)·[1 0 0]ᵀ (18), Θy = R_x(α)·R_z(β)·[0 1 0]ᵀ (19), and in the same manner
+    Θz = R_x(α)·R_y(β)·[0 0 1]ᵀ.
+    """
+    sa, ca, sb, cb = sin(alpha_rad), cos(alpha_rad), sin(beta_rad), cos(beta_rad)
+    return [[ca * cb, sb, -sa * cb], [-sb, ca * cb, sa * cb], [sb, -sa * cb, ca * cb]][axis]
+
+
+EFFECT = Effect(
+    name='misalignment',
+    place=Place.MOUNTING,
+    parameters=(
+        Parameter('alpha_rad', 'rad', -0.5, 0.5, 0.0175,
+                  'ADXL203 datasheet: package alignment 1 deg',
+                  'tilt of the sensing axis out of the plane (z: about x), equations 18 and 19'),
+        Parameter('beta_rad', 'rad', -0.5, 0.5, 0.0175,
+                  'ADXL203 datasheet: package alignment 1 deg, x to y 0.1 deg',
+                  'turn of the sensing axis in the plane (z: about y), equations 18 and 19'),
+    ),
+    apply=apply,
+    cause='The sensing axes are not those of the case; calibrate, or mount the package better.',
+)

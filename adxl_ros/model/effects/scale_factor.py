@@ -1,0 +1,35 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Scale factor of this unit beside the datasheet's (SF of equation 1)."""
+
+from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
+
+
+def apply(signals: Signals, p: Parameters) -> None:
+    """Add the offset to the scale factor, V/g."""
+    for d, offset in enumerate(p['offset_v_per_g']):
+        signals.scale_v_per_g[d] = signals.scale_v_per_g[d] + offset
+
+
+EFFECT = Effect(
+    name='scale_factor',
+    place=Place.ELECTRONICS,
+    parameters=(
+        Parameter('offset_v_per_g', 'V/g', -0.9, 9.0, 0.04,
+                  'ADXL203 datasheet: 960 to 1040 mV/g', 'scale factor minus the nominal one'),
+    ),
+    apply=apply,
+    cause='The scale factor of this unit is not the nominal one; calibrate the unit.',
+)

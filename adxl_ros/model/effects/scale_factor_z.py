@@ -1,0 +1,38 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Scale factor that depends on the out-of-plane axis: equations 15 and 17, centred and in g."""
+
+from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
+
+
+def apply(signals: Signals, p: Parameters) -> None:
+    """Add A_d·(r1·A_z + r2·A_z²) to the x and y axes."""
+    az = signals.sensed[2]
+    for d, (r1, r2) in enumerate(zip(p['linear_per_g'][:2], p['quadratic_per_g2'][:2])):
+        signals.output[d] = signals.output[d] + signals.sensed[d] * (r1 + r2 * az) * az
+
+
+EFFECT = Effect(
+    name='scale_factor_z',
+    place=Place.ELEMENT,
+    parameters=(
+        Parameter('linear_per_g', '1/g', -0.3, 0.3, 0.01, 'paper, figure 8',
+                  'r1 over r0 of equation 15', 'xy'),
+        Parameter('quadratic_per_g2', '1/g^2', -0.3, 0.3, 0.01, 'paper, figure 8',
+                  'r2 over r0 of equation 15', 'xy'),
+    ),
+    apply=apply,
+    cause='The out-of-plane axis changes the scale factor; calibrate with several planes alpha.',
+)

@@ -1,0 +1,201 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""One sample after the other: the inverse, the covariance and the tilt of a live stream."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from adxl_ros.model import chain, noise
+from adxl_ros.model.constants import AXES, G0_MPS2
+from adxl_ros.model.effects.base import Components
+from adxl_ros.model.maths import FLOATS
+from adxl_ros.model.sensor import Sensor
+from adxl_ros.model.tilt import angles, roll_pitch_covariance
+from adxl_ros.model.uncertainty import equation_5, measured_covariance, UNMEASURED_VARIANCE
+
+_CELL_MPS2 = 0.5
+"""Forces this near share a tangent and the covariance of the calibration, which vary slowly."""
+_MOST_CELLS = 4096
+_TOLERANCE_MPS2 = 1e-8
+"""What the next step of the inverse would add at most."""
+_MOST_STEPS = 8
+_MOTION_S = 0.5
+"""Time over which motion is told from noise."""
+_PAUSE_S = 1.0
+"""Time without a sample after which motion is learnt anew."""
+
+
+class Estimate(NamedTuple):
+    """
+    What one sample says.
+
+    Attributes
+    ----------
+    force
+        Specific force in the case frame, m/s².
+    covariance
+        Of the force: xx, xy, xz, yy, yz, zz, (m/s²)².
+    roll, pitch, inclination
+        Angle, rad, and its variance, rad²; those of an angle that is not shown pass
+        `tilt.UNOBSERVABLE_RAD2`.
+    roll_pitch
+        Covariance of roll and pitch, rad².
+    saturated
+        Whether the ADC was at a rail, so that the variances are those of no measurement.
+
+    """
+
+    force: Components
+    covariance: tuple[float, ...]
+    roll: tuple[float, float]
+    pitch: tuple[float, float]
+    inclination: tuple[float, float]
+    roll_pitch: float
+    saturated: bool
+
+
+class _Cell(NamedTuple):
+    at: chain.Tangent
+    measured: tuple[float, ...]
+
+
+class Live:
+    """
+    Follows one sensor sample by sample, in floats.
+
+    The force is that of `chain.inverse`: to 1e-8 m/s² where |f| = g has a solution, and to a few
+    hundredths of its standard deviation at alpha = ±90° where it has none.
+
+    What moves is not only under gravity, so that the z of equation 5 and the angles are off: the
+    variance of the in-plane force over the last half second, as far as it exceeds twice that of
+    the noise, is added to theirs. A derived z also gets the noise variance of a measured axis.
+    """
+
+    def __init__(self, sensor: Sensor) -> None:
+        self.sensor = sensor
+        self._zero_v = sensor.nominal_zero_g_v.tolist()
+        self._volts = (sensor.nominal_scale_v_per_g / G0_MPS2).tolist()
+        self._rails = (0.0, sensor.adc_vref_v - sensor.lsb_v, sensor.lsb_v / 2)
+        self._respond = chain.static_response(sensor)
+        self._step = chain.step(sensor.axes, sensor.local_gravity_mps2, sensor.z_sign, FLOATS)
+        self._invert = chain.inverse(sensor)
+        self._measured = measured_covariance(sensor)
+        self._cells: dict[tuple[int, int, int], _Cell] = {}
+        quiet = noise.sigma_v(sensor) / sensor.scale_v_per_g * G0_MPS2
+        self._noise = (quiet[:2] ** 2).tolist()
+        self._derives_z = sensor.axes == 'xy'
+        # A force, the response to it, and the motion so far: mean and variance by axis.
+        self._force: Components = [0.0, 0.0, 0.0]
+        self._last_volts = self._respond(self._force)
+        self._mean = [0.0] * len(self._noise)
+        self._variance = [0.0] * len(self._noise)
+        self._time_s = float('-inf')
+
+    def __call__(self, accel_mps2: Components, time_s: float) -> Estimate | None:
+        """
+        Estimate from one sample; None if no force explains it.
+
+        Parameters
+        ----------
+        accel_mps2
+            Nominally converted specific force, m/s², three floats, of which those of the
+            measured axes count.
+        time_s
+            Stamp of the sample, s.
+
+        """
+        volts = [zero + a * scale for zero, a, scale in
+                 zip(self._zero_v, accel_mps2, self._volts)]
+        force = self._inverse(volts)
+        if force is None:
+            return None
+        saturated = self._at_a_rail(volts)
+        unknown = UNMEASURED_VARIANCE if saturated else 0.0
+        motion = self._motion(force, time_s) + unknown
+        spread = self._covariance(force, unknown, motion)
+        # Of the angles, all of gravity is the signal and all motion is noise.
+        loose = (spread[0] + motion, spread[1], spread[2], spread[3] + motion, spread[4],
+                 spread[5] if self._derives_z else spread[5] + motion)
+        roll, pitch, inclination, _ = angles(force, loose, FLOATS)
+        return Estimate(force, spread, roll, pitch, inclination,
+                        roll_pitch_covariance(force, loose, FLOATS), saturated)
+
+    def _inverse(self, volts: Components) -> Components | None:
+        """Start where the last sample ended: its volts are the response to its force."""
+        at = self._cell(self._force).at
+        force, moved = self._force, 0.0
+        response = self._last_volts
+        for _ in range(_MOST_STEPS):
+            before, moved_before = force, moved
+            force = self._step([v - r for v, r in zip(volts, response)], before, at)
+            moved = max(abs(f - b) for f, b in zip(force, before))
+            # Each step is shorter than the one before by the same factor, or a smaller one.
+            if moved * moved <= _TOLERANCE_MPS2 * moved_before:
+                break
+            response = self._respond(force)
+        else:
+            force = self._invert(volts)
+        if not abs(force[0]) + abs(force[1]) + abs(force[2]) < float('inf'):
+            return None
+        self._force, self._last_volts = force, volts
+        return force
+
+    def _at_a_rail(self, volts: Components) -> bool:
+        low, high, half_lsb = self._rails
+        return any((v < low + half_lsb and v > low - half_lsb)
+                   or (v > high - half_lsb and v < high + half_lsb) for v in volts)
+
+    def _motion(self, force: Components, time_s: float) -> float:
+        """Update the running variance of the in-plane force; return its excess over noise."""
+        passed = time_s - self._time_s
+        self._time_s = time_s
+        if not 0 <= passed < _PAUSE_S:
+            self._mean, self._variance = force[:len(self._mean)], [0.0] * len(self._mean)
+            return 0.0
+        weight = passed / (passed + _MOTION_S)
+        most = 0.0
+        for d, quiet in enumerate(self._noise):
+            off = force[d] - self._mean[d]
+            self._mean[d] += weight * off
+            self._variance[d] = (1 - weight) * (self._variance[d] + weight * off * off)
+            most = max(most, self._variance[d] - 2 * quiet)
+        return most
+
+    def _covariance(self, force: Components, unknown: float, motion: float) -> tuple[float, ...]:
+        cell = self._cell(force)
+        if not self._derives_z:
+            xx, xy, xz, yy, yz, zz = cell.measured
+            return xx + unknown, xy, xz, yy + unknown, yz, zz + unknown
+        xx, xy, _, yy, _, _ = cell.measured
+        xx, xy, xz, yy, yz, zz = equation_5(force, (xx, xy, yy), cell.at.slope, FLOATS)
+        return xx + unknown, xy, xz, yy + unknown, yz, zz + self._noise[0] + motion
+
+    def _cell(self, force: Components) -> _Cell:
+        """Return the tangent and the covariance of the measured axes at the nearest grid point."""
+        key = (round(force[0] / _CELL_MPS2), round(force[1] / _CELL_MPS2),
+               round(force[2] / _CELL_MPS2))
+        cell = self._cells.get(key)
+        if cell is None:
+            if len(self._cells) >= _MOST_CELLS:
+                self._cells.clear()
+            covariance, at = self._measured([float(k * _CELL_MPS2) for k in key])
+            full = np.diag([0.0, UNMEASURED_VARIANCE, UNMEASURED_VARIANCE])
+            axes = [AXES.index(a) for a in self.sensor.axes]
+            full[np.ix_(axes, axes)] = covariance[:, :, 0]
+            cell = self._cells[key] = _Cell(at, tuple(full[np.triu_indices(3)].tolist()))
+        return cell

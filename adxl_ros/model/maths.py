@@ -1,0 +1,53 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The few functions that formulas need beside arithmetic, for arrays and for single samples."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+import math
+from typing import Any
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Maths:
+    """
+    Functions of one or two components, see `effects.base.Value`.
+
+    Attributes
+    ----------
+    most
+        The larger of two values.
+    where
+        The second value where the first holds, else the third.
+
+    """
+
+    sqrt: Callable[[Any], Any]
+    atan2: Callable[[Any, Any], Any]
+    most: Callable[[Any, Any], Any]
+    where: Callable[[Any, Any, Any], Any]
+
+
+def _choose(condition: bool, value: float, other: float) -> float:
+    return value if condition else other
+
+
+ARRAYS = Maths(np.sqrt, np.arctan2, np.maximum, np.where)
+FLOATS = Maths(math.sqrt, math.atan2, max, _choose)
+"""For single samples: a tenth of the cost of arrays of one."""
