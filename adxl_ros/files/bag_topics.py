@@ -1,0 +1,153 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Which topics of a bag are the sensor and its references, and what sensor_info says."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from adxl_ros.errors import UserError
+from adxl_ros.files.bag_storage import Bag
+
+IMU = 'sensor_msgs/msg/Imu'
+JOINT_STATE = 'sensor_msgs/msg/JointState'
+DIAGNOSTIC_STATUS = 'diagnostic_msgs/msg/DiagnosticStatus'
+TEMPERATURE = 'sensor_msgs/msg/Temperature'
+BATTERY_STATE = 'sensor_msgs/msg/BatteryState'
+
+_IDENTITY = ('serial', 'axes', 'nominal_zero_g_v', 'nominal_scale_v_per_g')
+
+
+@dataclass(frozen=True)
+class Topics:
+    """Full names of the topics in a bag; None is one that it does not hold."""
+
+    imu: str
+    joints: str | None = None
+    info: str | None = None
+    temperature: str | None = None
+    supply: str | None = None
+
+    def sampled(self) -> list[str]:
+        """Return the topics to read sample by sample."""
+        return [topic for topic in (self.imu, self.joints, self.temperature, self.supply) if topic]
+
+
+def find_topics(bag: Bag) -> Topics:
+    """
+    Find the topics by their names of interfaces, in any namespace, and their types.
+
+    Raises
+    ------
+    UserError
+        There is no `imu/data_raw`, or several sensors, or a topic is of another type.
+
+    """
+    imu = _only(bag, 'imu/data_raw', IMU)
+    if imu is None:
+        raise UserError(f'{bag.path}: no topic imu/data_raw of type {IMU}; it holds {_held(bag)}')
+    space = imu.removesuffix('imu/data_raw')
+    return Topics(imu,
+                  _beside(bag, space, 'stage/joint_states', JOINT_STATE),
+                  _beside(bag, space, 'sensor_info', DIAGNOSTIC_STATUS),
+                  # Others use these two names as well: only the right type is the sensor's.
+                  _typed(bag, space + 'temperature', TEMPERATURE),
+                  _typed(bag, space + 'supply', BATTERY_STATE))
+
+
+def find_ideal(bag: Bag) -> Topics:
+    """
+    Find another simulator's specific force: the only topic of type sensor_msgs/Imu.
+
+    Raises
+    ------
+    UserError
+        There is none, or there are several and none of them is `imu/data_raw`.
+
+    """
+    found = sorted(topic for topic, kind in bag.types if kind == IMU)
+    if len(found) == 1:
+        return Topics(found[0])
+    if not found:
+        raise UserError(f'{bag.path}: no topic of type {IMU}; it holds {_held(bag)}')
+    imu = _only(bag, 'imu/data_raw', IMU)
+    if imu is None:
+        raise UserError(f'{bag.path}: several topics of type {IMU}, none of them imu/data_raw: '
+                        f'{", ".join(found)}; record one')
+    return Topics(imu)
+
+
+def _typed(bag: Bag, topic: str, kind: str) -> str | None:
+    return topic if (topic, kind) in bag.types else None
+
+
+def _beside(bag: Bag, space: str, name: str, kind: str) -> str | None:
+    """Return the topic in the sensor's own namespace or, if there is none, the only one."""
+    return _typed(bag, space + name, kind) or _only(bag, name, kind)
+
+
+def _only(bag: Bag, name: str, kind: str) -> str | None:
+    found = sorted(item for item in bag.types if f'/{item[0]}'.endswith(f'/{name}'))
+    for topic, other in found:
+        if other != kind:
+            raise UserError(f'{bag.path}: topic {topic} is of type {other}, expected {kind}')
+    if len(found) > 1:
+        raise UserError(f'{bag.path}: several topics {name}: '
+                        f'{", ".join(topic for topic, _ in found)}; record one sensor')
+    return found[0][0] if found else None
+
+
+def _held(bag: Bag) -> str:
+    listed = ', '.join(f'{topic} ({kind})' for topic, kind in sorted(bag.types))
+    return (listed or 'no messages') + (f'; {bag.cut}' if bag.cut else '')
+
+
+def typestore() -> Any:
+    """Return the message definitions of ROS 2 Jazzy."""
+    from rosbags.typesys import get_typestore, Stores
+    return get_typestore(Stores.ROS2_JAZZY)
+
+
+def read_info(bag: Bag, topic: str | None) -> dict[str, str]:
+    """
+    Return the keys and values of `sensor_info`, those of its last message.
+
+    Raises
+    ------
+    UserError
+        The sensor changes in the middle of the recording, or its axes are no axes.
+
+    """
+    info: dict[str, str] = {}
+    if topic is None:
+        return info
+    types = typestore()
+    for _, raw in bag.messages([topic]):
+        try:
+            message = types.deserialize_cdr(raw, DIAGNOSTIC_STATUS)
+        except Exception as error:
+            # rosbags generates its decoder: damaged bytes fail in it in any way.
+            raise UserError(f'{bag.path}: topic {topic}: damaged message: {error}') from error
+        new = {pair.key: pair.value for pair in message.values}
+        for key in _IDENTITY:
+            if info.get(key, new.get(key)) != new.get(key):
+                raise UserError(f'{bag.path}: topic {topic}: {key} changes from {info[key]} to '
+                                f'{new.get(key)}; record each sensor by itself')
+        info = new
+    if info.get('axes', 'x') not in ('x', 'xy', 'xyz'):
+        raise UserError(f"{bag.path}: topic {topic}: axes is {info['axes']!r}, "
+                        'expected x, xy or xyz')
+    return info

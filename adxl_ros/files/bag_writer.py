@@ -1,0 +1,292 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Bags, written block by block: whole or not at all."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+import os
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from adxl_ros.errors import UserError
+from adxl_ros.files import cdr
+from adxl_ros.files.atomic import atomic_path
+from adxl_ros.files.bag_storage import import_rosbags
+from adxl_ros.files.bag_topics import (
+    BATTERY_STATE,
+    DIAGNOSTIC_STATUS,
+    IMU,
+    JOINT_STATE,
+    TEMPERATURE,
+    typestore,
+)
+from adxl_ros.files.columns import converted_info, JOINTS, Recording
+from adxl_ros.model.constants import G0_MPS2
+from adxl_ros.model.noise import sigma_v
+from adxl_ros.model.sensor import Sensor
+import numpy as np
+
+FRAME = 'imu_link'
+
+_ABSENT_VARIANCE = 1e6
+_ROWS_AT_ONCE = 65536
+_LAST_STAMP_NS = (1 << 31) * 1_000_000_000  # builtin_interfaces/Time has 32 bits of seconds
+
+# Messages of one layout: their topic's connection, the rows they belong to, and their bytes.
+_Batch = tuple[Any, np.ndarray, bytes]
+
+
+class BagWriter:
+    """
+    Write recordings to a bag, block by block: a rosbag2 directory, or one file for a name.mcap.
+
+    A context manager: the bag appears under its name when the block ends without an error. Each
+    sample becomes a message of `imu/data_raw` and, where the references were sampled, one of
+    `stage/joint_states`, `temperature` and `supply` with the same stamp. The voltage of
+    sensor_msgs/BatteryState is float32. Columns that are none of the package's are left out.
+    """
+
+    def __init__(self, path: str | os.PathLike, sensor: Sensor) -> None:
+        """
+        Prepare to write to `path`.
+
+        Parameters
+        ----------
+        path
+            The bag, replaced if it exists.
+        sensor
+            The unit whose nominal conversion `imu/data_raw` holds.
+
+        Raises
+        ------
+        UserError
+            The library rosbags is not installed.
+
+        """
+        self._path = Path(path)
+        self._sensor = sensor
+        self._rosbag2 = import_rosbags()
+        self._types = typestore()
+        self._connections: dict[str, Any] = {}
+        self._imu = _imu_template(self._types, sensor)
+
+    def __enter__(self) -> BagWriter:
+        """Open a new bag beside the one to replace."""
+        with ExitStack() as stack:
+            fresh = stack.enter_context(atomic_path(self._path))
+            folder = fresh
+            if self._path.suffix == '.mcap':
+                # rosbags writes directories: of this one only the file inside is kept.
+                folder = fresh.with_suffix('')
+                stack.callback(_keep_file, folder / f'{folder.name}.mcap', fresh)
+            self._writer = stack.enter_context(self._rosbag2.Writer(
+                folder, version=9, storage_plugin=self._rosbag2.StoragePlugin.MCAP))
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
+                 trace: TracebackType | None) -> None:
+        """Close the bag and, if all went well, put it in its place."""
+        self._stack.__exit__(kind, error, trace)
+
+    def write(self, recording: Recording) -> None:
+        """
+        Append samples.
+
+        Raises
+        ------
+        UserError
+            An axis of the sensor is missing, or a time cannot be a stamp.
+
+        """
+        stamp_ns = recording.stamp_ns
+        if stamp_ns[0] < 0 or stamp_ns[-1] >= _LAST_STAMP_NS:
+            raise UserError(f'{self._path}: times from {stamp_ns[0] / 1e9:g} to '
+                            f'{stamp_ns[-1] / 1e9:g} s cannot be stamps of ROS messages, '
+                            'which go from 0 to 2^31 s')
+        if 'sensor_info' not in self._connections:
+            self._write_info(recording, int(stamp_ns[0]))
+        accel = recording.accel_mps2(self._sensor)
+        for start in range(0, len(recording), _ROWS_AT_ONCE):
+            part = slice(start, start + _ROWS_AT_ONCE)
+            references = {name: values[part] for name, values in recording.columns.items()}
+            batches = [self._imu_batch(stamp_ns[part], accel[part]),
+                       *self._joint_batches(stamp_ns[part], references),
+                       *self._scalar_batches(stamp_ns[part], references)]
+            self._write_in_order(stamp_ns[part], batches)
+
+    def _connection(self, topic: str, kind: str, is_latched: bool = False) -> Any:
+        if topic not in self._connections:
+            self._connections[topic] = self._writer.add_connection(
+                topic, kind, typestore=self._types, offered_qos_profiles=[_qos(is_latched)])
+        return self._connections[topic]
+
+    def _write_info(self, recording: Recording, stamp_ns: int) -> None:
+        kinds = self._types.types
+        pair = kinds['diagnostic_msgs/msg/KeyValue']
+        info = converted_info(recording.info, self._sensor)
+        message = kinds[DIAGNOSTIC_STATUS](
+            level=0, name='sensor_info', message='', hardware_id=info['serial'],
+            values=[pair(key=key, value=value) for key, value in info.items()])
+        raw = self._types.serialize_cdr(message, DIAGNOSTIC_STATUS)
+        connection = self._connection('/sensor_info', DIAGNOSTIC_STATUS, is_latched=True)
+        self._writer.write(connection, stamp_ns, raw)
+
+    def _imu_batch(self, stamp_ns: np.ndarray, accel: np.ndarray) -> _Batch:
+        force = np.zeros((len(accel), 3))
+        force[:, :accel.shape[1]] = accel
+        data = cdr.fill(self._imu, cdr.imu(self._imu), stamp_ns, {'linear_acceleration': force})
+        return self._connection('/imu/data_raw', IMU), np.arange(len(accel)), data
+
+    def _joint_batches(self, stamp_ns: np.ndarray,
+                       references: dict[str, np.ndarray]) -> list[_Batch]:
+        """Return one batch for each set of joints that were sampled together."""
+        joints = {joint: references[column] for joint, column in JOINTS.items()
+                  if column in references}
+        if not joints:
+            return []
+        values = np.column_stack(list(joints.values()))
+        sampled = ~np.isnan(values)
+        batches = []
+        for pattern in np.unique(sampled, axis=0):
+            rows = np.flatnonzero((sampled == pattern).all(axis=1))
+            names = [joint for joint, is_there in zip(joints, pattern) if is_there]
+            if names:
+                template = _joint_template(self._types, names)
+                data = cdr.fill(template, cdr.joint_state(template), stamp_ns[rows],
+                                {'position': values[rows][:, pattern]})
+                batches.append((self._connection('/stage/joint_states', JOINT_STATE), rows, data))
+        return batches
+
+    def _scalar_batches(self, stamp_ns: np.ndarray,
+                        references: dict[str, np.ndarray]) -> list[_Batch]:
+        batches = []
+        for column, topic, kind, field, template, find in (
+                ('temperature_c', '/temperature', TEMPERATURE, 'temperature',
+                 _temperature_template, cdr.temperature),
+                ('supply_v', '/supply', BATTERY_STATE, 'voltage',
+                 _battery_template, cdr.battery_state)):
+            rows = np.flatnonzero(~np.isnan(references.get(column, np.zeros(0))))
+            if len(rows):
+                raw = template(self._types)
+                data = cdr.fill(raw, find(raw), stamp_ns[rows], {field: references[column][rows]})
+                batches.append((self._connection(topic, kind), rows, data))
+        return batches
+
+    def _write_in_order(self, stamp_ns: np.ndarray, batches: list[_Batch]) -> None:
+        rows = np.concatenate([batch_rows for _, batch_rows, _ in batches])
+        owner = np.repeat(np.arange(len(batches)), [len(batch[1]) for batch in batches])
+        place = np.concatenate([np.arange(len(batch[1])) for batch in batches])
+        order = np.argsort(rows, kind='stable')
+        sizes = [len(data) // len(batch_rows) for _, batch_rows, data in batches]
+        stamps = stamp_ns.tolist()
+        write = self._writer.write
+        for row, k, i in zip(rows[order].tolist(), owner[order].tolist(), place[order].tolist()):
+            connection, _, data = batches[k]
+            write(connection, stamps[row], data[i * sizes[k]:(i + 1) * sizes[k]])
+
+
+def _keep_file(file: Path, target: Path) -> None:
+    if file.exists():
+        os.replace(file, target)
+
+
+def _qos(is_latched: bool) -> Any:
+    """Return what `ros2 bag play` publishes with: reliable, and kept for those who come late."""
+    from rosbags.interfaces import (
+        Qos,
+        QosDurability,
+        QosHistory,
+        QosLiveliness,
+        QosReliability,
+        QosTime,
+    )
+    durability = QosDurability.TRANSIENT_LOCAL if is_latched else QosDurability.VOLATILE
+    forever = QosTime(9223372036, 854775807)
+    return Qos(QosHistory.KEEP_LAST, 1 if is_latched else 10, QosReliability.RELIABLE, durability,
+               forever, forever, QosLiveliness.AUTOMATIC, forever, False)
+
+
+def _header(types: Any, frame: str) -> Any:
+    time = types.types['builtin_interfaces/msg/Time'](sec=0, nanosec=0)
+    return types.types['std_msgs/msg/Header'](stamp=time, frame_id=frame)
+
+
+def _imu_template(types: Any, sensor: Sensor) -> bytes:
+    """Return an Imu without orientation and angular velocity, with the noise of one sample."""
+    absent = np.zeros(9)
+    absent[0] = -1.0
+    variance = np.full(3, _ABSENT_VARIANCE)
+    noise = sigma_v(sensor) / sensor.nominal_scale_v_per_g * G0_MPS2
+    variance[:len(sensor.axes)] = noise ** 2
+    vector = types.types['geometry_msgs/msg/Vector3'](x=0.0, y=0.0, z=0.0)
+    message = types.types[IMU](
+        header=_header(types, FRAME),
+        orientation=types.types['geometry_msgs/msg/Quaternion'](x=0.0, y=0.0, z=0.0, w=1.0),
+        orientation_covariance=absent,
+        angular_velocity=vector, angular_velocity_covariance=absent,
+        linear_acceleration=vector, linear_acceleration_covariance=np.diag(variance).ravel())
+    return bytes(types.serialize_cdr(message, IMU))
+
+
+def _joint_template(types: Any, names: list[str]) -> bytes:
+    none = np.zeros(0)
+    message = types.types[JOINT_STATE](
+        header=_header(types, ''), name=names, position=np.zeros(len(names)),
+        velocity=none, effort=none)
+    return bytes(types.serialize_cdr(message, JOINT_STATE))
+
+
+def _temperature_template(types: Any) -> bytes:
+    message = types.types[TEMPERATURE](
+        header=_header(types, FRAME), temperature=0.0, variance=0.0)
+    return bytes(types.serialize_cdr(message, TEMPERATURE))
+
+
+def _battery_template(types: Any) -> bytes:
+    """Return a BatteryState of which only the voltage is measured."""
+    unknown = float('nan')
+    none = np.zeros(0, np.float32)
+    message = types.types[BATTERY_STATE](
+        header=_header(types, FRAME), voltage=0.0, temperature=unknown, current=unknown,
+        charge=unknown, capacity=unknown, design_capacity=unknown, percentage=unknown,
+        power_supply_status=0, power_supply_health=0, power_supply_technology=0, present=True,
+        cell_voltage=none, cell_temperature=none, location='', serial_number='')
+    return bytes(types.serialize_cdr(message, BATTERY_STATE))
+
+
+def write_bag(path: str | os.PathLike, recording: Recording, sensor: Sensor) -> None:
+    """
+    Write a recording as a bag.
+
+    Parameters
+    ----------
+    path
+        A rosbag2 directory, or one file for a name.mcap; replaced if it exists.
+    recording
+        The samples and references.
+    sensor
+        The unit whose nominal conversion `imu/data_raw` holds.
+
+    Raises
+    ------
+    UserError
+        The bag cannot be written.
+
+    """
+    with BagWriter(path, sensor) as bag:
+        bag.write(recording)

@@ -1,0 +1,220 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+ROS messages in CDR, the wire format of DDS (OMG DDSI-RTPS, section 10), as arrays.
+
+Messages of one topic nearly always have the same layout: the same strings and array lengths,
+hence the same offsets. The offsets are found in the first message, and all messages that agree
+with it in strings and lengths are read, or written, as one table of bytes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+import struct
+
+import numpy as np
+
+_ORDERS = {b'\x00\x00': '>', b'\x00\x01': '<'}
+_BODY = 4  # the encapsulation header; alignment counts from behind it
+
+
+class CdrError(ValueError):
+    """A message that is not what its type says."""
+
+
+class Layout:
+    """
+    Offsets of the fields of one message, found by walking along it.
+
+    Attributes
+    ----------
+    order
+        Byte order, < or >.
+    fields
+        Offset, numpy type code and number of values by name.
+    texts
+        Strings by name, in the order of the message.
+    fixed
+        Offsets of the bytes that a message with the same layout has in common with this one.
+
+    """
+
+    def __init__(self, raw: bytes) -> None:
+        """Start behind the encapsulation header of `raw`."""
+        self._raw = raw
+        if raw[:2] not in _ORDERS:
+            raise CdrError(f'encapsulation 0x{raw[:2].hex()} is not plain CDR')
+        self.order = _ORDERS[raw[:2]]
+        self.fields: dict[str, tuple[int, str, int]] = {}
+        self.texts: dict[str, str] = {}
+        self.fixed: list[int] = [0, 1]
+        self._at = _BODY
+
+    def numbers(self, name: str, code: str, count: int = 1) -> None:
+        """Walk along `count` numbers of a numpy type, such as f8."""
+        if not count:
+            return
+        size = int(code[1:])
+        start = self._aligned(size)
+        self._advance(start, size * count)
+        self.fields[name] = (start, code, count)
+
+    def length(self) -> int:
+        """Walk along the length of a string or sequence and return it."""
+        start = self._aligned(4)
+        self._advance(start, 4)
+        self.fixed += range(start, start + 4)
+        return struct.unpack_from(self.order + 'I', self._raw, start)[0]
+
+    def text(self, name: str) -> None:
+        """Walk along a string."""
+        size = self.length()
+        start = self._at
+        self._advance(start, size)
+        self.fixed += range(start, start + size)
+        self.texts[name] = self._raw[start:start + size].rstrip(b'\0').decode(errors='replace')
+
+    def header(self) -> None:
+        """Walk along a std_msgs/Header."""
+        self.numbers('sec', 'i4')
+        self.numbers('nanosec', 'u4')
+        self.text('frame_id')
+
+    def _aligned(self, size: int) -> int:
+        return self._at + (_BODY - self._at) % size
+
+    def _advance(self, start: int, size: int) -> None:
+        self._at = start + size
+        if self._at > len(self._raw):
+            raise CdrError(f'{len(self._raw)} bytes are too few for it')
+
+
+def imu(raw: bytes) -> Layout:
+    """Find the fields of a sensor_msgs/Imu."""
+    layout = Layout(raw)
+    layout.header()
+    for name, count in (('orientation', 4), ('angular_velocity', 3), ('linear_acceleration', 3)):
+        layout.numbers(name, 'f8', count)
+        layout.numbers(f'{name}_covariance', 'f8', 9)
+    return layout
+
+
+def joint_state(raw: bytes) -> Layout:
+    """Find the names and positions of a sensor_msgs/JointState."""
+    layout = Layout(raw)
+    layout.header()
+    for i in range(layout.length()):
+        layout.text(f'name{i}')
+    layout.numbers('position', 'f8', layout.length())
+    return layout
+
+
+def temperature(raw: bytes) -> Layout:
+    """Find the fields of a sensor_msgs/Temperature."""
+    layout = Layout(raw)
+    layout.header()
+    layout.numbers('temperature', 'f8')
+    return layout
+
+
+def battery_state(raw: bytes) -> Layout:
+    """Find the voltage of a sensor_msgs/BatteryState."""
+    layout = Layout(raw)
+    layout.header()
+    layout.numbers('voltage', 'f4')
+    return layout
+
+
+@dataclass(frozen=True)
+class Table:
+    """Messages of one layout: which of those asked for they are, and their bytes (n, size)."""
+
+    rows: np.ndarray
+    data: np.ndarray
+    layout: Layout
+
+    def numbers(self, name: str) -> np.ndarray:
+        """Return a field of all messages as float64, (n, count)."""
+        start, code, count = self.layout.fields[name]
+        part = np.ascontiguousarray(self.data[:, start:start + int(code[1:]) * count])
+        return part.view(self.layout.order + code).astype(np.float64)
+
+    def stamp_ns(self) -> np.ndarray:
+        """Return the headers' stamps, ns, (n,) int64."""
+        sec, nanosec = (self.numbers(name)[:, 0].astype(np.int64) for name in ('sec', 'nanosec'))
+        return sec * 1_000_000_000 + nanosec
+
+
+def tables(raws: Sequence[bytes], find: Callable[[bytes], Layout]) -> Iterator[Table]:
+    """
+    Sort messages by layout.
+
+    Parameters
+    ----------
+    raws
+        The messages of one type.
+    find
+        Finds the layout of a message of that type, such as `imu`.
+
+    Raises
+    ------
+    CdrError
+        A message is too short or in another encoding.
+
+    """
+    rest = np.arange(len(raws))
+    while len(rest):
+        first = raws[rest[0]]
+        layout = find(first)
+        rows = np.array([i for i in rest.tolist() if len(raws[i]) == len(first)])
+        data = np.frombuffer(b''.join([raws[i] for i in rows.tolist()]), np.uint8)
+        data = data.reshape(len(rows), len(first))
+        same = (data[:, layout.fixed] == data[0, layout.fixed]).all(axis=1)
+        if not same.all():
+            rows, data = rows[same], data[same]
+        yield Table(rows, data, layout)
+        rest = np.setdiff1d(rest, rows, assume_unique=True)
+
+
+def fill(template: bytes, layout: Layout, stamp_ns: np.ndarray,
+         fields: Mapping[str, np.ndarray]) -> bytes:
+    """
+    Write one message a stamp.
+
+    Parameters
+    ----------
+    template
+        A message with the strings and lengths, and with the values of what is not in `fields`.
+    layout
+        Where its fields are.
+    stamp_ns
+        Stamps, ns, (n,).
+    fields
+        Values by field, (n, count).
+
+    Returns
+    -------
+    The messages, one after the other, each as long as the template.
+
+    """
+    data = np.tile(np.frombuffer(template, np.uint8), (len(stamp_ns), 1))
+    sec, nanosec = np.divmod(stamp_ns, 1_000_000_000)
+    for name, values in {'sec': sec, 'nanosec': nanosec, **fields}.items():
+        start, code, count = layout.fields[name]
+        part = np.ascontiguousarray(values.reshape(-1, count).astype(layout.order + code))
+        data[:, start:start + part.itemsize * count] = part.view(np.uint8)
+    return data.tobytes()

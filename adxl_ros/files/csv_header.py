@@ -1,0 +1,130 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The header of a CSV recording: which columns there are, and in which units."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+
+from adxl_ros.errors import UserError
+from adxl_ros.files.columns import ACCEL, REFERENCES, sensor_columns, TIME, VOLTS
+
+# Names by which people write other units; the canonical column's own unit comes first.
+_UNITS = (
+    ('s', 'ms', 'us', 'ns', 'min', 'h', 'sec'),
+    ('v', 'mv', 'uv', 'kv', 'volt', 'volts', 'lsb', 'adc', 'counts'),
+    ('mps2', 'g', 'mg', 'ug', 'ms2', 'm_s2', 'mss', 'cmps2', 'mmps2', 'gal'),
+    ('rad', 'deg', 'degree', 'degrees', 'mrad', 'urad', 'arcmin', 'arcsec', 'rev', 'turns'),
+    ('m', 'mm', 'cm', 'um', 'nm'),
+    ('c', 'k', 'f', 'degc', 'degf', 'celsius', 'kelvin', 'fahrenheit'),
+)
+_SPOKEN = {'s': 's', 'v': 'V', 'mps2': 'm/s²', 'rad': 'rad', 'm': 'm', 'c': '°C'}
+
+
+@dataclass(frozen=True)
+class Header:
+    """The names of the columns of a CSV file, and where the sensor's output stands."""
+
+    names: tuple[str, ...]
+    sensor: tuple[str, ...]
+
+    def index(self, name: str) -> int:
+        """Return where the column stands, from 0."""
+        return self.names.index(name)
+
+    @property
+    def needed(self) -> tuple[str, ...]:
+        """Columns that must have a number in every row."""
+        return (TIME, *self.sensor)
+
+    @property
+    def references(self) -> tuple[str, ...]:
+        """Columns that may be empty where the reference was not sampled."""
+        return tuple(name for name in self.names if name in REFERENCES)
+
+    def is_other(self, name: str) -> bool:
+        """Tell whether a column is none of the package's own, so that it may hold anything."""
+        return name not in self.needed and name not in REFERENCES
+
+
+def parse_header(where: str, fields: list[str], needed: tuple[str, ...] | None) -> Header:
+    """
+    Check the names of the columns.
+
+    Parameters
+    ----------
+    where
+        file:line, for messages.
+    fields
+        The header's fields.
+    needed
+        The columns that must be there; None is any form of the sensor's output.
+
+    Raises
+    ------
+    UserError
+        A needed column is missing, a column stands twice, or one is in another unit.
+
+    """
+    names = tuple(name.strip() for name in fields)
+    _refuse_delimiter(where, names)
+    _refuse_duplicates(where, names)
+    known = [name for name in names if name]
+    for column in _wanted(names):
+        _refuse_other_unit(where, names, column)
+    if TIME not in names:
+        raise UserError(f'{where}: no column {TIME}; the columns are {", ".join(known)}')
+    if needed is None:
+        return Header(names, sensor_columns(known, where))
+    for column in needed:
+        if column not in names:
+            raise UserError(f'{where}: no column {column}; the columns are {", ".join(known)}')
+    return Header(names, needed)
+
+
+def _wanted(names: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the columns to look for in other units; only one form of the sensor's output is."""
+    if any(name in names for name in VOLTS):
+        return (TIME, *VOLTS, *REFERENCES)
+    if any(name in names for name in ACCEL):
+        return (TIME, *ACCEL, *REFERENCES)
+    return (TIME, *VOLTS, *ACCEL, *REFERENCES)
+
+
+def _refuse_delimiter(where: str, names: tuple[str, ...]) -> None:
+    for mark, spoken in ((';', 'semicolons'), ('\t', 'tabs')):
+        if len(names) == 1 and mark in names[0]:
+            raise UserError(f'{where}: the columns are parted by {spoken}, expected commas '
+                            'and a decimal point')
+
+
+def _refuse_duplicates(where: str, names: tuple[str, ...]) -> None:
+    for name, count in Counter(names).items():
+        if name and count > 1:
+            places = [str(i + 1) for i, other in enumerate(names) if other == name]
+            raise UserError(f'{where}:{places[1]}: column {name} stands {count} times, '
+                            f'in the fields {", ".join(places)}; keep one')
+
+
+def _refuse_other_unit(where: str, names: tuple[str, ...], column: str) -> None:
+    if column in names:
+        return
+    stem, unit = column.rsplit('_', 1)
+    others = next(units[1:] for units in _UNITS if units[0] == unit)
+    for i, name in enumerate(names):
+        if name.lower() in {f'{stem}_{other}' for other in others}:
+            raise UserError(f'{where}:{i + 1}: column {name} is in another unit; expected '
+                            f'{_SPOKEN[unit]}, in a column named {column}')

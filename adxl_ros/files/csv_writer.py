@@ -1,0 +1,134 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""CSV recordings, written block by block: whole or not at all."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import ExitStack
+import os
+from types import TracebackType
+from typing import TextIO
+
+from adxl_ros.files.atomic import atomic_path
+from adxl_ros.files.columns import Recording, TIME
+import numpy as np
+
+_ROWS_AT_ONCE = 65536
+
+
+class CsvWriter:
+    """
+    Write columns to a CSV file, block by block.
+
+    A context manager: the file appears under its name when the block ends without an error.
+    Floats are written with as many digits as bring back the same float64; NaN is written empty.
+    """
+
+    def __init__(self, path: str | os.PathLike, digits: int | None = None) -> None:
+        """
+        Prepare to write.
+
+        Parameters
+        ----------
+        path
+            Replaced if it exists.
+        digits
+            Significant digits of all columns but the first, where fewer do: twelve cost a third.
+
+        """
+        self._path = path
+        self._digits = digits
+        self._names: list[str] = []
+
+    def __enter__(self) -> CsvWriter:
+        """Open a new file beside the one to replace."""
+        with ExitStack() as stack:
+            fresh = stack.enter_context(atomic_path(self._path))
+            self._file: TextIO = stack.enter_context(
+                open(fresh, 'w', encoding='utf-8', newline='\n'))
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
+                 trace: TracebackType | None) -> None:
+        """Close the file and, if all went well, put it in its place."""
+        self._stack.__exit__(kind, error, trace)
+
+    def write(self, columns: Mapping[str, np.ndarray],
+              info: Mapping[str, str] | None = None) -> None:
+        """
+        Append rows.
+
+        Parameters
+        ----------
+        columns
+            Arrays (n,) by column name, in the order of the file; the same names every time.
+        info
+            What stands as `# key: value` above the header; taken the first time.
+
+        """
+        if not self._names:
+            self._names = list(columns)
+            self._file.writelines(f'# {key}: {" ".join(value.split())}\n'
+                                  for key, value in (info or {}).items())
+            self._file.write(','.join(self._names) + '\n')
+        arrays = [np.asarray(columns[name]) for name in self._names]
+        for start in range(0, len(arrays[0]), _ROWS_AT_ONCE):
+            part = [array[start:start + _ROWS_AT_ONCE] for array in arrays]
+            self._file.write(_exactly(part) if self._digits is None else
+                             _rounded(part, self._digits))
+
+
+def _exactly(columns: list[np.ndarray]) -> str:
+    return '\n'.join(map(','.join, zip(*map(_fields, columns)))) + '\n'
+
+
+def _rounded(columns: list[np.ndarray], digits: int) -> str:
+    row = ','.join(['%r', *[f'%.{digits}g'] * (len(columns) - 1)]) + '\n'
+    rows = (row * len(columns[0])) % tuple(np.column_stack(columns).ravel().tolist())
+    return rows.replace('nan', '')
+
+
+def _fields(values: np.ndarray) -> list[str]:
+    text = list(map(repr, values.tolist()))
+    for i in np.flatnonzero(np.isnan(values)):
+        text[i] = ''
+    return text
+
+
+def recording_info(recording: Recording) -> dict[str, str]:
+    """Return what stands above the header of a recording's CSV file."""
+    info = {key: value for key, value in recording.info.items() if key != 'epoch_ns'}
+    return {**info, 'epoch_ns': str(recording.epoch_ns)} if recording.epoch_ns else info
+
+
+def recording_columns(recording: Recording) -> dict[str, np.ndarray]:
+    """Return the columns of a recording's CSV file."""
+    return {TIME: recording.time_s, **recording.columns}
+
+
+def write_csv(path: str | os.PathLike, recording: Recording) -> None:
+    """
+    Write a recording as CSV; reading it back gives the same numbers to the bit.
+
+    Raises
+    ------
+    UserError
+        The file cannot be written.
+
+    """
+    with CsvWriter(path) as file:
+        file.write(recording_columns(recording), recording_info(recording))

@@ -1,0 +1,173 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The journal of a calibration: every accepted pose on disk before it is acknowledged."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+import fcntl
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+from adxl_ros.errors import UserError
+from adxl_ros.files.atomic import sync
+
+FORMAT = 1
+
+
+class Journal:
+    """
+    An append-only file of JSON lines: a head that says what is calibrated, then entries.
+
+    The file is locked while it is open, so that two calibrations cannot share it.
+
+    Parameters
+    ----------
+    path
+        The file; made if it is not there.
+    head
+        What must be the same for entries to belong together: unit, mode, plan.
+
+    Attributes
+    ----------
+    entries
+        What an interrupted calibration with the same head left, in order.
+
+    Raises
+    ------
+    UserError
+        Locked by another calibration, of another head (says what differs), or not writable.
+
+    """
+
+    def __init__(self, path: str | os.PathLike, head: dict[str, Any]):
+        self.path = Path(path)
+        head = json.loads(json.dumps({'format': FORMAT, **head}))
+        try:
+            self._file = open(self.path, 'a+b', buffering=0)
+        except OSError as error:
+            raise UserError(f'{path}: cannot write the journal: {error.strerror}; choose a '
+                            'directory that exists and can be written') from None
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            self._file.close()
+            raise UserError(f'{path}: another calibration is writing this journal; finish or '
+                            'abort it, or choose another journal') from None
+        try:
+            self.entries = self._resume(head)
+        except UserError:
+            self._file.close()
+            raise
+
+    def append(self, entry: dict[str, Any]) -> None:
+        """
+        Write one entry and wait until it is on the disk.
+
+        Raises
+        ------
+        UserError
+            The disk does not take it; the journal stays as it was.
+
+        """
+        before = self._file.seek(0, os.SEEK_END)
+        line = json.dumps(entry).encode() + b'\n'
+        try:
+            if self._file.write(line) != len(line):
+                raise OSError(0, 'the disk is full')
+            os.fsync(self._file.fileno())
+        except OSError as error:
+            self._file.truncate(before)
+            raise UserError(f'{self.path}: cannot write the journal: {error.strerror}; make '
+                            'room and try again') from None
+
+    def close(self) -> None:
+        """Let the file go, for others to lock."""
+        self._file.close()
+
+    def _resume(self, head: dict[str, Any]) -> list[dict[str, Any]]:
+        known, whole = _parse(self.path)
+        if known and known[-1].get('done'):
+            # The finished one is kept beside the new one.
+            self._file.seek(0)
+            self.path.with_name(f'{self.path.name}.previous').write_bytes(self._file.read())
+            known, whole = [], 0
+        self._file.truncate(whole)
+        if not known:
+            self.append(head)
+            sync(self.path.parent)
+            return []
+        changed = [key for key in sorted(head.keys() | known[0].keys())
+                   if head.get(key) != known[0].get(key)]
+        if changed:
+            raise UserError(
+                f'{self.path}: holds an unfinished calibration of another kind: '
+                + ', '.join(f'{key} was {_short(known[0].get(key))}, is {_short(head.get(key))}'
+                            for key in changed) + '; go back, or remove the journal')
+        return known[1:]
+
+
+def read(path: str | os.PathLike) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """
+    Read the head and the entries of a journal.
+
+    Raises
+    ------
+    UserError
+        Not readable or not a journal.
+
+    """
+    try:
+        lines, _ = _parse(Path(path))
+    except OSError as error:
+        raise UserError(f'{path}: cannot be read: {error.strerror}') from None
+    if not lines:
+        raise UserError(f'{path}: an empty journal')
+    return lines[0], lines[1:]
+
+
+def accepted_poses(entries: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the accepted poses in order; one that was taken again replaces the earlier one."""
+    poses = {entry['pose']: entry for entry in entries if 'pose' in entry}
+    return [poses[number] for number in sorted(poses)]
+
+
+def _parse(path: Path) -> tuple[list[dict[str, Any]], int]:
+    """Return the whole lines and their length in bytes; a last line cut by a crash is left."""
+    lines, whole = [], 0
+    for number, raw in enumerate(_whole_lines(path.read_bytes()), 1):
+        try:
+            entry = json.loads(raw)
+            if not isinstance(entry, dict):
+                raise ValueError('not an object')
+        except ValueError as error:
+            raise UserError(f'{path}:{number}: not a journal: {error}') from None
+        lines.append(entry)
+        whole += len(raw) + 1
+    if lines and lines[0].get('format') != FORMAT:
+        raise UserError(f'{path}:1: format {lines[0].get("format")!r}, but this package reads '
+                        f'version {FORMAT}')
+    return lines, whole
+
+
+def _whole_lines(data: bytes) -> Iterator[bytes]:
+    yield from data.split(b'\n')[:-1]
+
+
+def _short(value: Any) -> str:
+    text = json.dumps(value)
+    return text if len(text) < 60 else f'{text[:57]}...'

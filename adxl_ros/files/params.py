@@ -1,0 +1,289 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The parameter file: what ROS nodes load, what `fit` writes, with one check for all."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import fields
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from adxl_ros.errors import UserError
+from adxl_ros.files.atomic import atomic_path
+from adxl_ros.model.effects import effect_named
+from adxl_ros.model.sensor import Sensor
+
+FORMAT = 1
+"""Version of the parameter file's format; another one is refused."""
+
+UNITS = 'V, V/g, 1/g, rad'
+"""Units of the coefficients, written into every file and checked."""
+
+FIGURES = {f.metadata['key']: f for f in fields(Sensor) if f.metadata}
+
+
+def load(path: str | os.PathLike) -> Sensor:
+    """
+    Read and check a parameter file.
+
+    Raises
+    ------
+    UserError
+        Not readable, not YAML, a key missing or unknown, a value of the wrong type, unit, length
+        or range, a covariance that is not positive: naming file, line and column.
+
+    """
+    flat = _read(Path(path))
+
+    def fail(key: str, why: str) -> UserError:
+        _, mark = flat.get(key, (None, None))
+        # A key that is missing has no place of its own: name the file.
+        where = f'{path}:{mark.line + 1}:{mark.column + 1}' if mark else f'{path}'
+        return UserError(f'{where}: {key}: {why}')
+
+    return from_flat({key: value for key, (value, _) in flat.items()}, fail)
+
+
+def from_flat(flat: dict[str, Any], fail: Any) -> Sensor:
+    """
+    Make a `Sensor` of flat parameters ('sensor.serial', 'bias.offset_v', ...), all checked.
+
+    Parameters
+    ----------
+    flat
+        As in the file, nested keys joined by dots; other nodes' keys may be among them.
+    fail
+        Callable (key, reason) that returns the exception to raise.
+
+    """
+    if flat.get('format') != FORMAT:
+        raise fail('format', f'version {flat.get("format")!r}, but this package reads version '
+                             f'{FORMAT}; fit the calibration again, or update the package')
+    if flat.get('units', UNITS) != UNITS:
+        raise fail('units', f'{flat["units"]!r}, but coefficients are in {UNITS!r}')
+    figures = {f.name: _figure(f, flat, fail) for f in FIGURES.values()}
+    count = len(figures['axes'])
+    for f in FIGURES.values():
+        value = figures[f.name]
+        if isinstance(value, np.ndarray) and len(value) != count:
+            raise fail(f.metadata['key'], f'{len(value)} values for {count} axes '
+                                          f'({figures["axes"]})')
+    if figures['z_sign'] == 0:
+        raise fail('sensor.z_sign', '0, but must be 1 (upright) or -1')
+    names = _strings('effects', flat, fail)
+    values = {name: _effect_values(name, figures['axes'], flat, fail) for name in names}
+    covariance, covariance_names = _covariance(flat, values, figures['axes'], fail)
+    provenance = {key.removeprefix('provenance.'): str(value) for key, value in flat.items()
+                  if key.startswith('provenance.')}
+    return Sensor(**figures, effects=names, values=values, covariance=covariance,
+                  covariance_names=covariance_names, provenance=provenance)
+
+
+def to_flat(sensor: Sensor) -> dict[str, Any]:
+    """Flatten a sensor to the parameters of its file, plain Python values, in file order."""
+    flat: dict[str, Any] = {'format': FORMAT, 'units': UNITS, 'model': sensor.model}
+    for key, f in FIGURES.items():
+        value = getattr(sensor, f.name)
+        flat[key] = value.tolist() if isinstance(value, np.ndarray) else value
+    if sensor.effects:
+        flat['effects'] = list(sensor.effects)
+    for name in sensor.effects:
+        for parameter, value in sensor.values[name].items():
+            flat[f'{name}.{parameter}'] = [float(v) for v in value]
+    if sensor.covariance_names:
+        flat['covariance_names'] = list(sensor.covariance_names)
+        flat['covariance'] = [float(v) for v in sensor.covariance.ravel()]
+    for key, text in sensor.provenance.items():
+        flat[f'provenance.{key}'] = text
+    return flat
+
+
+def save(path: str | os.PathLike, sensor: Sensor, comments: Iterable[str] = ()) -> None:
+    """
+    Write a parameter file, whole or not at all; floats round-trip.
+
+    Parameters
+    ----------
+    comments
+        Lines for people, put before the parameters.
+
+    """
+    tree: dict[str, Any] = {}
+    for key, value in to_flat(sensor).items():
+        *parents, leaf = key.split('.')
+        below = tree
+        for parent in parents:
+            below = below.setdefault(parent, {})
+        below[leaf] = value
+    text = yaml.dump({'/**': {'ros__parameters': tree}}, Dumper=_Dumper, sort_keys=False,
+                     default_flow_style=None, width=99, allow_unicode=True)
+    with atomic_path(path) as fresh:
+        fresh.write_text(''.join(f'# {line}\n' for line in comments) + text, encoding='utf-8')
+
+
+class _Dumper(yaml.SafeDumper):
+    """Writes floats so that ROS reads doubles (1.0, not 1; 1.0e-06, not 1e-06)."""
+
+
+def _represent_float(dumper: yaml.SafeDumper, value: float) -> yaml.Node:
+    text = repr(value)
+    if 'e' in text and '.' not in text:
+        text = text.replace('e', '.0e')
+    return dumper.represent_scalar('tag:yaml.org,2002:float', text)
+
+
+_Dumper.add_representer(float, _represent_float)
+
+
+def _read(path: Path) -> dict[str, tuple[Any, Any]]:
+    """Flatten /**: ros__parameters: to dotted keys, each with its place in the file."""
+    try:
+        text = path.read_text(encoding='utf-8')
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, 'strerror', None) or 'not UTF-8 text'
+        raise UserError(f'{path}: cannot be read: {reason}') from None
+    try:
+        root = yaml.compose(text, Loader=yaml.SafeLoader)
+    except yaml.YAMLError as error:
+        mark = getattr(error, 'problem_mark', None)
+        where = f'{path}:{mark.line + 1}:{mark.column + 1}' if mark else f'{path}'
+        raise UserError(f'{where}: not YAML: {getattr(error, "problem", error)}') from None
+    for key in ('/**', 'ros__parameters'):
+        root = _child(root, key, path)
+    flat: dict[str, tuple[Any, Any]] = {}
+    _flatten(root, '', flat, yaml.constructor.SafeConstructor())
+    return flat
+
+
+def _child(node: Any, key: str, path: Path) -> Any:
+    if isinstance(node, yaml.MappingNode):
+        for name, value in node.value:
+            if name.value == key and isinstance(value, yaml.MappingNode):
+                return value
+    raise UserError(f'{path}: no {key!r} with parameters below it; a parameter file begins with '
+                    "'/**:' and 'ros__parameters:'")
+
+
+def _flatten(node: yaml.MappingNode, prefix: str, flat: dict, build: Any) -> None:
+    for name, value in node.value:
+        key = f'{prefix}{name.value}'
+        if isinstance(value, yaml.MappingNode):
+            _flatten(value, f'{key}.', flat, build)
+        else:
+            flat[key] = (build.construct_object(value, deep=True), value.start_mark)
+
+
+def _figure(f: Any, flat: dict, fail: Any) -> Any:
+    key, kind = f.metadata['key'], f.type
+    if key not in flat:
+        raise fail(key, f'missing; it is the {f.metadata["doc"]}')
+    value = flat[key]
+    if kind == 'np.ndarray':
+        value = _floats(key, value, fail)
+    elif kind == 'float':
+        value = _floats(key, [value], fail)[0].item()
+    elif not isinstance(value, {'int': int, 'str': str}[kind]) or isinstance(value, bool):
+        raise fail(key, f'{value!r} is not {"a whole number" if kind == "int" else "text"}')
+    _bounded(key, value, f.metadata, fail)
+    return value
+
+
+def _bounded(key: str, value: Any, limits: Any, fail: Any) -> None:
+    if limits['choices'] and value not in limits['choices']:
+        raise fail(key, f'{value!r} is not one of {", ".join(limits["choices"])}')
+    if limits['lower'] is None:
+        return
+    for one in np.ravel(value):
+        if not limits['lower'] <= one <= limits['upper']:
+            raise fail(key, f'{one:g} {limits["unit"]} is outside {limits["lower"]:g} to '
+                            f'{limits["upper"]:g}')
+
+
+def _floats(key: str, value: Any, fail: Any) -> np.ndarray:
+    many = value if isinstance(value, (list, tuple, np.ndarray)) else [value]
+    for one in many:
+        if isinstance(one, bool) or not isinstance(one, float):
+            raise fail(key, f'{one!r} is not a floating-point number'
+                            + (f'; write {one}.0' if isinstance(one, int) else ''))
+        if not np.isfinite(one):
+            raise fail(key, f'{one} is not a finite number')
+    return np.array(many, float)
+
+
+def _strings(key: str, flat: dict, fail: Any) -> tuple[str, ...]:
+    value = flat.get(key) or []
+    if not isinstance(value, (list, tuple)) or not all(isinstance(one, str) for one in value):
+        raise fail(key, f'{value!r} is not a list of names')
+    if len(set(value)) != len(value):
+        raise fail(key, 'names one twice')
+    return tuple(value)
+
+
+def _effect_values(name: str, axes: str, flat: dict, fail: Any) -> dict[str, np.ndarray]:
+    try:
+        effect = effect_named(name)
+    except UserError as error:
+        raise fail('effects', str(error)) from None
+    values = {}
+    for parameter in effect.parameters:
+        key = f'{name}.{parameter.name}'
+        if key not in flat:
+            raise fail(key, f'missing; it is the {parameter.doc}, {parameter.unit}, by axis')
+        array = _floats(key, flat[key], fail)
+        if len(array) != len(axes):
+            raise fail(key, f'{len(array)} values for {len(axes)} axes ({axes})')
+        _bounded(key, array, {'choices': (), 'lower': parameter.lower,
+                              'upper': parameter.upper, 'unit': parameter.unit}, fail)
+        for axis, value in zip(axes, array):
+            if axis not in parameter.axes and value != 0:
+                raise fail(key, f'{value:g} for {axis}, which it does not act on; write 0.0')
+        values[parameter.name] = array
+    known = {p.name for p in effect.parameters}
+    for key in flat:
+        if key.startswith(f'{name}.') and key.removeprefix(f'{name}.') not in known:
+            raise fail(key, f'unknown parameter; {name} has {", ".join(sorted(known))}')
+    return values
+
+
+def _covariance(flat: dict, values: dict, axes: str, fail: Any) -> tuple:
+    names = _strings('covariance_names', flat, fail)
+    known = {f'{effect}.{parameter}.{axis}' for effect, of in values.items()
+             for parameter in of for axis in axes}
+    for name in names:
+        if name not in known:
+            raise fail('covariance_names', f'{name!r} is no parameter of the listed effects')
+    if not names:
+        return np.zeros((0, 0)), ()
+    if 'covariance' not in flat:
+        raise fail('covariance', f'missing; {len(names)} names stand in covariance_names')
+    matrix = _floats('covariance', flat['covariance'], fail)
+    if matrix.size != len(names) ** 2:
+        raise fail('covariance', f'{matrix.size} values, but {len(names)} names need '
+                                 f'{len(names) ** 2}')
+    matrix = matrix.reshape(len(names), -1)
+    scale = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    relative = matrix / np.outer(scale, scale)
+    if np.abs(relative - relative.T).max() > 1e-6:
+        raise fail('covariance', 'not symmetric')
+    smallest = np.linalg.eigvalsh(relative).min()
+    if smallest < -1e-9 or np.diag(matrix).min() < 0:
+        raise fail('covariance', f'not positive: its smallest eigenvalue is {smallest:.3g} in '
+                                 'units of the variances')
+    return matrix, names
