@@ -1,0 +1,382 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Nine parameters of a three-axis sensor from the magnitude of gravity over its rests.
+
+At rest the specific force has the magnitude of local gravity, whatever the pose. Zero-g, scale
+factor and three angles between the sensing axes make it so: V = zero-g + scale·(Θ·f/g₀) with
+Θ of equations 18 and 19. The magnitude cannot tell how the case turns with the axes, which is
+three angles: the gauge holds Θx on the case's x and Θy in its x-y plane.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+
+from adxl_ros.errors import UserError
+from adxl_ros.model.constants import AXES, G0_MPS2
+from adxl_ros.model.sensor import Sensor
+import numpy as np
+from scipy.optimize import brentq, least_squares
+from scipy.special import stdtrit
+
+NAMES = ('bias.offset_v.x', 'bias.offset_v.y', 'bias.offset_v.z',
+         'scale_factor.offset_v_per_g.x', 'scale_factor.offset_v_per_g.y',
+         'scale_factor.offset_v_per_g.z',
+         'misalignment.beta_rad.y', 'misalignment.alpha_rad.z', 'misalignment.beta_rad.z')
+MIN_RESTS = len(NAMES) + 1
+"""One rest more than coefficients: with fewer, nothing says how good the fit is."""
+PRIOR = 0.1
+"""Coefficients can be this far from nominal, in g, of the scale factor and in rad."""
+DETERMINED = 0.01
+"""A coefficient counts as determined below this: 10 mg, 1 %, 0.6°, what datasheets promise."""
+OUTLIER_CHANCE = 0.01
+"""Chance that a fit without knocks takes any of its rests for one."""
+STARTS, STEPS = 20, 15
+"""Fits to ten rests each, that one of them may be without knocks, and steps of each."""
+TRIAL = 1e-4
+"""Excess of a rest's magnitude, g, to begin with."""
+OUTLIERS = 0.25
+"""Share of the rests that may be knocks, at most."""
+
+
+@dataclass(frozen=True)
+class GravityFit:
+    """
+    What the rests say about the sensor.
+
+    Attributes
+    ----------
+    values
+        Effects' parameters by axis, as `Sensor.values` holds them.
+    covariance
+        Of the fitted coefficients in the units of NAMES, (9, 9).
+    before_mps2, residual_mps2, leave_one_out_mps2
+        Magnitude less local gravity at every rest, (k,): by the nominal figures, by the fit, and
+        by the fit to all other rests.
+    expected_mps2
+        Standard deviation of a rest's magnitude, (k,): of its mean, and what the means' noise
+        leaves unexplained.
+    excess_mps2
+        The part of it that the noise of the means leaves unexplained.
+    outliers
+        Numbers of the rests that do not fit the others, and were left out.
+
+    """
+
+    values: dict[str, dict[str, np.ndarray]]
+    covariance: np.ndarray
+    before_mps2: np.ndarray
+    residual_mps2: np.ndarray
+    leave_one_out_mps2: np.ndarray
+    expected_mps2: np.ndarray
+    excess_mps2: float
+    outliers: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class _Rests:
+    """Rests by nominal figures, g, (k, 3): means, variances of the means, and gravity, g."""
+
+    mean: np.ndarray
+    variance: np.ndarray
+    gravity: float
+
+    def __getitem__(self, part: np.ndarray) -> _Rests:
+        return _Rests(self.mean[part], self.variance[part], self.gravity)
+
+
+def fit_gravity(mean_v: np.ndarray, standard_error_v: np.ndarray, sensor: Sensor) -> GravityFit:
+    """
+    Fit the nine parameters by maximum likelihood.
+
+    The likelihood is that of the magnitudes; errors across gravity change them by nothing to
+    first order. Real rests scatter by more than the noise of their means (flicker, hysteresis,
+    what nine parameters do not hold): a common excess variance is estimated with the fit, so
+    that the covariance tells what the rests bear out.
+
+    Parameters
+    ----------
+    mean_v, standard_error_v
+        Mean of each rest and its standard error, V, (k, 3).
+    sensor
+        Nominal figures and local gravity of a three-axis sensor.
+
+    Raises
+    ------
+    UserError
+        If the rests do not determine the parameters: it names those, and rests to add.
+
+    """
+    scale = sensor.nominal_scale_v_per_g
+    rests = _Rests((mean_v - sensor.nominal_zero_g_v) / scale, (standard_error_v / scale) ** 2,
+                   sensor.local_gravity_mps2 / G0_MPS2)
+    nominal = np.zeros(len(NAMES))
+    _require_determined(rests, nominal, 0.0)
+    kept = _inliers(rests, nominal)
+    found, excess = _fit(rests[kept], nominal)
+    _require_determined(rests[kept], found, excess)
+    variance = _magnitude_variance(rests, found) + excess
+    jacobian = _jacobian(rests[kept].mean, found) / np.sqrt(variance[kept, None])
+    covariance = np.linalg.inv(jacobian.T @ jacobian)
+    covariance *= _t_factor(excess, variance[kept])
+    to_units = np.concatenate([scale, scale, np.ones(3)])
+    values = found * to_units
+    residual = _magnitude(rests.mean, found) - rests.gravity
+    return GravityFit(
+        values={'bias': {'offset_v': values[:3]},
+                'scale_factor': {'offset_v_per_g': values[3:6]},
+                'misalignment': {'alpha_rad': np.array([0.0, 0.0, values[7]]),
+                                 'beta_rad': np.array([0.0, values[6], values[8]])}},
+        covariance=covariance * np.outer(to_units, to_units),
+        before_mps2=G0_MPS2 * (np.linalg.norm(rests.mean, axis=1) - rests.gravity),
+        residual_mps2=G0_MPS2 * residual,
+        leave_one_out_mps2=G0_MPS2 * _leave_one_out(rests, kept, found, variance, residual),
+        expected_mps2=G0_MPS2 * np.sqrt(variance),
+        excess_mps2=G0_MPS2 * float(np.sqrt(excess)),
+        outliers=tuple(int(i) for i in np.flatnonzero(~kept)))
+
+
+def _axes(found: np.ndarray) -> np.ndarray:
+    """Directions of the sensing axes in the gauge, rows Θx, Θy, Θz, (3, 3)."""
+    sy, cy = np.sin(found[6]), np.cos(found[6])
+    sa, ca, sb, cb = np.sin(found[7]), np.cos(found[7]), np.sin(found[8]), np.cos(found[8])
+    return np.array([[1.0, 0.0, 0.0], [-sy, cy, 0.0], [sb, -sa * cb, ca * cb]])
+
+
+def _force(mean: np.ndarray, found: np.ndarray) -> np.ndarray:
+    """Specific force of each rest in the case frame, g, (k, 3)."""
+    sensed = (mean - found[:3]) / (1 + found[3:6])
+    return np.linalg.solve(_axes(found), sensed.T).T
+
+
+def _magnitude(mean: np.ndarray, found: np.ndarray) -> np.ndarray:
+    """Magnitude of each rest's specific force, g, (k,)."""
+    return np.linalg.norm(_force(mean, found), axis=1)
+
+
+def _by_output(force: np.ndarray, found: np.ndarray) -> np.ndarray:
+    """Differentiate each magnitude by what the axes sense: Θ⁻ᵀ·f/|f|, (k, 3)."""
+    along = force / np.linalg.norm(force, axis=1, keepdims=True)
+    return np.linalg.solve(_axes(found).T, along.T).T
+
+
+def _jacobian(mean: np.ndarray, found: np.ndarray) -> np.ndarray:
+    """Differentiate each magnitude by the nine parameters, (k, 9)."""
+    force = _force(mean, found)
+    by_sensed = _by_output(force, found)
+    by_output = by_sensed / (1 + found[3:6])
+    sensed = (mean - found[:3]) / (1 + found[3:6])
+    sy, cy = np.sin(found[6]), np.cos(found[6])
+    sa, ca, sb, cb = np.sin(found[7]), np.cos(found[7]), np.sin(found[8]), np.cos(found[8])
+    turns = ((1, [-cy, -sy, 0.0]), (2, [0.0, -ca * cb, -sa * cb]), (2, [cb, sa * sb, -ca * sb]))
+    by_angles = [by_sensed[:, axis] * (force @ np.array(row)) for axis, row in turns]
+    return -np.column_stack([by_output, by_output * sensed, *by_angles])
+
+
+def _magnitude_variance(rests: _Rests, found: np.ndarray) -> np.ndarray:
+    """Variance of each magnitude that the noise of the means explains, g², (k,)."""
+    by_output = _by_output(_force(rests.mean, found), found) / (1 + found[3:6])
+    return (by_output ** 2 * rests.variance).sum(axis=1)
+
+
+def _solve(rests: _Rests, start: np.ndarray, variance: np.ndarray) -> np.ndarray:
+    """Fit with given variances of the magnitudes, g², (k,)."""
+    sigma = np.sqrt(variance)
+    return least_squares(lambda p: (_magnitude(rests.mean, p) - rests.gravity) / sigma, start,
+                         lambda p: _jacobian(rests.mean, p) / sigma[:, None], method='lm',
+                         xtol=1e-12, ftol=1e-12, gtol=1e-12).x
+
+
+def _fit(rests: _Rests, start: np.ndarray) -> tuple[np.ndarray, float]:
+    """
+    Fit with the excess variance that makes chi-squared its degrees of freedom.
+
+    Returns
+    -------
+    found, excess
+        The parameters, and the excess variance, g²; 0 if the means' noise explains it all.
+
+    """
+    found, excess = start, 0.0
+    freedom = len(rests.mean) - len(NAMES)
+    for _ in range(20):
+        variance = _magnitude_variance(rests, found)
+        found = _solve(rests, found, variance + excess)
+        squares = (_magnitude(rests.mean, found) - rests.gravity) ** 2
+        before, excess = excess, _excess(squares, variance, freedom)
+        if abs(excess - before) <= 1e-6 * (excess + variance.min()):
+            break
+    return found, excess
+
+
+def _excess(squares: np.ndarray, variance: np.ndarray, freedom: int) -> float:
+    """Solve Σ r²/(v + excess) = freedom."""
+    def surplus(excess: float) -> float:
+        return float((squares / (variance + excess)).sum()) - freedom
+    if surplus(0.0) <= 0:
+        return 0.0
+    return float(brentq(surplus, 0.0, squares.sum() / freedom, rtol=1e-9, xtol=1e-30))
+
+
+def _t_factor(excess: float, variance: np.ndarray) -> float:
+    """
+    Widen the covariance for an excess that a few rests had to tell: Student's variance.
+
+    With ν degrees of freedom it is ν/(ν − 2) times that of the normal; the share of the variance
+    that the noise of the means explains needs no such allowance.
+    """
+    freedom = len(variance) - len(NAMES)
+    share = excess / variance.mean()
+    return 1 + share * 2 / max(freedom - 2, 1)
+
+
+def _inliers(rests: _Rests, start: np.ndarray) -> np.ndarray:
+    """
+    Tell which rests fit the others, (k,): the rest are knocks, or were no rests.
+
+    The best fit to most of them says which to begin with, so that several knocks cannot hide one
+    another. Then rests leave or come back, one at a time, by their studentised distance from
+    the fit to the others.
+    """
+    count = len(rests.mean)
+    most = min(int(OUTLIERS * count), count - MIN_RESTS)
+    kept = _robust_inliers(rests, start, most)
+    for _ in range(2 * most):
+        distance = _studentised(rests, kept, start)
+        allowed = -stdtrit(max(kept.sum() - MIN_RESTS, 1), OUTLIER_CHANCE / (2 * count))
+        back = np.where(kept, np.inf, distance)
+        out = np.where(kept, distance, 0)
+        if back.min() <= allowed:
+            kept[back.argmin()] = True
+        elif out.max() > allowed and (~kept).sum() < most:
+            kept[out.argmax()] = False
+        else:
+            break
+    return kept
+
+
+def _robust_inliers(rests: _Rests, start: np.ndarray, most: int) -> np.ndarray:
+    """
+    Tell which rests the best fit to all but `most` of them does not leave far off, (k,).
+
+    Least trimmed squares: from fits to a few rests each, step by step with the rests that each
+    fit suits best, to the one that suits its rests best.
+    """
+    count = len(rests.mean)
+    if not most:
+        return np.ones(count, bool)
+    draw = np.random.default_rng(0)
+    best, least = start, np.inf
+    for _ in range(STARTS):
+        found, suited = start, draw.choice(count, MIN_RESTS, replace=False)
+        for step in range(STEPS):
+            found = _gauss_newton(rests[suited], found)
+            squares = (_magnitude(rests.mean, found) - rests.gravity) ** 2
+            if step > 2:
+                suited = np.argsort(squares)[:count - most]
+        left = np.sort(squares)[:count - most].sum()
+        if left < least:
+            best, least = found, left
+    freedom = max(count - most - len(NAMES), 1)
+    spread = np.sqrt(least / freedom + _magnitude_variance(rests, best).mean())
+    return np.abs(_magnitude(rests.mean, best) - rests.gravity) <= 5 * spread
+
+
+def _gauss_newton(rests: _Rests, found: np.ndarray) -> np.ndarray:
+    """Take one step of a fit that the prior holds where the rests do not."""
+    rows = _jacobian(rests.mean, found)
+    weight = 1 / (_magnitude_variance(rests, found).mean() + TRIAL ** 2)
+    slope = weight * rows.T @ (_magnitude(rests.mean, found) - rests.gravity) + found / PRIOR ** 2
+    information = weight * rows.T @ rows + np.eye(len(NAMES)) / PRIOR ** 2
+    return np.clip(found - np.linalg.solve(information, slope), -0.5, 0.5)
+
+
+def _studentised(rests: _Rests, kept: np.ndarray, start: np.ndarray) -> np.ndarray:
+    """Distance of each rest from the fit to the others, in its standard deviations, (k,)."""
+    found, excess = _fit(rests[kept], start)
+    variance = _magnitude_variance(rests, found) + excess
+    covariance = np.linalg.inv(_information(rests[kept], found, excess))
+    jacobian = _jacobian(rests.mean, found)
+    leverage = np.einsum('ki,ij,kj->k', jacobian, covariance, jacobian) / variance
+    distance = np.abs(_magnitude(rests.mean, found) - rests.gravity) / np.sqrt(variance)
+    inside = distance / np.sqrt(np.maximum(1 - leverage, 1e-9))
+    # What remains of chi-squared without the rest itself; the means' noise is there in any case.
+    freedom = kept.sum() - len(NAMES)
+    others = (max((distance[kept] ** 2).sum(), freedom) - inside ** 2) / max(freedom - 1, 1)
+    inside = inside / np.sqrt(np.maximum(others, np.median(1 - excess / variance)))
+    return np.where(kept, inside, distance / np.sqrt(1 + leverage))
+
+
+def _leave_one_out(rests: _Rests, kept: np.ndarray, found: np.ndarray, variance: np.ndarray,
+                   residual: np.ndarray) -> np.ndarray:
+    """Error of each rest's magnitude by the fit to all others, g, (k,)."""
+    errors = residual.copy()
+    for i in np.flatnonzero(kept):
+        others = kept.copy()
+        others[i] = False
+        without = _solve(rests[others], found, variance[others])
+        errors[i] = _magnitude(rests.mean[i:i + 1], without)[0] - rests.gravity
+    return errors
+
+
+def _require_determined(rests: _Rests, found: np.ndarray, excess: float) -> None:
+    """Refuse rests that leave a coefficient open, naming it and the rests to add."""
+    information = _information(rests, found, excess)
+    open_names, count = _open(information), len(rests.mean)
+    if count >= MIN_RESTS and not open_names:
+        return
+    what = 'all nine coefficients' if len(open_names) == len(NAMES) else ', '.join(open_names)
+    lacking = f'leave {what} open' if open_names else f'are too few, {MIN_RESTS} are the least'
+    scatter = f' and scatter by {1e3 * np.sqrt(excess):.2g} mg' if excess else ''
+    poses = _poses_to_add(count, information, found, rests.gravity, TRIAL ** 2 + excess)
+    raise UserError(f'gravity: the {count} rests that were found {lacking}{scatter}: add rests '
+                    f'with {", ".join(poses)}')
+
+
+def _poses_to_add(count: int, information: np.ndarray, found: np.ndarray, gravity: float,
+                  variance: float) -> list[str]:
+    """Name the poses that tell most, one after the other, until all coefficients are told."""
+    poses: list[str] = []
+    candidates = [np.array(c) for c in product((0, 1, -1), repeat=3) if any(c)]
+    while (count + len(poses) < MIN_RESTS or _open(information)) and len(poses) < MIN_RESTS:
+        axes = [np.count_nonzero(c) for c in candidates]
+        directions = np.array(candidates) / np.sqrt(axes)[:, None]
+        outputs = found[:3] + (1 + found[3:6]) * (gravity * directions @ _axes(found).T)
+        rows = _jacobian(outputs, found)
+        told = np.einsum('ki,ij,kj->k', rows, np.linalg.inv(information), rows)
+        # With one or two axes along gravity a pose is easier to hold.
+        best = int(np.argmax(told / axes))
+        information = information + np.outer(rows[best], rows[best]) / variance
+        poses.append(' and '.join(f'{axis} {"up" if sign > 0 else "down"}' for axis, sign
+                                  in zip(AXES, candidates.pop(best)) if sign))
+    return poses
+
+
+def _information(rests: _Rests, found: np.ndarray, excess: float) -> np.ndarray:
+    """Information of the rests about the nine parameters, with that of the prior, (9, 9)."""
+    information = np.eye(len(NAMES)) / PRIOR ** 2
+    if len(rests.mean):
+        rows = _jacobian(rests.mean, found)
+        variance = _magnitude_variance(rests, found) + excess
+        information += rows.T @ (rows / variance[:, None])
+    return information
+
+
+def _open(information: np.ndarray) -> list[str]:
+    """Name the coefficients that the information does not determine."""
+    sigma = np.sqrt(np.diag(np.linalg.inv(information)))
+    return [name for name, s in zip(NAMES, sigma) if s > DETERMINED]

@@ -1,0 +1,136 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Poses: the mean output at rest beside the stage angles that the encoder gave."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from adxl_ros.errors import UserError
+from adxl_ros.model import chain
+from adxl_ros.model.constants import AXES
+from adxl_ros.model.effects.base import Components
+from adxl_ros.model.sensor import Sensor
+from adxl_ros.model.stage import specific_force
+
+
+@dataclass(frozen=True)
+class Poses:
+    """
+    Rests of one unit, (k,) of them.
+
+    Attributes
+    ----------
+    volts, std_v
+        Mean output of each measured axis and the standard deviation of that mean, V, (k, m).
+    alpha_rad, beta_rad
+        What the stage's encoder said, unwrapped, (k,); NaN without a stage.
+    time_s
+        Beginning and end of each rest, s, (k, 2).
+    check
+        True for a pose that is kept out of the fit to judge it, (k,).
+
+    """
+
+    volts: np.ndarray
+    std_v: np.ndarray
+    alpha_rad: np.ndarray
+    beta_rad: np.ndarray
+    time_s: np.ndarray
+    check: np.ndarray
+
+    def __len__(self) -> int:
+        """Count the poses."""
+        return len(self.volts)
+
+    @staticmethod
+    def from_entries(entries: Sequence[Mapping[str, Any]]) -> Poses:
+        """Take the poses of a journal."""
+        def column(name: str, missing: Any = np.nan) -> np.ndarray:
+            return np.array([entry.get(name, missing) for entry in entries])
+
+        times = np.column_stack([column('start_ns'), column('stop_ns')]) * 1e-9
+        return Poses(column('mean_v'), column('std_v'), column('alpha_rad'), column('beta_rad'),
+                     times, column('check', False))
+
+    def subset(self, chosen: np.ndarray) -> Poses:
+        """Keep some of the poses, by mask or index."""
+        return Poses(self.volts[chosen], self.std_v[chosen], self.alpha_rad[chosen],
+                     self.beta_rad[chosen], self.time_s[chosen], self.check[chosen])
+
+
+def together(parts: list[Poses]) -> Poses:
+    """Join the poses of several recordings of one unit."""
+    return Poses(*(np.concatenate([getattr(part, name) for part in parts])
+                   for name in Poses.__dataclass_fields__))
+
+
+def reference_force(poses: Poses, gravity_mps2: float) -> Components:
+    """Return the specific force that the stage angles promise, m/s², three components (k,)."""
+    return specific_force(poses.alpha_rad, poses.beta_rad, gravity_mps2)
+
+
+def pose_variance(sensor: Sensor, poses: Poses) -> np.ndarray:
+    """
+    Variance of a pose's volts about the model, V², (k, m): noise of the mean and the encoder's.
+
+    An encoder of step r leaves the true angle uniform within it: variance r²/12 a joint.
+    """
+    respond = chain.static_response(sensor)
+    variance = poses.std_v ** 2
+    step = 1e-4
+    for joint in range(2):
+        ends = []
+        for side in (step, -step):
+            angles = [poses.alpha_rad, poses.beta_rad]
+            angles[joint] = angles[joint] + side
+            ends.append(np.column_stack(
+                respond(specific_force(*angles, sensor.local_gravity_mps2))))
+        slope = (ends[0] - ends[1]) / (2 * step)
+        variance = variance + slope ** 2 * sensor.stage_resolution_rad ** 2 / 12
+    return variance
+
+
+def check_polarity(sensor: Sensor, poses: Poses) -> None:
+    """
+    Refuse a unit whose axes do not follow the stage as the frames say.
+
+    Raises
+    ------
+    UserError
+        An axis moves against its reference, or with that of another axis: inverted or swapped.
+
+    """
+    reference = np.column_stack(reference_force(poses, sensor.local_gravity_mps2))
+    for d, axis in enumerate(sensor.axes):
+        with np.errstate(invalid='ignore', divide='ignore'):
+            strength = np.array([np.corrcoef(poses.volts[:, d], reference[:, c])[0, 1]
+                                 for c in range(3)])
+        own = AXES.index(axis)
+        if not np.isfinite(strength[own]) or abs(strength[own]) > 0.9 and strength[own] > 0:
+            continue
+        if strength[own] < -0.9:
+            raise UserError(f'{axis}: reads against the stage (correlation {strength[own]:.2f}):'
+                            ' the axis is inverted; correct its sign or the mounting')
+        other = int(np.nanargmax(np.abs(strength)))
+        if other != own and abs(strength[other]) > 0.9:
+            sign = 'against' if strength[other] < 0 else 'with'
+            raise UserError(f'{axis}: moves {sign} the stage\'s {AXES[other]} (correlation '
+                            f'{strength[other]:.2f}): axes are swapped; correct the wiring or '
+                            'the mounting')

@@ -1,0 +1,179 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""From samples to poses: the same steps for a recording and for a live sweep."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from adxl_ros.calibrate.poses import Poses
+from adxl_ros.calibrate.rests import find_rests, Rest, rest_means
+from adxl_ros.calibrate.stillness import Noise
+from adxl_ros.errors import UserError
+from adxl_ros.files.columns import nominal_figures, Recording
+from adxl_ros.model import noise
+from adxl_ros.model.sensor import Sensor, with_axes
+
+_FINEST_ANGLE_RAD = 1e-5
+"""An encoder is never taken to be better than this, so that rounding in a file is no motion."""
+
+
+def known_noise(sensor: Sensor) -> Noise:
+    """Return the noise that the figures of a sensor promise, V."""
+    return Noise(noise.sigma_v(sensor), sensor.rc_s)
+
+
+def unit_of(sensor: Sensor, info: Mapping[str, str], where: str, axes: str | None = None,
+            rate_hz: float | None = None) -> Sensor:
+    """
+    Return the nominal sensor that a stream or recording is of: uncalibrated, with its serial.
+
+    What a fit does not find (filter, ADC, noise, stage) stays that of `sensor`.
+
+    Parameters
+    ----------
+    info
+        Keys of `sensor_info`.
+    where
+        The file or topic, for messages.
+    axes, rate_hz
+        As the samples show them; else those of `info`.
+
+    Raises
+    ------
+    UserError
+        The stream and `sensor` belong to different units, or `info` cannot be read.
+
+    """
+    serial = info.get('serial', sensor.serial)
+    if 'nominal' not in (serial, sensor.serial) and serial != sensor.serial:
+        raise UserError(f'{where}: is of the sensor {serial}, but the parameters are of '
+                        f'{sensor.serial}; give the parameters of that sensor, or nominal ones')
+    axes = axes or info.get('axes', sensor.axes)
+    bare = with_axes(replace(sensor, model='nominal', effects=(), values={},
+                             covariance=np.zeros((0, 0)), covariance_names=(), provenance={}),
+                     axes)
+    return replace(bare, serial=sensor.serial if serial == 'nominal' else serial,
+                   rate_hz=rate_hz or float(info.get('rate_hz', sensor.rate_hz)),
+                   **nominal_figures(info, axes, where))
+
+
+def recorded_unit(sensor: Sensor, recording: Recording) -> Sensor:
+    """Return the nominal sensor that a recording is of; see `unit_of`."""
+    return unit_of(sensor, recording.info, recording.path, recording.axes, rate_hz(recording))
+
+
+def rate_hz(recording: Recording) -> float:
+    """
+    Return the sample rate from the stamps, Hz, which a gap here and there does not move.
+
+    Raises
+    ------
+    UserError
+        Fewer than two samples.
+
+    """
+    if len(recording) < 2:
+        raise UserError(f'{recording.path}: {len(recording)} samples; at least 2 are needed')
+    return round(float(1 / np.median(np.diff(recording.time_s))), 6)
+
+
+def stage_angles(recording: Recording) -> np.ndarray | None:
+    """Return alpha and beta, rad, (n, 2), NaN where not sampled; None without a stage."""
+    columns = [recording.columns.get(name) for name in ('alpha_rad', 'beta_rad')]
+    if any(c is None or np.isnan(c).all() for c in columns):
+        return None
+    return np.column_stack(columns)
+
+
+def named_rests(recording: Recording, entries: Sequence[Mapping[str, Any]]) -> list[Rest]:
+    """
+    Find the rows of the rests that a journal names by their first and last stamp.
+
+    Raises
+    ------
+    UserError
+        The recording does not hold one of them.
+
+    """
+    stamps = recording.stamp_ns
+    rests = []
+    for number, entry in enumerate(entries, 1):
+        start, last = np.searchsorted(stamps, [entry['start_ns'], entry['stop_ns']])
+        if last >= len(stamps) or stamps[start] != entry['start_ns'] or \
+                stamps[last] != entry['stop_ns']:
+            raise UserError(f'{recording.path}: has no samples at the stamps of pose {number} of '
+                            'the journal; give the recording of that very run')
+        rests.append(Rest(int(start), int(last) + 1, float(recording.time_s[start]),
+                          float(recording.time_s[last])))
+    return rests
+
+
+def poses_of(recording: Recording, sensor: Sensor,
+             entries: Sequence[Mapping[str, Any]] | None = None) -> Poses:
+    """
+    Find the rests of a recording, or take a journal's, and average each.
+
+    Parameters
+    ----------
+    sensor
+        From `recorded_unit`.
+    entries
+        Poses of the journal of the run, which name the rests, the angles and the check poses.
+
+    Raises
+    ------
+    UserError
+        There is no rest.
+
+    """
+    volts, angles = recording.volts(sensor), stage_angles(recording)
+    known = known_noise(sensor)
+    if entries is None:
+        tolerance = max(sensor.stage_resolution_rad, _FINEST_ANGLE_RAD)
+        rests = find_rests(recording.time_s, volts, sensor.rate_hz, angles, known, learn=True,
+                           angle_tolerance_rad=None if angles is None else tolerance)
+    else:
+        rests = named_rests(recording, entries)
+    if not rests:
+        raise UserError(f'{recording.path}: the sensor is nowhere at rest; hold it still for at '
+                        'least 1 s in each pose')
+    mean, std = rest_means(recording.time_s, volts, rests, sensor.rate_hz, known)
+    if entries is None:
+        middle = rest_angles(angles, rests)
+        check = np.zeros(len(rests), bool)
+    else:
+        middle = np.array([[e.get('alpha_rad', np.nan), e.get('beta_rad', np.nan)]
+                           for e in entries])
+        check = np.array([bool(e.get('check', False)) for e in entries])
+    times = np.array([[r.time_start_s, r.time_stop_s] for r in rests])
+    return Poses(mean, std, middle[:, 0], middle[:, 1], times, check)
+
+
+def rest_angles(angles: np.ndarray | None, rests: Sequence[Rest]) -> np.ndarray:
+    """Average the encoder over each rest, rad, (k, 2); NaN without a stage."""
+    if angles is None:
+        return np.full((len(rests), 2), np.nan)
+    inside = [angles[r.start:r.stop] for r in rests]
+    return np.array([[_mean_of_known(part[:, joint]) for joint in range(2)] for part in inside])
+
+
+def _mean_of_known(values: np.ndarray) -> float:
+    known = values[np.isfinite(values)]
+    return float(known.mean()) if known.size else float('nan')
