@@ -1,0 +1,181 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Republish a stream corrected by its parameter file: acceleration, orientation, tilt."""
+
+from __future__ import annotations
+
+from collections import Counter
+from math import cos, sin
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import Vector3Stamped
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+from sensor_msgs.msg import Imu
+
+from adxl_ros.errors import UserError
+from adxl_ros.files import imu_bytes
+from adxl_ros.files.cdr import CdrError
+from adxl_ros.files.unit import check_unit
+from adxl_ros.model.live import Estimate, Live
+from adxl_ros.model.sensor import Sensor
+from adxl_ros.model.tilt import UNOBSERVABLE_RAD2
+from adxl_ros.nodes import common
+from adxl_ros.nodes.live_sensor import LiveSensor
+from adxl_ros.nodes.stream import Stream
+
+_DEPTH = 100
+"""Samples kept while the node is busy: 0.1 s at 1 kHz."""
+
+_UNKNOWN_RAD2 = 1e6
+"""Variance of an angle that is not known, yaw always among them.
+
+π²/3, that of a uniform angle, would let a filter that fuses 1000 samples a second believe in
+yaw = 0 before long; 1e6, as for an axis that is not there, never counts."""
+
+
+class Compensation(Node):
+    """The node; what it makes of a sample is in `model.live`, ROS-free."""
+
+    def __init__(self) -> None:
+        super().__init__('compensation')
+        self._info: dict[str, str] | None = None
+        self._refusal = ''
+        self._counts: Counter[str] = Counter()
+        self._reported: Counter[str] = Counter()
+        self._angles = [0.0, 0.0, 0.0]
+        LiveSensor(self, self._check_unit, self._use)
+        self._data = common.publisher(self, Imu, 'imu/data', _DEPTH)
+        self._tilt = common.publisher(self, Vector3Stamped, 'tilt', _DEPTH)
+        self._diagnostics = common.publisher(self, DiagnosticArray, '/diagnostics', 10)
+        common.subscription(self, DiagnosticStatus, 'sensor_info', self._on_info, 1, latched=True)
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._reported_ns = self._steady.now().nanoseconds
+        self.create_timer(1.0, self._report, clock=self._steady)
+        self._stream = Stream(self, Imu, 'imu/data_raw', self._on_sample, _DEPTH)
+
+    def close(self) -> None:
+        """End the thread that receives."""
+        self._stream.close()
+
+    def _use(self, sensor: Sensor, source: str) -> None:
+        # One assignment: the receiving thread has the old coefficients or the new ones.
+        self._live = Live(sensor)
+        self._source = source
+        of = f'{sensor.serial}, model {sensor.model}' if sensor.effects else \
+            f'{sensor.serial}, which is not calibrated'
+        self.get_logger().info(f'compensating by {source}: {of}')
+        self._judge()
+
+    def _check_unit(self, sensor: Sensor) -> None:
+        if self._info is not None:
+            check_unit(self._info, self._info.get('axes', sensor.axes), sensor,
+                       self.resolve_topic_name('sensor_info'))
+
+    def _on_info(self, message: DiagnosticStatus) -> None:
+        self._info = {pair.key: pair.value for pair in message.values}
+        self._judge()
+
+    def _judge(self) -> None:
+        """Find out whether the parameters are those of the stream, and say so on a change."""
+        before, self._refusal = self._refusal, ''
+        try:
+            self._check_unit(self._live.sensor)
+        except UserError as error:
+            self._refusal = str(error)
+        if self._refusal and self._refusal != before:
+            self.get_logger().error(f'publishing nothing: {self._refusal}')
+        elif before and not self._refusal:
+            self.get_logger().info('publishing again: the parameters are those of the stream')
+
+    def _on_sample(self, raw: bytes) -> None:
+        """Take one serialized Imu; in the receiving thread."""
+        self._counts['received'] += 1
+        if self._refusal:
+            return
+        try:
+            time_s, accel = imu_bytes.read(raw)
+        except CdrError:
+            self._counts['dropped'] += 1
+            return
+        estimate = self._live(accel, time_s)
+        if estimate is None:
+            self._counts['dropped'] += 1
+            return
+        self._counts['saturated'] += estimate.saturated
+        orientation = self._orientation(estimate)
+        xx, xy, xz, yy, yz, zz = estimate.covariance
+        self._data.publish(imu_bytes.corrected(
+            raw, orientation, (*estimate.force, xx, xy, xz, xy, yy, yz, xz, yz, zz)))
+        self._tilt.publish(imu_bytes.vector3_stamped(raw, self._angles))
+        self._counts['published'] += 1
+
+    def _orientation(self, estimate: Estimate) -> tuple[float, ...]:
+        """Turn the angles, where not shown the last ones, to a quaternion with yaw 0."""
+        variances = []
+        for i, (angle, variance) in enumerate((estimate.roll, estimate.pitch,
+                                               estimate.inclination)):
+            shown = variance < UNOBSERVABLE_RAD2
+            if shown:
+                self._angles[i] = angle
+            variances.append(variance if shown else _UNKNOWN_RAD2)
+        roll, pitch, _ = variances
+        both = estimate.roll_pitch if max(roll, pitch) < _UNKNOWN_RAD2 else 0.0
+        half_roll, half_pitch = self._angles[0] / 2, self._angles[1] / 2
+        sr, cr, sp, cp = sin(half_roll), cos(half_roll), sin(half_pitch), cos(half_pitch)
+        return (sr * cp, cr * sp, -sr * sp, cr * cp,
+                roll, both, 0.0, both, pitch, 0.0, 0.0, 0.0, _UNKNOWN_RAD2)
+
+    def _report(self) -> None:
+        """Publish diagnostics; once a second."""
+        now_ns = self._steady.now().nanoseconds
+        passed_s, self._reported_ns = (now_ns - self._reported_ns) * 1e-9, now_ns
+        counts = self._counts.copy()
+        new = {name: counts[name] - self._reported[name] for name in counts}
+        self._reported = counts
+        sensor = self._live.sensor
+        level, text = self._state(new)
+        unit = 'other' if self._refusal else 'confirmed' if self._info else 'not confirmed'
+        values: dict[str, Any] = {
+            'rate_in_hz': round(new.get('received', 0) / passed_s, 1),
+            'rate_out_hz': round(new.get('published', 0) / passed_s, 1),
+            **{name: counts[name] for name in ('received', 'published', 'dropped', 'saturated')},
+            'unit': unit, 'calibration': self._source, 'serial': sensor.serial,
+            'axes': sensor.axes, 'model': sensor.model, 'effects': ', '.join(sensor.effects),
+            **{f'provenance.{key}': value for key, value in sensor.provenance.items()}}
+        self._diagnostics.publish(common.diagnostics(
+            self, common.status(level, 'compensation', text, sensor.serial, values)))
+
+    def _state(self, new: dict[str, int]) -> tuple[bytes, str]:
+        if self._refusal:
+            return common.ERROR, f'publishing nothing: {self._refusal}'
+        if not new.get('received'):
+            return common.WARN, f'no samples on {self.resolve_topic_name("imu/data_raw")}'
+        for name, what in (('dropped', 'samples dropped that no force explains'),
+                           ('saturated', 'samples with the ADC at its rail')):
+            if new.get(name):
+                return common.WARN, f'{new[name]} {what}'
+        if self._info is None:
+            return common.WARN, (f'unit not confirmed: nothing on '
+                                 f'{self.resolve_topic_name("sensor_info")}')
+        if not self._live.sensor.effects:
+            return common.WARN, 'not calibrated: the nominal figures apply'
+        return common.OK, 'compensating'
+
+
+def main() -> int:
+    """Run the node."""
+    return common.main(Compensation, __doc__)
