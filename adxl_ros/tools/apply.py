@@ -1,0 +1,124 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Correct a recording by its parameter file: acceleration and tilt, from the sensor alone."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+import sys
+
+import numpy as np
+
+from adxl_ros.errors import UserError
+from adxl_ros.files import params, recording
+from adxl_ros.files.csv_writer import CsvWriter
+from adxl_ros.files.recording import Recording
+from adxl_ros.files.unit import check_unit
+from adxl_ros.model import chain
+from adxl_ros.model.constants import AXES
+from adxl_ros.model.sensor import Sensor, with_axes
+from adxl_ros.model.tilt import tilt
+from adxl_ros.model.uncertainty import force_covariance
+from adxl_ros.tools.common import progress, run
+
+_BLOCK_ROWS = 16384
+_DIGITS = 12
+"""Of an estimate: a millionth of the noise at least."""
+
+
+def parser() -> argparse.ArgumentParser:
+    """Describe the command line."""
+    parse = argparse.ArgumentParser(prog='apply', description=__doc__)
+    parse.add_argument('recording', metavar='RECORDING', help='rosbag2 directory, .mcap or CSV')
+    parse.add_argument('--params', metavar='FILE', required=True,
+                       help='the parameter file of the sensor')
+    parse.add_argument('-o', dest='output', metavar='OUT.csv', required=True)
+    return parse
+
+
+def apply(options: argparse.Namespace) -> int:
+    """Run the tool; see `parser`."""
+    if Path(options.output).resolve() == Path(options.recording).resolve():
+        raise UserError(f'{options.output}: is the recording itself; choose another output')
+    sensor = params.load(options.params)
+    lost = saturated = rows = 0
+    block = None
+    with CsvWriter(options.output, _DIGITS) as out, progress('apply') as show:
+        for block in recording.blocks(options.recording, _BLOCK_ROWS):
+            if not rows:
+                sensor = _of_unit(block, sensor)
+            volts = block.volts(sensor)
+            at_rail = chain.at_a_rail(volts, sensor)
+            columns = estimates(sensor, volts, at_rail)
+            out.write({'time_s': block.epoch_ns * 1e-9 + block.time_s, **columns})
+            rows += len(block)
+            lost += int(np.isnan(columns['ax_mps2']).sum())
+            saturated += int(at_rail.sum())
+            show(block.done)
+    _say(lost, rows, 'have no solution: their cells are empty')
+    _say(saturated, rows, "have the ADC at its rail: their standard deviations are inf")
+    if block is not None and 'cut' in block.notes:
+        print(f'apply: {block.notes["cut"]}', file=sys.stderr)
+    return 0
+
+
+def _of_unit(block: Recording, sensor: Sensor) -> Sensor:
+    if not sensor.effects:
+        sensor = with_axes(sensor, block.axes)
+    check_unit(block.info, block.axes, sensor, block.path)
+    return sensor
+
+
+def _say(count: int, rows: int, what: str) -> None:
+    if count:
+        print(f'apply: {count} of {rows} samples {what}', file=sys.stderr)
+
+
+def estimates(sensor: Sensor, volts: np.ndarray, at_rail: np.ndarray) -> dict[str, np.ndarray]:
+    """
+    Estimate force and angles with standard deviations, (n,) each, by column of the output.
+
+    NaN with standard deviation inf is what a sample does not show.
+
+    Parameters
+    ----------
+    sensor
+        The unit.
+    volts
+        ADC volts, (n, m).
+    at_rail
+        Samples of which nothing is sure, (n,).
+
+    """
+    force = chain.inverse(sensor)(list(volts.T))
+    covariance = force_covariance(sensor, force)
+    covariance[:, :, at_rail] = np.inf
+    angles = tilt(force, covariance, 'z' in sensor.axes)
+    std = np.sqrt([covariance[d, d] for d in range(3)])
+    if sensor.axes == 'x':
+        force[1:] = np.full((2, len(volts)), np.nan)
+    std[np.isnan(force)] = np.inf
+    columns = {f'a{axis}_mps2': f for axis, f in zip(AXES, force)}
+    columns |= {f'a{axis}_std_mps2': s for axis, s in zip(AXES, std)}
+    for names in (('roll', 'pitch', 'inclination'), ('alpha', 'beta')):
+        for kind in ('', '_std'):
+            columns |= {f'{name}{kind}_rad': getattr(angles, f'{name}{kind}') for name in names}
+    return columns
+
+
+def main() -> int:
+    """Run the tool on the command line."""
+    return run(parser(), apply)

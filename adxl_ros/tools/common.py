@@ -1,0 +1,98 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What every tool shares: how it ends, its default sensor, and its progress."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+import os
+from pathlib import Path
+import signal
+import sys
+from types import FrameType
+
+from ament_index_python.packages import get_package_share_directory
+
+from adxl_ros.errors import UserError
+
+
+def run(parser: argparse.ArgumentParser, command: Callable[[argparse.Namespace], int]) -> int:
+    """
+    Parse the command line and run a tool; return its exit status.
+
+    Parameters
+    ----------
+    parser
+        Ends the process with status 2 on wrong usage.
+    command
+        The tool; it may raise `UserError`.
+
+    Returns
+    -------
+    int
+        What the tool returns, 1 with one line on stderr if it could not do what was asked, 130
+        after Ctrl-C.
+
+    """
+    signal.signal(signal.SIGTERM, _terminated)
+    try:
+        status = command(parser.parse_args())
+        sys.stdout.flush()
+    except UserError as error:
+        print(f'{parser.prog}: {" ".join(str(error).split())}', file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print(f'{parser.prog}: interrupted; nothing was written', file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        # The reader of stdout has seen enough; Python must not complain when it flushes at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    return status
+
+
+def _terminated(number: int, frame: FrameType | None) -> None:
+    """End by an exception, so that files begun are removed on the way out."""
+    sys.exit(128 + number)
+
+
+def default_params() -> Path:
+    """Where the nominal sensor is installed, the default of every `--params`."""
+    return Path(get_package_share_directory('adxl_ros')) / 'params' / 'adxl203.yaml'
+
+
+@contextmanager
+def progress(title: str) -> Iterator[Callable[[float], None]]:
+    """
+    Show a bar on a terminal, where rich is installed; else nothing.
+
+    Yields
+    ------
+    callable
+        Takes the fraction that is done.
+
+    """
+    try:
+        from rich.console import Console
+        from rich.progress import Progress
+    except ImportError:
+        yield lambda done: None
+        return
+    console = Console(stderr=True)
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task(title, total=1.0)
+        yield lambda done: bar.update(task, completed=done)

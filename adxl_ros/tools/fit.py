@@ -1,0 +1,92 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Fit a calibration to recordings, without a running graph."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+import sys
+
+from adxl_ros.calibrate import recorded, result
+from adxl_ros.calibrate.poses import together
+from adxl_ros.errors import UserError
+from adxl_ros.files import journal, params, recording
+from adxl_ros.model.sensor import Sensor
+from adxl_ros.tools.common import default_params, run
+
+
+def parser() -> argparse.ArgumentParser:
+    """Describe the command line."""
+    parse = argparse.ArgumentParser(prog='fit', description=__doc__)
+    parse.add_argument('recording', nargs='+',
+                       help='rosbag2 directory, .mcap or CSV, all of one unit')
+    parse.add_argument('--params', metavar='FILE', default=None,
+                       help='figures that are not fitted (default: the nominal ADXL203)')
+    parse.add_argument('--model', choices=list(result.STAGE_FITS),
+                       help='against stage angles (default: physical); a three-axis recording '
+                            'without them is calibrated against gravity')
+    parse.add_argument('--journal', metavar='FILE',
+                       help='use the rests that the journal of this very run names')
+    parse.add_argument('-o', dest='output', metavar='FILE.yaml', required=True)
+    parse.add_argument('--report', metavar='DIR', help='leave the figures there')
+    return parse
+
+
+def fit(options: argparse.Namespace) -> int:
+    """Run the tool; see `parser`."""
+    if options.journal and len(options.recording) != 1:
+        raise UserError(f'--journal {options.journal}: names the rests of one recording, but '
+                        f'{len(options.recording)} are given')
+    sensor = params.load(options.params or default_params())
+    entries = _entries(options.journal)
+    unit: Sensor | None = None
+    parts = []
+    for path in options.recording:
+        read = recording.read(path)
+        for note in ('cut',):
+            if note in read.notes:
+                print(f'fit: {read.notes[note]}', file=sys.stderr)
+        unit = recorded.recorded_unit(unit or sensor, read)
+        parts.append(recorded.poses_of(read, unit, entries))
+    found = result.calibrate(unit, together(parts), options.model,
+                             result.name_of(options.recording))
+    if options.report:
+        folder = Path(options.report)
+        _make(folder)
+        found.draw(folder / 'calibration.png')
+    found.save(options.output)
+    print('\n'.join(found.comments()))
+    return 0
+
+
+def _entries(path: str | None) -> list[dict] | None:
+    if path is None:
+        return None
+    _, entries = journal.read(path)
+    final = next((e['rests'] for e in reversed(entries) if 'rests' in e), None)
+    return final if final is not None else journal.accepted_poses(entries)
+
+
+def _make(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f'{folder}: cannot be made: {error.strerror}') from None
+
+
+def main() -> int:
+    """Run the tool on the command line."""
+    return run(parser(), fit)
