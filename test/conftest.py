@@ -1,0 +1,176 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+What the tests share: a ROS domain of their own, the installed executables, the shared files.
+
+The executables are found through the ament index, as `ros2 run` does, and talk over DDS on the
+loopback interface in a domain that no other session of these tests and no other graph uses.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+import fcntl
+import os
+from pathlib import Path
+import signal
+import socket
+import subprocess
+import tempfile
+import time
+
+from ament_index_python.packages import get_package_prefix
+import pytest
+
+REPO = Path(__file__).resolve().parents[1]
+DOMAINS = range(1, 102)  # 0 is everybody's; above 101 lie ports that the system hands out
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    # A session that is told to end stops the processes it has started, as after Ctrl-C.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+
+
+def domain_in_use(domain: int) -> bool:
+    """Say whether somebody has the port to which a domain's participants announce themselves."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.bind(('', 7400 + 250 * domain))
+        except OSError:
+            return True
+    return False
+
+
+@pytest.fixture
+def ros_env(tmp_path: Path) -> Iterator[dict[str, str]]:
+    """Set the environment of a graph of this test's own, for this process and its children."""
+    locks = Path(tempfile.gettempdir())
+    for domain in DOMAINS:
+        with open(locks / f'adxl_ros_{os.getuid()}_domain_{domain}.lock', 'w') as lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                continue
+            if domain_in_use(domain):
+                continue
+            with pytest.MonkeyPatch.context() as patch:
+                patch.setenv('ROS_DOMAIN_ID', str(domain))
+                patch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+                patch.delenv('ROS_LOCALHOST_ONLY', raising=False)
+                patch.setenv('ROS_LOG_DIR', str(tmp_path / 'ros_log'))
+                yield dict(os.environ)
+            return
+    pytest.fail('every ROS domain from 1 to 101 is in use')
+
+
+def wait_until(condition: Callable[[], object], timeout_s: float, what: str) -> None:
+    """Poll `condition` until it holds, and fail with `what` after `timeout_s` seconds."""
+    end = time.monotonic() + timeout_s
+    while not condition():
+        if time.monotonic() > end:
+            pytest.fail(f'{what}: not after {timeout_s} s')
+        time.sleep(0.02)
+
+
+@dataclass(frozen=True)
+class Started:
+    """A process that runs an installed executable, and the file that takes what it prints."""
+
+    name: str
+    popen: subprocess.Popen
+    log: Path
+
+    def output(self) -> str:
+        """Read what it has printed so far, on stdout and stderr."""
+        return self.log.read_text(encoding='utf-8', errors='replace')
+
+    def wait_for(self, text: str, timeout_s: float = 20.0) -> None:
+        """Wait until it has printed `text`; fail when it ends without, or after the time."""
+        def seen() -> bool:
+            ended = self.popen.poll() is not None
+            found = text in self.output()
+            if ended and not found:
+                pytest.fail(f'{self.name} ended with {self.popen.returncode} and without '
+                            f'printing {text!r}:\n{self.output()}')
+            return found
+        wait_until(seen, timeout_s, f'{self.name} printing {text!r}')
+
+    def wait(self, timeout_s: float = 20.0) -> int:
+        """Wait until it ends by itself and return its exit status."""
+        wait_until(lambda: self.popen.poll() is not None, timeout_s, f'{self.name} ending')
+        return self.popen.returncode
+
+    def stop(self) -> int:
+        """End it with its children, kindly first, and return its exit status."""
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
+            if self.popen.poll() is None:
+                os.killpg(self.popen.pid, number)
+                with suppress(subprocess.TimeoutExpired):
+                    self.popen.wait(5.0)
+        with suppress(ProcessLookupError):  # children that outlived it
+            os.killpg(self.popen.pid, signal.SIGKILL)
+        return self.popen.wait()
+
+
+@pytest.fixture
+def start(ros_env: dict[str, str], tmp_path: Path) -> Iterator[Callable[..., Started]]:
+    """
+    Give a function of a name and arguments that starts an executable in this test's graph.
+
+    It returns a `Started` at once; all of them are stopped when the test ends. The files of what
+    they printed are `tmp_path / '<number>_<name>.log'`, and what a failing test's processes
+    printed is in its report.
+    """
+    started: list[Started] = []
+
+    def begin(name: str, *args: object) -> Started:
+        log = tmp_path / f'{len(started)}_{name}.log'
+        with open(log, 'wb') as file:
+            popen = subprocess.Popen(
+                [executable(name), *map(str, args)], env=ros_env, cwd=tmp_path,
+                stdin=subprocess.DEVNULL, stdout=file, stderr=subprocess.STDOUT,
+                start_new_session=True)
+        started.append(Started(name, popen, log))
+        return started[-1]
+
+    yield begin
+    for process in reversed(started):
+        process.stop()
+        print(f'--- {process.name}:\n{process.output()}')
+
+
+def executable(name: str) -> Path:
+    """Find an installed executable as `ros2 run` does."""
+    return Path(get_package_prefix('adxl_ros')) / 'lib' / 'adxl_ros' / name
+
+
+@pytest.fixture
+def run_tool(tmp_path: Path) -> Callable[..., subprocess.CompletedProcess]:
+    """Give a function of a name and arguments that runs a tool and captures what it prints."""
+    def run(name: str, *args: object, timeout_s: float = 120.0) -> subprocess.CompletedProcess:
+        return subprocess.run([executable(name), *map(str, args)], cwd=tmp_path, text=True,
+                              capture_output=True, timeout=timeout_s, stdin=subprocess.DEVNULL)
+    return run
+
+
+@pytest.fixture(scope='session')
+def shared_dir() -> Path:
+    """Name the folder of real recordings and samples beside the repository."""
+    path = REPO.parent / 'shared'
+    if not path.is_dir():
+        pytest.skip(f'no recordings in {path}')
+    return path

@@ -1,0 +1,84 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What `colcon build` installed, and ./run."""
+
+from importlib.metadata import distribution, EntryPoint
+import os
+from pathlib import Path
+import subprocess
+
+from ament_index_python.packages import get_package_prefix, get_package_share_directory
+from ament_index_python.resources import get_resource
+from conftest import executable, REPO
+import pytest
+
+SCRIPTS = [entry for entry in distribution('adxl_ros').entry_points
+           if entry.group == 'console_scripts']
+EXECUTABLES = [entry.name for entry in SCRIPTS]
+LAUNCH_FILES = ('calibrate.launch.py', 'robot.launch.py')
+
+
+def run(*args: str, **options: object) -> subprocess.CompletedProcess:
+    """Run ./run of this tree, when it is this tree that is under test."""
+    if Path(get_package_prefix('adxl_ros')) != REPO / 'install' / 'adxl_ros':
+        pytest.skip('the package under test was not built by make build')
+    command = [options.pop('path', REPO / 'run'), *args]
+    return subprocess.run(command, text=True, capture_output=True, timeout=60, **options)
+
+
+def test_is_an_ament_package() -> None:
+    get_resource('packages', 'adxl_ros')
+    assert list(Path(get_package_share_directory('adxl_ros')).glob('hook/ament_prefix_path.*'))
+
+
+@pytest.mark.parametrize('script', SCRIPTS, ids=EXECUTABLES)
+def test_executable_is_where_ros2_run_looks(script: EntryPoint) -> None:
+    assert os.access(executable(script.name), os.X_OK)
+    assert callable(script.load())
+
+
+@pytest.mark.parametrize('path', [
+    'package.xml', 'params/adxl203.yaml', *(f'launch/{name}' for name in LAUNCH_FILES),
+])
+def test_share(path: str) -> None:
+    assert (Path(get_package_share_directory('adxl_ros')) / path).is_file()
+
+
+def test_run_names_what_there_is() -> None:
+    for args in ((), ('no_such_tool',), ('../adxl_ros/fit',)):
+        done = run(*args)
+        assert done.returncode == 2
+        assert done.stdout == ''
+        assert done.stderr.count('\n') == 1
+        assert all(name in done.stderr for name in EXECUTABLES)
+
+
+def test_run_passes_arguments_and_status(tmp_path: Path) -> None:
+    link = tmp_path / 'a link'
+    link.symlink_to(REPO / 'run')
+    code = 'import adxl_ros, rclpy, sys; print(sys.argv[1:]); sys.exit(7)'
+    done = run('--exec', 'python', '-c', code, 'a b', '*', path=link, cwd=tmp_path)
+    assert (done.returncode, done.stdout, done.stderr) == (7, "['a b', '*']\n", '')
+
+
+@pytest.mark.parametrize('name', LAUNCH_FILES)
+def test_launch_file_loads(name: str) -> None:
+    pytest.importorskip('launch_ros', reason='launch_ros is not installed')
+    from launch import LaunchContext
+    from launch.launch_description_sources import PythonLaunchDescriptionSource
+    path = Path(get_package_share_directory('adxl_ros')) / 'launch' / name
+    description = PythonLaunchDescriptionSource(str(path)).get_launch_description(LaunchContext())
+    arguments = {argument.name for argument in description.get_launch_arguments()}
+    assert arguments >= {'params_file', 'namespace', 'frame_id', 'log_level'}

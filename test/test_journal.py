@@ -1,0 +1,95 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The journal: on disk before it is acknowledged, whole after any crash."""
+
+import json
+
+from adxl_ros.errors import UserError
+from adxl_ros.files.journal import accepted_poses, Journal, read
+import pytest
+
+HEAD = {'serial': 'A1', 'mode': 'stage'}
+
+
+def test_an_interrupted_calibration_resumes(tmp_path):
+    """Entries that were appended come back, and a line that a crash cut does not."""
+    path = tmp_path / 'j'
+    journal = Journal(path, HEAD)
+    journal.append({'pose': 0})
+    journal.append({'pose': 1})
+    journal.close()
+    with open(path, 'ab') as file:
+        file.write(b'{"pose": 2, "mea')
+    journal = Journal(path, HEAD)
+    assert journal.entries == [{'pose': 0}, {'pose': 1}]
+    journal.append({'pose': 2})
+    journal.close()
+    assert [entry['pose'] for entry in read(path)[1]] == [0, 1, 2]
+
+
+def test_another_unit_is_refused_and_says_what_changed(tmp_path):
+    """A journal of another unit is not continued."""
+    path = tmp_path / 'j'
+    journal = Journal(path, HEAD)
+    journal.append({'pose': 0})
+    journal.close()
+    with pytest.raises(UserError, match='serial was "A1", is "B2"'):
+        Journal(path, {**HEAD, 'serial': 'B2'})
+    assert len(read(path)[1]) == 1
+
+
+def test_two_at_once_are_refused(tmp_path):
+    """The second calibration of one journal is told so."""
+    first = Journal(tmp_path / 'j', HEAD)
+    with pytest.raises(UserError, match='another calibration is writing this journal'):
+        Journal(tmp_path / 'j', HEAD)
+    first.close()
+    Journal(tmp_path / 'j', HEAD).close()
+
+
+def test_a_finished_one_is_kept_beside_the_new(tmp_path):
+    """After a finished calibration a new one begins, and the old journal is kept."""
+    path = tmp_path / 'j'
+    journal = Journal(path, HEAD)
+    journal.append({'pose': 0})
+    journal.append({'done': True})
+    journal.close()
+    journal = Journal(path, {**HEAD, 'serial': 'B2'})
+    assert journal.entries == []
+    journal.close()
+    assert json.loads((tmp_path / 'j.previous').read_text().splitlines()[1]) == {'pose': 0}
+
+
+@pytest.mark.parametrize('text, words', [
+    ('', 'empty journal'), ('hello\n', ':1: not a journal'), ('{"format": 9}\n', 'format 9'),
+    ('[1]\n', 'not an object')])
+def test_what_is_no_journal(tmp_path, text, words):
+    """Files that are no journal are refused by their line."""
+    path = tmp_path / 'j'
+    path.write_text(text)
+    with pytest.raises(UserError, match=words):
+        read(path)
+
+
+def test_unwritable(tmp_path):
+    """A journal in a folder that is not there is refused."""
+    with pytest.raises(UserError, match='cannot write the journal'):
+        Journal(tmp_path / 'none' / 'j', HEAD)
+
+
+def test_a_pose_taken_again_replaces_the_first():
+    """`redo` appends the pose anew."""
+    entries = [{'pose': 0, 'v': 1}, {'pose': 1, 'v': 2}, {'pose': 0, 'v': 3}, {'done': True}]
+    assert accepted_poses(entries) == [{'pose': 0, 'v': 3}, {'pose': 1, 'v': 2}]

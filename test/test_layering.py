@@ -1,0 +1,59 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Arrows point down only, and what is not core is imported where it is used."""
+
+import ast
+from pathlib import Path
+import sys
+
+import pytest
+
+REPO = Path(__file__).resolve().parents[1]
+PACKAGE = REPO / 'adxl_ros'
+CORE = {'adxl_ros', 'ament_index_python', 'numpy', 'scipy', 'yaml'}
+ROS = {'builtin_interfaces', 'diagnostic_msgs', 'geometry_msgs', 'rcl_interfaces', 'rclpy',
+       'rosgraph_msgs', 'sensor_msgs', 'std_msgs', 'std_srvs'}
+
+
+def test_contracts(capsys: pytest.CaptureFixture) -> None:
+    cli = pytest.importorskip('importlinter.cli', reason='import-linter is not installed')
+    status = cli.lint_imports(config_filename=str(REPO / 'pyproject.toml'), no_cache=True)
+    assert status == 0, capsys.readouterr().out
+
+
+def imported_at_once(path: Path) -> set[str]:
+    """Name the packages that importing the module at `path` imports, type checking aside."""
+    found: set[str] = set()
+    todo: list[ast.AST] = [ast.parse(path.read_text(encoding='utf-8'))]
+    while todo:
+        node = todo.pop()
+        if isinstance(node, ast.Import):
+            found.update(alias.name.partition('.')[0] for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            found.add('adxl_ros' if node.level else str(node.module).partition('.')[0])
+        elif isinstance(node, ast.If) and 'TYPE_CHECKING' in ast.unparse(node.test):
+            todo.extend(node.orelse)
+        elif not isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda)):
+            todo.extend(ast.iter_child_nodes(node))
+    return found
+
+
+@pytest.mark.parametrize('path', sorted(PACKAGE.rglob('*.py')),
+                         ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_extras_are_imported_where_they_are_used(path: Path) -> None:
+    allowed = CORE | set(sys.stdlib_module_names)
+    if 'nodes' in path.parts:
+        allowed |= ROS
+    assert imported_at_once(path) <= allowed

@@ -1,0 +1,65 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Style, types and manifest; ament's own linters where they are installed."""
+
+import importlib.util
+from pathlib import Path
+import re
+import subprocess
+import sys
+
+import pytest
+
+REPO = Path(__file__).resolve().parents[1]
+PYTHON_SOURCES = ('adxl_ros', 'launch', 'test', 'setup.py')
+
+
+def run_module(name: str, *args: str) -> None:
+    """Run `python -m name` over the sources; show what it found."""
+    package = name.partition('.')[0]
+    if importlib.util.find_spec(package) is None:
+        pytest.skip(f'{package} is not installed')
+    done = subprocess.run([sys.executable, '-m', name, *args], cwd=REPO, text=True,
+                          stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+    assert done.returncode == 0, f'{name}:\n{done.stdout}'
+
+
+@pytest.mark.parametrize(('linter', 'paths'), [
+    ('ament_copyright', (*PYTHON_SOURCES, 'LICENSE')),
+    ('ament_flake8', PYTHON_SOURCES),
+    ('ament_pep257', PYTHON_SOURCES),
+    ('ament_xmllint', ('package.xml',)),
+])
+def test_ament(linter: str, paths: tuple[str, ...]) -> None:
+    run_module(f'{linter}.main', *paths)
+
+
+def test_ruff() -> None:
+    run_module('ruff', 'check', '--output-format', 'concise', *PYTHON_SOURCES)
+
+
+def test_mypy() -> None:
+    run_module('mypy')
+
+
+def test_manifest() -> None:
+    package = pytest.importorskip('catkin_pkg.package').parse_package(REPO / 'package.xml')
+    setup = (REPO / 'setup.py').read_text(encoding='utf-8')
+    assert package.name == 'adxl_ros'
+    assert package.package_format == 3
+    assert package.get_build_type() == 'ament_python'
+    assert package.licenses == ['Apache-2.0']
+    assert package.version == re.search(r"version='([^']+)'", setup)[1]
+    package.validate()

@@ -1,0 +1,110 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The model beside figures that others gave: the paper, the datasheet, closed forms."""
+
+from dataclasses import replace
+
+from adxl_ros.model import chain, noise
+from adxl_ros.model.effects import library
+from adxl_ros.model.effects.misalignment import direction
+from adxl_ros.model.stage import specific_force
+import numpy as np
+import pytest
+from units import nominal
+
+
+def test_directions_of_the_paper():
+    """Equation 18 with the paper's angles gives its Θx; (19) by hand, as its Θy is a slip."""
+    x = direction(0, np.radians(0.75), np.radians(-0.33))
+    assert np.round(x, 4).tolist() == [0.9999, -0.0058, -0.0131]
+    y = direction(1, np.radians(0.75), np.radians(0.5))
+    assert np.round(y, 4).tolist() == [-0.0087, 0.9999, 0.0131]
+
+
+def test_noise_of_the_filter():
+    """110 µg/√Hz behind 32 kΩ and 0.33 µF: 0.535 mg, which is 5.25 mm/s²."""
+    sensor = nominal()
+    assert 1 / (2 * np.pi * sensor.rc_s) == pytest.approx(15.07, abs=0.005)
+    assert noise.analog_sigma_v(sensor)[0] == pytest.approx(0.535e-3, rel=1e-3)
+    assert noise.analog_sigma_v(sensor)[0] * 9.80665 == pytest.approx(5.25e-3, rel=1e-3)
+
+
+def test_effective_samples_of_a_dwell():
+    """5 s at 1 kHz behind the filter are about 237 independent samples."""
+    assert noise.effective_samples(5000, 1e-3, nominal().rc_s) == pytest.approx(237, abs=0.5)
+    assert noise.effective_samples(5000, 1e-3, 0.0) == 5000
+
+
+def test_mean_of_simulated_noise_scatters_as_promised():
+    """Means over 5 s of simulated noise scatter by σ/√237."""
+    sensor = nominal(adc_bits=0)
+    rng = np.random.default_rng(5)
+    state = chain.settled(sensor, [0.0, 0.0, 9.8], rng)
+    flat = [np.zeros(400 * 5000), np.zeros(400 * 5000), np.full(400 * 5000, 9.8)]
+    volts = chain.sample(sensor, flat, state, rng)
+    means = volts.reshape(400, 5000, 2).mean(axis=1)
+    promised = noise.sigma_v(sensor)[0] / np.sqrt(noise.effective_samples(
+        5000, 1e-3, sensor.rc_s))
+    assert means.std() == pytest.approx(promised, rel=0.1)
+    assert volts.std() == pytest.approx(noise.sigma_v(sensor)[0], rel=0.02)
+
+
+def test_filter_at_10_hz():
+    """A 10 Hz sine behind the filter: amplitude 0.833, phase −33.6°."""
+    sensor = nominal(adc_bits=0, noise_density_g_per_rthz=np.zeros(2))
+    time = np.arange(5000) / 1000
+    shake = np.sin(2 * np.pi * 10 * time)
+    rng = np.random.default_rng(0)
+    state = chain.settled(sensor, [0.0, 0.0, 9.8], rng)
+    volts = chain.sample(sensor, [shake, 0 * shake, 0 * shake + 9.8], state, rng)[:, 0]
+    late = time > 1
+    wave = np.exp(-2j * np.pi * 10 * time[late])
+    ratio = ((volts[late] - 2.5) * wave).mean() / (shake[late] / 9.80665 * wave).mean()
+    assert abs(ratio) == pytest.approx(0.833, abs=0.001)
+    assert np.degrees(np.angle(ratio)) == pytest.approx(-33.6, abs=0.05)
+
+
+def test_blocks_join_to_one_run():
+    """The chain gives the same samples whether it runs in one block or in many."""
+    sensor = nominal()
+    force = specific_force(np.linspace(0, 1, 1000), np.linspace(0, 2, 1000), 9.8)
+    whole = chain.sample(sensor, force, chain.settled(
+        sensor, [0.0, 0.0, 9.8], np.random.default_rng(3)), np.random.default_rng(4))
+    rng = np.random.default_rng(4)
+    state = chain.settled(sensor, [0.0, 0.0, 9.8], np.random.default_rng(3))
+    parts = [chain.sample(sensor, [f[i:i + 77] for f in force], state, rng)
+             for i in range(0, 1000, 77)]
+    np.testing.assert_array_equal(whole, np.vstack(parts))
+
+
+@pytest.mark.parametrize('name', sorted(library()))
+def test_neutral_effect_is_identity(name):
+    """An effect whose parameters are 0 changes no bit."""
+    plain = nominal('xyz')
+    effect = library()[name]
+    neutral = replace(plain, effects=(name,),
+                      values={name: {p.name: np.zeros(3) for p in effect.parameters}})
+    force = specific_force(np.linspace(-3, 3, 50), np.linspace(-2, 4, 50), 9.8)
+    for before, after in zip(chain.static_response(plain)(force),
+                             chain.static_response(neutral)(force)):
+        np.testing.assert_array_equal(before, after)
+
+
+def test_stage_frames():
+    """The stage's frames: x up at alpha 90°, beta 0; y down at beta 90°; z up at alpha 0."""
+    quarter = np.pi / 2
+    np.testing.assert_allclose(specific_force(quarter, 0.0, 9.8), [9.8, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(specific_force(quarter, quarter, 9.8), [0, -9.8, 0], atol=1e-12)
+    np.testing.assert_allclose(specific_force(0.0, 1.0, 9.8), [0, 0, 9.8], atol=1e-12)

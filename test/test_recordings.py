@@ -1,0 +1,330 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Recordings as CSV: round trips, the real files, what is wrong with bad ones, memory, speed."""
+
+from dataclasses import replace
+import os
+from pathlib import Path
+import subprocess
+import sys
+import time
+
+from adxl_ros.errors import UserError
+from adxl_ros.files import csv_file, recording
+from adxl_ros.files.columns import ACCEL
+from adxl_ros.files.recording import CsvWriter, Recording
+from adxl_ros.model.constants import G0_MPS2
+import numpy as np
+import pytest
+from units import nominal
+
+HEADER = 'time_s,x_v,y_v,alpha_rad,beta_rad'
+GOOD = '0.0,2.5,2.6,1.5,0.1\n0.001,2.51,2.61,,\n0.002,2.52,2.62,1.6,0.2\n'
+
+GROWTH = """
+from resource import getrusage, RUSAGE_SELF
+import sys
+from adxl_ros.files import recording
+peaks_kb = []
+for block in recording.blocks(sys.argv[1], 5000):
+    peaks_kb.append(getrusage(RUSAGE_SELF).ru_maxrss)
+print(peaks_kb[-1] - peaks_kb[len(peaks_kb) // 4])
+"""
+
+
+def written(tmp_path: Path, text: str | bytes, name: str = 'run.csv') -> Path:
+    path = tmp_path / name
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    return path
+
+
+def refusal(path: Path) -> str:
+    """Return what the user is told, which is one line and begins with the file."""
+    with pytest.raises(UserError) as raised:
+        recording.read(path)
+    text = str(raised.value)
+    assert text.startswith(str(path))
+    assert '\n' not in text
+    return text.removeprefix(str(path))
+
+
+def growth_mb(path: Path) -> float:
+    """Return by how much memory grows while all but the first blocks of a recording are read."""
+    done = subprocess.run([sys.executable, '-c', GROWTH, path], text=True, check=True,
+                          capture_output=True, env={**os.environ,
+                                                    'PYTHONPATH': os.pathsep.join(sys.path)})
+    return float(done.stdout) / 1024
+
+
+def made(rng: np.random.Generator, count: int = 3000, axes: str = 'xyz') -> Recording:
+    """Make a recording of full-precision numbers, with references of every kind."""
+    columns = {f'{axis}_v': rng.normal(2.5, 0.5, count) for axis in axes}
+    for name in ('alpha_rad', 'beta_rad', 'shift_m', 'temperature_c', 'supply_v'):
+        columns[name] = np.where(rng.random(count) < 0.3, np.nan, rng.normal(size=count))
+    time_s = np.cumsum(rng.uniform(1e-4, 1e-3, count))
+    return Recording('made', time_s, columns, recording.sensor_info(nominal(axes)))
+
+
+def same_bits(one: np.ndarray, other: np.ndarray) -> bool:
+    """Tell whether two float64 arrays are the same, NaN being NaN."""
+    return np.array_equal(one, other, equal_nan=True) and np.array_equal(
+        np.signbit(one[~np.isnan(one)]), np.signbit(other[~np.isnan(other)]))
+
+
+def test_round_trip_to_the_bit(tmp_path: Path) -> None:
+    sent = made(np.random.default_rng(1))
+    sent.columns['x_v'][:6] = [0.1, -0.0, 5e-324, 1 / 3, -123456.789e-9, 2.0 ** 0.5]
+    sent.columns['other'] = np.where(sent.time_s > 0.5, np.inf, 1e300)
+    path = tmp_path / 'run.csv'
+    recording.write_csv(path, sent)
+    got = recording.read(path)
+    assert list(got.columns) == list(sent.columns)
+    assert same_bits(got.time_s, sent.time_s)
+    for name, values in sent.columns.items():
+        assert same_bits(got.columns[name], values), name
+    assert got.info == sent.info
+    assert got.axes == 'xyz'
+    assert got.done == 1.0
+
+
+def test_stamps_since_1970_keep_their_nanoseconds(tmp_path: Path) -> None:
+    epoch_ns = 1_750_000_000_000_000_000
+    stamps = epoch_ns + np.cumsum(np.random.default_rng(2).integers(1, 10**7, 500))
+    sent = Recording('made', (stamps - epoch_ns) / 1e9, {'x_v': np.ones(500)}, epoch_ns=epoch_ns)
+    recording.write_csv(tmp_path / 'run.csv', sent)
+    got = recording.read(tmp_path / 'run.csv')
+    assert (got.stamp_ns == stamps).all()
+    assert got.epoch_ns == epoch_ns
+
+
+def test_blocks_are_the_whole(tmp_path: Path) -> None:
+    path = tmp_path / 'run.csv'
+    recording.write_csv(path, made(np.random.default_rng(3), 5000))
+    whole = recording.read(path)
+    blocks = list(recording.blocks(path, 700))
+    assert max(len(block) for block in blocks) <= 700
+    assert same_bits(np.concatenate([b.columns['beta_rad'] for b in blocks]),
+                     whole.columns['beta_rad'])
+
+
+def test_writing_is_all_or_nothing(tmp_path: Path) -> None:
+    path = written(tmp_path, 'before')
+    with pytest.raises(KeyboardInterrupt), CsvWriter(path) as file:
+        file.write({'time_s': np.arange(3.0)})
+        raise KeyboardInterrupt
+    assert path.read_text() == 'before'
+    assert os.listdir(tmp_path) == ['run.csv']
+    with pytest.raises(UserError, match='nowhere'):
+        recording.write_csv(tmp_path / 'nowhere' / 'run.csv', made(np.random.default_rng(4), 5))
+
+
+def test_nominal_conversion_uses_the_figures_of_the_recording() -> None:
+    own = nominal('xy', nominal_zero_g_v=np.array([2.4, 2.6]))
+    sensor = nominal('xy')
+    volts = np.array([[2.4, 2.6], [3.4, 1.6]])
+    accel = (volts - own.nominal_zero_g_v) * G0_MPS2
+    columns = {name: accel[:, i] for i, name in enumerate(ACCEL[:2])}
+    carried = Recording('made', np.arange(2.0), columns, recording.sensor_info(own))
+    np.testing.assert_allclose(carried.volts(sensor), volts, rtol=1e-15)
+    np.testing.assert_allclose(carried.accel_mps2(sensor), (volts - 2.5) * G0_MPS2, atol=1e-14)
+    assert (carried.accel_mps2(own) == accel).all()
+    bare = replace(carried, info={})
+    np.testing.assert_allclose(bare.volts(sensor), volts + [0.1, -0.1], rtol=1e-15)
+    bare.info['nominal_zero_g_v'] = '2.5'
+    with pytest.raises(UserError, match="nominal_zero_g_v is '2.5', expected 2 numbers"):
+        bare.volts(sensor)
+
+
+def test_another_unit_is_refused() -> None:
+    carried = made(np.random.default_rng(5), 5)
+    carried.info['serial'] = 'A17'
+    recording.check_unit(carried, nominal('xyz'))
+    recording.check_unit(carried, nominal('xyz', serial='A17'))
+    with pytest.raises(UserError, match=r'A17.*B4'):
+        recording.check_unit(carried, nominal('xyz', serial='B4'))
+    with pytest.raises(UserError, match=r'axes xyz, .*for xy'):
+        recording.check_unit(carried, nominal('xy'))
+
+
+@pytest.mark.parametrize('text', [
+    f'{HEADER}\n{GOOD}',
+    f'{HEADER}\n{GOOD}'.rstrip('\n'),
+    f'{HEADER}\n{GOOD}'.replace('\n', '\r\n'),
+    f'\ufeff{HEADER}\n{GOOD}',
+    f'# serial: A17\n\n# a remark: of many words\n{HEADER}\n# axes: xy\n{GOOD}\n# end: 1\n',
+    f'{HEADER}\n   \n{GOOD}',
+    f' time_s, x_v , y_v,alpha_rad,beta_rad\n{GOOD}'.replace(',', ' , '),
+    f'{HEADER}\n{GOOD}'.replace(',,\n', ',nan,NaN\n'),
+    'beta_rad,y_v,alpha_rad,time_s,x_v\n0.1,2.6,1.5,0,2.5\n,2.61,,1e-3,2.51\n'
+    '0.2,2.62,1.6,.002,2.52\n',
+    'time_s,who,x_v,y_v,alpha_rad,beta_rad\n0,"a, b",2.5,2.6,1.5,0.1\n'
+    '0.001,c,"2.51",2.61,,\n0.002,"d ""e""",2.52,2.62,1.6,0.2\n',
+    'time_s,x_v,y_v,ax_mps2,alpha_rad,beta_rad,\n0,2.5,2.6,1e38,1.5,0.1,\n'
+    '0.001,2.51,2.61,,,,\n0.002,2.52,2.62,inf,1.6,0.2,\n',
+], ids=['plain', 'no last newline', 'CRLF', 'BOM', 'comments', 'blank line', 'spaces', 'nan',
+        'order', 'text column', 'other columns'])
+def test_forms_that_are_read(tmp_path: Path, text: str) -> None:
+    got = recording.read(written(tmp_path, text))
+    assert got.time_s.tolist() == [0.0, 0.001, 0.002]
+    assert got.columns['x_v'].tolist() == [2.5, 2.51, 2.52]
+    assert got.columns['y_v'].tolist() == [2.6, 2.61, 2.62]
+    assert same_bits(got.columns['alpha_rad'], np.array([1.5, np.nan, 1.6]))
+    assert same_bits(got.columns['beta_rad'], np.array([0.1, np.nan, 0.2]))
+    assert got.axes == 'xy'
+    assert 'who' not in got.columns
+    if 'ax_mps2' in text:
+        assert same_bits(got.columns['ax_mps2'], np.array([1e38, np.nan, np.inf]))
+    if 'serial' in text:
+        assert got.info == {'serial': 'A17', 'axes': 'xy', 'end': '1'}
+
+
+def test_a_gap_in_time_is_kept(tmp_path: Path) -> None:
+    got = recording.read(written(tmp_path, 'time_s,x_v\n0,1\n0.001,1\n9,1\n'))
+    assert got.time_s.tolist() == [0.0, 0.001, 9.0]
+
+
+@pytest.mark.parametrize(('text', 'told'), [
+    ('', ': is empty'),
+    ('# serial: A17\n', ': is empty'),
+    (f'{HEADER}\n', ': has a header, but no samples'),
+    (f'{HEADER}', ': has a header, but no samples'),
+    (GOOD, ':1: no column time_s; the columns are 0.0, 2.5'),
+    (f'x_v,y_v\n{GOOD}', ':1: no column time_s; the columns are x_v, y_v'),
+    (f'time_s,alpha_rad\n{GOOD}', ':1: no column of a sensor: needs x_v'),
+    (f'#\ntime_s,y_v,z_v\n{GOOD}', ':2: no column x_v beside y_v, z_v'),
+    (f'time_s,x_v,y_v,x_v\n{GOOD}', ':1:4: column x_v stands 2 times, in the fields 2, 4'),
+    (f'time_s,x_mv\n{GOOD}', ':1:2: column x_mv is in another unit; expected V, in a column '
+                             'named x_v'),
+    (f'time_s,x_v,y_v,z_mv\n{GOOD}', ':1:4: column z_mv is in another unit; expected V'),
+    (f'time_s,ax_g,ay_g\n{GOOD}', ':1:2: column ax_g is in another unit; expected m/s²'),
+    (f'time_s,x_v,alpha_deg\n{GOOD}', ':1:3: column alpha_deg is in another unit; expected rad'),
+    (f'time_ms,x_v\n{GOOD}', ':1:1: column time_ms is in another unit; expected s'),
+    (f'time_s,x_v,temperature_k\n{GOOD}', ':1:3: column temperature_k is in another unit; '
+                                          'expected °C'),
+    ('time_s;x_v\n0;1\n', ':1: the columns are parted by semicolons'),
+    (f'{HEADER}\n{GOOD}0.003,2.5x,2,1,1\n', ":5:2: x_v is '2.5x', not a number"),
+    (f'{HEADER}\n{GOOD}0.003,2_5,2,1,1\n', ":5:2: x_v is '2_5', not a number"),
+    (f'{HEADER}\n\n# remark\n{GOOD}0.003,2.5,2,--,1\n', ":7:4: alpha_rad is '--', not a "),
+    (f'{HEADER}\n{GOOD}0.003,2.5,2,1\n', ':5:5: 4 fields, but the header has 5'),
+    (f'{HEADER}\n0,1,1,1\n1,1,1,1,1,1\n', ':2:5: 4 fields, but the header has 5'),
+    (f'{HEADER}\n{GOOD}0.003,2.5,2,1,1,1\n', ':5:6: 6 fields, but the header has 5'),
+    (f'{HEADER}\n{GOOD}0.003,2.',
+     ':5:3: 2 fields, but the header has 5; the file ends in the middle of this line: delete it'),
+    (f'{HEADER}\n{GOOD}0.003,2.5,2.5,1,-', ":5:5: beta_rad is '-', not a number; the file ends"),
+    (f'{HEADER}\n{GOOD}0.003,,2.5,1,1\n', ':5:2: x_v is empty; every sample needs it'),
+    (f'{HEADER}\n{GOOD},2.5,2.5,1,1\n', ':5:1: time_s is empty'),
+    (f'{HEADER}\n{GOOD}0.003,2.5,NaN,1,1\n', ':5:3: y_v is NaN, not a finite number'),
+    (f'{HEADER}\n{GOOD}0.003,-inf,2.5,1,1\n', ':5:2: x_v is -inf, not a finite number'),
+    (f'{HEADER}\n{GOOD}nan,2.5,2.5,1,1\n', ':5:1: time_s is nan, not a finite number'),
+    (f'{HEADER}\n{GOOD}0.003,2.5,1e38,1,1\n', ':5:3: y_v is 1e38, beyond ±1e+06'),
+    (f'{HEADER}\n{GOOD}0.003,2.5,1e999,1,1\n', ':5:3: y_v is 1e999, not a finite number'),
+    (f'{HEADER}\n{GOOD}0.003,2.5,2.5,1,-1e38\n', ':5:5: beta_rad is -1e38, beyond ±1e+06'),
+    (f'{HEADER}\n{GOOD}1e38,2.5,2.5,1,1\n', ':5:1: time_s is 1e38, beyond ±9e+09'),
+    (f'{HEADER}\n{GOOD}0.0015,2.5,2.5,1,1\n', ':5:1: time runs backwards: time_s is 0.0015 '
+                                              'after 0.002 on line 4'),
+    (f'{HEADER}\n{GOOD}\n#\n0.002,2.5,2.5,1,1\n', ':7:1: time stands still: time_s is 0.002 '
+                                                  'after 0.002 on line 4'),
+    (f'# epoch_ns: soon\n{HEADER}\n{GOOD}', ": epoch_ns is 'soon', expected whole nanoseconds"),
+    (f'{HEADER},who\n0,1,1,1,1,'.encode() + b'B\xe4r\n', ':2: byte 12 of the line, 0xe4, is not '
+                                                         'UTF-8'),
+    (f'{HEADER}\n{GOOD}'.encode('utf-16'), ':1:1: is UTF-16; save the file as UTF-8'),
+    (b'a' * 6_000_000, ': a line is longer than 1048576 bytes'),
+    (b'#ROSBAG V2.0\n', ': is a bag of ROS 1; convert it: rosbags-convert'),
+    (b'\x89MCAP0\r\n', ': is a bag; rename it so that it ends in .mcap'),
+    (b'\x28\xb5\x2f\xfd', ': is compressed; name the directory with its metadata.yaml'),
+])
+def test_what_is_wrong_is_said_in_one_line(tmp_path: Path, text: str | bytes, told: str) -> None:
+    assert refusal(written(tmp_path, text)).startswith(told)
+
+
+def test_paths_that_cannot_be_read(tmp_path: Path) -> None:
+    assert refusal(tmp_path / 'gone.csv') == ': cannot read: No such file or directory'
+    path = written(tmp_path, f'{HEADER}\n{GOOD}')
+    path.chmod(0)
+    if os.access(path, os.R_OK):
+        pytest.skip('the superuser may read every file')
+    assert refusal(path) == ': cannot read: Permission denied'
+
+
+@pytest.mark.parametrize('place', [0, 80_000, 149_999])
+def test_faults_far_down_are_found(tmp_path: Path, place: int) -> None:
+    lines = [f'{i / 1000!r},2.5,2.5,{i % 7},0.1' for i in range(150_000)]
+    lines[place] = lines[place].replace('2.5,2.5', '2.5,x')
+    path = written(tmp_path, f'{HEADER}\n' + '\n'.join(lines) + '\n')
+    assert refusal(path) == f":{place + 2}:3: y_v is 'x', not a number"
+    if place:
+        lines[place] = lines[place - 1]
+        path = written(tmp_path, f'{HEADER}\n' + '\n'.join(lines) + '\n')
+        assert refusal(path).startswith(f':{place + 2}:1: time stands still')
+
+
+@pytest.mark.parametrize('size', [1, 7, 200])
+def test_where_the_file_is_cut_into_blocks_does_not_matter(
+        tmp_path: Path, monkeypatch: pytest.MonkeyPatch, size: int) -> None:
+    rows = GOOD.replace('\n', '\r\n')
+    path = written(tmp_path, f'\ufeff# serial: A17\r\n{HEADER}\n{rows}# end: 1\n0.1,1,2,3,4')
+    whole = recording.read(path)
+    monkeypatch.setattr(csv_file, '_CHUNK_BYTES', size)
+    cut = recording.read(path)
+    assert cut.info == whole.info == {'serial': 'A17', 'end': '1'}
+    assert cut.time_s.tolist() == whole.time_s.tolist() == [0.0, 0.001, 0.002, 0.1]
+    assert all(same_bits(cut.columns[name], whole.columns[name]) for name in whole.columns)
+
+
+def test_a_column_that_turns_to_text_is_left_out(tmp_path: Path) -> None:
+    lines = [f'{i / 1000!r},2.5,{i}' for i in range(400_000)]
+    lines[-1] = lines[-1].replace('2.5,', '2.5,no')
+    path = written(tmp_path, 'time_s,x_v,state\n' + '\n'.join(lines) + '\n')
+    assert list(recording.read(path).columns) == ['x_v']
+    assert 'state' in next(recording.blocks(path, 1000)).columns
+
+
+def test_ideal_force(tmp_path: Path) -> None:
+    path = written(tmp_path, 'time_s,ay_mps2,ax_mps2,az_mps2,x_v\n0,2,1,3,\n0.5,5,4,6,7\n')
+    time_s, force = recording.read_ideal(path)
+    assert time_s.tolist() == [0.0, 0.5]
+    assert force.tolist() == [[1, 2, 3], [4, 5, 6]]
+    assert recording.read_ideal(path, -10**9)[0].tolist() == [1.0, 1.5]
+    with pytest.raises(UserError, match='no column az_mps2'):
+        recording.read_ideal(written(tmp_path, 'time_s,ax_mps2,ay_mps2\n0,1,2\n'))
+
+
+def test_real_files_are_read(shared_dir: Path, tmp_path: Path) -> None:
+    paths = sorted([*shared_dir.glob('real/*.csv'), *shared_dir.glob('samples/*/*.csv')])
+    assert paths
+    for path in paths:
+        got = recording.read(path)
+        lines = path.read_text().splitlines()
+        header = next(i for i, line in enumerate(lines) if not line.startswith('#'))
+        assert len(got) == len(lines) - header - 1
+        last = dict(zip(lines[header].split(','), map(float, lines[-1].split(','))))
+        assert {'time_s': got.time_s[-1], **{k: v[-1] for k, v in got.columns.items()}} == last
+        recording.write_csv(tmp_path / 'again.csv', got)
+        again = recording.read(tmp_path / 'again.csv')
+        assert all(same_bits(again.columns[name], got.columns[name]) for name in got.columns)
+
+
+def test_reading_is_quick_and_its_memory_bounded(tmp_path: Path) -> None:
+    """A tenth of the 3 million rows that shall take 15 s; a loaded machine gets thrice that."""
+    path = tmp_path / 'long.csv'
+    rng = np.random.default_rng(6)
+    with CsvWriter(path) as file:
+        for start in range(0, 300_000, 50_000):
+            columns = {name: rng.normal(2.5, 0.3, 50_000) for name in ('x_v', 'y_v', 'z_v')}
+            file.write({'time_s': np.arange(start, start + 50_000) / 1000, **columns})
+    began = time.perf_counter()
+    assert sum(len(block) for block in recording.blocks(path, 65536)) == 300_000
+    assert time.perf_counter() - began < 4.5
+    assert growth_mb(path) < 10

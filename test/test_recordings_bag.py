@@ -1,0 +1,416 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Recordings as bags: round trips, what ros2 bag writes, references, cuts, bad bags, memory."""
+
+from dataclasses import replace
+from pathlib import Path
+import sys
+
+from adxl_ros.errors import UserError
+from adxl_ros.files import bag_file, cdr, recording
+from adxl_ros.files.columns import ACCEL, REFERENCES
+from adxl_ros.files.recording import Recording
+import numpy as np
+import pytest
+from test_recordings import growth_mb, refusal
+from units import nominal
+
+rosbag2 = pytest.importorskip('rosbags.rosbag2', reason='rosbags is not installed')
+bags = pytest.importorskip('bags')
+imu, info, joints, Sent, stamps = bags.imu, bags.info, bags.joints, bags.Sent, bags.stamps
+EPOCH_NS, IMU, INFO, JOINTS, STORE, STRING, TYPES = (
+    bags.EPOCH_NS, bags.IMU, bags.INFO, bags.JOINTS, bags.STORE, bags.STRING, bags.TYPES)
+
+
+def made(count: int = 3000, axes: str = 'xyz') -> Recording:
+    """Make a recording with references of every kind at every sample."""
+    rng = np.random.default_rng(1)
+    columns = {f'{axis}_v': rng.normal(2.5, 0.5, count) for axis in axes}
+    columns.update({name: rng.normal(size=count) for name in REFERENCES})
+    columns['supply_v'] = columns['supply_v'].astype(np.float32).astype(float)
+    steps = rng.integers(10**5, 10**7, count)
+    return Recording('made', np.cumsum(steps) / 1e9, columns,
+                     {**recording.sensor_info(nominal(axes)), 'place': 'bench 3'},
+                     epoch_ns=EPOCH_NS)
+
+
+@pytest.mark.parametrize('name', ['run', 'run.v2', 'run.mcap'])
+@pytest.mark.parametrize('axes', ['x', 'xy', 'xyz'])
+def test_round_trip_to_the_bit(tmp_path: Path, name: str, axes: str) -> None:
+    sent = made(axes=axes)
+    sensor = nominal(axes)
+    for _ in range(2):  # the second one replaces the first
+        recording.write_bag(tmp_path / name, sent, sensor)
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+    got = recording.read(tmp_path / name)
+    assert list(got.columns) == [*ACCEL[:len(axes)], *REFERENCES]
+    assert (got.accel_mps2(sensor) == sent.accel_mps2(sensor)).all()
+    np.testing.assert_allclose(got.volts(sensor), sent.volts(sensor), rtol=0, atol=1e-15)
+    for column in REFERENCES:
+        assert (got.columns[column] == sent.columns[column]).all(), column
+    assert (got.stamp_ns == sent.stamp_ns).all()
+    assert got.info == sent.info
+    assert got.notes['alpha_rad_gap_s'] == got.notes['alpha_rad_residual'] == 0.0
+    again = replace(got, path='again')
+    recording.write(tmp_path / 'again', again, sensor)
+    last = recording.read(tmp_path / 'again')
+    assert all((last.columns[k] == v).all() for k, v in got.columns.items())
+
+
+def test_bag_and_csv_say_the_same(tmp_path: Path) -> None:
+    sensor = nominal('xyz')
+    sent = replace(made(), epoch_ns=0)
+    recording.write(tmp_path / 'run.mcap', sent, sensor)
+    recording.write(tmp_path / 'run.csv', recording.read(tmp_path / 'run.mcap'), sensor)
+    one, other = (recording.read(tmp_path / name) for name in ('run.mcap', 'run.csv'))
+    assert (one.time_s == sent.time_s).all()
+    assert (one.time_s == other.time_s).all()
+    assert all((other.columns[k] == v).all() for k, v in one.columns.items())
+    assert one.info == other.info
+
+
+def test_what_is_written_is_what_others_read(tmp_path: Path) -> None:
+    sensor = nominal('xy')
+    sent = made(50, 'xy')
+    recording.write_bag(tmp_path / 'run', sent, sensor)
+    accel = sent.accel_mps2(sensor)
+    count: dict[str, int] = {}
+    with rosbag2.Reader(tmp_path / 'run') as reader:
+        latched = next(c for c in reader.connections if c.topic == '/sensor_info')
+        assert latched.ext.offered_qos_profiles[0].durability.name == 'TRANSIENT_LOCAL'
+        for connection, log_ns, raw in reader.messages():
+            message = STORE.deserialize_cdr(raw, connection.msgtype)
+            i = count[connection.topic] = count.get(connection.topic, -1) + 1
+            if connection.topic != '/sensor_info':
+                stamp = message.header.stamp
+                assert stamp.sec * 10**9 + stamp.nanosec == log_ns == sent.stamp_ns[i]
+            if connection.topic == '/imu/data_raw':
+                force = message.linear_acceleration
+                assert [force.x, force.y, force.z] == [*accel[i], 0.0]
+                assert message.header.frame_id == 'imu_link'
+                assert message.orientation_covariance[0] == -1
+                assert message.angular_velocity_covariance[0] == -1
+                variance = message.linear_acceleration_covariance.reshape(3, 3)
+                assert variance[2, 2] == 1e6
+                # 110 µg/√Hz over 1/(4 RC), and the noise of 16 bits over 5 V.
+                expected = (110e-6 * 9.80665) ** 2 / (4 * 32e3 * 0.33e-6)
+                assert variance[0, 0] == pytest.approx(expected, rel=0.01)
+            elif connection.topic == '/stage/joint_states':
+                assert message.name == ['alpha', 'beta', 'shift']
+                assert message.position[1] == sent.columns['beta_rad'][i]
+            elif connection.topic == '/supply':
+                assert message.voltage == sent.columns['supply_v'][i]
+    assert count == {'/sensor_info': 0, '/imu/data_raw': 49, '/stage/joint_states': 49,
+                     '/temperature': 49, '/supply': 49}
+
+
+def converted(source: Path, target: Path, storage: str, mode: str) -> None:
+    """Copy a bag into another storage and compression, beside topics of others."""
+    with rosbag2.Reader(source) as reader:
+        writer = rosbag2.Writer(target, version=9,
+                                storage_plugin=rosbag2.StoragePlugin[storage])
+        writer.set_compression(rosbag2.CompressionMode[mode], rosbag2.CompressionFormat.ZSTD)
+        with writer:
+            new = {c.id: writer.add_connection(c.topic, c.msgtype, typestore=STORE)
+                   for c in reader.connections}
+            other = writer.add_connection('/rosout', STRING, typestore=STORE)
+            writer.add_connection('/robot2/imu/data_raw', IMU, typestore=STORE)  # no message
+            for i, (connection, log_ns, raw) in enumerate(reader.messages()):
+                writer.write(new[connection.id], log_ns, raw)
+                if i % 10 == 0:
+                    text = STORE.serialize_cdr(TYPES[STRING](data='so'), STRING)
+                    writer.write(other, log_ns, bytes(text))
+
+
+@pytest.mark.parametrize(('storage', 'mode'), [
+    ('MCAP', 'NONE'), ('MCAP', 'STORAGE'), ('MCAP', 'FILE'), ('MCAP', 'MESSAGE'),
+    ('SQLITE3', 'NONE'), ('SQLITE3', 'FILE'), ('SQLITE3', 'MESSAGE')])
+def test_every_storage_and_compression(tmp_path: Path, storage: str, mode: str) -> None:
+    recording.write_bag(tmp_path / 'plain', made(), nominal('xyz'))
+    plain = recording.read(tmp_path / 'plain')
+    target = tmp_path / 'recorded'
+    converted(tmp_path / 'plain', target, storage, mode)
+    places = [target]
+    if mode != 'FILE':
+        places += [path for path in target.iterdir() if path.suffix in ('.mcap', '.db3')]
+    for place in places:
+        got = recording.read(place)
+        assert all((got.columns[k] == v).all() for k, v in plain.columns.items())
+        assert (got.stamp_ns == plain.stamp_ns).all()
+    (target / 'metadata.yaml').unlink()  # as after a kill
+    assert len(recording.read(target)) == len(plain)
+
+
+def test_split_bags_are_joined_in_the_order_of_their_numbers(tmp_path: Path) -> None:
+    target = tmp_path / 'run'
+    target.mkdir()
+    for i in range(11):
+        part = bags.bag_of(tmp_path / f'part{i}', map(imu, stamps(1100)[100 * i:100 * (i + 1)]))
+        (part / f'part{i}.mcap').rename(target / f'run_{i}.mcap')
+    assert recording.read(target).stamp_ns.tolist() == stamps(1100)
+    (target / 'metadata.yaml').write_text(
+        'rosbag2_bagfile_information: {relative_file_paths: [run_0.mcap, run_11.mcap]}')
+    assert refusal(target) == ': metadata.yaml names run_11.mcap, which is not there'
+
+
+@pytest.mark.parametrize('little_endian', [True, False])
+def test_both_byte_orders(tmp_path: Path, little_endian: bool) -> None:
+    rng = np.random.default_rng(2)
+    accel = rng.normal(size=(200, 3))
+    times = stamps(200)
+    messages = [imu(t, a, '/robot1/imu/data_raw') for t, a in zip(times, accel)]
+    messages += [joints(t, alpha=a[0], beta=a[1]) for t, a in zip(times, accel)]
+    got = recording.read(bags.bag_of(tmp_path / 'run', messages, little_endian))
+    assert got.axes == 'xy'  # as the covariance says
+    assert (np.column_stack([got.columns[n] for n in ACCEL[:2]]) == accel[:, :2]).all()
+    assert (got.columns['beta_rad'] == accel[:, 1]).all()
+    assert 'shift_m' not in got.columns
+    assert got.epoch_ns == EPOCH_NS
+
+
+def test_layouts_are_those_of_an_independent_decoder() -> None:
+    rng = np.random.default_rng(3)
+    for frame in ('', 'a', 'imu_link', 'nine_char'):
+        message = imu(EPOCH_NS, rng.normal(size=3), frame=frame).message
+        for little_endian in (True, False):
+            raw = bytes(STORE.serialize_cdr(message, IMU, little_endian=little_endian))
+            table, = cdr.tables([raw], cdr.imu)
+            force = message.linear_acceleration
+            assert table.numbers('linear_acceleration').tolist() == [[force.x, force.y, force.z]]
+            assert table.stamp_ns().tolist() == [EPOCH_NS]
+            assert table.layout.texts == {'frame_id': frame}
+            new = cdr.fill(raw, table.layout, np.array([5]),
+                           {'linear_acceleration': np.array([[1.0, 2.0, 3.0]])})
+            back = STORE.deserialize_cdr(new, IMU)
+            assert (back.linear_acceleration.y, back.header.stamp.nanosec) == (2.0, 5)
+
+
+def test_joints_may_come_one_by_one(tmp_path: Path) -> None:
+    times = stamps(100)
+    messages = [imu(t) for t in times]
+    for i, t in enumerate(times):
+        messages += [joints(t, beta=i / 7, other=5.0), joints(t, alpha=float(i)), joints(t)]
+    got = recording.read(bags.bag_of(tmp_path / 'run', messages))
+    assert got.columns['alpha_rad'].tolist() == list(range(100))
+    assert got.columns['beta_rad'].tolist() == [i / 7 for i in range(100)]
+    assert got.columns.keys() == {*ACCEL[:2], 'alpha_rad', 'beta_rad'}
+
+
+def test_references_at_another_rate_are_interpolated(tmp_path: Path) -> None:
+    times = np.array(stamps(4000))
+    start = times[1000] + 300_000
+    there = start + 20_000_000 * np.arange(100)  # 50 Hz, beside the samples, for 2 s
+    alpha = 2.0 * (there - times[0]) * 1e-9 + 30.0  # far beyond a turn: not wrapped
+    beta = np.sin(2 * np.pi * (there - times[0]) * 1e-9)
+    messages = [imu(int(t)) for t in times]
+    messages += [joints(int(t), alpha=a, beta=b) for t, a, b in zip(there, alpha, beta)]
+    path = bags.bag_of(tmp_path / 'run', sorted(messages, key=lambda sent: sent.stamp_ns))
+    got = recording.read(path)
+    inside = (times >= there[0]) & (times <= there[-1])
+    near = (times >= there[0] - 20_000_000) & (times <= there[-1] + 20_000_000)
+    s = (times - times[0]) * 1e-9
+    np.testing.assert_allclose(got.columns['alpha_rad'][inside], 2.0 * s[inside] + 30, rtol=1e-12)
+    assert (np.isnan(got.columns['alpha_rad']) == ~near).all()
+    assert (got.columns['alpha_rad'][near & (times < there[0])] == alpha[0]).all()
+    error = np.abs(got.columns['beta_rad'] - np.sin(2 * np.pi * s))[inside].max()
+    # Twice the spacing misses four times as much, and its rms is 1/√2 of its largest.
+    assert error < got.notes['beta_rad_residual'] < 4.5 * error
+    assert got.notes['alpha_rad_residual'] < 1e-9
+    assert 0.019 < got.notes['alpha_rad_gap_s'] <= 0.02
+    for rows in (100, 1000):
+        blocks = list(recording.blocks(path, rows))
+        assert np.array_equal(np.concatenate([b.columns['beta_rad'] for b in blocks]),
+                              got.columns['beta_rad'], equal_nan=True)
+        assert blocks[-1].notes['beta_rad_residual'] == pytest.approx(
+            got.notes['beta_rad_residual'])
+        assert blocks[-1].done == 1.0
+
+
+def test_a_stage_that_dies_does_not_hold_up_the_samples(
+        tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bag_file, '_HOLD_ROWS', 500)
+    messages = [m for t in stamps(3000) for m in (imu(t), joints(t, alpha=1.0))
+                if m.kind == IMU or t < stamps(200)[-1]]
+    path = bags.bag_of(tmp_path / 'run', messages)
+    blocks = list(recording.blocks(path, 100))
+    assert sum(map(len, blocks)) == 3000
+    assert max(map(len, blocks)) == 100
+    alpha = np.concatenate([block.columns['alpha_rad'] for block in blocks])
+    assert np.flatnonzero(np.isnan(alpha))[0] == 200
+
+
+@pytest.mark.parametrize('name', ['run', 'run.mcap'])
+def test_a_cut_file_is_read_up_to_the_cut(tmp_path: Path, name: str) -> None:
+    sensor = nominal('xyz')
+    recording.write_bag(tmp_path / name, made(9000), sensor)
+    file = tmp_path / name if name == 'run.mcap' else tmp_path / name / 'run.mcap'
+    whole = recording.read(tmp_path / name)
+    data = file.read_bytes()
+    counts = []
+    for size in (len(data) - 1, len(data) * 2 // 3, len(data) // 3, 100_000):
+        file.write_bytes(data[:size])
+        got = recording.read(tmp_path / name)
+        counts.append(len(got))
+        assert (got.stamp_ns == whole.stamp_ns[:len(got)]).all()
+        assert (got.columns['ay_mps2'] == whole.columns['ay_mps2'][:len(got)]).all()
+        assert got.info == whole.info
+        assert f'{file}: cut off' in got.notes['cut']
+        assert f'of {size}; the last sample read is at 1750000' in got.notes['cut']
+        assert 'cut' in list(recording.blocks(tmp_path / name, 100))[-1].notes
+    assert counts[0] == 9000
+    assert 5000 < counts[1] < 7000
+    assert 2000 < counts[2] < 4000
+    assert 100 < counts[3] < 300
+    file.write_bytes(data[:60])
+    assert '.mcap: cut off' in refusal(tmp_path / name)
+    file.write_bytes(b'')
+    assert refusal(tmp_path / name).endswith(': is empty')
+
+
+def test_damaged_files_are_refused(tmp_path: Path) -> None:
+    recording.write_bag(tmp_path / 'run.mcap', made(), nominal('xyz'))
+    data = bytearray((tmp_path / 'run.mcap').read_bytes())
+    data[-30] ^= 0xFF  # in the footer
+    (tmp_path / 'footer.mcap').write_bytes(data)
+    assert ': cannot read it as a rosbag2 recording: ' in refusal(tmp_path / 'footer.mcap')
+    recording.write_bag(tmp_path / 'plain', made(), nominal('xyz'))
+    converted(tmp_path / 'plain', tmp_path / 'sql', 'SQLITE3', 'NONE')
+    file = tmp_path / 'sql' / 'sql.db3'
+    file.write_bytes(file.read_bytes()[:100_000])
+    assert ': cannot read it as a rosbag2 recording: ' in refusal(tmp_path / 'sql')
+    (tmp_path / 'text.db3').write_text('time_s,x_v')
+    assert ': cannot read it as a rosbag2 recording: ' in refusal(tmp_path / 'text.db3')
+    (tmp_path / 'text.mcap').write_text('time_s,x_v')
+    assert refusal(tmp_path / 'text.mcap') == ': is no MCAP file: it does not begin as one'
+    (tmp_path / 'empty').mkdir()
+    assert refusal(tmp_path / 'empty').startswith(': is a directory without metadata.yaml')
+    (tmp_path / 'empty' / 'metadata.yaml').write_text('so: [')
+    assert 'metadata.yaml: does not list the files' in refusal(tmp_path / 'empty')
+
+
+T = stamps(3)
+CUT_IMU = bytes(STORE.serialize_cdr(imu(T[1]).message, IMU))[:100]
+
+
+@pytest.mark.parametrize(('messages', 'told'), [
+    ([Sent('/imu/data_raw', STRING, 0, TYPES[STRING](data=''))],
+     f': topic /imu/data_raw is of type {STRING}, expected {IMU}'),
+    ([imu(T[0], topic='/imu')],
+     f': no topic imu/data_raw of type {IMU}; it holds /imu ({IMU})'),
+    ([imu(T[0], topic='/a/imu/data_raw'), imu(T[0], topic='/b/imu/data_raw')],
+     ': several topics imu/data_raw: /a/imu/data_raw, /b/imu/data_raw; record one sensor'),
+    ([imu(T[0]), Sent('/stage/joint_states', STRING, 0, TYPES[STRING](data=''))],
+     f': topic /stage/joint_states is of type {STRING}, expected {JOINTS}'),
+    ([imu(T[0]), Sent('/sensor_info', STRING, 0, TYPES[STRING](data=''))],
+     f': topic /sensor_info is of type {STRING}, expected {INFO}'),
+    ([imu(T[0]), imu(T[1], frame='imu_link2')],
+     ": topic /imu/data_raw: frame_id changes from 'imu_link' to 'imu_link2'"),
+    ([imu(T[1]), imu(T[2]), imu(T[0])],
+     ': topic /imu/data_raw: time runs backwards: message 3 is stamped 1750000000.123456789 s '
+     'after 1750000000.125456789 s'),
+    ([imu(T[1]), imu(T[1])], ': topic /imu/data_raw: time stands still: message 2 is stamped'),
+    ([imu(T[0]), imu(T[1], (1, np.nan, 1))],
+     ': topic /imu/data_raw: message 2, stamped 1750000000.124456789 s: linear_acceleration.y is '
+     'nan m/s², expected a number within ±1e+06'),
+    ([imu(T[0]), imu(T[1], (1, 1, 1e38))],
+     ': topic /imu/data_raw: message 2, stamped 1750000000.124456789 s: linear_acceleration.z is '
+     '1e+38 m/s²'),
+    ([imu(T[0], variance=(-1, 0, 0))],
+     ': topic /imu/data_raw: says that it has no linear acceleration'),
+    ([imu(T[0], variance=(1, 1e6, 1))],
+     ': topic /imu/data_raw: linear_acceleration_covariance gives the axes xz'),
+    ([imu(T[0]), Sent('/imu/data_raw', IMU, T[1], raw=CUT_IMU)],
+     ': topic /imu/data_raw: a message is damaged: 100 bytes are too few for it'),
+    ([imu(T[0]), Sent('/imu/data_raw', IMU, T[1], raw=b'\0\7' + CUT_IMU)],
+     ': topic /imu/data_raw: a message is damaged: encapsulation 0x0007 is not plain CDR'),
+    ([imu(T[0]), joints(T[0], alpha=1e38)],
+     ': topic /stage/joint_states: alpha_rad is 1e+38 at 1750000000.123456789 s, beyond ±1e+06'),
+    ([imu(T[0]), joints(T[1], alpha=1.0), joints(T[0], alpha=1.0)],
+     ': topic /stage/joint_states: time runs backwards: 1750000000.123456789 s comes after '
+     '1750000000.124456789 s'),
+    ([info(serial='A'), imu(T[0]), info(serial='B')],
+     ': topic /sensor_info: serial changes from A to B; record each sensor by itself'),
+    ([info(axes='yx'), imu(T[0])], ": topic /sensor_info: axes is 'yx', expected x, xy or xyz"),
+    ([imu(T[0]), Sent('/sensor_info', INFO, 0, raw=b'\0\1\0\0\7')],
+     ': topic /sensor_info: damaged message: '),
+])
+def test_what_is_wrong_is_said_in_one_line(
+        tmp_path: Path, messages: list[Sent], told: str) -> None:
+    assert refusal(bags.bag_of(tmp_path / 'run', messages)).startswith(told)
+
+
+def test_the_sensors_own_namespace_comes_first(tmp_path: Path) -> None:
+    messages = [info('/a/sensor_info', serial='A'), info('/b/sensor_info', serial='B')]
+    messages += [imu(t, topic='/a/imu/data_raw') for t in T]
+    messages += [joints(t, '/b/stage/joint_states', alpha=2.0) for t in T]
+    got = recording.read(bags.bag_of(tmp_path / 'run', messages))
+    assert got.info == {'serial': 'A'}
+    assert got.columns['alpha_rad'].tolist() == [2.0, 2.0, 2.0]
+
+
+def test_ideal_force(tmp_path: Path) -> None:
+    messages = [imu(t, (i, 2, 3), '/world/imu', (0, 0, 0)) for i, t in enumerate(T)]
+    path = bags.bag_of(tmp_path / 'run', messages)
+    time_s, force = recording.read_ideal(path, EPOCH_NS)
+    assert (time_s == (np.array(T) - EPOCH_NS) / 1e9).all()
+    assert force.tolist() == [[0, 2, 3], [1, 2, 3], [2, 2, 3]]
+    two = [*messages, *(imu(t, topic='/other/imu') for t in T)]
+    with pytest.raises(UserError, match='several topics of type sensor_msgs/msg/Imu'):
+        recording.read_ideal(bags.bag_of(tmp_path / 'two', two))
+    with pytest.raises(UserError, match='no topic of type sensor_msgs/msg/Imu'):
+        recording.read_ideal(bags.bag_of(tmp_path / 'none', [joints(T[0])]))
+
+
+def test_writing_is_all_or_nothing(tmp_path: Path) -> None:
+    sensor = nominal('xyz')
+    for name in ('run', 'run.mcap', 'run.csv'):
+        with pytest.raises(KeyboardInterrupt), recording.writer(tmp_path / name, sensor) as append:
+            append(made(50))
+            raise KeyboardInterrupt
+    early = replace(made(50), epoch_ns=-10**12)
+    with pytest.raises(UserError, match='cannot be stamps of ROS messages'):
+        recording.write_bag(tmp_path / 'run', early, sensor)
+    with pytest.raises(UserError, match='has the axes xy, but the sensor'):
+        recording.write_bag(tmp_path / 'run', made(50, 'xy'), sensor)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_without_rosbags(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, 'rosbags.rosbag2', None)
+    (tmp_path / 'run').mkdir()
+    with pytest.raises(UserError, match='pip install "rosbags'):
+        recording.read(tmp_path / 'run')
+    with pytest.raises(UserError, match='pip install "rosbags'):
+        recording.write_bag(tmp_path / 'run', made(5), nominal('xyz'))
+
+
+def test_real_file_through_a_bag(shared_dir: Path, tmp_path: Path) -> None:
+    sensor = nominal('xyz')
+    real = recording.read(shared_dir / 'real' / 'two_axis_stand.csv')
+    recording.write_bag(tmp_path / 'run', real, sensor)
+    got = recording.read(tmp_path / 'run')
+    assert (got.time_s == real.time_s).all()
+    assert all((got.columns[name] == real.columns[name]).all() for name in ACCEL)
+
+
+def test_memory_is_bounded(tmp_path: Path) -> None:
+    part = made(6_000, 'xy')
+    del part.columns['temperature_c'], part.columns['supply_v']
+    span_ns = int(part.stamp_ns[-1] - part.stamp_ns[0]) + 10**6
+    with recording.writer(tmp_path / 'run', nominal('xy')) as append:
+        for i in range(5):
+            append(replace(part, epoch_ns=EPOCH_NS + i * span_ns))
+    assert len(recording.read(tmp_path / 'run')) == 30_000
+    assert growth_mb(tmp_path / 'run') < 10

@@ -1,0 +1,440 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Rests in made streams whose motion is known, in real ones, and live against offline."""
+
+import time
+
+from adxl_ros.calibrate.rests import find_rests, Rest, rest_means, RestFinder
+from adxl_ros.calibrate.stillness import Noise
+from adxl_ros.errors import UserError
+from adxl_ros.files import recording
+from adxl_ros.model.constants import G0_MPS2
+from hypothesis import given, settings, strategies
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+SIGMA = 0.05
+TAU_S = 32e3 * 0.33e-6
+ADXL = Noise(np.full(3, 0.535e-3), TAU_S)
+
+
+def directions(rng, count):
+    """Draw poses: specific force at rest, m/s²."""
+    drawn = rng.normal(size=(count, 3))
+    return G0_MPS2 * drawn / np.linalg.norm(drawn, axis=1, keepdims=True)
+
+
+def tumbled(rng, rate_hz, rest_s, turn_s=1.0, sigma=SIGMA):
+    """
+    Make a stream of rests with turns between them.
+
+    Returns
+    -------
+    time_s, samples, bounds, poses
+        Times (n,), samples (n, 3), rows at which each rest begins and ends (k, 2), and what the
+        sensor reads in it (k, 3).
+
+    """
+    poses = directions(rng, len(rest_s) + 1)
+    parts, bounds, row = [], [], 0
+    for here, there, length_s in zip(poses, poses[1:], rest_s):
+        rest, turn = round(length_s * rate_hz), round(turn_s * rate_hz)
+        share = np.linspace(0, 1, turn, endpoint=False)[:, None]
+        shake = 0.3 * np.sin(2 * np.pi * 3.1 * turn_s * share) * np.sin(np.pi * share)
+        parts += [np.tile(here, (rest, 1)), here + share * (there - here) + shake]
+        bounds.append((row, row + rest))
+        row += rest + turn
+    samples = np.concatenate(parts)
+    samples += sigma * rng.normal(size=samples.shape)
+    return np.arange(len(samples)) / rate_hz, samples, np.array(bounds), poses[:-1]
+
+
+def filtered(rng, count, sigma, rate_hz=1000.0, tau_s=TAU_S):
+    """Make the noise of an RC filter, (count, 3)."""
+    a = np.exp(-1 / (rate_hz * tau_s))
+    white = rng.normal(size=(count + 200, 3)) * np.sqrt(1 - a * a)
+    return sigma * lfilter([1.0], [1.0, -a], white, axis=0)[200:]
+
+
+def matched(rests, bounds):
+    """Assert that the rests are those of `bounds`, each inside its own, and return what is lost."""
+    assert len(rests) == len(bounds)
+    found = np.array([(rest.start, rest.stop) for rest in rests])
+    assert (found[:, 0] >= bounds[:, 0]).all()
+    assert (found[:, 1] <= bounds[:, 1]).all()
+    return np.diff(bounds, axis=1)[:, 0] - np.diff(found, axis=1)[:, 0]
+
+
+@pytest.mark.parametrize('rate_hz', [25.0, 100.0, 285.71, 1000.0, 10000.0])
+def test_rests_of_1_s_to_60_s(rate_hz):
+    rng = np.random.default_rng(1)
+    lengths = [1.0, 2.0, 5.0, 1.2, 60.0, 3.0, 10.0, 1.5]
+    time_s, samples, bounds, poses = tumbled(rng, rate_hz, lengths)
+    rests = find_rests(time_s, samples, rate_hz, min_rest_s=0.6)
+    # The row in which a turn begins is hardly moved: one block may reach beyond it.
+    slack = np.array([-1, 1]) * round(0.06 * rate_hz + 1)
+    lost = matched(rests, bounds + slack)
+    assert (lost < 0.7 * rate_hz + 4).all()
+    mean, error = rest_means(time_s, samples, rests, rate_hz)
+    assert np.abs((mean - poses) / error).max() < 6
+    assert [r.time_start_s for r in rests] == [time_s[r.start] for r in rests]
+    assert [r.time_stop_s for r in rests] == [time_s[r.stop - 1] for r in rests]
+
+
+@pytest.mark.parametrize('rate_hz', [1.0, 2.0, 5.0])
+def test_slow_streams(rate_hz):
+    rng = np.random.default_rng(2)
+    time_s, samples, bounds, poses = tumbled(rng, rate_hz, [60.0] * 8, turn_s=10.0)
+    rests = find_rests(time_s, samples, rate_hz)
+    lost = matched(rests, bounds + np.array([-1, 2]))
+    assert (lost <= 12).all()
+    mean, error = rest_means(time_s, samples, rests, rate_hz)
+    assert np.abs((mean - poses) / error).max() < 7
+
+
+def test_by_hand_a_pause_of_1_s_is_no_rest():
+    rng = np.random.default_rng(3)
+    time_s, samples, bounds, _ = tumbled(rng, 100.0, [5.0, 1.0, 5.0, 1.0, 5.0])
+    assert len(find_rests(time_s, samples, 100.0)) == 3
+    assert len(find_rests(time_s, samples, 100.0, min_rest_s=0.6)) == 5
+
+
+def damaged(rng, time_s, samples):
+    """Put NaN, gaps, a step back in time and absurd spikes into a stream."""
+    samples = samples.copy()
+    samples[rng.integers(len(samples), size=20)] = np.nan
+    samples[rng.integers(len(samples), size=2), 0] = (1e38, -np.inf)
+    time_s = time_s.copy()
+    for row, step_s in zip(rng.integers(len(samples), size=4), (0.5, 7.0, -0.2, 0.11)):
+        time_s[row:] += step_s
+    return time_s, samples
+
+
+@settings(max_examples=40, deadline=None)
+@given(strategies.integers(0, 2**32 - 1), strategies.integers(1, 3),
+       strategies.sampled_from([1.0, 20.0, 100.0, 400.0]), strategies.booleans(),
+       strategies.booleans())
+def test_live_equals_offline(seed, axes, rate_hz, known, staged):
+    """However a stream is portioned, the rests and their means are the same to the last bit."""
+    rng = np.random.default_rng(seed)
+    scale_s = 1.0 if rate_hz > 10 else 30.0
+    time_s, samples, _, _ = tumbled(rng, rate_hz, scale_s * rng.uniform(1, 8, 12), scale_s)
+    time_s, samples = damaged(rng, time_s, samples)
+    samples = samples[:, :axes]
+    noise = Noise(np.full(axes, SIGMA), 0.01) if known else None
+    tolerance = 1e-3 if staged else None
+    angles = np.round(samples[:, [0, 0]] / 3) if staged else None
+    offline = find_rests(time_s, samples, rate_hz, angles, noise, angle_tolerance_rad=tolerance)
+    live = RestFinder(rate_hz, axes, noise, angle_tolerance_rad=tolerance)
+    cuts = np.sort(rng.integers(0, len(samples), rng.integers(1, 300)))
+    for part in np.split(np.arange(len(samples)), cuts):
+        live.feed(time_s[part], samples[part], None if angles is None else angles[part])
+        if rng.random() < 0.05:
+            live.rests()
+            live.stillness()
+    assert live.rests() == offline
+    if offline:
+        for got, wanted in zip(live.means(offline),
+                               rest_means(time_s, samples, offline, rate_hz, noise)):
+            assert (got == wanted).all()
+
+
+def test_rests_appear_while_the_stream_runs():
+    rng = np.random.default_rng(4)
+    time_s, samples, bounds, _ = tumbled(rng, 100.0, [5.0] * 6)
+    finder, counts, still = RestFinder(100.0, 3), [], []
+    for row in range(0, len(samples), 50):
+        finder.feed(time_s[row:row + 50], samples[row:row + 50])
+        counts.append(len(finder.rests()))
+        judged = finder.stillness()
+        still.append(judged is not None and judged.still)
+    assert counts[-1] == 6
+    assert counts[36] >= 2
+    # Half a second into a rest the newest second still holds the turn; at its end it does not.
+    assert still[9] and not still[11] and still[21]
+
+
+def test_figures_of_a_rest_do_not_depend_on_others():
+    rng = np.random.default_rng(5)
+    time_s, samples, _, _ = tumbled(rng, 100.0, [5.0] * 6)
+    rests = find_rests(time_s, samples, 100.0)
+    together = rest_means(time_s, samples, rests, 100.0)
+    for k, rest in enumerate(rests):
+        for alone, of_all in zip(rest_means(time_s, samples, [rest], 100.0), together):
+            assert (alone[0] == of_all[k]).all()
+
+
+@pytest.mark.parametrize('rate_dps', [0.2, 0.5, 2.0])
+def test_slow_rotation_is_no_rest(rate_dps):
+    """Rest, turn by 10° so slowly that no window sees it, rest."""
+    rng = np.random.default_rng(6)
+    rest, turn = 1000, round(10 / rate_dps * 100)
+    angle = np.radians(np.concatenate([np.zeros(rest), np.linspace(0, 10, turn),
+                                       np.full(rest, 10.0)]))
+    samples = G0_MPS2 * np.column_stack([np.sin(angle), 0 * angle, np.cos(angle)])
+    samples += SIGMA * rng.normal(size=samples.shape)
+    rests = find_rests(np.arange(len(samples)) / 100, samples, 100.0, min_rest_s=0.6)
+    assert len(rests) == 2
+    for found, wanted in zip(rests, ((0, rest), (rest + turn, 2 * rest + turn))):
+        # Of the turn, at most what changes the pose by less than the noise of a second's mean.
+        assert found.start > wanted[0] - 100 * 0.25 / rate_dps
+        assert found.stop < wanted[1] + 100 * 0.25 / rate_dps
+        assert found.stop - found.start > 0.6 * rest
+
+
+def test_a_stream_that_only_turns_slowly_has_no_rest():
+    rng = np.random.default_rng(7)
+    angle = np.radians(np.arange(0, 60, 0.005))
+    samples = G0_MPS2 * np.column_stack([np.sin(angle), np.cos(angle) * 0.6, np.cos(angle) * 0.8])
+    samples += SIGMA * rng.normal(size=samples.shape)
+    assert find_rests(np.arange(len(samples)) / 100, samples, 100.0) == []
+
+
+def test_a_slip_splits_a_rest():
+    """The pose gives way by 0.5°, without a jolt."""
+    rng = np.random.default_rng(8)
+    samples = np.tile([0.0, 0.0, G0_MPS2], (2000, 1)) + SIGMA * rng.normal(size=(2000, 3))
+    samples[1000:, 0] += G0_MPS2 * np.radians(0.5)
+    first, second = find_rests(np.arange(2000) / 100, samples, 100.0)
+    assert 950 <= first.stop <= 1000 <= second.start <= 1050
+
+
+def test_a_knock_neither_ends_nor_moves_a_rest():
+    rng = np.random.default_rng(9)
+    samples = np.tile([0.0, 0.0, G0_MPS2], (1000, 1)) + SIGMA * rng.normal(size=(1000, 3))
+    still = samples.copy()
+    samples[500:520, 0] += 30 * np.exp(-np.arange(20) / 4)
+    time_s = np.arange(1000) / 100
+    rests = find_rests(time_s, samples, 100.0)
+    assert len(rests) == 1
+    mean, error = rest_means(time_s, samples, rests, 100.0)
+    assert np.abs(mean[0] - still.mean(axis=0)).max() < 2 * error.max()
+
+
+def test_a_flicker_of_noise_does_not_cut_a_long_rest():
+    """A minute of a sensor with 1/f noise as strong as its white noise from 0.5 Hz down."""
+    rng = np.random.default_rng(10)
+    count = 6000
+    spectrum = np.fft.rfft(rng.normal(size=(count, 3)), axis=0)
+    frequency = np.fft.rfftfreq(count, 0.01)
+    spectrum *= np.sqrt(1 + 0.5 / np.maximum(frequency, 0.01))[:, None]
+    samples = G0_MPS2 / np.sqrt(3) + SIGMA * np.fft.irfft(spectrum, count, axis=0)
+    rests = find_rests(np.arange(count) / 100, samples, 100.0)
+    assert sum(rest.stop - rest.start for rest in rests) > 0.9 * count
+    assert len(rests) <= 2
+
+
+def test_gaps_end_rests_and_nan_does_not():
+    rng = np.random.default_rng(11)
+    samples = np.tile([0.0, 0.0, G0_MPS2], (3000, 1)) + SIGMA * rng.normal(size=(3000, 3))
+    samples[::7, 1] = np.nan
+    time_s = np.arange(3000) / 100
+    time_s[1000:] += 0.5
+    time_s[2000:] -= 5.0
+    rests = find_rests(time_s, samples, 100.0)
+    assert [(r.start // 100, -(-r.stop // 100)) for r in rests] == [(0, 10), (10, 20), (20, 30)]
+    mean, error = rest_means(time_s, samples, rests, 100.0)
+    assert np.isfinite(mean).all() and np.isfinite(error).all()
+    wanted = np.nanmean(np.where(np.isnan(samples).any(axis=1)[:, None], np.nan, samples)
+                        [rests[0].start:rests[0].stop], axis=0)
+    assert mean[0] == pytest.approx(wanted, abs=1e-12)
+
+
+@pytest.mark.parametrize('samples', [
+    np.empty((0, 3)), np.zeros((3, 3)), np.full((5000, 3), np.nan), np.full((5000, 3), np.inf)])
+def test_nothing_to_find(samples):
+    time_s = np.arange(len(samples)) / 100
+    assert find_rests(time_s, samples, 100.0) == []
+    assert RestFinder(100.0, 3).stillness() is None
+
+
+@pytest.mark.parametrize('noise', [0.02, 0.1, 0.3])
+def test_noise_below_the_step_of_the_adc(noise):
+    """Codes that hold still, and others that flicker, are the same rest."""
+    rng = np.random.default_rng(12)
+    step = 0.04
+    time_s, samples, bounds, poses = tumbled(rng, 100.0, [6.0] * 20, sigma=noise * step)
+    samples = np.round(samples / step) * step
+    rests = find_rests(time_s, samples, 100.0)
+    matched(rests, bounds + np.array([-8, 8]))
+    mean, error = rest_means(time_s, samples, rests, 100.0)
+    assert (np.abs(mean - poses) < 0.5 * step + 3 * error).all()
+    # Rounding without noise errs by up to half a step, by 1/√12 of it in the rms.
+    if noise < 0.1:
+        assert error == pytest.approx(step / np.sqrt(12), rel=0.3)
+
+
+def test_a_stream_without_noise():
+    time_s, samples, bounds, poses = tumbled(np.random.default_rng(13), 100.0, [4.0] * 5, sigma=0)
+    rests = find_rests(time_s, samples, 100.0)
+    matched(rests, bounds + np.array([-8, 8]))
+    assert rest_means(time_s, samples, rests, 100.0)[0] == pytest.approx(poses, abs=1e-4)
+
+
+def test_known_noise_behind_its_filter():
+    """Five seconds at rest every six: all found, none cut, by the noise of the datasheet."""
+    rng = np.random.default_rng(14)
+    poses = directions(rng, 61) / G0_MPS2
+    volts = 2.5 + np.repeat(poses[:-1], 6000, axis=0)
+    ramp = np.clip((np.arange(len(volts)) % 6000 - 5000) / 1000, 0, 1)[:, None]
+    volts += ramp * np.repeat(np.diff(poses, axis=0), 6000, axis=0)
+    volts += filtered(rng, len(volts), 0.535e-3)
+    volts = np.round(volts / (5 / 2**16)) * 5 / 2**16
+    time_s = np.arange(len(volts)) / 1000
+    for learn in (False, True):
+        rests = find_rests(time_s, volts, 1000.0, noise=ADXL, learn=learn)
+        assert len(rests) == 60
+        lengths = np.array([rest.time_stop_s - rest.time_start_s for rest in rests])
+        assert np.median(lengths) > 4.6
+        mean, error = rest_means(time_s, volts, rests, 1000.0, ADXL)
+        off = (mean - 2.5 - poses[:-1]) / error
+        assert 0.75 < np.sqrt((off ** 2).mean()) < 1.15
+        # 5 s at 1 kHz count for 237 samples.
+        assert np.median(error) == pytest.approx(0.535e-3 / np.sqrt(237), rel=0.15)
+
+
+def test_says_what_moves():
+    rng = np.random.default_rng(15)
+    scale = G0_MPS2
+    finder = RestFinder(1000.0, 3, ADXL)
+    time_s = np.arange(3000) / 1000
+    volts = 2.5 + filtered(rng, 3000, 0.535e-3)
+    finder.feed(time_s[:1000], volts[:1000])
+    still = finder.stillness()
+    assert still.still and still.describe('m/s²', scale).startswith('at rest: ')
+    volts[1000:, 1] += 0.3 / scale * np.sqrt(2) * np.sin(2 * np.pi * 40 * time_s[1000:])
+    finder.feed(time_s[1000:2000], volts[1000:2000])
+    moving = finder.stillness()
+    assert not moving.still
+    assert (moving.axis, moving.figure) == (1, 'rms')
+    assert moving.value * scale == pytest.approx(0.3, rel=0.1)
+    # 0.535 mg rms, and what chi-squared allows the variance of 0.25 s.
+    assert 1.5 * 0.00525 < moving.limit * scale < 2 * 0.00525
+    assert moving.describe('m/s²', scale) == 'moving: 0.3 m/s² on y, must be below ' + \
+        f'{moving.limit * scale:.2g}'
+    volts[2000:] = 2.5 + filtered(rng, 1000, 0.535e-3)
+    volts[2000:, 2] += np.radians(0.5) * (time_s[2000:] - 2)
+    finder.feed(time_s[2000:], volts[2000:])
+    drifting = finder.stillness()
+    assert not drifting.still and (drifting.axis, drifting.figure) == (2, 'drift')
+    assert drifting.value == pytest.approx(np.radians(0.25), rel=0.2)
+
+
+def test_a_unit_noisier_than_its_file():
+    rng = np.random.default_rng(16)
+    time_s, samples, bounds, _ = tumbled(rng, 200.0, [4.0] * 8, sigma=2.5 * SIGMA)
+    stated = Noise(np.full(3, SIGMA))
+    assert find_rests(time_s, samples, 200.0, noise=stated) == []
+    rests = find_rests(time_s, samples, 200.0, noise=stated, learn=True)
+    matched(rests, bounds + np.array([-15, 15]))
+
+
+@pytest.mark.parametrize('tau_s, amplitude', [(0.1, 0.2), (0.5, 0.02), (1.0, 0.01)])
+def test_settling_is_left_out(tau_s, amplitude):
+    """What is left of the settling biases the mean by less than its standard error or so."""
+    rng = np.random.default_rng(17)
+    worst = []
+    for _ in range(10):
+        volts = 2.5 + filtered(rng, 6000, 0.535e-3)
+        time_s = np.arange(6000) / 1000
+        tail = amplitude * np.exp(-time_s / tau_s)
+        volts[:, 0] += tail
+        rest = find_rests(time_s, volts, 1000.0, noise=ADXL)[0]
+        assert rest.stop >= 5900
+        worst.append(tail[rest.start:rest.stop].mean())
+    assert np.median(worst) < 2 * 0.535e-3 / np.sqrt(237)
+
+
+def staged(rng, angles, volts_at):
+    """Make a stream of a stage at the angles (n, 2) of each row."""
+    volts = volts_at(angles) + filtered(rng, len(angles), 0.535e-3)
+    return np.arange(len(angles)) / 1000, volts
+
+
+def test_the_stage_turns_where_the_sensor_feels_nothing():
+    """At alpha = 0 beta cannot be felt: only the encoder ends the rests."""
+    rng = np.random.default_rng(18)
+    beta = np.clip(np.arange(24000) % 6000 / 500 - 10, 0, 1) + np.arange(24000) // 6000
+    angles = np.column_stack([np.zeros(24000), np.radians(30) * beta])
+    time_s, volts = staged(rng, angles, lambda a: 2.5 + np.zeros((len(a), 3)))
+    encoder = np.round(angles / 1.45e-3) * 1.45e-3
+    encoder[np.arange(24000) % 20 != 3] = np.nan  # read at 50 Hz
+    rests = find_rests(time_s, volts, 1000.0, encoder, ADXL, angle_tolerance_rad=1.45e-3)
+    assert len(rests) == 4
+    for k, rest in enumerate(rests):
+        assert np.ptp(angles[rest.start:rest.stop, 1]) < 2 * 1.45e-3
+        assert rest.stop - rest.start > 4600
+        # The filter's tail is left out as well.
+        assert k == 0 or rest.start >= 6000 * k - 500 + 8000 * TAU_S
+
+
+def test_an_encoder_that_flickers_between_two_codes_is_at_rest():
+    rng = np.random.default_rng(19)
+    angles = 1.45e-3 * rng.integers(0, 2, (5000, 2))
+    time_s, volts = staged(rng, angles, lambda a: 2.5 + np.zeros((len(a), 3)))
+    rest, = find_rests(time_s, volts, 1000.0, angles, ADXL, angle_tolerance_rad=1.45e-3)
+    assert rest.stop - rest.start > 4800
+
+
+def test_a_sensor_that_moves_under_a_still_stage():
+    rng = np.random.default_rng(20)
+    angles = np.zeros((12000, 2))
+    time_s, volts = staged(rng, angles, lambda a: 2.5 + np.zeros((len(a), 3)))
+    volts[5000:7000, 0] += 0.01 * np.sin(2 * np.pi * 7 * time_s[5000:7000])
+    rests = find_rests(time_s, volts, 1000.0, angles, ADXL, angle_tolerance_rad=1.45e-3)
+    assert [round(rest.time_start_s) for rest in rests] == [0, 7]
+
+
+def test_errors_of_means_are_honest():
+    """Noise of unknown spectrum: white, filtered, and what an anti-alias filter overshoots."""
+    rng = np.random.default_rng(21)
+    for shape in ([1.0], [0.2, 0.3, 0.3, 0.2], np.exp(-np.arange(40) / 8), [1.0, 0.4, -0.2]):
+        white = rng.normal(size=(150000, 3))
+        samples = lfilter(shape, [1.0], white, axis=0)
+        rests = [Rest(i, i + 500, i / 100, (i + 499) / 100) for i in range(1000, 149000, 500)]
+        mean, error = rest_means(np.arange(150000) / 100, samples, rests, 100.0)
+        assert 0.9 < np.sqrt(((mean / error) ** 2).mean()) < 1.25
+
+
+def test_a_rest_without_samples_is_refused():
+    with pytest.raises(UserError, match=r'rest from 9\.000 s to 10\.000 s holds no samples'):
+        rest_means(np.arange(100) / 100, np.zeros((100, 3)), [Rest(900, 1000, 9.0, 10.0)], 100.0)
+
+
+def test_speed():
+    """Three million samples of three axes in two seconds of an idle core."""
+    rng = np.random.default_rng(22)
+    time_s, samples, bounds, _ = tumbled(rng, 1000.0, [5.0] * 100)
+    time_s = np.arange(5 * len(samples)) / 1000
+    samples = np.tile(samples, (5, 1))
+    assert len(samples) == 3_000_000
+    began = time.process_time()
+    rests = find_rests(time_s, samples, 1000.0)
+    assert time.process_time() - began < 4
+    assert len(rests) == 500
+
+
+@pytest.mark.parametrize('name, fewest, most', [
+    ('mpu9150_0', 22, 24), ('mpu9150_1', 22, 24), ('mpu9150_2', 22, 24),
+    ('xsens_multiposition', 37, 39), ('two_axis_stand', 23, 25)])
+def test_real_streams(shared_dir, name, fewest, most):
+    """As many rests as their authors made, but for stops of a second; the same for all files."""
+    path = shared_dir / 'real' / f'{name}.csv'
+    if not path.exists():
+        pytest.skip(f'no {path}')
+    stream = recording.read(path)
+    samples = np.column_stack([stream.columns[f'a{a}_mps2'] for a in 'xyz'])
+    assert fewest <= len(find_rests(stream.time_s, samples, 100.0)) <= most

@@ -1,0 +1,160 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Linear and physical fits: equations 1 to 19 on made and drawn units."""
+
+from dataclasses import replace
+import time
+
+from adxl_ros.calibrate import linear, physical, result, verdict
+from adxl_ros.calibrate.poses import Poses
+from adxl_ros.errors import UserError
+import numpy as np
+import pytest
+from units import drawn, nominal, PLANES_RAD, swept
+
+
+def _made(volts, alpha_deg, beta_deg):
+    count = len(volts)
+    return Poses(np.array(volts, float), np.full((count, 2), 1e-5), np.radians(alpha_deg),
+                 np.radians(beta_deg), np.zeros((count, 2)), np.zeros(count, bool))
+
+
+def test_equations_1_to_3_on_made_volts():
+    """±1 g poses give SF = (V₊ − V₋)/2 and B = (V₊ + V₋)/2 whatever the other poses read."""
+    poses = _made([[3.52, 2.51], [1.50, 2.53], [2.44, 1.49], [2.60, 3.55], [2.9, 2.9]],
+                  [90, 90, 90, 90, 30], [0, 180, 90, 270, 45])
+    fitted = linear.fit(nominal(), poses)
+    assert fitted.scale_v_per_g == pytest.approx([1.01, 1.03], abs=1e-12)
+    assert fitted.zero_g_v == pytest.approx([2.51, 2.52], abs=1e-12)
+
+
+def test_linear_takes_local_gravity():
+    """Where g is 9.78 m/s² the same volts mean a larger V/g of standard g."""
+    poses = _made([[3.5, 2.5], [1.5, 2.5], [2.5, 1.5], [2.5, 3.5]], [90] * 4, [0, 180, 90, 270])
+    fitted = linear.fit(nominal(local_gravity_mps2=9.78), poses)
+    assert fitted.scale_v_per_g == pytest.approx([9.80665 / 9.78] * 2)
+
+
+def test_linear_without_upright_poses_uses_all():
+    """A sweep that never stands an axis upright is fitted by least squares over all poses."""
+    rng = np.random.default_rng(0)
+    truth = drawn(rng, nominal(), ('bias', 'scale_factor'))
+    fitted = linear.fit(nominal(), swept(rng, truth, np.radians([20, 40]), 0, noisy=False))
+    np.testing.assert_allclose(fitted.zero_g_v, truth.zero_g_v, atol=1e-9)
+    np.testing.assert_allclose(fitted.scale_v_per_g, truth.scale_v_per_g, atol=1e-9)
+
+
+def test_linear_refuses_an_axis_that_was_not_turned():
+    """A plane near the horizontal tells no scale factor, and the message says of which axis."""
+    rng = np.random.default_rng(0)
+    poses = swept(rng, nominal(), np.radians([1.0]), 0)
+    with pytest.raises(UserError, match=r'^x: its reference spans 0.03 g'):
+        linear.fit(nominal(), poses)
+
+
+@pytest.mark.parametrize('axes', ['xy', 'xyz'])
+def test_physical_finds_the_unit(axes):
+    """On drawn units the coefficients come out within their own intervals, tilt to 0.1°."""
+    rng = np.random.default_rng(7)
+    sensor = nominal(axes)
+    inside = []
+    for _ in range(12):
+        truth = drawn(rng, sensor)
+        poses = swept(rng, truth)
+        fitted = physical.fit(sensor, poses.subset(~poses.check))
+        std = np.sqrt(np.diag(fitted.covariance))
+        for name, sigma in zip(fitted.covariance_names, std):
+            effect, parameter, axis = name.split('.')
+            index = axes.index(axis)
+            error = (fitted.values[effect][parameter][index]
+                     - truth.values[effect][parameter][index])
+            inside.append(abs(error) < 1.645 * sigma)
+        of = verdict.score('physical', verdict.errors(fitted, poses.subset(poses.check)))
+        assert of.alpha_rms_deg < 0.1
+        assert of.accel_rms_mg < 0.6
+    assert 0.85 < np.mean(inside) < 0.99
+
+
+def test_physical_reduces_the_tilt_error_as_the_paper_does():
+    """Held-out alpha error falls by more than the paper's 88.9 %."""
+    rng = np.random.default_rng(11)
+    sensor = nominal()
+    ratios = []
+    for _ in range(10):
+        poses = swept(rng, drawn(rng, sensor))
+        linear_score, physical_score = verdict.held_out(
+            {'linear': linear.fit, 'physical': physical.fit}, sensor, poses)
+        ratios.append(physical_score.alpha_rms_deg / linear_score.alpha_rms_deg)
+    assert np.mean(ratios) < 1 - 0.889
+
+
+def test_physical_is_exact_without_noise():
+    """With a perfect stage and no noise what is left is the staged fit's own approximation."""
+    rng = np.random.default_rng(3)
+    truth = drawn(rng, nominal())
+    poses = swept(rng, truth, noisy=False)
+    fitted = physical.fit(nominal(), poses.subset(~poses.check))
+    errors = verdict.errors(fitted, poses.subset(poses.check))
+    assert np.abs(errors.accel_mps2).max() < 0.3e-3 * 9.8
+
+
+def test_physical_takes_less_than_a_second():
+    """The fit with its uncertainties is quick."""
+    rng = np.random.default_rng(1)
+    poses = swept(rng, drawn(rng, nominal()))
+    began = time.perf_counter()
+    physical.fit(nominal(), poses)
+    assert time.perf_counter() - began < 1.0
+
+
+@pytest.mark.parametrize('planes_deg, missing', [
+    ([30, 60], 'alpha = 90 deg'), ([90], 'planes alpha = 30, 60, 120 and 150'),
+    ([90, 60], 'planes alpha = 30, 60, 120 and 150')])
+def test_physical_says_which_planes_are_missing(planes_deg, missing):
+    """A sweep of too few planes is refused by naming those to add."""
+    rng = np.random.default_rng(1)
+    poses = swept(rng, drawn(rng, nominal()), np.radians(planes_deg), 0)
+    with pytest.raises(UserError, match=missing):
+        physical.fit(nominal(), poses)
+
+
+def test_z_dependence_and_hysteresis_like_paths():
+    """Figure 2: forth and back give the same path, and x at ±beta differ by the cross-axis."""
+    rng = np.random.default_rng(2)
+    truth = drawn(rng, nominal())
+    poses = swept(rng, truth, PLANES_RAD[2:3], 0, noisy=False)
+    half = len(poses) // 2
+    np.testing.assert_allclose(poses.volts[:half], poses.volts[half:][::-1], atol=1e-9)
+
+
+@pytest.mark.parametrize('change, words', [
+    (lambda v: v * [-1, 1] + [5, 0], 'x: reads against the stage'),
+    (lambda v: v[:, ::-1], 'axes are swapped')])
+def test_wrong_polarity_is_named(change, words):
+    """An inverted or swapped axis is named before anything is fitted."""
+    rng = np.random.default_rng(4)
+    poses = swept(rng, nominal())
+    with pytest.raises(UserError, match=words):
+        result.calibrate(nominal(), replace(poses, volts=change(poses.volts)), None, 'made')
+
+
+def test_verdict_without_check_poses_holds_out_folds():
+    """A recording without check poses is judged by fits that leave a fifth out."""
+    rng = np.random.default_rng(6)
+    poses = swept(rng, drawn(rng, nominal()), check_poses=0)
+    found = result.calibrate(nominal(), poses, None, 'made')
+    assert found.fitted.model == 'physical'
+    assert [line.split()[0] for line in found.verdict[:4]] == ['held', 'nominal', 'linear',
+                                                              'physical']

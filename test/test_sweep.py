@@ -1,0 +1,170 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The guided sweep without ROS: what it waits for, says and accepts."""
+
+from adxl_ros.calibrate.plan import sweep as plan_sweep, Target
+from adxl_ros.calibrate.sweep import Settings, Sweep
+from adxl_ros.calibrate.tumble import Tumble
+from adxl_ros.errors import UserError
+from adxl_ros.model import chain
+from adxl_ros.model.stage import specific_force
+import numpy as np
+import pytest
+from units import nominal
+
+TARGETS = [Target(np.pi / 2, 0.0), Target(np.pi / 2, np.pi / 6)]
+
+
+class Bench:
+    """A sensor on a stage, sampled at 1 kHz; time begins at a wall clock's nanoseconds."""
+
+    def __init__(self, sweep, sensor, seed=1):
+        self.sweep = sweep
+        self.sensor = sensor
+        self.now_ns = 1_700_000_000_000_000_000
+        self.rng = np.random.default_rng(seed)
+        self.state = chain.settled(sensor, [9.8, 0.0, 0.0], self.rng)
+
+    def run(self, seconds, alpha, beta, encoder=True, shake_mps2=0.0):
+        """Hold the angles (floats, or functions of time) for so long; stop at an entry."""
+        for _ in range(round(seconds / 0.05)):
+            time = np.arange(50) / 1000
+            force = specific_force(np.full(50, alpha), np.full(50, beta), 9.80665,
+                                   shake_mps2 * np.sin(2 * np.pi * 7 * (
+                                       self.now_ns % 10 ** 9 * 1e-9 + time)))
+            volts = chain.sample(self.sensor, force, self.state, self.rng)
+            stamps = self.now_ns + np.arange(50) * 1_000_000
+            if encoder:
+                self.sweep.stage(self.now_ns, alpha, beta)
+            self.sweep.feed(stamps, volts)
+            self.now_ns += 50_000_000
+            entry = self.sweep.accept()
+            if entry is not None:
+                return entry
+        return None
+
+
+def _bench(mode='commanded', **changes):
+    sensor = nominal(**changes)
+    settings = Settings(dwell_s=5.0, tolerance_rad=0.0035, timeout_s=20.0, stage_mode=mode)
+    return Bench(Sweep(sensor, TARGETS, 0, settings), sensor)
+
+
+def test_a_pose_keeps_its_full_dwell():
+    """A pose is 5000 samples at rest after arrival, with the deviation of 237 samples."""
+    bench = _bench()
+    entry = bench.run(10, np.pi / 2, 0.0)
+    assert entry['samples'] == 5000
+    assert entry['stop_ns'] - entry['start_ns'] == 4_999_000_000
+    assert entry['std_v'][0] == pytest.approx(0.535e-3 / np.sqrt(237), rel=0.8)
+    assert entry['mean_v'][0] == pytest.approx(3.5, abs=3e-4)
+
+
+def test_nothing_is_accepted_before_arrival_and_the_text_says_how_far_off():
+    """A stage 3° off is waited for; after the time-out the state says since when."""
+    bench = _bench()
+    assert bench.run(3, np.pi / 2, np.radians(3)) is None
+    state = bench.sweep.state()
+    assert (state.phase, state.late) == ('stage', False)
+    assert 'beta is 3.00 deg off' in state.text
+    bench.run(20, np.pi / 2, np.radians(3))
+    state = bench.sweep.state()
+    assert state.late
+    assert 'for 23 s' in state.text
+
+
+def test_without_encoder_it_says_so():
+    """No joint states at all: the state names the topic."""
+    bench = _bench()
+    bench.run(1, np.pi / 2, 0.0, encoder=False)
+    assert 'nothing on stage/joint_states' in bench.sweep.state().text
+
+
+def test_a_sensor_that_shakes_is_not_at_rest():
+    """Motion is said with its figure and the limit, and nothing is accepted."""
+    bench = _bench()
+    assert bench.run(8, np.pi / 2, 0.0, shake_mps2=0.3) is None
+    state = bench.sweep.state()
+    assert state.phase == 'rest'
+    assert 'moving: 0.' in state.text and 'm/s² on x, must be below 0.0' in state.text
+
+
+def test_motion_during_the_dwell_begins_it_anew():
+    """A knock after 3 s costs those 3 s, not the quality of the pose."""
+    bench = _bench()
+    assert bench.run(3, np.pi / 2, 0.0) is None
+    assert bench.run(0.2, np.pi / 2, 0.0, shake_mps2=1.0) is None
+    knocked_ns = bench.now_ns
+    entry = bench.run(10, np.pi / 2, 0.0)
+    assert entry['start_ns'] >= knocked_ns
+
+
+def test_a_stage_that_leaves_and_returns_begins_anew():
+    """Samples of a first arrival do not count after the stage has moved."""
+    bench = _bench()
+    bench.run(4, np.pi / 2, 0.0)
+    bench.run(1, np.pi / 2, 0.05)
+    returned_ns = bench.now_ns
+    entry = bench.run(10, np.pi / 2, 0.0)
+    assert entry['start_ns'] > returned_ns
+
+
+@pytest.mark.parametrize('mode, beta', [('encoder', 0.02), ('manual', 0.0)])
+def test_the_operator_captures(mode, beta):
+    """With an operator nothing happens before capture; whose angle counts is the mode's."""
+    bench = _bench(mode)
+    assert bench.run(7, np.pi / 2, 0.02, encoder=mode == 'encoder') is None
+    assert bench.sweep.state().phase == 'operator'
+    captured_ns = bench.now_ns
+    bench.sweep.capture()
+    entry = bench.run(7, np.pi / 2, 0.02, encoder=mode == 'encoder')
+    assert entry['start_ns'] >= captured_ns - 1_000_000
+    assert entry['beta_rad'] == pytest.approx(beta)
+
+
+def test_the_plan_is_the_papers_and_refuses_nonsense():
+    """Planes forth and back by 30°, then check poses off the grid."""
+    targets = plan_sweep([np.pi / 2, 0.5], np.radians(30), 8)
+    assert len(targets) == 2 * 26 + 8
+    beta = np.degrees([t.beta_rad for t in targets[:26]])
+    np.testing.assert_allclose(beta, [*range(0, 361, 30), *range(360, -1, -30)])
+    assert [t.check for t in targets].count(True) == 8
+    with pytest.raises(UserError, match='names no plane'):
+        plan_sweep([], 0.5, 0)
+    with pytest.raises(UserError, match='sweep.step_rad: 0 rad'):
+        plan_sweep([1.0], 0.0, 0)
+
+
+def test_rests_by_hand_are_announced_as_they_end():
+    """A tumble counts its rests and names what moves between them."""
+    sensor = nominal('xyz', noise_density_g_per_rthz=np.full(3, 300e-6))
+    tumble = Tumble(sensor, 0)
+    rng = np.random.default_rng(2)
+    state = chain.settled(sensor, [0.0, 0.0, 9.8], rng)
+    alphas = np.repeat(np.linspace(0, 2.5, 6), 4000) + np.concatenate(
+        [np.concatenate([np.zeros(3000), 0.2 * np.sin(np.linspace(0, 40, 1000))])
+         for _ in range(6)])
+    volts = chain.sample(sensor, specific_force(alphas, 0 * alphas, 9.80665), state, rng)
+    found = []
+    for i in range(0, len(volts), 100):
+        tumble.feed(np.arange(i, i + 100) * 1_000_000 + 10 ** 18, volts[i:i + 100])
+        while (entry := tumble.accept()) is not None:
+            found.append(entry)
+            tumble.move(entry['pose'] + 1)
+    assert len(found) == 6
+    results = tumble.results(found)
+    assert len(results) == 6
+    assert all(2.0 < e['samples'] / 1000 < 3.1 for e in results)
+    assert '6 rests (4 more at least)' in tumble.state().text

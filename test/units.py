@@ -1,0 +1,68 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Made units and sweeps that the tests share."""
+
+from dataclasses import replace
+from pathlib import Path
+
+from adxl_ros.calibrate.physical import EFFECTS
+from adxl_ros.calibrate.plan import sweep
+from adxl_ros.calibrate.poses import Poses
+from adxl_ros.files import params
+from adxl_ros.model import chain, noise
+from adxl_ros.model.effects import effect_named
+from adxl_ros.model.stage import specific_force
+import numpy as np
+
+NOMINAL = Path(__file__).resolve().parents[1] / 'params' / 'adxl203.yaml'
+PLANES_RAD = np.radians([30, 60, 90, 120, 150])
+
+
+def nominal(axes='xy', **changes):
+    """Return the nominal ADXL203, with that many axes."""
+    sensor = params.load(NOMINAL)
+    count = len(axes)
+    arrays = {name: np.full(count, getattr(sensor, name)[0]) for name in (
+        'nominal_zero_g_v', 'nominal_scale_v_per_g', 'noise_density_g_per_rthz')}
+    return replace(sensor, axes=axes, **{**arrays, **changes})
+
+
+def drawn(rng, sensor, effects=EFFECTS):
+    """Draw a unit at datasheet spread, in the gauge of the fits."""
+    values = {}
+    for name in effects:
+        values[name] = {p.name: np.array([
+            rng.normal() * 0.5 * p.scale
+            * (a in p.axes and (name, p.name) not in {('cross_axis', 'linear'),
+                                                      ('cross_axis_z', 'linear')})
+            for a in sensor.axes]) for p in effect_named(name).parameters}
+    return replace(sensor, effects=tuple(effects), values=values)
+
+
+def swept(rng, truth, planes_rad=PLANES_RAD, check_poses=16, noisy=True):
+    """Sweep a unit: poses with the noise of 5 s means and a stage that errs within a step."""
+    targets = sweep(planes_rad, np.radians(30), check_poses)
+    alpha, beta = (np.array([getattr(t, name) for t in targets])
+                   for name in ('alpha_rad', 'beta_rad'))
+    slack = truth.stage_resolution_rad * noisy
+    force = specific_force(alpha + slack * rng.uniform(-0.5, 0.5, len(alpha)),
+                           beta + slack * rng.uniform(-0.5, 0.5, len(beta)),
+                           truth.local_gravity_mps2)
+    volts = np.column_stack(chain.static_response(truth)(force))
+    count = noise.effective_samples(5000, 1e-3, truth.rc_s)
+    std = np.broadcast_to(noise.sigma_v(truth) / np.sqrt(count), volts.shape)
+    volts = volts + noisy * std * rng.normal(size=volts.shape)
+    return Poses(volts, std, alpha, beta, np.zeros((len(alpha), 2)),
+                 np.array([t.check for t in targets]))
