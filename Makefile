@@ -40,18 +40,19 @@ unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
 made_for := $(mode) $(CURDIR)
 ifneq ($(made_for),$(shell test -x .venv/bin/python && cat .venv/.ready 2>/dev/null))
 .venv/.ready: FORCE
+make_venv = python='$(base_python)'; \
+    [ -n "$$python" ] || { echo 'make: no CPython 3.10 to 3.13 with venv found: install python3' \
+        'and python3-venv, or say make PYTHON=/path/to/python' >&2; exit 1; }; \
+    echo "making .venv with $$python, ROS 2 from: $(mode)"; \
+    rm -rf .venv && \
+    "$$python" -m venv $(if $(ros_python),--system-site-packages) .venv && \
+    { .venv/bin/python -m pip freeze | grep -E '^(numpy|scipy|pytest)==' || :; } \
+        > .venv/constraints.txt
 endif
 
+# The constraints keep the versions that an installed ROS was built with.
 .venv/.ready: $(requirements)
-	@if [ "$$(cat $@ 2>/dev/null)" != '$(made_for)' ] || [ ! -x .venv/bin/python ]; then \
-	    python='$(base_python)'; \
-	    [ -n "$$python" ] || { echo 'make: no CPython 3.10 to 3.13 with venv found: install' \
-	        'python3 and python3-venv, or say make PYTHON=/path/to/python' >&2; exit 1; }; \
-	    echo "making .venv with $$python, ROS 2 from: $(mode)"; \
-	    rm -rf .venv && \
-	    "$$python" -m venv $(if $(ros_python),--system-site-packages) .venv && \
-	    { .venv/bin/python -m pip freeze | grep -E '^(numpy|scipy|pytest)==' > .venv/constraints.txt || :; } \
-	fi
+	@$(make_venv)
 	@rm -f $@
 	@echo 'installing into .venv: $(requirements)'
 	@.venv/bin/python -m pip install --quiet --disable-pip-version-check \

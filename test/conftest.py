@@ -16,7 +16,7 @@
 What the tests share: a ROS domain of their own, the installed executables, the shared files.
 
 The executables are found through the ament index, as `ros2 run` does, and talk over DDS on the
-loopback interface in a domain that no other session of these tests and no other graph uses.
+loopback interface in a domain that no other run of these tests and no other graph uses.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ DOMAINS = range(1, 102)  # 0 is everybody's; above 101 lie ports that the system
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    # A session that is told to end stops the processes it has started, as after Ctrl-C.
+    # A run that is told to end stops the processes it has started, as after Ctrl-C.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
 
 

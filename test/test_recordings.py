@@ -258,9 +258,11 @@ def test_paths_that_cannot_be_read(tmp_path: Path) -> None:
     assert refusal(path) == ': cannot read: Permission denied'
 
 
-@pytest.mark.parametrize('place', [0, 80_000, 149_999])
-def test_faults_far_down_are_found(tmp_path: Path, place: int) -> None:
-    lines = [f'{i / 1000!r},2.5,2.5,{i % 7},0.1' for i in range(150_000)]
+@pytest.mark.parametrize('place', [0, 1600, 2999])
+def test_faults_far_down_are_found(
+        tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: int) -> None:
+    monkeypatch.setattr(csv_file, '_CHUNK_BYTES', 10_000)
+    lines = [f'{i / 1000!r},2.5,2.5,{i % 7},0.1' for i in range(3000)]
     lines[place] = lines[place].replace('2.5,2.5', '2.5,x')
     path = written(tmp_path, f'{HEADER}\n' + '\n'.join(lines) + '\n')
     assert refusal(path) == f":{place + 2}:3: y_v is 'x', not a number"
@@ -283,12 +285,27 @@ def test_where_the_file_is_cut_into_blocks_does_not_matter(
     assert all(same_bits(cut.columns[name], whole.columns[name]) for name in whole.columns)
 
 
-def test_a_column_that_turns_to_text_is_left_out(tmp_path: Path) -> None:
-    lines = [f'{i / 1000!r},2.5,{i}' for i in range(400_000)]
+def test_a_column_that_turns_to_text_is_left_out(
+        tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(csv_file, '_CHUNK_BYTES', 10_000)
+    lines = [f'{i / 1000!r},2.5,{i}' for i in range(3000)]
     lines[-1] = lines[-1].replace('2.5,', '2.5,no')
     path = written(tmp_path, 'time_s,x_v,state\n' + '\n'.join(lines) + '\n')
     assert list(recording.read(path).columns) == ['x_v']
     assert 'state' in next(recording.blocks(path, 1000)).columns
+
+
+def test_text_columns_are_passed_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(csv_file, '_CHUNK_BYTES', 10_000)
+    text = ['far out', '', '"q"', 'ä', '7', '"a,b"']
+    lines = [f'{text[i % 5]},{text[i // 5 % 5]}, {i / 1000!r} ,{text[i % 3]},{1 / (i + 1)!r},,'
+             f'{text[i // 1000]}' for i in range(3000)]
+    header = 'who,where,time_s,why,x_v,alpha_rad,how\n'
+    got = recording.read(written(tmp_path, header + '\n'.join(lines)))
+    assert (got.time_s == np.arange(3000) / 1000).all()
+    assert (got.columns['x_v'] == 1 / np.arange(1.0, 3001)).all()
+    assert np.isnan(got.columns['alpha_rad']).all()
+    assert list(got.columns) == ['x_v', 'alpha_rad']
 
 
 def test_ideal_force(tmp_path: Path) -> None:
@@ -317,14 +334,14 @@ def test_real_files_are_read(shared_dir: Path, tmp_path: Path) -> None:
 
 
 def test_reading_is_quick_and_its_memory_bounded(tmp_path: Path) -> None:
-    """A tenth of the 3 million rows that shall take 15 s; a loaded machine gets thrice that."""
+    """A tenth of the 3 million rows that shall take 15 s; a slow machine gets thrice that."""
     path = tmp_path / 'long.csv'
     rng = np.random.default_rng(6)
     with CsvWriter(path) as file:
         for start in range(0, 300_000, 50_000):
             columns = {name: rng.normal(2.5, 0.3, 50_000) for name in ('x_v', 'y_v', 'z_v')}
             file.write({'time_s': np.arange(start, start + 50_000) / 1000, **columns})
-    began = time.perf_counter()
+    began = time.process_time()
     assert sum(len(block) for block in recording.blocks(path, 65536)) == 300_000
-    assert time.perf_counter() - began < 4.5
+    assert time.process_time() - began < 4.5
     assert growth_mb(path) < 10

@@ -70,7 +70,7 @@ def filtered(rng, count, sigma, rate_hz=1000.0, tau_s=TAU_S):
 
 
 def matched(rests, bounds):
-    """Assert that the rests are those of `bounds`, each inside its own, and return what is lost."""
+    """Assert that each rest is inside that of `bounds`, and return what is lost of it."""
     assert len(rests) == len(bounds)
     found = np.array([(rest.start, rest.stop) for rest in rests])
     assert (found[:, 0] >= bounds[:, 0]).all()
@@ -87,7 +87,8 @@ def test_rests_of_1_s_to_60_s(rate_hz):
     # The row in which a turn begins is hardly moved: one block may reach beyond it.
     slack = np.array([-1, 1]) * round(0.06 * rate_hz + 1)
     lost = matched(rests, bounds + slack)
-    assert (lost < 0.7 * rate_hz + 4).all()
+    assert (lost < (0.7 + 0.2 * np.array(lengths)) * rate_hz + 4).all()
+    assert np.median(lost) < 0.5 * rate_hz + 4
     mean, error = rest_means(time_s, samples, rests, rate_hz)
     assert np.abs((mean - poses) / error).max() < 6
     assert [r.time_start_s for r in rests] == [time_s[r.start] for r in rests]
@@ -100,14 +101,14 @@ def test_slow_streams(rate_hz):
     time_s, samples, bounds, poses = tumbled(rng, rate_hz, [60.0] * 8, turn_s=10.0)
     rests = find_rests(time_s, samples, rate_hz)
     lost = matched(rests, bounds + np.array([-1, 2]))
-    assert (lost <= 12).all()
+    assert (lost <= 20).all() and np.median(lost) <= 12
     mean, error = rest_means(time_s, samples, rests, rate_hz)
     assert np.abs((mean - poses) / error).max() < 7
 
 
 def test_by_hand_a_pause_of_1_s_is_no_rest():
     rng = np.random.default_rng(3)
-    time_s, samples, bounds, _ = tumbled(rng, 100.0, [5.0, 1.0, 5.0, 1.0, 5.0])
+    time_s, samples, _, _ = tumbled(rng, 100.0, [5.0, 1.0, 5.0, 1.0, 5.0])
     assert len(find_rests(time_s, samples, 100.0)) == 3
     assert len(find_rests(time_s, samples, 100.0, min_rest_s=0.6)) == 5
 
@@ -154,7 +155,7 @@ def test_live_equals_offline(seed, axes, rate_hz, known, staged):
 
 def test_rests_appear_while_the_stream_runs():
     rng = np.random.default_rng(4)
-    time_s, samples, bounds, _ = tumbled(rng, 100.0, [5.0] * 6)
+    time_s, samples, _, _ = tumbled(rng, 100.0, [5.0] * 6)
     finder, counts, still = RestFinder(100.0, 3), [], []
     for row in range(0, len(samples), 50):
         finder.feed(time_s[row:row + 50], samples[row:row + 50])
@@ -189,9 +190,9 @@ def test_slow_rotation_is_no_rest(rate_dps):
     rests = find_rests(np.arange(len(samples)) / 100, samples, 100.0, min_rest_s=0.6)
     assert len(rests) == 2
     for found, wanted in zip(rests, ((0, rest), (rest + turn, 2 * rest + turn))):
-        # Of the turn, at most what changes the pose by less than the noise of a second's mean.
-        assert found.start > wanted[0] - 100 * 0.25 / rate_dps
-        assert found.stop < wanted[1] + 100 * 0.25 / rate_dps
+        # Of the turn at most half a degree.
+        assert found.start > wanted[0] - 100 * 0.5 / rate_dps
+        assert found.stop < wanted[1] + 100 * 0.5 / rate_dps
         assert found.stop - found.start > 0.6 * rest
 
 
@@ -209,7 +210,7 @@ def test_a_slip_splits_a_rest():
     samples = np.tile([0.0, 0.0, G0_MPS2], (2000, 1)) + SIGMA * rng.normal(size=(2000, 3))
     samples[1000:, 0] += G0_MPS2 * np.radians(0.5)
     first, second = find_rests(np.arange(2000) / 100, samples, 100.0)
-    assert 950 <= first.stop <= 1000 <= second.start <= 1050
+    assert 940 <= first.stop <= 1000 <= second.start <= 1060
 
 
 def test_a_knock_neither_ends_nor_moves_a_rest():
@@ -274,7 +275,8 @@ def test_noise_below_the_step_of_the_adc(noise):
     assert (np.abs(mean - poses) < 0.5 * step + 3 * error).all()
     # Rounding without noise errs by up to half a step, by 1/√12 of it in the rms.
     if noise < 0.1:
-        assert error == pytest.approx(step / np.sqrt(12), rel=0.3)
+        assert np.median(error) == pytest.approx(step / np.sqrt(12), rel=1e-3)
+        assert (error > 0.99 * step / np.sqrt(12)).all()
 
 
 def test_a_stream_without_noise():
@@ -344,18 +346,18 @@ def test_a_unit_noisier_than_its_file():
 
 @pytest.mark.parametrize('tau_s, amplitude', [(0.1, 0.2), (0.5, 0.02), (1.0, 0.01)])
 def test_settling_is_left_out(tau_s, amplitude):
-    """What is left of the settling biases the mean by less than its standard error or so."""
+    """What is left of the settling biases the mean by not much more than its standard error."""
     rng = np.random.default_rng(17)
     worst = []
     for _ in range(10):
-        volts = 2.5 + filtered(rng, 6000, 0.535e-3)
-        time_s = np.arange(6000) / 1000
+        volts = 2.5 + filtered(rng, 10000, 0.535e-3)
+        time_s = np.arange(10000) / 1000
         tail = amplitude * np.exp(-time_s / tau_s)
         volts[:, 0] += tail
         rest = find_rests(time_s, volts, 1000.0, noise=ADXL)[0]
-        assert rest.stop >= 5900
+        assert rest.stop >= 9000
         worst.append(tail[rest.start:rest.stop].mean())
-    assert np.median(worst) < 2 * 0.535e-3 / np.sqrt(237)
+    assert np.median(worst) < 2.5 * 0.535e-3 / np.sqrt(237)
 
 
 def staged(rng, angles, volts_at):
@@ -417,7 +419,7 @@ def test_a_rest_without_samples_is_refused():
 def test_speed():
     """Three million samples of three axes in two seconds of an idle core."""
     rng = np.random.default_rng(22)
-    time_s, samples, bounds, _ = tumbled(rng, 1000.0, [5.0] * 100)
+    _, samples, _, _ = tumbled(rng, 1000.0, [5.0] * 100)
     time_s = np.arange(5 * len(samples)) / 1000
     samples = np.tile(samples, (5, 1))
     assert len(samples) == 3_000_000

@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from itertools import pairwise
 
 import numpy as np
 
@@ -24,7 +25,7 @@ BLOCK_S = 0.05
 """Length of a block, s: well below a rest, well above the time between samples where it can be."""
 GAP_S = 0.1
 """Time without a sample that ends a block and a rest, s (or five samples, if that is longer)."""
-CHUNK = 1 << 16
+CHUNK = 1 << 13
 """Samples worked on at once: what fits a cache, so that long recordings cost no memory."""
 
 
@@ -47,9 +48,9 @@ class Blocks:
     run
         Number of the gapless run that the block is a part of, (k,).
     count
-        Rows without NaN, (k,).
+        Rows without NaN, (k,); 0 where that is less than half.
     mean
-        Mean by axis, (k, m); NaN where half the rows are missing.
+        Mean of those by axis, (k, m); where there are none, that of the block before.
     squares
         Sum of the squared deviations from the mean, (k, m).
     step
@@ -104,7 +105,8 @@ class BlockCutter:
         self.size = block_samples(rate_hz)
         self._axes = axes
         self._gap_s = max(GAP_S, 5 / rate_hz)
-        self._rest = np.empty((0, 1 + axes + angles))
+        self._rest = np.empty((1 + axes + angles, 0))
+        self._mean = np.zeros((axes, 1))
         self._row = 0
         self._run = -1
         self._last_time_s = -np.inf
@@ -124,49 +126,78 @@ class BlockCutter:
             Encoder angles, rad, (n, a), NaN where not sampled.
 
         """
-        columns = [time_s, samples] if angles_rad is None else [time_s, samples, angles_rad]
-        rows = np.column_stack([np.asarray(c, float) for c in columns])
-        return Blocks.join([self._cut(rows[i:i + CHUNK])
-                            for i in range(0, max(len(rows), 1), CHUNK)])
+        given = [time_s[:, None], samples] + ([] if angles_rad is None else [angles_rad])
+        return Blocks.join([self.none()] + [
+            self._cut(np.concatenate([part[i:i + CHUNK].T for part in given]))
+            for i in range(0, len(time_s), CHUNK)])
 
     def none(self) -> Blocks:
         """Give no blocks, of the right shape."""
         return self._summed(self._rest, np.empty(0, int), np.empty(0, int))
 
-    def _cut(self, rows: np.ndarray) -> Blocks:
-        rows = np.concatenate([self._rest, rows])
-        step_s = np.diff(rows[:, 0], prepend=self._last_time_s)
-        broken = ~((step_s >= 0) & (step_s <= self._gap_s))
-        begins = np.flatnonzero(broken)
-        edges = np.unique(np.concatenate([[0], begins, [len(rows)]]))
+    def _cut(self, columns: np.ndarray) -> Blocks:
+        """Cut what is left of the rows before, and these, (1 + m + a, n)."""
+        columns = np.concatenate([self._rest, columns], axis=1)
+        count = columns.shape[1]
+        step_s = np.diff(columns[0], prepend=self._last_time_s)
+        begins = np.flatnonzero(~((step_s >= 0) & (step_s <= self._gap_s)))
+        edges = np.unique(np.concatenate([[0], begins, [count]]))
         whole = np.diff(edges) // self.size
-        first = np.repeat(edges[:-1] + self.size * (whole - np.cumsum(whole)), whole)
-        start = first + self.size * np.arange(len(first))
-        run = self._run + np.searchsorted(begins, start, side='right')
-        kept = len(rows) if not len(whole) else edges[-2] + self.size * whole[-1]
-        blocks = self._summed(rows, start, run)
+        start = np.repeat(edges[:-1] + self.size * (whole - np.cumsum(whole)), whole)
+        start += self.size * np.arange(len(start))
+        blocks = self._summed(columns, start,
+                              self._run + np.searchsorted(begins, start, side='right'))
         # Breaks within what is kept for later are seen again then, with the same time before.
+        kept = int(edges[-2] + self.size * whole[-1])
         self._run += int(np.searchsorted(begins, kept))
         self._row += kept
         if kept:
-            self._last_time_s = rows[kept - 1, 0]
-        self._rest = rows[kept:]
+            self._last_time_s = columns[0, kept - 1]
+        self._rest = columns[:, kept:]
         return blocks
 
-    def _summed(self, rows: np.ndarray, start: np.ndarray, run: np.ndarray) -> Blocks:
-        block = rows[start[:, None] + np.arange(self.size)]
-        samples, angles = block[:, :, 1:1 + self._axes], block[:, :, 1 + self._axes:]
-        good = np.isfinite(samples).all(axis=2)
+    def _summed(self, columns: np.ndarray, start: np.ndarray, run: np.ndarray) -> Blocks:
+        """Sum the blocks that begin at the columns `start`, each by itself."""
+        block = columns[:, start[:, None] + np.arange(self.size)]
+        samples, angles = block[1:1 + self._axes], block[1 + self._axes:]
+        good = np.isfinite(samples).all(axis=0)
+        if not good.all():
+            good &= 2 * good.sum(axis=1, keepdims=True) > self.size
+            samples = np.where(good, samples, np.nan)
         count = good.sum(axis=1)
-        enough = 2 * count > self.size
+        change = np.abs(np.diff(samples, axis=2))
+        step = np.where(change > 0, change, np.inf).min(axis=2, initial=np.inf)
         # Spikes of 1e38 and worse overflow here: such a block is not at rest, whatever it holds.
         with np.errstate(over='ignore', invalid='ignore'):
-            total = np.where(good[..., None], samples, 0).sum(axis=1)
-            mean = np.where(enough, 1.0, np.nan)[:, None] * total / np.maximum(count, 1)[:, None]
-            deviation = np.where(good[..., None], samples - mean[:, None], 0)
-            change = np.abs(np.diff(samples, axis=1))
-            squares = (deviation ** 2).sum(axis=1)
-        step = np.where(change > 0, change, np.inf).min(axis=1, initial=np.inf)
-        angle = np.stack([np.fmin.reduce(angles, axis=1), np.fmax.reduce(angles, axis=1)], axis=1)
-        return Blocks(self._row + start, block[:, [0, -1], 0], run, count, mean, squares, step,
-                      angle)
+            mean = np.where(good, samples, 0).sum(axis=2) / np.maximum(count, 1)
+            squares = (np.where(good, samples - mean[..., None], 0) ** 2).sum(axis=2)
+        mean = np.concatenate([self._mean, mean], axis=1)
+        mean = mean[:, np.maximum.accumulate(np.where(count, np.arange(1, len(count) + 1), 0))]
+        if len(count):
+            self._mean = mean[:, -1:]
+        bounds = np.stack([np.fmin.reduce(angles, axis=2), np.fmax.reduce(angles, axis=2)])
+        return Blocks(self._row + start, block[0][:, [0, -1]], run, count, mean.T, squares.T,
+                      step.T, bounds.transpose(2, 0, 1))
+
+
+def runs_of(still: np.ndarray, run: np.ndarray) -> list[tuple[int, int]]:
+    """List the bounds of consecutive blocks that are all `still` and in one gapless run."""
+    group = np.where(still, run, -1)
+    edges = np.concatenate([[0], np.flatnonzero(np.diff(group)) + 1, [len(group)]])
+    return [(int(a), int(b)) for a, b in pairwise(edges) if a < b and still[a]]
+
+
+def angle_bounds(blocks: Blocks) -> np.ndarray:
+    """
+    Negative lowest and highest angle that each block can have had, (k, 2, a).
+
+    An encoder that is read less often than the sensor leaves blocks without an angle, and even
+    in others it may turn between two readings: the readings before and after count too.
+    """
+    bounds = blocks.angle * np.array([[-1.0], [1.0]])
+    known = np.isfinite(bounds).all(axis=(1, 2))
+    place, last = np.arange(len(known)), len(known) - 1
+    before = np.maximum.accumulate(np.where(known, place, 0))
+    after = np.minimum.accumulate(np.where(known, place, last)[::-1])[::-1]
+    return np.fmax(bounds, np.fmax(bounds[before[np.maximum(place - 1, 0)]],
+                                   bounds[after[np.minimum(place + 1, last)]]))

@@ -19,8 +19,6 @@ from __future__ import annotations
 import os
 from typing import Any
 
-import numpy as np
-
 from adxl_ros.calibrate import linear, physical
 from adxl_ros.calibrate.poses import Poses, reference_force
 from adxl_ros.errors import UserError
@@ -28,6 +26,7 @@ from adxl_ros.files.atomic import atomic_path
 from adxl_ros.model import chain
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.sensor import Sensor
+import numpy as np
 
 _FINE_G = np.linspace(-1, 1, 201)
 
@@ -38,6 +37,8 @@ def draw_sweep(path: str | os.PathLike, sensor: Sensor, fitted: Sensor, poses: P
 
     Parameters
     ----------
+    path
+        The file to write.
     sensor
         The nominal figures that the fit started from.
     fitted
@@ -77,6 +78,10 @@ def draw_gravity(path: str | os.PathLike, name: str, before_mps2: np.ndarray,
 
     Parameters
     ----------
+    path
+        The file to write.
+    name
+        Of the unit.
     before_mps2, after_mps2
         |f| − g of each rest by the nominal figures and by the fit, m/s², (k,).
     std_mps2

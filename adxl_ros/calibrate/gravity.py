@@ -31,11 +31,10 @@ from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 from scipy.optimize import brentq, least_squares
-from scipy.special import stdtrit
+from scipy.special import gammaln, stdtrit
 
-NAMES = ('bias.offset_v.x', 'bias.offset_v.y', 'bias.offset_v.z',
-         'scale_factor.offset_v_per_g.x', 'scale_factor.offset_v_per_g.y',
-         'scale_factor.offset_v_per_g.z',
+NAMES = (*(f'bias.offset_v.{axis}' for axis in AXES),
+         *(f'scale_factor.offset_v_per_g.{axis}' for axis in AXES),
          'misalignment.beta_rad.y', 'misalignment.alpha_rad.z', 'misalignment.beta_rad.z')
 MIN_RESTS = len(NAMES) + 1
 """One rest more than coefficients: with fewer, nothing says how good the fit is."""
@@ -47,8 +46,12 @@ OUTLIER_CHANCE = 0.01
 """Chance that a fit without knocks takes any of its rests for one."""
 STARTS, STEPS = 20, 15
 """Fits to ten rests each, that one of them may be without knocks, and steps of each."""
+ROUNDING = 1e-9
+"""Error of a mean without noise, g."""
 TRIAL = 1e-4
 """Excess of a rest's magnitude, g, to begin with."""
+KNOCK = 0.03
+"""Width of what a knock can make of a magnitude, g."""
 OUTLIERS = 0.25
 """Share of the rests that may be knocks, at most."""
 
@@ -118,11 +121,13 @@ def fit_gravity(mean_v: np.ndarray, standard_error_v: np.ndarray, sensor: Sensor
     Raises
     ------
     UserError
-        If the rests do not determine the parameters: it names those, and rests to add.
+        If the rests do not determine the parameters: it names those, and rests to add; or if
+        what they read is not gravity at all.
 
     """
     scale = sensor.nominal_scale_v_per_g
-    rests = _Rests((mean_v - sensor.nominal_zero_g_v) / scale, (standard_error_v / scale) ** 2,
+    rests = _Rests((mean_v - sensor.nominal_zero_g_v) / scale,
+                   (standard_error_v / scale) ** 2 + ROUNDING ** 2,
                    sensor.local_gravity_mps2 / G0_MPS2)
     nominal = np.zeros(len(NAMES))
     _require_determined(rests, nominal, 0.0)
@@ -202,15 +207,7 @@ def _solve(rests: _Rests, start: np.ndarray, variance: np.ndarray) -> np.ndarray
 
 
 def _fit(rests: _Rests, start: np.ndarray) -> tuple[np.ndarray, float]:
-    """
-    Fit with the excess variance that makes chi-squared its degrees of freedom.
-
-    Returns
-    -------
-    found, excess
-        The parameters, and the excess variance, g²; 0 if the means' noise explains it all.
-
-    """
+    """Fit the parameters, and the excess variance, g², that makes chi-squared its freedom."""
     found, excess = start, 0.0
     freedom = len(rests.mean) - len(NAMES)
     for _ in range(20):
@@ -233,31 +230,37 @@ def _excess(squares: np.ndarray, variance: np.ndarray, freedom: int) -> float:
 
 
 def _t_factor(excess: float, variance: np.ndarray) -> float:
-    """
-    Widen the covariance for an excess that a few rests had to tell: Student's variance.
-
-    With ν degrees of freedom it is ν/(ν − 2) times that of the normal; the share of the variance
-    that the noise of the means explains needs no such allowance.
-    """
+    """Widen the covariance for an excess that ν rests told: Student's variance, ν/(ν − 2)."""
+    # The share of the variance that the noise of the means explains needs no such allowance.
     freedom = len(variance) - len(NAMES)
-    share = excess / variance.mean()
-    return 1 + share * 2 / max(freedom - 2, 1)
+    return 1 + excess / variance.mean() * 2 / max(freedom - 2, 1)
 
 
 def _inliers(rests: _Rests, start: np.ndarray) -> np.ndarray:
     """
     Tell which rests fit the others, (k,): the rest are knocks, or were no rests.
 
-    The best fit to most of them says which to begin with, so that several knocks cannot hide one
-    another. Then rests leave or come back, one at a time, by their studentised distance from
-    the fit to the others.
+    Rests leave or come back, one at a time, by their studentised distance from the fit to the
+    others: once from all of them, and once from the best fit to most of them, where several
+    knocks cannot hide one another. The likelihood tells which of the two results is right.
     """
     count = len(rests.mean)
     most = min(int(OUTLIERS * count), count - MIN_RESTS)
-    kept = _robust_inliers(rests, start, most)
+    everything = np.ones(count, bool)
+    if most < 1:
+        return everything
+    results = [_exchanged(rests, begin, start, most)
+               for begin in (everything, _robust_inliers(rests, start, most))]
+    return min(results, key=lambda kept: _unlikeliness(rests, kept, start))
+
+
+def _exchanged(rests: _Rests, kept: np.ndarray, start: np.ndarray, most: int) -> np.ndarray:
+    """Let rests leave or come back until each kept one fits, and each other does not, (k,)."""
+    kept = kept.copy()
     for _ in range(2 * most):
         distance = _studentised(rests, kept, start)
-        allowed = -stdtrit(max(kept.sum() - MIN_RESTS, 1), OUTLIER_CHANCE / (2 * count))
+        freedom = max(kept.sum() - MIN_RESTS, 1)
+        allowed = -stdtrit(freedom, OUTLIER_CHANCE / (2 * len(kept)))
         back = np.where(kept, np.inf, distance)
         out = np.where(kept, distance, 0)
         if back.min() <= allowed:
@@ -269,6 +272,16 @@ def _inliers(rests: _Rests, start: np.ndarray) -> np.ndarray:
     return kept
 
 
+def _unlikeliness(rests: _Rests, kept: np.ndarray, start: np.ndarray) -> float:
+    """Negative logarithm of the residual likelihood, knocks being anywhere within KNOCK."""
+    found, excess = _fit(rests[kept], start)
+    variance = _magnitude_variance(rests[kept], found).mean() + excess
+    count, knocks = len(kept), (~kept).sum()
+    ways = gammaln(count + 1) - gammaln(knocks + 1) - gammaln(count - knocks + 1)
+    return float((kept.sum() - len(NAMES)) / 2 * np.log(variance * 2 * np.pi * np.e)
+                 + knocks * np.log(KNOCK) + ways)
+
+
 def _robust_inliers(rests: _Rests, start: np.ndarray, most: int) -> np.ndarray:
     """
     Tell which rests the best fit to all but `most` of them does not leave far off, (k,).
@@ -277,8 +290,6 @@ def _robust_inliers(rests: _Rests, start: np.ndarray, most: int) -> np.ndarray:
     fit suits best, to the one that suits its rests best.
     """
     count = len(rests.mean)
-    if not most:
-        return np.ones(count, bool)
     draw = np.random.default_rng(0)
     best, least = start, np.inf
     for _ in range(STARTS):
@@ -334,9 +345,14 @@ def _leave_one_out(rests: _Rests, kept: np.ndarray, found: np.ndarray, variance:
 
 
 def _require_determined(rests: _Rests, found: np.ndarray, excess: float) -> None:
-    """Refuse rests that leave a coefficient open, naming it and the rests to add."""
+    """Refuse rests that leave a coefficient open, or read something else than gravity."""
     information = _information(rests, found, excess)
     open_names, count = _open(information), len(rests.mean)
+    read = np.median(_magnitude(rests.mean, found)) if count else rests.gravity
+    if not 0.5 < read / rests.gravity < 2:
+        raise UserError(f'gravity: the rests read {read * G0_MPS2:.3g} m/s², not '
+                        f'{rests.gravity * G0_MPS2:.3g}: put nominal_zero_g_v, '
+                        'nominal_scale_v_per_g or local_gravity_mps2 right')
     if count >= MIN_RESTS and not open_names:
         return
     what = 'all nine coefficients' if len(open_names) == len(NAMES) else ', '.join(open_names)

@@ -18,12 +18,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
-
 from adxl_ros.calibrate.poses import Poses, reference_force
 from adxl_ros.errors import UserError
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.sensor import Sensor
+import numpy as np
 
 _UPRIGHT = np.cos(np.radians(0.5))
 """Within 0.5° an axis counts as at ±1 g: the cosine errs by 40 µg at most."""
@@ -48,7 +47,7 @@ def fit(sensor: Sensor, poses: Poses) -> Sensor:
     zero, scale, covariance = [], [], []
     for d, axis in enumerate(sensor.axes):
         b, s, c = _one_axis(axis, force[:, AXES.index(axis)], poses.volts[:, d],
-                            sensor.local_gravity_mps2 / G0_MPS2)
+                            poses.std_v[:, d], sensor.local_gravity_mps2 / G0_MPS2)
         zero.append(b)
         scale.append(s)
         covariance.append(c)
@@ -69,7 +68,7 @@ def upright(reference_g: np.ndarray, gravity_g: float) -> np.ndarray:
     return np.abs(reference_g) >= gravity_g * _UPRIGHT
 
 
-def _one_axis(axis: str, reference_g: np.ndarray, volts: np.ndarray,
+def _one_axis(axis: str, reference_g: np.ndarray, volts: np.ndarray, std_v: np.ndarray,
               gravity_g: float) -> tuple[float, float, np.ndarray]:
     used = upright(reference_g, gravity_g)
     if not ((reference_g[used] > 0).any() and (reference_g[used] < 0).any()):
@@ -81,5 +80,5 @@ def _one_axis(axis: str, reference_g: np.ndarray, volts: np.ndarray,
     design = np.column_stack([np.ones(used.sum()), reference_g[used]])
     (zero, scale), *_ = np.linalg.lstsq(design, volts[used], rcond=None)
     residual = volts - zero - scale * reference_g
-    spread = np.sum(residual ** 2) / max(len(volts) - 2, 1)
+    spread = max(np.sum(residual ** 2) / max(len(volts) - 2, 1), np.mean(std_v ** 2))
     return zero, scale, spread * np.linalg.inv(design.T @ design)

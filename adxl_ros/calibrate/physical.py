@@ -26,8 +26,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import numpy as np
-
 from adxl_ros.calibrate import linear
 from adxl_ros.calibrate.poses import pose_variance, Poses, reference_force
 from adxl_ros.errors import UserError
@@ -35,6 +33,7 @@ from adxl_ros.model import chain
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.model.stage import specific_force
+import numpy as np
 
 EFFECTS = ('bias', 'scale_factor', 'misalignment', 'cross_axis', 'cross_axis_z',
            'scale_factor_z')
@@ -106,17 +105,15 @@ def _one_axis(d: int, start: Sensor, poses: Poses) -> Stages:
     p = _quadratic(other[vertical], residual[vertical],
                    'the plane alpha = 90 deg', 'poses at steps of 30 deg in beta there')  # (11)
     rest = volts - _polynomial(p, other)
-    plane_az, plane_bias, plane_scale = [], [], []
+    found = []
     for chosen in planes(poses.alpha_rad):
         inclined = np.abs(np.sin(poses.alpha_rad[chosen]).mean()) >= _FLATTEST
         if inclined and np.ptp(own[chosen]) > 0.1:
             s, b = np.polyfit(own[chosen], rest[chosen], 1)
         else:
             s, b = np.nan, np.mean(rest[chosen] - scale[d] * own[chosen])
-        plane_az.append(az[chosen].mean())
-        plane_bias.append(b - zero[d])                                       # (12)
-        plane_scale.append(s)                                                # (15)
-    plane_az, plane_bias, plane_scale = map(np.array, (plane_az, plane_bias, plane_scale))
+        found.append((az[chosen].mean(), b - zero[d], s))                    # (12), (15)
+    plane_az, plane_bias, plane_scale = np.array(found).T
     wanted = 'planes alpha = 30, 60, 120 and 150 deg beside 90'
     known = np.isfinite(plane_scale)
     r = _quadratic(plane_az[known], plane_scale[known], 'the inclined planes', wanted)  # (15)
@@ -143,7 +140,7 @@ def _polynomial(coefficients: np.ndarray, a: np.ndarray) -> np.ndarray:
 def _assemble(sensor: Sensor, poses: Poses, of: list[Stages]) -> Sensor:
     """Fix the gauge and state the result in the effects' parameters."""
     count = len(sensor.axes)
-    values = {name: {} for name in EFFECTS}
+    values: dict[str, dict[str, np.ndarray]] = {name: {} for name in EFFECTS}
     zero, scale = sensor.nominal_zero_g_v.copy(), sensor.nominal_scale_v_per_g.copy()
     alpha, beta = np.zeros(count), np.zeros(count)
     terms = {name: np.zeros(count) for name in ('p2', 'q2', 'r1', 'r2')}
@@ -201,9 +198,9 @@ def _covariance(sensor: Sensor, fitted: Sensor, poses: Poses) -> np.ndarray:
     rng = np.random.default_rng(0)
     drawn = []
     for _ in range(_REPLICAS):
-        angles = [angle + widen * fitted.stage_resolution_rad * rng.uniform(-0.5, 0.5, len(poses))
-                  for angle in (poses.alpha_rad, poses.beta_rad)]
-        volts = np.column_stack(respond(specific_force(*angles, fitted.local_gravity_mps2)))
+        slack = widen * fitted.stage_resolution_rad * rng.uniform(-0.5, 0.5, (2, len(poses)))
+        volts = np.column_stack(respond(specific_force(
+            poses.alpha_rad + slack[0], poses.beta_rad + slack[1], fitted.local_gravity_mps2)))
         volts += widen * poses.std_v * rng.standard_normal(volts.shape)
         again = replace(poses, volts=volts)
         drawn.append(_flat(_assemble(sensor, again, stages(sensor, again))))

@@ -19,9 +19,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
 from adxl_ros.errors import UserError
+import numpy as np
 
 _GOLDEN_RAD = np.pi * (3 - np.sqrt(5))
 

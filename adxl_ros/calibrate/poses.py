@@ -20,14 +20,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from adxl_ros.errors import UserError
 from adxl_ros.model import chain
 from adxl_ros.model.constants import AXES
 from adxl_ros.model.effects.base import Components
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.model.stage import specific_force
+import numpy as np
 
 
 @dataclass(frozen=True)
@@ -98,10 +97,9 @@ def pose_variance(sensor: Sensor, poses: Poses) -> np.ndarray:
     for joint in range(2):
         ends = []
         for side in (step, -step):
-            angles = [poses.alpha_rad, poses.beta_rad]
-            angles[joint] = angles[joint] + side
-            ends.append(np.column_stack(
-                respond(specific_force(*angles, sensor.local_gravity_mps2))))
+            ends.append(np.column_stack(respond(specific_force(
+                poses.alpha_rad + side * (joint == 0), poses.beta_rad + side * (joint == 1),
+                sensor.local_gravity_mps2))))
         slope = (ends[0] - ends[1]) / (2 * step)
         variance = variance + slope ** 2 * sensor.stage_resolution_rad ** 2 / 12
     return variance
@@ -123,7 +121,7 @@ def check_polarity(sensor: Sensor, poses: Poses) -> None:
             strength = np.array([np.corrcoef(poses.volts[:, d], reference[:, c])[0, 1]
                                  for c in range(3)])
         own = AXES.index(axis)
-        if not np.isfinite(strength[own]) or abs(strength[own]) > 0.9 and strength[own] > 0:
+        if not np.isfinite(strength[own]) or (abs(strength[own]) > 0.9 and strength[own] > 0):
             continue
         if strength[own] < -0.9:
             raise UserError(f'{axis}: reads against the stage (correlation {strength[own]:.2f}):'
@@ -131,6 +129,6 @@ def check_polarity(sensor: Sensor, poses: Poses) -> None:
         other = int(np.nanargmax(np.abs(strength)))
         if other != own and abs(strength[other]) > 0.9:
             sign = 'against' if strength[other] < 0 else 'with'
-            raise UserError(f'{axis}: moves {sign} the stage\'s {AXES[other]} (correlation '
+            raise UserError(f"{axis}: moves {sign} the stage's {AXES[other]} (correlation "
                             f'{strength[other]:.2f}): axes are swapped; correct the wiring or '
                             'the mounting')

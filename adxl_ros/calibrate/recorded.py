@@ -20,8 +20,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
-
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.calibrate.rests import find_rests, Rest, rest_means
 from adxl_ros.calibrate.stillness import Noise
@@ -29,6 +27,7 @@ from adxl_ros.errors import UserError
 from adxl_ros.files.columns import nominal_figures, Recording
 from adxl_ros.model import noise
 from adxl_ros.model.sensor import Sensor, with_axes
+import numpy as np
 
 _FINEST_ANGLE_RAD = 1e-5
 """An encoder is never taken to be better than this, so that rounding in a file is no motion."""
@@ -48,6 +47,8 @@ def unit_of(sensor: Sensor, info: Mapping[str, str], where: str, axes: str | Non
 
     Parameters
     ----------
+    sensor
+        What is known beforehand.
     info
         Keys of `sensor_info`.
     where
@@ -69,9 +70,20 @@ def unit_of(sensor: Sensor, info: Mapping[str, str], where: str, axes: str | Non
     bare = with_axes(replace(sensor, model='nominal', effects=(), values={},
                              covariance=np.zeros((0, 0)), covariance_names=(), provenance={}),
                      axes)
+    changes: dict[str, Any] = dict(nominal_figures(info, axes, where))
     return replace(bare, serial=sensor.serial if serial == 'nominal' else serial,
-                   rate_hz=rate_hz or float(info.get('rate_hz', sensor.rate_hz)),
-                   **nominal_figures(info, axes, where))
+                   rate_hz=rate_hz or _rate_of(info, sensor, where), **changes)
+
+
+def _rate_of(info: Mapping[str, str], sensor: Sensor, where: str) -> float:
+    text = info.get('rate_hz', str(sensor.rate_hz))
+    try:
+        rate = float(text)
+    except ValueError:
+        rate = 0.0
+    if not 0 < rate < 1e6:
+        raise UserError(f'{where}: rate_hz is {text!r}, expected samples a second')
+    return rate
 
 
 def recorded_unit(sensor: Sensor, recording: Recording) -> Sensor:
@@ -96,10 +108,11 @@ def rate_hz(recording: Recording) -> float:
 
 def stage_angles(recording: Recording) -> np.ndarray | None:
     """Return alpha and beta, rad, (n, 2), NaN where not sampled; None without a stage."""
-    columns = [recording.columns.get(name) for name in ('alpha_rad', 'beta_rad')]
-    if any(c is None or np.isnan(c).all() for c in columns):
+    names = ('alpha_rad', 'beta_rad')
+    if not all(name in recording.columns for name in names):
         return None
-    return np.column_stack(columns)
+    angles = np.column_stack([recording.columns[name] for name in names])
+    return None if np.isnan(angles).all(axis=0).any() else angles
 
 
 def named_rests(recording: Recording, entries: Sequence[Mapping[str, Any]]) -> list[Rest]:
@@ -109,19 +122,20 @@ def named_rests(recording: Recording, entries: Sequence[Mapping[str, Any]]) -> l
     Raises
     ------
     UserError
-        The recording does not hold one of them.
+        The recording lacks more than a tenth of the samples of one of them.
 
     """
     stamps = recording.stamp_ns
     rests = []
     for number, entry in enumerate(entries, 1):
-        start, last = np.searchsorted(stamps, [entry['start_ns'], entry['stop_ns']])
-        if last >= len(stamps) or stamps[start] != entry['start_ns'] or \
-                stamps[last] != entry['stop_ns']:
-            raise UserError(f'{recording.path}: has no samples at the stamps of pose {number} of '
-                            'the journal; give the recording of that very run')
-        rests.append(Rest(int(start), int(last) + 1, float(recording.time_s[start]),
-                          float(recording.time_s[last])))
+        start = int(np.searchsorted(stamps, entry['start_ns'], 'left'))
+        stop = int(np.searchsorted(stamps, entry['stop_ns'], 'right'))
+        if stop - start < 0.9 * entry['samples']:
+            raise UserError(f'{recording.path}: has {stop - start} samples between the stamps of '
+                            f'pose {number} of the journal, which has {entry["samples"]}; give '
+                            'the recording of that very run')
+        rests.append(Rest(start, stop, float(recording.time_s[start]),
+                          float(recording.time_s[stop - 1])))
     return rests
 
 
@@ -132,6 +146,8 @@ def poses_of(recording: Recording, sensor: Sensor,
 
     Parameters
     ----------
+    recording
+        Read as a whole.
     sensor
         From `recorded_unit`.
     entries

@@ -27,9 +27,8 @@ of the stream itself, or both.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
 
-from adxl_ros.calibrate.blocks import BlockCutter, Blocks
+from adxl_ros.calibrate.blocks import angle_bounds, BlockCutter, Blocks, runs_of
 from adxl_ros.calibrate.stillness import (
     adc_step,
     batch_scatter,
@@ -173,7 +172,7 @@ class RestFinder:
         newest = self.blocks()[-least:]
         if limits is None or len(newest) < least or newest.run[0] != newest.run[-1]:
             return None
-        rms = np.sqrt(window_variance(newest, self._spans.window)[-1])
+        rms = np.sqrt(window_variance(newest, self._spans)[-1])
         halves = newest.mean[-2 * half:].reshape(2, half, -1).mean(axis=1)
         values = np.nan_to_num(np.concatenate([rms, np.abs(halves[1] - halves[0])]), nan=np.inf)
         allowed = np.concatenate([np.sqrt(limits.variance),
@@ -187,7 +186,7 @@ class RestFinder:
         """Judge the stream so far, once for every new block."""
         blocks = self.blocks()
         if self._judged is None or self._judged[0] != len(blocks):
-            windows = window_variance(blocks, self._spans.window)
+            windows = window_variance(blocks, self._spans)
             limits = self._limits(blocks, windows)
             rests = [] if limits is None else self._rests(blocks, windows, limits)
             self._judged = len(blocks), limits, rests
@@ -201,11 +200,13 @@ class RestFinder:
         return known.or_more(learned) if known and learned else known or learned
 
     def _rests(self, blocks: Blocks, windows: np.ndarray, limits: Limits) -> list[Rest]:
+        """Find the rests among the blocks of the whole stream."""
         quiet = quiet_blocks(blocks, windows, limits.variance, self._spans.window)
         still = quiet & ~self._drifting(blocks, quiet, limits)
-        bounds = None if self.angle_tolerance_rad is None else _angle_bounds(blocks)
+        bounds = None if self.angle_tolerance_rad is None else angle_bounds(blocks)
+        posed = [part for run in runs_of(still, blocks.run) for part in self._turned(bounds, *run)]
         parts = [self._without_ends(blocks.mean, first + self._settle, stop, limits)
-                 for run in _runs(still, blocks.run) for first, stop in self._turned(bounds, *run)]
+                 for first, stop in posed]
         parts = [part for part in parts if part[1] - part[0] >= self._spans.window]
         return [Rest(int(blocks.start[first]), int(blocks.start[stop - 1]) + self._spans.size,
                      float(blocks.time_s[first, 0]), float(blocks.time_s[stop - 1, 1]))
@@ -217,7 +218,8 @@ class RestFinder:
         Tell which blocks lie where the mean moves, (k,), by comparing neighbouring halves.
 
         Short halves come first, and longer ones look only where those saw nothing: a slip costs
-        its surroundings, and only a drift too slow for them costs more.
+        its surroundings, and only a drift too slow for them costs more. What is left between two
+        drifting parts drifts as well, unless it is long enough for the longest halves.
         """
         drifting = np.zeros(len(blocks), bool)
         for octave in range(DRIFT_OCTAVES):
@@ -229,12 +231,16 @@ class RestFinder:
             np.add.at(marks, places - half // 2, 1)
             np.add.at(marks, places + half // 2, -1)
             drifting |= np.cumsum(marks)[:-1] > 0
+        for first, stop in runs_of(quiet & ~drifting, blocks.run):
+            between = first and stop < len(blocks) and drifting[first - 1] and drifting[stop]
+            if between and stop - first < self._spans.longest:
+                drifting[first:stop] = True
         return drifting
 
     def _without_ends(self, means: np.ndarray, first: int, stop: int,
                       limits: Limits) -> tuple[int, int]:
         """Cut the ends that differ from the bulk: settling, or a hand that comes."""
-        longest = min((stop - first) // 4, self._spans.half << DRIFT_OCTAVES - 1)
+        longest = min((stop - first) // 4, self._spans.longest // 2)
         if longest > 0:
             noise = limits.block_noise(self._spans), limits.flicker, limits.step
             first += unlike_beginning(means[first:stop], longest, *noise)
@@ -245,13 +251,14 @@ class RestFinder:
         """Split blocks `first` to `stop` where an encoder angle leaves its tolerance."""
         if bounds is None:
             return [(first, stop)]
-        parts, begin, range_ = [], first, bounds[first]
-        for i in range(first, stop):
-            range_ = np.fmax(range_, bounds[i])
-            if not self._constant(range_):
-                parts.append((begin, i))
-                begin, range_ = i, bounds[i]
-        return parts + [(begin, stop)]
+        parts, begin, widest = [], first, bounds[first]
+        changed = (bounds[first + 1:stop] != bounds[first:stop - 1]).any(axis=(1, 2))
+        for i in first + 1 + np.flatnonzero(changed):
+            widest = np.fmax(widest, bounds[i])
+            if not self._constant(widest):
+                parts.append((begin, int(i)))
+                begin, widest = int(i), bounds[i]
+        return [*parts, (begin, stop)]
 
     def _constant(self, bounds: np.ndarray) -> bool:
         """Tell whether the angles within `bounds`, (2, a), count as one pose."""
@@ -263,21 +270,28 @@ class RestFinder:
                 limits: Limits) -> list[tuple[int, int]]:
         """Join parts between which a knock left the mean, and the angles, where they were."""
         joined: list[tuple[int, int]] = []
-        longest = self._spans.half << DRIFT_OCTAVES - 1
         for first, stop in parts:
-            if joined:
-                begin, end = joined[-1]
-                near = (first - end <= max(KNOCK_S / self._spans.block_s, self._spans.window)
-                        and blocks.run[begin] == blocks.run[first])
-                if near and (bounds is None
-                             or self._constant(np.fmax.reduce(bounds[begin:stop], axis=0))):
-                    before = blocks.mean[max(begin, end - longest):end]
-                    after = blocks.mean[first:min(stop, first + longest)]
-                    if not limits.tells_apart(before, after, self._spans, END_SIGMAS):
-                        joined[-1] = begin, stop
-                        continue
-            joined.append((first, stop))
+            begin, end = joined[-1] if joined else (0, 0)
+            if (joined and self._near(blocks, end, first)
+                    and (bounds is None or self._constant(np.fmax.reduce(bounds[begin:stop])))
+                    and not self._moved(blocks.mean, (begin, end), (first, stop), limits)):
+                joined[-1] = begin, stop
+            else:
+                joined.append((first, stop))
         return joined
+
+    def _near(self, blocks: Blocks, end: int, first: int) -> bool:
+        """Tell whether what begins at `first` follows shortly on what stops at `end`."""
+        longest = max(KNOCK_S / self._spans.block_s, self._spans.window)
+        return first - end <= longest and bool(blocks.run[end - 1] == blocks.run[first])
+
+    def _moved(self, means: np.ndarray, before: tuple[int, int], after: tuple[int, int],
+               limits: Limits) -> bool:
+        """Tell whether the mean beside a disturbance is another before it than after it."""
+        reach = self._spans.longest // 2
+        return limits.tells_apart(means[max(before[0], before[1] - reach):before[1]],
+                                  means[after[0]:min(after[1], after[0] + reach)],
+                                  self._spans, END_SIGMAS)
 
 
 def find_rests(time_s: np.ndarray, samples: np.ndarray, rate_hz: float,
@@ -318,7 +332,7 @@ def rest_means(time_s: np.ndarray, samples: np.ndarray, rests: list[Rest], rate_
     -------
     mean, standard_error
         In the unit of the samples, (k, m). The error is that of the scatter between parts of the
-        rest, and not below that of the known noise. A rest's figures do not depend on others.
+        rest, and not below that of the known noise. Other rests tell the step of the ADC only.
 
     Raises
     ------
@@ -353,8 +367,8 @@ def _mean(part: Blocks, step: np.ndarray, spans: Spans,
     The noise may have any spectrum: the means of up to twenty batches of the rest, so long that
     they are nearly independent, scatter by its long-run variance.
     """
-    mean = part.count @ np.nan_to_num(part.mean) / part.count.sum()
-    white = np.nansum(part.squares, axis=0) / max((part.count - 1).sum(), 1)
+    mean = part.count @ part.mean / part.count.sum()
+    white = part.squares.sum(axis=0) / max((part.count - 1).sum(), 1)
     squares, freedom = batch_scatter(part.mean, max(-(-len(part) // BATCHES), 2))
     variance = np.maximum(squares / max(freedom, 1), white / spans.size) / len(part)
     if noise is not None:
@@ -366,30 +380,8 @@ def _mean(part: Blocks, step: np.ndarray, spans: Spans,
 
 def _without_knocks(part: Blocks, step: np.ndarray, spans: Spans) -> Blocks:
     """Leave out the blocks of a rest where the variance is not that of most of it."""
-    windows = window_variance(part, spans.window)
+    part = part[part.count > 0]
+    windows = window_variance(part, spans)
     _, limit = quiet_variance(part, windows, step)
     calm = part[quiet_blocks(part, windows, limit, spans.window)]
-    return calm if len(calm) else part
-
-
-def _runs(still: np.ndarray, run: np.ndarray) -> list[tuple[int, int]]:
-    """List the bounds of consecutive blocks that are all `still` and in one gapless run."""
-    group = np.where(still, run, -1)
-    edges = np.concatenate([[0], np.flatnonzero(np.diff(group)) + 1, [len(group)]])
-    return [(int(a), int(b)) for a, b in pairwise(edges) if a < b and still[a]]
-
-
-def _angle_bounds(blocks: Blocks) -> np.ndarray:
-    """
-    Negative lowest and highest angle that each block can have had, (k, 2, a).
-
-    An encoder that is read less often than the sensor leaves blocks without an angle, and even
-    in others it may turn between two readings: the readings before and after count too.
-    """
-    bounds = blocks.angle * np.array([[-1.0], [1.0]])
-    known = np.isfinite(bounds).all(axis=(1, 2))
-    place, last = np.arange(len(known)), len(known) - 1
-    before = np.maximum.accumulate(np.where(known, place, 0))
-    after = np.minimum.accumulate(np.where(known, place, last)[::-1])[::-1]
-    return np.fmax(bounds, np.fmax(bounds[before[np.maximum(place - 1, 0)]],
-                                   bounds[after[np.minimum(place + 1, last)]]))
+    return calm if 2 * len(calm) > len(part) else part

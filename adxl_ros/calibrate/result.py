@@ -23,8 +23,6 @@ from importlib.metadata import PackageNotFoundError, version
 import os
 from pathlib import Path
 
-import numpy as np
-
 from adxl_ros.calibrate import figures, gravity, linear, physical, verdict
 from adxl_ros.calibrate.poses import check_polarity, Poses
 from adxl_ros.errors import UserError
@@ -32,6 +30,7 @@ from adxl_ros.files import params
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.sensor import Sensor
+import numpy as np
 
 STAGE_FITS = {'linear': linear.fit, 'physical': physical.fit}
 """Models that are fitted against the stage, simplest first."""
@@ -76,6 +75,8 @@ def calibrate(sensor: Sensor, poses: Poses, model: str | None, source: str) -> R
     ----------
     sensor
         The nominal sensor of the unit.
+    poses
+        Its rests, with angles or without.
     model
         'linear' or 'physical'; None takes the best that the poses determine.
     source
@@ -105,9 +106,9 @@ def _against_stage(sensor: Sensor, poses: Poses, model: str | None, source: str)
     if model is None:
         model = 'physical' if sensor.axes != 'x' else 'linear'
     fitted = STAGE_FITS[model](sensor, fitting)
-    tried = {'nominal': lambda sensor, _: sensor, **STAGE_FITS}
-    tried = dict(list(tried.items())[:list(tried).index(model) + 1])
-    scores = verdict.held_out(tried, sensor, poses)
+    fits: dict[str, verdict.Fit] = {'nominal': lambda sensor, _: sensor, **STAGE_FITS}
+    tried = list(fits)[:list(fits).index(model) + 1]
+    scores = verdict.held_out({name: fits[name] for name in tried}, sensor, poses)
     residual = verdict.errors(fitted, fitting).accel_mps2 / G0_MPS2 * 1e3
     fitted = replace(fitted, provenance=_provenance(source, poses, {
         'reference': 'stage', 'residual_mg': f'{np.sqrt(np.mean(residual ** 2)):.4f}'}))

@@ -26,8 +26,8 @@ from scipy.special import chdtri
 
 WINDOW_S, WINDOW_SAMPLES = 0.25, 8
 """A variance is judged over this time, s, and no fewer samples."""
-HALF_S, BATCH_S = 0.5, 0.25
-"""The shortest halves of a drift, s, and parts of a rest whose means are nearly independent."""
+HALF_S = 0.5
+"""The shortest halves whose means are compared for a drift, s."""
 DRIFT_OCTAVES = 4
 """Neighbouring halves of 0.5, 1, 2 and 4 s are compared: beyond, a sensor's flicker decides."""
 SPREAD_RATIO = (2.25, 9.0)
@@ -67,8 +67,6 @@ class Spans:
         A variance is judged over this many, odd, so that one is in the middle.
     half
         The shortest halves whose means are compared.
-    batch
-        Means over these are nearly independent.
 
     """
 
@@ -76,7 +74,6 @@ class Spans:
     dt_s: float
     window: int
     half: int
-    batch: int
 
     @staticmethod
     def at(rate_hz: float) -> Spans:
@@ -84,13 +81,17 @@ class Spans:
         size = block_samples(rate_hz)
         block_s = size / rate_hz
         window = max(round(WINDOW_S / block_s), -(-WINDOW_SAMPLES // size)) // 2 * 2 + 1
-        return Spans(size, 1 / rate_hz, window, max(round(HALF_S / block_s), 4),
-                     max(round(BATCH_S / block_s), 2))
+        return Spans(size, 1 / rate_hz, window, max(round(HALF_S / block_s), 4))
 
     @property
     def block_s(self) -> float:
         """Time of a block, s."""
         return self.size * self.dt_s
+
+    @property
+    def longest(self) -> int:
+        """Count the blocks of both halves, where they are longest."""
+        return self.half << DRIFT_OCTAVES
 
 
 @dataclass(frozen=True)
@@ -121,8 +122,9 @@ class Limits:
 
     @property
     def flicker(self) -> np.ndarray:
-        """Noise of the difference of two means, however long, (m,)."""
-        return self.drift[-1]
+        """Noise of the difference of two means that is there however long they are, (m,)."""
+        white = self.drift[0] ** 2 / (1 << DRIFT_OCTAVES - 1)
+        return np.sqrt(np.maximum(self.drift[-1] ** 2 - white, 0))
 
     def block_noise(self, spans: Spans) -> np.ndarray:
         """Noise of the mean of one block, (m,)."""
@@ -172,7 +174,7 @@ def learned_limits(blocks: Blocks, windows: np.ndarray, step: np.ndarray,
         None while the stream is too short.
 
     """
-    if len(blocks) < max(spans.window, 2 * spans.half):
+    if len(blocks) < max(spans.window, 2 * spans.half) or not blocks.count.any():
         return None
     variance, limit = quiet_variance(blocks, windows, step)
     quiet = quiet_blocks(blocks, windows, limit, spans.window)
@@ -181,9 +183,11 @@ def learned_limits(blocks: Blocks, windows: np.ndarray, step: np.ndarray,
         half = spans.half << octave
         noise = _drift_noise(*half_differences(blocks, quiet, half), half)
         white = np.sqrt(2 * variance / (half * spans.size))
-        # A filter or flicker makes it more than white noise would, but not more with the octave.
-        longer = drift[octave - 1] if octave else np.inf
-        drift[octave] = white if noise is None else np.maximum(np.minimum(noise, longer), white)
+        if octave:
+            # Noise falls with the length, by no more than that of white noise.
+            shorter = drift[octave - 1]
+            noise = shorter / np.sqrt(2) if noise is None else np.minimum(noise, shorter)
+        drift[octave] = white if noise is None else np.maximum(noise, white)
     return Limits(limit, drift, undithered(step, np.sqrt(variance)))
 
 
@@ -213,7 +217,7 @@ def quiet_variance(blocks: Blocks, windows: np.ndarray,
     Two neighbouring codes in equal parts are what noise below the ADC's step shows at most, and
     samples without any noise still have rounding.
     """
-    middle = np.nanmedian(np.abs(blocks.mean), axis=0) if np.isfinite(blocks.mean).any() else 0.0
+    middle = np.median(np.abs(blocks.mean), axis=0)
     least = step ** 2 / 4 + (1e-9 * middle) ** 2 + 1e-300
     found = [_quietest(v, low) for v, low in zip(windows.T, least)]
     variance, ratio = np.array(found).T
@@ -254,17 +258,23 @@ def adc_step(blocks: Blocks) -> np.ndarray:
 
 def undithered(step: np.ndarray, sigma: np.ndarray) -> np.ndarray:
     """
-    Error of a mean that rounding to `step` leaves when noise `sigma` dithers it, (m,).
+    Error of a mean that rounding to `step` leaves when samples scatter by `sigma`, (m,).
 
-    The first harmonic of the rounding error averages to exp(−2π²σ²/step²) of itself (Widrow's
-    quantisation theorem): nothing from half a step of noise on, all of it with none.
+    Noise dithers the first harmonic of the rounding error down to exp(−2π²σ²/step²) of itself
+    (Widrow's quantisation theorem): nothing from a step of noise on, all of it with none. A
+    scatter of up to half a step says nothing about the noise: two codes may just flicker.
     """
-    noise = np.maximum(sigma ** 2 - step ** 2 / 12, 0)
+    noise = np.maximum(sigma ** 2 - step ** 2 / 4, 0)
     return step * np.exp(-2 * np.pi ** 2 * noise / np.where(step > 0, step, np.inf) ** 2)
 
 
-def window_variance(blocks: Blocks, window: int) -> np.ndarray:
-    """Variance of the samples in every `window` blocks, (k − window + 1, m); inf at gaps."""
+def window_variance(blocks: Blocks, spans: Spans) -> np.ndarray:
+    """
+    Variance of the samples in every window, (k − window + 1, m).
+
+    It is inf across a gap, and where half the samples are missing.
+    """
+    window = spans.window
     if len(blocks) < window:
         return np.empty((0, blocks.mean.shape[1]))
     means = sliding_window_view(blocks.mean, window, axis=0)
@@ -275,8 +285,9 @@ def window_variance(blocks: Blocks, window: int) -> np.ndarray:
         between = (counts * (means - centre[..., None]) ** 2).sum(axis=2)
         within = sliding_window_view(blocks.squares, window, axis=0).sum(axis=2)
         variance = (within + between) / np.maximum(rows - 1, 1)
-    whole = blocks.run[window - 1:] == blocks.run[:len(blocks) - window + 1]
-    return np.where(whole[:, None] & np.isfinite(variance), variance, np.inf)
+    gapless = blocks.run[window - 1:] == blocks.run[:len(blocks) - window + 1]
+    usable = gapless[:, None] & (2 * rows > window * spans.size)
+    return np.where(usable & np.isfinite(variance), variance, np.inf)
 
 
 def quiet_blocks(blocks: Blocks, windows: np.ndarray, limit: np.ndarray,
@@ -308,7 +319,6 @@ def half_differences(blocks: Blocks, usable: np.ndarray,
     if places < 1:
         return np.empty((0, blocks.mean.shape[1])), np.zeros(0, bool)
     # Sums of what is usable only: a spike of 1e38 would erase everything that is added to it.
-    usable = usable & np.isfinite(blocks.mean).all(axis=1)
     centre = np.median(blocks.mean[usable], axis=0) if usable.any() else 0.0
     total = np.zeros((len(blocks) + 1, blocks.mean.shape[1]))
     np.cumsum(np.where(usable[:, None], blocks.mean - centre, 0), axis=0, out=total[1:])
@@ -362,6 +372,7 @@ def batch_scatter(means: np.ndarray, length: int) -> tuple[np.ndarray, int]:
 
     """
     count = len(means) // length
+    if count < 2:
+        return np.zeros(means.shape[1]), 0
     batches = means[:count * length].reshape(count, length, -1).mean(axis=1)
-    squares = length * ((batches - batches.mean(axis=0)) ** 2).sum(axis=0) if count else 0.0
-    return np.broadcast_to(squares, means.shape[1:]), max(count - 1, 0)
+    return length * ((batches - batches.mean(axis=0)) ** 2).sum(axis=0), count - 1

@@ -26,13 +26,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from adxl_ros.calibrate.plan import Target
 from adxl_ros.calibrate.recorded import known_noise
 from adxl_ros.calibrate.rests import Rest, rest_means, RestFinder
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.sensor import Sensor
+import numpy as np
 
 STAGE_MODES = ('commanded', 'encoder', 'manual')
 _KEPT_ANGLES = 100000
@@ -114,9 +113,11 @@ class Sweep:
     def stage(self, stamp_ns: int, alpha_rad: float, beta_rad: float) -> None:
         """Take an encoder reading."""
         self._angles.append((stamp_ns, alpha_rad, beta_rad))
-        if self.settings.stage_mode != 'commanded' or self.target is None:
+        target = self.target
+        if self.settings.stage_mode != 'commanded' or target is None:
             return
-        arrived = self._off_rad() <= self.settings.tolerance_rad
+        off_rad = max(abs(alpha_rad - target.alpha_rad), abs(beta_rad - target.beta_rad))
+        arrived = off_rad <= self.settings.tolerance_rad
         if arrived and not self._captured:
             self._restart()
         self._captured = arrived
@@ -196,10 +197,6 @@ class Sweep:
                                   known_noise(self._sensor), learn=False)
         self._stamps: list[np.ndarray] = []
         self._volts: list[np.ndarray] = []
-
-    def _off_rad(self) -> float:
-        _, alpha, beta = self._angles[-1]
-        return max(abs(alpha - self.target.alpha_rad), abs(beta - self.target.beta_rad))
 
     def _off_text(self, target: Target) -> str:
         if not self._angles:

@@ -19,14 +19,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
-
 from adxl_ros.calibrate.gravity import MIN_RESTS
 from adxl_ros.calibrate.recorded import known_noise
 from adxl_ros.calibrate.rests import Rest, RestFinder
 from adxl_ros.calibrate.sweep import State
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.sensor import Sensor
+import numpy as np
 
 _ENDED_S = 1.0
 """A rest is announced when the stream has gone on for this long after it."""

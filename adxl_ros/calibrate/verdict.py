@@ -19,8 +19,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import numpy as np
-
 from adxl_ros.calibrate.poses import Poses, reference_force
 from adxl_ros.errors import UserError
 from adxl_ros.model import chain
@@ -28,6 +26,10 @@ from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.model.tilt import tilt
 from adxl_ros.model.uncertainty import force_covariance
+import numpy as np
+
+Fit = Callable[[Sensor, Poses], Sensor]
+"""Fits a nominal sensor to poses."""
 
 _FOLDS = 5
 _BLIND_RAD = np.radians(1.0)
@@ -92,7 +94,7 @@ def score(model: str, of: Errors) -> Score:
                  _rms(accel), _largest(accel), int(np.isnan(alpha).sum()))
 
 
-def held_out(fits: dict[str, Callable[[Sensor, Poses], Sensor]], sensor: Sensor,
+def held_out(fits: dict[str, Fit], sensor: Sensor,
              poses: Poses) -> list[Score]:
     """
     Score models on poses kept out of their fit.
@@ -105,6 +107,10 @@ def held_out(fits: dict[str, Callable[[Sensor, Poses], Sensor]], sensor: Sensor,
     ----------
     fits
         Fit functions by the name of their model.
+    sensor
+        The nominal sensor that they start from.
+    poses
+        All of them, check poses too.
 
     """
     scores = []
@@ -124,7 +130,7 @@ def _folds(poses: Poses) -> list[np.ndarray]:
     return [np.arange(len(poses)) % _FOLDS == fold for fold in range(_FOLDS)]
 
 
-def _determined(fit: Callable[[Sensor, Poses], Sensor], sensor: Sensor, rest: Poses) -> bool:
+def _determined(fit: Fit, sensor: Sensor, rest: Poses) -> bool:
     try:
         fit(sensor, rest)
     except UserError:

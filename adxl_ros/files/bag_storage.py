@@ -133,7 +133,7 @@ class _Whole:
 
 
 def _unreadable(path: Path, error: Exception) -> UserError:
-    said = ' '.join(str(error).split()) or type(error).__name__
+    said = ' '.join(str(error).split()) or f'damaged ({type(error).__name__})'
     return UserError(f'{path}: cannot read it as a rosbag2 recording: {said}')
 
 

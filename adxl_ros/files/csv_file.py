@@ -40,7 +40,6 @@ _LONGEST_LINE_BYTES = 1 << 20
 # As nanoseconds, a stamp has to fit in 64 bits.
 _TIME_LIMIT_S = 9e9
 
-_PADDING = re.compile(rb'[ \t]*([,\n])[ \t]*')
 _INFO = re.compile(r'#+\s*([A-Za-z_][\w.]*)\s*:(?:\s+(.*))?$')
 _NUMBER = re.compile(r'\s*([-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?|[-+]?(nan|inf|infinity))?\s*',
                      re.ASCII | re.IGNORECASE)
@@ -235,14 +234,15 @@ def _columns(state: _State, lines: _Lines) -> dict[str, np.ndarray]:
 
 def _fast(state: _State, lines: _Lines) -> np.ndarray | None:
     """Parse all lines in one go; None where a line needs a closer look."""
-    count = len(state.header.names)
-    data = lines.data
-    if b' ' in data or b'\t' in data:
-        data = _PADDING.sub(rb'\1', data)
-    # numpy reads a field of nothing but white space as -1.
-    if any(space in data for space in b' \t\v\f\r') or len(state.used) != count:
+    names = state.header.names
+    data = _unpadded(lines.data)
+    bounds = _bounds(data, len(names))
+    if bounds is None:
         return None
-    if not _has_fields(data, count):
+    used = [state.header.index(name) for name in state.used]
+    data = _blanked(data, bounds, sorted(set(range(len(names))) - set(used)))
+    # numpy reads a field of nothing but white space as -1.
+    if any(space in data for space in b' \t\v\f\r'):
         return None
     text = data.replace(b'\n', b',')
     if text.startswith(b','):
@@ -257,18 +257,47 @@ def _fast(state: _State, lines: _Lines) -> np.ndarray | None:
             values = np.fromstring(text, sep=',')
         except (ValueError, DeprecationWarning):
             return None
-    return values.reshape(-1, count) if len(values) == count * len(lines.numbers) else None
+    size = len(names) * len(lines.numbers)
+    return values.reshape(-1, len(names))[:, used] if len(values) == size else None
 
 
-def _has_fields(data: bytes, count: int) -> bool:
-    """Tell whether every line has `count` fields."""
+def _unpadded(data: bytes) -> bytes:
+    """Take out the spaces beside commas and newlines."""
+    if b'\t' in data:
+        data = data.replace(b'\t', b' ')
+    if b' ' in data:
+        for padded in (b', ', b' ,', b'\n ', b' \n'):
+            while padded in data:
+                data = data.replace(padded, padded.strip(b' '))
+    return data
+
+
+def _bounds(data: bytes, count: int) -> np.ndarray | None:
+    """
+    Return where the fields are bounded, by line; None where a line has not `count` fields.
+
+    Field k stands between bounds k and k + 1, the places of the commas and newlines beside it.
+    """
     characters = np.frombuffer(data, np.uint8)
     ends = np.flatnonzero(characters == ord('\n'))
     commas = np.flatnonzero(characters == ord(','))
     if len(commas) != (count - 1) * len(ends):
-        return False
-    by_line = commas.reshape(len(ends), count - 1)
-    return bool((by_line[:, -1] < ends).all() and (by_line[1:, 0] > ends[:-1]).all())
+        return None
+    starts = np.concatenate([[-1], ends[:-1]])
+    bounds = np.column_stack([starts, commas.reshape(len(ends), count - 1), ends])
+    return bounds if (np.diff(bounds, axis=1) > 0).all() else None
+
+
+def _blanked(data: bytes, bounds: np.ndarray, unused: list[int]) -> bytes:
+    """Take out the text of unused fields."""
+    if not unused:
+        return data
+    change = np.zeros(len(data) + 1, np.int8)
+    for k in unused:
+        change[bounds[:, k] + 1] += 1
+        change[bounds[:, k + 1]] -= 1
+    kept = np.cumsum(change[:-1], dtype=np.int8) == 0
+    return np.frombuffer(data, np.uint8)[kept].tobytes()
 
 
 def _field_by_field(state: _State, lines: _Lines) -> np.ndarray:

@@ -58,7 +58,7 @@ class Journal:
         self.path = Path(path)
         head = json.loads(json.dumps({'format': FORMAT, **head}))
         try:
-            self._file = open(self.path, 'a+b', buffering=0)
+            self._file = open(self.path, 'a+b', buffering=0)  # noqa: SIM115 (kept open)
         except OSError as error:
             raise UserError(f'{path}: cannot write the journal: {error.strerror}; choose a '
                             'directory that exists and can be written') from None

@@ -22,13 +22,12 @@ import os
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import yaml
-
 from adxl_ros.errors import UserError
 from adxl_ros.files.atomic import atomic_path
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.sensor import Sensor
+import numpy as np
+import yaml
 
 FORMAT = 1
 """Version of the parameter file's format; another one is refused."""
@@ -50,15 +49,16 @@ def load(path: str | os.PathLike) -> Sensor:
         or range, a covariance that is not positive: naming file, line and column.
 
     """
-    flat = _read(Path(path))
+    flat, marks = _read(Path(path))
 
     def fail(key: str, why: str) -> UserError:
-        _, mark = flat.get(key, (None, None))
-        # A key that is missing has no place of its own: name the file.
-        where = f'{path}:{mark.line + 1}:{mark.column + 1}' if mark else f'{path}'
-        return UserError(f'{where}: {key}: {why}')
+        # What is missing has no place of its own: name that of what it belongs to.
+        place = key
+        while place not in marks:
+            place = place.rpartition('.')[0]
+        return UserError(f'{_where(path, marks[place])}: {key}: {why}')
 
-    return from_flat({key: value for key, (value, _) in flat.items()}, fail)
+    return from_flat(flat, fail)
 
 
 def from_flat(flat: dict[str, Any], fail: Any) -> Sensor:
@@ -121,6 +121,10 @@ def save(path: str | os.PathLike, sensor: Sensor, comments: Iterable[str] = ()) 
 
     Parameters
     ----------
+    path
+        The file to write.
+    sensor
+        What it shall hold.
     comments
         Lines for people, put before the parameters.
 
@@ -142,34 +146,43 @@ class _Dumper(yaml.SafeDumper):
     """Writes floats so that ROS reads doubles (1.0, not 1; 1.0e-06, not 1e-06)."""
 
 
-def _represent_float(dumper: yaml.SafeDumper, value: float) -> yaml.Node:
+def _float_text(value: float) -> str:
     text = repr(value)
-    if 'e' in text and '.' not in text:
-        text = text.replace('e', '.0e')
-    return dumper.represent_scalar('tag:yaml.org,2002:float', text)
+    return text if '.' in text else text.replace('e', '.0e')
+
+
+def _represent_float(dumper: yaml.SafeDumper, value: float) -> yaml.Node:
+    return dumper.represent_scalar('tag:yaml.org,2002:float', _float_text(value))
 
 
 _Dumper.add_representer(float, _represent_float)
 
 
-def _read(path: Path) -> dict[str, tuple[Any, Any]]:
-    """Flatten /**: ros__parameters: to dotted keys, each with its place in the file."""
+def _read(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Flatten /**: ros__parameters: to dotted keys; return values, and the places of keys."""
     try:
         text = path.read_text(encoding='utf-8')
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, 'strerror', None) or 'not UTF-8 text'
         raise UserError(f'{path}: cannot be read: {reason}') from None
+    flat: dict[str, Any] = {}
     try:
         root = yaml.compose(text, Loader=yaml.SafeLoader)
+        for key in ('/**', 'ros__parameters'):
+            root = _child(root, key, path)
+        marks = {'': root.start_mark}
+        _flatten(root, '', flat, marks, path)
     except yaml.YAMLError as error:
-        mark = getattr(error, 'problem_mark', None)
-        where = f'{path}:{mark.line + 1}:{mark.column + 1}' if mark else f'{path}'
-        raise UserError(f'{where}: not YAML: {getattr(error, "problem", error)}') from None
-    for key in ('/**', 'ros__parameters'):
-        root = _child(root, key, path)
-    flat: dict[str, tuple[Any, Any]] = {}
-    _flatten(root, '', flat, yaml.constructor.SafeConstructor())
-    return flat
+        problem = ' '.join(str(getattr(error, 'problem', error)).split())
+        raise UserError(f'{_where(path, getattr(error, "problem_mark", None))}: not YAML: '
+                        f'{problem}') from None
+    except RecursionError:
+        raise UserError(f'{path}: a node contains itself') from None
+    return flat, marks
+
+
+def _where(path: str | os.PathLike, mark: Any) -> str:
+    return f'{path}:{mark.line + 1}:{mark.column + 1}' if mark else f'{path}'
 
 
 def _child(node: Any, key: str, path: Path) -> Any:
@@ -177,17 +190,21 @@ def _child(node: Any, key: str, path: Path) -> Any:
         for name, value in node.value:
             if name.value == key and isinstance(value, yaml.MappingNode):
                 return value
-    raise UserError(f'{path}: no {key!r} with parameters below it; a parameter file begins with '
-                    "'/**:' and 'ros__parameters:'")
+    raise UserError(f'{_where(path, node and node.start_mark)}: no {key!r} with parameters below '
+                    "it; a parameter file begins with '/**:' and 'ros__parameters:'")
 
 
-def _flatten(node: yaml.MappingNode, prefix: str, flat: dict, build: Any) -> None:
+def _flatten(node: yaml.MappingNode, prefix: str, flat: dict, marks: dict, path: Path) -> None:
     for name, value in node.value:
         key = f'{prefix}{name.value}'
+        if key in marks:
+            raise UserError(f'{_where(path, name.start_mark)}: {key}: stands twice; keep one')
         if isinstance(value, yaml.MappingNode):
-            _flatten(value, f'{key}.', flat, build)
+            marks[key] = name.start_mark
+            _flatten(value, f'{key}.', flat, marks, path)
         else:
-            flat[key] = (build.construct_object(value, deep=True), value.start_mark)
+            marks[key] = value.start_mark
+            flat[key] = yaml.constructor.SafeConstructor().construct_object(value, deep=True)
 
 
 def _figure(f: Any, flat: dict, fail: Any) -> Any:
@@ -220,11 +237,18 @@ def _floats(key: str, value: Any, fail: Any) -> np.ndarray:
     many = value if isinstance(value, (list, tuple, np.ndarray)) else [value]
     for one in many:
         if isinstance(one, bool) or not isinstance(one, float):
-            raise fail(key, f'{one!r} is not a floating-point number'
-                            + (f'; write {one}.0' if isinstance(one, int) else ''))
+            raise fail(key, f'{one!r} is not a floating-point number{_as_float(one)}')
         if not np.isfinite(one):
             raise fail(key, f'{one} is not a finite number')
     return np.array(many, float)
+
+
+def _as_float(value: Any) -> str:
+    """Suggest what to write for an integer, or for 1e-6, which YAML reads as text."""
+    try:
+        return f'; write {_float_text(float(value))}'
+    except (TypeError, ValueError):
+        return ''
 
 
 def _strings(key: str, flat: dict, fail: Any) -> tuple[str, ...]:
@@ -278,12 +302,15 @@ def _covariance(flat: dict, values: dict, axes: str, fail: Any) -> tuple:
         raise fail('covariance', f'{matrix.size} values, but {len(names)} names need '
                                  f'{len(names) ** 2}')
     matrix = matrix.reshape(len(names), -1)
+    for name, variance in zip(names, np.diag(matrix)):
+        if variance < 0:
+            raise fail('covariance', f'the variance of {name} is {variance:g}, not positive')
     scale = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
     relative = matrix / np.outer(scale, scale)
     if np.abs(relative - relative.T).max() > 1e-6:
         raise fail('covariance', 'not symmetric')
     smallest = np.linalg.eigvalsh(relative).min()
-    if smallest < -1e-9 or np.diag(matrix).min() < 0:
+    if smallest < -1e-9:
         raise fail('covariance', f'not positive: its smallest eigenvalue is {smallest:.3g} in '
                                  'units of the variances')
     return matrix, names

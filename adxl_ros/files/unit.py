@@ -18,11 +18,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-import numpy as np
-
 from adxl_ros.errors import UserError
 from adxl_ros.files.columns import FORMAT, nominal_figures
 from adxl_ros.model.sensor import Sensor
+import numpy as np
 
 
 def check_unit(info: Mapping[str, str], axes: str, sensor: Sensor, where: str) -> None:
@@ -38,6 +37,8 @@ def check_unit(info: Mapping[str, str], axes: str, sensor: Sensor, where: str) -
         Keys of `sensor_info`.
     axes
         Measured axes.
+    sensor
+        What the parameters describe.
     where
         The recording or topic, for messages.
 

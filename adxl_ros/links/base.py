@@ -22,9 +22,8 @@ from importlib import import_module
 import pkgutil
 from typing import Any, Protocol
 
-import numpy as np
-
 from adxl_ros.model.sensor import Sensor
+import numpy as np
 
 HELPERS = ('base', 'sim_stage')
 """Modules of this folder that are no links."""

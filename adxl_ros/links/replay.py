@@ -20,13 +20,12 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
-
 from adxl_ros.errors import UserError
 from adxl_ros.files import recording
 from adxl_ros.files.columns import nominal_figures, Recording, REFERENCES
 from adxl_ros.links.base import Option, Samples, State
 from adxl_ros.model.sensor import Sensor, with_axes
+import numpy as np
 
 OPTIONS = (
     Option('recording', '', 'the recording to play: a rosbag2 directory, .mcap or CSV'),

@@ -21,13 +21,12 @@ from math import inf
 import time
 from typing import Any
 
-import numpy as np
-
 from adxl_ros.links.base import Option, Samples, State
 from adxl_ros.links.sim_stage import JOINTS
 from adxl_ros.model import chain
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.model.stage import specific_force
+import numpy as np
 
 OPTIONS = (
     Option('speed', 1.0, 'sensor time by real time; other than 1 with /clock', '', 0.01, 1000.0),
@@ -45,6 +44,9 @@ _FOREIGN_NS = 2_000_000_000
 """A stage whose stamps are farther from the samples' than this lives by another clock."""
 _GAP_NS = 50_000_000
 """Over a longer gap in what the stage says the pose is held, not interpolated."""
+_BEAT_NS = 10_000_000
+"""The first sample is on a multiple of this, as the stage's stamps are: no reference lies between
+samples."""
 _FOR_EVER_NS = 2 ** 63 - 1
 
 
@@ -112,7 +114,8 @@ class SimulatedSensor:
     def begin(self, now_ns: int) -> int:
         """Let the next sample be due now; return the samples that are left out."""
         skipped = self._skipped(now_ns)
-        self._origin_ns, self._made, self._until_ns = now_ns, 0, now_ns
+        self._origin_ns = -(-now_ns // _BEAT_NS) * _BEAT_NS
+        self._made, self._until_ns = 0, now_ns
         self._stamps, self._volts = self._stamps[:0], self._volts[:0]
         self._motion = [(0, *self._motion[-1][1:4], 0.0, 0.0, 0.0)]
         return skipped

@@ -19,10 +19,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from math import exp
 
-import numpy as np
-
 from adxl_ros.errors import UserError
 from adxl_ros.model.simulate import encoder
+import numpy as np
 
 JOINTS = ('alpha', 'beta', 'shift')
 _FARTHEST = {'alpha': 100.0, 'beta': 100.0, 'shift': 10.0}

@@ -20,15 +20,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from math import exp
 
-import numpy as np
-from scipy.signal import lfilter
-
 from adxl_ros.model import noise
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Components, Place, Signals, Value
 from adxl_ros.model.maths import ARRAYS, Maths
 from adxl_ros.model.sensor import Sensor
+import numpy as np
+from scipy.signal import lfilter
 
 _TOLERANCE_MPS2 = 1e-10
 _LOST_MPS2 = 1e-6
@@ -107,7 +106,7 @@ class Tangent:
 def tangent(respond: Callable[[Components], Components], axes: str,
             force: Components) -> Tangent:
     """
-    Linearise the inverse of `static_response` around a force, m/s² (arrays, or floats).
+    Linearise the inverse of `static_response` around a force, m/s², arrays or floats.
 
     Parameters
     ----------
@@ -115,6 +114,8 @@ def tangent(respond: Callable[[Components], Components], axes: str,
         From `static_response`.
     axes
         Measured axes.
+    force
+        Three components.
 
     """
     by_force = jacobian(respond, force).tolist() if isinstance(force[0], float) \
@@ -264,6 +265,8 @@ def sample(sensor: Sensor, force: Components, state: FilterState,
 
     Parameters
     ----------
+    sensor
+        The unit.
     force
         Three components, m/s², each (n,), at `sensor.rate_hz`.
     state

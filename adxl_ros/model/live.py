@@ -18,8 +18,6 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numpy as np
-
 from adxl_ros.model import chain, noise
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.effects.base import Components
@@ -27,15 +25,18 @@ from adxl_ros.model.maths import FLOATS
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.model.tilt import angles, roll_pitch_covariance
 from adxl_ros.model.uncertainty import equation_5, measured_covariance, UNMEASURED_VARIANCE
+import numpy as np
 
 _CELL_MPS2 = 0.5
 """Forces this near share a tangent and the covariance of the calibration, which vary slowly."""
 _MOST_CELLS = 4096
+_LIMIT_MPS2 = 1e6
+"""No sensor gives as much."""
 _TOLERANCE_MPS2 = 1e-8
 """What the next step of the inverse would add at most."""
 _MOST_STEPS = 8
 _MOTION_S = 0.5
-"""Time over which motion is told from noise."""
+"""Time over which motion is told from noise: some 24 independent samples behind the filter."""
 _PAUSE_S = 1.0
 """Time without a sample after which motion is learnt anew."""
 
@@ -82,8 +83,9 @@ class Live:
     hundredths of its standard deviation at alpha = ±90° where it has none.
 
     What moves is not only under gravity, so that the z of equation 5 and the angles are off: the
-    variance of the in-plane force over the last half second, as far as it exceeds twice that of
-    the noise, is added to theirs. A derived z also gets the noise variance of a measured axis.
+    variance of the in-plane force over half a second, of the last two half seconds the larger,
+    is added to theirs as far as it exceeds twice that of the noise. A derived z also gets the
+    noise variance of a measured axis.
     """
 
     def __init__(self, sensor: Sensor) -> None:
@@ -99,11 +101,9 @@ class Live:
         quiet = noise.sigma_v(sensor) / sensor.scale_v_per_g * G0_MPS2
         self._noise = (quiet[:2] ** 2).tolist()
         self._derives_z = sensor.axes == 'xy'
-        # A force, the response to it, and the motion so far: mean and variance by axis.
+        # A force, and the volts that respond to it.
         self._force: Components = [0.0, 0.0, 0.0]
         self._last_volts = self._respond(self._force)
-        self._mean = [0.0] * len(self._noise)
-        self._variance = [0.0] * len(self._noise)
         self._time_s = float('-inf')
 
     def __call__(self, accel_mps2: Components, time_s: float) -> Estimate | None:
@@ -120,8 +120,8 @@ class Live:
 
         """
         volts = [zero + a * scale for zero, a, scale in
-                 zip(self._zero_v, accel_mps2, self._volts)]
-        force = self._inverse(volts)
+                 zip(self._zero_v, accel_mps2, self._volts) if abs(a) < _LIMIT_MPS2]
+        force = self._inverse(volts) if len(volts) == len(self._volts) else None
         if force is None:
             return None
         saturated = self._at_a_rail(volts)
@@ -161,20 +161,28 @@ class Live:
                    or (v > high - half_lsb and v < high + half_lsb) for v in volts)
 
     def _motion(self, force: Components, time_s: float) -> float:
-        """Update the running variance of the in-plane force; return its excess over noise."""
-        passed = time_s - self._time_s
+        """Return how far the in-plane force of late has varied beyond its noise, (m/s²)²."""
+        if not 0 <= time_s - self._time_s < _PAUSE_S:
+            self._motion_before = 0.0
+            self._begin(time_s)
+        elif time_s - self._began_s > _MOTION_S:
+            self._motion_before = self._excess()
+            self._begin(time_s)
         self._time_s = time_s
-        if not 0 <= passed < _PAUSE_S:
-            self._mean, self._variance = force[:len(self._mean)], [0.0] * len(self._mean)
-            return 0.0
-        weight = passed / (passed + _MOTION_S)
-        most = 0.0
-        for d, quiet in enumerate(self._noise):
-            off = force[d] - self._mean[d]
-            self._mean[d] += weight * off
-            self._variance[d] = (1 - weight) * (self._variance[d] + weight * off * off)
-            most = max(most, self._variance[d] - 2 * quiet)
-        return most
+        self._count += 1
+        for d, value in enumerate(force[:len(self._noise)]):
+            off = value - self._mean[d]
+            self._mean[d] += off / self._count
+            self._squares[d] += off * (value - self._mean[d])
+        return max(self._excess(), self._motion_before)
+
+    def _begin(self, time_s: float) -> None:
+        self._began_s, self._count = time_s, 0
+        self._mean, self._squares = [0.0, 0.0], [0.0, 0.0]
+
+    def _excess(self) -> float:
+        return max(0.0, *(squares / self._count - 2 * quiet
+                          for squares, quiet in zip(self._squares, self._noise)))
 
     def _covariance(self, force: Components, unknown: float, motion: float) -> tuple[float, ...]:
         cell = self._cell(force)

@@ -16,14 +16,13 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from adxl_ros.model.sensor import Sensor
+import numpy as np
 
 
 def analog_sigma_v(sensor: Sensor) -> np.ndarray:
     """
-    Standard deviation of the analog noise by axis, V, (m,): white noise through the RC.
+    Give the standard deviation of the analog noise by axis, V, (m,): white noise through the RC.
 
     A first-order filter of time constant RC passes the noise bandwidth 1/(4·RC) = f_c·π/2; with
     no filter it is half the sample rate.
@@ -34,7 +33,7 @@ def analog_sigma_v(sensor: Sensor) -> np.ndarray:
 
 
 def sigma_v(sensor: Sensor) -> np.ndarray:
-    """Standard deviation of one sample by axis, V, (m,): the analog noise and LSB²/12."""
+    """Add LSB²/12 to the analog noise: standard deviation of one sample by axis, V, (m,)."""
     return np.hypot(analog_sigma_v(sensor), sensor.lsb_v / np.sqrt(12))
 
 

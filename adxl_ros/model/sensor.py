@@ -19,10 +19,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-import numpy as np
-
 from adxl_ros.errors import UserError
 from adxl_ros.model.constants import G0_MPS2
+import numpy as np
 
 MODELS = ('nominal', 'linear', 'physical', 'full', 'gravity')
 
@@ -112,6 +111,8 @@ def with_axes(sensor: Sensor, axes: str) -> Sensor:
 
     Parameters
     ----------
+    sensor
+        Not calibrated, unless it has these axes.
     axes
         x, xy or xyz.
 

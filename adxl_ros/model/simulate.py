@@ -16,12 +16,11 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from adxl_ros.model import chain
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.model.stage import specific_force
 from adxl_ros.model.trajectory import Motion
+import numpy as np
 
 
 def simulate(sensor: Sensor, motion: Motion, rng: np.random.Generator) -> dict[str, np.ndarray]:

@@ -16,9 +16,8 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from adxl_ros.model.effects.base import Components, Value
+import numpy as np
 
 
 def specific_force(alpha_rad: Value, beta_rad: Value, gravity_mps2: float,

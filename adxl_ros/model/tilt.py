@@ -18,10 +18,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from adxl_ros.model.effects.base import Components, Value
 from adxl_ros.model.maths import ARRAYS, Maths
+import numpy as np
 
 UNOBSERVABLE_RAD2 = 1.0
 """An angle whose variance passes this is not shown: even a guess is 1.8 rad off, rms."""

@@ -65,7 +65,7 @@ def visit(poses_rad: Sequence[tuple[float, float]], rate_hz: float,
 
 
 def sweep(rate_hz: float, _: np.random.Generator) -> Motion:
-    """Visit the paper's experiments 1 and 2: planes alpha 90, 60, 30, 120, 150°, forth and back."""
+    """Visit planes alpha 90, 60, 30, 120, 150°, forth and back (experiments 1 and 2)."""
     forth = list(range(0, 361, 30))
     return _visit_deg([(alpha, beta) for alpha in (90, 60, 30, 120, 150)
                        for beta in forth + forth[::-1]], rate_hz)

@@ -19,14 +19,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
-import numpy as np
-
 from adxl_ros.model import chain, noise
 from adxl_ros.model.constants import AXES
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Components, Value
 from adxl_ros.model.maths import ARRAYS, Maths
 from adxl_ros.model.sensor import Sensor
+import numpy as np
 
 UNMEASURED_VARIANCE = 1e6
 """Variance of an axis that the sensor does not have, (m/s²)²."""
@@ -97,7 +96,7 @@ def measured_covariance(sensor: Sensor, sample_variance_v2: np.ndarray | None = 
         if len(sensor.covariance):
             of = np.moveaxis(by_parameter(force).reshape(m, len(sensor.covariance), -1), 2, 0)
             volts = volts + of @ sensor.covariance @ np.swapaxes(of, 1, 2)
-        back = np.moveaxis(np.array(at.back).reshape(m, m, -1), 2, 0)
+        back: np.ndarray = np.moveaxis(np.array(at.back).reshape(m, m, -1), 2, 0)
         return np.moveaxis(back @ volts @ np.swapaxes(back, 1, 2), 0, 2), at
 
     return covariance

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 import os
 from pathlib import Path
 import signal
@@ -27,13 +27,6 @@ import sys
 import tempfile
 import time
 
-import numpy as np
-import rclpy
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
-from rclpy.node import Node
-from rclpy.qos import qos_profile_sensor_data, QoSProfile
-from sensor_msgs.msg import Imu
-
 from adxl_ros.calibrate import physical, recorded
 from adxl_ros.errors import UserError
 from adxl_ros.files import cdr, params, recording
@@ -41,6 +34,12 @@ from adxl_ros.files.columns import Recording, sensor_info
 from adxl_ros.model.simulate import simulate
 from adxl_ros.model.trajectory import sweep
 from adxl_ros.nodes.common import nominal_path
+import numpy as np
+import rclpy
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import qos_profile_sensor_data, QoSProfile
+from sensor_msgs.msg import Imu
 
 _RATE_HZ = 1000.0
 _ROWS = 3_000_000
@@ -121,10 +120,8 @@ def _bare(make: type[Node]) -> int:
     rclpy.init()
     executor = SingleThreadedExecutor()
     executor.add_node(make())
-    try:
+    with suppress(KeyboardInterrupt, ExternalShutdownException):
         executor.spin()
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
     return 0
 
 
@@ -214,4 +211,3 @@ def _reading() -> None:
     began = time.perf_counter()
     physical.fit(sensor, poses)
     print(f'{"physical fit":36} {len(poses):8d} {time.perf_counter() - began:8.2f}')
-

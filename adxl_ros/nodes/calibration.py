@@ -20,14 +20,6 @@ import os
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from rclpy.clock import Clock, ClockType
-from rclpy.node import Node
-from rclpy.task import Future
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from sensor_msgs.msg import Imu, JointState
-from std_srvs.srv import Trigger
-
 from adxl_ros.calibrate import plan, recorded, result
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.calibrate.sweep import Settings, STAGE_MODES, Sweep
@@ -37,6 +29,14 @@ from adxl_ros.files import cdr
 from adxl_ros.files.journal import accepted_poses, Journal
 from adxl_ros.model.sensor import Sensor, to_volts
 from adxl_ros.nodes import common
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+import numpy as np
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+from rclpy.task import Future
+from sensor_msgs.msg import Imu, JointState
+from std_srvs.srv import Trigger
 
 _POLL_S = 0.05
 _REPEAT_COMMAND_S = 0.5
@@ -96,8 +96,11 @@ class Calibration(Node):
         common.subscription(self, DiagnosticStatus, 'sensor_info', self._on_info, 1, latched=True)
         common.subscription(self, Imu, 'imu/data_raw', self._raw.append, _QUEUE, raw=True)
         common.subscription(self, JointState, 'stage/joint_states', self._on_stage, 1000)
-        for name in ('start', 'capture', 'redo', 'finish', 'abort'):
+        for name in ('start', 'redo', 'finish', 'abort'):
             self.create_service(Trigger, f'~/{name}', getattr(self, f'_on_{name}'))
+        # It answers when the pose is on disk: samples must go on coming meanwhile.
+        self.create_service(Trigger, '~/capture', self._on_capture,
+                            callback_group=ReentrantCallbackGroup())
         self.create_timer(_POLL_S, self._poll, clock=self._steady)
         self.create_timer(1.0, self._report_state, clock=self._steady)
 

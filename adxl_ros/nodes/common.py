@@ -23,6 +23,10 @@ import signal
 import sys
 from typing import Any
 
+from adxl_ros.errors import UserError
+from adxl_ros.files import params
+from adxl_ros.model.effects import library
+from adxl_ros.model.sensor import Sensor
 from ament_index_python.packages import get_package_share_directory
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
@@ -38,11 +42,6 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 from rclpy.utilities import remove_ros_args
 import yaml
-
-from adxl_ros.errors import UserError
-from adxl_ros.files import params
-from adxl_ros.model.effects import library
-from adxl_ros.model.sensor import Sensor
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 _KINDS = {'np.ndarray': Parameter.Type.DOUBLE_ARRAY, 'float': Parameter.Type.DOUBLE,
@@ -201,6 +200,8 @@ def make_sensor(flat: Mapping[str, Any],
 
     Parameters
     ----------
+    flat
+        Values by dotted key.
     refuse
         Makes the error of a parameter and a reason; by default it names its parameter file.
 

@@ -20,12 +20,6 @@ from collections import Counter
 from math import cos, sin
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from geometry_msgs.msg import Vector3Stamped
-from rclpy.clock import Clock, ClockType
-from rclpy.node import Node
-from sensor_msgs.msg import Imu
-
 from adxl_ros.errors import UserError
 from adxl_ros.files import imu_bytes
 from adxl_ros.files.cdr import CdrError
@@ -36,6 +30,11 @@ from adxl_ros.model.tilt import UNOBSERVABLE_RAD2
 from adxl_ros.nodes import common
 from adxl_ros.nodes.live_sensor import LiveSensor
 from adxl_ros.nodes.stream import Stream
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import Vector3Stamped
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+from sensor_msgs.msg import Imu
 
 _DEPTH = 100
 """Samples kept while the node is busy: 0.1 s at 1 kHz."""

@@ -27,18 +27,17 @@ import subprocess
 import sys
 import time
 
+from adxl_ros.errors import UserError
+from adxl_ros.files import params
+from adxl_ros.model.effects import effect_named
+from adxl_ros.model.sensor import Sensor
+from adxl_ros.nodes.common import nominal_path
 from diagnostic_msgs.msg import DiagnosticArray
 import numpy as np
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from std_srvs.srv import Trigger
-
-from adxl_ros.errors import UserError
-from adxl_ros.files import params
-from adxl_ros.model.effects import effect_named
-from adxl_ros.model.sensor import Sensor
-from adxl_ros.nodes.common import nominal_path
 
 _SPEED = 12.0
 _SILENT_S = 60.0

@@ -19,16 +19,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from builtin_interfaces.msg import Time
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-import numpy as np
-from rclpy.clock import Clock, ClockType
-from rclpy.node import Node
-from rclpy.serialization import serialize_message
-from rclpy.subscription import Subscription
-from rosgraph_msgs.msg import Clock as ClockMessage
-from sensor_msgs.msg import BatteryState, Imu, JointState, Temperature
-
 from adxl_ros.errors import UserError
 from adxl_ros.files import cdr
 from adxl_ros.files.columns import JOINTS, sensor_info
@@ -39,6 +29,16 @@ from adxl_ros.model.sensor import Sensor, to_nominal_mps2
 from adxl_ros.model.uncertainty import UNMEASURED_VARIANCE
 from adxl_ros.nodes import common
 from adxl_ros.nodes.beat import Beat
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+import numpy as np
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from rclpy.serialization import serialize_message
+from rclpy.subscription import Subscription
+from rosgraph_msgs.msg import Clock as ClockMessage
+from sensor_msgs.msg import BatteryState, Imu, JointState, Temperature
 
 _TICK_S = 0.004
 """A wake-up costs as much as ten samples: at 1 kHz it publishes four of them."""
@@ -70,7 +70,8 @@ class Driver(Node):
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._wall = Clock(clock_type=ClockType.SYSTEM_TIME)
         self._tally = Tally(self._steady.now().nanoseconds)
-        self._now_ns = self._waited_ns = 0
+        self._now_ns: int | None = None
+        self._waited_ns = 0
         self._ticked_ns = self._steady.now().nanoseconds
         self._fault = ''
         self._link: base.Link | None = None
@@ -95,15 +96,16 @@ class Driver(Node):
                                              sensor_info(sensor)))
             self._references = References(self, self._frame, self._link.references)
             if hasattr(self._link, 'feel'):
-                self._stage = common.subscription(
-                    self, JointState, 'stage/true_joint_states', self._feel, 1000,
-                    group=common.NotForExecutors())
+                self._stage = self.create_subscription(
+                    JointState, 'stage/true_joint_states', self._feel, QoSProfile(depth=_QUEUE),
+                    callback_group=common.NotForExecutors())
             self._beat = Beat(self, self._tick, _TICK_S)
         self.create_timer(1.0, self._report, clock=self._steady)
 
     def _take_from_stage(self) -> None:
-        while (taken := self._stage.handle.take_message(JointState, False)) is not None:
-            self._feel(taken[0])
+        with self._stage.handle:
+            while (taken := self._stage.handle.take_message(JointState, False)) is not None:
+                self._feel(taken[0])
 
     def _feel(self, message: JointState) -> None:
         stamp = message.header.stamp
@@ -117,7 +119,7 @@ class Driver(Node):
             return
         steady_ns = self._steady.now().nanoseconds
         passed_ns, self._ticked_ns = steady_ns - self._ticked_ns, steady_ns
-        if not self._now_ns and not self._may_begin(passed_ns):
+        if self._now_ns is None and not self._may_begin(passed_ns):
             return
         if self._stage is not None:
             self._take_from_stage()
@@ -174,9 +176,11 @@ class Driver(Node):
         state = base.State('error', self._fault)
         if not self._fault:
             waiting = base.State('ok', 'waiting for a subscriber of imu/data_raw')
-            state = self._link.state() if self._now_ns else waiting
-        newest_ns = self._now_ns if self._is_clock else self._wall.now().nanoseconds
-        values, warning = self._tally.report(self._steady.now().nanoseconds, newest_ns)
+            state = waiting if self._now_ns is None else self._link.state()
+        now_ns = self._now_ns
+        if now_ns is not None and not self._is_clock:
+            now_ns = self._wall.now().nanoseconds
+        values, warning = self._tally.report(self._steady.now().nanoseconds, now_ns or 0)
         level = common.WARN if warning and state.level == 'ok' else _LEVELS[state.level]
         text = ', '.join(filter(None, (f'{self._type}: {state.text}', warning)))
         self._diagnostics.publish(common.diagnostics(self, common.status(
@@ -255,11 +259,11 @@ class Tally:
         real_ns, sensed_ns, samples, missing, saturated = (
             a - b for a, b in zip(now, self._then))
         self._then = now
-        age_s = (now_ns - self._newest_ns) * 1e-9 if self._newest_ns is not None else -1.0
         values = {'rate_hz': round(samples / sensed_ns * 1e9, 3) if sensed_ns > 0 else 0.0,
-                  'missing': self.missing, 'saturated': self.saturated,
-                  'age_s': round(age_s, 6), 'samples': self.samples,
+                  'missing': self.missing, 'saturated': self.saturated, 'samples': self.samples,
                   'speed': round(sensed_ns / real_ns, 3) if real_ns > 0 else 0.0}
+        if self._newest_ns is not None:
+            values['age_s'] = round((now_ns - self._newest_ns) * 1e-9, 6)
         wrong = [f'{missing} samples missing'] if missing else []
         wrong += [f'{saturated} samples saturated'] if saturated else []
         return values, ', '.join(wrong)
@@ -280,6 +284,8 @@ class References:
 
     def publish(self, stamps: np.ndarray, columns: Mapping[str, np.ndarray]) -> None:
         """Publish what is new, and what is not once in a while."""
+        if not len(stamps):
+            return
         for name, publisher in self._publishers.items():
             if name == 'stage':
                 values = np.column_stack([columns[column] for column in self._joints])

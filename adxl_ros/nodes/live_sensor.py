@@ -16,18 +16,18 @@
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
-
-from rcl_interfaces.msg import SetParametersResult
-from rclpy.node import Node
-from rclpy.parameter import Parameter
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import params
 from adxl_ros.model.effects import library
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.nodes import common
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.node import Node
+from rclpy.parameter import Parameter
 
 _FIXED = {'format', 'units', *params.FIGURES}
 _EFFECTS = {f'{effect.name}.{p.name}': effect.name
@@ -52,6 +52,8 @@ class LiveSensor:
 
         Parameters
         ----------
+        node
+            Whose parameters they are.
         fits
             Raises `UserError` if the node cannot use that sensor.
         use
@@ -132,7 +134,8 @@ class LiveSensor:
         return SetParametersResult(successful=True)
 
     def _changes(self, parameters: Sequence[Parameter]) -> dict[str, Any]:
-        return {p.name: p.value for p in parameters
+        return {p.name: p.value.tolist() if isinstance(p.value, array) else p.value
+                for p in parameters
                 if p.name in _FIXED or p.name in _COEFFICIENTS
                 or p.name.startswith('provenance.')}
 

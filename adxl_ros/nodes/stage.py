@@ -18,17 +18,16 @@ from __future__ import annotations
 
 from collections import deque
 
+from adxl_ros.errors import UserError
+from adxl_ros.files.params import FIGURES
+from adxl_ros.links.sim_stage import JOINTS, SimulatedStage
+from adxl_ros.nodes import common
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
 import numpy as np
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
-
-from adxl_ros.errors import UserError
-from adxl_ros.files.params import FIGURES
-from adxl_ros.links.sim_stage import JOINTS, SimulatedStage
-from adxl_ros.nodes import common
 
 _STEP_NS = 10_000_000
 _JUMP_NS = 1_000_000_000

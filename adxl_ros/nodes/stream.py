@@ -26,10 +26,9 @@ from collections.abc import Callable
 import threading
 from typing import Any
 
+from adxl_ros.nodes import common
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
-
-from adxl_ros.nodes import common
 
 _LOOK_UP_NS = 100_000_000
 """Time after which a thread that waits for a message looks whether it shall end."""
@@ -49,6 +48,14 @@ class Stream:
 
         Parameters
         ----------
+        node
+            Whose subscription it is.
+        kind
+            Type of the messages.
+        topic
+            Its name.
+        callback
+            Takes the bytes of a message.
         depth
             Messages that are kept while the callback is busy.
 

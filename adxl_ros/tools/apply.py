@@ -20,8 +20,6 @@ import argparse
 from pathlib import Path
 import sys
 
-import numpy as np
-
 from adxl_ros.errors import UserError
 from adxl_ros.files import params, recording
 from adxl_ros.files.csv_writer import CsvWriter
@@ -33,6 +31,7 @@ from adxl_ros.model.sensor import Sensor, with_axes
 from adxl_ros.model.tilt import tilt
 from adxl_ros.model.uncertainty import force_covariance
 from adxl_ros.tools.common import progress, run
+import numpy as np
 
 _BLOCK_ROWS = 16384
 _DIGITS = 12
@@ -69,7 +68,7 @@ def apply(options: argparse.Namespace) -> int:
             saturated += int(at_rail.sum())
             show(block.done)
     _say(lost, rows, 'have no solution: their cells are empty')
-    _say(saturated, rows, "have the ADC at its rail: their standard deviations are inf")
+    _say(saturated, rows, 'have the ADC at its rail: their standard deviations are inf')
     if block is not None and 'cut' in block.notes:
         print(f'apply: {block.notes["cut"]}', file=sys.stderr)
     return 0
@@ -103,10 +102,11 @@ def estimates(sensor: Sensor, volts: np.ndarray, at_rail: np.ndarray) -> dict[st
         Samples of which nothing is sure, (n,).
 
     """
-    force = chain.inverse(sensor)(list(volts.T))
-    covariance = force_covariance(sensor, force)
-    covariance[:, :, at_rail] = np.inf
-    angles = tilt(force, covariance, 'z' in sensor.axes)
+    with np.errstate(all='ignore'):  # volts that no force explains
+        force = chain.inverse(sensor)(list(volts.T))
+        covariance = force_covariance(sensor, force)
+        covariance[:, :, at_rail] = np.inf
+        angles = tilt(force, covariance, 'z' in sensor.axes)
     std = np.sqrt([covariance[d, d] for d in range(3)])
     if sensor.axes == 'x':
         force[1:] = np.full((2, len(volts)), np.nan)

@@ -25,9 +25,8 @@ import signal
 import sys
 from types import FrameType
 
-from ament_index_python.packages import get_package_share_directory
-
 from adxl_ros.errors import UserError
+from ament_index_python.packages import get_package_share_directory
 
 
 def run(parser: argparse.ArgumentParser, command: Callable[[argparse.Namespace], int]) -> int:

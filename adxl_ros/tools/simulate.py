@@ -20,8 +20,6 @@ import argparse
 from dataclasses import replace
 from difflib import get_close_matches
 
-import numpy as np
-
 from adxl_ros.errors import UserError
 from adxl_ros.files import params, recording
 from adxl_ros.files.columns import Recording, sensor_info
@@ -30,6 +28,7 @@ from adxl_ros.model.sensor import Sensor
 from adxl_ros.model.simulate import simulate as run_chain
 from adxl_ros.model.trajectory import TRAJECTORIES
 from adxl_ros.tools.common import default_params, run
+import numpy as np
 
 
 def parser() -> argparse.ArgumentParser:

@@ -19,11 +19,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import Union
+from typing import Any
 
-import numpy as np
-
-Value = Union[float, np.ndarray]
+Value = Any
 """One component of a signal: an array over samples, or a float for one sample.
 
 Effects compute component by component with plain arithmetic, so that one description serves

@@ -1,0 +1,117 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""A node of the tests' own, beside the nodes that they have started."""
+
+from collections import defaultdict
+import time
+
+from adxl_ros.files import cdr
+from diagnostic_msgs.msg import DiagnosticArray
+import numpy as np
+import pytest
+import rclpy
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.qos import DurabilityPolicy, QoSProfile
+
+
+def stamp_ns(message):
+    """Return the stamp of a message's header, ns."""
+    return message.header.stamp.sec * 10 ** 9 + message.header.stamp.nanosec
+
+
+def accel(message):
+    """Return the linear acceleration of an Imu, m/s², (3,)."""
+    a = message.linear_acceleration
+    return np.array([a.x, a.y, a.z])
+
+
+def imu_table(raws):
+    """Return stamps, ns, (n,), and accelerations, m/s², (n, 3), of serialized Imu messages."""
+    table, = cdr.tables(raws, cdr.imu)
+    return table.stamp_ns(), table.numbers('linear_acceleration')
+
+
+class Graph:
+    """Keeps what topics bring, by topic; the newest diagnostics by the name of the node."""
+
+    def __init__(self):
+        self.got = defaultdict(list)
+        self.diagnostics = {}
+        self._context = Context()
+
+    def __enter__(self):
+        rclpy.init(args=[], context=self._context)
+        self.node = rclpy.create_node('tester', context=self._context)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self.node)
+        self.node.create_subscription(DiagnosticArray, '/diagnostics', self._diagnose, 100)
+        return self
+
+    def __exit__(self, *_):
+        self._executor.shutdown()
+        self.node.destroy_node()
+        self._context.try_shutdown()
+
+    def _diagnose(self, message):
+        for status in message.status:
+            self.diagnostics[status.name.split(':')[0]] = status
+
+    def listen(self, kind, topic, depth=10000, latched=False, raw=False):
+        """Keep the messages of a topic, or their bytes; returns the list that they go to."""
+        qos = QoSProfile(depth=depth)
+        if latched:
+            qos.durability = DurabilityPolicy.TRANSIENT_LOCAL
+        kept = self.got[topic]
+
+        def keep(first):
+            kept.append(first)
+            for _ in range(1000):
+                if (more := made.handle.take_message(kind, raw)) is None:
+                    break
+                kept.append(more[0])
+
+        made = self.node.create_subscription(kind, topic, keep, qos, raw=raw)
+        return kept
+
+    def spin_until(self, condition, timeout_s, what):
+        """Listen until a condition holds; fail with `what` after the time."""
+        end = time.monotonic() + timeout_s
+        while not condition():
+            self._executor.spin_once(timeout_sec=0.05)
+            if time.monotonic() > end:
+                pytest.fail(f'{what}: not after {timeout_s} s; diagnostics: {self.diagnostics}')
+
+    def spin(self, seconds):
+        """Listen for so long."""
+        end = time.monotonic() + seconds
+        while (left := end - time.monotonic()) > 0:
+            self._executor.spin_once(timeout_sec=left)
+
+    def call(self, kind, service, request, timeout_s=20.0):
+        """Call a service and return its answer."""
+        client = self.node.create_client(kind, service)
+        assert client.wait_for_service(timeout_s), f'no service {service}'
+        future = client.call_async(request)
+        self.spin_until(future.done, timeout_s, f'answer of {service}')
+        return future.result()
+
+    def said(self, node, text):
+        """Tell whether the newest diagnostics of a node hold a text."""
+        return node in self.diagnostics and text in self.diagnostics[node].message
+
+    def value(self, node, key):
+        """Return a value of the newest diagnostics of a node."""
+        return {pair.key: pair.value for pair in self.diagnostics[node].values}[key]

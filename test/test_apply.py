@@ -1,0 +1,247 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The tool apply: the columns, the numbers, and what it refuses."""
+
+from collections.abc import Callable
+import csv
+from dataclasses import replace
+from pathlib import Path
+import subprocess
+
+from adxl_ros.files import params, recording
+from adxl_ros.files.columns import Recording, sensor_info
+from adxl_ros.model import chain
+from adxl_ros.model.sensor import Sensor, to_nominal_mps2
+from adxl_ros.model.stage import specific_force
+import numpy as np
+import pytest
+from units import drawn, nominal
+
+G = 9.80665
+COLUMNS = [
+    'time_s', 'ax_mps2', 'ay_mps2', 'az_mps2', 'ax_std_mps2', 'ay_std_mps2', 'az_std_mps2',
+    'roll_rad', 'pitch_rad', 'inclination_rad', 'roll_std_rad', 'pitch_std_rad',
+    'inclination_std_rad', 'alpha_rad', 'beta_rad', 'alpha_std_rad', 'beta_std_rad']
+ALPHA, BETA = np.radians([20, 70, 50, 35]), np.radians([10, -100, 150, 60])
+
+RunTool = Callable[..., subprocess.CompletedProcess]
+
+
+def unit(axes: str = 'xy') -> Sensor:
+    sensor = replace(drawn(np.random.default_rng(1), nominal(axes)), serial='17')
+    return replace(sensor, covariance=1e-6 * np.eye(len(axes)),
+                   covariance_names=tuple(f'bias.offset_v.{a}' for a in axes))
+
+
+def record(folder: Path, sensor: Sensor, volts: np.ndarray, info: dict[str, str] | None = None,
+           units: str = 'v') -> Path:
+    """Write volts (n, m) as a CSV recording at 1 kHz."""
+    data = volts if units == 'v' else to_nominal_mps2(volts, sensor)
+    names = ('x_v', 'y_v', 'z_v') if units == 'v' else ('ax_mps2', 'ay_mps2', 'az_mps2')
+    part = Recording('made', 10 + np.arange(len(volts)) / 1000,
+                     dict(zip(names, data.T)),
+                     sensor_info(sensor) if info is None else info)
+    recording.write(folder / 'made.csv', part, sensor)
+    params.save(folder / 'unit.yaml', sensor)
+    return folder / 'made.csv'
+
+
+def felt(sensor: Sensor, alpha: np.ndarray = ALPHA, beta: np.ndarray = BETA) -> np.ndarray:
+    return np.column_stack(chain.static_response(sensor)(specific_force(alpha, beta, G)))
+
+
+def applied(run_tool: RunTool, path: Path, parameters: Path | None = None) -> tuple:
+    done = run_tool('apply', path, '--params', parameters or path.with_name('unit.yaml'),
+                    '-o', path.with_name('out.csv'))
+    assert done.returncode == 0, done.stderr
+    with open(path.with_name('out.csv'), encoding='utf-8', newline='') as file:
+        rows = list(csv.reader(file))
+    assert rows[0] == COLUMNS
+    table = dict(zip(COLUMNS, map(list, zip(*rows[1:]))))
+    return table, done.stderr
+
+
+def numbers(table: dict, *names: str) -> np.ndarray:
+    return np.array([[float(v) if v else np.nan for v in table[name]] for name in names])
+
+
+@pytest.mark.parametrize('axes', ['xy', 'xyz'])
+@pytest.mark.parametrize('units', ['v', 'mps2'])
+def test_force_and_angles_are_recovered(run_tool: RunTool, tmp_path: Path, axes: str,
+                                        units: str) -> None:
+    sensor = unit(axes)
+    table, said = applied(run_tool, record(tmp_path, sensor, felt(sensor), units=units))
+    assert said == ''
+    force = np.array(specific_force(ALPHA, BETA, G))
+    np.testing.assert_allclose(numbers(table, 'ax_mps2', 'ay_mps2', 'az_mps2'), force, atol=1e-9)
+    np.testing.assert_allclose(numbers(table, 'alpha_rad', 'beta_rad'), [ALPHA, BETA], atol=1e-9)
+    expected = [np.arctan2(force[1], force[2]), np.arctan2(-force[0], np.hypot(*force[1:])), ALPHA]
+    np.testing.assert_allclose(numbers(table, 'roll_rad', 'pitch_rad', 'inclination_rad'),
+                               expected, atol=1e-9)
+    assert table['time_s'] == ['10.0', '10.001', '10.002', '10.003']
+    std = numbers(table, *(name for name in COLUMNS if '_std_' in name))
+    assert (std > 0).all()
+    assert np.isfinite(std).all()
+    assert (numbers(table, 'ax_std_mps2') < 0.02).all()
+
+
+def test_z_sign_and_the_range_of_alpha(run_tool: RunTool, tmp_path: Path) -> None:
+    """Without z, alpha is in [0, π/2], though z_sign says that it hangs upside down."""
+    sensor = replace(unit(), z_sign=-1)
+    path = record(tmp_path, sensor, felt(sensor, np.pi - ALPHA))
+    table, _ = applied(run_tool, path)
+    np.testing.assert_allclose(numbers(table, 'az_mps2')[0], -G * np.cos(ALPHA), atol=1e-9)
+    np.testing.assert_allclose(numbers(table, 'alpha_rad')[0], ALPHA, atol=1e-9)
+    np.testing.assert_allclose(numbers(table, 'inclination_rad')[0], np.pi - ALPHA, atol=1e-9)
+
+
+def test_what_is_not_shown_is_empty(run_tool: RunTool, tmp_path: Path) -> None:
+    sensor = unit()
+    table, _ = applied(run_tool, record(tmp_path, sensor, felt(
+        sensor, np.array([0.0, np.pi / 2, np.pi / 2]), np.array([1.0, 0.0, np.pi]))))
+    assert [text == '' for text in table['beta_rad']] == [True, False, False]
+    assert [text == 'inf' for text in table['beta_std_rad']] == [True, False, False]
+    assert table['roll_rad'][1:] == ['', '']
+    assert table['roll_std_rad'][1:] == ['inf', 'inf']
+    # In (−π, π].
+    assert numbers(table, 'beta_rad')[0, 2] == pytest.approx(np.pi, abs=1e-3)
+
+
+def test_one_axis(run_tool: RunTool, tmp_path: Path) -> None:
+    sensor = nominal('x', serial='17')
+    table, _ = applied(run_tool, record(tmp_path, sensor, np.array([[2.5], [3.0]])))
+    np.testing.assert_allclose(numbers(table, 'ax_mps2'), [[0, G / 2]], atol=1e-9)
+    assert table['az_mps2'] == ['', '']
+    assert table['az_std_mps2'] == table['pitch_std_rad'] == ['inf', 'inf']
+
+
+def test_samples_without_a_solution_are_kept_and_counted(run_tool: RunTool,
+                                                         tmp_path: Path) -> None:
+    sensor = unit()
+    volts = np.vstack([felt(sensor), [[20.0, 2.0]], [[0.0, 2.5]], felt(sensor)])
+    table, said = applied(run_tool, record(tmp_path, sensor, volts))
+    assert len(table['time_s']) == 10
+    lost, rail = ({name: table[name][i] for name in COLUMNS} for i in (4, 5))
+    for row in (lost, rail):
+        assert {row[name] for name in COLUMNS if '_std_' in name} == {'inf'}
+        assert row['pitch_rad'] == row['alpha_rad'] == ''
+    assert lost['ax_mps2'] == lost['az_mps2'] == ''
+    assert float(rail['ax_mps2']) < -20
+    assert said == ('apply: 1 of 10 samples have no solution: their cells are empty\n'
+                    'apply: 1 of 10 samples have the ADC at its rail: their standard deviations '
+                    'are inf\n')
+    assert table['ax_mps2'][:4] == table['ax_mps2'][6:]
+
+
+def test_a_nominal_file_fits_any_axes_and_unit(run_tool: RunTool, tmp_path: Path) -> None:
+    made = nominal('xyz', serial='mpu')
+    path = record(tmp_path, made, felt(made), units='mps2')
+    params.save(tmp_path / 'nominal.yaml', nominal('xy'))
+    table, _ = applied(run_tool, path, tmp_path / 'nominal.yaml')
+    np.testing.assert_allclose(numbers(table, 'az_mps2')[0], G * np.cos(ALPHA), atol=1e-9)
+
+
+def test_a_recording_that_says_nothing_of_its_unit(run_tool: RunTool, tmp_path: Path) -> None:
+    sensor = unit()
+    applied(run_tool, record(tmp_path, sensor, felt(sensor), info={}))
+
+
+def refused(run_tool: RunTool, path: Path, *more: object) -> str:
+    """Run apply, expecting one line on stderr, status 1, and nothing written or left behind."""
+    before = {p: p.read_bytes() for p in path.parent.iterdir() if p.is_file()}
+    done = run_tool('apply', path, *(more or (
+        '--params', path.with_name('unit.yaml'), '-o', path.with_name('out.csv'))))
+    assert done.returncode == 1
+    assert done.stdout == ''
+    assert done.stderr.count('\n') == 1
+    assert {p: p.read_bytes() for p in path.parent.iterdir() if p.is_file()} == before
+    assert not [p for p in path.parent.iterdir() if p.name.startswith('.')]
+    return done.stderr
+
+
+@pytest.mark.parametrize(('key', 'value', 'message'), [
+    ('serial', '18', 'serial number 18, but the parameters are those of 17'),
+    ('nominal_zero_g_v', '1.5, 1.5', 'nominal_zero_g_v is [1.5, 1.5], but [2.5, 2.5]'),
+    ('nominal_scale_v_per_g', '0.3, 0.3', 'nominal_scale_v_per_g is [0.3, 0.3], but [1.0, 1.0]'),
+    ('nominal_zero_g_v', 'two, 2.5', 'nominal_zero_g_v'),
+    ('format', '2', 'format version 2, but this package reads version 1'),
+])
+def test_another_unit_is_refused(run_tool: RunTool, tmp_path: Path, key: str, value: str,
+                                 message: str) -> None:
+    sensor = unit()
+    path = record(tmp_path, sensor, felt(sensor), {**sensor_info(sensor), key: value})
+    said = refused(run_tool, path)
+    assert message in said
+    assert str(path) in said
+
+
+def test_other_axes_are_refused(run_tool: RunTool, tmp_path: Path) -> None:
+    made = unit('xyz')
+    path = record(tmp_path, made, felt(made))
+    params.save(tmp_path / 'unit.yaml', unit('xy'))
+    said = refused(run_tool, path)
+    assert 'calibrated for the axes xy, not xyz' in said or 'are for xy' in said
+
+
+def test_bad_input_leaves_the_earlier_output(run_tool: RunTool, tmp_path: Path) -> None:
+    sensor = unit()
+    path = record(tmp_path, sensor, felt(sensor))
+    (tmp_path / 'out.csv').write_text('earlier')
+    text = path.read_text(encoding='utf-8')
+    path.write_text(text + '10.004,nan,2.5\n', encoding='utf-8')
+    line = text.count('\n') + 1
+    assert f'{path}:{line}:2: x_v is nan' in refused(run_tool, path)
+    (tmp_path / 'unit.yaml').write_text('/**:\n  ros__parameters:\n    format: 1\n')
+    path.write_text(text, encoding='utf-8')
+    assert f'{tmp_path}/unit.yaml:3:5: ' in refused(run_tool, path)
+
+
+def test_where_it_cannot_write(run_tool: RunTool, tmp_path: Path) -> None:
+    sensor = unit()
+    path = record(tmp_path, sensor, felt(sensor))
+    parameters = tmp_path / 'unit.yaml'
+    said = refused(run_tool, path, '--params', parameters, '-o', tmp_path / 'none' / 'out.csv')
+    assert 'out.csv: cannot write' in said
+    said = refused(run_tool, path, '--params', parameters, '-o', path)
+    assert 'is the recording itself' in said
+    assert 'cannot read' in refused(run_tool, tmp_path / 'none.csv', '--params', parameters,
+                                    '-o', tmp_path / 'out.csv')
+
+
+def test_wrong_usage(run_tool: RunTool, tmp_path: Path) -> None:
+    assert run_tool('apply').returncode == 2
+    assert run_tool('apply', 'a.csv', '-o', 'b.csv').returncode == 2
+
+
+def test_many_blocks_are_as_one(run_tool: RunTool, tmp_path: Path) -> None:
+    """Rows beyond a block, in the order of the recording."""
+    sensor = unit()
+    count = 40000
+    alpha, beta = np.linspace(0.3, 1.3, count), np.linspace(-3, 3, count)
+    path = record(tmp_path, sensor, felt(sensor, alpha, beta))
+    table, _ = applied(run_tool, path)
+    np.testing.assert_allclose(numbers(table, 'alpha_rad', 'beta_rad'), [alpha, beta], atol=1e-8)
+
+
+def test_bag_gives_the_same(run_tool: RunTool, tmp_path: Path) -> None:
+    pytest.importorskip('rosbags', reason='rosbags is not installed')
+    sensor = unit()
+    path = record(tmp_path, sensor, felt(sensor))
+    from_csv, _ = applied(run_tool, path)
+    recording.write(tmp_path / 'bag', recording.read(path), sensor)
+    from_bag, _ = applied(run_tool, tmp_path / 'bag', tmp_path / 'unit.yaml')
+    names = [name for name in COLUMNS if name != 'time_s']
+    np.testing.assert_allclose(numbers(from_bag, *names), numbers(from_csv, *names), rtol=1e-9)
+    np.testing.assert_allclose(numbers(from_bag, 'time_s'), numbers(from_csv, 'time_s'))

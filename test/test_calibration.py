@@ -1,0 +1,195 @@
+"""The guided calibration through the live graph: stage, rests, journal, verdict, file."""
+
+import time
+
+from adxl_ros.files import journal, params
+from conftest import wait_until
+from diagnostic_msgs.msg import DiagnosticStatus
+from graph import Graph
+import numpy as np
+import pytest
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from sensor_msgs.msg import Imu, JointState
+from std_srvs.srv import Trigger
+from units import drawn, nominal
+
+FAST = ('-p', 'use_sim_time:=true')
+QUICK = ('-p', 'sweep.planes_rad:=[0.785, 1.5707963267948966, 2.356]', '-p',
+         'sweep.step_rad:=0.7853981633974483', '-p', 'sweep.dwell_s:=1.0', '-p',
+         'sweep.check_poses:=6')
+
+
+def _files(tmp_path, seed=3):
+    """Write the file of a drawn unit and of its nominal sensor."""
+    base = nominal(serial='T1')
+    truth, bare = tmp_path / 'truth.yaml', tmp_path / 'nominal.yaml'
+    params.save(truth, drawn(np.random.default_rng(seed), base))
+    params.save(bare, base)
+    return truth, bare
+
+
+def _record(graph, kind, topic):
+    """Keep the arrival and the bytes of a topic's messages, as a bag does."""
+    kept = []
+    qos = QoSProfile(depth=20000)
+    if topic == '/sensor_info':
+        qos.durability = DurabilityPolicy.TRANSIENT_LOCAL
+
+    def keep(raw):
+        kept.append((time.monotonic_ns(), raw))
+        while (more := made.handle.take_message(kind, True)) is not None:
+            kept.append((time.monotonic_ns(), more[0]))
+
+    made = graph.node.create_subscription(kind, topic, keep, qos, raw=True)
+    return kept
+
+
+def _sweep(start, truth, bare, *more):
+    start('driver', '--ros-args', '--params-file', truth, '-p', 'link.speed:=4.0', *FAST)
+    start('stage', '--ros-args', '--params-file', bare, *FAST)
+    return start('calibration', '--ros-args', '--params-file', bare, *FAST, *QUICK, *more)
+
+
+def test_a_sweep_ends_with_a_file_and_fit_agrees_on_its_bag(start, run_tool, tmp_path):
+    """The live sweep and `fit` on its bag, with its journal, give the same coefficients."""
+    rosbags = pytest.importorskip('bags', reason='rosbags is not installed')
+    truth, bare = _files(tmp_path)
+    kinds = {'/imu/data_raw': Imu, '/stage/joint_states': JointState,
+             '/sensor_info': DiagnosticStatus}
+    with Graph() as graph:
+        kept = {topic: _record(graph, kind, topic) for topic, kind in kinds.items()}
+        _sweep(start, truth, bare, '-p', 'autostart:=true', '-p', 'output:=unit.yaml')
+        graph.spin_until((tmp_path / 'unit.yaml').exists, 120, 'the parameter file')
+    found = params.load(tmp_path / 'unit.yaml')
+    want = params.load(truth)
+    assert (found.model, found.serial) == ('physical', 'T1')
+    np.testing.assert_allclose(found.zero_g_v, want.zero_g_v, atol=1e-3)
+    np.testing.assert_allclose(found.scale_v_per_g, want.scale_v_per_g, atol=1e-3)
+    head = (tmp_path / 'unit.yaml').read_text().split('/**')[0]
+    assert '# linear' in head and '# physical' in head
+
+    sent = []
+    for topic, kind in (('/imu/data_raw', rosbags.IMU), ('/stage/joint_states', rosbags.JOINTS),
+                        ('/sensor_info', rosbags.INFO)):
+        sent += [rosbags.Sent(topic, kind, at, raw=raw) for at, raw in kept[topic]]
+    bag = rosbags.bag_of(tmp_path / 'bag', sorted(sent, key=lambda one: one.stamp_ns))
+    done = run_tool('fit', bag, '--params', bare, '--journal', 'unit.yaml.journal',
+                    '-o', 'offline.yaml')
+    assert done.returncode == 0, done.stderr
+    offline = params.load(tmp_path / 'offline.yaml')
+    for effect, values in found.values.items():
+        for name, value in values.items():
+            np.testing.assert_allclose(offline.values[effect][name], value, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(offline.covariance, found.covariance, rtol=1e-6)
+
+    _, entries = journal.read(tmp_path / 'unit.yaml.journal')
+    assert entries[-1]['done']
+    assert sum(entry['check'] for entry in entries[-1]['rests']) == 6
+    assert all(entry['samples'] == 1000 for entry in entries[-1]['rests'])
+
+
+def test_services_and_refusals(start, tmp_path):
+    """Two sweeps at once, a finish without poses and an abort are answered in words."""
+    truth, bare = _files(tmp_path)
+    with Graph() as graph:
+        def ask(name):
+            answer = graph.call(Trigger, f'calibration/{name}', Trigger.Request())
+            return answer.success, answer.message
+
+        _sweep(start, truth, bare)
+        graph.spin_until(lambda: graph.said('driver', ''), 30, 'the driver')
+        graph.spin_until(lambda: graph.said('calibration', 'call ~/start'), 30, 'idle')
+        assert ask('finish') == (False, 'no calibration is running')
+        assert ask('abort')[0] is False
+        assert ask('start')[0]
+        graph.spin_until(lambda: int(graph.value('calibration', 'accepted')) >= 2, 60, 'two poses')
+        assert ask('start') == (False, 'a calibration is running; finish or abort it first')
+        assert ask('capture')[0] is False
+        second = start('calibration', '--ros-args', '--params-file', bare, *FAST, *QUICK,
+                       '-p', 'autostart:=true', '-r', '__node:=second')
+        second.wait_for('another calibration is writing this journal')
+        assert 'Traceback' not in second.output()
+        done, words = ask('abort')
+        assert done and 'its poses stay in' in words
+        assert not (tmp_path / 'calibration.yaml').exists()
+
+        assert ask('start')[0]
+        graph.spin_until(lambda: int(graph.value('calibration', 'accepted')) >= 3, 60, 'resumed')
+        assert ask('finish') == (True, 'wrote calibration.yaml')
+        # Three poses of one plane determine the linear model alone, and the log says so.
+        assert params.load(tmp_path / 'calibration.yaml').model == 'linear'
+
+
+def test_a_stage_that_never_arrives_is_said(start, tmp_path):
+    """Without a stage the node stays up and says in diagnostics what it waits for."""
+    truth, bare = _files(tmp_path)
+    with Graph() as graph:
+        start('driver', '--ros-args', '--params-file', truth)
+        node = start('calibration', '--ros-args', '--params-file', bare, *QUICK,
+                     '-p', 'autostart:=true', '-p', 'stage.timeout_s:=2.0')
+        graph.spin_until(lambda: graph.said('calibration', 'nothing on stage/joint_states')
+                         and graph.diagnostics['calibration'].level == DiagnosticStatus.WARN,
+                         30, 'the warning')
+        graph.spin(3)
+        assert node.popen.poll() is None
+        assert node.output().count('the stage has not arrived') == 1
+
+
+def test_an_output_that_cannot_be_written_is_refused_at_the_start(start, tmp_path):
+    """Nobody walks a sweep whose result has no place to go."""
+    truth, bare = _files(tmp_path)
+    with Graph() as graph:
+        _sweep(start, truth, bare, '-p', 'autostart:=true', '-p', 'output:=none/unit.yaml')
+        graph.spin_until(lambda: graph.said('calibration', 'output: none/unit.yaml'), 30, 'why')
+
+
+def test_settings_out_of_range_end_the_node(start, tmp_path):
+    """A step of 0 is refused at the start, in one line."""
+    _, bare = _files(tmp_path)
+    node = start('calibration', '--ros-args', '--params-file', bare, '-p', 'sweep.step_rad:=0.0')
+    assert node.wait() == 1
+    assert 'sweep.step_rad' in node.output()
+    assert 'Traceback' not in node.output()
+
+
+@pytest.mark.parametrize('name, most_mg', [('mpu9150_0', 0.26), ('xsens_multiposition', 0.12),
+                                           ('two_axis_stand', 0.15)])
+def test_a_real_sensor_through_the_live_graph(start, run_tool, tmp_path, shared_dir, name,
+                                              most_mg):
+    """Replay, calibration in gravity mode and `fit` agree, and reach the known magnitudes."""
+    source = shared_dir / 'real' / f'{name}.csv'
+    with Graph() as graph:
+        start('calibration', '--ros-args', *FAST, '-p', 'mode:=gravity', '-p', 'autostart:=true',
+              '-p', 'output:=live.yaml')
+        graph.spin_until(lambda: graph.said('calibration', 'waiting for sensor_info'), 30, 'up')
+        start('driver', '--ros-args', *FAST, '-p', 'link.type:=replay', '-p',
+              f'link.recording:={source}', '-p', 'link.speed:=40.0')
+        graph.spin_until(lambda: 'driver' in graph.diagnostics
+                         and graph.value('driver', 'link_state') == 'ended', 120, 'the end')
+        answer = graph.call(Trigger, 'calibration/finish', Trigger.Request())
+        assert answer.success, answer.message
+    live = params.load(tmp_path / 'live.yaml')
+    assert float(live.provenance['residual_mg']) < most_mg
+    done = run_tool('fit', source, '-o', 'offline.yaml')
+    assert done.returncode == 0, done.stderr
+    offline = params.load(tmp_path / 'offline.yaml')
+    for effect, values in live.values.items():
+        for parameter, value in values.items():
+            np.testing.assert_allclose(offline.values[effect][parameter], value, atol=1e-9)
+
+
+def test_an_operator_captures(start, tmp_path):
+    """Without a motor nothing is taken before ~/capture, which answers when it is on disk."""
+    truth, bare = _files(tmp_path)
+    with Graph() as graph:
+        start('driver', '--ros-args', '--params-file', truth, '-p', 'link.speed:=4.0', *FAST,
+              '-p', 'link.alpha_rad:=0.785', '-p', 'link.beta_rad:=0.0')
+        start('calibration', '--ros-args', '--params-file', bare, *FAST, *QUICK,
+              '-p', 'autostart:=true', '-p', 'stage.mode:=manual')
+        graph.spin_until(lambda: graph.said('calibration', 'then capture'), 30, 'the request')
+        answer = graph.call(Trigger, 'calibration/capture', Trigger.Request(), 30)
+        assert answer.success and 'pose 1 is on disk' in answer.message
+        _, entries = journal.read(tmp_path / 'calibration.yaml.journal')
+        assert entries[0]['alpha_rad'] == 0.785
+        wait_until(lambda: graph.call(Trigger, 'calibration/redo', Trigger.Request()).success,
+                   10, 'redo')

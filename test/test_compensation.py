@@ -1,0 +1,379 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The compensation over DDS: what it publishes, what it refuses, and coefficients set live."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+import signal
+
+from adxl_ros.files import params
+from adxl_ros.files.columns import sensor_info
+from adxl_ros.model import chain
+from adxl_ros.model.sensor import Sensor, to_nominal_mps2
+from adxl_ros.model.stage import specific_force
+from adxl_ros.model.uncertainty import force_covariance
+from conftest import Started
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+from geometry_msgs.msg import Vector3Stamped
+from graph import accel, Graph, stamp_ns
+import numpy as np
+import pytest
+from rcl_interfaces.srv import DescribeParameters, GetParameters, SetParametersAtomically
+from rclpy.parameter import Parameter, parameter_value_to_python
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import Imu
+from units import drawn, nominal
+
+G = 9.80665
+NODE = 'compensation'
+Start = Callable[..., Started]
+
+
+def unit(serial: str = '17', axes: str = 'xy', seed: int = 1) -> Sensor:
+    sensor = drawn(np.random.default_rng(seed), nominal(axes))
+    return replace(sensor, serial=serial, model='physical', provenance={'source': f'by {serial}'},
+                   covariance_names=('bias.offset_v.x', 'bias.offset_v.y'),
+                   covariance=np.array([[2e-6, 1e-6], [1e-6, 3e-6]]))
+
+
+class Robot:
+    """A driver's topics, and what the compensation makes of them."""
+
+    def __init__(self, graph: Graph) -> None:
+        self.graph = graph
+        self.data = graph.listen(Imu, 'imu/data')
+        self.tilt = graph.listen(Vector3Stamped, 'tilt')
+        self._raw = graph.node.create_publisher(Imu, 'imu/data_raw', 100)
+        self._info = graph.node.create_publisher(DiagnosticStatus, 'sensor_info', QoSProfile(
+            depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL))
+        self._sent = 0
+
+    def inform(self, sensor: Sensor, **changes: str) -> None:
+        """Publish sensor_info."""
+        self._info.publish(DiagnosticStatus(values=[
+            KeyValue(key=k, value=v) for k, v in {**sensor_info(sensor), **changes}.items()]))
+
+    def connected(self, timeout_s: float = 20.0) -> None:
+        """Wait until the compensation hears and is heard."""
+        self.graph.spin_until(
+            lambda: self._raw.get_subscription_count()
+            and self.graph.node.count_publishers('tilt')
+            and self.graph.node.count_publishers('imu/data') and NODE in self.graph.diagnostics,
+            timeout_s, 'compensation connected')
+
+    def send(self, values: list[float]) -> None:
+        """Publish one sample of nominal acceleration, m/s²."""
+        message = Imu()
+        self._sent += 1
+        message.header.stamp.sec = self._sent
+        message.header.frame_id = 'arm_imu'
+        message.orientation_covariance[0] = message.angular_velocity_covariance[0] = -1.0
+        a = message.linear_acceleration
+        a.x, a.y, a.z = values
+        self._raw.publish(message)
+
+    def answer(self, values: list[float]) -> Imu:
+        """Publish one sample and return what the compensation makes of it."""
+        count, tilts = len(self.data), len(self.tilt)
+        self.send(values)
+        self.graph.spin_until(lambda: len(self.data) > count and len(self.tilt) > tilts, 10.0,
+                              'corrected sample')
+        return self.data[-1]
+
+    def set(self, **values: object) -> str:
+        """Set parameters all at once; __ stands for a dot. Return the reason of a refusal."""
+        request = SetParametersAtomically.Request(parameters=[
+            Parameter(name.replace('__', '.'), value=value).to_parameter_msg()
+            for name, value in values.items()])
+        result = self.graph.call(SetParametersAtomically, f'{NODE}/set_parameters_atomically',
+                                 request).result
+        assert result.successful == (result.reason == '')
+        return result.reason
+
+    def get(self, *names: str) -> list:
+        """Return the values of parameters."""
+        request = GetParameters.Request(names=list(names))
+        values = self.graph.call(GetParameters, f'{NODE}/get_parameters', request).values
+        return [parameter_value_to_python(value) for value in values]
+
+    def level(self, level: bytes, text: str) -> None:
+        """Wait for diagnostics."""
+        self.graph.spin_until(
+            lambda: self.graph.said(NODE, text)
+            and self.graph.diagnostics[NODE].level == level, 10.0, f'{level!r} {text}')
+
+
+@pytest.fixture
+def robot(ros_env: dict[str, str]) -> Iterator[Robot]:
+    with Graph() as graph:
+        yield Robot(graph)
+
+
+def started(start: Start, tmp_path: Path, sensor: Sensor, *more: object) -> Started:
+    params.save(tmp_path / 'unit.yaml', sensor)
+    return start(NODE, '--ros-args', '--params-file', tmp_path / 'unit.yaml', *more)
+
+
+def felt(sensor: Sensor, force: list[float]) -> list[float]:
+    """Return the nominal acceleration of a sensor that feels a force, m/s², three floats."""
+    volts = np.array([chain.static_response(sensor)(force)])
+    return [*to_nominal_mps2(volts, sensor)[0].tolist(), 0.0][:3]
+
+
+def pose(alpha: float, beta: float) -> list[float]:
+    return [float(f) for f in specific_force(alpha, beta, G)]
+
+
+def test_corrected_stream(robot: Robot, start: Start, tmp_path: Path) -> None:
+    sensor = unit()
+    process = started(start, tmp_path, sensor)
+    robot.inform(sensor)
+    robot.connected()
+    force = pose(0.7, -1.2)
+    message = robot.answer(felt(sensor, force))
+    np.testing.assert_allclose(accel(message), force, atol=1e-7)
+    assert message.header.frame_id == 'arm_imu'
+    assert message.angular_velocity_covariance[0] == -1
+    covariance = force_covariance(sensor, force)[:, :, 0]
+    found = message.linear_acceleration_covariance.reshape(3, 3)
+    np.testing.assert_array_equal(found, found.T)
+    # The message says by its variance that z is not measured.
+    noise = found[2, 2] - covariance[2, 2]
+    assert noise == pytest.approx((5.3e-3) ** 2, rel=0.2)
+    np.testing.assert_allclose(found - np.diag([0, 0, noise]), covariance, rtol=0.05, atol=2e-7)
+    roll, pitch = np.arctan2(force[1], force[2]), np.arctan2(-force[0], np.hypot(*force[1:]))
+    q = message.orientation
+    np.testing.assert_allclose(
+        [q.w, q.x, q.y, q.z],
+        [np.cos(roll / 2) * np.cos(pitch / 2), np.sin(roll / 2) * np.cos(pitch / 2),
+         np.cos(roll / 2) * np.sin(pitch / 2), -np.sin(roll / 2) * np.sin(pitch / 2)], atol=1e-7)
+    about = message.orientation_covariance.reshape(3, 3)
+    assert about[2, 2] == 1e6
+    assert (np.diag(about)[:2] > 1e-8).all()
+    assert (np.diag(about)[:2] < 1e-5).all()
+    tilt = robot.tilt[-1]
+    assert tilt.header == message.header
+    np.testing.assert_allclose([tilt.vector.x, tilt.vector.y, tilt.vector.z], [roll, pitch, 0.7],
+                               atol=1e-7)
+    for beta in np.linspace(0, 1, 20):
+        robot.answer(felt(sensor, pose(0.7, beta)))
+    robot.level(DiagnosticStatus.OK, 'compensating')
+    status = robot.graph.diagnostics[NODE]
+    assert status.hardware_id == '17'
+    assert {pair.key: pair.value for pair in status.values}.items() >= {
+        'unit': 'confirmed', 'serial': '17', 'model': 'physical', 'received': '21',
+        'published': '21', 'dropped': '0', 'provenance.source': 'by 17'}.items()
+    process.popen.send_signal(signal.SIGINT)
+    assert process.wait() == 0
+    assert 'Traceback' not in process.output()
+    assert stamp_ns(message) == 10 ** 9
+
+
+def test_without_a_file_the_nominal_sensor_applies(robot: Robot, start: Start) -> None:
+    process = start(NODE)
+    robot.connected()
+    process.wait_for('adxl203.yaml: nominal, which is not calibrated')
+    np.testing.assert_allclose(accel(robot.answer([3.0, 4.0, 0.0])),
+                               [3, 4, (G * G - 25) ** 0.5], atol=1e-7)
+    robot.level(DiagnosticStatus.WARN, 'unit not confirmed')
+    robot.inform(nominal(serial='any'))
+    robot.answer([3.0, 4.0, 0.0])
+    robot.level(DiagnosticStatus.WARN, 'not calibrated')
+    robot.level(DiagnosticStatus.WARN, 'no samples on /imu/data_raw')
+
+
+def test_what_is_not_shown_stands(robot: Robot, start: Start, tmp_path: Path) -> None:
+    """With x upright roll is not seen: the last one stands, its variance is very large."""
+    sensor = unit(axes='xyz')
+    started(start, tmp_path, sensor)
+    robot.connected()
+    robot.answer(felt(sensor, pose(0.7, -1.2)))
+    roll = robot.tilt[-1].vector.x
+    message = robot.answer(felt(sensor, [G, 0.0, 0.0]))
+    vector = robot.tilt[-1].vector
+    assert vector.x == roll
+    assert vector.y == pytest.approx(-np.pi / 2, abs=1e-3)
+    about = message.orientation_covariance.reshape(3, 3)
+    assert about[0, 0] == 1e6
+    assert about[0, 1] == about[1, 0] == 0
+    assert 0 < about[1, 1] < 1e-5
+
+
+def test_nan_never_leaves(robot: Robot, start: Start, tmp_path: Path) -> None:
+    sensor = unit()
+    started(start, tmp_path, sensor)
+    robot.inform(sensor)
+    robot.connected()
+    good = felt(sensor, pose(0.5, 0.5))
+    before = accel(robot.answer(good))
+    for bad in (float('nan'), float('inf'), 1e38, -1e300, 5e3):
+        robot.send([bad, good[1], 0.0])
+    np.testing.assert_array_equal(accel(robot.answer(good)), before)
+    assert len(robot.data) == len(robot.tilt) == 2
+    robot.level(DiagnosticStatus.WARN, '5 samples dropped')
+    assert robot.graph.value(NODE, 'dropped') == '5'
+    robot.answer([-2.5 * G, good[1], 0.0])
+    robot.level(DiagnosticStatus.WARN, '1 samples with the ADC at its rail')
+
+
+@pytest.mark.parametrize(('key', 'value', 'reason'), [
+    ('serial', '18', 'serial number 18, but the parameters are those of 17'),
+    ('axes', 'xyz', 'axes xyz, but the parameters of 17 are for xy'),
+    ('nominal_zero_g_v', '1.65, 1.65', 'nominal_zero_g_v is [1.65, 1.65], but [2.5, 2.5]'),
+    ('nominal_scale_v_per_g', '0.3, 0.3', 'nominal_scale_v_per_g is [0.3, 0.3], but [1.0, 1.0]'),
+    ('format', '99', 'format version 99, but this package reads version 1'),
+])
+def test_another_unit_is_refused(robot: Robot, start: Start, tmp_path: Path, key: str,
+                                 value: str, reason: str) -> None:
+    sensor = unit()
+    process = started(start, tmp_path, sensor)
+    changes = {key: value}
+    if key == 'axes':
+        changes |= {'nominal_zero_g_v': '2.5, 2.5, 2.5', 'nominal_scale_v_per_g': '1, 1, 1'}
+    robot.inform(sensor, **changes)
+    robot.connected()
+    robot.level(DiagnosticStatus.ERROR, reason)
+    for _ in range(3):
+        robot.send(felt(sensor, pose(0.5, 0.5)))
+    robot.graph.spin_until(lambda: robot.graph.value(NODE, 'received') == '3', 10.0, 'received')
+    assert not robot.data
+    assert not robot.tilt
+    robot.inform(sensor)
+    process.wait_for('publishing again')
+    robot.answer(felt(sensor, pose(0.5, 0.5)))
+    robot.level(DiagnosticStatus.OK, 'compensating')
+    assert process.output().count('publishing nothing') == 1
+
+
+def test_coefficients_are_set_all_or_none(robot: Robot, start: Start, tmp_path: Path) -> None:
+    sensor = replace(nominal(), serial='17', effects=('bias', 'scale_factor'), values={
+        'bias': {'offset_v': np.zeros(2)}, 'scale_factor': {'offset_v_per_g': np.zeros(2)}})
+    started(start, tmp_path, sensor)
+    robot.inform(sensor)
+    robot.connected()
+    names = ('effects', 'bias.offset_v', 'scale_factor.offset_v_per_g', 'covariance')
+    assert accel(robot.answer([1.0, 2.0, 0.0]))[0] == pytest.approx(1.0, abs=1e-7)
+    assert robot.set(bias__offset_v=[0.1, 0.0], scale_factor__offset_v_per_g=[0.25, 0.0]) == ''
+    after = accel(robot.answer([1.0, 2.0, 0.0]))[0]
+    assert after == pytest.approx((1.0 - 0.1 * G) / 1.25, abs=1e-7)
+    held = robot.get(*names[:3])
+    for values, reason in (
+            ({'bias__offset_v': [0.2, 0.0], 'scale_factor__offset_v_per_g': [99.0, 0.0]},
+             'scale_factor.offset_v_per_g: 99 V/g is outside -0.9 to 9'),
+            ({'bias__offset_v': [0.2]}, 'bias.offset_v: 1 values for 2 axes'),
+            ({'bias__offset_v': [float('nan'), 0.0]}, 'bias.offset_v: nan is not a finite'),
+            ({'misalignment__alpha_rad': [0.1, 0.1]}, 'effects does not list misalignment'),
+            ({'effects': ['bias', 'misalignment']}, 'missing'),
+            ({'effects': ['bias', 'none']}, "unknown effect 'none'"),
+            ({'covariance_names': ['bias.offset_v.x'], 'covariance': [-1.0]},
+             'the variance of bias.offset_v.x is -1'),
+            ({'sensor__serial': '18'}, 'sensor.serial: belongs to the parameter file'),
+            ({'bias__offset_v': [0.2, 0.0], 'sensor__axes': 'x'}, 'sensor.axes: belongs to'),
+            ({'format': 2}, 'format: belongs to the parameter file'),
+            ({'calibration': '/none.yaml'}, '/none.yaml: cannot be read'),
+            ({'calibration': '/none.yaml', 'bias__offset_v': [0.2, 0.0]}, 'cannot be set toget')):
+        assert reason in robot.set(**values)
+        assert robot.get(*names[:3]) == held
+        assert accel(robot.answer([1.0, 2.0, 0.0]))[0] == after
+    # Effects that the file does not list come with all that they need.
+    assert robot.set(effects=['bias', 'misalignment'], misalignment__alpha_rad=[0.0, 0.0],
+                     misalignment__beta_rad=[0.0, 0.02], covariance=[1e-4],
+                     covariance_names=['bias.offset_v.x']) == ''
+    message = robot.answer([1.0, 2.0, 0.0])
+    assert accel(message)[0] == pytest.approx(1.0 - 0.1 * G, abs=1e-7)
+    assert message.linear_acceleration_covariance[0] == pytest.approx(1e-4 * G * G, rel=0.01)
+
+
+def test_calibration_loads_a_whole_file_or_nothing(robot: Robot, start: Start,
+                                                   tmp_path: Path) -> None:
+    first, second = unit(seed=1), replace(unit(seed=2), noise_density_g_per_rthz=np.full(2, 1e-3))
+    second = replace(second, effects=('bias',), values={'bias': second.values['bias']},
+                     provenance={'date': '2026-02-03'})
+    other = tmp_path / 'other.yaml'
+    params.save(other, second)
+    params.save(tmp_path / 'foreign.yaml', unit('18'))
+    broken = tmp_path / 'broken.yaml'
+    broken.write_text(other.read_text().replace('rate_hz: 1000.0', 'rate_hz: 1000'))
+    started(start, tmp_path, first)
+    robot.inform(first)
+    robot.connected()
+    force = pose(0.6, 0.3)
+    np.testing.assert_allclose(accel(robot.answer(felt(first, force))), force, atol=1e-7)
+    assert 'serial number 17, but the parameters are those of 18' in robot.set(
+        calibration=str(tmp_path / 'foreign.yaml'))
+    reason = robot.set(calibration=str(broken))
+    assert f'{broken}:' in reason
+    assert 'sensor.rate_hz: 1000 is not a floating-point number' in reason
+    np.testing.assert_allclose(accel(robot.answer(felt(first, force))), force, atol=1e-7)
+    assert robot.set(calibration=str(other)) == ''
+    np.testing.assert_allclose(accel(robot.answer(felt(second, force))), force, atol=1e-7)
+    flat = params.to_flat(second)
+    found = robot.get('calibration', *flat)
+    assert found == [str(other), *flat.values()]
+    assert robot.get('misalignment.alpha_rad', 'provenance.source') == [[], '']
+    robot.graph.spin_until(lambda: robot.graph.value(NODE, 'calibration') == str(other), 10.0,
+                           'calibration in diagnostics')
+    assert robot.graph.value(NODE, 'provenance.date') == '2026-02-03'
+    assert robot.set(bias__offset_v=[0.0, 0.0]) == ''
+    robot.graph.spin_until(lambda: 'set since' in robot.graph.value(NODE, 'calibration'), 10.0,
+                           'the change in diagnostics')
+
+
+def test_parameters_are_described(robot: Robot, start: Start, tmp_path: Path) -> None:
+    start(NODE, '--ros-args', '-p', f'calibration:={_saved(tmp_path, unit())}')
+    robot.connected()
+    names = ['sensor.serial', 'bias.offset_v', 'calibration', 'sensor.rate_hz', 'effects']
+    found = robot.graph.call(DescribeParameters, f'{NODE}/describe_parameters',
+                             DescribeParameters.Request(names=names)).descriptors
+    assert all(d.description and not d.read_only for d in found)
+    assert found[1].additional_constraints == '-2 to 2'
+    assert found[3].floating_point_range[0].to_value == 1e5
+    assert robot.get('sensor.serial', 'sensor.axes') == ['17', 'xy']
+
+
+def _saved(folder: Path, sensor: Sensor) -> Path:
+    params.save(folder / 'given.yaml', sensor)
+    return folder / 'given.yaml'
+
+
+def test_best_effort_publishers_are_heard(robot: Robot, start: Start, tmp_path: Path) -> None:
+    started(start, tmp_path, unit())
+    robot._raw = robot.graph.node.create_publisher(Imu, 'imu/data_raw', QoSProfile(
+        depth=10, reliability=ReliabilityPolicy.BEST_EFFORT))
+    robot.connected()
+    robot.answer(felt(unit(), pose(0.5, 0.5)))
+
+
+@pytest.mark.parametrize(('right', 'wrong', 'message'), [
+    ('format: 1', 'format: 9', ':3:13: format: version 9, but this package reads version 1'),
+    ('units: V, V/g, 1/g, rad', 'units: mV', ":4:12: units: 'mV', but coefficients are in"),
+    ('[2.0e-06, 1.0e-06, 1.0e-06, 3.0e-06]', '[2.0e-06, 9.0e-06, 9.0e-06, 3.0e-06]',
+     'covariance: not positive'),
+    ('rate_hz: 1000.0', 'rate_hz: 1000', 'rate_hz'),
+    ('effects: [', 'effects: [[', 'not YAML'),
+])
+def test_a_bad_file_ends_it_with_one_line(start: Start, tmp_path: Path, right: str, wrong: str,
+                                          message: str) -> None:
+    path = _saved(tmp_path, unit())
+    text = path.read_text()
+    assert right in text
+    path.write_text(text.replace(right, wrong))
+    for arguments in (('--params-file', path), ('-p', f'calibration:={path}')):
+        process = start(NODE, '--ros-args', *arguments)
+        assert process.wait() == 1
+        assert process.output().count('\n') == 1
+        assert f'{path}:' in process.output()
+        assert message in process.output()

@@ -1,0 +1,242 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The driver over DDS: what it publishes, and how it takes what is wrong."""
+
+import os
+import signal
+
+from adxl_ros.files.columns import sensor_info
+from adxl_ros.model import noise
+from adxl_ros.model.sensor import to_nominal_mps2, to_volts
+from adxl_ros.nodes.driver import imu_message, ImuWriter, References
+from diagnostic_msgs.msg import DiagnosticStatus
+from graph import accel, Graph, stamp_ns
+import numpy as np
+import pytest
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import DescribeParameters, ListParameters, SetParameters
+from rclpy.serialization import deserialize_message, serialize_message
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import BatteryState, Imu, JointState, Temperature
+from units import NOMINAL, nominal
+
+ROS = '--ros-args'
+
+
+def written(path, rows=400, columns=('ax_mps2', 'ay_mps2', 'az_mps2'), dt_s=0.005):
+    t = 10.0 + dt_s * np.arange(rows)
+    data = {'ax_mps2': np.sin(t), 'ay_mps2': np.cos(t), 'az_mps2': 9.8 + 0 * t,
+            'alpha_rad': 0.1 * t, 'beta_rad': 0 * t, 'temperature_c': 20 + np.floor(t),
+            'supply_v': 5 + 0 * t}
+    lines = [','.join(['time_s', *columns])]
+    lines += [','.join(map(repr, [float(t[k]), *(float(data[c][k]) for c in columns)]))
+              for k in range(rows)]
+    path.write_text('\n'.join(lines) + '\n')
+    return np.column_stack([data[c] for c in columns])
+
+
+@pytest.mark.parametrize('axes', ['x', 'xy', 'xyz'])
+def test_serialized_samples_are_what_rclpy_serializes(axes):
+    sensor = nominal(axes)
+    volts = np.linspace(1.1, 3.9, 5 * len(axes)).reshape(5, -1)
+    stamps = 1_700_000_000_999_999_990 + 5 * np.arange(5)
+    template = imu_message(sensor, 'imu_link')
+    for message, stamp, a in zip(ImuWriter(sensor, 'imu_link').messages(stamps, volts), stamps,
+                                 to_nominal_mps2(volts, sensor)):
+        template.header.stamp.sec, template.header.stamp.nanosec = map(
+            int, divmod(stamp, 10 ** 9))
+        for axis, value in zip('xyz', [*map(float, a), 0.0, 0.0]):
+            setattr(template.linear_acceleration, axis, value)
+        # What stands in the 3 bytes of padding behind the frame is left to chance.
+        expected = serialize_message(template)
+        assert (message[:25], message[28:]) == (expected[:25], expected[28:])
+        assert deserialize_message(message, Imu) == template
+
+
+def test_saturation_is_seen_at_the_rails_and_beyond_the_range():
+    volts = np.array([[2.5, 2.5], [0.0, 2.5], [2.5, 5 * (1 - 2 ** -16)], [2.5, 4.3], [4.1, 0.9]])
+    writer = ImuWriter(nominal(), 'imu_link')
+    assert writer.saturated(volts).tolist() == [False, True, True, True, False]
+    digital = ImuWriter(nominal(adc_bits=0, range_g=16.0), 'imu_link')
+    assert not digital.saturated(volts).any()
+
+
+def test_sim_publishes_every_sample_as_the_interfaces_say(start):
+    driver = start('driver', ROS, '-p', 'link.alpha_rad:=1.5707963267948966', '-p',
+                   'frame_id:=case', '-p', 'sensor.serial:=A7')
+    sensor = nominal()
+    with Graph() as graph:
+        samples = graph.listen(Imu, 'imu/data_raw')
+        info = graph.listen(DiagnosticStatus, 'sensor_info', latched=True)
+        graph.spin_until(lambda: len(samples) >= 3000 and info, 30, '3000 samples')
+        graph.spin_until(lambda: 'driver' in graph.diagnostics, 5, 'diagnostics')
+        status = graph.diagnostics['driver']
+        assert status.level == DiagnosticStatus.OK
+        assert status.hardware_id == 'A7'
+        assert float(graph.value('driver', 'rate_hz')) == pytest.approx(1000, rel=0.1)
+        assert graph.value('driver', 'missing') == graph.value('driver', 'saturated') == '0'
+        assert 0 <= float(graph.value('driver', 'age_s')) < 1
+    stamps = np.array([stamp_ns(message) for message in samples])
+    assert (np.diff(stamps) == 1_000_000).all()
+    first = samples[0]
+    assert first.header.frame_id == 'case'
+    assert first.orientation_covariance[0] == first.angular_velocity_covariance[0] == -1
+    variance = first.linear_acceleration_covariance.reshape(3, 3)
+    sigma = noise.sigma_v(sensor) * 9.80665
+    assert variance == pytest.approx(np.diag([*sigma ** 2, 1e6]))
+    told = {pair.key: pair.value for pair in info[0].values}
+    assert told == sensor_info(sensor) | {'serial': 'A7'}
+    a = np.array([accel(message) for message in samples])
+    assert not a[:, 2].any()
+    assert a[:, :2].mean(0) == pytest.approx([9.80665, 0], abs=0.05)
+    codes = to_volts(a[:, :2], sensor) / sensor.lsb_v
+    assert np.abs(codes - np.rint(codes)).max() < 1e-6, 'volts are recovered exactly'
+    assert driver.stop() == 0
+    assert 'Traceback' not in driver.output()
+
+
+def test_replay_passes_a_recording_on_faster_than_real_time(start, tmp_path):
+    columns = ('ax_mps2', 'ay_mps2', 'az_mps2', 'alpha_rad', 'beta_rad', 'temperature_c',
+               'supply_v')
+    data = written(tmp_path / 'r.csv', 1000, columns)
+    with Graph() as graph:
+        samples = graph.listen(Imu, 'imu/data_raw')
+        stage = graph.listen(JointState, 'stage/joint_states')
+        temperature = graph.listen(Temperature, 'temperature')
+        supply = graph.listen(BatteryState, 'supply')
+        clock = graph.listen(Clock, '/clock')
+        start('driver', ROS, '-p', 'link.type:=replay', '-p', 'link.recording:=r.csv', '-p',
+              'link.speed:=4.0')
+        graph.spin_until(lambda: graph.said('driver', 'ended'), 30, 'the end')
+        assert graph.value('driver', 'link_state') == 'ended'
+    assert len(samples) == 1000
+    stamps = np.array([stamp_ns(message) for message in samples])
+    assert np.abs(stamps - 1e9 * (10 + 0.005 * np.arange(1000))).max() < 1000
+    assert np.abs([accel(m) - row[:3] for m, row in zip(samples, data)]).max() < 1e-12
+    assert stage[-1].name == ['alpha', 'beta']
+    by_stamp = dict(zip(stamps, data[:, 3]))
+    assert all(m.position[0] == by_stamp[stamp_ns(m)] for m in stage)
+    assert len(stage) == 1000, 'alpha changes with each sample'
+    assert sorted({m.temperature for m in temperature}) == [30, 31, 32, 33, 34]
+    assert len(temperature) <= 10
+    assert {m.voltage for m in supply} == {5.0}
+    ticks = [c.clock.sec + c.clock.nanosec * 1e-9 for c in clock]
+    assert ticks == sorted(ticks)
+    assert ticks[-1] > 14.9
+
+
+def test_replay_in_real_time_is_stamped_now(start, tmp_path):
+    written(tmp_path / 'r.csv', 300)
+    with Graph() as graph:
+        samples = graph.listen(Imu, 'imu/data_raw')
+        start('driver', ROS, '-p', 'link.type:=replay', '-p', 'link.recording:=r.csv', '-p',
+              'link.loop:=true')
+        graph.spin_until(lambda: len(samples) >= 200, 30, '200 samples')
+        now = graph.node.get_clock().now().nanoseconds
+    stamps = np.array([stamp_ns(message) for message in samples])
+    assert abs(stamps[-1] - now) < 1e9
+    assert np.diff(stamps) == pytest.approx(5e6, abs=2)
+
+
+def test_references_that_stay_are_published_seldom(ros_env):
+    with Graph() as graph:
+        sent = []
+        references = References(graph.node, 'imu_link', ('alpha_rad', 'temperature_c'))
+        for publisher in references._publishers.values():
+            publisher.publish = sent.append
+        stamps = 1_000_000 * np.arange(3000)
+        columns = {'alpha_rad': np.full(3000, 0.5), 'temperature_c': np.full(3000, 20.0)}
+        columns['alpha_rad'][1:10] = np.nan
+        for part in np.split(np.arange(3000), 30):
+            references.publish(stamps[part], {k: of[part] for k, of in columns.items()})
+    joints = [m for m in sent if isinstance(m, JointState)]
+    assert len(joints) == 300
+    assert all(np.isfinite(m.position).all() for m in joints)
+    assert len(sent) - len(joints) == 3
+
+
+@pytest.mark.parametrize('text, why', [
+    (None, 'No such file'), ('', 'empty'), ('time_s,x_v\n0.0,1.0\n0.1,two\n', "x_v is 'two'")])
+def test_a_bad_recording_leaves_the_node_up_to_say_so(start, tmp_path, text, why):
+    if text is not None:
+        (tmp_path / 'bad.csv').write_text(text)
+    with Graph() as graph:
+        graph.listen(Imu, 'imu/data_raw')
+        driver = start('driver', ROS, '-p', 'link.type:=replay', '-p', 'link.recording:=bad.csv')
+        graph.spin_until(lambda: graph.said('driver', why), 20, 'the reason')
+        assert graph.diagnostics['driver'].level == DiagnosticStatus.ERROR
+        graph.spin(1.5)
+    assert driver.popen.poll() is None
+    assert driver.stop() == 0
+    lines = [line for line in driver.output().splitlines() if line]
+    assert len(lines) == 1, lines
+    assert 'bad.csv' in lines[0]
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_it_quietly(start, number):
+    driver = start('driver')
+    with Graph() as graph:
+        samples = graph.listen(Imu, 'imu/data_raw')
+        graph.spin_until(lambda: samples, 20, 'a sample')
+    os.kill(driver.popen.pid, number)
+    assert driver.wait() == 0
+    assert driver.output() == ''
+
+
+@pytest.mark.parametrize('change, place, why', [
+    (('1000.0', '1000'), ':19:', 'DOUBLE'), (('[2.5, 2.5]', '[2.5, 2]'), ':12:', '2 is not of'),
+    (('      rate_hz: 1000.0\n', ''), '', 'sensor.rate_hz: missing'),
+    (('format: 1', 'format: 2'), ':6:', 'version 2'), (('axes: xy', 'axes: xyz'), '', '3 axes'),
+    (('axes: xy', 'axes: [xy'), '', 'not YAML'), (('range_g: 1.7', 'range_g: -1.0'), ':20:', '-1'),
+    (('model: nominal', 'model: nominal\n    effects: [bias]'), '', 'bias.offset_v: missing')])
+def test_a_bad_parameter_file_is_refused_with_the_place(start, tmp_path, change, place, why):
+    path = tmp_path / 'bad.yaml'
+    path.write_text(NOMINAL.read_text().replace(*change))
+    assert path.read_text() != NOMINAL.read_text()
+    driver = start('driver', ROS, '--params-file', path)
+    assert driver.wait() == 1
+    assert len(driver.output().splitlines()) == 1, driver.output()
+    assert f'{path}{place}' in driver.output()
+    assert why in driver.output()
+
+
+@pytest.mark.parametrize('arguments, status', [
+    ((ROS, '-p', 'link.type:=carrier_pigeon'), 1), ((ROS, '-p', 'link.speed:=0.0'), 1),
+    ((ROS, '--params-file', 'nowhere.yaml'), 1), (('--speed', '3'), 2), ((ROS, '--sped', '3'), 2)])
+def test_a_bad_start_ends_with_one_line(start, arguments, status):
+    driver = start('driver', *arguments)
+    assert driver.wait() == status
+    assert 'Traceback' not in driver.output()
+    assert arguments[-1].split(':=')[-1] in driver.output()
+
+
+def test_parameters_say_what_they_are_and_cannot_be_set(start):
+    start('driver', ROS, '--params-file', NOMINAL)
+    with Graph() as graph:
+        names = graph.call(ListParameters, 'driver/list_parameters',
+                           ListParameters.Request()).result.names
+        own = [n for n in names if not n.startswith(('qos_overrides', 'use_sim', 'start_type'))]
+        assert {'sensor.rate_hz', 'link.type', 'link.speed', 'frame_id'} <= set(own)
+        about = graph.call(DescribeParameters, 'driver/describe_parameters',
+                           DescribeParameters.Request(names=own)).descriptors
+        assert all(d.description and d.read_only for d in about)
+        rate = next(d for d in about if d.name == 'sensor.rate_hz').floating_point_range[0]
+        assert (rate.from_value, rate.to_value) == (0.01, 100000)
+        value = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=500.0)
+        answer = graph.call(SetParameters, 'driver/set_parameters', SetParameters.Request(
+            parameters=[Parameter(name='sensor.rate_hz', value=value)])).results[0]
+        assert not answer.successful
+        assert 'read-only' in answer.reason

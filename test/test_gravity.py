@@ -1,0 +1,349 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Nine parameters from gravity: made units with known truth, refusals, and real recordings."""
+
+from dataclasses import replace
+import time
+
+from adxl_ros.calibrate import gravity
+from adxl_ros.calibrate.gravity import fit_gravity, NAMES
+from adxl_ros.calibrate.rests import find_rests, rest_means
+from adxl_ros.errors import UserError
+from adxl_ros.files import recording
+from adxl_ros.model import chain
+from adxl_ros.model.constants import G0_MPS2
+from adxl_ros.model.sensor import to_volts
+from hypothesis import given, settings, strategies
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+from units import nominal
+
+EFFECTS = ('bias', 'scale_factor', 'misalignment')
+MG = 1000 / G0_MPS2
+SIX = np.concatenate([np.eye(3), -np.eye(3)])
+EDGES = np.array([[1, 1, 0], [1, -1, 0], [-1, 1, 0], [-1, -1, 0], [0, 1, 1], [0, 1, -1],
+                  [0, -1, 1], [0, -1, -1], [1, 0, 1], [1, 0, -1], [-1, 0, 1], [-1, 0, -1]]) / 2**.5
+
+
+def rms(values):
+    return np.sqrt(np.mean(np.square(values)))
+
+
+def unit(rng, spread=1.0, **changes):
+    """Draw a three-axis unit in the gauge of the fit, and its nine parameters."""
+    sensor = nominal('xyz', **changes)
+    scale = sensor.nominal_scale_v_per_g
+    truth = np.concatenate([scale * rng.uniform(-0.1, 0.1, 3), scale * rng.uniform(-0.04, 0.04, 3),
+                            rng.normal(0, 0.0175, 3)]) * spread
+    values = {'bias': {'offset_v': truth[:3]}, 'scale_factor': {'offset_v_per_g': truth[3:6]},
+              'misalignment': {'alpha_rad': np.array([0, 0, truth[7]]),
+                               'beta_rad': np.array([0, truth[6], truth[8]])}}
+    return replace(sensor, effects=EFFECTS, values=values), truth
+
+
+def directions(rng, count):
+    drawn = rng.normal(size=(count, 3))
+    return drawn / np.linalg.norm(drawn, axis=1, keepdims=True)
+
+
+def rested(rng, sensor, poses, error_v=5e-5, excess_g=0.0):
+    """Make the rests of a unit in `poses`: means and standard errors, V, through the chain."""
+    force = poses * (sensor.local_gravity_mps2
+                     + G0_MPS2 * excess_g * rng.normal(size=(len(poses), 1)))
+    volts = np.column_stack(chain.static_response(sensor)(list(force.T)))
+    errors = error_v * rng.uniform(0.5, 2, (len(poses), 1)) * np.ones(3)
+    return volts + errors * rng.normal(size=volts.shape), errors
+
+
+def bare(sensor):
+    return replace(sensor, effects=(), values={})
+
+
+def parameters(fit):
+    """Put the fitted values in the order of NAMES."""
+    return np.array([fit.values[effect][parameter]['xyz'.index(axis)]
+                     for effect, parameter, axis in (name.split('.') for name in NAMES)])
+
+
+@settings(max_examples=30, deadline=None)
+@given(strategies.integers(0, 2**32 - 1))
+def test_exact_without_noise(seed):
+    """The chain's own response is inverted, for any unit, scale and gravity."""
+    rng = np.random.default_rng(seed)
+    sensor, truth = unit(rng, 2.0, nominal_scale_v_per_g=rng.uniform(0.3, 2, 3),
+                         nominal_zero_g_v=rng.uniform(1, 3, 3),
+                         local_gravity_mps2=rng.uniform(9.76, 9.83))
+    means, errors = rested(rng, sensor, directions(rng, 24), 0.0)
+    fit = fit_gravity(means, errors, bare(sensor))
+    assert np.abs(parameters(fit) - truth).max() < 1e-8
+    assert np.abs(fit.residual_mps2).max() < 1e-8
+    assert fit.outliers == ()
+
+
+def test_jacobian_against_differences():
+    rng = np.random.default_rng(1)
+    mean, found = directions(rng, 20) * 1.05, rng.normal(0, 0.05, 9)
+    step = 1e-6
+    for k, column in enumerate(gravity._jacobian(mean, found).T):
+        up, down = found.copy(), found.copy()
+        up[k] += step
+        down[k] -= step
+        wanted = (gravity._magnitude(mean, up) - gravity._magnitude(mean, down)) / (2 * step)
+        assert column == pytest.approx(wanted, abs=1e-9)
+
+
+@pytest.mark.parametrize('count, error_v, excess_g', [
+    (12, 1e-4, 0.0), (18, 1e-4, 0.0), (30, 1e-4, 0.0), (24, 1e-6, 0.0), (24, 2e-5, 2e-4),
+    (16, 2e-5, 2e-4), (24, 1e-4, 1e-4)])
+def test_covariance_is_honest(count, error_v, excess_g):
+    """90 % intervals hold the truth in 85 to 95 % of the units; without excess in no fewer."""
+    rng = np.random.default_rng(2)
+    inside, false = [], 0
+    for _ in range(60):
+        sensor, truth = unit(rng)
+        poses = np.concatenate([SIX, directions(rng, count - 6)])
+        means, errors = rested(rng, sensor, poses, error_v, excess_g)
+        fit = fit_gravity(means, errors, bare(sensor))
+        off = np.abs(parameters(fit) - truth) / np.sqrt(np.diag(fit.covariance))
+        inside.append(off < 1.645)
+        false += len(fit.outliers)
+    assert 0.85 < np.mean(inside) < 0.96
+    assert false <= 3
+
+
+def test_covariance_in_other_units():
+    """Half the scale factor halves volts: the figures in g are the same."""
+    rng = np.random.default_rng(3)
+    sensor, _ = unit(rng)
+    means, errors = rested(rng, sensor, directions(rng, 24))
+    one = fit_gravity(means, errors, bare(sensor))
+    half = replace(bare(sensor), nominal_zero_g_v=sensor.nominal_zero_g_v / 2,
+                   nominal_scale_v_per_g=sensor.nominal_scale_v_per_g / 2)
+    other = fit_gravity(means / 2, errors / 2, half)
+    units = np.array([0.5] * 6 + [1.0] * 3)
+    assert parameters(other) == pytest.approx(parameters(one) * units, abs=1e-9)
+    assert other.covariance == pytest.approx(one.covariance * np.outer(units, units), rel=1e-6)
+
+
+def test_order_does_not_matter():
+    rng = np.random.default_rng(4)
+    sensor, _ = unit(rng)
+    means, errors = rested(rng, sensor, directions(rng, 24), 5e-5, 1e-4)
+    order = rng.permutation(24)
+    one, other = (fit_gravity(means[o], errors[o], bare(sensor)) for o in (np.arange(24), order))
+    assert parameters(other) == pytest.approx(parameters(one), abs=1e-7)
+    assert other.leave_one_out_mps2 == pytest.approx(one.leave_one_out_mps2[order], abs=1e-6)
+
+
+def test_excess_is_what_the_means_do_not_explain():
+    rng = np.random.default_rng(5)
+    found = []
+    for _ in range(20):
+        sensor, _ = unit(rng)
+        fit = fit_gravity(*rested(rng, sensor, directions(rng, 30), 2e-5, 3e-4), bare(sensor))
+        found.append(fit.excess_mps2 * MG)
+    assert np.mean(found) == pytest.approx(0.3, rel=0.15)
+
+
+def test_leave_one_out_is_that():
+    rng = np.random.default_rng(6)
+    sensor, _ = unit(rng)
+    means, errors = rested(rng, sensor, directions(rng, 16), 5e-5)
+    fit = fit_gravity(means, errors, bare(sensor))
+    for i in (0, 7, 15):
+        others = np.arange(16) != i
+        without = replace(sensor, values=fit_gravity(means[others], errors[others],
+                                                     bare(sensor)).values)
+        force = np.array(chain.inverse(without)(list(means[i:i + 1].T)))
+        off = np.linalg.norm(force) - sensor.local_gravity_mps2
+        # The excess is estimated anew without the rest, the weights change a little.
+        assert fit.leave_one_out_mps2[i] == pytest.approx(off, abs=2e-4)
+
+
+@pytest.mark.parametrize('count, knocks, size_g', [
+    (14, 1, 0.02), (18, 2, 0.02), (24, 1, 0.002), (24, 3, 0.02), (24, 3, 0.2), (40, 5, 0.005)])
+def test_knocks_are_named(count, knocks, size_g):
+    """Rests that were none do not spoil the fit, and hide neither themselves nor one another."""
+    rng = np.random.default_rng(7)
+    right, worst = 0, []
+    for _ in range(20):
+        sensor, truth = unit(rng)
+        poses = np.concatenate([SIX, directions(rng, count - 6)])
+        means, errors = rested(rng, sensor, poses, 5e-5, 5e-5)
+        bad = rng.choice(count, knocks, replace=False)
+        means[bad] += poses[bad] * size_g * rng.choice([-1, 1], (knocks, 1)) \
+            * rng.uniform(0.7, 1.5, (knocks, 1))
+        fit = fit_gravity(means, errors, bare(sensor))
+        right += set(fit.outliers) >= set(bad.tolist()) and len(fit.outliers) <= knocks + 1
+        worst.append(np.abs(parameters(fit) - truth)[:3].max())
+    assert right >= 18
+    assert np.median(worst) < 4e-4
+
+
+@pytest.mark.parametrize('poses, names, advice', [
+    (SIX, 'misalignment.beta_rad.y, misalignment.alpha_rad.z, misalignment.beta_rad.z', ' and '),
+    (np.tile(SIX, (3, 1)),
+     'misalignment.beta_rad.y, misalignment.alpha_rad.z, misalignment.beta_rad.z', ' and '),
+    (np.tile([[0.6, 0.0, 0.8]], (20, 1)), 'all nine coefficients', 'z down'),
+    (np.zeros((0, 3)), 'all nine coefficients', 'x up'),
+    (np.column_stack([np.cos(np.arange(20)), np.sin(np.arange(20)), np.zeros(20)]),
+     'bias.offset_v.z, scale_factor.offset_v_per_g.z, misalignment.alpha_rad.z, '
+     'misalignment.beta_rad.z', 'z up'),
+])
+def test_refuses_what_the_rests_leave_open(poses, names, advice):
+    rng = np.random.default_rng(8)
+    sensor, _ = unit(rng)
+    means, errors = rested(rng, sensor, poses)
+    with pytest.raises(UserError) as refused:
+        fit_gravity(means, errors, bare(sensor))
+    text = str(refused.value)
+    assert text.startswith(f'gravity: the {len(poses)} rests that were found leave ')
+    assert f'{names} open: add rests with ' in text
+    assert advice in text.split('add rests with')[1]
+    assert '\n' not in text
+
+
+def test_refuses_what_is_not_gravity():
+    rng = np.random.default_rng(12)
+    sensor, _ = unit(rng)
+    means, errors = rested(rng, sensor, directions(rng, 24))
+    wrong = replace(bare(sensor), nominal_scale_v_per_g=np.full(3, 0.1))
+    with pytest.raises(UserError, match=r'rests read \d+ m/s², not 9\.8.*nominal_scale_v_per_g'):
+        fit_gravity(means, errors, wrong)
+
+
+def test_the_advice_is_enough():
+    """The poses that a refusal names make the fit possible."""
+    rng = np.random.default_rng(9)
+    sensor, truth = unit(rng)
+    few = directions(rng, 24) * [1, 1, 0.02]
+    few[:, 2] = np.abs(few[:, 2])
+    for poses in (few / np.linalg.norm(few, axis=1, keepdims=True), SIX[:4], directions(rng, 9)):
+        with pytest.raises(UserError) as refused:
+            fit_gravity(*rested(rng, sensor, poses), bare(sensor))
+        added = []
+        for pose in str(refused.value).split('add rests with ')[1].split(', '):
+            vector = np.zeros(3)
+            for part in pose.split(' and '):
+                axis, way = part.split()
+                vector['xyz'.index(axis)] = 1 if way == 'up' else -1
+            added.append(vector / np.linalg.norm(vector))
+        poses = np.concatenate([poses, added])
+        fit = fit_gravity(*rested(rng, sensor, poses), bare(sensor))
+        assert np.abs(parameters(fit) - truth).max() < 0.02
+
+
+def plain(means, errors, sensor):
+    """Fit offsets and a lower triangular matrix by unweighted least squares, from nominal."""
+    scaled = (means - sensor.nominal_zero_g_v) / sensor.nominal_scale_v_per_g
+    lower = np.tril_indices(3)
+
+    def magnitudes(p, rows=slice(None)):
+        matrix = np.zeros((3, 3))
+        matrix[lower] = p[3:]
+        return np.linalg.norm((scaled[rows] - p[:3]) @ matrix.T, axis=1)
+
+    wanted = sensor.local_gravity_mps2 / G0_MPS2
+    start = np.concatenate([np.zeros(3), np.eye(3)[lower]])
+    everything = least_squares(lambda p: magnitudes(p) - wanted, start).x
+    out = []
+    for i in range(len(means)):
+        rows = np.arange(len(means)) != i
+        found = least_squares(lambda p, rows=rows: magnitudes(p, rows) - wanted, everything).x
+        out.append(magnitudes(found, [i])[0] - wanted)
+    return G0_MPS2 * (magnitudes(everything) - wanted), G0_MPS2 * np.array(out)
+
+
+def test_no_worse_than_plain_least_squares():
+    """Rests from 1 to 60 s: the weights tell, in what other rests then read."""
+    rng = np.random.default_rng(10)
+    ours, theirs = [], []
+    for _ in range(15):
+        sensor, _ = unit(rng)
+        poses = directions(rng, 24)
+        errors = np.exp(rng.uniform(np.log(3e-5), np.log(3e-4), (24, 1))) * np.ones(3)
+        means, _ = rested(rng, sensor, poses, 0.0)
+        means = means + errors * rng.normal(size=means.shape)
+        ours.append(fit_gravity(means, errors, bare(sensor)).leave_one_out_mps2)
+        theirs.append(plain(means, errors, sensor)[1])
+    assert rms(ours) < rms(theirs)
+
+
+def real(shared_dir, name, local_gravity_mps2=G0_MPS2):
+    """Read a recording, find its rests and average them, all as by default."""
+    path = shared_dir / 'real' / f'{name}.csv'
+    if not path.exists():
+        pytest.skip(f'no {path}')
+    stream = recording.read(path)
+    sensor = nominal('xyz', local_gravity_mps2=local_gravity_mps2)
+    volts = to_volts(np.column_stack([stream.columns[f'a{a}_mps2'] for a in 'xyz']), sensor)
+    rests = find_rests(stream.time_s, volts, 100.0)
+    return sensor, rests, *rest_means(stream.time_s, volts, rests, 100.0)
+
+
+XSENS_MPS2 = 9.81744
+
+
+@pytest.mark.parametrize('name, local, before, within, without', [
+    ('mpu9150_0', G0_MPS2, (8, 24), 0.26, 0.33), ('mpu9150_1', G0_MPS2, (8, 24.5), 0.26, 0.33),
+    ('mpu9150_2', G0_MPS2, (8, 24), 0.26, 0.33),
+    ('xsens_multiposition', XSENS_MPS2, (100, 150), 0.104, 0.16),
+    ('two_axis_stand', G0_MPS2, (60, 64), 0.12, 0.145)])
+def test_real_units(shared_dir, name, local, before, within, without):
+    """What others reached on these recordings, rms over the rests in mg, with one set of rules."""
+    sensor, _, means, errors = real(shared_dir, name, local)
+    fit = fit_gravity(means, errors, sensor)
+    assert before[0] < MG * rms(fit.before_mps2) < before[1]
+    assert MG * rms(fit.residual_mps2) < within
+    assert MG * rms(fit.leave_one_out_mps2) < without
+    assert len(fit.outliers) == 0
+    _, theirs = plain(means, errors, sensor)
+    assert rms(fit.leave_one_out_mps2) < 1.05 * rms(theirs)
+
+
+def test_real_unit_on_rests_kept_out(shared_dir):
+    """Fitted on 24 rests, the others read gravity to 0.12 mg."""
+    sensor, _, means, errors = real(shared_dir, 'xsens_multiposition', XSENS_MPS2)
+    fit = fit_gravity(means[:24], errors[:24], sensor)
+    fitted = replace(sensor, effects=EFFECTS, values=fit.values)
+    force = np.array(chain.inverse(fitted)(list(means[24:].T)))
+    assert MG * rms(np.linalg.norm(force, axis=0) - XSENS_MPS2) < 0.125
+
+
+def test_three_real_units_turn_alike(shared_dir):
+    """Three sensors on one body: the change of tilt between rests agrees to 0.04° or so."""
+    units = [real(shared_dir, f'mpu9150_{k}') for k in range(3)]
+    common = [(a, b, c) for a in units[0][1] for b in units[1][1] for c in units[2][1]
+              if min(a.stop, b.stop, c.stop) - max(a.start, b.start, c.start) > 100]
+    turned = []
+    for k, (sensor, rests, means, errors) in enumerate(units):
+        fit = fit_gravity(means, errors, sensor)
+        fitted = replace(sensor, effects=EFFECTS, values=fit.values)
+        force = np.array(chain.inverse(fitted)(list(means.T)))[
+            :, [rests.index(same[k]) for same in common]]
+        along = force / np.linalg.norm(force, axis=0)
+        turned.append(np.degrees(np.arccos((along[:, 1:] * along[:, :-1]).sum(axis=0))))
+    for one, other in ((0, 1), (0, 2), (1, 2)):
+        assert rms(turned[one] - turned[other]) < 0.06
+
+
+def test_speed():
+    rng = np.random.default_rng(11)
+    sensor, _ = unit(rng)
+    means, errors = rested(rng, sensor, directions(rng, 40), 5e-5, 1e-4)
+    began = time.process_time()
+    fit_gravity(means, errors, bare(sensor))
+    assert time.process_time() - began < 1

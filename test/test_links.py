@@ -1,0 +1,284 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The links without ROS: the simulated sensor and stage, and the replay."""
+
+from dataclasses import replace
+import time
+
+from adxl_ros.errors import UserError
+from adxl_ros.links import base, replay, sim
+from adxl_ros.links.sim_stage import SimulatedStage
+from adxl_ros.model import noise
+from adxl_ros.model.sensor import to_nominal_mps2
+from adxl_ros.model.stage import specific_force
+import numpy as np
+import pytest
+from units import nominal
+
+MS = 1_000_000
+START = 1_700_000_000 * 10 ** 9
+
+
+def simulated(sensor=None, alpha=np.pi / 2, beta=0.0, seed=0):
+    link = sim.open_link(sensor or nominal(),
+                         {'alpha_rad': alpha, 'beta_rad': beta, 'seed': seed})
+    link.begin(START)
+    return link
+
+
+def ideal():
+    """Return a sensor without noise, filter and ADC, which shows what it feels."""
+    return nominal('xyz', noise_density_g_per_rthz=np.zeros(3), rc_capacitance_f=0.0, adc_bits=0)
+
+
+def taken(link, until_ns, step_ns):
+    parts = [link.read(now) for now in range(START, until_ns + 1, step_ns)]
+    return (np.concatenate([p.stamp_ns for p in parts]), np.concatenate([p.volts for p in parts]))
+
+
+def test_every_link_can_be_opened_by_its_name():
+    assert base.names()[0] == 'sim'
+    assert 'replay' in base.names()
+    for name in base.names():
+        module = base.module_of(name)
+        assert callable(module.open_link)
+        assert all(isinstance(option, base.Option) for option in module.OPTIONS)
+
+
+def test_sim_samples_a_pose_with_the_noise_that_the_figures_promise():
+    sensor = nominal()
+    stamps, volts = taken(simulated(sensor), START + 20_000 * MS, 4 * MS)
+    assert np.array_equal(stamps, START + MS * np.arange(20_001))
+    expected = [2.5 + 9.80665 / 9.80665, 2.5]
+    count = noise.effective_samples(len(volts), 1e-3, sensor.rc_s)
+    assert np.abs(volts.mean(0) - expected).max() < 5 * noise.sigma_v(sensor)[0] / count ** 0.5
+    assert volts.std(0) == pytest.approx(noise.sigma_v(sensor), rel=0.15)
+
+
+def test_sim_gives_the_same_samples_whoever_asks_how_often():
+    often = taken(simulated(), START + 1000 * MS, 3 * MS)
+    seldom = taken(simulated(), START + 1000 * MS, 250 * MS)
+    assert np.array_equal(often[1][:1000], seldom[1][:1000])
+    assert not np.array_equal(often[1], taken(simulated(seed=1), START + 1000 * MS, 3 * MS)[1])
+
+
+def turning(t):
+    """Return a smooth motion: alpha, beta, shift and their rates."""
+    return ({'alpha': 0.5 + 0.4 * np.sin(3 * t), 'beta': -2 * np.cos(t),
+             'shift': 0.01 * np.sin(8 * t)},
+            {'alpha': 1.2 * np.cos(3 * t), 'beta': 2 * np.sin(t), 'shift': 0.08 * np.cos(8 * t)})
+
+
+def test_sim_feels_the_true_motion_at_its_samples():
+    link = simulated(ideal())
+    for k in range(101):
+        link.feel(START + k * 10 * MS, *turning(k * 0.01))
+    samples = link.read(START + 5000 * MS)
+    assert samples.until_ns == START + 1000 * MS, 'sensor time waits for the stage'
+    t = (samples.stamp_ns - START) * 1e-9
+    position, _ = turning(t)
+    felt = to_nominal_mps2(samples.volts, ideal())
+    truth = np.column_stack(specific_force(position['alpha'], position['beta'], 9.80665,
+                                           -0.64 * np.sin(8 * t)))
+    error = np.abs(felt - truth)[1:]
+    assert error[:, 1:].max() < 1e-6
+    assert error[:, 0].max() < 1e-3, 'x has the second derivative of the interpolation'
+
+
+def test_sim_waits_for_a_stage_and_holds_the_pose_of_a_lost_one(monkeypatch):
+    clock = [100.0]
+    monkeypatch.setattr(time, 'monotonic', lambda: clock[0])
+    link = simulated(ideal())
+    assert link.read(START + 100 * MS).until_ns == START + 100 * MS
+    link.feel(START + 200 * MS, {'alpha': 0.3, 'beta': 0.0}, {})
+    assert link.read(START + 900 * MS).until_ns == START + 200 * MS
+    clock[0] += 0.9
+    assert not len(link.read(START + 1100 * MS).stamp_ns)
+    clock[0] += 0.2
+    after = link.read(START + 1300 * MS)
+    assert after.until_ns == START + 1300 * MS
+    assert link.state().level == 'warn'
+    assert 'stage lost' in link.state().text
+    held = np.column_stack(specific_force(np.array([0.3]), 0.0, 9.80665))
+    assert np.abs(to_nominal_mps2(after.volts, ideal()) - held).max() < 1e-9
+    link.feel(START + 1310 * MS, {'alpha': 0.3, 'beta': 0.0}, {})
+    assert link.state() == base.State('ok', 'on the stage')
+    assert link.read(START + 9000 * MS).until_ns == START + 1310 * MS
+
+
+def test_sim_takes_the_word_of_a_stage_that_was_started_anew():
+    link = simulated(ideal())
+    for k in range(11):
+        link.feel(START + k * 10 * MS, {'alpha': 0.3, 'beta': 0.0}, {})
+    for k in range(5, 9):
+        link.feel(START + k * 10 * MS, {'alpha': 0.7, 'beta': 0.0}, {})
+    samples = link.read(START + 200 * MS)
+    assert samples.until_ns == START + 80 * MS
+    assert to_nominal_mps2(samples.volts, ideal())[-1, 2] == pytest.approx(9.80665 * np.cos(0.7))
+
+
+@pytest.mark.parametrize('stamp, alpha, why', [
+    (START + 3600 * 1000 * MS, 0.1, 'another clock'), (START - 3000 * MS, 0.1, 'another clock'),
+    (START + 10 * MS, np.nan, 'not finite')])
+def test_sim_does_not_feel_nonsense(stamp, alpha, why):
+    link = simulated(ideal(), alpha=0.2)
+    link.feel(stamp, {'alpha': alpha, 'beta': 0.0}, {'alpha': 0.0, 'beta': 0.0})
+    assert link.state().level == 'warn'
+    assert why in link.state().text
+    samples = link.read(START + 100 * MS)
+    assert len(samples.stamp_ns) == 101
+    assert to_nominal_mps2(samples.volts, ideal())[-1, 2] == pytest.approx(9.80665 * np.cos(0.2))
+
+
+def test_sim_counts_what_a_jump_of_the_clock_leaves_out():
+    link = simulated()
+    link.read(START + 100 * MS)
+    assert link.begin(START + 3100 * MS) == 3000
+    assert link.read(START + 3101 * MS).stamp_ns.tolist() == [START + 3100 * MS, START + 3101 * MS]
+
+
+def a_stage(**changes):
+    figures = {'pose': np.zeros(3), 'slew': np.array([0.5, 0.5, 0.01]), 'settling_s': 0.3,
+               'resolution': np.array([1.5e-3, 1.5e-3, 0.0]), 'seed': 3} | changes
+    return SimulatedStage(**figures)
+
+
+def test_stage_moves_at_the_slew_rate_and_comes_to_rest_in_the_encoder_step_told():
+    stage = a_stage()
+    stage.command({'alpha': 0.5, 'beta': -0.3})
+    fastest = 0.0
+    for _ in range(130):
+        stage.step(0.01)
+        fastest = max(fastest, np.abs(stage.velocity).max())
+    assert fastest == pytest.approx(0.5, rel=1e-3)
+    assert not stage.moving()
+    assert stage.encoder()[:2] == pytest.approx(np.rint(np.array([0.5, -0.3]) / 1.5e-3) * 1.5e-3)
+    off = np.abs(stage.position - stage.encoder())[:2]
+    assert (off <= 0.75e-3).all()
+    assert (off > 1e-6).all(), 'the true pose differs from what the encoder shows'
+
+
+def test_stage_rests_elsewhere_in_the_step_when_it_comes_again():
+    stage, rests = a_stage(), []
+    for target in (0.3, 0.0, 0.3):
+        for _ in range(200):
+            stage.command({'alpha': target})
+            stage.step(0.01)
+        rests.append(stage.position[0])
+    assert rests[0] != rests[2]
+    assert abs(rests[0] - rests[2]) < 1.5e-3
+
+
+def test_stage_does_the_same_in_long_and_short_steps():
+    coarse, fine = a_stage(), a_stage()
+    for stage, count in ((coarse, 30), (fine, 3000)):
+        stage.command({'alpha': 0.3, 'shift': -0.5})
+        for _ in range(count):
+            stage.step(0.3 / count)
+    assert coarse.position == pytest.approx(fine.position, abs=1e-12)
+    assert coarse.velocity == pytest.approx(fine.velocity, abs=1e-11)
+
+
+@pytest.mark.parametrize('command', [
+    {'gamma': 0.1}, {'alpha': np.nan}, {'alpha': 0.1, 'beta': np.inf}, {'alpha': 1e38}])
+def test_stage_refuses_a_command_as_a_whole(command):
+    stage = a_stage()
+    before = stage.position.copy()
+    with pytest.raises(UserError, match=list(command)[-1]):
+        stage.command(command)
+    stage.step(1.0)
+    assert stage.position == pytest.approx(before, abs=1e-12)
+
+
+def written(path, rows, head='time_s,ax_mps2,ay_mps2,az_mps2'):
+    path.write_text('\n'.join([head, *(','.join(map(repr, row)) for row in rows)]) + '\n')
+    return path
+
+
+def opened(path, loop=False, sensor=None):
+    link = replay.open_link(sensor or nominal(), {'recording': str(path), 'loop': loop})
+    link.begin(START)
+    return link
+
+
+ROWS = [(5.0 + 0.01 * k, 0.1 * k, -1.0, 9.8) for k in range(50)]
+
+
+def test_replay_gives_every_row_at_its_time(tmp_path):
+    link = opened(written(tmp_path / 'r.csv', ROWS))
+    assert link.sensor.axes == 'xyz'
+    assert link.sensor.rate_hz == pytest.approx(100)
+    assert link.start_ns == 5 * 10 ** 9
+    first = link.read(START + 95 * MS)
+    assert np.allclose(first.stamp_ns, START + 10 * MS * np.arange(10), atol=1, rtol=0)
+    assert to_nominal_mps2(first.volts, link.sensor)[:, 0] == pytest.approx(
+        0.1 * np.arange(10), abs=1e-12)
+    rest = link.read(START + 10_000 * MS)
+    assert len(rest.stamp_ns) == 40
+    assert first.missing == rest.missing == 0
+    assert link.state().text == 'ended'
+    assert not len(link.read(START + 20_000 * MS).stamp_ns)
+
+
+def test_replay_loops_without_a_gap(tmp_path):
+    link = opened(written(tmp_path / 'r.csv', ROWS), loop=True)
+    stamps, now = [], START
+    while len(stamps) < 120:
+        samples = link.read(now := now + 7 * MS)
+        stamps += samples.stamp_ns.tolist()
+        assert not samples.missing
+    assert np.allclose(np.diff(stamps), 10 * MS, atol=2, rtol=0)
+    assert link.state().text == 'playing'
+
+
+def test_replay_counts_the_rows_that_a_recording_lacks(tmp_path):
+    link = opened(written(tmp_path / 'r.csv', ROWS[:20] + ROWS[23:]))
+    assert link.read(START + 1000 * MS).missing == 3
+
+
+def test_replay_goes_by_the_figures_of_the_recording(tmp_path):
+    path = tmp_path / 'r.csv'
+    path.write_text('# serial: 17\n# rate_hz: 200.0\n# nominal_zero_g_v: 1.5, 1.6\n'
+                    '# nominal_scale_v_per_g: 0.3, 0.4\ntime_s,x_v,y_v,temperature_c\n'
+                    '0.0,1.5,2.0,20.5\n0.005,1.8,1.6,\n')
+    link = opened(path, sensor=replace(nominal(), serial='5'))
+    assert (link.sensor.serial, link.sensor.rate_hz, link.sensor.axes) == ('17', 200.0, 'xy')
+    assert link.references == ('temperature_c',)
+    samples = link.read(START + 1000 * MS)
+    assert to_nominal_mps2(samples.volts, link.sensor) == pytest.approx(
+        np.array([[0, 9.80665], [9.80665, 0]]))
+    assert samples.references['temperature_c'][0] == 20.5
+    assert np.isnan(samples.references['temperature_c'][1])
+
+
+@pytest.mark.parametrize('text, why', [
+    ('', 'empty'), ('time_s,x_v\n', 'no samples'), ('time_s,a\n0.0,1.0\n', 'column'),
+    ('time_s,x_v\n0.0,1.0\n0.1,two\n', 'two'), ('time_s,x_v\n0.0,1.0\n0.1,nan\n', ':3'),
+    ('time_s,x_v\n1.0,1.0\n0.5,1.0\n', ':3'), ('time_s,x_v\n0.0,1.0\n0.1,1e38\n', ':3'),
+    ('# rate_hz: fast\ntime_s,x_v\n0.0,1.0\n', 'rate_hz')])
+def test_replay_says_in_one_line_what_is_wrong(tmp_path, text, why):
+    path = tmp_path / 'bad.csv'
+    path.write_text(text)
+    with pytest.raises(UserError) as error:
+        opened(path).read(START + 10_000 * MS)
+    assert str(path) in str(error.value)
+    assert why in str(error.value)
+    assert '\n' not in str(error.value)
+
+
+@pytest.mark.parametrize('recording, why', [('', 'link.recording'), ('/no/such.csv', 'No such')])
+def test_replay_without_a_recording_is_refused(recording, why):
+    with pytest.raises(UserError, match=why):
+        replay.open_link(nominal(), {'recording': recording, 'loop': False})

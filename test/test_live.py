@@ -1,0 +1,231 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Sample by sample the same as block by block, and the bytes that carry it."""
+
+from dataclasses import replace
+
+from adxl_ros.files import imu_bytes
+from adxl_ros.files.cdr import CdrError
+from adxl_ros.model import chain, live
+from adxl_ros.model.live import Live
+from adxl_ros.model.noise import sigma_v
+from adxl_ros.model.sensor import Sensor, to_nominal_mps2
+from adxl_ros.model.stage import specific_force
+from adxl_ros.model.tilt import tilt
+from adxl_ros.model.uncertainty import force_covariance, UNMEASURED_VARIANCE
+from geometry_msgs.msg import Vector3Stamped
+import numpy as np
+import pytest
+from rclpy.serialization import deserialize_message, serialize_message
+from sensor_msgs.msg import Imu
+from units import drawn, nominal
+
+G = 9.80665
+
+
+def unit(axes: str) -> Sensor:
+    """Draw a unit with a covariance of its zero-g."""
+    sensor = drawn(np.random.default_rng(1), nominal(axes))
+    names = tuple(f'bias.offset_v.{axis}' for axis in axes)
+    return replace(sensor, covariance_names=names,
+                   covariance=1e-6 * (np.eye(len(axes)) + 0.3))
+
+
+def samples(sensor: Sensor, force: list[np.ndarray]) -> list[list[float]]:
+    """Let the sensor feel a force at its rate; return nominal acceleration, (n, 3)."""
+    rng = np.random.default_rng(2)
+    state = chain.settled(sensor, [float(f[0]) for f in force], rng)
+    volts = chain.sample(sensor, force, state, rng)
+    accel = np.zeros((len(volts), 3))
+    accel[:, :len(sensor.axes)] = to_nominal_mps2(volts, sensor)
+    return accel.tolist()
+
+
+def turning(seconds: float) -> list[np.ndarray]:
+    time_s = np.arange(round(seconds * 1000)) / 1000
+    return specific_force(0.7 + 0.3 * np.sin(time_s), 0.5 * time_s, G)
+
+
+def at_rest(alpha: float, beta: float, count: int) -> list[np.ndarray]:
+    return [np.full(count, f) for f in specific_force(alpha, beta, G)]
+
+
+@pytest.mark.parametrize('axes', ['x', 'xy', 'xyz'])
+def test_agrees_with_blocks(axes: str) -> None:
+    sensor = unit(axes)
+    accel = samples(sensor, turning(2.0))
+    follow = Live(sensor)
+    found = [follow(a, i / 1000) for i, a in enumerate(accel)]
+    volts = sensor.nominal_zero_g_v + np.array(accel)[:, :len(axes)] / G * \
+        sensor.nominal_scale_v_per_g
+    force = chain.inverse(sensor)(list(volts.T))
+    np.testing.assert_allclose([f.force for f in found], np.array(force).T, rtol=0, atol=2e-8)
+    covariance = force_covariance(sensor, force)
+    measured = np.sqrt(covariance[[0, 0], [0, 0]] if axes == 'x' else
+                       covariance[[0, 1], [0, 1]]).T
+    std = np.sqrt([[f.covariance[0], f.covariance[0 if axes == 'x' else 3]] for f in found])
+    np.testing.assert_allclose(std, measured, rtol=0.05)
+    angles = tilt(force, covariance, 'z' in axes)
+    shown = np.isfinite(angles.roll)
+    np.testing.assert_allclose(np.array([f.roll[0] for f in found])[shown], angles.roll[shown],
+                               rtol=0, atol=1e-7)
+    np.testing.assert_allclose([f.inclination[0] for f in found if axes != 'x'],
+                               angles.inclination[np.full(len(found), axes != 'x')],
+                               rtol=0, atol=1e-7)
+
+
+def test_at_rest_z_gets_the_noise_of_a_measured_axis() -> None:
+    sensor = unit('xy')
+    accel = samples(sensor, at_rest(0.6, 1.0, 3000))
+    follow = Live(sensor)
+    found = [follow(a, i / 1000) for i, a in enumerate(accel)]
+    zz = force_covariance(sensor, [np.array([v]) for v in found[-1].force])[2, 2, 0]
+    noise = (sigma_v(sensor)[0] / sensor.scale_v_per_g[0] * G) ** 2
+    assert found[-1].covariance[5] == pytest.approx(zz + noise, rel=0.1)
+    assert max(f.covariance[5] for f in found) < 2 * (zz + noise)
+
+
+def test_motion_widens_z_and_the_angles_and_passes() -> None:
+    """Shaken by 2 m/s² rms along x, z and tilt are as unsure as that; afterwards they are not."""
+    sensor = unit('xy')
+    force = at_rest(0.6, 1.0, 9000)
+    shaken = slice(2000, 5000)
+    force[0][shaken] += 2 * 2 ** 0.5 * np.sin(2 * np.pi * 3 * np.arange(3000) / 1000)
+    follow = Live(sensor)
+    found = [follow(a, i / 1000) for i, a in enumerate(samples(sensor, force))]
+    std = np.sqrt([f.covariance[5] for f in found])
+    assert 1.5 < np.median(std[3500:5000]) < 3
+    assert np.sqrt(np.median([f.pitch[1] for f in found[3500:5000]])) > 0.15
+    # The x axis itself is measured, moving or not.
+    assert max(f.covariance[0] for f in found) < 1.1 * found[0].covariance[0]
+    assert std[-1] < 1.1 * std[1900]
+    three_axes = Live(unit('xyz'))
+    for i, a in enumerate(samples(unit('xyz'), force)[:4000]):
+        last = three_axes(a, i / 1000)
+    assert last.covariance[5] < 1e-3
+    assert np.sqrt(last.pitch[1]) > 0.15
+
+
+def test_a_pause_or_a_clock_set_back_is_no_motion() -> None:
+    sensor = nominal('xyz')
+    follow = Live(sensor)
+    for i in range(1000):
+        follow([0.0, 0.0, G], i / 1000)
+    for time_s in (5.0, 1.0):
+        assert follow([3.0, 0.0, 9.0], time_s).pitch[1] < 1e-3
+        follow([0.0, 0.0, G], time_s + 2)
+
+
+def test_at_the_vertical_it_differs_by_less_than_its_uncertainty() -> None:
+    sensor = unit('xy')
+    accel = samples(sensor, at_rest(np.pi / 2, 0.4, 2000))
+    follow = Live(sensor)
+    found = [follow(a, i / 1000) for i, a in enumerate(accel)]
+    volts = sensor.nominal_zero_g_v + np.array(accel)[:, :2] / G * sensor.nominal_scale_v_per_g
+    force = np.array(chain.inverse(sensor)(list(volts.T)))
+    off = np.abs(np.array([f.force for f in found]) - force.T)
+    std = np.sqrt([[f.covariance[0], f.covariance[3], f.covariance[5]] for f in found])
+    assert np.isfinite(off).all()
+    assert np.max(off / std) < 0.1
+
+
+@pytest.mark.parametrize('bad', [float('nan'), float('inf'), -1e300])
+@pytest.mark.parametrize('axes', ['x', 'xy', 'xyz'])
+def test_what_no_force_explains_is_none_and_spoils_nothing(axes: str, bad: float) -> None:
+    sensor = unit(axes)
+    accel = samples(sensor, at_rest(0.6, 1.0, 40))
+    follow, again = Live(sensor), Live(sensor)
+    for i, a in enumerate(accel):
+        if i % 10 == 5:
+            assert again([bad, *a[1:]], i / 1000) is None
+        assert follow(a, i / 1000) == again(a, i / 1000)
+
+
+def test_at_a_rail_nothing_is_sure() -> None:
+    sensor = nominal('xyz')
+    follow = Live(sensor)
+    rail = (5.0 - sensor.lsb_v - 2.5) * G
+    for _ in range(2):
+        assert not follow([0.0, 0.0, G], 0.0).saturated
+        found = follow([0.1, rail, 0.0], 0.001)
+        assert found.saturated
+        assert min(found.covariance[i] for i in (0, 3, 5)) >= UNMEASURED_VARIANCE
+        assert min(found.roll[1], found.pitch[1], found.inclination[1]) > 1
+    assert not follow([0.1, rail + 1.0, 0.0], 0.002).saturated
+
+
+def test_memory_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live, '_MOST_CELLS', 10)
+    follow = Live(nominal('xyz'))
+    for a in np.random.default_rng(3).normal(size=(100, 3)) * 5:
+        assert follow(a.tolist(), 0.0).force == pytest.approx(a.tolist())
+        assert len(follow._cells) <= 10
+
+
+def imu(frame_id: str) -> Imu:
+    message = Imu()
+    message.header.frame_id = frame_id
+    message.header.stamp.sec, message.header.stamp.nanosec = -3, 500_000_000
+    message.angular_velocity.z = 0.25
+    message.angular_velocity_covariance[0] = message.orientation_covariance[0] = -1.0
+    a = message.linear_acceleration
+    a.x, a.y, a.z = 1.0, -2.0, 9.0
+    return message
+
+
+def big_endian(raw: bytes) -> bytes:
+    """Swap the bytes of every number of a serialized Imu or Vector3Stamped."""
+    length = int.from_bytes(raw[12:16], 'little')
+    numbers = 4 + (12 + length + 7) // 8 * 8
+    head = b''.join(raw[i:i + 4][::-1] for i in (4, 8, 12))
+    return b'\0\0' + raw[2:4] + head + raw[16:numbers] + np.frombuffer(
+        raw[numbers:], '<f8').astype('>f8').tobytes()
+
+
+@pytest.mark.parametrize('frame_id', ['', 'a', 'abc', 'imu_link', 'arm/imu_of_the_left_hand'])
+@pytest.mark.parametrize('order', ['little', 'big'])
+def test_bytes_are_the_messages(frame_id: str, order: str) -> None:
+    """What is put into the bytes is what rclpy reads from them, in both byte orders."""
+    message = imu(frame_id)
+    raw = serialize_message(message)
+    if order == 'big':
+        raw = big_endian(raw)
+    assert imu_bytes.read(raw) == (-2.5, (1.0, -2.0, 9.0))
+    orientation, acceleration = [float(v) for v in range(13)], [float(v) for v in range(20, 32)]
+    made = imu_bytes.corrected(raw, orientation, acceleration)
+    o, a = message.orientation, message.linear_acceleration
+    o.x, o.y, o.z, o.w = orientation[:4]
+    a.x, a.y, a.z = acceleration[:3]
+    message.orientation_covariance = orientation[4:]
+    message.linear_acceleration_covariance = acceleration[3:]
+    assert deserialize_message(made, Imu) == message
+    tilted = imu_bytes.vector3_stamped(raw, (0.1, 0.2, 0.3))
+    expected = Vector3Stamped(header=message.header)
+    v = expected.vector
+    v.x, v.y, v.z = 0.1, 0.2, 0.3
+    assert deserialize_message(tilted, Vector3Stamped) == expected
+    if order == 'little' and frame_id == 'abc':  # no padding, whose bytes are anything
+        assert made == serialize_message(message)
+        assert tilted == serialize_message(expected)
+
+
+@pytest.mark.parametrize('spoil', [lambda raw: raw[:-1], lambda raw: raw[:10], lambda raw: b'',
+                                   lambda raw: b'\x00\x03' + raw[2:],
+                                   lambda raw: raw[:12] + b'\xff\xff\xff\x7f' + raw[16:]])
+def test_bytes_that_are_no_imu(spoil: object) -> None:
+    raw = serialize_message(imu('imu_link'))
+    imu_bytes.read(raw)
+    with pytest.raises(CdrError):
+        imu_bytes.read(spoil(raw))

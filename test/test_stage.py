@@ -1,0 +1,165 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The stage over DDS, alone and in lockstep with the driver's simulated sensor."""
+
+import os
+import signal
+
+from adxl_ros.model.stage import specific_force
+from diagnostic_msgs.msg import DiagnosticStatus
+from graph import Graph, imu_table, stamp_ns
+import numpy as np
+import pytest
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import Imu, JointState
+
+ROS = '--ros-args'
+SIM_TIME = (ROS, '-p', 'use_sim_time:=true')
+STEP = np.radians(5 / 60)
+IDEAL = ('-p', 'sensor.noise_density_g_per_rthz:=[0.0,0.0,0.0]', '-p', 'sensor.axes:=xyz', '-p',
+         'sensor.nominal_zero_g_v:=[2.5,2.5,2.5]', '-p',
+         'sensor.nominal_scale_v_per_g:=[1.0,1.0,1.0]', '-p', 'sensor.rc_capacitance_f:=0.0', '-p',
+         'sensor.adc_bits:=0')
+
+
+class Commander(Graph):
+    """Tells the stage where to go, and keeps where it says it is."""
+
+    def __enter__(self):
+        super().__enter__()
+        self.shown = self.listen(JointState, 'stage/joint_states')
+        self.true = self.listen(JointState, 'stage/true_joint_states')
+        self.command = self.node.create_publisher(JointState, 'stage/command', 10)
+        return self
+
+    def go(self, **joints):
+        """Command until the stage has arrived; a command that nobody hears yet is lost."""
+        def arrived():
+            self.command.publish(JointState(name=list(joints), position=list(joints.values())))
+            self.spin(0.2)
+            last = dict(zip(self.shown[-1].name, self.shown[-1].position)) if self.shown else {}
+            return last and np.abs(self.shown[-1].velocity).max() < 1e-4 and all(
+                abs(last[j] - angle) <= STEP / 2 + 1e-9 for j, angle in joints.items())
+
+        self.spin_until(arrived, 60, 'arrival')
+
+
+def test_it_goes_where_it_is_told_and_shows_its_encoder(start):
+    start('stage', ROS, '-p', 'slew_rate_rad_s:=1.0', '-p', 'beta_rad:=0.2')
+    with Commander() as graph:
+        graph.spin_until(lambda: graph.shown, 20, 'joint states')
+        assert list(graph.shown[0].name) == ['alpha', 'beta', 'shift']
+        assert graph.shown[0].position[1] == pytest.approx(0.2, abs=STEP / 2)
+        graph.go(alpha=0.5, beta=-0.3)
+        graph.spin(0.3)
+        now = graph.node.get_clock().now().nanoseconds
+    stamps = np.array([stamp_ns(m) for m in graph.shown])
+    assert (np.diff(stamps) == 10_000_000).all()
+    assert stamps[-1] <= now
+    shown = np.array([m.position for m in graph.shown])
+    steps = shown[:, :2] / STEP
+    assert np.abs(steps - np.rint(steps)).max() < 1e-6
+    assert max(np.abs(m.velocity).max() for m in graph.shown) == pytest.approx(1, rel=0.01)
+    true = {stamp_ns(m): m.position for m in graph.true}
+    assert max(true) > stamps[-1], 'the true motion is known ahead'
+    off = np.array([true[s][:2] - p[:2] for s, p in zip(stamps, shown) if s in true])
+    assert 1e-6 < np.abs(off).max() <= STEP / 2 + 1e-9
+
+
+@pytest.mark.parametrize('names, positions, why', [
+    (['alpha'], [np.nan], 'alpha = nan'), (['gamma'], [0.1], "no joint 'gamma'"),
+    (['alpha', 'beta'], [0.1], '2 names, but 1'), (['beta'], [1e38], 'out of reach')])
+def test_a_command_that_makes_no_sense_is_refused(start, names, positions, why):
+    stage = start('stage')
+    with Commander() as graph:
+        graph.spin_until(lambda: graph.shown, 20, 'the stage')
+        graph.spin(1)
+        graph.command.publish(JointState(name=names, position=positions))
+        graph.spin_until(lambda: graph.said('stage', why), 20, 'the refusal')
+        assert graph.diagnostics['stage'].level == DiagnosticStatus.WARN
+        assert '/stage/command' in graph.diagnostics['stage'].message
+        assert not np.abs(graph.shown[-1].position).max() > STEP
+        graph.spin_until(lambda: graph.said('stage', 'at rest'), 20, 'that all is well again')
+    assert stage.stop() == 0
+    assert len(stage.output().splitlines()) == 1
+    assert why in stage.output()
+
+
+@pytest.mark.parametrize('speed', [1.0, 5.0])
+def test_the_simulated_sensor_feels_the_true_angles(start, speed):
+    clock = SIM_TIME if speed != 1 else (ROS,)
+    start('stage', *clock)
+    start('driver', *clock, '-p', f'link.speed:={speed}', *IDEAL)
+    with Commander() as graph:
+        samples = graph.listen(Imu, 'imu/data_raw', raw=True)
+        graph.spin_until(lambda: graph.said('driver', 'on the stage') and graph.true, 20, 'both')
+        del samples[:]
+        graph.go(alpha=0.8, beta=-0.5)
+        graph.go(alpha=1.5, beta=0.7)
+        assert graph.value('driver', 'missing') == '0'
+    stamps, measured = imu_table(samples)
+    assert (np.diff(stamps) == 1_000_000).all()
+    true = {stamp_ns(m): m.position for m in graph.true}
+    rows = [k for k, stamp in enumerate(stamps) if stamp in true]
+    assert len(rows) == pytest.approx((stamps >= min(true)).sum() / 10, abs=2)
+    alpha, beta, _ = np.array([true[stamps[k]] for k in rows]).T
+    assert np.ptp(alpha) > 1.4
+    assert np.ptp(beta) > 1.1
+    expected = np.column_stack(specific_force(alpha, beta, 9.80665))
+    assert np.abs(measured[rows] - expected).max() < 1e-9
+
+
+def test_sensor_time_goes_on_without_the_stage_and_waits_for_it_again(start):
+    start('driver', *SIM_TIME, '-p', 'link.speed:=5.0', *IDEAL)
+    with Commander() as graph:
+        samples = graph.listen(Imu, 'imu/data_raw', raw=True)
+        clock = graph.listen(Clock, '/clock')
+        graph.spin_until(lambda: len(samples) > 100, 20, 'samples without a stage')
+        assert graph.said('driver', 'no stage') or 'driver' not in graph.diagnostics
+        stage = start('stage', *SIM_TIME, '-p', 'alpha_rad:=0.5')
+        graph.spin_until(lambda: graph.said('driver', 'on the stage'), 20, 'the stage')
+        os.kill(stage.popen.pid, signal.SIGKILL)
+        graph.spin_until(lambda: graph.said('driver', 'stage lost'), 20, 'the loss')
+        assert graph.diagnostics['driver'].level == DiagnosticStatus.WARN
+        count = len(samples)
+        graph.spin_until(lambda: len(samples) > count + 1000, 20, 'samples after the loss')
+        assert imu_table(samples[-1:])[1][0, 2] == pytest.approx(9.80665 * np.cos(0.5), abs=0.01)
+        start('stage', *SIM_TIME, '-p', 'alpha_rad:=1.0')
+        graph.spin_until(lambda: graph.said('driver', 'on the stage'), 20, 'the new stage')
+        count = len(samples)
+        graph.spin_until(lambda: len(samples) > count + 1000, 20, 'samples on the new stage')
+        assert imu_table(samples[-1:])[1][0, 2] == pytest.approx(9.80665 * np.cos(1.0), abs=0.02)
+    stamps, _ = imu_table(samples)
+    assert (np.diff(stamps) == 1_000_000).all()
+    ticks = [c.clock.sec * 10 ** 9 + c.clock.nanosec for c in clock]
+    assert ticks == sorted(ticks)
+
+
+def test_a_stage_by_another_clock_is_told(start):
+    start('stage', ROS, '-p', 'alpha_rad:=0.5')
+    start('driver', ROS, '-p', 'link.speed:=30.0')
+    with Commander() as graph:
+        graph.spin_until(lambda: graph.said('driver', 'another clock') or
+                         graph.said('driver', 'on the stage'), 20, 'the driver')
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_it_quietly(start, number):
+    stage = start('stage')
+    with Commander() as graph:
+        graph.spin_until(lambda: graph.shown, 20, 'joint states')
+    os.kill(stage.popen.pid, number)
+    assert stage.wait() == 0
+    assert stage.output() == ''
