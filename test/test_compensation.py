@@ -93,7 +93,7 @@ class Robot:
                               'corrected sample')
         return self.data[-1]
 
-    def set(self, **values: object) -> str:
+    def assign(self, **values: object) -> str:
         """Set parameters all at once; __ stands for a dot. Return the reason of a refusal."""
         request = SetParametersAtomically.Request(parameters=[
             Parameter(name.replace('__', '.'), value=value).to_parameter_msg()
@@ -266,7 +266,7 @@ def test_coefficients_are_set_all_or_none(robot: Robot, start: Start, tmp_path: 
     robot.connected()
     names = ('effects', 'bias.offset_v', 'scale_factor.offset_v_per_g', 'covariance')
     assert accel(robot.answer([1.0, 2.0, 0.0]))[0] == pytest.approx(1.0, abs=1e-7)
-    assert robot.set(bias__offset_v=[0.1, 0.0], scale_factor__offset_v_per_g=[0.25, 0.0]) == ''
+    assert robot.assign(bias__offset_v=[0.1, 0.0], scale_factor__offset_v_per_g=[0.25, 0.0]) == ''
     after = accel(robot.answer([1.0, 2.0, 0.0]))[0]
     assert after == pytest.approx((1.0 - 0.1 * G) / 1.25, abs=1e-7)
     held = robot.get(*names[:3])
@@ -285,13 +285,14 @@ def test_coefficients_are_set_all_or_none(robot: Robot, start: Start, tmp_path: 
             ({'format': 2}, 'format: belongs to the parameter file'),
             ({'calibration': '/none.yaml'}, '/none.yaml: cannot be read'),
             ({'calibration': '/none.yaml', 'bias__offset_v': [0.2, 0.0]}, 'cannot be set toget')):
-        assert reason in robot.set(**values)
+        assert reason in robot.assign(**values)
         assert robot.get(*names[:3]) == held
         assert accel(robot.answer([1.0, 2.0, 0.0]))[0] == after
     # Effects that the file does not list come with all that they need.
-    assert robot.set(effects=['bias', 'misalignment'], misalignment__alpha_rad=[0.0, 0.0],
-                     misalignment__beta_rad=[0.0, 0.02], covariance=[1e-4],
-                     covariance_names=['bias.offset_v.x']) == ''
+    assert not robot.assign(
+        effects=['bias', 'misalignment'], misalignment__alpha_rad=[0.0, 0.0],
+        misalignment__beta_rad=[0.0, 0.02], covariance=[1e-4],
+        covariance_names=['bias.offset_v.x'])
     message = robot.answer([1.0, 2.0, 0.0])
     assert accel(message)[0] == pytest.approx(1.0 - 0.1 * G, abs=1e-7)
     assert message.linear_acceleration_covariance[0] == pytest.approx(1e-4 * G * G, rel=0.01)
@@ -312,13 +313,13 @@ def test_calibration_loads_a_whole_file_or_nothing(robot: Robot, start: Start,
     robot.connected()
     force = pose(0.6, 0.3)
     np.testing.assert_allclose(accel(robot.answer(felt(first, force))), force, atol=1e-7)
-    assert 'serial number 17, but the parameters are those of 18' in robot.set(
+    assert 'serial number 17, but the parameters are those of 18' in robot.assign(
         calibration=str(tmp_path / 'foreign.yaml'))
-    reason = robot.set(calibration=str(broken))
+    reason = robot.assign(calibration=str(broken))
     assert f'{broken}:' in reason
     assert 'sensor.rate_hz: 1000 is not a floating-point number' in reason
     np.testing.assert_allclose(accel(robot.answer(felt(first, force))), force, atol=1e-7)
-    assert robot.set(calibration=str(other)) == ''
+    assert robot.assign(calibration=str(other)) == ''
     np.testing.assert_allclose(accel(robot.answer(felt(second, force))), force, atol=1e-7)
     flat = params.to_flat(second)
     found = robot.get('calibration', *flat)
@@ -327,7 +328,7 @@ def test_calibration_loads_a_whole_file_or_nothing(robot: Robot, start: Start,
     robot.graph.spin_until(lambda: robot.graph.value(NODE, 'calibration') == str(other), 10.0,
                            'calibration in diagnostics')
     assert robot.graph.value(NODE, 'provenance.date') == '2026-02-03'
-    assert robot.set(bias__offset_v=[0.0, 0.0]) == ''
+    assert robot.assign(bias__offset_v=[0.0, 0.0]) == ''
     robot.graph.spin_until(lambda: 'set since' in robot.graph.value(NODE, 'calibration'), 10.0,
                            'the change in diagnostics')
 

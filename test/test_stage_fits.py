@@ -156,5 +156,5 @@ def test_verdict_without_check_poses_holds_out_folds():
     poses = swept(rng, drawn(rng, nominal()), check_poses=0)
     found = result.calibrate(nominal(), poses, None, 'made')
     assert found.fitted.model == 'physical'
-    assert [line.split()[0] for line in found.verdict[:4]] == ['held', 'nominal', 'linear',
-                                                              'physical']
+    first_words = [line.split()[0] for line in found.verdict[:4]]
+    assert first_words == ['held', 'nominal', 'linear', 'physical']

@@ -20,8 +20,8 @@ stream leaves behind, so that the rests of a finished stream are the same howeve
 block is quiet if the variance around it is the noise's. A row of quiet blocks is a rest if its
 mean does not move either: neither over 0.5 s to 4 s anywhere in it, nor at its ends, where a
 filter or a stage settles. A knock that leaves the mean where it was does not end a rest, but it
-is left out of the mean. The noise is known (a parameter file's), learned from the quietest parts
-of the stream itself, or both.
+is left out of the mean; a live stage, which only goes by known noise, begins its dwell anew. The
+noise is known (a parameter file's), learned from the quietest parts of the stream itself, or both.
 """
 
 from __future__ import annotations
@@ -210,7 +210,8 @@ class RestFinder:
         parts = [part for part in parts if part[1] - part[0] >= self._spans.window]
         return [Rest(int(blocks.start[first]), int(blocks.start[stop - 1]) + self._spans.size,
                      float(blocks.time_s[first, 0]), float(blocks.time_s[stop - 1, 1]))
-                for first, stop in self._joined(blocks, bounds, parts, limits)
+                for first, stop in (self._joined(blocks, bounds, parts, limits)
+                                    if self.learn else parts)
                 if stop - first >= self._least]
 
     def _drifting(self, blocks: Blocks, quiet: np.ndarray, limits: Limits) -> np.ndarray:

@@ -95,7 +95,7 @@ class Sweep:
 
     @property
     def target(self) -> Target | None:
-        """The pose to go to; None at the end."""
+        """Return the pose to go to; None at the end."""
         return self._targets[self.index] if self.index < len(self._targets) else None
 
     def move(self, index: int) -> None:

@@ -64,7 +64,7 @@ class Samples:
         Time up to which the link has nothing more to give.
     missing
         Samples lost since the last call.
-    references
+    references : mapping or tuple
         What was recorded beside the sensor, by the column names of a recording, (n,); NaN where
         it was not sampled.
 
@@ -89,7 +89,7 @@ class Link(Protocol):
     ----------
     sensor
         Whose figures make the samples readable.
-    references
+    references : mapping or tuple
         Names of the references that its samples come with.
     waits
         Whether it has a beginning that nobody should miss: it starts with its first listener.

@@ -89,6 +89,8 @@ class SimulatedSensor:
 
         Parameters
         ----------
+        stamp_ns
+            ROS time, ns.
         position, velocity
             By joint, rad or m and their rates; a joint that is not named stays.
 

@@ -109,7 +109,8 @@ class SimulatedStage:
 
     def moving(self) -> bool:
         """Tell whether a joint is more than an encoder's step from its goal."""
-        return bool((np.abs(self.position - self._goal) > np.maximum(self._resolution, 1e-9)).any())
+        off = np.abs(self.position - self._goal)
+        return bool((off > np.maximum(self._resolution, 1e-9)).any())
 
     def _reachable(self, target: np.ndarray) -> np.ndarray:
         on_step = np.array([encoder(p, r) for p, r in zip(target, self._resolution)])

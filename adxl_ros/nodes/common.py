@@ -119,8 +119,14 @@ def declare(node: Node, name: str, default: Any, doc: str, unit: str = '',
 
     Parameters
     ----------
+    node, name
+        Whose parameter, and its name.
     default
         The value, or a `Parameter.Type` for a parameter that has none.
+    doc, unit
+        What it is, for the descriptor.
+    lower, upper, choices
+        What it may be.
     live
         Whether it can be set while the node runs.
 
@@ -166,6 +172,8 @@ def declare_sensor(node: Node, live: bool = False) -> dict[str, Any]:
 
     Parameters
     ----------
+    node
+        Which declares them.
     live
         Whether they can be set while the node runs; the node's callbacks say which, and how.
 
@@ -243,6 +251,8 @@ def subscription(node: Node, kind: Any, topic: str, callback: Callable, depth: i
 
     Parameters
     ----------
+    node, kind, topic, depth
+        As `Node.create_subscription` takes them.
     callback
         Takes a message, or its bytes.
     depth
