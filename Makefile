@@ -73,8 +73,11 @@ install/.built: .venv/.ready $(sources)
 	    'did not build an ament package: does package.xml validate?' >&2; exit 1; }
 	@touch $@
 
+# Recordings of real sensors beside the clone take part.
+real := $(wildcard ../shared/real/mpu9150_0.csv)
+
 demo: build
-	./run demo -o demo_output
+	./run demo -o demo_output $(if $(real),--real $(real))
 
 # In test/, so that Python imports the installed package and not the sources beside it.
 test: build
@@ -84,7 +87,7 @@ lint: build
 	cd test && ../run --exec python -m pytest -q test_linters.py test_layering.py
 
 bench: build
-	./run bench
+	./run bench $(ARGS)
 
 clean:
 	rm -rf .venv build install log demo_output .*_cache .hypothesis

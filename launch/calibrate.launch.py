@@ -18,7 +18,8 @@ Guide a sweep: the driver, the stage and the calibration.
     ros2 launch adxl_ros calibrate.launch.py output:=unit_17.yaml
     ros2 launch adxl_ros calibrate.launch.py mode:=gravity output:=unit_17.yaml
 
-It ends with the calibration, which starts by itself; the stage is left out in mode `gravity`.
+The calibration starts by itself and stays up to show its verdict; in mode `gravity` there is no
+stage, and `ros2 service call /calibration/finish std_srvs/srv/Trigger` fits what is there.
 """
 
 from launch import LaunchDescription

@@ -18,6 +18,7 @@ from collections.abc import Callable
 import csv
 from dataclasses import replace
 from pathlib import Path
+import signal
 import subprocess
 
 from adxl_ros.files import params, recording
@@ -25,6 +26,7 @@ from adxl_ros.files.columns import Recording, sensor_info
 from adxl_ros.model import chain
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
 from adxl_ros.model.stage import specific_force
+from conftest import executable, wait_until
 import numpy as np
 import pytest
 from units import drawn, nominal
@@ -218,6 +220,23 @@ def test_where_it_cannot_write(run_tool: RunTool, tmp_path: Path) -> None:
     assert 'is the recording itself' in said
     assert 'cannot read' in refused(run_tool, tmp_path / 'none.csv', '--params', parameters,
                                     '-o', tmp_path / 'out.csv')
+
+
+@pytest.mark.parametrize(('number', 'status'), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_interrupted_it_leaves_nothing(tmp_path: Path, number: int, status: int) -> None:
+    sensor = unit()
+    path = record(tmp_path, sensor, felt(sensor, *np.full((2, 200000), 0.5)))
+    process = subprocess.Popen(
+        [executable('apply'), path, '--params', tmp_path / 'unit.yaml', '-o',
+         tmp_path / 'out.csv'], stderr=subprocess.PIPE, text=True)
+    wait_until(lambda: [p for p in tmp_path.iterdir() if p.name.startswith('.out')], 20.0,
+               'output begun')
+    process.send_signal(number)
+    _, said = process.communicate(timeout=20)
+    assert process.returncode == status
+    assert said.count('\n') <= 1
+    assert 'Traceback' not in said
+    assert sorted(p.name for p in tmp_path.iterdir()) == ['made.csv', 'unit.yaml']
 
 
 def test_wrong_usage(run_tool: RunTool, tmp_path: Path) -> None:

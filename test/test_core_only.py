@@ -21,6 +21,7 @@ where they are not installed.
 
 from importlib.metadata import requires
 import json
+from pathlib import Path
 import re
 import subprocess
 import sys
@@ -82,3 +83,17 @@ def test_every_core_module_imports() -> None:
     result = json.loads(done.stdout)
     assert {name.split('.')[1] for name in result['modules']} == set(wanted)
     assert result['blocked'] == []
+
+
+def test_a_csv_is_fitted(tmp_path: Path) -> None:
+    """`simulate` and `fit` on CSV need numpy and scipy alone; a plot says what to install."""
+    run = 'from adxl_ros.tools.{0} import main\nsys.argv[0] = {0!r}\nsys.exit(main())'
+    sweep, output = str(tmp_path / 'sweep.csv'), str(tmp_path / 'unit.yaml')
+    done = run_without_extras(run.format('simulate'), 'sweep', '--rate', '100', '-o', sweep)
+    assert done.returncode == 0, done.stderr
+    done = run_without_extras(run.format('fit'), sweep, '-o', output)
+    assert done.returncode == 0, done.stderr
+    assert Path(output).exists()
+    done = run_without_extras(run.format('fit'), sweep, '-o', output, '--report', str(tmp_path))
+    assert done.returncode == 1
+    assert done.stderr == 'fit: plots need matplotlib; pip install matplotlib\n'

@@ -112,7 +112,7 @@ def test_covariance_is_honest(count, error_v, excess_g):
     """90 % intervals hold the truth in 85 to 95 % of the units; without excess in no fewer."""
     rng = np.random.default_rng(2)
     inside, false = [], 0
-    for _ in range(60):
+    for _ in range(40):
         sensor, truth = unit(rng)
         poses = np.concatenate([SIX, directions(rng, count - 6)])
         means, errors = rested(rng, sensor, poses, error_v, excess_g)

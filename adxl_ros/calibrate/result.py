@@ -24,9 +24,10 @@ import os
 from pathlib import Path
 
 from adxl_ros.calibrate import figures, gravity, linear, physical, verdict
-from adxl_ros.calibrate.poses import check_polarity, Poses
+from adxl_ros.calibrate.poses import check_polarity, Poses, reference_force
 from adxl_ros.errors import UserError
 from adxl_ros.files import params
+from adxl_ros.model import chain
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.sensor import Sensor
@@ -109,7 +110,9 @@ def _against_stage(sensor: Sensor, poses: Poses, model: str | None, source: str)
     fits: dict[str, verdict.Fit] = {'nominal': lambda sensor, _: sensor, **STAGE_FITS}
     tried = list(fits)[:list(fits).index(model) + 1]
     scores = verdict.held_out({name: fits[name] for name in tried}, sensor, poses)
-    residual = verdict.errors(fitted, fitting).accel_mps2 / G0_MPS2 * 1e3
+    predicted = np.column_stack(chain.static_response(fitted)(
+        reference_force(fitting, fitted.local_gravity_mps2)))
+    residual = (fitting.volts - predicted) / fitted.scale_v_per_g * 1e3
     fitted = replace(fitted, provenance=_provenance(source, poses, {
         'reference': 'stage', 'residual_mg': f'{np.sqrt(np.mean(residual ** 2)):.4f}'}))
     return Result(sensor, fitted, verdict.table(scores), poses)

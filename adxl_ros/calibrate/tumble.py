@@ -30,6 +30,8 @@ import numpy as np
 _ENDED_S = 1.0
 """A rest is announced when the stream has gone on for this long after it."""
 ENOUGH_RESTS = 24
+_JUDGE_NS = 500_000_000
+"""The whole stream is judged anew no more often than this: it costs more as it grows."""
 
 
 class Tumble:
@@ -56,7 +58,7 @@ class Tumble:
         self._sensor = sensor
         self._resumed = done
         self._stamps: list[np.ndarray] = []
-        self._said_ns = 0
+        self._said_ns = self._judge_ns = 0
         self._finder = RestFinder(sensor.rate_hz, len(sensor.axes), known_noise(sensor),
                                   learn=True)
 
@@ -69,14 +71,16 @@ class Tumble:
 
     def accept(self) -> dict[str, Any] | None:
         """Return the next rest that has ended, for the journal, else None."""
-        if not self._stamps:
+        if not self._stamps or self._stamps[-1][-1] < self._judge_ns:
             return None
         stamps = self._all_stamps()
+        self._judge_ns = int(stamps[-1]) + _JUDGE_NS
         for rest in self._finder.rests():
             entry = self._entry(self.index, rest, stamps)
             ended = (stamps[-1] - entry['stop_ns']) * 1e-9 > _ENDED_S
             if ended and entry['start_ns'] > self._said_ns:
                 self._said_ns = entry['stop_ns']
+                self._judge_ns = 0
                 return entry
         return None
 

@@ -108,6 +108,10 @@ def main(make_node: Callable[[], Node], about: str | None) -> int:
     finally:
         getattr(node, 'close', lambda: None)()
         rclpy.try_shutdown()
+        # A launch passes Ctrl-C on, which the terminal has sent, too: the second one may come
+        # when Python has already put its handlers away.
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.SIG_IGN)
     return 0
 
 

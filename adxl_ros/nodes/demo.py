@@ -202,16 +202,18 @@ def _end(processes: Sequence[subprocess.Popen]) -> None:
 
 def _wait(watcher: Watcher, finished: object) -> None:
     """Show the calibration's progress until it has finished; raises when it falls silent."""
-    shown, heard = '', time.monotonic()
+    shown, tenth, heard = '', '', time.monotonic()
     while not finished():
         watcher.watch(0.2)
         said = watcher.of('calibration')
         text = f'  pose {said.get("pose", "-")}: {said.get("message", "starting")}'
         if text != shown:
             heard = time.monotonic()
-            print(f'\r{text[:98]:98}' if sys.stdout.isatty() else text, flush=True,
-                  end='' if sys.stdout.isatty() else '\n')
-        shown = text
+            if sys.stdout.isatty():
+                print(f'\r{text[:98]:98}', end='', flush=True)
+            elif said.get('pose', '')[:-1] != tenth:
+                print(text, flush=True)
+        shown, tenth = text, said.get('pose', '')[:-1]
         if time.monotonic() - heard > _SILENT_S:
             raise UserError(f'no progress for {_SILENT_S:g} s; the calibration said: {text}')
     if sys.stdout.isatty():

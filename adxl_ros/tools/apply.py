@@ -30,7 +30,7 @@ from adxl_ros.model.constants import AXES
 from adxl_ros.model.sensor import Sensor, with_axes
 from adxl_ros.model.tilt import tilt
 from adxl_ros.model.uncertainty import force_covariance
-from adxl_ros.tools.common import progress, run
+from adxl_ros.tools.common import default_params, progress, run
 import numpy as np
 
 _BLOCK_ROWS = 16384
@@ -42,8 +42,8 @@ def parser() -> argparse.ArgumentParser:
     """Describe the command line."""
     parse = argparse.ArgumentParser(prog='apply', description=__doc__)
     parse.add_argument('recording', metavar='RECORDING', help='rosbag2 directory, .mcap or CSV')
-    parse.add_argument('--params', metavar='FILE', required=True,
-                       help='the parameter file of the sensor')
+    parse.add_argument('--params', metavar='FILE', default=None,
+                       help='the calibrated sensor (default: the nominal ADXL203)')
     parse.add_argument('-o', dest='output', metavar='OUT.csv', required=True)
     return parse
 
@@ -52,7 +52,7 @@ def apply(options: argparse.Namespace) -> int:
     """Run the tool; see `parser`."""
     if Path(options.output).resolve() == Path(options.recording).resolve():
         raise UserError(f'{options.output}: is the recording itself; choose another output')
-    sensor = params.load(options.params)
+    sensor = params.load(options.params or default_params())
     lost = saturated = rows = 0
     block = None
     with CsvWriter(options.output, _DIGITS) as out, progress('apply') as show:

@@ -1,0 +1,134 @@
+"""`simulate` and `fit` through the front door: what they write, repeat and refuse."""
+
+from adxl_ros.files import params, recording
+import numpy as np
+import pytest
+from units import drawn, NOMINAL, nominal
+
+HEAD = 'time_s,x_v,y_v,alpha_rad,beta_rad\n'
+
+
+def test_simulate_fit_and_apply_make_one_path(run_tool, tmp_path):
+    """A simulated sweep is fitted to its coefficients, and apply brings its angles back."""
+    truth = drawn(np.random.default_rng(8), nominal(serial='S8'))
+    params.save(tmp_path / 'truth.yaml', truth)
+    params.save(tmp_path / 'nominal.yaml', nominal(serial='S8'))
+    for name, trajectory in (('sweep', 'sweep'), ('tilt', 'tilt_alpha')):
+        done = run_tool('simulate', trajectory, '--params', 'truth.yaml', '--rate', 200,
+                        '--seed', 5, '-o', f'{name}.csv')
+        assert (done.returncode, done.stderr) == (0, '')
+    done = run_tool('fit', 'sweep.csv', '--params', 'nominal.yaml', '-o', 'unit.yaml',
+                    '--report', 'figures')
+    assert done.returncode == 0, done.stderr
+    assert 'physical model' in done.stdout and 'held out' in done.stdout
+    assert (tmp_path / 'figures' / 'calibration.png').stat().st_size > 20000
+    fitted = params.load(tmp_path / 'unit.yaml')
+    np.testing.assert_allclose(fitted.zero_g_v, truth.zero_g_v, atol=5e-4)
+    np.testing.assert_allclose(fitted.scale_v_per_g, truth.scale_v_per_g, atol=5e-4)
+    done = run_tool('apply', 'tilt.csv', '--params', 'unit.yaml', '-o', 'tilt_out.csv')
+    assert done.returncode == 0, done.stderr
+    out = np.genfromtxt(tmp_path / 'tilt_out.csv', delimiter=',', names=True, comments='#')
+    alpha = np.abs(recording.read(tmp_path / 'tilt.csv').columns['alpha_rad'])
+    still = (alpha > np.radians(25)) & (alpha < np.radians(65))
+    assert np.sqrt(np.mean((out['alpha_rad'] - alpha)[still] ** 2)) < np.radians(0.2)
+
+
+def test_several_recordings_of_one_unit_are_fitted_together(run_tool, tmp_path):
+    """Two sweeps determine the unit better than one, and the file says so."""
+    for seed in (1, 2):
+        run_tool('simulate', 'sweep', '--rate', 100, '--seed', seed, '-o', f'{seed}.csv')
+    run_tool('fit', '1.csv', '-o', 'one.yaml')
+    done = run_tool('fit', '1.csv', '2.csv', '-o', 'both.yaml')
+    assert done.returncode == 0, done.stderr
+    one, both = params.load(tmp_path / 'one.yaml'), params.load(tmp_path / 'both.yaml')
+    assert np.mean(np.diag(both.covariance) / np.diag(one.covariance)) < 0.8
+    assert both.provenance['source'] == '1.csv, 2.csv'
+
+
+def test_the_same_seed_gives_the_same_bytes(run_tool, tmp_path):
+    """Recordings repeat to the bit by their seed, and differ without."""
+    for name, seed in (('a', 4), ('b', 4), ('c', 5)):
+        run_tool('simulate', 'tilt_beta', '--rate', 100, '--seed', seed, '-o', f'{name}.csv')
+    a, b, c = ((tmp_path / f'{name}.csv').read_bytes() for name in 'abc')
+    assert a == b != c
+
+
+@pytest.mark.parametrize('arguments, words', [
+    (['--effect', 'cros_axis'], "unknown effect 'cros_axis'; did you mean cross_axis?"),
+    (['--effect', 'bias:ofset_v=0.1'], "bias has no parameter 'ofset_v'; did you mean offset_v?"),
+    (['--effect', 'bias:offset_v=nine'], "'nine' is not a number"),
+    (['--effect', 'bias:offset_v=9'], '9 V is outside -2 to 2'),
+    (['--effect', 'cross_axis:linear.z=0.1'], "no axis 'z' to act on"),
+    (['--rate', '-3'], '--rate -3: outside'),
+    (['--params', 'none.yaml'], 'none.yaml: cannot be read')])
+def test_simulate_refuses(run_tool, tmp_path, arguments, words):
+    """What simulate cannot do it says in one line, and writes nothing."""
+    done = run_tool('simulate', 'tilt_beta', *arguments, '-o', 'out.csv')
+    assert done.returncode == 1
+    assert words in done.stderr and done.stderr.count('\n') == 1
+    assert not (tmp_path / 'out.csv').exists()
+
+
+@pytest.mark.parametrize('text, words', [
+    ('', 'empty'),
+    (HEAD, 'bad.csv'),
+    ('time_s,y_v\n0,1\n', 'x_v'),
+    (HEAD + '0,1,2,0,0\n0.1,one,2,0,0\n', "bad.csv:3:2: x_v is 'one'"),
+    (HEAD + '0,1,2,0,0\n0.1,nan,2,0,0\n', 'bad.csv:3:2'),
+    (HEAD + '0,1,2,0,0\n-0.1,1,2,0,0\n', 'bad.csv:3:1'),
+    (HEAD + '0,1,2,0,0\n0.1,1e38,2,0,0\n', 'bad.csv:3:2'),
+    (HEAD + '0,1,2,0,0\n0.1,1,2,0', 'bad.csv:3'),
+    (HEAD + '0,1,2,0,0\n0.1,1,2,0,0\n', 'nowhere at rest'),
+    ('time_s,x_v,y_v\n' + ''.join(f'{i / 100},2.5,2.5\n' for i in range(500)),
+     'no stage angles')])
+def test_fit_refuses_a_bad_recording(run_tool, tmp_path, text, words):
+    """One line with file, line and column; status 1; the earlier output stays."""
+    (tmp_path / 'bad.csv').write_text(text)
+    (tmp_path / 'unit.yaml').write_text('before')
+    done = run_tool('fit', 'bad.csv', '-o', 'unit.yaml')
+    assert done.returncode == 1
+    assert words in done.stderr and done.stderr.count('\n') == 1, done.stderr
+    assert (tmp_path / 'unit.yaml').read_text() == 'before'
+
+
+def test_fit_refuses_another_unit_and_a_missing_folder(run_tool, tmp_path):
+    """A recording of another serial, and an output that has no folder, are refused."""
+    run_tool('simulate', 'sweep', '--rate', 100, '-o', 'a.csv')
+    text = (tmp_path / 'a.csv').read_text().replace('serial: nominal', 'serial: A1')
+    (tmp_path / 'a.csv').write_text(text)
+    other = NOMINAL.read_text().replace('serial: nominal', 'serial: B2')
+    (tmp_path / 'b.yaml').write_text(other)
+    done = run_tool('fit', 'a.csv', '--params', 'b.yaml', '-o', 'unit.yaml')
+    assert done.returncode == 1 and 'A1' in done.stderr and 'B2' in done.stderr
+    done = run_tool('fit', 'a.csv', '-o', 'none/unit.yaml')
+    assert done.returncode == 1 and 'none/unit.yaml: cannot write into none' in done.stderr
+
+
+def test_wrong_usage(run_tool):
+    """Wrong usage is status 2."""
+    assert run_tool('fit').returncode == 2
+    assert run_tool('fit', 'a.csv', '--model', 'cubic', '-o', 'x').returncode == 2
+    assert run_tool('simulate', 'somersault', '-o', 'x').returncode == 2
+
+
+@pytest.mark.parametrize('name, in_sample, left_out', [
+    ('mpu9150_0', 0.26, 0.33), ('mpu9150_1', 0.26, 0.33), ('mpu9150_2', 0.26, 0.33),
+    ('xsens_multiposition', 0.10, 0.16), ('two_axis_stand', 0.12, 0.14)])
+def test_real_recordings_reach_what_a_plain_fit_does(run_tool, tmp_path, shared_dir, name,
+                                                     in_sample, left_out):
+    """The magnitude of gravity over the rests of real sensors, rms in mg."""
+    done = run_tool('fit', shared_dir / 'real' / f'{name}.csv', '-o', 'unit.yaml')
+    assert done.returncode == 0, done.stderr
+    provenance = params.load(tmp_path / 'unit.yaml').provenance
+    assert float(provenance['residual_mg']) < in_sample + 0.005
+    assert float(provenance['leave_one_out_mg']) < left_out + 0.005
+
+
+@pytest.mark.parametrize('name', ['no_gap', 'temperature_bias', 'time_offset'])
+def test_sweeps_of_another_generator(run_tool, tmp_path, shared_dir, name):
+    """The linear fit of a sample's sweep leaves held-out poses within 0.1 mg."""
+    done = run_tool('fit', shared_dir / 'samples' / name / 'cal.csv', '--model', 'linear',
+                    '-o', 'unit.yaml')
+    assert done.returncode == 0, done.stderr
+    linear = next(line for line in done.stdout.splitlines() if line.startswith('linear '))
+    assert float(linear.split('/')[-2].split()[-1]) < 0.1
