@@ -128,7 +128,8 @@ def _quadratic(a: np.ndarray, values: np.ndarray, where: str, add: str,
     """Fit the coefficients of 1, a·growth, a², or say what the data lack."""
     if len(planes(a)) < 3 or np.ptp(a) < 0.3:
         raise UserError(f'the physical model is not determined: {len(planes(a))} distinct '
-                        f'inputs in {where}, at least 3 are needed; add {add}')
+                        f'inputs in {where}, at least 3 are needed; add {add}, or fit '
+                        'the linear model')
     design = np.column_stack([np.ones_like(a), a * growth, a * a])
     return np.linalg.lstsq(design, values, rcond=None)[0]
 

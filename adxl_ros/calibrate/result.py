@@ -79,7 +79,7 @@ def calibrate(sensor: Sensor, poses: Poses, model: str | None, source: str) -> R
     poses
         Its rests, with angles or without.
     model
-        'linear' or 'physical'; None takes the best that the poses determine.
+        'linear' or 'physical'; None is physical, or linear for a sensor of one axis.
     source
         Where the poses come from, for the provenance.
 
