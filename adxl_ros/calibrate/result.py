@@ -60,7 +60,8 @@ class Result:
         """Write the figures of this unit as PNG."""
         if self.gravity_fit is not None:
             fit = self.gravity_fit
-            figures.draw_gravity(path, self.fitted.serial, fit.before_mps2, fit.residual_mps2,
+            name = f'{self.fitted.serial} ({self.fitted.provenance["source"]})'
+            figures.draw_gravity(path, name, fit.before_mps2, fit.residual_mps2,
                                  fit.expected_mps2)
         else:
             fitted = self.fitted if self.fitted.model == 'physical' else \
