@@ -97,7 +97,7 @@ def draw_gravity(path: str | os.PathLike, name: str, before_mps2: np.ndarray,
         axis.errorbar(rests, mg, yerr=1.645 * std_mps2 / G0_MPS2 * 1e3, fmt='o', ms=4, lw=1)
         axis.set(title=f'{title}: rms {np.sqrt(np.mean(mg ** 2)):.2f} mg', xlabel='rest',
                  ylabel='magnitude minus gravity, mg')
-    figure.suptitle(f'{name}: {len(rests)} rests (bars: 90 %, as the noise of their means lets expect)')
+    figure.suptitle(f'{name}: {len(rests)} rests (bars: 90 %, expected)')
     _write(figure, path)
 
 
