@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Noise of the chain: density, effective sample counts and Allan deviation."""
+"""Noise of the chain: density and effective sample counts."""
 
 from __future__ import annotations
 
@@ -61,30 +61,3 @@ def effective_samples(count: int | np.ndarray, dt_s: float, rc_s: float) -> np.n
     a = np.exp(-dt_s / rc_s)
     correlated = 2 * a / (1 - a) * (1 - (1 - a ** n) / (n * (1 - a)))
     return n / (1 + correlated)
-
-
-def allan_deviation(values: np.ndarray, dt_s: float) -> tuple[np.ndarray, np.ndarray]:
-    """
-    Overlapping Allan deviation at octave averaging times.
-
-    Parameters
-    ----------
-    values
-        One signal at a constant rate, (n,).
-    dt_s
-        Time between samples, s.
-
-    Returns
-    -------
-    tau_s, deviation
-        Averaging times, s, and the deviation in the unit of `values`, both (k,). IEEE Std
-        952-1997, annex C.
-
-    """
-    total = np.concatenate([[0.0], np.cumsum(values - values.mean())])
-    lengths = 2 ** np.arange(int(np.log2(max(len(values) // 3, 1))) + 1)
-    deviation = []
-    for m in lengths:
-        second = total[2 * m:] - 2 * total[m:-m] + total[:-2 * m]
-        deviation.append(np.sqrt(np.mean((second / m) ** 2) / 2))
-    return lengths * dt_s, np.array(deviation)

@@ -21,7 +21,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 import os
 from pathlib import Path
-import signal
 import subprocess
 import sys
 import tempfile
@@ -34,6 +33,7 @@ from adxl_ros.files.columns import Recording, sensor_info
 from adxl_ros.model.simulate import simulate
 from adxl_ros.model.trajectory import sweep
 from adxl_ros.nodes.common import nominal_path
+from adxl_ros.nodes.demo import end
 import numpy as np
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
@@ -171,13 +171,7 @@ def _running(commands: Sequence[Sequence[str]]) -> Iterator[list[subprocess.Pope
     try:
         yield processes
     finally:
-        for process in processes:
-            process.send_signal(signal.SIGINT)
-        for process in processes:
-            try:
-                process.wait(10)
-            except subprocess.TimeoutExpired:
-                process.kill()
+        end(processes)
 
 
 def _cpu_s(pid: int) -> float:

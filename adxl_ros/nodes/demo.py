@@ -189,10 +189,11 @@ def _graph() -> Iterator[tuple]:
     finally:
         watcher.destroy_node()
         rclpy.try_shutdown()
-        _end(processes)
+        end(processes)
 
 
-def _end(processes: Sequence[subprocess.Popen]) -> None:
+def end(processes: Sequence[subprocess.Popen]) -> None:
+    """Interrupt processes, and kill those that do not end within 10 s."""
     for process in processes:
         process.send_signal(signal.SIGINT)
     for process in processes:
