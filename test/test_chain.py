@@ -18,6 +18,7 @@ from dataclasses import replace
 
 from adxl_ros.errors import UserError
 from adxl_ros.model import chain, noise
+from adxl_ros.model.coefficients import get, names_of, parameter_of, put, with_neutral
 from adxl_ros.model.effects import library
 from adxl_ros.model.maths import ARRAYS, FLOATS
 from adxl_ros.model.sensor import Sensor, with_axes
@@ -33,28 +34,32 @@ G = 9.80665
 AXES = ('x', 'xy', 'xyz')
 
 
+INVERTIBLE = tuple(name for name, effect in library().items()
+                   if effect.invertible and 'stage' not in effect.needs)
+
+
 @st.composite
 def sensors(draw: st.DrawFn, axes: str) -> Sensor:
-    """Draw a unit with every effect of the library, within twice its typical size."""
-    values = {}
-    for effect in library().values():
-        values[effect.name] = {p.name: np.array([
-            draw(st.floats(-2, 2)) * p.scale if a in p.axes else 0.0 for a in axes])
-            for p in effect.parameters}
-    return replace(nominal(axes), effects=tuple(values), values=values)
+    """Draw a unit with every invertible effect of the library, within twice its typical size."""
+    sensor = with_neutral(nominal(axes), INVERTIBLE)
+    names = coefficients(sensor)
+    return put(sensor, names, [
+        parameter_of(n).scale * (1 if parameter_of(n).shape else draw(st.floats(-2, 2)))
+        for n in names])
+
+
+def coefficients(sensor: Sensor) -> tuple[str, ...]:
+    return tuple(n for name in sensor.effects for n in names_of(library()[name], sensor.axes))
 
 
 def one_of(axes: str, seed: int) -> Sensor:
     """Draw a unit at datasheet spread with a covariance of its coefficients."""
     rng = np.random.default_rng(seed)
-    values = {e.name: {p.name: np.array([rng.normal() * p.scale * (a in p.axes) for a in axes])
-                       for p in e.parameters} for e in library().values()}
-    names = tuple(f'{e.name}.{p.name}.{a}' for e in library().values() for p in e.parameters
-                  for a in axes if a in p.axes)
-    scale = np.array([p.scale for e in library().values() for p in e.parameters
-                      for a in axes if a in p.axes])
+    sensor = with_neutral(nominal(axes), INVERTIBLE)
+    names = tuple(n for n in coefficients(sensor) if not parameter_of(n).shape)
+    scale = np.array([parameter_of(n).scale for n in names])
     mixed = rng.normal(size=(len(names), len(names))) * 0.05 * scale[:, None] / len(names) ** 0.5
-    return replace(nominal(axes), effects=tuple(values), values=values,
+    return replace(put(sensor, names, rng.normal(size=len(names)) * scale),
                    covariance=mixed @ mixed.T, covariance_names=names)
 
 
@@ -133,13 +138,9 @@ def test_intervals_cover_what_they_promise(axes: str) -> None:
     root = np.linalg.cholesky(sensor.covariance + 1e-30 * np.eye(len(sensor.covariance)))
     volts = []
     for _ in range(draws):
-        values = {name: dict(of) for name, of in sensor.values.items()}
-        for name, by in zip(sensor.covariance_names, root @ rng.normal(size=len(root))):
-            effect, parameter, axis = name.split('.')
-            moved = values[effect][parameter].copy()
-            moved[sensor.axes.index(axis)] += by
-            values[effect][parameter] = moved
-        volts.append(chain.static_response(replace(sensor, values=values))(list(force)))
+        drawn = get(sensor, sensor.covariance_names) + root @ rng.normal(size=len(root))
+        volts.append(chain.static_response(put(sensor, sensor.covariance_names, drawn))(
+            list(force)))
     volts = np.array(volts) + noise.sigma_v(sensor)[:, None] * rng.normal(
         size=(draws, len(axes), len(beta)))
     volts = np.moveaxis(volts, 1, 0).reshape(len(axes), -1)

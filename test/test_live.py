@@ -30,7 +30,7 @@ import numpy as np
 import pytest
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import Imu
-from units import drawn, nominal
+from units import drawn, Fed, nominal
 
 G = 9.80665
 
@@ -45,9 +45,7 @@ def unit(axes: str) -> Sensor:
 
 def samples(sensor: Sensor, force: list[np.ndarray]) -> list[list[float]]:
     """Let the sensor feel a force at its rate; return nominal acceleration, (n, 3)."""
-    rng = np.random.default_rng(2)
-    state = chain.settled(sensor, [float(f[0]) for f in force], rng)
-    volts = chain.sample(sensor, force, state, rng)
+    volts = Fed(sensor, 2)(force)
     accel = np.zeros((len(volts), 3))
     accel[:, :len(sensor.axes)] = to_nominal_mps2(volts, sensor)
     return accel.tolist()

@@ -14,15 +14,14 @@
 
 """The model beside figures that others gave: the paper, the datasheet, closed forms."""
 
-from dataclasses import replace
-
 from adxl_ros.model import chain, noise
+from adxl_ros.model.coefficients import with_neutral
 from adxl_ros.model.effects import library
 from adxl_ros.model.effects.misalignment import direction
 from adxl_ros.model.stage import specific_force
 import numpy as np
 import pytest
-from units import nominal
+from units import Fed, nominal
 
 
 def test_directions_of_the_paper():
@@ -50,10 +49,9 @@ def test_effective_samples_of_a_dwell():
 def test_mean_of_simulated_noise_scatters_as_promised():
     """Means over 5 s of simulated noise scatter by σ/√237."""
     sensor = nominal(adc_bits=0)
-    rng = np.random.default_rng(5)
-    state = chain.settled(sensor, [0.0, 0.0, 9.8], rng)
-    flat = [np.zeros(400 * 5000), np.zeros(400 * 5000), np.full(400 * 5000, 9.8)]
-    volts = chain.sample(sensor, flat, state, rng)
+    fed = Fed(sensor, 5)
+    volts = np.vstack([fed([np.zeros(50000), np.zeros(50000), np.full(50000, 9.8)])
+                       for _ in range(40)])
     means = volts.reshape(400, 5000, 2).mean(axis=1)
     promised = noise.sigma_v(sensor)[0] / np.sqrt(noise.effective_samples(
         5000, 1e-3, sensor.rc_s))
@@ -66,9 +64,7 @@ def test_filter_at_10_hz():
     sensor = nominal(adc_bits=0, noise_density_g_per_rthz=np.zeros(2))
     time = np.arange(5000) / 1000
     shake = np.sin(2 * np.pi * 10 * time)
-    rng = np.random.default_rng(0)
-    state = chain.settled(sensor, [0.0, 0.0, 9.8], rng)
-    volts = chain.sample(sensor, [shake, 0 * shake, 0 * shake + 9.8], state, rng)[:, 0]
+    volts = Fed(sensor)([shake, 0 * shake, 0 * shake + 9.8])[:, 0]
     late = time > 1
     wave = np.exp(-2j * np.pi * 10 * time[late])
     ratio = ((volts[late] - 2.5) * wave).mean() / (shake[late] / 9.80665 * wave).mean()
@@ -80,22 +76,16 @@ def test_blocks_join_to_one_run():
     """The chain gives the same samples whether it runs in one block or in many."""
     sensor = nominal()
     force = specific_force(np.linspace(0, 1, 1000), np.linspace(0, 2, 1000), 9.8)
-    whole = chain.sample(sensor, force, chain.settled(
-        sensor, [0.0, 0.0, 9.8], np.random.default_rng(3)), np.random.default_rng(4))
-    rng = np.random.default_rng(4)
-    state = chain.settled(sensor, [0.0, 0.0, 9.8], np.random.default_rng(3))
-    parts = [chain.sample(sensor, [f[i:i + 77] for f in force], state, rng)
-             for i in range(0, 1000, 77)]
+    whole, parts = Fed(sensor, 3)(force), Fed(sensor, 3)
+    parts = [parts([f[i:i + 77] for f in force]) for i in range(0, 1000, 77)]
     np.testing.assert_array_equal(whole, np.vstack(parts))
 
 
 @pytest.mark.parametrize('name', sorted(library()))
 def test_neutral_effect_is_identity(name):
-    """An effect whose parameters are 0 changes no bit."""
+    """An effect whose parameters are neutral changes no bit."""
     plain = nominal('xyz')
-    effect = library()[name]
-    neutral = replace(plain, effects=(name,),
-                      values={name: {p.name: np.zeros(3) for p in effect.parameters}})
+    neutral = with_neutral(plain, [name])
     force = specific_force(np.linspace(-3, 3, 50), np.linspace(-2, 4, 50), 9.8)
     for before, after in zip(chain.static_response(plain)(force),
                              chain.static_response(neutral)(force)):

@@ -18,11 +18,10 @@ from adxl_ros.calibrate.plan import sweep as plan_sweep, Target
 from adxl_ros.calibrate.sweep import Settings, Sweep
 from adxl_ros.calibrate.tumble import Tumble
 from adxl_ros.errors import UserError
-from adxl_ros.model import chain
 from adxl_ros.model.stage import specific_force
 import numpy as np
 import pytest
-from units import nominal
+from units import Fed, nominal
 
 TARGETS = [Target(np.pi / 2, 0.0), Target(np.pi / 2, np.pi / 6)]
 
@@ -34,8 +33,7 @@ class Bench:
         self.sweep = sweep
         self.sensor = sensor
         self.now_ns = 1_700_000_000_000_000_000
-        self.rng = np.random.default_rng(seed)
-        self.state = chain.settled(sensor, [9.8, 0.0, 0.0], self.rng)
+        self.fed = Fed(sensor, seed)
 
     def run(self, seconds, alpha, beta, encoder=True, shake_mps2=0.0):
         """Hold the angles (floats, or functions of time) for so long; stop at an entry."""
@@ -44,7 +42,7 @@ class Bench:
             force = specific_force(np.full(50, alpha), np.full(50, beta), 9.80665,
                                    shake_mps2 * np.sin(2 * np.pi * 7 * (
                                        self.now_ns % 10 ** 9 * 1e-9 + time)))
-            volts = chain.sample(self.sensor, force, self.state, self.rng)
+            volts = self.fed(force)
             stamps = self.now_ns + np.arange(50) * 1_000_000
             if encoder:
                 self.sweep.stage(self.now_ns, alpha, beta)
@@ -151,12 +149,10 @@ def test_rests_by_hand_are_announced_as_they_end():
     """A tumble counts its rests and names what moves between them."""
     sensor = nominal('xyz', noise_density_g_per_rthz=np.full(3, 300e-6))
     tumble = Tumble(sensor, 0)
-    rng = np.random.default_rng(2)
-    state = chain.settled(sensor, [0.0, 0.0, 9.8], rng)
     alphas = np.repeat(np.linspace(0, 2.5, 6), 4000) + np.concatenate(
         [np.concatenate([np.zeros(3000), 0.2 * np.sin(np.linspace(0, 40, 1000))])
          for _ in range(6)])
-    volts = chain.sample(sensor, specific_force(alphas, 0 * alphas, 9.80665), state, rng)
+    volts = Fed(sensor, 2)(specific_force(alphas, 0 * alphas, 9.80665))
     found = []
     for i in range(0, len(volts), 100):
         tumble.feed(np.arange(i, i + 100) * 1_000_000 + 10 ** 18, volts[i:i + 100])

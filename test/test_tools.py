@@ -108,7 +108,8 @@ def test_wrong_usage(run_tool):
     """Wrong usage is status 2."""
     assert run_tool('fit').returncode == 2
     assert run_tool('fit', 'a.csv', '--model', 'cubic', '-o', 'x').returncode == 2
-    assert run_tool('simulate', 'somersault', '-o', 'x').returncode == 2
+    unknown = run_tool('simulate', 'rihc', '-o', 'x')
+    assert unknown.returncode == 2 and 'did you mean rich?' in unknown.stderr
 
 
 @pytest.mark.parametrize('name, in_sample, left_out', [

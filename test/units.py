@@ -23,6 +23,8 @@ from adxl_ros.calibrate.poses import Poses
 from adxl_ros.files import params
 from adxl_ros.model import chain, noise
 from adxl_ros.model.effects import effect_named
+from adxl_ros.model.motion import Motion
+from adxl_ros.model.response import Response
 from adxl_ros.model.stage import specific_force
 import numpy as np
 
@@ -66,3 +68,20 @@ def swept(rng, truth, planes_rad=PLANES_RAD, check_poses=16, noisy=True):
     volts = volts + noisy * std * rng.normal(size=volts.shape)
     return Poses(volts, std, alpha, beta, np.zeros((len(alpha), 2)),
                  np.array([t.check for t in targets]))
+
+
+class Fed:
+    """A sensor that is given its specific force sample by sample, and gives its volts."""
+
+    def __init__(self, sensor, seed=0):
+        self.rate_hz, self.count = sensor.rate_hz, 0
+        self.respond = Response(sensor, Motion(np.inf, force=lambda at_s: self.force,
+                                               internal_rate_hz=sensor.rate_hz), seed)
+
+    def __call__(self, force):
+        """Feel three components, m/s^2, each (n,)."""
+        count = max(np.size(f) for f in force)
+        self.force = [np.broadcast_to(np.asarray(f, float), count) for f in force]
+        stamps_s = (self.count + np.arange(count)) / self.rate_hz
+        self.count += count
+        return self.respond(stamps_s)

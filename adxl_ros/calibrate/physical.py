@@ -30,6 +30,7 @@ from adxl_ros.calibrate import linear
 from adxl_ros.calibrate.poses import pose_variance, Poses, reference_force
 from adxl_ros.errors import UserError
 from adxl_ros.model import chain
+from adxl_ros.model.coefficients import get
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.model.stage import specific_force
@@ -204,12 +205,6 @@ def _covariance(sensor: Sensor, fitted: Sensor, poses: Poses) -> np.ndarray:
             poses.alpha_rad + slack[0], poses.beta_rad + slack[1], fitted.local_gravity_mps2)))
         volts += widen * poses.std_v * rng.standard_normal(volts.shape)
         again = replace(poses, volts=volts)
-        drawn.append(_flat(_assemble(sensor, again, stages(sensor, again))))
+        drawn.append(get(_assemble(sensor, again, stages(sensor, again)),
+                         fitted.covariance_names))
     return np.cov(np.array(drawn).T)
-
-
-def _flat(fitted: Sensor) -> np.ndarray:
-    """Return the values of `covariance_names`, (k,)."""
-    split = (name.split('.') for name in fitted.covariance_names)
-    return np.array([fitted.values[effect][parameter][fitted.axes.index(axis)]
-                     for effect, parameter, axis in split])

@@ -148,9 +148,10 @@ def coefficients(sensor: Sensor) -> list[str]:
         units = {p.name: p.unit for p in effect_named(effect).parameters}
         for parameter, values in of_effect.items():
             label, shown = absolute.get((effect, parameter), (f'{effect}.{parameter}', values))
-            entries = [f'{axis} {value:.6g} +- {_NINETY * std[key]:.2g}'
-                       for axis, value in zip(sensor.axes, shown)
-                       if (key := f'{effect}.{parameter}.{axis}') in std]
+            ends = list(sensor.axes) if np.ndim(values) else ['']
+            entries = [f'{axis} {value:.6g} +- {_NINETY * std[key]:.2g}'.lstrip()
+                       for axis, value in zip(ends, np.ravel(shown))
+                       if (key := f'{effect}.{parameter}.{axis}'.rstrip('.')) in std]
             if entries:
                 lines.append(f'  {label:34} {"   ".join(entries)} {units[parameter]}')
     return lines

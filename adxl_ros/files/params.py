@@ -24,6 +24,7 @@ from typing import Any
 
 from adxl_ros.errors import UserError
 from adxl_ros.files.atomic import atomic_path
+from adxl_ros.model.coefficients import names_of
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.sensor import Sensor
 import numpy as np
@@ -106,7 +107,7 @@ def to_flat(sensor: Sensor) -> dict[str, Any]:
         flat['effects'] = list(sensor.effects)
     for name in sensor.effects:
         for parameter, value in sensor.values[name].items():
-            flat[f'{name}.{parameter}'] = [float(v) for v in value]
+            flat[f'{name}.{parameter}'] = np.asarray(value, float).tolist()
     if sensor.covariance_names:
         flat['covariance_names'] = list(sensor.covariance_names)
         flat['covariance'] = [float(v) for v in sensor.covariance.ravel()]
@@ -269,16 +270,20 @@ def _effect_values(name: str, axes: str, flat: dict, fail: Any) -> dict[str, np.
     for parameter in effect.parameters:
         key = f'{name}.{parameter.name}'
         if key not in flat:
-            raise fail(key, f'missing; it is the {parameter.doc}, {parameter.unit}, by axis')
+            raise fail(key, f'missing; it is the {parameter.doc}, {parameter.unit}'
+                            f'{", by axis" if parameter.axes else ""}')
         array = _floats(key, flat[key], fail)
-        if len(array) != len(axes):
+        if parameter.axes and len(array) != len(axes):
             raise fail(key, f'{len(array)} values for {len(axes)} axes ({axes})')
+        if not parameter.axes and isinstance(flat[key], (list, tuple)):
+            raise fail(key, f'{flat[key]} is a list; it is one number without axes')
         _bounded(key, array, {'choices': (), 'lower': parameter.lower,
                               'upper': parameter.upper, 'unit': parameter.unit}, fail)
-        for axis, value in zip(axes, array):
-            if axis not in parameter.axes and value != 0:
-                raise fail(key, f'{value:g} for {axis}, which it does not act on; write 0.0')
-        values[parameter.name] = array
+        for axis, value in zip(axes if parameter.axes else '', array):
+            if axis not in parameter.axes and value != parameter.neutral:
+                raise fail(key, f'{value:g} for {axis}, which it does not act on; write '
+                                f'{parameter.neutral!r}')
+        values[parameter.name] = array if parameter.axes else array[0]
     known = {p.name for p in effect.parameters}
     for key in flat:
         if key.startswith(f'{name}.') and key.removeprefix(f'{name}.') not in known:
@@ -288,8 +293,7 @@ def _effect_values(name: str, axes: str, flat: dict, fail: Any) -> dict[str, np.
 
 def _covariance(flat: dict, values: dict, axes: str, fail: Any) -> tuple:
     names = _strings('covariance_names', flat, fail)
-    known = {f'{effect}.{parameter}.{axis}' for effect, of in values.items()
-             for parameter in of for axis in axes}
+    known = {name for effect in values for name in names_of(effect_named(effect), axes)}
     for name in names:
         if name not in known:
             raise fail('covariance_names', f'{name!r} is no parameter of the listed effects')

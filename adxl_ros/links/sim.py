@@ -17,15 +17,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from math import inf
 import time
 from typing import Any
 
 from adxl_ros.links.base import Option, Samples, State
 from adxl_ros.links.sim_stage import JOINTS
-from adxl_ros.model import chain
+from adxl_ros.model.motion import Motion
+from adxl_ros.model.response import Response
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.model.stage import specific_force
 import numpy as np
 
 OPTIONS = (
@@ -72,11 +73,10 @@ class SimulatedSensor:
     def __init__(self, sensor: Sensor, pose: list[float], seed: int) -> None:
         """Rest in a pose: alpha, beta, rad, and shift, m."""
         self.sensor = sensor
-        self._rng = np.random.default_rng(seed)
-        force = specific_force(pose[0], pose[1], sensor.local_gravity_mps2)
-        self._filter = chain.settled(sensor, [float(f) for f in force], self._rng)
+        self._seed = seed
         # Motion of the joints: stamp, position, velocity of each, (k, 1 + 3 + 3).
         self._motion = [(0, *pose, 0.0, 0.0, 0.0)]
+        self._respond = self._settled()
         self._heard_s = -inf
         self._state = State('ok', 'at rest, no stage')
         self._origin_ns = self._made = self._until_ns = 0
@@ -120,6 +120,7 @@ class SimulatedSensor:
         self._made, self._until_ns = 0, now_ns
         self._stamps, self._volts = self._stamps[:0], self._volts[:0]
         self._motion = [(0, *self._motion[-1][1:4], 0.0, 0.0, 0.0)]
+        self._respond = self._settled()
         return skipped
 
     def read(self, now_ns: int) -> Samples:
@@ -164,29 +165,36 @@ class SimulatedSensor:
         ahead = min(until + _AHEAD_NS, self._known_ns())
         stamps = self._stamp(self._made + np.arange(_BLOCK, dtype=float))
         stamps = stamps[:np.searchsorted(stamps, ahead, 'right')]
-        alpha, beta, shift_acceleration = self._pose(stamps)
-        force = specific_force(alpha, beta, self.sensor.local_gravity_mps2, shift_acceleration)
         self._made += len(stamps)
-        volts = chain.sample(self.sensor, force, self._filter, self._rng)
+        volts = self._respond((stamps - self._origin_ns) * 1e-9)
         self._stamps = np.concatenate([self._stamps, stamps])
         self._volts = np.concatenate([self._volts, volts])
         while len(self._motion) > 1 and self._motion[1][0] <= stamps[-1]:
             del self._motion[0]
 
-    def _pose(self, stamps: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Interpolate alpha, beta, rad, and the acceleration of the shift, m/s², (n,) each."""
+    def _settled(self) -> Response:
+        """Let the sensor be at rest where the stage is; its noise is new each time."""
+        joints = [partial(self._joint, j) for j in range(len(JOINTS))]
+        self._seed += 1
+        return Response(self.sensor, Motion(inf, *joints), self._seed - 1)
+
+    def _joint(self, joint: int, time_s: np.ndarray, order: int = 0) -> np.ndarray:
+        """Interpolate a joint at times since the origin, s, (n,); see `motion.Path`."""
+        stamps = self._origin_ns + np.rint(time_s * 1e9).astype(np.int64)
         knots = np.array([m[0] for m in self._motion], np.int64)
-        motion = np.array([m[1:] for m in self._motion])
-        left = (np.searchsorted(knots, stamps) - 1).clip(0)
+        at = np.array([(m[1 + joint], m[4 + joint]) for m in self._motion])
+        left = (np.searchsorted(knots, stamps, 'right') - 1).clip(0)
         right = (left + 1).clip(max=len(knots) - 1)
         step_ns = knots[right] - knots[left]
         held = (step_ns <= 0) | (step_ns > _GAP_NS)
-        h = np.where(held, 1, step_ns)[:, None] * 1e-9
-        u = np.where(held, 0.0, (stamps - knots[left]) * 1e-9 / h[:, 0])[:, None]
-        p0, v0 = motion[left, :3], motion[left, 3:] * h
-        p1, v1 = motion[right, :3], motion[right, 3:] * h
+        h = np.where(held, 1, step_ns) * 1e-9
+        u = np.where(held, 0.0, (stamps - knots[left]) * 1e-9 / h)
+        (p0, v0), (p1, v1) = at[left].T, at[right].T
+        v0, v1 = np.where(held, 0.0, v0 * h), v1 * h
         # Cubic Hermite: exact in position and velocity at the stage's stamps.
         square, cube = 3 * (p1 - p0) - 2 * v0 - v1, 2 * (p0 - p1) + v0 + v1
-        position = p0 + u * (v0 + u * (square + u * cube))
-        acceleration = np.where(held[:, None], 0.0, (2 * square + 6 * u * cube) / h ** 2)
-        return position[:, 0], position[:, 1], acceleration[:, 2]
+        if order == 0:
+            return p0 + u * (v0 + u * (square + u * cube))
+        moving = np.where(held, 0.0, v0 + u * (2 * square + 3 * u * cube) if order == 1
+                          else (2 * square + 6 * u * cube) / h)
+        return moving / h

@@ -18,16 +18,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from math import exp
+from typing import Any
 
-from adxl_ros.model import noise
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.effects import effect_named
-from adxl_ros.model.effects.base import Components, Place, Signals, Value
+from adxl_ros.model.effects.base import Components, Environment, Parameters, Place, Signals, Value
 from adxl_ros.model.maths import ARRAYS, Maths
 from adxl_ros.model.sensor import Sensor
 import numpy as np
-from scipy.signal import lfilter
+
+NOMINAL = Environment(time_s=float('inf'))
+"""Nominal temperature and supply, long after power on: where drifts are 0."""
 
 _TOLERANCE_MPS2 = 1e-10
 _LOST_MPS2 = 1e-6
@@ -35,41 +36,90 @@ _LOST_MPS2 = 1e-6
 _MOST_ITERATIONS = 60
 
 
-def static_response(sensor: Sensor) -> Callable[[Components], Components]:
+def static_response(sensor: Sensor) -> Callable[..., Components]:
     """
-    Prepare the chain from specific force to volts, without filter, noise and ADC.
+    Prepare the chain from specific force to volts at rest: its invertible effects.
+
+    Filter, noise, the steps of the ADC, the stage, and effects with a memory are left to
+    `response`.
 
     Returns
     -------
     callable
         Maps the three components of specific force in the case frame, m/s² (arrays of one shape,
-        or floats), to the volts of each measured axis.
+        or floats), and, if it is not the nominal one, an `Environment` of such a shape, to the
+        volts of each measured axis.
 
     """
-    effects = [effect_named(name) for name in sensor.effects]
-    steps = {place: [(e.apply, {k: tuple(map(float, v)) for k, v in
-                                sensor.values[e.name].items()})
-                     for e in effects if e.place is place] for place in Place}
+    run = {place: applied(sensor, place, True) for place in Place}
     zero_g_v = sensor.nominal_zero_g_v.tolist()
     scale_v_per_g = sensor.nominal_scale_v_per_g.tolist()
 
-    def respond(force: Components) -> Components:
-        signals = Signals([f / G0_MPS2 for f in force])
-        for apply, values in steps[Place.MOUNTING]:
+    def respond(force: Components, environment: Environment = NOMINAL) -> Components:
+        signals = Signals(environment, sensed=[f / G0_MPS2 for f in force],
+                          nominal_scale_v_per_g=scale_v_per_g, vref_v=sensor.adc_vref_v)
+        for apply, values in run[Place.MOUNTING]:
             apply(signals, values)
         signals.output = list(signals.sensed)
-        for apply, values in steps[Place.ELEMENT]:
+        for apply, values in run[Place.ELEMENT]:
             apply(signals, values)
         signals.zero_g_v, signals.scale_v_per_g = list(zero_g_v), list(scale_v_per_g)
-        for apply, values in steps[Place.ELECTRONICS]:
+        for apply, values in run[Place.ELECTRONICS]:
             apply(signals, values)
-        return [zero + scale * out for zero, scale, out in
-                zip(signals.zero_g_v, signals.scale_v_per_g, signals.output)]
+        volts = converted(signals)
+        if run[Place.ADC]:
+            signals.input_v, signals.volts = volts, list(volts)
+            for apply, values in run[Place.ADC]:
+                apply(signals, values)
+            volts = signals.volts
+        return volts
 
     return respond
 
 
-def jacobian(respond: Callable[[Components], Components], force: Components) -> np.ndarray:
+def converted(signals: Signals) -> Components:
+    """Turn the output of the element into volts, by measured axis."""
+    return [zero + scale * out for zero, scale, out in
+            zip(signals.zero_g_v, signals.scale_v_per_g, signals.output)]
+
+
+def applied(sensor: Sensor, place: Place, invertible: bool | None = None
+            ) -> list[tuple[Callable[[Signals, Parameters], None], Parameters]]:
+    """
+    Return what the sensor's effects of a place apply, and with which parameters.
+
+    Parameters
+    ----------
+    sensor
+        The unit.
+    place
+        Of the chain.
+    invertible
+        Only those that the inverse undoes.
+
+    """
+    effects = [effect_named(name) for name in sensor.effects]
+    return [(e.apply, parameters(sensor, e.name)) for e in effects
+            if e.place is place and (e.invertible or not invertible)]
+
+
+def parameters(sensor: Sensor, effect: str) -> Parameters:
+    """Return the parameters of one of the sensor's effects as its `apply` takes them."""
+    listed = {name: np.asarray(value, float).tolist()
+              for name, value in sensor.values[effect].items()}
+    return {name: tuple(v) if isinstance(v, list) else v for name, v in listed.items()}
+
+
+def gravity_mps2(sensor: Sensor) -> float:
+    """Return the local gravity with what effects add to it."""
+    signals = Signals(NOMINAL, gravity_mps2=sensor.local_gravity_mps2)
+    for apply, values in applied(sensor, Place.STAGE, True):
+        apply(signals, values)
+    return signals.gravity_mps2
+
+
+def jacobian(respond: Callable[..., Components], force: Components,
+             environment: Environment = NOMINAL) -> np.ndarray:
     """
     Differentiate volts by specific force at one or many points, V/(m/s²).
 
@@ -81,7 +131,8 @@ def jacobian(respond: Callable[[Components], Components], force: Components) -> 
     for c in range(3):
         above, below = list(force), list(force)
         above[c], below[c] = above[c] + step, below[c] - step
-        columns.append([(a - b) / (2 * step) for a, b in zip(respond(above), respond(below))])
+        columns.append([(a - b) / (2 * step) for a, b in zip(
+            respond(above, environment), respond(below, environment))])
     return np.swapaxes(np.array(columns), 0, 1)
 
 
@@ -103,8 +154,8 @@ class Tangent:
     slope: Components
 
 
-def tangent(respond: Callable[[Components], Components], axes: str,
-            force: Components) -> Tangent:
+def tangent(respond: Callable[..., Components], axes: str, force: Components,
+            environment: Environment = NOMINAL) -> Tangent:
     """
     Linearise the inverse of `static_response` around a force, m/s², arrays or floats.
 
@@ -116,10 +167,13 @@ def tangent(respond: Callable[[Components], Components], axes: str,
         Measured axes.
     force
         Three components.
+    environment
+        Of their shape.
 
     """
-    by_force = jacobian(respond, force).tolist() if isinstance(force[0], float) \
-        else jacobian(respond, force)
+    by_force: Any = jacobian(respond, force, environment)
+    if isinstance(force[0], float):
+        by_force = by_force.tolist()
     measured = [AXES.index(a) for a in axes]
     back = _inverted([[row[c] for c in measured] for row in by_force])
     if axes != 'xy':
@@ -206,25 +260,29 @@ def inverse(sensor: Sensor, z_sign: np.ndarray | None = None) -> Callable[..., C
     Returns
     -------
     callable
-        Maps the volts of each axis, arrays (n,) or floats, to three components, m/s². Samples
-        that have no solution come back as NaN.
+        Maps the volts of each axis, arrays (n,) or floats, and, if it is not the nominal one, an
+        `Environment` to three components, m/s². Samples that have no solution come back as
+        NaN.
 
     """
-    respond = static_response(sensor)
+    respond, gravity = static_response(sensor), gravity_mps2(sensor)
     up = np.asarray(sensor.z_sign if z_sign is None else z_sign)
 
-    def invert(volts: Components) -> Components:
+    def invert(volts: Components, environment: Environment = NOMINAL) -> Components:
         data = np.array(volts, float).reshape(len(volts), -1)
         signs = np.broadcast_to(up, data.shape[1])
         force = np.zeros((3, data.shape[1]))
         lost = np.ones(data.shape[1], bool)
         left = np.flatnonzero(np.isfinite(data).all(axis=0))
-        at = tangent(respond, sensor.axes, [0.0, 0.0, 0.0])
+        around = Environment(*(np.broadcast_to(np.asarray(e, float), data.shape[1])
+                               for e in environment))
+        at = tangent(respond, sensor.axes, list(force[:, left]),
+                     Environment(*(e[left] for e in around)))
         with np.errstate(all='ignore'):
             for _ in range(_MOST_ITERATIONS):
-                here = list(force[:, left])
-                miss = [v - r for v, r in zip(data[:, left], respond(here))]
-                advance = step(sensor.axes, sensor.local_gravity_mps2, signs[left], ARRAYS)
+                here, there = list(force[:, left]), Environment(*(e[left] for e in around))
+                miss = [v - r for v, r in zip(data[:, left], respond(here, there))]
+                advance = step(sensor.axes, gravity, signs[left], ARRAYS)
                 after = np.array(advance(miss, here, at))
                 moved = np.abs(after - here).max(axis=0)
                 force[:, left], lost[left] = after, ~(moved < _LOST_MPS2)
@@ -232,85 +290,20 @@ def inverse(sensor: Sensor, z_sign: np.ndarray | None = None) -> Callable[..., C
                 left = left[(moved >= _TOLERANCE_MPS2) & (moved < np.inf)]
                 if not len(left):
                     break
-                at = tangent(respond, sensor.axes, list(force[:, left]))
+                at = tangent(respond, sensor.axes, list(force[:, left]),
+                             Environment(*(e[left] for e in around)))
         force[:, lost] = np.nan
         return list(force) if np.ndim(volts[0]) else force[:, 0].tolist()
 
     return invert
 
 
-@dataclass
-class FilterState:
-    """What the filter and the noise carry from one block to the next, V, each (m,)."""
-
-    last_input: np.ndarray
-    filtered: np.ndarray
-    noise: np.ndarray
-
-
-def settled(sensor: Sensor, force: Components, rng: np.random.Generator) -> FilterState:
-    """Return the state of a sensor that has felt one force, m/s² (three floats), for long."""
-    volts = np.array(static_response(sensor)(force), float)
-    white = noise.analog_sigma_v(sensor) if sensor.rc_s else np.zeros_like(volts)
-    return FilterState(volts, volts, white * rng.standard_normal(len(volts)))
-
-
-def sample(sensor: Sensor, force: Components, state: FilterState,
-           rng: np.random.Generator) -> np.ndarray:
-    """
-    Run a block through the whole chain: effects, RC filter, noise, ADC.
-
-    The filter is discretised exactly for an input that is linear between samples, and the noise
-    behind it is the exactly sampled AR(1) sequence, so that neither depends on the rate.
-
-    Parameters
-    ----------
-    sensor
-        The unit.
-    force
-        Three components, m/s², each (n,), at `sensor.rate_hz`.
-    state
-        From `settled` or the block before; updated in place.
-    rng
-        Source of the noise.
-
-    Returns
-    -------
-    ndarray
-        Volts that the ADC gives, (n, m).
-
-    """
-    count = len(np.asarray(force[0]))
-    volts = np.column_stack([np.broadcast_to(v, count) for v in static_response(sensor)(force)])
-    sigma = noise.analog_sigma_v(sensor)
-    white = rng.standard_normal(volts.shape)
-    if sensor.rc_s:
-        volts = _filtered(volts, 1 / (sensor.rate_hz * sensor.rc_s), state)
-        a = exp(-1 / (sensor.rate_hz * sensor.rc_s))
-        coloured, _ = lfilter([1.0], [1.0, -a], white * sigma * (1 - a * a) ** 0.5, axis=0,
-                              zi=(a * state.noise)[None])
-        state.noise = coloured[-1]
-    else:
-        coloured = white * sigma
-    return quantise(volts + coloured, sensor)
-
-
-def _filtered(volts: np.ndarray, ratio: float, state: FilterState) -> np.ndarray:
-    a = exp(-ratio)
-    new = 1 - (1 - a) / ratio
-    old = (1 - a) / ratio - a
-    drive = new * volts + old * np.vstack([state.last_input, volts[:-1]])
-    out, _ = lfilter([1.0], [1.0, -a], drive, axis=0, zi=(a * state.filtered)[None])
-    state.last_input, state.filtered = volts[-1], out[-1]
-    return out
-
-
-def quantise(volts: np.ndarray, sensor: Sensor) -> np.ndarray:
-    """Round volts to the ADC's codes, at most its rails; unchanged without an ADC."""
-    if not sensor.lsb_v:
+def quantise(volts: np.ndarray, sensor: Sensor, lsb_v: float) -> np.ndarray:
+    """Round volts to steps of the ADC, V, at most its rails; unchanged without an ADC."""
+    if not lsb_v:
         return volts
-    codes = np.clip(np.rint(volts / sensor.lsb_v), 0, 2 ** sensor.adc_bits - 1)
-    return codes * sensor.lsb_v
+    highest = sensor.adc_vref_v - sensor.lsb_v
+    return np.clip(np.rint(volts / lsb_v) * lsb_v, 0.0, np.floor(highest / lsb_v) * lsb_v)
 
 
 def at_a_rail(volts: np.ndarray, sensor: Sensor) -> np.ndarray:

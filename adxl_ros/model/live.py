@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 from adxl_ros.model import chain, noise
 from adxl_ros.model.constants import AXES, G0_MPS2
-from adxl_ros.model.effects.base import Components
+from adxl_ros.model.effects.base import Components, Environment
 from adxl_ros.model.maths import FLOATS
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.model.tilt import angles, roll_pitch_covariance
@@ -30,6 +30,8 @@ import numpy as np
 _CELL_MPS2 = 0.5
 """Forces this near share a tangent and the covariance of the calibration, which vary slowly."""
 _MOST_CELLS = 4096
+_NEAR = Environment(0.0, 0.5, 0.01)
+"""Surroundings this near, °C and V, share them, too."""
 _LIMIT_MPS2 = 1e6
 """No sensor gives as much."""
 _TOLERANCE_MPS2 = 1e-8
@@ -94,7 +96,7 @@ class Live:
         self._volts = (sensor.nominal_scale_v_per_g / G0_MPS2).tolist()
         self._rails = (0.0, sensor.adc_vref_v - sensor.lsb_v, sensor.lsb_v / 2)
         self._respond = chain.static_response(sensor)
-        self._step = chain.step(sensor.axes, sensor.local_gravity_mps2, sensor.z_sign, FLOATS)
+        self._step = chain.step(sensor.axes, chain.gravity_mps2(sensor), sensor.z_sign, FLOATS)
         self._invert = chain.inverse(sensor)
         self._measured = measured_covariance(sensor)
         self._cells: dict[tuple[int, int, int], _Cell] = {}
@@ -103,6 +105,7 @@ class Live:
         self._derives_z = sensor.axes == 'xy'
         # A force, and the volts that respond to it.
         self._force: Components = [0.0, 0.0, 0.0]
+        self._around = self._cells_around = chain.NOMINAL
         self._last_volts = self._respond(self._force)
         self._time_s = float('-inf')
 
@@ -135,6 +138,27 @@ class Live:
         return Estimate(force, spread, roll, pitch, inclination,
                         roll_pitch_covariance(force, loose, FLOATS), saturated)
 
+    def surround(self, temperature_c: float | None = None, supply_v: float | None = None
+                 ) -> None:
+        """
+        Take the surroundings from now on; those that are not named stay.
+
+        Parameters
+        ----------
+        temperature_c
+            Of the sensor, °C.
+        supply_v
+            Of the sensor, V.
+
+        """
+        self._around = self._around._replace(**{name: value for name, value in (
+            ('temperature_c', temperature_c), ('supply_v', supply_v)) if value is not None})
+        if any(abs(now - then) > near for now, then, near in zip(
+                self._around[1:], self._cells_around[1:], _NEAR[1:])):
+            self._cells.clear()
+            self._cells_around = self._around
+        self._last_volts = self._respond(self._force, self._around)
+
     def _inverse(self, volts: Components) -> Components | None:
         """Start where the last sample ended: its volts are the response to its force."""
         at = self._cell(self._force).at
@@ -147,9 +171,9 @@ class Live:
             # Each step is shorter than the one before by the same factor, or a smaller one.
             if moved * moved <= _TOLERANCE_MPS2 * moved_before:
                 break
-            response = self._respond(force)
+            response = self._respond(force, self._around)
         else:
-            force = self._invert(volts)
+            force = self._invert(volts, self._around)
         if not abs(force[0]) + abs(force[1]) + abs(force[2]) < float('inf'):
             return None
         self._force, self._last_volts = force, volts
@@ -201,7 +225,8 @@ class Live:
         if cell is None:
             if len(self._cells) >= _MOST_CELLS:
                 self._cells.clear()
-            covariance, at = self._measured([float(k * _CELL_MPS2) for k in key])
+            covariance, at = self._measured([float(k * _CELL_MPS2) for k in key],
+                                            self._around)
             full = np.diag([0.0, UNMEASURED_VARIANCE, UNMEASURED_VARIANCE])
             axes = [AXES.index(a) for a in self.sensor.axes]
             full[np.ix_(axes, axes)] = covariance[:, :, 0]

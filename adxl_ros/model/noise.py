@@ -20,14 +20,23 @@ from adxl_ros.model.sensor import Sensor
 import numpy as np
 
 
-def analog_sigma_v(sensor: Sensor) -> np.ndarray:
+def analog_sigma_v(sensor: Sensor, rc_s: np.ndarray | None = None) -> np.ndarray:
     """
     Give the standard deviation of the analog noise by axis, V, (m,): white noise through the RC.
 
     A first-order filter of time constant RC passes the noise bandwidth 1/(4·RC) = f_c·π/2; with
     no filter it is half the sample rate.
+
+    Parameters
+    ----------
+    sensor
+        Stated figures.
+    rc_s
+        Time constants by axis, s, (m,), where they are not the stated one.
+
     """
-    bandwidth_hz = 0.25 / sensor.rc_s if sensor.rc_s else sensor.rate_hz / 2
+    rc = np.full(len(sensor.axes), sensor.rc_s) if rc_s is None else rc_s
+    bandwidth_hz = np.where(rc > 0, 0.25 / np.where(rc > 0, rc, 1.0), sensor.rate_hz / 2)
     density = sensor.noise_density_g_per_rthz * sensor.nominal_scale_v_per_g
     return density * np.sqrt(bandwidth_hz)
 

@@ -16,34 +16,71 @@
 
 from __future__ import annotations
 
-from adxl_ros.model import chain
+from collections.abc import Iterator
+
+from adxl_ros.model.motion import Held, Motion
+from adxl_ros.model.response import Response
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.model.stage import specific_force
-from adxl_ros.model.trajectory import Motion
 import numpy as np
 
+Columns = dict[str, np.ndarray]
+_BLOCK = 32768
 
-def simulate(sensor: Sensor, motion: Motion, rng: np.random.Generator) -> dict[str, np.ndarray]:
+
+def simulate(sensor: Sensor, motion: Motion, seed: int) -> Columns:
     """
     Run a manoeuvre through the chain and read the stage by its encoder.
 
     Returns
     -------
     dict
-        Columns of a recording by canonical name, each (n,): `time_s`, volts, `alpha_rad`,
-        `beta_rad`, and `shift_m` where it moves.
+        Columns of a recording by canonical name, each (n,): `time_s`, volts, the joints'
+        encoders, temperature and supply where the manoeuvre has them.
 
     """
-    force = specific_force(motion.alpha_rad, motion.beta_rad, sensor.local_gravity_mps2,
-                           motion.shift_acceleration_mps2)
-    state = chain.settled(sensor, [float(f[0]) for f in force], rng)
-    volts = chain.sample(sensor, force, state, rng)
-    columns = {'time_s': motion.time_s}
-    columns.update({f'{axis}_v': volts[:, d] for d, axis in enumerate(sensor.axes)})
-    columns['alpha_rad'] = encoder(motion.alpha_rad, sensor.stage_resolution_rad)
-    columns['beta_rad'] = encoder(motion.beta_rad, sensor.stage_resolution_rad)
-    if motion.shift_m.any():
-        columns['shift_m'] = motion.shift_m
+    parts = list(blocks(sensor, motion, seed))
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
+def blocks(sensor: Sensor, motion: Motion, seed: int, begin_s: float = 0.0
+           ) -> Iterator[Columns]:
+    """
+    Run a manoeuvre block by block; see `simulate`.
+
+    Parameters
+    ----------
+    sensor
+        The unit, sampled at its rate.
+    motion
+        What it feels.
+    seed
+        Of all randomness: the same gives the same to the bit.
+    begin_s
+        Time of the first sample.
+
+    """
+    respond = Response(sensor, motion, seed, begin_s)
+    count = max(int(round(motion.duration_s * sensor.rate_hz, 6)), 1)
+    for begin in range(0, count, _BLOCK):
+        time_s = begin_s + np.arange(begin, min(begin + _BLOCK, count)) / sensor.rate_hz
+        volts = respond(time_s)
+        yield {'time_s': time_s,
+               **{f'{axis}_v': volts[:, d] for d, axis in enumerate(sensor.axes)},
+               **references(sensor, motion, time_s)}
+
+
+def references(sensor: Sensor, motion: Motion, time_s: np.ndarray) -> Columns:
+    """Return what is recorded beside the sensor at the stamps, (n,) by column."""
+    columns = {}
+    if motion.force is None:
+        columns['alpha_rad'] = encoder(motion.alpha(time_s), sensor.stage_resolution_rad)
+        columns['beta_rad'] = encoder(motion.beta(time_s), sensor.stage_resolution_rad)
+        if not isinstance(motion.shift, Held):
+            columns['shift_m'] = motion.shift(time_s)
+    if motion.temperature_c:
+        columns['temperature_c'] = motion.temperature_c(time_s)
+    if motion.supply_v:
+        columns['supply_v'] = motion.supply_v(time_s)
     return columns
 
 

@@ -16,12 +16,15 @@
 
 from __future__ import annotations
 
-from adxl_ros.model.effects.base import Components, Value
+from adxl_ros.model.effects.base import Components, Joint, Value
 import numpy as np
+
+UPRIGHT = (0.0, 0.0, 1.0)
 
 
 def specific_force(alpha_rad: Value, beta_rad: Value, gravity_mps2: float,
-                   shift_acceleration_mps2: Value = 0.0) -> Components:
+                   shift_acceleration_mps2: Value = 0.0,
+                   up: Components | tuple[float, float, float] = UPRIGHT) -> Components:
     """
     Specific force in the case frame of a sensor on the stage, m/s².
 
@@ -36,6 +39,8 @@ def specific_force(alpha_rad: Value, beta_rad: Value, gravity_mps2: float,
         Local gravity, m/s².
     shift_acceleration_mps2
         Second derivative of the `shift` joint, m/s².
+    up
+        The vertical in the frame of the stage's base; its y is the axis of alpha.
 
     Returns
     -------
@@ -43,7 +48,70 @@ def specific_force(alpha_rad: Value, beta_rad: Value, gravity_mps2: float,
         The three components, each in the shape of the angles.
 
     """
-    sin_alpha = np.sin(alpha_rad)
-    return [gravity_mps2 * sin_alpha * np.cos(beta_rad) + shift_acceleration_mps2,
-            -gravity_mps2 * sin_alpha * np.sin(beta_rad),
-            gravity_mps2 * np.cos(alpha_rad)]
+    x, y, z = (gravity_mps2 * u for u in up)
+    sin_alpha, cos_alpha = np.sin(alpha_rad), np.cos(alpha_rad)
+    sin_beta, cos_beta = np.sin(beta_rad), np.cos(beta_rad)
+    along = x * cos_alpha + z * sin_alpha
+    return [along * cos_beta + y * sin_beta + shift_acceleration_mps2,
+            y * cos_beta - along * sin_beta,
+            z * cos_alpha - x * sin_alpha]
+
+
+def angular_motion(alpha: Joint, beta: Joint) -> tuple[Components, Components]:
+    """
+    Angular velocity and acceleration of the sensor, in its own frame, rad/s and rad/s².
+
+    ω = β̇·[0 0 1] − α̇·[sin β, cos β, 0], which leaves f(α, β) of a fixed vertical as above:
+    ḟ = −ω × f.
+    """
+    sin_beta, cos_beta = np.sin(beta.position), np.cos(beta.position)
+    along, across = sin_beta * alpha.velocity, cos_beta * alpha.velocity
+    return ([-along, -across, beta.velocity],
+            [-sin_beta * alpha.acceleration - across * beta.velocity,
+             -cos_beta * alpha.acceleration + along * beta.velocity,
+             beta.acceleration])
+
+
+def carried(omega: Components, omega_dot: Components, r: Components) -> Components:
+    """
+    Acceleration of a point that a turning body carries: ω × (ω × r) + ω̇ × r, m/s².
+
+    Parameters
+    ----------
+    omega, omega_dot
+        From `angular_motion`.
+    r
+        From the axis to the point, in the body's frame, m.
+
+    """
+    centripetal = cross(omega, cross(omega, r))
+    return [c + t for c, t in zip(centripetal, cross(omega_dot, r))]
+
+
+def cross(a: Components, b: Components) -> Components:
+    """Return the vector product, component by component."""
+    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+
+
+def felt(alpha: Joint, beta: Joint, shift: Joint, gravity_mps2: float,
+         up: Components | tuple[float, float, float] = UPRIGHT) -> Components:
+    """
+    Specific force of a sensor at the axes while all joints move, m/s².
+
+    A shifted sensor is carried by the turning stage and feels Coriolis' acceleration.
+
+    Parameters
+    ----------
+    alpha, beta, shift
+        Joints with their derivatives.
+    gravity_mps2, up
+        As for `specific_force`.
+
+    """
+    force = specific_force(alpha.position, beta.position, gravity_mps2, shift.acceleration, up)
+    if np.any(shift.position) and (np.any(alpha.velocity) or np.any(beta.velocity)):
+        omega, omega_dot = angular_motion(alpha, beta)
+        arm = [shift.position, 0.0, 0.0]
+        coriolis = cross(omega, [2 * shift.velocity, 0.0, 0.0])
+        force = [f + c + w for f, c, w in zip(force, carried(omega, omega_dot, arm), coriolis)]
+    return force

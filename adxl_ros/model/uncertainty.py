@@ -17,12 +17,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
-from adxl_ros.model import chain, noise
+from adxl_ros.model import chain, coefficients, noise
 from adxl_ros.model.constants import AXES
-from adxl_ros.model.effects import effect_named
-from adxl_ros.model.effects.base import Components, Value
+from adxl_ros.model.effects.base import Components, Environment, Value
 from adxl_ros.model.maths import ARRAYS, Maths
 from adxl_ros.model.sensor import Sensor
 import numpy as np
@@ -38,7 +36,8 @@ _OVERHANG_MPS2 = -0.5
 
 
 def force_covariance(sensor: Sensor, force: Components,
-                     sample_variance_v2: np.ndarray | None = None) -> np.ndarray:
+                     sample_variance_v2: np.ndarray | None = None,
+                     environment: Environment = chain.NOMINAL) -> np.ndarray:
     """
     Covariance of the specific force that `chain.inverse` gives, (m/s²)², (3, 3, n).
 
@@ -53,10 +52,12 @@ def force_covariance(sensor: Sensor, force: Components,
         Specific force in the case frame, m/s², three components (n,).
     sample_variance_v2
         Variance of the volts by axis, V², (m,); that of one sample's noise unless given.
+    environment
+        Around the samples.
 
     """
     force = [np.atleast_1d(np.asarray(f, float)) for f in force]
-    measured, at = measured_covariance(sensor, sample_variance_v2)(force)
+    measured, at = measured_covariance(sensor, sample_variance_v2)(force, environment)
     axes = [AXES.index(a) for a in sensor.axes]
     full = np.zeros((3, 3, len(force[0])))
     full[1, 1] = full[2, 2] = UNMEASURED_VARIANCE
@@ -69,7 +70,7 @@ def force_covariance(sensor: Sensor, force: Components,
 
 
 def measured_covariance(sensor: Sensor, sample_variance_v2: np.ndarray | None = None
-                        ) -> Callable[[Components], tuple[np.ndarray, chain.Tangent]]:
+                        ) -> Callable[..., tuple[np.ndarray, chain.Tangent]]:
     """
     Prepare the covariance of the measured axes, given the others.
 
@@ -81,7 +82,8 @@ def measured_covariance(sensor: Sensor, sample_variance_v2: np.ndarray | None = 
     Returns
     -------
     callable
-        Maps specific force, m/s², three arrays (n,) or floats, to the covariance, (m/s²)²,
+        Maps specific force, m/s², three arrays (n,) or floats, and an `Environment`, if it is
+        not the nominal one, to the covariance, (m/s²)²,
         (m, m, n), and the `chain.Tangent` there.
 
     """
@@ -90,11 +92,13 @@ def measured_covariance(sensor: Sensor, sample_variance_v2: np.ndarray | None = 
     m = len(sensor.axes)
     respond, by_parameter = chain.static_response(sensor), _parameter_tangent(sensor)
 
-    def covariance(force: Components) -> tuple[np.ndarray, chain.Tangent]:
-        at = chain.tangent(respond, sensor.axes, force)
+    def covariance(force: Components, environment: Environment = chain.NOMINAL
+                   ) -> tuple[np.ndarray, chain.Tangent]:
+        at = chain.tangent(respond, sensor.axes, force, environment)
         volts = np.diag(sample_variance_v2)
         if len(sensor.covariance):
-            of = np.moveaxis(by_parameter(force).reshape(m, len(sensor.covariance), -1), 2, 0)
+            of = by_parameter(force, environment).reshape(m, len(sensor.covariance), -1)
+            of = np.moveaxis(of, 2, 0)
             volts = volts + of @ sensor.covariance @ np.swapaxes(of, 1, 2)
         back: np.ndarray = np.moveaxis(np.array(at.back).reshape(m, m, -1), 2, 0)
         return np.moveaxis(back @ volts @ np.swapaxes(back, 1, 2), 0, 2), at
@@ -155,26 +159,18 @@ def parameter_tangent(sensor: Sensor, force: Components) -> np.ndarray:
     return _parameter_tangent(sensor)(force)
 
 
-def _parameter_tangent(sensor: Sensor) -> Callable[[Components], np.ndarray]:
+def _parameter_tangent(sensor: Sensor) -> Callable[..., np.ndarray]:
     differences = []
     for name in sensor.covariance_names:
-        effect, parameter, axis = name.split('.')
-        scale = next(p.scale for p in effect_named(effect).parameters if p.name == parameter)
-        above, below = (chain.static_response(_shifted(sensor, effect, parameter, axis, by))
-                        for by in (1e-3 * scale, -1e-3 * scale))
-        differences.append((above, below, 2e-3 * scale))
+        at, step = coefficients.get(sensor, [name]), 1e-3 * coefficients.parameter_of(name).scale
+        above, below = (chain.static_response(coefficients.put(sensor, [name], at + by))
+                        for by in (step, -step))
+        differences.append((above, below, 2 * step))
 
-    def by_parameter(force: Components) -> np.ndarray:
-        columns = [[(a - b) / apart for a, b in zip(above(force), below(force))]
+    def by_parameter(force: Components, environment: Environment = chain.NOMINAL) -> np.ndarray:
+        columns = [[(a - b) / apart for a, b in zip(above(force, environment),
+                                                    below(force, environment))]
                    for above, below, apart in differences]
         return np.swapaxes(np.array(columns), 0, 1)
 
     return by_parameter
-
-
-def _shifted(sensor: Sensor, effect: str, parameter: str, axis: str, by: float) -> Sensor:
-    values = {name: dict(of) for name, of in sensor.values.items()}
-    moved = np.array(values[effect][parameter], float)
-    moved[sensor.axes.index(axis)] += by
-    values[effect][parameter] = moved
-    return replace(sensor, values=values)

@@ -182,8 +182,7 @@ def _cpu_s(pid: int) -> float:
 def _reading() -> None:
     """Print how long 3 million rows take to read, and the physical fit of a sweep."""
     sensor = params.load(nominal_path())
-    rng = np.random.default_rng(0)
-    columns = simulate(sensor, sweep(sensor.rate_hz, rng), rng)
+    columns = simulate(sensor, sweep(np.random.default_rng(0)), 0)
     count = len(columns['time_s'])
     whole = {name: np.resize(values, _ROWS) for name, values in columns.items()}
     time_s = np.arange(_ROWS) / sensor.rate_hz

@@ -195,7 +195,8 @@ def declare_sensor(node: Node, live: bool = False) -> dict[str, Any]:
                             live)
     coefficients = [('effects', kind.STRING_ARRAY, 'effects that this unit has', '', None, None)]
     for effect in library().values():
-        coefficients += [(f'{effect.name}.{p.name}', kind.DOUBLE_ARRAY, f'{p.doc}, by axis',
+        coefficients += [(f'{effect.name}.{p.name}', kind.DOUBLE_ARRAY if p.axes else kind.DOUBLE,
+                          f'{p.doc}, by axis' if p.axes else p.doc,
                           p.unit, p.lower, p.upper) for p in effect.parameters]
     coefficients += [
         ('covariance_names', kind.STRING_ARRAY, 'coefficients in the covariance', '', None, None),

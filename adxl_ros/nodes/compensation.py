@@ -17,13 +17,15 @@
 from __future__ import annotations
 
 from collections import Counter
-from math import cos, sin
+from math import cos, isfinite, sin
 from typing import Any
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import imu_bytes
 from adxl_ros.files.cdr import CdrError
 from adxl_ros.files.unit import check_unit
+from adxl_ros.model import chain
+from adxl_ros.model.effects import effect_named
 from adxl_ros.model.live import Estimate, Live
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.model.tilt import UNOBSERVABLE_RAD2
@@ -34,7 +36,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import Vector3Stamped
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
-from sensor_msgs.msg import Imu
+from sensor_msgs.msg import BatteryState, Imu, Temperature
 
 _DEPTH = 100
 """Samples kept while the node is busy: 0.1 s at 1 kHz."""
@@ -56,11 +58,16 @@ class Compensation(Node):
         self._counts: Counter[str] = Counter()
         self._reported: Counter[str] = Counter()
         self._angles = [0.0, 0.0, 0.0]
+        # Surroundings to be taken up, and those that are.
+        self._around: dict[str, float] = {}
+        self._known: dict[str, float] = {}
         LiveSensor(self, self._check_unit, self._use)
         self._data = common.publisher(self, Imu, 'imu/data', _DEPTH)
         self._tilt = common.publisher(self, Vector3Stamped, 'tilt', _DEPTH)
         self._diagnostics = common.publisher(self, DiagnosticArray, '/diagnostics', 10)
         common.subscription(self, DiagnosticStatus, 'sensor_info', self._on_info, 1, latched=True)
+        common.subscription(self, Temperature, 'temperature', self._on_temperature, 1)
+        common.subscription(self, BatteryState, 'supply', self._on_supply, 1)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._reported_ns = self._steady.now().nanoseconds
         self.create_timer(1.0, self._report, clock=self._steady)
@@ -72,7 +79,9 @@ class Compensation(Node):
 
     def _use(self, sensor: Sensor, source: str) -> None:
         # One assignment: the receiving thread has the old coefficients or the new ones.
-        self._live = Live(sensor)
+        live = Live(sensor)
+        live.surround(**self._known)
+        self._live = live
         self._source = source
         of = f'{sensor.serial}, model {sensor.model}' if sensor.effects else \
             f'{sensor.serial}, which is not calibrated'
@@ -87,6 +96,17 @@ class Compensation(Node):
     def _on_info(self, message: DiagnosticStatus) -> None:
         self._info = {pair.key: pair.value for pair in message.values}
         self._judge()
+
+    def _on_temperature(self, message: Temperature) -> None:
+        self._surround('temperature_c', message.temperature)
+
+    def _on_supply(self, message: BatteryState) -> None:
+        self._surround('supply_v', message.voltage)
+
+    def _surround(self, name: str, value: float) -> None:
+        # The receiving thread takes it up with its next sample.
+        if isfinite(value):
+            self._around[name] = value
 
     def _judge(self) -> None:
         """Find out whether the parameters are those of the stream, and say so on a change."""
@@ -110,6 +130,10 @@ class Compensation(Node):
         except CdrError:
             self._counts['dropped'] += 1
             return
+        if self._around:
+            around, self._around = self._around, {}
+            self._live.surround(**around)
+            self._known |= around
         estimate = self._live(accel, time_s)
         if estimate is None:
             self._counts['dropped'] += 1
@@ -170,9 +194,23 @@ class Compensation(Node):
         if self._info is None:
             return common.WARN, (f'unit not confirmed: nothing on '
                                  f'{self.resolve_topic_name("sensor_info")}')
+        lacks = self._lacks()
+        if lacks:
+            return common.WARN, lacks
         if not self._live.sensor.effects:
             return common.WARN, 'not calibrated: the nominal figures apply'
         return common.OK, 'compensating'
+
+    def _lacks(self) -> str:
+        """Name what the calibration follows and nobody says."""
+        topics = {'temperature_c': 'temperature', 'supply_v': 'supply'}
+        for effect in map(effect_named, self._live.sensor.effects):
+            for name in effect.follows:
+                if name in topics and name not in self._known:
+                    nominal = getattr(chain.NOMINAL, name)
+                    return (f'{effect.name} is taken at {nominal:g}: nothing on '
+                            f'{self.resolve_topic_name(topics[name])}')
+        return ''
 
 
 def main() -> int:

@@ -27,6 +27,8 @@ from adxl_ros.files.recording import Recording
 from adxl_ros.files.unit import check_unit
 from adxl_ros.model import chain
 from adxl_ros.model.constants import AXES
+from adxl_ros.model.effects import effect_named
+from adxl_ros.model.effects.base import Place
 from adxl_ros.model.sensor import Sensor, with_axes
 from adxl_ros.model.tilt import tilt
 from adxl_ros.model.uncertainty import force_covariance
@@ -54,6 +56,7 @@ def apply(options: argparse.Namespace) -> int:
         raise UserError(f'{options.output}: is the recording itself; choose another output')
     sensor = params.load(options.params or default_params())
     lost = saturated = rows = 0
+    began_s = 0.0
     block = None
     with CsvWriter(options.output, _DIGITS) as out, progress('apply') as show:
         for block in recording.blocks(options.recording, _BLOCK_ROWS):
@@ -61,7 +64,10 @@ def apply(options: argparse.Namespace) -> int:
                 sensor = _of_unit(block, sensor)
             volts = block.volts(sensor)
             at_rail = chain.at_a_rail(volts, sensor)
-            columns = estimates(sensor, volts, at_rail)
+            if not rows:
+                began_s = float(block.time_s[0])
+                _say_unknown(block, sensor)
+            columns = estimates(sensor, volts, at_rail, _around(block, began_s))
             out.write({'time_s': block.epoch_ns * 1e-9 + block.time_s, **columns})
             rows += len(block)
             lost += int(np.isnan(columns['ax_mps2']).sum())
@@ -86,7 +92,30 @@ def _say(count: int, rows: int, what: str) -> None:
         print(f'apply: {count} of {rows} samples {what}', file=sys.stderr)
 
 
-def estimates(sensor: Sensor, volts: np.ndarray, at_rail: np.ndarray) -> dict[str, np.ndarray]:
+def _around(block: Recording, began_s: float) -> chain.Environment:
+    """Return what is around the samples; nominal where it was not measured."""
+    measured = {name: values for name in ('temperature_c', 'supply_v')
+                if (values := block.columns.get(name)) is not None}
+    return chain.Environment(block.time_s - began_s, **{
+        name: np.where(np.isfinite(values), values, getattr(chain.NOMINAL, name))
+        for name, values in measured.items()})
+
+
+def _say_unknown(block: Recording, sensor: Sensor) -> None:
+    """Say which effects are not undone, or undone for nominal surroundings."""
+    for effect in map(effect_named, sensor.effects):
+        if not effect.invertible and effect.acts_on == 'mean' and effect.place < Place.CLOCK \
+                and 'stage' not in effect.needs:
+            print(f'apply: {effect.name} is not undone: no single sample tells it',
+                  file=sys.stderr)
+        for name in effect.follows:
+            if name != 'time_s' and not np.isfinite(block.columns.get(name, np.nan)).all():
+                print(f'apply: {block.path}: {name} is not there or has gaps: {effect.name} is '
+                      f'taken at {getattr(chain.NOMINAL, name):g} there', file=sys.stderr)
+
+
+def estimates(sensor: Sensor, volts: np.ndarray, at_rail: np.ndarray,
+              around: chain.Environment = chain.NOMINAL) -> dict[str, np.ndarray]:
     """
     Estimate force and angles with standard deviations, (n,) each, by column of the output.
 
@@ -100,11 +129,13 @@ def estimates(sensor: Sensor, volts: np.ndarray, at_rail: np.ndarray) -> dict[st
         ADC volts, (n, m).
     at_rail
         Samples of which nothing is sure, (n,).
+    around
+        Their surroundings.
 
     """
     with np.errstate(all='ignore'):  # volts that no force explains
-        force = chain.inverse(sensor)(list(volts.T))
-        covariance = force_covariance(sensor, force)
+        force = chain.inverse(sensor)(list(volts.T), around)
+        covariance = force_covariance(sensor, force, environment=around)
         covariance[:, :, at_rail] = np.inf
         angles = tilt(force, covariance, 'z' in sensor.axes)
     std = np.sqrt([covariance[d, d] for d in range(3)])

@@ -17,31 +17,48 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
 from dataclasses import replace
 from difflib import get_close_matches
+from pathlib import Path
 
+from adxl_ros.calibrate.recorded import rate_hz
 from adxl_ros.errors import UserError
 from adxl_ros.files import params, recording
-from adxl_ros.files.columns import Recording, sensor_info
-from adxl_ros.model.effects import effect_named
+from adxl_ros.files.columns import JOINTS, Recording, REFERENCES, sensor_info
+from adxl_ros.model import simulate as simulator
+from adxl_ros.model.follow import Force, Smoothed
+from adxl_ros.model.motion import Held, Motion
+from adxl_ros.model.response import Response
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.model.simulate import simulate as run_chain
 from adxl_ros.model.trajectory import TRAJECTORIES
-from adxl_ros.tools.common import default_params, run
+from adxl_ros.tools.common import default_params, progress, run
+from adxl_ros.tools.effect_option import SYNTAX, with_effects
 import numpy as np
+
+_BLOCK = 32768
+_FASTEST_RAD_S = 100.0
+"""No stage turns a sensor faster; a jump in the angle is no motion."""
 
 
 def parser() -> argparse.ArgumentParser:
     """Describe the command line."""
-    about = '; '.join(f'{name}: {f.__doc__.splitlines()[0]}' for name, f in TRAJECTORIES.items())
-    parse = argparse.ArgumentParser(prog='simulate', description=__doc__, epilog=about)
-    parse.add_argument('trajectory', choices=list(TRAJECTORIES), metavar='TRAJECTORY',
-                       help=', '.join(TRAJECTORIES))
+    about = '\n'.join(f'  {name:12}{f.__doc__.splitlines()[0]}'
+                      for name, f in TRAJECTORIES.items() if f.__doc__)
+    parse = argparse.ArgumentParser(
+        prog='simulate', description=__doc__, formatter_class=argparse.RawTextHelpFormatter,
+        epilog=f'trajectories:\n{about}\n'
+               '  imu         Feel the specific force of --force: ax_mps2, ay_mps2, az_mps2 or\n'
+               '              sensor_msgs/Imu, of any simulator.\n'
+               '  RECORDING   Follow the stage angles of a recording again, at its stamps.')
+    parse.add_argument('trajectory', metavar='TRAJECTORY',
+                       help=f'{", ".join(TRAJECTORIES)}, imu, or a recording')
     parse.add_argument('--params', metavar='FILE', default=None,
                        help='the sensor (default: the nominal ADXL203)')
     parse.add_argument('--effect', action='append', default=[], metavar='NAME[:key=value,...]',
-                       help='add an effect; KEY=VALUE for all its axes, KEY.AXIS=VALUE for one; '
-                            'a name alone takes typical values')
+                       help=f'add an effect: {SYNTAX}')
+    parse.add_argument('--force', metavar='RECORDING',
+                       help='specific force for the trajectory imu')
     parse.add_argument('--rate', type=float, metavar='HZ', help='sample rate')
     parse.add_argument('--seed', type=int, default=0, help='of noise and manoeuvre (default 0)')
     parse.add_argument('-o', dest='output', metavar='RECORDING', required=True,
@@ -51,64 +68,123 @@ def parser() -> argparse.ArgumentParser:
 
 def simulate(options: argparse.Namespace) -> int:
     """Run the tool; see `parser`."""
+    if options.trajectory not in (*TRAJECTORIES, 'imu') and not Path(options.trajectory).exists():
+        near = get_close_matches(options.trajectory, [*TRAJECTORIES, 'imu'], 1)
+        parser().error(f'{options.trajectory}: neither a trajectory nor a recording'
+                       f'{f"; did you mean {near[0]}?" if near else ""}; the trajectories are '
+                       f'{", ".join(TRAJECTORIES)}, imu')
     sensor = params.load(options.params or default_params())
     if options.rate is not None:
         if not 0.01 <= options.rate <= 1e5:
             raise UserError(f'--rate {options.rate:g}: outside 0.01 to 100000 Hz')
         sensor = replace(sensor, rate_hz=options.rate)
-    for text in options.effect:
-        sensor = with_effect(sensor, text)
-    rng = np.random.default_rng(options.seed)
-    columns = run_chain(sensor, TRAJECTORIES[options.trajectory](sensor.rate_hz, rng), rng)
-    time_s = columns.pop('time_s')
-    recording.write(options.output, Recording(str(options.output), time_s, columns,
-                                              sensor_info(sensor)), sensor)
+    if options.seed < 0:
+        raise UserError(f'--seed {options.seed}: must be 0 or more')
+    for path in filter(None, (options.trajectory, options.force)):
+        if Path(path).resolve() == Path(options.output).resolve():
+            raise UserError(f'{options.output}: is the input itself; choose another output')
+    sensor = with_effects(sensor, options.effect)
+    sensor, duration_s, begin_s, blocks = _run(sensor, options)
+    with recording.writer(options.output, sensor) as write, progress('simulate') as show:
+        for columns in blocks:
+            time_s = columns.pop('time_s')
+            write(Recording(str(options.output), time_s, columns, sensor_info(sensor)))
+            show(min((time_s[-1] - begin_s) / max(duration_s, 1e-9), 1.0))
     return 0
 
 
-def with_effect(sensor: Sensor, text: str) -> Sensor:
+def _run(sensor: Sensor, options: argparse.Namespace
+         ) -> tuple[Sensor, float, float, Iterator[simulator.Columns]]:
+    """Return the sensor at its rate, how long it runs from when, and the blocks."""
+    name = options.trajectory
+    if (name == 'imu') != bool(options.force):
+        raise UserError('--force RECORDING goes with the trajectory imu, and imu with it: '
+                        'simulate imu --force RECORDING')
+    if name == 'imu':
+        motion, begin_s = _felt(options.force, options.rate is None)
+        if options.rate is None:
+            sensor = replace(sensor, rate_hz=motion.internal_rate_hz)
+            motion = replace(motion, internal_rate_hz=max(sensor.rate_hz, 1000.0))
+        blocks = simulator.blocks(sensor, motion, options.seed, begin_s)
+        return sensor, motion.duration_s, begin_s, blocks
+    if name in TRAJECTORIES:
+        motion = TRAJECTORIES[name](np.random.default_rng(options.seed))
+        return sensor, motion.duration_s, 0.0, simulator.blocks(sensor, motion, options.seed)
+    read = recording.read(name)
+    motion = _followed(read, sensor)
+    begin_s, end_s = float(read.time_s[0]), float(read.time_s[-1])
+    if options.rate is not None:
+        return sensor, end_s - begin_s, begin_s, simulator.blocks(
+            sensor, replace(motion, duration_s=end_s - begin_s), options.seed, begin_s)
+    sensor = replace(sensor, rate_hz=rate_hz(read))
+    return sensor, end_s - begin_s, begin_s, _again(sensor, motion, read, options.seed)
+
+
+def _again(sensor: Sensor, motion: Motion, read: Recording, seed: int
+           ) -> Iterator[simulator.Columns]:
+    """Sample at the stamps of a recording, beside its own references."""
+    respond = Response(sensor, motion, seed, float(read.time_s[0]))
+    for begin in range(0, len(read), _BLOCK):
+        part = slice(begin, begin + _BLOCK)
+        volts = respond(read.time_s[part])
+        yield {'time_s': read.time_s[part],
+               **{f'{axis}_v': volts[:, d] for d, axis in enumerate(sensor.axes)},
+               **{name: read.columns[name][part] for name in REFERENCES if name in read.columns}}
+
+
+def _felt(path: str, resampled: bool) -> tuple[Motion, float]:
+    """Read specific force; its internal rate is that of its samples."""
+    time_s, force = recording.read_ideal(path)
+    if len(time_s) < 4:
+        raise UserError(f'{path}: {len(time_s)} samples of specific force; at least 4 are needed')
+    begin_s = float(time_s[0])
+    duration_s = float(time_s[-1] - begin_s)
+    rate = round(1 / float(np.median(np.diff(time_s))), 6)
+    return Motion(duration_s + 1 / rate, force=Force(time_s, force),
+                  internal_rate_hz=rate if resampled else max(rate, 1000.0)), begin_s
+
+
+def _followed(read: Recording, sensor: Sensor) -> Motion:
     """
-    Add an effect, or change its parameters, as the command line states it.
+    Make the motion of a recording's references.
 
     Raises
     ------
     UserError
-        Unknown effect, parameter or axis (the nearest is suggested), or out of bounds.
+        There are no stage angles, or they jump as no stage does.
 
     """
-    name, _, rest = text.partition(':')
-    effect = effect_named(name)
-    count = len(sensor.axes)
-    values = dict(sensor.values.get(name) or {p.name: np.zeros(count)
-                                              for p in effect.parameters})
-    if not rest:
-        values = {p.name: np.array([p.scale * (a in p.axes) for a in sensor.axes])
-                  for p in effect.parameters}
-    for part in filter(None, rest.split(',')):
-        key, _, figure = part.partition('=')
-        parameter_name, _, axis = key.partition('.')
-        parameter = next((p for p in effect.parameters if p.name == parameter_name), None)
-        if parameter is None:
-            names = [p.name for p in effect.parameters]
-            near = get_close_matches(parameter_name, names, 1) or names
-            raise UserError(f'--effect {text}: {name} has no parameter {parameter_name!r}; did '
-                            f'you mean {near[0]}?')
-        try:
-            value = float(figure)
-        except ValueError:
-            raise UserError(f'--effect {text}: {figure!r} is not a number') from None
-        if not parameter.lower <= value <= parameter.upper:
-            raise UserError(f'--effect {text}: {value:g} {parameter.unit} is outside '
-                            f'{parameter.lower:g} to {parameter.upper:g}')
-        chosen = [i for i, a in enumerate(sensor.axes)
-                  if a in parameter.axes and axis in ('', a)]
-        if not chosen:
-            raise UserError(f'--effect {text}: no axis {axis!r} to act on; the sensor has '
-                            f'{sensor.axes}, {parameter_name} acts on {parameter.axes}')
-        values[parameter_name] = values[parameter_name].copy()
-        values[parameter_name][chosen] = value
-    effects = sensor.effects if name in sensor.effects else (*sensor.effects, name)
-    return replace(sensor, effects=effects, values={**sensor.values, name: values})
+    for name in ('alpha_rad', 'beta_rad'):
+        if name not in read.columns or np.isnan(read.columns[name]).all():
+            raise UserError(f'{read.path}: no stage angle {name} to follow; for specific force '
+                            f'say simulate imu --force {read.path}')
+    steps = {'alpha': sensor.stage_resolution_rad, 'beta': sensor.stage_resolution_rad,
+             'shift': 0.0}
+    joints = {}
+    for joint, name in JOINTS.items():
+        values = read.columns.get(name)
+        if values is None or np.isnan(values).all():
+            joints[joint] = Held()
+            continue
+        if joint != 'shift':
+            _check_speed(read, name, steps[joint])
+        joints[joint] = Smoothed(read.time_s, values, steps[joint])
+    around = {name: Smoothed(read.time_s, read.columns[name], 0.0)
+              for name in ('temperature_c', 'supply_v')
+              if name in read.columns and np.isfinite(read.columns[name]).any()}
+    return Motion(float(read.time_s[-1] - read.time_s[0]), **joints, **around)
+
+
+def _check_speed(read: Recording, name: str, step: float) -> None:
+    known = np.flatnonzero(np.isfinite(read.columns[name]))
+    moved = np.abs(np.diff(read.columns[name][known]))
+    passed = np.diff(read.time_s[known])
+    fast = np.flatnonzero(moved - 2 * step > _FASTEST_RAD_S * passed)
+    if len(fast):
+        i = fast[0]
+        raise UserError(f'{read.path}: {name} jumps by {moved[i]:.3g} rad within {passed[i]:.3g} '
+                        f's at {read.time_s[known[i]]:.6g} s, which no stage does; unwrap the '
+                        'angle, or cut the recording there')
 
 
 def main() -> int:

@@ -19,7 +19,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import Any
+from typing import Any, NamedTuple
+
+import numpy as np
 
 Value = Any
 """One component of a signal: an array over samples, or a float for one sample.
@@ -28,52 +30,132 @@ Effects compute component by component with plain arithmetic, so that one descri
 recordings (arrays) and a live sample (floats, without the cost of small arrays)."""
 
 Components = list[Value]
-Parameters = dict[str, tuple[float, ...]]
+Parameters = dict[str, Any]
+"""By name: a tuple of floats, one an axis, or a float where a parameter has no axes."""
 
 
 class Place(IntEnum):
-    """Where in the chain an effect acts; the chain runs in this order."""
+    """
+    Where in the chain an effect acts; the chain runs in this order.
 
+    The clock comes last, for it says which instant a sample is stamped with; it is evaluated
+    first, so that a sample is taken at its instant and nothing is resampled.
+    """
+
+    STAGE = 1
+    FORCE = 2
     MOUNTING = 3
     ELEMENT = 4
     ELECTRONICS = 5
+    ADC = 6
+    CODE = 7
+    CLOCK = 8
+
+
+class Environment(NamedTuple):
+    """What is around the sensor: time since power on, temperature, its supply."""
+
+    time_s: Value = 0.0
+    temperature_c: Value = 25.0
+    supply_v: Value = 5.0
+
+
+class Joint(NamedTuple):
+    """Motion of one joint of the stage: rad or m, and its first two derivatives by time."""
+
+    position: Value = 0.0
+    velocity: Value = 0.0
+    acceleration: Value = 0.0
 
 
 @dataclass
 class Signals:
     """
-    What runs through the static part of the chain, component by component.
+    What runs through the chain, component by component; a place reads and writes its own.
 
     Attributes
     ----------
+    environment
+        At the instants of the samples.
+    time_s
+        CLOCK: stamps, to be turned into the instants at which the samples are taken, s.
+    alpha, beta, shift
+        STAGE: joints as the encoder has them, to be turned into true ones.
+    up
+        STAGE: the vertical in the frame of the stage's base, a unit vector.
+    gravity_mps2
+        STAGE: true local gravity.
+    force
+        FORCE: specific force in the case frame, m/s², three.
     sensed
-        Specific force along the sensing axes, g, always three: axes that are not measured keep
-        the component along the case's axis.
+        MOUNTING: specific force along the sensing axes, g, always three: axes that are not
+        measured keep the component along the case's axis.
     output
-        What the element makes of it, g; starts as `sensed`. Effects read `sensed` and add to
-        `output`, so that their order does not matter.
+        ELEMENT: what the element makes of it, g; starts as `sensed`. Effects read `sensed` and
+        add to `output`, so that their order does not matter.
     zero_g_v, scale_v_per_g
-        Figures of the conversion to volts, by measured axis.
+        ELECTRONICS: figures of the conversion to volts, by measured axis.
+    rc_s, noise_ratio, lsb_v
+        ELECTRONICS: time constant of the output filter, s, and white noise by its stated
+        density, by measured axis; step of the ADC, V.
+    input_v, volts
+        ADC: volts by measured axis at the input of the ADC, and with what effects add to them;
+        effects read the first and add to the second. CODE: `volts` are what the ADC gives.
+    nominal_scale_v_per_g
+        The stated scale factor by measured axis, which turns g into volts at the ADC.
+    vref_v
+        Full scale of the ADC, V.
+    dt_s
+        Time between the samples of the arrays, s.
+    memory
+        What the effect that is being applied keeps from one block to the next; empty at the
+        beginning.
+    rng
+        Source of randomness of the effect that is being applied, its own by the seed.
 
     """
 
-    sensed: Components
+    environment: Environment
+    time_s: Value = 0.0
+    alpha: Joint = Joint()
+    beta: Joint = Joint()
+    shift: Joint = Joint()
+    up: Components = field(default_factory=list)
+    gravity_mps2: float = 0.0
+    force: Components = field(default_factory=list)
+    sensed: Components = field(default_factory=list)
     output: Components = field(default_factory=list)
     zero_g_v: Components = field(default_factory=list)
     scale_v_per_g: Components = field(default_factory=list)
+    rc_s: list[float] = field(default_factory=list)
+    noise_ratio: list[float] = field(default_factory=list)
+    lsb_v: float = 0.0
+    input_v: Components = field(default_factory=list)
+    volts: Components = field(default_factory=list)
+    nominal_scale_v_per_g: list[float] = field(default_factory=list)
+    vref_v: float = 0.0
+    dt_s: float = 0.0
+    memory: dict[Any, Any] = field(default_factory=dict)
+    rng: np.random.Generator | None = None
 
 
 @dataclass(frozen=True)
 class Parameter:
     """
-    One parameter of an effect, an entry an axis; neutral is 0: a departure from the nominal.
+    One parameter of an effect, a departure from the nominal chain.
 
     Attributes
     ----------
-    axes
-        The axes that it means something for; the entries of others must be 0.
     scale
         A typical magnitude, with its source (datasheet, paper or physics).
+    axes
+        The axes that it means something for, an entry an axis, those of others 0; empty for one
+        figure without axes.
+    neutral
+        The value that leaves the chain as it is; a figure of shape (a frequency, a time
+        constant), which means nothing while its amplitude is neutral, has its typical value.
+    typical
+        The value that the effect takes where only its name is given; `scale` unless stated.
 
     """
 
@@ -85,6 +167,13 @@ class Parameter:
     source: str
     doc: str
     axes: str = 'xyz'
+    neutral: float = 0.0
+    typical: float | None = None
+
+    @property
+    def shape(self) -> bool:
+        """Tell whether it only shapes what another parameter gives the size of."""
+        return self.neutral == self.scale
 
 
 @dataclass(frozen=True)
@@ -95,9 +184,20 @@ class Effect:
     Attributes
     ----------
     apply
-        Changes the signals in place, given the parameters as tuples of floats by axis.
+        Changes the signals of its place, given the parameters; vectorised.
     cause
         One sentence for a report: what causes it and what to do about it.
+    smooth
+        Whether the output is differentiable in the parameters.
+    acts_on
+        'mean' where it shows in the mean of the output, 'noise' where only statistics show it.
+    invertible
+        Whether it is a smooth function of the sample's own force and environment, which the
+        inverse undoes; an effect of the stage, of memory or of noise is not.
+    needs
+        What must be there for it to act: 'stage', 'filter', 'adc', 'noise'.
+    follows
+        The fields of `Environment` that it follows.
 
     """
 
@@ -106,3 +206,8 @@ class Effect:
     parameters: tuple[Parameter, ...]
     apply: Callable[[Signals, Parameters], None]
     cause: str
+    smooth: bool = True
+    acts_on: str = 'mean'
+    invertible: bool = False
+    needs: tuple[str, ...] = ()
+    follows: tuple[str, ...] = ()

@@ -31,5 +31,6 @@ EFFECT = Effect(
                   'zero-g output minus the nominal one'),
     ),
     apply=apply,
+    invertible=True,
     cause='The zero-g output of this unit is not the nominal one; calibrate the unit.',
 )

@@ -34,5 +34,6 @@ EFFECT = Effect(
                   'p2 of equation 11', 'xy'),
     ),
     apply=apply,
+    invertible=True,
     cause='The other in-plane axis shifts the bias; calibrate with the plane alpha = 90 deg.',
 )

@@ -34,5 +34,6 @@ EFFECT = Effect(
                   'q2 of equation 13', 'xy'),
     ),
     apply=apply,
+    invertible=True,
     cause='The out-of-plane axis shifts the bias; calibrate with several planes alpha.',
 )

@@ -34,5 +34,6 @@ EFFECT = Effect(
                   'r2 over r0 of equation 15', 'xy'),
     ),
     apply=apply,
+    invertible=True,
     cause='The out-of-plane axis changes the scale factor; calibrate with several planes alpha.',
 )

@@ -1,0 +1,40 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Integral nonlinearity of the ADC: one curve over its codes for all channels."""
+
+from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
+import numpy as np
+
+
+def apply(signals: Signals, p: Parameters) -> None:
+    """Add A·sin(2π·n·V/V_ref) to the volts of each axis."""
+    turn = 2 * np.pi * p['cycles'] / signals.vref_v
+    for d, volts in enumerate(signals.input_v):
+        signals.volts[d] = signals.volts[d] + p['amplitude_v'] * np.sin(turn * volts)
+
+
+EFFECT = Effect(
+    name='adc_inl',
+    place=Place.ADC,
+    parameters=(
+        Parameter('amplitude_v', 'V', -0.05, 0.05, 3e-4, 'physics: 4 LSB of 16 bit at 5 V',
+                  'largest deviation from the straight line', ''),
+        Parameter('cycles', '1', 0.5, 64.0, 8.0, 'physics: segments of a converter',
+                  'periods of the deviation over the full scale', '', neutral=8.0),
+    ),
+    apply=apply,
+    invertible=True,
+    cause='The ADC is not straight; calibrate it with a source of volts, or choose another.',
+)

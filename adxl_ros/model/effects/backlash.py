@@ -1,0 +1,46 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Backlash of the stage: the joint follows its encoder with play."""
+
+from adxl_ros.model.effects.base import Effect, Joint, Parameter, Parameters, Place, Signals
+from adxl_ros.model.play import play
+
+
+def apply(signals: Signals, p: Parameters) -> None:
+    """Let the joint follow with a dead band; it moves only while its flanks touch."""
+    for joint in ('alpha', 'beta'):
+        half = p[f'{joint}_rad'] / 2
+        if half:
+            q, rate, growth = getattr(signals, joint)
+            memory = signals.memory.setdefault(joint, {})
+            followed = play(q, half, memory)
+            touches = abs(q - followed) >= half * (1 - 1e-9)
+            setattr(signals, joint, Joint(followed, rate * touches, growth * touches))
+
+
+EFFECT = Effect(
+    name='backlash',
+    place=Place.STAGE,
+    parameters=(
+        Parameter('alpha_rad', 'rad', 0.0, 0.2, 1e-3, 'physics: worm gears, 3 arcmin',
+                  'dead band of alpha, its full width', ''),
+        Parameter('beta_rad', 'rad', 0.0, 0.2, 1e-3, 'physics: worm gears, 3 arcmin',
+                  'dead band of beta, its full width', ''),
+    ),
+    apply=apply,
+    smooth=False,
+    needs=('stage',),
+    cause='The gears have play; approach each pose from the same side, or preload them.',
+)

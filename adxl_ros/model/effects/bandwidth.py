@@ -1,0 +1,37 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Bandwidth of the output filter: the on-chip resistor is known to a quarter only."""
+
+from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
+
+
+def apply(signals: Signals, p: Parameters) -> None:
+    """Multiply the time constant of the RC filter by 1 + r."""
+    for d, ratio in enumerate(p['resistance_ratio']):
+        signals.rc_s[d] = signals.rc_s[d] * (1 + ratio)
+
+
+EFFECT = Effect(
+    name='bandwidth',
+    place=Place.ELECTRONICS,
+    parameters=(
+        Parameter('resistance_ratio', '1', -0.95, 10.0, 0.15,
+                  'ADXL203 datasheet: 32 kOhm +-25 %',
+                  "filter's resistance by the stated one, minus 1"),
+    ),
+    apply=apply,
+    needs=('filter',),
+    cause='The output filter is not the stated one; measure its resistor and capacitor.',
+)

@@ -1,0 +1,44 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Tilt of the stage's base: its vertical is not the plumb line."""
+
+from math import cos, sin
+
+from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
+
+
+def apply(signals: Signals, p: Parameters) -> None:
+    """Turn the vertical about the base's x and then its y, the axis of alpha."""
+    x, y, z = signals.up
+    c, s = cos(p['x_rad']), sin(p['x_rad'])
+    y, z = y * c - z * s, y * s + z * c
+    c, s = cos(p['y_rad']), sin(p['y_rad'])
+    signals.up = [x * c + z * s, y, z * c - x * s]
+
+
+EFFECT = Effect(
+    name='base_tilt',
+    place=Place.STAGE,
+    parameters=(
+        Parameter('x_rad', 'rad', -0.5, 0.5, 1.75e-3, 'paper: level of 0.1 deg',
+                  "turn of the vertical about the base's x, across the axis of alpha", ''),
+        Parameter('y_rad', 'rad', -0.5, 0.5, 1.75e-3, 'paper: level of 0.1 deg',
+                  'turn of the vertical about the axis of alpha; the same as an offset of alpha',
+                  ''),
+    ),
+    apply=apply,
+    needs=('stage',),
+    cause='The base of the stage is not level; level it, or measure its tilt.',
+)

@@ -1,0 +1,47 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Random walk of the zero-g: acceleration random walk, rate noise of an Allan deviation."""
+
+from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
+import numpy as np
+
+
+def apply(signals: Signals, p: Parameters) -> None:
+    """Add the sum of independent steps; after a time t it is k·√t off, rms, g."""
+    assert signals.rng is not None
+    density = np.array(p['density_g_per_rts'])
+    drawn = signals.rng.standard_normal((len(signals.environment.time_s), len(density)))
+    if not density.any():
+        return
+    drawn *= density * np.sqrt(signals.dt_s)
+    drawn[:1] += signals.memory.get('walked', np.zeros(len(density)))
+    walk = np.cumsum(drawn, axis=0)
+    signals.memory['walked'] = walk[-1] if len(walk) else drawn.sum(axis=0)
+    for d, scale in enumerate(signals.nominal_scale_v_per_g):
+        signals.volts[d] = signals.volts[d] + walk[:, d] * scale
+
+
+EFFECT = Effect(
+    name='bias_walk',
+    place=Place.ADC,
+    parameters=(
+        Parameter('density_g_per_rts', 'g/sqrt(s)', 0.0, 0.1, 2e-5,
+                  'physics: slow stress in package and solder',
+                  'growth of the wandering zero-g with the root of time'),
+    ),
+    apply=apply,
+    acts_on='noise',
+    cause='The zero-g wanders; take the zero again more often, or choose a quieter sensor.',
+)

@@ -1,0 +1,34 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Clock skew: the clock that stamps the samples runs fast or slow."""
+
+from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
+
+
+def apply(signals: Signals, p: Parameters) -> None:
+    """Take samples earlier than stamped by a part of the time since the beginning."""
+    signals.time_s = signals.time_s - p['ratio'] * signals.time_s
+
+
+EFFECT = Effect(
+    name='clock_skew',
+    place=Place.CLOCK,
+    parameters=(
+        Parameter('ratio', 's/s', -0.01, 0.01, 1e-4, 'physics: crystals, 100 ppm',
+                  "by how much the stamps' clock runs fast", ''),
+    ),
+    apply=apply,
+    cause='The clocks of sensor and stage drift apart; discipline them by one source.',
+)

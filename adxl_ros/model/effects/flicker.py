@@ -1,0 +1,83 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Flicker noise: 1/f noise as a sum of Ornstein-Uhlenbeck processes."""
+
+from functools import lru_cache
+
+from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
+import numpy as np
+from scipy.signal import lfilter
+
+_LOWEST_HZ = 1e-5
+_HIGHEST = 10 ** -0.5
+"""Highest corner by the rate: what folds back makes up for those that are missing above it."""
+_PER_DECADE = 2
+"""With so many corners a decade the sum is 1/f within 2 % up to a fifth of the rate."""
+
+
+def apply(signals: Signals, p: Parameters) -> None:
+    """
+    Add noise of the one-sided density k²/f, g²/Hz, from 10⁻⁴ Hz up to a fifth of the rate.
+
+    Processes of one variance at corners evenly spaced by their logarithm sum up to 1/f (van der
+    Ziel 1950); each is sampled exactly.
+    """
+    assert signals.rng is not None
+    corners = corners_hz(1 / signals.dt_s)
+    count = len(signals.environment.time_s)
+    drawn = signals.rng.standard_normal((count, len(p['density_g_per_rthz']), len(corners)))
+    # Variance of each: its density, σ²·2/(π·f_c)/(1 + (f/f_c)²), summed over ln f is σ²/(f·Δln f).
+    sigma = np.sqrt(np.log(10) / _PER_DECADE)
+    decay = np.exp(-2 * np.pi * corners * signals.dt_s)
+    for d, density in enumerate(p['density_g_per_rthz']):
+        if not density or not count:
+            continue
+        before = signals.memory.get(d)
+        noise = np.zeros(count)
+        last = np.empty(len(corners))
+        for i, a in enumerate(decay):
+            step = np.sqrt(1 - a * a)
+            steps = drawn[:, d, i].copy()
+            if before is None:
+                steps[0] /= step       # stationary from the first sample on
+            x, _ = lfilter([step], [1.0, -a], steps, zi=[0.0 if before is None
+                                                         else a * before[i]])
+            noise += x
+            last[i] = x[-1]
+        signals.memory[d] = last
+        signals.volts[d] = (signals.volts[d]
+                            + density * sigma * noise * signals.nominal_scale_v_per_g[d])
+
+
+@lru_cache(maxsize=8)
+def corners_hz(rate_hz: float) -> np.ndarray:
+    """Return the corners of the processes that a sample rate needs, Hz."""
+    highest = _HIGHEST * rate_hz
+    count = int(np.log10(highest / _LOWEST_HZ) * _PER_DECADE) + 1
+    return highest * 10 ** (-np.arange(count) / _PER_DECADE)
+
+
+EFFECT = Effect(
+    name='flicker',
+    place=Place.ADC,
+    parameters=(
+        Parameter('density_g_per_rthz', 'g/sqrt(Hz)', 0.0, 0.1, 1e-4,
+                  'physics: corner near 1 Hz beside 110 ug/sqrt(Hz)',
+                  'density at 1 Hz; it grows as one over the root of the frequency'),
+    ),
+    apply=apply,
+    acts_on='noise',
+    cause='The electronics have 1/f noise; average shorter and take the zero more often.',
+)

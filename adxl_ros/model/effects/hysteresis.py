@@ -1,0 +1,56 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Hysteresis of the sensing element: a Prandtl-Ishlinskii operator of the acceleration."""
+
+from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
+from adxl_ros.model.play import play
+
+_THRESHOLDS = (0.25, 0.5, 0.75, 1.0)
+"""Of the reach: one stop operator each, with equal weights."""
+
+
+def apply(signals: Signals, p: Parameters) -> None:
+    """
+    Let the output lag by a mean of stop operators, x − play(x), each by its threshold.
+
+    The lag is at most `half_width_g`, which it reaches `reach_g`·2 after a reversal
+    (Prandtl-Ishlinskii; Brokate and Sprekels, "Hysteresis and Phase Transitions", 1996).
+    """
+    for d, half_width in enumerate(p['half_width_g']):
+        if not half_width:
+            continue
+        sensed, lag = signals.sensed[d], 0.0
+        for i, part in enumerate(_THRESHOLDS):
+            threshold = part * p['reach_g']
+            memory = signals.memory.setdefault((d, i), {})
+            lag = lag + (sensed - play(sensed, threshold, memory)) / threshold
+        signals.output[d] = signals.output[d] - half_width / len(_THRESHOLDS) * lag
+
+
+EFFECT = Effect(
+    name='hysteresis',
+    place=Place.ELEMENT,
+    parameters=(
+        Parameter('half_width_g', 'g', -0.1, 0.1, 2e-3, 'physics: friction in die and package',
+                  'largest lag behind the input, half of the width of the loop'),
+        Parameter('reach_g', 'g', 1e-3, 2.0, 0.2, 'physics: part of the range',
+                  'change of the input after a reversal that builds up half of the lag', '',
+                  neutral=0.2),
+    ),
+    apply=apply,
+    smooth=False,
+    cause='The reading depends on where the sensor comes from; approach poses from both sides '
+          'and average, or relieve the package of mounting stress.',
+)

@@ -1,0 +1,39 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Lever arm: a sensor off the axes of the stage feels the turning."""
+
+from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
+from adxl_ros.model.stage import angular_motion, carried
+
+
+def apply(signals: Signals, p: Parameters) -> None:
+    """Add ω × (ω × r) + ω̇ × r: centripetal and tangential, m/s²."""
+    r = [p['x_m'], p['y_m'], p['z_m']]
+    if any(r):
+        added = carried(*angular_motion(signals.alpha, signals.beta), r)
+        signals.force = [f + a for f, a in zip(signals.force, added)]
+
+
+EFFECT = Effect(
+    name='lever_arm',
+    place=Place.FORCE,
+    parameters=tuple(
+        Parameter(f'{axis}_m', 'm', -2.0, 2.0, 0.02, 'physics: size of a board',
+                  f"from the axis to the sensor along the sensor's {axis}", '')
+        for axis in 'xyz'),
+    apply=apply,
+    needs=('stage',),
+    cause='The sensor is off the axis of rotation; mount it on the axis, or state the arm.',
+)

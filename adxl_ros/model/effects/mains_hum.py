@@ -1,0 +1,42 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Mains hum: a sine at the input of the ADC."""
+
+from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
+import numpy as np
+
+
+def apply(signals: Signals, p: Parameters) -> None:
+    """Add A·sin(2π·f·t + φ) to the volts of each axis."""
+    wave = np.sin(2 * np.pi * p['frequency_hz'] * signals.environment.time_s + p['phase_rad'])
+    for d, amplitude in enumerate(p['amplitude_v']):
+        signals.volts[d] = signals.volts[d] + amplitude * wave
+
+
+EFFECT = Effect(
+    name='mains_hum',
+    place=Place.ADC,
+    parameters=(
+        Parameter('amplitude_v', 'V', -1.0, 1.0, 1e-3, 'physics: unshielded cable',
+                  'amplitude of the sine'),
+        Parameter('frequency_hz', 'Hz', 1.0, 1000.0, 50.0, 'mains: 50 or 60 Hz',
+                  'frequency of the sine', '', neutral=50.0),
+        Parameter('phase_rad', 'rad', -7.0, 7.0, 1.0, 'any', 'phase at time 0', '',
+                  typical=0.0),
+    ),
+    apply=apply,
+    acts_on='noise',
+    cause='The mains couple in; shield and twist the cable, and ground it at one end.',
+)

@@ -1,0 +1,44 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Resonance of the mount: the sensor feels the motion through a spring and a damper."""
+
+from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
+from adxl_ros.model.filters import resonator
+
+
+def apply(signals: Signals, p: Parameters) -> None:
+    """Let a part of the force come through ω²/(s² + 2·ζ·ω·s + ω²)."""
+    for d, gain in enumerate(p['gain']):
+        if gain:
+            sensed = signals.sensed[d]
+            through = resonator(sensed, p['frequency_hz'], p['damping_ratio'], signals.dt_s,
+                                signals.memory.setdefault(d, {}))
+            signals.sensed[d] = sensed + gain * (through - sensed)
+
+
+EFFECT = Effect(
+    name='mount_resonance',
+    place=Place.MOUNTING,
+    parameters=(
+        Parameter('gain', '1', -2.0, 2.0, 1.0, 'physics: 0 is rigid, 1 all through the mount',
+                  'part of the force that comes through the mount'),
+        Parameter('frequency_hz', 'Hz', 2.0, 450.0, 120.0, 'physics: a board on standoffs',
+                  'natural frequency, undamped', '', neutral=120.0),
+        Parameter('damping_ratio', '1', 0.001, 0.95, 0.05, 'physics: metal and FR4',
+                  'damping by the critical one', '', neutral=0.05),
+    ),
+    apply=apply,
+    cause='The mount is a spring; stiffen it, or keep the motion away from its resonance.',
+)

@@ -1,0 +1,38 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Odd nonlinearity of an axis: its scale factor falls or grows with its own input."""
+
+from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
+
+
+def apply(signals: Signals, p: Parameters) -> None:
+    """Add k·a³ of the axis's own acceleration, g."""
+    for d, k in enumerate(p['cubic_per_g2']):
+        own = signals.sensed[d]
+        signals.output[d] = signals.output[d] + k * own * own * own
+
+
+EFFECT = Effect(
+    name='nonlinearity',
+    place=Place.ELEMENT,
+    parameters=(
+        Parameter('cubic_per_g2', '1/g^2', -0.1, 0.1, 7e-4,
+                  'ADXL203 datasheet: nonlinearity 0.2 % of 1.7 g full scale',
+                  'coefficient of the cube of the own axis'),
+    ),
+    apply=apply,
+    invertible=True,
+    cause='The scale factor changes with the input; calibrate with poses between 0 and 1 g.',
+)

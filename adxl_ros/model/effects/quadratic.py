@@ -1,0 +1,38 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Even nonlinearity of an axis: the two directions differ in scale factor."""
+
+from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
+
+
+def apply(signals: Signals, p: Parameters) -> None:
+    """Add k·a² of the axis's own acceleration, g."""
+    for d, k in enumerate(p['quadratic_per_g']):
+        own = signals.sensed[d]
+        signals.output[d] = signals.output[d] + k * own * own
+
+
+EFFECT = Effect(
+    name='quadratic',
+    place=Place.ELEMENT,
+    parameters=(
+        Parameter('quadratic_per_g', '1/g', -0.1, 0.1, 1.2e-3,
+                  'ADXL203 datasheet: nonlinearity 0.2 % of 1.7 g full scale',
+                  'coefficient of the square of the own axis'),
+    ),
+    apply=apply,
+    invertible=True,
+    cause='Up and down differ in scale factor; calibrate, and let no supply clip one side.',
+)

@@ -1,0 +1,38 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Saturation: the output stage goes no farther than its limit."""
+
+from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
+import numpy as np
+
+
+def apply(signals: Signals, p: Parameters) -> None:
+    """Clip the output of each axis at plus and minus its limit, g."""
+    for d, limit in enumerate(p['limit_g']):
+        signals.output[d] = np.clip(signals.output[d], -limit, limit)
+
+
+EFFECT = Effect(
+    name='saturation',
+    place=Place.ELECTRONICS,
+    parameters=(
+        Parameter('limit_g', 'g', 0.1, 1000.0, 1.0,
+                  'ADXL203 datasheet: range 1.7 g at least; lower with a low supply',
+                  'largest output of either sign; 1000 is none', neutral=1000.0),
+    ),
+    apply=apply,
+    smooth=False,
+    cause='The output clips; raise the supply, lower the gain, or choose a wider range.',
+)

@@ -1,0 +1,45 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Spikes: single samples that are far off."""
+
+from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
+import numpy as np
+
+
+def apply(signals: Signals, p: Parameters) -> None:
+    """Throw samples off by plus or minus A, each axis for itself, at a mean rate."""
+    assert signals.rng is not None
+    axes = len(signals.volts)
+    drawn = signals.rng.random((len(signals.environment.time_s), axes, 2))
+    hit = drawn[:, :, 0] < p['rate_hz'] * signals.dt_s
+    sign = np.where(drawn[:, :, 1] < 0.5, -1.0, 1.0)
+    for d, amplitude in enumerate(p['amplitude_v']):
+        signals.volts[d] = signals.volts[d] + np.where(hit[:, d], amplitude * sign[:, d], 0.0)
+
+
+EFFECT = Effect(
+    name='spikes',
+    place=Place.ADC,
+    parameters=(
+        Parameter('rate_hz', 'Hz', 0.0, 1000.0, 0.2, 'physics: loose contacts, switching loads',
+                  'spikes a second and axis', ''),
+        Parameter('amplitude_v', 'V', 0.0, 10.0, 0.05, 'physics: loose contacts',
+                  'size of a spike, of either sign'),
+    ),
+    apply=apply,
+    smooth=False,
+    acts_on='noise',
+    cause='Single samples are far off; look for loose contacts and loads that switch.',
+)

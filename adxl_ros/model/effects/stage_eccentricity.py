@@ -1,0 +1,45 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Eccentricity of the stage's encoder discs: an error of one period a turn."""
+
+from adxl_ros.model.effects.base import Effect, Joint, Parameter, Parameters, Place, Signals
+import numpy as np
+
+
+def apply(signals: Signals, p: Parameters) -> None:
+    """Add s·sin q + c·cos q to each joint, and what follows for its motion."""
+    for joint in ('alpha', 'beta'):
+        s, c = p[f'{joint}_sine_rad'], p[f'{joint}_cosine_rad']
+        if s or c:
+            q, rate, growth = getattr(signals, joint)
+            sine, cosine = np.sin(q), np.cos(q)
+            slope, bend = s * cosine - c * sine, -s * sine - c * cosine
+            setattr(signals, joint, Joint(
+                q + s * sine + c * cosine, rate + slope * rate,
+                growth + slope * growth + bend * rate * rate))
+
+
+EFFECT = Effect(
+    name='stage_eccentricity',
+    place=Place.STAGE,
+    parameters=tuple(
+        Parameter(f'{joint}_{wave}_rad', 'rad', -0.2, 0.2, 1e-3,
+                  'physics: a disc of 20 mm that is 20 um off its axis',
+                  f'true {joint} minus the encoder, part of the {wave}', '')
+        for joint in ('alpha', 'beta') for wave in ('sine', 'cosine')),
+    apply=apply,
+    needs=('stage',),
+    cause='The disc of an encoder is off its axis; use two reading heads, or a table of errors.',
+)

@@ -1,0 +1,39 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Offset of the stage's encoders."""
+
+from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
+
+
+def apply(signals: Signals, p: Parameters) -> None:
+    """Add the offsets to the encoders' angles."""
+    for joint in ('alpha', 'beta'):
+        read = getattr(signals, joint)
+        setattr(signals, joint, read._replace(position=read.position + p[f'{joint}_rad']))
+
+
+EFFECT = Effect(
+    name='stage_offset',
+    place=Place.STAGE,
+    parameters=(
+        Parameter('alpha_rad', 'rad', -0.5, 0.5, 1.75e-3, 'paper: level of 0.1 deg',
+                  'true alpha minus the encoder', ''),
+        Parameter('beta_rad', 'rad', -0.5, 0.5, 1.75e-3, 'paper: level of 0.1 deg',
+                  'true beta minus the encoder', ''),
+    ),
+    apply=apply,
+    needs=('stage',),
+    cause='The zero of an encoder is off; set it by a level, or remount the sensor by 180 deg.',
+)

@@ -1,0 +1,57 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Stuck samples: the link repeats its last sample for a while."""
+
+from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
+import numpy as np
+
+
+def apply(signals: Signals, p: Parameters) -> None:
+    """Hold all axes for a fixed time, beginning at random at a mean rate."""
+    assert signals.rng is not None
+    count = len(signals.environment.time_s)
+    begins = signals.rng.random(count) < p['rate_hz'] * signals.dt_s
+    length = max(round(p['duration_s'] / signals.dt_s), 1)
+    numbers = np.arange(count)
+    # A sample is stuck where the newest beginning is less than the length behind.
+    newest = np.maximum.accumulate(np.where(begins, numbers, -2 ** 40))
+    newest = np.where(newest < 0, signals.memory.get('newest', -2 ** 40), newest)
+    good = numbers - newest >= length
+    # Each stuck sample repeats the last good one, which may be in the block before.
+    source = np.maximum.accumulate(np.where(good, numbers, -1))
+    for d, volts in enumerate(signals.volts):
+        before = signals.memory.get(d, volts[0] if count else 0.0)
+        held = np.where(source < 0, before, volts[source])
+        signals.volts[d] = held
+        if count:
+            signals.memory[d] = held[-1]
+    if count:
+        signals.memory['newest'] = newest[-1] - count
+
+
+EFFECT = Effect(
+    name='stuck',
+    place=Place.CODE,
+    parameters=(
+        Parameter('rate_hz', 'Hz', 0.0, 1000.0, 0.1, 'physics: a bus that times out',
+                  'beginnings a second', ''),
+        Parameter('duration_s', 's', 1e-4, 100.0, 0.05, 'physics: a few frames',
+                  'time that the sample is held', '', neutral=0.05),
+    ),
+    apply=apply,
+    smooth=False,
+    acts_on='noise',
+    cause='The link repeats samples; look at the bus, its load and its buffers.',
+)

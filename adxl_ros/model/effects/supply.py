@@ -1,0 +1,48 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Supply: zero-g and scale factor follow it, but the ADXL203 is not exactly ratiometric."""
+
+from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
+
+_SCALE_EXPONENT = 1.135
+"""ln(560/1000)/ln(3/5): 560 mV/g at 3 V beside 1000 mV/g at 5 V."""
+
+
+def apply(signals: Signals, p: Parameters) -> None:
+    """Multiply zero-g and scale factor by powers of the supply over its nominal, V."""
+    ratio = signals.environment.supply_v / p['nominal_v']
+    zero, scale = ratio ** p['zero_g_exponent'], ratio ** p['scale_exponent']
+    for d, _ in enumerate(signals.zero_g_v):
+        signals.zero_g_v[d] = signals.zero_g_v[d] * zero
+        signals.scale_v_per_g[d] = signals.scale_v_per_g[d] * scale
+
+
+EFFECT = Effect(
+    name='supply',
+    place=Place.ELECTRONICS,
+    parameters=(
+        Parameter('zero_g_exponent', '1', -3.0, 3.0, 1.0, 'ADXL203 datasheet: ratiometric',
+                  'power of the supply that the zero-g follows; 0 is not at all', ''),
+        Parameter('scale_exponent', '1', -3.0, 3.0, _SCALE_EXPONENT,
+                  'ADXL203 datasheet: 560 mV/g at 3 V, not 600',
+                  'power of the supply that the scale factor follows; 0 is not at all', ''),
+        Parameter('nominal_v', 'V', 1.0, 30.0, 5.0, 'ADXL203 datasheet: figures at 5 V',
+                  'supply at which the figures hold', '', neutral=5.0),
+    ),
+    apply=apply,
+    invertible=True,
+    follows=('supply_v',),
+    cause='The output follows the supply; measure the supply and correct, or regulate it.',
+)

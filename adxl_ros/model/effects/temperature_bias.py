@@ -1,0 +1,40 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Zero-g that moves with temperature."""
+
+from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
+
+REFERENCE_C = 25.0
+
+
+def apply(signals: Signals, p: Parameters) -> None:
+    """Add k·(T − 25 °C) to the output, g."""
+    off_k = signals.environment.temperature_c - REFERENCE_C
+    for d, per_k in enumerate(p['per_k']):
+        signals.output[d] = signals.output[d] + per_k * off_k
+
+
+EFFECT = Effect(
+    name='temperature_bias',
+    place=Place.ELECTRONICS,
+    parameters=(
+        Parameter('per_k', 'g/K', -0.1, 0.1, 1e-4, 'ADXL203 datasheet: 0.1 mg/degC',
+                  'change of the zero-g with temperature, from 25 degC on'),
+    ),
+    apply=apply,
+    invertible=True,
+    follows=('temperature_c',),
+    cause='The zero-g follows the temperature; measure it and correct, or keep it steady.',
+)

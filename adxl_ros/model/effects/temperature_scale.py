@@ -1,0 +1,40 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Scale factor that moves with temperature."""
+
+from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
+from adxl_ros.model.effects.temperature_bias import REFERENCE_C
+
+
+def apply(signals: Signals, p: Parameters) -> None:
+    """Multiply the scale factor by 1 + k·(T − 25 °C)."""
+    off_k = signals.environment.temperature_c - REFERENCE_C
+    for d, per_k in enumerate(p['per_k']):
+        signals.scale_v_per_g[d] = signals.scale_v_per_g[d] * (1 + per_k * off_k)
+
+
+EFFECT = Effect(
+    name='temperature_scale',
+    place=Place.ELECTRONICS,
+    parameters=(
+        Parameter('per_k', '1/K', -0.01, 0.01, 1e-4,
+                  'ADXL203 datasheet: sensitivity +-0.3 % over temperature',
+                  'relative change of the scale factor with temperature, from 25 degC on'),
+    ),
+    apply=apply,
+    invertible=True,
+    follows=('temperature_c',),
+    cause='The scale factor follows the temperature; measure it and correct, or keep it steady.',
+)

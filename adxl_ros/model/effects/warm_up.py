@@ -1,0 +1,41 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Warm-up: a zero-g that settles after power on."""
+
+from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
+import numpy as np
+
+
+def apply(signals: Signals, p: Parameters) -> None:
+    """Add A·exp(−t/τ) to the output, g; t is the time since power on."""
+    left = np.exp(-signals.environment.time_s / p['tau_s'])
+    for d, amplitude in enumerate(p['amplitude_g']):
+        signals.output[d] = signals.output[d] + amplitude * left
+
+
+EFFECT = Effect(
+    name='warm_up',
+    place=Place.ELECTRONICS,
+    parameters=(
+        Parameter('amplitude_g', 'g', -0.5, 0.5, 2e-3, 'physics: 20 K of own heat at 0.1 mg/K',
+                  'zero-g at power on beside the settled one'),
+        Parameter('tau_s', 's', 1.0, 1e5, 300.0, 'physics: a board in still air',
+                  'time constant of settling', '', neutral=300.0),
+    ),
+    apply=apply,
+    invertible=True,
+    follows=('time_s',),
+    cause='The sensor warms up after power on; wait some time constants before measuring.',
+)

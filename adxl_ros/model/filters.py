@@ -1,0 +1,123 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Continuous-time filters, exact for an input that is a polynomial between its samples."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from scipy.signal import lfilter
+
+ORDER = 6
+"""Samples that the polynomial runs through: the newest ones, so that no filter looks ahead."""
+_QUADRATURE = 24
+_STIFF = 8.0
+
+
+def low_pass(x: np.ndarray, tau_s: float, dt_s: float, memory: dict[str, Any]) -> np.ndarray:
+    """
+    Filter by 1/(1 + τ·s); at rest at its first input before the first block.
+
+    Parameters
+    ----------
+    x
+        Input, (n,).
+    tau_s
+        Time constant, s; 0 passes the input on.
+    dt_s
+        Time between samples, s.
+    memory
+        What it keeps from one block to the next.
+
+    """
+    if not tau_s:
+        return x
+    return pole(x, -1 / tau_s, dt_s, memory) / tau_s
+
+
+def resonator(x: np.ndarray, frequency_hz: float, damping_ratio: float, dt_s: float,
+              memory: dict[str, Any]) -> np.ndarray:
+    """
+    Filter by ω²/(s² + 2·ζ·ω·s + ω²), ζ < 1, by partial fractions; otherwise as `low_pass`.
+
+    Parameters
+    ----------
+    x, dt_s, memory
+        As for `low_pass`.
+    frequency_hz
+        ω/2π, undamped.
+    damping_ratio
+        ζ.
+
+    """
+    omega = 2 * np.pi * frequency_hz
+    damped = omega * np.sqrt(1 - damping_ratio ** 2)
+    mode = pole(x, complex(-damping_ratio * omega, damped), dt_s, memory)
+    return omega ** 2 / damped * mode.imag
+
+
+def pole(x: np.ndarray, rate: complex, dt_s: float, memory: dict[str, Any]) -> np.ndarray:
+    """
+    Solve w' = rate·w + x: exact for x a polynomial through the newest `ORDER` samples.
+
+    The error is of order (ω·dt)^6 for an input of angular frequency ω. An exponential
+    Adams-Moulton method (Hochbruck and Ostermann 2010, section 2.6).
+
+    Parameters
+    ----------
+    x
+        Input, (n,).
+    rate
+        The pole, 1/s; its real part is negative.
+    dt_s
+        Time between samples, s.
+    memory
+        Holds the newest inputs and the last w; empty before the first block, when w is at rest
+        at the first input.
+
+    """
+    if not len(x):
+        return x
+    first = not memory
+    before = memory.get('inputs', np.full(ORDER - 1, x[0]))
+    at = memory.get('w', -x[0] / rate)
+    inputs = np.concatenate([before, x])
+    drive = np.convolve(inputs, _weights(rate * dt_s) * dt_s, 'valid')
+    decay = np.exp(rate * dt_s)
+    if first:
+        drive[0] = -x[0] / rate * (1 - decay)
+    w, _ = lfilter([1.0], [1.0, -decay], drive, zi=np.array([decay * at]))
+    memory['inputs'], memory['w'] = inputs[-(ORDER - 1):], w[-1]
+    return w
+
+
+@lru_cache(maxsize=64)
+def _weights(z: complex) -> np.ndarray:
+    """Weights of the newest inputs, newest first: ∫ exp(z·(1 − s))·Lⱼ(s) ds over 0 to 1."""
+    nodes = 1.0 - np.arange(ORDER)
+    lagrange = [np.poly(np.delete(nodes, j)) / np.prod(nodes[j] - np.delete(nodes, j))
+                for j in range(ORDER)]
+    if abs(z) < _STIFF:
+        s, weight = np.polynomial.legendre.leggauss(_QUADRATURE)
+        s, weight = (s + 1) / 2, weight / 2
+        growth = weight * np.exp(z * (1 - s))
+        return np.array([np.sum(growth * np.polyval(c, s)) for c in lagrange])
+    # The integrals of s^k by parts: stable for a large z only.
+    moments = [(np.exp(z) - 1) / z]
+    for k in range(1, ORDER):
+        moments.append((k * moments[-1] - 1) / z)
+    return np.array([np.dot(c[::-1], moments) for c in lagrange])

@@ -1,0 +1,317 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Each effect: neutral is identity, blocks join, tangents agree, closed forms hold."""
+
+from dataclasses import replace
+
+from adxl_ros.errors import UserError
+from adxl_ros.model import chain
+from adxl_ros.model.coefficients import (
+    get,
+    names_of,
+    neutral,
+    parameter_of,
+    put,
+    typical,
+    with_neutral,
+)
+from adxl_ros.model.effects import library
+from adxl_ros.model.filters import low_pass, resonator
+from adxl_ros.model.motion import Held, Knots, Motion
+from adxl_ros.model.play import play
+from adxl_ros.model.response import Response
+from adxl_ros.model.simulate import simulate
+from adxl_ros.model.stage import specific_force
+from adxl_ros.model.trajectory import Sine, Steps
+import numpy as np
+import pytest
+from scipy.signal import welch
+from units import Fed, nominal
+
+G = 9.80665
+NAMES = sorted(library())
+CLEAN = {'noise_density_g_per_rthz': np.zeros(3), 'adc_bits': 0}
+MOTION = Motion(12.0, Knots([0, 1, 3, 5, 7, 12], [0.5, 0.5, 1.2, 0.9, 2.0, 2.0]),
+                Knots([0, 2, 4, 5, 12], [0, 0, 2, 1.5, 3]), Knots([0, 6, 7, 12], [0, 0, 0.02, 0]),
+                temperature_c=Steps(25.0, ((2.0, 35.0),), 1.0),
+                supply_v=Steps(5.0, ((4.0, 4.8),), 0.5))
+
+
+def having(name, sensor=None, **changes):
+    """Return a sensor with one effect, typical but for the changes."""
+    sensor = sensor or nominal('xyz', **CLEAN)
+    values = {**typical(library()[name], sensor.axes), **{k: np.asarray(v, float)
+                                                          for k, v in changes.items()}}
+    return replace(sensor, effects=(name,), values={name: values})
+
+
+def volts(sensor, motion=MOTION, seed=1):
+    """Simulate; volts, (n, m)."""
+    columns = simulate(sensor, motion, seed)
+    return np.column_stack([columns[f'{axis}_v'] for axis in sensor.axes])
+
+
+@pytest.fixture(scope='module')
+def plain():
+    """Return what a sensor without effects says, with noise and ADC."""
+    return volts(nominal('xyz'))
+
+
+def test_the_library_is_that_of_the_interfaces():
+    """All names that other software relies on are there."""
+    names = ('bias scale_factor cross_axis scale_factor_z cross_axis_z misalignment '
+             'nonlinearity quadratic hysteresis bandwidth mount_resonance temperature_bias '
+             'temperature_scale warm_up bias_walk supply saturation quantisation adc_inl '
+             'noise_excess flicker mains_hum spikes stuck vibration_rectification time_offset '
+             'clock_skew gravity base_tilt stage_offset stage_eccentricity backlash lever_arm')
+    listed = names.split()
+    assert not set(listed) - set(NAMES)
+
+
+@pytest.mark.parametrize('name', NAMES)
+def test_neutral_is_identity_to_the_bit(name, plain):
+    """An effect at its neutral values changes no bit of a noisy recording in motion."""
+    np.testing.assert_array_equal(volts(with_neutral(nominal('xyz'), [name])), plain)
+
+
+@pytest.mark.parametrize('name', NAMES)
+def test_typical_values_show_and_join(name, plain):
+    """A typical effect changes something, the same in one block and in many."""
+    sensor = having(name, nominal('xyz'))
+    if name == 'saturation':
+        sensor = put(sensor, ['saturation.limit_g.z'], [0.3])
+    if name == 'spikes' or name == 'stuck':
+        sensor = put(sensor, [f'{name}.rate_hz'], [3.0])
+    whole = volts(sensor)
+    assert np.abs(whole - plain).max() > 5e-5
+    respond, stamps = Response(sensor, MOTION, 1), np.arange(len(whole)) / sensor.rate_hz
+    parts = [respond(stamps[i:i + 777]) for i in range(0, len(stamps), 777)]
+    np.testing.assert_array_equal(np.vstack(parts), whole)
+
+
+@pytest.mark.parametrize('name', [n for n in NAMES if library()[n].smooth
+                                  and library()[n].acts_on == 'mean'])
+def test_tangents_do_not_depend_on_the_step(name):
+    """Smooth effects: differences by two steps agree, so that fits can use them."""
+    sensor = having(name)
+    for coefficient in names_of(library()[name], 'xyz'):
+        at, scale = get(sensor, [coefficient])[0], parameter_of(coefficient).scale
+        slopes = [(volts(put(sensor, [coefficient], [at + step]))
+                   - volts(put(sensor, [coefficient], [at - step]))) / (2 * step)
+                  for step in (1e-3 * scale, 2e-4 * scale)]
+        size = np.abs(slopes[0]).max()
+        assert np.abs(slopes[0] - slopes[1]).max() <= 2e-3 * size + 1e-9 / scale
+
+
+@pytest.mark.parametrize('name', NAMES)
+def test_says_what_it_is(name):
+    """Bounds hold the neutral and the typical value; unit, source and cause are stated."""
+    effect = library()[name]
+    assert effect.cause.endswith('.') and effect.acts_on in ('mean', 'noise')
+    for p in effect.parameters:
+        assert p.unit and p.source and p.doc and p.scale > 0
+        for value in (p.neutral, p.scale if p.typical is None else p.typical):
+            assert p.lower <= value <= p.upper
+
+
+def test_filter_at_10_hz():
+    """The RC of the paper at 10 Hz: 0.833, −33.6°."""
+    time_s = np.arange(4000) / 1000
+    out = low_pass(np.sin(20 * np.pi * time_s), 32e3 * 0.33e-6, 1e-3, {})
+    wave = 2j * (out * np.exp(-20j * np.pi * time_s))[2000:].mean()
+    assert abs(wave) == pytest.approx(0.8333, abs=1e-4)
+    assert np.degrees(np.angle(wave)) == pytest.approx(-33.56, abs=0.01)
+
+
+def test_resonance():
+    """At its natural frequency a resonator gives 1/(2·ζ), a quarter turn late."""
+    time_s = np.arange(20000) / 4000
+    out = resonator(np.sin(2 * np.pi * 80 * time_s), 80.0, 0.05, 1 / 4000, {})
+    wave = 2j * (out * np.exp(-2j * np.pi * 80 * time_s))[10000:].mean()
+    assert abs(wave) == pytest.approx(10.0, rel=1e-4)
+    assert np.degrees(np.angle(wave)) == pytest.approx(-90.0, abs=0.01)
+
+
+def test_play_s_loop():
+    """A cycle of amplitude A through a dead band 2·r encloses 4·r·(A − r)."""
+    x = np.tile(np.concatenate([np.linspace(-1, 1, 4001), np.linspace(1, -1, 4001)]), 2)
+    y = play(x, 0.3, {})
+    cycle = slice(8002, None)
+    area = abs(np.sum(np.diff(y[cycle]) * (x[cycle][1:] + x[cycle][:-1]) / 2))
+    assert area == pytest.approx(4 * 0.3 * (1 - 0.3), rel=1e-3)
+
+
+def test_play_is_its_recursion():
+    """Turning points give what yₙ = max(xₙ − r, min(xₙ + r, yₙ₋₁)) gives, to the bit."""
+    x = np.round(np.cumsum(np.random.default_rng(0).normal(size=5000)), 1)
+    at, expected = x[0], []
+    for value in x:
+        at = max(value - 2, min(value + 2, at))
+        expected.append(at)
+    memory = {}
+    parts = [play(x[i:i + 61], 2, memory) for i in range(0, len(x), 61)]
+    np.testing.assert_array_equal(np.concatenate(parts), expected)
+
+
+def test_hysteresis_lags_by_its_half_width():
+    """Far from a reversal the output is half a loop behind, on either side."""
+    sweep = np.concatenate([np.linspace(-1, 1, 3000), np.linspace(1, -1, 3000)])
+    sensor = having('hysteresis', nominal('x', rc_capacitance_f=0.0, adc_bits=0,
+                                          noise_density_g_per_rthz=np.zeros(1)))
+    out = Fed(sensor)([sweep * G, 0.0, 0.0])[:, 0] - 2.5
+    up, down = np.interp(0.0, sweep[:3000], out[:3000]), np.interp(0.0, sweep[:2999:-1],
+                                                                   out[:2999:-1])
+    assert (up, down) == pytest.approx((-2e-3, 2e-3), abs=1e-9)
+
+
+def test_backlash_lags_by_half_of_its_width():
+    """A turning joint is half of the dead band behind its encoder."""
+    swing = Motion(8.0, Held(np.pi / 2), Knots([0, 3, 4, 7, 8], [0, 2, 2, 0, 0]))
+    off = volts(having('backlash', beta_rad=4e-3), swing) - volts(nominal('xyz', **CLEAN), swing)
+    # At beta = 2 and at beta = 0 of alpha 90°: df_x = −sin(beta)·d beta·g.
+    assert off[3900, 0] == pytest.approx(-np.sin(2.0) * -2e-3, rel=2e-3)
+    assert off[-1, 1] == pytest.approx(-2e-3, rel=1e-3)
+
+
+def test_lever_arm_is_centripetal_and_tangential():
+    """ω²·r towards the axis at constant speed, ω̇·r across it while it grows."""
+    spin = Motion(9.0, Held(0.0), Knots([0, 2, 8, 9], [0, 3, 21, 22.5], [0, 3, 3, 0]))
+    off = (volts(having('lever_arm', x_m=0.1, y_m=0.0, z_m=0.0), spin)
+           - volts(nominal('xyz', **CLEAN), spin)) * G
+    assert off[5000] == pytest.approx([-0.9, 0.0, 0.0], abs=1e-6)
+    growth = spin.beta(np.array([1.0]), 2)[0]
+    assert growth > 1.0
+    slow = having('lever_arm', nominal('xyz', **{**CLEAN, 'rc_capacitance_f': 0.0}),
+                  x_m=0.1, y_m=0.0, z_m=0.0)
+    off = (volts(slow, spin) - volts(nominal('xyz', **CLEAN, rc_capacitance_f=0.0), spin)) * G
+    assert off[1000, 1] == pytest.approx(0.1 * growth, rel=1e-6)
+
+
+def test_supply_is_not_quite_ratiometric():
+    """The ADXL203 gives 560 mV/g and 1.5 V at 3 V."""
+    respond = chain.static_response(having('supply'))
+    around = chain.NOMINAL._replace(supply_v=3.0)
+    zero, one = (respond([f, 0.0, 0.0], around)[0] for f in (0.0, G))
+    assert zero == pytest.approx(1.5, abs=1e-12)
+    assert one - zero == pytest.approx(0.560, abs=2e-4)
+
+
+def test_temperature_moves_zero_g_and_scale():
+    """0.1 mg/K from 25 °C on, and the scale factor by its part."""
+    around = chain.NOMINAL._replace(temperature_c=35.0)
+    assert chain.static_response(having('temperature_bias'))([0.0, 0.0, 0.0], around)[0] == \
+        pytest.approx(2.501, abs=1e-12)
+    assert chain.static_response(having('temperature_scale'))([G, 0.0, 0.0], around)[0] == \
+        pytest.approx(3.501, abs=1e-12)
+
+
+def test_vibration_shifts_by_its_mean_square():
+    """A vibration of 1 m/s² at 40 Hz shifts the zero-g by k·a²/2."""
+    shake = Motion(12.0, Held(np.pi / 2), Held(np.pi / 2), Sine(1 / (80 * np.pi) ** 2, 40.0))
+    off = volts(having('vibration_rectification'), shake) - volts(nominal('xyz', **CLEAN), shake)
+    assert off[-4000:, 0].mean() == pytest.approx(0.05 * (1 / G) ** 2 / 2, rel=1e-3)
+
+
+def test_quantisation_s_variance_is_its_step_s():
+    """Rounding a slow ramp leaves LSB²/12, by as many bits as are left."""
+    sensor = nominal('x', noise_density_g_per_rthz=np.zeros(1))
+    ramp = [np.linspace(0, 1, 60000) * G, 0.0, 0.0]
+    exact = Fed(replace(sensor, adc_bits=0))(ramp)
+    for lost in (0, 3):
+        coarse = Fed(having('quantisation', sensor, lost_bits=lost))(ramp)
+        lsb = sensor.lsb_v * 2 ** lost
+        assert np.var(coarse - exact) == pytest.approx(lsb ** 2 / 12, rel=0.01)
+
+
+def test_flicker_is_one_over_f():
+    """Its density is k²/f within 2 % up to a fifth of the rate, and so is the drawn noise."""
+    rest = Motion(4000.0, internal_rate_hz=10.0)
+    found = []
+    for seed in range(3):
+        sensor = having('flicker', nominal('xyz', **CLEAN, rate_hz=100.0))
+        data = volts(sensor, rest, seed)
+        f, density = welch(data, 100.0, nperseg=2 ** 16, axis=0, detrend=False)
+        found.append(density.mean(axis=1))
+    shape = np.mean(found, axis=0) * f / 1e-8
+    for low, tolerance in ((0.03, 0.15), (0.3, 0.05), (2.0, 0.03), (6.0, 0.03)):
+        assert shape[(f > low) & (f < 2 * low)].mean() == pytest.approx(1.0, abs=tolerance)
+    corners = np.array([0.001, 0.02, 0.1, 0.7, 3.0, 9.0, 19.0])
+    assert flicker_theory(corners, 100.0) == pytest.approx(np.ones(7), abs=0.02)
+
+
+def flicker_theory(f, rate_hz):
+    """Return the sum of the processes' sampled densities times f, k = 1."""
+    from adxl_ros.model.effects.flicker import corners_hz
+    a = np.exp(-2 * np.pi * corners_hz(rate_hz) / rate_hz)[:, None]
+    step = np.log(10) / 2
+    each = 2 / rate_hz * (1 - a * a) / (1 - 2 * a * np.cos(2 * np.pi * f / rate_hz) + a * a)
+    return f * step * each.sum(axis=0)
+
+
+def test_bias_walks_with_the_root_of_time():
+    """After t its variance over units is k²·t."""
+    sensor = having('bias_walk', nominal('xyz', **CLEAN, rate_hz=100.0))
+    ends = [volts(sensor, Motion(50.0, internal_rate_hz=10.0), seed)[-1] - [2.5, 2.5, 3.5]
+            for seed in range(150)]
+    assert np.std(ends) == pytest.approx(2e-5 * np.sqrt(50), rel=0.1)
+
+
+def test_stamps_of_late_data():
+    """Positive offset and skew: a sample holds what was before its stamp."""
+    ramp = Motion(20.0, Held(np.pi / 2), Knots([0, 1, 19, 20], [0, .05, 1.85, 1.9],
+                                               [0, 0.1, 0.1, 0]))
+    clean = volts(nominal('xyz', **CLEAN), ramp)[:, 1]
+    late = volts(having('time_offset', offset_s=0.02), ramp)[:, 1]
+    np.testing.assert_allclose(late[3020:15000], clean[3000:14980], atol=1e-12)
+    skewed = volts(having('clock_skew', ratio=1e-3), ramp)[:, 1]
+    assert skewed[10000] == pytest.approx(clean[9990], abs=1e-7)
+
+
+def test_inverse_by_surroundings():
+    """With temperature, supply and time since power on known, the inverse is exact."""
+    names = [n for n in NAMES if library()[n].invertible and 'stage' not in library()[n].needs]
+    sensor = with_neutral(nominal('xyz'), names)
+    sensor = replace(sensor, values={n: typical(library()[n], 'xyz') for n in names})
+    rng = np.random.default_rng(0)
+    around = chain.Environment(rng.uniform(0, 900, 400), rng.uniform(-20, 60, 400),
+                               rng.uniform(4.5, 5.5, 400))
+    truth = rng.normal(size=(3, 400)) * 5
+    found = chain.inverse(sensor)(chain.static_response(sensor)(list(truth), around), around)
+    np.testing.assert_allclose(np.array(found), truth, atol=1e-9 * G)
+
+
+def test_local_gravity_is_used_by_equation_5():
+    """A two-axis sensor takes its z from the corrected gravity."""
+    sensor = having('gravity', nominal('xy'))
+    force = specific_force(0.6, 0.3, chain.gravity_mps2(sensor))
+    found = chain.inverse(sensor)(chain.static_response(sensor)([float(f) for f in force]))
+    assert found == pytest.approx([float(f) for f in force], abs=1e-9)
+
+
+@pytest.mark.parametrize('name, changes, motion', [
+    ('bandwidth', {'rc_capacitance_f': 0.0}, MOTION),
+    ('quantisation', {'adc_bits': 0}, MOTION),
+    ('noise_excess', {'noise_density_g_per_rthz': np.zeros(3)}, MOTION),
+    ('backlash', {}, Motion(1.0, force=lambda at_s: [0 * at_s] * 3))])
+def test_nothing_to_act_on_is_said(name, changes, motion):
+    """An effect without filter, ADC, noise or stage is refused by name."""
+    with pytest.raises(UserError, match=f'^{name} acts on the '):
+        Response(replace(having(name, nominal('xyz')), **changes), motion, 0)
+
+
+def test_neutral_values_are_stated_by_axis():
+    """Values have an entry an axis, or none."""
+    values = neutral(library()['mount_resonance'], 'xy')
+    assert values['gain'].tolist() == [0.0, 0.0] and values['frequency_hz'].shape == ()
