@@ -183,7 +183,7 @@ class SimulatedSensor:
         stamps = self._origin_ns + np.rint(time_s * 1e9).astype(np.int64)
         knots = np.array([m[0] for m in self._motion], np.int64)
         at = np.array([(m[1 + joint], m[4 + joint]) for m in self._motion])
-        left = (np.searchsorted(knots, stamps, 'right') - 1).clip(0)
+        left = (np.searchsorted(knots, stamps) - 1).clip(0)
         right = (left + 1).clip(max=len(knots) - 1)
         step_ns = knots[right] - knots[left]
         held = (step_ns <= 0) | (step_ns > _GAP_NS)
