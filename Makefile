@@ -2,10 +2,11 @@
 # make demo     the main job on a simulated sensor: a table, and plots in demo_output/
 # make test     every test         (make test ARGS='-k fit')
 # make bench    rate, missing samples, latency and CPU of the live nodes
+# make gallery  docs/effects.md and its plots, from the library of effects
 # make lint     the linters alone
 # make clean    remove what these made
 
-.PHONY: build demo test bench lint clean FORCE
+.PHONY: build demo test bench gallery lint clean FORCE
 .DEFAULT_GOAL := build
 
 # The first Python that can run the line $1.
@@ -88,6 +89,9 @@ lint: build
 
 bench: build
 	./run bench $(ARGS)
+
+gallery: build
+	./run --exec python docs/gallery.py docs
 
 clean:
 	rm -rf .venv build install log demo_output .*_cache .hypothesis

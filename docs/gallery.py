@@ -1,0 +1,223 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Draw docs/effects.md: each effect of the library, clean and with it; `make gallery`."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+import sys
+
+from adxl_ros.files import params
+from adxl_ros.model.coefficients import put, typical
+from adxl_ros.model.effects import library
+from adxl_ros.model.effects.base import Effect, Place
+from adxl_ros.model.motion import Held, Knots, Motion
+from adxl_ros.model.sensor import Sensor, with_axes
+from adxl_ros.model.simulate import Columns, simulate
+from adxl_ros.model.trajectory import Steps, SweptSine
+import matplotlib
+
+matplotlib.use('Agg')
+import matplotlib.pyplot as plt
+import numpy as np
+from scipy.signal import welch
+
+DOCS = Path(__file__).resolve().parent
+COLOURS = {'x': 'tab:blue', 'y': 'tab:orange', 'z': 'tab:green'}
+TURN = 2 * np.pi
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A manoeuvre and how to look at it; `noisy` keeps the noise and the ADC."""
+
+    motion: Motion
+    across: str = 'time_s'
+    label: str = 'time, s'
+    unit: float = 1.0
+    noisy: bool = False
+    axes: str = 'xy'
+    kind: str = 'lines'
+
+
+def turning(alpha_deg: float, seconds: float = 36.0) -> Motion:
+    """Turn beta forth and back at constant speed in one plane."""
+    half, rate = seconds / 2, TURN / (seconds / 2 - 1)
+    return Motion(seconds, Held(np.radians(alpha_deg)), Knots(
+        [0, 1, half - 1, half, half + 1, seconds - 1, seconds],
+        [0, rate / 2, TURN - rate / 2, TURN, TURN - rate / 2, rate / 2, 0],
+        [0, rate, rate, 0, -rate, -rate, 0]))
+
+
+def plane(alpha_deg: float, axes: str = 'xy') -> Scene:
+    """Look at one plane over beta."""
+    return Scene(turning(alpha_deg), 'beta_rad', f'beta at alpha = {alpha_deg:g}°, deg',
+                 180 / np.pi, axes=axes)
+
+
+REST = Motion(300.0, Held(np.radians(60)), Held(np.radians(30)), internal_rate_hz=1000.0)
+SWING = Motion(6.0, Held(np.pi / 2), Knots([0, 1, 2, 3, 4, 5, 6], [0, 0, 1.5, 0, -1.5, 0, 0]))
+SHAKE = Motion(44.0, Held(np.pi / 2), Held(np.pi / 2), SweptSine(2.0, 40.0))
+WARM = replace(REST, duration_s=1200.0, internal_rate_hz=10.0,
+               temperature_c=Steps(25.0, ((200, 45), (700, 10)), 60.0))
+SUPPLY = replace(REST, duration_s=60.0, supply_v=Steps(5.0, ((15, 4.8), (30, 5.2), (45, 5.0)), 1))
+TILTING = Scene(Motion(18.0, turning(0.0).beta, Held(np.radians(30))), 'alpha_rad',
+                'alpha at beta = 30°, deg', 180 / np.pi)
+OVER_TIME = Scene(REST, noisy=True, axes='x')
+SCENES = {
+    'misalignment': plane(90), 'cross_axis_z': TILTING, 'scale_factor_z': plane(30),
+    'gravity': plane(45, 'xyz'), 'base_tilt': plane(90, 'xyz'), 'stage_offset': plane(45, 'xyz'),
+    'saturation': Scene(turning(90), 'beta_rad', 'beta at alpha = 90°, deg', 180 / np.pi),
+    'lever_arm': Scene(SWING), 'time_offset': Scene(SWING), 'bandwidth': Scene(SWING),
+    'clock_skew': Scene(turning(90, 120.0)), 'mount_resonance': Scene(SHAKE, axes='x'),
+    'vibration_rectification': Scene(SHAKE, axes='x'), 'temperature_bias': Scene(WARM),
+    'temperature_scale': Scene(WARM), 'warm_up': Scene(WARM), 'supply': Scene(SUPPLY),
+    'bias_walk': Scene(replace(REST, duration_s=1200.0)), 'spikes': replace(
+        OVER_TIME, motion=replace(REST, duration_s=20.0)),
+    'stuck': Scene(replace(SWING, duration_s=6.0), noisy=True, axes='x'),
+    'mains_hum': replace(OVER_TIME, kind='spectrum'), 'flicker': replace(OVER_TIME,
+                                                                         kind='spectrum'),
+    'noise_excess': replace(OVER_TIME, kind='spectrum'),
+    'quantisation': replace(OVER_TIME, kind='codes')}
+LOUDER = {'stuck.rate_hz': 1.0, 'stuck.duration_s': 0.2, 'saturation.limit_g.x': 0.9,
+          'saturation.limit_g.y': 0.9, 'saturation.limit_g.z': 0.9, 'clock_skew.ratio': 1e-3,
+          'mount_resonance.frequency_hz': 25.0}
+"""Where a typical value would not be seen on the manoeuvre."""
+
+
+def main(output: Path) -> None:
+    """Draw every effect and write the page."""
+    nominal = with_axes(params.load(DOCS.parent / 'params' / 'adxl203.yaml'), 'xyz')
+    nominal = replace(nominal, rate_hz=500.0)
+    (output / 'effects').mkdir(parents=True, exist_ok=True)
+    lines = ['# Gallery of effects', '', 'Made by `make gallery` from the library itself: '
+             'typical values, unless the caption says otherwise; seed 0.', '']
+    place = None
+    for effect in sorted(library().values(), key=lambda e: (e.place, e.name)):
+        if effect.place is not place:
+            place = effect.place
+            lines += [f'## {TITLES[place]}', '']
+        caption = draw(nominal, effect, output / 'effects' / f'{effect.name}.png')
+        lines += page(effect, caption)
+    (output / 'effects.md').write_text('\n'.join(lines), encoding='utf-8')
+
+
+TITLES = {Place.STAGE: 'Stage', Place.FORCE: 'Specific force', Place.MOUNTING: 'Mounting',
+          Place.ELEMENT: 'Sensing element', Place.ELECTRONICS: 'Electronics and RC filter',
+          Place.ADC: 'Input of the ADC', Place.CODE: 'Codes and link', Place.CLOCK: 'Clock'}
+
+
+def page(effect: Effect, caption: str) -> list[str]:
+    """Say about an effect what the library knows."""
+    said = [f'Acts on the {effect.acts_on}',
+            'smooth in its parameters' if effect.smooth else 'not smooth in its parameters',
+            'undone by the inverse' if effect.invertible else 'not undone by the inverse']
+    said += [f'needs a {need}' for need in effect.needs]
+    said += [f'follows `{name}`' for name in effect.follows]
+    rows = [f'| `{p.name}` | {p.unit} | {p.neutral:g} | {p.lower:g} to {p.upper:g} | {p.scale:g} '
+            f'| {", ".join(p.axes) or "-"} | {p.doc} | {p.source} |' for p in effect.parameters]
+    return [f'### {effect.name}', '', effect.cause, '', f'![{effect.name}](effects/'
+            f'{effect.name}.png)', '', caption, '', f'{"; ".join(said)}.', '',
+            '| parameter | unit | neutral | bounds | typical | axes | meaning | source |',
+            '|---|---|---|---|---|---|---|---|', *rows, '']
+
+
+def draw(nominal: Sensor, effect: Effect, path: Path) -> str:
+    """Draw one effect; return the caption."""
+    scene = SCENES.get(effect.name, plane(90))
+    sensor = nominal if scene.noisy else replace(
+        nominal, noise_density_g_per_rthz=np.zeros(3), adc_bits=nominal.adc_bits * (
+            'adc' in effect.needs))
+    with_it = replace(sensor, effects=(effect.name,),
+                      values={effect.name: typical(effect, 'xyz')})
+    louder = {k: v for k, v in LOUDER.items() if k.startswith(f'{effect.name}.')}
+    with_it = put(with_it, list(louder), list(louder.values()))
+    clean, changed = (simulate(unit, scene.motion, 0) for unit in (sensor, with_it))
+    figure, (above, below) = plt.subplots(2, 1, figsize=(7.5, 4.6), constrained_layout=True)
+    {'lines': lines_of, 'spectrum': spectrum, 'codes': codes}[scene.kind](
+        above, below, scene, clean, changed, sensor)
+    above.set_title(effect.name, loc='left', fontweight='bold')
+    figure.savefig(path, dpi=85)
+    plt.close(figure)
+    stated = ', '.join(f'`{k.split(".", 1)[1]}` = {v:g}' for k, v in louder.items())
+    return f'Here with {stated}.' if stated else 'Typical values.'
+
+
+def lines_of(above: plt.Axes, below: plt.Axes, scene: Scene, clean: Columns, changed: Columns,
+             sensor: Sensor) -> None:
+    """Draw output and difference over time or an angle, in the direction of travel."""
+    across = clean[scene.across] * scene.unit
+    forth = np.ones(len(across), bool)
+    if np.ptp(np.sign(np.diff(across))) == 2:
+        forth[len(across) // 2:] = False
+    for axis in scene.axes:
+        column = f'{axis}_v'
+        scale, zero = sensor.nominal_scale_v_per_g[0], sensor.nominal_zero_g_v[0]
+        before, after = ((c[column] - zero) / scale for c in (clean, changed))
+        above.plot(across[forth], before[forth], color='0.7', lw=3)
+        above.plot(across[forth], after[forth], color=COLOURS[axis], lw=1, label=axis)
+        off = (after - before) * 1e3
+        below.plot(across[forth], off[forth], color=COLOURS[axis], lw=1.2)
+        if not forth.all():
+            below.plot(across[~forth], off[~forth], color=COLOURS[axis], lw=1, ls='--')
+    above.set_ylabel('output, g')
+    above.plot([], [], color='0.7', lw=3, label='clean')
+    above.legend(ncol=4, loc='lower right', bbox_to_anchor=(1, 1), fontsize=8, frameon=False)
+    low, high = below.get_ylim()
+    if high - low < 1e-3 * max(abs(low), abs(high)):
+        below.set_ylim(0, 1.3 * high)
+    back = '' if forth.all() else '\ndashed: on the way back'
+    below.set_ylabel(f'difference, mg{back}')
+    below.set_xlabel(scene.label)
+    for ax in (above, below):
+        ax.grid(alpha=0.3)
+
+
+def spectrum(above: plt.Axes, below: plt.Axes, scene: Scene, clean: Columns, changed: Columns,
+             sensor: Sensor) -> None:
+    """Draw a stretch and the noise densities."""
+    part = slice(0, 1000)
+    for columns, colour, width, label in ((clean, '0.7', 3, 'clean'),
+                                          (changed, COLOURS['x'], 1, 'with it')):
+        volts = columns['x_v'] - columns['x_v'].mean()
+        above.plot(columns['time_s'][part], volts[part] * 1e3, color=colour, lw=width / 2)
+        f, density = welch(volts, sensor.rate_hz, nperseg=16384)
+        below.loglog(f[1:], np.sqrt(density[1:]) * 1e6, color=colour, lw=width, label=label)
+    above.set_ylabel('x, mg')
+    above.set_xlabel('time, s')
+    below.set_ylabel('density, ug/sqrt(Hz)')
+    below.set_xlabel('frequency, Hz')
+    below.legend(fontsize=8)
+    for ax in (above, below):
+        ax.grid(alpha=0.3, which='both')
+
+
+def codes(above: plt.Axes, below: plt.Axes, scene: Scene, clean: Columns, changed: Columns,
+          sensor: Sensor) -> None:
+    """Draw a stretch and how often each code comes."""
+    part = slice(0, 150)
+    for columns, colour, width, label in ((clean, '0.7', 3, 'clean'),
+                                          (changed, COLOURS['x'], 1.2, 'with it')):
+        above.step(columns['time_s'][part], columns['x_v'][part] * 1e3, color=colour, lw=width)
+        code, count = np.unique(np.rint(columns['x_v'] / sensor.lsb_v), return_counts=True)
+        below.vlines(code, 0, count / count.sum(), color=colour, lw=width * 1.5, label=label)
+    above.set_ylabel('x, mV')
+    above.set_xlabel('time, s')
+    below.set_ylabel('share of samples')
+    below.set_xlabel('code of the ADC')
+    below.legend(fontsize=8)
+
+
+if __name__ == '__main__':
+    main(Path(sys.argv[1]) if len(sys.argv) > 1 else DOCS)

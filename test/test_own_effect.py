@@ -1,0 +1,68 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The page about effects of one's own: its package, installed as written, works everywhere."""
+
+import os
+from pathlib import Path
+import re
+import subprocess
+import sys
+
+from adxl_ros.files import params
+import numpy as np
+from units import nominal
+
+PAGE = Path(__file__).resolve().parents[1] / 'docs' / 'own_effect.md'
+
+
+def test_the_page_s_package_works(tmp_path, monkeypatch, run_tool):
+    """Its module and entry point, found by simulate, by parameter files and by apply."""
+    blocks = re.findall(r'`([a-z_.]+)`:\n\n```\w+\n(.*?)```', PAGE.read_text(), re.DOTALL)
+    assert {name for name, _ in blocks} == {'pyproject.toml', 'crane_effects.py'}
+    package = tmp_path / 'package'
+    package.mkdir()
+    for name, text in blocks:
+        (package / name).write_text(text)
+        assert len(text.splitlines()) < 45
+    site = tmp_path / 'site'
+    done = subprocess.run([sys.executable, '-m', 'pip', 'install', '--quiet', '--no-deps',
+                           '--no-index', '--no-build-isolation', '--target', str(site), '.'],
+                          cwd=package, text=True, capture_output=True)
+    assert done.returncode == 0, done.stderr
+    monkeypatch.setenv('PYTHONPATH', f'{site}{os.pathsep}{os.environ.get("PYTHONPATH", "")}')
+    line = re.search(r'simulate (sweep .*) -o', PAGE.read_text())
+    assert line
+    effect = line[1].split()[2]
+    made = run_tool('simulate', 'tilt_alpha', '--rate', '50', '--effect', effect, '-o', 'a.csv')
+    assert made.returncode == 0, made.stderr
+    plain = run_tool('simulate', 'tilt_alpha', '--rate', '50', '-o', 'b.csv')
+    assert plain.returncode == 0, plain.stderr
+    read = [np.genfromtxt(tmp_path / name, delimiter=',', names=True, comments='#')['x_v']
+            for name in ('a.csv', 'b.csv')]
+    # 2 Ohm · 0.7 mA; its growth with the output averages out over a whole turn.
+    assert abs(np.mean(read[0] - read[1]) - 1.4e-3) < 2e-5
+    path = tmp_path / 'unit.yaml'
+    params.save(path, nominal('xy'))
+    text = path.read_text().rstrip() + ('\n    effects: [cable_sag]\n    cable_sag:\n'
+                                        '      resistance_ohm: 2.0\n      current_a: 7.0e-4\n'
+                                        '      growth_per_g: [0.05, 0.05]\n')
+    path.write_text(text)
+    applied = run_tool('apply', 'a.csv', '--params', path, '-o', 'out.csv')
+    assert applied.returncode == 0, applied.stderr
+    bare = run_tool('apply', 'b.csv', '-o', 'bare.csv')
+    assert bare.returncode == 0, bare.stderr
+    ax = [np.genfromtxt(tmp_path / name, delimiter=',', names=True)['ax_mps2']
+          for name in ('out.csv', 'bare.csv')]
+    assert abs(np.mean(ax[0] - ax[1])) < 2e-4
