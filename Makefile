@@ -3,10 +3,11 @@
 # make test     every test         (make test ARGS='-k fit')
 # make bench    rate, missing samples, latency and CPU of the live nodes
 # make gallery  docs/effects.md and its plots, from the library of effects
+# make long    an 8-hour recording through apply: memory and time
 # make lint     the linters alone
 # make clean    remove what these made
 
-.PHONY: build demo test bench gallery lint clean FORCE
+.PHONY: build demo test bench gallery long lint clean FORCE
 .DEFAULT_GOAL := build
 
 # The first Python that can run the line $1.
@@ -92,6 +93,11 @@ bench: build
 
 gallery: build
 	./run --exec python docs/gallery.py docs
+
+# Its executables are found as `ros2 run` finds them.
+long: build
+	cd test && PATH="$(CURDIR)/install/adxl_ros/lib/adxl_ros:$$PATH" \
+	    ../run --exec python long_recording.py $(ARGS)
 
 clean:
 	rm -rf .venv build install log demo_output .*_cache .hypothesis

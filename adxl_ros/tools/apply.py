@@ -32,7 +32,7 @@ from adxl_ros.model.effects.base import Place
 from adxl_ros.model.sensor import Sensor, with_axes
 from adxl_ros.model.tilt import tilt
 from adxl_ros.model.uncertainty import force_covariance
-from adxl_ros.tools.common import default_params, progress, run
+from adxl_ros.tools.common import default_params, progress, run, say_notes
 import numpy as np
 
 _BLOCK_ROWS = 16384
@@ -75,8 +75,8 @@ def apply(options: argparse.Namespace) -> int:
             show(block.done)
     _say(lost, rows, 'have no solution: their cells are empty')
     _say(saturated, rows, 'have the ADC at its rail: their standard deviations are inf')
-    if block is not None and 'cut' in block.notes:
-        print(f'apply: {block.notes["cut"]}', file=sys.stderr)
+    if block is not None:
+        say_notes('apply', block)
     return 0
 
 

@@ -26,6 +26,7 @@ import sys
 from types import FrameType
 
 from adxl_ros.errors import UserError
+from adxl_ros.files.columns import Recording, REFERENCES
 from ament_index_python.packages import get_package_share_directory
 
 
@@ -74,6 +75,30 @@ def default_params() -> Path:
     return Path(get_package_share_directory('adxl_ros')) / 'params' / 'adxl203.yaml'
 
 
+def say_notes(tool: str, read: Recording) -> None:
+    """
+    Tell on stderr what reading a recording showed: where it was cut, how well it is aligned.
+
+    Parameters
+    ----------
+    tool
+        Who says it.
+    read
+        The recording, or its last block.
+
+    """
+    if 'cut' in read.notes:
+        print(f'{tool}: {read.notes["cut"]}', file=sys.stderr)
+    for name in REFERENCES:
+        # References with the sensor's own stamps need no alignment.
+        if read.notes.get(f'{name}_gap_s'):
+            unit = {'rad': 'rad', 'm': 'm', 'c': 'degC', 'v': 'V'}[name.rsplit('_', 1)[1]]
+            print(f'{tool}: {read.path}: {name} aligned by its stamps: residual '
+                  f'{read.notes[f"{name}_residual"]:.3g} {unit} rms, '
+                  f'{read.notes[f"{name}_gap_s"]:.3g} s from the nearest message at most',
+                  file=sys.stderr)
+
+
 @contextmanager
 def progress(title: str) -> Iterator[Callable[[float], None]]:
     """
@@ -87,11 +112,21 @@ def progress(title: str) -> Iterator[Callable[[float], None]]:
     """
     try:
         from rich.console import Console
-        from rich.progress import Progress
+        from rich.progress import (
+            BarColumn,
+            Progress,
+            TaskProgressColumn,
+            TextColumn,
+            TimeElapsedColumn,
+            TimeRemainingColumn,
+        )
     except ImportError:
         yield lambda done: None
         return
     console = Console(stderr=True)
-    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
+    columns = (TextColumn('{task.description}'), BarColumn(), TaskProgressColumn(),
+               TimeElapsedColumn(), TextColumn('left'), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True,
+                  disable=not console.is_terminal) as bar:
         task = bar.add_task(title, total=1.0)
         yield lambda done: bar.update(task, completed=done)

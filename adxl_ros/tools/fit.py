@@ -18,14 +18,13 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-import sys
 
 from adxl_ros.calibrate import recorded, result
 from adxl_ros.calibrate.poses import together
 from adxl_ros.errors import UserError
 from adxl_ros.files import journal, params, recording
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.tools.common import default_params, run
+from adxl_ros.tools.common import default_params, run, say_notes
 
 
 def parser() -> argparse.ArgumentParser:
@@ -56,9 +55,7 @@ def fit(options: argparse.Namespace) -> int:
     parts = []
     for path in options.recording:
         read = recording.read(path)
-        for note in ('cut',):
-            if note in read.notes:
-                print(f'fit: {read.notes[note]}', file=sys.stderr)
+        say_notes('fit', read)
         unit = recorded.recorded_unit(unit or sensor, read)
         parts.append(recorded.poses_of(read, unit, entries))
     found = result.calibrate(unit, together(parts), options.model,

@@ -32,7 +32,7 @@ from adxl_ros.model.motion import Held, Motion
 from adxl_ros.model.response import Response
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.model.trajectory import TRAJECTORIES
-from adxl_ros.tools.common import default_params, progress, run
+from adxl_ros.tools.common import default_params, progress, run, say_notes
 from adxl_ros.tools.effect_option import SYNTAX, with_effects
 import numpy as np
 
@@ -111,6 +111,7 @@ def _run(sensor: Sensor, options: argparse.Namespace
         motion = TRAJECTORIES[name](np.random.default_rng(options.seed))
         return sensor, motion.duration_s, 0.0, simulator.blocks(sensor, motion, options.seed)
     read = recording.read(name)
+    say_notes('simulate', read)
     motion = _followed(read, sensor)
     begin_s, end_s = float(read.time_s[0]), float(read.time_s[-1])
     if options.rate is not None:
