@@ -32,6 +32,8 @@ from rclpy.parameter import Parameter
 _FIXED = {'format', 'units', *params.FIGURES}
 _EFFECTS = {f'{effect.name}.{p.name}': effect.name
             for effect in library().values() for p in effect.parameters}
+_NEUTRAL = {f'{effect.name}.{p.name}': p.neutral
+            for effect in library().values() for p in effect.parameters}
 _CHANGED = ', with coefficients set since'
 _COEFFICIENTS = {'effects', 'covariance_names', 'covariance', *_EFFECTS}
 
@@ -114,8 +116,9 @@ class LiveSensor:
 
     def _parameter(self, name: str, value: Any) -> Parameter:
         kind = Parameter.Type(self._node.describe_parameter(name).type)
-        nothing = '' if kind == Parameter.Type.STRING else []
-        return Parameter(name, kind, nothing if value is None else value)
+        # One figure cannot be empty; that of an effect which is not listed means nothing.
+        nothing: Any = {Parameter.Type.STRING: '', Parameter.Type.DOUBLE: _NEUTRAL.get(name)}
+        return Parameter(name, kind, nothing.get(kind, []) if value is None else value)
 
     def _check(self, parameters: Sequence[Parameter]) -> SetParametersResult:
         """Say whether a set leads to a sensor that the node can use."""
