@@ -22,6 +22,7 @@ import signal
 from adxl_ros.files import params
 from adxl_ros.files.columns import sensor_info
 from adxl_ros.model import chain
+from adxl_ros.model.coefficients import put, with_neutral
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
 from adxl_ros.model.stage import specific_force
 from adxl_ros.model.uncertainty import force_covariance
@@ -34,7 +35,7 @@ import pytest
 from rcl_interfaces.srv import DescribeParameters, GetParameters, SetParametersAtomically
 from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import Imu
+from sensor_msgs.msg import BatteryState, Imu, Temperature
 from units import drawn, nominal
 
 G = 9.80665
@@ -180,6 +181,32 @@ def test_corrected_stream(robot: Robot, start: Start, tmp_path: Path) -> None:
     assert process.wait() == 0
     assert 'Traceback' not in process.output()
     assert stamp_ns(message) == 10 ** 9
+
+
+def test_supply_and_temperature_are_taken_out(robot: Robot, start: Start, tmp_path: Path) -> None:
+    """What `supply` and `temperature` say reaches the inverse; what is not said is named."""
+    sensor = with_neutral(unit(), ['supply', 'temperature_bias'])
+    sensor = put(sensor, ['supply.zero_g_exponent', 'supply.scale_exponent',
+                          'temperature_bias.per_k.x'], [1.0, 1.135, 1e-3])
+    started(start, tmp_path, sensor)
+    robot.inform(sensor)
+    robot.connected()
+    node = robot.graph.node
+    supply = node.create_publisher(BatteryState, 'supply', 1)
+    temperature = node.create_publisher(Temperature, 'temperature', 1)
+    force, around = pose(0.7, 0.4), chain.NOMINAL._replace(temperature_c=35.0, supply_v=4.8)
+    volts = np.array([chain.static_response(sensor)(force, around)])
+    shown = [*to_nominal_mps2(volts, sensor)[0].tolist(), 0.0]
+    robot.answer(shown)
+    robot.level(DiagnosticStatus.WARN, 'supply is taken at 5: nothing on /supply')
+
+    def corrected() -> bool:
+        supply.publish(BatteryState(voltage=4.8))
+        temperature.publish(Temperature(temperature=35.0))
+        return bool(np.abs(np.array(accel(robot.answer(shown))) - force).max() < 1e-5)
+
+    robot.graph.spin_until(corrected, 10.0, 'corrected for the surroundings')
+    robot.level(DiagnosticStatus.OK, 'compensating')
 
 
 def test_without_a_file_the_nominal_sensor_applies(robot: Robot, start: Start) -> None:

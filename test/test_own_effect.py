@@ -20,7 +20,7 @@ import re
 import subprocess
 import sys
 
-from adxl_ros.files import params
+from adxl_ros.files import params, recording
 import numpy as np
 from units import nominal
 
@@ -49,8 +49,7 @@ def test_the_page_s_package_works(tmp_path, monkeypatch, run_tool):
     assert made.returncode == 0, made.stderr
     plain = run_tool('simulate', 'tilt_alpha', '--rate', '50', '-o', 'b.csv')
     assert plain.returncode == 0, plain.stderr
-    read = [np.genfromtxt(tmp_path / name, delimiter=',', names=True, comments='#')['x_v']
-            for name in ('a.csv', 'b.csv')]
+    read = [recording.read(tmp_path / name).columns['x_v'] for name in ('a.csv', 'b.csv')]
     # 2 Ohm · 0.7 mA; its growth with the output averages out over a whole turn.
     assert abs(np.mean(read[0] - read[1]) - 1.4e-3) < 2e-5
     path = tmp_path / 'unit.yaml'

@@ -17,7 +17,7 @@
 from dataclasses import replace
 import json
 
-from adxl_ros.files import recording
+from adxl_ros.files import params, recording
 from adxl_ros.model import noise
 from adxl_ros.model.coefficients import put, typical, with_neutral
 from adxl_ros.model.effects import library
@@ -241,3 +241,23 @@ def test_neutral_effects_of_a_file_stay(tmp_path):
     force = [np.linspace(0, G, 500), 0.0, G]
     np.testing.assert_array_equal(Fed(sensor)(force), Fed(with_neutral(sensor, [
         n for n, e in library().items() if 'stage' not in e.needs]))(force))
+
+
+def test_apply_takes_temperature_and_supply_out(run_tool, tmp_path):
+    """A soak with drifts: corrected by what it recorded beside the sensor, and said without."""
+    effects = ('--effect', 'supply', '--effect', 'temperature_bias:per_k=1e-3')
+    made = run_tool('simulate', 'soak', '--rate', '2', *effects, '-o', 'soak.csv')
+    assert made.returncode == 0, made.stderr
+    sensor = with_neutral(nominal('xy'), ['supply', 'temperature_bias'])
+    sensor = replace(sensor, values={**sensor.values, 'supply': typical(library()['supply'], 'xy'),
+                                     'temperature_bias': {'per_k': np.full(2, 1e-3)}})
+    params.save(tmp_path / 'unit.yaml', sensor)
+    done = run_tool('apply', 'soak.csv', '--params', 'unit.yaml', '-o', 'out.csv')
+    assert done.returncode == 0 and not done.stderr
+    ax = np.genfromtxt(tmp_path / 'out.csv', delimiter=',', names=True)['ax_mps2']
+    assert np.abs(ax - G * np.sin(np.radians(60)) * np.cos(np.radians(30))).max() < 0.03
+    bare = [','.join(line.split(',')[:3]) if line[0] != '#' else line
+            for line in (tmp_path / 'soak.csv').read_text().splitlines()]
+    (tmp_path / 'bare.csv').write_text('\n'.join(bare) + '\n')
+    done = run_tool('apply', 'bare.csv', '--params', 'unit.yaml', '-o', 'out.csv')
+    assert done.returncode == 0 and 'supply is taken at 5' in done.stderr
