@@ -346,5 +346,3 @@ def next_poses(unit: Sensor, poses: Poses, names: Sequence[str], sigma: float, c
         chosen.append((float(alpha[best]), float(beta[best])))
         information = information + rows[best].T @ rows[best]
     return chosen
-
-
