@@ -147,14 +147,14 @@ def test_wrong_polarity_is_named(change, words):
     rng = np.random.default_rng(4)
     poses = swept(rng, nominal())
     with pytest.raises(UserError, match=words):
-        result.calibrate(nominal(), replace(poses, volts=change(poses.volts)), None, 'made')
+        result.calibrate(nominal(), [replace(poses, volts=change(poses.volts))], None, ['made'])
 
 
 def test_verdict_without_check_poses_holds_out_folds():
     """A recording without check poses is judged by fits that leave a fifth out."""
     rng = np.random.default_rng(6)
     poses = swept(rng, drawn(rng, nominal()), check_poses=0)
-    found = result.calibrate(nominal(), poses, None, 'made')
-    assert found.fitted.model == 'physical'
-    first_words = [line.split()[0] for line in found.verdict[:4]]
-    assert first_words == ['held', 'nominal', 'linear', 'physical']
+    found = result.calibrate(nominal(), [poses], None, ['made'])
+    assert found.fitted.model == 'full'
+    first_words = [line.split()[0] for line in found.verdict[:5]]
+    assert first_words == ['held', 'nominal', 'linear', 'physical', 'full']

@@ -52,7 +52,7 @@ def draw_sweep(path: str | os.PathLike, sensor: Sensor, fitted: Sensor, poses: P
     force = np.column_stack(reference_force(swept, sensor.local_gravity_mps2)) / G0_MPS2
     predicted = np.column_stack(chain.static_response(fitted)(
         reference_force(swept, sensor.local_gravity_mps2)))
-    figure, grid = _pyplot().subplots(2, 6, figsize=(26, 9), layout='constrained')
+    figure, grid = pyplot().subplots(2, 6, figsize=(26, 9), layout='constrained')
     for d, row in enumerate(grid):
         straight = start.zero_g_v[d] + start.scale_v_per_g[d] * force[:, d]
         deviation = 1e3 * (swept.volts[:, d] - straight)
@@ -68,7 +68,7 @@ def draw_sweep(path: str | os.PathLike, sensor: Sensor, fitted: Sensor, poses: P
                  'scale factor, V/g', 'fig. 8: scale factor against z (15, 17)')
     figure.suptitle(f'{fitted.serial}: deviation from the linear model, and what the physical '
                     'model makes of it (Ang et al. 2007, figures 2 to 8)')
-    _write(figure, path)
+    write(figure, path)
 
 
 def draw_gravity(path: str | os.PathLike, name: str, before_mps2: np.ndarray,
@@ -88,7 +88,7 @@ def draw_gravity(path: str | os.PathLike, name: str, before_mps2: np.ndarray,
         Standard deviation of the rest's mean, m/s², (k,).
 
     """
-    figure, axes = _pyplot().subplots(1, 2, figsize=(12, 4.5), layout='constrained')
+    figure, axes = pyplot().subplots(1, 2, figsize=(12, 4.5), layout='constrained')
     rests = np.arange(1, len(after_mps2) + 1)
     for axis, values, title in ((axes[0], before_mps2, 'nominal'),
                                 (axes[1], after_mps2, 'calibrated')):
@@ -98,7 +98,7 @@ def draw_gravity(path: str | os.PathLike, name: str, before_mps2: np.ndarray,
         axis.set(title=f'{title}: rms {np.sqrt(np.mean(mg ** 2)):.2f} mg', xlabel='rest',
                  ylabel='magnitude minus gravity, mg')
     figure.suptitle(f'{name}: {len(rests)} rests (bars: 90 %, expected)')
-    _write(figure, path)
+    write(figure, path)
 
 
 def _paths(axis: Any, d: int, force: np.ndarray, poses: Poses, deviation: np.ndarray,
@@ -149,7 +149,8 @@ def _along_z(axis: Any, d: int, az_g: np.ndarray, values: np.ndarray, curve: np.
     axis.set(xlabel='z reference, g', ylabel=f'{"xy"[d]} {label}', title=title)
 
 
-def _pyplot() -> Any:
+def pyplot() -> Any:
+    """Return matplotlib's drawing functions, without a display."""
     try:
         import matplotlib
     except ImportError:
@@ -159,7 +160,8 @@ def _pyplot() -> Any:
     return matplotlib.pyplot
 
 
-def _write(figure: Any, path: str | os.PathLike) -> None:
+def write(figure: Any, path: str | os.PathLike) -> None:
+    """Write a figure as PNG, whole or not at all."""
     with atomic_path(path) as fresh:
         figure.savefig(fresh, dpi=80, format='png')
-    _pyplot().close(figure)
+    pyplot().close(figure)

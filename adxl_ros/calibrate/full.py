@@ -18,13 +18,16 @@ The full model: one maximum-likelihood fit of all poses, all axes, with errors o
 The volts of a pose are the chain's at angles that the stage has not quite reached,
 V = h(f(α + δα, β + δβ; tilt); θ) + noise of the mean, with δ ~ N(0, σ²) a joint and pose, and the
 level of the base known to `LEVEL_RAD`. The δ are integrated out: a pose weighs by the inverse of
-S = diag(std²) + σ²·JJᵀ, J = ∂V/∂(α, β) (errors in variables; Fuller 1987, section 3.2). The tilt
+S = diag(std²) + σ²·JJᵀ, J = ∂V/∂(α, β) (errors in variables; Fuller 1987, section 3.2), where J is
+taken at the most likely angles, so that a stage that is off by degrees is still straight. The tilt
 of the base is fitted beside the sensor, with its prior, and left out of the result.
 
 Gauge: p0, q0 of (11) and (13) belong to the zero-g and r0 of (15) to the scale factor; p1 and q1
-are the misalignment, `cross_axis.linear` and `cross_axis_z.linear` stay 0. At rest x² + y² + z² is
-g², so that a square of the own axis is those of the others and `quadratic` stays out. The case's x
-is where beta = 0 points, so that an offset of beta is part of the misalignment.
+are the misalignment to first order, so that `cross_axis.linear` and `cross_axis_z.linear` stay 0.
+Products tell them apart, by r1·p1·z·c and the like: where poses held out ask for it (see
+`full_terms`), the two are fitted, too, with the datasheet's 1.5 % for prior. At rest x² + y² + z²
+is g², so that a square of the own axis is those of the others and `quadratic` stays out. The
+case's x is where beta = 0 points, so that an offset of beta is part of the misalignment.
 """
 
 from __future__ import annotations
@@ -33,14 +36,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from adxl_ros.calibrate import linear
+from adxl_ros.calibrate.posed import (
+    by_angles,
+    by_coefficients,
+    pose_covariance,
+    response,
+)
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.errors import UserError
-from adxl_ros.model import chain
 from adxl_ros.model.coefficients import get, names_of, parameter_of, put, with_neutral
 from adxl_ros.model.effects import effect_named
-from adxl_ros.model.effects.base import Joint, Place, Signals
+from adxl_ros.model.effects.base import Place
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.model.stage import specific_force, UPRIGHT
 import numpy as np
 from scipy.optimize import minimize_scalar
 from scipy.stats import chi2
@@ -51,12 +58,15 @@ GAUGE = ('cross_axis.linear', 'cross_axis_z.linear')
 LEVEL_RAD = np.radians(0.1)
 """Standard deviation of the level of the base, each way: the paper's 0.1°."""
 _STAGE = ('base_tilt.x_rad', 'base_tilt.y_rad')
+_HARDLY = 5.0
 _KNOCKED = 1e-6
 """A pose less likely than this is disturbed, as long as such poses are few."""
 _MOST_KNOCKED = 0.2
-_ANGLE_STEP_RAD = 1e-4
-_ROUNDS = 12
+_ROUNDS, _STEPS = 16, 12
+_SHRINK, _STRAIGHT = 0.2, 0.1
 _CONVERGED = 1e-4
+_LONGEST = 3.0
+"""Longest step, in typical sizes."""
 _FEWEST_SPARE = 40
 """Residuals beyond the parameters that are needed to judge the stage's errors by them."""
 
@@ -70,6 +80,8 @@ class FullFit:
     ----------
     fitted
         The unit with its covariance.
+    unit
+        The same with what was fitted of the stage, which belongs to no sensor.
     names
         Fitted coefficients, those of the stage last.
     stage_sigma_rad
@@ -82,29 +94,20 @@ class FullFit:
         Inverse covariance of `names`, priors included.
     distances
         Squared Mahalanobis distance of each pose, (k,).
+    at
+        The poses turned to the most likely angles, in which the model is straight.
 
     """
 
     fitted: Sensor
+    unit: Sensor
     names: tuple[str, ...]
     stage_sigma_rad: float
     stated_sigma_rad: float
     knocked: tuple[int, ...]
     information: np.ndarray
     distances: np.ndarray
-
-
-def fit(sensor: Sensor, poses: Poses) -> Sensor:
-    """
-    Fit the full model.
-
-    Raises
-    ------
-    UserError
-        The poses do not determine it; see `fit_full`.
-
-    """
-    return fit_full(sensor, poses).fitted
+    at: Poses
 
 
 def fit_full(sensor: Sensor, poses: Poses, terms: Sequence[str] = TERMS) -> FullFit:
@@ -118,7 +121,7 @@ def fit_full(sensor: Sensor, poses: Poses, terms: Sequence[str] = TERMS) -> Full
     poses
         Of one unit on one stage.
     terms
-        Effects to fit, of the sensor or of the stage.
+        Effects to fit, of the sensor or of the stage, and names of `GAUGE`.
 
     Raises
     ------
@@ -127,88 +130,83 @@ def fit_full(sensor: Sensor, poses: Poses, terms: Sequence[str] = TERMS) -> Full
 
     """
     start = linear.fit(sensor, poses)
-    unit = with_neutral(replace(start, covariance=np.zeros((0, 0)), covariance_names=()), terms)
+    effects = [term.split('.')[0] for term in terms]
+    unit = with_neutral(replace(start, covariance=np.zeros((0, 0)), covariance_names=()), effects)
     unit = with_neutral(unit, ['base_tilt'])
     names = coefficients(unit.axes, terms)
     stated = sensor.stage_resolution_rad / np.sqrt(12)
-    kept, sigma = np.ones(len(poses), bool), stated
     require_determined(unit, poses, names, stated)
-    for _ in range(4):
+    kept, sigma, at, used = np.ones(len(poses), bool), stated, poses, poses
+    unit = _solved(unit, poses, names, sigma, kept)
+    for i in range(_ROUNDS):
         before = kept, sigma
-        unit = _solved(unit, poses, names, sigma, kept)
-        sigma = _stage_sigma(unit, poses, names, stated, kept)
-        unit = _solved(unit, poses, names, sigma, kept)
-        distances = _distances(unit, poses, sigma)
+        for _ in range(1 if i else 3):
+            sigma = _stage_sigma(unit, used, names, stated, kept)
+            # Angles off by δ leave δ²/2 of g beside the straight line, until they are found.
+            bent = sensor.nominal_scale_v_per_g * sigma ** 2 * _SHRINK ** i
+            used = replace(at, std_v=np.hypot(at.std_v, bent))
+        unit, at = _stepped(unit, poses, used, names, sigma, kept)
+        if np.any(bent > _STRAIGHT * poses.std_v.mean(axis=0)):
+            continue
+        distances = _distances(unit, at, sigma)
         kept = distances < chi2.isf(_KNOCKED, len(unit.axes))
         if kept.mean() < 1 - _MOST_KNOCKED:
             kept = np.ones(len(poses), bool)
         if np.array_equal(kept, before[0]) and abs(sigma - before[1]) <= 1e-3 * max(sigma, 1e-9):
             break
-    information = _normal(unit, poses, names, sigma, kept)[0]
-    covariance = np.linalg.inv(information)
-    of_sensor = [i for i, name in enumerate(names) if not _of_stage(name)]
+    known = information(unit, at.subset(kept), names, sigma)
+    covariance = np.linalg.inv(known)
+    of_sensor = [i for i, name in enumerate(names) if not of_stage(name)]
     fitted = replace(
         _without_stage(unit), model='full',
         covariance=covariance[np.ix_(of_sensor, of_sensor)],
         covariance_names=tuple(names[i] for i in of_sensor))
-    return FullFit(fitted, names, sigma, stated, tuple(np.flatnonzero(~kept).tolist()),
-                   information, distances)
+    return FullFit(fitted, unit, names, sigma, stated, tuple(np.flatnonzero(~kept).tolist()),
+                   known, distances, at)
 
 
 def coefficients(axes: str, terms: Sequence[str]) -> tuple[str, ...]:
     """Name what is fitted: the terms' coefficients but for the gauge, and the base's tilt."""
-    of_sensor = [name for term in terms for name in names_of(effect_named(term), axes)
-                 if name.rsplit('.', 1)[0] not in GAUGE and not parameter_of(name).shape
-                 and not _of_stage(name)]
-    of_stage = [name for term in terms for name in names_of(effect_named(term), axes)
-                if _of_stage(name) and name not in _STAGE]
-    return (*of_sensor, *_STAGE, *of_stage)
+    named = [name for effect in dict.fromkeys(term.split('.')[0] for term in terms)
+             for name in names_of(effect_named(effect), axes) if not parameter_of(name).shape
+             and term_of(name) in terms]
+    return (*(n for n in named if not of_stage(n)), *_STAGE,
+            *(n for n in named if of_stage(n) and n not in _STAGE))
 
 
-def response(unit: Sensor, alpha_rad: np.ndarray, beta_rad: np.ndarray) -> np.ndarray:
-    """Return the volts that the chain promises at the stage's angles, (k, m)."""
-    signals = Signals(chain.NOMINAL, alpha=Joint(alpha_rad), beta=Joint(beta_rad),
-                      up=list(UPRIGHT), gravity_mps2=unit.local_gravity_mps2)
-    for apply, values in chain.applied(unit, Place.STAGE):
-        apply(signals, values)
-    force = specific_force(signals.alpha.position, signals.beta.position, signals.gravity_mps2,
-                           0.0, signals.up)
-    return np.column_stack(np.broadcast_arrays(*chain.static_response(unit)(force)))
-
-
-def by_angles(unit: Sensor, alpha_rad: np.ndarray, beta_rad: np.ndarray) -> np.ndarray:
-    """Differentiate volts by alpha and beta, V/rad, (k, m, 2)."""
-    h = _ANGLE_STEP_RAD
-    return np.stack([
-        (response(unit, alpha_rad + h * a, beta_rad + h * b)
-         - response(unit, alpha_rad - h * a, beta_rad - h * b)) / (2 * h)
-        for a, b in ((1, 0), (0, 1))], axis=2)
-
-
-def by_coefficients(unit: Sensor, alpha_rad: np.ndarray, beta_rad: np.ndarray,
-                    names: Sequence[str]) -> np.ndarray:
-    """Differentiate volts by coefficients, V a unit, (k, m, p)."""
-    columns = []
-    for name in names:
-        at, step = get(unit, [name]), 1e-3 * parameter_of(name).scale
-        above, below = (response(put(unit, [name], at + by), alpha_rad, beta_rad)
-                        for by in (step, -step))
-        columns.append((above - below) / (2 * step))
-    return np.stack(columns, axis=2)
-
-
-def pose_covariance(unit: Sensor, poses: Poses, sigma_rad: float) -> np.ndarray:
-    """Covariance of the volts of each pose about the model, V², (k, m, m); see the module."""
-    slope = by_angles(unit, poses.alpha_rad, poses.beta_rad)
-    noise = poses.std_v[:, :, None] ** 2 * np.eye(len(unit.axes))
-    return noise + sigma_rad ** 2 * slope @ np.swapaxes(slope, 1, 2)
+def term_of(name: str) -> str:
+    """Return the term that a coefficient belongs to: its effect, or one of `GAUGE`."""
+    effect, parameter = name.split('.')[:2]
+    return f'{effect}.{parameter}' if f'{effect}.{parameter}' in GAUGE else effect
 
 
 def priors(names: Sequence[str]) -> np.ndarray:
-    """Return the inverse variances that are known beforehand: of the stage's errors, (p,)."""
-    spread = np.array([LEVEL_RAD if name in _STAGE else parameter_of(name).scale * 3
-                       for name in names])
-    return np.where([_of_stage(name) for name in names], 1 / spread ** 2, 0.0)
+    """
+    Return the inverse variances that are known beforehand, (p,).
+
+    The level and the gauge are known; a coefficient of the sensor is hardly ever beyond five
+    times its typical size, which says nothing where the poses say anything.
+    """
+    spread = [LEVEL_RAD if name in _STAGE else parameter_of(name).scale * (
+        1 if term_of(name) in GAUGE else 3 if of_stage(name) else _HARDLY) for name in names]
+    return 1 / np.square(spread)
+
+
+def information(unit: Sensor, poses: Poses, names: Sequence[str], sigma_rad: float) -> np.ndarray:
+    """
+    Fisher information of poses about coefficients, priors of the stage included, (p, p).
+
+    Its inverse is the Cramér-Rao bound.
+
+    Parameters
+    ----------
+    unit
+        Where it is taken.
+    poses, names, sigma_rad
+        As `FullFit` has them.
+
+    """
+    return _normal(unit, poses, names, sigma_rad, np.ones(len(poses), bool))[0]
 
 
 def _normal(unit: Sensor, poses: Poses, names: Sequence[str], sigma: float, kept: np.ndarray
@@ -216,8 +214,8 @@ def _normal(unit: Sensor, poses: Poses, names: Sequence[str], sigma: float, kept
     """Return the information matrix and the gradient of the log-likelihood with priors."""
     used = poses.subset(kept)
     white = _whitener(unit, used, sigma)
-    design = white @ by_coefficients(unit, used.alpha_rad, used.beta_rad, names)
-    off = (white @ (used.volts - response(unit, used.alpha_rad, used.beta_rad))[:, :, None])
+    design = white @ by_coefficients(unit, used, names)
+    off = (white @ (used.volts - response(unit, used))[:, :, None])
     flat, residual = design.reshape(-1, len(names)), off.reshape(-1)
     known = priors(names)
     return flat.T @ flat + np.diag(known), flat.T @ residual - known * get(unit, names)
@@ -230,10 +228,12 @@ def _whitener(unit: Sensor, poses: Poses, sigma: float) -> np.ndarray:
 def _solved(unit: Sensor, poses: Poses, names: Sequence[str], sigma: float, kept: np.ndarray
             ) -> Sensor:
     """Gauss-Newton steps to the maximum; the chain is nearly linear in its coefficients."""
-    for _ in range(_ROUNDS):
+    typical = np.array([parameter_of(name).scale for name in names])
+    for _ in range(_STEPS):
         information, gradient = _normal(unit, poses, names, sigma, kept)
         scale = 1 / np.sqrt(np.diag(information))
         step = scale * np.linalg.solve(information * np.outer(scale, scale), scale * gradient)
+        step *= min(1.0, _LONGEST / np.abs(step / typical).max())
         unit = put(unit, names, get(unit, names) + step)
         if np.abs(step / scale).max() < _CONVERGED:
             break
@@ -251,9 +251,9 @@ def _stage_sigma(unit: Sensor, poses: Poses, names: Sequence[str], stated: float
     if kept.sum() * len(unit.axes) - len(names) < _FEWEST_SPARE:
         return stated
     used = poses.subset(kept)
-    off = used.volts - response(unit, used.alpha_rad, used.beta_rad)
-    slope = by_angles(unit, used.alpha_rad, used.beta_rad)
-    design = by_coefficients(unit, used.alpha_rad, used.beta_rad, names)
+    off = used.volts - response(unit, used)
+    slope = by_angles(unit, used)
+    design = by_coefficients(unit, used, names)
     noise = used.std_v[:, :, None] ** 2 * np.eye(len(unit.axes))
     spread = slope @ np.swapaxes(slope, 1, 2)
     known = np.diag(priors(names))
@@ -274,12 +274,60 @@ def _stage_sigma(unit: Sensor, poses: Poses, names: Sequence[str], stated: float
     return float(np.exp(found.x))
 
 
+def _stepped(unit: Sensor, poses: Poses, at: Poses, names: Sequence[str], sigma: float,
+             kept: np.ndarray) -> tuple[Sensor, Poses]:
+    """
+    Go to the most likely coefficients and angles, or as far on the way as it gets better.
+
+    `poses` are as measured, `at` the same about the angles before, see `_moved`.
+    """
+    before = get(unit, names), np.column_stack([at.alpha_rad - poses.alpha_rad,
+                                                at.beta_rad - poses.beta_rad])
+    solved = _solved(unit, at, names, sigma, kept)
+    slope = by_angles(solved, at)
+    off = (at.volts - response(solved, at))[:, :, None]
+    inverse = np.linalg.inv(pose_covariance(solved, at, sigma))
+    after = get(solved, names), (sigma ** 2 * np.swapaxes(slope, 1, 2) @ inverse @ off)[:, :, 0]
+    known = priors(names)
+
+    def cost(values: np.ndarray, step: np.ndarray) -> float:
+        left = poses.volts - response(put(unit, names, values), _turned(poses, step))
+        return float(np.sum((left / at.std_v)[kept] ** 2) + np.sum(known * values ** 2)
+                     + np.sum((step / max(sigma, 1e-9))[kept] ** 2))
+
+    worst = cost(*before)
+    for share in 0.5 ** np.arange(8):
+        values, step = (b + share * (a - b) for b, a in zip(before, after))
+        if cost(values, step) <= worst:
+            break
+    unit = put(unit, names, values)
+    return unit, _moved(unit, poses, step)
+
+
+def _turned(poses: Poses, step_rad: np.ndarray) -> Poses:
+    return replace(poses, alpha_rad=poses.alpha_rad + step_rad[:, 0],
+                   beta_rad=poses.beta_rad + step_rad[:, 1])
+
+
+def _moved(unit: Sensor, poses: Poses, step_rad: np.ndarray) -> Poses:
+    """
+    Turn poses to more likely angles, (k, 2) of steps.
+
+    What the model makes of the steps is added to the volts, so that they are linear in the error
+    of the measured angles.
+    """
+    there = _turned(poses, step_rad)
+    return replace(there, volts=poses.volts + (by_angles(unit, there)
+                                               @ step_rad[:, :, None])[:, :, 0])
+
+
 def _distances(unit: Sensor, poses: Poses, sigma: float) -> np.ndarray:
-    off = (poses.volts - response(unit, poses.alpha_rad, poses.beta_rad))[:, :, None]
+    off = (poses.volts - response(unit, poses))[:, :, None]
     return np.sum((_whitener(unit, poses, sigma) @ off) ** 2, axis=(1, 2))
 
 
-def _of_stage(name: str) -> bool:
+def of_stage(name: str) -> bool:
+    """Tell whether a coefficient is the stage's and not the sensor's."""
     return effect_named(name.split('.')[0]).place is Place.STAGE
 
 
@@ -298,11 +346,13 @@ def require_determined(unit: Sensor, poses: Poses, names: Sequence[str], sigma: 
         Names the coefficients and the poses that would determine them.
 
     """
-    everyone = np.ones(len(poses), bool)
-    information = _normal(unit, poses, names, sigma, everyone)[0]
     scale = np.array([parameter_of(name).scale for name in names])
-    weak = np.linalg.inv(information * np.outer(scale, scale) + 1e-6 * np.eye(len(names)))
-    lost = [name for name, variance in zip(names, np.diag(weak)) if variance > 1.0]
+    vague = [not of_stage(name) and term_of(name) not in GAUGE for name in names]
+    told = information(unit, poses, names, sigma) - np.diag(priors(names) * vague)
+    known = told * np.outer(scale, scale)
+    weak = np.linalg.inv(known + 1e-6 * np.eye(len(names)))
+    lost = [name for name, variance, need in zip(names, np.diag(weak), vague)
+            if variance > 1.0 and need]
     if lost or poses.volts.size <= len(names):
         add = ', '.join(f'({np.degrees(a):.0f}, {np.degrees(b):.0f})'
                         for a, b in next_poses(unit, poses, names, sigma))
@@ -334,15 +384,14 @@ def next_poses(unit: Sensor, poses: Poses, names: Sequence[str], sigma: float, c
                  np.tile(np.median(poses.std_v, axis=0), (len(alpha), 1)), alpha, beta,
                  np.zeros((len(alpha), 2)), np.zeros(len(alpha), bool))
     scale = np.array([parameter_of(name).scale for name in names])
-    rows = _whitener(unit, grid, sigma) @ by_coefficients(unit, alpha, beta, names) * scale
-    everyone = np.ones(len(poses), bool)
-    information = _normal(unit, poses, names, sigma, everyone)[0] * np.outer(scale, scale)
+    rows = _whitener(unit, grid, sigma) @ by_coefficients(unit, grid, names) * scale
+    known = information(unit, poses, names, sigma) * np.outer(scale, scale)
     chosen = []
     for _ in range(count):
-        covariance = np.linalg.inv(information + 1e-6 * np.eye(len(names)))
+        covariance = np.linalg.inv(known + 1e-6 * np.eye(len(names)))
         gain = np.linalg.slogdet(np.eye(rows.shape[1])
                                  + rows @ covariance @ np.swapaxes(rows, 1, 2))[1]
         best = int(np.argmax(gain))
         chosen.append((float(alpha[best]), float(beta[best])))
-        information = information + rows[best].T @ rows[best]
+        known = known + rows[best].T @ rows[best]
     return chosen

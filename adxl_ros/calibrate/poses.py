@@ -17,13 +17,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 from adxl_ros.errors import UserError
 from adxl_ros.model import chain
 from adxl_ros.model.constants import AXES
-from adxl_ros.model.effects.base import Components
+from adxl_ros.model.effects.base import Components, Environment, Value
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.model.stage import specific_force
 import numpy as np
@@ -44,6 +44,8 @@ class Poses:
         Beginning and end of each rest, s, (k, 2).
     check
         True for a pose that is kept out of the fit to judge it, (k,).
+    temperature_c, supply_v
+        Means over each rest, (k,); NaN where they were not measured.
 
     """
 
@@ -53,6 +55,14 @@ class Poses:
     beta_rad: np.ndarray
     time_s: np.ndarray
     check: np.ndarray
+    temperature_c: np.ndarray = None  # type: ignore[assignment]
+    supply_v: np.ndarray = None  # type: ignore[assignment]
+
+    def __post_init__(self) -> None:
+        """Take what was not measured as unknown."""
+        for name in ('temperature_c', 'supply_v'):
+            if getattr(self, name) is None:
+                object.__setattr__(self, name, np.full(len(self.volts), np.nan))
 
     def __len__(self) -> int:
         """Count the poses."""
@@ -70,14 +80,24 @@ class Poses:
 
     def subset(self, chosen: np.ndarray) -> Poses:
         """Keep some of the poses, by mask or index."""
-        return Poses(self.volts[chosen], self.std_v[chosen], self.alpha_rad[chosen],
-                     self.beta_rad[chosen], self.time_s[chosen], self.check[chosen])
+        return Poses(*(getattr(self, field.name)[chosen] for field in fields(self)))
+
+    @property
+    def environment(self) -> Environment:
+        """Temperature and supply of each rest; the nominal ones where they were not measured."""
+        return chain.NOMINAL._replace(
+            temperature_c=_known(self.temperature_c, chain.NOMINAL.temperature_c),
+            supply_v=_known(self.supply_v, chain.NOMINAL.supply_v))
 
 
 def together(parts: list[Poses]) -> Poses:
     """Join the poses of several recordings of one unit."""
-    return Poses(*(np.concatenate([getattr(part, name) for part in parts])
-                   for name in Poses.__dataclass_fields__))
+    return Poses(*(np.concatenate([getattr(part, field.name) for part in parts])
+                   for field in fields(Poses)))
+
+
+def _known(values: np.ndarray, otherwise: Value) -> np.ndarray:
+    return np.where(np.isfinite(values), values, otherwise)
 
 
 def reference_force(poses: Poses, gravity_mps2: float) -> Components:

@@ -20,6 +20,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+from adxl_ros.calibrate import filter_noise
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.calibrate.rests import find_rests, Rest, rest_means
 from adxl_ros.calibrate.stillness import Noise
@@ -29,6 +30,8 @@ from adxl_ros.model import noise
 from adxl_ros.model.sensor import Sensor, with_axes
 import numpy as np
 
+_GAP = 1.5
+"""Samples further apart than so many periods are not neighbours."""
 _FINEST_ANGLE_RAD = 1e-5
 """An encoder is never taken to be better than this, so that rounding in a file is no motion."""
 
@@ -179,17 +182,35 @@ def poses_of(recording: Recording, sensor: Sensor,
                            for e in entries])
         check = np.array([bool(e.get('check', False)) for e in entries])
     times = np.array([[r.time_start_s, r.time_stop_s] for r in rests])
-    return Poses(mean, std, middle[:, 0], middle[:, 1], times, check)
+    return Poses(mean, std, middle[:, 0], middle[:, 1], times, check,
+                 *(_means(recording.columns.get(name), rests)
+                   for name in ('temperature_c', 'supply_v')))
 
 
 def rest_angles(angles: np.ndarray | None, rests: Sequence[Rest]) -> np.ndarray:
     """Average the encoder over each rest, rad, (k, 2); NaN without a stage."""
     if angles is None:
         return np.full((len(rests), 2), np.nan)
-    inside = [angles[r.start:r.stop] for r in rests]
-    return np.array([[_mean_of_known(part[:, joint]) for joint in range(2)] for part in inside])
+    return np.column_stack([_means(angles[:, joint], rests) for joint in range(2)])
+
+
+def _means(values: np.ndarray | None, rests: Sequence[Rest]) -> np.ndarray:
+    if values is None:
+        return np.full(len(rests), np.nan)
+    return np.array([_mean_of_known(values[r.start:r.stop]) for r in rests])
 
 
 def _mean_of_known(values: np.ndarray) -> float:
     known = values[np.isfinite(values)]
     return float(known.mean()) if known.size else float('nan')
+
+
+def filter_noise_of(recording: Recording, sensor: Sensor, poses: Poses
+                    ) -> list[filter_noise.FilterNoise | None]:
+    """Estimate the filter of each axis from the noise of the poses; see `filter_noise`."""
+    volts = recording.volts(sensor)
+    first, last = np.searchsorted(recording.time_s, poses.time_s.T)
+    rests = [volts[a:b + 1] for a, b in zip(first, last)
+             if b > a and np.diff(recording.time_s[a:b + 1]).max() * sensor.rate_hz < _GAP]
+    return [filter_noise.estimate([r[:, d] for r in rests], sensor.rate_hz, sensor.rc_s,
+                                  sensor.lsb_v) for d in range(len(sensor.axes))]

@@ -21,10 +21,11 @@ from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from importlib.metadata import PackageNotFoundError, version
 import os
-from pathlib import Path
 
-from adxl_ros.calibrate import figures, gravity, linear, physical, verdict
-from adxl_ros.calibrate.poses import check_polarity, Poses, reference_force
+from adxl_ros.calibrate import figures, full_terms, full_words, gravity, linear, physical, verdict
+from adxl_ros.calibrate.agree import require_one_mounting
+from adxl_ros.calibrate.filter_noise import FilterNoise, with_filter
+from adxl_ros.calibrate.poses import check_polarity, Poses, reference_force, together
 from adxl_ros.errors import UserError
 from adxl_ros.files import params
 from adxl_ros.model import chain
@@ -33,9 +34,8 @@ from adxl_ros.model.effects import effect_named
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
-STAGE_FITS = {'linear': linear.fit, 'physical': physical.fit}
+STAGE_FITS = {'linear': linear.fit, 'physical': physical.fit, 'full': full_terms.fit}
 """Models that are fitted against the stage, simplest first."""
-_NINETY = 1.6449
 
 
 @dataclass(frozen=True)
@@ -64,12 +64,14 @@ class Result:
             figures.draw_gravity(path, name, fit.before_mps2, fit.residual_mps2,
                                  fit.expected_mps2)
         else:
-            fitted = self.fitted if self.fitted.model == 'physical' else \
+            fitted = self.fitted if self.fitted.model in ('physical', 'full') else \
                 physical.fit(self.nominal, self.poses.subset(~self.poses.check))
             figures.draw_sweep(path, self.nominal, fitted, self.poses)
 
 
-def calibrate(sensor: Sensor, poses: Poses, model: str | None, source: str) -> Result:
+def calibrate(sensor: Sensor, parts: Sequence[Poses], model: str | None,
+              sources: Sequence[str], effects: Sequence[str] = (),
+              filters: Sequence[Sequence[FilterNoise | None]] = ()) -> Result:
     """
     Fit the poses of one unit: against the stage where there are angles, else gravity.
 
@@ -77,22 +79,28 @@ def calibrate(sensor: Sensor, poses: Poses, model: str | None, source: str) -> R
     ----------
     sensor
         The nominal sensor of the unit.
-    poses
-        Its rests, with angles or without.
+    parts
+        Its rests by recording, with angles or without.
     model
-        'linear' or 'physical'; None is physical, or linear for a sensor of one axis.
-    source
-        Where the poses come from, for the provenance.
+        'linear', 'physical' or 'full'; None is the richest that the poses determine.
+    sources
+        Where the poses come from, by recording, for messages and the provenance.
+    effects
+        What the full model is to hold beside its terms.
+    filters
+        What the noise says of the filter, by recording and axis, for the full model.
 
     Raises
     ------
     UserError
-        The poses do not determine the model.
+        The poses do not determine the model, or the recordings contradict each other.
 
     """
+    poses, source = together(list(parts)), ', '.join(sources)
     if np.isfinite(poses.alpha_rad).all():
-        return _against_stage(sensor, poses, model, source)
-    if model is not None:
+        model = model or ('full' if effects else None)
+        return _against_stage(sensor, parts, model, sources, effects, filters)
+    if model not in (None, 'full'):
         raise UserError(f'{source}: the {model} model is fitted against stage angles (alpha_rad '
                         'and beta_rad), which are not there; leave --model out to calibrate a '
                         'three-axis sensor against gravity')
@@ -102,21 +110,55 @@ def calibrate(sensor: Sensor, poses: Poses, model: str | None, source: str) -> R
     return _against_gravity(sensor, poses, source)
 
 
-def _against_stage(sensor: Sensor, poses: Poses, model: str | None, source: str) -> Result:
+def _against_stage(sensor: Sensor, parts: Sequence[Poses], model: str | None,
+                   sources: Sequence[str], effects: Sequence[str],
+                   filters: Sequence[Sequence[FilterNoise | None]]) -> Result:
+    poses = together(list(parts))
     check_polarity(sensor, poses)
     fitting = poses.subset(~poses.check)
-    if model is None:
-        model = 'physical' if sensor.axes != 'x' else 'linear'
-    fitted = STAGE_FITS[model](sensor, fitting)
-    fits: dict[str, verdict.Fit] = {'nominal': lambda sensor, _: sensor, **STAGE_FITS}
-    tried = list(fits)[:list(fits).index(model) + 1]
-    scores = verdict.held_out({name: fits[name] for name in tried}, sensor, poses)
+    refusals: list[str] = []
+    for name in ([model] if model else reversed(STAGE_FITS)):
+        try:
+            found = _fit(name, sensor, fitting, parts, sources, effects)
+            break
+        except UserError as error:
+            if name in (model, 'linear'):
+                raise
+            refusals.append(f'not {name}: {error}')
+    fitted = found.fitted
+    simpler = list(STAGE_FITS)[:list(STAGE_FITS).index(fitted.model)]
+    scores = verdict.held_out({'nominal': lambda sensor, _: sensor,
+                               **{name: STAGE_FITS[name] for name in simpler},
+                               fitted.model: found.fit}, sensor, poses)
     predicted = np.column_stack(chain.static_response(fitted)(
-        reference_force(fitting, fitted.local_gravity_mps2)))
+        reference_force(fitting, fitted.local_gravity_mps2), fitting.environment))
     residual = (fitting.volts - predicted) / fitted.scale_v_per_g * 1e3
-    fitted = replace(fitted, provenance=_provenance(source, poses, {
+    said = found.said
+    if fitted.model == 'full':
+        fitted, more = with_filter(fitted, filters)
+        said = [*said, *more]
+    fitted = replace(fitted, provenance=_provenance(', '.join(sources), poses, {
         'reference': 'stage', 'residual_mg': f'{np.sqrt(np.mean(residual ** 2)):.4f}'}))
-    return Result(sensor, fitted, verdict.table(scores), poses)
+    return Result(sensor, fitted, [*refusals, *verdict.table(scores), *said], poses)
+
+
+def _fit(model: str, sensor: Sensor, fitting: Poses, parts: Sequence[Poses],
+         sources: Sequence[str], effects: Sequence[str]) -> _Found:
+    """Fit one model; the full one with the terms more that poses held out ask for."""
+    if model != 'full':
+        return _Found(STAGE_FITS[model](sensor, fitting), STAGE_FITS[model], [])
+    found, judged = full_terms.fit_judged(sensor, fitting, effects)
+    if len(parts) > 1:
+        require_one_mounting(found, parts, sources)
+    return _Found(found.fitted, lambda sensor, poses: full_terms.fit_judged(
+        sensor, poses, effects)[0].fitted, full_words.words(found, fitting, judged))
+
+
+@dataclass(frozen=True)
+class _Found:
+    fitted: Sensor
+    fit: verdict.Fit
+    said: list[str]
 
 
 def _against_gravity(sensor: Sensor, poses: Poses, source: str) -> Result:
@@ -149,7 +191,7 @@ def coefficients(sensor: Sensor) -> list[str]:
         for parameter, values in of_effect.items():
             label, shown = absolute.get((effect, parameter), (f'{effect}.{parameter}', values))
             ends = list(sensor.axes) if np.ndim(values) else ['']
-            entries = [f'{axis} {value:.6g} +- {_NINETY * std[key]:.2g}'.lstrip()
+            entries = [f'{axis} {value:.6g} +- {verdict.NINETY * std[key]:.2g}'.lstrip()
                        for axis, value in zip(ends, np.ravel(shown))
                        if (key := f'{effect}.{parameter}.{axis}'.rstrip('.')) in std]
             if entries:
@@ -170,11 +212,6 @@ def _provenance(source: str, poses: Poses, more: dict[str, str]) -> dict[str, st
             'package_version': package_version(), 'source': source,
             'poses': str(int((~poses.check).sum())),
             'check_poses': str(int(poses.check.sum())), **more}
-
-
-def name_of(paths: Sequence[str | os.PathLike]) -> str:
-    """Join the names of recordings for the provenance, without their folders."""
-    return ', '.join(Path(path).name for path in paths)
 
 
 def _rms_mg(values_mps2: np.ndarray) -> float:

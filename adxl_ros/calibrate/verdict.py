@@ -31,6 +31,8 @@ import numpy as np
 Fit = Callable[[Sensor, Poses], Sensor]
 """Fits a nominal sensor to poses."""
 
+NINETY = 1.6449
+"""Half of a 90 % interval, in standard deviations."""
 _FOLDS = 5
 _BLIND_RAD = np.radians(1.0)
 """Poses that show an angle worse than this are not scored for it (alpha near ±90° without z)."""
@@ -68,8 +70,9 @@ def errors(sensor: Sensor, poses: Poses) -> Errors:
     sensor without z cannot tell α from π − α. The sign of its z comes from the stage.
     """
     up = np.where(np.cos(poses.alpha_rad) < 0, -1, 1)
-    force = chain.inverse(sensor, up)(list(poses.volts.T))
-    covariance = force_covariance(sensor, force, np.mean(poses.std_v, axis=0) ** 2)
+    force = chain.inverse(sensor, up)(list(poses.volts.T), poses.environment)
+    covariance = force_covariance(sensor, force, np.mean(poses.std_v, axis=0) ** 2,
+                                  poses.environment)
     measures_z = 'z' in sensor.axes
     angles = tilt(force, covariance, measures_z)
     turned = poses.alpha_rad - 2 * np.pi * np.round(poses.alpha_rad / (2 * np.pi))
@@ -115,8 +118,13 @@ def held_out(fits: dict[str, Fit], sensor: Sensor,
     """
     scores = []
     for model, fit in fits.items():
-        parts = [errors(fit(sensor, poses.subset(~out)), poses.subset(out))
-                 for out in _folds(poses) if _determined(fit, sensor, poses.subset(~out))]
+        parts = []
+        for out in _folds(poses):
+            try:
+                fitted = fit(sensor, poses.subset(~out))
+            except UserError:
+                continue
+            parts.append(errors(fitted, poses.subset(out)))
         if parts:
             scores.append(score(model, Errors(*(
                 np.concatenate([getattr(part, name) for part in parts])
@@ -128,14 +136,6 @@ def _folds(poses: Poses) -> list[np.ndarray]:
     if poses.check.any():
         return [poses.check]
     return [np.arange(len(poses)) % _FOLDS == fold for fold in range(_FOLDS)]
-
-
-def _determined(fit: Fit, sensor: Sensor, rest: Poses) -> bool:
-    try:
-        fit(sensor, rest)
-    except UserError:
-        return False
-    return True
 
 
 def table(scores: list[Score]) -> list[str]:

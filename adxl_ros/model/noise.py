@@ -16,11 +16,35 @@
 
 from __future__ import annotations
 
+from adxl_ros.model import chain
+from adxl_ros.model.effects import effect_named
+from adxl_ros.model.effects.base import Place, Signals
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
 
-def analog_sigma_v(sensor: Sensor, rc_s: np.ndarray | None = None) -> np.ndarray:
+def electronics(sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Return what the sensor's effects make of the filter and of the white noise.
+
+    Returns
+    -------
+    tuple
+        Time constant of the filter by axis, s, (m,); noise density by the stated one, (m,).
+
+    """
+    count = len(sensor.axes)
+    signals = Signals(chain.NOMINAL, zero_g_v=sensor.nominal_zero_g_v.tolist(),
+                      scale_v_per_g=sensor.nominal_scale_v_per_g.tolist(),
+                      output=[0.0] * count, rc_s=[sensor.rc_s] * count,
+                      noise_ratio=[1.0] * count)
+    for effect in map(effect_named, sensor.effects):
+        if effect.needs in (('filter',), ('noise',)) and effect.place is Place.ELECTRONICS:
+            effect.apply(signals, chain.parameters(sensor, effect.name))
+    return np.array(signals.rc_s), np.array(signals.noise_ratio)
+
+
+def analog_sigma_v(sensor: Sensor) -> np.ndarray:
     """
     Give the standard deviation of the analog noise by axis, V, (m,): white noise through the RC.
 
@@ -30,14 +54,12 @@ def analog_sigma_v(sensor: Sensor, rc_s: np.ndarray | None = None) -> np.ndarray
     Parameters
     ----------
     sensor
-        Stated figures.
-    rc_s
-        Time constants by axis, s, (m,), where they are not the stated one.
+        Stated figures, and effects of its filter and its noise.
 
     """
-    rc = np.full(len(sensor.axes), sensor.rc_s) if rc_s is None else rc_s
-    bandwidth_hz = np.where(rc > 0, 0.25 / np.where(rc > 0, rc, 1.0), sensor.rate_hz / 2)
-    density = sensor.noise_density_g_per_rthz * sensor.nominal_scale_v_per_g
+    rc_s, ratio = electronics(sensor)
+    bandwidth_hz = np.where(rc_s > 0, 0.25 / np.where(rc_s > 0, rc_s, 1.0), sensor.rate_hz / 2)
+    density = ratio * sensor.noise_density_g_per_rthz * sensor.nominal_scale_v_per_g
     return density * np.sqrt(bandwidth_hz)
 
 

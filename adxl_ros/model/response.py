@@ -205,7 +205,7 @@ class Response:
         Samples that are missing are drawn, too, as far as the filter remembers.
         """
         rc_s, rate_hz = np.array(signals.rc_s), self.sensor.rate_hz
-        sigma = noise.analog_sigma_v(self.sensor, rc_s) * signals.noise_ratio
+        sigma = noise.analog_sigma_v(self.sensor)
         decay = np.array([np.exp(-1 / (rate_hz * rc)) if rc else 0.0 for rc in rc_s])
         passed = np.rint(np.diff(stamps_s, prepend=self._last_s) * rate_hz).astype(np.intp)
         passed = np.clip(passed, 1, 1 + ceil(50 * rc_s.max() * rate_hz))

@@ -270,13 +270,7 @@ class Calibration(Node):
     def _fit(self, entries: list[dict[str, Any]]) -> result.Result:
         poses = Poses.from_entries(entries)
         source = Path(self.journal.path).name
-        if self.mode == 'gravity':
-            return result.calibrate(self.unit, poses, None, source)
-        try:
-            return result.calibrate(self.unit, poses, 'physical', source)
-        except UserError as error:
-            self.get_logger().warning(f'{error}; the linear model is fitted instead')
-            return result.calibrate(self.unit, poses, 'linear', source)
+        return result.calibrate(self.unit, [poses], None, [source])
 
     def _stop(self, text: str) -> None:
         self.walk, self._wanted = None, False

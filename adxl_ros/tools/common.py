@@ -75,6 +75,22 @@ def default_params() -> Path:
     return Path(get_package_share_directory('adxl_ros')) / 'params' / 'adxl203.yaml'
 
 
+def make_folder(folder: Path) -> None:
+    """
+    Make a folder for what a tool leaves.
+
+    Raises
+    ------
+    UserError
+        It cannot be made.
+
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f'{folder}: cannot be made: {error.strerror}') from None
+
+
 def say_notes(tool: str, read: Recording) -> None:
     """
     Tell on stderr what reading a recording showed: where it was cut, how well it is aligned.

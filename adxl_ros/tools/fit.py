@@ -20,11 +20,10 @@ import argparse
 from pathlib import Path
 
 from adxl_ros.calibrate import recorded, result
-from adxl_ros.calibrate.poses import together
 from adxl_ros.errors import UserError
 from adxl_ros.files import journal, params, recording
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.tools.common import default_params, run, say_notes
+from adxl_ros.tools.common import default_params, make_folder, run, say_notes
 
 
 def parser() -> argparse.ArgumentParser:
@@ -35,8 +34,11 @@ def parser() -> argparse.ArgumentParser:
     parse.add_argument('--params', metavar='FILE', default=None,
                        help='figures that are not fitted (default: the nominal ADXL203)')
     parse.add_argument('--model', choices=list(result.STAGE_FITS),
-                       help='against stage angles (default: physical); a three-axis recording '
-                            'without them is calibrated against gravity')
+                       help='against stage angles (default: the richest that the poses '
+                            'determine); a three-axis recording without them is '
+                            'calibrated against gravity')
+    parse.add_argument('--effect', metavar='NAME', action='append', default=[],
+                       help='an effect more for the full model to find')
     parse.add_argument('--journal', metavar='FILE',
                        help='use the rests that the journal of this very run names')
     parse.add_argument('-o', dest='output', metavar='FILE.yaml', required=True)
@@ -52,17 +54,19 @@ def fit(options: argparse.Namespace) -> int:
     sensor = params.load(options.params or default_params())
     entries = _entries(options.journal)
     unit: Sensor | None = None
-    parts = []
+    parts, filters = [], []
     for path in options.recording:
         read = recording.read(path)
         say_notes('fit', read)
         unit = recorded.recorded_unit(unit or sensor, read)
         parts.append(recorded.poses_of(read, unit, entries))
-    found = result.calibrate(unit, together(parts), options.model,
-                             result.name_of(options.recording))
+        filters.append(recorded.filter_noise_of(read, unit, parts[-1]))
+    found = result.calibrate(unit, parts, options.model,
+                             [Path(path).name for path in options.recording],
+                             options.effect, filters)
     if options.report:
         folder = Path(options.report)
-        _make(folder)
+        make_folder(folder)
         found.draw(folder / 'calibration.png')
     found.save(options.output)
     print('\n'.join(found.comments()))
@@ -75,13 +79,6 @@ def _entries(path: str | None) -> list[dict] | None:
     _, entries = journal.read(path)
     final = next((e['rests'] for e in reversed(entries) if 'rests' in e), None)
     return final if final is not None else journal.accepted_poses(entries)
-
-
-def _make(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserError(f'{folder}: cannot be made: {error.strerror}') from None
 
 
 def main() -> int:

@@ -1,0 +1,249 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The full model: intervals that hold, the gauge, bad poses, bad stages, contradictions."""
+
+from dataclasses import replace
+import time
+
+from adxl_ros.calibrate import full, full_terms, full_words, result
+from adxl_ros.errors import UserError
+from adxl_ros.files import params
+from adxl_ros.model import chain
+from adxl_ros.model.coefficients import get, put, with_neutral
+from adxl_ros.model.stage import specific_force
+import numpy as np
+import pytest
+from units import drawn, NOMINAL, nominal, PLANES_RAD, swept
+
+NINETY = 1.6449
+TERMS = full.TERMS
+
+
+def swept_unit(seed, axes='xy', stage_deg=5 / 60, **options):
+    """Draw a unit of all terms and sweep it; return nominal figures, the unit, its poses."""
+    rng = np.random.default_rng(seed)
+    sensor = nominal(axes)
+    truth = drawn(rng, sensor, TERMS)
+    poses = swept(rng, replace(truth, stage_resolution_rad=np.radians(stage_deg)), **options)
+    return sensor, truth, poses
+
+
+def errors(found, truth):
+    """Errors of the coefficients and their promised deviations, (p,) each."""
+    names = found.fitted.covariance_names
+    truth = with_neutral(truth, {name.split('.')[0] for name in names})
+    return (get(found.fitted, names) - get(truth, names),
+            np.sqrt(np.diag(found.fitted.covariance)))
+
+
+@pytest.mark.parametrize('axes, units', [('xy', 70), ('xyz', 50)])
+def test_ninety_percent_intervals_cover_ninety_percent(axes, units):
+    """Over more than a thousand intervals of drawn units each way."""
+    z = np.concatenate([np.divide(*errors(full.fit_full(sensor, poses), truth))
+                        for sensor, truth, poses in (swept_unit(k, axes) for k in range(units))])
+    assert len(z) > 1000
+    assert 0.88 < np.mean(np.abs(z) < NINETY) < 0.92
+
+
+def test_one_axis():
+    """A sensor of one axis is fitted, too."""
+    sensor, truth, poses = swept_unit(1, 'x')
+    off, std = errors(full.fit_full(sensor, poses), truth)
+    assert np.abs(off / std).max() < 4
+
+
+def test_the_gauge_is_fixed_where_only_the_sum_shows():
+    """Linear cross-axis terms alone are a misalignment, and cross_axis.linear stays 0."""
+    rng = np.random.default_rng(3)
+    truth = drawn(rng, nominal(), ('bias', 'scale_factor', 'misalignment'))
+    truth = with_neutral(truth, ['cross_axis', 'cross_axis_z'])
+    truth = put(truth, ['cross_axis.linear.x', 'cross_axis_z.linear.y'], [0.012, -0.02])
+    poses = swept(rng, truth)
+    found, _ = full_terms.fit_judged(nominal(), poses)
+    assert not set(full.GAUGE) & {full.term_of(name) for name in found.fitted.covariance_names}
+    assert found.fitted.values['cross_axis']['linear'].tolist() == [0, 0]
+    turned = found.fitted.values['misalignment']['beta_rad'][0]
+    assert turned == pytest.approx(
+        truth.values['misalignment']['beta_rad'][0] + 0.012, abs=4e-4)
+
+
+def test_the_gauge_is_freed_where_products_show_the_parts():
+    """With a scale factor that depends on z the same terms are fitted, to the noise."""
+    rng = np.random.default_rng(3)
+    truth = drawn(rng, nominal(), TERMS)
+    truth = put(truth, ['cross_axis.linear.x', 'cross_axis_z.linear.y',
+                        'scale_factor_z.linear_per_g.x', 'scale_factor_z.quadratic_per_g2.y'],
+                [0.015, -0.02, 0.01, 0.01])
+    poses = swept(rng, replace(truth, stage_resolution_rad=0.0))
+    held = np.radians([[40, 10], [75, 200], [130, 300], [20, 100]])
+    force = specific_force(*held.T, truth.local_gravity_mps2)
+    volts = chain.static_response(truth)(force)
+    worst = {}
+    for name, found in (('fixed', full.fit_full(nominal(), poses)),
+                        ('judged', full_terms.fit_judged(nominal(), poses)[0])):
+        up = np.where(np.cos(held[:, 0]) < 0, -1, 1)
+        off = np.subtract(chain.inverse(found.fitted, up)(volts), force)[:2]
+        worst[name] = np.abs(off).max()
+    assert worst['judged'] < 3e-4 and worst['fixed'] > 2 * worst['judged']
+
+
+def test_knocked_poses_are_named_and_left_out():
+    """Three poses in which somebody knocked do not move the coefficients."""
+    sensor, truth, poses = swept_unit(5, check_poses=0)
+    bad = [7, 40, 90]
+    volts = poses.volts.copy()
+    volts[bad] += [[0.01, 0.0], [0.0, -0.02], [0.03, 0.01]]
+    found, judged = full_terms.fit_judged(sensor, replace(poses, volts=volts))
+    assert found.knocked == tuple(bad)
+    off, std = errors(found, truth)
+    assert np.sqrt(np.mean((off / std) ** 2)) < 1.6
+    assert any('left out, disturbed: pose 8 (alpha' in line
+               for line in full_words.words(found, poses, judged))
+
+
+@pytest.mark.parametrize('stage_deg', [1.0, 3.0])
+def test_a_bad_stage_is_found_and_the_sensor_is_not_blamed(stage_deg):
+    """The stage's error is estimated, and zero-g is as good as the magnitude of gravity tells."""
+    sensor, truth, poses = swept_unit(6, 'xyz', stage_deg * np.sqrt(12))
+    found, judged = full_terms.fit_judged(sensor, poses)
+    assert np.degrees(found.stage_sigma_rad) == pytest.approx(stage_deg, rel=0.15)
+    off, std = errors(found, truth)
+    assert np.sqrt(np.mean((off / std) ** 2)) < 1.6
+    zero_g = [name.startswith('bias') for name in found.fitted.covariance_names]
+    assert np.abs(off[zero_g]).max() < 1e-4
+    assert any('the reference is worse than stated' in line
+               for line in full_words.words(found, poses, judged))
+
+
+def test_terms_that_are_not_there_do_not_earn_their_place():
+    """A unit of zero-g, scale and misalignment alone: nothing else gains on poses held out."""
+    rng = np.random.default_rng(8)
+    truth = drawn(rng, nominal(), ('bias', 'scale_factor', 'misalignment'))
+    judged = full_terms.fit_judged(nominal(), swept(rng, truth))[1]
+    assert [term.name for term in judged if term.earns] == ['misalignment']
+
+
+def test_the_next_poses_help_more_than_others():
+    """Poses that the fit asks for shrink the joint interval more than as many of the sweep."""
+    sensor, _, poses = swept_unit(9, check_poses=0)
+    found = full.fit_full(sensor, poses)
+    asked = full.next_poses(found.unit, poses, found.names, found.stage_sigma_rad)
+
+    def volume(angles_rad):
+        more = poses.subset(np.arange(len(angles_rad)))
+        more = replace(more, alpha_rad=angles_rad[:, 0], beta_rad=angles_rad[:, 1])
+        known = found.information + full.information(
+            found.unit, more, found.names, found.stage_sigma_rad) - np.diag(
+                full.priors(found.names))
+        return -np.linalg.slogdet(known)[1]
+
+    others = np.column_stack([poses.alpha_rad, poses.beta_rad])[[5, 30, 60, 100]]
+    assert volume(np.array(asked)) < volume(others)
+
+
+def test_temperature_that_moved_is_said_and_fitted():
+    """15 degC of warming during the sweep: the verdict says so, or the term takes it."""
+    sensor, truth, poses = swept_unit(10, check_poses=0)
+    warm = replace(poses, temperature_c=np.linspace(20, 35, len(poses)))
+    found, judged = full_terms.fit_judged(sensor, warm)
+    words = full_words.words(found, warm, judged)
+    assert any('temperature moved by 15.0 degC' in line for line in words)
+    drift = 1e-3 * truth.scale_v_per_g * (warm.temperature_c[:, None] - 25)
+    found, judged = full_terms.fit_judged(sensor, replace(warm, volts=warm.volts + drift))
+    assert found.fitted.values['temperature_bias']['per_k'] == pytest.approx([1e-3] * 2, rel=0.1)
+    assert not any('temperature moved' in line
+                   for line in full_words.words(found, warm, judged))
+
+
+@pytest.mark.parametrize('planes_deg, lost', [
+    ([90], 'cross_axis_z.quadratic_per_g'), ([90, 60], 'scale_factor_z')])
+def test_poses_of_too_few_planes_are_refused(planes_deg, lost):
+    """The message names what is open and which poses to add."""
+    sensor, _, poses = swept_unit(1, planes_rad=np.radians(planes_deg), check_poses=0)
+    with pytest.raises(UserError, match=rf'do not tell .*{lost}.*add poses \(alpha, beta\) = '):
+        full.fit_full(sensor, poses)
+
+
+def test_what_is_not_determined_falls_back_and_says_so():
+    """Without a choice the richest model that the poses determine is fitted."""
+    sensor, _, poses = swept_unit(1, planes_rad=PLANES_RAD[2:3], check_poses=0)
+    found = result.calibrate(sensor, [poses], None, ['made'])
+    assert found.fitted.model == 'linear'
+    assert found.verdict[0].startswith('not full: the full model is not determined')
+    assert found.verdict[1].startswith('not physical: ')
+
+
+def test_several_recordings_of_one_unit():
+    """Two sweeps are fitted together, and tell more than one."""
+    rng = np.random.default_rng(12)
+    truth = drawn(rng, nominal(), TERMS)
+    parts = [swept(rng, truth, check_poses=0) for _ in range(2)]
+    one = result.calibrate(nominal(), parts[:1], 'full', ['a'])
+    both = result.calibrate(nominal(), parts, 'full', ['a', 'b'])
+    assert np.trace(both.fitted.covariance) < 0.7 * np.trace(one.fitted.covariance)
+
+
+@pytest.mark.parametrize('change, words', [
+    (lambda truth: put(truth, ['misalignment.alpha_rad.x', 'misalignment.alpha_rad.y'],
+                       truth.values['misalignment']['alpha_rad'] + [0.02, 0.02]), 'is turned by'),
+    (lambda truth: put(truth, ['bias.offset_v.x'],
+                       truth.values['bias']['offset_v'][:1] + 0.08), 'has its zero-g off by')])
+def test_recordings_that_contradict_each_other_are_refused(change, words):
+    """Another mounting or another unit: the message has the figure and its significance."""
+    rng = np.random.default_rng(13)
+    truth = drawn(rng, nominal(), TERMS)
+    parts = [swept(rng, unit, check_poses=0) for unit in (truth, truth, change(truth))]
+    with pytest.raises(UserError, match=rf'{words} .* standard deviations: another unit'):
+        result.calibrate(nominal(), parts, 'full', ['a.csv', 'b.csv', 'c.csv'])
+
+
+def test_six_hundred_poses_of_three_axes_take_two_seconds():
+    """With errors of the stage and the comparison of terms."""
+    sensor, _, poses = swept_unit(2, 'xyz', planes_rad=np.radians(np.linspace(0, 180, 23)))
+    assert len(poses) > 600
+    began = time.perf_counter()
+    found, _ = full_terms.fit_judged(sensor, poses)
+    assert time.perf_counter() - began < 2.0
+    assert len(found.names) >= 20
+
+
+def test_the_filter_is_found_in_the_noise(run_tool, tmp_path):
+    """`fit` on a simulated sweep gives the filter's resistor, and keeps it in the file."""
+    run_tool('simulate', 'sweep', '--params', NOMINAL, '--effect',
+             'bandwidth:resistance_ratio.x=0.2,resistance_ratio.y=-0.15', '--effect',
+             'misalignment', '-o', tmp_path / 'sweep.csv')
+    done = run_tool('fit', tmp_path / 'sweep.csv', '-o', tmp_path / 'unit.yaml')
+    assert 'bandwidth.resistance_ratio' in done.stdout
+    fitted = params.load(tmp_path / 'unit.yaml')
+    assert fitted.model == 'full'
+    ratio = fitted.values['bandwidth']['resistance_ratio']
+    assert ratio == pytest.approx([0.2, -0.15], abs=0.04)
+    std = np.sqrt(np.diag(fitted.covariance))[-2:]
+    assert np.abs((ratio - [0.2, -0.15]) / std).max() < 4
+
+
+def test_an_effect_more_on_the_command_line(run_tool, tmp_path):
+    """--effect adds a term; one that rests cannot tell is refused by name."""
+    run_tool('simulate', 'sweep', '--params', NOMINAL, '-o', tmp_path / 'sweep.csv')
+    run_tool('fit', tmp_path / 'sweep.csv', '--effect', 'stage_eccentricity', '-o',
+             tmp_path / 'unit.yaml')
+    done = run_tool('fit', tmp_path / 'sweep.csv', '--effect', 'hysteresis', '-o',
+                    tmp_path / 'other.yaml')
+    assert done.returncode == 1
+    assert 'hysteresis' in done.stderr and 'Traceback' not in done.stderr
+    done = run_tool('fit', tmp_path / 'sweep.csv', '--effect', 'temprature_bias', '-o',
+                    tmp_path / 'other.yaml')
+    assert done.returncode == 1 and 'temperature_bias' in done.stderr
+    assert not (tmp_path / 'other.yaml').exists()
