@@ -21,8 +21,9 @@ import signal
 
 from adxl_ros.files import params
 from adxl_ros.files.columns import sensor_info
-from adxl_ros.model import chain
+from adxl_ros.model import chain, paper_inverse, unfilter
 from adxl_ros.model.coefficients import put, with_neutral
+from adxl_ros.model.maths import FLOATS
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
 from adxl_ros.model.stage import specific_force
 from adxl_ros.model.uncertainty import force_covariance
@@ -405,3 +406,37 @@ def test_a_bad_file_ends_it_with_one_line(start: Start, tmp_path: Path, right: s
         assert process.output().count('\n') == 1
         assert f'{path}:' in process.output()
         assert message in process.output()
+
+
+def test_the_filter_is_undone_late_and_with_own_stamps(robot: Robot, start: Start,
+                                                       tmp_path: Path) -> None:
+    """undo_filter: what comes out is the zero-phase inverse, eight samples later."""
+    sensor = replace(unit(), rate_hz=1.0, rc_capacitance_f=3e-5, covariance=np.zeros((0, 0)),
+                     covariance_names=())
+    started(start, tmp_path, sensor, '-p', 'undo_filter:=true')
+    robot.inform(sensor)
+    robot.connected()
+    values = {pair.key: pair.value for pair in robot.graph.diagnostics[NODE].values}
+    assert values['delay_s'] == '8.0'
+    alpha = 0.6 + 0.1 * np.sin(0.2 * np.arange(40))
+    volts = np.column_stack(chain.static_response(sensor)(specific_force(alpha, 0.3, G)))
+    for row in to_nominal_mps2(volts, sensor):
+        robot.send([*row.tolist(), 0.0])
+    robot.graph.spin_until(lambda: len(robot.data) == 32, 10.0, '32 of 40 samples')
+    assert [stamp_ns(m) for m in robot.data] == [k * 10 ** 9 for k in range(1, 33)]
+    back = unfilter.undone(volts, np.arange(1.0, 41.0), np.full(2, sensor.rc_s), 1.0)
+    expected = np.transpose(chain.inverse(sensor)(list(back.T)))[:32]
+    got = np.array([accel(m) for m in robot.data])
+    np.testing.assert_allclose(got[8:, :2], expected[8:, :2], atol=1e-5)
+
+
+def test_the_papers_inverse_by_choice(robot: Robot, start: Start, tmp_path: Path) -> None:
+    """inverse:=paper gives equations 14 to 21; another word is refused at the start."""
+    sensor = unit()
+    started(start, tmp_path, sensor, '-p', 'inverse:=paper')
+    robot.inform(sensor)
+    robot.connected()
+    values = felt(sensor, pose(0.7, 0.4))
+    volts = [v[0] for v in chain.static_response(sensor)([np.array([f]) for f in pose(0.7, 0.4)])]
+    expected = paper_inverse.inverse(sensor, maths=FLOATS)([float(v) for v in volts])
+    assert accel(robot.answer(values)) == pytest.approx(expected, abs=1e-6)

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from adxl_ros.model import chain, noise
+from adxl_ros.model import chain, noise, paper_inverse, unfilter
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.effects.base import Components, Environment
 from adxl_ros.model.maths import FLOATS
@@ -90,17 +90,33 @@ class Live:
     noise variance of a measured axis.
     """
 
-    def __init__(self, sensor: Sensor) -> None:
+    def __init__(self, sensor: Sensor, paper: bool = False, undo_filter: bool = False) -> None:
+        """
+        Prepare for a sensor.
+
+        Parameters
+        ----------
+        sensor
+            The unit.
+        paper
+            By the paper's approximate inverse instead of the exact one.
+        undo_filter
+            The samples come from `unfilter.Delayed`, so that their noise is that before the
+            filter.
+
+        """
         self.sensor = sensor
+        self._paper = paper_inverse.inverse(sensor, maths=FLOATS) if paper else None
+        variance_v2 = unfilter.variance_v2(sensor) if undo_filter else noise.sigma_v(sensor) ** 2
         self._zero_v = sensor.nominal_zero_g_v.tolist()
         self._volts = (sensor.nominal_scale_v_per_g / G0_MPS2).tolist()
         self._rails = (0.0, sensor.adc_vref_v - sensor.lsb_v, sensor.lsb_v / 2)
         self._respond = chain.static_response(sensor)
         self._step = chain.step(sensor.axes, chain.gravity_mps2(sensor), sensor.z_sign, FLOATS)
         self._invert = chain.inverse(sensor)
-        self._measured = measured_covariance(sensor)
+        self._measured = measured_covariance(sensor, variance_v2)
         self._cells: dict[tuple[int, int, int], _Cell] = {}
-        quiet = noise.sigma_v(sensor) / sensor.scale_v_per_g * G0_MPS2
+        quiet = np.sqrt(variance_v2) / sensor.scale_v_per_g * G0_MPS2
         self._noise = (quiet[:2] ** 2).tolist()
         self._derives_z = sensor.axes == 'xy'
         # A force, and the volts that respond to it.
@@ -122,9 +138,18 @@ class Live:
             Stamp of the sample, s.
 
         """
+        volts = self.volts(accel_mps2)
+        return self.of_volts(volts, time_s) if volts else None
+
+    def volts(self, accel_mps2: Components) -> Components:
+        """Undo the nominal conversion; empty if no sensor gives as much."""
         volts = [zero + a * scale for zero, a, scale in
                  zip(self._zero_v, accel_mps2, self._volts) if abs(a) < _LIMIT_MPS2]
-        force = self._inverse(volts) if len(volts) == len(self._volts) else None
+        return volts if len(volts) == len(self._volts) else []
+
+    def of_volts(self, volts: Components, time_s: float) -> Estimate | None:
+        """Estimate from the volts of one sample; see the call."""
+        force = self._inverse(volts)
         if force is None:
             return None
         saturated = self._at_a_rail(volts)
@@ -161,6 +186,9 @@ class Live:
 
     def _inverse(self, volts: Components) -> Components | None:
         """Start where the last sample ended: its volts are the response to its force."""
+        if self._paper:
+            self._force = self._paper(volts, self._around)
+            return self._force if abs(sum(self._force)) < float('inf') else None
         at = self._cell(self._force).at
         force, moved = self._force, 0.0
         response = self._last_volts

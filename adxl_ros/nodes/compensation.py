@@ -24,7 +24,7 @@ from adxl_ros.errors import UserError
 from adxl_ros.files import imu_bytes
 from adxl_ros.files.cdr import CdrError
 from adxl_ros.files.unit import check_unit
-from adxl_ros.model import chain
+from adxl_ros.model import chain, noise, unfilter
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.live import Estimate, Live
 from adxl_ros.model.sensor import Sensor
@@ -61,6 +61,12 @@ class Compensation(Node):
         # Surroundings to be taken up, and those that are.
         self._around: dict[str, float] = {}
         self._known: dict[str, float] = {}
+        self._paper = common.declare(
+            self, 'inverse', 'exact', "of the model: exact, or the paper's approximation",
+            choices=('exact', 'paper')) == 'paper'
+        self._undo_filter = common.declare(
+            self, 'undo_filter', False, 'take the RC filter out, amplitude and phase; a sample '
+            f'is published {unfilter.HALF} samples late, with its own stamp')
         LiveSensor(self, self._check_unit, self._use)
         self._data = common.publisher(self, Imu, 'imu/data', _DEPTH)
         self._tilt = common.publisher(self, Vector3Stamped, 'tilt', _DEPTH)
@@ -79,22 +85,36 @@ class Compensation(Node):
 
     def _use(self, sensor: Sensor, source: str) -> None:
         # One assignment: the receiving thread has the old coefficients or the new ones.
-        live = Live(sensor)
+        live = Live(sensor, self._paper, self._undo_filter)
         live.surround(**self._known)
         self._live = live
+        self._delayed = self._new_delayed(sensor)
         self._source = source
         of = f'{sensor.serial}, model {sensor.model}' if sensor.effects else \
             f'{sensor.serial}, which is not calibrated'
         self.get_logger().info(f'compensating by {source}: {of}')
         self._judge()
 
+    def _new_delayed(self, sensor: Sensor) -> unfilter.Delayed:
+        return unfilter.Delayed(noise.electronics(sensor)[0], self._rate_hz(sensor))
+
+    def _rate_hz(self, sensor: Sensor) -> float:
+        """Return the rate that the stream states, else that of the calibration."""
+        try:
+            return float((self._info or {})['rate_hz']) or sensor.rate_hz
+        except (KeyError, ValueError):
+            return sensor.rate_hz
+
     def _check_unit(self, sensor: Sensor) -> None:
+        if self._paper and sensor.axes == 'x':
+            raise UserError("inverse: the paper's needs the axes x and y, the sensor has x")
         if self._info is not None:
             check_unit(self._info, self._info.get('axes', sensor.axes), sensor,
                        self.resolve_topic_name('sensor_info'))
 
     def _on_info(self, message: DiagnosticStatus) -> None:
         self._info = {pair.key: pair.value for pair in message.values}
+        self._delayed = self._new_delayed(self._live.sensor)
         self._judge()
 
     def _on_temperature(self, message: Temperature) -> None:
@@ -134,7 +154,17 @@ class Compensation(Node):
             around, self._around = self._around, {}
             self._live.surround(**around)
             self._known |= around
-        estimate = self._live(accel, time_s)
+        volts = self._live.volts(accel)
+        if not volts:
+            self._counts['dropped'] += 1
+        elif self._undo_filter:
+            for ready in self._delayed(time_s, volts, raw):
+                self._estimate(*ready)
+        else:
+            self._estimate(time_s, volts, raw)
+
+    def _estimate(self, time_s: float, volts: list[float], raw: bytes) -> None:
+        estimate = self._live.of_volts(volts, time_s)
         if estimate is None:
             self._counts['dropped'] += 1
             return
@@ -176,6 +206,7 @@ class Compensation(Node):
             'rate_in_hz': round(new.get('received', 0) / passed_s, 1),
             'rate_out_hz': round(new.get('published', 0) / passed_s, 1),
             **{name: counts[name] for name in ('received', 'published', 'dropped', 'saturated')},
+            'delay_s': unfilter.HALF / self._rate_hz(sensor) if self._undo_filter else 0.0,
             'unit': unit, 'calibration': self._source, 'serial': sensor.serial,
             'axes': sensor.axes, 'model': sensor.model, 'effects': ', '.join(sensor.effects),
             **{f'provenance.{key}': value for key, value in sensor.provenance.items()}}

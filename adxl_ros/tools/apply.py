@@ -17,20 +17,24 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+import itertools
 from pathlib import Path
 import sys
 
+from adxl_ros.calibrate.recorded import rate_hz
 from adxl_ros.errors import UserError
 from adxl_ros.files import params, recording
 from adxl_ros.files.csv_writer import CsvWriter
 from adxl_ros.files.recording import Recording
 from adxl_ros.files.unit import check_unit
-from adxl_ros.model import chain
+from adxl_ros.model import chain, noise, paper_inverse, unfilter
 from adxl_ros.model.constants import AXES
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Place
 from adxl_ros.model.sensor import Sensor, with_axes
-from adxl_ros.model.tilt import tilt
+from adxl_ros.model.tilt import Tilt, tilt
 from adxl_ros.model.uncertainty import force_covariance
 from adxl_ros.tools.common import default_params, progress, run, say_notes
 import numpy as np
@@ -46,6 +50,10 @@ def parser() -> argparse.ArgumentParser:
     parse.add_argument('recording', metavar='RECORDING', help='rosbag2 directory, .mcap or CSV')
     parse.add_argument('--params', metavar='FILE', default=None,
                        help='the calibrated sensor (default: the nominal ADXL203)')
+    parse.add_argument('--inverse', choices=('exact', 'paper'), default='exact',
+                       help="of the model: exact, or the paper's approximation (14) to (21)")
+    parse.add_argument('--undo-filter', action='store_true',
+                       help='take the RC filter out, amplitude and phase, for what moves')
     parse.add_argument('-o', dest='output', metavar='OUT.csv', required=True)
     return parse
 
@@ -59,15 +67,18 @@ def apply(options: argparse.Namespace) -> int:
     began_s = 0.0
     block = None
     with CsvWriter(options.output, _DIGITS) as out, progress('apply') as show:
-        for block in recording.blocks(options.recording, _BLOCK_ROWS):
-            if not rows:
-                sensor = _of_unit(block, sensor)
-            volts = block.volts(sensor)
-            at_rail = chain.at_a_rail(volts, sensor)
-            if not rows:
-                began_s = float(block.time_s[0])
-                _say_unknown(block, sensor)
-            columns = estimates(sensor, volts, at_rail, _around(block, began_s))
+        blocks = recording.blocks(options.recording, _BLOCK_ROWS)
+        first = next(blocks, None)
+        if first is not None:
+            sensor = _of_unit(first, sensor)
+            sensor = replace(sensor, rate_hz=rate_hz(first) if len(first) > 1 else sensor.rate_hz)
+            began_s = float(first.time_s[0])
+            _say_unknown(first, sensor, options.undo_filter)
+            blocks = itertools.chain([first], blocks)
+        estimate = Estimates(sensor, options.inverse == 'paper', options.undo_filter)
+        for block, volts in _with_volts(blocks, sensor, options.undo_filter):
+            at_rail = chain.at_a_rail(block.volts(sensor), sensor)
+            columns = estimate(volts, at_rail, _around(block, began_s))
             out.write({'time_s': block.epoch_ns * 1e-9 + block.time_s, **columns})
             rows += len(block)
             lost += int(np.isnan(columns['ax_mps2']).sum())
@@ -78,6 +89,14 @@ def apply(options: argparse.Namespace) -> int:
     if block is not None:
         say_notes('apply', block)
     return 0
+
+
+def _with_volts(blocks: Iterable[Recording], sensor: Sensor, undo_filter: bool
+                ) -> Iterator[tuple[Recording, np.ndarray]]:
+    if not undo_filter:
+        return ((block, block.volts(sensor)) for block in blocks)
+    return unfilter.undone_blocks(((block, block.time_s, block.volts(sensor)) for block in blocks),
+                                  noise.electronics(sensor)[0], sensor.rate_hz)
 
 
 def _of_unit(block: Recording, sensor: Sensor) -> Sensor:
@@ -101,9 +120,11 @@ def _around(block: Recording, began_s: float) -> chain.Environment:
         for name, values in measured.items()})
 
 
-def _say_unknown(block: Recording, sensor: Sensor) -> None:
+def _say_unknown(block: Recording, sensor: Sensor, undo_filter: bool) -> None:
     """Say which effects are not undone, or undone for nominal surroundings."""
     for effect in map(effect_named, sensor.effects):
+        if undo_filter and 'filter' in effect.needs:
+            continue
         if not effect.invertible and effect.acts_on == 'mean' and effect.place < Place.CLOCK \
                 and 'stage' not in effect.needs:
             print(f'apply: {effect.name} is not undone: no single sample tells it',
@@ -114,33 +135,64 @@ def _say_unknown(block: Recording, sensor: Sensor) -> None:
                       f'taken at {getattr(chain.NOMINAL, name):g} there', file=sys.stderr)
 
 
-def estimates(sensor: Sensor, volts: np.ndarray, at_rail: np.ndarray,
-              around: chain.Environment = chain.NOMINAL) -> dict[str, np.ndarray]:
-    """
-    Estimate force and angles with standard deviations, (n,) each, by column of the output.
+class Estimates:
+    """Estimates of force and angles with standard deviations, by column of the output."""
 
-    NaN with standard deviation inf is what a sample does not show.
+    def __init__(self, sensor: Sensor, paper: bool = False, undo_filter: bool = False) -> None:
+        """
+        Prepare for a unit.
 
-    Parameters
-    ----------
-    sensor
-        The unit.
-    volts
-        ADC volts, (n, m).
-    at_rail
-        Samples of which nothing is sure, (n,).
-    around
-        Their surroundings.
+        Parameters
+        ----------
+        sensor
+            The unit.
+        paper
+            By the paper's approximate inverse instead of the exact one.
+        undo_filter
+            The volts are those before the filter, with the noise that comes with it.
 
-    """
-    with np.errstate(all='ignore'):  # volts that no force explains
-        force = chain.inverse(sensor)(list(volts.T), around)
-        covariance = force_covariance(sensor, force, environment=around)
-        covariance[:, :, at_rail] = np.inf
-        angles = tilt(force, covariance, 'z' in sensor.axes)
+        Raises
+        ------
+        UserError
+            The paper's inverse is not for this sensor.
+
+        """
+        if paper and sensor.axes == 'x':
+            raise UserError('--inverse paper: needs the axes x and y, the sensor has x; leave it '
+                            'out')
+        self._sensor = sensor
+        self._invert = (paper_inverse if paper else chain).inverse(sensor)
+        self._variance_v2 = unfilter.variance_v2(sensor) if undo_filter else None
+
+    def __call__(self, volts: np.ndarray, at_rail: np.ndarray,
+                 around: chain.Environment = chain.NOMINAL) -> dict[str, np.ndarray]:
+        """
+        Estimate, (n,) each; NaN with standard deviation inf is what a sample does not show.
+
+        Parameters
+        ----------
+        volts
+            ADC volts, (n, m).
+        at_rail
+            Samples of which nothing is sure, (n,).
+        around
+            Their surroundings.
+
+        """
+        sensor = self._sensor
+        with np.errstate(all='ignore'):  # volts that no force explains
+            force = self._invert(list(volts.T), around)
+            covariance = force_covariance(sensor, force, self._variance_v2, around)
+            covariance[:, :, at_rail] = np.inf
+            angles = tilt(force, covariance, 'z' in sensor.axes)
+        return _columns(sensor, force, covariance, angles)
+
+
+def _columns(sensor: Sensor, force: list, covariance: np.ndarray, angles: Tilt
+             ) -> dict[str, np.ndarray]:
     std = np.sqrt([covariance[d, d] for d in range(3)])
     if sensor.axes == 'x':
-        force[1:] = np.full((2, len(volts)), np.nan)
+        force[1:] = np.full((2, len(force[0])), np.nan)
     std[np.isnan(force)] = np.inf
     columns = {f'a{axis}_mps2': f for axis, f in zip(AXES, force)}
     columns |= {f'a{axis}_std_mps2': s for axis, s in zip(AXES, std)}

@@ -1,0 +1,191 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The RC filter undone, and the paper's approximate inverse beside the exact one."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+from adxl_ros.files import params, recording
+from adxl_ros.files.columns import Recording, sensor_info
+from adxl_ros.model import chain, noise, paper_inverse, unfilter
+from adxl_ros.model.coefficients import put, with_neutral
+from adxl_ros.model.filters import low_pass
+from adxl_ros.model.live import Live
+from adxl_ros.model.maths import FLOATS
+from adxl_ros.model.motion import Held, Motion
+from adxl_ros.model.response import Response
+from adxl_ros.model.stage import specific_force
+from adxl_ros.model.trajectory import Sine
+import numpy as np
+import pytest
+from units import drawn, nominal
+
+RC_S = np.array([0.0106, 0.012])
+RATE_HZ = 1000.0
+
+
+def filtered(inputs, rate_hz=RATE_HZ, fine=16):
+    """Filter functions of time finely, exactly enough, and sample them: stamps and volts."""
+    time_s = np.arange(int(2 * rate_hz * fine)) / (rate_hz * fine)
+    out = [low_pass(f(time_s), rc, 1 / (rate_hz * fine), {}) for f, rc in zip(inputs, RC_S)]
+    return time_s[::fine], np.column_stack(out)[::fine]
+
+
+def test_amplitude_and_phase_come_back():
+    """10, 60 and 150 Hz behind 15 Hz filters come back to a thousandth, without delay."""
+    def felt(t):
+        return np.sin(62.8 * t) + 0.5 * np.cos(377 * t) + 0.2 * np.sin(942 * t)
+
+    time_s, volts = filtered([felt, lambda t: 2 * felt(t)])
+    back = unfilter.undone(volts, time_s, RC_S, RATE_HZ)[300:-20]
+    expected = np.column_stack([felt(time_s), 2 * felt(time_s)])[300:-20]
+    assert np.abs(back - expected).max() < 2e-3
+
+
+def test_a_gap_is_not_bridged():
+    """Samples beside a gap are undone from their own side, and never from across."""
+    time_s, volts = filtered([np.sin, np.cos])
+    kept = np.ones(len(time_s), bool)
+    kept[900:1400] = False
+    back = unfilter.undone(volts[kept], time_s[kept], RC_S, RATE_HZ)
+    whole = unfilter.undone(volts, time_s, RC_S, RATE_HZ)[kept]
+    assert np.abs(back - whole)[500:].max() < 0.03
+    np.testing.assert_array_equal(back[900], volts[kept][900])
+
+
+@pytest.mark.parametrize('sizes', [[2000], [700, 3, 1297], [16] * 125])
+def test_blocks_give_what_the_whole_gives(sizes):
+    """How a recording is cut makes no difference but beside blocks shorter than the filter."""
+    time_s, volts = filtered([np.sin, np.cos])
+    cuts = np.cumsum([0, *sizes])
+    blocks = [(i, time_s[a:b], volts[a:b]) for i, (a, b) in enumerate(pairwise(cuts))]
+    parts = list(unfilter.undone_blocks(blocks, RC_S, RATE_HZ))
+    assert [token for token, _ in parts] == list(range(len(sizes)))
+    back = np.concatenate([part for _, part in parts])
+    whole = unfilter.undone(volts, time_s, RC_S, RATE_HZ)
+    if min(sizes) >= unfilter.HALF:
+        np.testing.assert_allclose(back, whole, atol=1e-12)
+    assert np.abs(back - whole)[50:].max() < 1e-3
+
+
+def test_a_stream_gives_the_same_eight_samples_later():
+    """Delayed is the zero-phase inverse, sample by sample, with the samples' own stamps."""
+    time_s, volts = filtered([np.sin, np.cos])
+    kept = np.r_[0:500, 700:1200]
+    delayed = unfilter.Delayed(RC_S, RATE_HZ)
+    out, late = [], []
+    for i in kept:
+        for stamp, back, token in delayed(float(time_s[i]), volts[i].tolist(), i):
+            assert stamp == time_s[token]
+            out.append((token, *back))
+            late.append(i - token)
+    out = np.array(out)
+    count = len(out)
+    np.testing.assert_array_equal(out[:, 0], kept[:count])
+    assert count == len(kept) - unfilter.HALF
+    expected = unfilter.undone(volts[kept], time_s[kept], RC_S, RATE_HZ)[:count]
+    np.testing.assert_allclose(out[:, 1:], expected, atol=1e-9)
+    assert sorted(late)[len(late) // 2] == unfilter.HALF
+
+
+def test_the_variance_is_that_of_the_noise_that_comes_back():
+    """Noise of a simulated sensor at rest behind the inverse, against `variance_v2`."""
+    sensor = put(with_neutral(nominal(), ['bandwidth']),
+                 ['bandwidth.resistance_ratio.x'], [-0.2])
+    time_s = np.arange(200_000) / sensor.rate_hz
+    volts = Response(sensor, Motion(200.0, Held(0.5), Held(0.7)), 3)(time_s)
+    back = unfilter.undone(volts, time_s, noise.electronics(sensor)[0], sensor.rate_hz)
+    assert back[100:-100].std(axis=0) ** 2 == pytest.approx(
+        unfilter.variance_v2(sensor), rel=0.02)
+
+
+def test_motion_through_apply(run_tool, tmp_path):
+    """10 Hz of 0.118 m/s² come back whole with --undo-filter, and as 0.83 of it without."""
+    sensor = replace(nominal(), noise_density_g_per_rthz=np.zeros(2))
+    motion = Motion(4.0, Held(np.pi / 4), Held(np.pi / 2), Sine(30e-6, 10.0))
+    time_s = np.arange(4000) / 1000
+    volts = Response(sensor, motion, 0)(time_s)
+    params.save(tmp_path / 'unit.yaml', sensor)
+    recording.write(tmp_path / 'made.csv', Recording(
+        'made', time_s, dict(zip(('x_v', 'y_v'), volts.T)), sensor_info(sensor)), sensor)
+    reach = {}
+    for more in ((), ('--undo-filter',)):
+        run_tool('apply', tmp_path / 'made.csv', '--params', tmp_path / 'unit.yaml', *more,
+                 '-o', tmp_path / 'out.csv')
+        table = np.genfromtxt(tmp_path / 'out.csv', delimiter=',', names=True)
+        phase = 2 * np.pi * 10 * time_s[1000:3000]
+        ax = table['ax_mps2'][1000:3000]
+        reach[more] = 2 * np.mean(ax * np.exp(-1j * phase)) / -1j
+    # -0.118 m/s² is the acceleration of +30 µm·sin.
+    asked = -30e-6 * (2 * np.pi * 10) ** 2
+    assert abs(reach['--undo-filter',] / asked - 1) < 5e-3
+    assert abs(reach[()] / asked) == pytest.approx(0.833, abs=5e-3)
+    assert np.degrees(np.angle(reach[()] / asked)) == pytest.approx(-33.6, abs=0.5)
+
+
+def unit(rng, **more):
+    """Draw a unit of the paper's terms."""
+    return drawn(rng, nominal(**more))
+
+
+def poses(count=200):
+    """Draw poses upright, off the plane where z is a root of zero."""
+    rng = np.random.default_rng(0)
+    alpha = rng.uniform(0, np.radians(70), count)
+    return specific_force(alpha, rng.uniform(0, 2 * np.pi, count), 9.80665)
+
+
+@pytest.mark.parametrize('axes', ['xy', 'xyz'])
+def test_the_papers_inverse_is_near_and_the_exact_one_exact(axes):
+    """(14) to (21) are off by second order: more than 1e-6, less than some mg; exact: 1e-9."""
+    sensor = unit(np.random.default_rng(2), axes=axes)
+    force = poses()
+    volts = chain.static_response(sensor)(force)
+    exact = np.subtract(chain.inverse(sensor)(volts), force)
+    paper = np.subtract(paper_inverse.inverse(sensor)(volts), force)
+    assert np.abs(exact).max() < 1e-9
+    assert 1e-4 < np.abs(paper[:2]).max() < 0.05
+
+
+def test_the_papers_inverse_is_exact_for_a_linear_unit():
+    """Without cross-axis terms nothing is approximate."""
+    sensor = drawn(np.random.default_rng(2), nominal(), ('bias', 'scale_factor'))
+    force = poses()
+    back = paper_inverse.inverse(sensor)(chain.static_response(sensor)(force))
+    np.testing.assert_allclose(back, force, atol=1e-9)
+
+
+def test_the_papers_inverse_live_is_that_of_arrays():
+    """Sample by sample in floats as in arrays."""
+    sensor = unit(np.random.default_rng(4))
+    volts = chain.static_response(sensor)(poses(5))
+    whole = np.transpose(paper_inverse.inverse(sensor)(volts))
+    single = paper_inverse.inverse(sensor, maths=FLOATS)
+    live = Live(sensor, paper=True)
+    for i, expected in enumerate(whole):
+        one = [float(v[i]) for v in volts]
+        np.testing.assert_allclose(single(one), expected, atol=1e-12)
+        np.testing.assert_allclose(live.of_volts(one, float(i)).force, expected, atol=1e-12)
+
+
+def test_the_papers_inverse_needs_two_axes(run_tool, tmp_path):
+    """A sensor of one axis is refused in one line."""
+    sensor = nominal('x')
+    params.save(tmp_path / 'unit.yaml', sensor)
+    recording.write(tmp_path / 'made.csv', Recording(
+        'made', np.arange(10) / 1000, {'x_v': np.full(10, 2.5)}, sensor_info(sensor)), sensor)
+    done = run_tool('apply', tmp_path / 'made.csv', '--params', tmp_path / 'unit.yaml',
+                    '--inverse', 'paper', '-o', tmp_path / 'out.csv')
+    assert done.returncode == 1 and '--inverse paper: needs the axes x and y' in done.stderr
