@@ -7,7 +7,7 @@
 # make lint     the linters alone
 # make clean    remove what these made
 
-.PHONY: build demo test bench gallery long lint clean FORCE
+.PHONY: build demo test bench gallery reproduction long lint clean FORCE
 .DEFAULT_GOAL := build
 
 # The first Python that can run the line $1.
@@ -93,6 +93,9 @@ bench: build
 
 gallery: build
 	./run --exec python docs/gallery.py docs
+
+reproduction: build
+	./run reproduce --units 40 -o docs $(ARGS)
 
 # Its executables are found as `ros2 run` finds them.
 long: build

@@ -1,0 +1,106 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The paper's experiments on simulated units, or its calibration of recordings."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from datetime import date
+from pathlib import Path
+
+from adxl_ros.calibrate import figures as sweep_figures, recorded, result
+from adxl_ros.errors import UserError
+from adxl_ros.files import params, recording
+from adxl_ros.files.atomic import atomic_path
+from adxl_ros.model.sensor import Sensor
+from adxl_ros.paper import experiments, figures, page, score, units
+from adxl_ros.paper.page import FIGURES
+from adxl_ros.tools.common import default_params, make_folder, progress, run, say_notes
+import numpy as np
+
+
+def parser() -> argparse.ArgumentParser:
+    """Describe the command line."""
+    parse = argparse.ArgumentParser(prog='reproduce', description=__doc__)
+    parse.add_argument('recording', nargs='*',
+                       help='sweeps of one unit; without any, units are simulated')
+    parse.add_argument('--params', metavar='FILE', default=None,
+                       help='figures that units are drawn about, or one unit with its effects '
+                            '(default: the nominal ADXL203)')
+    parse.add_argument('--seed', type=int, default=0)
+    parse.add_argument('--units', type=int, default=20, help='how many are drawn')
+    parse.add_argument('-o', dest='output', metavar='DIR', required=True)
+    return parse
+
+
+def reproduce(options: argparse.Namespace) -> int:
+    """Run the tool; see `parser`."""
+    if options.units < 1:
+        raise UserError(f'--units {options.units}: at least 1 is needed')
+    if options.seed < 0:
+        raise UserError(f'--seed {options.seed}: must not be negative')
+    sensor = params.load(options.params or default_params())
+    folder = Path(options.output)
+    make_folder(folder / FIGURES)
+    text = _of_recordings(sensor, options.recording, folder) if options.recording \
+        else _simulated(sensor, options, folder)
+    with atomic_path(folder / 'reproduction.md') as fresh:
+        Path(fresh).write_text(text, encoding='utf-8')
+    print(text.split('## Figures')[0].strip())
+    print(f'\n{folder / "reproduction.md"} and its figures are written')
+    return 0
+
+
+def _of_recordings(sensor: Sensor, paths: Sequence[str], folder: Path) -> str:
+    unit, parts = sensor, []
+    for path in paths:
+        read = recording.read(path)
+        say_notes('reproduce', read)
+        unit = recorded.recorded_unit(unit, read)
+        parts.append(recorded.poses_of(read, unit))
+    found = result.calibrate(unit, parts, 'full', [Path(path).name for path in paths])
+    found.draw(folder / FIGURES / 'sweep.png')
+    lines = '\n'.join(found.comments())
+    return (f"# The paper's calibration of {', '.join(paths)}\n\n```\n{lines}\n```\n\n"
+            f'The paper: alpha {page.in_words("alpha")}; beta {page.in_words("beta")}.\n\n'
+            f'## Figures\n\n![Figures 2 to 8]({FIGURES}/sweep.png)\n')
+
+
+def _simulated(sensor: Sensor, options: argparse.Namespace, folder: Path) -> str:
+    if not sensor.axes.startswith('xy'):
+        raise UserError(f'the paper has a sensor of the axes x and y, not {sensor.axes}')
+    with progress('reproduce') as show:
+        found = units.judge_all(sensor, options.units, options.seed, show)
+    first = 1000 * options.seed
+    truth = experiments.draw(sensor, experiments.PAPER, np.random.default_rng([first, 0]))
+    unit = experiments.calibrated(truth, first)
+    pictures = folder / FIGURES
+    sweep_figures.draw_sweep(pictures / 'sweep.png', experiments.bare(truth),
+                             unit.fitted['physical'], unit.poses)
+    figures.draw_misalignment(pictures / 'misalignment.png', found['paper'][0].directions)
+    figures.draw_tilt(pictures / 'tilt.png', found['paper'][0])
+    figures.draw_motion(pictures / 'motion.png', unit.fitted, experiments.shaken(truth, first))
+    figures.draw_components(pictures / 'components.png', truth, unit.fitted['physical'],
+                            unit.fitted['linear'])
+    drawn = 'one unit' if sensor.effects else f'{options.units} units'
+    made = (f'adxl_ros {result.package_version()}, {date.today()}, {drawn} on each stage, '
+            f'seed {options.seed}.')
+    return page.page(found, score.motion_bound_mmps2(sensor), made)
+
+
+def main() -> int:
+    """Run the tool on the command line."""
+    return run(parser(), reproduce)
