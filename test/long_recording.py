@@ -59,6 +59,8 @@ def main() -> None:
     parse.add_argument('--hours', type=float, default=8.0)
     parse.add_argument('--folder', type=Path, default=None, help='for some 8 GB')
     options = parse.parse_args()
+    # A shell's background job ignores Ctrl-C, and so would all that it starts.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     with tempfile.TemporaryDirectory(dir=options.folder) as folder:
         unit = Path(folder) / 'unit.yaml'
         params.save(unit, drawn(np.random.default_rng(1), nominal('xyz')))
