@@ -22,7 +22,7 @@ from adxl_ros.model import noise
 from adxl_ros.model.coefficients import put, typical, with_neutral
 from adxl_ros.model.effects import library
 from adxl_ros.model.follow import Smoothed
-from adxl_ros.model.motion import Motion
+from adxl_ros.model.motion import Knots, Motion
 from adxl_ros.model.response import Response
 from adxl_ros.model.simulate import simulate
 from adxl_ros.model.trajectory import rich, sweep, TRAJECTORIES
@@ -261,3 +261,17 @@ def test_apply_takes_temperature_and_supply_out(run_tool, tmp_path):
     (tmp_path / 'bare.csv').write_text('\n'.join(bare) + '\n')
     done = run_tool('apply', 'bare.csv', '--params', 'unit.yaml', '-o', 'out.csv')
     assert done.returncode == 0 and 'supply is taken at 5' in done.stderr
+
+
+def test_quick_moves_among_slow_ones_are_followed():
+    """A stage that mostly creeps and then leaps: no reading is off by much more than a step."""
+    step = np.radians(0.01)
+    moves = Knots([0, 40, 41, 41.6, 60, 60.5, 61, 90], [0, 1, 1, 2, 2, 3, 2.5, 3.2])
+    time_s = np.arange(0, 90, 0.008)
+    true = moves(time_s)
+    path = Smoothed(time_s, np.rint(true / step) * step, step)
+    off = path(time_s) - true
+    assert np.abs(off).max() < 2 * step
+    assert np.sqrt(np.mean(off ** 2)) < 0.3 * step
+    worst = np.abs(path(time_s, 2) - moves(time_s, 2))
+    assert np.sqrt(np.mean(worst ** 2)) < 0.1 * np.abs(moves(time_s, 2)).max()

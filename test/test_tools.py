@@ -20,7 +20,7 @@ def test_simulate_fit_and_apply_make_one_path(run_tool, tmp_path):
     done = run_tool('fit', 'sweep.csv', '--params', 'nominal.yaml', '-o', 'unit.yaml',
                     '--report', 'figures')
     assert done.returncode == 0, done.stderr
-    assert 'physical model' in done.stdout and 'held out' in done.stdout
+    assert 'full model' in done.stdout and 'held out' in done.stdout
     assert (tmp_path / 'figures' / 'calibration.png').stat().st_size > 20000
     fitted = params.load(tmp_path / 'unit.yaml')
     np.testing.assert_allclose(fitted.zero_g_v, truth.zero_g_v, atol=5e-4)

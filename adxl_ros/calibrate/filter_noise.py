@@ -82,7 +82,7 @@ class FilterNoise:
 def estimate(rests: Iterable[np.ndarray], rate_hz: float, rc_s: float, lsb_v: float
              ) -> FilterNoise | None:
     """
-    Estimate the time constant of one axis; None if no rest is long enough.
+    Estimate the time constant of one axis; None without noise or a rest that is long enough.
 
     Parameters
     ----------
@@ -105,9 +105,9 @@ def estimate(rests: Iterable[np.ndarray], rate_hz: float, rc_s: float, lsb_v: fl
             part = volts[begin:begin + size]
             total += np.abs(np.fft.rfft(window * (part - part.mean()))) ** 2
             count += 1
-    if count < 2:
+    if count < 2 or not rc_s or not np.any(power := total / max(count, 1)):
         return None
-    power, weight = total / count, _OVERLAPPED * count
+    weight = _OVERLAPPED * count
     lags = np.correlate(window, window, 'full')[size - 1:]
     used = np.arange(len(power)) > _LOWEST_BINS
     start = np.log([max(float(np.mean(power[used])) / size, lsb_v ** 2, 1e-18),
@@ -124,6 +124,8 @@ def estimate(rests: Iterable[np.ndarray], rate_hz: float, rc_s: float, lsb_v: fl
                          options={'xatol': 1e-5, 'fatol': 1e-6, 'maxiter': 2000})
         off = power / _expected(found.x, lags) - 1
         used &= off < _LINE / np.sqrt(weight)
+        if used.sum() < _FEWEST // 2:
+            return None
         start = found.x
     scatter = float(np.mean(off[used] ** 2) * weight)
     information = _curvature(found.x, used, lags) * weight / _ALIKE

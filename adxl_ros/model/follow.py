@@ -22,6 +22,7 @@ from adxl_ros.model.effects.base import Components
 import numpy as np
 from scipy.interpolate import BSpline, CubicSpline, make_interp_spline
 from scipy.linalg import solveh_banded
+from scipy.ndimage import maximum_filter1d, uniform_filter1d
 
 _DEGREE = 5
 _KNOT_S = 0.03
@@ -32,6 +33,8 @@ _MARGIN_S = 3.0
 memory."""
 _PROBES = 12
 _FEWEST = 100
+_ROUNDS, _SOFTER, _WIDER = 16, 0.2, 15
+_LOCAL_S, _ALLOWED = 0.3, 1.7
 _STRENGTHS = (10.0 ** np.arange(-12, 13, 0.5)).tolist()
 
 
@@ -41,7 +44,8 @@ class Smoothed:
 
     A quintic P-spline (Eilers and Marx 1996) with a penalty on the third derivative. Its
     strength is the greatest with which the readings in motion are off by no more than an encoder
-    leaves, step/√12 rms, so that what it smooths away is the encoder's and nothing else. Built
+    leaves, step/√12 rms, so that what it smooths away is the encoder's and nothing else; where
+    they are off by more for a while, in a quick move among slow ones, it gives way there. Built
     window by window where it is asked for.
     """
 
@@ -62,7 +66,7 @@ class Smoothed:
         known = np.isfinite(reading)
         self._time_s, self._reading = time_s[known], reading[known]
         self._windows: dict[int, BSpline] = {}
-        self._strength = self._matched(step)
+        self._step, self._strength = step, self._matched(step)
 
     def __call__(self, time_s: np.ndarray, order: int = 0) -> np.ndarray:
         """See `motion.Path`."""
@@ -81,7 +85,8 @@ class Smoothed:
         if window not in self._windows:
             while len(self._windows) > 3:
                 del self._windows[min(self._windows)]
-            self._windows[window] = smoothing_spline(*self._part(window), self._strength)
+            self._windows[window] = smoothing_spline(
+                *self._part(window), self._strength, self._step)
         return self._windows[window]
 
     def _part(self, window: int) -> tuple[np.ndarray, np.ndarray]:
@@ -98,7 +103,8 @@ class Smoothed:
         return float(np.median(known)) if known else 0.0
 
 
-def smoothing_spline(time_s: np.ndarray, reading: np.ndarray, strength: float) -> BSpline:
+def smoothing_spline(time_s: np.ndarray, reading: np.ndarray, strength: float, step: float
+                     ) -> BSpline:
     """
     Fit one window; see `Smoothed`.
 
@@ -108,6 +114,8 @@ def smoothing_spline(time_s: np.ndarray, reading: np.ndarray, strength: float) -
         s and rad or m, (n,), all known.
     strength
         Of the penalty, by sample; 0 interpolates.
+    step
+        Of the encoder, in the unit of the reading.
 
     """
     if len(time_s) <= 2 * _DEGREE or np.ptp(reading) == 0:
@@ -116,7 +124,18 @@ def smoothing_spline(time_s: np.ndarray, reading: np.ndarray, strength: float) -
     if not strength:
         return make_interp_spline(time_s, reading, k=_DEGREE)
     window = _Window(time_s, reading)
-    return BSpline(window.knots, window.coefficients(strength) + window.middle, _DEGREE)
+    strengths = np.full(len(window.right) - 3, strength)
+    for _ in range(_ROUNDS):
+        coefficients = window.coefficients(strengths)
+        off2 = (reading - window.middle - window.design @ coefficients) ** 2
+        near = max(round(_LOCAL_S / (time_s[-1] - time_s[0]) * len(time_s)), 5)
+        local = np.interp(window.centres, time_s, uniform_filter1d(off2, near))
+        stiff = local > _ALLOWED * step ** 2 / 12
+        if not stiff.any():
+            break
+        # A softer stretch begins before the move that asks for it.
+        strengths[maximum_filter1d(stiff, _WIDER)] *= _SOFTER
+    return BSpline(window.knots, coefficients + window.middle, _DEGREE)
 
 
 def matched_strength(time_s: np.ndarray, reading: np.ndarray, step: float) -> float:
@@ -137,7 +156,8 @@ def matched_strength(time_s: np.ndarray, reading: np.ndarray, step: float) -> fl
     window = _Window(time_s, reading)
 
     def too_strong(strength: float) -> bool:
-        off = reading - window.middle - window.design @ window.coefficients(strength)
+        off = reading - window.middle - window.design @ window.coefficients(
+            np.full(len(window.right) - 3, strength))
         return bool(np.sqrt(np.mean(off[moving] ** 2)) > step / np.sqrt(12))
 
     index = bisect_left(_STRENGTHS, True, key=too_strong)
@@ -155,14 +175,18 @@ class _Window:
         self.knots = np.concatenate([inner[0] - outer[::-1], inner, inner[-1] + outer])
         self.design = BSpline.design_matrix(time_s, self.knots, _DEGREE)
         self.middle = float(reading.mean())
-        self._right = self.design.T @ (reading - self.middle)
+        self.right = self.design.T @ (reading - self.middle)
         self._normal = _banded(self.design.T @ self.design)
         # Where there is no sample and no penalty, the spline is held by next to nothing.
         self._normal[-1] += 1e-12 * self._normal[-1].max()
-        self._penalty = _third_differences(len(self._right)) * len(time_s) / len(self._right)
+        self._by_sample = len(time_s) / len(self.right)
+        # A third difference weighs four coefficients, whose splines peak between these knots.
+        self.centres = np.convolve(self.knots, np.full(_DEGREE + 5, 1 / (_DEGREE + 5)), 'valid')
 
-    def coefficients(self, strength: float) -> np.ndarray:
-        return solveh_banded(self._normal + strength * self._penalty, self._right)
+    def coefficients(self, strengths: np.ndarray) -> np.ndarray:
+        """Fit with a strength of the penalty by third difference, (k − 3,)."""
+        penalty = _third_differences(strengths * self._by_sample)
+        return solveh_banded(self._normal + penalty, self.right)
 
 
 def _banded(matrix: object) -> np.ndarray:
@@ -174,14 +198,13 @@ def _banded(matrix: object) -> np.ndarray:
     return bands
 
 
-def _third_differences(count: int) -> np.ndarray:
-    """Return DᵀD of third differences, banded."""
-    bands = np.zeros((_DEGREE + 1, count))
-    weights = np.array([-1.0, 3.0, -3.0, 1.0])
+def _third_differences(weights: np.ndarray) -> np.ndarray:
+    """Return DᵀWD of third differences with their weights, (k − 3,), banded."""
+    bands = np.zeros((_DEGREE + 1, len(weights) + 3))
+    row = np.array([-1.0, 3.0, -3.0, 1.0])
     for i in range(4):
         for j in range(i, 4):
-            columns = np.arange(count - 3) + j
-            bands[_DEGREE - (j - i), columns] += weights[i] * weights[j]
+            bands[_DEGREE - (j - i), j:j + len(weights)] += row[i] * row[j] * weights
     return bands
 
 

@@ -25,10 +25,10 @@ from pathlib import Path
 from adxl_ros.calibrate.recorded import rate_hz
 from adxl_ros.errors import UserError
 from adxl_ros.files import params, recording
-from adxl_ros.files.columns import JOINTS, Recording, REFERENCES, sensor_info
+from adxl_ros.files.columns import Recording, REFERENCES, sensor_info
+from adxl_ros.files.followed import felt, followed
 from adxl_ros.model import simulate as simulator
-from adxl_ros.model.follow import Force, Smoothed
-from adxl_ros.model.motion import Held, Motion
+from adxl_ros.model.motion import Motion
 from adxl_ros.model.response import Response
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.model.trajectory import TRAJECTORIES
@@ -37,8 +37,6 @@ from adxl_ros.tools.effect_option import SYNTAX, with_effects
 import numpy as np
 
 _BLOCK = 32768
-_FASTEST_RAD_S = 100.0
-"""No stage turns a sensor faster; a jump in the angle is no motion."""
 
 
 def parser() -> argparse.ArgumentParser:
@@ -101,7 +99,7 @@ def _run(sensor: Sensor, options: argparse.Namespace
         raise UserError('--force RECORDING goes with the trajectory imu, and imu with it: '
                         'simulate imu --force RECORDING')
     if name == 'imu':
-        motion, begin_s = _felt(options.force, options.rate is None)
+        motion, begin_s = felt(options.force, options.rate is None)
         if options.rate is None:
             sensor = replace(sensor, rate_hz=motion.internal_rate_hz)
             motion = replace(motion, internal_rate_hz=max(sensor.rate_hz, 1000.0))
@@ -112,7 +110,7 @@ def _run(sensor: Sensor, options: argparse.Namespace
         return sensor, motion.duration_s, 0.0, simulator.blocks(sensor, motion, options.seed)
     read = recording.read(name)
     say_notes('simulate', read)
-    motion = _followed(read, sensor)
+    motion = followed(read, sensor)
     begin_s, end_s = float(read.time_s[0]), float(read.time_s[-1])
     if options.rate is not None:
         return sensor, end_s - begin_s, begin_s, simulator.blocks(
@@ -131,61 +129,6 @@ def _again(sensor: Sensor, motion: Motion, read: Recording, seed: int
         yield {'time_s': read.time_s[part],
                **{f'{axis}_v': volts[:, d] for d, axis in enumerate(sensor.axes)},
                **{name: read.columns[name][part] for name in REFERENCES if name in read.columns}}
-
-
-def _felt(path: str, resampled: bool) -> tuple[Motion, float]:
-    """Read specific force; its internal rate is that of its samples."""
-    time_s, force = recording.read_ideal(path)
-    if len(time_s) < 4:
-        raise UserError(f'{path}: {len(time_s)} samples of specific force; at least 4 are needed')
-    begin_s = float(time_s[0])
-    duration_s = float(time_s[-1] - begin_s)
-    rate = round(1 / float(np.median(np.diff(time_s))), 6)
-    return Motion(duration_s + 1 / rate, force=Force(time_s, force),
-                  internal_rate_hz=rate if resampled else max(rate, 1000.0)), begin_s
-
-
-def _followed(read: Recording, sensor: Sensor) -> Motion:
-    """
-    Make the motion of a recording's references.
-
-    Raises
-    ------
-    UserError
-        There are no stage angles, or they jump as no stage does.
-
-    """
-    for name in ('alpha_rad', 'beta_rad'):
-        if name not in read.columns or np.isnan(read.columns[name]).all():
-            raise UserError(f'{read.path}: no stage angle {name} to follow; for specific force '
-                            f'say simulate imu --force {read.path}')
-    steps = {'alpha': sensor.stage_resolution_rad, 'beta': sensor.stage_resolution_rad,
-             'shift': 0.0}
-    joints = {}
-    for joint, name in JOINTS.items():
-        values = read.columns.get(name)
-        if values is None or np.isnan(values).all():
-            joints[joint] = Held()
-            continue
-        if joint != 'shift':
-            _check_speed(read, name, steps[joint])
-        joints[joint] = Smoothed(read.time_s, values, steps[joint])
-    around = {name: Smoothed(read.time_s, read.columns[name], 0.0)
-              for name in ('temperature_c', 'supply_v')
-              if name in read.columns and np.isfinite(read.columns[name]).any()}
-    return Motion(float(read.time_s[-1] - read.time_s[0]), **joints, **around)
-
-
-def _check_speed(read: Recording, name: str, step: float) -> None:
-    known = np.flatnonzero(np.isfinite(read.columns[name]))
-    moved = np.abs(np.diff(read.columns[name][known]))
-    passed = np.diff(read.time_s[known])
-    fast = np.flatnonzero(moved - 2 * step > _FASTEST_RAD_S * passed)
-    if len(fast):
-        i = fast[0]
-        raise UserError(f'{read.path}: {name} jumps by {moved[i]:.3g} rad within {passed[i]:.3g} '
-                        f's at {read.time_s[known[i]]:.6g} s, which no stage does; unwrap the '
-                        'angle, or cut the recording there')
 
 
 def main() -> int:
