@@ -1,0 +1,191 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The diagnosis as a whole, as a library call."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+from adxl_ros.calibrate.recorded import rate_hz
+from adxl_ros.files.columns import Recording
+from adxl_ros.files.unit import check_unit
+from adxl_ros.gap import faults, noise_like, search, unknown, verdict
+from adxl_ros.gap.far import Shrunk, shrunk
+from adxl_ros.gap.faults import Fault
+from adxl_ros.gap.floor import Floor, floor
+from adxl_ros.gap.next_step import Next, proposed
+from adxl_ros.gap.noise_like import Sign
+from adxl_ros.gap.search import Hypothesis, Study
+from adxl_ros.gap.series import Series, series_of
+from adxl_ros.gap.verdict import Verdict
+from adxl_ros.gap.where import Cell, covered, map_of
+from adxl_ros.model.motion import Motion
+from adxl_ros.model.sensor import Sensor, with_axes
+import numpy as np
+
+_HARMLESS = 0.0
+"""A hypothesis whose closed share may be below this on what was held out is not confirmed."""
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """
+    All that was found.
+
+    Attributes
+    ----------
+    fault
+        Of the recording; then there is nothing else.
+    series, used
+        The recordings at the rate of the search, and the samples that count.
+    verdict, hypotheses
+        The answer, and what was weighed.
+    study
+        Residuals and tangents.
+    sensor
+        The baseline with what was found, ready for `simulate`.
+
+    """
+
+    fault: Fault | None
+    series: list[Series]
+    used: list[np.ndarray]
+    floor: Floor | None = None
+    verdict: Verdict | None = None
+    hypotheses: tuple[Hypothesis, ...] = ()
+    signs: tuple[Sign, ...] = ()
+    shrunk: Shrunk | None = None
+    cells: tuple[Cell, ...] = ()
+    missing: tuple[str, ...] = ()
+    proposal: Next | None = None
+    study: Study | None = None
+    sensor: Sensor | None = None
+
+
+def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None = None,
+             seed: int = 0, show: Callable[[float], None] = lambda done: None) -> Diagnosis:
+    """
+    Compare recordings of one unit with the simulator, and find what the simulator lacks.
+
+    Parameters
+    ----------
+    recordings
+        Read as a whole.
+    sensor
+        The baseline: stated figures and modelled effects.
+    sim
+        Specific force by another simulator, in place of the stage.
+    seed
+        Of bootstraps.
+    show
+        Takes the fraction that is done.
+
+    Raises
+    ------
+    UserError
+        A recording is of another unit, or its reference cannot be followed.
+
+    """
+    if not sensor.effects:
+        sensor = with_axes(sensor, recordings[0].axes)
+    series, used, signs = [], [], []
+    for read in recordings:
+        check_unit(read.info, read.axes, sensor, read.path)
+        rate = rate_hz(read)
+        one = series_of(read, replace(sensor, rate_hz=rate), rate, sim)
+        fault = faults.look(one)
+        if fault is not None:
+            return Diagnosis(fault, [one], [np.ones(len(one), bool)])
+        volts = read.volts(sensor)
+        coarse = noise_like.coarse_steps(volts, sensor)
+        if coarse is not None:
+            signs.append(coarse)
+            bits = round(sensor.adc_bits - float(coarse.values['lost_bits']))
+            one = replace(one, sensor=replace(one.sensor, adc_bits=bits))
+        good, of_samples = noise_like.bad_samples(volts, read.time_s,
+                                                  replace(one.sensor, rate_hz=rate))
+        every = max(1, round(rate / one.sensor.rate_hz))
+        series.append(one)
+        used.append(good[::every][:len(one)])
+        signs += of_samples
+    show(0.05)
+    study = search.study(series, used, lambda done: show(0.05 + 0.25 * done))
+    base = floor(series, used)
+    noise_mps2 = float(np.sqrt(np.mean((base.noise_v / series[0].scale_v_per_mps2) ** 2)))
+    found = verdict.worthy(study, search.search(
+        study, lambda done: show(0.3 + 0.4 * done)), noise_mps2)
+    far = None
+    while found[0].effects:
+        far = shrunk(study, found[0], base, seed)
+        if far.closed_ci[1] > _HARMLESS and not far.harm:
+            break
+        # What does not hold on stretches held out is not the cause.
+        found, far = found[1:], None
+    best = found[0]
+    show(0.8)
+    beside = unknown.discrepancy(study, best)
+    explained = float(np.sqrt(sum(verdict.contribution_mps2(study, best, effect) ** 2
+                                  for effect in best.effects)))
+    for one, mask in zip(series, used):
+        there = replace(best.sensor, rate_hz=one.sensor.rate_hz)
+        signs += noise_like.of_residual(one.volts - one.simulated(there), mask,
+                                        replace(one, sensor=there))
+    signs = list({sign.effect: sign for sign in sorted(signs, key=lambda s: s.nats)}.values())
+    answer = verdict.judge(study, found, beside, signs, noise_mps2, explained)
+    answer = _insufficient(answer, series)
+    show(0.9)
+    if far is None:
+        far = shrunk(study, replace(best, effects=()), base, seed)
+    residual = series[0].volts - series[0].simulated(series[0].sensor)
+    cells = map_of(series[0], residual, used[0], base.rms_mps2, seed)
+    missing = covered(series)
+    show(1.0)
+    return Diagnosis(None, series, used, base, answer, tuple(found), tuple(signs), far,
+                     tuple(cells), tuple(missing), proposed(answer, missing), study,
+                     _with_signs(best.sensor, signs, sensor, answer))
+
+
+def _insufficient(answer: Verdict, series: Sequence[Series]) -> Verdict:
+    """Take back "no gap" where nothing moves or warms: such a recording cannot say it."""
+    if answer.status != 'no_gap':
+        return answer
+    for one in series:
+        moved = one.reference == 'sim' or (one.reference == 'stage' and not one.still.all())
+        around = [getattr(one.motion, name) for name in ('temperature_c', 'supply_v')]
+        changed = any(path is not None and np.ptp(path(one.time_s)) > least
+                      for path, least in zip(around, (1.0, 0.02)))
+        if moved or changed:
+            return answer
+    return replace(answer, status='insufficient')
+
+
+def _with_signs(found: Sensor, signs: Sequence[Sign], baseline: Sensor, answer: Verdict
+                ) -> Sensor:
+    """Put the noise-like effects beside those of the mean, at the baseline's rate."""
+    if answer.status in ('no_gap', 'unknown', 'insufficient'):
+        return baseline
+    effects, values = list(found.effects), dict(found.values)
+    for sign in signs:
+        if sign.effect != 'unknown':
+            if sign.effect not in effects:
+                effects.append(sign.effect)
+            values[sign.effect] = sign.values
+    known = [i for i, name in enumerate(baseline.covariance_names)
+             if name.split('.')[0] in effects]
+    return replace(found, effects=tuple(effects), values=values, rate_hz=baseline.rate_hz,
+                   adc_bits=baseline.adc_bits,
+                   covariance=baseline.covariance[np.ix_(known, known)],
+                   covariance_names=tuple(baseline.covariance_names[i] for i in known))

@@ -1,0 +1,215 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The evidence for hypotheses: Bayesian model comparison on whitened tangents.
+
+Columns are tangents of the simulated output by coefficients; a hypothesis is a set of them.
+Coefficients have normal priors of their typical size, zero-g and scale what the calibration and
+their stability leave. The evidence integrates the coefficients out (Bishop 2006, section 3.5), so
+that an effect that the recording hardly shows gains nothing and costs nothing. The noise is that
+of `whiten`, fitted anew to each hypothesis.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+from adxl_ros.gap.whiten import Whitener
+import numpy as np
+
+BLOCKS = 24
+"""Stretches that a recording is cut into, to hold some out."""
+_ROUNDS = 3
+_TINY = 1e-300
+
+
+@dataclass(frozen=True)
+class Channel:
+    """
+    One axis of one recording.
+
+    Attributes
+    ----------
+    ids
+        Numbers of the columns that it follows, (k,).
+    grams
+        Products of the whitened residual (first) and columns, by walk and block, (w, b, k+1, k+1).
+    counts
+        Samples by block, (b,).
+    log_priors
+        Of the walks, (w,).
+
+    """
+
+    ids: np.ndarray
+    grams: np.ndarray
+    counts: np.ndarray
+    log_priors: np.ndarray
+
+
+def channel(residual: np.ndarray, columns: np.ndarray, ids: np.ndarray, used: np.ndarray,
+            filters: Sequence[Whitener]) -> Channel:
+    """
+    Whiten one axis of one recording.
+
+    Parameters
+    ----------
+    residual, columns
+        (n,) and (n, k), V.
+    ids
+        Numbers of the columns, (k,).
+    used
+        Samples that count, (n,); the others are bridged by straight lines, all alike.
+    filters
+        From `whiten.whiteners`.
+
+    """
+    data = bridged(np.column_stack([residual, columns]), used)
+    edges = np.linspace(0, len(data), BLOCKS + 1).astype(int)
+    grams = np.empty((len(filters), BLOCKS, data.shape[1], data.shape[1]))
+    for i, whiten in enumerate(filters):
+        white = whiten(data) * used[:, None]
+        # The first sample is a step from nothing.
+        white[0] = 0.0
+        for b, (begin, end) in enumerate(pairwise(edges)):
+            grams[i, b] = white[begin:end].T @ white[begin:end]
+    counts = np.add.reduceat(used, edges[:-1]).astype(float)
+    return Channel(ids, grams, counts, np.array([f.log_prior for f in filters]))
+
+
+def bridged(data: np.ndarray, used: np.ndarray) -> np.ndarray:
+    """Replace rows that do not count by straight lines between those that do."""
+    if used.all() or not used.any():
+        return data
+    rows = np.arange(len(data))
+    return np.column_stack([np.interp(rows, rows[used], column[used]) for column in data.T])
+
+
+@dataclass(frozen=True)
+class Fit:
+    """
+    A hypothesis after the fit.
+
+    Attributes
+    ----------
+    ids, values, covariance
+        Coefficients, (k,), (k,), (k, k).
+    log_evidence
+        Of the samples, nats.
+    walks, variance
+        By channel: number of the walk, and variance of the innovations, V².
+
+    """
+
+    ids: np.ndarray
+    values: np.ndarray
+    covariance: np.ndarray
+    log_evidence: float
+    walks: tuple[int, ...]
+    variance: np.ndarray
+
+
+def fit(channels: Sequence[Channel], ids: Sequence[int], prior: np.ndarray,
+        blocks: np.ndarray | None = None, start: Fit | None = None) -> Fit:
+    """
+    Fit a hypothesis.
+
+    Parameters
+    ----------
+    channels
+        Axes of recordings.
+    ids
+        Columns of the hypothesis, nuisances among them.
+    prior
+        Standard deviation of each column's coefficient, by number, (all,).
+    blocks
+        Which blocks count, (b,); all of them unless given.
+    start
+        A fit with walks and variances near those of this one.
+
+    """
+    own = np.array(sorted(ids), int)
+    chosen = np.ones(BLOCKS, bool) if blocks is None else blocks
+    grams, counts = [], []
+    for c in channels:
+        at = np.flatnonzero(np.isin(c.ids, own))
+        rows = np.concatenate([[0], 1 + at])
+        grams.append((np.searchsorted(own, c.ids[at]),
+                      c.grams[:, chosen].sum(axis=1)[:, rows[:, None], rows]))
+        counts.append(max(float(c.counts[chosen].sum()), 1.0))
+    walks = list(start.walks) if start else [len(c.log_priors) // 2 for c in channels]
+    variance = np.array([g[w, 0, 0] / n for (_, g), w, n in zip(grams, walks, counts)])
+    known = prior[own] ** -2.0
+    for _ in range(_ROUNDS):
+        precision, pull = np.diag(known), np.zeros(len(own))
+        for (at, g), w, s2 in zip(grams, walks, variance):
+            precision[np.ix_(at, at)] += g[w, 1:, 1:] / s2
+            pull[at] += g[w, 1:, 0] / s2
+        factor = np.linalg.cholesky(precision)
+        values = np.linalg.solve(factor.T, np.linalg.solve(factor, pull))
+        left = [_left(g, values[at]) for at, g in grams]
+        walks = [int(np.argmax(-n / 2 * np.log(np.maximum(r, _TINY)) + c.log_priors))
+                 for r, n, c in zip(left, counts, channels)]
+        variance = np.array([max(r[w], _TINY) / n for r, w, n in zip(left, walks, counts)])
+    log_evidence = -0.5 * float(np.sum(known * values ** 2)) \
+        - float(np.log(np.diag(factor)).sum()) + 0.5 * float(np.log(known).sum())
+    for n, s2, w, c in zip(counts, variance, walks, channels):
+        log_evidence += float(-n / 2 * (np.log(s2) + 1) + c.log_priors[w])
+    return Fit(own, values, np.linalg.inv(precision), log_evidence, tuple(walks), variance)
+
+
+def _left(grams: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return the squares that coefficients leave, by walk."""
+    v = np.concatenate([[1.0], -values])
+    return np.einsum('i,wij,j->w', v, grams, v)
+
+
+def predicted(channels: Sequence[Channel], found: Fit, blocks: np.ndarray) -> np.ndarray:
+    """Return the log-likelihood of blocks that were not fitted, nats, by block, (b,)."""
+    out = np.zeros(len(blocks))
+    for c, w, s2 in zip(channels, found.walks, found.variance):
+        at = np.flatnonzero(np.isin(c.ids, found.ids))
+        v = np.zeros(len(c.ids) + 1)
+        v[0] = 1.0
+        v[1 + at] = -found.values[np.searchsorted(found.ids, c.ids[at])]
+        left = np.einsum('i,bij,j->b', v, c.grams[w][blocks], v)
+        out += -0.5 * (left / s2 + c.counts[blocks] * np.log(s2))
+    return out
+
+
+def lost(channels: Sequence[Channel], found: Fit, values: np.ndarray, prior: np.ndarray,
+         blocks: np.ndarray | None = None) -> float:
+    """
+    Return what the log-posterior at other values of the coefficients lacks of its maximum, nats.
+
+    Parameters
+    ----------
+    channels, prior, blocks
+        As for `fit`.
+    found
+        The fit.
+    values
+        Of all its coefficients, (k,).
+
+    """
+    chosen = np.ones(BLOCKS, bool) if blocks is None else blocks
+    off = values - found.values
+    precision = np.diag(prior[found.ids] ** -2.0)
+    for c, w, s2 in zip(channels, found.walks, found.variance):
+        at = np.searchsorted(found.ids, c.ids)
+        precision[np.ix_(at, at)] += c.grams[w][chosen].sum(axis=0)[1:, 1:] / s2
+    return 0.5 * float(off @ precision @ off)

@@ -1,0 +1,294 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Effects that show in statistics and not in the mean, each against what the file promises."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from adxl_ros.gap.floor import runs
+from adxl_ros.gap.series import Series
+from adxl_ros.model import noise
+from adxl_ros.model.sensor import Sensor
+import numpy as np
+from scipy.optimize import minimize
+from scipy.signal import lfilter, periodogram
+from scipy.stats import norm
+
+_MAINS_HZ = (50.0, 60.0)
+_MAINS_WITHIN_HZ = 0.6
+_LINE_NATS = 14.0
+"""Excess of the largest ordinate of a periodogram over what thousands of them reach by chance."""
+_SPIKE_SIGMA = 7.0
+_EXCESS = 1.2
+"""Noise density by the stated one: units differ by less."""
+_STEPS = 1.6
+_DRIFT_G = 8e-4
+"""Wandering of the zero-g over the recording, rms, that a healthy unit does not reach."""
+_NEAREST, _FEWEST = 2, 500
+
+
+@dataclass(frozen=True)
+class Sign:
+    """
+    One noise-like effect that shows.
+
+    Attributes
+    ----------
+    effect
+        Its name; 'unknown' for a line that is no mains.
+    values
+        Its parameters, by name: arrays by axis, or one figure.
+    nats
+        How much more likely the recording is with it, about.
+    words
+        For people.
+
+    """
+
+    effect: str
+    values: dict[str, np.ndarray]
+    nats: float
+    words: str
+
+
+def bad_samples(volts: np.ndarray, time_s: np.ndarray, sensor: Sensor
+                ) -> tuple[np.ndarray, list[Sign]]:
+    """
+    Find samples that say nothing: stuck, spikes, missing.
+
+    Parameters
+    ----------
+    volts, time_s
+        As recorded, (n, m) and (n,).
+    sensor
+        The baseline.
+
+    Returns
+    -------
+    tuple
+        Samples that count, (n,); the effects behind those that do not.
+
+    """
+    finite = np.isfinite(volts).all(axis=1)
+    good, signs = finite.copy(), []
+    stuck = _stuck(volts, sensor) & finite
+    if stuck.any():
+        begins = runs(stuck)
+        span = float(time_s[-1] - time_s[0])
+        held_s = float(np.median([time_s[b - 1] - time_s[a] for a, b in begins]))
+        good &= ~stuck
+        signs.append(Sign('stuck', {
+            'rate_hz': np.array(len(begins) / span),
+            'duration_s': np.array(max(held_s + 1 / sensor.rate_hz, 1 / sensor.rate_hz))},
+            5.0 * len(begins), f'{len(begins)} times the samples repeat, {held_s:.3g} s long'))
+    spikes, size = _spikes(volts, good, sensor)
+    if spikes.any():
+        count = int(spikes.any(axis=1).sum())
+        good &= ~spikes.any(axis=1)
+        rate_hz = spikes.sum() / len(sensor.axes) / float(time_s[-1] - time_s[0])
+        signs.append(Sign('spikes', {'rate_hz': np.array(rate_hz), 'amplitude_v': size},
+                          10.0 * count, f'{count} samples stand alone, by '
+                          f'{size.max() * 1e3:.3g} mV'))
+    return good, signs
+
+
+def _stuck(volts: np.ndarray, sensor: Sensor) -> np.ndarray:
+    """Tell samples that repeat the one before in all axes, longer than chance does."""
+    same = np.concatenate([[False], (np.diff(volts, axis=0) == 0).all(axis=1)])
+    # Neighbours go along with each other: the root is on the safe side.
+    usual = float(np.sqrt(np.prod([np.mean(np.diff(v) == 0) for v in volts.T])))
+    chance = max(usual, 1e-3 if len(sensor.axes) > 1 else 0.05)
+    longest = max(3, int(np.ceil(np.log(1e-4 / len(volts)) / np.log(min(chance, 0.5)))))
+    out = np.zeros(len(volts), bool)
+    for begin, end in runs(same):
+        if end - begin >= longest:
+            out[begin:end] = True
+    return out
+
+
+def _spikes(volts: np.ndarray, good: np.ndarray, sensor: Sensor
+            ) -> tuple[np.ndarray, np.ndarray]:
+    """Tell samples that leave the line between their neighbours and come back."""
+    middle = volts - (np.roll(volts, _NEAREST, 0) + np.roll(volts, -_NEAREST, 0)) / 2
+    out, size = np.zeros(volts.shape, bool), np.zeros(volts.shape[1])
+    # What comes back after samples that repeat, or are missing, is no spike.
+    whole = np.convolve(good, np.ones(4 * _NEAREST + 1), 'same') > 4 * _NEAREST
+    for d in range(volts.shape[1]):
+        off = middle[:, d]
+        calm = np.nanmedian(np.abs(off[good])) / 0.6745
+        # What moves is not told from spikes by this: compare with what is around it, too.
+        local = _local_scale(np.nan_to_num(off), round(max(sensor.rate_hz * 0.2, 9)))
+        far = (np.abs(off) > _SPIKE_SIGMA * np.maximum(local, max(calm, sensor.lsb_v))) & whole
+        far[:_NEAREST] = far[-_NEAREST:] = False
+        # The neighbours of a spike leave the line by half of it.
+        peak = np.abs(off) >= np.maximum.reduce([
+            np.abs(np.roll(off, k)) for k in range(-_NEAREST, _NEAREST + 1)])
+        alone = far & peak
+        if alone.sum() >= 3:
+            out[:, d] = alone
+            size[d] = float(np.median(np.abs(off[alone])))
+    return out, size
+
+
+def _local_scale(values: np.ndarray, width: int) -> np.ndarray:
+    """Rms of the values around, without the largest: by blocks, interpolated."""
+    count = max(len(values) // width, 1)
+    blocks = np.abs(values[:count * width]).reshape(count, -1)
+    scale = np.median(blocks, axis=1) / 0.6745
+    return np.interp(np.arange(len(values)), (np.arange(count) + 0.5) * width, scale)
+
+
+def coarse_steps(volts: np.ndarray, sensor: Sensor) -> Sign | None:
+    """Tell an ADC whose codes are coarser than stated."""
+    if not sensor.lsb_v:
+        return None
+    lost = []
+    for v in volts.T:
+        levels = np.unique(v[np.isfinite(v)])
+        apart = np.diff(levels)
+        apart = apart[apart > sensor.lsb_v * 0.3]
+        if len(apart) < 8:
+            return None
+        step = float(np.median(apart[apart < 1.5 * apart.min()]))
+        lost.append(np.log2(step / sensor.lsb_v))
+    bits = float(np.median(lost))
+    if bits < np.log2(_STEPS):
+        return None
+    return Sign('quantisation', {'lost_bits': np.array(bits)}, 1e3,
+                f'codes are {2 ** bits:.3g} steps apart')
+
+
+def of_residual(residual_v: np.ndarray, used: np.ndarray, series: Series) -> list[Sign]:
+    """
+    Look at what the best hypothesis of the mean leaves.
+
+    Parameters
+    ----------
+    residual_v
+        V, (n, m).
+    used
+        Samples that count, (n,).
+    series
+        Of the same samples.
+
+    """
+    sensor = series.sensor
+    signs = []
+    rows = np.arange(len(residual_v))
+    data = np.column_stack([np.interp(rows, rows[used], r[used]) for r in residual_v.T])
+    rc_s, _ = noise.electronics(sensor)
+    decay = np.exp(-1 / (sensor.rate_hz * np.where(rc_s > 0, rc_s, 1e-9)))
+    white = np.column_stack([lfilter([1.0, -a], [1.0], r)[1:] for r, a in zip(data.T, decay)])
+    line = _line(white, sensor, residual_v, series.time_s)
+    if line is not None:
+        signs.append(line)
+    # Differences, so that a wandering zero-g is none of it; where it moves, what is not modelled
+    # would pass for noise.
+    promised = np.sqrt(noise.analog_sigma_v(sensor) ** 2 * (1 - decay ** 2) * 2
+                       + sensor.lsb_v ** 2 / 12 * (1 + (1 + decay) ** 2 + decay ** 2))
+    step, still = np.diff(white, axis=0), (series.still & used)[2:]
+    calm = step[still] if still.sum() > _FEWEST else step[used[2:]]
+    seen = np.median(np.abs(calm), axis=0) / norm.ppf(0.75)
+    ratio = seen / promised
+    if np.median(ratio) > _EXCESS and line is None:
+        signs.append(Sign('noise_excess', {'ratio': ratio - 1},
+                          len(white) * float(np.log(np.median(ratio)) ** 2),
+                          f'white noise is {np.median(ratio):.2f} of what is stated'))
+    drift = _drift(data, series)
+    if drift is not None:
+        signs.append(drift)
+    return signs
+
+
+def _line(white: np.ndarray, sensor: Sensor, residual_v: np.ndarray, time_s: np.ndarray
+          ) -> Sign | None:
+    frequency, power = periodogram(white, sensor.rate_hz, 'hann', axis=0)
+    keep = frequency > 1.0
+    frequency, power = frequency[keep], power[keep]
+    if len(frequency) < 64:
+        return None
+    around = np.column_stack([_local_level(p) for p in power.T])
+    excess = (power / around).sum(axis=1)
+    best = int(np.argmax(excess))
+    nats = float(excess[best]) - np.log(len(frequency)) - len(sensor.axes)
+    if nats < _LINE_NATS:
+        return None
+    at = float(frequency[best])
+    for mains in _MAINS_HZ:
+        for k in (1, 2):
+            alias = abs((k * mains + sensor.rate_hz / 2) % sensor.rate_hz - sensor.rate_hz / 2)
+            if abs(alias - at) < _MAINS_WITHIN_HZ:
+                turn = np.exp(-2j * np.pi * at * time_s)
+                amplitude = 2 * np.abs(np.nanmean(residual_v * turn[:, None], axis=0))
+                true = k * mains + (at - alias)
+                return Sign('mains_hum', {
+                    'amplitude_v': amplitude, 'frequency_hz': np.array(true),
+                    'phase_rad': np.zeros(len(sensor.axes))}, nats,
+                    f'a line at {at:.2f} Hz, {amplitude.max() * 1e3:.3g} mV')
+    return Sign('unknown', {}, nats, f'a line at {at:.2f} Hz, which is no mains frequency')
+
+
+def _local_level(power: np.ndarray, width: int = 201) -> np.ndarray:
+    """Mean of the ordinates around by their median."""
+    count = max(len(power) // width, 1)
+    blocks = power[:count * width].reshape(count, -1) if len(power) >= width else power[None]
+    level = np.median(blocks, axis=1) / np.log(2)
+    return np.interp(np.arange(len(power)), (np.arange(count) + 0.5) * width, level)
+
+
+def _drift(data: np.ndarray, series: Series) -> Sign | None:
+    """Tell flicker from a wandering zero-g by the slope of the spectrum at low frequencies."""
+    sensor = series.sensor
+    scale = sensor.scale_v_per_g
+    seconds = data[:len(data) // round(sensor.rate_hz) * round(sensor.rate_hz)]
+    means = seconds.reshape(-1, round(sensor.rate_hz), data.shape[1]).mean(axis=1) / scale
+    if len(means) < 50:
+        return None
+    wander = np.median(np.std(_smooth(means), axis=0))
+    if wander < _DRIFT_G:
+        return None
+    step = np.diff(means, axis=0)
+    frequency, power = periodogram(step, 1.0, 'hann', axis=0)
+    frequency, power = frequency[1:], power[1:].mean(axis=1)
+    shape = 2 * (1 - np.cos(2 * np.pi * frequency))
+    fits = {}
+    for name, slope in (('flicker', 1.0), ('bias_walk', 2.0)):
+        def cost(x: np.ndarray, slope: float = slope) -> float:
+            model = shape * (np.exp(x[0]) + np.exp(x[1]) * frequency ** -slope)
+            return float(np.sum(power / model + np.log(model)))
+        start = np.log([np.median(power / shape) / 2, np.median(power / shape) / 20])
+        fits[name] = minimize(cost, start, method='Nelder-Mead')
+    name = min(fits, key=lambda n: fits[n].fun)
+    level = float(np.sqrt(np.exp(fits[name].x[1])))
+    count = len(sensor.axes)
+    if name == 'flicker':
+        values = {'density_g_per_rthz': np.full(count, level)}
+        words = f'1/f noise of {level * 1e6:.3g} µg/√Hz at 1 Hz'
+    else:
+        values = {'density_g_per_rts': np.full(count, level * 2 * np.pi / np.sqrt(2))}
+        words = f'the zero-g wanders by {wander * 1e3:.2g} mg'
+    return Sign(name, values, abs(fits['flicker'].fun - fits['bias_walk'].fun) + 5.0, words)
+
+
+def _smooth(means: np.ndarray, width: int = 5) -> np.ndarray:
+    kernel = np.ones(width) / width
+    return np.column_stack([np.convolve(m, kernel, 'valid') for m in means.T])
+
+
+def loudest(signs: Sequence[Sign]) -> Sign | None:
+    """Return the sign that says most."""
+    return max(signs, key=lambda sign: sign.nats, default=None)

@@ -1,0 +1,185 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+What the library does not hold: a flexible discrepancy beside the best hypothesis.
+
+Splines and products over force, rate, direction, temperature, supply and time, by axis, with their
+own prior; the tangents of the hypothesis are fitted beside them, so that they only take what it
+cannot. They are never offered first: a flexible term would steal what an effect explains.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from adxl_ros.gap import evidence
+from adxl_ros.gap.search import _columns, Hypothesis, NUISANCES, Study
+from adxl_ros.gap.series import Series
+from adxl_ros.model.coefficients import get, names_of
+from adxl_ros.model.constants import G0_MPS2
+from adxl_ros.model.effects import effect_named
+from adxl_ros.model.stage import specific_force
+import numpy as np
+from scipy.interpolate import BSpline
+
+PRIOR_G = 2e-3
+"""Standard deviation of what one basis function does."""
+
+
+@dataclass(frozen=True)
+class Discrepancy:
+    """
+    What a flexible term finds beside a hypothesis.
+
+    Attributes
+    ----------
+    gain
+        Of the log-evidence, nats.
+    rms_mps2
+        Of what it adds, over samples and axes.
+    where
+        Dimension by dimension, what its part alone would gain, nats.
+
+    """
+
+    gain: float
+    rms_mps2: float
+    where: dict[str, float]
+
+
+def discrepancy(of: Study, best: Hypothesis) -> Discrepancy:
+    """Fit the flexible term beside the best hypothesis."""
+    effects = tuple(dict.fromkeys((*best.effects, *NUISANCES)))
+    names = [n for e in effects for n in names_of(effect_named(e), best.sensor.axes)
+             if n in of.names or '.'.join(n.split('.')[:2]) in {
+                 '.'.join(m.split('.')[:2]) for m in best.names}]
+    values = get(best.sensor, names)
+    prior = list(of.priors(best.effects)[[of.names.index(n) if n in of.names else 0
+                                          for n in names]])
+    channels: list[evidence.Channel] = []
+    kinds: dict[str, list[int]] = {}
+    for one, mask in zip(of.series, of.used):
+        sensor = best.sensor
+        there = one.simulated(sensor)
+        tangents = _columns(one, sensor, names, values, there)
+        basis = flexible(one)
+        for d in range(len(sensor.axes)):
+            scale = float(sensor.scale_v_per_g[d])
+            columns, ids = [tangents[:, d]], [np.arange(len(names))]
+            for kind, of_kind in basis.items():
+                first = len(prior)
+                prior += [PRIOR_G * scale] * of_kind.shape[1]
+                at = np.arange(first, len(prior))
+                kinds.setdefault(kind, []).extend(at.tolist())
+                columns.append(of_kind)
+                ids.append(at)
+            channels.append(evidence.channel(
+                one.volts[:, d] - there[:, d], np.column_stack(columns), np.concatenate(ids),
+                mask, of.filters[len(channels)]))
+    sd = np.array(prior)
+    own = list(range(len(names)))
+    alone = evidence.fit(channels, own, sd)
+    gains = {kind: evidence.fit(channels, [*own, *ids], sd, start=alone).log_evidence
+             - alone.log_evidence for kind, ids in kinds.items()}
+    kept = [kind for kind, gain in gains.items() if gain > 0]
+    if not kept:
+        return Discrepancy(0.0, 0.0, gains)
+    chosen = [*own, *(i for kind in kept for i in kinds[kind])]
+    whole = evidence.fit(channels, chosen, sd, start=alone)
+    return Discrepancy(whole.log_evidence - alone.log_evidence,
+                       _rms(of, whole, kept, len(names), best), gains)
+
+
+def _rms(of: Study, whole: evidence.Fit, kept: list[str], first: int, best: Hypothesis) -> float:
+    squares, count, at = 0.0, 0, first
+    value = dict(zip(whole.ids.tolist(), whole.values))
+    for one, mask in zip(of.series, of.used):
+        basis = flexible(one)
+        for d in range(len(best.sensor.axes)):
+            total = np.zeros(len(one))
+            for kind, of_kind in basis.items():
+                ids = range(at, at + of_kind.shape[1])
+                at += of_kind.shape[1]
+                if kind in kept:
+                    total += of_kind @ np.array([value[i] for i in ids])
+            total = (total - total[mask].mean()) / one.scale_v_per_mps2[d]
+            squares += float(np.sum(total[mask] ** 2))
+            count += int(mask.sum())
+    return float(np.sqrt(squares / max(count, 1)))
+
+
+def flexible(series: Series) -> dict[str, np.ndarray]:
+    """Return basis functions by dimension, (n, k) each, of size 1 about."""
+    time_s, motion = series.time_s, series.motion
+    out: dict[str, np.ndarray] = {}
+    if series.reference == 'stage':
+        alpha, beta = motion.alpha(time_s), motion.beta(time_s)
+        rates = [motion.alpha(time_s, 1), motion.beta(time_s, 1)]
+        f = np.array(specific_force(alpha, beta, 1.0))
+        out['force'] = _products(f)
+        out['alpha_rad'] = _splines(alpha, 6)
+        out['beta_rad'] = np.column_stack([g(k * beta) for k in (1, 2, 3, 4)
+                                           for g in (np.sin, np.cos)])
+        scale = [max(float(np.abs(r).max()), 1e-9) for r in rates]
+        parts = [r / s for r, s in zip(rates, scale) if s > 1e-3]
+        if parts:
+            out['rate'] = np.column_stack([g for r in parts for g in (
+                r, r * r, r * f[0], r * f[1], r * f[2], np.abs(r))])
+            turns = [_direction(r) for r in parts]
+            out['direction'] = np.column_stack([t * g for t in turns
+                                                for g in (np.ones_like(t), *f)])
+            turned = np.column_stack([np.abs(r) * s > 1e-3 for r, s in zip(rates, scale)])
+            since = _since(time_s, np.any(turned, axis=1))
+            out['since_move_s'] = np.column_stack([np.exp(-since / tau) for tau in (1, 4, 16)])
+    elif series.reference == 'sim' and motion.force is not None:
+        f = np.array([v / G0_MPS2 for v in motion.force(time_s)])
+        out['force'] = _products(f)
+    for name in ('temperature_c', 'supply_v'):
+        path = getattr(motion, name)
+        if path is not None:
+            values = path(time_s)
+            if np.ptp(values) > (0.5 if name == 'temperature_c' else 0.01):
+                out[name] = _splines(values, 5)
+    out['time_s'] = (np.arange(1, 25)[None] * (time_s[-1] - time_s[0]) / 25 + time_s[0]
+                     < time_s[:, None]).astype(float)
+    return {kind: values - values.mean(axis=0) for kind, values in out.items()}
+
+
+def _products(f: np.ndarray) -> np.ndarray:
+    x, y, z = f
+    powers = [(i, j, k) for i in range(5) for j in range(5) for k in range(5)
+              if 2 <= i + j + k <= 4]
+    return np.column_stack([x ** i * y ** j * z ** k for i, j, k in powers])
+
+
+def _splines(values: np.ndarray, count: int) -> np.ndarray:
+    low, high = float(values.min()), float(values.max())
+    if high - low < 1e-6:
+        return np.zeros((len(values), 0))
+    inner = np.linspace(low, high, count - 2)
+    knots = np.concatenate([[low] * 3, inner, [high] * 3])
+    return BSpline.design_matrix(np.clip(values, low, high), knots, 3).toarray()[:, 1:]
+
+
+def _direction(rate: np.ndarray) -> np.ndarray:
+    """Direction of the last move, −1, 0 before the first, or 1."""
+    moving = np.abs(rate) > 1e-3
+    last = np.maximum.accumulate(np.where(moving, np.arange(len(rate)), -1))
+    return np.where(last >= 0, np.sign(rate[np.maximum(last, 0)]), 0.0)
+
+
+def _since(time_s: np.ndarray, moving: np.ndarray) -> np.ndarray:
+    last = np.maximum.accumulate(np.where(moving, time_s, -np.inf))
+    return np.minimum(time_s - last, 1e3)

@@ -1,0 +1,189 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+From hypotheses to a verdict: probabilities, sets that cannot be told apart, unknown.
+
+Evidence decides between hypotheses that the library holds. Three rules stand before it, because
+the library is never quite the truth: an effect must make a visible part of the gap, an effect more
+must be worth it, and what a flexible term finds beside the best hypothesis is unknown.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from adxl_ros.gap.noise_like import Sign
+from adxl_ros.gap.search import Hypothesis, NUISANCES, Study
+from adxl_ros.gap.unknown import Discrepancy
+from adxl_ros.model.coefficients import neutral
+from adxl_ros.model.effects import effect_named
+from adxl_ros.model.effects.base import Effect
+import numpy as np
+
+PRIOR = {0: 0.35, 1: 0.40, 2: 0.15, 3: 0.03}
+"""Of as many effects; what is left is unknown."""
+VISIBLE = 0.12
+"""An effect that makes less of the noise than this, rms, is not the gap."""
+SHARE = 0.02
+"""Nor is one that makes less of the squares of the gap than this."""
+RIVAL = 0.05
+"""A rival more probable than this cannot be told apart."""
+CERTAIN = 0.5
+UNKNOWN_NATS = 12.0
+UNKNOWN_OF_GAP, UNKNOWN_OF_NOISE = 0.3, 0.4
+"""What a flexible term must find, by the rms of the gap and of the noise, to be unknown."""
+_TEMPER = 0.5
+"""Nats count half: samples of a model that is nearly right are not quite independent."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """
+    The answer.
+
+    Attributes
+    ----------
+    status
+        Of interfaces: 'no_gap', 'explained', 'inseparable', 'unknown', 'insufficient'.
+    effects, groups
+        Named for certain; sets of which one is.
+    probability
+        Of that answer.
+    hypotheses
+        Effects and probability, the most probable first; they sum to 1.
+    best
+        The hypothesis that is taken.
+    places
+        Where an unknown shows, the strongest first.
+
+    """
+
+    status: str
+    effects: tuple[str, ...]
+    groups: tuple[tuple[str, ...], ...]
+    probability: float
+    hypotheses: tuple[tuple[tuple[str, ...], float], ...]
+    best: Hypothesis
+    places: tuple[str, ...] = ()
+
+
+def contribution_mps2(of: Study, found: Hypothesis, effect: str) -> float:
+    """Return what one effect of a hypothesis makes, rms about its mean, m/s²."""
+    library = effect_named(effect)
+    squares, count = 0.0, 0
+    for one, mask in zip(of.series, of.used):
+        sensor = replace(found.sensor, rate_hz=one.sensor.rate_hz)
+        without = replace(sensor, values={**sensor.values, effect: _baseline(of, effect, library)})
+        whole = (one.simulated(sensor) - one.simulated(without))[mask]
+        if effect not in NUISANCES:
+            whole = whole - whole.mean(axis=0)
+        squares += float(np.sum((whole / one.scale_v_per_mps2) ** 2))
+        count += whole.size
+    return float(np.sqrt(squares / max(count, 1)))
+
+
+def _baseline(of: Study, effect: str, library: Effect) -> dict[str, np.ndarray]:
+    sensor = of.series[0].sensor
+    return sensor.values[effect] if effect in sensor.effects else neutral(library, sensor.axes)
+
+
+def worthy(of: Study, found: Sequence[Hypothesis], noise_mps2: float) -> list[Hypothesis]:
+    """Keep the hypotheses of which each effect makes a visible part of the gap."""
+    kept = []
+    for one in found:
+        parts = [contribution_mps2(of, one, effect) for effect in one.effects]
+        whole = sum(p * p for p in parts)
+        if all(p > VISIBLE * noise_mps2 and p * p > SHARE * whole for p in parts):
+            kept.append(one)
+    return kept
+
+
+def judge(of: Study, found: Sequence[Hypothesis], discrepancy: Discrepancy | None,
+          signs: Sequence[Sign], noise_mps2: float, gap_mps2: float) -> Verdict:
+    """
+    Weigh the hypotheses.
+
+    Parameters
+    ----------
+    of
+        The recordings.
+    found
+        Worthy hypotheses, none among them.
+    discrepancy
+        Beside the most probable of them.
+    signs
+        Noise-like effects that show.
+    noise_mps2, gap_mps2
+        Rms of the noise, and of what the most probable hypothesis explains, m/s².
+
+    """
+    count = len({v.effect for v in of.variants})
+    ways = {0: 1, 1: count, 2: count * (count - 1) / 2, 3: count * (count - 1) * (count - 2) / 6}
+    weight = np.array([_TEMPER * h.log_evidence + np.log(PRIOR[len(h.effects)]
+                                                         / ways[len(h.effects)]) for h in found])
+    order = np.argsort(-weight, kind='stable')
+    found = [found[i] for i in order]
+    share = np.exp(weight[order] - weight[order[0]])
+    best = found[0]
+    unknown = 0.02
+    places: tuple[str, ...] = ()
+    if discrepancy is not None and discrepancy.gain > UNKNOWN_NATS \
+            and discrepancy.rms_mps2 > UNKNOWN_OF_NOISE * noise_mps2 \
+            and discrepancy.rms_mps2 > UNKNOWN_OF_GAP * gap_mps2:
+        unknown = 0.9
+        places = tuple(sorted((k for k, g in discrepancy.where.items() if g > UNKNOWN_NATS),
+                              key=lambda k: -discrepancy.where[k]))
+    known = share / share.sum() * (1 - unknown)
+    loud = tuple(sign.effect for sign in signs if sign.effect != 'unknown')
+    if any(sign.effect == 'unknown' for sign in signs):
+        unknown = max(unknown, 0.9)
+        known = known / known.sum() * (1 - unknown)
+        places = (*places, 'frequency')
+    listed = [(tuple(sorted((*h.effects, *loud))), float(p)) for h, p in zip(found, known)]
+    listed.append((('unknown',), float(unknown)))
+    listed.sort(key=lambda one: -one[1])
+    if unknown > CERTAIN:
+        return Verdict('unknown', (), (), float(unknown), tuple(listed), best, places)
+    rivals = _rivals(found, known)
+    certain = tuple(sorted((*(e for e in best.effects if len(rivals[e]) == 1), *loud)))
+    groups = tuple(sorted({tuple(sorted(rivals[e])) for e in best.effects
+                           if len(rivals[e]) > 1}))
+    inside = {frozenset((*certain, *loud)) | set(choice) for choice in _choices(groups)}
+    probability = float(sum(p for effects, p in listed if frozenset(effects) in inside))
+    if not best.effects and not loud:
+        return Verdict('no_gap', (), (), float(known[0]), tuple(listed), best)
+    status = 'inseparable' if groups else 'explained'
+    return Verdict(status, certain, groups, probability, tuple(listed), best)
+
+
+def _rivals(found: Sequence[Hypothesis], known: np.ndarray) -> dict[str, set[str]]:
+    """Return by effect of the best hypothesis those that could stand in its place."""
+    best = found[0]
+    out = {effect: {effect} for effect in best.effects}
+    for h, p in zip(found[1:], known[1:]):
+        if p < RIVAL * known[0] or len(h.effects) != len(best.effects):
+            continue
+        gone, new = set(best.effects) - set(h.effects), set(h.effects) - set(best.effects)
+        for effect in gone:
+            out[effect] |= new
+    return out
+
+
+def _choices(groups: Sequence[Sequence[str]]) -> list[tuple[str, ...]]:
+    out: list[tuple[str, ...]] = [()]
+    for group in groups:
+        out = [(*one, effect) for one in out for effect in group]
+    return out

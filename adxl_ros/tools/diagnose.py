@@ -1,0 +1,80 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Find where a recording differs from the simulator, and which effect causes it."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+from adxl_ros.errors import UserError
+from adxl_ros.files import params, recording
+from adxl_ros.files.atomic import atomic_path
+from adxl_ros.files.followed import felt
+from adxl_ros.gap import diagnose as gap, page, report
+from adxl_ros.tools.common import default_params, make_folder, progress, run, say_notes
+
+
+def parser() -> argparse.ArgumentParser:
+    """Describe the command line."""
+    parse = argparse.ArgumentParser(prog='diagnose', description=__doc__)
+    parse.add_argument('recording', nargs='+',
+                       help='rosbag2 directory, .mcap or CSV, all of one unit')
+    parse.add_argument('--params', metavar='FILE', default=None,
+                       help='what the simulator models (default: the nominal ADXL203)')
+    parse.add_argument('--sim', metavar='RECORDING',
+                       help='ideal specific force of the same manoeuvre by another simulator')
+    parse.add_argument('--seed', type=int, default=0, help='of bootstraps (default 0)')
+    parse.add_argument('--json', action='store_true', help='print the report as JSON')
+    parse.add_argument('-o', dest='output', metavar='DIR', required=True)
+    return parse
+
+
+def diagnose(options: argparse.Namespace) -> int:
+    """Run the tool; see `parser`."""
+    if options.seed < 0:
+        raise UserError(f'--seed {options.seed}: must not be negative')
+    if options.sim and len(options.recording) > 1:
+        raise UserError(f'--sim {options.sim}: goes with one recording, but '
+                        f'{len(options.recording)} are given')
+    sensor = params.load(options.params or default_params())
+    sim = felt(options.sim, False)[0] if options.sim else None
+    recordings = []
+    for path in options.recording:
+        recordings.append(recording.read(path))
+        say_notes('diagnose', recordings[-1])
+    with progress('diagnose') as show:
+        found = gap.diagnose(recordings, sensor, sim, options.seed, show)
+    folder = Path(options.output)
+    make_folder(folder)
+    text = json.dumps(report.as_json(found), indent=1, allow_nan=False) + '\n'
+    _write(folder / 'report.json', text)
+    _write(folder / 'report.html', page.page(found, ', '.join(
+        Path(path).name for path in options.recording)))
+    if found.sensor is not None:
+        params.save(folder / 'params.yaml', found.sensor, report.screenful(found))
+    print(text if options.json else '\n'.join(report.screenful(found)))
+    return 0
+
+
+def _write(path: Path, text: str) -> None:
+    with atomic_path(path) as fresh:
+        Path(fresh).write_text(text, encoding='utf-8')
+
+
+def main() -> int:
+    """Run the tool on the command line."""
+    return run(parser(), diagnose)

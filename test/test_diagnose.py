@@ -1,0 +1,180 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""`diagnose`: gaps that are made on purpose, and recordings that are no good."""
+
+from dataclasses import replace
+import json
+
+from adxl_ros.files import params, recording
+from adxl_ros.files.columns import Recording, sensor_info
+from adxl_ros.gap import report
+from adxl_ros.gap.diagnose import diagnose
+from adxl_ros.model import trajectory
+from adxl_ros.model.motion import Knots, Motion
+from adxl_ros.model.simulate import simulate
+from adxl_ros.tools.effect_option import with_effects
+import numpy as np
+import pytest
+from units import nominal
+
+KEYS = {'schema', 'verdict', 'hypotheses', 'gap', 'where', 'candidates', 'next_experiment'}
+
+
+def unit(axes='xyz', rate_hz=125.0):
+    """Return a calibrated unit."""
+    rng = np.random.default_rng(1)
+    count = len(axes)
+    names = tuple(f'{p}.{a}' for p in ('bias.offset_v', 'scale_factor.offset_v_per_g')
+                  for a in axes)
+    return replace(
+        nominal(axes), rate_hz=rate_hz, stage_resolution_rad=1e-4, model='linear',
+        effects=('bias', 'scale_factor'), covariance_names=names,
+        covariance=np.eye(2 * count) * 1e-9,
+        values={'bias': {'offset_v': rng.normal(size=count) * 0.03},
+                'scale_factor': {'offset_v_per_g': rng.normal(size=count) * 0.02}})
+
+
+def turned():
+    """Turn beta in two planes at two speeds, with rests, and warm up by 12 degC."""
+    script = trajectory.Script(np.pi / 2, 0.0)
+    for alpha in (np.pi / 2, np.pi / 4, 2.0):
+        script.go(alpha, 0.0)
+        script.rest(3.0)
+        for to, speed in ((2.0, 0.6), (0.5, 1.5), (6.0, 1.0), (3.0, 2.5), (0.0, 0.8)):
+            script.run('beta', to, speed)
+            script.rest(1.0)
+    alpha, beta = script.joints()
+    warm = Knots([0.0, script.now / 3, 2 * script.now / 3, script.now], [25.0, 25.0, 37.0, 33.0])
+    return Motion(script.now, alpha, beta, temperature_c=warm)
+
+
+def made(sensor, effects=(), seed=3, change=None):
+    """Simulate a recording with effects."""
+    columns = simulate(with_effects(sensor, list(effects)), turned(), seed)
+    if change is not None:
+        columns = change(columns)
+    time_s = columns.pop('time_s')
+    return Recording('made', time_s, columns, sensor_info(sensor))
+
+
+def diagnosed(sensor, *effects, change=None):
+    """Diagnose such a recording by the library call."""
+    found = diagnose([made(sensor, effects, change=change)], sensor)
+    told = report.as_json(found)
+    assert set(told) >= KEYS
+    return told, found
+
+
+def test_no_gap():
+    """A unit that is what its file says, but for a little drift."""
+    told, _ = diagnosed(unit(), 'bias_walk:density_g_per_rts=2e-5')
+    assert told['verdict'] == {'status': 'no_gap', 'effects': [], 'groups': [],
+                               'data_fault': None, 'probability': 0.98}
+    assert told['gap']['floor_source'] == 'still'
+    assert told['gap']['before'] == pytest.approx(5.3e-3, rel=0.1)
+
+
+@pytest.mark.parametrize('option, parameter, value', [
+    ('temperature_bias:per_k=4e-4', 'per_k.x', 4e-4),
+    ('backlash:alpha_rad=0.004,beta_rad=0.004', 'beta_rad', 0.004),
+    ('misalignment:alpha_rad=0.003,beta_rad=-0.002', 'alpha_rad.y', 0.003)])
+def test_one_effect_is_named_and_the_gap_closed(option, parameter, value):
+    """Name, parameter, and nearly all of the gap closed."""
+    name = option.split(':')[0]
+    told, _ = diagnosed(unit(), option)
+    assert (told['verdict']['status'], told['verdict']['effects']) == ('explained', [name])
+    found = next(c for c in told['candidates'] if c['effect'] == name)
+    assert found['parameters'][parameter]['value'] == pytest.approx(value, rel=0.1)
+    assert told['gap']['closed'] > 0.95
+    assert sum(h['probability'] for h in told['hypotheses']) == pytest.approx(1, abs=1e-9)
+
+
+def test_what_the_library_does_not_hold_is_unknown():
+    """A zero-g that follows the fourth harmonic of beta: unknown, and over beta."""
+    def change(columns):
+        for axis, phase in (('x', 0.0), ('y', 1.0), ('z', 2.0)):
+            columns[f'{axis}_v'] = columns[f'{axis}_v'] + 4e-3 * np.sin(
+                4 * columns['beta_rad'] + phase)
+        return columns
+
+    told, _ = diagnosed(unit(), change=change)
+    assert told['verdict']['status'] == 'unknown'
+    assert {'effects': ['unknown'], 'probability': 0.9} in told['hypotheses']
+    assert 'beta_rad' in told['unknown_where']
+
+
+@pytest.mark.parametrize('option, effect', [
+    ('mains_hum:amplitude_v=0.003', 'mains_hum'),
+    ('noise_excess:ratio=1.0', 'noise_excess'),
+    ('spikes:rate_hz=0.5,amplitude_v=0.05', 'spikes'),
+    ('stuck:rate_hz=0.2,duration_s=0.1', 'stuck'),
+    ('quantisation:lost_bits=4', 'quantisation')])
+def test_noise_like_effects_are_named(option, effect):
+    """By their own statistics: a line, a level, what stands alone, what repeats, steps."""
+    verdict = diagnosed(unit(), option)[0]['verdict']
+    assert (verdict['status'], verdict['effects']) == ('explained', [effect])
+
+
+@pytest.mark.parametrize('change, fault', [
+    (lambda c: c | {'x_v': c['y_v'], 'y_v': c['x_v']}, 'axis_swapped'),
+    (lambda c: c | {'y_v': 5 - c['y_v']}, 'axis_inverted'),
+    (lambda c: c | {a: (c[a] - 2.5) * 9.80665 + 2.5 for a in ('x_v', 'y_v', 'z_v')}, 'unit'),
+    (lambda c: c | {a: np.roll(c[a], 300) for a in ('x_v', 'y_v', 'z_v')}, 'time_misaligned'),
+    (lambda c: c | {'x_v': np.where(np.arange(len(c['x_v'])) % 2, np.nan, c['x_v'])}, 'missing'),
+    (lambda c: c | {'x_v': np.clip(c['x_v'], 2.4, 2.6)}, 'saturated')])
+def test_faults_of_the_recording_are_called_what_they_are(change, fault):
+    """Never a confident wrong effect: the fault is named and nothing else is."""
+    told, found = diagnosed(unit(), change=change)
+    assert (told['verdict']['status'], told['verdict']['data_fault']) == ('bad_data', fault)
+    assert told['verdict']['effects'] == [] and found.sensor is None
+
+
+def test_too_short_is_insufficient():
+    """Ten seconds say nothing."""
+    told, _ = diagnosed(unit(), change=lambda c: {k: v[:1250] for k, v in c.items()})
+    assert told['verdict']['status'] == 'insufficient'
+    assert 'too short' in told['summary']
+
+
+def test_the_command_leaves_report_page_and_parameters(run_tool, tmp_path):
+    """Twice the same to the byte; with the parameters that it writes there is no gap left."""
+    sensor = unit('xy')
+    read = made(sensor, ['temperature_bias:per_k=4e-4'])
+    recording.write(tmp_path / 'run.csv', read, sensor)
+    params.save(tmp_path / 'unit.yaml', sensor)
+    files = []
+    for name in ('a', 'b'):
+        done = run_tool('diagnose', 'run.csv', '--params', 'unit.yaml', '-o', name)
+        assert (done.returncode, done.stderr) == (0, '')
+        assert done.stdout.startswith('temperature_bias (probability')
+        files.append([(tmp_path / name / f).read_bytes()
+                      for f in ('report.json', 'report.html', 'params.yaml')])
+    assert files[0] == files[1]
+    page = files[0][1].decode()
+    assert 'temperature_bias' in page and 'http' not in page
+    again = run_tool('diagnose', 'run.csv', '--params', 'a/params.yaml', '-o', 'c', '--json')
+    assert json.loads(again.stdout)['verdict']['status'] == 'no_gap'
+
+
+@pytest.mark.parametrize('name', ['no_gap', 'temperature_bias', 'time_offset'])
+def test_samples_of_another_generator(run_tool, tmp_path, shared_dir, name):
+    """The three samples come out right from `fit --model linear` and `diagnose`."""
+    folder = shared_dir / 'samples' / name
+    run_tool('fit', folder / 'cal.csv', '--model', 'linear', '-o', tmp_path / 'unit.yaml')
+    done = run_tool('diagnose', folder / 'run.csv', '--params', tmp_path / 'unit.yaml', '-o',
+                    tmp_path / 'out', '--json')
+    verdict = json.loads(done.stdout)['verdict']
+    assert verdict['effects'] == ([] if name == 'no_gap' else [name])
+    assert verdict['status'] == ('no_gap' if name == 'no_gap' else 'explained')
