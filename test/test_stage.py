@@ -105,6 +105,8 @@ def test_the_simulated_sensor_feels_the_true_angles(start, speed):
     with Commander() as graph:
         samples = graph.listen(Imu, 'imu/data_raw', raw=True)
         graph.spin_until(lambda: graph.said('driver', 'on the stage') and graph.true, 20, 'both')
+        # The driver knows the stage from its first message on, not from its discovery.
+        graph.spin_until(lambda: len(samples) > 500 and len(graph.true) > 50, 20, 'a while')
         del samples[:]
         graph.go(alpha=0.8, beta=-0.5)
         graph.go(alpha=1.5, beta=0.7)
