@@ -132,9 +132,12 @@ def judge(found: full.FullFit) -> list[Term]:
     for name in dict.fromkeys(linear.term):
         if name in ALWAYS or name in full.GAUGE:
             continue
-        inside = linear.base[linear.term == name].all()
-        changed = linear.base & (linear.term != name) if inside else \
-            linear.base | (linear.term == name)
+        own = linear.term == name
+        if name == 'misalignment':
+            # The linear cross-axis terms would stand in for it.
+            own = own | (np.isin(linear.term, full.GAUGE) & linear.base)
+        inside = linear.base[own].all()
+        changed = linear.base & ~own if inside else linear.base | own
         gain = (linear.held_out(changed) - with_all) / 2 * (1 if inside else -1)
         spread = max(float(np.std(gain)) * np.sqrt(len(gain)), 1e-12)
         judged.append(Term(str(name), bool(inside), float(gain.sum()),
