@@ -22,7 +22,7 @@ from adxl_ros.errors import UserError
 from adxl_ros.files import recording
 from adxl_ros.files.columns import JOINTS, Recording
 from adxl_ros.model.follow import Force, Smoothed
-from adxl_ros.model.motion import Held, Motion
+from adxl_ros.model.motion import Held, Motion, Path
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
@@ -82,10 +82,14 @@ def followed(read: Recording, sensor: Sensor) -> Motion:
         if joint != 'shift':
             _check_speed(read, name, steps[joint])
         joints[joint] = Smoothed(read.time_s, values, steps[joint])
-    around = {name: Smoothed(read.time_s, read.columns[name], 0.0)
-              for name in ('temperature_c', 'supply_v')
-              if name in read.columns and np.isfinite(read.columns[name]).any()}
-    return Motion(float(read.time_s[-1] - read.time_s[0]), **joints, **around)
+    return Motion(float(read.time_s[-1] - read.time_s[0]), **joints, **surroundings(read))
+
+
+def surroundings(read: Recording) -> dict[str, Path]:
+    """Return what a recording holds of temperature, °C, and supply, V, as paths by name."""
+    return {name: Smoothed(read.time_s, read.columns[name], 0.0)
+            for name in ('temperature_c', 'supply_v')
+            if name in read.columns and np.isfinite(read.columns[name]).any()}
 
 
 def _check_speed(read: Recording, name: str, step: float) -> None:

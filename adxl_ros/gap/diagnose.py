@@ -17,7 +17,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from adxl_ros.calibrate.recorded import rate_hz
 from adxl_ros.files.columns import Recording
@@ -26,18 +26,18 @@ from adxl_ros.gap import faults, noise_like, search, unknown, verdict
 from adxl_ros.gap.far import Shrunk, shrunk
 from adxl_ros.gap.faults import Fault
 from adxl_ros.gap.floor import Floor, floor
+from adxl_ros.gap.likeness import Likeness, likeness
+from adxl_ros.gap.local import Hypothesis
 from adxl_ros.gap.next_step import Next, proposed
 from adxl_ros.gap.noise_like import Sign
-from adxl_ros.gap.search import Hypothesis, Study
-from adxl_ros.gap.series import Series, series_of
+from adxl_ros.gap.scores import Score, scores
+from adxl_ros.gap.series import Series, series_of, thinned
+from adxl_ros.gap.study import Study, study, WANDERING
 from adxl_ros.gap.verdict import Verdict
 from adxl_ros.gap.where import Cell, covered, map_of
 from adxl_ros.model.motion import Motion
 from adxl_ros.model.sensor import Sensor, with_axes
 import numpy as np
-
-_HARMLESS = 0.0
-"""A hypothesis whose closed share may be below this on what was held out is not confirmed."""
 
 
 @dataclass(frozen=True)
@@ -55,6 +55,10 @@ class Diagnosis:
         The answer, and what was weighed.
     study
         Residuals and tangents.
+    scores
+        Of each effect alone, on tangents.
+    alike
+        Recorded noise by simulated noise, recording by recording, before and after.
     sensor
         The baseline with what was found, ready for `simulate`.
 
@@ -72,6 +76,8 @@ class Diagnosis:
     missing: tuple[str, ...] = ()
     proposal: Next | None = None
     study: Study | None = None
+    scores: dict[str, Score] = field(default_factory=dict)
+    alike: tuple[tuple[Likeness, ...], tuple[Likeness, ...]] = ((), ())
     sensor: Sensor | None = None
 
 
@@ -101,61 +107,86 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
     """
     if not sensor.effects:
         sensor = with_axes(sensor, recordings[0].axes)
-    series, used, signs = [], [], []
+    full, counted, signs = [], [], []
     for read in recordings:
         check_unit(read.info, read.axes, sensor, read.path)
-        rate = rate_hz(read)
-        one = series_of(read, replace(sensor, rate_hz=rate), rate, sim)
-        fault = faults.look(one)
+        one = series_of(read, replace(sensor, rate_hz=rate_hz(read)), sim)
+        thin = thinned(one)
+        fault = faults.look(one, thin)
         if fault is not None:
             return Diagnosis(fault, [one], [np.ones(len(one), bool)])
-        volts = read.volts(sensor)
-        coarse = noise_like.coarse_steps(volts, sensor)
+        coarse = noise_like.coarse_steps(one.volts, sensor)
         if coarse is not None:
             signs.append(coarse)
             bits = round(sensor.adc_bits - float(coarse.values['lost_bits']))
             one = replace(one, sensor=replace(one.sensor, adc_bits=bits))
-        good, of_samples = noise_like.bad_samples(volts, read.time_s,
-                                                  replace(one.sensor, rate_hz=rate))
-        every = max(1, round(rate / one.sensor.rate_hz))
-        series.append(one)
-        used.append(good[::every][:len(one)])
+        good, of_samples = noise_like.bad_samples(one.volts, one.time_s, one.sensor)
+        full.append(one)
+        counted.append(good)
         signs += of_samples
     show(0.05)
-    study = search.study(series, used, lambda done: show(0.05 + 0.25 * done))
-    base = floor(series, used)
+    series = [thinned(one) for one in full]
+    used = [good[::round(one.sensor.rate_hz / thin.sensor.rate_hz)]
+            for one, thin, good in zip(full, series, counted)]
+    weighed = study(series, used, lambda done: show(0.05 + 0.25 * done))
+    base = floor(full, counted)
     noise_mps2 = float(np.sqrt(np.mean((base.noise_v / series[0].scale_v_per_mps2) ** 2)))
-    found = verdict.worthy(study, search.search(
-        study, lambda done: show(0.3 + 0.4 * done)), noise_mps2)
+    found = verdict.worthy(weighed, search.search(
+        weighed, lambda done: show(0.3 + 0.4 * done)), noise_mps2)
     far = None
     while found[0].effects:
-        far = shrunk(study, found[0], base, seed)
-        if far.closed_ci[1] > _HARMLESS and not far.harm:
+        far = shrunk(weighed, full, counted, found[0], base, seed)
+        if far.predicted > 0 and not far.harm:
             break
         # What does not hold on stretches held out is not the cause.
         found, far = found[1:], None
     best = found[0]
     show(0.8)
-    beside = unknown.discrepancy(study, best)
-    explained = float(np.sqrt(sum(verdict.contribution_mps2(study, best, effect) ** 2
+    beside = unknown.discrepancy(weighed, best)
+    explained = float(np.sqrt(sum(verdict.contribution_mps2(weighed, best, effect) ** 2
                                   for effect in best.effects)))
-    for one, mask in zip(series, used):
+    for one, mask in zip(full, counted):
         there = replace(best.sensor, rate_hz=one.sensor.rate_hz)
-        signs += noise_like.of_residual(one.volts - one.simulated(there), mask,
+        signs += noise_like.of_residual(one.residual(best.sensor), mask,
                                         replace(one, sensor=there))
     signs = list({sign.effect: sign for sign in sorted(signs, key=lambda s: s.nats)}.values())
-    answer = verdict.judge(study, found, beside, signs, noise_mps2, explained)
+    if far is None:
+        far = shrunk(weighed, full, counted, replace(best, effects=()), base, seed)
+    found[0] = best = _drift_named(best, full, counted)
+    loud = _with_signs(best.sensor, signs, sensor)
+    alike = [[likeness(one, one.residual(mean), mask, whole, seed)
+              for one, mask in zip(full, counted)]
+             for mean, whole in ((sensor, sensor), (best.sensor, loud))]
+    as_noise = float(np.sqrt(np.mean([one.sigma_mps2 ** 2 for one in alike[1]])))
+    answer = verdict.judge(weighed, found, beside, signs, noise_mps2, explained,
+                           verdict.left(far, as_noise))
     answer = _insufficient(answer, series)
     show(0.9)
-    if far is None:
-        far = shrunk(study, replace(best, effects=()), base, seed)
-    residual = series[0].volts - series[0].simulated(series[0].sensor)
-    cells = map_of(series[0], residual, used[0], base.rms_mps2, seed)
+    cells = map_of(series[0], series[0].residual(series[0].sensor), used[0], base.rms_mps2, seed)
     missing = covered(series)
+    alone = scores(weighed, seed)
     show(1.0)
     return Diagnosis(None, series, used, base, answer, tuple(found), tuple(signs), far,
-                     tuple(cells), tuple(missing), proposed(answer, missing), study,
-                     _with_signs(best.sensor, signs, sensor, answer))
+                     tuple(cells), tuple(missing), proposed(answer, missing), weighed, alone,
+                     (tuple(alike[0]), tuple(alike[1])),
+                     sensor if answer.status in ('no_gap', 'unknown', 'insufficient') else loud)
+
+
+def _drift_named(best: Hypothesis, full: Sequence[Series], counted: Sequence[np.ndarray]
+                 ) -> Hypothesis:
+    """Call a drift of the zero-g flicker where its spectrum says so."""
+    if WANDERING not in best.effects:
+        return best
+    signs = [noise_like.drift(one.residual(best.sensor), mask, one)
+             for one, mask in zip(full, counted)]
+    sign = max((s for s in signs if s is not None), key=lambda s: s.nats, default=None)
+    if sign is None or sign.effect == WANDERING:
+        return best
+    effects = tuple(sign.effect if e == WANDERING else e for e in best.effects)
+    values = {name: of for name, of in best.sensor.values.items() if name != WANDERING}
+    sensor = replace(best.sensor, values={**values, sign.effect: sign.values}, effects=tuple(
+        sign.effect if e == WANDERING else e for e in best.sensor.effects))
+    return replace(best, effects=effects, sensor=sensor)
 
 
 def _insufficient(answer: Verdict, series: Sequence[Series]) -> Verdict:
@@ -172,11 +203,8 @@ def _insufficient(answer: Verdict, series: Sequence[Series]) -> Verdict:
     return replace(answer, status='insufficient')
 
 
-def _with_signs(found: Sensor, signs: Sequence[Sign], baseline: Sensor, answer: Verdict
-                ) -> Sensor:
+def _with_signs(found: Sensor, signs: Sequence[Sign], baseline: Sensor) -> Sensor:
     """Put the noise-like effects beside those of the mean, at the baseline's rate."""
-    if answer.status in ('no_gap', 'unknown', 'insufficient'):
-        return baseline
     effects, values = list(found.effects), dict(found.values)
     for sign in signs:
         if sign.effect != 'unknown':

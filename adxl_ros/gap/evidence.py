@@ -31,7 +31,7 @@ from itertools import pairwise
 from adxl_ros.gap.whiten import Whitener
 import numpy as np
 
-BLOCKS = 24
+BLOCKS = 48
 """Stretches that a recording is cut into, to hold some out."""
 _ROUNDS = 3
 _TINY = 1e-300
@@ -50,8 +50,8 @@ class Channel:
         Products of the whitened residual (first) and columns, by walk and block, (w, b, k+1, k+1).
     counts
         Samples by block, (b,).
-    log_priors
-        Of the walks, (w,).
+    log_priors, healthy
+        Of the walks, and whether a unit that does not wander may have them, (w,).
 
     """
 
@@ -59,6 +59,7 @@ class Channel:
     grams: np.ndarray
     counts: np.ndarray
     log_priors: np.ndarray
+    healthy: np.ndarray
 
 
 def channel(residual: np.ndarray, columns: np.ndarray, ids: np.ndarray, used: np.ndarray,
@@ -78,17 +79,19 @@ def channel(residual: np.ndarray, columns: np.ndarray, ids: np.ndarray, used: np
         From `whiten.whiteners`.
 
     """
-    data = bridged(np.column_stack([residual, columns]), used)
-    edges = np.linspace(0, len(data), BLOCKS + 1).astype(int)
-    grams = np.empty((len(filters), BLOCKS, data.shape[1], data.shape[1]))
+    data = np.ascontiguousarray(bridged(np.column_stack([residual, columns]), used).T)
+    edges = np.linspace(0, len(used), BLOCKS + 1).astype(int)
+    grams = np.empty((len(filters), BLOCKS, len(data), len(data)))
     for i, whiten in enumerate(filters):
-        white = whiten(data) * used[:, None]
+        white = whiten(data)
+        white[:, ~used] = 0.0
         # The first sample is a step from nothing.
-        white[0] = 0.0
+        white[:, 0] = 0.0
         for b, (begin, end) in enumerate(pairwise(edges)):
-            grams[i, b] = white[begin:end].T @ white[begin:end]
+            grams[i, b] = white[:, begin:end] @ white[:, begin:end].T
     counts = np.add.reduceat(used, edges[:-1]).astype(float)
-    return Channel(ids, grams, counts, np.array([f.log_prior for f in filters]))
+    return Channel(ids, grams, counts, np.array([f.log_prior for f in filters]),
+                   np.array([f.healthy for f in filters]))
 
 
 def bridged(data: np.ndarray, used: np.ndarray) -> np.ndarray:
@@ -124,7 +127,8 @@ class Fit:
 
 
 def fit(channels: Sequence[Channel], ids: Sequence[int], prior: np.ndarray,
-        blocks: np.ndarray | None = None, start: Fit | None = None) -> Fit:
+        blocks: np.ndarray | None = None, start: Fit | None = None, wanders: bool = False
+        ) -> Fit:
     """
     Fit a hypothesis.
 
@@ -140,6 +144,8 @@ def fit(channels: Sequence[Channel], ids: Sequence[int], prior: np.ndarray,
         Which blocks count, (b,); all of them unless given.
     start
         A fit with walks and variances near those of this one.
+    wanders
+        The zero-g may wander more than that of a healthy unit.
 
     """
     own = np.array(sorted(ids), int)
@@ -151,7 +157,9 @@ def fit(channels: Sequence[Channel], ids: Sequence[int], prior: np.ndarray,
         grams.append((np.searchsorted(own, c.ids[at]),
                       c.grams[:, chosen].sum(axis=1)[:, rows[:, None], rows]))
         counts.append(max(float(c.counts[chosen].sum()), 1.0))
-    walks = list(start.walks) if start else [len(c.log_priors) // 2 for c in channels]
+    priors = [np.where(c.healthy | wanders | ~c.healthy.any(), c.log_priors, -np.inf)
+              for c in channels]
+    walks = list(start.walks) if start else [int(np.argmax(p)) for p in priors]
     variance = np.array([g[w, 0, 0] / n for (_, g), w, n in zip(grams, walks, counts)])
     known = prior[own] ** -2.0
     for _ in range(_ROUNDS):
@@ -162,8 +170,8 @@ def fit(channels: Sequence[Channel], ids: Sequence[int], prior: np.ndarray,
         factor = np.linalg.cholesky(precision)
         values = np.linalg.solve(factor.T, np.linalg.solve(factor, pull))
         left = [_left(g, values[at]) for at, g in grams]
-        walks = [int(np.argmax(-n / 2 * np.log(np.maximum(r, _TINY)) + c.log_priors))
-                 for r, n, c in zip(left, counts, channels)]
+        walks = [int(np.argmax(-n / 2 * np.log(np.maximum(r, _TINY)) + p))
+                 for r, n, p in zip(left, counts, priors)]
         variance = np.array([max(r[w], _TINY) / n for r, w, n in zip(left, walks, counts)])
     log_evidence = -0.5 * float(np.sum(known * values ** 2)) \
         - float(np.log(np.diag(factor)).sum()) + 0.5 * float(np.log(known).sum())
@@ -194,7 +202,9 @@ def predicted(channels: Sequence[Channel], found: Fit, blocks: np.ndarray) -> np
 def lost(channels: Sequence[Channel], found: Fit, values: np.ndarray, prior: np.ndarray,
          blocks: np.ndarray | None = None) -> float:
     """
-    Return what the log-posterior at other values of the coefficients lacks of its maximum, nats.
+    Return what the log-posterior at other values of coefficients lacks of its maximum, nats.
+
+    The other coefficients are at their best beside them.
 
     Parameters
     ----------
@@ -203,13 +213,16 @@ def lost(channels: Sequence[Channel], found: Fit, values: np.ndarray, prior: np.
     found
         The fit.
     values
-        Of all its coefficients, (k,).
+        Of the first coefficients, (j,).
 
     """
     chosen = np.ones(BLOCKS, bool) if blocks is None else blocks
-    off = values - found.values
+    count = len(values)
+    off = values - found.values[:count]
     precision = np.diag(prior[found.ids] ** -2.0)
     for c, w, s2 in zip(channels, found.walks, found.variance):
         at = np.searchsorted(found.ids, c.ids)
         precision[np.ix_(at, at)] += c.grams[w][chosen].sum(axis=0)[1:, 1:] / s2
-    return 0.5 * float(off @ precision @ off)
+    own, across, rest = precision[:count, :count], precision[:count, count:], \
+        precision[count:, count:]
+    return 0.5 * float(off @ (own - across @ np.linalg.solve(rest, across.T)) @ off)

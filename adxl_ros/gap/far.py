@@ -21,15 +21,20 @@ the rms over held-out samples and axes, zero-g and scale at their posterior from
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 from adxl_ros.gap import evidence
 from adxl_ros.gap.evidence import BLOCKS
 from adxl_ros.gap.floor import Floor
-from adxl_ros.gap.search import Hypothesis, refined, Study
+from adxl_ros.gap.local import Hypothesis, local
+from adxl_ros.gap.series import Series
+from adxl_ros.gap.study import Study
+from adxl_ros.model.sensor import Sensor
 import numpy as np
 
-_FOLDS = 2
+_FOLDS, _RUN = 4, 2
+_HARM = 1.005
 _DRAWS = 400
 
 
@@ -44,6 +49,10 @@ class Shrunk:
         (before² − after²)/(before² − floor²), held out; nan where there is no gap to close.
     harm
         Whether after is more than before.
+    within_mps2
+        Rms about the fit to all stretches, none held out.
+    predicted
+        Nats by which stretches held out are more likely with the effects than without.
 
     """
 
@@ -53,16 +62,21 @@ class Shrunk:
     closed: float
     closed_ci: tuple[float, float]
     harm: bool
+    within_mps2: float
+    predicted: float
 
 
-def shrunk(of: Study, best: Hypothesis, floor: Floor, seed: int) -> Shrunk:
+def shrunk(of: Study, full: Sequence[Series], counted: Sequence[np.ndarray], best: Hypothesis,
+           floor: Floor, seed: int) -> Shrunk:
     """
-    Fit on half of the stretches and simulate the other, both ways.
+    Fit on half of the stretches and simulate the other at the full rate, both ways.
 
     Parameters
     ----------
     of
-        The recordings.
+        The recordings as searched.
+    full, counted
+        The same at their full rate, and the samples that count.
     best
         Effects whose parameters are fitted anew.
     floor
@@ -73,20 +87,23 @@ def shrunk(of: Study, best: Hypothesis, floor: Floor, seed: int) -> Shrunk:
     """
     number = np.arange(BLOCKS)
     before, after, counts = np.zeros(BLOCKS), np.zeros(BLOCKS), np.zeros(BLOCKS)
-    start = dict(zip(best.names, best.values))
+    plain = local(of, (), of.series[0].sensor)
+    found = local(of, best.effects, best.sensor)
+    predicted = 0.0
     for fold in range(_FOLDS):
-        out = (number // 3) % _FOLDS == fold
+        out = (number // _RUN) % _FOLDS == fold
         near = np.convolve(out, np.ones(3), 'same') > 0
-        fitted = refined(of, best.effects, start, {}, ~near if (~near).sum() > 6 else ~out)
-        plain = refined(of, (), {}, {}, ~near if (~near).sum() > 6 else ~out)
-        for one, mask in zip(of.series, of.used):
-            edges = np.linspace(0, len(one), BLOCKS + 1).astype(int)
-            for sensor, total in ((plain.sensor, before), (fitted.sensor, after)):
-                off = one.volts - one.simulated(replace(sensor, rate_hz=one.sensor.rate_hz))
-                squares = np.where(mask[:, None], (off / one.scale_v_per_mps2) ** 2,
-                                   0.0).mean(axis=1)
-                total[out] += np.add.reduceat(squares, edges[:-1])[out]
+        for here, total, sign in ((plain, before, -1.0), (found, after, 1.0)):
+            fit = here.fit(~near)
+            predicted += sign * float(evidence.predicted(
+                here.channels, fit, np.flatnonzero(out)).sum())
+            sensor = here.fitted(fit)
+            for one, mask in zip(full, counted):
+                total[out] += _by_block(one, mask, sensor)[out]
+        for mask in counted:
+            edges = np.linspace(0, len(mask), BLOCKS + 1).astype(int)
             counts[out] += np.add.reduceat(mask, edges[:-1])[out]
+    within = sum(_by_block(one, mask, best.sensor).sum() for one, mask in zip(full, counted))
     f2 = floor.rms_mps2 ** 2
     b2, a2 = before.sum() / counts.sum(), after.sum() / counts.sum()
     rng = np.random.default_rng(seed)
@@ -99,10 +116,12 @@ def shrunk(of: Study, best: Hypothesis, floor: Floor, seed: int) -> Shrunk:
     closed = (b2 - a2) / (b2 - min(f2, a2)) if b2 > f2 else float('nan')
     low, high = np.quantile(np.clip(np.nan_to_num(shares), -1, 1), [0.05, 0.95])
     return Shrunk(float(np.sqrt(b2)), float(np.sqrt(a2)), floor.rms_mps2, float(min(closed, 1.0)),
-                  (float(low), float(high)), bool(a2 > b2 * 1.001))
+                  (float(low), float(high)), bool(a2 > b2 * _HARM),
+                  float(np.sqrt(within / counts.sum())), predicted)
 
 
-def predicts(of: Study, best: Hypothesis) -> float:
-    """Return how much more likely held-out stretches are with the effect, nats."""
-    return float(best.log_evidence - evidence.fit(
-        of.channels, sorted(of.nuisances()), of.priors(())).log_evidence)
+def _by_block(series: Series, used: np.ndarray, sensor: Sensor) -> np.ndarray:
+    """Return the sum over samples of the mean square over axes, (m/s²)², by block, (b,)."""
+    edges = np.linspace(0, len(series), BLOCKS + 1).astype(int)
+    squares = ((series.residual(sensor) / series.scale_v_per_mps2) ** 2).mean(axis=1)
+    return np.add.reduceat(np.where(used, squares, 0.0), edges[:-1])

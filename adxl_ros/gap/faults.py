@@ -28,6 +28,7 @@ import numpy as np
 
 SHORTEST_S = 30.0
 _LEAST_MOTION_G = 0.05
+_LEAST_MOVED_G = 0.3
 _ALIKE = 0.9
 _WORST_MISSING = 0.3
 _LEAST_GAIN = 0.5
@@ -46,14 +47,14 @@ class Fault:
     words: str
 
 
-def look(series: Series) -> Fault | None:
+def look(series: Series, thin: Series) -> Fault | None:
     """
     Find what makes a diagnosis of effects meaningless.
 
     Parameters
     ----------
-    series
-        The recording at the search's rate.
+    series, thin
+        The recording at its full rate, and at the search's.
 
     """
     span_s = float(series.time_s[-1] - series.time_s[0])
@@ -71,8 +72,23 @@ def look(series: Series) -> Fault | None:
         return Fault('saturated', 'bad_data', f'{100 * _railed(series, finite):.0f} % of the '
                      'samples are at the end of the range; check supply, range and wiring')
     if series.reference == 'rest':
+        return _moved(series, finite)
+    return _axes(thin, np.isfinite(thin.volts).all(axis=1))
+
+
+def _moved(series: Series, finite: np.ndarray) -> Fault | None:
+    """Tell a sensor that moves while no reference says how."""
+    g = series.volts[finite] / series.sensor.scale_v_per_g
+    step = np.std(np.diff(g, axis=0), axis=0)
+    spread = np.quantile(g, 0.98, axis=0) - np.quantile(g, 0.02, axis=0)
+    worst = int(np.argmax(spread))
+    if spread[worst] < _LEAST_MOVED_G or step[worst] > spread[worst]:
         return None
-    return _axes(series, finite)
+    angles = 'its stage angles do not change' if 'alpha_rad' in series.columns else \
+        'it has no stage angles'
+    return Fault('reference', 'bad_data', f'{series.sensor.axes[worst]} moves by '
+                 f'{spread[worst]:.2f} g, but {angles}; give the angles, or --sim with the '
+                 'specific force of the same manoeuvre')
 
 
 def _clock(series: Series) -> Fault | None:

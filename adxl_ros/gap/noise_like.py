@@ -21,6 +21,7 @@ from dataclasses import dataclass
 
 from adxl_ros.gap.floor import runs
 from adxl_ros.gap.series import Series
+from adxl_ros.gap.whiten import HEALTHY_G_PER_RTS
 from adxl_ros.model import noise
 from adxl_ros.model.sensor import Sensor
 import numpy as np
@@ -39,6 +40,10 @@ _STEPS = 1.6
 _DRIFT_G = 8e-4
 """Wandering of the zero-g over the recording, rms, that a healthy unit does not reach."""
 _NEAREST, _FEWEST = 2, 500
+_CALM_S = 10.0
+_REST_S, _FEWEST_RESTS = 2.5, 4
+_LEVELS, _ODD = 0.02, 4.0
+"""Of the range: levels that spikes are counted by; how much rarer others may be there."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +101,7 @@ def bad_samples(volts: np.ndarray, time_s: np.ndarray, sensor: Sensor
             'duration_s': np.array(max(held_s + 1 / sensor.rate_hz, 1 / sensor.rate_hz))},
             5.0 * len(begins), f'{len(begins)} times the samples repeat, {held_s:.3g} s long'))
     spikes, size = _spikes(volts, good, sensor)
-    if spikes.any():
+    if spikes.any() and not _by_level(volts, spikes):
         count = int(spikes.any(axis=1).sum())
         good &= ~spikes.any(axis=1)
         rate_hz = spikes.sum() / len(sensor.axes) / float(time_s[-1] - time_s[0])
@@ -144,6 +149,18 @@ def _spikes(volts: np.ndarray, good: np.ndarray, sensor: Sensor
     return out, size
 
 
+def _by_level(volts: np.ndarray, spikes: np.ndarray) -> bool:
+    """Tell samples that leave the line at some levels only: steps of the ADC do, spikes do not."""
+    usual, odd = 0.0, 0
+    for v, alone in zip(volts.T, spikes.T):
+        level = np.floor(v / (_LEVELS * max(np.nanmax(v) - np.nanmin(v), 1e-9)))
+        before = np.roll(level, _NEAREST)
+        there = np.isin(before, np.unique(before[alone]))
+        usual += float(there.mean()) * alone.sum()
+        odd += int(alone.sum())
+    return bool(odd > 10 and usual / odd < 1 / _ODD)
+
+
 def _local_scale(values: np.ndarray, width: int) -> np.ndarray:
     """Rms of the values around, without the largest: by blocks, interpolated."""
     count = max(len(values) // width, 1)
@@ -188,12 +205,16 @@ def of_residual(residual_v: np.ndarray, used: np.ndarray, series: Series) -> lis
     """
     sensor = series.sensor
     signs = []
-    rows = np.arange(len(residual_v))
-    data = np.column_stack([np.interp(rows, rows[used], r[used]) for r in residual_v.T])
+    data = _filled(residual_v, used)
     rc_s, _ = noise.electronics(sensor)
     decay = np.exp(-1 / (sensor.rate_hz * np.where(rc_s > 0, rc_s, 1e-9)))
     white = np.column_stack([lfilter([1.0, -a], [1.0], r)[1:] for r, a in zip(data.T, decay)])
-    line = _line(white, sensor, residual_v, series.time_s)
+    # A line that shows while the sensor rests is no trace of how it moves.
+    rests = (series.still & used)[1:]
+    calm = white * rests[:, None] if rests.sum() > _CALM_S * sensor.rate_hz else white
+    line = _line(calm, sensor, residual_v, series.time_s)
+    if calm is white and line is not None and line.effect == 'unknown':
+        line = None
     if line is not None:
         signs.append(line)
     # Differences, so that a wandering zero-g is none of it; where it moves, what is not modelled
@@ -201,17 +222,19 @@ def of_residual(residual_v: np.ndarray, used: np.ndarray, series: Series) -> lis
     promised = np.sqrt(noise.analog_sigma_v(sensor) ** 2 * (1 - decay ** 2) * 2
                        + sensor.lsb_v ** 2 / 12 * (1 + (1 + decay) ** 2 + decay ** 2))
     step, still = np.diff(white, axis=0), (series.still & used)[2:]
-    calm = step[still] if still.sum() > _FEWEST else step[used[2:]]
-    seen = np.median(np.abs(calm), axis=0) / norm.ppf(0.75)
+    chosen = step[still] if still.sum() > _FEWEST else step[used[2:]]
+    seen = np.median(np.abs(chosen), axis=0) / norm.ppf(0.75)
     ratio = seen / promised
     if np.median(ratio) > _EXCESS and line is None:
         signs.append(Sign('noise_excess', {'ratio': ratio - 1},
                           len(white) * float(np.log(np.median(ratio)) ** 2),
                           f'white noise is {np.median(ratio):.2f} of what is stated'))
-    drift = _drift(data, series)
-    if drift is not None:
-        signs.append(drift)
     return signs
+
+
+def _filled(values: np.ndarray, used: np.ndarray) -> np.ndarray:
+    rows = np.arange(len(values))
+    return np.column_stack([np.interp(rows, rows[used], v[used]) for v in values.T])
 
 
 def _line(white: np.ndarray, sensor: Sensor, residual_v: np.ndarray, time_s: np.ndarray
@@ -237,7 +260,7 @@ def _line(white: np.ndarray, sensor: Sensor, residual_v: np.ndarray, time_s: np.
                 true = k * mains + (at - alias)
                 return Sign('mains_hum', {
                     'amplitude_v': amplitude, 'frequency_hz': np.array(true),
-                    'phase_rad': np.zeros(len(sensor.axes))}, nats,
+                    'phase_rad': np.array(0.0)}, nats,
                     f'a line at {at:.2f} Hz, {amplitude.max() * 1e3:.3g} mV')
     return Sign('unknown', {}, nats, f'a line at {at:.2f} Hz, which is no mains frequency')
 
@@ -250,9 +273,14 @@ def _local_level(power: np.ndarray, width: int = 201) -> np.ndarray:
     return np.interp(np.arange(len(power)), (np.arange(count) + 0.5) * width, level)
 
 
-def _drift(data: np.ndarray, series: Series) -> Sign | None:
-    """Tell flicker from a wandering zero-g by the slope of the spectrum at low frequencies."""
+def drift(residual_v: np.ndarray, used: np.ndarray, series: Series) -> Sign | None:
+    """
+    Tell flicker from a wandering zero-g by the slope of the spectrum at low frequencies.
+
+    Parameters are those of `of_residual`; None where it wanders too little to tell.
+    """
     sensor = series.sensor
+    data = _filled(residual_v, used)
     scale = sensor.scale_v_per_g
     seconds = data[:len(data) // round(sensor.rate_hz) * round(sensor.rate_hz)]
     means = seconds.reshape(-1, round(sensor.rate_hz), data.shape[1]).mean(axis=1) / scale
@@ -282,6 +310,36 @@ def _drift(data: np.ndarray, series: Series) -> Sign | None:
         values = {'density_g_per_rts': np.full(count, level * 2 * np.pi / np.sqrt(2))}
         words = f'the zero-g wanders by {wander * 1e3:.2g} mg'
     return Sign(name, values, abs(fits['flicker'].fun - fits['bias_walk'].fun) + 5.0, words)
+
+
+def wanders_at_rest(series: Series, used: np.ndarray) -> bool:
+    """
+    Tell whether the zero-g wanders while nothing moves, more than that of a healthy unit.
+
+    What a model lacks shows as drift, too, but from pose to pose; a sensor that wanders does so
+    within a rest. Means of a second are compared over half of each rest: their difference grows
+    by w²·t.
+    """
+    rate = series.sensor.rate_hz
+    second = max(round(rate), 1)
+    squares, times = [], []
+    for begin, end in runs(series.still & used):
+        half = (end - begin) // 2
+        if end - begin < _REST_S * rate:
+            continue
+        for a in range(begin, begin + half - second + 1, max(half, 1)):
+            first, last = (series.volts[i:i + second].mean(axis=0) for i in (a, a + half))
+            squares.append(((last - first) / series.sensor.scale_v_per_g) ** 2)
+            times.append(half / rate)
+    if len(series.still) and series.reference == 'rest':
+        return True
+    if len(squares) < _FEWEST_RESTS:
+        return False
+    white = (noise.sigma_v(series.sensor) / series.sensor.scale_v_per_g) ** 2 * 2 / np.array([
+        noise.effective_samples(second, 1 / rate, rc) for rc in noise.electronics(
+            series.sensor)[0]])
+    expected = white + HEALTHY_G_PER_RTS ** 2 * np.mean(times)
+    return bool(np.mean(squares) > np.mean(expected) * (1 + 2 * np.sqrt(2 / np.size(squares))))
 
 
 def _smooth(means: np.ndarray, width: int = 5) -> np.ndarray:

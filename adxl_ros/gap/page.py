@@ -17,7 +17,6 @@
 from __future__ import annotations
 
 from base64 import b64encode
-from dataclasses import replace
 from html import escape
 from io import BytesIO
 from typing import Any
@@ -93,9 +92,7 @@ def _bar(found: Diagnosis) -> Any:
 def _overlay(found: Diagnosis) -> Any:
     assert found.verdict is not None
     one = found.series[0]
-    before = one.volts - one.simulated(one.sensor)
-    after = one.volts - one.simulated(replace(found.verdict.best.sensor,
-                                              rate_hz=one.sensor.rate_hz))
+    before, after = one.residual(one.sensor), one.residual(found.verdict.best.sensor)
     count = len(one.sensor.axes)
     figure, grid = pyplot().subplots(count, 2, figsize=(12, 2.6 * count), layout='constrained',
                                      squeeze=False, width_ratios=(2, 1))

@@ -20,8 +20,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from adxl_ros.gap.diagnose import Diagnosis
-from adxl_ros.gap.search import Hypothesis
-from adxl_ros.gap.tangents import BY_THEMSELVES
+from adxl_ros.gap.local import Hypothesis
 from adxl_ros.model.coefficients import parameter_of
 from adxl_ros.model.effects import effect_named, library
 import numpy as np
@@ -51,7 +50,7 @@ def as_json(found: Diagnosis) -> dict[str, Any]:
                 'after': _round(far.after_mps2), 'floor': _round(far.floor_mps2),
                 'floor_source': found.floor.source, 'closed': _round(far.closed),
                 'closed_ci': [_round(c) for c in far.closed_ci]},
-        'where': [{'axis': c.axis, 'dimension': c.dimension,
+        'where': [{'axis': c.axis, 'dimension': c.dimension, 'statistic': c.statistic,
                    'range': [_round(c.low), _round(c.high)], 'mean': _round(c.mean_mps2),
                    'floor_units': _round(c.floor_units), 'share': _round(c.share),
                    'p': _round(c.p)} for c in found.cells[:40]],
@@ -94,14 +93,15 @@ def _candidates(found: Diagnosis) -> list[dict[str, Any]]:
     for name in library():
         if name not in chance and name not in seen:
             continue
-        visible = any(variant.effect == name for variant in found.study.variants)
+        score = found.scores.get(name)
         signs = [s for s in found.signs if s.effect == name]
         best = name in v.best.effects or bool(signs)
         out.append({
             'effect': name, 'probability': _round(min(chance.get(name, 0.0), 1.0)),
             'closed': _round(found.shrunk.closed) if best and not signs else None,
-            'p': None, 'parameters': _parameters(seen.get(name), name),
-            'visibility': 1.0 if visible or name in BY_THEMSELVES or signs else 0.0,
+            'p': _round(score.p) if score else float(np.exp(-signs[0].nats)) if signs else None,
+            'parameters': _parameters(seen.get(name), name),
+            'visibility': _round(score.visibility) if score else 1.0,
             'inseparable_from': rivals.get(name, []), 'cause': effect_named(name).cause})
         if signs:
             out[-1]['parameters'] = {p: {'value': np.asarray(value).tolist()}

@@ -17,11 +17,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from adxl_ros.errors import UserError
 from adxl_ros.gap.series import Series
-from adxl_ros.model.coefficients import names_of, parameter_of, with_neutral
+from adxl_ros.model.coefficients import names_of, parameter_of, put, with_neutral
 from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.effects.base import Effect, Parameter
 from adxl_ros.model.sensor import Sensor
@@ -35,8 +35,8 @@ _SMALL = 0.2
 """Step of a smooth parameter, by its typical size."""
 _LARGE = (1.0, 4.0, 16.0)
 """Steps of one that is not: what a play of 1 mrad does tells little of one of 15."""
-BY_THEMSELVES = ('saturation', 'quantisation', 'stuck', 'spikes')
-"""Effects that are told by statistics of their own."""
+_CLIPPED = (0.002, 0.01, 0.03, 0.1, 0.3)
+"""Part of the samples that a limit clips where it is tried."""
 
 
 @dataclass(frozen=True)
@@ -56,6 +56,8 @@ class Variant:
         Coefficients and the standard deviation that they may have, (p,).
     columns
         By axis: numbers of the coefficients that it follows, and volts a unit, (n, of them).
+    begin
+        Where the fit of a limit begins, by coefficient; its columns are what that limit does.
 
     """
 
@@ -65,12 +67,17 @@ class Variant:
     names: tuple[str, ...]
     prior: np.ndarray
     columns: tuple[tuple[np.ndarray, np.ndarray], ...]
+    begin: dict[str, float] = field(default_factory=dict)
 
 
 def candidates(sensor: Sensor) -> list[Effect]:
     """Return the effects of the library that act on the mean and have tangents."""
-    return [effect for effect in library().values()
-            if effect.acts_on == 'mean' and effect.name not in BY_THEMSELVES]
+    return [effect for effect in library().values() if effect.acts_on == 'mean']
+
+
+def limits(effect: Effect) -> list[Parameter]:
+    """Return the parameters that do nothing until the signal reaches them."""
+    return [p for p in effect.parameters if p.neutral == p.upper and not p.shape]
 
 
 def variants(series: Series, effect: Effect, base: np.ndarray) -> Iterator[Variant]:
@@ -79,6 +86,10 @@ def variants(series: Series, effect: Effect, base: np.ndarray) -> Iterator[Varia
 
     One that has nothing to act on in this recording has no variant.
     """
+    if limits(effect):
+        if effect.name not in series.sensor.effects:
+            yield from _limited(series, effect, limits(effect)[0], base)
+        return
     # An effect that the sensor has keeps its shape.
     for shape in [{}] if effect.name in series.sensor.effects else shapes(effect):
         for size in (_SMALL,) if effect.smooth else _LARGE:
@@ -88,6 +99,23 @@ def variants(series: Series, effect: Effect, base: np.ndarray) -> Iterator[Varia
                 return
             if found is not None:
                 yield found
+
+
+def _limited(series: Series, effect: Effect, limit: Parameter, base: np.ndarray
+             ) -> Iterator[Variant]:
+    """Try a limit where it clips a small part of the samples, and more."""
+    axes = series.sensor.axes
+    held = with_neutral(series.sensor, [effect.name])
+    g = np.abs(base - series.sensor.zero_g_v) / series.sensor.scale_v_per_g
+    for part in _CLIPPED:
+        values = np.clip(np.quantile(g, 1 - part, axis=0), limit.lower, limit.upper)
+        does = series.simulated(put(held, names := names_of(effect, axes), values)) - base
+        seen = [d for d in range(len(axes)) if np.any(np.abs(does[:, d]) > 1e-9)]
+        if seen:
+            yield Variant(effect.name, {}, part, tuple(names[d] for d in seen), np.ones(
+                len(seen)), tuple((np.array([seen.index(d)] if d in seen else [], int),
+                                   does[:, [d]] if d in seen else np.zeros((len(base), 0)))
+                                  for d in range(len(axes))), dict(zip(names, values)))
 
 
 def shapes(effect: Effect) -> list[dict[str, float]]:
@@ -117,6 +145,8 @@ def variant(series: Series, effect: Effect, shape: dict[str, float], size: float
                 <= p.upper:
             step = (p.upper - float(np.max(values))) or -p.scale * size
         moved = (series.simulated(_stepped(held, effect.name, p, step)) - start) / step
+        if series.reference == 'rest' and effect.name != 'bias':
+            moved -= moved.mean(axis=0)
         own = names_of(replace(effect, parameters=(p,)), axes)
         for name in own:
             reach = [axes.index(name.split('.')[2])] if p.axes else range(len(axes))

@@ -22,18 +22,21 @@ cannot. They are never offered first: a flexible term would steal what an effect
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from adxl_ros.gap import evidence
-from adxl_ros.gap.search import _columns, Hypothesis, NUISANCES, Study
+from adxl_ros.gap.local import Hypothesis, local
+from adxl_ros.gap.past import direction, since_move_s
 from adxl_ros.gap.series import Series
-from adxl_ros.model.coefficients import get, names_of
+from adxl_ros.gap.study import Study, WANDERING
 from adxl_ros.model.constants import G0_MPS2
-from adxl_ros.model.effects import effect_named
+from adxl_ros.model.filters import low_pass
 from adxl_ros.model.stage import specific_force
 import numpy as np
 from scipy.interpolate import BSpline
 
+_CREEP_S = (2.0, 10.0, 50.0)
 PRIOR_G = 2e-3
 """Standard deviation of what one basis function does."""
 
@@ -61,61 +64,42 @@ class Discrepancy:
 
 def discrepancy(of: Study, best: Hypothesis) -> Discrepancy:
     """Fit the flexible term beside the best hypothesis."""
-    effects = tuple(dict.fromkeys((*best.effects, *NUISANCES)))
-    names = [n for e in effects for n in names_of(effect_named(e), best.sensor.axes)
-             if n in of.names or '.'.join(n.split('.')[:2]) in {
-                 '.'.join(m.split('.')[:2]) for m in best.names}]
-    values = get(best.sensor, names)
-    prior = list(of.priors(best.effects)[[of.names.index(n) if n in of.names else 0
-                                          for n in names]])
-    channels: list[evidence.Channel] = []
+    bases = [flexible(one) for one in of.series]
+    here = local(of, best.effects, best.sensor,
+                 [np.column_stack(list(basis.values())) for basis in bases], best.fit.walks)
+    own, sd = list(range(len(here.names))), list(here.prior)
     kinds: dict[str, list[int]] = {}
-    for one, mask in zip(of.series, of.used):
-        sensor = best.sensor
-        there = one.simulated(sensor)
-        tangents = _columns(one, sensor, names, values, there)
-        basis = flexible(one)
-        for d in range(len(sensor.axes)):
-            scale = float(sensor.scale_v_per_g[d])
-            columns, ids = [tangents[:, d]], [np.arange(len(names))]
-            for kind, of_kind in basis.items():
-                first = len(prior)
-                prior += [PRIOR_G * scale] * of_kind.shape[1]
-                at = np.arange(first, len(prior))
-                kinds.setdefault(kind, []).extend(at.tolist())
-                columns.append(of_kind)
-                ids.append(at)
-            channels.append(evidence.channel(
-                one.volts[:, d] - there[:, d], np.column_stack(columns), np.concatenate(ids),
-                mask, of.filters[len(channels)]))
-    sd = np.array(prior)
-    own = list(range(len(names)))
-    alone = evidence.fit(channels, own, sd)
-    gains = {kind: evidence.fit(channels, [*own, *ids], sd, start=alone).log_evidence
+    for one, basis in zip(of.series, bases):
+        for scale in one.sensor.scale_v_per_g:
+            for kind, columns in basis.items():
+                kinds.setdefault(kind, []).extend(range(len(sd), len(sd) + columns.shape[1]))
+                sd += [PRIOR_G * float(scale)] * columns.shape[1]
+    prior = np.array(sd)
+    wanders = WANDERING in best.effects
+    alone = evidence.fit(here.channels, own, prior, wanders=wanders)
+    gains = {kind: evidence.fit(here.channels, [*own, *ids], prior, None, alone, wanders
+                                ).log_evidence
              - alone.log_evidence for kind, ids in kinds.items()}
     kept = [kind for kind, gain in gains.items() if gain > 0]
     if not kept:
         return Discrepancy(0.0, 0.0, gains)
     chosen = [*own, *(i for kind in kept for i in kinds[kind])]
-    whole = evidence.fit(channels, chosen, sd, start=alone)
+    whole = evidence.fit(here.channels, chosen, prior, None, alone, wanders)
+    value = np.zeros(len(prior))
+    value[whole.ids] = whole.values
     return Discrepancy(whole.log_evidence - alone.log_evidence,
-                       _rms(of, whole, kept, len(names), best), gains)
+                       _rms(of, bases, value[len(own):]), gains)
 
 
-def _rms(of: Study, whole: evidence.Fit, kept: list[str], first: int, best: Hypothesis) -> float:
-    squares, count, at = 0.0, 0, first
-    value = dict(zip(whole.ids.tolist(), whole.values))
-    for one, mask in zip(of.series, of.used):
-        basis = flexible(one)
-        for d in range(len(best.sensor.axes)):
-            total = np.zeros(len(one))
-            for kind, of_kind in basis.items():
-                ids = range(at, at + of_kind.shape[1])
-                at += of_kind.shape[1]
-                if kind in kept:
-                    total += of_kind @ np.array([value[i] for i in ids])
-            total = (total - total[mask].mean()) / one.scale_v_per_mps2[d]
-            squares += float(np.sum(total[mask] ** 2))
+def _rms(of: Study, bases: Sequence[dict[str, np.ndarray]], value: np.ndarray) -> float:
+    """Return the rms of the flexible term over samples and axes, m/s²."""
+    squares, count, at = 0.0, 0, 0
+    for one, mask, basis in zip(of.series, of.used, bases):
+        columns = np.column_stack(list(basis.values()))
+        for scale in one.scale_v_per_mps2:
+            total = columns @ value[at:at + columns.shape[1]] / scale
+            at += columns.shape[1]
+            squares += float(np.sum((total[mask] - total[mask].mean()) ** 2))
             count += int(mask.sum())
     return float(np.sqrt(squares / max(count, 1)))
 
@@ -137,12 +121,15 @@ def flexible(series: Series) -> dict[str, np.ndarray]:
         if parts:
             out['rate'] = np.column_stack([g for r in parts for g in (
                 r, r * r, r * f[0], r * f[1], r * f[2], np.abs(r))])
-            turns = [_direction(r) for r in parts]
+            turns = [direction(r) for r in parts]
             out['direction'] = np.column_stack([t * g for t in turns
                                                 for g in (np.ones_like(t), *f)])
-            turned = np.column_stack([np.abs(r) * s > 1e-3 for r, s in zip(rates, scale)])
-            since = _since(time_s, np.any(turned, axis=1))
-            out['since_move_s'] = np.column_stack([np.exp(-since / tau) for tau in (1, 4, 16)])
+            since = since_move_s(time_s, rates)
+            # What creeps follows the force late, by one time or another.
+            lags = [low_pass(part, tau_s, float(np.median(np.diff(time_s))), {}) - part
+                    for tau_s in _CREEP_S for part in f]
+            out['since_move_s'] = np.column_stack([
+                *(np.exp(-since / tau) for tau in (1, 4, 16)), *lags])
     elif series.reference == 'sim' and motion.force is not None:
         f = np.array([v / G0_MPS2 for v in motion.force(time_s)])
         out['force'] = _products(f)
@@ -171,15 +158,3 @@ def _splines(values: np.ndarray, count: int) -> np.ndarray:
     inner = np.linspace(low, high, count - 2)
     knots = np.concatenate([[low] * 3, inner, [high] * 3])
     return BSpline.design_matrix(np.clip(values, low, high), knots, 3).toarray()[:, 1:]
-
-
-def _direction(rate: np.ndarray) -> np.ndarray:
-    """Direction of the last move, −1, 0 before the first, or 1."""
-    moving = np.abs(rate) > 1e-3
-    last = np.maximum.accumulate(np.where(moving, np.arange(len(rate)), -1))
-    return np.where(last >= 0, np.sign(rate[np.maximum(last, 0)]), 0.0)
-
-
-def _since(time_s: np.ndarray, moving: np.ndarray) -> np.ndarray:
-    last = np.maximum.accumulate(np.where(moving, time_s, -np.inf))
-    return np.minimum(time_s - last, 1e3)

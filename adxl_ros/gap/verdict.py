@@ -25,26 +25,33 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from adxl_ros.gap.far import Shrunk
+from adxl_ros.gap.local import Hypothesis
 from adxl_ros.gap.noise_like import Sign
-from adxl_ros.gap.search import Hypothesis, NUISANCES, Study
+from adxl_ros.gap.study import Study, WANDERING
 from adxl_ros.gap.unknown import Discrepancy
 from adxl_ros.model.coefficients import neutral
+from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Effect
 import numpy as np
 
 PRIOR = {0: 0.35, 1: 0.40, 2: 0.15, 3: 0.03}
 """Of as many effects; what is left is unknown."""
-VISIBLE = 0.12
+VISIBLE = 0.06
 """An effect that makes less of the noise than this, rms, is not the gap."""
 SHARE = 0.02
 """Nor is one that makes less of the squares of the gap than this."""
+TAKEN = 0.006
+"""Nor is an effect more that takes less off the squares of the gap than this."""
 RIVAL = 0.05
 """A rival more probable than this cannot be told apart."""
 CERTAIN = 0.5
-UNKNOWN_NATS = 12.0
-UNKNOWN_OF_GAP, UNKNOWN_OF_NOISE = 0.3, 0.4
+UNKNOWN_NATS = 15.0
+UNKNOWN_OF_GAP, UNKNOWN_OF_NOISE = 0.3, 0.12
 """What a flexible term must find, by the rms of the gap and of the noise, to be unknown."""
+LEFT_OF_GAP, LEFT_OF_NOISE = 0.7, 0.5
+"""What is left above the floor, by what is explained and by the noise, to be unknown."""
 _TEMPER = 0.5
 """Nats count half: samples of a model that is nearly right are not quite independent."""
 
@@ -82,17 +89,26 @@ class Verdict:
 
 def contribution_mps2(of: Study, found: Hypothesis, effect: str) -> float:
     """Return what one effect of a hypothesis makes, rms about its mean, m/s²."""
+    if effect == WANDERING:
+        return _wandered_mps2(of, found)
     library = effect_named(effect)
     squares, count = 0.0, 0
     for one, mask in zip(of.series, of.used):
         sensor = replace(found.sensor, rate_hz=one.sensor.rate_hz)
         without = replace(sensor, values={**sensor.values, effect: _baseline(of, effect, library)})
         whole = (one.simulated(sensor) - one.simulated(without))[mask]
-        if effect not in NUISANCES:
+        if effect not in ('bias', 'scale_factor'):
             whole = whole - whole.mean(axis=0)
         squares += float(np.sum((whole / one.scale_v_per_mps2) ** 2))
         count += whole.size
     return float(np.sqrt(squares / max(count, 1)))
+
+
+def _wandered_mps2(of: Study, found: Hypothesis) -> float:
+    """Return the rms about its mean of a random walk over the recordings, w·√(T/6), m/s²."""
+    walk = found.sensor.values[WANDERING]['density_g_per_rts']
+    span_s = np.mean([one.time_s[-1] - one.time_s[0] for one in of.series])
+    return float(G0_MPS2 * np.sqrt(np.mean(walk ** 2) * span_s / 6))
 
 
 def _baseline(of: Study, effect: str, library: Effect) -> dict[str, np.ndarray]:
@@ -101,18 +117,59 @@ def _baseline(of: Study, effect: str, library: Effect) -> dict[str, np.ndarray]:
 
 
 def worthy(of: Study, found: Sequence[Hypothesis], noise_mps2: float) -> list[Hypothesis]:
-    """Keep the hypotheses of which each effect makes a visible part of the gap."""
+    """
+    Keep the hypotheses of which each effect makes a visible part of the gap.
+
+    What an effect more takes off the squares is compared with the same hypothesis without it: no
+    form of an effect is quite the sensor's, and what is left of a large one always looks a little
+    like some other.
+    """
+    least = VISIBLE * noise_mps2
+    squares = {frozenset(h.effects): _squares_mps2(of, h) for h in found}
+    none = squares[frozenset()]
     kept = []
     for one in found:
-        parts = [contribution_mps2(of, one, effect) for effect in one.effects]
-        whole = sum(p * p for p in parts)
-        if all(p > VISIBLE * noise_mps2 and p * p > SHARE * whole for p in parts):
+        parts = {effect: contribution_mps2(of, one, effect) for effect in one.effects}
+        whole, here = sum(p * p for p in parts.values()), squares[frozenset(one.effects)]
+        for effect, part in parts.items():
+            without = squares.get(frozenset(one.effects) - {effect})
+            taken = part * part if without is None or effect == WANDERING else without - here
+            if part < least or part * part < SHARE * whole or taken < least ** 2 \
+                    or taken < TAKEN * (none - here):
+                break
+        else:
             kept.append(one)
     return kept
 
 
+def _squares_mps2(of: Study, found: Hypothesis) -> float:
+    """Return the mean square of what a hypothesis leaves, (m/s²)²."""
+    squares, count = 0.0, 0
+    for one, mask in zip(of.series, of.used):
+        off = (one.residual(found.sensor) / one.scale_v_per_mps2)[mask]
+        squares += float(np.sum(off ** 2))
+        count += off.size
+    return squares / max(count, 1)
+
+
+def left(far: Shrunk, noise_mps2: float) -> float:
+    """
+    Return the rms of what is left above the floor, m/s².
+
+    Parameters
+    ----------
+    far
+        On stretches held out.
+    noise_mps2
+        Rms of the noise that was found, drift, lines and steps included.
+
+    """
+    return float(np.sqrt(max(far.within_mps2 ** 2 - max(far.floor_mps2, noise_mps2) ** 2, 0.0)))
+
+
 def judge(of: Study, found: Sequence[Hypothesis], discrepancy: Discrepancy | None,
-          signs: Sequence[Sign], noise_mps2: float, gap_mps2: float) -> Verdict:
+          signs: Sequence[Sign], noise_mps2: float, gap_mps2: float, left_mps2: float
+          ) -> Verdict:
     """
     Weigh the hypotheses.
 
@@ -128,6 +185,8 @@ def judge(of: Study, found: Sequence[Hypothesis], discrepancy: Discrepancy | Non
         Noise-like effects that show.
     noise_mps2, gap_mps2
         Rms of the noise, and of what the most probable hypothesis explains, m/s².
+    left_mps2
+        Rms of what neither it nor noise explains on stretches held out, m/s²; see `left`.
 
     """
     count = len({v.effect for v in of.variants})
@@ -146,6 +205,9 @@ def judge(of: Study, found: Sequence[Hypothesis], discrepancy: Discrepancy | Non
         unknown = 0.9
         places = tuple(sorted((k for k, g in discrepancy.where.items() if g > UNKNOWN_NATS),
                               key=lambda k: -discrepancy.where[k]))
+    if left_mps2 > LEFT_OF_NOISE * noise_mps2 and left_mps2 > LEFT_OF_GAP * gap_mps2:
+        unknown = 0.9
+        places = places or ('frequency',)
     known = share / share.sum() * (1 - unknown)
     loud = tuple(sign.effect for sign in signs if sign.effect != 'unknown')
     if any(sign.effect == 'unknown' for sign in signs):

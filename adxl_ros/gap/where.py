@@ -13,28 +13,34 @@
 # limitations under the License.
 
 """
-Where the gap lies: the mean residual over axis and dimension, tested as a whole.
+Where the gap lies: the residual's mean and variance over axis and dimension, tested as a whole.
 
 Cells are judged by the largest of all their statistics under a bootstrap of whole blocks with
-random signs (max-T; Westfall and Young 1993), so that 200 cells do not give ten false ones.
+random signs (max-T; Westfall and Young 1993), so that 200 cells do not give ten false ones. Bands
+of frequency are judged by the power that the noise should have there.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
+from adxl_ros.gap.past import direction, since_move_s
 from adxl_ros.gap.series import Series
-from adxl_ros.gap.unknown import _direction, _since
+from adxl_ros.model import noise
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.stage import specific_force
 import numpy as np
+from scipy.signal import periodogram
+from scipy.stats import gamma
 
 _CELLS = 8
 _DRAWS = 500
 _BLOCK_S = 2.0
 _FEWEST = 3
-BANDS_HZ = (0.0, 0.1, 1.0, 5.0, 15.0, 40.0)
+_LEAST = 0.05
+_BANDS_HZ = (0.0, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 500.0)
 
 
 @dataclass(frozen=True)
@@ -44,10 +50,15 @@ class Cell:
 
     Attributes
     ----------
+    statistic
+        'mean', 'variance', or 'power' of a band of frequency.
+    low, high
+        Of the dimension, in the unit of its name.
     mean_mps2, floor_units
-        Mean residual, and by the floor.
+        Mean residual (of the others: root of what is more than elsewhere, or than noise), and by
+        the floor.
     share
-        Of the squares of the gap: those of the means of the cells of this axis and dimension.
+        Of the squares of the residual.
     p
         Family-wise probability under no gap.
 
@@ -55,6 +66,7 @@ class Cell:
 
     axis: str
     dimension: str
+    statistic: str
     low: float
     high: float
     mean_mps2: float
@@ -74,8 +86,8 @@ def dimensions(series: Series) -> dict[str, np.ndarray]:
         out |= {f'force_{axis}_g': f for axis, f in zip(AXES, force)}
         rates = [motion.alpha(time_s, 1), motion.beta(time_s, 1)]
         out['rate_rad_s'] = np.hypot(*rates)
-        out['direction_alpha'], out['direction_beta'] = map(_direction, rates)
-        out['since_move_s'] = np.minimum(_since(time_s, out['rate_rad_s'] > 1e-3), 60.0)
+        out['direction_alpha'], out['direction_beta'] = map(direction, rates)
+        out['since_move_s'] = np.minimum(since_move_s(time_s, rates), 60.0)
     elif series.reference == 'sim' and motion.force is not None:
         out |= {f'force_{axis}_g': f / G0_MPS2 for axis, f in zip(AXES, motion.force(time_s))}
     for name in ('temperature_c', 'supply_v'):
@@ -119,37 +131,72 @@ def map_of(series: Series, residual_v: np.ndarray, used: np.ndarray, floor_mps2:
 
     """
     off = residual_v / series.scale_v_per_mps2
-    off = off - off[used].mean(axis=0)
+    off = np.where(used[:, None], off - off[used].mean(axis=0), 0.0)
+    out = [*_over(series, off, used, floor_mps2, seed),
+           *_over_frequency(series, off, floor_mps2)]
+    return sorted(out, key=lambda cell: -cell.share)
+
+
+def _over(series: Series, off: np.ndarray, used: np.ndarray, floor_mps2: float, seed: int
+          ) -> Iterator[Cell]:
+    """Test mean and variance over all dimensions at once."""
     block = max(round(_BLOCK_S * series.sensor.rate_hz), 2)
     number = np.arange(len(off)) // block
     blocks = int(number[-1]) + 1
-    cells: list[tuple[str, str, float, float]] = []
+    squares = off ** 2
+    about = squares - squares[used].mean(axis=0)
+    names: list[tuple[str, str, str, float, float]] = []
     sums, counts = [], []
     for name, values in dimensions(series).items():
         edges = np.unique(np.quantile(values[used], np.linspace(0, 1, _CELLS + 1)))
-        if len(edges) < 2:
-            continue
         inside = np.clip(np.searchsorted(edges, values, 'right') - 1, 0, len(edges) - 2)
-        for cell in range(len(edges) - 1):
+        for cell, (low, high) in enumerate(pairwise(edges)):
             chosen = used & (inside == cell)
             n = np.bincount(number[chosen], minlength=blocks)
             for d, axis in enumerate(series.sensor.axes):
-                cells.append((axis, name, float(edges[cell]), float(edges[cell + 1])))
-                sums.append(np.bincount(number[chosen], off[chosen, d], minlength=blocks))
-                counts.append(n)
+                for statistic, of in (('mean', off), ('variance', about)):
+                    names.append((axis, name, statistic, float(low), float(high)))
+                    sums.append(np.bincount(number[chosen], of[chosen, d], minlength=blocks))
+                    counts.append(n)
     total, size = np.array(sums), np.array(counts).sum(axis=1)
-    enough = (np.array(counts) > 0).sum(axis=1) >= _FEWEST
+    spread = np.sqrt((total ** 2).sum(axis=1))
+    enough = ((np.array(counts) > 0).sum(axis=1) >= _FEWEST) & (spread > 0)
+    signs = np.random.default_rng(seed).choice([-1.0, 1.0], (blocks, _DRAWS))
     with np.errstate(all='ignore'):
         mean = total.sum(axis=1) / size
-        spread = np.sqrt((total ** 2).sum(axis=1))
-        seen = np.where(enough & (spread > 0), np.abs(total.sum(axis=1)) / spread, 0.0)
-        signs = np.random.default_rng(seed).choice([-1.0, 1.0], (blocks, _DRAWS))
-        drawn = np.where((enough & (spread > 0))[:, None],
-                         np.abs(total @ signs) / spread[:, None], 0.0)
-    largest = drawn.max(axis=0)
-    p = (1 + (largest[None] >= seen[:, None]).sum(axis=1)) / (_DRAWS + 1)
-    whole = float(np.sum(off[used] ** 2))
-    out = [Cell(axis, name, low, high, float(mean[i]), float(mean[i] / floor_mps2),
-                float(min(mean[i] ** 2 * size[i] / whole, 1.0)), float(p[i]))
-           for i, (axis, name, low, high) in enumerate(cells) if enough[i] and p[i] < 0.05]
-    return sorted(out, key=lambda cell: -cell.share)
+        seen = np.where(enough, np.abs(total.sum(axis=1)) / spread, 0.0)
+        drawn = np.where(enough[:, None], np.abs(total @ signs) / spread[:, None], 0.0)
+    p = (1 + (drawn.max(axis=0)[None] >= seen[:, None]).sum(axis=1)) / (_DRAWS + 1)
+    whole = float(np.sum(squares))
+    for i, (axis, name, statistic, low, high) in enumerate(names):
+        if not enough[i] or p[i] >= _LEAST or (statistic == 'variance' and mean[i] <= 0):
+            continue
+        square = mean[i] ** 2 if statistic == 'mean' else mean[i]
+        size_mps2 = mean[i] if statistic == 'mean' else np.sqrt(mean[i])
+        yield Cell(axis, name, statistic, low, high, float(size_mps2),
+                   float(size_mps2 / floor_mps2), float(min(square * size[i] / whole, 1.0)),
+                   float(p[i]))
+
+
+def _over_frequency(series: Series, off: np.ndarray, floor_mps2: float) -> Iterator[Cell]:
+    """Compare the power in bands with that of the stated noise; p by Bonferroni."""
+    rate_hz = series.sensor.rate_hz
+    frequency, power = periodogram(off, rate_hz, axis=0)
+    promised = noise.density_v2_per_hz(series.sensor, frequency) / series.scale_v_per_mps2 ** 2
+    step = float(frequency[1])
+    bands = [(low, min(high, rate_hz / 2)) for low, high in pairwise(_BANDS_HZ)
+             if low < rate_hz / 2]
+    for low, high in bands:
+        inside = (frequency > low) & (frequency <= high)
+        count = int(inside.sum())
+        for d, axis in enumerate(series.sensor.axes):
+            if not count:
+                continue
+            seen, usual = power[inside, d].sum(), promised[inside, d].sum()
+            p = float(gamma.sf(seen / usual * count, count)) * len(bands) * off.shape[1]
+            more = max(seen - usual, 0.0) * step
+            if p < _LEAST:
+                yield Cell(axis, 'frequency_hz', 'power', low, high, float(np.sqrt(more)),
+                           float(np.sqrt(more) / floor_mps2),
+                           float(min(more / np.sum(np.mean(off ** 2, axis=0)), 1.0)),
+                           max(p, 1e-12))

@@ -15,15 +15,17 @@
 """
 Noise that can drift, whitened: white noise behind the filter, the ADC's steps, a wandering zero-g.
 
-y = n + w + Σ q·η with n an AR(1) sequence of a = exp(−dt/RC), w white and the sum a random walk,
-is (1 − aL)(1 − L)·y = an MA(2), whose factor is found from its spectrum (Brockwell and Davis 1991,
-section 3.2). Its innovations are white; their variance is fitted, so that the level of the noise
-need not be known, only how fast the zero-g wanders by it, which is searched on a grid. Whitened
-residuals are therefore neither fooled by correlation nor by drift.
+y = n + w + d with n an AR(1) sequence of a = exp(−dt/RC), w white and d a random walk that forgets
+by b = exp(−dt/τ) a sample, is (1 − aL)(1 − bL)·y = an MA(2), whose factor is found from its
+spectrum (Brockwell and Davis 1991, section 3.2). Its innovations are white; their variance is
+fitted, so that the level of the noise need not be known, only how fast the zero-g wanders by it,
+and how soon it comes back, which is searched on a grid. Whitened residuals are therefore neither
+fooled by correlation nor by drift.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from adxl_ros.gap.series import Series
@@ -32,7 +34,10 @@ import numpy as np
 from scipy.signal import lfilter
 
 WALKS_G_PER_RTS = (1e-7, 3e-6, 1e-5, 3e-5, 1e-4, 3e-4, 1e-3, 3e-3)
-"""Wandering of the zero-g that is tried."""
+RETURNING_G_PER_RTS, RETURN_S = (1e-4, 3e-4, 1e-3, 3e-3), 100.0
+"""Wandering of the zero-g that is tried: for good, and coming back within a time."""
+HEALTHY_G_PER_RTS = 1e-4
+"""1 mg within 100 s; what wanders more has the effect `bias_walk`."""
 _USUAL_G_PER_RTS, _DECADES = 2e-5, 1.0
 """What is usual (`bias_walk`), and how far it may be from that, as a standard deviation."""
 _LOWEST_NOISE_V = 1e-7
@@ -40,15 +45,27 @@ _LOWEST_NOISE_V = 1e-7
 
 @dataclass(frozen=True)
 class Whitener:
-    """A filter num(L)/den(L) that makes the noise white, and how likely such noise is."""
+    """
+    A filter num(L)/den(L) that makes the noise white, and how likely such noise is.
+
+    Attributes
+    ----------
+    walk_g_per_rts
+        Wandering that it is for.
+    healthy
+        Whether a unit without the effect `bias_walk` may wander so.
+
+    """
 
     num: np.ndarray
     den: np.ndarray
     log_prior: float
+    walk_g_per_rts: float
+    healthy: bool
 
     def __call__(self, values: np.ndarray) -> np.ndarray:
-        """Filter columns, (n, k)."""
-        return lfilter(self.num, self.den, values, axis=0)
+        """Filter series, (k, n)."""
+        return lfilter(self.num, self.den, values)
 
 
 def whiteners(series: Series, d: int) -> list[Whitener]:
@@ -61,14 +78,21 @@ def whiteners(series: Series, d: int) -> list[Whitener]:
     steps = sensor.lsb_v / np.sqrt(12)
     scale = float(sensor.scale_v_per_g[d])
     out = []
-    for walk in WALKS_G_PER_RTS:
-        pole, apart = np.array([1, -a]), np.array([1, -1])
+    tried = [(walk, np.inf) for walk in WALKS_G_PER_RTS]
+    for walk, back_s in [*tried, *((walk, RETURN_S) for walk in RETURNING_G_PER_RTS)]:
+        pole, apart = np.array([1, -a]), np.array([1, -np.exp(-dt_s / back_s)])
         spectrum = (level ** 2 * (1 - a * a) * _square(apart, 2)
                     + steps ** 2 * _square(np.convolve(pole, apart), 2)
                     + (walk * scale) ** 2 * dt_s * _square(pole, 2))
         out.append(Whitener(np.convolve(pole, apart), _factor(spectrum),
-                            -0.5 * (np.log10(walk / _USUAL_G_PER_RTS) / _DECADES) ** 2))
+                            -0.5 * (np.log10(walk / _USUAL_G_PER_RTS) / _DECADES) ** 2,
+                            walk, walk <= HEALTHY_G_PER_RTS))
     return out
+
+
+def near(filters: Sequence[Whitener], best: int) -> list[Whitener]:
+    """Return the best filter and its neighbours, enough where the noise is already known."""
+    return [f for i, f in enumerate(filters) if abs(i - best) <= 1]
 
 
 def _square(polynomial: np.ndarray, order: int) -> np.ndarray:

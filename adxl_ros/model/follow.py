@@ -28,6 +28,8 @@ _DEGREE = 5
 _KNOT_S = 0.03
 """Distance of the knots: motion slower than 10 Hz is free, the penalty does the rest."""
 _WINDOW_S = 60.0
+_WINDOWS = 64
+"""So many are held in memory."""
 _MARGIN_S = 3.0
 """Windows of a long recording overlap by this on each side, which is far beyond the spline's
 memory."""
@@ -83,7 +85,7 @@ class Smoothed:
 
     def _spline(self, window: int) -> BSpline:
         if window not in self._windows:
-            while len(self._windows) > 3:
+            while len(self._windows) >= _WINDOWS:
                 del self._windows[min(self._windows)]
             self._windows[window] = smoothing_spline(
                 *self._part(window), self._strength, self._step)

@@ -68,6 +68,28 @@ def sigma_v(sensor: Sensor) -> np.ndarray:
     return np.hypot(analog_sigma_v(sensor), sensor.lsb_v / np.sqrt(12))
 
 
+def density_v2_per_hz(sensor: Sensor, frequency_hz: np.ndarray) -> np.ndarray:
+    """
+    Return the one-sided spectral density of the samples' noise, V²/Hz, (k, m).
+
+    An AR(1) sequence (Percival and Walden 1993, section 9.2) and the ADC's steps, which are
+    white.
+
+    Parameters
+    ----------
+    sensor
+        Stated figures, sampled at its rate.
+    frequency_hz
+        Up to half the rate, (k,).
+
+    """
+    rc_s, _ = electronics(sensor)
+    decay = np.where(rc_s > 0, np.exp(-1 / (sensor.rate_hz * np.where(rc_s > 0, rc_s, 1.0))), 0.0)
+    turn = np.exp(-2j * np.pi * frequency_hz / sensor.rate_hz)[:, None]
+    shape = (1 - decay ** 2) / np.abs(1 - decay * turn) ** 2
+    return 2 / sensor.rate_hz * (analog_sigma_v(sensor) ** 2 * shape + sensor.lsb_v ** 2 / 12)
+
+
 def effective_samples(count: int | np.ndarray, dt_s: float, rc_s: float) -> np.ndarray:
     """
     Count the independent samples that make a mean as good as `count` filtered ones.

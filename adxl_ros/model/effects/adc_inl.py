@@ -19,10 +19,22 @@ import numpy as np
 
 
 def apply(signals: Signals, p: Parameters) -> None:
-    """Add A·sin(2π·n·V/V_ref) to the volts of each axis."""
+    """
+    Add A·sin(2π·n·V/V_ref) and the wrong weights of the heaviest bits to the volts of each axis.
+
+    A converter that weighs bit by bit is off by the error of each bit that is set (van de
+    Plassche, "CMOS Integrated Analog-to-Digital Converters", 2003): half of it up or down.
+    """
     turn = 2 * np.pi * p['cycles'] / signals.vref_v
     for d, volts in enumerate(signals.input_v):
-        signals.volts[d] = signals.volts[d] + p['amplitude_v'] * np.sin(turn * volts)
+        off = p['amplitude_v'] * np.sin(turn * volts)
+        for bit, name in enumerate(_BITS, 1):
+            if p[name]:
+                off = off + p[name] * (np.floor(volts / signals.vref_v * 2 ** bit) % 2 - 0.5)
+        signals.volts[d] = signals.volts[d] + off
+
+
+_BITS = ('first_bit_v', 'second_bit_v', 'third_bit_v', 'fourth_bit_v')
 
 
 EFFECT = Effect(
@@ -33,6 +45,9 @@ EFFECT = Effect(
                   'largest deviation from the straight line', ''),
         Parameter('cycles', '1', 0.5, 64.0, 8.0, 'physics: segments of a converter',
                   'periods of the deviation over the full scale', '', neutral=8.0),
+        *(Parameter(name, 'V', -0.05, 0.05, 3e-4, 'physics: 4 LSB of 16 bit at 5 V',
+                    f'error of the weight of bit {i} from above', '', typical=0.0)
+          for i, name in enumerate(_BITS, 1)),
     ),
     apply=apply,
     invertible=True,

@@ -26,7 +26,7 @@ EFFECT = Effect(
     name='gravity',
     place=Place.STAGE,
     parameters=(
-        Parameter('offset_mps2', 'm/s^2', -0.2, 0.2, 0.01,
+        Parameter('offset_mps2', 'm/s^2', -5.0, 5.0, 0.01,
                   'geodesy: 9.780 at the equator, 9.832 at the poles',
                   'local gravity minus the stated one', ''),
     ),

@@ -20,10 +20,10 @@ REFERENCE_C = 25.0
 
 
 def apply(signals: Signals, p: Parameters) -> None:
-    """Add k·(T − 25 °C) to the output, g."""
+    """Add k·(T − 25 °C) + k2·(T − 25 °C)² to the output, g."""
     off_k = signals.environment.temperature_c - REFERENCE_C
-    for d, per_k in enumerate(p['per_k']):
-        signals.output[d] = signals.output[d] + per_k * off_k
+    for d, (per_k, per_k2) in enumerate(zip(p['per_k'], p['per_k2'])):
+        signals.output[d] = signals.output[d] + off_k * (per_k + off_k * per_k2)
 
 
 EFFECT = Effect(
@@ -31,7 +31,10 @@ EFFECT = Effect(
     place=Place.ELECTRONICS,
     parameters=(
         Parameter('per_k', 'g/K', -0.1, 0.1, 1e-4, 'ADXL203 datasheet: 0.1 mg/degC',
-                  'change of the zero-g with temperature, from 25 degC on'),
+                  'slope of the zero-g over temperature at 25 degC'),
+        Parameter('per_k2', 'g/K^2', -0.01, 0.01, 1e-6,
+                  'physics: a slope that changes by 1 % a degree',
+                  'curvature of the zero-g over temperature', typical=0.0),
     ),
     apply=apply,
     invertible=True,

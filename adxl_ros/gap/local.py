@@ -1,0 +1,265 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""A hypothesis about values of its coefficients: differentiated there, fitted, simulated again."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from adxl_ros.gap import evidence
+from adxl_ros.gap.evidence import Channel, Fit
+from adxl_ros.gap.series import Series
+from adxl_ros.gap.study import Study, WANDERING
+from adxl_ros.gap.tangents import WIDE
+from adxl_ros.gap.whiten import near
+from adxl_ros.model.coefficients import get, names_of, parameter_of, put, with_neutral
+from adxl_ros.model.effects import effect_named
+from adxl_ros.model.effects.base import Parameter
+from adxl_ros.model.sensor import Sensor
+import numpy as np
+
+_STEPS = 5
+_CHANGED = 1e-3
+_GAINS = 0.05
+"""A step that gains less, in nats, is the last."""
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """
+    A set of effects after its fit.
+
+    Attributes
+    ----------
+    effects
+        Names; none for no gap.
+    sensor
+        The baseline with the effects, and all that is free in every hypothesis, as fitted.
+    names, values, std
+        Fitted coefficients of the effects, as departures from the baseline.
+    log_evidence
+        Nats.
+    fit
+        The last linear step.
+
+    """
+
+    effects: tuple[str, ...]
+    sensor: Sensor
+    names: tuple[str, ...]
+    values: np.ndarray
+    std: np.ndarray
+    log_evidence: float
+    fit: Fit
+
+
+@dataclass(frozen=True)
+class Local:
+    """
+    A hypothesis differentiated about values of its coefficients.
+
+    What is free in every hypothesis is differentiated at the baseline: it stays near it.
+
+    Attributes
+    ----------
+    sensor
+        At the values.
+    names
+        Coefficients, those of the effects first, (k,).
+    middle, prior
+        Mean and standard deviation beforehand, (k,).
+    values
+        Of the coefficients of the effects, (j,).
+    channels
+        Whitened: residuals as at the mean beforehand, and columns.
+
+    """
+
+    sensor: Sensor
+    names: tuple[str, ...]
+    middle: np.ndarray
+    prior: np.ndarray
+    values: np.ndarray
+    channels: list[Channel]
+
+    def fit(self, blocks: np.ndarray | None = None) -> Fit:
+        """Fit all coefficients to some blocks, all unless given, (b,)."""
+        return evidence.fit(self.channels, range(len(self.names)), self.prior, blocks,
+                            wanders=WANDERING in self.sensor.effects)
+
+    def fitted(self, found: Fit, moved: bool = True) -> Sensor:
+        """Return the sensor after a fit, within bounds; the effects as they are if not moved."""
+        values = self.middle + found.values
+        if not moved:
+            values[:len(self.values)] = self.values
+        return put(self.sensor, self.names, _within(self.names, values))
+
+    def log_evidence(self, found: Fit) -> float:
+        """Return the log-evidence at the values themselves, nats."""
+        return found.log_evidence - evidence.lost(
+            self.channels, found, self.values - self.middle[:len(self.values)], self.prior)
+
+
+def local(of: Study, effects: Sequence[str], sensor: Sensor,
+          beside: Sequence[np.ndarray] = (), noise: Sequence[int] | None = None) -> Local:
+    """
+    Differentiate the effects of a hypothesis about a sensor.
+
+    Parameters
+    ----------
+    of
+        The recordings.
+    effects
+        Names.
+    sensor
+        Has them; its coefficients are the values.
+    beside
+        More columns by recording, (n, j), V a unit, each axis with coefficients of its own: they
+        are numbered on, axis by axis.
+    noise
+        Numbers of the filters about which the noise of each channel is, where it is known.
+
+    """
+    held = with_neutral(of.series[0].sensor, effects)
+    own = [name for effect in effects for name in names_of(effect_named(effect), held.axes)
+           if bent(parameter_of(name)) or name in of.names]
+    free = [n for n in dict.fromkeys(n for names in of.free for n in names)
+            if n.split('.')[0] not in effects]
+    held = with_neutral(held, dict.fromkeys(n.split('.')[0] for n in free))
+    parameters = [parameter_of(name) for name in own]
+    middle = np.array([p.scale if bent(p) else float(get(held, [name])[0])
+                       for name, p in zip(own, parameters)])
+    values = get(sensor, own)
+    sensor = put(held, own, values)
+    prior = [p.scale * (1 if bent(p) else WIDE) for p in parameters]
+    names = [*own, *free]
+    channels: list[Channel] = []
+    count = len(names)
+    for number, (one, mask) in enumerate(zip(of.series, of.used)):
+        more = beside[number] if beside else np.zeros((len(one), 0))
+        at_rate = replace(sensor, rate_hz=one.sensor.rate_hz)
+        there = one.simulated(at_rate)
+        columns = columns_at(one, at_rate, own, values, there)
+        for d in range(len(held.axes)):
+            at = [i for i, n in enumerate(own)
+                  if len(n.split('.')) == 2 or held.axes.index(n.split('.')[2]) == d]
+            known = of.free[len(channels)]
+            also = [n for n in free if n in known]
+            design = columns[:, d, at]
+            residual = one.volts[:, d] - there[:, d] + design @ (values - middle)[at]
+            tried = of.filters[len(channels)]
+            channels.append(evidence.channel(
+                residual, np.column_stack([design, *(known[n] for n in also), more]),
+                np.array([*at, *(names.index(n) for n in also),
+                          *range(count, count + more.shape[1])], int), mask,
+                tried if noise is None else near(tried, noise[len(channels)])))
+            count += more.shape[1]
+    return Local(sensor, tuple(names), np.concatenate([middle, get(held, free)]),
+                 np.array([*prior, *(of.tolerance(n) for n in free)]), values, channels)
+
+
+def bent(p: Parameter) -> bool:
+    """Tell a parameter that is no size: it has a typical value, and no neutral one near it."""
+    return p.shape or p.neutral == p.upper
+
+
+def refined(of: Study, effects: Sequence[str], start: dict[str, float],
+            shapes: dict[str, float]) -> Hypothesis:
+    """
+    Fit a set of effects by re-simulation, parameters of shape included.
+
+    Gauss-Newton: simulate and differentiate at the present values, whiten, fit, until the
+    evidence no longer gains; a step that loses is halved.
+
+    Parameters
+    ----------
+    of
+        The recordings.
+    effects
+        Their names.
+    start
+        Departures from the baseline to begin with, by coefficient.
+    shapes
+        Parameters of shape to begin with, by `effect.parameter`.
+
+    """
+    effects = tuple(dict.fromkeys(effects))
+    sensor = with_neutral(of.series[0].sensor, effects)
+    names = [n for effect in effects for n in names_of(effect_named(effect), sensor.axes)]
+    begin = []
+    for name in names:
+        p = parameter_of(name)
+        middle = p.scale if bent(p) else float(get(sensor, [name])[0])
+        short = '.'.join(name.split('.')[:2])
+        begin.append(shapes[short] if bent(p) and short in shapes
+                     else middle + start.get(name, 0.0))
+    sensor = put(sensor, names, _within(names, np.array(begin)))
+    best: tuple[float, Local, Fit] | None = None
+    step = np.zeros(0)
+    for _ in range(_STEPS):
+        here = local(of, effects, sensor)
+        found = here.fit()
+        reached = here.log_evidence(found)
+        own = slice(len(here.values))
+        if best is not None and reached < best[0] - _CHANGED:
+            step = step / 2
+            sensor = put(sensor, here.names[own], _within(here.names[own],
+                                                          best[1].values + step))
+            continue
+        done = best is not None and reached - best[0] < _GAINS
+        best = (reached, here, found)
+        step = (here.middle + found.values)[own] - here.values
+        if done or np.all(np.abs(step) < _CHANGED * here.prior[own]):
+            break
+        sensor = put(sensor, here.names[own], _within(here.names[own], here.values + step))
+    assert best is not None
+    reached, here, found = best
+    own = slice(len(here.values))
+    fitted = here.fitted(found, False)
+    if WANDERING in effects:
+        walks = [f[w].walk_g_per_rts for f, w in zip(of.filters, found.walks)]
+        fitted = replace(fitted, values={**fitted.values, WANDERING: {
+            'density_g_per_rts': np.array(walks[:len(fitted.axes)])}})
+    return Hypothesis(effects, fitted, here.names[own],
+                      here.values - here.middle[own],
+                      np.sqrt(np.diag(found.covariance))[own], reached, found)
+
+
+def _within(names: Sequence[str], values: np.ndarray) -> np.ndarray:
+    lower, upper = (np.array([getattr(parameter_of(n), side) for n in names])
+                    for side in ('lower', 'upper'))
+    return np.clip(values, lower, upper)
+
+
+def columns_at(series: Series, sensor: Sensor, names: Sequence[str], values: np.ndarray,
+             there: np.ndarray) -> np.ndarray:
+    """Differentiate volts by coefficients at their values, (n, m, p); all axes at once."""
+    out = np.zeros((*there.shape, len(names)))
+    groups: dict[str, list[int]] = {}
+    for i, name in enumerate(names):
+        groups.setdefault('.'.join(name.split('.')[:2]), []).append(i)
+    for of in groups.values():
+        p = parameter_of(names[of[0]])
+        by = p.scale * (0.02 if effect_named(names[of[0]].split('.')[0]).smooth else 0.3)
+        if values[of[0]] + by > p.upper:
+            by = -by
+        moved = series.simulated(put(sensor, [names[i] for i in of], values[of] + by))
+        for i in of:
+            parts = names[i].split('.')
+            axes = [sensor.axes.index(parts[2])] if len(parts) == 3 else range(len(sensor.axes))
+            for d in axes:
+                out[:, d, i] = (moved[:, d] - there[:, d]) / by
+    return out
