@@ -187,8 +187,9 @@ def test_corrected_stream(robot: Robot, start: Start, tmp_path: Path) -> None:
 def test_supply_and_temperature_are_taken_out(robot: Robot, start: Start, tmp_path: Path) -> None:
     """What `supply` and `temperature` say reaches the inverse; what is not said is named."""
     sensor = with_neutral(unit(), ['supply', 'temperature_bias'])
-    sensor = put(sensor, ['supply.zero_g_exponent', 'supply.scale_exponent',
-                          'temperature_bias.per_k.x'], [1.0, 1.135, 1e-3])
+    sensor = put(sensor, ['temperature_bias.per_k.x', *(
+        f'supply.{figure}_exponent.{axis}' for figure in ('zero_g', 'scale')
+        for axis in sensor.axes)], [1e-3, *[1.0] * 2, *[1.135] * 2])
     started(start, tmp_path, sensor)
     robot.inform(sensor)
     robot.connected()

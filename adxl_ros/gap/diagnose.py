@@ -153,7 +153,7 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
     if far is None:
         far = shrunk(weighed, full, counted, replace(best, effects=()), base, seed)
     found[0] = best = _drift_named(best, full, counted)
-    loud = _with_signs(best.sensor, signs, sensor)
+    loud = _with_signs(best, signs, sensor)
     alike = [[likeness(one, one.residual(mean), mask, whole, seed)
               for one, mask in zip(full, counted)]
              for mean, whole in ((sensor, sensor), (best.sensor, loud))]
@@ -167,7 +167,7 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
     alone = scores(weighed, seed)
     show(1.0)
     return Diagnosis(None, series, used, base, answer, tuple(found), tuple(signs), far,
-                     tuple(cells), tuple(missing), proposed(answer, missing), weighed, alone,
+                     tuple(cells), tuple(missing), proposed(answer, missing, seed), weighed, alone,
                      (tuple(alike[0]), tuple(alike[1])),
                      sensor if answer.status in ('no_gap', 'unknown', 'insufficient') else loud)
 
@@ -203,9 +203,13 @@ def _insufficient(answer: Verdict, series: Sequence[Series]) -> Verdict:
     return replace(answer, status='insufficient')
 
 
-def _with_signs(found: Sensor, signs: Sequence[Sign], baseline: Sensor) -> Sensor:
+def _with_signs(best: Hypothesis, signs: Sequence[Sign], baseline: Sensor) -> Sensor:
     """Put the noise-like effects beside those of the mean, at the baseline's rate."""
-    effects, values = list(found.effects), dict(found.values)
+    found = best.sensor
+    # Filter and latency within their tolerance are not worth an effect.
+    effects = [e for e in found.effects if e in (*baseline.effects, *best.effects)
+               or e in ('bias', 'scale_factor')]
+    values = {name: of for name, of in found.values.items() if name in effects}
     for sign in signs:
         if sign.effect != 'unknown':
             if sign.effect not in effects:

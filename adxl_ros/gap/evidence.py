@@ -186,6 +186,26 @@ def _left(grams: np.ndarray, values: np.ndarray) -> np.ndarray:
     return np.einsum('i,wij,j->w', v, grams, v)
 
 
+def robust_std(channels: Sequence[Channel], found: Fit, prior: np.ndarray) -> np.ndarray:
+    """
+    Return standard deviations that hold where the model is not quite right, too, (k,).
+
+    The larger of the model's and of what the scores of blocks say (sandwich; White 1982,
+    Econometrica 50, blocks for what is correlated).
+    """
+    own = len(found.ids)
+    scores = np.zeros((BLOCKS, own))
+    for c, w, s2 in zip(channels, found.walks, found.variance):
+        at = np.flatnonzero(np.isin(c.ids, found.ids))
+        to = np.searchsorted(found.ids, c.ids[at])
+        rows = c.grams[w][:, 1 + at]
+        scores[:, to] += (rows[:, :, 0] - rows[:, :, 1 + at] @ found.values[to]) / s2
+    scores = scores - scores.mean(axis=0)
+    sandwich = found.covariance @ (scores.T @ scores) @ found.covariance * BLOCKS / (BLOCKS - 1)
+    return np.sqrt(np.maximum(np.diag(found.covariance),
+                              np.minimum(np.diag(sandwich), prior[found.ids] ** 2)))
+
+
 def predicted(channels: Sequence[Channel], found: Fit, blocks: np.ndarray) -> np.ndarray:
     """Return the log-likelihood of blocks that were not fitted, nats, by block, (b,)."""
     out = np.zeros(len(blocks))

@@ -30,6 +30,8 @@ from adxl_ros.gap.floor import Floor
 from adxl_ros.gap.local import Hypothesis, local
 from adxl_ros.gap.series import Series
 from adxl_ros.gap.study import Study
+from adxl_ros.gap.whiten import USUAL_G_PER_RTS
+from adxl_ros.model.effects import effect_named
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
@@ -88,6 +90,8 @@ def shrunk(of: Study, full: Sequence[Series], counted: Sequence[np.ndarray], bes
     number = np.arange(BLOCKS)
     before, after, counts = np.zeros(BLOCKS), np.zeros(BLOCKS), np.zeros(BLOCKS)
     plain = local(of, (), of.series[0].sensor)
+    # What only makes noise leaves the mean, and the gap, as they are.
+    by_mean = any(effect_named(effect).acts_on == 'mean' for effect in best.effects)
     found = local(of, best.effects, best.sensor)
     predicted = 0.0
     for fold in range(_FOLDS):
@@ -97,13 +101,16 @@ def shrunk(of: Study, full: Sequence[Series], counted: Sequence[np.ndarray], bes
             fit = here.fit(~near)
             predicted += sign * float(evidence.predicted(
                 here.channels, fit, np.flatnonzero(out)).sum())
-            sensor = here.fitted(fit)
+            shown = here if by_mean else plain
+            sensor, free = shown.fitted(shown.fit(~near)), 'bias' in shown.effects
             for one, mask in zip(full, counted):
-                total[out] += _by_block(one, mask, sensor)[out]
+                total[out] += _by_block(one, mask, sensor, ~near, of, free)[out]
         for mask in counted:
             edges = np.linspace(0, len(mask), BLOCKS + 1).astype(int)
             counts[out] += np.add.reduceat(mask, edges[:-1])[out]
-    within = sum(_by_block(one, mask, best.sensor).sum() for one, mask in zip(full, counted))
+    everywhere = np.ones(BLOCKS, bool)
+    within = sum(_by_block(one, mask, best.sensor, everywhere, of, 'bias' in best.effects).sum()
+                 for one, mask in zip(full, counted))
     f2 = floor.rms_mps2 ** 2
     b2, a2 = before.sum() / counts.sum(), after.sum() / counts.sum()
     rng = np.random.default_rng(seed)
@@ -120,8 +127,22 @@ def shrunk(of: Study, full: Sequence[Series], counted: Sequence[np.ndarray], bes
                   float(np.sqrt(within / counts.sum())), predicted)
 
 
-def _by_block(series: Series, used: np.ndarray, sensor: Sensor) -> np.ndarray:
-    """Return the sum over samples of the mean square over axes, (m/s²)², by block, (b,)."""
+def _by_block(series: Series, used: np.ndarray, sensor: Sensor, blocks: np.ndarray, of: Study,
+              free: bool) -> np.ndarray:
+    """
+    Return the sum over samples of the mean square over axes, (m/s²)², by block, (b,).
+
+    The level of a zero-g that wanders is that of the stretches that are not held out, within its
+    tolerance; where it is an effect, wherever they say.
+    """
     edges = np.linspace(0, len(series), BLOCKS + 1).astype(int)
-    squares = ((series.residual(sensor) / series.scale_v_per_mps2) ** 2).mean(axis=1)
+    off = series.residual(sensor)
+    fitted = used & np.repeat(blocks, np.diff(edges))
+    if fitted.any():
+        span_s = float(series.time_s[-1] - series.time_s[0])
+        drift = USUAL_G_PER_RTS ** 2 * span_s / 6 * series.sensor.scale_v_per_g ** 2
+        known = np.array([np.inf if free else of.tolerance(f'bias.offset_v.{axis}')
+                          for axis in series.sensor.axes]) ** 2
+        off = off - off[fitted].mean(axis=0) / (1 + drift / known)
+    squares = ((off / series.scale_v_per_mps2) ** 2).mean(axis=1)
     return np.add.reduceat(np.where(used, squares, 0.0), edges[:-1])

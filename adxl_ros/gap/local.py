@@ -75,6 +75,8 @@ class Local:
 
     Attributes
     ----------
+    effects
+        Names.
     sensor
         At the values.
     names
@@ -88,6 +90,7 @@ class Local:
 
     """
 
+    effects: tuple[str, ...]
     sensor: Sensor
     names: tuple[str, ...]
     middle: np.ndarray
@@ -167,7 +170,7 @@ def local(of: Study, effects: Sequence[str], sensor: Sensor,
                           *range(count, count + more.shape[1])], int), mask,
                 tried if noise is None else near(tried, noise[len(channels)])))
             count += more.shape[1]
-    return Local(sensor, tuple(names), np.concatenate([middle, get(held, free)]),
+    return Local(tuple(effects), sensor, tuple(names), np.concatenate([middle, get(held, free)]),
                  np.array([*prior, *(of.tolerance(n) for n in free)]), values, channels)
 
 
@@ -235,7 +238,8 @@ def refined(of: Study, effects: Sequence[str], start: dict[str, float],
             'density_g_per_rts': np.array(walks[:len(fitted.axes)])}})
     return Hypothesis(effects, fitted, here.names[own],
                       here.values - here.middle[own],
-                      np.sqrt(np.diag(found.covariance))[own], reached, found)
+                      evidence.robust_std(here.channels, found, here.prior)[own], reached,
+                      found)
 
 
 def _within(names: Sequence[str], values: np.ndarray) -> np.ndarray:
@@ -253,7 +257,9 @@ def columns_at(series: Series, sensor: Sensor, names: Sequence[str], values: np.
         groups.setdefault('.'.join(name.split('.')[:2]), []).append(i)
     for of in groups.values():
         p = parameter_of(names[of[0]])
-        by = p.scale * (0.02 if effect_named(names[of[0]].split('.')[0]).smooth else 0.3)
+        limit = p.neutral == p.upper
+        by = p.scale * (0.3 if not limit and not effect_named(
+            names[of[0]].split('.')[0]).smooth else 0.02)
         if values[of[0]] + by > p.upper:
             by = -by
         moved = series.simulated(put(sensor, [names[i] for i in of], values[of] + by))

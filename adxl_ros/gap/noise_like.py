@@ -209,12 +209,14 @@ def of_residual(residual_v: np.ndarray, used: np.ndarray, series: Series) -> lis
     rc_s, _ = noise.electronics(sensor)
     decay = np.exp(-1 / (sensor.rate_hz * np.where(rc_s > 0, rc_s, 1e-9)))
     white = np.column_stack([lfilter([1.0, -a], [1.0], r)[1:] for r, a in zip(data.T, decay)])
-    # A line that shows while the sensor rests is no trace of how it moves.
-    rests = (series.still & used)[1:]
-    calm = white * rests[:, None] if rests.sum() > _CALM_S * sensor.rate_hz else white
-    line = _line(calm, sensor, residual_v, series.time_s)
-    if calm is white and line is not None and line.effect == 'unknown':
-        line = None
+    # Differences, so that a wandering zero-g is no line.
+    apart, rests = np.diff(white, axis=0), (series.still & used)[2:]
+    line = _line(apart, sensor, residual_v, series.time_s)
+    if line is not None and line.effect == 'unknown':
+        # What does not show while the sensor rests is a trace of how it moves.
+        resting = None if rests.sum() < _CALM_S * sensor.rate_hz else _line(
+            apart * rests[:, None], sensor, residual_v, series.time_s)
+        line = None if resting is None or resting.effect != 'unknown' else line
     if line is not None:
         signs.append(line)
     # Differences, so that a wandering zero-g is none of it; where it moves, what is not modelled

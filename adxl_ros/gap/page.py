@@ -19,12 +19,13 @@ from __future__ import annotations
 from base64 import b64encode
 from html import escape
 from io import BytesIO
+from itertools import pairwise
 from typing import Any
 
 from adxl_ros.calibrate.figures import pyplot
 from adxl_ros.gap.diagnose import Diagnosis
-from adxl_ros.gap.report import as_json, sentence
-from adxl_ros.gap.verdict import contribution_mps2
+from adxl_ros.gap.report import as_json, sentence, shares
+from adxl_ros.gap.where import SHOWS_P
 from adxl_ros.model.constants import G0_MPS2
 import numpy as np
 from scipy.signal import welch
@@ -38,6 +39,7 @@ border-bottom:1px solid #ddd;text-align:left;vertical-align:top}img{width:100%}
 code{background:#f3f3f3;padding:.1em .3em}@media print{body{margin:0}h2{break-after:avoid}}
 """
 _SHOWN = 20_000
+_COLUMNS = 8
 
 
 def page(found: Diagnosis, title: str) -> str:
@@ -57,8 +59,9 @@ def page(found: Diagnosis, title: str) -> str:
         report = as_json(found)
         parts += ['<h2>How far it shrinks</h2>', _picture(_bar(found)),
                   '<h2>Before and after</h2>', _picture(_overlay(found)),
-                  '<h2>Where</h2>', _where(report), _list('Not covered by this recording',
-                                                          report['not_covered']),
+                  '<h2>Noise, recorded by simulated</h2>', _noise(report),
+                  '<h2>Where</h2>', _picture(_map(found)), _where(report),
+                  _list('Not covered by this recording', report['not_covered']),
                   '<h2>Which</h2>', _hypotheses(report), _candidates(report),
                   '<h2>What cannot be told apart, and what to do next</h2>', _next(report)]
     return (f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{escape(title)}'
@@ -73,19 +76,29 @@ def _picture(figure: Any) -> str:
 
 
 def _bar(found: Diagnosis) -> Any:
-    assert found.verdict is not None and found.shrunk is not None and found.study is not None
+    """Draw the squares of the gap: the floor, each effect's part, what is left."""
+    assert found.shrunk is not None
     far = found.shrunk
-    figure, axis = pyplot().subplots(figsize=(10, 1.9), layout='constrained')
-    mg = {'before': far.before_mps2, 'after': far.after_mps2, 'floor': far.floor_mps2}
-    for i, (label, value) in enumerate(mg.items()):
-        axis.barh(2 - i, 1e3 * value / G0_MPS2, color=('#c44', '#484', '#999')[i])
-        axis.text(1e3 * value / G0_MPS2, 2 - i, f' {label}: {1e3 * value / G0_MPS2:.3f} mg rms',
-                  va='center', fontsize=9)
-    best = found.verdict.best
-    parts = {effect: contribution_mps2(found.study, best, effect) for effect in best.effects}
-    axis.set(yticks=[], xlabel='mg rms, held out', title=', '.join(
-        f'{effect} {1e3 * part / G0_MPS2:.2f} mg' for effect, part in parts.items()))
-    axis.margins(x=0.25)
+    squares = [(1e3 * v / G0_MPS2) ** 2 for v in (far.floor_mps2, far.after_mps2,
+                                                  far.before_mps2)]
+    floor, after, before = squares[0], max(squares[0], squares[1]), max(squares)
+    parts = {'floor': floor, 'left': after - floor} | {
+        effect: share * (before - floor) for effect, share in shares(found).items()}
+    if sum(parts.values()) < before:
+        parts['not explained'] = before - sum(parts.values())
+    figure, axis = pyplot().subplots(figsize=(10, 1.8), layout='constrained')
+    begin = 0.0
+    for i, (label, width) in enumerate(parts.items()):
+        axis.barh(0, width, left=begin, color='#999' if label == 'floor' else f'C{i + 1}',
+                  label=f'{label}: {width:.3g} mg²')
+        begin += width
+    for label, square in zip(('after', 'before'), (after, before)):
+        axis.axvline(square, color='k', lw=0.8)
+        axis.annotate(f'{label} {np.sqrt(square):.3g} mg', (square, 0.45), rotation=30,
+                      fontsize=8, annotation_clip=False)
+    axis.set(yticks=[], ylim=(-0.4, 1.0), xlabel='mean square, held out, mg²')
+    axis.legend(fontsize=8, ncols=len(parts), loc='upper right', frameon=False)
+    axis.spines[['top', 'right', 'left']].set_visible(False)
     return figure
 
 
@@ -112,6 +125,28 @@ def _overlay(found: Diagnosis) -> Any:
     return figure
 
 
+def _map(found: Diagnosis) -> Any:
+    """Draw all cells of the map: mean residual by range, ringed where it shows."""
+    cells = [c for c in found.cells if c.statistic == 'mean']
+    rows = sorted({(c.dimension, c.axis) for c in cells})
+    limit = max((abs(c.mean_mps2) for c in cells), default=1.0) * 1e3 / G0_MPS2
+    figure, axis = pyplot().subplots(figsize=(10, 0.8 + 0.24 * len(rows)), layout='constrained')
+    drawn = None
+    for i, row in enumerate(rows):
+        own = sorted((c for c in cells if (c.dimension, c.axis) == row), key=lambda c: c.low)
+        shows = ['k' if c.p < SHOWS_P else 'none' for c in own]
+        drawn = axis.scatter(np.arange(len(own)), np.full(len(own), i), marker='s', s=180,
+                             c=[1e3 * c.mean_mps2 / G0_MPS2 for c in own], cmap='RdBu_r',
+                             vmin=-limit, vmax=limit, edgecolors=shows)
+        axis.text(_COLUMNS, i, f'{own[0].low:.4g} to {own[-1].high:.4g}', fontsize=8, va='center')
+    axis.set(yticks=range(len(rows)), xticks=[], xlim=(-0.5, _COLUMNS + 2),
+             xlabel='from the lowest range to the highest; ringed: p < 0.05, family-wise')
+    axis.set_yticklabels([f'{dimension}  {name}' for dimension, name in rows], fontsize=8)
+    if drawn is not None:
+        figure.colorbar(drawn, label='mean residual, mg', shrink=0.6)
+    return figure
+
+
 def _table(head: list[str], rows: list[list[str]]) -> str:
     if not rows:
         return '<p>Nothing.</p>'
@@ -122,10 +157,23 @@ def _table(head: list[str], rows: list[list[str]]) -> str:
 
 
 def _where(report: dict[str, Any]) -> str:
-    return _table(['axis', 'dimension', 'range', 'mean, mg', 'in floors', 'share', 'p (family)'], [
-        [c['axis'], c['dimension'], f'{c["range"][0]:.4g} to {c["range"][1]:.4g}',
+    return _table(['axis', 'dimension', 'of', 'range', 'mg', 'in floors', 'share', 'p (family)'], [
+        [c['axis'], c['dimension'], c['statistic'], f'{c["range"][0]:.4g} to {c["range"][1]:.4g}',
          f'{1e3 * c["mean"] / G0_MPS2:+.2f}', f'{c["floor_units"]:+.1f}',
          f'{100 * c["share"]:.1f} %', f'{c["p"]:.3f}'] for c in report['where'][:12]])
+
+
+def _noise(report: dict[str, Any]) -> str:
+    rows = []
+    for one in report['gap']['noise']:
+        bands = one['bands_hz']
+        names = [f'{low:.3g} to {high:.3g} Hz' for low, high in pairwise(bands)]
+        names += [f'Allan deviation at {t:g} s' for t in one['allan_s']]
+        rows += [[name, f'{before:.2f}', f'{after:.2f}'] for name, before, after in zip(
+            names, *([*one[f'power_ratio_{when}'], *one[f'allan_ratio_{when}']]
+                     for when in ('before', 'after')))]
+        rows.append(['log-likelihood gained, nats', '', f'{one["log_likelihood_gain"]:.0f}'])
+    return _table(['power or deviation, recorded by simulated', 'before', 'after'], rows)
 
 
 def _hypotheses(report: dict[str, Any]) -> str:
@@ -155,5 +203,8 @@ def _next(report: dict[str, Any]) -> str:
     step = report['next_experiment']
     if step is None:
         return ''.join(groups) + '<p>Nothing more is asked for.</p>'
+    menu = '' if not step['menu'] else _table(['manoeuvre', 'minutes', 'nats a minute'], [
+        [one['manoeuvre'], f'{one["minutes"]:.1f}', f'{one["nats_per_minute"]:.1f}']
+        for one in step['menu']])
     return ''.join(groups) + (f'<p>{escape(step["manoeuvre"])}: {escape(step["why"])}.</p>'
-                              f'<p><code>{escape(step["command"])}</code></p>')
+                              f'<p><code>{escape(step["command"])}</code></p>{menu}')

@@ -21,6 +21,8 @@ from typing import Any
 
 from adxl_ros.gap.diagnose import Diagnosis
 from adxl_ros.gap.local import Hypothesis
+from adxl_ros.gap.verdict import contribution_mps2
+from adxl_ros.gap.where import SHOWS_P
 from adxl_ros.model.coefficients import parameter_of
 from adxl_ros.model.effects import effect_named, library
 import numpy as np
@@ -49,11 +51,12 @@ def as_json(found: Diagnosis) -> dict[str, Any]:
         'gap': {'unit': 'm/s^2', 'before': _round(far.before_mps2),
                 'after': _round(far.after_mps2), 'floor': _round(far.floor_mps2),
                 'floor_source': found.floor.source, 'closed': _round(far.closed),
-                'closed_ci': [_round(c) for c in far.closed_ci]},
+                'closed_ci': [_round(c) for c in far.closed_ci],
+                'noise': _noise(found)},
         'where': [{'axis': c.axis, 'dimension': c.dimension, 'statistic': c.statistic,
                    'range': [_round(c.low), _round(c.high)], 'mean': _round(c.mean_mps2),
                    'floor_units': _round(c.floor_units), 'share': _round(c.share),
-                   'p': _round(c.p)} for c in found.cells[:40]],
+                   'p': _round(c.p)} for c in found.cells if c.p < SHOWS_P][:40],
         'not_covered': list(found.missing),
         'unknown_where': list(v.places),
         'candidates': _candidates(found),
@@ -61,8 +64,38 @@ def as_json(found: Diagnosis) -> dict[str, Any]:
                        for s in found.signs],
         'next_experiment': None if found.proposal is None else {
             'manoeuvre': found.proposal.manoeuvre, 'why': found.proposal.why,
-            'command': found.proposal.command},
+            'command': found.proposal.command,
+            'nats_per_minute': found.proposal.nats_per_minute and _round(
+                found.proposal.nats_per_minute),
+            'menu': [{'manoeuvre': words, 'minutes': _round(minutes),
+                      'nats_per_minute': _round(worth)}
+                     for words, minutes, worth in found.proposal.menu]},
         'summary': sentence(found)}
+
+
+def _noise(found: Diagnosis) -> list[dict[str, Any]]:
+    """Compare recorded with simulated noise, recording by recording."""
+    return [{'recording': one.name, 'log_likelihood_gain': _round(
+                after.log_likelihood - before.log_likelihood),
+             'bands_hz': [_round(f) for f in after.bands_hz],
+             'power_ratio_before': [_round(r) for r in before.power],
+             'power_ratio_after': [_round(r) for r in after.power],
+             'allan_s': list(after.times_s),
+             'allan_ratio_before': [_round(r) for r in before.allan],
+             'allan_ratio_after': [_round(r) for r in after.allan]}
+            for one, before, after in zip(found.series, *found.alike)]
+
+
+def shares(found: Diagnosis) -> dict[str, float]:
+    """Split the squares that close, before less after, among the effects by what each makes."""
+    assert found.verdict is not None and found.shrunk is not None and found.study is not None
+    parts = {effect: contribution_mps2(found.study, found.verdict.best, effect) ** 2
+             for effect in found.verdict.best.effects}
+    whole = sum(parts.values())
+    closes = max(found.shrunk.before_mps2 ** 2 - found.shrunk.after_mps2 ** 2, 0.0)
+    gap = max(found.shrunk.before_mps2 ** 2 - found.shrunk.floor_mps2 ** 2, 1e-30)
+    return {effect: float(min(closes / gap, 1.0) * part / whole) if whole else 0.0
+            for effect, part in parts.items()}
 
 
 def _round(value: float) -> float | None:
@@ -89,6 +122,7 @@ def _candidates(found: Diagnosis) -> list[dict[str, Any]]:
         for effect in h.effects:
             seen.setdefault(effect, h)
     rivals = {effect: [e for e in group if e != effect] for group in v.groups for effect in group}
+    share = shares(found)
     out = []
     for name in library():
         if name not in chance and name not in seen:
@@ -101,6 +135,7 @@ def _candidates(found: Diagnosis) -> list[dict[str, Any]]:
             'closed': _round(found.shrunk.closed) if best and not signs else None,
             'p': _round(score.p) if score else float(np.exp(-signs[0].nats)) if signs else None,
             'parameters': _parameters(seen.get(name), name),
+            'share': _round(share[name]) if name in share else None,
             'visibility': _round(score.visibility) if score else 1.0,
             'inseparable_from': rivals.get(name, []), 'cause': effect_named(name).cause})
         if signs:

@@ -103,7 +103,8 @@ class Study:
         return float(np.hypot(TOLERANCE[effect] * scale, np.sqrt(known)))
 
 def study(series: Sequence[Series], used: Sequence[np.ndarray],
-          show: Callable[[float], None], noise: Sequence[int] | None = None) -> Study:
+          show: Callable[[float], None], noise: Sequence[int] | None = None,
+          only: Sequence[str] | None = None) -> Study:
     """
     Differentiate the baseline by the whole library in all recordings.
 
@@ -117,10 +118,12 @@ def study(series: Sequence[Series], used: Sequence[np.ndarray],
         Takes the fraction that is done.
     noise
         Numbers of the filters about which the noise of each channel is, where it is known.
+    only
+        These effects and what is free, not the whole library.
 
     """
     every: dict[tuple, dict[int, Variant]] = {}
-    effects = candidates(series[0].sensor)
+    effects = [e for e in candidates() if only is None or e.name in (*only, *TOLERANCE)]
     for i, one in enumerate(series):
         base = one.simulated(one.sensor)
         for k, effect in enumerate(effects):

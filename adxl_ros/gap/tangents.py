@@ -35,7 +35,7 @@ _SMALL = 0.2
 """Step of a smooth parameter, by its typical size."""
 _LARGE = (1.0, 4.0, 16.0)
 """Steps of one that is not: what a play of 1 mrad does tells little of one of 15."""
-_CLIPPED = (0.002, 0.01, 0.03, 0.1, 0.3)
+_CLIPPED = (0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.3)
 """Part of the samples that a limit clips where it is tried."""
 
 
@@ -70,7 +70,7 @@ class Variant:
     begin: dict[str, float] = field(default_factory=dict)
 
 
-def candidates(sensor: Sensor) -> list[Effect]:
+def candidates() -> list[Effect]:
     """Return the effects of the library that act on the mean and have tangents."""
     return [effect for effect in library().values() if effect.acts_on == 'mean']
 
@@ -103,16 +103,18 @@ def variants(series: Series, effect: Effect, base: np.ndarray) -> Iterator[Varia
 
 def _limited(series: Series, effect: Effect, limit: Parameter, base: np.ndarray
              ) -> Iterator[Variant]:
-    """Try a limit where it clips a small part of the samples, and more."""
+    """Try a limit where it clips a small part of the samples, and more: one, or by axis."""
     axes = series.sensor.axes
     held = with_neutral(series.sensor, [effect.name])
     g = np.abs(base - series.sensor.zero_g_v) / series.sensor.scale_v_per_g
-    for part in _CLIPPED:
-        values = np.clip(np.quantile(g, 1 - part, axis=0), limit.lower, limit.upper)
+    levels = [level for part in _CLIPPED for level in (
+        np.quantile(g, 1 - part, axis=0), np.full(len(axes), np.quantile(g, 1 - part)))]
+    for number, level in enumerate(levels):
+        values = np.clip(level, limit.lower, limit.upper)
         does = series.simulated(put(held, names := names_of(effect, axes), values)) - base
         seen = [d for d in range(len(axes)) if np.any(np.abs(does[:, d]) > 1e-9)]
         if seen:
-            yield Variant(effect.name, {}, part, tuple(names[d] for d in seen), np.ones(
+            yield Variant(effect.name, {}, float(number), tuple(names[d] for d in seen), np.ones(
                 len(seen)), tuple((np.array([seen.index(d)] if d in seen else [], int),
                                    does[:, [d]] if d in seen else np.zeros((len(base), 0)))
                                   for d in range(len(axes))), dict(zip(names, values)))

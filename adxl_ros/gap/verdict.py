@@ -42,6 +42,8 @@ VISIBLE = 0.06
 """An effect that makes less of the noise than this, rms, is not the gap."""
 SHARE = 0.02
 """Nor is one that makes less of the squares of the gap than this."""
+EXACT = ('bias', 'scale_factor', 'gravity')
+"""Effects whose form is beyond doubt: they leave nothing that looks like another."""
 TAKEN = 0.006
 """Nor is an effect more that takes less off the squares of the gap than this."""
 RIVAL = 0.05
@@ -130,12 +132,16 @@ def worthy(of: Study, found: Sequence[Hypothesis], noise_mps2: float) -> list[Hy
     kept = []
     for one in found:
         parts = {effect: contribution_mps2(of, one, effect) for effect in one.effects}
-        whole, here = sum(p * p for p in parts.values()), squares[frozenset(one.effects)]
+        whole = sum(p * p for effect, p in parts.items() if effect not in EXACT)
+        here = squares[frozenset(one.effects)]
+        closes = min(none - here, whole)
         for effect, part in parts.items():
             without = squares.get(frozenset(one.effects) - {effect})
-            taken = part * part if without is None or effect == WANDERING else without - here
+            taken = part * part
+            if without is not None and effect not in (WANDERING, 'bias'):
+                taken = without - here
             if part < least or part * part < SHARE * whole or taken < least ** 2 \
-                    or taken < TAKEN * (none - here):
+                    or taken < TAKEN * closes:
                 break
         else:
             kept.append(one)
@@ -143,11 +149,11 @@ def worthy(of: Study, found: Sequence[Hypothesis], noise_mps2: float) -> list[Hy
 
 
 def _squares_mps2(of: Study, found: Hypothesis) -> float:
-    """Return the mean square of what a hypothesis leaves, (m/s²)²."""
+    """Return the mean square of what a hypothesis leaves about its mean, (m/s²)²."""
     squares, count = 0.0, 0
     for one, mask in zip(of.series, of.used):
         off = (one.residual(found.sensor) / one.scale_v_per_mps2)[mask]
-        squares += float(np.sum(off ** 2))
+        squares += float(np.sum((off - off.mean(axis=0)) ** 2))
         count += off.size
     return squares / max(count, 1)
 
@@ -199,13 +205,15 @@ def judge(of: Study, found: Sequence[Hypothesis], discrepancy: Discrepancy | Non
     best = found[0]
     unknown = 0.02
     places: tuple[str, ...] = ()
-    if discrepancy is not None and discrepancy.gain > UNKNOWN_NATS \
-            and discrepancy.rms_mps2 > UNKNOWN_OF_NOISE * noise_mps2 \
-            and discrepancy.rms_mps2 > UNKNOWN_OF_GAP * gap_mps2:
+    # A zero-g that wanders is followed by what is flexible, too.
+    if WANDERING not in best.effects and discrepancy is not None \
+            and discrepancy.gain > UNKNOWN_NATS \
+            and discrepancy.rms_mps2 > max(UNKNOWN_OF_NOISE * noise_mps2,
+                                           UNKNOWN_OF_GAP * gap_mps2):
         unknown = 0.9
         places = tuple(sorted((k for k, g in discrepancy.where.items() if g > UNKNOWN_NATS),
                               key=lambda k: -discrepancy.where[k]))
-    if left_mps2 > LEFT_OF_NOISE * noise_mps2 and left_mps2 > LEFT_OF_GAP * gap_mps2:
+    if WANDERING not in best.effects and left_mps2 > LEFT_OF_NOISE * noise_mps2 and left_mps2 > LEFT_OF_GAP * gap_mps2:
         unknown = 0.9
         places = places or ('frequency',)
     known = share / share.sum() * (1 - unknown)

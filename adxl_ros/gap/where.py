@@ -39,7 +39,7 @@ _CELLS = 8
 _DRAWS = 500
 _BLOCK_S = 2.0
 _FEWEST = 3
-_LEAST = 0.05
+SHOWS_P = 0.05
 _BANDS_HZ = (0.0, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 500.0)
 
 
@@ -114,7 +114,7 @@ def covered(series: Sequence[Series]) -> list[str]:
 def map_of(series: Series, residual_v: np.ndarray, used: np.ndarray, floor_mps2: float, seed: int
            ) -> list[Cell]:
     """
-    Map the residual of a recording; the cells that show, the largest share first.
+    Map the residual of a recording; all cells that can be tested, the largest share first.
 
     Parameters
     ----------
@@ -169,7 +169,7 @@ def _over(series: Series, off: np.ndarray, used: np.ndarray, floor_mps2: float, 
     p = (1 + (drawn.max(axis=0)[None] >= seen[:, None]).sum(axis=1)) / (_DRAWS + 1)
     whole = float(np.sum(squares))
     for i, (axis, name, statistic, low, high) in enumerate(names):
-        if not enough[i] or p[i] >= _LEAST or (statistic == 'variance' and mean[i] <= 0):
+        if not enough[i] or (statistic == 'variance' and mean[i] <= 0):
             continue
         square = mean[i] ** 2 if statistic == 'mean' else mean[i]
         size_mps2 = mean[i] if statistic == 'mean' else np.sqrt(mean[i])
@@ -195,8 +195,7 @@ def _over_frequency(series: Series, off: np.ndarray, floor_mps2: float) -> Itera
             seen, usual = power[inside, d].sum(), promised[inside, d].sum()
             p = float(gamma.sf(seen / usual * count, count)) * len(bands) * off.shape[1]
             more = max(seen - usual, 0.0) * step
-            if p < _LEAST:
-                yield Cell(axis, 'frequency_hz', 'power', low, high, float(np.sqrt(more)),
-                           float(np.sqrt(more) / floor_mps2),
-                           float(min(more / np.sum(np.mean(off ** 2, axis=0)), 1.0)),
-                           max(p, 1e-12))
+            yield Cell(axis, 'frequency_hz', 'power', low, high, float(np.sqrt(more)),
+                       float(np.sqrt(more) / floor_mps2),
+                       float(min(more / np.sum(np.mean(off ** 2, axis=0)), 1.0)),
+                       float(np.clip(p, 1e-12, 1.0)))

@@ -38,7 +38,7 @@ RETURNING_G_PER_RTS, RETURN_S = (1e-4, 3e-4, 1e-3, 3e-3), 100.0
 """Wandering of the zero-g that is tried: for good, and coming back within a time."""
 HEALTHY_G_PER_RTS = 1e-4
 """1 mg within 100 s; what wanders more has the effect `bias_walk`."""
-_USUAL_G_PER_RTS, _DECADES = 2e-5, 1.0
+USUAL_G_PER_RTS, _DECADES = 2e-5, 1.0
 """What is usual (`bias_walk`), and how far it may be from that, as a standard deviation."""
 _LOWEST_NOISE_V = 1e-7
 
@@ -85,7 +85,7 @@ def whiteners(series: Series, d: int) -> list[Whitener]:
                     + steps ** 2 * _square(np.convolve(pole, apart), 2)
                     + (walk * scale) ** 2 * dt_s * _square(pole, 2))
         out.append(Whitener(np.convolve(pole, apart), _factor(spectrum),
-                            -0.5 * (np.log10(walk / _USUAL_G_PER_RTS) / _DECADES) ** 2,
+                            -0.5 * (np.log10(walk / USUAL_G_PER_RTS) / _DECADES) ** 2,
                             walk, walk <= HEALTHY_G_PER_RTS))
     return out
 

@@ -23,10 +23,9 @@ _SCALE_EXPONENT = 1.135
 def apply(signals: Signals, p: Parameters) -> None:
     """Multiply zero-g and scale factor by powers of the supply over its nominal, V."""
     ratio = signals.environment.supply_v / p['nominal_v']
-    zero, scale = ratio ** p['zero_g_exponent'], ratio ** p['scale_exponent']
-    for d, _ in enumerate(signals.zero_g_v):
-        signals.zero_g_v[d] = signals.zero_g_v[d] * zero
-        signals.scale_v_per_g[d] = signals.scale_v_per_g[d] * scale
+    for d, (zero, scale) in enumerate(zip(p['zero_g_exponent'], p['scale_exponent'])):
+        signals.zero_g_v[d] = signals.zero_g_v[d] * ratio ** zero
+        signals.scale_v_per_g[d] = signals.scale_v_per_g[d] * ratio ** scale
 
 
 EFFECT = Effect(
@@ -34,10 +33,10 @@ EFFECT = Effect(
     place=Place.ELECTRONICS,
     parameters=(
         Parameter('zero_g_exponent', '1', -3.0, 3.0, 1.0, 'ADXL203 datasheet: ratiometric',
-                  'power of the supply that the zero-g follows; 0 is not at all', ''),
+                  'power of the supply that the zero-g follows; 0 is not at all'),
         Parameter('scale_exponent', '1', -3.0, 3.0, _SCALE_EXPONENT,
                   'ADXL203 datasheet: 560 mV/g at 3 V, not 600',
-                  'power of the supply that the scale factor follows; 0 is not at all', ''),
+                  'power of the supply that the scale factor follows; 0 is not at all'),
         Parameter('nominal_v', 'V', 1.0, 30.0, 5.0, 'ADXL203 datasheet: figures at 5 V',
                   'supply at which the figures hold', '', neutral=5.0),
     ),
