@@ -66,6 +66,7 @@ class Label:
     floor_mps2: float
     faults: list[dict[str, Any]] = field(default_factory=list)
     flexible: float = 0.0
+    plain: dict[str, str] = field(default_factory=dict)
 
     @property
     def true(self) -> tuple[str, ...]:
@@ -127,25 +128,36 @@ def draw(plan: Plan) -> Label:
     """Fix what is true of a case: sizes for the strengths drawn, and what can be seen."""
     at = scene(plan.seed, plan.seconds)
     floor = sight.rms(_noise(at))
+    eye = sight.Eye(at)
+    responses = eye.responses()
     label = Label(plan.name, plan.group, plan.effects, plan.seed, plan.seconds,
                   at.manoeuvre.kind, at.unit.axes, floor)
-    if not plan.effects or plan.group == 'zero':
-        return label
-    rng = np.random.default_rng([*plan.seed, 9])
-    eye = sight.Eye(at)
-    rivals = eye.rivals()
+    if plan.effects and plan.group != 'zero':
+        label = _with_faults(label, at, eye, responses)
+    return replace(label, plain=eye.plain_choices(_residual(label, at, eye), responses))
+
+
+def _with_faults(label: Label, at: sight.Scene, eye: sight.Eye,
+                 responses: dict[str, list[np.ndarray]]) -> Label:
+    rng = np.random.default_rng([*label.seed, 9])
+    rivals = {name: eye.span(changes) for name, changes in responses.items()}
     rows, flexible = [], 0.0
-    for name in plan.effects:
+    for name in label.effects:
         kind = KINDS[name]
         wanted = math.exp(rng.uniform(math.log(WEAKEST_MPS2), math.log(STRONGEST_MPS2)))
         fault, change = _sized(at, eye, Fault(kind, kind.start, kind.draw(rng, at.unit)), wanted)
         row, best = _sight(eye, rivals, fault, change)
         row['strength_mps2'] = sight.rms(sight.beyond_calibration(at.unit, change, eye.force))
-        row['strength_floors'] = row['strength_mps2'] / floor
+        row['strength_floors'] = row['strength_mps2'] / label.floor_mps2
         rows.append(row)
         if not kind.known and row['power'] > 0.5:
             flexible = eye.flexible(rivals[best], eye.seen(change))
     return replace(label, faults=rows, flexible=flexible)
+
+
+def _residual(label: Label, at: sight.Scene, eye: sight.Eye) -> np.ndarray:
+    volts = render(at.unit, at.manoeuvre, faults_of(label), at.seed)
+    return (volts - at.unit.stated_zero_v[:, None]) * at.unit.volts_to_mps2 - eye.force
 
 
 def _noise(at: sight.Scene) -> np.ndarray:

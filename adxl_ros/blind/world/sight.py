@@ -53,7 +53,7 @@ class Scene:
 
     def force(self) -> np.ndarray:
         """Give each axis's own specific force without faults, (axes, n) m/s^2."""
-        volts = render(self.unit, self.manoeuvre, [], self.seed, noise=False, fine_hz=_COARSE_HZ)
+        volts = render(self.unit, self.manoeuvre, [], self.seed, noise=False)
         return (volts - self.unit.zero_v[:, None]) * self.unit.volts_to_mps2
 
 
@@ -129,21 +129,57 @@ class Eye:
         vector = np.concatenate([self.whiten(change), np.zeros(2 * self.axes)])
         return vector - self.stated @ (self.stated.T @ vector)
 
-    def rivals(self) -> dict[str, np.ndarray]:
-        """Span the responses of every effect of the mean, as orthonormal columns."""
+    def responses(self) -> dict[str, list[np.ndarray]]:
+        """Give the responses of every effect of the mean, (axes, n) m/s^2 each."""
         out = {}
         for name in KNOWN:
             kind = KINDS[name]
-            if kind.random and name != 'adc_inl':
-                continue
-            columns = []
-            for shape in kind.spread(self.scene.unit):
-                for times in kind.sizes:
-                    change = self.scene.response(
-                        [Fault(kind, times * kind.start, shape)], coarse=True)
-                    columns += [self.seen(part) for part in _parts(kind, change)]
-            out[name] = _orthonormal(columns)
+            if not kind.random or name == 'adc_inl':
+                out[name] = [part for shape in kind.spread(self.scene.unit)
+                             for times in kind.sizes
+                             for part in _parts(kind, self.scene.response(
+                                 [Fault(kind, times * kind.start, shape)], coarse=True))]
         return out
+
+    def span(self, responses: list[np.ndarray]) -> np.ndarray:
+        """Span whitened responses by orthonormal columns."""
+        return _orthonormal([self.seen(change) for change in responses], self.stated.shape[0])
+
+    def plain_choices(self, residual: np.ndarray,
+                      responses: dict[str, list[np.ndarray]]) -> dict[str, str]:
+        """
+        Choose an effect as is often done: by smallest RMSE, and by BIC as if noise were white.
+
+        Parameters
+        ----------
+        residual
+            Recording less simulator, (axes, n) m/s^2; zero-g and scale are refitted freely.
+        responses
+            Of every effect, in this world's own forms: more than a user has.
+
+        Returns
+        -------
+        dict
+            By `rmse` and `bic` the name of an effect; empty for none.
+
+        """
+        axes = range(self.axes)
+        affine = _orthonormal([(what * (np.arange(self.axes) == d)[:, None]).ravel()
+                               for what in (np.ones_like(self.force), self.force)
+                               for d in axes], residual.size)
+
+        def beyond(rows: np.ndarray) -> np.ndarray:
+            return rows.ravel() - affine @ (affine.T @ rows.ravel())
+
+        rest = beyond(residual)
+        total, cost = float(rest @ rest), math.log(rest.size)
+        squares, scores = {}, {'': rest.size * math.log(total)}
+        for name, changes in responses.items():
+            columns = _orthonormal([beyond(change) for change in changes], rest.size)
+            squares[name] = total - float(np.sum((columns.T @ rest) ** 2))
+            scores[name] = rest.size * math.log(squares[name]) + columns.shape[1] * cost
+        return {'rmse': min(squares, key=squares.__getitem__),
+                'bic': min(scores, key=scores.__getitem__)}
 
     def flexible(self, taken: np.ndarray, vector: np.ndarray) -> float:
         """
@@ -167,7 +203,7 @@ class Eye:
                 rows[d] = hat
                 column = self.seen(rows)
                 columns.append(column - taken @ (taken.T @ column))
-            basis = _orthonormal(columns)
+            basis = _orthonormal(columns, len(whole))
             found += float(np.sum((basis.T @ whole) ** 2))
             used += basis.shape[1]
         return float(ncx2.sf(chi2.isf(0.001, used), used, found))
@@ -180,12 +216,12 @@ def _parts(kind: Kind, change: np.ndarray) -> list[np.ndarray]:
             if change[d].any()]
 
 
-def _orthonormal(columns: list[np.ndarray]) -> np.ndarray:
-    """Give an orthonormal basis of what columns of any size span."""
+def _orthonormal(columns: list[np.ndarray], length: int) -> np.ndarray:
+    """Give an orthonormal basis, (length, k), of what columns of any size span."""
     sizes = [float(np.linalg.norm(column)) for column in columns]
     kept = [column / size for column, size in zip(columns, sizes) if size > 1e-6]
     if not kept:
-        return np.zeros((len(columns[0]), 0))
+        return np.zeros((length, 0))
     stack = np.stack(kept, axis=1)
     values, vectors = np.linalg.eigh(stack.T @ stack)
     good = values > 1e-8 * values[-1]
