@@ -30,7 +30,7 @@ from adxl_ros.blind.world.unit import G0
 import numpy as np
 
 # Strength: rms beyond the stated calibration, m/s^2, log-uniform.
-WEAKEST_MPS2, STRONGEST_MPS2 = 0.01e-3 * G0, 15e-3 * G0
+WEAKEST_MPS2, STRONGEST_MPS2 = 0.02e-3 * G0, 15e-3 * G0
 SECONDS = (90.0, 200.0)
 
 

@@ -173,9 +173,10 @@ def true_parameters(label: Label) -> dict[str, float]:
             out |= {f'stage_eccentricity.{part}_rad': v for part, v in zip(
                 ('beta_sine', 'beta_cosine', 'alpha_sine', 'alpha_cosine'), w)}
         elif name == 'misalignment':
-            # Equations 18 and 19, to first order; w is xy, xz, yx, yz of the directions.
-            out |= {'misalignment.beta_rad.x': w[0], 'misalignment.alpha_rad.x': -w[1],
-                    'misalignment.beta_rad.y': -w[2], 'misalignment.alpha_rad.y': w[3]}
+            # Equations 18 and 19, to first order, of the directions xy, xz, yx, yz, zx, zy.
+            out |= {f'misalignment.{part}_rad.{d}': sign * v for part, d, sign, v in zip(
+                ('beta', 'alpha', 'beta', 'alpha', 'beta', 'alpha'), 'xxyyzz',
+                (1, -1, -1, 1, 1, -1), w)}
         elif name == 'mount_resonance':
             out['mount_resonance.frequency_hz'] = one['shape']['hertz']
     return out

@@ -119,7 +119,7 @@ def render(unit: Unit, manoeuvre: Manoeuvre, faults: Sequence[Fault], seed: int,
                 fault.kind.act(run, fault.size, fault.shape)
 
     if noise:
-        _interpolation_error(run)
+        _stage_errors(run)
     act('stage')
     run.force = _force(run)
     act('mount')
@@ -153,11 +153,13 @@ def references(unit: Unit, manoeuvre: Manoeuvre, seed: int) -> dict[str, np.ndar
             'supply_v': supply + 1e-4 * rng.normal(size=len(t))}
 
 
-def _interpolation_error(run: Run) -> None:
-    """Add what an encoder does between its lines, inside the stated resolution."""
+def _stage_errors(run: Run) -> None:
+    """Add a stage's errors inside its stated resolution, and an encoder's between its lines."""
     step, rng = run.unit.resolution_rad, run.random('encoder')
-    for joint in (run.alpha, run.beta):
-        joint += 0.15 * step * np.sin(2 * np.pi * joint / (37 * step) + rng.uniform(0, 6.28))
+    for joint, (offset, sine, cosine) in zip((run.alpha, run.beta),
+                                             run.unit.stage_rad.reshape(2, 3)):
+        joint += offset + sine * np.sin(joint) + cosine * np.cos(joint) + 0.15 * step * np.sin(
+            2 * np.pi * joint / (37 * step) + rng.uniform(0, 2 * np.pi))
 
 
 def _turn(run: Run, vector: np.ndarray) -> np.ndarray:

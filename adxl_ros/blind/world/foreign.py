@@ -96,7 +96,7 @@ def _with(**bounds: tuple[float, float]):
 
 def _foreign(act, place: str, draw=by_axis) -> dict:
     return {'place': place, 'act': act, 'draw': draw, 'spread': ones, 'start': 1e-3,
-            'most': 0.2}
+            'most': 0.05}
 
 
 KINDS = {
@@ -110,5 +110,5 @@ KINDS = {
     'dead_zone': _foreign(dead_zone, 'element'),
     'product': _foreign(product, 'element'),
     'bearing_bump': _foreign(bearing_bump, 'stage',
-                             _with(sharp=(6.0, 20.0), at=(-3.1, 3.1))),
+                             _with(sharp=(6.0, 20.0), at=(-3.1, 3.1))) | {'most': 0.01},
 }

@@ -22,7 +22,7 @@ import math
 from adxl_ros.blind.world.chain import LSB, references, render, stamps
 from adxl_ros.blind.world.kinds import Fault, Kind, KINDS, KNOWN
 from adxl_ros.blind.world.motion import Manoeuvre
-from adxl_ros.blind.world.unit import G0, SCALE_SD, Unit, ZERO_SD_G
+from adxl_ros.blind.world.unit import G0, SCALE_SD, STAGE_SD, Unit, ZERO_SD_G
 import numpy as np
 from scipy.optimize import lsq_linear, minimize_scalar
 from scipy.stats import chi2, ncx2, norm
@@ -110,15 +110,29 @@ class Eye:
         self.axes, self.count = self.force.shape
         self.weight = 1 / np.sqrt(_spectrum(scene.unit, self.count) * scene.unit.rate_hz / 2)
         stated = []
+        for prior, change in enumerate(self._stage()):
+            rows = np.zeros(2 * self.axes + 6)
+            rows[2 * self.axes + prior] = 1.0
+            stated.append(np.concatenate([self.whiten(change), rows]))
         for d in range(self.axes):
             for what, sd in ((np.ones_like(self.force[d]), ZERO_SD_G * G0),
                              (self.force[d], SCALE_SD)):
                 rows = np.zeros_like(self.force)
                 rows[d] = what
-                prior = np.zeros(2 * self.axes)
-                prior[len(stated)] = 1 / sd
+                prior = np.zeros(2 * self.axes + 6)
+                prior[len(stated) - 6] = 1 / sd
                 stated.append(np.concatenate([self.whiten(rows), prior]))
         self.stated = np.linalg.qr(np.stack(stated, axis=1))[0]
+
+    def _stage(self) -> list[np.ndarray]:
+        """Give what each error of the stage changes, at its standard deviation."""
+        unit = self.scene.unit
+        size = STAGE_SD * unit.resolution_rad
+        sets = [('stage_offset', [0]), ('stage_eccentricity', [2]), ('stage_eccentricity', [3]),
+                ('stage_offset', [1]), ('stage_eccentricity', [0]), ('stage_eccentricity', [1])]
+        return [self.scene.response([Fault(KINDS[name], size, {
+            'w': np.isin(np.arange(4), which).astype(float)})], coarse=True)
+            for name, which in sets]
 
     def whiten(self, change: np.ndarray) -> np.ndarray:
         """Whiten (axes, n) m/s^2 into one vector."""
@@ -126,7 +140,7 @@ class Eye:
 
     def seen(self, change: np.ndarray) -> np.ndarray:
         """Whiten a change and take off what the stated calibration may account for."""
-        vector = np.concatenate([self.whiten(change), np.zeros(2 * self.axes)])
+        vector = np.concatenate([self.whiten(change), np.zeros(2 * self.axes + 6)])
         return vector - self.stated @ (self.stated.T @ vector)
 
     def responses(self) -> dict[str, list[np.ndarray]]:

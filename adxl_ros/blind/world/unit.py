@@ -24,6 +24,8 @@ G0 = 9.80665
 ADC_BITS, ADC_VREF = 16, 5.0
 # What a calibration some days old still vouches for (standard deviations).
 ZERO_SD_G, SCALE_SD = 150e-6, 150e-6
+# Errors of the stage by its stated resolution (standard deviation of each).
+STAGE_SD = 0.15
 
 
 @dataclass(frozen=True)
@@ -32,7 +34,8 @@ class Unit:
     A sensor on its stage; arrays have one entry an axis.
 
     `zero_v`, `scale_v_per_g`, `noise_g_per_rthz` and `corner_hz` are true on the day of the
-    recording; the `stated_` ones are what the user knows.
+    recording; the `stated_` ones are what the user knows. `stage_rad` is how far the stage's
+    angles are off: of alpha, then of beta, the offset and parts of the angle's sine and cosine.
     """
 
     axes: str
@@ -43,10 +46,10 @@ class Unit:
     noise_g_per_rthz: np.ndarray
     stated_noise_g_per_rthz: np.ndarray
     corner_hz: float
-    stated_corner_hz: float
     walk_g_per_rts: np.ndarray
     flicker_g: np.ndarray
     resolution_rad: float
+    stage_rad: np.ndarray
     rate_hz: float
 
     @property
@@ -68,14 +71,15 @@ def draw(rng: np.random.Generator) -> Unit:
     scale = 1.0 + 0.04 * np.clip(rng.normal(0, 0.5, n), -1, 1)
     noise = 110e-6 * np.exp(rng.normal(0, 0.12, n))
     corner = 50.0 * np.exp(rng.normal(0, 0.08))
+    resolution = float(np.deg2rad(rng.choice([0.002, 0.005, 0.01])))
     return Unit(
         axes, zero, scale,
         zero + ZERO_SD_G * scale * rng.normal(size=n),
         scale * (1 + SCALE_SD * rng.normal(size=n)),
         noise, noise * np.exp(rng.normal(0, 0.015, n)),
-        corner, corner * np.exp(rng.normal(0, 0.01)),
+        corner,
         10 ** rng.uniform(-6.0, -5.1, n), 10 ** rng.uniform(-5.3, -4.7, n),
-        float(np.deg2rad(rng.choice([0.002, 0.005, 0.01]))),
+        resolution, STAGE_SD * resolution * np.clip(rng.normal(size=6), -2, 2),
         float(rng.choice([100.0, 125.0, 200.0, 250.0])))
 
 
@@ -104,7 +108,7 @@ def parameter_file(unit: Unit, serial: str) -> str:
       nominal_scale_v_per_g: {row(np.full(n, 1.0))}
       noise_density_g_per_rthz: {row(unit.stated_noise_g_per_rthz)}
       rc_resistance_ohm: {resistance:.9e}
-      rc_capacitance_f: {1 / (2 * np.pi * resistance * unit.stated_corner_hz):.9e}
+      rc_capacitance_f: {1 / (2 * np.pi * resistance * unit.corner_hz):.9e}
       adc_bits: {ADC_BITS}
       adc_vref_v: {ADC_VREF}
       rate_hz: {unit.rate_hz:05.1f}
