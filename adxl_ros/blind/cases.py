@@ -90,7 +90,7 @@ def plans(seed: int, count: int, seconds: tuple[float, float] = SECONDS) -> list
              for _ in range(pairs)]
     rows += [('zero', (name,)) for name in _turns(KNOWN, math.ceil(count / 12), rng)]
     order = rng.permutation(len(rows))
-    return [Plan(f'r{i:04d}', *rows[k], (seed, 2, int(k)), seconds)
+    return [Plan(f'r{i:04d}', rows[k][0], rows[k][1], (seed, 2, int(k)), seconds)
             for i, k in enumerate(order)]
 
 
@@ -242,8 +242,8 @@ def as_json(labels: list[Label]) -> str:
 def from_json(text: str) -> list[Label]:
     """Read labels from JSON."""
     lists = ('effects', 'seed', 'seconds')
-    return [Label(**{name: tuple(value) if name in lists else value
-                     for name, value in row.items()}) for row in json.loads(text)]
+    rows: list[dict[str, Any]] = json.loads(text)
+    return [Label(**{**row, **{name: tuple(row[name]) for name in lists}}) for row in rows]
 
 
 def write_all(seed: int, count: int, folder: Path) -> list[Label]:

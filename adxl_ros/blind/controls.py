@@ -24,7 +24,7 @@ from adxl_ros.blind import marks
 from adxl_ros.blind.cases import Label
 from adxl_ros.blind.marks import Answer
 import numpy as np
-from scipy.stats import fisher_exact
+from scipy.stats import fisher_exact, rankdata
 
 # A check of some thousand would be called leaky for nothing by each control.
 _CHANCE = 0.002
@@ -62,50 +62,41 @@ def metadata(recordings: Path, labels: Sequence[Label]) -> dict[str, Any]:
     """
     Guess labels from files' sizes, lengths, times and names alone.
 
-    The largest share of correctly guessed groups (or effects) over all figures of a file, each
-    cut into bins by rank, beside the same with labels permuted.
+    The score is the share of the variance of a figure's ranks that the labels explain (Kruskal
+    and Wallis), for the figure that they explain best; at chance is the same with labels permuted.
+    Labels are taken three ways: by group, by effect, and as something or nothing.
     """
     facts = np.array([_facts(recordings, label.name) for label in labels], float)
-    facts = np.column_stack([facts, np.arange(len(labels))])
-    groups = [np.unique([label.group for label in labels], return_inverse=True)[1],
-              np.unique([label.group not in ('none', 'zero') for label in labels],
-                        return_inverse=True)[1],
-              np.unique(['+'.join(label.effects) for label in labels], return_inverse=True)[1]]
-    rng = np.random.default_rng(0)
-    columns = [_ranks(column) for column in facts.T]
+    ranks = rankdata(np.column_stack([facts, np.arange(len(labels))]), axis=0)
+    ranks -= ranks.mean(axis=0)
+    ways = [[label.group for label in labels], ['+'.join(label.effects) for label in labels],
+            ['something' if label.effects else 'nothing' for label in labels]]
+    rng, count = np.random.default_rng(0), len(labels)
+    own, chance = [], []
+    for way in ways:
+        which = np.unique(way, return_inverse=True)[1]
+        members = np.eye(which.max() + 1)[which]
+        own.append(_explained(members, ranks))
+        chance.append([_explained(members[rng.permutation(count)], ranks)
+                       for _ in range(_SHUFFLES)])
+    above = np.sum(np.array(chance) >= np.array(own)[:, None] - 1e-12, axis=1)
+    p = float((1 + above.min()) / (1 + _SHUFFLES))
+    return {'score': own[0], 'chance': float(np.mean(chance[0])), 'p': p, 'leaks': p < _CHANCE}
 
-    def informed(order: np.ndarray) -> np.ndarray:
-        return np.array([max(_guessed(bins, group[order]) for bins in columns)
-                         for group in groups])
 
-    own = informed(np.arange(len(labels)))
-    chance = np.array([informed(rng.permutation(len(labels))) for _ in range(_SHUFFLES // 4)])
-    # Each of the three against the permuted ones; it leaks where none of those comes up to it.
-    p = (1 + np.sum(chance >= own - 1e-12, axis=0)) / (1 + len(chance))
-    return {'score': float(own[0]), 'chance': float(chance[:, 0].mean()), 'p': float(p.min()),
-            'leaks': bool(p.min() < 1.5 / len(chance))}
+def _explained(members: np.ndarray, ranks: np.ndarray) -> float:
+    """Give the share of ranks' variance between groups, of the figure where it is largest."""
+    sums = members.T @ ranks
+    between = np.sum(sums ** 2 / members.sum(axis=0)[:, None], axis=0)
+    return float(np.max(between / np.maximum(np.sum(ranks ** 2, axis=0), 1e-12)))
 
 
 def _facts(recordings: Path, name: str) -> tuple[float, ...]:
     csv, yaml = recordings / f'{name}.csv', recordings / f'{name}.yaml'
     data, about = csv.read_bytes(), csv.stat()
-    rows = data.count(b'\n')
-    last = data.rstrip().rsplit(b'\n', 1)[-1].split(b',')[0]
-    return (about.st_size, rows, about.st_size / max(rows, 1), about.st_mtime,
-            yaml.stat().st_size, yaml.stat().st_mtime, float(last))
-
-
-def _ranks(column: np.ndarray) -> np.ndarray:
-    """Cut a figure into at most eight bins, equal values together."""
-    edges = np.unique(np.quantile(column, np.linspace(0, 1, 9)[1:-1]))
-    return np.searchsorted(edges, column, 'right')
-
-
-def _guessed(bins: np.ndarray, group: np.ndarray) -> float:
-    """Give the share that is guessed by saying the commonest group of each bin."""
-    table = np.zeros((bins.max() + 1, group.max() + 1))
-    np.add.at(table, (bins, group), 1)
-    return float(table.max(axis=1).sum() / len(group))
+    rows, last = data.count(b'\n'), data.rstrip().rsplit(b'\n', 1)[-1]
+    return (about.st_size, rows, about.st_size - rows * len(last), about.st_mtime,
+            yaml.stat().st_size, yaml.stat().st_mtime, float(last.split(b',')[0]))
 
 
 def strength_zero(labels: Sequence[Label], answers: Sequence[Answer]) -> dict[str, Any]:

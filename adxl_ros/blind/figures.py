@@ -72,11 +72,11 @@ def curve(strength: np.ndarray, detected: np.ndarray, by_chance: float) -> dict[
     if len(x) < 8 or y.all() or not y.any():
         return {'at_50': None, 'at_90': None, 'bins': bins(strength, detected)}
     rng = np.random.default_rng(0)
-    fitted = _logistic(x, y, by_chance)
+    fitted = _logistic(x, y, by_chance, [float(q) for q in np.quantile(x, (0.2, 0.5))])
     drawn = []
     for _ in range(200):
         take = rng.integers(len(x), size=len(x))
-        drawn.append(_logistic(x[take], y[take], by_chance))
+        drawn.append(_logistic(x[take], y[take], by_chance, fitted[:1]))
     out: dict[str, Any] = {'bins': bins(strength, detected), 'by_chance': by_chance,
                            'middle': fitted[0], 'width': fitted[1], 'missed': fitted[2]}
     for level in (0.5, 0.9):
@@ -94,14 +94,15 @@ def detection(x: np.ndarray, middle: float, width: float, missed: float,
     return by_chance + (1 - by_chance - missed) / (1 + np.exp(-(x - middle) / width))
 
 
-def _logistic(x: np.ndarray, y: np.ndarray, by_chance: float) -> tuple[float, float, float]:
+def _logistic(x: np.ndarray, y: np.ndarray, by_chance: float,
+              starts: Sequence[float]) -> tuple[float, float, float]:
     def cost(p: np.ndarray) -> float:
         chance = np.clip(detection(x, p[0], math.exp(p[1]), p[2], by_chance), 1e-6, 1 - 1e-6)
         return float(-np.sum(y * np.log(chance) + (1 - y) * np.log(1 - chance)))
 
     best = min((minimize(cost, [middle, math.log(0.5), 0.02], method='L-BFGS-B', bounds=[
         (x.min() - 2, x.max() + 2), (math.log(0.05), math.log(5)), (0, 0.5)])
-        for middle in np.quantile(x, (0.2, 0.5))), key=lambda fit: fit.fun)
+        for middle in starts), key=lambda fit: fit.fun)
     return float(best.x[0]), math.exp(best.x[1]), float(best.x[2])
 
 

@@ -68,7 +68,8 @@ def answer(result: dict[str, Any]) -> Answer:
         hypotheses = tuple((frozenset(one['effects']), float(one['probability']))
                            for one in report['hypotheses'])
         parameters = {
-            f'{one["effect"]}.{name}': (float(row['value']), *map(float, row['ci']))
+            f'{one["effect"]}.{name}': (float(row['value']), float(row['ci'][0]),
+                                         float(row['ci'][1]))
             for one in report['candidates'] for name, row in one['parameters'].items()
             if isinstance(row, dict) and row.get('ci')}
         certain = frozenset(verdict['effects'])

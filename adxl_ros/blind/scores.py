@@ -104,8 +104,7 @@ def bars(made: dict[str, Any]) -> list[dict[str, Any]]:
         figure, met = made[name], None
         if figure['value'] is not None:
             low, high = figure['ci']
-            met = (low <= level[0] if way < 0 else high >= level[0] if way > 0
-                   else low <= level[1] and high >= level[0])
+            met = (way > 0 or low <= level[-1]) and (way < 0 or high >= level[0])
         rows.append({'name': name, 'words': words, 'way': way, 'bar': list(level), 'met': met,
                      **{key: figure[key] for key in ('value', 'ci', 'count')}})
     return rows

@@ -17,9 +17,10 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 from adxl_ros.blind.world.chain import LSB, pink, Run
-from adxl_ros.blind.world.shapes import by_axis, column, ones, Shape, vector
+from adxl_ros.blind.world.shapes import Act, by_axis, column, Draw, ones, Shape, vector
 from adxl_ros.blind.world.unit import ADC_BITS, Unit
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
@@ -96,11 +97,12 @@ def _mains(rng: np.random.Generator, unit: Unit) -> Shape:
     return {**by_axis(rng, unit), 'hertz': float(rng.choice([50.0, 60.0]))}
 
 
-def _at_rate(least: float, most: float):
+def _at_rate(least: float, most: float) -> Draw:
     return lambda rng, unit: {**by_axis(rng, unit), 'rate': float(rng.uniform(least, most))}
 
 
-def _disorder(act, place: str, start: float, most: float, draw=by_axis) -> dict:
+def _disorder(act: Act, place: str, start: float, most: float,
+              draw: Draw = by_axis) -> dict[str, Any]:
     return {'place': place, 'act': act, 'draw': draw, 'spread': ones, 'each': True,
             'start': start, 'most': most, 'random': True}
 

@@ -17,9 +17,10 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 from adxl_ros.blind.world.chain import Run
-from adxl_ros.blind.world.shapes import by_axis, column, low_pass, ones, Shape, weights
+from adxl_ros.blind.world.shapes import Act, by_axis, column, low_pass, ones, Shape, weights
 from adxl_ros.blind.world.unit import G0, Unit
 import numpy as np
 from scipy.signal import butter, sosfilt
@@ -73,8 +74,8 @@ def quadratic(run: Run, size: float, shape: Shape) -> None:
 
 
 def saturation(run: Run, size: float, shape: Shape) -> None:
-    """Clip softly, the sooner the larger the size (g off a limit of 1.3 g)."""
-    limit = 1.3 - size * np.abs(column(shape))
+    """Clip softly, the sooner the larger the size (g off the range of 1.7 g)."""
+    limit = 1.7 - size * np.abs(column(shape))
     run.u /= (1 + np.abs(run.u / limit) ** 40) ** (1 / 40)
 
 
@@ -137,6 +138,12 @@ def _settlings(unit: Unit) -> list[Shape]:
     return [{**ones(unit)[0], 'lag': lag} for lag in (15.0, 27.0, 50.0)]
 
 
+def _limited(rng: np.random.Generator, unit: Unit) -> Shape:
+    count = len(unit.axes)
+    one = np.arange(count) == rng.integers(count)
+    return {'w': one.astype(float) if rng.random() < 0.4 else np.ones(count)}
+
+
 def _turned(rng: np.random.Generator, unit: Unit) -> Shape:
     return {'w': weights(2 * len(unit.axes), rng)}
 
@@ -145,7 +152,7 @@ def _turns(unit: Unit) -> list[Shape]:
     return [{'w': row} for row in np.eye(2 * len(unit.axes))]
 
 
-def _each(act, place: str, start: float, most: float) -> dict:
+def _each(act: Act, place: str, start: float, most: float) -> dict[str, Any]:
     return {'place': place, 'act': act, 'draw': by_axis, 'spread': ones, 'each': True,
             'start': start, 'most': most}
 
@@ -164,7 +171,8 @@ KINDS = {
     'scale_factor_z': {**_each(scale_factor_z, 'element', 1e-3, 0.05), **_PLANE},
     'nonlinearity': _each(nonlinearity, 'element', 1e-3, 0.1),
     'quadratic': _each(quadratic, 'element', 1e-3, 0.1),
-    'saturation': {**_each(saturation, 'element', 0.3, 0.7), 'sizes': (0.8, 1.0, 1.3)},
+    'saturation': {**_each(saturation, 'element', 0.6, 1.1), 'draw': _limited,
+                   'sizes': (0.8, 1.0, 1.3)},
     'hysteresis': _each(hysteresis, 'element', 1e-3, 0.03),
     'temperature_bias': _each(temperature_bias, 'element', 1e-3, 0.05),
     'temperature_scale': _each(temperature_scale, 'element', 1e-3, 0.1),

@@ -16,8 +16,19 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from adxl_ros.blind.world.chain import Run
-from adxl_ros.blind.world.shapes import by_axis, column, low_pass, memory, ones, Shape
+from adxl_ros.blind.world.shapes import (
+    Act,
+    by_axis,
+    column,
+    Draw,
+    low_pass,
+    memory,
+    ones,
+    Shape,
+)
 from adxl_ros.blind.world.unit import G0
 import numpy as np
 
@@ -87,14 +98,14 @@ def bearing_bump(run: Run, size: float, shape: Shape) -> None:
     run.beta += bump
 
 
-def _with(**bounds: tuple[float, float]):
+def _with(**bounds: tuple[float, float]) -> Draw:
     return lambda rng, unit: {**by_axis(rng, unit), **{
         name: float(rng.uniform(*pair)) for name, pair in bounds.items()}}
 
 
 
 
-def _foreign(act, place: str, draw=by_axis) -> dict:
+def _foreign(act: Act, place: str, draw: Draw = by_axis) -> dict[str, Any]:
     return {'place': place, 'act': act, 'draw': draw, 'spread': ones, 'start': 1e-3,
             'most': 0.05}
 

@@ -18,14 +18,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 from adxl_ros.blind.world import disorder, element, foreign, stage
-from adxl_ros.blind.world.chain import Run
+from adxl_ros.blind.world.shapes import Act, Draw, Shape
 from adxl_ros.blind.world.unit import Unit
-import numpy as np
-
-Shape = dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -41,8 +37,8 @@ class Kind:
 
     name: str
     place: str
-    act: Callable[[Run, float, Shape], None]
-    draw: Callable[[np.random.Generator, Unit], Shape]
+    act: Act
+    draw: Draw
     spread: Callable[[Unit], list[Shape]]
     start: float
     most: float

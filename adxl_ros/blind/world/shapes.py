@@ -19,11 +19,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from adxl_ros.blind.world.chain import Run
 from adxl_ros.blind.world.unit import Unit
 import numpy as np
 from scipy.signal import lfilter
 
 Shape = dict[str, Any]
+Draw = Callable[[np.random.Generator, Unit], Shape]
+Act = Callable[[Run, float, Shape], None]
 
 
 def weights(count: int, rng: np.random.Generator) -> np.ndarray:

@@ -19,7 +19,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 import math
 
-from adxl_ros.blind.world.chain import LSB, references, render, stamps
+from adxl_ros.blind.world.chain import FINE_HZ, LSB, references, render, stamps
 from adxl_ros.blind.world.kinds import Fault, Kind, KINDS, KNOWN
 from adxl_ros.blind.world.motion import Manoeuvre
 from adxl_ros.blind.world.unit import G0, SCALE_SD, STAGE_SD, Unit, ZERO_SD_G
@@ -46,10 +46,10 @@ class Scene:
     def response(self, faults: list[Fault], coarse: bool = False) -> np.ndarray:
         """Give what faults change, (axes, n) m/s^2 as the user converts."""
         noise = any(fault.kind.random for fault in faults)
-        more = {'noise': noise, **({'fine_hz': _COARSE_HZ} if coarse else {})}
-        changed = (render(self.unit, self.manoeuvre, some, self.seed, **more)
-                   for some in (faults, []))
-        return (next(changed) - next(changed)) * self.unit.volts_to_mps2
+        fine = _COARSE_HZ if coarse else FINE_HZ
+        with_faults, without = (render(self.unit, self.manoeuvre, some, self.seed, noise=noise,
+                                       fine_hz=fine) for some in (faults, []))
+        return (with_faults - without) * self.unit.volts_to_mps2
 
     def force(self) -> np.ndarray:
         """Give each axis's own specific force without faults, (axes, n) m/s^2."""
@@ -110,10 +110,10 @@ class Eye:
         self.axes, self.count = self.force.shape
         self.weight = 1 / np.sqrt(_spectrum(scene.unit, self.count) * scene.unit.rate_hz / 2)
         stated = []
-        for prior, change in enumerate(self._stage()):
-            rows = np.zeros(2 * self.axes + 6)
-            rows[2 * self.axes + prior] = 1.0
-            stated.append(np.concatenate([self.whiten(change), rows]))
+        for i, change in enumerate(self._stage()):
+            prior = np.zeros(2 * self.axes + 6)
+            prior[2 * self.axes + i] = 1.0
+            stated.append(np.concatenate([self.whiten(change), prior]))
         for d in range(self.axes):
             for what, sd in ((np.ones_like(self.force[d]), ZERO_SD_G * G0),
                              (self.force[d], SCALE_SD)):
