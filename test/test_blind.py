@@ -25,6 +25,7 @@ import sys
 from adxl_ros.blind import cases, check, controls, marks, page, real, run, scores, seal
 from adxl_ros.blind.cases import Label
 from adxl_ros.blind.world import chain, kinds, motion, sight, unit
+from adxl_ros.calibrate.figures import pyplot
 from adxl_ros.errors import UserError
 import numpy as np
 import pytest
@@ -188,7 +189,7 @@ def test_always_one_effect_scores_as_it_should(original, known_nothing, tmp_path
     assert not made['leaks']
     permuted = made['controls']['labels_permuted']
     assert permuted['score'] == pytest.approx(permuted['chance'], abs=0.02)
-    text = page.page(made)
+    text = page.page(made, pyplot())
     assert text.count('<img') == 3 and 'http' not in text.replace('http-equiv', '')
     assert '| false alarms | 1 (' in page.markdown(made)
 
@@ -281,7 +282,7 @@ def test_a_leaky_generator_is_caught(known_nothing, tmp_path, pool):
     shutil.copytree(known_nothing[0] / 'labels' / 'held', folder / 'labels' / 'held')
     made = check.scored(folder, script(tmp_path, PADDED), pool, show)
     assert made['controls']['metadata_only']['leaks'] and made['leaks']
-    assert 'LEAKS' in page.summary(made) and 'LEAKS' in page.page(made)
+    assert 'LEAKS' in page.summary(made) and 'LEAKS' in page.page(made, pyplot())
 
 
 def test_an_effect_at_strength_zero_must_not_show(tmp_path):

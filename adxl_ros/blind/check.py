@@ -22,6 +22,7 @@ from datetime import date
 from functools import partial
 import json
 from pathlib import Path
+import secrets
 from typing import Any
 
 from adxl_ros.blind import cases, controls, held, marks, run, scores, seal, store
@@ -32,22 +33,42 @@ from adxl_ros.errors import UserError
 Show = Callable[[str], Callable[[float], None]]
 
 
-def sealed(folder: Path, seed: int, trials: int, pool: Executor,
+def sealed(folder: Path, seed: int | None, trials: int, pool: Executor,
            show: Callable[[float], None]) -> str:
     """
-    Draw and seal a check, unless the folder has one already; give the published hash.
+    Draw and seal a check, or go on with the folder's; give the published hash.
+
+    Parameters
+    ----------
+    folder
+        Empty, or with a check that was cut short.
+    seed
+        Of the cases; any if None.
+    trials
+        How many, beside those at strength zero.
+    pool
+        Draws in parallel.
+    show
+        Takes the fraction that is done.
 
     Raises
     ------
     UserError
-        The folder has a check of another seed or size.
+        The folder has a check of another seed or size, or something else.
 
     """
-    digest = seal.published(folder)
+    digest, has = seal.published(folder), seal.begun(folder)
+    if digest is not None:
+        opened = seal.unseal(folder, leave_open=False)
+        has = opened.seed, opened.trials
+    elif has is None and any(folder.glob('*')):
+        raise UserError(f'{folder}: is not empty and holds no check; choose another folder')
+    seed = (has[0] if has else secrets.randbelow(2 ** 31)) if seed is None else seed
+    if has not in (None, (seed, trials)):
+        raise UserError(f'{folder}: holds a check of another seed or number of trials; say the '
+                        'same again to go on with it, or choose another folder')
     if digest is not None:
         return digest
-    if any(folder.glob('*')) and not (folder / 'labels' / 'drawn').exists():
-        raise UserError(f'{folder}: is not empty and holds no check; choose another folder')
     return seal.seal(folder, seed, cases.plans(seed, trials), trials, pool, show)
 
 

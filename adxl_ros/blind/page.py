@@ -24,7 +24,6 @@ from typing import Any
 from adxl_ros.blind.figures import detection
 from adxl_ros.blind.marks import UNKNOWN
 from adxl_ros.blind.world.unit import G0
-from adxl_ros.errors import UserError
 import numpy as np
 
 _STYLE = """
@@ -55,15 +54,19 @@ def markdown(made: dict[str, Any]) -> str:
     return '\n'.join(out)
 
 
-def page(made: dict[str, Any]) -> str:
-    """Lay out the page."""
+def page(made: dict[str, Any], pyplot: Any) -> str:
+    """Lay out the page; its pictures are drawn with matplotlib's `pyplot`."""
     tables = _tables(made)
-    pictures = {'Detection against strength': _curves(made), 'Calibration': _calibration(made),
-                'What was taken for what': _confusion(made)}
+    pictures = {'Detection against strength': _curves, 'Calibration': _calibration,
+                'What was taken for what': _confusion}
     parts = ['<h1>Blind check of diagnose</h1>', f'<p class="said">{escape(_drawn(made))}</p>',
              f'<p class="said{" leak" if made["leaks"] else ""}">{escape(_leaks(made))}</p>']
-    for title, picture in pictures.items():
-        parts += [f'<h2>{escape(title)}</h2>', picture]
+    for title, draw in pictures.items():
+        figure, out = draw(made, pyplot), BytesIO()
+        figure.savefig(out, dpi=90, format='png', metadata={'Software': None})
+        pyplot.close(figure)
+        parts += [f'<h2>{escape(title)}</h2>', '<img alt="" src="data:image/png;base64,'
+                  f'{b64encode(out.getvalue()).decode()}">']
     for title, table in tables.items():
         if table[1]:
             parts += [f'<h2>{escape(title)}</h2>', _html(table)]
@@ -185,25 +188,8 @@ def _html(table: Table) -> str:
     return f'<table><tr>{top}</tr>{body}</table>'
 
 
-def _pyplot() -> Any:
-    try:
-        import matplotlib
-    except ImportError:
-        raise UserError('plots need matplotlib; pip install matplotlib') from None
-    matplotlib.use('Agg')
-    import matplotlib.pyplot
-    return matplotlib.pyplot
-
-
-def _picture(figure: Any) -> str:
-    out = BytesIO()
-    figure.savefig(out, dpi=90, format='png', metadata={'Software': None})
-    _pyplot().close(figure)
-    return f'<img alt="" src="data:image/png;base64,{b64encode(out.getvalue()).decode()}">'
-
-
-def _curves(made: dict[str, Any]) -> str:
-    figure, axis = _pyplot().subplots(figsize=(10, 4), layout='constrained')
+def _curves(made: dict[str, Any], pyplot: Any) -> Any:
+    figure, axis = pyplot.subplots(figsize=(10, 4), layout='constrained')
     for i, (name, one) in enumerate(made['scores']['detection'].items()):
         if not one['bins']:
             continue
@@ -223,21 +209,21 @@ def _curves(made: dict[str, Any]) -> str:
     axis.set(xscale='log', xlabel='strength, mg rms beyond zero-g and scale',
              ylabel='share detected', ylim=(-0.03, 1.03))
     axis.legend(fontsize=8)
-    return _picture(figure)
+    return figure
 
 
-def _calibration(made: dict[str, Any]) -> str:
-    figure, axis = _pyplot().subplots(figsize=(5, 4), layout='constrained')
+def _calibration(made: dict[str, Any], pyplot: Any) -> Any:
+    figure, axis = pyplot.subplots(figsize=(5, 4), layout='constrained')
     rows = made['scores']['reliability']
     axis.plot([0, 1], [0, 1], 'k:', lw=0.8)
     axis.scatter([row['confidence'] for row in rows], [row['right'] for row in rows],
                  [8 + row['count'] for row in rows])
     axis.set(xlabel='probability that the verdict gives itself', ylabel='share right',
              xlim=(-0.03, 1.03), ylim=(-0.03, 1.03))
-    return _picture(figure)
+    return figure
 
 
-def _confusion(made: dict[str, Any]) -> str:
+def _confusion(made: dict[str, Any], pyplot: Any) -> Any:
     table = made['scores']['confusion']
     rows = [name for name in ('none', UNKNOWN) if name in table] + [
         name for name in table if name not in ('none', UNKNOWN)]
@@ -245,7 +231,7 @@ def _confusion(made: dict[str, Any]) -> str:
     columns = [name for name in rows if name in said] + sorted(said - set(rows))
     shares = np.array([[table[row].get(column, 0) / sum(table[row].values())
                         for column in columns] for row in rows]).reshape(len(rows), -1)
-    figure, axis = _pyplot().subplots(figsize=(11, 10), layout='constrained')
+    figure, axis = pyplot.subplots(figsize=(11, 10), layout='constrained')
     axis.imshow(shares, cmap='Blues', vmin=0, vmax=1, aspect='auto')
     axis.set_xticks(range(len(columns)), columns, rotation=90, fontsize=7)
     axis.set_yticks(range(len(rows)), [f'{row} ({sum(table[row].values())})' for row in rows],
@@ -256,4 +242,4 @@ def _confusion(made: dict[str, Any]) -> str:
                 axis.text(j, i, table[row][column], ha='center', va='center', fontsize=6,
                           color='white' if shares[i, j] > 0.6 else 'black')
     axis.set(xlabel='said', ylabel='true (cases)')
-    return _picture(figure)
+    return figure

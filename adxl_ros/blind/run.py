@@ -181,8 +181,11 @@ def workers(scheduler: str | None) -> Iterator[Executor]:
     if scheduler is None:
         # Each takes one core; what is spawned reads this before it loads numpy.
         os.environ['OPENBLAS_NUM_THREADS'] = '1'
-        with ProcessPoolExecutor(cores(), get_context('spawn')) as pool:
+        pool = ProcessPoolExecutor(cores(), get_context('spawn'), _deaf)
+        try:
             yield pool
+        finally:
+            pool.shutdown(cancel_futures=True)
         return
     try:
         from distributed import Client
@@ -194,6 +197,11 @@ def workers(scheduler: str | None) -> Iterator[Executor]:
         raise UserError(f'--scheduler {scheduler}: no scheduler answers: {error}') from None
     with client, client.get_executor(pure=False) as pool:
         yield pool
+
+
+def _deaf() -> None:
+    """Leave Ctrl-C to the parent: it stops giving work, and what is under way ends."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def cores() -> int:

@@ -91,13 +91,10 @@ def seal(folder: Path, seed: int, plans: list[Plan], trials: int, pool: Executor
             store.write(path, text.encode('ascii'))
             # When it was drawn would tell of the work that its label made.
             os.utime(path, (0, 0))
-        row = {'seed': seed, 'label': json.loads(cases.as_json([label]))[0]}
+        row = {'seed': seed, 'trials': trials, 'label': json.loads(cases.as_json([label]))[0]}
         store.write(drawn / f'{name}.json', json.dumps(row).encode())
 
-    have = {path.stem: json.loads(path.read_bytes()) for path in drawn.glob('*.json')}
-    if any(row['seed'] != seed for row in have.values()):
-        raise UserError(f'{folder}: holds cases of another seed; choose another folder')
-    todo = [plan for plan in plans if plan.name not in have]
+    todo = [plan for plan in plans if not (drawn / f'{plan.name}.json').exists()]
     store.each(pool, make, [partial(_only, plan) for plan in todo], keep, show,
                len(plans) - len(todo))
     rows = [json.loads((drawn / f'{plan.name}.json').read_bytes())['label'] for plan in plans]
@@ -134,9 +131,17 @@ def published(folder: Path) -> str | None:
         raise UserError(f'{path}: is no seal; seal anew into another folder') from None
 
 
-def unseal(folder: Path) -> Sealed:
+def begun(folder: Path) -> tuple[int, int] | None:
+    """Give seed and trials of a check that was cut short while it was drawn."""
+    for path in (folder / 'labels' / 'drawn').glob('*.json'):
+        row = json.loads(path.read_bytes())
+        return row['seed'], row['trials']
+    return None
+
+
+def unseal(folder: Path, leave_open: bool = True) -> Sealed:
     """
-    Open the labels, check them against the published hash, and leave them in the open.
+    Open the labels, check them against the published hash, and leave them in the open or not.
 
     Raises
     ------
@@ -160,7 +165,9 @@ def unseal(folder: Path) -> Sealed:
     if hashlib.sha256(text).hexdigest() != digest:
         raise UserError(f'{folder / "labels"}: the labels are not those whose hash {digest} was '
                         'published; they have been changed since')
-    store.write(plain, text)
+    if leave_open and not plain.exists():
+        store.write(plain, text)
+        _key_path(digest).unlink(missing_ok=True)
     what: dict[str, Any] = json.loads(text)
     return Sealed(what['seed'], what['trials'], cases.from_json(json.dumps(what['labels'])))
 

@@ -19,9 +19,10 @@ from __future__ import annotations
 import argparse
 import json
 from pathlib import Path
-import secrets
+import sys
 
 from adxl_ros.blind import check, page, real, run as running
+from adxl_ros.calibrate.figures import pyplot
 from adxl_ros.errors import UserError
 from adxl_ros.files.atomic import atomic_path
 from adxl_ros.tools.common import make_folder, progress, run
@@ -50,14 +51,21 @@ def parser() -> argparse.ArgumentParser:
 
 def blind(options: argparse.Namespace) -> int:
     """Run the tool; see `parser`."""
-    if options.seed is None:
-        options.seed = secrets.randbelow(2 ** 31)
     if options.trials < 1:
         raise UserError(f'--trials {options.trials}: at least 1 is needed')
-    if options.seed < 0:
+    if options.seed is not None and options.seed < 0:
         raise UserError(f'--seed {options.seed}: must not be negative')
     arms = [real.arm(words) for words in options.real]
     folder = Path(options.output or options.seal or options.open)
+    try:
+        return _check(options, folder, arms)
+    except KeyboardInterrupt:
+        print(f'{PROG}: interrupted; the same command goes on where it was', file=sys.stderr)
+        return 130
+
+
+def _check(options: argparse.Namespace, folder: Path, arms: list[real.Arm]) -> int:
+    draw = pyplot()
     if not options.open:
         make_folder(folder)
     with running.workers(options.scheduler) as pool:
@@ -72,7 +80,7 @@ def blind(options: argparse.Namespace) -> int:
             with progress('real') as show:
                 made['real'] = real.put_back(arms, None, pool, show)
     for name, text in (('blind.json', json.dumps(made, indent=1, allow_nan=False) + '\n'),
-                       ('blind.md', page.markdown(made)), ('blind.html', page.page(made))):
+                       ('blind.md', page.markdown(made)), ('blind.html', page.page(made, draw))):
         with atomic_path(folder / name) as fresh:
             fresh.write_text(text, encoding='utf-8')
     print(page.summary(made))
