@@ -174,10 +174,10 @@ def _real(made: dict[str, Any]) -> Table:
             f'{name.split(".", 1)[1]}: {row["deleted"]:.3g}' + (
                 f', found {row["found"][0]:.3g} ({row["found"][1]:.3g} to {row["found"][2]:.3g})'
                 if row['found'] else '') for name, row in one['parameters'].items())
-        rows.append([one['recording'], one['deleted'] or 'nothing',
+        rows.append([one['recording'], one['against'], one['deleted'] or 'nothing',
                      {None: '-', True: 'yes', False: 'NO'}[one['put_back']],
                      ', '.join(one['named']) or one['status'], figures])
-    return ['recording', 'deleted', 'put back', 'named', 'parameters'], rows
+    return ['recording', 'against', 'deleted', 'put back', 'named', 'parameters'], rows
 
 
 def _html(table: Table) -> str:

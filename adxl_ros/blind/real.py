@@ -12,7 +12,13 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Real sensors: an effect is deleted from calibrated parameters, and should be put back."""
+"""
+Real sensors: an effect is deleted from calibrated parameters, and should be put back.
+
+Where a recording has neither a stage nor another simulator's force beside it, its own calibrated
+force, smoothed, stands for what the sensor felt: noise and motion are real, but what the
+calibration itself lacks cannot show.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +33,11 @@ from typing import Any
 
 from adxl_ros.blind import marks, run, store
 from adxl_ros.errors import UserError
+import numpy as np
+from scipy.signal import butter, sosfiltfilt
 import yaml
+
+_SMOOTH_HZ = 5.0
 
 
 @dataclass(frozen=True)
@@ -37,6 +47,7 @@ class Arm:
     recording: Path
     parameters: dict[str, Any]
     sim: Path | None
+    itself: bool = False
 
 
 def arm(words: str) -> Arm:
@@ -62,7 +73,37 @@ def arm(words: str) -> Arm:
         raise UserError(f'{paths[1]}: no parameter file with effects: {error}') from None
     if not effects:
         raise UserError(f'{paths[1]}: holds no effect to delete; calibrate the unit first')
-    return Arm(paths[0].resolve(), keys, paths[2].resolve() if len(paths) == 3 else None)
+    sim = paths[2].resolve() if len(paths) == 3 else None
+    return Arm(paths[0].resolve(), keys, sim, sim is None and _without_stage(paths[0]))
+
+
+def _without_stage(recording: Path) -> bool:
+    """Say whether a CSV recording has no angles of a stage."""
+    if recording.suffix != '.csv':
+        return False
+    with open(recording, encoding='utf-8') as lines:
+        head = next((line for line in lines if not line.startswith('#')), '')
+    return 'alpha_rad' not in head
+
+
+def _felt(one: Arm, folder: Path) -> Path:
+    """Calibrate a recording by its full parameters and smooth it, without delay."""
+    (folder / 'full.yaml').write_text(yaml.safe_dump(one.parameters))
+    status, error = run.call([*run.executable('apply'), str(one.recording), '--params',
+                              'full.yaml', '-o', 'felt.csv'], folder)
+    if status:
+        raise UserError(error)
+    lines = [line for line in (folder / 'felt.csv').read_text().splitlines()
+             if not line.startswith('#')]
+    names = ['time_s', 'ax_mps2', 'ay_mps2', 'az_mps2']
+    columns = [lines[0].split(',').index(name) for name in names]
+    rows = np.genfromtxt(lines[1:], delimiter=',', usecols=columns)
+    rate = 1 / np.median(np.diff(rows[:, 0]))
+    smooth = butter(4, _SMOOTH_HZ, fs=rate, output='sos')
+    rows[:, 1:] = sosfiltfilt(smooth, np.nan_to_num(rows[:, 1:]), axis=0)
+    path = folder / 'sim.csv'
+    np.savetxt(path, rows, delimiter=',', header=','.join(names), comments='', fmt='%.9g')
+    return path
 
 
 def without(parameters: dict[str, Any], effect: str | None) -> dict[str, Any]:
@@ -88,8 +129,8 @@ def put_back(arms: Sequence[Arm], command: Sequence[str] | None, pool: Executor,
     Returns
     -------
     list
-        A row each: `recording`, `deleted` (None for nothing), `put_back`, `status`, `top`,
-        `probability`, `gap_mps2` before anything is added, and `parameters`: deleted and found.
+        A row each: `recording`, `against` what, `deleted` (None for nothing), `put_back`,
+        `status`, `top`, `probability`, `gap_mps2` before anything is added, and `parameters`: deleted and found.
 
     """
     rows: dict[tuple[int, str | None], dict[str, Any]] = {}
@@ -113,9 +154,10 @@ def _diagnose(one: Arm, i: int, effect: str | None,
     with tempfile.TemporaryDirectory(prefix='diagnose_') as made:
         folder = Path(made)
         (folder / 'unit.yaml').write_text(yaml.safe_dump(without(one.parameters, effect)))
+        sim = _felt(one, folder) if one.itself else one.sim
         words = [*(command or run.executable('diagnose')), str(one.recording), '--params',
                  'unit.yaml', '-o', 'out', '--seed', '0']
-        status, error = run.call([*words, *(['--sim', str(one.sim)] if one.sim else [])], folder)
+        status, error = run.call([*words, *(['--sim', str(sim)] if sim else [])], folder)
         try:
             report = json.loads((folder / 'out' / 'report.json').read_bytes())
         except (OSError, ValueError):
@@ -134,7 +176,10 @@ def _row(one: Arm, effect: str | None, result: run.Result) -> dict[str, Any]:
         figures |= {key: {'deleted': value, 'found': given.parameters.get(key)}
                     for key, value in rows.items()}
     report = result['report'] or {}
-    return {'recording': one.recording.name, 'deleted': effect, 'status': given.status,
+    against = 'itself, calibrated and smoothed' if one.itself else \
+        one.sim.name if one.sim else 'the stage'
+    return {'recording': one.recording.name, 'against': against, 'deleted': effect,
+            'status': given.status,
             'put_back': None if effect is None else effect in given.named,
             'top': sorted(given.top), 'named': sorted(given.named),
             'probability': given.probability, 'error': result['error'],
