@@ -363,7 +363,7 @@ def test_the_curve_finds_the_strength():
 def test_every_fault_changes_a_recording(name):
     """In proportion to its size or more, and not at all at size zero; one rich manoeuvre."""
     at = sight.Scene(unit.draw(np.random.default_rng(0)), motion.draw(
-        np.random.default_rng(2), (60.0, 62.0), 'rich'), 1)
+        np.random.default_rng(2), (60.0, 62.0), 125.0, 'rich'), 1)
     kind = kinds.KINDS[name]
     shape = kind.draw(np.random.default_rng(1), at.unit)
 
@@ -378,7 +378,7 @@ def test_every_fault_changes_a_recording(name):
 def test_ideal_observer(state):
     """What is strong is seen, what is weak is not, and a tilted bench is an offset of alpha."""
     at = sight.Scene(unit.draw(np.random.default_rng(0)), motion.draw(
-        np.random.default_rng(2), (60.0, 62.0), 'one_plane'), 1)
+        np.random.default_rng(2), (60.0, 62.0), 125.0, 'one_plane'), 1)
     eye = sight.Eye(at)
     kind = kinds.KINDS['stage_offset']
     seen = [sight.power(float(np.sum(eye.seen(at.response([kinds.Fault(

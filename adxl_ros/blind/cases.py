@@ -107,9 +107,9 @@ def scene(seed: tuple[int, ...], seconds: tuple[float, float],
     """Set the scene of a case, or the same unit in another manoeuvre of its kind."""
     drawn = unit.draw(np.random.default_rng([*seed, 0]))
     rng = np.random.default_rng([*seed, 1])
-    seen = motion.draw(rng, seconds)
+    seen = motion.draw(rng, seconds, drawn.rate_hz)
     if held_out:
-        seen = motion.draw(rng, seconds, kind=seen.kind)
+        seen = motion.draw(rng, seconds, drawn.rate_hz, seen.kind)
     return sight.Scene(drawn, seen, _whole([*seed, 2 + held_out]))
 
 

@@ -69,10 +69,11 @@ def judge(label: Label, stated: str, found: str | None) -> tuple[str, dict[str, 
         off = (measured - simulated) * unit.volts_to_mps2
         return np.mean(sight.beyond_calibration(unit, off, eye.force) ** 2, axis=0)
 
-    def world(some: list[Fault]) -> np.ndarray:
-        return squares(render(unit, at.manoeuvre, some, at.seed, noise=False))
+    def clean(some: list[Fault]) -> np.ndarray:
+        return render(unit, at.manoeuvre, some, at.seed, noise=False)
 
-    before = squares(_simulate(csv, stated))
+    plain, nothing = _simulate(csv, stated), clean([])
+    before = squares(plain)
     after, error = before, None
     if changed and found:
         try:
@@ -80,7 +81,9 @@ def judge(label: Label, stated: str, found: str | None) -> tuple[str, dict[str, 
         except UserError as problem:
             # What was found cannot be simulated: it closes nothing.
             error = str(problem)
-    floor, oracle = world(faults), world(_fitted(label, faults))
+    # The same simulator, which follows the encoder's rounded angles, with the world's own effect.
+    floor, oracle = (squares(plain + clean(some) - nothing)
+                     for some in (faults, _fitted(label, faults)))
     block = int(_BLOCK_S * unit.rate_hz)
     gap_ci, harm_ci = (_interval(row, block) for row in (before - floor, after - before))
     return label.name, {'before': before.mean(), 'after': after.mean(), 'oracle': oracle.mean(),

@@ -130,7 +130,8 @@ def put_back(arms: Sequence[Arm], command: Sequence[str] | None, pool: Executor,
     -------
     list
         A row each: `recording`, `against` what, `deleted` (None for nothing), `put_back`,
-        `status`, `top`, `probability`, `gap_mps2` before anything is added, and `parameters`: deleted and found.
+        `status`, `top`, `probability`, `gap_mps2` before anything is added, and `parameters`:
+        deleted and found.
 
     """
     rows: dict[tuple[int, str | None], dict[str, Any]] = {}

@@ -39,6 +39,9 @@ BARS = (
     ('unknown_recall', 'recall of unknown where a flexible model sees it', 1, (0.8,)),
 )
 
+# What is made worse by less than this part of the floor's mean square is not harm.
+_HARM = 0.01
+
 
 @dataclass(frozen=True)
 class Trial:
@@ -162,7 +165,7 @@ def _held(real: Sequence[Trial]) -> dict[str, Any]:
     closed, ratio, harm = [], [], []
     for trial in real:
         held = trial.held
-        harm.append(held is not None and held['harm_ci'][0] > 0)
+        harm.append(held is not None and held['harm_ci'][0] > _HARM * held['floor'])
         if held is None or trial.label.group not in ('single', 'pair') \
                 or held['gap_ci'][0] <= 0 or not marks.visible(trial.label):
             continue

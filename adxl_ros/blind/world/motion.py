@@ -31,6 +31,7 @@ class Script:
     alpha: list[float] = field(default_factory=lambda: [np.pi / 2])
     beta: list[float] = field(default_factory=lambda: [0.0])
     swings: list[tuple[str, float, float, float, float]] = field(default_factory=list)
+    fastest_hz: float = 22.0
 
     @property
     def end(self) -> float:
@@ -91,13 +92,27 @@ class Manoeuvre:
         return np.interp(t, *self.temperature), np.interp(t, *self.supply)
 
 
-def draw(rng: np.random.Generator, seconds: tuple[float, float] = (100.0, 210.0),
+def draw(rng: np.random.Generator, seconds: tuple[float, float], rate_hz: float,
          kind: str | None = None) -> Manoeuvre:
-    """Draw a manoeuvre of a length between the two of `seconds`; a quarter are poor."""
+    """
+    Draw a manoeuvre; a quarter are poor.
+
+    Parameters
+    ----------
+    rng
+        Draws.
+    seconds
+        Shortest and longest.
+    rate_hz
+        Of the recording: nothing moves so fast that a period has less than ten samples.
+    kind
+        One of `POOR`, or rich; drawn if None.
+
+    """
     length = rng.uniform(*seconds)
     if kind is None:
         kind = str(rng.choice(POOR)) if rng.random() < 0.25 else 'rich'
-    script = Script()
+    script = Script(fastest_hz=min(22.0, rate_hz / 10))
     script.beta[0] = rng.uniform(-np.pi, np.pi)
     script.rest(rng.uniform(1.5, 3.0))
     {'rich': _rich, 'one_way': _one_way, 'crawl': _crawl, 'few_poses': _few_poses,
@@ -146,7 +161,7 @@ def _swing_alpha(script: Script, rng: np.random.Generator) -> None:
 
 def _shake(script: Script, rng: np.random.Generator) -> None:
     for _ in range(2):
-        hertz = np.exp(rng.uniform(np.log(3), np.log(22)))
+        hertz = np.exp(rng.uniform(np.log(3), np.log(script.fastest_hz)))
         size = rng.uniform(0.8, 3.5) / (2 * np.pi * hertz) ** 2
         script.swing('shift', size, hertz, rng.uniform(4, 7))
 
