@@ -141,6 +141,9 @@ def diagnose_all(folder: Path, command: Sequence[str] | None, pool: Executor,
 
     store.each(pool, diagnose, [partial(job, name) for name in todo], keep, show,
                len(names) - len(todo))
+    if code_version(command) != code:
+        raise UserError('the code of the diagnosis was changed while it ran: seal anew into '
+                        'another folder, and leave the package alone meanwhile')
     return {name: json.loads((reports / f'{name}.json').read_bytes()) for name in names}
 
 

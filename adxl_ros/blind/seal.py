@@ -167,7 +167,6 @@ def unseal(folder: Path, leave_open: bool = True) -> Sealed:
                         'published; they have been changed since')
     if leave_open and not plain.exists():
         store.write(plain, text)
-        _key_path(digest).unlink(missing_ok=True)
     what: dict[str, Any] = json.loads(text)
     return Sealed(what['seed'], what['trials'], cases.from_json(json.dumps(what['labels'])))
 
