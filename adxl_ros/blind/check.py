@@ -97,6 +97,7 @@ def scored(folder: Path, command: Sequence[str] | None, pool: Executor,
     digest = seal.published(folder)
     if digest is None:
         raise UserError(f'{folder}: nothing is sealed there; use --seal {folder} first')
+    seal.close(folder)
     results = run.diagnose_all(folder, command, pool, show('diagnose'))
     version = (folder / 'reports' / 'version.txt').read_text()
     opened = seal.unseal(folder)

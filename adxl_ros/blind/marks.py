@@ -141,6 +141,7 @@ def true_parameters(label: Label) -> dict[str, float]:
     """
     out: dict[str, float] = {}
     unit = cases.scene(label.seed, label.seconds).unit
+    stage = unit.stage_rad
     for one in label.faults:
         name, size = one['effect'], one['size']
         w = size * np.asarray(one['shape'].get('w', [0.0]), float)
@@ -165,14 +166,15 @@ def true_parameters(label: Label) -> dict[str, float]:
         elif name == 'lever_arm':
             out |= {f'lever_arm.{d}_m': v for d, v in zip('xyz', w)}
         elif name == 'stage_offset':
-            out |= {'stage_offset.alpha_rad': w[0], 'stage_offset.beta_rad': w[1]}
+            out |= {'stage_offset.alpha_rad': w[0] + stage[0],
+                    'stage_offset.beta_rad': w[1] + stage[3]}
         elif name == 'base_tilt':
             out |= {'base_tilt.x_rad': -w[1], 'base_tilt.y_rad': w[0]}
         elif name == 'backlash':
             out |= {'backlash.alpha_rad': abs(w[0]), 'backlash.beta_rad': abs(w[1])}
         elif name == 'stage_eccentricity':
-            out |= {f'stage_eccentricity.{part}_rad': v for part, v in zip(
-                ('beta_sine', 'beta_cosine', 'alpha_sine', 'alpha_cosine'), w)}
+            out |= {f'stage_eccentricity.{part}_rad': v + stage[i] for part, v, i in zip(
+                ('beta_sine', 'beta_cosine', 'alpha_sine', 'alpha_cosine'), w, (4, 5, 1, 2))}
         elif name == 'misalignment':
             # Equations 18 and 19, to first order, of the directions xy, xz, yx, yz, zx, zy.
             out |= {f'misalignment.{part}_rad.{d}': sign * v for part, d, sign, v in zip(

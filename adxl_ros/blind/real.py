@@ -37,7 +37,7 @@ import numpy as np
 from scipy.signal import butter, sosfiltfilt
 import yaml
 
-_SMOOTH_HZ = 5.0
+_SMOOTH_HZ = 15.0
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ def _felt(one: Arm, folder: Path) -> Path:
     columns = [lines[0].split(',').index(name) for name in names]
     rows = np.genfromtxt(lines[1:], delimiter=',', usecols=columns)
     rate = 1 / np.median(np.diff(rows[:, 0]))
-    smooth = butter(4, _SMOOTH_HZ, fs=rate, output='sos')
+    smooth = butter(4, min(_SMOOTH_HZ, rate / 4), fs=rate, output='sos')
     rows[:, 1:] = sosfiltfilt(smooth, np.nan_to_num(rows[:, 1:]), axis=0)
     path = folder / 'sim.csv'
     np.savetxt(path, rows, delimiter=',', header=','.join(names), comments='', fmt='%.9g')

@@ -33,6 +33,7 @@ import json
 import os
 from pathlib import Path
 import secrets
+import shutil
 from typing import Any
 
 from adxl_ros.blind import cases, store
@@ -110,10 +111,13 @@ def seal(folder: Path, seed: int, plans: list[Plan], trials: int, pool: Executor
     store.write(folder / 'seal.json', json.dumps({
         'sha256_of_salt_and_labels': digest, 'cases': len(plans), 'date': str(date.today()),
     }, indent=1).encode())
-    for path in drawn.glob('*.json'):
-        path.unlink()
-    drawn.rmdir()
+    close(folder)
     return digest
+
+
+def close(folder: Path) -> None:
+    """Take away what drawing left beside the sealed labels, also where it was cut short there."""
+    shutil.rmtree(folder / 'labels' / 'drawn', ignore_errors=True)
 
 
 def _only(plan: Plan) -> tuple[Plan]:
