@@ -171,20 +171,19 @@ def _sized(at: sight.Scene, eye: sight.Eye, fault: Fault,
            wanted: float) -> tuple[Fault, np.ndarray]:
     """Find the size of a fault that has the wanted strength, or the most it can have."""
     kind, tried = fault.kind, []
-    for _ in range(9):
+    while True:
         change = at.response([fault], coarse=True)
         found = sight.rms(sight.beyond_calibration(at.unit, change, eye.force))
         tried.append((math.log(fault.size), math.log(max(found, 1e-12))))
-        if abs(tried[-1][1] - math.log(wanted)) < 0.05 or (
+        if abs(tried[-1][1] - math.log(wanted)) < 0.05 or len(tried) == 9 or (
                 fault.size == kind.most and found < wanted):
-            break
+            return fault, change
         slope = 1.0
         if len(tried) > 1 and tried[-1][0] != tried[-2][0]:
             slope = (tried[-1][1] - tried[-2][1]) / (tried[-1][0] - tried[-2][0])
         step = (math.log(wanted) - tried[-1][1]) / min(max(slope, 0.7), 30.0)
         size = fault.size * math.exp(min(max(step, -3.0), 3.0))
         fault = replace(fault, size=min(size, kind.most))
-    return fault, change
 
 
 def _sight(eye: sight.Eye, rivals: dict[str, np.ndarray], fault: Fault,

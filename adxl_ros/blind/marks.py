@@ -46,17 +46,17 @@ class Answer:
 
     @property
     def named(self) -> frozenset[str]:
-        """Every effect that the verdict names, for certain or as one of a group."""
+        """Name every effect of the verdict, for certain or as one of a group."""
         return self.certain.union(*self.groups)
 
     @property
     def top(self) -> frozenset[str]:
-        """The most probable hypothesis."""
+        """Give the most probable hypothesis."""
         return max(self.hypotheses, key=lambda one: one[1])[0]
 
     @property
     def gap(self) -> bool:
-        """Whether it says that there is something."""
+        """Say whether the answer is that there is something."""
         return self.status in ('explained', 'inseparable', 'unknown', 'bad_data')
 
 
@@ -68,8 +68,8 @@ def answer(result: dict[str, Any]) -> Answer:
         hypotheses = tuple((frozenset(one['effects']), float(one['probability']))
                            for one in report['hypotheses'])
         parameters = {
-            f'{one["effect"]}.{name}': (float(row['value']), float(row['ci'][0]),
-                                         float(row['ci'][1]))
+            f'{one["effect"]}.{name}': (
+                float(row['value']), float(row['ci'][0]), float(row['ci'][1]))
             for one in report['candidates'] for name, row in one['parameters'].items()
             if isinstance(row, dict) and row.get('ci')}
         certain = frozenset(verdict['effects'])

@@ -103,8 +103,6 @@ def _with(**bounds: tuple[float, float]) -> Draw:
         name: float(rng.uniform(*pair)) for name, pair in bounds.items()}}
 
 
-
-
 def _foreign(act: Act, place: str, draw: Draw = by_axis) -> dict[str, Any]:
     return {'place': place, 'act': act, 'draw': draw, 'spread': ones, 'start': 1e-3,
             'most': 0.05}
