@@ -4,10 +4,11 @@
 # make bench    rate, missing samples, latency and CPU of the live nodes
 # make gallery  docs/effects.md and its plots, from the library of effects
 # make long    an 8-hour recording through apply: memory and time
+# make blind    the blind check of diagnose, 600 trials, into blind_output/ (make blind ARGS='--seed 1')
 # make lint     the linters alone
 # make clean    remove what these made
 
-.PHONY: build demo test bench gallery reproduction long lint clean FORCE
+.PHONY: build demo test bench gallery reproduction long blind lint clean FORCE
 .DEFAULT_GOAL := build
 
 # The first Python that can run the line $1.
@@ -102,6 +103,10 @@ long: build
 	cd test && PATH="$(CURDIR)/install/adxl_ros/lib/adxl_ros:$$PATH" \
 	    ../run --exec python long_recording.py $(ARGS)
 
+# Goes on where it was cut short; with a seed of its own in ARGS, into another folder.
+blind: build
+	./run blind -o blind_output $(ARGS)
+
 clean:
-	rm -rf .venv build install log demo_output .*_cache .hypothesis
+	rm -rf .venv build install log demo_output blind_output .*_cache .hypothesis
 	find adxl_ros launch test -name __pycache__ -prune -exec rm -rf {} +

@@ -55,7 +55,7 @@ setup(
     entry_points={
         'console_scripts': [
             *scripts('nodes', ('driver', 'stage', 'calibration', 'compensation', 'demo', 'bench')),
-            *scripts('tools', ('simulate', 'fit', 'apply', 'diagnose', 'reproduce')),
+            *scripts('tools', ('simulate', 'fit', 'apply', 'diagnose', 'blind', 'reproduce')),
         ],
     },
 )

@@ -1,0 +1,93 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Check `diagnose` on data whose effect is withheld, and say how often it is right."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+import sys
+
+from adxl_ros.blind import check, page, real, run as running
+from adxl_ros.calibrate.figures import pyplot
+from adxl_ros.errors import UserError
+from adxl_ros.files.atomic import atomic_path
+from adxl_ros.tools.common import make_folder, progress, run
+
+PROG = 'blind'
+
+
+def parser() -> argparse.ArgumentParser:
+    """Describe the command line."""
+    parse = argparse.ArgumentParser(prog=PROG, description=__doc__)
+    parse.add_argument('--trials', type=int, default=600,
+                       help='how many cases (default 600), and a twelfth at strength zero')
+    parse.add_argument('--seed', type=int, default=None,
+                       help='of the cases; drawn if not given, and told when labels are opened')
+    parse.add_argument('--real', metavar='RECORDING:PARAMS[:SIM]', action='append', default=[],
+                       help='a real recording with calibrated parameters, whose effects are '
+                            'deleted one by one to see whether they are put back; may be repeated')
+    parse.add_argument('--scheduler', metavar='ADDRESS', help='of a Dask cluster to run on')
+    where = parse.add_mutually_exclusive_group(required=True)
+    where.add_argument('-o', dest='output', metavar='DIR', help='seal, diagnose, open and score')
+    where.add_argument('--seal', metavar='DIR', help='only draw the cases and seal their labels')
+    where.add_argument('--open', metavar='DIR',
+                       help='diagnose what is not diagnosed yet, open the labels and score')
+    return parse
+
+
+def blind(options: argparse.Namespace) -> int:
+    """Run the tool; see `parser`."""
+    if options.trials < 1:
+        raise UserError(f'--trials {options.trials}: at least 1 is needed')
+    if options.seed is not None and options.seed < 0:
+        raise UserError(f'--seed {options.seed}: must not be negative')
+    arms = [real.arm(words) for words in options.real]
+    folder = Path(options.output or options.seal or options.open)
+    try:
+        return _check(options, folder, arms)
+    except KeyboardInterrupt:
+        print(f'{PROG}: interrupted; the same command goes on where it was', file=sys.stderr)
+        return 130
+
+
+def _check(options: argparse.Namespace, folder: Path, arms: list[real.Arm]) -> int:
+    draw = pyplot()
+    if not options.open:
+        make_folder(folder)
+    with running.workers(options.scheduler) as pool:
+        if not options.open:
+            with progress('draw') as show:
+                digest = check.sealed(folder, options.seed, options.trials, pool, show)
+            print(f'SHA-256 of salt and labels: {digest}', flush=True)
+        if options.seal:
+            return 0
+        made = check.scored(folder, None, pool, progress)
+        if arms:
+            with progress('real') as show:
+                made['real'] = real.put_back(arms, None, pool, show)
+    for name, text in (('blind.json', json.dumps(made, indent=1, allow_nan=False) + '\n'),
+                       ('blind.md', page.markdown(made)), ('blind.html', page.page(made, draw))):
+        with atomic_path(folder / name) as fresh:
+            fresh.write_text(text, encoding='utf-8')
+    print(page.summary(made))
+    print(f'\n{folder / "blind.html"} is written')
+    return 0
+
+
+def main() -> int:
+    """Run the tool on the command line."""
+    return run(parser(), blind)

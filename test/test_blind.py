@@ -1,0 +1,454 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""`blind`: the machinery, on small seeded checks with diagnoses that cheat or know nothing."""
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+import hashlib
+import json
+from pathlib import Path
+import shutil
+import sys
+
+from adxl_ros.blind import cases, check, controls, marks, page, real, run, scores, seal
+from adxl_ros.blind.cases import Label
+from adxl_ros.blind.world import chain, kinds, motion, sight, unit
+from adxl_ros.calibrate.figures import pyplot
+from adxl_ros.errors import UserError
+import numpy as np
+import pytest
+import yaml
+
+SEED, TRIALS, SECONDS = 5, 20, (20.0, 24.0)
+# A diagnosis that is a script: `said(recording, parameters)` gives status and hypotheses.
+SCRIPT = """
+import json, os, sys
+from pathlib import Path
+{body}
+recording, parameters, out = sys.argv[1], sys.argv[3], Path(sys.argv[5])
+status, hypotheses = said(Path(recording), Path(parameters))
+best = max(hypotheses, key=lambda one: one[1])
+out.mkdir()
+(out / 'report.json').write_text(json.dumps({{
+    'verdict': {{'status': status, 'effects': [] if 'unknown' in best[0] else best[0],
+                'groups': [], 'probability': best[1]}},
+    'hypotheses': [{{'effects': e, 'probability': p}} for e, p in hypotheses],
+    'gap': {{'closed': None, 'before': 0.01}}, 'candidates': []}}))
+"""
+NOTHING = "def said(recording, parameters): return 'no_gap', [[[], 0.9], [['bias'], 0.1]]"
+ALWAYS = "def said(recording, parameters): return 'explained', [[['lever_arm'], 1.0]]"
+# Looks about for labels: near its files, in its environment, and where it was told they are.
+CHEAT = """
+def said(recording, parameters):
+    places = [Path.cwd(), *Path.cwd().resolve().parents[:-2], Path({folder!r})]
+    places += [Path(word) for value in os.environ.values() for word in value.split(':')
+               if 'label' in word or 'blind' in word]
+    for place in places:
+        for path in place.rglob('*label*'):
+            for file in ([path] if path.is_file() else path.rglob('*')):
+                try:
+                    rows = json.loads(file.read_bytes())['labels']
+                except (OSError, ValueError, KeyError, TypeError):
+                    continue
+                for row in rows:
+                    if row['name'] == recording.stem and row['effects']:
+                        return 'explained', [[row['effects'], 1.0]]
+    return 'no_gap', [[[], 1.0]]
+"""
+
+
+def show(stage):
+    return lambda done: None
+
+
+def script(folder, body):
+    """Write a diagnosis and say how to run it."""
+    path = folder / 'diagnosis.py'
+    path.write_text(SCRIPT.format(body=body))
+    return [sys.executable, str(path)]
+
+
+@pytest.fixture(scope='module')
+def pool():
+    with ThreadPoolExecutor(2) as pool:
+        yield pool
+
+
+@pytest.fixture(scope='module')
+def state(tmp_path_factory):
+    """Keep keys where this user's own are not."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv('XDG_STATE_HOME', str(tmp_path_factory.mktemp('state')))
+        yield
+
+
+@pytest.fixture(scope='module')
+def original(tmp_path_factory, state):
+    folder = tmp_path_factory.mktemp('check') / 'blind'
+    with run.workers(None) as pool:
+        seal.seal(folder, SEED, cases.plans(SEED, TRIALS, SECONDS), TRIALS, pool,
+                  show(''))
+    return folder
+
+
+@pytest.fixture(scope='module')
+def known_nothing(original, tmp_path_factory, pool):
+    """Score a diagnosis that never finds anything, once for all tests that build on it."""
+    folder = tmp_path_factory.mktemp('nothing')
+    shutil.copytree(original, folder / 'blind')
+    return folder / 'blind', check.scored(folder / 'blind', script(folder, NOTHING), pool, show)
+
+
+def copied(original, known_nothing, folder):
+    """Copy the sealed check, with the held-out simulations, which those tests do not change."""
+    shutil.copytree(original, folder / 'blind')
+    shutil.copytree(known_nothing[0] / 'labels' / 'held', folder / 'blind' / 'labels' / 'held')
+    return folder / 'blind'
+
+
+def test_a_sealed_check_tells_nothing(original):
+    names = sorted(path.name for path in (original / 'recordings').iterdir())
+    count = TRIALS + 2
+    assert names == sorted(f'r{i:04d}.{suffix}' for i in range(count)
+                           for suffix in ('csv', 'yaml'))
+    assert {path.stat().st_mtime for path in (original / 'recordings').iterdir()} == {0}
+    effects = [name.encode() for name in kinds.KINDS if name not in (
+        'bias', 'gravity', 'scale_factor', 'supply')]
+    for path in original.rglob('*'):
+        data = path.read_bytes() if path.is_file() else b''
+        assert [name for name in effects if name in data] == [], path
+        assert b'"seed"' not in data, path
+
+
+def test_labels_are_those_of_the_hash(original, known_nothing, tmp_path, pool):
+    folder, made = known_nothing
+    text = (folder / 'labels' / 'labels.json').read_bytes()
+    digest = json.loads((original / 'seal.json').read_bytes())['sha256_of_salt_and_labels']
+    assert hashlib.sha256(text).hexdigest() == digest == made['hash']
+    drawn = [cases.draw(plan) for plan in cases.plans(SEED, TRIALS, SECONDS)[:1]]
+    opened = seal.unseal(folder).labels[:1]
+    assert [label.effects for label in drawn] == [label.effects for label in opened]
+    assert [one['size'] for label in drawn for one in label.faults] == pytest.approx(
+        [one['size'] for label in opened for one in label.faults])
+    other = copied(original, known_nothing, tmp_path)
+    (other / 'labels' / 'labels.json').write_bytes(text.replace(b'"single"', b'"pair"'))
+    with pytest.raises(UserError, match='not those whose hash'):
+        check.scored(other, script(tmp_path, NOTHING), pool, show)
+
+
+def test_nothing_found_scores_as_it_should(known_nothing):
+    made = known_nothing[1]
+    assert made['scores']['false_alarms']['value'] == 0
+    for score in ('top_1', 'set_recall', 'unknown_recall_all', 'harm'):
+        assert made['scores'][score]['value'] == 0
+    assert made['scores']['closed']['value'] == 0
+    assert not made['leaks']
+    groups = [row['group'] for row in made['rows']]
+    assert [groups.count(name) for name in ('none', 'pair', 'outside', 'single', 'zero')] == [
+        5, 4, 4, 7, 2]
+
+
+def test_a_cheat_finds_no_labels(original, known_nothing, tmp_path, pool):
+    folder = copied(original, known_nothing, tmp_path)
+    cheat = script(tmp_path, CHEAT.format(folder=str(folder)))
+    sealed = check.scored(folder, cheat, pool, show)
+    assert not any(row['named'] for row in sealed['rows'])
+    # The same diagnosis does cheat where labels lie open.
+    shutil.rmtree(folder / 'reports')
+    opened = check.scored(folder, cheat, pool, show)
+    assert all(sorted(row['named']) == sorted(row['effects']) for row in opened['rows']
+               if row['group'] != 'zero')
+
+
+def test_always_one_effect_scores_as_it_should(original, known_nothing, tmp_path, pool):
+    folder = copied(original, known_nothing, tmp_path)
+    made = check.scored(folder, script(tmp_path, ALWAYS), pool, show)
+    score = made['scores']
+    assert score['false_alarms']['value'] == 1
+    singles = [row for row in made['rows'] if row['group'] == 'single']
+    own = [row['effects'] == ['lever_arm'] for row in singles]
+    assert score['top_1_all_singles']['value'] == sum(own) / len(own)
+    assert {name for row in score['confusion'].values() for name in row} == {'lever_arm'}
+    assert score['set_size']['value'] == 1
+    assert score['calibration_error']['value'] == pytest.approx(
+        1 - score['verdict_right']['value'])
+    met = {row['name']: row['met'] for row in made['bars']}
+    assert not met['false_alarms'] and not met['top_1'] and not met['calibration_error']
+    assert not made['leaks']
+    permuted = made['controls']['labels_permuted']
+    assert permuted['score'] == pytest.approx(permuted['chance'], abs=0.02)
+    text = page.page(made, pyplot())
+    assert text.count('<img') == 3 and 'http' not in text.replace('http-equiv', '')
+    assert '| false alarms | 1 (' in page.markdown(made)
+
+
+def test_a_process_is_given_its_recording_and_no_more(original, tmp_path):
+    body = """
+def said(recording, parameters):
+    seen = [sorted(path.name for path in Path.cwd().iterdir()), dict(os.environ)]
+    return 'no_gap', [[[], 1.0], [[json.dumps(seen)], 0.0]]
+"""
+    csv = original / 'recordings' / 'r0000.csv'
+    name, result = run.diagnose('r0000', csv.read_bytes(), b'', script(tmp_path, body))
+    files, environment = json.loads(result['report']['hypotheses'][1]['effects'][0])
+    assert name == 'r0000' and files == ['r0000.csv', 'r0000.yaml']
+    assert not any(str(original.parent) in value for value in environment.values())
+    assert environment['HOME'] != str(Path.home())
+
+
+def test_resumes_where_it_was_cut(original, known_nothing, tmp_path, pool):
+    folder = copied(original, known_nothing, tmp_path)
+    command = script(tmp_path, NOTHING)
+
+    class Cut(Exception):
+        pass
+
+    def cut(done):
+        if done > 0.4:
+            raise Cut
+
+    with pytest.raises(Cut):
+        run.diagnose_all(folder, command, pool, cut)
+    before = {path: path.stat().st_mtime_ns for path in (folder / 'reports').glob('r*.json')}
+    assert 0 < len(before) < TRIALS
+    assert len(run.diagnose_all(folder, command, pool, show(''))) == TRIALS + 2
+    assert all(path.stat().st_mtime_ns == time for path, time in before.items())
+    with pytest.raises(UserError, match='another version'):
+        run.diagnose_all(folder, script(tmp_path, ALWAYS), pool, show(''))
+
+
+def test_drawing_resumes(tmp_path, pool, state):
+    plans = cases.plans(3, 2, SECONDS)
+
+    def twice(plan):
+        if plan.name == 'r0002' and not (tmp_path / 'again').exists():
+            raise KeyboardInterrupt
+        return seal.draw(plan)
+
+    with pytest.raises(KeyboardInterrupt):
+        seal.seal(tmp_path / 'blind', 3, plans, 2, pool, show(''), twice)
+    (tmp_path / 'again').touch()
+    digest = seal.seal(tmp_path / 'blind', 3, plans, 2, pool, show(''), twice)
+    opened = seal.unseal(tmp_path / 'blind')
+    assert digest == seal.published(tmp_path / 'blind')
+    assert [label.name for label in opened.labels] == ['r0000', 'r0001', 'r0002']
+
+
+def test_a_failed_diagnosis_counts_as_such(tmp_path):
+    command = [sys.executable, '-c', 'import sys; sys.exit("no such thing")']
+    result = run.diagnose('r0', b'time_s,x_v\n', b'', command)[1]
+    given = marks.answer(result)
+    assert (given.status, given.gap, result['error']) == ('failed', False, 'no such thing')
+    for report in ({}, {'verdict': None}, {'verdict': {'status': 'explained'}}, []):
+        assert marks.answer({'report': report, 'seconds': 1.0}).status == 'failed'
+
+
+def padded(label, recording):
+    """Make a recording longer where its label has an effect, at strength zero, too."""
+    return '# ' + 'x' * 5000 + '\n' + recording if label.effects else recording
+
+
+PADDED = """
+def said(recording, parameters):
+    found = recording.read_text().startswith('#')
+    return ('explained', [[['bias'], 1.0]]) if found else ('no_gap', [[[], 1.0]])
+"""
+
+
+def test_a_leaky_generator_is_caught(known_nothing, tmp_path, pool):
+    """The same cases again, by a generator whose files tell which have an effect."""
+    folder, labels = tmp_path / 'blind', seal.unseal(known_nothing[0]).labels
+    recordings = known_nothing[0] / 'recordings'
+
+    def leaking(plan):
+        label = next(label for label in labels if label.name == plan.name)
+        text, parameters = ((recordings / f'{plan.name}.{suffix}').read_text()
+                            for suffix in ('csv', 'yaml'))
+        return label, padded(label, text), parameters
+
+    seal.seal(folder, SEED, cases.plans(SEED, TRIALS, SECONDS), TRIALS, pool, show(''), leaking)
+    shutil.copytree(known_nothing[0] / 'labels' / 'held', folder / 'labels' / 'held')
+    made = check.scored(folder, script(tmp_path, PADDED), pool, show)
+    assert made['controls']['metadata_only']['leaks'] and made['leaks']
+    assert 'LEAKS' in page.summary(made) and 'LEAKS' in page.page(made, pyplot())
+
+
+def test_an_effect_at_strength_zero_must_not_show(tmp_path):
+    """What only the generator's own marks tell of shows at strength zero."""
+    labels, answers = drawn_labels(), []
+    for label in labels:
+        text = padded(label, 'time_s,x_v\n0.0,2.5\n')
+        answers.append(marks.answer(run.diagnose(
+            label.name, text.encode(), b'', script(tmp_path, PADDED))[1]))
+    assert controls.strength_zero(labels, answers)['leaks']
+
+
+def drawn_labels():
+    """Return labels of a fair mix, without their recordings."""
+    at = {'manoeuvre': 'rich', 'axes': 'xyz', 'floor_mps2': 0.01}
+    rows = []
+    for plan in cases.plans(1, 60):
+        faults = [{'effect': name, 'size': 1.0, 'shape': {'w': [0.0] * 6, 'hertz': 9.0},
+                   'strength_mps2': 0.01 * (i + 1), 'power': 1.0, 'told': 1.0, 'inseparable': []}
+                  for i, name in enumerate(plan.effects)]
+        rows.append(Label(plan.name, plan.group, plan.effects, plan.seed, plan.seconds, **at,
+                          faults=faults, flexible=1.0, plain={'rmse': 'bias', 'bic': ''}))
+    return rows
+
+
+def answered(label, wrong=False):
+    """Answer rightly, or with an effect that is not there."""
+    said = frozenset({'bias', 'gravity'}) if wrong else marks.truth(label)
+    status = 'no_gap' if not said else 'unknown' if 'unknown' in said else 'explained'
+    return marks.Answer(status, said, (), 0.95, ((said, 0.95), (frozenset({'x'}), 0.05)), {}, 1.0)
+
+
+def test_perfect_and_wrong_answers():
+    labels = drawn_labels()
+    right = scores.scores([scores.Trial(label, answered(label), None) for label in labels])
+    for name in ('top_1', 'set_recall', 'unknown_recall', 'verdict_right'):
+        assert right[name]['value'] == 1
+    assert right['false_alarms']['value'] == right['harm']['value'] == 0
+    assert right['calibration_error']['value'] == pytest.approx(0.05)
+    assert right['brier']['value'] == pytest.approx(2 * 0.05 ** 2)
+    assert right['pairs']['whole']['value'] == 1
+    assert all(row['met'] for row in scores.bars(right) if row['met'] is not None)
+    wrong = scores.scores([scores.Trial(label, answered(label, True), None)
+                           for label in labels])
+    assert wrong['false_alarms']['value'] == 1 and wrong['top_1']['value'] == 0
+    assert {row['name'] for row in scores.bars(wrong) if row['met']} == {'harm'}
+
+
+def test_groups_hold_the_truth_or_not():
+    label = next(label for label in drawn_labels() if label.group == 'pair')
+    one, two = label.effects
+    given = answered(label)
+
+    def says(certain, *groups):
+        return replace(given, status='inseparable', certain=frozenset(certain),
+                       groups=tuple(frozenset(group) for group in groups))
+
+    assert marks.verdict_right(says([one], [two, 'a']), label)
+    assert marks.verdict_right(says([], [two, 'a'], [one, 'b']), label)
+    assert not marks.verdict_right(says([one], ['a', 'b']), label)
+    assert not marks.verdict_right(says([], [one, two]), label)
+    assert not marks.verdict_right(says([one, two], ['a', 'b']), label)
+    label.faults[0]['power'] = 0.1
+    assert marks.verdict_right(says([two]), label)
+    assert not marks.verdict_right(says([one]), label)
+
+
+def test_the_curve_finds_the_strength():
+    rng = np.random.default_rng(0)
+    strength = np.exp(rng.uniform(-7, -1, 600))
+    seen = rng.random(600) < 1 / (1 + np.exp(-(np.log(strength) + 4) / 0.5))
+    found = scores.figures.curve(strength, seen, 0.0)
+    assert found['at_50']['ci'][0] < np.exp(-4) < found['at_50']['ci'][1]
+    assert found['at_90']['ci'][0] < np.exp(-4 + 0.5 * np.log(9)) < found['at_90']['ci'][1]
+
+
+@pytest.mark.parametrize('name', kinds.KINDS)
+def test_every_fault_changes_a_recording(name):
+    """In proportion to its size or more, and not at all at size zero; one rich manoeuvre."""
+    at = sight.Scene(unit.draw(np.random.default_rng(0)), motion.draw(
+        np.random.default_rng(2), (60.0, 62.0), 125.0, 'rich'), 1)
+    kind = kinds.KINDS[name]
+    shape = kind.draw(np.random.default_rng(1), at.unit)
+
+    def size(times):
+        return sight.rms(at.response([kinds.Fault(kind, times * kind.start, shape)], True))
+
+    assert size(0.0) == pytest.approx(0, abs=1e-9)
+    assert 0 < size(1.0) < size(2.0)
+    assert np.isfinite(size(1.0))
+
+
+def test_ideal_observer(state):
+    """What is strong is seen, what is weak is not, and a tilted bench is an offset of alpha."""
+    at = sight.Scene(unit.draw(np.random.default_rng(0)), motion.draw(
+        np.random.default_rng(2), (60.0, 62.0), 125.0, 'one_plane'), 1)
+    eye = sight.Eye(at)
+    kind = kinds.KINDS['stage_offset']
+    seen = [sight.power(float(np.sum(eye.seen(at.response([kinds.Fault(
+        kind, size, {'w': [0.0, 1.0]})])) ** 2))) for size in (1e-7, 3e-3)]
+    assert seen[0] < 0.05 and seen[1] > 0.99
+    clean = eye.seen(np.zeros_like(eye.force))
+    assert np.allclose(clean, 0)
+    noise = chain.render(at.unit, at.manoeuvre, [], 3) - chain.render(
+        at.unit, at.manoeuvre, [], 3, noise=False)
+    spread = eye.seen(noise * at.unit.volts_to_mps2)
+    # Whitened noise has variance 1: the spectrum that the oracle uses is that of the noise.
+    assert np.var(spread) == pytest.approx(1, abs=0.05)
+
+
+def test_real_arm_puts_back(original, tmp_path, pool):
+    """A diagnosis that names what its parameters lack."""
+    keys = yaml.safe_load((original / 'recordings' / 'r0000.yaml').read_text())
+    (tmp_path / 'unit.yaml').write_text(yaml.safe_dump(keys))
+    body = """
+def said(recording, parameters):
+    missing = [name for name in ('bias', 'scale_factor') if name + ':' not in
+               parameters.read_text()]
+    return ('explained', [[missing, 1.0]]) if missing else ('no_gap', [[[], 1.0]])
+"""
+    csv = original / 'recordings' / 'r0000.csv'
+    rows = real.put_back([real.arm(f'{csv}:{tmp_path / "unit.yaml"}')], script(tmp_path, body),
+                         pool, show(''))
+    assert [(row['deleted'], row['put_back']) for row in rows] == [
+        (None, None), ('bias', True), ('scale_factor', True)]
+    left = real.without(keys, 'bias')['/**']['ros__parameters']
+    count = len(left['sensor']['axes'])
+    assert left['effects'] == ['scale_factor'] and 'bias' not in left
+    assert len(left['covariance']) == count ** 2
+    assert left['covariance_names'] == [f'scale_factor.offset_v_per_g.{axis}'
+                                        for axis in left['sensor']['axes']]
+    with pytest.raises(UserError, match='no such file'):
+        real.arm(f'{csv}:nowhere.yaml')
+
+
+def test_on_a_cluster(original, known_nothing, tmp_path):
+    distributed = pytest.importorskip('distributed')
+    folder = copied(original, known_nothing, tmp_path)
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None,
+                                  local_directory=str(tmp_path)) as cluster, \
+            run.workers(cluster.scheduler_address) as pool:
+        found = run.diagnose_all(folder, script(tmp_path, NOTHING), pool, show(''))
+    assert len(found) == TRIALS + 2 and all(one['report'] for one in found.values())
+
+
+def test_through_the_front_door(run_tool, tmp_path, state):
+    """Sealed by one call, diagnosed, opened and scored by another."""
+    sealed = run_tool('blind', '--seal', 'dir', '--trials', 1, '--seed', 156)
+    assert sealed.returncode == 0, sealed.stderr
+    digest = json.loads((tmp_path / 'dir' / 'seal.json').read_text())['sha256_of_salt_and_labels']
+    assert digest in sealed.stdout
+    assert not list((tmp_path / 'dir' / 'labels').glob('*.json'))
+    opened = run_tool('blind', '--open', 'dir', timeout_s=300)
+    assert opened.returncode == 0, opened.stderr
+    made = json.loads((tmp_path / 'dir' / 'blind.json').read_text())
+    assert (made['hash'], made['seed'], made['trials'], made['cases']) == (digest, 156, 1, 2)
+    assert made['failed'] == {}
+    for name in ('blind.html', 'blind.md'):
+        assert digest in (tmp_path / 'dir' / name).read_text()
+
+
+@pytest.mark.parametrize('words, status, says', [
+    (['--trials', 3], 2, 'required'), (['-o', 'a', '--open', 'b'], 2, 'not allowed'),
+    (['--trials', 0, '-o', 'a'], 1, 'at least 1'), (['--open', 'none'], 1, '--seal none'),
+    (['-o', 'a', '--real', 'x:y'], 1, 'x: no such file')])
+def test_wrong_usage(run_tool, tmp_path, words, status, says):
+    failed = run_tool('blind', *words)
+    assert failed.returncode == status and says in failed.stderr
+    assert 'Traceback' not in failed.stderr
