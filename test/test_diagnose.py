@@ -21,8 +21,11 @@ from adxl_ros.files import params, recording
 from adxl_ros.files.columns import Recording, sensor_info
 from adxl_ros.gap import report
 from adxl_ros.gap.diagnose import diagnose
+from adxl_ros.gap.local import Hypothesis
+from adxl_ros.gap.next_step import proposed
+from adxl_ros.gap.verdict import Verdict
 from adxl_ros.model import trajectory
-from adxl_ros.model.motion import Knots, Motion
+from adxl_ros.model.motion import Held, Knots, Motion
 from adxl_ros.model.simulate import simulate
 from adxl_ros.tools.effect_option import with_effects
 import numpy as np
@@ -131,6 +134,8 @@ def test_noise_like_effects_are_named(option, effect):
     (lambda c: c | {'x_v': c['y_v'], 'y_v': c['x_v']}, 'axis_swapped'),
     (lambda c: c | {'y_v': 5 - c['y_v']}, 'axis_inverted'),
     (lambda c: c | {a: (c[a] - 2.5) * 9.80665 + 2.5 for a in ('x_v', 'y_v', 'z_v')}, 'unit'),
+    (lambda c: c | {a: c[a] * 1e3 for a in ('x_v', 'y_v', 'z_v')}, 'unit'),
+    (lambda c: c | {'time_s': c['time_s'] + 40.0 * (c['time_s'] > 30)}, 'clock_jump'),
     (lambda c: c | {a: np.roll(c[a], 300) for a in ('x_v', 'y_v', 'z_v')}, 'time_misaligned'),
     (lambda c: c | {'x_v': np.where(np.arange(len(c['x_v'])) % 2, np.nan, c['x_v'])}, 'missing'),
     (lambda c: c | {'x_v': np.clip(c['x_v'], 2.4, 2.6)}, 'saturated')])
@@ -166,6 +171,116 @@ def test_the_command_leaves_report_page_and_parameters(run_tool, tmp_path):
     assert 'temperature_bias' in page and 'http' not in page
     again = run_tool('diagnose', 'run.csv', '--params', 'a/params.yaml', '-o', 'c', '--json')
     assert json.loads(again.stdout)['verdict']['status'] == 'no_gap'
+
+
+def turning(alphas, speeds, rests_s=2.0):
+    """Turn beta forth and back in some planes at some speeds."""
+    script = trajectory.Script(alphas[0], 0.0)
+    for alpha in alphas:
+        script.go(alpha, 0.0)
+        script.rest(rests_s)
+        for speed in speeds:
+            for to in (2.5, 0.0):
+                script.run('beta', to, speed)
+                script.rest(rests_s)
+    return script
+
+
+def recorded(sensor, motion, effects=(), seed=3):
+    """Simulate a recording of a manoeuvre."""
+    columns = simulate(with_effects(sensor, list(effects)), motion, seed)
+    time_s = columns.pop('time_s')
+    return Recording('made', time_s, columns, sensor_info(sensor))
+
+
+def named(found):
+    """Return all that a verdict names, for certain or in a group."""
+    verdict = report.as_json(found)['verdict']
+    return {*verdict['effects'], *(e for group in verdict['groups'] for e in group)}
+
+
+@pytest.mark.parametrize('effect', ['backlash:beta_rad=0.003', 'time_offset:offset_s=0.005', None])
+def test_a_poor_manoeuvre_widens_the_answer_and_makes_none_wrong(effect):
+    """A minute, two axes, one plane, one speed: the truth is among what is named, or nothing."""
+    sensor = unit('xy')
+    script = turning([np.pi / 2], [0.7] * 3, 4.0)
+    alpha, beta = script.joints()
+    found = diagnose([recorded(sensor, Motion(script.now, alpha, beta),
+                               [effect] if effect else [])], sensor)
+    if effect is None:
+        assert found.verdict.status == 'no_gap'
+    else:
+        assert effect.split(':')[0] in named(found)
+
+
+def test_what_does_not_move_is_not_called_free_of_a_gap():
+    """A minute at rest: no verdict, and what was not covered."""
+    sensor = unit('xy')
+    found = diagnose([recorded(sensor, Motion(60.0, Held(1.0), Held(0.5)))], sensor)
+    told = report.as_json(found)
+    assert told['verdict']['status'] == 'insufficient'
+    assert 'motion' in told['not_covered'] and told['next_experiment']
+
+
+def test_repeats_tell_the_floor_where_nothing_rests():
+    """Two runs of one trajectory without a rest: what differs between them is the floor."""
+    sensor = replace(unit('xy'), stage_resolution_rad=1e-5)
+    time_s = np.arange(0.0, 70.0, 0.5)
+    alpha, beta = (Knots(time_s, 1.0 + 0.4 * np.sin(rate * time_s), 0.4 * rate * np.cos(
+        rate * time_s)) for rate in (0.31, 0.53))
+    motion = Motion(65.0, alpha, beta)
+    found = diagnose([recorded(sensor, motion, seed=seed) for seed in (1, 2)], sensor)
+    told = report.as_json(found)
+    assert told['gap']['floor_source'] == 'repeats'
+    # 110 ug/rtHz behind 15 Hz and 16 bit at 5 V.
+    assert told['gap']['floor'] == pytest.approx(5.3e-3, rel=0.1)
+
+
+def test_noise_is_compared_where_the_mean_is_blind():
+    """Twice the noise: four times the power, until the simulator has it, too."""
+    told, _ = diagnosed(unit(), 'noise_excess:ratio=1.0')
+    noise = told['gap']['noise'][0]
+    assert noise['power_ratio_before'][-1] == pytest.approx(4.0, rel=0.1)
+    assert noise['power_ratio_after'][-1] == pytest.approx(1.0, rel=0.1)
+    assert noise['log_likelihood_gain'] > 100
+
+
+def test_the_next_manoeuvre_is_the_one_that_tells_most():
+    """Temperature or warm-up: heating tells, a shaker does not; both are simulated."""
+    sensor = with_effects(unit('xy'), ['temperature_bias:per_k=3e-4'])
+    best = Hypothesis(('temperature_bias',), sensor, (), np.zeros(0), np.zeros(0), 0.0, None)
+    verdict = Verdict('inseparable', (), (('temperature_bias', 'warm_up'),), 0.9, (), best)
+    asked = proposed(verdict, [], 0)
+    worth = {words: rate for words, _, rate in asked.menu}
+    assert 'simulate soak' in asked.command and asked.nats_per_minute > 5
+    assert worth['shake along x from 2 to 40 Hz'] < 0.1 * asked.nats_per_minute
+
+
+def test_temperature_is_named_in_a_climatic_chamber(run_tool, tmp_path, shared_dir):
+    """A real recording at rest, and the slopes of its README: +0.16, -0.15, -0.43 mg/degC."""
+    done = run_tool('diagnose', shared_dir / 'real' / 'thermal_chamber.csv', '-o', tmp_path,
+                    '--json')
+    told = json.loads(done.stdout)
+    assert 'temperature_bias' in told['verdict']['effects']
+    found = next(c for c in told['candidates'] if c['effect'] == 'temperature_bias')
+    slopes = [found['parameters'][f'per_k.{axis}']['value'] for axis in 'xyz']
+    assert slopes == pytest.approx([1.6e-4, -1.5e-4, -4.3e-4], rel=0.2)
+
+
+def test_another_simulator_takes_the_place_of_the_stage(run_tool, tmp_path, shared_dir):
+    """Optical tracking is no simulator of an IMU: a gap, and no effect is claimed for it."""
+    done = run_tool('diagnose', shared_dir / 'real' / 'broad_02_real.csv', '--sim',
+                    shared_dir / 'real' / 'broad_02_sim.csv', '-o', tmp_path, '--json')
+    told = json.loads(done.stdout)
+    assert (told['verdict']['status'], told['verdict']['effects']) == ('unknown', [])
+    assert any(c['dimension'] == 'frequency_hz' for c in told['where'])
+
+
+def test_a_sensor_that_moves_without_a_reference_gets_no_verdict(run_tool, tmp_path, shared_dir):
+    """Turned by hand: one line says what is missing."""
+    done = run_tool('diagnose', shared_dir / 'real' / 'mpu9150_0.csv', '-o', tmp_path, '--json')
+    verdict = json.loads(done.stdout)['verdict']
+    assert (verdict['status'], verdict['data_fault']) == ('bad_data', 'reference')
 
 
 @pytest.mark.parametrize('name', ['no_gap', 'temperature_bias', 'time_offset'])

@@ -213,7 +213,8 @@ def judge(of: Study, found: Sequence[Hypothesis], discrepancy: Discrepancy | Non
         unknown = 0.9
         places = tuple(sorted((k for k, g in discrepancy.where.items() if g > UNKNOWN_NATS),
                               key=lambda k: -discrepancy.where[k]))
-    if WANDERING not in best.effects and left_mps2 > LEFT_OF_NOISE * noise_mps2 and left_mps2 > LEFT_OF_GAP * gap_mps2:
+    if WANDERING not in best.effects \
+            and left_mps2 > max(LEFT_OF_NOISE * noise_mps2, LEFT_OF_GAP * gap_mps2):
         unknown = 0.9
         places = places or ('frequency',)
     known = share / share.sum() * (1 - unknown)
