@@ -25,7 +25,7 @@ from typing import Any, Protocol
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
-HELPERS = ('base', 'channels', 'clock_map', 'count', 'port', 'retry', 'sim_stage', 'timeline',
+HELPERS = ('base', 'board', 'channels', 'clock_map', 'count', 'port', 'retry', 'sim_stage', 'timeline',
            'wire')
 """Modules of this folder that are no links."""
 

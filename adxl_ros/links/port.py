@@ -40,9 +40,11 @@ class Port:
     Attributes
     ----------
     trouble
-        Why there is none, in one line; '' while it is open.
+        Why there is none, in one line; '' while it is open, and before the first try.
     opened
         How often it was.
+    opened_s
+        When it was the last time, by the monotonic clock.
     received
         Bytes so far.
     heard_s
@@ -53,14 +55,14 @@ class Port:
     def __init__(self, name: str, baud: int) -> None:
         """Name the port; the first `read` opens it."""
         self.opened = self.received = 0
-        self.heard_s = 0.0
+        self.heard_s = self.opened_s = 0.0
         self._name, self._baud = name, baud
         self._serial = _pyserial()
         self._open: Any = None
         self._poll: Any = None
         self._retry = Retry()
-        self._looked_s = self._opened_s = 0.0
-        self.trouble = f'{name}: not open yet'
+        self._looked_s = 0.0
+        self.trouble = ''
 
     def read(self) -> bytes | None:
         """Return what has come, b'' after 50 ms without; None where the port was not open."""
@@ -102,7 +104,7 @@ class Port:
             self.trouble = f'{self._name}: {_reason(error)}'
             return
         self.opened += 1
-        self._opened_s = time.monotonic()
+        self.opened_s = time.monotonic()
         self.trouble = ''
         try:
             self._poll = select.poll()
@@ -138,7 +140,7 @@ class Port:
         except (OSError, AttributeError):
             return
         if stat.S_ISSOCK(held.st_mode):
-            if now_s - max(self.heard_s, self._opened_s) > _DEAD_S:
+            if now_s - max(self.heard_s, self.opened_s) > _DEAD_S:
                 self._lose(f'silent for {_DEAD_S:g} s')
             return
         try:

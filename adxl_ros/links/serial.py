@@ -59,6 +59,9 @@ _USUAL = (*AXES, channels.SUPPLY)
 _SILENT_S = 0.5
 _DEAF_S = 1.0
 """Bytes without a frame for so long are not those of a board at this rate."""
+_INFORMED_S = 1.5
+"""A board that has just been opened says what it is within this."""
+_CONNECTING = 'connecting'
 _BYTES_PER_S = 4e6
 _FASTER = 20.0
 """Samples are taken at so many times their stated rate at most; the rest waits, or is the
@@ -151,6 +154,8 @@ class SerialLink:
         now_s = time.monotonic()
         if self._port.trouble:
             return 'error', self._port.trouble
+        if self._info is None and now_s - max(self._port.opened_s, self._began_s) < _INFORMED_S:
+            return 'ok', _CONNECTING
         name = self._options['port']
         silent_s = now_s - max(self._port.heard_s, self._began_s)
         if silent_s > max(_SILENT_S, 3 * self._longest_s):
@@ -221,7 +226,7 @@ class SerialLink:
         self._refusal = ''
         try:
             roles = self._roles or list(_USUAL[:info.channels])
-            if len(roles) != info.channels:
+            if len(roles) > info.channels:
                 raise UserError(f'link.channels: {len(roles)} are named, the board has '
                                 f'{info.channels}')
             channels.check_roles([role for role in roles if self._roles or role not in AXES
