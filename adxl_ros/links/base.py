@@ -25,8 +25,8 @@ from typing import Any, Protocol
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
-HELPERS = ('base', 'board', 'channels', 'clock_map', 'count', 'port', 'retry', 'sim_stage', 'timeline',
-           'wire')
+HELPERS = ('base', 'board', 'channels', 'clock_map', 'count', 'iio_device', 'port', 'retry',
+           'sim_stage', 'timeline', 'wire')
 """Modules of this folder that are no links."""
 
 

@@ -211,7 +211,7 @@ class ClockMap:
             off = lag_ns - offset_ns - slope * at_s
             weight = np.where(off > 0, _LATE, 1.0)
             self.jitter_ns = float(np.median(np.abs(off)))
-        self.drift_ppm = slope * 1e-3
+        self.drift_ppm = float(slope) * 1e-3
         ahead_s = (device_ns - origin.device_ns) * 1e-9
         return origin.lag_ns + round(offset_ns + slope * ahead_s)
 
@@ -289,15 +289,19 @@ class RosClock:
 
     _STEP_NS = 1_000_000
     _TRIES = 3
+    _SHARP_NS = 20_000
 
     def __init__(self) -> None:
         """Look at both clocks."""
         self.steps = 0
-        self._offset_ns = float(self._look())
+        self._offset_ns = float(self._look()[1])
 
     def watch(self) -> int:
         """Follow the system's clock; return by how much it was set since the last call, or 0."""
-        off_ns = self._look() - self._offset_ns
+        uncertain_ns, seen_ns = self._look()
+        if uncertain_ns > self._SHARP_NS:
+            return 0
+        off_ns = seen_ns - self._offset_ns
         if abs(off_ns) < self._STEP_NS:
             self._offset_ns += 0.05 * off_ns
             return 0
@@ -309,11 +313,10 @@ class RosClock:
         """Return ROS times, ns, of monotonic ones."""
         return host_ns + round(self._offset_ns)
 
-    def _look(self) -> int:
-        """Read both clocks, of some tries the one that was interrupted least."""
-        best = None
+    def _look(self) -> tuple[int, int]:
+        """Return how sure it is and the offset, ns: of some looks the least interrupted one."""
+        looks = []
         for _ in range(self._TRIES):
             before, system, after = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
-            if best is None or after - before < best[0]:
-                best = after - before, system - (before + after) // 2
-        return best[1]
+            looks.append((after - before, system - (before + after) // 2))
+        return min(looks)

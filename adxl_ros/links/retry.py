@@ -21,6 +21,8 @@ import time
 _FIRST_S = 0.01
 _LONGEST_S = 0.08
 """A device that is back is noticed within this."""
+_SLOW_S = 1.0
+"""A device that is there, but not what the parameters say, is not asked more often."""
 
 
 class Retry:
@@ -38,9 +40,9 @@ class Retry:
             time.sleep(min(left_s, 0.05))
         return left_s <= 0.05
 
-    def failed(self) -> None:
-        """Take the time until the next try."""
-        self._next_s = time.monotonic() + self._wait_s
+    def failed(self, slow: bool = False) -> None:
+        """Take the time until the next try; `slow` where trying soon is not likely to help."""
+        self._next_s = time.monotonic() + (_SLOW_S if slow else self._wait_s)
         self._wait_s = min(2 * self._wait_s, _LONGEST_S)
 
     def worked(self) -> None:
