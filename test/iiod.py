@@ -67,7 +67,8 @@ class Adc:
                            'current_timestamp_clock': 'realtime', **setting.get('attributes', {})}
         self.offset_ns = setting.get('offset_ns', 7_000_000_000)
         self.drift = 1 + setting.get('ppm', 0) * 1e-6
-        self.began_ns = time.monotonic_ns()
+        # A server that is started anew finds the same device.
+        self.began_ns = setting.get('began_ns') or time.monotonic_ns()
         self.buffers, self.count = 4, 20
         self.next = 0
         self.lost = 0
