@@ -122,18 +122,19 @@ def driver(*parameters):
 
 
 def run(row, rig, pid, seconds):
-    """Do what a row says, wait until samples flow again, and return the book."""
+    """Do what a row says; return the book, and after how many ms samples flowed again."""
     rig.begin()
     back_ns = row.act(rig, pid, seconds)
+    recovered_ms = rig.recovered_ms(back_ns) if back_ns else None
     rig.count(200, 20, f'samples after: {row.name}')
-    return rig.close(back_ns)
+    return rig.close(), recovered_ms
 
 
-def line(row, book):
+def line(row, book, recovered_ms):
     """Write a row of the table."""
-    known = 'exact' if book.missing == book.said and not book.estimated else \
-        f'estimated {book.said}'
-    after = '' if book.first_after_ms != book.first_after_ms else f'{book.first_after_ms:.0f} ms'
+    known = f'{book.said}, {book.estimated} of them estimated' if book.estimated else \
+        'exactly that' if book.missing == book.said else f'{book.said}'
+    after = '' if recovered_ms is None else f'{recovered_ms:.0f} ms'
     return (f'| {row.name} | {book.published} | {book.wrong} | {book.missing} | {known} | '
             f'{after} | {book.error_ms:.2f} |')
 
@@ -153,7 +154,7 @@ def main():
                 with driver(*rig.parameters()) as process:
                     rig.count(1000, 30)
                     for row in rows:
-                        print(line(row, run(row, rig, process.pid, seconds)), flush=True)
+                        print(line(row, *run(row, rig, process.pid, seconds)), flush=True)
                 rig.end()
     return 0
 

@@ -63,6 +63,8 @@ class Adc:
         self.setting = setting
         self.rate = float(setting.get('rate', 1000.0))
         self.channels = [*setting.get('channels', CHANNELS)]
+        # libiio numbers the channels of the buffer, its stamps last, before the others.
+        self.last = sum(not c.get('unbuffered') for c in self.channels)
         self.attributes = {'sampling_frequency': str(self.rate),
                            'current_timestamp_clock': 'realtime', **setting.get('attributes', {})}
         self.offset_ns = setting.get('offset_ns', 7_000_000_000)
@@ -82,7 +84,7 @@ class Adc:
         return self.began_ns + self.offset_ns + round(k * 1e9 / self.rate)
 
     def open(self, count, mask):
-        self.enabled = [i for i in range(len(self.channels) + 1) if mask >> i & 1]
+        self.enabled = [i for i in range(self.last + 1) if mask >> i & 1]
         self.count, self.next = count, self.now()
 
     def samples(self, count):
@@ -108,7 +110,7 @@ class Adc:
         """Lay a sample out as the kernel does: each element at a multiple of its size."""
         out = b''
         for i in self.enabled:
-            if i == len(self.channels):
+            if i == self.last:
                 size, order, value = 8, 'le', self.stamp(k)
             else:
                 order, sign, bits, stored, shift = format_of(self.channels[i])
@@ -117,9 +119,9 @@ class Adc:
                     value -= 2 ** (bits - 1)
                 value = (value % 2 ** bits) << shift
             out += b'\0' * (-len(out) % size)
-            signed = i == len(self.channels)
+            signed = i == self.last
             out += value.to_bytes(size, 'big' if order == 'be' else 'little', signed=signed)
-        largest = max(8 if i == len(self.channels) else format_of(self.channels[i])[3] // 8
+        largest = max(8 if i == self.last else format_of(self.channels[i])[3] // 8
                       for i in self.enabled)
         return out + b'\0' * (-len(out) % largest)
 
@@ -138,7 +140,7 @@ class Adc:
                          + ''.join(attribute(c, n) for n in names) + '</channel>')
         stamp = '' if self.setting.get('unstamped') else (
             '<channel id="timestamp" type="input"><scan-element index='
-            f'"{len(self.channels)}" format="le:S64/64&gt;&gt;0" /></channel>')
+            f'"{self.last}" format="le:S64/64&gt;&gt;0" /></channel>')
         own = ''.join(f'<attribute name="{n}" />' for n in self.attributes)
         return ('<?xml version="1.0" encoding="utf-8"?><!DOCTYPE context ['
                 + GRAMMAR + ']>'

@@ -66,7 +66,6 @@ class Book:
     said: int
     estimated: int
     error_ms: float
-    first_after_ms: float
 
     @property
     def right(self):
@@ -130,17 +129,24 @@ class Rig:
         self.graph.spin(0.05)
         self.take()
 
-    def close(self, back_ns=0):
+    def recovered_ms(self, back_ns):
+        """Wait for a sample taken after a monotonic time; return how long after it came, ms."""
+        ros_ns = back_ns + time.time_ns() - time.monotonic_ns()
+
+        def there():
+            self.take()
+            return self.stamps[-1] >= ros_ns
+        self.graph.spin_until(there, 20, 'a new sample')
+        return (time.monotonic_ns() - back_ns) * 1e-6
+
+    def close(self):
         """Return what stands on the page."""
         self.settle()
-        ros_ns = back_ns + time.time_ns() - time.monotonic_ns() if back_ns else 0
-        after = self.stamps[self.stamps >= ros_ns]
         return Book(len(self.numbers) - 1, self.wrong,
                     int(self.numbers[-1] - self.numbers[0]) - len(self.numbers) + 1,
                     round(self.said('missing') - self.base),
                     round(self.said('missing_estimated') - self.base_estimated),
-                    float(np.abs(self.errors).max()),
-                    (after[0] - ros_ns) * 1e-6 if back_ns and len(after) else np.nan)
+                    float(np.abs(self.errors).max()))
 
 
 class SerialRig(Rig):

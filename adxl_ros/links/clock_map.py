@@ -55,6 +55,8 @@ _SMOOTH_NS = 50e6
 """Differences up to this are taken up smoothly; a larger one forward is a step of the stamps."""
 _BEND = 0.05
 _HARD_BEND = 0.5
+_LEAST_SLOPE = 1e-3
+"""Stamps go forward, however fast a device that is none may send."""
 
 
 @dataclass(frozen=True)
@@ -191,7 +193,7 @@ class ClockMap:
         bend = _BEND if abs(off_ns) < _SMOOTH_NS else _HARD_BEND
         slope = (device_ns + ahead_ns + self._fit(device_ns + ahead_ns) - here_ns) / ahead_ns
         drift = 1 + self.drift_ppm * 1e-6
-        self._slope = min(max(slope, drift - bend), drift + bend)
+        self._slope = max(min(max(slope, drift - bend), drift + bend), _LEAST_SLOPE)
         self._at_ns, self._to_ns = device_ns, here_ns
 
     def _fit(self, device_ns: int) -> int:

@@ -154,14 +154,14 @@ class SerialLink:
         now_s = time.monotonic()
         if self._port.trouble:
             return 'error', self._port.trouble
+        if self._version:
+            return 'error', self._version
         if self._info is None and now_s - max(self._port.opened_s, self._began_s) < _INFORMED_S:
             return 'ok', _CONNECTING
         name = self._options['port']
         silent_s = now_s - max(self._port.heard_s, self._began_s)
         if silent_s > max(_SILENT_S, 3 * self._longest_s):
             return 'warn', f'{name}: silent, the board sends nothing'
-        if self._version:
-            return 'error', self._version
         if now_s - self._good_s > max(_DEAF_S, 3 * self._longest_s):
             return 'warn', (f'{name}: bytes, but no frame of wire format 1: is link.baud '
                             f'({self._options["baud"]}) that of the board?')
