@@ -123,7 +123,7 @@ class Rig:
 
     def settle(self):
         """Wait for diagnostics that know all that has been published."""
-        self.count(300, 30)
+        self.count(round(0.3 * self.setting.get('rate', 1000.0)), 30)
         self.graph.diagnostics.clear()
         self.graph.spin_until(lambda: 'driver' in self.graph.diagnostics, 10, 'diagnostics')
         self.graph.spin(0.05)
@@ -241,3 +241,9 @@ def hold(pid, seconds, graph):
     graph.spin(seconds)
     os.kill(pid, signal.SIGCONT)
     return time.monotonic_ns()
+
+
+def memory_mib(pid):
+    """Return what a process holds in memory, MiB."""
+    text = Path(f'/proc/{pid}/status').read_text()
+    return int(text.split('VmRSS:')[1].split()[0]) / 1024

@@ -22,22 +22,15 @@
 import argparse
 from collections import defaultdict
 from importlib.metadata import version
-from pathlib import Path
 import sys
 import tempfile
 import time
 
 from faults import driver, line, Row, run, SERIAL
-from rig import Book, graph_of_own, SerialRig
+from rig import Book, graph_of_own, memory_mib, SerialRig
 import numpy as np
 
 _EVERY_S = 20.0
-
-
-def memory_mib(pid):
-    """Return what a process holds in memory, MiB."""
-    text = Path(f'/proc/{pid}/status').read_text()
-    return int(text.split('VmRSS:')[1].split()[0]) / 1024
 
 
 def soak(minutes, seed):

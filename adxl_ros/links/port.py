@@ -29,6 +29,7 @@ _WAIT_MS = 50
 _MOST = 65536
 _LOOK_S = 0.1
 """A silent port is looked after this often: the device may be another one by now."""
+SILENT = 'silent, the board sends nothing'
 _DEAD_S = 3.0
 """A network connection that is silent for so long is made anew."""
 
@@ -141,7 +142,7 @@ class Port:
             return
         if stat.S_ISSOCK(held.st_mode):
             if now_s - max(self.heard_s, self.opened_s) > _DEAD_S:
-                self._lose(f'silent for {_DEAD_S:g} s')
+                self._lose(SILENT)
             return
         try:
             there = os.stat(self._name)

@@ -27,7 +27,7 @@ from adxl_ros.links import channels
 from adxl_ros.links.base import Option, Samples, State
 from adxl_ros.links.clock_map import ClockMap
 from adxl_ros.links.count import Count
-from adxl_ros.links.port import Port
+from adxl_ros.links.port import Port, SILENT
 from adxl_ros.links.timeline import Block, Timeline
 from adxl_ros.links.wire import (
     AFTER_RESET,
@@ -161,7 +161,7 @@ class SerialLink:
         name = self._options['port']
         silent_s = now_s - max(self._port.heard_s, self._began_s)
         if silent_s > max(_SILENT_S, 3 * self._longest_s):
-            return 'warn', f'{name}: silent, the board sends nothing'
+            return 'warn', f'{name}: {SILENT}'
         if now_s - self._good_s > max(_DEAF_S, 3 * self._longest_s):
             return 'warn', (f'{name}: bytes, but no frame of wire format 1: is link.baud '
                             f'({self._options["baud"]}) that of the board?')

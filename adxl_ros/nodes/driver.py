@@ -198,6 +198,8 @@ class Driver(LifecycleNode):
         except UserError as error:
             self._fail(error)
             samples = None
+        if not self.context.ok():
+            return
         if self._fault:
             time.sleep(_TICK_S)
             return
