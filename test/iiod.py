@@ -13,8 +13,7 @@
 # limitations under the License.
 
 """
-A small IIOD: the text protocol of libiio 0.x on loopback, with one ADC whose samples tell who
-they are.
+A small IIOD: the text protocol of libiio 0.x, with one ADC whose samples tell who they are.
 
     python iiod.py '{"port": 0, "rate": 1000, "channels": [...]}'
 
@@ -24,9 +23,7 @@ buffers, and loses those that come then.
 """
 
 import json
-import os
 import socketserver
-import struct
 import sys
 import time
 
@@ -83,7 +80,7 @@ class Adc:
     def stamp(self, k):
         return self.began_ns + self.offset_ns + round(k * 1e9 / self.rate)
 
-    def open(self, count, mask):
+    def begin(self, count, mask):
         self.enabled = [i for i in range(self.last + 1) if mask >> i & 1]
         self.count, self.next = count, self.now()
 
@@ -106,7 +103,7 @@ class Adc:
                 time.sleep(0.001)
         return numbers
 
-    def bytes(self, k):
+    def packed(self, k):
         """Lay a sample out as the kernel does: each element at a multiple of its size."""
         out = b''
         for i in self.enabled:
@@ -134,7 +131,7 @@ class Adc:
             scan = '' if c.get('unbuffered') else \
                 f'<scan-element index="{i}" format="{c.get("format", "le:u16/16>>0")}" />'
             names = [n for n in ('label', 'offset', 'scale', 'raw')
-                     if n in c or n == 'raw' or n == 'scale' and 'scale' not in c]
+                     if n in c or n == 'raw' or (n == 'scale' and 'scale' not in c)]
             parts.append(f'<channel id="{c["id"]}" type="input">'.replace('>>', '&gt;&gt;')
                          + scan.replace('>>', '&gt;&gt;')
                          + ''.join(attribute(c, n) for n in names) + '</channel>')
@@ -202,13 +199,13 @@ class Client(socketserver.StreamRequestHandler):
                 adc.buffers = int(rest[-1])
                 self.answer(0)
             elif command == 'OPEN':
-                adc.open(int(rest[1]), int(rest[2], 16))
+                adc.begin(int(rest[1]), int(rest[2], 16))
                 self.mask = rest[2]
                 self.answer(0)
             elif command == 'READBUF':
                 size = int(rest[1])
-                per_sample = len(adc.bytes(0))
-                data = b''.join(map(adc.bytes, adc.samples(size // per_sample)))
+                per_sample = len(adc.packed(0))
+                data = b''.join(map(adc.packed, adc.samples(size // per_sample)))
                 self.answer(len(data), self.mask.encode() + b'\n' + data)
             elif command in ('CLOSE', 'TIMEOUT'):
                 self.answer(0)
@@ -225,7 +222,7 @@ class Server(socketserver.ThreadingTCPServer):
     daemon_threads = True
 
     def handle_error(self, request, client_address):
-        """A client that has gone is no news."""
+        """Say nothing: a client that has gone is no news."""
 
 
 def main():

@@ -27,8 +27,8 @@ import tempfile
 import time
 
 from faults import driver, line, Row, run, SERIAL
-from rig import Book, graph_of_own, memory_mib, SerialRig
 import numpy as np
+from rig import Book, graph_of_own, memory_mib, SerialRig
 
 _EVERY_S = 20.0
 
@@ -85,7 +85,7 @@ def main():
     print(f'\nMemory of the driver: {memory[0]:.1f} MiB after a minute, {memory[-1]:.1f} MiB at '
           'the end.')
     wrong = [row.name for row, told in books.items() for b, _ in told
-             if b.wrong or row.exact and b.missing != b.said]
+             if b.wrong or (row.exact and b.missing != b.said)]
     print(f'soak: wrong: {", ".join(wrong)}' if wrong else 'soak: nothing wrong', file=sys.stderr)
     return 1 if wrong else 0
 

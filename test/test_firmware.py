@@ -58,13 +58,14 @@ def data(library, counts, time_us, index, overruns, codes, bits=16):
 
 
 def test_the_vector_of_the_interfaces(library):
-    frame = data(library, Counts(7, 0), 1_000_000, 70, 0, np.array([[0x8000, 0], [0x1234, 0xffff]]))
+    codes = np.array([[0x8000, 0], [0x1234, 0xffff]])
+    frame = data(library, Counts(7, 0), 1_000_000, 70, 0, codes)
     vector = bytes.fromhex('03010101020701010440420f01010101024601010101030202028001093412ffff'
                            'e9e413f100')
     assert decode(vector[:-1]).flags == 0
     found = decode(frame[:-1])
     assert found.flags == RAIL
-    assert found.codes.tolist() == [[0x8000, 0], [0x1234, 0xffff]]
+    assert np.array_equal(found.codes, codes)
     assert (found.sequence, found.time_us, found.index) == (7, 1_000_000, 70)
 
 

@@ -156,7 +156,7 @@ def judged(*frames, arrived_us=None):
 
 def test_every_sample_that_lacks_is_counted_over_the_wrap_too():
     base = 2 ** 32 - 15
-    count, found = judged(*(data(base + k, time_us=k * 1000) for k in (0, 10, 20, 50)))
+    _, found = judged(*(data(base + k, time_us=k * 1000) for k in (0, 10, 20, 50)))
     assert found == [(base, None, False), (base + 10, 0, False), (5, 0, False), (35, 20, False)]
 
 
@@ -179,7 +179,7 @@ def test_a_reset_begins_a_new_count_whether_it_is_said_or_not():
 def test_a_board_that_does_the_same_again_after_its_reset_is_heard_again():
     first = [data(10 * k) for k in range(300)]
     arrivals = iter(range(0, 10 ** 9, 10_000))
-    count, found = judged(*first, *first, arrived_us=lambda f: next(arrivals))
+    _, found = judged(*first, *first, arrived_us=lambda f: next(arrivals))
     again = [lost for _, lost, _ in found].index(None, 1)
     assert again == 300
     assert 2900 <= len(found) * 10 - 2500 <= 3000, 'half a second makes it sure'

@@ -218,7 +218,8 @@ def test_by_default_the_channels_are_x_y_z_supply(line):
     got = one.read(lambda g: one.number(g) >= 300)
     assert got[0].volts.shape[1] == 3
     supply = np.concatenate([s.references['supply_v'] for s in got])
-    assert supply[np.isfinite(supply)] == pytest.approx(one.codes[:, 3].mean() * 5 / 2 ** 16, rel=1e-3)
+    assert supply[np.isfinite(supply)] == pytest.approx(
+        one.codes[:, 3].mean() * 5 / 2 ** 16, rel=1e-3)
 
 
 @pytest.mark.parametrize('info, options, why', [

@@ -129,7 +129,7 @@ class ClockMap:
 
         """
         lag_ns = arrived_ns - self._delay_ns - device_ns
-        if self.settled and arrived_ns - self._delay_ns - self._line(device_ns) < -_EARLY_NS \
+        if (self.settled and arrived_ns - self._delay_ns - self._line(device_ns) < -_EARLY_NS) \
                 or self._shifted(lag_ns):
             self.steps += 1
             self.restart()
@@ -147,7 +147,7 @@ class ClockMap:
                 self._steer(device_ns, _HORIZON_S)
         self._count += 1
         open_s = (device_ns - self._opened_ns) * 1e-9
-        if open_s >= _WINDOW_S and self._count >= _ENOUGH or open_s >= _LONGEST_WINDOW_S:
+        if (open_s >= _WINDOW_S and self._count >= _ENOUGH) or open_s >= _LONGEST_WINDOW_S:
             self._windows.append(self._open)
             self._open = None
             while len(self._windows) > _FEW \

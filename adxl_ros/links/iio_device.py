@@ -126,7 +126,7 @@ class Stream:
             raise ReadError(f'{self.name}: lost: {_words(error)}') from None
         lengths = {len(device_ns), *map(len, values.values())}
         if len(lengths) != 1 or not len(device_ns) or not (
-                0 <= device_ns.min() and device_ns.max() < _LAST_NS):
+                device_ns.min() >= 0 and device_ns.max() < _LAST_NS):
             raise ReadError(f'{self.name}: a buffer that makes no sense')
         return device_ns, values
 
@@ -212,7 +212,7 @@ def _knock(uri: str) -> None:
     if kind != 'ip':
         return
     host, colon, port = address.rpartition(':')
-    if not colon or ':' in host and not host.endswith(']'):
+    if not colon or (':' in host and not host.endswith(']')):
         host, port = address, _PORT
     with socket.create_connection((host.strip('[]'), int(port)), _KNOCK_S) as knock:
         knock.sendall(b'VERSION\r\n')

@@ -16,7 +16,7 @@
 The serial wire format, version 1: frames of samples, encoded and decoded.
 
 A frame is COBS(payload, CRC-32 of the payload) and one 0x00; everything is little-endian. The
-format is the contract with the board: docs/links.md has its table, firmware/ the same encoder in C.
+format is the contract with the board: docs/links.md has its table, firmware/ its encoder in C.
 """
 
 from __future__ import annotations

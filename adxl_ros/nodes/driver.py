@@ -161,6 +161,9 @@ class Driver(LifecycleNode):
         self._waited_ns = 0
         self._ticked_ns = self._steady.now().nanoseconds
         self._link = self._module.open_link(self._given, self._options)
+        if self._link.live and self.get_parameter('use_sim_time').value:
+            self.get_logger().warning('use_sim_time: a real device lives in real time; its '
+                                      'samples are stamped by the system clock')
         self._references = References(self, self._frame, self._link.references)
         self._say = StateLog(self.get_logger(), self._link.state().text)
         if self._link.sensor is not None:
