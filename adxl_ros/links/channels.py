@@ -105,6 +105,7 @@ class Seldom:
                     if count:
                         thin[name][begin] = total / count
                     total, count = 0.0, 0
-                total, count = total + float(part.sum()), count + len(part)
+                known = part[np.isfinite(part)]
+                total, count = total + float(known.sum()), count + len(known)
             self._sums[name] = total, count
         return thin
