@@ -67,7 +67,7 @@ endif
 
 # Directories count, too: their time changes when a file in them is removed.
 sources := package.xml setup.py setup.cfg \
-    $(shell find adxl_ros launch params resource -name __pycache__ -prune -o -print)
+    $(shell find adxl_ros launch params resource security -name __pycache__ -prune -o -print)
 
 build: install/.built
 
