@@ -96,7 +96,7 @@ def test_every_fault_of_a_board_is_counted_exactly(start, tmp_path):
 
 def test_every_fault_of_an_iiod_is_survived(start, tmp_path):
     try:
-        iio_device._iio()
+        iio_device.library()
     except UserError as error:
         pytest.skip(str(error))
     with Graph() as graph:

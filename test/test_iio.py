@@ -31,7 +31,7 @@ DEFAULTS = {option.name: option.default for option in iio.OPTIONS}
 @pytest.fixture(scope='module', autouse=True)
 def library():
     try:
-        iio_device._iio()
+        iio_device.library()
     except UserError as error:
         pytest.skip(str(error))
 

@@ -42,7 +42,7 @@ def listed(value: str | Sequence[str]) -> list[str]:
     The string is for the command line, where YAML would take a bare y in a list for a boolean.
     """
     parts = value.split(',') if isinstance(value, str) else value
-    if not all(isinstance(part, str) for part in parts):
+    if not isinstance(parts, Sequence) or not all(isinstance(part, str) for part in parts):
         raise UserError(f'link.channels: {value!r} is not a list of strings')
     return [part.strip() for part in parts if part.strip()]
 

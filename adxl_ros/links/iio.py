@@ -25,7 +25,7 @@ from adxl_ros.errors import UserError
 from adxl_ros.links import channels
 from adxl_ros.links.base import Option, Samples, State
 from adxl_ros.links.clock_map import ClockMap, HostStamps
-from adxl_ros.links.iio_device import open_stream, ReadError, Stream
+from adxl_ros.links.iio_device import library, open_stream, ReadError, Stream
 from adxl_ros.links.retry import Retry
 from adxl_ros.links.timeline import Block, Timeline
 from adxl_ros.model.sensor import Sensor
@@ -54,6 +54,7 @@ def open_link(sensor: Sensor, options: Mapping[str, Any]) -> IioLink:
     # Without a host libiio would look for one on the network: only parameters say what is read.
     if not uri.startswith(_KINDS) or uri == 'ip:' or not uri.isascii():
         raise UserError(f'link.uri: {uri!r} is none of local:, ip:HOST, usb:..., serial:...')
+    library()
     return IioLink(sensor, options)
 
 
@@ -79,6 +80,7 @@ class IioLink:
         self._timeline = Timeline(ClockMap(options['delay']))
         self._retry = Retry()
         self._trouble = ''
+        self._figures: Mapping[str, Any] = {}
         self._opened = self._repeated = 0
         self._last_ns: int | None = None
         self._heard_s = time.monotonic()
@@ -140,7 +142,7 @@ class IioLink:
         self._stream, self._trouble = stream, ''
         self._opened += 1
         self._heard_s = time.monotonic()
-        if self.sensor is None or stream.figures != self._figures:
+        if stream.figures != self._figures:
             self._figures = stream.figures
             self.sensor = replace(self._unit, **stream.figures)
             if stream.by_host_clock:

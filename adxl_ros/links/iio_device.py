@@ -42,7 +42,7 @@ _SLOW_S = 1.0
 """Attributes, such as a temperature without a buffer, are read this often."""
 _CLOCK = 'current_timestamp_clock'
 _LAST_NS = 2 ** 62
-INSTALL = ('link.type iio needs the Python package pylibiio and the library libiio 0.x: '
+_INSTALL = ('link.type iio needs the Python package pylibiio and the library libiio 0.x: '
            'pip install "pylibiio<1", apt install libiio0')
 
 
@@ -99,7 +99,7 @@ class Stream:
         with suppress(OSError):
             device.set_kernel_buffers_count(_KERNEL_BUFFERS)
         context.set_timeout(round((_PATIENCE_S + 2 * self.block_s) * 1000))
-        self._buffer = _iio().Buffer(device, count)
+        self._buffer = library().Buffer(device, count)
 
     def read(self) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         """
@@ -168,7 +168,7 @@ def open_stream(uri: str, name: str, entries: Sequence[str], sensor: Sensor) -> 
         It is there, but not as the parameters say.
 
     """
-    iio = _iio()
+    iio = library()
     try:
         _knock(uri)
         context = iio.Context(uri)
@@ -328,7 +328,7 @@ def _use_monotonic_clock(device: Any) -> bool:
 def _set_rate(context: Any, device: Any, chosen: Sequence[Any], rate_hz: float) -> float:
     """Set the sample rate wherever it is set, and return what holds then."""
     places: list[Mapping[str, Any]] = [device.attrs, *(c.attrs for c in chosen)]
-    triggers = [d for d in context.devices if isinstance(d, _iio().Trigger)]
+    triggers = [d for d in context.devices if isinstance(d, library().Trigger)]
     places += [t.attrs for t in triggers if len(triggers) == 1]
     attribute = next((p['sampling_frequency'] for p in places if 'sampling_frequency' in p), None)
     if attribute is None:
@@ -359,9 +359,10 @@ def _words(error: OSError | ValueError) -> str:
     return os.strerror(abs(code)) if code else ' '.join(str(error).split())
 
 
-def _iio() -> Any:
+def library() -> Any:
+    """Return the module iio; raises `UserError` where it, or libiio, is not installed."""
     try:
         import iio
     except (ImportError, OSError, AttributeError):
-        raise UserError(INSTALL) from None
+        raise UserError(_INSTALL) from None
     return iio

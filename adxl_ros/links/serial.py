@@ -34,6 +34,7 @@ from adxl_ros.links.wire import (
     Data,
     decode,
     Info,
+    library,
     Splitter,
     VersionError,
     WireError,
@@ -75,6 +76,7 @@ def open_link(sensor: Sensor, options: Mapping[str, Any]) -> SerialLink:
         raise UserError('link.port: names no port; set it to a device path or a pyserial URL')
     if not options['temperature_v_per_c']:
         raise UserError('link.temperature_v_per_c: 0 tells no temperature')
+    library()
     return SerialLink(sensor, options)
 
 

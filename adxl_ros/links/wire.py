@@ -156,7 +156,7 @@ class Encoder:
 
 def frame(payload: bytes) -> bytes:
     """Put the CRC behind a payload, and both into COBS with its 0x00."""
-    return _cobs().encode(payload + _CRC.pack(zlib.crc32(payload))) + b'\0'
+    return library().encode(payload + _CRC.pack(zlib.crc32(payload))) + b'\0'
 
 
 def decode(raw: bytes) -> Info | Data:
@@ -176,7 +176,7 @@ def decode(raw: bytes) -> Info | Data:
         It is damaged, or says what cannot be.
 
     """
-    cobs = _cobs()
+    cobs = library()
     try:
         whole = cobs.decode(raw)
     except cobs.DecodeError as error:
@@ -259,10 +259,11 @@ class Splitter:
         self._rest, self._skipping = b'', False
 
 
-def _cobs() -> Any:
+def library() -> Any:
+    """Return the module cobs.cobs; raises `UserError` where it is not installed."""
     try:
         from cobs import cobs
     except ImportError:
         raise UserError('the serial wire format needs the Python package cobs: '
-                        'pip install cobs') from None
+                        'pip install pyserial cobs') from None
     return cobs

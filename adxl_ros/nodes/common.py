@@ -146,7 +146,7 @@ def declare(node: Node, name: str, default: Any, doc: str, unit: str = '',
         The value given has another type, or is out of range or not among the choices.
 
     """
-    either = default == ()
+    either = isinstance(default, tuple)
     if either:
         default = ''
     kind = default if isinstance(default, Parameter.Type) else \

@@ -302,21 +302,32 @@ class Driver(LifecycleNode):
 
 
 class StateLog:
-    """Logs the state of a link when it has changed, and then once a second at most."""
+    """Logs the state of a link and its events when they are news, once a second at most."""
 
     _SHORTEST_S = 1.0
+    _EVENTS = (('resets', 'the device was reset or is another one: a new count begins'),
+               ('clock_steps', 'the clock of the device has stepped: it is followed anew'),
+               ('system_clock_steps', 'the system clock was set: the stamps follow it'))
 
     def __init__(self, logger: RcutilsLogger, text: str) -> None:
         """Take the first state as known."""
         self._logger, self._said = logger, text
         self._said_s = -self._SHORTEST_S
+        self._counts = {name: 0 for name, _ in self._EVENTS}
 
     def __call__(self, state: base.State) -> None:
         """Log it, if it is news."""
         now_s = time.monotonic()
-        if state.text == self._said or now_s - self._said_s < self._SHORTEST_S:
+        events = {name: state.values.get(name, 0) for name, _ in self._EVENTS}
+        if (state.text == self._said and events == self._counts) \
+                or now_s - self._said_s < self._SHORTEST_S:
             return
-        self._said, self._said_s = state.text, now_s
+        for name, what in self._EVENTS:
+            if events[name] > self._counts[name]:
+                self._logger.warning(what)
+        before, self._said, self._said_s, self._counts = self._said, state.text, now_s, events
+        if state.text == before:
+            return
         # rclpy wants one severity a line of code.
         if state.level == 'ok':
             self._logger.info(state.text)
