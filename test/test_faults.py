@@ -29,7 +29,7 @@ from adxl_ros.files import params
 from adxl_ros.links import board, iio_device
 from adxl_ros.model.effects import effect_named
 from diagnostic_msgs.msg import DiagnosticStatus
-from faults import bytes_hurt, driver_stopped, IIO, Row, run, SERIAL
+from faults import bytes_hurt, IIO, Row, run, SERIAL
 from graph import accel, Graph, stamp_ns
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
@@ -75,7 +75,7 @@ def test_every_fault_of_a_board_is_counted_exactly(start, tmp_path):
                     assert rig.recovered_ms(back_ns) < 1000, row.name
                 rig.count(100, 20, row.name)
             return 0
-        book, _ = run(Row('all', all_of_it), rig, driver.popen.pid, 1.0)
+        book, _ = run(Row('all', all_of_it), rig, driver.popen.pid, 0.7)
         assert book.wrong == 0
         assert book.missing > 1137, 'there were faults'
         assert book.missing == book.said
@@ -288,9 +288,9 @@ def test_a_measured_supply_takes_the_supply_out(start, tmp_path):
                   'link.channels:=x,y,supply,temperature', '-p', 'link.supply_scale:=2.0', '-p',
                   'stamp_offset:=0.0105')
             start('compensation', ROS, '--params-file', tmp_path / 'unit.yaml')
-            graph.spin_until(lambda: supply and temperature and len(corrected) > 100, 30, 'all')
-            corrected.clear()
-            graph.spin_until(lambda: len(corrected) > 100, 10, 'corrected samples')
+            graph.spin_until(lambda: supply and temperature and corrected, 30, 'all of it')
+            # A supply that stays is said once a second: the compensation may not know it yet.
+            graph.spin_until(lambda: abs(accel(corrected[-1])[0]) < 0.01, 10, 'the correction')
             newest_s = (stamp_ns(raw[-1]) - graph.node.get_clock().now().nanoseconds) * 1e-9
     finally:
         end()
@@ -307,7 +307,7 @@ def test_simulate_is_a_board(start, run_tool, tmp_path):
         sender.wait_for('link.port:=bench')
         samples = graph.listen(Imu, 'imu/data_raw')
         start('driver', ROS, '-p', 'link.type:=serial', '-p', 'link.port:=bench')
-        graph.spin_until(lambda: len(samples) > 2000, 30, 'samples')
+        graph.spin_until(lambda: len(samples) > 1000, 30, 'samples')
         assert graph.value('driver', 'link_state') == 'streaming'
         graph.spin_until(lambda: float(graph.value('driver', 'rate_hz')) > 900, 5, 'the rate')
         assert graph.value('driver', 'missing') == '0'
@@ -320,13 +320,3 @@ def test_simulate_is_a_board(start, run_tool, tmp_path):
     assert done.returncode == 1
     assert 'file: is no terminal' in done.stderr
     assert run_tool('simulate', 'tilt_alpha').returncode == 2
-
-
-def test_a_driver_that_was_stopped_goes_on_from_the_clock(start, tmp_path):
-    """At a rate of 100 Hz the terminal holds all of three seconds: nothing is lost."""
-    with board_rig(tmp_path, {'rate': 100.0}) as rig:
-        driver = start('driver', ROS, *rig.parameters())
-        rig.count(100, 30)
-        book, _ = run(Row('stopped', driver_stopped), rig, driver.popen.pid, 1.0)
-        assert (book.wrong, book.missing, book.said) == (0, 0, 0)
-        assert book.error_ms < 20

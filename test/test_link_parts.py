@@ -76,8 +76,8 @@ def test_stamps_of_a_jittery_link_are_true_to_a_millisecond(ppm, least, most, de
     link = Link(ppm, least, most, delay_s, seed=ppm % 7)
     link.run(4000)
     errors = link.errors()
-    assert np.abs(errors).max() < 1.5, 'from the first sample on'
-    assert np.abs(errors[2000:]).max() < 1.0
+    assert np.abs(errors).max() < 1.0, 'from the first sample on'
+    assert np.abs(errors[5000:]).max() < 0.4
     assert link.map.drift_ppm == pytest.approx(ppm, abs=10)
 
 

@@ -245,6 +245,23 @@ def test_a_channel_that_the_sensor_does_not_have_is_not_published(line):
     assert 'the channel of z is not used' in one.link.state().text
 
 
+def test_frames_that_the_info_frame_rules_out_are_not_published(line):
+    one = line(info=Info(1000.0, 12, 2, 5.0, ''))
+    one.codes %= 4096
+    one.inform()
+    one.frames(2)
+    one.codes[3, 1] = 4096
+    one.frames(1)
+    one.codes = np.full((10, 3), 1000)
+    one.frames(1)
+    one.codes = np.full((10, 2), 1000)
+    one.frames(1)
+    got = one.read(lambda g: one.number(g) >= 30)
+    assert one.number(got) == 30
+    assert sum(s.missing for s in got) == 20
+    assert one.value('bad_frames') == 2
+
+
 def test_another_version_of_the_format_is_said(line):
     one = line()
     one.send(frame(b'\1\2' + bytes(30)))

@@ -36,8 +36,12 @@ _LONGEST_WINDOW_S = 5.0
 _SPAN_S = 25.0
 _FEW = 20
 """So many windows are kept however old they are."""
+_FIRST_S = 0.15
 _SETTLE_S = 0.06
-"""Samples of a new clock wait so long for their stamps: of some arrivals one is early."""
+"""Samples of the first clock, and of a later one, which must not keep a robot waiting, wait so
+long for their stamps: of some arrivals one is early."""
+_QUICK_S = 0.3
+"""Within this the stamps of a new clock follow an arrival that is earlier than those before."""
 _HORIZON_S = 2.0
 """Stamps approach a better line within this, so that its corrections are no jitter."""
 _PRIOR_S2 = 1.0
@@ -101,6 +105,7 @@ class ClockMap:
         self.steps = 0
         self._delay_ns = round(delay_s * 1e9)
         self._out_ns: int | None = None
+        self._settle_s = _FIRST_S
         self.restart()
 
     def restart(self) -> None:
@@ -109,7 +114,7 @@ class ClockMap:
         self.settled = False
         self._windows: deque[_Window] = deque()
         self._open: _Window | None = None
-        self._opened_ns = self._count = 0
+        self._opened_ns = self._seen_ns = self._count = 0
         self._first_arrived_ns: int | None = None
         self._doubt: _Doubt | None = None
         # The stamps' line: passes through a point, ns, with a slope.
@@ -144,8 +149,9 @@ class ClockMap:
                 self._opened_ns, self._count = device_ns, 0
             self._open = _Window(device_ns, lag_ns)
             if self.settled and not self._windows:
-                self._steer(device_ns, _HORIZON_S)
+                self._steer(device_ns, max(_QUICK_S, 2e-9 * (device_ns - self._seen_ns)))
         self._count += 1
+        self._seen_ns = device_ns
         open_s = (device_ns - self._opened_ns) * 1e-9
         if (open_s >= _WINDOW_S and self._count >= _ENOUGH) or open_s >= _LONGEST_WINDOW_S:
             self._windows.append(self._open)
@@ -162,8 +168,9 @@ class ClockMap:
                 and now_ns - self._doubt.first_ns >= _SETTLE_S * 1e9:
             self._resolve(self._doubt)
         if not self.settled and self._open is not None \
-                and now_ns - self._first_arrived_ns >= _SETTLE_S * 1e9:
+                and now_ns - self._first_arrived_ns >= self._settle_s * 1e9:
             self.settled = True
+            self._settle_s = _SETTLE_S
             self._at_ns = self._open.device_ns
             self._to_ns = self._at_ns + self._fit(self._at_ns)
         return self.settled and self._doubt is None

@@ -97,7 +97,7 @@ class IioLink:
         else:
             try:
                 self._take(*self._stream.read())
-            except ReadError as error:
+            except (ReadError, UserError) as error:
                 self._lose(str(error))
         samples = self._timeline.take()
         if samples is None:

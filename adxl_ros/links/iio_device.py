@@ -43,7 +43,7 @@ _SLOW_S = 1.0
 _CLOCK = 'current_timestamp_clock'
 _LAST_NS = 2 ** 62
 _INSTALL = ('link.type iio needs the Python package pylibiio and the library libiio 0.x: '
-           'pip install "pylibiio<1", apt install libiio0')
+            'pip install "pylibiio<1", apt install libiio0')
 
 
 class ReadError(Exception):

@@ -16,9 +16,11 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 import os
 import select
 import stat
+import termios
 import time
 from typing import Any
 
@@ -92,14 +94,15 @@ class Port:
     def close(self) -> None:
         """Let go of it."""
         if self._open is not None:
-            self._open.close()
+            with suppress(OSError):  # what was unplugged may not close
+                self._open.close()
             self._open = None
 
     def _reopen(self) -> None:
         serial = self._serial
         try:
             self._open = serial.serial_for_url(self._name, self._baud, timeout=0, exclusive=True)
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, termios.error) as error:
             self._open = None
             self._retry.failed()
             self.trouble = f'{self._name}: {_reason(error)}'
@@ -153,7 +156,7 @@ class Port:
             self._lose('its name stands for another device now')
 
 
-def _reason(error: OSError | ValueError) -> str:
+def _reason(error: Exception) -> str:
     """Say in stable words why a port does not open."""
     code = getattr(error, 'errno', None)
     if code in (11, 16):  # EAGAIN of the lock, EBUSY

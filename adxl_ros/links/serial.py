@@ -242,8 +242,11 @@ class SerialLink:
     def _on_data(self, data: Data, arrived_ns: int) -> None:
         info = self._info
         self._longest_s = len(data.codes) / (info.rate_hz if info else 1000.0)
-        if info is None or self._refusal or data.codes.shape[1] != info.channels:
+        if info is None or self._refusal:
             self._held_back += len(data.codes)
+            return
+        if data.codes.shape[1] != info.channels or data.codes.max() >= 2 ** info.bits:
+            self._bad += 1  # whole, but not what the info frame says
             return
         for found in self._count(data, arrived_ns):
             if found.lost is None:
