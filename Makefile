@@ -3,12 +3,16 @@
 # make test     every test         (make test ARGS='-k fit')
 # make bench    rate, missing samples, latency and CPU of the live nodes
 # make gallery  docs/effects.md and its plots, from the library of effects
-# make long    an 8-hour recording through apply: memory and time
+# make faults   the links under every fault, as a table
+# make soak     half an hour of random faults
+# make fuzz     the decoder and the serial link, two minutes of hostile bytes
+# make long     an 8-hour recording through apply: memory and time
 # make blind    the blind check of diagnose, 600 trials, into blind_output/ (make blind ARGS='--seed 1')
 # make lint     the linters alone
 # make clean    remove what these made
 
-.PHONY: build demo test bench gallery reproduction long blind lint clean FORCE
+.PHONY: build demo test bench gallery reproduction long faults soak fuzz blind lint clean \
+    FORCE
 .DEFAULT_GOAL := build
 
 # The first Python that can run the line $1.
@@ -64,7 +68,7 @@ endif
 
 # Directories count, too: their time changes when a file in them is removed.
 sources := package.xml setup.py setup.cfg \
-    $(shell find adxl_ros launch params resource -name __pycache__ -prune -o -print)
+    $(shell find adxl_ros launch params resource security -name __pycache__ -prune -o -print)
 
 build: install/.built
 
@@ -90,7 +94,17 @@ lint: build
 	cd test && ../run --exec python -m pytest -q test_linters.py test_layering.py
 
 bench: build
-	./run bench $(ARGS)
+	./run bench --iiod test/iiod.py $(ARGS)
+
+# Each of these takes long: its table goes into docs/links.md.
+faults soak: build
+	cd test && ../run --exec python $@.py $(ARGS)
+
+# With atheris where it installs; else by mutations of its own.
+fuzz: build
+	-.venv/bin/python -m pip install --quiet --disable-pip-version-check \
+	    --requirement requirements/fuzz.txt
+	cd test && ../run --exec python fuzz_links.py $(ARGS)
 
 gallery: build
 	./run --exec python docs/gallery.py docs

@@ -43,6 +43,7 @@ setup(
         (f'share/{PACKAGE}', ['package.xml']),
         (f'share/{PACKAGE}/launch', glob('launch/*.launch.py')),
         (f'share/{PACKAGE}/params', glob('params/*.yaml')),
+        (f'share/{PACKAGE}/security', glob('security/*.xml')),
     ],
     python_requires='>=3.10',
     install_requires=['setuptools', *requirements('core')],

@@ -24,20 +24,17 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
-import fcntl
 import os
 from pathlib import Path
 import signal
-import socket
 import subprocess
-import tempfile
 import time
 
 from ament_index_python.packages import get_package_prefix
+from domain import own_domain
 import pytest
 
 REPO = Path(__file__).resolve().parents[1]
-DOMAINS = range(1, 102)  # 0 is everybody's; above 101 lie ports that the system hands out
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -45,36 +42,15 @@ def pytest_configure(config: pytest.Config) -> None:
     signal.signal(signal.SIGTERM, signal.default_int_handler)
 
 
-def domain_in_use(domain: int) -> bool:
-    """Say whether somebody has the port to which a domain's participants announce themselves."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        try:
-            probe.bind(('', 7400 + 250 * domain))
-        except OSError:
-            return True
-    return False
-
-
 @pytest.fixture
 def ros_env(tmp_path: Path) -> Iterator[dict[str, str]]:
     """Set the environment of a graph of this test's own, for this process and its children."""
-    locks = Path(tempfile.gettempdir())
-    for domain in DOMAINS:
-        with open(locks / f'adxl_ros_{os.getuid()}_domain_{domain}.lock', 'w') as lock:
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError:
-                continue
-            if domain_in_use(domain):
-                continue
-            with pytest.MonkeyPatch.context() as patch:
-                patch.setenv('ROS_DOMAIN_ID', str(domain))
-                patch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-                patch.delenv('ROS_LOCALHOST_ONLY', raising=False)
-                patch.setenv('ROS_LOG_DIR', str(tmp_path / 'ros_log'))
-                yield dict(os.environ)
-            return
-    pytest.fail('every ROS domain from 1 to 101 is in use')
+    with own_domain() as domain, pytest.MonkeyPatch.context() as patch:
+        patch.setenv('ROS_DOMAIN_ID', str(domain))
+        patch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+        patch.delenv('ROS_LOCALHOST_ONLY', raising=False)
+        patch.setenv('ROS_LOG_DIR', str(tmp_path / 'ros_log'))
+        yield dict(os.environ)
 
 
 def wait_until(condition: Callable[[], object], timeout_s: float, what: str) -> None:

@@ -85,6 +85,27 @@ def test_every_core_module_imports() -> None:
     assert result['blocked'] == []
 
 
+def test_a_real_link_says_what_to_install() -> None:
+    code = """
+from adxl_ros.errors import UserError
+from adxl_ros.files import params
+from adxl_ros.links import base
+for name, given in (('serial', {'port': '/dev/null'}), ('iio', {})):
+    module = base.module_of(name)
+    options = {option.name: option.default for option in module.OPTIONS}
+    try:
+        module.open_link(params.load(sys.argv[1]), options | given)
+    except UserError as error:
+        print(error)
+"""
+    nominal = Path(__file__).resolve().parents[1] / 'params' / 'adxl203.yaml'
+    done = run_without_extras(code, str(nominal))
+    assert done.returncode == 0, done.stderr
+    serial, iio = done.stdout.splitlines()
+    assert 'pip install pyserial cobs' in serial
+    assert 'pip install "pylibiio<1", apt install libiio0' in iio
+
+
 def test_a_csv_is_fitted(tmp_path: Path) -> None:
     """`simulate` and `fit` on CSV need numpy and scipy alone; a plot says what to install."""
     run = 'from adxl_ros.tools.{0} import main\nsys.argv[0] = {0!r}\nsys.exit(main())'

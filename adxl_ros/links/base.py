@@ -25,16 +25,21 @@ from typing import Any, Protocol
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
-HELPERS = ('base', 'sim_stage')
+HELPERS = ('base', 'board', 'channels', 'clock_map', 'count', 'iio_device', 'port', 'retry',
+           'sim_stage', 'timeline', 'wire')
 """Modules of this folder that are no links."""
 
 
 @dataclass(frozen=True)
 class Option:
-    """One parameter `link.<name>` of the driver; the type of the default is its type."""
+    """
+    One parameter `link.<name>` of the driver; the type of the default is its type.
+
+    An empty tuple stands for a list of strings, or one string with commas.
+    """
 
     name: str
-    default: bool | int | float | str
+    default: bool | int | float | str | tuple[()]
     doc: str
     unit: str = ''
     lower: float | None = None
@@ -43,10 +48,23 @@ class Option:
 
 @dataclass(frozen=True)
 class State:
-    """How a link is: level `ok`, `warn` or `error`, and one or two words, or a line of reasons."""
+    """
+    How a link is.
+
+    Attributes
+    ----------
+    level
+        `ok`, `warn` or `error`.
+    text
+        One or two words, or a line of reasons; it changes when the state does, and only then.
+    values : mapping
+        Figures for diagnostics.
+
+    """
 
     level: str
     text: str
+    values: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -67,6 +85,8 @@ class Samples:
     references : mapping or tuple
         What was recorded beside the sensor, by the column names of a recording, (n,); NaN where
         it was not sampled.
+    estimated
+        How many of `missing` are estimated by time, not counted.
 
     """
 
@@ -75,6 +95,7 @@ class Samples:
     until_ns: int
     missing: int = 0
     references: Mapping[str, np.ndarray] = field(default_factory=dict)
+    estimated: int = 0
 
 
 class Link(Protocol):
@@ -88,7 +109,10 @@ class Link(Protocol):
     Attributes
     ----------
     sensor
-        Whose figures make the samples readable.
+        Whose figures make the samples readable; None until the device has said.
+    live
+        Whether samples come when a device sends them. Then `read` waits for them, 50 ms or so,
+        and their stamps are the link's; else it gives at once what is due.
     references : mapping or tuple
         Names of the references that its samples come with.
     waits
@@ -98,7 +122,8 @@ class Link(Protocol):
 
     """
 
-    sensor: Sensor
+    sensor: Sensor | None
+    live: bool
     references: tuple[str, ...]
     waits: bool
     start_ns: int | None

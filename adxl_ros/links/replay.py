@@ -53,6 +53,7 @@ class Replay:
     Its stamps are kept relative to each other; the first is when the replay begins.
     """
 
+    live = False
     waits = True
 
     def __init__(self, sensor: Sensor, path: str, loop: bool) -> None:

@@ -66,6 +66,7 @@ class SimulatedSensor:
     samples. A stage that falls silent is waited for for a second; then its last pose is held.
     """
 
+    live = False
     references = ()
     waits = False
     start_ns = None

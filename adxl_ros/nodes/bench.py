@@ -17,7 +17,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 import os
 from pathlib import Path
@@ -30,6 +30,7 @@ from adxl_ros.calibrate import physical, recorded
 from adxl_ros.errors import UserError
 from adxl_ros.files import cdr, params, recording
 from adxl_ros.files.columns import Recording, sensor_info
+from adxl_ros.links import wire
 from adxl_ros.model.simulate import simulate
 from adxl_ros.model.trajectory import sweep
 from adxl_ros.nodes.common import nominal_path
@@ -92,10 +93,14 @@ def main() -> int:
     """Run the benchmark; returns the exit status."""
     parse = argparse.ArgumentParser(prog='bench', description=__doc__)
     parse.add_argument('--seconds', type=float, default=20.0, help='of each live measurement')
+    parse.add_argument('--iiod', metavar='FILE', help="the tests' IIOD, for the link iio")
     parse.add_argument('--bare', choices=list(_BARE), help=argparse.SUPPRESS)
+    parse.add_argument('--read', metavar='PORT', help=argparse.SUPPRESS)
     options = parse.parse_args()
     if options.bare:
         return _bare(_BARE[options.bare])
+    if options.read:
+        return _bare_reader(options.read)
     os.environ.setdefault('ROS_DOMAIN_ID', str(60 + os.getpid() % 40))
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
     try:
@@ -107,6 +112,8 @@ def main() -> int:
         _live('bare publisher and relay', 'relayed', bare, options.seconds)
         _live('driver', 'imu/data_raw', [[node[0]]], options.seconds)
         _live('driver and compensation', 'imu/data', [[node[0]], [node[1]]], options.seconds)
+        _links(node[0], options.iiod, options.seconds)
+        _decoding()
         _reading()
     except UserError as error:
         print(f'bench: {error}', file=sys.stderr)
@@ -123,6 +130,68 @@ def _bare(make: type[Node]) -> int:
     with suppress(KeyboardInterrupt, ExternalShutdownException):
         executor.spin()
     return 0
+
+
+def _bare_reader(port: str) -> int:
+    """Read what a board sends, and do nothing with it."""
+    with open(port, 'rb', buffering=0) as file, suppress(KeyboardInterrupt, OSError):
+        while file.read(65536):
+            pass
+    return 0
+
+
+def _links(driver: str, iiod: str | None, seconds: float) -> None:
+    """Print the rows of the links: the driver on a board, and on an IIOD, beside a bare reader."""
+    with tempfile.TemporaryDirectory() as folder:
+        port = str(Path(folder, 'board'))
+        simulate = str(Path(sys.argv[0]).with_name('simulate'))
+        with _running([[simulate, 'soak', '--port', port]]):
+            _until(Path(port).exists, 'the board')
+            _bare_reading(port, seconds)
+            _live('driver, serial, 2 axes and 2 more', 'imu/data_raw', [[
+                driver, '--ros-args', '-p', 'link.type:=serial', '-p', f'link.port:={port}', '-p',
+                'link.channels:=x,y,supply,temperature']], seconds)
+    if iiod is None:
+        return
+    with subprocess.Popen([sys.executable, iiod], stdout=subprocess.PIPE, text=True) as server:
+        try:
+            uri = f'ip:127.0.0.1:{server.stdout.readline().strip()}'
+            _live('driver, iio, 2 axes and supply', 'imu/data_raw', [[
+                driver, '--ros-args', '-p', 'link.type:=iio', '-p', f'link.uri:={uri}']], seconds)
+        except UserError as error:
+            print(f'{"driver, iio":36} {error}: is libiio 0.x installed?')
+        finally:
+            server.kill()
+
+
+def _bare_reading(port: str, seconds: float) -> None:
+    with _running([[sys.executable, sys.argv[0], '--read', port]]) as (reader,):
+        time.sleep(2.0)
+        before = _cpu_s(reader.pid)
+        time.sleep(seconds)
+        load = 100 * (_cpu_s(reader.pid) - before) / seconds
+    print(f'{"bare reader, decodes nothing":36} {"":8} {"":8} {"":7} {"":7}   {load:.1f} %',
+          flush=True)
+
+
+def _until(condition: Callable[[], bool], what: str) -> None:
+    end_s = time.monotonic() + 20
+    while not condition():
+        if time.monotonic() > end_s:
+            raise UserError(f'{what} does not begin')
+        time.sleep(0.05)
+
+
+def _decoding() -> None:
+    """Print how many frames of the serial link are decoded in a second."""
+    encoder = wire.Encoder(wire.Info(_RATE_HZ, 16, 3, 5.0, 'bench'))
+    codes = np.random.default_rng(0).integers(1, 65535, (10, 3))
+    stream = b''.join(encoder.data_frame(10_000 * k, 10 * k, codes) for k in range(20_000))
+    cut = wire.Splitter()
+    began = time.perf_counter()
+    count = sum(isinstance(wire.decode(raw), wire.Data) for i in range(0, len(stream), 4096)
+                for raw in cut(stream[i:i + 4096]))
+    print(f'\n{"frames decoded a second":36} {count / (time.perf_counter() - began):8.0f}')
 
 
 def _live(label: str, topic: str, commands: Sequence[Sequence[str]], seconds: float) -> None:

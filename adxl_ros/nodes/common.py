@@ -126,7 +126,8 @@ def declare(node: Node, name: str, default: Any, doc: str, unit: str = '',
     node, name
         Whose parameter, and its name.
     default
-        The value, or a `Parameter.Type` for a parameter that has none.
+        The value, or a `Parameter.Type` for a parameter that has none; an empty tuple for a list
+        of strings, or one string with commas.
     doc, unit
         What it is, for the descriptor.
     lower, upper, choices
@@ -145,12 +146,16 @@ def declare(node: Node, name: str, default: Any, doc: str, unit: str = '',
         The value given has another type, or is out of range or not among the choices.
 
     """
+    either = isinstance(default, tuple)
+    if either:
+        default = ''
     kind = default if isinstance(default, Parameter.Type) else \
         Parameter.Type.from_parameter_value(default)
     limits = '' if lower is None else f'{lower:g} to {upper:g}'
     one_of = 'one of ' + ', '.join(choices) if choices else ''
     descriptor = ParameterDescriptor(
         description=', '.join(filter(None, (doc, unit))), read_only=not live,
+        dynamic_typing=either,
         additional_constraints=one_of or limits)
     if lower is not None and upper is not None:
         if kind == Parameter.Type.DOUBLE:

@@ -31,7 +31,7 @@ from adxl_ros.model.sensor import Sensor
 from adxl_ros.model.tilt import UNOBSERVABLE_RAD2
 from adxl_ros.nodes import common
 from adxl_ros.nodes.live_sensor import LiveSensor
-from adxl_ros.nodes.stream import Stream
+from adxl_ros.nodes.loop import Loop, Received
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import Vector3Stamped
 from rclpy.clock import Clock, ClockType
@@ -77,11 +77,12 @@ class Compensation(Node):
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._reported_ns = self._steady.now().nanoseconds
         self.create_timer(1.0, self._report, clock=self._steady)
-        self._stream = Stream(self, Imu, 'imu/data_raw', self._on_sample, _DEPTH)
+        self._loop = Loop(self, Received(self, Imu, 'imu/data_raw', self._on_sample, _DEPTH),
+                          'imu/data_raw')
 
     def close(self) -> None:
         """End the thread that receives."""
-        self._stream.close()
+        self._loop.close()
 
     def _use(self, sensor: Sensor, source: str) -> None:
         # One assignment: the receiving thread has the old coefficients or the new ones.

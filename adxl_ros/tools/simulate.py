@@ -17,16 +17,19 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from dataclasses import replace
 from difflib import get_close_matches
 from pathlib import Path
+import sys
 
 from adxl_ros.calibrate.recorded import rate_hz
 from adxl_ros.errors import UserError
 from adxl_ros.files import params, recording
 from adxl_ros.files.columns import Recording, REFERENCES, sensor_info
 from adxl_ros.files.followed import felt, followed
+from adxl_ros.links import board
 from adxl_ros.model import simulate as simulator
 from adxl_ros.model.motion import Motion
 from adxl_ros.model.response import Response
@@ -37,6 +40,7 @@ from adxl_ros.tools.effect_option import SYNTAX, with_effects
 import numpy as np
 
 _BLOCK = 32768
+Taker = Callable[[simulator.Columns], None]
 
 
 def parser() -> argparse.ArgumentParser:
@@ -59,8 +63,11 @@ def parser() -> argparse.ArgumentParser:
                        help='specific force for the trajectory imu')
     parse.add_argument('--rate', type=float, metavar='HZ', help='sample rate')
     parse.add_argument('--seed', type=int, default=0, help='of noise and manoeuvre (default 0)')
-    parse.add_argument('-o', dest='output', metavar='RECORDING', required=True,
-                       help='.csv, .mcap or a rosbag2 directory')
+    parse.add_argument('--port', metavar='PATH',
+                       help='be a board: send the samples in real time to a terminal device, or\n'
+                       'to a new pseudo-terminal of this name')
+    parse.add_argument('-o', dest='output', metavar='RECORDING',
+                       help='.csv, .mcap or a rosbag2 directory (with --port: not needed)')
     return parse
 
 
@@ -71,6 +78,8 @@ def simulate(options: argparse.Namespace) -> int:
         parser().error(f'{options.trajectory}: neither a trajectory nor a recording'
                        f'{f"; did you mean {near[0]}?" if near else ""}; the trajectories are '
                        f'{", ".join(TRAJECTORIES)}, imu')
+    if not options.output and not options.port:
+        parser().error('the following arguments are required: -o, or --port')
     sensor = params.load(options.params or default_params())
     if options.rate is not None:
         if not 0.01 <= options.rate <= 1e5:
@@ -79,16 +88,47 @@ def simulate(options: argparse.Namespace) -> int:
     if options.seed < 0:
         raise UserError(f'--seed {options.seed}: must be 0 or more')
     for path in filter(None, (options.trajectory, options.force)):
-        if Path(path).resolve() == Path(options.output).resolve():
+        if options.output and Path(path).resolve() == Path(options.output).resolve():
             raise UserError(f'{options.output}: is the input itself; choose another output')
     sensor = with_effects(sensor, options.effect)
     sensor, duration_s, begin_s, blocks = _run(sensor, options)
-    with recording.writer(options.output, sensor) as write, progress('simulate') as show:
+    with ExitStack() as stack:
+        takers = []
+        if options.port:
+            takers.append(_sender(stack, sensor, options.port))
+        if options.output:
+            takers.append(_writer(stack, sensor, str(options.output)))
+        show = stack.enter_context(progress('simulate'))
         for columns in blocks:
-            time_s = columns.pop('time_s')
-            write(Recording(str(options.output), time_s, columns, sensor_info(sensor)))
-            show(min((time_s[-1] - begin_s) / max(duration_s, 1e-9), 1.0))
+            for take in takers:
+                take(columns)
+            show(min((columns['time_s'][-1] - begin_s) / max(duration_s, 1e-9), 1.0))
     return 0
+
+
+def _writer(stack: ExitStack, sensor: Sensor, path: str) -> Taker:
+    write = stack.enter_context(recording.writer(path, sensor))
+
+    def take(columns: simulator.Columns) -> None:
+        others = {name: values for name, values in columns.items() if name != 'time_s'}
+        write(Recording(path, columns['time_s'], others, sensor_info(sensor)))
+
+    return take
+
+
+def _sender(stack: ExitStack, sensor: Sensor, port: str) -> Taker:
+    board.check(sensor)
+    fd = stack.enter_context(board.opened(port))
+    sending: list[board.Board] = []
+
+    def take(columns: simulator.Columns) -> None:
+        if not sending:
+            roles = board.roles_of(sensor, columns)
+            sending.append(board.Board(sensor, roles, fd))
+            print(f'simulate: sending: {board.reading(port, roles)}', file=sys.stderr)
+        sending[0].send(columns)
+
+    return take
 
 
 def _run(sensor: Sensor, options: argparse.Namespace

@@ -1,0 +1,153 @@
+/* Copyright 2026 the adxl_ros authors
+ *
+ * Licensed under the Apache License, Version 2.0 (the "License");
+ * you may not use this file except in compliance with the License.
+ * You may obtain a copy of the License at
+ *
+ *     http://www.apache.org/licenses/LICENSE-2.0
+ *
+ * Unless required by applicable law or agreed to in writing, software
+ * distributed under the License is distributed on an "AS IS" BASIS,
+ * WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+ * See the License for the specific language governing permissions and
+ * limitations under the License.
+ */
+
+
+/* An ADXL203 (or its kind) on a 16 bit SPI ADC, sent to adxl_ros's driver, link.type serial.
+ *
+ * Teensy (any) or an Arduino with an ATmega328P, 32U4 or 2560; ADC ADS8344, 5 V, its CS on pin 10.
+ * CH0 x, CH1 y, CH2 the sensor's supply through a 2:1 divider (link.channels:=x,y,supply
+ * link.supply_scale:=2.0). For another ADC change read_adc() and the figures below it.
+ *
+ * A timer takes the samples, ten make a block, the loop sends whole blocks. When the host does
+ * not read, blocks are dropped and their samples counted: the driver knows exactly what lacks. */
+
+#include <SPI.h>
+
+#include "frame.h"
+
+const float RATE_HZ = 1000.0f;
+const uint8_t CHANNELS = 3;
+const uint8_t BITS = 16;
+const float VREF_V = 5.0f;
+const char SERIAL_NUMBER[] = "adxl-0001"; /* of the sensor on this board, 16 characters at most */
+const long BAUD = 500000;                 /* USB boards ignore it */
+
+const uint8_t CS_PIN = 10;
+const uint8_t BLOCK = 10;
+const uint8_t BLOCKS = 8;
+const SPISettings ADC_BUS(2000000, MSBFIRST, SPI_MODE0);
+
+struct block {
+    uint64_t t_us;
+    uint32_t first_index;
+    uint16_t overruns;
+    uint16_t codes[BLOCK * CHANNELS];
+};
+
+/* The timer writes blocks[made % BLOCKS], the loop sends blocks[sent % BLOCKS]. */
+static struct block blocks[BLOCKS];
+static volatile uint8_t made, sent;
+static struct frame_counts counts = {0, FRAME_AFTER_RESET};
+static uint8_t frame[FRAME_ROOM(BLOCK, CHANNELS)];
+
+static uint16_t read_adc(uint8_t channel) {
+    /* Start, channel, single ended, always on; a busy clock, then 16 bits. */
+    const uint8_t select = (uint8_t)(((channel & 1) << 2) | (channel >> 1));
+    uint32_t raw;
+    digitalWrite(CS_PIN, LOW);
+    SPI.transfer(0x87 | (select << 4));
+    raw = (uint32_t)SPI.transfer(0) << 16;
+    raw |= (uint32_t)SPI.transfer(0) << 8;
+    raw |= SPI.transfer(0);
+    digitalWrite(CS_PIN, HIGH);
+    return (uint16_t)(raw >> 7);
+}
+
+/* micros() wraps after 71 minutes; the device clock does not. */
+static uint64_t now_us() {
+    static uint32_t last = 0, wraps = 0;
+    const uint32_t us = micros();
+    wraps += us < last;
+    last = us;
+    return ((uint64_t)wraps << 32) | us;
+}
+
+static void take_sample() {
+    static uint32_t index = 0;
+    static uint16_t overruns = 0;
+    static uint8_t filled = 0;
+    const uint64_t t_us = now_us();
+    struct block *b = &blocks[made % BLOCKS];
+    if (!filled && (uint8_t)(made - sent) == BLOCKS) { /* nowhere to put it */
+        index++;
+        overruns++;
+        return;
+    }
+    if (!filled) {
+        b->t_us = t_us;
+        b->first_index = index;
+        b->overruns = overruns;
+    }
+    SPI.beginTransaction(ADC_BUS);
+    for (uint8_t c = 0; c < CHANNELS; c++) {
+        b->codes[filled * CHANNELS + c] = read_adc(c);
+    }
+    SPI.endTransaction();
+    index++;
+    if (++filled == BLOCK) {
+        filled = 0;
+        made++;
+    }
+}
+
+#if defined(TEENSYDUINO)
+static IntervalTimer timer;
+static void start_timer() { timer.begin(take_sample, 1e6f / RATE_HZ); }
+#elif defined(__AVR__)
+ISR(TIMER1_COMPA_vect) { take_sample(); }
+static void start_timer() {
+    noInterrupts();
+    TCCR1A = 0;
+    TCCR1B = _BV(WGM12) | _BV(CS11); /* clear on compare, clock / 8 */
+    TCNT1 = 0;
+    OCR1A = (uint16_t)(F_CPU / 8 / RATE_HZ) - 1;
+    TIMSK1 = _BV(OCIE1A);
+    interrupts();
+}
+#else
+#error "Only Teensy and AVR have their timer here: let it call take_sample() RATE_HZ times a second"
+#endif
+
+void setup() {
+    pinMode(CS_PIN, OUTPUT);
+    digitalWrite(CS_PIN, HIGH);
+    SPI.begin();
+    Serial.begin(BAUD);
+    start_timer();
+}
+
+static void send(size_t length) {
+    /* Waits for room where the port has less than a frame; the timer goes on meanwhile. */
+    Serial.write(frame, length);
+}
+
+void loop() {
+    static uint32_t informed_ms = 0;
+    static bool informed = false;
+    if (!Serial) { /* no host has opened the port: what it misses is counted */
+        return;
+    }
+    if (!informed || millis() - informed_ms >= 1000) {
+        send(frame_info(&counts, RATE_HZ, BITS, CHANNELS, VREF_V, SERIAL_NUMBER, frame));
+        informed_ms = millis();
+        informed = true;
+    }
+    if (made != sent) {
+        const struct block *b = &blocks[sent % BLOCKS];
+        send(frame_data(&counts, b->t_us, b->first_index, b->overruns, BLOCK, CHANNELS, b->codes,
+                        BITS, frame));
+        sent++;
+    }
+}

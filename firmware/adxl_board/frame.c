@@ -1,0 +1,121 @@
+/* Copyright 2026 the adxl_ros authors
+ *
+ * Licensed under the Apache License, Version 2.0 (the "License");
+ * you may not use this file except in compliance with the License.
+ * You may obtain a copy of the License at
+ *
+ *     http://www.apache.org/licenses/LICENSE-2.0
+ *
+ * Unless required by applicable law or agreed to in writing, software
+ * distributed under the License is distributed on an "AS IS" BASIS,
+ * WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+ * See the License for the specific language governing permissions and
+ * limitations under the License.
+ */
+
+#include "frame.h"
+
+#include <string.h>
+
+/* Bytes go through these two steps as they are written: no second buffer is needed. */
+struct writer {
+    uint8_t *out;  /* where the frame begins */
+    size_t code;   /* where the length of the present COBS run goes */
+    size_t next;   /* where the next byte goes */
+    uint32_t crc;
+};
+
+static void stuff(struct writer *w, uint8_t byte) {
+    if (byte) {
+        w->out[w->next++] = byte;
+    }
+    if (!byte || w->next - w->code == 255) {
+        w->out[w->code] = (uint8_t)(w->next - w->code);
+        w->code = w->next++;
+    }
+}
+
+static void put(struct writer *w, uint8_t byte) {
+    int bit;
+    w->crc ^= byte;
+    for (bit = 0; bit < 8; bit++) {
+        w->crc = (w->crc >> 1) ^ ((w->crc & 1) ? 0xEDB88320u : 0);
+    }
+    stuff(w, byte);
+}
+
+static void put_number(struct writer *w, uint64_t value, int bytes) {
+    while (bytes--) {
+        put(w, (uint8_t)value);
+        value >>= 8;
+    }
+}
+
+static void put_float(struct writer *w, float value) {
+    uint32_t raw;
+    memcpy(&raw, &value, sizeof raw);
+    put_number(w, raw, 4);
+}
+
+static void begin(struct writer *w, struct frame_counts *counts, uint8_t type, uint16_t flags,
+                  uint8_t *out) {
+    w->out = out;
+    w->code = 0;
+    w->next = 1;
+    w->crc = 0xFFFFFFFFu;
+    put(w, type);
+    put(w, 1); /* version */
+    put_number(w, flags, 2);
+    put_number(w, counts->block_seq++, 4);
+}
+
+static size_t end(struct writer *w) {
+    uint32_t crc = ~w->crc;
+    int i;
+    for (i = 0; i < 4; i++) {
+        stuff(w, (uint8_t)(crc >> (8 * i)));
+    }
+    w->out[w->code] = (uint8_t)(w->next - w->code);
+    w->out[w->next++] = 0;
+    return w->next;
+}
+
+size_t frame_data(struct frame_counts *counts, uint64_t t_dev_us, uint32_t first_index,
+                  uint16_t overruns, uint8_t nsamp, uint8_t nch, const uint16_t *codes,
+                  uint8_t bits, uint8_t *out) {
+    struct writer w;
+    uint16_t flags = counts->flags;
+    size_t i, count = (size_t)nsamp * nch;
+    for (i = 0; i < count; i++) {
+        if (codes[i] == 0 || codes[i] >= (1uL << bits) - 1) {
+            flags |= FRAME_RAIL;
+        }
+    }
+    begin(&w, counts, 1, flags, out);
+    counts->flags = 0;
+    put_number(&w, t_dev_us, 8);
+    put_number(&w, first_index, 4);
+    put_number(&w, overruns, 2);
+    put(&w, nsamp);
+    put(&w, nch);
+    for (i = 0; i < count; i++) {
+        put_number(&w, codes[i], 2);
+    }
+    return end(&w);
+}
+
+size_t frame_info(struct frame_counts *counts, float rate_hz, uint8_t bits, uint8_t nch,
+                  float vref_v, const char *serial, uint8_t *out) {
+    struct writer w;
+    int i, ended = 0;
+    begin(&w, counts, 2, counts->flags, out);
+    put_float(&w, rate_hz);
+    put(&w, bits);
+    put(&w, nch);
+    put_float(&w, vref_v);
+    for (i = 0; i < 16; i++) {
+        ended = ended || !serial[i];
+        put(&w, ended ? 0 : (uint8_t)serial[i]);
+    }
+    return end(&w);
+}

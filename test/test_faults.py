@@ -1,0 +1,322 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The driver on devices that are hurt: whatever happens, it stays up, right and countable."""
+
+from contextlib import contextmanager
+from dataclasses import replace
+import os
+from pathlib import Path
+import re
+import socket
+import subprocess
+import threading
+import time
+
+from adxl_ros.errors import UserError
+from adxl_ros.files import params
+from adxl_ros.links import board, iio_device
+from adxl_ros.model.effects import effect_named
+from diagnostic_msgs.msg import DiagnosticStatus
+from faults import bytes_hurt, IIO, Row, run, SERIAL
+from graph import accel, Graph, stamp_ns
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+import numpy as np
+import pytest
+from rig import IioRig, memory_mib, SerialRig
+from sensor_msgs.msg import BatteryState, Imu, Temperature
+from units import nominal
+
+ROS = '--ros-args'
+
+
+@contextmanager
+def board_rig(tmp_path, setting=None):
+    with Graph() as graph:
+        rig = SerialRig(graph, tmp_path, setting)
+        try:
+            yield rig
+        finally:
+            rig.end()
+
+
+def lines(process):
+    return [line for line in process.output().splitlines() if line]
+
+
+def test_every_fault_of_a_board_is_counted_exactly(start, tmp_path):
+    """One page of the book for all faults over which the board's count goes on."""
+    by_name = {row.name: row for row in SERIAL}
+    page = [*(bytes_hurt(kind, 1e-3) for kind in ('flip', 'lose', 'insert', 'burst')),
+            *(by_name[name] for name in (
+                'wrong baud rate', '100 kB without a delimiter', '200 kB of noise',
+                '137 samples lost by the board', 'unplugged for 1 s, in a read',
+                'board and clock halted for 1 s', 'reader stopped for 3 s'))]
+    with board_rig(tmp_path, {'banner': True, 'ppm': 60}) as rig:
+        driver = start('driver', ROS, *rig.parameters())
+        rig.count(500, 30)
+
+        def all_of_it(rig, pid, seconds):
+            for row in page:
+                back_ns = row.act(rig, pid, seconds)
+                if back_ns:
+                    assert rig.recovered_ms(back_ns) < 1000, row.name
+                rig.count(100, 20, row.name)
+            return 0
+        book, _ = run(Row('all', all_of_it), rig, driver.popen.pid, 0.7)
+        assert book.wrong == 0
+        assert book.missing > 1137, 'there were faults'
+        assert book.missing == book.said
+        assert book.estimated == 0
+        assert book.error_ms < 20
+        reset = by_name['reset, away for 0.5 s']
+        book, recovered_ms = run(reset, rig, driver.popen.pid, 1.0)
+        assert book.wrong == 0
+        assert book.said == book.estimated == pytest.approx(book.missing, abs=3)
+        assert 450 < book.missing < 700
+        assert recovered_ms < 1000
+        assert rig.said('resets') == 1
+        assert float(rig.graph.value('driver', 'clock_drift_ppm')) == pytest.approx(60, abs=200)
+    assert driver.popen.poll() is None
+    assert driver.stop() == 0
+    assert 'Traceback' not in driver.output()
+
+
+def test_every_fault_of_an_iiod_is_survived(start, tmp_path):
+    try:
+        iio_device.library()
+    except UserError as error:
+        pytest.skip(str(error))
+    with Graph() as graph:
+        rig = IioRig(graph)
+        driver = start('driver', ROS, *rig.parameters())
+        rig.count(500, 30)
+        for row in IIO:
+            book, recovered_ms = run(row, rig, driver.popen.pid, 1.0)
+            assert book.wrong == 0, row.name
+            assert book.said == book.estimated == pytest.approx(book.missing, abs=2), row.name
+            assert book.missing > 500, row.name
+            assert recovered_ms is None or recovered_ms < 1000, row.name
+        assert graph.value('driver', 'link_state') == 'streaming at 1000 Hz'
+        rig.end()
+    assert driver.stop() == 0
+    own = [line for line in lines(driver) if '[driver]' in line]
+    assert len(own) <= 2 + 2 * 4, own
+
+
+def test_a_device_that_comes_late_is_found_and_each_state_is_said_once(start, tmp_path):
+    with Graph() as graph:
+        driver = start('driver', ROS, '-p', 'link.type:=serial', '-p',
+                       f'link.port:={tmp_path / "board"}')
+        graph.spin_until(lambda: graph.said('driver', 'No such file'), 20, 'the reason')
+        assert graph.diagnostics['driver'].level == DiagnosticStatus.ERROR
+        graph.spin(1.5)
+        rig = SerialRig(graph, tmp_path)
+        came = time.monotonic()
+        rig.count(100, 20)
+        assert time.monotonic() - came < 2
+        graph.spin_until(lambda: graph.said('driver', 'streaming'), 5, 'streaming')
+        rig.end()
+        graph.spin_until(lambda: graph.said('driver', 'No such file'), 5, 'the end of the board')
+    assert driver.stop() == 0
+    told = [re.sub(r'^\[(\w+)\] \[[\d.]+\] \[driver\]: ', r'\1 ', line) for line in lines(driver)]
+    path = tmp_path / 'board'
+    assert told[0] == f'ERROR {path}: No such file or directory'
+    assert [line.split(';')[0] for line in told[1:3]] == ['INFO connecting', 'INFO streaming']
+    assert 4 <= len(told) <= 5, told
+
+
+def test_two_drivers_cannot_have_one_port(start, tmp_path):
+    with board_rig(tmp_path) as rig:
+        first = start('driver', ROS, *rig.parameters())
+        rig.count(500, 30)
+        rig.begin()
+        second = start('driver', ROS, *rig.parameters(), '-r', '__node:=second')
+        graph = rig.graph
+        graph.spin_until(lambda: graph.said('second', 'in use'), 20, 'the refusal')
+        graph.spin(1.0)
+        book = rig.close()
+        assert (book.wrong, book.missing, book.said) == (0, 0, 0)
+        first.stop()
+        graph.spin_until(lambda: graph.said('second', 'streaming'), 10, 'taking over')
+    assert second.popen.poll() is None
+
+
+def test_a_hostile_stream_costs_no_memory_and_no_other_link(start, tmp_path):
+    """Noise as fast as it is taken, then frames with lengths that lie, on a socket."""
+    with board_rig(tmp_path) as rig, socket.create_server(('127.0.0.1', 0)) as server:
+        start('driver', ROS, *rig.parameters())
+        port = server.getsockname()[1]
+        hurt = start('driver', ROS, '-p', 'link.type:=serial', '-p',
+                     f'link.port:=socket://127.0.0.1:{port}', '-r', '__ns:=/hurt')
+        peer, _ = server.accept()
+        peer.sendall(b'hello')
+        rig.count(500, 30)
+        rig.begin()
+        before = memory_mib(hurt.popen.pid)
+        rng = np.random.default_rng(0)
+        chunk = rng.bytes(1_000_000)
+        bombs = b''.join(bytes([0xff]) * 254 + rng.bytes(3) for _ in range(4000))
+        peer.settimeout(0.2)
+        sent = 0
+        end = time.monotonic() + 5
+        while time.monotonic() < end:
+            try:
+                sent += peer.send(chunk if sent % 2 else bombs)
+            except TimeoutError:
+                pass
+            except OSError:  # silent before: the driver has connected anew
+                peer = server.accept()[0]
+            rig.graph.spin(0.01)
+        after = memory_mib(hurt.popen.pid)
+        book = rig.close()
+        assert sent > 5_000_000
+        assert (book.wrong, book.missing, book.said) == (0, 0, 0)
+        assert after - before < 8, f'{before} MiB before, {after} MiB after'
+        assert hurt.popen.poll() is None
+        peer.close()
+
+
+def test_a_full_disk_for_the_log_stops_nothing(start, ros_env, tmp_path, monkeypatch):
+    folder = tmp_path / 'full'
+    folder.mkdir()
+    mount = ['mount', '-t', 'tmpfs', '-o', 'size=4k', 'tmpfs', folder]
+    if os.getuid() or subprocess.run(mount, capture_output=True).returncode:
+        pytest.skip('cannot mount a small file system')
+    try:
+        (folder / 'fill').write_bytes(b'x' * 4096)
+        ros_env['ROS_LOG_DIR'] = str(folder)
+        with board_rig(tmp_path) as rig:
+            driver = start('driver', ROS, *rig.parameters())
+            rig.count(500, 30)
+            rig.begin()
+            for _ in range(3):
+                rig.tell_board('unplug 0.3')
+                rig.count(300, 20)
+            book = rig.close()
+            assert book.right, book
+            assert driver.popen.poll() is None
+        assert driver.stop() == 0
+        assert 'Traceback' not in driver.output()
+    finally:
+        subprocess.run(['umount', '-l', folder], check=True)
+
+
+def change(graph, transition):
+    request = ChangeState.Request(transition=Transition(id=transition))
+    return graph.call(ChangeState, 'driver/change_state', request).success
+
+
+def test_a_manager_has_the_driver_in_its_hand(start, tmp_path):
+    with board_rig(tmp_path) as rig:
+        graph = rig.graph
+        driver = start('driver', ROS, *rig.parameters(), '-p', 'autostart:=false')
+        for transition, state in ((None, 'unconfigured'),
+                                  (Transition.TRANSITION_CONFIGURE, 'inactive'),
+                                  (Transition.TRANSITION_ACTIVATE, 'active'),
+                                  (Transition.TRANSITION_DEACTIVATE, 'inactive'),
+                                  (Transition.TRANSITION_ACTIVATE, 'active'),
+                                  (Transition.TRANSITION_DEACTIVATE, 'inactive'),
+                                  (Transition.TRANSITION_CLEANUP, 'unconfigured'),
+                                  (Transition.TRANSITION_UNCONFIGURED_SHUTDOWN, 'finalized')):
+            assert transition is None or change(graph, transition)
+            answer = graph.call(GetState, 'driver/get_state', GetState.Request())
+            assert answer.current_state.label == state
+            if state == 'active':
+                rig.count(300, 20)
+                continue
+            rig.take()
+            rig.graph.spin(0.3)
+            rig.take()
+            before = len(rig.numbers)
+            graph.diagnostics.clear()
+            graph.spin_until(lambda: graph.said('driver', 'inactive'), 5, 'inactive')
+            rig.take()
+            assert len(rig.numbers) == before, 'inactive it reads nothing'
+            held = [os.readlink(f) for f in Path(f'/proc/{driver.popen.pid}/fd').iterdir()
+                    if f.is_symlink() and os.path.lexists(f)]
+            assert os.path.realpath(rig.path) not in held
+        assert rig.wrong == 0
+
+
+def feeding(tmp_path, sensor, columns):
+    """Let a board send the same again and again; returns its port and how to end it."""
+    path, stop = str(tmp_path / 'fed'), threading.Event()
+    ready = threading.Event()
+
+    def feed():
+        with board.opened(path) as fd:
+            sender = board.Board(sensor, board.roles_of(sensor, columns), fd)
+            ready.set()
+            while not stop.is_set():
+                sender.send(columns)
+    thread = threading.Thread(target=feed)
+    thread.start()
+    ready.wait()
+    return path, lambda: (stop.set(), thread.join())
+
+
+def test_a_measured_supply_takes_the_supply_out(start, tmp_path):
+    """At 4.8 V a ratiometric sensor shows -0.2 V / (1 V/g) at 0 g, unless it is corrected."""
+    effect = effect_named('supply')
+    sensor = replace(nominal(), effects=('supply',), values={'supply': {
+        p.name: np.array(1.0 if p.name.endswith('exponent') else 5.0)
+        for p in effect.parameters}})
+    params.save(tmp_path / 'unit.yaml', sensor)
+    columns = {'x_v': np.full(200, 2.4), 'y_v': np.full(200, 2.4 + 0.96 / 2),
+               'supply_v': np.full(200, 4.8), 'temperature_c': np.full(200, 31.0)}
+    path, end = feeding(tmp_path, nominal(), columns)
+    try:
+        with Graph() as graph:
+            raw = graph.listen(Imu, 'imu/data_raw')
+            corrected = graph.listen(Imu, 'imu/data')
+            supply = graph.listen(BatteryState, 'supply')
+            temperature = graph.listen(Temperature, 'temperature')
+            start('driver', ROS, '-p', 'link.type:=serial', '-p', f'link.port:={path}', '-p',
+                  'link.channels:=x,y,supply,temperature', '-p', 'link.supply_scale:=2.0', '-p',
+                  'stamp_offset:=0.0105')
+            start('compensation', ROS, '--params-file', tmp_path / 'unit.yaml')
+            graph.spin_until(lambda: supply and temperature and corrected, 30, 'all of it')
+            # A supply that stays is said once a second: the compensation may not know it yet.
+            graph.spin_until(lambda: abs(accel(corrected[-1])[0]) < 0.01, 10, 'the correction')
+            newest_s = (stamp_ns(raw[-1]) - graph.node.get_clock().now().nanoseconds) * 1e-9
+    finally:
+        end()
+    assert supply[-1].voltage == pytest.approx(4.8, abs=1e-3)
+    assert temperature[-1].temperature == pytest.approx(31, abs=0.02)
+    assert accel(raw[-1])[:2] == pytest.approx([-0.1 * 9.80665, 0.38 * 9.80665], abs=0.01)
+    assert accel(corrected[-1])[:2] == pytest.approx([0, 0.5 * 9.80665], abs=0.01)
+    assert newest_s < -0.0105, 'the delay of the filter is taken out of the stamps'
+
+
+def test_simulate_is_a_board(start, run_tool, tmp_path):
+    with Graph() as graph:
+        sender = start('simulate', 'tilt_alpha', '--port', 'bench', '--seed', '3')
+        sender.wait_for('link.port:=bench')
+        samples = graph.listen(Imu, 'imu/data_raw')
+        start('driver', ROS, '-p', 'link.type:=serial', '-p', 'link.port:=bench')
+        graph.spin_until(lambda: len(samples) > 1000, 30, 'samples')
+        assert graph.value('driver', 'link_state') == 'streaming'
+        graph.spin_until(lambda: float(graph.value('driver', 'rate_hz')) > 900, 5, 'the rate')
+        assert graph.value('driver', 'missing') == '0'
+    stamps = np.array([stamp_ns(m) for m in samples])
+    assert np.diff(stamps) == pytest.approx(1e6, rel=0.06)
+    sender.stop()
+    assert not (tmp_path / 'bench').is_symlink()
+    (tmp_path / 'file').touch()
+    done = run_tool('simulate', 'tilt_alpha', '--port', 'file')
+    assert done.returncode == 1
+    assert 'file: is no terminal' in done.stderr
+    assert run_tool('simulate', 'tilt_alpha').returncode == 2

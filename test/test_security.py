@@ -1,0 +1,61 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The policy for SROS 2 allows what the nodes have, and nothing else."""
+
+import os
+import pty
+from xml.etree import ElementTree
+
+from ament_index_python.packages import get_package_share_directory
+from graph import Graph
+import pytest
+
+POLICY = os.path.join(get_package_share_directory('adxl_ros'), 'security', 'adxl_ros.policy.xml')
+# rcl makes these where they are wanted: with use_sim_time, as the clock, with a replay's stage.
+SOMETIMES = {'/clock', '/stage/joint_states'}
+
+
+def allowed(node):
+    """Return the names that a node may publish, subscribe and reply to."""
+    tree = ElementTree.parse(POLICY)
+    profile = tree.find(f".//enclave[@path='/adxl_ros/{node}']//profile[@node='{node}']")
+
+    def names(path):
+        return {f'/{node}/{e.text[1:]}' if e.text.startswith('~') else f'/{e.text}'
+                for e in profile.findall(path)}
+    return (names("topics[@publish='ALLOW']/topic"), names("topics[@subscribe='ALLOW']/topic"),
+            names("services[@reply='ALLOW']/service"))
+
+
+@pytest.mark.parametrize('node', ['driver', 'stage', 'calibration', 'compensation'])
+def test_the_policy_is_what_the_node_needs(start, node):
+    ours, theirs = pty.openpty()
+    extra = () if node != 'driver' else (
+        '-p', 'link.type:=serial', '-p', f'link.port:={os.ttyname(theirs)}', '-p',
+        'link.channels:=x,y,supply,temperature')
+    start(node, '--ros-args', *extra)
+    with Graph() as graph:
+        graph.spin_until(lambda: node in graph.diagnostics, 20, 'diagnostics')
+        graph.spin(0.3)
+        had = [{name for name, _ in of(node, '/')} for of in (
+            graph.node.get_publisher_names_and_types_by_node,
+            graph.node.get_subscriber_names_and_types_by_node,
+            graph.node.get_service_names_and_types_by_node)]
+    os.close(ours)
+    os.close(theirs)
+    for may, has in zip(allowed(node), had):
+        assert has <= may
+        assert may - has <= SOMETIMES | ({'/stage/true_joint_states'} & may
+                                         if node == 'driver' else set())

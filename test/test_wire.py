@@ -1,0 +1,151 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The serial wire format: its vector, what it refuses, what no stream of bytes can do to it."""
+
+from dataclasses import replace
+import zlib
+
+from adxl_ros.links.wire import (
+    AFTER_RESET,
+    Data,
+    decode,
+    Encoder,
+    frame,
+    Info,
+    MOST_BYTES,
+    RAIL,
+    Splitter,
+    VersionError,
+    WireError,
+)
+from hypothesis import given, settings, strategies as st
+import numpy as np
+import pytest
+
+PAYLOAD = bytes.fromhex(
+    '010100000700000040420f00000000004600000000000202008000003412ffff')
+FRAME = bytes.fromhex(
+    '03010101020701010440420f01010101024601010101030202028001093412ffffe9e413f100')
+INFO = Info(1000.0, 16, 2, 5.0, 'A7')
+
+
+def test_the_vector_of_the_interfaces():
+    assert zlib.crc32(PAYLOAD).to_bytes(4, 'little') == bytes.fromhex('e9e413f1')
+    assert frame(PAYLOAD) == FRAME
+    data = decode(FRAME[:-1])
+    assert (data.flags, data.sequence, data.time_us, data.index, data.overruns) == \
+        (0, 7, 1_000_000, 70, 0)
+    assert data.codes.tolist() == [[0x8000, 0], [0x1234, 0xffff]]
+
+
+def test_the_encoder_makes_the_vector_but_for_the_flags_that_it_sets():
+    encoder = Encoder(INFO)
+    for _ in range(7):
+        encoder.info_frame()
+    made = decode(encoder.data_frame(1_000_000, 70, np.array([[0x8000, 0], [0x1234, 0xffff]]))
+                  [:-1])
+    assert made.flags == RAIL | AFTER_RESET
+    assert replace(made, flags=0, check=0, codes=None) == \
+        replace(decode(FRAME[:-1]), check=0, codes=None)
+
+
+def test_info_comes_back_as_it_was_and_the_reset_is_told_until_the_first_samples():
+    encoder = Encoder(Info(333.25, 12, 3, 3.3, 'board 17'))
+    info = decode(encoder.info_frame()[:-1])
+    assert info == Info(333.25, 12, 3, pytest.approx(3.3, rel=1e-7), 'board 17')
+    assert info.flags == AFTER_RESET
+    assert decode(encoder.data_frame(0, 0, np.full((2, 3), 7))[:-1]).flags == AFTER_RESET
+    assert decode(encoder.data_frame(0, 2, np.full((2, 3), 7))[:-1]).flags == 0
+    assert decode(encoder.info_frame()[:-1]).flags == 0
+
+
+@pytest.mark.parametrize('change, why', [
+    (lambda p: p[:1] + b'\2' + p[2:], 'wire format 2'), (lambda p: b'\3' + p[1:], 'type 3'),
+    (lambda p: p[:-1], '32 bytes|31 bytes'), (lambda p: p[:22] + b'\3' + p[23:], 'samples'),
+    (lambda p: p[:8] + b'\xff' * 8 + p[16:], 'at 18446744073709551615 us'),
+    (lambda p: p[:6], '6 bytes|does not match')])
+def test_what_cannot_be_is_refused(change, why):
+    kind = VersionError if 'format' in why else WireError
+    with pytest.raises(kind, match=why):
+        decode(frame(change(PAYLOAD))[:-1])
+
+
+@pytest.mark.parametrize('info', [
+    replace(INFO, rate_hz=float('nan')), replace(INFO, rate_hz=0.0), replace(INFO, bits=0),
+    replace(INFO, bits=17), replace(INFO, channels=0), replace(INFO, channels=200),
+    replace(INFO, vref_v=float('inf')), replace(INFO, vref_v=-1.0), replace(INFO, serial='\n')])
+def test_an_info_frame_that_makes_no_sense_is_refused(info):
+    with pytest.raises(WireError, match='an info frame'):
+        decode(Encoder(info).info_frame()[:-1])
+
+
+def test_a_single_changed_lost_or_added_byte_is_never_taken_for_a_frame():
+    rng = np.random.default_rng(0)
+    raw = FRAME[:-1]
+    for _ in range(3000):
+        at, byte = int(rng.integers(len(raw))), bytes([rng.integers(256)])
+        for bad in (raw[:at] + byte + raw[at + 1:], raw[:at] + raw[at + 1:],
+                    raw[:at] + byte + raw[at:]):
+            for part in bad.split(b'\0'):
+                if part == raw:
+                    continue
+                with pytest.raises(WireError):
+                    decode(part)
+
+
+def test_a_stream_without_an_end_is_skipped_and_not_kept():
+    cut = Splitter()
+    assert cut(b'noise\0') == [b'noise']
+    for _ in range(100):
+        assert cut(b'\x55' * 1000) == []
+        assert len(cut._rest) <= MOST_BYTES
+    assert cut(b'tail\0' + FRAME + FRAME[:5]) == [FRAME[:-1]]
+    assert cut.skipped == 100_004
+    assert cut(FRAME[5:]) == [FRAME[:-1]]
+
+
+@settings(deadline=None, max_examples=300)
+@given(st.binary(max_size=400))
+def test_any_bytes_are_a_frame_or_an_error(raw):
+    try:
+        found = decode(raw)
+    except WireError:
+        return
+    assert isinstance(found, Info | Data)
+
+
+@settings(deadline=None, max_examples=200)
+@given(st.lists(st.one_of(st.binary(max_size=50), st.just(FRAME)), max_size=20),
+       st.integers(1, 30))
+def test_how_a_stream_is_cut_into_chunks_changes_nothing(parts, size):
+    stream = b''.join(parts) + b'\0'
+    whole = Splitter()(stream)
+    cut = Splitter()
+    pieces = [raw for i in range(0, len(stream), size) for raw in cut(stream[i:i + size])]
+    assert pieces == whole
+
+
+@settings(deadline=None, max_examples=200)
+@given(st.integers(1, 12), st.integers(1, 8), st.integers(0, 2 ** 53), st.integers(0, 2 ** 40),
+       st.randoms(use_true_random=False))
+def test_every_frame_comes_back_as_it_was(count, channels, time_us, index, random):
+    codes = np.array([[random.randrange(2 ** 16) for _ in range(channels)]
+                      for _ in range(count)], np.uint16)
+    raw = Encoder(replace(INFO, channels=channels)).data_frame(time_us, index, codes)
+    assert raw.count(b'\0') == 1
+    assert raw.endswith(b'\0')
+    data = decode(raw[:-1])
+    assert np.array_equal(data.codes, codes)
+    assert (data.time_us, data.index) == (time_us, index % 2 ** 32)
