@@ -42,8 +42,10 @@ VISIBLE = 0.06
 """An effect that makes less of the noise than this, rms, is not the gap."""
 SHARE = 0.02
 """Nor is one that makes less of the squares of the gap than this."""
-EXACT = ('bias', 'scale_factor', 'gravity')
-"""Effects whose form is beyond doubt: they leave nothing that looks like another."""
+EXACT = ('bias', 'scale_factor', 'gravity', 'misalignment', 'stage_offset', 'base_tilt',
+         'lever_arm', 'time_offset', 'clock_skew')
+"""Effects whose form, geometry or a clock, is beyond doubt: they leave nothing that looks like
+another."""
 TAKEN = 0.006
 """Nor is an effect more that takes less off the squares of the gap than this."""
 RIVAL = 0.05

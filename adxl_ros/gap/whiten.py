@@ -34,9 +34,11 @@ import numpy as np
 from scipy.signal import lfilter
 
 WALKS_G_PER_RTS = (1e-7, 3e-6, 1e-5, 3e-5, 1e-4, 3e-4, 1e-3, 3e-3)
-RETURNING_G_PER_RTS, RETURN_S = (1e-4, 3e-4, 1e-3, 3e-3), 100.0
-"""Wandering of the zero-g that is tried: for good, and coming back within a time."""
-HEALTHY_G_PER_RTS = 1e-4
+RETURNING = ((1e-4, 10.0), (2e-4, 10.0), (5e-5, 100.0), (3e-4, 100.0), (1e-3, 100.0),
+             (3e-3, 100.0))
+"""Wandering of the zero-g that is tried: for good, and coming back within a time, s. 1/f noise is
+between them."""
+HEALTHY_G_PER_RTS, _HEALTHY_G = 1e-4, 5e-4
 """1 mg within 100 s; what wanders more has the effect `bias_walk`."""
 USUAL_G_PER_RTS, _DECADES = 2e-5, 1.0
 """What is usual (`bias_walk`), and how far it may be from that, as a standard deviation."""
@@ -78,15 +80,15 @@ def whiteners(series: Series, d: int) -> list[Whitener]:
     steps = sensor.lsb_v / np.sqrt(12)
     scale = float(sensor.scale_v_per_g[d])
     out = []
-    tried = [(walk, np.inf) for walk in WALKS_G_PER_RTS]
-    for walk, back_s in [*tried, *((walk, RETURN_S) for walk in RETURNING_G_PER_RTS)]:
+    for walk, back_s in (*((walk, np.inf) for walk in WALKS_G_PER_RTS), *RETURNING):
         pole, apart = np.array([1, -a]), np.array([1, -np.exp(-dt_s / back_s)])
         spectrum = (level ** 2 * (1 - a * a) * _square(apart, 2)
                     + steps ** 2 * _square(np.convolve(pole, apart), 2)
                     + (walk * scale) ** 2 * dt_s * _square(pole, 2))
         out.append(Whitener(np.convolve(pole, apart), _factor(spectrum),
                             -0.5 * (np.log10(walk / USUAL_G_PER_RTS) / _DECADES) ** 2,
-                            walk, walk <= HEALTHY_G_PER_RTS))
+                            walk, walk <= HEALTHY_G_PER_RTS
+                            or walk * np.sqrt(back_s / 2) <= _HEALTHY_G))
     return out
 
 
