@@ -143,8 +143,6 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
     best = found[0]
     show(0.8)
     beside = unknown.discrepancy(weighed, best)
-    explained = float(np.sqrt(sum(verdict.contribution_mps2(weighed, best, effect) ** 2
-                                  for effect in best.effects)))
     for one, mask in zip(full, counted):
         there = replace(best.sensor, rate_hz=one.sensor.rate_hz)
         signs += noise_like.of_residual(one.residual(best.sensor), mask,
@@ -157,9 +155,10 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
     alike = [[likeness(one, one.residual(mean), mask, whole, seed)
               for one, mask in zip(full, counted)]
              for mean, whole in ((sensor, sensor), (best.sensor, loud))]
+    explained = float(np.sqrt(max(far.before_mps2 ** 2 - far.within_mps2 ** 2, 0.0)))
     as_noise = float(np.sqrt(np.mean([one.sigma_mps2 ** 2 for one in alike[1]])))
     answer = verdict.judge(weighed, found, beside, signs, noise_mps2, explained,
-                           verdict.left(far, as_noise))
+                           verdict.left(far, base, as_noise))
     answer = _insufficient(answer, series)
     show(0.9)
     cells = map_of(series[0], series[0].residual(series[0].sensor), used[0], base.rms_mps2, seed)

@@ -227,6 +227,9 @@ def of_residual(residual_v: np.ndarray, used: np.ndarray, series: Series) -> lis
     chosen = step[still] if still.sum() > _FEWEST else step[used[2:]]
     seen = np.median(np.abs(chosen), axis=0) / norm.ppf(0.75)
     ratio = seen / promised
+    if still.sum() > _FEWEST:
+        # Noise that the filter did not pass looks like more of it, sample by sample.
+        ratio = np.minimum(ratio, np.std(data[2:][still], axis=0) / noise.sigma_v(sensor))
     if np.median(ratio) > _EXCESS and line is None:
         signs.append(Sign('noise_excess', {'ratio': ratio - 1},
                           len(white) * float(np.log(np.median(ratio)) ** 2),

@@ -26,6 +26,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from adxl_ros.gap.far import Shrunk
+from adxl_ros.gap.floor import Floor
 from adxl_ros.gap.local import Hypothesis
 from adxl_ros.gap.noise_like import Sign
 from adxl_ros.gap.study import Study, WANDERING
@@ -160,19 +161,22 @@ def _squares_mps2(of: Study, found: Hypothesis) -> float:
     return squares / max(count, 1)
 
 
-def left(far: Shrunk, noise_mps2: float) -> float:
+def left(far: Shrunk, floor: Floor, noise_mps2: float) -> float:
     """
     Return the rms of what is left above the floor, m/s².
 
     Parameters
     ----------
     far
-        On stretches held out.
+        About the fit.
+    floor
+        Where it was not seen, noise that was found is part of it.
     noise_mps2
-        Rms of the noise that was found, drift, lines and steps included.
+        Rms of the noise that was found, lines and steps included.
 
     """
-    return float(np.sqrt(max(far.within_mps2 ** 2 - max(far.floor_mps2, noise_mps2) ** 2, 0.0)))
+    noise = max(floor.rms_mps2, noise_mps2 if floor.source == 'assumed' else 0.0)
+    return float(np.sqrt(max(far.within_mps2 ** 2 - noise ** 2, 0.0)))
 
 
 def judge(of: Study, found: Sequence[Hypothesis], discrepancy: Discrepancy | None,
