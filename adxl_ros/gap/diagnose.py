@@ -39,6 +39,8 @@ from adxl_ros.model.motion import Motion
 from adxl_ros.model.sensor import Sensor, with_axes
 import numpy as np
 
+_TELLS_NATS = 3.0
+
 
 @dataclass(frozen=True)
 class Diagnosis:
@@ -150,7 +152,6 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
     signs = list({sign.effect: sign for sign in sorted(signs, key=lambda s: s.nats)}.values())
     if far is None:
         far = shrunk(weighed, full, counted, replace(best, effects=()), base, seed)
-    found[0] = best = _drift_named(best, full, counted)
     loud = _with_signs(best, signs, sensor)
     alike = [[likeness(one, one.residual(mean), mask, whole, seed)
               for one, mask in zip(full, counted)]
@@ -158,8 +159,8 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
     explained = float(np.sqrt(max(far.before_mps2 ** 2 - far.within_mps2 ** 2, 0.0)))
     as_noise = float(np.sqrt(np.mean([one.sigma_mps2 ** 2 for one in alike[1]])))
     answer = verdict.judge(weighed, found, beside, signs, noise_mps2, explained,
-                           verdict.left(far, base, as_noise))
-    answer = _insufficient(answer, series)
+                           verdict.left(far, as_noise))
+    answer = _insufficient(_drift_named(answer, best, full, counted), series)
     show(0.9)
     cells = map_of(series[0], series[0].residual(series[0].sensor), used[0], base.rms_mps2, seed)
     missing = covered(series)
@@ -171,21 +172,24 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
                      sensor if answer.status in ('no_gap', 'unknown', 'insufficient') else loud)
 
 
-def _drift_named(best: Hypothesis, full: Sequence[Series], counted: Sequence[np.ndarray]
-                 ) -> Hypothesis:
-    """Call a drift of the zero-g flicker where its spectrum says so."""
-    if WANDERING not in best.effects:
-        return best
+def _drift_named(answer: Verdict, best: Hypothesis, full: Sequence[Series],
+                 counted: Sequence[np.ndarray]) -> Verdict:
+    """Call a drift of the zero-g what its spectrum says, or either where it does not tell."""
+    if WANDERING not in answer.effects:
+        return answer
     signs = [noise_like.drift(one.residual(best.sensor), mask, one)
              for one, mask in zip(full, counted)]
     sign = max((s for s in signs if s is not None), key=lambda s: s.nats, default=None)
-    if sign is None or sign.effect == WANDERING:
-        return best
-    effects = tuple(sign.effect if e == WANDERING else e for e in best.effects)
-    values = {name: of for name, of in best.sensor.values.items() if name != WANDERING}
-    sensor = replace(best.sensor, values={**values, sign.effect: sign.values}, effects=tuple(
-        sign.effect if e == WANDERING else e for e in best.sensor.effects))
-    return replace(best, effects=effects, sensor=sensor)
+    others = tuple(e for e in answer.effects if e != WANDERING)
+    if sign is None or sign.nats < _TELLS_NATS:
+        return replace(answer, status='inseparable', effects=others,
+                       groups=(*answer.groups, (WANDERING, 'flicker')))
+    if sign.effect == WANDERING:
+        return answer
+    renamed = [(tuple(sorted(sign.effect if e == WANDERING else e for e in effects)), p)
+               for effects, p in answer.hypotheses]
+    return replace(answer, effects=tuple(sorted((*others, sign.effect))),
+                   hypotheses=tuple(renamed))
 
 
 def _insufficient(answer: Verdict, series: Sequence[Series]) -> Verdict:

@@ -33,6 +33,7 @@ import numpy as np
 
 _STEPS = 5
 _CHANGED = 1e-3
+_BEYOND = 4.0
 _GAINS = 0.05
 """A step that gains less, in nats, is the last."""
 
@@ -105,7 +106,10 @@ class Local:
 
     def fitted(self, found: Fit, moved: bool = True) -> Sensor:
         """Return the sensor after a fit, within bounds; the effects as they are if not moved."""
-        values = self.middle + found.values
+        off, own = found.values, len(self.values)
+        # A healthy unit stays within its tolerance; what goes beyond is an effect.
+        within = np.clip(off[own:], -_BEYOND * self.prior[own:], _BEYOND * self.prior[own:])
+        values = self.middle + np.concatenate([off[:own], within])
         if not moved:
             values[:len(self.values)] = self.values
         return put(self.sensor, self.names, _within(self.names, values))
@@ -249,7 +253,7 @@ def _within(names: Sequence[str], values: np.ndarray) -> np.ndarray:
 
 
 def columns_at(series: Series, sensor: Sensor, names: Sequence[str], values: np.ndarray,
-             there: np.ndarray) -> np.ndarray:
+               there: np.ndarray) -> np.ndarray:
     """Differentiate volts by coefficients at their values, (n, m, p); all axes at once."""
     out = np.zeros((*there.shape, len(names)))
     groups: dict[str, list[int]] = {}

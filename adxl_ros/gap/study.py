@@ -102,6 +102,7 @@ class Study:
             known = float(sensor.covariance[i, i])
         return float(np.hypot(TOLERANCE[effect] * scale, np.sqrt(known)))
 
+
 def study(series: Sequence[Series], used: Sequence[np.ndarray],
           show: Callable[[float], None], noise: Sequence[int] | None = None,
           only: Sequence[str] | None = None) -> Study:

@@ -26,10 +26,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from adxl_ros.gap.far import Shrunk
-from adxl_ros.gap.floor import Floor
 from adxl_ros.gap.local import Hypothesis
 from adxl_ros.gap.noise_like import Sign
-from adxl_ros.gap.study import Study, WANDERING
+from adxl_ros.gap.study import Study, TOLERANCE, WANDERING
 from adxl_ros.gap.unknown import Discrepancy
 from adxl_ros.model.coefficients import neutral
 from adxl_ros.model.constants import G0_MPS2
@@ -55,6 +54,8 @@ CERTAIN = 0.5
 UNKNOWN_NATS = 15.0
 UNKNOWN_OF_GAP, UNKNOWN_OF_NOISE = 0.3, 0.12
 """What a flexible term must find, by the rms of the gap and of the noise, to be unknown."""
+UNKNOWN_LEFT = 0.2
+"""What must be left above the floor, by what is explained: less is another form of the same."""
 LEFT_OF_GAP, LEFT_OF_NOISE = 0.7, 0.5
 """What is left above the floor, by what is explained and by the noise, to be unknown."""
 _TEMPER = 0.5
@@ -141,7 +142,7 @@ def worthy(of: Study, found: Sequence[Hypothesis], noise_mps2: float) -> list[Hy
         for effect, part in parts.items():
             without = squares.get(frozenset(one.effects) - {effect})
             taken = part * part
-            if without is not None and effect not in (WANDERING, 'bias'):
+            if without is not None and effect not in (WANDERING, *TOLERANCE):
                 taken = without - here
             if part < least or part * part < SHARE * whole or taken < least ** 2 \
                     or taken < TAKEN * closes:
@@ -161,7 +162,7 @@ def _squares_mps2(of: Study, found: Hypothesis) -> float:
     return squares / max(count, 1)
 
 
-def left(far: Shrunk, floor: Floor, noise_mps2: float) -> float:
+def left(far: Shrunk, noise_mps2: float) -> float:
     """
     Return the rms of what is left above the floor, m/s².
 
@@ -169,14 +170,11 @@ def left(far: Shrunk, floor: Floor, noise_mps2: float) -> float:
     ----------
     far
         About the fit.
-    floor
-        Where it was not seen, noise that was found is part of it.
     noise_mps2
-        Rms of the noise that was found, lines and steps included.
+        Rms of the noise that was found, lines, spikes and steps included.
 
     """
-    noise = max(floor.rms_mps2, noise_mps2 if floor.source == 'assumed' else 0.0)
-    return float(np.sqrt(max(far.within_mps2 ** 2 - noise ** 2, 0.0)))
+    return float(np.sqrt(max(far.within_mps2 ** 2 - max(far.floor_mps2, noise_mps2) ** 2, 0.0)))
 
 
 def judge(of: Study, found: Sequence[Hypothesis], discrepancy: Discrepancy | None,
@@ -215,7 +213,8 @@ def judge(of: Study, found: Sequence[Hypothesis], discrepancy: Discrepancy | Non
     if WANDERING not in best.effects and discrepancy is not None \
             and discrepancy.gain > UNKNOWN_NATS \
             and discrepancy.rms_mps2 > max(UNKNOWN_OF_NOISE * noise_mps2,
-                                           UNKNOWN_OF_GAP * gap_mps2):
+                                           UNKNOWN_OF_GAP * gap_mps2) \
+            and left_mps2 > UNKNOWN_LEFT * gap_mps2:
         unknown = 0.9
         places = tuple(sorted((k for k, g in discrepancy.where.items() if g > UNKNOWN_NATS),
                               key=lambda k: -discrepancy.where[k]))
