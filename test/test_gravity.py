@@ -340,6 +340,13 @@ def test_three_real_units_turn_alike(shared_dir):
         assert rms(turned[one] - turned[other]) < 0.06
 
 
+def test_too_few_rests_are_said_in_one_line(run_tool, shared_dir):
+    """Moved by hand all the time, behind no filter: which poses are missing, no traceback."""
+    done = run_tool('fit', shared_dir / 'real' / 'broad_02_real.csv', '-o', 'unit.yaml')
+    assert done.returncode == 1
+    assert done.stderr.startswith('fit: gravity: ') and done.stderr.count('\n') == 1
+
+
 def test_speed():
     rng = np.random.default_rng(11)
     sensor, _ = unit(rng)

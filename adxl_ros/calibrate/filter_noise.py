@@ -47,6 +47,7 @@ _WHITE_STD = 0.7
 """Standard deviation of the logarithm of the ADC's white noise about LSB²/12."""
 _LINE = 6.0
 """An ordinate this far above the others, in standard deviations, is a line (hum) and no noise."""
+_SINGULAR = 1e12
 _MOST_STD = 0.1
 """An estimate worse than this says nothing beside the ±25 % of the datasheet."""
 _MOST_SCATTER = 2.0
@@ -130,6 +131,8 @@ def estimate(rests: Iterable[np.ndarray], rate_hz: float, rc_s: float, lsb_v: fl
     scatter = float(np.mean(off[used] ** 2) * weight)
     information = _curvature(found.x, used, lags) * weight / _ALIKE
     information += np.diag([0.0, 0.0, _WHITE_STD ** -2])
+    if np.linalg.cond(information) > _SINGULAR:
+        return None     # noise that no filter has shaped: it says nothing of one
     ratio_std = float(np.sqrt(np.linalg.inv(information)[1, 1] * max(scatter, 1.0)))
     return FilterNoise(float(np.exp(found.x[1]) / rate_hz), ratio_std, scatter)
 
