@@ -88,7 +88,7 @@ demo: build
 
 # In test/, so that Python imports the installed package and not the sources beside it.
 test: build
-	cd test && ../run --exec python -m pytest $(ARGS)
+	cd test && OPENBLAS_NUM_THREADS=1 ../run --exec python -m pytest -n 2 --dist loadgroup $(ARGS)
 
 lint: build
 	cd test && ../run --exec python -m pytest -q test_linters.py test_layering.py

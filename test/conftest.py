@@ -42,6 +42,13 @@ def pytest_configure(config: pytest.Config) -> None:
     signal.signal(signal.SIGTERM, signal.default_int_handler)
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Keep the tests that run a graph in one worker, after each other: they need their core."""
+    for item in items:
+        if 'ros_env' in getattr(item, 'fixturenames', ()):
+            item.add_marker(pytest.mark.xdist_group('graph'))
+
+
 @pytest.fixture
 def ros_env(tmp_path: Path) -> Iterator[dict[str, str]]:
     """Set the environment of a graph of this test's own, for this process and its children."""

@@ -272,8 +272,7 @@ def test_a_measured_supply_takes_the_supply_out(start, tmp_path):
     """At 4.8 V a ratiometric sensor shows -0.2 V / (1 V/g) at 0 g, unless it is corrected."""
     effect = effect_named('supply')
     sensor = replace(nominal(), effects=('supply',), values={'supply': {
-        p.name: np.array(1.0 if p.name.endswith('exponent') else 5.0)
-        for p in effect.parameters}})
+        p.name: np.full(2, 1.0) if p.axes else np.array(5.0) for p in effect.parameters}})
     params.save(tmp_path / 'unit.yaml', sensor)
     columns = {'x_v': np.full(200, 2.4), 'y_v': np.full(200, 2.4 + 0.96 / 2),
                'supply_v': np.full(200, 4.8), 'temperature_c': np.full(200, 31.0)}

@@ -168,7 +168,8 @@ def fit_full(sensor: Sensor, poses: Poses, terms: Sequence[str] = TERMS) -> Full
 def coefficients(axes: str, terms: Sequence[str]) -> tuple[str, ...]:
     """Name what is fitted: the terms' coefficients but for the gauge, and the base's tilt."""
     named = [name for effect in dict.fromkeys(term.split('.')[0] for term in terms)
-             for name in names_of(effect_named(effect), axes) if not parameter_of(name).shape
+             for name in names_of(effect_named(effect), axes)
+             if not parameter_of(name).shape and not parameter_of(name).optional
              and term_of(name) in terms]
     return (*(n for n in named if not of_stage(n)), *_STAGE,
             *(n for n in named if of_stage(n) and n not in _STAGE))

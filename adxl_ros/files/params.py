@@ -24,7 +24,7 @@ from typing import Any
 
 from adxl_ros.errors import UserError
 from adxl_ros.files.atomic import atomic_path
-from adxl_ros.model.coefficients import names_of
+from adxl_ros.model.coefficients import names_of, neutral
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.sensor import Sensor
 import numpy as np
@@ -269,6 +269,9 @@ def _effect_values(name: str, axes: str, flat: dict, fail: Any) -> dict[str, np.
     values = {}
     for parameter in effect.parameters:
         key = f'{name}.{parameter.name}'
+        if key not in flat and parameter.optional:
+            values[parameter.name] = neutral(effect, axes)[parameter.name]
+            continue
         if key not in flat:
             raise fail(key, f'missing; it is the {parameter.doc}, {parameter.unit}'
                             f'{", by axis" if parameter.axes else ""}')

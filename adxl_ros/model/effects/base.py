@@ -175,6 +175,11 @@ class Parameter:
         """Tell whether it only shapes what another parameter gives the size of."""
         return self.neutral == self.scale
 
+    @property
+    def optional(self) -> bool:
+        """Tell whether the effect is itself without it: files may leave it out, fits do."""
+        return self.typical == self.neutral
+
 
 @dataclass(frozen=True)
 class Effect:
