@@ -78,7 +78,7 @@ def test_never_worse_than_others(name, shared_dir, record_property):
     others = {'plain': (rms_mg(plain(accel, g)(accel) - g), left_out(plain)),
               'imucal': (rms_mg(ferraris(accel, g)(accel) - g), np.inf)}
     for label, figures in {'ours': ours, **others}.items():
-        record_property(f'{name}_{label}_mg', figures)
+        record_property(f'{name}_{label}_mg', [float(figure) for figure in figures])
         print(f'{name:20} {label:7} in-sample {figures[0]:.3f} mg, leave-one-out {figures[1]:.3f}')
     for figures in others.values():
         # In-sample nothing beats least squares, which ours, weighted by the noise, is not quite.
