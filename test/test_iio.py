@@ -169,12 +169,13 @@ def test_what_does_not_fit_is_said_and_nothing_made_up(served, setting, options,
 
 def test_stamps_are_those_of_the_devices_clock(served):
     _, link = served(setting={'ppm': 80, 'offset_ns': -3_000_000_000})
-    got = taken(link, 6000)
+    got = taken(link, 9000, 15.0)
     stamps = np.concatenate([s.stamp_ns for s in got])
     assert (np.diff(stamps) > 0).all()
-    x = np.arange(len(stamps))[2000:]
-    line = np.polyval(np.polyfit(x, stamps[2000:] - stamps[0], 1), x)
-    assert (stamps[2000:] - stamps[0] - line).std() < 20_000
+    # The map approaches the drift of 80 ppm within some seconds; then the link is steady.
+    x = np.arange(len(stamps))[5000:]
+    line = np.polyval(np.polyfit(x, stamps[5000:] - stamps[0], 1), x)
+    assert (stamps[5000:] - stamps[0] - line).std() < 20_000
     assert sum(s.missing for s in got) == 0
     assert abs(time.time_ns() - stamps[-1]) < 60e6
 
