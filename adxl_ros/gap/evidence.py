@@ -48,6 +48,8 @@ class Channel:
         Numbers of the columns that it follows, (k,).
     grams
         Products of the whitened residual (first) and columns, by walk and block, (w, b, k+1, k+1).
+    whole
+        Their sums over all blocks, (w, k+1, k+1).
     counts
         Samples by block, (b,).
     log_priors, healthy
@@ -57,6 +59,7 @@ class Channel:
 
     ids: np.ndarray
     grams: np.ndarray
+    whole: np.ndarray
     counts: np.ndarray
     log_priors: np.ndarray
     healthy: np.ndarray
@@ -90,7 +93,8 @@ def channel(residual: np.ndarray, columns: np.ndarray, ids: np.ndarray, used: np
         for b, (begin, end) in enumerate(pairwise(edges)):
             grams[i, b] = white[:, begin:end] @ white[:, begin:end].T
     counts = np.add.reduceat(used, edges[:-1]).astype(float)
-    return Channel(ids, grams, counts, np.array([f.log_prior for f in filters]),
+    return Channel(ids, grams, grams.sum(axis=1), counts,
+                   np.array([f.log_prior for f in filters]),
                    np.array([f.healthy for f in filters]))
 
 
@@ -154,8 +158,8 @@ def fit(channels: Sequence[Channel], ids: Sequence[int], prior: np.ndarray,
     for c in channels:
         at = np.flatnonzero(np.isin(c.ids, own))
         rows = np.concatenate([[0], 1 + at])
-        grams.append((np.searchsorted(own, c.ids[at]),
-                      c.grams[:, chosen].sum(axis=1)[:, rows[:, None], rows]))
+        together = c.whole if blocks is None else c.grams[:, chosen].sum(axis=1)
+        grams.append((np.searchsorted(own, c.ids[at]), together[:, rows[:, None], rows]))
         counts.append(max(float(c.counts[chosen].sum()), 1.0))
     priors = [np.where(c.healthy | wanders | ~c.healthy.any(), c.log_priors, -np.inf)
               for c in channels]
@@ -219,8 +223,8 @@ def predicted(channels: Sequence[Channel], found: Fit, blocks: np.ndarray) -> np
     return out
 
 
-def lost(channels: Sequence[Channel], found: Fit, values: np.ndarray, prior: np.ndarray,
-         blocks: np.ndarray | None = None) -> float:
+def lost(channels: Sequence[Channel], found: Fit, values: np.ndarray, prior: np.ndarray
+         ) -> float:
     """
     Return what the log-posterior at other values of coefficients lacks of its maximum, nats.
 
@@ -228,21 +232,20 @@ def lost(channels: Sequence[Channel], found: Fit, values: np.ndarray, prior: np.
 
     Parameters
     ----------
-    channels, prior, blocks
-        As for `fit`.
+    channels, prior
+        As for `fit`, of all blocks.
     found
         The fit.
     values
         Of the first coefficients, (j,).
 
     """
-    chosen = np.ones(BLOCKS, bool) if blocks is None else blocks
     count = len(values)
     off = values - found.values[:count]
     precision = np.diag(prior[found.ids] ** -2.0)
     for c, w, s2 in zip(channels, found.walks, found.variance):
         at = np.searchsorted(found.ids, c.ids)
-        precision[np.ix_(at, at)] += c.grams[w][chosen].sum(axis=0)[1:, 1:] / s2
+        precision[np.ix_(at, at)] += c.whole[w, 1:, 1:] / s2
     own, across, rest = precision[:count, :count], precision[:count, count:], \
         precision[count:, count:]
     return 0.5 * float(off @ (own - across @ np.linalg.solve(rest, across.T)) @ off)

@@ -69,7 +69,7 @@ def scores(of: Study, seed: int) -> dict[str, Score]:
     count = len(of.names)
     gram, pull = np.zeros((count, count)), np.zeros(count)
     for c, walk, variance in zip(of.channels, none.walks, none.variance):
-        whole = c.grams[walk].sum(axis=0) / variance
+        whole = c.whole[walk] / variance
         gram[np.ix_(c.ids, c.ids)] += whole[1:, 1:]
         pull[c.ids] += whole[1:, 0]
     nuisances = np.array(of.nuisances())

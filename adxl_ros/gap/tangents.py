@@ -90,9 +90,10 @@ def variants(series: Series, effect: Effect, base: np.ndarray) -> Iterator[Varia
         if effect.name not in series.sensor.effects:
             yield from _limited(series, effect, limits(effect)[0], base)
         return
-    # An effect that the sensor has keeps its shape.
+    # An effect that the sensor has keeps its shape; one with a shape is linear beside it.
+    bends = not effect.smooth and not any(p.shape for p in effect.parameters)
     for shape in [{}] if effect.name in series.sensor.effects else shapes(effect):
-        for size in (_SMALL,) if effect.smooth else _LARGE:
+        for size in _LARGE if bends else (_SMALL,):
             try:
                 found = variant(series, effect, shape, size, base)
             except UserError:
@@ -179,8 +180,3 @@ def _stepped(sensor: Sensor, effect: str, p: Parameter, step: float) -> Sensor:
     values = dict(sensor.values[effect])
     values[p.name] = np.asarray(values[p.name], float) + step
     return replace(sensor, values={**sensor.values, effect: values})
-
-
-def named(name: str) -> Effect:
-    """Return an effect of the library by its name."""
-    return effect_named(name)

@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+from math import ceil
 from typing import Any
 
 import numpy as np
@@ -25,9 +26,8 @@ def play(x: np.ndarray, half_width: float, memory: dict[str, Any]) -> np.ndarray
     """
     Follow the input with a dead band: yₙ = max(xₙ − r, min(xₙ + r, yₙ₋₁)).
 
-    Between two turning points of the input, the output is known in closed form from its value
-    at the first of them, so that only turning points are visited one by one (Krejčí,
-    "Hysteresis, Convexity and Dissipation in Hyperbolic Equations", 1996, section II.2).
+    A step clamps the output between xₙ − r and xₙ + r. Clamps one after the other are a clamp
+    again, so that stretches of the input are run side by side and then joined.
 
     Parameters
     ----------
@@ -36,8 +36,8 @@ def play(x: np.ndarray, half_width: float, memory: dict[str, Any]) -> np.ndarray
     half_width
         r, in the unit of the input.
     memory
-        Keeps the last input and output from one block to the next; empty before the first,
-        when the output is in the middle of its dead band.
+        Keeps the last output from one block to the next; empty before the first, when the output
+        is in the middle of its dead band.
 
     Returns
     -------
@@ -47,25 +47,18 @@ def play(x: np.ndarray, half_width: float, memory: dict[str, Any]) -> np.ndarray
     """
     if not half_width or not len(x):
         return x
-    inputs = np.concatenate([[memory.get('input', x[0])], x])
-    steps = np.diff(inputs)
-    rising = steps > 0
-    moves = np.flatnonzero(steps)
-    # A stretch begins where the sign of the motion changes; those at rest belong to the last.
-    turns = moves[np.flatnonzero(np.diff(rising[moves])) + 1] if len(moves) else moves
-    begins = np.concatenate([[0], turns]).astype(np.intp)
-    ends = np.concatenate([turns, [len(x)]]).astype(np.intp)
-    upward = np.zeros(len(begins), bool)
-    if len(moves):
-        upward[0], upward[1:] = rising[moves[0]], rising[turns]
+    length = ceil(np.sqrt(len(x)) / 3)
+    padded = np.concatenate([x, np.full(-len(x) % length, x[-1])])
+    stretches = np.ascontiguousarray(padded.reshape(-1, length).T)
+    # By place in each stretch: what the stretch has done to an output so far, as one clamp.
+    low, high = stretches - half_width, stretches + half_width
+    for n in range(1, length):
+        np.maximum(low[n], np.minimum(high[n], high[n - 1]), out=high[n])
+        np.maximum(low[n], np.minimum(high[n], low[n - 1]), out=low[n])
     at = memory.get('output', float(x[0]))
-    start = []
-    for last, up in zip(inputs[ends].tolist(), upward.tolist()):
-        start.append(at)
-        at = max(at, last - half_width) if up else min(at, last + half_width)
-    counts = ends - begins
-    held = np.repeat(start, counts)
-    up = np.repeat(upward, counts)
-    out = np.where(up, np.maximum(held, x - half_width), np.minimum(held, x + half_width))
-    memory['input'], memory['output'] = x[-1], at
-    return out
+    begin = []
+    for bottom, top in zip(low[-1].tolist(), high[-1].tolist()):
+        begin.append(at)
+        at = max(bottom, min(top, at))
+    memory['output'] = at
+    return np.maximum(low, np.minimum(high, begin)).T.ravel()[:len(x)]

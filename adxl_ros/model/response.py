@@ -206,6 +206,8 @@ class Response:
         """
         rc_s, rate_hz = np.array(signals.rc_s), self.sensor.rate_hz
         sigma = noise.analog_sigma_v(self.sensor)
+        if not sigma.any():
+            return np.zeros((len(stamps_s), len(sigma)))
         decay = np.array([np.exp(-1 / (rate_hz * rc)) if rc else 0.0 for rc in rc_s])
         passed = np.rint(np.diff(stamps_s, prepend=self._last_s) * rate_hz).astype(np.intp)
         passed = np.clip(passed, 1, 1 + ceil(50 * rc_s.max() * rate_hz))
