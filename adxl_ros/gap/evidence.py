@@ -30,6 +30,7 @@ from itertools import pairwise
 
 from adxl_ros.gap.whiten import Whitener
 import numpy as np
+from scipy.linalg import cho_solve
 
 BLOCKS = 48
 """Stretches that a recording is cut into, to hold some out."""
@@ -52,8 +53,8 @@ class Channel:
         Their sums over all blocks, (w, k+1, k+1).
     counts
         Samples by block, (b,).
-    log_priors, healthy
-        Of the walks, and whether a unit that does not wander may have them, (w,).
+    log_priors, needs
+        Of the filters, and the effect that the noise of each takes, '' for none, (w,).
 
     """
 
@@ -62,7 +63,7 @@ class Channel:
     whole: np.ndarray
     counts: np.ndarray
     log_priors: np.ndarray
-    healthy: np.ndarray
+    needs: np.ndarray
 
 
 def channel(residual: np.ndarray, columns: np.ndarray, ids: np.ndarray, used: np.ndarray,
@@ -95,7 +96,7 @@ def channel(residual: np.ndarray, columns: np.ndarray, ids: np.ndarray, used: np
     counts = np.add.reduceat(used, edges[:-1]).astype(float)
     return Channel(ids, grams, grams.sum(axis=1), counts,
                    np.array([f.log_prior for f in filters]),
-                   np.array([f.healthy for f in filters]))
+                   np.array(['' if f.healthy else f.drift for f in filters]))
 
 
 def bridged(data: np.ndarray, used: np.ndarray) -> np.ndarray:
@@ -115,6 +116,8 @@ class Fit:
     ----------
     ids, values, covariance
         Coefficients, (k,), (k,), (k, k).
+    held
+        Those that are as large as they may be, (k,); their covariance is none.
     log_evidence
         Of the samples, nats.
     walks, variance
@@ -125,14 +128,15 @@ class Fit:
     ids: np.ndarray
     values: np.ndarray
     covariance: np.ndarray
+    held: np.ndarray
     log_evidence: float
     walks: tuple[int, ...]
     variance: np.ndarray
 
 
-def fit(channels: Sequence[Channel], ids: Sequence[int], prior: np.ndarray,
-        blocks: np.ndarray | None = None, start: Fit | None = None, wanders: bool = False
-        ) -> Fit:
+def fit(channels: Sequence[Channel], ids: Sequence[int], prior: np.ndarray, most: np.ndarray,
+        blocks: np.ndarray | None = None, start: Fit | None = None,
+        wanders: Sequence[str] = ()) -> Fit:
     """
     Fit a hypothesis.
 
@@ -142,14 +146,15 @@ def fit(channels: Sequence[Channel], ids: Sequence[int], prior: np.ndarray,
         Axes of recordings.
     ids
         Columns of the hypothesis, nuisances among them.
-    prior
-        Standard deviation of each column's coefficient, by number, (all,).
+    prior, most
+        Standard deviation of each column's coefficient, and how large it may be, by number,
+        (all,) each.
     blocks
         Which blocks count, (b,); all of them unless given.
     start
         A fit with walks and variances near those of this one.
     wanders
-        The zero-g may wander more than that of a healthy unit.
+        Effects by which the zero-g may wander more than that of a healthy unit.
 
     """
     own = np.array(sorted(ids), int)
@@ -161,27 +166,46 @@ def fit(channels: Sequence[Channel], ids: Sequence[int], prior: np.ndarray,
         together = c.whole if blocks is None else c.grams[:, chosen].sum(axis=1)
         grams.append((np.searchsorted(own, c.ids[at]), together[:, rows[:, None], rows]))
         counts.append(max(float(c.counts[chosen].sum()), 1.0))
-    priors = [np.where(c.healthy | wanders | ~c.healthy.any(), c.log_priors, -np.inf)
-              for c in channels]
+    allowed = [np.isin(c.needs, ('', *wanders)) for c in channels]
+    priors = [np.where(may | ~may.any(), c.log_priors, -np.inf)
+              for c, may in zip(channels, allowed)]
     walks = list(start.walks) if start else [int(np.argmax(p)) for p in priors]
     variance = np.array([g[w, 0, 0] / n for (_, g), w, n in zip(grams, walks, counts)])
-    known = prior[own] ** -2.0
+    known, bound = prior[own] ** -2.0, most[own]
     for _ in range(_ROUNDS):
         precision, pull = np.diag(known), np.zeros(len(own))
         for (at, g), w, s2 in zip(grams, walks, variance):
             precision[np.ix_(at, at)] += g[w, 1:, 1:] / s2
             pull[at] += g[w, 1:, 0] / s2
-        factor = np.linalg.cholesky(precision)
-        values = np.linalg.solve(factor.T, np.linalg.solve(factor, pull))
+        values, held, covariance, factor = _bounded(precision, pull, bound)
         left = [_left(g, values[at]) for at, g in grams]
         walks = [int(np.argmax(-n / 2 * np.log(np.maximum(r, _TINY)) + p))
                  for r, n, p in zip(left, counts, priors)]
         variance = np.array([max(r[w], _TINY) / n for r, w, n in zip(left, walks, counts)])
     log_evidence = -0.5 * float(np.sum(known * values ** 2)) \
-        - float(np.log(np.diag(factor)).sum()) + 0.5 * float(np.log(known).sum())
+        - float(np.log(np.diag(factor)).sum()) + 0.5 * float(np.log(known[~held]).sum())
     for n, s2, w, c in zip(counts, variance, walks, channels):
         log_evidence += float(-n / 2 * (np.log(s2) + 1) + c.log_priors[w])
-    return Fit(own, values, np.linalg.inv(precision), log_evidence, tuple(walks), variance)
+    return Fit(own, values, covariance, held, log_evidence, tuple(walks), variance)
+
+
+def _bounded(precision: np.ndarray, pull: np.ndarray, bound: np.ndarray
+             ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Solve for values within bounds; give which are held, the others' covariance and factor."""
+    values, held = np.zeros(len(bound)), np.zeros(len(bound), bool)
+    while True:
+        free = ~held
+        factor = np.linalg.cholesky(precision[np.ix_(free, free)])
+        values[free] = cho_solve((factor, True), (pull - precision @ np.where(held, values, 0.0))[
+            free])
+        beyond = np.abs(values) > bound * (1 + 1e-9)
+        if not beyond.any():
+            break
+        values[beyond] = np.sign(values[beyond]) * bound[beyond]
+        held |= beyond
+    covariance = np.zeros_like(precision)
+    covariance[np.ix_(free, free)] = cho_solve((factor, True), np.eye(int(free.sum())))
+    return values, held, covariance, factor
 
 
 def _left(grams: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -214,13 +238,33 @@ def predicted(channels: Sequence[Channel], found: Fit, blocks: np.ndarray) -> np
     """Return the log-likelihood of blocks that were not fitted, nats, by block, (b,)."""
     out = np.zeros(len(blocks))
     for c, w, s2 in zip(channels, found.walks, found.variance):
-        at = np.flatnonzero(np.isin(c.ids, found.ids))
-        v = np.zeros(len(c.ids) + 1)
-        v[0] = 1.0
-        v[1 + at] = -found.values[np.searchsorted(found.ids, c.ids[at])]
-        left = np.einsum('i,bij,j->b', v, c.grams[w][blocks], v)
+        left = _by_block(c, found, w)[blocks]
         out += -0.5 * (left / s2 + c.counts[blocks] * np.log(s2))
     return out
+
+
+def uneven(channels: Sequence[Channel], found: Fit) -> float:
+    """
+    Return how unlike each other the blocks are: 1 where the noise is the same in all of them.
+
+    The rms, over blocks, of what each block's squares depart from the mean by, in standard
+    deviations of such a sum of white noise; of the channel where it is largest.
+    """
+    most = 0.0
+    for c, w, s2 in zip(channels, found.walks, found.variance):
+        counts = np.maximum(c.counts, 1.0)
+        depart = (_by_block(c, found, w) / (s2 * counts) - 1) * np.sqrt(counts / 2)
+        most = max(most, float(np.sqrt(np.mean(depart[c.counts > 0] ** 2))))
+    return most
+
+
+def _by_block(c: Channel, found: Fit, walk: int) -> np.ndarray:
+    """Return the squares that a fit leaves, by block, (b,)."""
+    at = np.flatnonzero(np.isin(c.ids, found.ids))
+    v = np.zeros(len(c.ids) + 1)
+    v[0] = 1.0
+    v[1 + at] = -found.values[np.searchsorted(found.ids, c.ids[at])]
+    return np.einsum('i,bij,j->b', v, c.grams[walk], v)
 
 
 def lost(channels: Sequence[Channel], found: Fit, values: np.ndarray, prior: np.ndarray
@@ -246,6 +290,8 @@ def lost(channels: Sequence[Channel], found: Fit, values: np.ndarray, prior: np.
     for c, w, s2 in zip(channels, found.walks, found.variance):
         at = np.searchsorted(found.ids, c.ids)
         precision[np.ix_(at, at)] += c.whole[w, 1:, 1:] / s2
-    own, across, rest = precision[:count, :count], precision[:count, count:], \
-        precision[count:, count:]
+    free = np.flatnonzero(~found.held)
+    free = free[free >= count]
+    own, across, rest = precision[:count, :count], precision[:count, free], \
+        precision[np.ix_(free, free)]
     return 0.5 * float(off @ (own - across @ np.linalg.solve(rest, across.T)) @ off)

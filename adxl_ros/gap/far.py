@@ -30,7 +30,7 @@ from adxl_ros.gap.floor import Floor
 from adxl_ros.gap.local import Hypothesis, local
 from adxl_ros.gap.series import Series
 from adxl_ros.gap.study import Study
-from adxl_ros.gap.whiten import USUAL_G_PER_RTS
+from adxl_ros.gap.whiten import USUAL
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.sensor import Sensor
 import numpy as np
@@ -140,7 +140,7 @@ def _by_block(series: Series, used: np.ndarray, sensor: Sensor, blocks: np.ndarr
     fitted = used & np.repeat(blocks, np.diff(edges))
     if fitted.any():
         span_s = float(series.time_s[-1] - series.time_s[0])
-        drift = USUAL_G_PER_RTS ** 2 * span_s / 6 * series.sensor.scale_v_per_g ** 2
+        drift = USUAL ** 2 * span_s / 6 * series.sensor.scale_v_per_g ** 2
         known = np.array([np.inf if free else of.tolerance(f'bias.offset_v.{axis}')
                           for axis in series.sensor.axes]) ** 2
         off = off - off[fitted].mean(axis=0) / (1 + drift / known)

@@ -22,9 +22,9 @@ from dataclasses import dataclass, replace
 from adxl_ros.gap import evidence
 from adxl_ros.gap.evidence import Channel, Fit
 from adxl_ros.gap.series import Series
-from adxl_ros.gap.study import Study, WANDERING
+from adxl_ros.gap.study import BEYOND, STRAIGHT, straight, Study
 from adxl_ros.gap.tangents import WIDE
-from adxl_ros.gap.whiten import near
+from adxl_ros.gap.whiten import drifts_among, near
 from adxl_ros.model.coefficients import get, names_of, parameter_of, put, with_neutral
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Parameter
@@ -33,7 +33,6 @@ import numpy as np
 
 _STEPS = 5
 _CHANGED = 1e-3
-_BEYOND = 4.0
 _GAINS = 0.05
 """A step that gains less, in nats, is the last."""
 
@@ -55,6 +54,8 @@ class Hypothesis:
         Nats.
     fit
         The last linear step.
+    uneven
+        Of what it leaves; see `evidence.uneven`.
 
     """
 
@@ -65,6 +66,7 @@ class Hypothesis:
     std: np.ndarray
     log_evidence: float
     fit: Fit
+    uneven: float
 
 
 @dataclass(frozen=True)
@@ -99,17 +101,20 @@ class Local:
     values: np.ndarray
     channels: list[Channel]
 
-    def fit(self, blocks: np.ndarray | None = None) -> Fit:
+    def fit(self, blocks: np.ndarray | None = None, wanders: Sequence[str] = ()) -> Fit:
         """Fit all coefficients to some blocks, all unless given, (b,)."""
-        return evidence.fit(self.channels, range(len(self.names)), self.prior, blocks,
-                            wanders=WANDERING in self.sensor.effects)
+        return evidence.fit(self.channels, range(len(self.names)), self.prior, self.most, blocks,
+                            wanders=(*wanders, *drifts_among(self.sensor.effects)))
+
+    @property
+    def most(self) -> np.ndarray:
+        """How large coefficients may be: a healthy unit stays within its tolerance, (k,)."""
+        own = np.arange(len(self.names)) < len(self.values)
+        return np.where(own, np.inf, BEYOND * self.prior)
 
     def fitted(self, found: Fit, moved: bool = True) -> Sensor:
         """Return the sensor after a fit, within bounds; the effects as they are if not moved."""
-        off, own = found.values, len(self.values)
-        # A healthy unit stays within its tolerance; what goes beyond is an effect.
-        within = np.clip(off[own:], -_BEYOND * self.prior[own:], _BEYOND * self.prior[own:])
-        values = self.middle + np.concatenate([off[:own], within])
+        values = self.middle + found.values
         if not moved:
             values[:len(self.values)] = self.values
         return put(self.sensor, self.names, _within(self.names, values))
@@ -154,6 +159,8 @@ def local(of: Study, effects: Sequence[str], sensor: Sensor,
     prior = [p.scale * (1 if bent(p) else WIDE) for p in parameters]
     names = [*own, *free]
     channels: list[Channel] = []
+    lines: list[dict[int, np.ndarray]] = []
+    does: list[list[tuple[int, np.ndarray]]] = []
     count = len(names)
     for number, (one, mask) in enumerate(zip(of.series, of.used)):
         more = beside[number] if beside else np.zeros((len(one), 0))
@@ -165,6 +172,8 @@ def local(of: Study, effects: Sequence[str], sensor: Sensor,
                   if len(n.split('.')) == 2 or held.axes.index(n.split('.')[2]) == d]
             known = of.free[len(channels)]
             also = [n for n in free if n in known]
+            lines.append({names.index(n): known[n] for n in also if n.split('.')[0] in STRAIGHT})
+            does.append([(0, there[:, d] - of.base[number][:, d])])
             design = columns[:, d, at]
             residual = one.volts[:, d] - there[:, d] + design @ (values - middle)[at]
             tried = of.filters[len(channels)]
@@ -174,8 +183,11 @@ def local(of: Study, effects: Sequence[str], sensor: Sensor,
                           *range(count, count + more.shape[1])], int), mask,
                 tried if noise is None else near(tried, noise[len(channels)])))
             count += more.shape[1]
+    looks = straight(lines, does, 1)
+    prior += [float(np.hypot(of.tolerance(n), looks[i][0] if i in looks else 0.0))
+              for i, n in enumerate(free, len(own))]
     return Local(tuple(effects), sensor, tuple(names), np.concatenate([middle, get(held, free)]),
-                 np.array([*prior, *(of.tolerance(n) for n in free)]), values, channels)
+                 np.array(prior), values, channels)
 
 
 def bent(p: Parameter) -> bool:
@@ -236,14 +248,15 @@ def refined(of: Study, effects: Sequence[str], start: dict[str, float],
     reached, here, found = best
     own = slice(len(here.values))
     fitted = here.fitted(found, False)
-    if WANDERING in effects:
-        walks = [f[w].walk_g_per_rts for f, w in zip(of.filters, found.walks)]
-        fitted = replace(fitted, values={**fitted.values, WANDERING: {
-            'density_g_per_rts': np.array(walks[:len(fitted.axes)])}})
+    for drift in drifts_among(effects):
+        chosen = [f[w] for f, w in zip(of.filters, found.walks)][:len(fitted.axes)]
+        fitted = replace(fitted, values={**fitted.values, drift: {
+            effect_named(drift).parameters[0].name: np.array([
+                f.density if f.drift == drift else 0.0 for f in chosen])}})
     return Hypothesis(effects, fitted, here.names[own],
                       here.values - here.middle[own],
                       evidence.robust_std(here.channels, found, here.prior)[own], reached,
-                      found)
+                      found, evidence.uneven(here.channels, found))
 
 
 def _within(names: Sequence[str], values: np.ndarray) -> np.ndarray:

@@ -16,16 +16,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 from adxl_ros.gap.floor import runs
 from adxl_ros.gap.series import Series
-from adxl_ros.gap.whiten import HEALTHY_G_PER_RTS
+from adxl_ros.gap.whiten import HEALTHY
 from adxl_ros.model import noise
 from adxl_ros.model.sensor import Sensor
 import numpy as np
-from scipy.optimize import minimize
 from scipy.signal import lfilter, periodogram
 from scipy.stats import norm
 
@@ -37,8 +35,6 @@ _SPIKE_SIGMA = 7.0
 _EXCESS = 1.2
 """Noise density by the stated one: units differ by less."""
 _STEPS = 1.6
-_DRIFT_G = 8e-4
-"""Wandering of the zero-g over the recording, rms, that a healthy unit does not reach."""
 _NEAREST, _FEWEST = 2, 500
 _CALM_S = 10.0
 _REST_S, _FEWEST_RESTS = 1.0, 4
@@ -278,45 +274,6 @@ def _local_level(power: np.ndarray, width: int = 201) -> np.ndarray:
     return np.interp(np.arange(len(power)), (np.arange(count) + 0.5) * width, level)
 
 
-def drift(residual_v: np.ndarray, used: np.ndarray, series: Series) -> Sign | None:
-    """
-    Tell flicker from a wandering zero-g by the slope of the spectrum at low frequencies.
-
-    Parameters are those of `of_residual`; None where it wanders too little to tell.
-    """
-    sensor = series.sensor
-    data = _filled(residual_v, used)
-    scale = sensor.scale_v_per_g
-    seconds = data[:len(data) // round(sensor.rate_hz) * round(sensor.rate_hz)]
-    means = seconds.reshape(-1, round(sensor.rate_hz), data.shape[1]).mean(axis=1) / scale
-    if len(means) < 50:
-        return None
-    wander = np.median(np.std(_smooth(means), axis=0))
-    if wander < _DRIFT_G:
-        return None
-    step = np.diff(means, axis=0)
-    frequency, power = periodogram(step, 1.0, 'hann', axis=0)
-    frequency, power = frequency[1:], power[1:].mean(axis=1)
-    shape = 2 * (1 - np.cos(2 * np.pi * frequency))
-    fits = {}
-    for name, slope in (('flicker', 1.0), ('bias_walk', 2.0)):
-        def cost(x: np.ndarray, slope: float = slope) -> float:
-            model = shape * (np.exp(x[0]) + np.exp(x[1]) * frequency ** -slope)
-            return float(np.sum(power / model + np.log(model)))
-        start = np.log([np.median(power / shape) / 2, np.median(power / shape) / 20])
-        fits[name] = minimize(cost, start, method='Nelder-Mead')
-    name = min(fits, key=lambda n: fits[n].fun)
-    level = float(np.sqrt(np.exp(fits[name].x[1])))
-    count = len(sensor.axes)
-    if name == 'flicker':
-        values = {'density_g_per_rthz': np.full(count, level)}
-        words = f'1/f noise of {level * 1e6:.3g} µg/√Hz at 1 Hz'
-    else:
-        values = {'density_g_per_rts': np.full(count, level * 2 * np.pi / np.sqrt(2))}
-        words = f'the zero-g wanders by {wander * 1e3:.2g} mg'
-    return Sign(name, values, abs(fits['flicker'].fun - fits['bias_walk'].fun), words)
-
-
 def wanders_at_rest(series: Series, used: np.ndarray) -> bool:
     """
     Tell whether the zero-g wanders while nothing moves, more than that of a healthy unit.
@@ -339,18 +296,8 @@ def wanders_at_rest(series: Series, used: np.ndarray) -> bool:
         squares.append(((last - first) / series.sensor.scale_v_per_g) ** 2)
         independent = np.array([noise.effective_samples(half, 1 / rate, rc) for rc in rc_s])
         expected.append(2 * sigma_g ** 2 / independent
-                        + HEALTHY_G_PER_RTS ** 2 * half / rate * 2 / 3)
+                        + HEALTHY['bias_walk'] ** 2 * half / rate * 2 / 3)
     if len(squares) < _FEWEST_RESTS:
         return False
     spread = 2 * np.sqrt(2 / np.size(squares))
     return bool(np.mean(np.array(squares) / np.array(expected)) > 1.5 + spread)
-
-
-def _smooth(means: np.ndarray, width: int = 5) -> np.ndarray:
-    kernel = np.ones(width) / width
-    return np.column_stack([np.convolve(m, kernel, 'valid') for m in means.T])
-
-
-def loudest(signs: Sequence[Sign]) -> Sign | None:
-    """Return the sign that says most."""
-    return max(signs, key=lambda sign: sign.nats, default=None)

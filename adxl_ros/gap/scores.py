@@ -65,7 +65,7 @@ def scores(of: Study, seed: int) -> dict[str, Score]:
         Of the draws.
 
     """
-    none = fit(of.channels, of.nuisances(), of.priors(()))
+    none = fit(of.channels, of.nuisances(), *of.priors(()))
     count = len(of.names)
     gram, pull = np.zeros((count, count)), np.zeros(count)
     for c, walk, variance in zip(of.channels, none.walks, none.variance):
@@ -73,7 +73,7 @@ def scores(of: Study, seed: int) -> dict[str, Score]:
         gram[np.ix_(c.ids, c.ids)] += whole[1:, 1:]
         pull[c.ids] += whole[1:, 0]
     nuisances = np.array(of.nuisances())
-    held = gram[np.ix_(nuisances, nuisances)] + np.diag(of.priors(())[nuisances] ** -2.0)
+    held = gram[np.ix_(nuisances, nuisances)] + np.diag(of.priors(())[0][nuisances] ** -2.0)
     taken = np.linalg.solve(held, gram[nuisances]).T
     left = gram - taken @ gram[nuisances]
     pull = pull - taken @ pull[nuisances]

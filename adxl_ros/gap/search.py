@@ -27,17 +27,19 @@ from itertools import combinations
 
 from adxl_ros.errors import UserError
 from adxl_ros.gap.evidence import Fit
-from adxl_ros.gap.local import Hypothesis, refined
+from adxl_ros.gap.local import Hypothesis, local, refined
 from adxl_ros.gap.noise_like import wanders_at_rest
-from adxl_ros.gap.study import on_tangents, Study, study, TOLERANCE, WANDERING
+from adxl_ros.gap.study import on_tangents, STRAIGHT, Study, study, TOLERANCE
 from adxl_ros.gap.tangents import Variant
-from adxl_ros.model.coefficients import parameter_of
+from adxl_ros.gap.whiten import DRIFTS, drifts_among
+from adxl_ros.model.coefficients import parameter_of, with_neutral
 import numpy as np
 
 MOST_EFFECTS = 3
 _REFINED, _PAIRED = 8, 8
 _WORTH = 5.0
 """Nats that a hypothesis must gain on tangents to be fitted in full."""
+_UNEVEN = 1.4
 
 
 def search(of: Study, show: Callable[[float], None]) -> list[Hypothesis]:
@@ -59,7 +61,8 @@ def search(of: Study, show: Callable[[float], None]) -> list[Hypothesis]:
     none = on_tangents(of, [])
     singles = _ranked(of, [(i,) for i in range(len(of.variants))], none)
     _refine(of, singles[:_REFINED], none, found)
-    if any(wanders_at_rest(one, mask) for one, mask in zip(of.series, of.used)):
+    at_rest = any(wanders_at_rest(one, mask) for one, mask in zip(of.series, of.used))
+    if at_rest:
         _wandering(of, found)
     show(0.3)
     best = _best(found)
@@ -73,6 +76,9 @@ def search(of: Study, show: Callable[[float], None]) -> list[Hypothesis]:
         best = _best(found)
         if 1 < len(best.effects) < MOST_EFFECTS:
             _forward(of, best, found)
+    _less(of, _best(found), found)
+    if not at_rest and _drifts(of, _best(found)):
+        _wandering(of, found)
     show(1.0)
     return sorted(found.values(), key=lambda h: -h.log_evidence)
 
@@ -81,24 +87,48 @@ def _best(found: dict[tuple[str, ...], Hypothesis]) -> Hypothesis:
     return max(found.values(), key=lambda h: h.log_evidence)
 
 
+def _drifts(of: Study, best: Hypothesis) -> bool:
+    """Tell whether what a hypothesis leaves is likelier with a zero-g that wanders."""
+    here = local(of, best.effects, best.sensor)
+    return here.fit(wanders=DRIFTS).log_evidence - here.fit().log_evidence > _WORTH
+
+
 def _wandering(of: Study, found: dict[tuple[str, ...], Hypothesis]) -> None:
-    """Let the zero-g wander, alone, beside the best so far, and beside what is best with it."""
+    """
+    Let the zero-g wander, alone, beside the best so far, and beside what is best with it.
+
+    Such noise is the same all the time; what shows in some stretches more than in others is not
+    that.
+    """
     ranked = sorted(found.values(), key=lambda h: -h.log_evidence)
-    for h in [h for h in ranked if h.effects][:_REFINED // 2]:
-        start = dict(zip(h.names, h.values))
-        one = _resimulated(of, (*h.effects, WANDERING), start, {})
-        if one is not None:
-            found[one.effects] = one
-    drifting = on_tangents(of, [], None, True)
-    alone = refined(of, (WANDERING,), {}, {})
-    found[alone.effects] = alone
-    beside = _ranked(of, [(i,) for i in range(len(of.variants))], drifting, True)
-    _refine(of, beside[:_REFINED // 2], drifting, found, (WANDERING,))
+    several = [h for h in ranked if 0 < len(h.effects) < MOST_EFFECTS][:_REFINED // 2]
+    for drift in DRIFTS:
+        for h in several:
+            start = dict(zip(h.names, h.values))
+            one = _resimulated(of, (*h.effects, drift), start, {})
+            if one is not None:
+                found[one.effects] = one
+        drifting = on_tangents(of, [], None, (drift,))
+        alone = refined(of, (drift,), {}, {})
+        found[alone.effects] = alone
+        beside = _ranked(of, [(i,) for i in range(len(of.variants))], drifting, (drift,))
+        _refine(of, beside[:_REFINED // 2], drifting, found, (drift,))
+    for h in list(found.values()):
+        if drifts_among(h.effects) and h.uneven > _UNEVEN:
+            del found[h.effects]
 
 
 def around(of: Study, best: Hypothesis) -> Study:
-    """Return the study about a hypothesis: residuals and tangents at its fit."""
-    there = [replace(one, sensor=replace(best.sensor, rate_hz=one.sensor.rate_hz))
+    """
+    Return the study about a hypothesis: residuals and tangents at its fit.
+
+    Filter and latency stay where the file has them, so that they are as free as before.
+    """
+    at_file = with_neutral(of.series[0].sensor, best.sensor.effects).values
+    kept = (*best.effects, *STRAIGHT)
+    values = {effect: at_file[effect] if effect in TOLERANCE and effect not in kept
+              else of_effect for effect, of_effect in best.sensor.values.items()}
+    there = [replace(one, sensor=replace(best.sensor, values=values, rate_hz=one.sensor.rate_hz))
              for one in of.series]
     return study(there, of.used, lambda done: None, best.fit.walks)
 
@@ -107,20 +137,20 @@ def _forward(of: Study, best: Hypothesis, found: dict[tuple[str, ...], Hypothesi
     """Add one effect more to a hypothesis: on tangents about it, then in full."""
     there = around(of, best)
     own = [i for i, v in enumerate(there.variants) if v.effect in best.effects]
-    wanders = WANDERING in best.effects
+    wanders = drifts_among(best.effects)
     alone = on_tangents(there, own, None, wanders)
     gains = []
     for i, more in enumerate(there.variants):
-        if more.effect in best.effects or more.effect in TOLERANCE:
+        if more.effect in best.effects:
             continue
         fit = on_tangents(there, [*own, i], alone, wanders)
         gains.append((fit.log_evidence - alone.log_evidence, i, fit))
-    base = {v.effect: k for k, v in enumerate(of.variants)}
+    base = {v.effect for v in of.variants}
     for gain, i, fit in sorted(gains, key=lambda one: -one[0])[:_REFINED // 2]:
         if gain < _WORTH:
             break
         effects = (*best.effects, there.variants[i].effect)
-        if not all(e in base or e == WANDERING for e in effects):
+        if not all(e in base or e in DRIFTS for e in effects):
             continue
         start = dict(zip(best.names, best.values))
         start |= {there.names[k]: v for k, v in zip(fit.ids, fit.values)
@@ -132,8 +162,20 @@ def _forward(of: Study, best: Hypothesis, found: dict[tuple[str, ...], Hypothesi
             found[one.effects] = one
 
 
+def _less(of: Study, best: Hypothesis, found: dict[tuple[str, ...], Hypothesis]) -> None:
+    """Leave out each effect of a hypothesis: the first that was found may have been a stand-in."""
+    start = dict(zip(best.names, best.values))
+    known = {frozenset(effects) for effects in found}
+    for effect in best.effects:
+        fewer = tuple(e for e in best.effects if e != effect)
+        if frozenset(fewer) not in known:
+            one = _resimulated(of, fewer, start, {})
+            if one is not None:
+                found[one.effects] = one
+
+
 def _ranked(of: Study, sets: Sequence[tuple[int, ...]], none: Fit,
-            wanders: bool = False) -> list[tuple[float, tuple[int, ...], Fit]]:
+            wanders: Sequence[str] = ()) -> list[tuple[float, tuple[int, ...], Fit]]:
     """Fit sets of variants on tangents; the best of each set of effects, the best first."""
     best: dict[frozenset[str], tuple[float, tuple[int, ...], Fit]] = {}
     for chosen in sets:

@@ -18,12 +18,13 @@ Recordings of one unit beside the baseline, differentiated by the whole library.
 Some coefficients are never exactly those of the file: zero-g and scale factor age, the resistor
 and capacitor of the filter have tolerances, stamps have a latency. They are free in every
 hypothesis, within what a healthy unit shows, so that they neither steal from an effect nor lend
-to it, and are only named where they go beyond that.
+to it, and are only named where they go beyond that. Whatever an effect does in a straight line,
+calibration has taken up, or not: zero-g and scale factor are as free as that beside it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 from adxl_ros.gap import evidence, whiten
@@ -32,11 +33,13 @@ from adxl_ros.gap.series import Series
 from adxl_ros.gap.tangents import candidates, Variant, variants
 import numpy as np
 
-WANDERING = 'bias_walk'
-"""The effect that lets the noise of a hypothesis drift more than that of a healthy unit."""
-TOLERANCE = {'bias': 5e-4, 'scale_factor': 5e-4, 'bandwidth': 0.02, 'time_offset': 1e-4}
+TOLERANCE = {'bias': 2.5e-4, 'scale_factor': 2.5e-4, 'bandwidth': 0.02, 'time_offset': 1e-4}
 """What a healthy unit shows from day to day, beside the file's covariance, as standard deviations:
 zero-g in g, scale factor, resistance of the filter, and latency of the stamps in s."""
+STRAIGHT = ('bias', 'scale_factor')
+"""Of these, what a straight line is made of."""
+BEYOND = 4.0
+"""So many of these, and the unit is not healthy: it takes an effect."""
 
 
 @dataclass(frozen=True)
@@ -46,8 +49,8 @@ class Study:
 
     Attributes
     ----------
-    series, used
-        Recordings, and the samples of each that count.
+    series, used, base
+        Recordings, the samples of each that count, and what the baseline says, V, (n, m).
     variants, ids
         Of the library, and the numbers of their columns.
     names, prior
@@ -58,11 +61,15 @@ class Study:
         That whiten, by channel.
     free
         By channel: what is free in every hypothesis, and its columns, volts a unit, (n,).
+    straight
+        By coefficient of zero-g and scale factor: how much of it a unit of each column looks like,
+        (all,).
 
     """
 
     series: list[Series]
     used: list[np.ndarray]
+    base: list[np.ndarray]
     variants: list[Variant]
     ids: list[list[int]]
     names: list[str]
@@ -70,18 +77,29 @@ class Study:
     channels: list[Channel]
     filters: list[list[whiten.Whitener]] = field(default_factory=list)
     free: list[dict[str, np.ndarray]] = field(default_factory=list)
+    straight: dict[str, np.ndarray] = field(default_factory=dict)
 
     def nuisances(self) -> list[int]:
         """Return the numbers of the columns of what is free in every hypothesis."""
         return [i for v, of in zip(self.variants, self.ids) if v.effect in TOLERANCE for i in of]
 
-    def priors(self, chosen: Iterable[str]) -> np.ndarray:
-        """Return prior deviations where only the chosen effects go beyond their tolerance."""
-        prior = self.prior.copy()
+    def priors(self, chosen: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+        """
+        Return prior deviations of all columns, and how large each may be.
+
+        Only the chosen variants, by number, go beyond the tolerance of a healthy unit.
+        """
+        prior, most = self.prior.copy(), np.full(len(self.prior), np.inf)
+        effects = {self.variants[i].effect for i in chosen}
+        columns = [k for i in chosen for k in self.ids[i]]
         for i in self.nuisances():
-            if self.names[i].split('.')[0] not in chosen:
-                prior[i] = self.tolerance(self.names[i])
-        return prior
+            name = self.names[i]
+            if name.split('.')[0] not in effects:
+                looks = self.straight.get(name, np.zeros(len(prior)))[columns] * prior[columns]
+                prior[i] = np.hypot(self.tolerance(name), np.sqrt(np.sum(looks ** 2)))
+                # How large the chosen are is not known yet, nor is their straight part.
+                most[i] = np.inf if np.any(looks) else BEYOND * prior[i]
+        return prior, most
 
     def tolerance(self, name: str) -> float:
         """
@@ -90,7 +108,7 @@ class Study:
         Where the sensor rests, its pose is not known, so that only changes of zero-g tell.
         """
         effect, *_, axis = name.split('.')
-        if effect not in ('bias', 'scale_factor'):
+        if effect not in STRAIGHT:
             return TOLERANCE[effect]
         sensor = self.series[0].sensor
         scale = float(sensor.scale_v_per_g[sensor.axes.index(axis)])
@@ -125,8 +143,8 @@ def study(series: Sequence[Series], used: Sequence[np.ndarray],
     """
     every: dict[tuple, dict[int, Variant]] = {}
     effects = [e for e in candidates() if only is None or e.name in (*only, *TOLERANCE)]
-    for i, one in enumerate(series):
-        base = one.simulated(one.sensor)
+    bases = [one.simulated(one.sensor) for one in series]
+    for i, (one, base) in enumerate(zip(series, bases)):
         for k, effect in enumerate(effects):
             for found in variants(one, effect, base):
                 key = (found.effect, tuple(found.shape.items()), found.size)
@@ -164,12 +182,52 @@ def study(series: Sequence[Series], used: Sequence[np.ndarray],
                 np.array([i for i, _ in of_axis]), mask, filters[-1]))
     free = [{names[i]: column for i, column in of_axis if names[i].split('.')[0] in TOLERANCE}
             for of_series in columns for of_axis in of_series]
-    return Study(list(series), list(used), kept, ids, names, np.array(prior), channels, filters,
-                 free)
+    looks = straight([{names.index(name): column for name, column in of.items()
+                       if name.split('.')[0] in STRAIGHT} for of in free],
+                     [of_axis for of_series in columns for of_axis in of_series], len(names))
+    return Study(list(series), list(used), bases, kept, ids, names, np.array(prior), channels,
+                 filters, free, {names[i]: of for i, of in looks.items()})
+
+
+def straight(lines: Sequence[dict[int, np.ndarray]],
+             columns: Sequence[Sequence[tuple[int, np.ndarray]]], count: int
+             ) -> dict[int, np.ndarray]:
+    """
+    Say how much of a straight line columns look like, by least squares.
+
+    Parameters
+    ----------
+    lines
+        By channel: number and column, (n,), of what makes the line.
+    columns
+        By channel: numbers, below `count`, and columns, (n,).
+    count
+        Of the columns.
+
+    Returns
+    -------
+    dict
+        By number of what makes the line: its amount a unit of each column, (count,).
+
+    """
+    grams: dict[tuple[int, ...], np.ndarray] = {}
+    pulls: dict[tuple[int, ...], np.ndarray] = {}
+    for line, of in zip(lines, columns):
+        if not line or not of:
+            continue
+        key, matrix = tuple(line), np.column_stack(list(line.values()))
+        grams[key] = grams.get(key, 0.0) + matrix.T @ matrix
+        pull = pulls.setdefault(key, np.zeros((len(line), count)))
+        for i, column in of:
+            pull[:, i] += matrix.T @ column
+    out: dict[int, np.ndarray] = {}
+    for key, gram in grams.items():
+        out |= dict(zip(key, np.linalg.lstsq(gram, pulls[key])[0]))
+    return out
 
 
 def on_tangents(of: Study, chosen: Sequence[int], start: Fit | None = None,
-                wanders: bool = False) -> Fit:
+                wanders: Sequence[str] = ()) -> Fit:
     """
     Fit a set of variants, by number, on the tangents at the baseline.
 
@@ -182,9 +240,10 @@ def on_tangents(of: Study, chosen: Sequence[int], start: Fit | None = None,
     start
         A fit with noise like that of this one.
     wanders
-        Whether the zero-g may wander more than that of a healthy unit.
+        Effects by which the zero-g may wander more than that of a healthy unit, beside those of
+        the baseline.
 
     """
-    effects = [of.variants[i].effect for i in chosen]
+    wanders = (*wanders, *whiten.drifts_among(of.series[0].sensor.effects))
     ids = set(of.nuisances()).union(*(of.ids[i] for i in chosen))
-    return evidence.fit(of.channels, sorted(ids), of.priors(effects), None, start, wanders)
+    return evidence.fit(of.channels, sorted(ids), *of.priors(chosen), None, start, wanders)

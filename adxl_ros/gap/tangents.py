@@ -22,7 +22,7 @@ from dataclasses import dataclass, field, replace
 from adxl_ros.errors import UserError
 from adxl_ros.gap.series import Series
 from adxl_ros.model.coefficients import names_of, parameter_of, put, with_neutral
-from adxl_ros.model.effects import effect_named, library
+from adxl_ros.model.effects import library
 from adxl_ros.model.effects.base import Effect, Parameter
 from adxl_ros.model.sensor import Sensor
 import numpy as np

@@ -26,10 +26,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from adxl_ros.gap import evidence
+from adxl_ros.gap.evidence import Fit
 from adxl_ros.gap.local import Hypothesis, local
 from adxl_ros.gap.past import direction, since_move_s
 from adxl_ros.gap.series import Series
-from adxl_ros.gap.study import Study, WANDERING
+from adxl_ros.gap.study import Study
+from adxl_ros.gap.whiten import drifts_among
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.filters import low_pass
 from adxl_ros.model.stage import specific_force
@@ -39,6 +41,8 @@ from scipy.interpolate import BSpline
 _CREEP_S = (2.0, 10.0, 50.0)
 PRIOR_G = 2e-3
 """Standard deviation of what one basis function does."""
+UNKNOWN_NATS = 15.0
+"""Gain of a flexible term that shows something to be there."""
 
 
 @dataclass(frozen=True)
@@ -67,25 +71,28 @@ def discrepancy(of: Study, best: Hypothesis) -> Discrepancy:
     bases = [flexible(one) for one in of.series]
     here = local(of, best.effects, best.sensor,
                  [np.column_stack(list(basis.values())) for basis in bases], best.fit.walks)
-    own, sd = list(range(len(here.names))), list(here.prior)
+    own, sd, most = list(range(len(here.names))), list(here.prior), list(here.most)
     kinds: dict[str, list[int]] = {}
     for one, basis in zip(of.series, bases):
         for scale in one.sensor.scale_v_per_g:
             for kind, columns in basis.items():
                 kinds.setdefault(kind, []).extend(range(len(sd), len(sd) + columns.shape[1]))
                 sd += [PRIOR_G * float(scale)] * columns.shape[1]
-    prior = np.array(sd)
-    wanders = WANDERING in best.effects
-    alone = evidence.fit(here.channels, own, prior, wanders=wanders)
-    gains = {kind: evidence.fit(here.channels, [*own, *ids], prior, None, alone, wanders
-                                ).log_evidence
-             - alone.log_evidence for kind, ids in kinds.items()}
+                most += [np.inf] * columns.shape[1]
+
+    def fit(ids: Sequence[int], start: Fit | None = None) -> Fit:
+        return evidence.fit(here.channels, ids, np.array(sd), np.array(most), None, start,
+                            drifts_among(best.sensor.effects))
+
+    alone = fit(own)
+    gains = {kind: fit([*own, *ids], alone).log_evidence - alone.log_evidence
+             for kind, ids in kinds.items()}
     kept = [kind for kind, gain in gains.items() if gain > 0]
     if not kept:
         return Discrepancy(0.0, 0.0, gains)
     chosen = [*own, *(i for kind in kept for i in kinds[kind])]
-    whole = evidence.fit(here.channels, chosen, prior, None, alone, wanders)
-    value = np.zeros(len(prior))
+    whole = fit(chosen, alone)
+    value = np.zeros(len(sd))
     value[whole.ids] = whole.values
     return Discrepancy(whole.log_evidence - alone.log_evidence,
                        _rms(of, bases, value[len(own):]), gains)

@@ -28,8 +28,9 @@ from dataclasses import dataclass, replace
 from adxl_ros.gap.far import Shrunk
 from adxl_ros.gap.local import Hypothesis
 from adxl_ros.gap.noise_like import Sign
-from adxl_ros.gap.study import Study, TOLERANCE, WANDERING
-from adxl_ros.gap.unknown import Discrepancy
+from adxl_ros.gap.study import Study, TOLERANCE
+from adxl_ros.gap.unknown import Discrepancy, UNKNOWN_NATS
+from adxl_ros.gap.whiten import DRIFTS, drifts_among
 from adxl_ros.model.coefficients import neutral
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects import effect_named
@@ -51,7 +52,6 @@ TAKEN = 0.006
 RIVAL = 0.05
 """A rival more probable than this cannot be told apart."""
 CERTAIN = 0.5
-UNKNOWN_NATS = 15.0
 UNKNOWN_OF_GAP, UNKNOWN_OF_NOISE = 0.3, 0.12
 """What a flexible term must find, by the rms of the gap and of the noise, to be unknown."""
 UNKNOWN_LEFT = 0.2
@@ -95,8 +95,8 @@ class Verdict:
 
 def contribution_mps2(of: Study, found: Hypothesis, effect: str) -> float:
     """Return what one effect of a hypothesis makes, rms about its mean, m/s²."""
-    if effect == WANDERING:
-        return _wandered_mps2(of, found)
+    if effect in DRIFTS:
+        return _wandered_mps2(of, found, effect)
     library = effect_named(effect)
     squares, count = 0.0, 0
     for one, mask in zip(of.series, of.used):
@@ -110,11 +110,18 @@ def contribution_mps2(of: Study, found: Hypothesis, effect: str) -> float:
     return float(np.sqrt(squares / max(count, 1)))
 
 
-def _wandered_mps2(of: Study, found: Hypothesis) -> float:
-    """Return the rms about its mean of a random walk over the recordings, w·√(T/6), m/s²."""
-    walk = found.sensor.values[WANDERING]['density_g_per_rts']
+def _wandered_mps2(of: Study, found: Hypothesis, drift: str) -> float:
+    """
+    Return the rms about its mean of a drift over the recordings, m/s².
+
+    Of a random walk w·√(T/6); of 1/f noise its density by the root of ln of T by its highest
+    frequency.
+    """
+    density = np.sqrt(np.mean(next(iter(found.sensor.values[drift].values())) ** 2))
     span_s = np.mean([one.time_s[-1] - one.time_s[0] for one in of.series])
-    return float(G0_MPS2 * np.sqrt(np.mean(walk ** 2) * span_s / 6))
+    highest_hz = of.series[0].sensor.rate_hz / 2
+    return float(G0_MPS2 * density * (np.sqrt(span_s / 6) if drift == 'bias_walk'
+                                      else np.sqrt(np.log(highest_hz * span_s))))
 
 
 def _baseline(of: Study, effect: str, library: Effect) -> dict[str, np.ndarray]:
@@ -142,7 +149,7 @@ def worthy(of: Study, found: Sequence[Hypothesis], noise_mps2: float) -> list[Hy
         for effect, part in parts.items():
             without = squares.get(frozenset(one.effects) - {effect})
             taken = part * part
-            if without is not None and effect not in (WANDERING, *TOLERANCE):
+            if without is not None and effect not in (*DRIFTS, *TOLERANCE):
                 taken = without - here
             if part < least or part * part < SHARE * whole or taken < least ** 2 \
                     or taken < TAKEN * closes:
@@ -209,17 +216,16 @@ def judge(of: Study, found: Sequence[Hypothesis], discrepancy: Discrepancy | Non
     best = found[0]
     unknown = 0.02
     places: tuple[str, ...] = ()
-    # A zero-g that wanders is followed by what is flexible, too.
-    if WANDERING not in best.effects and discrepancy is not None \
-            and discrepancy.gain > UNKNOWN_NATS \
+    drifts = bool(drifts_among(best.effects))
+    if discrepancy is not None and discrepancy.gain > UNKNOWN_NATS \
             and discrepancy.rms_mps2 > max(UNKNOWN_OF_NOISE * noise_mps2,
                                            UNKNOWN_OF_GAP * gap_mps2) \
-            and left_mps2 > UNKNOWN_LEFT * gap_mps2:
+            and (drifts or left_mps2 > UNKNOWN_LEFT * gap_mps2):
         unknown = 0.9
         places = tuple(sorted((k for k, g in discrepancy.where.items() if g > UNKNOWN_NATS),
                               key=lambda k: -discrepancy.where[k]))
-    if WANDERING not in best.effects \
-            and left_mps2 > max(LEFT_OF_NOISE * noise_mps2, LEFT_OF_GAP * gap_mps2):
+    # Nothing is left of a drift but what it is known by.
+    if not drifts and left_mps2 > max(LEFT_OF_NOISE * noise_mps2, LEFT_OF_GAP * gap_mps2):
         unknown = 0.9
         places = places or ('frequency',)
     known = share / share.sum() * (1 - unknown)

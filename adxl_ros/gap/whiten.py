@@ -15,63 +15,74 @@
 """
 Noise that can drift, whitened: white noise behind the filter, the ADC's steps, a wandering zero-g.
 
-y = n + w + d with n an AR(1) sequence of a = exp(−dt/RC), w white and d a random walk that forgets
-by b = exp(−dt/τ) a sample, is (1 − aL)(1 − bL)·y = an MA(2), whose factor is found from its
-spectrum (Brockwell and Davis 1991, section 3.2). Its innovations are white; their variance is
-fitted, so that the level of the noise need not be known, only how fast the zero-g wanders by it,
-and how soon it comes back, which is searched on a grid. Whitened residuals are therefore neither
+y = n + w + d with n an AR(1) sequence of a = exp(−dt/RC), w white and d a random walk is
+(1 − aL)(1 − L)·y = an MA(2), whose factor is found from its spectrum (Brockwell and Davis 1991,
+section 3.2). Below the corner where 1/f noise meets the white, poles and zeros in turn whiten it,
+one pair a decade (Corsini and Saletti 1988, IEEE Trans. Instrum. Meas. 37). The innovations are
+white; their variance is fitted, so that the level of the noise need not be known, only how fast
+the zero-g wanders by it, which is searched on a grid. Whitened residuals are therefore neither
 fooled by correlation nor by drift.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from adxl_ros.gap.series import Series
 from adxl_ros.model import noise
 import numpy as np
-from scipy.signal import lfilter
+from scipy.signal import sosfilt, tf2sos, zpk2sos
 
+DRIFTS = ('bias_walk', 'flicker')
+"""The effects that let the zero-g wander."""
 WALKS_G_PER_RTS = (1e-7, 3e-6, 1e-5, 3e-5, 1e-4, 3e-4, 1e-3, 3e-3)
-RETURNING = ((1e-4, 10.0), (2e-4, 10.0), (5e-5, 100.0), (3e-4, 100.0), (1e-3, 100.0),
-             (3e-3, 100.0))
-"""Wandering of the zero-g that is tried: for good, and coming back within a time, s. 1/f noise is
-between them."""
-HEALTHY_G_PER_RTS, _HEALTHY_G = 1e-4, 5e-4
-"""1 mg within 100 s; what wanders more has the effect `bias_walk`."""
-USUAL_G_PER_RTS, _DECADES = 2e-5, 1.0
-"""What is usual (`bias_walk`), and how far it may be from that, as a standard deviation."""
+FLICKERS_G_PER_RTHZ = (3e-5, 6e-5, 1.2e-4, 2.5e-4, 5e-4, 1e-3, 2e-3, 4e-3)
+HEALTHY = {'bias_walk': 1e-4, 'flicker': 1.5e-4}
+"""What a unit without these effects may show: 1 mg within 100 s, 0.5 mg over five decades."""
+USUAL, _DECADES = 2e-5, 1.0
+"""What is usual of both, and how far it may be from that, as a standard deviation."""
 _LOWEST_NOISE_V = 1e-7
+
+
+def drifts_among(effects: Iterable[str]) -> tuple[str, ...]:
+    """Return those by which the zero-g may wander."""
+    return tuple(e for e in effects if e in DRIFTS)
 
 
 @dataclass(frozen=True)
 class Whitener:
     """
-    A filter num(L)/den(L) that makes the noise white, and how likely such noise is.
+    A filter that makes noise white, and how likely such noise is.
 
     Attributes
     ----------
-    walk_g_per_rts
-        Wandering that it is for.
-    healthy
-        Whether a unit without the effect `bias_walk` may wander so.
+    sections
+        Of second order, (s, 6).
+    log_prior
+        Of such noise.
+    drift, density
+        Effect that it is for, and how much of that, in its own unit.
 
     """
 
-    num: np.ndarray
-    den: np.ndarray
+    sections: np.ndarray
     log_prior: float
-    walk_g_per_rts: float
-    healthy: bool
+    drift: str
+    density: float
+
+    @property
+    def healthy(self) -> bool:
+        """Whether a unit without the effect may wander so."""
+        return self.density <= HEALTHY[self.drift]
 
     def __call__(self, values: np.ndarray) -> np.ndarray:
         """Filter series, (k, n)."""
-        return lfilter(self.num, self.den, values)
+        return sosfilt(self.sections, values)
 
 
 def whiteners(series: Series, d: int) -> list[Whitener]:
-    """Return the filters for the walks that are tried, for axis d of a recording."""
+    """Return the filters for the noise that is tried, for axis d of a recording."""
     sensor = series.sensor
     rc_s, _ = noise.electronics(sensor)
     dt_s = float(np.median(np.diff(series.time_s)))
@@ -79,22 +90,38 @@ def whiteners(series: Series, d: int) -> list[Whitener]:
     level = max(float(noise.analog_sigma_v(sensor)[d]), _LOWEST_NOISE_V)
     steps = sensor.lsb_v / np.sqrt(12)
     scale = float(sensor.scale_v_per_g[d])
+    pole, apart = np.array([1, -a]), np.array([1, -1.0])
     out = []
-    for walk, back_s in (*((walk, np.inf) for walk in WALKS_G_PER_RTS), *RETURNING):
-        pole, apart = np.array([1, -a]), np.array([1, -np.exp(-dt_s / back_s)])
+    for walk in WALKS_G_PER_RTS:
         spectrum = (level ** 2 * (1 - a * a) * _square(apart, 2)
                     + steps ** 2 * _square(np.convolve(pole, apart), 2)
                     + (walk * scale) ** 2 * dt_s * _square(pole, 2))
-        out.append(Whitener(np.convolve(pole, apart), _factor(spectrum),
-                            -0.5 * (np.log10(walk / USUAL_G_PER_RTS) / _DECADES) ** 2,
-                            walk, walk <= HEALTHY_G_PER_RTS
-                            or walk * np.sqrt(back_s / 2) <= _HEALTHY_G))
+        out.append(_whitener(tf2sos(np.convolve(pole, apart), _factor(spectrum, 2)),
+                             'bias_walk', walk))
+    still = _factor(level ** 2 * (1 - a * a) * _square(np.ones(1), 1)
+                    + steps ** 2 * _square(pole, 1), 1)
+    white_v2_per_hz = 2 * dt_s * (level ** 2 * (1 + a) / (1 - a) + steps ** 2)
+    span_s = float(series.time_s[-1] - series.time_s[0])
+    for density in FLICKERS_G_PER_RTHZ:
+        corner_hz = (density * scale) ** 2 / white_v2_per_hz
+        top_hz = min(corner_hz, 0.25 / dt_s)
+        decades = int(np.ceil(max(np.log10(top_hz * span_s), 0.0)))
+        bends_hz = top_hz * 10.0 ** -np.arange(decades)
+        zeros, poles = (np.exp(-2 * np.pi * dt_s * bends_hz * by) for by in (10 ** -0.5, 1.0))
+        out.append(_whitener(zpk2sos([a, *zeros], [-still[1], *poles], 1.0), 'flicker', density))
+        if corner_hz > top_hz:
+            break
     return out
+
+
+def _whitener(sections: np.ndarray, drift: str, density: float) -> Whitener:
+    return Whitener(sections, -0.5 * (np.log10(density / USUAL) / _DECADES) ** 2, drift, density)
 
 
 def near(filters: Sequence[Whitener], best: int) -> list[Whitener]:
     """Return the best filter and its neighbours, enough where the noise is already known."""
-    return [f for i, f in enumerate(filters) if abs(i - best) <= 1]
+    return [f for i, f in enumerate(filters)
+            if abs(i - best) <= 1 and f.drift == filters[best].drift]
 
 
 def _square(polynomial: np.ndarray, order: int) -> np.ndarray:
@@ -104,9 +131,10 @@ def _square(polynomial: np.ndarray, order: int) -> np.ndarray:
     return np.pad(whole, spare)
 
 
-def _factor(spectrum: np.ndarray) -> np.ndarray:
+def _factor(spectrum: np.ndarray, order: int) -> np.ndarray:
     """Return the monic polynomial with all roots inside the circle whose square is this."""
     trimmed = np.trim_zeros(np.where(np.abs(spectrum) > 1e-14 * spectrum.max(), spectrum, 0.0))
     roots = np.roots(trimmed)
     inside = roots[np.argsort(np.abs(roots))[:len(roots) // 2]]
-    return np.real(np.poly(inside))
+    found = np.real(np.poly(inside))
+    return np.pad(found, (0, order + 1 - len(found)))

@@ -34,7 +34,8 @@ def apply(signals: Signals, p: Parameters) -> None:
         signals.volts[d] = signals.volts[d] + off
 
 
-_BITS = ('first_bit_v', 'second_bit_v', 'third_bit_v', 'fourth_bit_v')
+_BITS = ('first_bit_v', 'second_bit_v', 'third_bit_v', 'fourth_bit_v', 'fifth_bit_v',
+         'sixth_bit_v')
 
 
 EFFECT = Effect(
