@@ -118,6 +118,46 @@ def test_what_the_library_does_not_hold_is_unknown():
     assert 'beta_rad' in told['unknown_where']
 
 
+def test_the_straight_part_of_an_effect_may_be_in_the_scale_factor():
+    """Bent between 0 and 1 g, right at both, as a tumble test leaves it: nonlinearity alone."""
+    def change(columns):
+        for axis in 'xyz':
+            g = columns[f'{axis}_v'] - 2.5
+            columns[f'{axis}_v'] = columns[f'{axis}_v'] + 0.02 * (g ** 3 - g)
+        return columns
+
+    told, _ = diagnosed(unit(), change=change)
+    assert (told['verdict']['status'], told['verdict']['effects']) == (
+        'explained', ['nonlinearity'])
+    assert told['gap']['closed'] > 0.95
+
+
+@pytest.mark.parametrize('option, effect', [
+    ('flicker:density_g_per_rthz=6e-4', 'flicker'),
+    ('bias_walk:density_g_per_rts=6e-4', 'bias_walk')])
+def test_kinds_of_drift_are_told_apart(option, effect):
+    """1/f noise and a random walk, by their spectra, and by no other effect."""
+    assert named(diagnosed(unit(), option)[1]) == {effect}
+
+
+def test_what_shows_only_while_it_turns_is_no_drift():
+    """A ripple of the gears, 40 periods a turn."""
+    def change(columns):
+        return columns | {'x_v': columns['x_v'] + 3e-3 * np.sin(40 * columns['beta_rad'])}
+
+    assert diagnosed(unit(), change=change)[0]['verdict']['status'] == 'unknown'
+
+
+def test_stretches_without_numbers_are_left_out():
+    """Half a minute of one axis is missing: the same verdict."""
+    def change(columns):
+        late = (columns['time_s'] > 20) & (columns['time_s'] < 35)
+        return columns | {'y_v': np.where(late, np.nan, columns['y_v'])}
+
+    told, _ = diagnosed(unit(), 'misalignment:alpha_rad=0.003,beta_rad=-0.002', change=change)
+    assert told['verdict']['effects'] == ['misalignment']
+
+
 @pytest.mark.parametrize('option, effect', [
     ('mains_hum:amplitude_v=0.003', 'mains_hum'),
     ('noise_excess:ratio=1.0', 'noise_excess'),
@@ -171,6 +211,19 @@ def test_the_command_leaves_report_page_and_parameters(run_tool, tmp_path):
     assert 'temperature_bias' in page and 'http' not in page
     again = run_tool('diagnose', 'run.csv', '--params', 'a/params.yaml', '-o', 'c', '--json')
     assert json.loads(again.stdout)['verdict']['status'] == 'no_gap'
+
+
+def test_several_recordings_and_bags(run_tool, tmp_path):
+    """A CSV file and a bag of one unit are one diagnosis."""
+    sensor = unit('xy')
+    params.save(tmp_path / 'unit.yaml', sensor)
+    for name, seed in (('a.csv', 3), ('b.mcap', 4)):
+        recording.write(tmp_path / name, made(sensor, ['time_offset:offset_s=0.004'], seed),
+                        sensor)
+    done = run_tool('diagnose', 'a.csv', 'b.mcap', '--params', 'unit.yaml', '-o', 'out', '--json')
+    told = json.loads(done.stdout)
+    assert told['verdict']['effects'] == ['time_offset']
+    assert [one['recording'] for one in told['gap']['noise']] == ['a.csv', 'b.mcap']
 
 
 def turning(alphas, speeds, rests_s=2.0):
@@ -248,7 +301,8 @@ def test_noise_is_compared_where_the_mean_is_blind():
 def test_the_next_manoeuvre_is_the_one_that_tells_most():
     """Temperature or warm-up: heating tells, a shaker does not; both are simulated."""
     sensor = with_effects(unit('xy'), ['temperature_bias:per_k=3e-4'])
-    best = Hypothesis(('temperature_bias',), sensor, (), np.zeros(0), np.zeros(0), 0.0, None)
+    best = Hypothesis(('temperature_bias',), sensor, (), np.zeros(0), np.zeros(0), 0.0,
+                      None, 1.0)
     verdict = Verdict('inseparable', (), (('temperature_bias', 'warm_up'),), 0.9, (), best)
     asked = proposed(verdict, [], 0)
     worth = {words: rate for words, _, rate in asked.menu}

@@ -32,7 +32,7 @@ from adxl_ros.gap.next_step import Next, proposed
 from adxl_ros.gap.noise_like import Sign
 from adxl_ros.gap.scores import Score, scores
 from adxl_ros.gap.series import Series, series_of, thinned
-from adxl_ros.gap.study import Study, study, TOLERANCE
+from adxl_ros.gap.study import study, TOLERANCE
 from adxl_ros.gap.verdict import Verdict
 from adxl_ros.gap.where import Cell, covered, map_of
 from adxl_ros.model.motion import Motion
@@ -53,8 +53,8 @@ class Diagnosis:
         The recordings at the rate of the search, and the samples that count.
     verdict, hypotheses
         The answer, and what was weighed.
-    study
-        Residuals and tangents.
+    contributions
+        What each effect of the verdict's hypothesis makes, rms m/s².
     scores
         Of each effect alone, on tangents.
     alike
@@ -75,7 +75,7 @@ class Diagnosis:
     cells: tuple[Cell, ...] = ()
     missing: tuple[str, ...] = ()
     proposal: Next | None = None
-    study: Study | None = None
+    contributions: dict[str, float] = field(default_factory=dict)
     scores: dict[str, Score] = field(default_factory=dict)
     alike: tuple[tuple[Likeness, ...], tuple[Likeness, ...]] = ((), ())
     sensor: Sensor | None = None
@@ -107,7 +107,7 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
     """
     if not sensor.effects:
         sensor = with_axes(sensor, recordings[0].axes)
-    full, counted, signs = [], [], []
+    full, series, counted, used, signs = [], [], [], [], []
     for read in recordings:
         check_unit(read.info, read.axes, sensor, read.path)
         one = series_of(read, replace(sensor, rate_hz=rate_hz(read)), sim)
@@ -119,42 +119,39 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
         if coarse is not None:
             signs.append(coarse)
             bits = round(sensor.adc_bits - float(coarse.values['lost_bits']))
-            one = replace(one, sensor=replace(one.sensor, adc_bits=bits))
+            one, thin = (replace(s, sensor=replace(s.sensor, adc_bits=bits)) for s in (one, thin))
         good, of_samples = noise_like.bad_samples(one.volts, one.time_s, one.sensor)
         full.append(one)
+        series.append(thin)
         counted.append(good)
+        used.append(good[::round(one.sensor.rate_hz / thin.sensor.rate_hz)])
         signs += of_samples
     show(0.05)
-    series = [thinned(one) for one in full]
-    used = [good[::round(one.sensor.rate_hz / thin.sensor.rate_hz)]
-            for one, thin, good in zip(full, series, counted)]
     weighed = study(series, used, lambda done: show(0.05 + 0.25 * done))
     base = floor(full, counted)
     noise_mps2 = float(np.sqrt(np.mean((base.noise_v / series[0].scale_v_per_mps2) ** 2)))
     found = verdict.worthy(weighed, search.search(
         weighed, lambda done: show(0.3 + 0.4 * done)), noise_mps2)
-    far = None
-    while found[0].effects:
+    far = shrunk(weighed, full, counted, found[0], base, seed)
+    # What does not hold on stretches held out is not the cause; zero-g, scale, filter and latency
+    # follow the recording within limits in any case.
+    while found[0].effects and (far.harm or (
+            far.predicted <= 0 and not set(found[0].effects) <= set(TOLERANCE))):
+        found = found[1:]
         far = shrunk(weighed, full, counted, found[0], base, seed)
-        # Zero-g, scale, filter and latency follow the recording within limits in any case.
-        if not far.harm and (far.predicted > 0 or set(found[0].effects) <= set(TOLERANCE)):
-            break
-        # What does not hold on stretches held out is not the cause.
-        found, far = found[1:], None
     best = found[0]
     show(0.8)
     beside = unknown.discrepancy(weighed, best)
-    for one, mask in zip(full, counted):
+    left = [one.residual(best.sensor) for one in full]
+    for one, mask, off in zip(full, counted, left):
         there = replace(best.sensor, rate_hz=one.sensor.rate_hz)
-        signs += noise_like.of_residual(one.residual(best.sensor), mask,
-                                        replace(one, sensor=there))
+        signs += noise_like.of_residual(off, mask, replace(one, sensor=there))
     signs = list({sign.effect: sign for sign in sorted(signs, key=lambda s: s.nats)}.values())
-    if far is None:
-        far = shrunk(weighed, full, counted, replace(best, effects=()), base, seed)
     loud = _with_signs(best, signs, sensor)
-    alike = [[likeness(one, one.residual(mean), mask, whole, seed)
-              for one, mask in zip(full, counted)]
-             for mean, whole in ((sensor, sensor), (best.sensor, loud))]
+    before = [one.residual(sensor) for one in full]
+    alike = [tuple(likeness(one, off, mask, whole, seed)
+                   for one, off, mask in zip(full, offs, counted))
+             for offs, whole in ((before, sensor), (left, loud))]
     explained = float(np.sqrt(max(far.before_mps2 ** 2 - far.within_mps2 ** 2, 0.0)))
     as_noise = float(np.sqrt(np.mean([one.sigma_mps2 ** 2 for one in alike[1]])))
     answer = verdict.judge(weighed, found, beside, signs, noise_mps2, explained,
@@ -166,8 +163,9 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
     alone = scores(weighed, seed)
     show(1.0)
     return Diagnosis(None, series, used, base, answer, tuple(found), tuple(signs), far,
-                     tuple(cells), tuple(missing), proposed(answer, missing, seed), weighed, alone,
-                     (tuple(alike[0]), tuple(alike[1])),
+                     tuple(cells), tuple(missing), proposed(answer, missing, seed),
+                     {effect: verdict.contribution_mps2(weighed, answer.best, effect)
+                      for effect in answer.best.effects}, alone, (alike[0], alike[1]),
                      sensor if answer.status in ('no_gap', 'unknown', 'insufficient') else loud)
 
 

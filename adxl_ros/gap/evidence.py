@@ -84,7 +84,7 @@ def channel(residual: np.ndarray, columns: np.ndarray, ids: np.ndarray, used: np
 
     """
     data = np.ascontiguousarray(bridged(np.column_stack([residual, columns]), used).T)
-    edges = np.linspace(0, len(used), BLOCKS + 1).astype(int)
+    edges = block_edges(len(used))
     grams = np.empty((len(filters), BLOCKS, len(data), len(data)))
     for i, whiten in enumerate(filters):
         white = whiten(data)
@@ -97,6 +97,11 @@ def channel(residual: np.ndarray, columns: np.ndarray, ids: np.ndarray, used: np
     return Channel(ids, grams, grams.sum(axis=1), counts,
                    np.array([f.log_prior for f in filters]),
                    np.array(['' if f.healthy else f.drift for f in filters]))
+
+
+def block_edges(count: int) -> np.ndarray:
+    """Return where the stretches of so many samples begin and end, (b + 1,)."""
+    return np.linspace(0, count, BLOCKS + 1).astype(int)
 
 
 def bridged(data: np.ndarray, used: np.ndarray) -> np.ndarray:

@@ -71,7 +71,7 @@ class Shrunk:
 def shrunk(of: Study, full: Sequence[Series], counted: Sequence[np.ndarray], best: Hypothesis,
            floor: Floor, seed: int) -> Shrunk:
     """
-    Fit on half of the stretches and simulate the other at the full rate, both ways.
+    Fit on three quarters of the stretches and simulate the others at the full rate, in turn.
 
     Parameters
     ----------
@@ -97,17 +97,18 @@ def shrunk(of: Study, full: Sequence[Series], counted: Sequence[np.ndarray], bes
     for fold in range(_FOLDS):
         out = (number // _RUN) % _FOLDS == fold
         near = np.convolve(out, np.ones(3), 'same') > 0
-        for here, total, sign in ((plain, before, -1.0), (found, after, 1.0)):
-            fit = here.fit(~near)
-            predicted += sign * float(evidence.predicted(
-                here.channels, fit, np.flatnonzero(out)).sum())
-            shown = here if by_mean else plain
-            sensor, free = shown.fitted(shown.fit(~near)), 'bias' in shown.effects
-            for one, mask in zip(full, counted):
-                total[out] += _by_block(one, mask, sensor, ~near, of, free)[out]
-        for mask in counted:
-            edges = np.linspace(0, len(mask), BLOCKS + 1).astype(int)
-            counts[out] += np.add.reduceat(mask, edges[:-1])[out]
+        fits = [here.fit(~near) for here in (plain, found)]
+        without, with_it = (float(evidence.predicted(here.channels, fit, np.flatnonzero(
+            out)).sum()) for here, fit in zip((plain, found), fits))
+        predicted += with_it - without
+        sensors = plain.fitted(fits[0]), found.fitted(fits[1])
+        for one, mask in zip(full, counted):
+            squares = _by_block(one, mask, sensors[0], ~near, of, False)
+            before[out] += squares[out]
+            if by_mean:
+                squares = _by_block(one, mask, sensors[1], ~near, of, 'bias' in best.effects)
+            after[out] += squares[out]
+            counts[out] += np.add.reduceat(mask, evidence.block_edges(len(mask))[:-1])[out]
     everywhere = np.ones(BLOCKS, bool)
     within = sum(_by_block(one, mask, best.sensor, everywhere, of, 'bias' in best.effects).sum()
                  for one, mask in zip(full, counted))
@@ -135,7 +136,7 @@ def _by_block(series: Series, used: np.ndarray, sensor: Sensor, blocks: np.ndarr
     The level of a zero-g that wanders is that of the stretches that are not held out, within its
     tolerance; where it is an effect, wherever they say.
     """
-    edges = np.linspace(0, len(series), BLOCKS + 1).astype(int)
+    edges = evidence.block_edges(len(series))
     off = series.residual(sensor)
     fitted = used & np.repeat(blocks, np.diff(edges))
     if fitted.any():

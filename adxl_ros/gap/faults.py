@@ -23,7 +23,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from adxl_ros.gap.series import Series
-from adxl_ros.model.constants import AXES
 import numpy as np
 
 SHORTEST_S = 30.0
@@ -68,8 +67,9 @@ def look(series: Series, thin: Series) -> Fault | None:
     clock = _clock(series)
     if clock is not None:
         return clock
-    if _railed(series, finite) > _WORST_MISSING:
-        return Fault('saturated', 'bad_data', f'{100 * _railed(series, finite):.0f} % of the '
+    railed = _railed(series, finite)
+    if railed > _WORST_MISSING:
+        return Fault('saturated', 'bad_data', f'{100 * railed:.0f} % of the '
                      'samples are at the end of the range; check supply, range and wiring')
     if series.reference == 'rest':
         return _moved(series, finite)
@@ -132,15 +132,16 @@ def _axes(series: Series, finite: np.ndarray) -> Fault | None:
                       for d in axes])
     for i, d in enumerate(axes):
         if alike[i, i] < -_ALIKE:
-            return Fault('axis_inverted', 'bad_data', f'{AXES[d]} reads against the reference '
-                         f'(correlation {alike[i, i]:.2f}): the axis is inverted; correct its '
-                         'sign or the mounting')
+            return Fault('axis_inverted', 'bad_data', f'{sensor.axes[d]} reads against the '
+                         f'reference (correlation {alike[i, i]:.2f}): the axis is inverted; '
+                         'correct its sign or the mounting')
         best = int(np.argmax(np.abs(alike[i])))
         if best != i and abs(alike[i, best]) > _ALIKE > 2 * abs(alike[i, i]) - 0.5:
             sign = 'against' if alike[i, best] < 0 else 'with'
-            return Fault('axis_swapped', 'bad_data', f'{AXES[d]} moves {sign} the reference of '
-                         f'{AXES[axes[best]]} (correlation {alike[i, best]:.2f}): axes are '
-                         'swapped; correct the wiring or the mounting')
+            return Fault('axis_swapped', 'bad_data', f'{sensor.axes[d]} moves {sign} the '
+                         f'reference of {sensor.axes[axes[best]]} (correlation '
+                         f'{alike[i, best]:.2f}): axes are swapped; correct the wiring or '
+                         'the mounting')
     gains = [float(np.polyfit(promised[finite, d], seen[finite, d], 1)[0])
              for i, d in enumerate(axes) if alike[i, i] > _ALIKE]
     for ratio, words in _RATIOS.items():

@@ -21,10 +21,10 @@ noise that the simulator itself makes, without and with what was found.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
+from adxl_ros.gap.evidence import bridged
 from adxl_ros.gap.series import Series
 from adxl_ros.model.response import Response
 from adxl_ros.model.sensor import Sensor
@@ -85,14 +85,13 @@ def likeness(full: Series, residual_v: np.ndarray, used: np.ndarray, sensor: Sen
     """
     noise_v = simulated_noise(full, sensor, seed)
     rate_hz = full.sensor.rate_hz
-    rows = np.arange(len(residual_v))
-    seen = np.column_stack([np.interp(rows, rows[used], r[used]) for r in residual_v.T])
-    seen, made = ((v - v.mean(axis=0)) / full.scale_v_per_mps2 for v in (seen, noise_v))
+    seen, made = ((v - v.mean(axis=0)) / full.scale_v_per_mps2
+                  for v in (bridged(residual_v, used), noise_v))
     frequency, power = periodogram(seen, rate_hz, axis=0)
     _, other = periodogram(made, rate_hz, axis=0)
     edges = np.geomspace(max(frequency[1], 0.05), rate_hz / 2, _BANDS + 1)
     edges[0] = 0.0
-    ratios = [float(np.sqrt(power[inside].sum() / other[inside].sum()) ** 2)
+    ratios = [float(power[inside].sum() / other[inside].sum())
               for inside in ((frequency > low) & (frequency <= high)
                              for low, high in pairwise(edges))]
     length = min(round(_SEGMENT_S * rate_hz), len(made))
@@ -129,8 +128,3 @@ def allan_deviation(values: np.ndarray, count: int) -> np.ndarray:
     total = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
     twice = total[2 * count:] - 2 * total[count:-count] + total[:-2 * count]
     return np.sqrt(np.mean(twice ** 2, axis=0) / 2) / count
-
-
-def gained(before: Sequence[Likeness], after: Sequence[Likeness]) -> float:
-    """Return how much more likely recordings are after than before, nats."""
-    return sum(a.log_likelihood - b.log_likelihood for a, b in zip(after, before))

@@ -27,7 +27,6 @@ from adxl_ros.gap.tangents import WIDE
 from adxl_ros.gap.whiten import drifts_among, near
 from adxl_ros.model.coefficients import get, names_of, parameter_of, put, with_neutral
 from adxl_ros.model.effects import effect_named
-from adxl_ros.model.effects.base import Parameter
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
@@ -147,16 +146,16 @@ def local(of: Study, effects: Sequence[str], sensor: Sensor,
     """
     held = with_neutral(of.series[0].sensor, effects)
     own = [name for effect in effects for name in names_of(effect_named(effect), held.axes)
-           if bent(parameter_of(name)) or name in of.names]
+           if not parameter_of(name).sized or name in of.names]
     free = [n for n in dict.fromkeys(n for names in of.free for n in names)
             if n.split('.')[0] not in effects]
     held = with_neutral(held, dict.fromkeys(n.split('.')[0] for n in free))
     parameters = [parameter_of(name) for name in own]
-    middle = np.array([p.scale if bent(p) else float(get(held, [name])[0])
+    middle = np.array([float(get(held, [name])[0]) if p.sized else p.scale
                        for name, p in zip(own, parameters)])
     values = get(sensor, own)
     sensor = put(held, own, values)
-    prior = [p.scale * (1 if bent(p) else WIDE) for p in parameters]
+    prior = [p.scale * (WIDE if p.sized else 1) for p in parameters]
     names = [*own, *free]
     channels: list[Channel] = []
     lines: list[dict[int, np.ndarray]] = []
@@ -190,11 +189,6 @@ def local(of: Study, effects: Sequence[str], sensor: Sensor,
                  np.array(prior), values, channels)
 
 
-def bent(p: Parameter) -> bool:
-    """Tell a parameter that is no size: it has a typical value, and no neutral one near it."""
-    return p.shape or p.neutral == p.upper
-
-
 def refined(of: Study, effects: Sequence[str], start: dict[str, float],
             shapes: dict[str, float]) -> Hypothesis:
     """
@@ -221,9 +215,9 @@ def refined(of: Study, effects: Sequence[str], start: dict[str, float],
     begin = []
     for name in names:
         p = parameter_of(name)
-        middle = p.scale if bent(p) else float(get(sensor, [name])[0])
+        middle = float(get(sensor, [name])[0]) if p.sized else p.scale
         short = '.'.join(name.split('.')[:2])
-        begin.append(shapes[short] if bent(p) and short in shapes
+        begin.append(shapes[short] if not p.sized and short in shapes
                      else middle + start.get(name, 0.0))
     sensor = put(sensor, names, _within(names, np.array(begin)))
     best: tuple[float, Local, Fit] | None = None
@@ -274,8 +268,7 @@ def columns_at(series: Series, sensor: Sensor, names: Sequence[str], values: np.
         groups.setdefault('.'.join(name.split('.')[:2]), []).append(i)
     for of in groups.values():
         p = parameter_of(names[of[0]])
-        limit = p.neutral == p.upper
-        by = p.scale * (0.3 if not limit and not effect_named(
+        by = p.scale * (0.3 if not p.limit and not effect_named(
             names[of[0]].split('.')[0]).smooth else 0.02)
         if values[of[0]] + by > p.upper:
             by = -by

@@ -18,9 +18,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from adxl_ros.gap.evidence import bridged
 from adxl_ros.gap.floor import runs
 from adxl_ros.gap.series import Series
-from adxl_ros.gap.whiten import HEALTHY
 from adxl_ros.model import noise
 from adxl_ros.model.sensor import Sensor
 import numpy as np
@@ -37,7 +37,6 @@ _EXCESS = 1.2
 _STEPS = 1.6
 _NEAREST, _FEWEST = 2, 500
 _CALM_S = 10.0
-_REST_S, _FEWEST_RESTS = 1.0, 4
 _LEVELS, _ODD = 0.02, 4.0
 """Of the range: levels that spikes are counted by; how much rarer others may be there."""
 
@@ -201,7 +200,7 @@ def of_residual(residual_v: np.ndarray, used: np.ndarray, series: Series) -> lis
     """
     sensor = series.sensor
     signs = []
-    data = _filled(residual_v, used)
+    data = bridged(residual_v, used)
     rc_s, _ = noise.electronics(sensor)
     decay = np.exp(-1 / (sensor.rate_hz * np.where(rc_s > 0, rc_s, 1e-9)))
     white = np.column_stack([lfilter([1.0, -a], [1.0], r)[1:] for r, a in zip(data.T, decay)])
@@ -231,11 +230,6 @@ def of_residual(residual_v: np.ndarray, used: np.ndarray, series: Series) -> lis
                           len(white) * float(np.log(np.max(ratio)) ** 2),
                           f'white noise is {np.max(ratio):.2f} of what is stated'))
     return signs
-
-
-def _filled(values: np.ndarray, used: np.ndarray) -> np.ndarray:
-    rows = np.arange(len(values))
-    return np.column_stack([np.interp(rows, rows[used], v[used]) for v in values.T])
 
 
 def _line(white: np.ndarray, sensor: Sensor, residual_v: np.ndarray, time_s: np.ndarray
@@ -272,32 +266,3 @@ def _local_level(power: np.ndarray, width: int = 201) -> np.ndarray:
     blocks = power[:count * width].reshape(count, -1) if len(power) >= width else power[None]
     level = np.median(blocks, axis=1) / np.log(2)
     return np.interp(np.arange(len(power)), (np.arange(count) + 0.5) * width, level)
-
-
-def wanders_at_rest(series: Series, used: np.ndarray) -> bool:
-    """
-    Tell whether the zero-g wanders while nothing moves, more than that of a healthy unit.
-
-    What a model lacks shows as drift, too, but from pose to pose; a sensor that wanders does so
-    within a rest. The means of the halves of each rest are compared: for a random walk of w over
-    halves of h they differ by w²·h·2/3 beside the noise.
-    """
-    if series.reference == 'rest':
-        return True
-    rate = series.sensor.rate_hz
-    rc_s, _ = noise.electronics(series.sensor)
-    sigma_g = noise.sigma_v(series.sensor) / series.sensor.scale_v_per_g
-    squares, expected = [], []
-    for begin, end in runs(series.still & used):
-        half = (end - begin) // 2
-        if end - begin < _REST_S * rate:
-            continue
-        first, last = (series.volts[a:a + half].mean(axis=0) for a in (begin, begin + half))
-        squares.append(((last - first) / series.sensor.scale_v_per_g) ** 2)
-        independent = np.array([noise.effective_samples(half, 1 / rate, rc) for rc in rc_s])
-        expected.append(2 * sigma_g ** 2 / independent
-                        + HEALTHY['bias_walk'] ** 2 * half / rate * 2 / 3)
-    if len(squares) < _FEWEST_RESTS:
-        return False
-    spread = 2 * np.sqrt(2 / np.size(squares))
-    return bool(np.mean(np.array(squares) / np.array(expected)) > 1.5 + spread)

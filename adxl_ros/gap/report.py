@@ -21,7 +21,6 @@ from typing import Any
 
 from adxl_ros.gap.diagnose import Diagnosis
 from adxl_ros.gap.local import Hypothesis
-from adxl_ros.gap.verdict import contribution_mps2
 from adxl_ros.gap.where import SHOWS_P
 from adxl_ros.model.coefficients import parameter_of
 from adxl_ros.model.effects import effect_named, library
@@ -88,9 +87,8 @@ def _noise(found: Diagnosis) -> list[dict[str, Any]]:
 
 def shares(found: Diagnosis) -> dict[str, float]:
     """Split the squares that close, before less after, among the effects by what each makes."""
-    assert found.verdict is not None and found.shrunk is not None and found.study is not None
-    parts = {effect: contribution_mps2(found.study, found.verdict.best, effect) ** 2
-             for effect in found.verdict.best.effects}
+    assert found.shrunk is not None
+    parts = {effect: rms ** 2 for effect, rms in found.contributions.items()}
     whole = sum(parts.values())
     closes = max(found.shrunk.before_mps2 ** 2 - found.shrunk.after_mps2 ** 2, 0.0)
     gap = max(found.shrunk.before_mps2 ** 2 - found.shrunk.floor_mps2 ** 2, 1e-30)
@@ -111,7 +109,7 @@ def _summing_to_one(hypotheses: Sequence[tuple[tuple[str, ...], float]]
 
 def _candidates(found: Diagnosis) -> list[dict[str, Any]]:
     """Lay out what was weighed, effect by effect, the most probable first."""
-    assert found.verdict is not None and found.study is not None and found.shrunk is not None
+    assert found.verdict is not None and found.shrunk is not None
     v = found.verdict
     chance: dict[str, float] = {}
     for effects, p in v.hypotheses:
@@ -152,7 +150,7 @@ def _parameters(h: Hypothesis | None, effect: str) -> dict[str, Any]:
         if not name.startswith(f'{effect}.'):
             continue
         p = parameter_of(name)
-        middle = value + (p.scale if p.shape else 0.0)
+        middle = value + (0.0 if p.sized else p.scale)
         out[name.split('.', 1)[1]] = {
             'value': _round(middle), 'ci': [_round(middle - _NINETY * std),
                                             _round(middle + _NINETY * std)], 'unit': p.unit}

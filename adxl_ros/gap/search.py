@@ -28,7 +28,6 @@ from itertools import combinations
 from adxl_ros.errors import UserError
 from adxl_ros.gap.evidence import Fit
 from adxl_ros.gap.local import Hypothesis, local, refined
-from adxl_ros.gap.noise_like import wanders_at_rest
 from adxl_ros.gap.study import on_tangents, STRAIGHT, Study, study, TOLERANCE
 from adxl_ros.gap.tangents import Variant
 from adxl_ros.gap.whiten import DRIFTS, drifts_among
@@ -61,9 +60,6 @@ def search(of: Study, show: Callable[[float], None]) -> list[Hypothesis]:
     none = on_tangents(of, [])
     singles = _ranked(of, [(i,) for i in range(len(of.variants))], none)
     _refine(of, singles[:_REFINED], none, found)
-    at_rest = any(wanders_at_rest(one, mask) for one, mask in zip(of.series, of.used))
-    if at_rest:
-        _wandering(of, found)
     show(0.3)
     best = _best(found)
     if best.effects:
@@ -77,7 +73,7 @@ def search(of: Study, show: Callable[[float], None]) -> list[Hypothesis]:
         if 1 < len(best.effects) < MOST_EFFECTS:
             _forward(of, best, found)
     _less(of, _best(found), found)
-    if not at_rest and _drifts(of, _best(found)):
+    if _drifts(of, _best(found)):
         _wandering(of, found)
     show(1.0)
     return sorted(found.values(), key=lambda h: -h.log_evidence)

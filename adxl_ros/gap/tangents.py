@@ -77,7 +77,7 @@ def candidates() -> list[Effect]:
 
 def limits(effect: Effect) -> list[Parameter]:
     """Return the parameters that do nothing until the signal reaches them."""
-    return [p for p in effect.parameters if p.neutral == p.upper and not p.shape]
+    return [p for p in effect.parameters if p.limit and not p.shape]
 
 
 def variants(series: Series, effect: Effect, base: np.ndarray) -> Iterator[Variant]:

@@ -131,7 +131,7 @@ def _baseline(of: Study, effect: str, library: Effect) -> dict[str, np.ndarray]:
 
 def worthy(of: Study, found: Sequence[Hypothesis], noise_mps2: float) -> list[Hypothesis]:
     """
-    Keep the hypotheses of which each effect makes a visible part of the gap.
+    Keep the hypotheses of which each effect makes a visible part of the gap, the likeliest first.
 
     What an effect more takes off the squares is compared with the same hypothesis without it: no
     form of an effect is quite the sensor's, and what is left of a large one always looks a little
@@ -156,7 +156,16 @@ def worthy(of: Study, found: Sequence[Hypothesis], noise_mps2: float) -> list[Hy
                 break
         else:
             kept.append(one)
-    return kept
+    weight = _weights(of, kept)
+    return [kept[i] for i in np.argsort(-weight, kind='stable')]
+
+
+def _weights(of: Study, found: Sequence[Hypothesis]) -> np.ndarray:
+    """Return log-probabilities of hypotheses but for a constant: evidence, and how many alike."""
+    count = len({v.effect for v in of.variants})
+    ways = {0: 1, 1: count, 2: count * (count - 1) / 2, 3: count * (count - 1) * (count - 2) / 6}
+    return np.array([_TEMPER * h.log_evidence + np.log(PRIOR[len(h.effects)]
+                                                       / ways[len(h.effects)]) for h in found])
 
 
 def _squares_mps2(of: Study, found: Hypothesis) -> float:
@@ -195,7 +204,7 @@ def judge(of: Study, found: Sequence[Hypothesis], discrepancy: Discrepancy | Non
     of
         The recordings.
     found
-        Worthy hypotheses, none among them.
+        Worthy hypotheses, the likeliest first, none among them.
     discrepancy
         Beside the most probable of them.
     signs
@@ -206,13 +215,8 @@ def judge(of: Study, found: Sequence[Hypothesis], discrepancy: Discrepancy | Non
         Rms of what neither it nor noise explains on stretches held out, m/s²; see `left`.
 
     """
-    count = len({v.effect for v in of.variants})
-    ways = {0: 1, 1: count, 2: count * (count - 1) / 2, 3: count * (count - 1) * (count - 2) / 6}
-    weight = np.array([_TEMPER * h.log_evidence + np.log(PRIOR[len(h.effects)]
-                                                         / ways[len(h.effects)]) for h in found])
-    order = np.argsort(-weight, kind='stable')
-    found = [found[i] for i in order]
-    share = np.exp(weight[order] - weight[order[0]])
+    weight = _weights(of, found)
+    share = np.exp(weight - weight[0])
     best = found[0]
     unknown = 0.02
     places: tuple[str, ...] = ()

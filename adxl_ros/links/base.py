@@ -98,6 +98,11 @@ class Samples:
     estimated: int = 0
 
 
+def nothing(sensor: Sensor, until_ns: int) -> Samples:
+    """Return no samples of a sensor."""
+    return Samples(np.zeros(0, np.int64), np.zeros((0, len(sensor.axes))), until_ns)
+
+
 class Link(Protocol):
     """
     A source of samples.

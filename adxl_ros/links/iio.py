@@ -23,7 +23,7 @@ from typing import Any
 
 from adxl_ros.errors import UserError
 from adxl_ros.links import channels
-from adxl_ros.links.base import Option, Samples, State
+from adxl_ros.links.base import nothing, Option, Samples, State
 from adxl_ros.links.clock_map import ClockMap, HostStamps
 from adxl_ros.links.iio_device import library, open_stream, ReadError, Stream
 from adxl_ros.links.retry import Retry
@@ -100,10 +100,7 @@ class IioLink:
             except (ReadError, UserError) as error:
                 self._lose(str(error))
         samples = self._timeline.take()
-        if samples is None:
-            return Samples(np.zeros(0, np.int64), np.zeros((0, len(self._unit.axes))),
-                           time.time_ns())
-        return samples
+        return nothing(self._unit, time.time_ns()) if samples is None else samples
 
     def state(self) -> State:
         """Say how the device and the clock are."""
@@ -172,11 +169,6 @@ class IioLink:
         if not fresh.any():
             return
         self._last_ns = int(newest[-1])
-        if channels.SUPPLY in values:
-            values = {**values, channels.SUPPLY:
-                      values[channels.SUPPLY] * self._options['supply_scale']}
-        volts, beside = channels.split({r: v[fresh] for r, v in values.items()}, self._unit)
-        lacking = {name: np.full(len(volts), np.nan)
-                   for name in self.references if name not in beside}
-        self._timeline.put(Block(device_ns[fresh], volts, {**beside, **lacking}), arrived_ns,
-                           None)
+        self._timeline.put(Block(device_ns[fresh], *channels.split(
+            {role: v[fresh] for role, v in values.items()}, self._unit, self.references,
+            self._options['supply_scale'])), arrived_ns, None)

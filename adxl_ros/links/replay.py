@@ -23,7 +23,7 @@ from typing import Any
 from adxl_ros.errors import UserError
 from adxl_ros.files import recording
 from adxl_ros.files.columns import nominal_figures, Recording, REFERENCES
-from adxl_ros.links.base import Option, Samples, State
+from adxl_ros.links.base import nothing, Option, Samples, State
 from adxl_ros.model.sensor import Sensor, with_axes
 import numpy as np
 
@@ -81,7 +81,7 @@ class Replay:
     def read(self, now_ns: int) -> Samples:
         """Return the rows that are due, at most to the end of a block."""
         if self._block is None:
-            return Samples(np.zeros(0, np.int64), np.zeros((0, len(self.sensor.axes))), now_ns)
+            return nothing(self.sensor, now_ns)
         end = int(np.searchsorted(self._stamps, now_ns - self._offset_ns, 'right'))
         rows = slice(self._row, max(end, self._row))
         stamps = self._stamps[rows] + self._offset_ns

@@ -24,7 +24,7 @@ from typing import Any
 
 from adxl_ros.errors import UserError
 from adxl_ros.links import channels
-from adxl_ros.links.base import Option, Samples, State
+from adxl_ros.links.base import nothing, Option, Samples, State
 from adxl_ros.links.clock_map import ClockMap
 from adxl_ros.links.count import Count
 from adxl_ros.links.port import Port, SILENT
@@ -132,10 +132,7 @@ class SerialLink:
             else:
                 self._on_data(frame, arrived_ns)
         samples = self._timeline.take()
-        if samples is None:
-            return Samples(np.zeros(0, np.int64), np.zeros((0, len(self._unit.axes))),
-                           time.time_ns())
-        return samples
+        return nothing(self._unit, time.time_ns()) if samples is None else samples
 
     def state(self) -> State:
         """Say how the port, the frames and the clock are."""
@@ -261,15 +258,11 @@ class SerialLink:
         roles = self._roles or _USUAL[:info.channels]
         volts = data.codes * (info.vref_v / 2 ** info.bits)
         values = {role: volts[:, i] for i, role in enumerate(roles)}
-        if channels.SUPPLY in values:
-            values[channels.SUPPLY] = values[channels.SUPPLY] * self._options['supply_scale']
         if channels.TEMPERATURE in values:
             values[channels.TEMPERATURE] = (
                 values[channels.TEMPERATURE] - self._options['temperature_zero_v']
             ) / self._options['temperature_v_per_c']
         steps = np.arange(len(volts)) * (1e9 / info.rate_hz)
         device_ns = data.time_us * 1000 + np.rint(steps).astype(np.int64)
-        axes, beside = channels.split(values, self._unit)
-        missing = {name: np.full(len(volts), np.nan)
-                   for name in self.references if name not in beside}
-        return Block(device_ns, axes, {**beside, **missing})
+        return Block(device_ns, *channels.split(values, self._unit, self.references,
+                                                self._options['supply_scale']))

@@ -176,6 +176,16 @@ class Parameter:
         return self.neutral == self.scale
 
     @property
+    def limit(self) -> bool:
+        """Tell whether it does nothing until the signal reaches it: its neutral value is none."""
+        return self.neutral == self.upper
+
+    @property
+    def sized(self) -> bool:
+        """Tell whether it is the size of something, which is nothing where it is neutral."""
+        return not (self.shape or self.limit)
+
+    @property
     def optional(self) -> bool:
         """Tell whether the effect is itself without it: files may leave it out, fits do."""
         return self.typical == self.neutral
