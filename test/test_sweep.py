@@ -57,7 +57,7 @@ class Bench:
 def _bench(mode='commanded', **changes):
     sensor = nominal(**changes)
     settings = Settings(dwell_s=5.0, tolerance_rad=0.0035, timeout_s=20.0, stage_mode=mode)
-    return Bench(Sweep(sensor, TARGETS, 0, settings), sensor)
+    return Bench(Sweep(sensor, TARGETS, settings), sensor)
 
 
 def test_a_pose_keeps_its_full_dwell():
@@ -76,7 +76,7 @@ def test_nothing_is_accepted_before_arrival_and_the_text_says_how_far_off():
     assert bench.run(3, np.pi / 2, np.radians(3)) is None
     state = bench.sweep.state()
     assert (state.phase, state.late) == ('stage', False)
-    assert 'beta is 3.00 deg off' in state.text
+    assert 'beta is 3.0° from the asked 0°' in state.text
     bench.run(20, np.pi / 2, np.radians(3))
     state = bench.sweep.state()
     assert state.late
@@ -148,7 +148,7 @@ def test_the_plan_is_the_papers_and_refuses_nonsense():
 def test_rests_by_hand_are_announced_as_they_end():
     """A tumble counts its rests and names what moves between them."""
     sensor = nominal('xyz', noise_density_g_per_rthz=np.full(3, 300e-6))
-    tumble = Tumble(sensor, 0)
+    tumble = Tumble(sensor, 3.0)
     alphas = np.repeat(np.linspace(0, 2.5, 6), 4000) + np.concatenate(
         [np.concatenate([np.zeros(3000), 0.2 * np.sin(np.linspace(0, 40, 1000))])
          for _ in range(6)])
@@ -158,9 +158,9 @@ def test_rests_by_hand_are_announced_as_they_end():
         tumble.feed(np.arange(i, i + 100) * 1_000_000 + 10 ** 18, volts[i:i + 100])
         while (entry := tumble.accept()) is not None:
             found.append(entry)
-            tumble.move(entry['pose'] + 1)
+            tumble.take(entry)
     assert len(found) == 5
-    results = tumble.results(found)
+    results = tumble.results()
     assert len(results) == 6
     assert all(2.0 < e['samples'] / 1000 < 3.1 for e in results)
     assert '5 rests (5 more at least)' in tumble.state().text
