@@ -27,7 +27,7 @@ from adxl_ros.calibrate.plan import Target
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
-_UNLIKELY = 6.0
+_UNLIKELY = 3.5
 """A reading this many standard deviations from what it should be is that of another pose."""
 _MODEL_G = 5e-3
 """What stage and model may miss beyond what is known of them, g."""

@@ -12,27 +12,30 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What arrives while a calibration runs, beside the rests: the newest second, surroundings."""
+"""What arrives while a calibration runs, beside the poses: the newest samples, surroundings."""
 
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
 from collections import deque
 
+from adxl_ros.calibrate.recorded import known_noise
+from adxl_ros.calibrate.rests import RestFinder, Stillness
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
 import numpy as np
 
-_NEWEST_S = 0.5
+_JUDGED_S, _SHOWN_S = 1.2, 0.5
 _SAMPLES = 20
 _STALE_NS = 60_000_000_000
 
 
 class Newest:
-    """The newest half second of a stream, and at least twenty samples."""
+    """The newest second of a stream, and at least twenty samples."""
 
     def __init__(self, sensor: Sensor) -> None:
         self._sensor = sensor
-        self._keep = max(round(_NEWEST_S * sensor.rate_hz), _SAMPLES)
+        self._keep, self._show = (max(round(seconds * sensor.rate_hz), _SAMPLES)
+                                  for seconds in (_JUDGED_S, _SHOWN_S))
         self.stamps_ns = np.zeros(0, np.int64)
         self.volts = np.zeros((0, len(sensor.axes)))
 
@@ -43,11 +46,19 @@ class Newest:
 
     def mean_mps2(self) -> list[float]:
         """Return what the axes read on average, m/s², (m,)."""
-        return to_nominal_mps2(self.volts, self._sensor).mean(axis=0).tolist()
+        return self._shown().mean(axis=0).tolist()
 
     def rms_mps2(self) -> list[float]:
         """Return how they scatter about it, m/s², (m,)."""
-        return to_nominal_mps2(self.volts, self._sensor).std(axis=0).tolist()
+        return self._shown().std(axis=0).tolist()
+
+    def stillness(self) -> Stillness | None:
+        """Judge by the noise of the figures whether they are at rest; None if too few."""
+        finder = RestFinder(self._sensor.rate_hz, len(self._sensor.axes),
+                            known_noise(self._sensor), learn=False)
+        if len(self.stamps_ns):
+            finder.feed((self.stamps_ns - self.stamps_ns[0]) * 1e-9, self.volts)
+        return finder.stillness()
 
     def rate_hz(self) -> float:
         """Return the rate of the stamps, Hz; NaN while there are too few of them."""
@@ -55,6 +66,9 @@ class Newest:
             return float('nan')
         period_ns = float(np.median(np.diff(self.stamps_ns)))
         return 1e9 / period_ns if period_ns > 0 else float('nan')
+
+    def _shown(self) -> np.ndarray:
+        return to_nominal_mps2(self.volts[-self._show:], self._sensor)
 
 
 class Surroundings:

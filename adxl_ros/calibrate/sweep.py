@@ -31,7 +31,7 @@ from adxl_ros.calibrate import known, refusals
 from adxl_ros.calibrate.dwell import Dwell
 from adxl_ros.calibrate.plan import Target
 from adxl_ros.calibrate.poses import Poses
-from adxl_ros.calibrate.rests import Rest, Stillness
+from adxl_ros.calibrate.rests import Rest
 from adxl_ros.calibrate.stream import Surroundings
 from adxl_ros.errors import UserError
 from adxl_ros.model.sensor import Sensor
@@ -258,10 +258,6 @@ class Sweep:
         """Return why a pose was refused since the last call, or ''."""
         text, self._unsaid = self._unsaid, ''
         return text
-
-    def stillness(self) -> Stillness | None:
-        """Judge the newest samples at the pose."""
-        return self._dwell.stillness() if self._captured else None
 
     def dwelt_s(self) -> float:
         """Return for how long the sensor has been at rest in the pose, s."""

@@ -47,6 +47,7 @@ _JUDGE_NS = 500_000_000
 """The whole stream is judged anew no more often than this: it costs more as it grows."""
 _STEPS = 3
 _SHARE = 0.01
+_NOW = 20
 
 
 class Tumble:
@@ -177,7 +178,7 @@ class Tumble:
         """Return what points up at present, (3,); None without samples."""
         if not len(self._newest.volts):
             return None
-        mean = self._newest.volts.mean(axis=0, keepdims=True)
+        mean = self._newest.volts[-_NOW:].mean(axis=0, keepdims=True)
         force = force_of(rests_of(mean, 0 * mean, self.sensor).mean, self._found)[0]
         return force / max(float(np.linalg.norm(force)), 1e-9)
 

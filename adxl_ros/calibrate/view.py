@@ -19,7 +19,9 @@ from __future__ import annotations
 from typing import Any
 
 from adxl_ros.calibrate import directions, known
+from adxl_ros.calibrate.rests import Stillness
 from adxl_ros.calibrate.session import Session
+from adxl_ros.calibrate.stream import Newest
 from adxl_ros.calibrate.sweep import Sweep
 from adxl_ros.calibrate.tumble import ENOUGH_RESTS, Tumble
 from adxl_ros.model.coefficients import get
@@ -45,17 +47,13 @@ class View:
         walk = self._session.walk
         state = walk.state()
         return {'phase': state.phase, 'text': state.text, 'late': state.late,
-                'where': walk.where(), **live(self._session.newest, self._session.unit),
-                **self._rest(), **self._pose(), **self._learned()}
+                'where': walk.where(), **self._live(), **self._pose(), **self._learned()}
 
-    def _rest(self) -> dict[str, Any]:
-        still = self._session.walk.stillness()
-        if still is None:
-            return {'rest': None}
-        scale = G0_MPS2 / float(self._session.unit.nominal_scale_v_per_g[still.axis])
-        return {'rest': {'still': still.still, 'axis': self._session.unit.axes[still.axis],
-                         'figure': still.figure, 'value': still.value * scale,
-                         'limit': still.limit * scale}}
+    def _live(self) -> dict[str, Any]:
+        walk, newest = self._session.walk, self._session.newest
+        # By hand the noise is learned: what counts as a rest is for the walk to say.
+        still = walk.stillness() if isinstance(walk, Tumble) else newest.stillness()
+        return live(newest, self._session.unit, still)
 
     def _pose(self) -> dict[str, Any]:
         walk = self._session.walk
@@ -94,12 +92,18 @@ class View:
         return self._slow
 
 
-def live(newest: Any, unit: Sensor) -> dict[str, Any]:
-    """Return the live reading: mean and noise of the newest half second, m/s², and the rate."""
+def live(newest: Newest, unit: Sensor, still: Stillness | None) -> dict[str, Any]:
+    """Return the live reading: mean and noise, m/s², the rate, and the rest detector."""
     if not len(newest.volts):
         return {'live': None}
+    rest = None
+    if still is not None:
+        scale = G0_MPS2 / float(unit.nominal_scale_v_per_g[still.axis])
+        rest = {'still': still.still, 'axis': unit.axes[still.axis], 'figure': still.figure,
+                'value': still.value * scale, 'limit': still.limit * scale}
     return {'live': [[axis, mean, rms] for axis, mean, rms in zip(
-        unit.axes, newest.mean_mps2(), newest.rms_mps2())], 'rate_hz': newest.rate_hz()}
+        unit.axes, newest.mean_mps2(), newest.rms_mps2())], 'rate_hz': newest.rate_hz(),
+        'rest': rest}
 
 
 def _of_sweep(walk: Sweep) -> dict[str, Any]:
@@ -137,4 +141,5 @@ def _planes(walk: Sweep) -> list[list[Any]]:
             row[0] += i in walk.accepted
             row[1] += 1
         before = target
-    return [[name, *row] for name, row in rows.items()]
+    order = sorted(rows, key=lambda name: (name.startswith('check'), name.startswith('beta')))
+    return [[name, *rows[name]] for name in order]

@@ -26,7 +26,7 @@ from adxl_ros.errors import UserError
 from adxl_ros.files import cdr
 from adxl_ros.model.sensor import Sensor, to_volts
 from adxl_ros.nodes import announce, common
-from adxl_ros.nodes.console import Console
+from adxl_ros.nodes.console import Console, IDLE
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 import numpy as np
 import rclpy
@@ -390,7 +390,7 @@ class Calibration(Node):
                 silent = self._steady.now().nanoseconds - self._heard_ns > _SILENT_S * 1e9
                 return 'info', 'waiting for sensor_info' + (
                     '; is the driver running?' if silent else ''), True
-            return 'idle', self.said or 'idle; call ~/start', False
+            return 'idle', self.said or IDLE, False
         silent_s = (self._steady.now().nanoseconds - self._heard_ns) * 1e-9
         if silent_s > _SILENT_S:
             topic = self.resolve_topic_name('imu/data_raw')

@@ -23,6 +23,9 @@ from adxl_ros.calibrate.view import live, View
 from adxl_ros.screen.terminal import open_terminal, Terminal
 from rclpy.node import Node
 
+IDLE = 'idle; call ~/start'
+"""What a node says that has not been told to begin."""
+
 _EVERY = 4
 """The screen is given new figures every so many turns: five times a second."""
 _RUNNING = {'c': 'capture', 'r': 'redo', 's': 'skip', 'f': 'finish', 'a': 'abort', 'q': 'quit'}
@@ -56,7 +59,8 @@ class Console:
             self._press(key)
         self._turns += 1
         if self._turns % _EVERY == 0:
-            self.show(*self._node.state()[:2])
+            phase, text, _ = self._node.state()
+            self.show(phase, 'press b to begin' if text == IDLE else text)
 
     def show(self, phase: str, text: str) -> None:
         """Show the figures now."""
@@ -81,7 +85,7 @@ class Console:
             return {**self._view[1].figures(), **figures}
         self._view = None
         newest = node.newest()
-        return {**figures, **(live(newest, unit) if newest is not None else {})}
+        return {**figures, **(live(newest, unit, newest.stillness()) if newest is not None else {})}
 
     def _keys(self) -> dict[str, str]:
         if self._node.question:

@@ -53,7 +53,7 @@ def draw(figures: Mapping[str, Any], log: Sequence[str], size: ConsoleDimensions
            *_progress(figures, width)]
     bottom = [*_log(log), _keys(figures)]
     room = size.height - len(top) - len(bottom)
-    middle = _outcome(figures) or _learned(figures, width)
+    middle = _outcome(figures, width) or _learned(figures, width)
     lines = [*top, *middle[:max(room, 0)]]
     lines += [_text('')] * (size.height - len(lines) - len(bottom))
     # In a small terminal the keys and what is to be done stay.
@@ -119,12 +119,13 @@ def _progress(figures: Mapping[str, Any], width: int) -> list[Text]:
 
 
 def _learned(figures: Mapping[str, Any], width: int) -> list[Text]:
-    return [_text(f'{name:33.33} {_bar(share, 6)} {"  ".join(shown)}')
+    return [_text(f'{name:36.36} {_bar(share, 6)} {"  ".join(shown)}')
             for name, shown, share in figures.get('coefficients', ())]
 
 
-def _outcome(figures: Mapping[str, Any]) -> list[Text]:
-    return [_text(line) for line in figures.get('outcome', ())]
+def _outcome(figures: Mapping[str, Any], width: int) -> list[Text]:
+    return [_text(part) for line in figures.get('outcome', ())
+            for part in (wrap(line, width - 1) if len(line) > width else [line])]
 
 
 def _log(log: Sequence[str]) -> list[Text]:
