@@ -35,6 +35,7 @@ _JUDGED = 48
 _SHOWN_RAD = np.radians(1.0)
 """Poses that not even a perfect calibration shows better than this are not judged by."""
 _LEAST_STD_V = 1e-7
+_LOOKED_RAD, _LONGEST_RAD, _TURNS, _EXPLAINED = np.radians(60.0), 0.3, 25, 3.0
 
 
 @dataclass(frozen=True)
@@ -79,6 +80,26 @@ class Known:
         covariance = slope @ self.covariance @ slope.T + posed.pose_covariance(
             self.unit, pose, self.stage_rad)[0]
         return posed.response(self.unit, pose)[0], np.sqrt(np.diag(covariance))
+
+    def seen_at(self, alpha_rad: float, beta_rad: float, volts: np.ndarray, slack_v: np.ndarray
+                ) -> tuple[float, float] | None:
+        """
+        Find the angles near a pose at which volts, (m,), would be read, rad.
+
+        Where a pose does not show an angle, it stays. None if no angles explain the volts to
+        within about `slack_v`, (m,).
+        """
+        step, by = np.zeros(2), 1 / _LOOKED_RAD ** 2
+        for _ in range(_TURNS):
+            pose = _at(np.array([alpha_rad + step[0]]), np.array([beta_rad + step[1]]),
+                       self.pose_std_v)
+            off = (volts - posed.response(self.unit, pose)[0]) / slack_v
+            slope = posed.by_angles(self.unit, pose)[0] / slack_v[:, None]
+            more = np.linalg.solve(slope.T @ slope + by * np.eye(2), slope.T @ off - by * step)
+            step = step + np.clip(more, -_LONGEST_RAD, _LONGEST_RAD)
+        if np.abs(off).max() > _EXPLAINED:
+            return None
+        return alpha_rad + float(step[0]), beta_rad + float(step[1])
 
     def after(self, targets: Sequence[Target]) -> Known:
         """Return what will be known once those poses are taken, too."""

@@ -126,9 +126,9 @@ def reading(known: Known, target: Target, volts: np.ndarray, tolerance_rad: floa
     if known.poses < _TRUSTED and _crossed(reads, expected):
         return f'{said}: axis inverted or swapped; check wiring, mounting and pose'
     before = ', or take the pose before again' if 0 < known.poses < _TRUSTED else ''
-    there = _seen_at(reads, target, 'z' in sensor.axes)
-    off = angles(target, there[0], there[1], tolerance_rad)
-    if off and np.hypot(*reads[:2]) < 1 + _SAME_G:
+    there = known.seen_at(target.alpha_rad, target.beta_rad, volts, slack_v)
+    off = angles(target, *there, tolerance_rad) if there else ''
+    if off:
         return f'{said}: by the sensor, {off}; check the pose and the mounting{before}'
     return f'{said}; check the pose, the mounting and the wiring{before}'
 
@@ -168,19 +168,6 @@ def _crossed(reads: np.ndarray, expected: np.ndarray) -> bool:
               for step in (1, -1)]
     return not same(reads) and any(same(sign * reads[order]) for order in orders
                                    for sign in signs)
-
-
-def _seen_at(reads: np.ndarray, target: Target, measures_z: bool) -> tuple[float, float]:
-    """Return the alpha and beta nearest the target that explain what x, y (and z) read, rad."""
-    if len(reads) < 2:
-        return target.alpha_rad, target.beta_rad
-    plane = min(float(np.hypot(reads[0], reads[1])), 1.0)
-    alpha = float(np.arctan2(plane, reads[2])) if measures_z else float(np.arcsin(plane))
-    if not measures_z and target.alpha_rad > np.pi / 2:
-        alpha = np.pi - alpha
-    beta = float(np.arctan2(-reads[1], reads[0]))
-    turns = np.round((target.beta_rad - beta) / (2 * np.pi))
-    return alpha, beta + 2 * np.pi * float(turns)
 
 
 def _span(seconds: float) -> str:

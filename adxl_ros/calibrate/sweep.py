@@ -39,7 +39,7 @@ import numpy as np
 
 STAGE_MODES = ('commanded', 'encoder', 'manual')
 _KEPT_ANGLES = 100000
-_OFFSETS = 50
+_OFFSETS, _FEWEST_OFFSETS = 20, 4
 _BACK_NS = 1_000_000_000
 
 
@@ -124,6 +124,7 @@ class Sweep:
         self._since_ns: int | None = None
         self.newest_ns: int | None = None
         self._refusal = self._unsaid = ''
+        self._fresh = False
         self.known = self._learned(None)
         self.index = self._next()
         if accepted and self.index < len(targets):
@@ -186,8 +187,7 @@ class Sweep:
         if self._angles and stamp_ns < self._angles[-1][0] - _BACK_NS:
             self._angles.clear()
         self._angles.append((stamp_ns, alpha_rad, beta_rad))
-        if self.newest_ns is not None:
-            self._ahead_s.append((stamp_ns - self.newest_ns) * 1e-9)
+        self._fresh = True
         target = self.target
         if self.settings.stage_mode != 'commanded' or target is None:
             return
@@ -206,6 +206,9 @@ class Sweep:
             self._since_ns, self._ahead_s = None, deque(maxlen=_OFFSETS)
             self._captured, self._dwell = False, Dwell(self.sensor, 0)
         self.newest_ns = int(stamps_ns[-1])
+        if self._fresh:
+            self._ahead_s.append((self._angles[-1][0] - self.newest_ns) * 1e-9)
+            self._fresh = False
         if self._since_ns is None:
             self._since_ns = int(stamps_ns[0])
         if self._captured:
@@ -349,11 +352,13 @@ class Sweep:
     def _wrong(self, entry: dict[str, Any], volts: np.ndarray) -> str:
         """Say what speaks against a pose with these samples, or ''."""
         first = next((e['temperature_c'] for e in self.results() if 'temperature_c' in e), np.nan)
-        return (refusals.saturated(self.sensor, volts)
-                or refusals.temperature(first, entry.get('temperature_c', np.nan),
-                                        self.settings.temperature_span_c)
-                or refusals.reading(self.known, Target(entry['alpha_rad'], entry['beta_rad']),
-                                    np.array(entry['mean_v']), self.settings.tolerance_rad))
+        why = (refusals.saturated(self.sensor, volts)
+               or refusals.temperature(first, entry.get('temperature_c', np.nan),
+                                       self.settings.temperature_span_c))
+        if why or self.verifying:
+            return why
+        return refusals.reading(self.known, Target(entry['alpha_rad'], entry['beta_rad']),
+                                np.array(entry['mean_v']), self.settings.tolerance_rad)
 
     def _refuse(self, why: str) -> None:
         """Say why, once; what turns itself is looked at again, an operator captures again."""
@@ -381,7 +386,7 @@ class Sweep:
         self._go(self._next())
 
     def _clocks(self) -> str:
-        if len(self._ahead_s) < _OFFSETS:
+        if len(self._ahead_s) < _FEWEST_OFFSETS:
             return ''
         return refusals.clocks(min(self._ahead_s, key=abs))
 

@@ -16,17 +16,16 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from adxl_ros.calibrate import recorded
-from adxl_ros.calibrate.session import Plan, Session
+from adxl_ros.calibrate.session import Session
 from adxl_ros.calibrate.stream import Newest
-from adxl_ros.calibrate.sweep import MountingError, Settings, STAGE_MODES, Sweep
+from adxl_ros.calibrate.sweep import MountingError, Sweep
 from adxl_ros.errors import UserError
-from adxl_ros.files import cdr
-from adxl_ros.model.sensor import Sensor, to_volts
+from adxl_ros.model.sensor import Sensor
 from adxl_ros.nodes import announce, common
+from adxl_ros.nodes.asked import declare_plan
 from adxl_ros.nodes.console import Console, IDLE
+from adxl_ros.nodes.samples import Samples
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 import numpy as np
 import rclpy
@@ -34,14 +33,10 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.task import Future
-from sensor_msgs.msg import BatteryState, Imu, JointState, Temperature
+from sensor_msgs.msg import BatteryState, JointState, Temperature
 from std_srvs.srv import Trigger
 
 _POLL_S = 0.05
-_SILENT_S = 3.0
-_QUEUE = 20000
-_COMPENSATED_RAD2 = 1e5
-"""Variance of a yaw that is not known: a mark of compensation's output."""
 _SERVICES = ('start', 'redo', 'skip', 'finish', 'abort')
 
 
@@ -51,7 +46,12 @@ class Calibration(Node):
     def __init__(self) -> None:
         super().__init__('calibration')
         self.base = common.make_sensor(common.declare_sensor(self))
-        self._declare()
+        self.autostart = common.declare(self, 'autostart', False,
+                                        'start without a call of ~/start')
+        self.resume = common.declare(
+            self, 'resume', 'ask', 'go on with an interrupted calibration; ask where there is a '
+            'screen, else go on', choices=('ask', 'yes', 'no'))
+        self.asked = declare_plan(self)
         self.unit: Sensor | None = None
         self.session: Session | None = None
         self.outcome: list[str] = []
@@ -60,56 +60,18 @@ class Calibration(Node):
         self._wanted = self.autostart
         self._anew = self.resume == 'no'
         self._newest: Newest | None = None
-        self._raw: list[bytes] = []
         self._captures: list[Future] = []
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._heard_ns = self._steady.now().nanoseconds
+        self._samples = Samples(self)
         self._announcer = announce.Announcer(self)
         self._connect()
         self.console = Console(self) if common.declare(
             self, 'screen', True, 'show a screen, where the node runs in a terminal') else None
 
-    def _declare(self) -> None:
-        degrees = np.radians
-        declare = common.declare
-        mode = declare(self, 'mode', 'stage', 'what the reference is',
-                       choices=('stage', 'gravity'))
-        self.autostart = declare(self, 'autostart', False, 'start without a call of ~/start')
-        self.resume = declare(self, 'resume', 'ask', 'go on with an interrupted calibration; ask '
-                              'where there is a screen, else go on', choices=('ask', 'yes', 'no'))
-        output = Path(declare(self, 'output', 'calibration.yaml', 'parameter file to write'))
-        journal = declare(self, 'journal', '', 'file of accepted poses; empty: beside the output')
-        report = declare(self, 'report', '', 'directory for the figures; empty: none')
-        planes = declare(self, 'sweep.planes_rad',
-                         [float(degrees(a)) for a in (30, 60, 90, 120, 150)],
-                         'planes alpha of the sweep, rad')
-        step = declare(self, 'sweep.step_rad', float(degrees(30)), 'step of beta', 'rad',
-                       0.005, 1.6)
-        dwell = declare(self, 'sweep.dwell_s', 5.0, 'time at rest a pose', 's', 0.5, 3600.0)
-        checks = declare(self, 'sweep.check_poses', 16,
-                         'poses kept out of the fit for the verdict', '', 0, 1000)
-        self.settings = Settings(
-            dwell,
-            declare(self, 'stage.tolerance_rad', float(degrees(0.2)),
-                    'arrived within this', 'rad', 1e-6, 0.2),
-            declare(self, 'stage.timeout_s', 60.0, 'a pose that takes longer is said to be late',
-                    's', 1.0, 86400.0),
-            declare(self, 'stage.mode', 'commanded', 'who turns the stage', choices=STAGE_MODES),
-            declare(self, 'stage.near_rad', float(degrees(2)),
-                    'a stage turned by hand is captured within this of the pose', 'rad', 1e-4,
-                    0.5),
-            declare(self, 'sweep.temperature_span_c', 3.0,
-                    'how far the temperature may be from that of the first pose', 'degC', 0.1,
-                    1000.0))
-        self.asked = Plan(mode, tuple(planes), step, checks, self.settings, output,
-                          Path(journal or f'{output}.journal'), report)
-        self.asked.targets()
-
     def _connect(self) -> None:
         self._diagnostics = common.publisher(self, DiagnosticArray, '/diagnostics', 10)
         subscribe = common.subscription
         subscribe(self, DiagnosticStatus, 'sensor_info', self._on_info, 1, latched=True)
-        subscribe(self, Imu, 'imu/data_raw', self._raw.append, _QUEUE, raw=True)
         subscribe(self, JointState, 'stage/joint_states', self._on_stage, 1000)
         subscribe(self, Temperature, 'temperature',
                   lambda m: self._surround('temperature_c', m, m.temperature), 100)
@@ -178,7 +140,7 @@ class Calibration(Node):
         """Take the pose that the operator has reached; returns whether, and why not."""
         if self.session is None:
             return False, 'no calibration is running'
-        if self._sweep is not None and self.settings.stage_mode == 'commanded':
+        if self._sweep is not None and self.asked.settings.stage_mode == 'commanded':
             return False, 'nothing to capture: the stage moves itself, and poses are taken when ' \
                           'it has arrived'
         if self._hindrance:
@@ -264,8 +226,8 @@ class Calibration(Node):
 
     def _start(self, unit: Sensor) -> None:
         self.session = session = Session(unit, self.asked, self._anew)
-        self._raw.clear()
-        self._heard_ns = self._steady.now().nanoseconds
+        self._samples.clear()
+        self._samples.heard()
         self.outcome = []
         if session.resumed:
             again = 'the last one first, to see that the mounting is as it was; ' \
@@ -311,28 +273,16 @@ class Calibration(Node):
 
     def _watch(self) -> None:
         """Show the live reading while no calibration runs."""
-        batch = self._raw[:]
-        self._raw.clear()
-        if batch and self.unit is not None and self.console is not None:
-            stamps, accel, _ = _decoded(batch)
-            self._newest.feed(stamps, to_volts(accel[:, :len(self.unit.axes)], self.unit))
+        if self._newest is not None and self.console is not None:
+            self._newest.feed(*self._samples.take(self.unit))
+        else:
+            self._samples.clear()
 
     def _take_samples(self) -> None:
-        if not self._raw:
+        stamps, volts = self._samples.take(self.unit)
+        if not len(stamps):
             return
-        batch = self._raw[:]
-        self._raw.clear()
-        self._heard_ns = self._steady.now().nanoseconds
-        stamps, accel, yaw_rad2 = _decoded(batch)
-        hindrance = ''
-        if yaw_rad2 > _COMPENSATED_RAD2:
-            hindrance = (f'{self.resolve_topic_name("imu/data_raw")}: this stream is already '
-                         'compensated (it carries an orientation, as imu/data does); remap it to '
-                         "the driver's imu/data_raw")
-        else:
-            accel = accel[:, :len(self.unit.axes)]
-            finite = np.isfinite(accel).all(axis=1)
-            hindrance = self.session.feed(stamps[finite], to_volts(accel[finite], self.unit))
+        hindrance = self._samples.compensated or self.session.feed(stamps, volts)
         if hindrance and not self._hindrance:
             self.fail(hindrance)
         self._hindrance = hindrance
@@ -387,15 +337,12 @@ class Calibration(Node):
             return 'question', self.question, True
         if self.session is None:
             if self._wanted:
-                silent = self._steady.now().nanoseconds - self._heard_ns > _SILENT_S * 1e9
-                return 'info', 'waiting for sensor_info' + (
-                    '; is the driver running?' if silent else ''), True
+                silent = '; is the driver running?' if self._samples.silent() else ''
+                return 'info', f'waiting for sensor_info{silent}', True
             return 'idle', self.said or IDLE, False
-        silent_s = (self._steady.now().nanoseconds - self._heard_ns) * 1e-9
-        if silent_s > _SILENT_S:
-            topic = self.resolve_topic_name('imu/data_raw')
-            who = '' if self.count_publishers(topic) else ', and nobody publishes it'
-            return 'silent', f'nothing on {topic} for {silent_s:.0f} s{who}', True
+        silent = self._samples.silent()
+        if silent:
+            return 'silent', silent, True
         if self._hindrance:
             return 'refused', self._hindrance, True
         state = self.session.walk.state()
@@ -438,25 +385,6 @@ class Calibration(Node):
             self.session.close()
         if self.console is not None:
             self.console.close()
-
-
-def _decoded(batch: list[bytes]) -> tuple[np.ndarray, np.ndarray, float]:
-    """
-    Read serialized messages.
-
-    Returns
-    -------
-    tuple
-        Stamps, ns, (n,); linear acceleration, m/s², (n, 3); largest variance of a yaw, rad².
-
-    """
-    stamps, accel, yaw = np.empty(len(batch), np.int64), np.empty((len(batch), 3)), 0.0
-    for table in cdr.tables(batch, cdr.imu):
-        stamps[table.rows] = table.stamp_ns()
-        accel[table.rows] = table.numbers('linear_acceleration')
-        variances = table.numbers('orientation_covariance')
-        yaw = max(yaw, float(np.where(variances[:, 0] < 0, 0, variances[:, 8]).max()))
-    return stamps, accel, yaw
 
 
 def _stamp_ns(message: JointState | Temperature | BatteryState) -> int:

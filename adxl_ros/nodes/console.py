@@ -85,7 +85,9 @@ class Console:
             return {**self._view[1].figures(), **figures}
         self._view = None
         newest = node.newest()
-        return {**figures, **(live(newest, unit, newest.stillness()) if newest is not None else {})}
+        if newest is None:
+            return figures
+        return {**figures, **live(newest, unit, newest.stillness())}
 
     def _keys(self) -> dict[str, str]:
         if self._node.question:
@@ -100,7 +102,7 @@ class Console:
         elif action == 'begin':
             self.asks = True
             self._tell(node.start())
-        elif action == 'go on' or action == 'begin anew':
+        elif action in ('go on', 'begin anew'):
             self._tell(node.start(anew=action == 'begin anew'))
         elif action is not None:
             self._tell(getattr(node, action)())

@@ -36,7 +36,7 @@ _QUEUE = 1000
 
 class Simulated:
     """
-    The simulated stage: 100 poses a second of ROS time, on `stage/joint_states` as the encoders show them.
+    The simulated stage: 100 poses a second of ROS time, on `stage/joint_states`, by its encoders.
 
     A command takes effect after the delay of the controller. The true motion is thus known
     ahead, and goes ahead of time to `stage/true_joint_states`, for a simulated sensor to feel.
@@ -85,7 +85,8 @@ class Simulated:
         except UserError as error:
             self._refusals += 1
             self._refusal = f'{self._node.resolve_topic_name("stage/command")}: {error}'
-            self._node.get_logger().warning(f'{self._refusal}; the stage goes where it was told before')
+            self._node.get_logger().warning(
+                f'{self._refusal}; the stage goes where it was told before')
 
     def _tick(self) -> None:
         """Go on to the time up to which the motion is certain, and show what is due."""

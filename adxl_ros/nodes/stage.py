@@ -27,9 +27,10 @@ class Stage(Node):
 
     def __init__(self) -> None:
         super().__init__('stage')
-        kind = common.declare(self, 'stage.type', 'simulated', 'the simulated stage, or the bridge to '
-                              'a controller that takes joint states or trajectories',
-                              choices=('simulated', 'joint_state', 'trajectory'))
+        kind = common.declare(
+            self, 'stage.type', 'simulated', 'the simulated stage, or the bridge to a controller '
+            'that takes joint states or trajectories',
+            choices=('simulated', 'joint_state', 'trajectory'))
         self.inside = Simulated(self) if kind == 'simulated' else Bridge(self, kind)
 
 
