@@ -23,7 +23,6 @@ never blocks; what is logged meanwhile goes to the screen, and into the terminal
 from __future__ import annotations
 
 from contextlib import suppress
-from importlib.util import find_spec
 import json
 import os
 import socket
@@ -43,7 +42,9 @@ def open_terminal() -> tuple[Terminal | None, str]:
         return None, ''
     if os.tcgetpgrp(sys.stdin.fileno()) != os.getpgrp():
         return None, ''
-    if find_spec('rich') is None:
+    try:
+        import rich  # noqa: F401
+    except ImportError:
         return None, 'no screen, plain lines: it needs rich; pip install rich'
     return Terminal(), ''
 
