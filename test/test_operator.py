@@ -185,8 +185,8 @@ def test_a_compensated_stream_and_a_wrong_rate_are_refused(start, tmp_path):
         operator.spin_until(lambda: operator.said('other', 'samples are 500 a second'), 60, 'why')
 
 
-def test_temperature_and_the_driver_may_come_and_go(start, tmp_path):
-    """A temperature that moved is refused by its figures; a driver started anew is followed."""
+def test_a_temperature_that_moved_is_refused_until_it_is_back(start, tmp_path):
+    """By its figures, and what the pose had is in the journal."""
     with Operator() as operator:
         node = _bench(start, tmp_path, 'commanded')
         warm = operator.node.create_publisher(Temperature, 'temperature', 10)

@@ -87,6 +87,7 @@ def bench(start, tmp_path):
 def test_an_operator_is_led_through_a_sweep_by_the_screen(start, terminal, tmp_path):
     """Begin, a mistake, poses, a skip, a redo, the end: all by keys, all to be seen."""
     bench(start, tmp_path)
+    (tmp_path / 'unit.yaml').write_text('the earlier one\n')
     with Hands() as hands:
         seen = terminal(*FAST, '-p', 'stage.mode:=encoder')
         seen.wait_for('press b to begin', 'calibration of T1 (xy) into unit.yaml', '1000 Hz')
@@ -128,6 +129,8 @@ def test_an_operator_is_led_through_a_sweep_by_the_screen(start, terminal, tmp_p
         assert seen.popen.wait(20) == 0
         assert seen.restored()
         assert 'pose 6 is on disk' in seen.raw.decode().split('\x1b[?1049l')[-1]
+    assert params.load(tmp_path / 'unit.yaml').serial == 'T1'
+    assert (tmp_path / 'unit.yaml.previous').read_text() == 'the earlier one\n'
     _, entries = journal.read(tmp_path / 'unit.yaml.journal')
     poses = journal.accepted_poses(entries)
     assert len(poses) == 5 and journal.skipped_poses(entries) == {4}

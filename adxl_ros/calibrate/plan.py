@@ -23,6 +23,8 @@ from itertools import pairwise
 from adxl_ros.errors import UserError
 import numpy as np
 
+ORDER = 1
+"""To be raised with every change of `guided`: an interrupted sweep cannot go on in another."""
 _GOLDEN_RAD = np.pi * (3 - np.sqrt(5))
 
 

@@ -144,7 +144,7 @@ def mounting(sensor: Sensor, before_v: np.ndarray, now_v: np.ndarray, number: in
     return (f'mounting changed: in pose {number} {sensor.axes[axis]} reads {now_v[axis]:.4f} V, '
             f'but read {before_v[axis]:.4f} V before the interruption ({off_g[axis] * 1e3:.0f} mg '
             f'apart, {allowed * 1e3:.0f} mg are allowed); put the sensor back as it was, or begin '
-            'anew with resume:=no')
+            'anew with resume:=anew')
 
 
 def degrees(angle_rad: float) -> str:

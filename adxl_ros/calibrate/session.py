@@ -21,7 +21,6 @@ from dataclasses import dataclass
 import os
 from pathlib import Path
 from typing import Any
-import zlib
 
 from adxl_ros.calibrate import plan, refusals, result
 from adxl_ros.calibrate.poses import Poses
@@ -75,11 +74,10 @@ class Plan:
                 **{name: np.asarray(getattr(unit, name)).tolist() for name in _FIGURES}}
         if self.mode == 'gravity':
             return head
-        text = ' '.join(f'{t.alpha_rad:.9f} {t.beta_rad:.9f}' for t in self.targets())
         return {**head, 'stage.mode': self.settings.stage_mode,
                 'sweep.dwell_s': self.settings.dwell_s, 'sweep.planes_rad': self.planes_rad,
                 'sweep.step_rad': self.step_rad, 'sweep.check_poses': self.checks,
-                'order': f'{zlib.crc32(text.encode()):08x}'}
+                'order': plan.ORDER}
 
     def interrupted(self, unit: Sensor) -> tuple[int, str] | None:
         """Look for an interrupted calibration; see `journal.unfinished`."""

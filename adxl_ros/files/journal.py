@@ -116,7 +116,7 @@ class Journal:
             known, whole = [], 0
         if known and (changed := differences(known[0], head)):
             raise UserError(f'{self.path}: holds an unfinished calibration of another kind: '
-                            f'{changed}; go back, or begin anew with resume:=no (it is kept)')
+                            f'{changed}; go back, or begin anew with resume:=anew (it is kept)')
         self._file.truncate(whole)
         if not known:
             self.append(head)

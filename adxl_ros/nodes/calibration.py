@@ -50,7 +50,7 @@ class Calibration(Node):
                                         'start without a call of ~/start')
         self.resume = common.declare(
             self, 'resume', 'ask', 'go on with an interrupted calibration; ask where there is a '
-            'screen, else go on', choices=('ask', 'yes', 'no'))
+            'screen, else go on', choices=('ask', 'continue', 'anew'))
         self.asked = declare_plan(self)
         self.unit: Sensor | None = None
         self.session: Session | None = None
@@ -58,7 +58,7 @@ class Calibration(Node):
         self.question = ''
         self.said = self._hindrance = self._warned = ''
         self._wanted = self.autostart
-        self._anew = self.resume == 'no'
+        self._anew = self.resume == 'anew'
         self._newest: Newest | None = None
         self._captures: list[Future] = []
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -130,7 +130,7 @@ class Calibration(Node):
         if self.session is not None:
             return False, 'a calibration is running; finish or abort it first'
         self._wanted, self.question = True, ''
-        self._anew = self.resume == 'no' if anew is None else anew
+        self._anew = self.resume == 'anew' if anew is None else anew
         self._try_to_start()
         if self.session is None and self._wanted:
             return True, 'starts when sensor_info arrives'
@@ -230,9 +230,10 @@ class Calibration(Node):
         self._samples.heard()
         self.outcome = []
         if session.resumed:
-            again = 'the last one first, to see that the mounting is as it was; ' \
+            again = ' (the last one first, to see that the mounting is as it was)' \
                 if self._sweep is not None and self._sweep.verifying else ''
-            resumed = f', resumed after {session.resumed} poses, {again}resume:=no begins anew'
+            resumed = f', resumed after {session.resumed} poses{again}; ' \
+                      'resume:=anew puts them aside'
         else:
             resumed = ''
         self.say(f'calibrating {unit.serial}: ' + (
