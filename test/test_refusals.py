@@ -16,10 +16,12 @@
 
 from dataclasses import replace
 
-from adxl_ros.calibrate import known, refusals
-from adxl_ros.calibrate.plan import guided, Target
+from adxl_ros.calibrate import known, refusals, verdict
+from adxl_ros.calibrate.plan import guided, spread, Target
+from adxl_ros.calibrate.poses import Poses
 from adxl_ros.calibrate.sweep import MountingError, Settings, Sweep
 from adxl_ros.calibrate.tumble import Tumble
+from adxl_ros.model import chain
 from adxl_ros.model.coefficients import parameter_of
 from adxl_ros.model.stage import specific_force
 import numpy as np
@@ -283,6 +285,26 @@ def test_what_is_known_is_what_the_fits_find():
     few = known.from_poses(nominal('xyz'), poses.subset(np.arange(20)), 5.0, 4e-4)
     assert told.tilt_error_rad() < 0.05 * few.tilt_error_rad()
     assert np.degrees(told.tilt_error_rad()) < 0.02
+
+
+def test_the_tilt_to_expect_is_that_of_poses_not_seen():
+    """After half of the sweep, errors over the sphere are what the screen has promised."""
+    promised, found = [], []
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        truth = drawn(rng, nominal('xyz'))
+        half = swept(rng, truth, np.radians([30, 60, 90, 120, 150]), 0).subset(
+            np.arange(130) % 26 < 13)
+        told = known.from_poses(nominal('xyz'), half, 5.0, truth.stage_resolution_rad / 12 ** 0.5)
+        promised.append(told.tilt_error_rad())
+        alpha, beta = np.array([(t.alpha_rad, t.beta_rad) for t in spread(48)]).T
+        volts = np.column_stack(chain.static_response(truth)(specific_force(alpha, beta, 9.80665)))
+        std_v = np.tile(told.pose_std_v, (48, 1))
+        unseen = Poses(volts + std_v * rng.normal(size=volts.shape), std_v, alpha, beta,
+                       np.zeros((48, 2)), np.zeros(48, bool))
+        off = verdict.errors(told.sensor(), unseen)
+        found.append(np.nanmean(np.concatenate([off.alpha_rad, off.beta_rad]) ** 2))
+    assert np.sqrt(np.mean(found)) == pytest.approx(np.mean(promised), rel=0.4)
 
 
 def test_stage_vectors_agree_with_directions():

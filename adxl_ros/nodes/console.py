@@ -28,7 +28,8 @@ IDLE = 'idle; call ~/start'
 
 _EVERY = 4
 """The screen is given new figures every so many turns: five times a second."""
-_RUNNING = {'c': 'capture', 'r': 'redo', 's': 'skip', 'f': 'finish', 'a': 'abort', 'q': 'quit'}
+_RUNNING = {'r': 'redo', 's': 'skip', 'f': 'finish', 'a': 'abort', 'q': 'quit'}
+_BY_HAND = {'c': 'capture', **_RUNNING}
 _IDLE = {'b': 'begin', 'q': 'quit'}
 _ASKED = {'y': 'go on', 'n': 'begin anew', 'a': 'abort', 'q': 'quit'}
 
@@ -92,7 +93,11 @@ class Console:
     def _keys(self) -> dict[str, str]:
         if self._node.question:
             return _ASKED
-        return _IDLE if self._node.session is None else _RUNNING
+        if self._node.session is None:
+            return _IDLE
+        asked = self._node.asked
+        by_hand = asked.mode == 'stage' and asked.settings.stage_mode != 'commanded'
+        return _BY_HAND if by_hand else _RUNNING
 
     def _press(self, key: str) -> None:
         action = self._keys().get('c' if key == ' ' else key)
