@@ -40,7 +40,7 @@ class Operator(Graph):
         self.commands = self.node.create_publisher(JointState, 'stage/command', 10)
         return self
 
-    def next(self):
+    def asked(self):
         """Return what is announced: number, alpha, beta, and the words."""
         newest = self.announced[-1]
         told = {pair.key: pair.value for pair in newest.values}
@@ -91,7 +91,7 @@ def test_an_operator_who_makes_mistakes_ends_with_a_good_file(start, tmp_path):
     with Operator() as operator:
         node = _bench(start, tmp_path, 'encoder')
         operator.spin_until(lambda: operator.announced, 60, 'the first pose')
-        number, alpha, beta, words = operator.next()
+        number, alpha, beta, words = operator.asked()
         assert (number, alpha, beta) == (1, np.pi / 4, 0.0)
         assert words == 'pose 1 of 20: turn the stage to alpha 45.0°, beta 0.0°, then capture'
         # A wrong pose.
@@ -110,7 +110,7 @@ def test_an_operator_who_makes_mistakes_ends_with_a_good_file(start, tmp_path):
                                                      operator.command(alpha, beta, 0.0)))
         assert done and said == 'pose 1 is on disk'
         # Goes on to the next pose before this one is taken.
-        number, alpha, beta, _ = operator.next()
+        number, alpha, beta, _ = operator.asked()
         assert number == 2
         operator.turn(alpha, beta)
         done, said = operator.ask(meanwhile=lambda: operator.turn(alpha, beta + np.pi / 4))
@@ -124,12 +124,12 @@ def test_an_operator_who_makes_mistakes_ends_with_a_good_file(start, tmp_path):
         assert node.popen.poll() is None
         # And then does it right.
         for _ in range(2, 21):
-            number, alpha, beta, _ = operator.next()
+            number, alpha, beta, _ = operator.asked()
             operator.turn(alpha, beta)
             done, said = operator.ask()
             assert done, said
             operator.spin_until(lambda number=number: (tmp_path / 'unit.yaml').exists()
-                                or operator.next()[0] > number, 30, 'the next pose')
+                                or operator.asked()[0] > number, 30, 'the next pose')
         operator.spin_until((tmp_path / 'unit.yaml').exists, 60, 'the file')
     want = params.load(tmp_path / 'truth.yaml')
     found = params.load(tmp_path / 'unit.yaml')

@@ -31,8 +31,8 @@ _NEARLY = 0.5
 """Directions that tell as much as this of the best one's: the nearest of them is asked for."""
 
 
-def gain(information: np.ndarray, found: np.ndarray, gravity: float) -> tuple[np.ndarray,
-                                                                             np.ndarray]:
+def gain(information: np.ndarray, found: np.ndarray, gravity: float
+         ) -> tuple[np.ndarray, np.ndarray]:
     """
     Return what a rest in each candidate tells, (26,), and its derivatives, (26, 9).
 

@@ -65,8 +65,8 @@ def rests_of(mean_v: np.ndarray, standard_error_v: np.ndarray, sensor: Sensor) -
                  sensor.local_gravity_mps2 / G0_MPS2)
 
 
-def in_units(found: np.ndarray, sensor: Sensor) -> tuple[dict[str, dict[str, np.ndarray]],
-                                                         np.ndarray]:
+def in_units(found: np.ndarray, sensor: Sensor
+             ) -> tuple[dict[str, dict[str, np.ndarray]], np.ndarray]:
     """Return what was found in the effects' parameters, and the units of NAMES in it, (9,)."""
     scale = sensor.nominal_scale_v_per_g
     to_units = np.concatenate([scale, scale, np.ones(3)])
