@@ -19,7 +19,8 @@ from dataclasses import replace
 from adxl_ros.calibrate import known, refusals, verdict
 from adxl_ros.calibrate.plan import guided, spread, Target
 from adxl_ros.calibrate.poses import Poses
-from adxl_ros.calibrate.sweep import MountingError, Settings, Sweep
+from adxl_ros.calibrate.state import Settings
+from adxl_ros.calibrate.sweep import MountingError, Sweep
 from adxl_ros.calibrate.tumble import Tumble
 from adxl_ros.model import chain
 from adxl_ros.model.coefficients import parameter_of
@@ -213,6 +214,29 @@ def test_the_mounting_is_looked_at_after_an_interruption(by_rad, words):
         'alpha_rad': np.zeros(2), 'beta_rad': np.full(2, by_rad)}}))
     with pytest.raises(MountingError, match=words):
         after.run(4, np.pi / 2, 0.0)
+
+
+def test_what_shakes_for_minutes_is_forgotten_and_taken_when_it_is_still():
+    """A long wait costs neither memory nor the pose."""
+    shaken = bench()
+    assert shaken.run(70, np.pi / 2, 0.0, shake_mps2=0.3) is None
+    assert shaken.sweep._dwell.age_s() < 65
+    assert shaken.run(5, np.pi / 2, 0.0)
+
+
+def test_by_hand_a_last_pose_that_differs_can_be_set_anew():
+    """Without an encoder it may be the operator who missed the pose: nothing is stopped."""
+    before = bench('manual')
+    before.run(0.2, np.pi / 2, 0.0)
+    before.sweep.capture()
+    entry = before.run(5, np.pi / 2, 0.0)
+    after = bench('manual', accepted=[entry])
+    for beta, words in ((np.radians(4), 'mounting changed: in pose 1 y reads'), (0.0, '')):
+        after.run(0.2, np.pi / 2, beta)
+        after.sweep.capture()
+        assert after.run(3, np.pi / 2, beta) is None
+        assert words in after.sweep.state().text
+    assert not after.sweep.verifying and after.sweep.target == NEXT
 
 
 def test_redo_and_skip_walk_the_plan():

@@ -15,7 +15,8 @@
 """The guided sweep without ROS: what it waits for, says and accepts."""
 
 from adxl_ros.calibrate.plan import guided, sweep as plan_sweep, Target, travel_rad
-from adxl_ros.calibrate.sweep import Settings, Sweep
+from adxl_ros.calibrate.state import Settings
+from adxl_ros.calibrate.sweep import Sweep
 from adxl_ros.calibrate.tumble import Tumble
 from adxl_ros.errors import UserError
 from adxl_ros.model.stage import specific_force

@@ -66,6 +66,15 @@ class Dwell:
         rests = self.rests()
         return (rests[-1].stop - rests[-1].start) / self._sensor.rate_hz if rests else 0.0
 
+    def at_rest(self) -> bool:
+        """Tell whether the newest samples are at rest."""
+        still = self.stillness()
+        return still is not None and still.still
+
+    def age_s(self) -> float:
+        """Return for how long there have been samples, s."""
+        return sum(map(len, self._stamps)) / self._sensor.rate_hz
+
     def volts(self, rest: Rest) -> np.ndarray:
         """Return the samples of a rest, V, (n, m)."""
         return np.concatenate(self._volts)[rest.start:rest.stop]

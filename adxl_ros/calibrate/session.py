@@ -24,8 +24,9 @@ from typing import Any
 
 from adxl_ros.calibrate import plan, refusals, result
 from adxl_ros.calibrate.poses import Poses
+from adxl_ros.calibrate.state import Settings
 from adxl_ros.calibrate.stream import Newest
-from adxl_ros.calibrate.sweep import Settings, Sweep
+from adxl_ros.calibrate.sweep import Sweep
 from adxl_ros.calibrate.tumble import Tumble
 from adxl_ros.errors import UserError
 from adxl_ros.files.journal import accepted_poses, Journal, skipped_poses, unfinished
@@ -79,9 +80,16 @@ class Plan:
                 'sweep.step_rad': self.step_rad, 'sweep.check_poses': self.checks,
                 'order': plan.ORDER}
 
-    def interrupted(self, unit: Sensor) -> tuple[int, str] | None:
-        """Look for an interrupted calibration; see `journal.unfinished`."""
-        return unfinished(self.journal, self.head(unit))
+    def question(self, unit: Sensor) -> str:
+        """Ask what to do with an interrupted calibration; '' where there is none."""
+        found = unfinished(self.journal, self.head(unit))
+        if found is None:
+            return ''
+        poses, changed = found
+        then = f', which cannot go on: {changed}. Begin anew (n; it is kept), or abort (a) and ' \
+               'put that back?' if changed else \
+            ' of this unit. Go on with them (y), or begin anew (n; they are kept)?'
+        return f'{self.journal} holds {poses} poses of an interrupted calibration{then}'
 
 
 class Session:
@@ -166,7 +174,7 @@ class Session:
     def skip(self) -> str:
         """Leave the pose at hand out; return what is done."""
         if isinstance(self.walk, Sweep) and not self.walk.verifying and not self.over:
-            self.journal.append({'skip': self.walk.index})
+            self.journal.append({'skip': self.walk.index, 'drop': self.walk.index})
         return self.walk.skip() if not self.over else 'there is no pose left to skip'
 
     def redo(self) -> str:

@@ -24,7 +24,6 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 from adxl_ros.calibrate import known, refusals
@@ -32,62 +31,16 @@ from adxl_ros.calibrate.dwell import Dwell
 from adxl_ros.calibrate.plan import Target
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.calibrate.rests import Rest
+from adxl_ros.calibrate.state import Settings, State
 from adxl_ros.calibrate.stream import Surroundings
 from adxl_ros.errors import UserError
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
-STAGE_MODES = ('commanded', 'encoder', 'manual')
 _KEPT_ANGLES = 100000
 _OFFSETS, _FEWEST_OFFSETS = 20, 4
 _BACK_NS = 1_000_000_000
-
-
-@dataclass(frozen=True)
-class Settings:
-    """
-    How poses are taken; times are sensor time.
-
-    Attributes
-    ----------
-    dwell_s, timeout_s
-        Time at rest a pose, and after which a pose is said to be late.
-    tolerance_rad, near_rad
-        Arrived within: a stage that moves itself, one that is turned by hand.
-    stage_mode
-        One of `STAGE_MODES`.
-    temperature_span_c
-        How far the temperature may be from that of the first pose.
-
-    """
-
-    dwell_s: float
-    tolerance_rad: float
-    timeout_s: float
-    stage_mode: str
-    near_rad: float = 0.035
-    temperature_span_c: float = 3.0
-
-
-@dataclass(frozen=True)
-class State:
-    """
-    What a calibration waits for.
-
-    Attributes
-    ----------
-    phase
-        'operator', 'stage', 'rest', 'dwell', 'refused' or 'done'.
-    text
-        The same for people, with figures.
-    late
-        Whether it has waited longer than the time-out, or refuses what it gets.
-
-    """
-
-    phase: str
-    text: str
-    late: bool
+_OLD_S, _SILENT_S = 60.0, 3.0
 
 
 class MountingError(UserError):
@@ -169,6 +122,7 @@ class Sweep:
             self._go(self._next())
             return f'pose {number} is not taken again: the mounting is not checked'
         self.skipped.add(self.index)
+        self.accepted.pop(self.index, None)
         self._go(self._next())
         return f'pose {number} is left out'
 
@@ -231,6 +185,10 @@ class Sweep:
         wanted = round(self.settings.dwell_s * self.sensor.rate_hz)
         rest = next((r for r in self._dwell.rests() if r.stop - r.start >= wanted), None)
         if rest is None:
+            # What moves for a long time is judged as a whole again and again: forget it.
+            if self._dwell.age_s() > _OLD_S + 2 * self.settings.dwell_s and \
+                    not self._dwell.at_rest():
+                self._dwell = Dwell(self.sensor, (self.newest_ns or 0) + 1)
             return None
         entry = self._entry(self._dwell.mean(rest, wanted), target)
         why = self._moved_away(rest, entry) or self._wrong(entry, self._dwell.volts(rest))
@@ -256,6 +214,10 @@ class Sweep:
     def results(self) -> list[dict[str, Any]]:
         """Return the poses to fit: all that were accepted."""
         return [self.accepted[number] for number in sorted(self.accepted)]
+
+    def tilt_error_rad(self) -> float:
+        """Return the rms error of alpha and beta to expect after the poses so far, rad."""
+        return self.known.tilt_error_rad()
 
     def refused(self) -> str:
         """Return why a pose was refused since the last call, or ''."""
@@ -380,6 +342,9 @@ class Sweep:
                              for name in ('alpha_rad', 'beta_rad'))
         why = refusals.mounting(self.sensor, np.array(self._verify['mean_v']),
                                 np.array(entry['mean_v']), self.index + 1, stage_rad)
+        if why and self.settings.stage_mode == 'manual':
+            self._refuse(f'{why}; or turn the stage to where it was, and capture again')
+            return
         if why:
             raise MountingError(why)
         self._verify = None
@@ -393,6 +358,9 @@ class Sweep:
     def _off_text(self, target: Target) -> str:
         if self.angles is None:
             return 'nothing on stage/joint_states'
+        silent_s = ((self.newest_ns or 0) - self._angles[-1][0]) * 1e-9
+        if silent_s > _SILENT_S:
+            return f'nothing on stage/joint_states for {silent_s:.0f} s'
         return refusals.angles(target, *self.angles, self.settings.tolerance_rad) or 'arrived'
 
     def _angle_between(self, first_ns: int, last_ns: int, target: Target) -> tuple[float, float]:

@@ -35,8 +35,8 @@ from adxl_ros.calibrate.magnitude import (
 )
 from adxl_ros.calibrate.recorded import known_noise
 from adxl_ros.calibrate.rests import Rest, RestFinder, Stillness
+from adxl_ros.calibrate.state import State
 from adxl_ros.calibrate.stream import Newest, Surroundings
-from adxl_ros.calibrate.sweep import State
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 

@@ -113,7 +113,7 @@ def _of_sweep(walk: Sweep) -> dict[str, Any]:
     return {'coverage': _planes(walk),
             'coefficients': known.by_term(told.names, get(told.unit, told.names), told.std,
                                           told.prior),
-            'tilt_deg': float(np.degrees(told.tilt_error_rad())),
+            'tilt_deg': float(np.degrees(walk.tilt_error_rad())),
             'tilt_end_deg': float(np.degrees(told.after(left).tilt_error_rad()))}
 
 

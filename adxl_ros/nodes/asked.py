@@ -19,7 +19,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from adxl_ros.calibrate.session import Plan
-from adxl_ros.calibrate.sweep import Settings, STAGE_MODES
+from adxl_ros.calibrate.state import Settings, STAGE_MODES
 from adxl_ros.nodes import common
 import numpy as np
 from rclpy.node import Node

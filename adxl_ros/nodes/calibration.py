@@ -16,6 +16,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+import os
+
 from adxl_ros.calibrate import recorded
 from adxl_ros.calibrate.session import Session
 from adxl_ros.calibrate.stream import Newest
@@ -28,7 +31,6 @@ from adxl_ros.nodes.console import Console, IDLE
 from adxl_ros.nodes.samples import Samples
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 import numpy as np
-import rclpy
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
@@ -56,7 +58,7 @@ class Calibration(Node):
         self.session: Session | None = None
         self.outcome: list[str] = []
         self.question = ''
-        self.said = self._hindrance = self._warned = ''
+        self.said = self._hindrance = self._warned = self._foreign = ''
         self._wanted = self.autostart
         self._anew = self.resume == 'anew'
         self._newest: Newest | None = None
@@ -85,7 +87,7 @@ class Calibration(Node):
         self.create_timer(_POLL_S, self._poll, clock=self._steady)
         self.create_timer(1.0, self._report_state, clock=self._steady)
 
-    def _service(self, name: str):
+    def _service(self, name: str) -> Callable[..., Trigger.Response]:
         def answer(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
             response.success, response.message = getattr(self, name)()
             return response
@@ -96,8 +98,10 @@ class Calibration(Node):
         try:
             unit = recorded.unit_of(self.base, info, 'sensor_info')
         except UserError as error:
-            self.fail(f'{error}')
+            self._foreign = f'{error}'
+            self.fail(self._foreign)
             return
+        self._foreign = ''
         if self.session is not None:
             was, now = (self.asked.head(of) for of in (self.session.unit, unit))
             changed = ', '.join(f'{key} was {was[key]}, is {now[key]}' for key in was
@@ -105,9 +109,7 @@ class Calibration(Node):
             if changed:
                 self._stop(f'sensor_info: {changed}: changed during the calibration; put it back '
                            'and start again, the poses are kept')
-        if self.unit is None or len(unit.axes) != len(self.unit.axes):
-            self._newest = Newest(unit)
-        self.unit = unit
+        self.unit, self._newest = unit, Newest(unit)
 
     def _on_stage(self, message: JointState) -> None:
         angles = dict(zip(message.name, message.position))
@@ -213,14 +215,8 @@ class Calibration(Node):
 
     def _ask(self) -> bool:
         """Ask in the terminal what to do with an interrupted calibration, if there is one."""
-        found = self.asked.interrupted(self.unit) if self.resume == 'ask' else None
-        if found is not None:
-            poses, changed = found
-            self.question = (
-                f'{self.asked.journal} holds {poses} poses of an interrupted calibration' + (
-                    f', which cannot go on: {changed}. Begin anew (n; it is kept), or abort (a) '
-                    'and put that back?' if changed else
-                    ' of this unit. Go on with them (y), or begin anew (n; they are kept)?'))
+        if self.resume == 'ask':
+            self.question = self.asked.question(self.unit)
         self.console.asks = False
         return bool(self.question)
 
@@ -312,7 +308,10 @@ class Calibration(Node):
         if session is not None:
             session.close()
         self._answer_captures(False, text)
-        self.fail(text) if failed else self.say(text)
+        if failed:
+            self.fail(text)
+        else:
+            self.say(text)
 
     def say(self, text: str) -> None:
         """Log what is news."""
@@ -337,6 +336,8 @@ class Calibration(Node):
         if self.question:
             return 'question', self.question, True
         if self.session is None:
+            if self._wanted and self._foreign:
+                return 'refused', self._foreign, True
             if self._wanted:
                 silent = '; is the driver running?' if self._samples.silent() else ''
                 return 'info', f'waiting for sensor_info{silent}', True
@@ -359,7 +360,8 @@ class Calibration(Node):
             walk = self.session.walk
             number = walk.index + 1 if isinstance(walk, Sweep) else len(walk.accepted) + 1
             values |= {'phase': phase, 'pose': str(number), 'next': walk.where(),
-                       'accepted': str(self.session.done)}
+                       'accepted': str(self.session.done),
+                       'tilt_error_deg': float(np.degrees(walk.tilt_error_rad()))}
         serial = self.unit.serial if self.unit else ''
         self._diagnostics.publish(common.diagnostics(self, common.status(
             common.WARN if late else common.OK, 'calibration', text, serial, values)))
@@ -376,10 +378,6 @@ class Calibration(Node):
         """Return the newest samples; None before there is a unit."""
         return self.session.newest if self.session else self._newest
 
-    def leave(self) -> None:
-        """End the node."""
-        rclpy.try_shutdown()
-
     def close(self) -> None:
         """Let the journal and the terminal go."""
         if self.session is not None:
@@ -394,4 +392,7 @@ def _stamp_ns(message: JointState | Temperature | BatteryState) -> int:
 
 def main() -> int:
     """Run the node."""
+    # Through shared memory, Fast DDS does not reach a process again that was killed and started
+    # anew (eProsima/Fast-DDS issues 2811, 5053 and 5469): an interrupted sweep could not go on.
+    os.environ.setdefault('FASTDDS_BUILTIN_TRANSPORTS', 'UDPv4')
     return common.main(Calibration, __doc__)

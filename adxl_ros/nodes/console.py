@@ -21,6 +21,7 @@ from typing import Any
 from adxl_ros.calibrate.session import Session
 from adxl_ros.calibrate.view import live, View
 from adxl_ros.screen.terminal import open_terminal, Terminal
+import rclpy
 from rclpy.node import Node
 
 IDLE = 'idle; call ~/start'
@@ -55,6 +56,8 @@ class Console:
             self._terminal.close()
             self._terminal, self.asks = None, False
             self._node.get_logger().warning('the screen has ended; plain lines from here on')
+            if self._node.question:
+                self._node.start()
             return
         for key in self._terminal.pressed():
             self._press(key)
@@ -103,7 +106,7 @@ class Console:
         action = self._keys().get('c' if key == ' ' else key)
         node = self._node
         if action == 'quit':
-            node.leave()
+            rclpy.try_shutdown()
         elif action == 'begin':
             self.asks = True
             self._tell(node.start())

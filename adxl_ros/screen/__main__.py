@@ -44,6 +44,10 @@ class Log:
         self.lines: deque[str] = deque(maxlen=_KEPT_LINES)
         self._fd, self._rest = fd, b''
 
+    def fileno(self) -> int:
+        """Return what to wait for."""
+        return self._fd
+
     def read(self) -> bool:
         """Take what is there; return False when nothing will come any more."""
         with suppress(BlockingIOError):
@@ -124,10 +128,8 @@ def main() -> int:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     talk = socket.socket(fileno=int(sys.argv[1]))
     talk.setblocking(False)
-    fd = int(sys.argv[2])
-    os.set_blocking(fd, False)
-    log = Log(fd)
-    log.fileno = lambda: fd  # type: ignore[attr-defined]
+    log = Log(int(sys.argv[2]))
+    os.set_blocking(log.fileno(), False)
     terminal = sys.stdin.fileno()
     saved = termios.tcgetattr(terminal)
     keys = termios.tcgetattr(terminal)

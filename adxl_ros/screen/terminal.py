@@ -38,7 +38,8 @@ RESET = '\x1b[?1049l\x1b[?25h\x1b[0m'
 
 def open_terminal() -> tuple[Terminal | None, str]:
     """Open a screen where there is a terminal; else None, and what is missing, if anything is."""
-    if not (sys.stdin.isatty() and sys.stdout.isatty()) or os.environ.get('TERM') == 'dumb':
+    if not all(stream and stream.isatty() for stream in (sys.stdin, sys.stdout)) \
+            or os.environ.get('TERM') == 'dumb':
         return None, ''
     if os.tcgetpgrp(sys.stdin.fileno()) != os.getpgrp():
         return None, ''
@@ -90,8 +91,9 @@ class Terminal:
 
     def close(self) -> None:
         """End the screen, and see that the terminal is as it was."""
-        sys.stdout.flush()
-        sys.stderr.flush()
+        with suppress(OSError):
+            sys.stdout.flush()
+            sys.stderr.flush()
         for fd, original in self._outputs:
             os.dup2(original, fd)
             os.close(original)
