@@ -87,16 +87,18 @@ class Sweeps:
         node = self._start('calibration', 'bare.yaml', *SWEEP)
         began, log = time.monotonic(), self.folder / 'calibration.log'
         after_s, since = self.rng.uniform(0.0, 2.0), None
-        while time.monotonic() - began < _LONGEST_S:
-            text = log.read_text(errors='replace')
-            if since is None and 'calibrating' in text:
-                since = time.monotonic()
-            if 'wrote unit.yaml' in text or (
-                    since is not None and time.monotonic() - since > after_s):
-                break
-            time.sleep(0.005)
-        os.kill(node.pid, signal.SIGKILL)
-        node.wait()
+        try:
+            while time.monotonic() - began < _LONGEST_S:
+                text = log.read_text(errors='replace')
+                if since is None and 'calibrating' in text:
+                    since = time.monotonic()
+                if 'wrote unit.yaml' in text or (
+                        since is not None and time.monotonic() - since > after_s):
+                    break
+                time.sleep(0.005)
+        finally:
+            os.kill(node.pid, signal.SIGKILL)
+            node.wait()
         self.kills += 1
         self._look(log.read_text(errors='replace'), since is not None)
 

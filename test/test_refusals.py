@@ -123,9 +123,9 @@ def test_a_wrong_pose_is_told_once_the_unit_is_known():
 
 
 def test_units_at_the_edge_of_the_datasheet_are_never_refused():
-    """Of 40 units with departures up to twice the datasheet's limits, no pose is refused."""
+    """Of 15 units with departures up to twice the datasheet's limits, no pose is refused."""
     rng = np.random.default_rng(7)
-    for _ in range(40):
+    for _ in range(15):
         truth = drawn(rng, nominal('xyz'))
         truth = replace(truth, values={e: {p: _edge(f'{e}.{p}', v) for p, v in of.items()}
                                        for e, of in truth.values.items()})
