@@ -57,7 +57,8 @@ class Sweeps:
     """
 
     def __init__(self, folder, env, seed):
-        self.folder, self.env = Path(folder), env
+        # A process that is killed within Fast DDS's shared memory leaves it locked for others.
+        self.folder, self.env = Path(folder), {**env, 'FASTDDS_BUILTIN_TRANSPORTS': 'UDPv4'}
         self.rng = np.random.default_rng(seed)
         self.kills = self.sweeps = self.poses = 0
         self.lost, self.broken, self.moments = [], [], {}
