@@ -4,7 +4,7 @@
 # make bench    rate, missing samples, latency and CPU of the live nodes
 # make gallery  docs/effects.md and its plots, from the library of effects
 # make faults   the links under every fault, as a table
-# make soak     half an hour of random faults
+# make soak     half an hour of random faults, and 200 kills of a sweep
 # make fuzz     the decoder and the serial link, two minutes of hostile bytes
 # make long     an 8-hour recording through apply: memory and time
 # make blind    the blind check of diagnose, 600 trials, into blind_output/ (make blind ARGS='--seed 1')
@@ -96,7 +96,7 @@ lint: build
 bench: build
 	./run bench --iiod test/iiod.py $(ARGS)
 
-# Each of these takes long: its table goes into docs/links.md.
+# Each of these takes long: its tables go into docs/links.md and docs/guided.md.
 faults soak: build
 	cd test && ../run --exec python $@.py $(ARGS)
 

@@ -13,20 +13,22 @@
 # limitations under the License.
 
 """
-1 kHz of three channels for half an hour, with a random fault every 20 s.
+1 kHz of three channels for half an hour, with a random fault every 20 s; a sweep killed 200 times.
 
-    make soak                       prints a table for docs/links.md
-    make soak ARGS='--minutes 5 --seed 3'
+    make soak                       prints tables for docs/links.md and docs/guided.md
+    make soak ARGS='--minutes 5 --kills 20 --seed 3'
 """
 
 import argparse
 from collections import defaultdict
 from importlib.metadata import version
+import os
 import sys
 import tempfile
 import time
 
 from faults import driver, line, Row, run, SERIAL
+from kills import kill
 import numpy as np
 from rig import Book, graph_of_own, memory_mib, SerialRig
 
@@ -71,10 +73,27 @@ def main():
     parse = argparse.ArgumentParser(description=__doc__)
     parse.add_argument('--minutes', type=float, default=30.0)
     parse.add_argument('--seed', type=int, default=1)
+    parse.add_argument('--kills', type=int, default=200)
     options = parse.parse_args()
+    wrong = []
+    if options.minutes:
+        wrong += links(options)
+    if options.kills:
+        wrong += sweeps(options)
+    print(f'soak: wrong: {", ".join(wrong)}' if wrong else 'soak: nothing wrong', file=sys.stderr)
+    return 1 if wrong else 0
+
+
+def dated(options, what):
+    """Return the line above a table."""
+    return (f'{time.strftime("%Y-%m-%d")}, adxl_ros {version("adxl_ros")}, seed {options.seed}, '
+            f'{what}.\n')
+
+
+def links(options):
+    """Run the links for a while, print their table, and return what went wrong."""
     books, memory = soak(options.minutes, options.seed)
-    print(f'{time.strftime("%Y-%m-%d")}, adxl_ros {version("adxl_ros")}, seed {options.seed}, '
-          f'{options.minutes:g} minutes.\n')
+    print(dated(options, f'{options.minutes:g} minutes'))
     print('| fault | times | published | wrong | missing | said | recovered within | '
           'worst stamp, ms |\n|---|---|---|---|---|---|---|---|')
     for row, told in sorted(books.items(), key=lambda item: item[0].name):
@@ -84,10 +103,21 @@ def main():
         Row('', None), *summed([b for told in books.values() for b in told])).split('|')[2:]]))
     print(f'\nMemory of the driver: {memory[0]:.1f} MiB after a minute, {memory[-1]:.1f} MiB at '
           'the end.')
-    wrong = [row.name for row, told in books.items() for b, _ in told
-             if b.wrong or (row.exact and b.missing != b.said)]
-    print(f'soak: wrong: {", ".join(wrong)}' if wrong else 'soak: nothing wrong', file=sys.stderr)
-    return 1 if wrong else 0
+    return [row.name for row, told in books.items() for b, _ in told
+            if b.wrong or (row.exact and b.missing != b.said)]
+
+
+def sweeps(options):
+    """Kill a sweep again and again, print what came of it, and return what went wrong."""
+    with tempfile.TemporaryDirectory() as folder, graph_of_own():
+        told = kill(folder, dict(os.environ), options.kills, options.seed)
+    print(dated(options, f'{told.kills} kills'))
+    print('| killed while | times |\n|---|---|')
+    for moment, times in sorted(told.moments.items()):
+        print(f'| {moment} | {times} |')
+    print(f'\n{told.poses} poses were acknowledged, {told.sweeps} sweeps came to their end; '
+          f'lost or changed: {len(told.lost)}, broken files: {len(told.broken)}.')
+    return [*told.lost, *told.broken]
 
 
 if __name__ == '__main__':

@@ -14,10 +14,12 @@
 
 """The journal: on disk before it is acknowledged, whole after any crash."""
 
+import errno
 import json
+import os
 
 from adxl_ros.errors import UserError
-from adxl_ros.files.journal import accepted_poses, Journal, read
+from adxl_ros.files.journal import accepted_poses, Journal, read, skipped_poses, unfinished
 import pytest
 
 HEAD = {'serial': 'A1', 'mode': 'stage'}
@@ -93,3 +95,59 @@ def test_a_pose_taken_again_replaces_the_first():
     """`redo` appends the pose anew."""
     entries = [{'pose': 0, 'v': 1}, {'pose': 1, 'v': 2}, {'pose': 0, 'v': 3}, {'done': True}]
     assert accepted_poses(entries) == [{'pose': 0, 'v': 3}, {'pose': 1, 'v': 2}]
+
+
+def test_a_pose_is_synced_before_it_is_acknowledged(tmp_path, monkeypatch):
+    """What a power cut after `append` leaves is what fsync was called for, the entry in it."""
+    path, synced = tmp_path / 'j', []
+    journal = Journal(path, HEAD)
+    sync = os.fsync
+    monkeypatch.setattr(os, 'fsync', lambda fd: (synced.append(path.read_bytes()), sync(fd)))
+    journal.append({'pose': 0})
+    assert json.loads(synced[-1].splitlines()[-1]) == {'pose': 0}
+    monkeypatch.setattr(os, 'fsync', _no_room)
+    with pytest.raises(UserError, match='No space left on device; make room'):
+        journal.append({'pose': 1})
+    assert read(path)[1] == [{'pose': 0}]
+
+
+def _no_room(_):
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def test_anew_keeps_the_interrupted_one(tmp_path):
+    """Poses of an interrupted calibration are put aside, not away."""
+    path = tmp_path / 'j'
+    journal = Journal(path, HEAD)
+    journal.append({'pose': 0})
+    journal.close()
+    assert unfinished(path, HEAD) == (1, '')
+    assert unfinished(path, {**HEAD, 'serial': 'B2'}) == (1, 'serial was "A1", is "B2"')
+    journal = Journal(path, {**HEAD, 'serial': 'B2'}, anew=True)
+    assert journal.entries == []
+    journal.close()
+    kept, = tmp_path.glob('j.2*')
+    assert read(kept) == ({'format': 1, **HEAD}, [{'pose': 0}])
+    assert unfinished(path, HEAD) is None
+
+
+def test_poses_that_were_dropped_or_left_out():
+    """A rest that is forgotten counts no more; a pose that is left out is known as such."""
+    entries = [{'pose': 0}, {'pose': 1}, {'drop': 1}, {'skip': 4}, {'pose': 2}]
+    assert accepted_poses(entries) == [{'pose': 0}, {'pose': 2}]
+    assert skipped_poses(entries) == {4}
+
+
+def test_what_a_power_cut_leaves_at_the_end_is_no_pose(tmp_path):
+    """A file system may have given the file its length, but not yet its bytes."""
+    path = tmp_path / 'j'
+    journal = Journal(path, HEAD)
+    journal.append({'pose': 0})
+    journal.close()
+    with open(path, 'ab') as file:
+        file.write(bytes(200))
+    journal = Journal(path, HEAD)
+    assert journal.entries == [{'pose': 0}]
+    journal.append({'pose': 1})
+    journal.close()
+    assert read(path)[1] == [{'pose': 0}, {'pose': 1}]

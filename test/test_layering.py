@@ -24,7 +24,7 @@ REPO = Path(__file__).resolve().parents[1]
 PACKAGE = REPO / 'adxl_ros'
 CORE = {'adxl_ros', 'ament_index_python', 'numpy', 'scipy', 'yaml'}
 ROS = {'builtin_interfaces', 'diagnostic_msgs', 'geometry_msgs', 'rcl_interfaces', 'rclpy',
-       'rosgraph_msgs', 'sensor_msgs', 'std_msgs', 'std_srvs'}
+       'rosgraph_msgs', 'sensor_msgs', 'std_msgs', 'std_srvs', 'trajectory_msgs'}
 
 
 def test_contracts(capsys: pytest.CaptureFixture) -> None:

@@ -85,3 +85,31 @@ class Fed:
         stamps_s = (self.count + np.arange(count)) / self.rate_hz
         self.count += count
         return self.respond(stamps_s)
+
+
+class Bench:
+    """A sensor on a stage, sampled at 1 kHz; time begins at a wall clock's nanoseconds."""
+
+    def __init__(self, sweep, sensor, seed=1):
+        self.sweep = sweep
+        self.sensor = sensor
+        self.now_ns = 1_700_000_000_000_000_000
+        self.fed = Fed(sensor, seed)
+
+    def run(self, seconds, alpha, beta, encoder=True, shake_mps2=0.0):
+        """Hold the angles (floats, or functions of time) for so long; stop at an entry."""
+        for _ in range(round(seconds / 0.05)):
+            time = np.arange(50) / 1000
+            force = specific_force(np.full(50, alpha), np.full(50, beta), 9.80665,
+                                   shake_mps2 * np.sin(2 * np.pi * 7 * (
+                                       self.now_ns % 10 ** 9 * 1e-9 + time)))
+            volts = self.fed(force)
+            stamps = self.now_ns + np.arange(50) * 1_000_000
+            if encoder:
+                self.sweep.stage(self.now_ns, alpha, beta)
+            self.sweep.feed(stamps, volts)
+            self.now_ns += 50_000_000
+            entry = self.sweep.accept()
+            if entry is not None:
+                return entry
+        return None

@@ -24,32 +24,34 @@ three angles: the gauge holds Θx on the case's x and Θy in its x-y plane.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import product
 
+from adxl_ros.calibrate.directions import poses_to_add
+from adxl_ros.calibrate.magnitude import (
+    gauss_newton,
+    in_units,
+    information_of,
+    jacobian_of,
+    magnitude,
+    magnitude_variance,
+    NAMES,
+    open_names,
+    Rests,
+    rests_of,
+    TRIAL,
+)
 from adxl_ros.errors import UserError
-from adxl_ros.model.constants import AXES, G0_MPS2
+from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 from scipy.optimize import brentq, least_squares
 from scipy.special import gammaln, stdtrit
 
-NAMES = (*(f'bias.offset_v.{axis}' for axis in AXES),
-         *(f'scale_factor.offset_v_per_g.{axis}' for axis in AXES),
-         'misalignment.beta_rad.y', 'misalignment.alpha_rad.z', 'misalignment.beta_rad.z')
 MIN_RESTS = len(NAMES) + 1
 """One rest more than coefficients: with fewer, nothing says how good the fit is."""
-PRIOR = 0.1
-"""Coefficients can be this far from nominal, in g, of the scale factor and in rad."""
-DETERMINED = 0.01
-"""A coefficient counts as determined below this: 10 mg, 1 %, 0.6°, what datasheets promise."""
 OUTLIER_CHANCE = 0.01
 """Chance that a fit without knocks takes any of its rests for one."""
 STARTS, STEPS = 20, 15
 """Fits to ten rests each, that one of them may be without knocks, and steps of each."""
-ROUNDING = 1e-9
-"""Error of a mean without noise, g."""
-TRIAL = 1e-4
-"""Excess of a rest's magnitude, g, to begin with."""
 KNOCK = 0.03
 """Width of what a knock can make of a magnitude, g."""
 OUTLIERS = 0.25
@@ -90,18 +92,6 @@ class GravityFit:
     outliers: tuple[int, ...]
 
 
-@dataclass(frozen=True)
-class _Rests:
-    """Rests by nominal figures, g, (k, 3): means, variances of the means, and gravity, g."""
-
-    mean: np.ndarray
-    variance: np.ndarray
-    gravity: float
-
-    def __getitem__(self, part: np.ndarray) -> _Rests:
-        return _Rests(self.mean[part], self.variance[part], self.gravity)
-
-
 def fit_gravity(mean_v: np.ndarray, standard_error_v: np.ndarray, sensor: Sensor) -> GravityFit:
     """
     Fit the nine parameters by maximum likelihood.
@@ -125,27 +115,20 @@ def fit_gravity(mean_v: np.ndarray, standard_error_v: np.ndarray, sensor: Sensor
         what they read is not gravity at all.
 
     """
-    scale = sensor.nominal_scale_v_per_g
-    rests = _Rests((mean_v - sensor.nominal_zero_g_v) / scale,
-                   (standard_error_v / scale) ** 2 + ROUNDING ** 2,
-                   sensor.local_gravity_mps2 / G0_MPS2)
+    rests = rests_of(mean_v, standard_error_v, sensor)
     nominal = np.zeros(len(NAMES))
     _require_determined(rests, nominal, 0.0)
     kept = _inliers(rests, nominal)
     found, excess = _fit(rests[kept], nominal)
     _require_determined(rests[kept], found, excess)
-    variance = _magnitude_variance(rests, found) + excess
-    jacobian = _jacobian(rests[kept].mean, found) / np.sqrt(variance[kept, None])
+    variance = magnitude_variance(rests, found) + excess
+    jacobian = jacobian_of(rests[kept].mean, found) / np.sqrt(variance[kept, None])
     covariance = np.linalg.inv(jacobian.T @ jacobian)
     covariance *= _t_factor(excess, variance[kept])
-    to_units = np.concatenate([scale, scale, np.ones(3)])
-    values = found * to_units
-    residual = _magnitude(rests.mean, found) - rests.gravity
+    values, to_units = in_units(found, sensor)
+    residual = magnitude(rests.mean, found) - rests.gravity
     return GravityFit(
-        values={'bias': {'offset_v': values[:3]},
-                'scale_factor': {'offset_v_per_g': values[3:6]},
-                'misalignment': {'alpha_rad': np.array([0.0, 0.0, values[7]]),
-                                 'beta_rad': np.array([0.0, values[6], values[8]])}},
+        values=values,
         covariance=covariance * np.outer(to_units, to_units),
         before_mps2=G0_MPS2 * (np.linalg.norm(rests.mean, axis=1) - rests.gravity),
         residual_mps2=G0_MPS2 * residual,
@@ -155,65 +138,22 @@ def fit_gravity(mean_v: np.ndarray, standard_error_v: np.ndarray, sensor: Sensor
         outliers=tuple(int(i) for i in np.flatnonzero(~kept)))
 
 
-def _axes(found: np.ndarray) -> np.ndarray:
-    """Directions of the sensing axes in the gauge, rows Θx, Θy, Θz, (3, 3)."""
-    sy, cy = np.sin(found[6]), np.cos(found[6])
-    sa, ca, sb, cb = np.sin(found[7]), np.cos(found[7]), np.sin(found[8]), np.cos(found[8])
-    return np.array([[1.0, 0.0, 0.0], [-sy, cy, 0.0], [sb, -sa * cb, ca * cb]])
-
-
-def _force(mean: np.ndarray, found: np.ndarray) -> np.ndarray:
-    """Specific force of each rest in the case frame, g, (k, 3)."""
-    sensed = (mean - found[:3]) / (1 + found[3:6])
-    return np.linalg.solve(_axes(found), sensed.T).T
-
-
-def _magnitude(mean: np.ndarray, found: np.ndarray) -> np.ndarray:
-    """Magnitude of each rest's specific force, g, (k,)."""
-    return np.linalg.norm(_force(mean, found), axis=1)
-
-
-def _by_output(force: np.ndarray, found: np.ndarray) -> np.ndarray:
-    """Differentiate each magnitude by what the axes sense: Θ⁻ᵀ·f/|f|, (k, 3)."""
-    along = force / np.linalg.norm(force, axis=1, keepdims=True)
-    return np.linalg.solve(_axes(found).T, along.T).T
-
-
-def _jacobian(mean: np.ndarray, found: np.ndarray) -> np.ndarray:
-    """Differentiate each magnitude by the nine parameters, (k, 9)."""
-    force = _force(mean, found)
-    by_sensed = _by_output(force, found)
-    by_output = by_sensed / (1 + found[3:6])
-    sensed = (mean - found[:3]) / (1 + found[3:6])
-    sy, cy = np.sin(found[6]), np.cos(found[6])
-    sa, ca, sb, cb = np.sin(found[7]), np.cos(found[7]), np.sin(found[8]), np.cos(found[8])
-    turns = ((1, [-cy, -sy, 0.0]), (2, [0.0, -ca * cb, -sa * cb]), (2, [cb, sa * sb, -ca * sb]))
-    by_angles = [by_sensed[:, axis] * (force @ np.array(row)) for axis, row in turns]
-    return -np.column_stack([by_output, by_output * sensed, *by_angles])
-
-
-def _magnitude_variance(rests: _Rests, found: np.ndarray) -> np.ndarray:
-    """Variance of each magnitude that the noise of the means explains, g², (k,)."""
-    by_output = _by_output(_force(rests.mean, found), found) / (1 + found[3:6])
-    return (by_output ** 2 * rests.variance).sum(axis=1)
-
-
-def _solve(rests: _Rests, start: np.ndarray, variance: np.ndarray) -> np.ndarray:
+def _solve(rests: Rests, start: np.ndarray, variance: np.ndarray) -> np.ndarray:
     """Fit with given variances of the magnitudes, g², (k,)."""
     sigma = np.sqrt(variance)
-    return least_squares(lambda p: (_magnitude(rests.mean, p) - rests.gravity) / sigma, start,
-                         lambda p: _jacobian(rests.mean, p) / sigma[:, None], method='lm',
+    return least_squares(lambda p: (magnitude(rests.mean, p) - rests.gravity) / sigma, start,
+                         lambda p: jacobian_of(rests.mean, p) / sigma[:, None], method='lm',
                          xtol=1e-12, ftol=1e-12, gtol=1e-12).x
 
 
-def _fit(rests: _Rests, start: np.ndarray) -> tuple[np.ndarray, float]:
+def _fit(rests: Rests, start: np.ndarray) -> tuple[np.ndarray, float]:
     """Fit the parameters, and the excess variance, g², that makes chi-squared its freedom."""
     found, excess = start, 0.0
     freedom = len(rests.mean) - len(NAMES)
     for _ in range(20):
-        variance = _magnitude_variance(rests, found)
+        variance = magnitude_variance(rests, found)
         found = _solve(rests, found, variance + excess)
-        squares = (_magnitude(rests.mean, found) - rests.gravity) ** 2
+        squares = (magnitude(rests.mean, found) - rests.gravity) ** 2
         before, excess = excess, _excess(squares, variance, freedom)
         if abs(excess - before) <= 1e-6 * (excess + variance.min()):
             break
@@ -236,7 +176,7 @@ def _t_factor(excess: float, variance: np.ndarray) -> float:
     return 1 + excess / variance.mean() * 2 / max(freedom - 2, 1)
 
 
-def _inliers(rests: _Rests, start: np.ndarray) -> np.ndarray:
+def _inliers(rests: Rests, start: np.ndarray) -> np.ndarray:
     """
     Tell which rests fit the others, (k,): the rest are knocks, or were no rests.
 
@@ -254,7 +194,7 @@ def _inliers(rests: _Rests, start: np.ndarray) -> np.ndarray:
     return min(results, key=lambda kept: _unlikeliness(rests, kept, start))
 
 
-def _exchanged(rests: _Rests, kept: np.ndarray, start: np.ndarray, most: int) -> np.ndarray:
+def _exchanged(rests: Rests, kept: np.ndarray, start: np.ndarray, most: int) -> np.ndarray:
     """Let rests leave or come back until each kept one fits, and each other does not, (k,)."""
     kept = kept.copy()
     for _ in range(2 * most):
@@ -272,17 +212,17 @@ def _exchanged(rests: _Rests, kept: np.ndarray, start: np.ndarray, most: int) ->
     return kept
 
 
-def _unlikeliness(rests: _Rests, kept: np.ndarray, start: np.ndarray) -> float:
+def _unlikeliness(rests: Rests, kept: np.ndarray, start: np.ndarray) -> float:
     """Negative logarithm of the residual likelihood, knocks being anywhere within KNOCK."""
     found, excess = _fit(rests[kept], start)
-    variance = _magnitude_variance(rests[kept], found).mean() + excess
+    variance = magnitude_variance(rests[kept], found).mean() + excess
     count, knocks = len(kept), (~kept).sum()
     ways = gammaln(count + 1) - gammaln(knocks + 1) - gammaln(count - knocks + 1)
     return float((kept.sum() - len(NAMES)) / 2 * np.log(variance * 2 * np.pi * np.e)
                  + knocks * np.log(KNOCK) + ways)
 
 
-def _robust_inliers(rests: _Rests, start: np.ndarray, most: int) -> np.ndarray:
+def _robust_inliers(rests: Rests, start: np.ndarray, most: int) -> np.ndarray:
     """
     Tell which rests the best fit to all but `most` of them does not leave far off, (k,).
 
@@ -295,35 +235,26 @@ def _robust_inliers(rests: _Rests, start: np.ndarray, most: int) -> np.ndarray:
     for _ in range(STARTS):
         found, suited = start, draw.choice(count, MIN_RESTS, replace=False)
         for step in range(STEPS):
-            found = _gauss_newton(rests[suited], found)
-            squares = (_magnitude(rests.mean, found) - rests.gravity) ** 2
+            found = gauss_newton(rests[suited], found)
+            squares = (magnitude(rests.mean, found) - rests.gravity) ** 2
             if step > 2:
                 suited = np.argsort(squares)[:count - most]
         left = np.sort(squares)[:count - most].sum()
         if left < least:
             best, least = found, left
     freedom = max(count - most - len(NAMES), 1)
-    spread = np.sqrt(least / freedom + _magnitude_variance(rests, best).mean())
-    return np.abs(_magnitude(rests.mean, best) - rests.gravity) <= 5 * spread
+    spread = np.sqrt(least / freedom + magnitude_variance(rests, best).mean())
+    return np.abs(magnitude(rests.mean, best) - rests.gravity) <= 5 * spread
 
 
-def _gauss_newton(rests: _Rests, found: np.ndarray) -> np.ndarray:
-    """Take one step of a fit that the prior holds where the rests do not."""
-    rows = _jacobian(rests.mean, found)
-    weight = 1 / (_magnitude_variance(rests, found).mean() + TRIAL ** 2)
-    slope = weight * rows.T @ (_magnitude(rests.mean, found) - rests.gravity) + found / PRIOR ** 2
-    information = weight * rows.T @ rows + np.eye(len(NAMES)) / PRIOR ** 2
-    return np.clip(found - np.linalg.solve(information, slope), -0.5, 0.5)
-
-
-def _studentised(rests: _Rests, kept: np.ndarray, start: np.ndarray) -> np.ndarray:
+def _studentised(rests: Rests, kept: np.ndarray, start: np.ndarray) -> np.ndarray:
     """Distance of each rest from the fit to the others, in its standard deviations, (k,)."""
     found, excess = _fit(rests[kept], start)
-    variance = _magnitude_variance(rests, found) + excess
-    covariance = np.linalg.inv(_information(rests[kept], found, excess))
-    jacobian = _jacobian(rests.mean, found)
+    variance = magnitude_variance(rests, found) + excess
+    covariance = np.linalg.inv(information_of(rests[kept], found, excess))
+    jacobian = jacobian_of(rests.mean, found)
     leverage = np.einsum('ki,ij,kj->k', jacobian, covariance, jacobian) / variance
-    distance = np.abs(_magnitude(rests.mean, found) - rests.gravity) / np.sqrt(variance)
+    distance = np.abs(magnitude(rests.mean, found) - rests.gravity) / np.sqrt(variance)
     inside = distance / np.sqrt(np.maximum(1 - leverage, 1e-9))
     # What remains of chi-squared without the rest itself; the means' noise is there in any case.
     freedom = kept.sum() - len(NAMES)
@@ -332,7 +263,7 @@ def _studentised(rests: _Rests, kept: np.ndarray, start: np.ndarray) -> np.ndarr
     return np.where(kept, inside, distance / np.sqrt(1 + leverage))
 
 
-def _leave_one_out(rests: _Rests, kept: np.ndarray, found: np.ndarray, variance: np.ndarray,
+def _leave_one_out(rests: Rests, kept: np.ndarray, found: np.ndarray, variance: np.ndarray,
                    residual: np.ndarray) -> np.ndarray:
     """Error of each rest's magnitude by the fit to all others, g, (k,)."""
     errors = residual.copy()
@@ -340,59 +271,25 @@ def _leave_one_out(rests: _Rests, kept: np.ndarray, found: np.ndarray, variance:
         others = kept.copy()
         others[i] = False
         without = _solve(rests[others], found, variance[others])
-        errors[i] = _magnitude(rests.mean[i:i + 1], without)[0] - rests.gravity
+        errors[i] = magnitude(rests.mean[i:i + 1], without)[0] - rests.gravity
     return errors
 
 
-def _require_determined(rests: _Rests, found: np.ndarray, excess: float) -> None:
+def _require_determined(rests: Rests, found: np.ndarray, excess: float) -> None:
     """Refuse rests that leave a coefficient open, or read something else than gravity."""
-    information = _information(rests, found, excess)
-    open_names, count = _open(information), len(rests.mean)
-    read = np.median(_magnitude(rests.mean, found)) if count else rests.gravity
+    information = information_of(rests, found, excess)
+    lost, count = open_names(information), len(rests.mean)
+    read = np.median(magnitude(rests.mean, found)) if count else rests.gravity
     if not 0.5 < read / rests.gravity < 2:
         raise UserError(f'gravity: the rests read {read * G0_MPS2:.3g} m/s², not '
                         f'{rests.gravity * G0_MPS2:.3g}: put nominal_zero_g_v, '
                         'nominal_scale_v_per_g or local_gravity_mps2 right')
-    if count >= MIN_RESTS and not open_names:
+    if count >= MIN_RESTS and not lost:
         return
-    what = 'all nine coefficients' if len(open_names) == len(NAMES) else ', '.join(open_names)
-    lacking = f'leave {what} open' if open_names else f'are too few, {MIN_RESTS} are the least'
+    what = 'all nine coefficients' if len(lost) == len(NAMES) else ', '.join(lost)
+    lacking = f'leave {what} open' if lost else f'are too few, {MIN_RESTS} are the least'
     scatter = f' and scatter by {1e3 * np.sqrt(excess):.2g} mg' if excess else ''
-    poses = _poses_to_add(count, information, found, rests.gravity, TRIAL ** 2 + excess)
+    poses = poses_to_add(max(MIN_RESTS - count, 0), information, found, rests.gravity,
+                         TRIAL ** 2 + excess)
     raise UserError(f'gravity: the {count} rests that were found {lacking}{scatter}: add rests '
                     f'with {", ".join(poses)}')
-
-
-def _poses_to_add(count: int, information: np.ndarray, found: np.ndarray, gravity: float,
-                  variance: float) -> list[str]:
-    """Name the poses that tell most, one after the other, until all coefficients are told."""
-    poses: list[str] = []
-    candidates = [np.array(c) for c in product((0, 1, -1), repeat=3) if any(c)]
-    while (count + len(poses) < MIN_RESTS or _open(information)) and len(poses) < MIN_RESTS:
-        axes = [np.count_nonzero(c) for c in candidates]
-        directions = np.array(candidates) / np.sqrt(axes)[:, None]
-        outputs = found[:3] + (1 + found[3:6]) * (gravity * directions @ _axes(found).T)
-        rows = _jacobian(outputs, found)
-        told = np.einsum('ki,ij,kj->k', rows, np.linalg.inv(information), rows)
-        # With one or two axes along gravity a pose is easier to hold.
-        best = int(np.argmax(told / axes))
-        information = information + np.outer(rows[best], rows[best]) / variance
-        poses.append(' and '.join(f'{axis} {"up" if sign > 0 else "down"}' for axis, sign
-                                  in zip(AXES, candidates.pop(best)) if sign))
-    return poses
-
-
-def _information(rests: _Rests, found: np.ndarray, excess: float) -> np.ndarray:
-    """Information of the rests about the nine parameters, with that of the prior, (9, 9)."""
-    information = np.eye(len(NAMES)) / PRIOR ** 2
-    if len(rests.mean):
-        rows = _jacobian(rests.mean, found)
-        variance = _magnitude_variance(rests, found) + excess
-        information += rows.T @ (rows / variance[:, None])
-    return information
-
-
-def _open(information: np.ndarray) -> list[str]:
-    """Name the coefficients that the information does not determine."""
-    sigma = np.sqrt(np.diag(np.linalg.inv(information)))
-    return [name for name, s in zip(NAMES, sigma) if s > DETERMINED]

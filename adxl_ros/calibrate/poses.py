@@ -76,7 +76,7 @@ class Poses:
 
         times = np.column_stack([column('start_ns'), column('stop_ns')]) * 1e-9
         return Poses(column('mean_v'), column('std_v'), column('alpha_rad'), column('beta_rad'),
-                     times, column('check', False))
+                     times, column('check', False), column('temperature_c'), column('supply_v'))
 
     def subset(self, chosen: np.ndarray) -> Poses:
         """Keep some of the poses, by mask or index."""

@@ -26,6 +26,7 @@ from adxl_ros.calibrate.rests import find_rests, Rest, rest_means
 from adxl_ros.calibrate.stillness import Noise
 from adxl_ros.errors import UserError
 from adxl_ros.files.columns import nominal_figures, Recording
+from adxl_ros.files.unit import same_unit
 from adxl_ros.model import noise
 from adxl_ros.model.sensor import Sensor, with_axes
 import numpy as np
@@ -66,7 +67,7 @@ def unit_of(sensor: Sensor, info: Mapping[str, str], where: str, axes: str | Non
 
     """
     serial = info.get('serial', sensor.serial)
-    if 'nominal' not in (serial, sensor.serial) and serial != sensor.serial:
+    if not same_unit(serial, sensor.serial):
         raise UserError(f'{where}: is of the sensor {serial}, but the parameters are of '
                         f'{sensor.serial}; give the parameters of that sensor, or nominal ones')
     axes = axes or info.get('axes', sensor.axes)

@@ -47,7 +47,9 @@ from adxl_ros.calibrate.stillness import (
     window_variance,
 )
 from adxl_ros.errors import UserError
+from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.noise import effective_samples
+from adxl_ros.model.sensor import Sensor
 import numpy as np
 
 HELD_S, STAGED_S = 1.4, 0.6
@@ -101,6 +103,11 @@ class Stillness:
         how = 'at rest' if self.still else {'rms': 'moving', 'drift': 'drifting'}[self.figure]
         return (f'{how}: {self.value * scale:.2g} {unit} on {axes[self.axis]}, '
                 f'must be below {self.limit * scale:.2g}')
+
+    def in_mps2(self, sensor: Sensor) -> str:
+        """Say it in m/s², for samples that are a sensor's volts."""
+        scale = G0_MPS2 / float(sensor.nominal_scale_v_per_g[self.axis])
+        return self.describe('m/s²', scale, sensor.axes)
 
 
 class RestFinder:

@@ -28,6 +28,7 @@ from adxl_ros.calibrate.filter_noise import FilterNoise, with_filter
 from adxl_ros.calibrate.poses import check_polarity, Poses, reference_force, together
 from adxl_ros.errors import UserError
 from adxl_ros.files import params
+from adxl_ros.files.atomic import keep_previous
 from adxl_ros.model import chain
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects import effect_named
@@ -53,7 +54,8 @@ class Result:
         return [*coefficients(self.fitted), '', *self.verdict]
 
     def save(self, path: str | os.PathLike) -> None:
-        """Write the parameter file, whole or not at all."""
+        """Write the parameter file, whole or not at all; one that was there is kept beside it."""
+        keep_previous(path)
         params.save(path, self.fitted, self.comments())
 
     def draw(self, path: str | os.PathLike) -> None:

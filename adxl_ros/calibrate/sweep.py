@@ -16,56 +16,35 @@
 The guided sweep, free of ROS: samples and encoder angles in, accepted poses out.
 
 A pose goes through: the stage arrives (or the operator captures), the sensor comes to rest, a
-full dwell at rest is averaged. Motion during the dwell begins it anew.
+full dwell at rest is averaged, and nothing speaks against it (`refusals`). Motion during the
+dwell begins it anew.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+from adxl_ros.calibrate import known, refusals
+from adxl_ros.calibrate.dwell import Dwell
 from adxl_ros.calibrate.plan import Target
-from adxl_ros.calibrate.recorded import known_noise
-from adxl_ros.calibrate.rests import Rest, rest_means, RestFinder
-from adxl_ros.model.constants import G0_MPS2
+from adxl_ros.calibrate.poses import Poses
+from adxl_ros.calibrate.rests import Rest
+from adxl_ros.calibrate.state import Settings, State
+from adxl_ros.calibrate.stream import Surroundings
+from adxl_ros.errors import UserError
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
-STAGE_MODES = ('commanded', 'encoder', 'manual')
 _KEPT_ANGLES = 100000
+_OFFSETS, _FEWEST_OFFSETS = 20, 4
+_BACK_NS = 1_000_000_000
+_OLD_S, _SILENT_S = 60.0, 3.0
 
 
-@dataclass(frozen=True)
-class Settings:
-    """How poses are taken; times are sensor time."""
-
-    dwell_s: float
-    tolerance_rad: float
-    timeout_s: float
-    stage_mode: str
-
-
-@dataclass(frozen=True)
-class State:
-    """
-    What the sweep waits for.
-
-    Attributes
-    ----------
-    phase
-        'operator', 'stage', 'rest', 'dwell' or 'done'.
-    text
-        The same for people, with figures.
-    late
-        Whether it has waited longer than the time-out.
-
-    """
-
-    phase: str
-    text: str
-    late: bool
+class MountingError(UserError):
+    """The sensor is not mounted as it was before an interruption."""
 
 
 class Sweep:
@@ -78,135 +57,311 @@ class Sweep:
         The nominal sensor of the stream; its noise decides what is at rest.
     targets
         The whole plan.
-    done
-        How many of its poses are there already.
+    settings
+        How poses are taken.
+    accepted, skipped
+        What an interrupted sweep has left: the last of its poses is taken again first, to see
+        that the sensor is mounted as it was.
 
     """
 
-    def __init__(self, sensor: Sensor, targets: Sequence[Target], done: int, settings: Settings):
-        self.settings = settings
-        self.index = done
-        self._sensor = sensor
-        self._targets = targets
+    def __init__(self, sensor: Sensor, targets: Sequence[Target], settings: Settings,
+                 accepted: Sequence[Mapping[str, Any]] = (), skipped: Iterable[int] = ()):
+        self.settings, self.targets, self.sensor = settings, targets, sensor
+        self.accepted: dict[int, dict[str, Any]] = {e['pose']: dict(e) for e in accepted}
+        self.skipped = set(skipped) - set(self.accepted)
+        self.surroundings = Surroundings()
+        self._verify: dict[str, Any] | None = None
         self._angles: deque[tuple[int, float, float]] = deque(maxlen=_KEPT_ANGLES)
+        self._ahead_s: deque[float] = deque(maxlen=_OFFSETS)
         self._since_ns: int | None = None
-        self._newest_ns: int | None = None
+        self.newest_ns: int | None = None
+        self._refusal = self._unsaid = ''
+        self._fresh = False
+        self.known = self._learned(None)
+        self.index = self._next()
+        if accepted and self.index < len(targets):
+            self._verify = self.accepted[max(accepted, key=lambda e: e['stop_ns'])['pose']]
+            self.index = self._verify['pose']
         self._begin()
 
     @property
     def target(self) -> Target | None:
         """Return the pose to go to; None at the end."""
-        return self._targets[self.index] if self.index < len(self._targets) else None
+        return self.targets[self.index] if self.index < len(self.targets) else None
 
-    def move(self, index: int) -> None:
-        """Go on with the pose of that number (from 0)."""
-        self.index = index
-        self._since_ns = self._newest_ns
-        self._begin()
+    @property
+    def verifying(self) -> bool:
+        """Tell whether a pose is taken again to see that the mounting is as it was."""
+        return self._verify is not None
 
-    def capture(self) -> None:
-        """Take the pose in which the operator has put the sensor."""
-        self._restart()
-        self._arrived_ns = self._newest_ns or 0
+    @property
+    def angles(self) -> tuple[float, float] | None:
+        """Return where the stage is, alpha and beta, rad; None while it is silent."""
+        return self._angles[-1][1:] if self._angles else None
+
+    def capture(self) -> str:
+        """Take the pose in which the operator has put the sensor; return why not, or ''."""
+        target = self.target
+        if target is not None and self.settings.stage_mode == 'encoder':
+            if self.angles is None:
+                return 'nothing on stage/joint_states: in stage.mode encoder its angle counts'
+            off = self._clocks() or refusals.angles(target, *self.angles, self.settings.near_rad)
+            if off:
+                return f'{off}; turn the stage there and capture again'
+        self._refusal = ''
+        self._dwell = Dwell(self.sensor, (self.newest_ns or 0) + 1)
         self._captured = True
+        return ''
+
+    def skip(self) -> str:
+        """Leave the pose out; return what is done, for people."""
+        number = self.index + 1
+        if self._verify is not None:
+            self._verify = None
+            self._go(self._next())
+            return f'pose {number} is not taken again: the mounting is not checked'
+        self.skipped.add(self.index)
+        self.accepted.pop(self.index, None)
+        self._go(self._next())
+        return f'pose {number} is left out'
+
+    def redo(self) -> str:
+        """Go back to the pose before; return what is done, or '' where there is none."""
+        taken = [i for i in range(self.index) if i in self.accepted or i in self.skipped]
+        if not taken or self._verify is not None:
+            return ''
+        # Its earlier reading must not speak against the new one.
+        self.known = self._learned(None, without=taken[-1])
+        self._go(taken[-1])
+        return f'pose {self.index + 1} will be taken again'
 
     def stage(self, stamp_ns: int, alpha_rad: float, beta_rad: float) -> None:
         """Take an encoder reading."""
+        if self._angles and stamp_ns < self._angles[-1][0] - _BACK_NS:
+            self._angles.clear()
         self._angles.append((stamp_ns, alpha_rad, beta_rad))
+        self._fresh = True
         target = self.target
         if self.settings.stage_mode != 'commanded' or target is None:
             return
         off_rad = max(abs(alpha_rad - target.alpha_rad), abs(beta_rad - target.beta_rad))
         arrived = off_rad <= self.settings.tolerance_rad
         if arrived and not self._captured:
-            self._restart()
+            self._dwell = Dwell(self.sensor, stamp_ns)
         self._captured = arrived
 
     def feed(self, stamps_ns: np.ndarray, volts: np.ndarray) -> None:
         """Take samples: stamps, ns, (n,), and volts, (n, m)."""
         if not len(stamps_ns):
             return
-        self._newest_ns = int(stamps_ns[-1])
+        if self.newest_ns is not None and stamps_ns[0] < self.newest_ns - _BACK_NS:
+            # A driver that was started anew, on a clock of its own: the pose begins anew.
+            self._since_ns, self._ahead_s = None, deque(maxlen=_OFFSETS)
+            self._captured, self._dwell = False, Dwell(self.sensor, 0)
+        self.newest_ns = int(stamps_ns[-1])
+        if self._fresh:
+            self._ahead_s.append((self._angles[-1][0] - self.newest_ns) * 1e-9)
+            self._fresh = False
         if self._since_ns is None:
             self._since_ns = int(stamps_ns[0])
-        if not self._captured:
-            return
-        # What was sampled before the stage arrived is no part of the pose.
-        new = stamps_ns >= self._arrived_ns
-        stamps_ns, volts = stamps_ns[new], volts[new]
-        self._stamps.append(stamps_ns)
-        self._volts.append(volts)
-        # From the arrival: float64 seconds since 1970 resolve only 0.2 µs.
-        self._finder.feed((stamps_ns - self._arrived_ns) * 1e-9, volts)
+        if self._captured:
+            self._dwell.feed(stamps_ns, volts)
 
     def accept(self) -> dict[str, Any] | None:
-        """Return the pose for the journal when a full dwell at rest is there, else None."""
-        target = self.target
-        if target is None or not self._captured or not self._stamps:
-            return None
-        wanted = round(self.settings.dwell_s * self._sensor.rate_hz)
-        rest = next((r for r in self._finder.rests() if r.stop - r.start >= wanted), None)
-        if rest is None:
-            return None
-        stamps, volts = np.concatenate(self._stamps), np.concatenate(self._volts)
-        start, stop = rest.start, rest.start + wanted
-        times = (stamps - self._arrived_ns) * 1e-9
-        mean, std = rest_means(times, volts, [Rest(start, stop, times[start], times[stop - 1])],
-                               self._sensor.rate_hz, known_noise(self._sensor))
-        first_ns, last_ns = int(stamps[start]), int(stamps[stop - 1])
-        alpha, beta = self._angle_between(first_ns, last_ns, target)
-        return {'pose': self.index, 'alpha_rad': alpha, 'beta_rad': beta, 'check': target.check,
-                'start_ns': first_ns, 'stop_ns': last_ns, 'samples': wanted,
-                'mean_v': mean[0].tolist(), 'std_v': std[0].tolist()}
+        """
+        Return the pose for the journal when a full dwell at rest is there, else None.
 
-    def results(self, accepted: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+        Raises
+        ------
+        MountingError
+            The pose before the interruption reads something else now: the mounting changed.
+
+        """
+        target = self.target
+        if target is None or not self._captured or (
+                self.settings.stage_mode != 'manual' and self._clocks()):
+            return None
+        wanted = round(self.settings.dwell_s * self.sensor.rate_hz)
+        rest = next((r for r in self._dwell.rests() if r.stop - r.start >= wanted), None)
+        if rest is None:
+            # What moves for a long time is judged as a whole again and again: forget it.
+            if self._dwell.age_s() > _OLD_S + 2 * self.settings.dwell_s and \
+                    not self._dwell.at_rest():
+                self._dwell = Dwell(self.sensor, (self.newest_ns or 0) + 1)
+            return None
+        entry = self._entry(self._dwell.mean(rest, wanted), target)
+        why = self._moved_away(rest, entry) or self._wrong(entry, self._dwell.volts(rest))
+        if why:
+            self._refuse(why)
+            return None
+        if self._verify is not None:
+            self._check_mounting(entry)
+            return None
+        return entry
+
+    def take(self, entry: dict[str, Any]) -> None:
+        """Count a pose that is on disk, and go on to the next that is open."""
+        self.accepted[entry['pose']] = entry
+        self.skipped.discard(entry['pose'])
+        self.known = self._learned(self.known)
+        self._go(self._next())
+
+    def retry(self) -> None:
+        """Take the same pose anew."""
+        self._go(self.index)
+
+    def results(self) -> list[dict[str, Any]]:
         """Return the poses to fit: all that were accepted."""
-        return list(accepted)
+        return [self.accepted[number] for number in sorted(self.accepted)]
+
+    def tilt_error_rad(self) -> float:
+        """Return the rms error of alpha and beta to expect after the poses so far, rad."""
+        return self.known.tilt_error_rad()
+
+    def refused(self) -> str:
+        """Return why a pose was refused since the last call, or ''."""
+        text, self._unsaid = self._unsaid, ''
+        return text
+
+    def dwelt_s(self) -> float:
+        """Return for how long the sensor has been at rest in the pose, s."""
+        return min(self._dwell.at_rest_s(), self.settings.dwell_s) if self._captured else 0.0
+
+    def where(self) -> str:
+        """Name the pose to reach."""
+        target = self.target
+        if target is None:
+            return ''
+        again = ' once more, to see that the mounting is as it was' if self._verify else ''
+        return f'alpha {np.degrees(target.alpha_rad):.1f}°, ' \
+               f'beta {np.degrees(target.beta_rad):.1f}°{again}'
 
     def state(self) -> State:
         """Say what is waited for, and by how much it is off."""
         target = self.target
         if target is None:
             return State('done', 'all poses are taken', False)
-        waited_s = ((self._newest_ns or 0) - (self._since_ns or 0)) * 1e-9
+        waited_s = ((self.newest_ns or 0) - (self._since_ns or 0)) * 1e-9
         late = waited_s > self.settings.timeout_s
         since = f' for {waited_s:.0f} s' if late else ''
-        where = f'alpha {np.degrees(target.alpha_rad):.1f}, ' \
-                f'beta {np.degrees(target.beta_rad):.1f} deg'
+        if self.settings.stage_mode != 'manual' and (apart := self._clocks()):
+            return State('stage', apart, True)
+        if self._refusal:
+            return State('refused', self._refusal, True)
         if not self._captured:
             if self.settings.stage_mode != 'commanded':
-                return State('operator', f'turn the stage to {where}, then capture', False)
-            return State('stage', f'the stage has not arrived at {where}{since}: '
+                return State('operator', f'turn the stage to {self.where()}, then capture{since}',
+                             False)
+            return State('stage', f'the stage has not arrived at {self.where()}{since}: '
                                   f'{self._off_text(target)}', late)
-        still = self._finder.stillness()
+        still = self._dwell.stillness()
         if still is None:
-            return State('rest', f'at {where}: waiting for samples{since}', late)
-        unit = G0_MPS2 / float(self._sensor.nominal_scale_v_per_g[still.axis])
-        text = still.describe('m/s²', unit, self._sensor.axes)
+            return State('rest', f'at {self.where()}: waiting for samples{since}', late)
         if still.still:
-            return State('dwell', f'at {where}: averaging', late)
-        return State('rest', f'at {where}: {text}{since}', late)
+            return State('dwell', f'at {self.where()}: averaging', late)
+        steady = '; if nothing touches it, sensor.noise_density_g_per_rthz is too low for this ' \
+            'unit' if late and still.figure == 'rms' else ''
+        return State('rest', f'at {self.where()}: {still.in_mps2(self.sensor)}{since}{steady}',
+                     late)
+
+    def _next(self) -> int:
+        return next((i for i in range(len(self.targets))
+                     if i not in self.accepted and i not in self.skipped), len(self.targets))
+
+    def _go(self, index: int) -> None:
+        self.index = index
+        self._since_ns = self.newest_ns
+        self._refusal = ''
+        self._begin()
 
     def _begin(self) -> None:
         self._captured = False
-        self._restart()
+        self._dwell = Dwell(self.sensor, self._angles[-1][0] if self._angles else 0)
 
-    def _restart(self) -> None:
-        self._arrived_ns = self._angles[-1][0] if self._angles else 0
-        self._finder = RestFinder(self._sensor.rate_hz, len(self._sensor.axes),
-                                  known_noise(self._sensor), learn=False)
-        self._stamps: list[np.ndarray] = []
-        self._volts: list[np.ndarray] = []
+    def _learned(self, before: known.Known | None, without: int | None = None) -> known.Known:
+        stage_rad = self.sensor.stage_resolution_rad / np.sqrt(12)
+        entries = [e for e in self.results() if not e.get('check') and e['pose'] != without]
+        poses = Poses.from_entries(entries) if entries else Poses(
+            *(np.zeros((0, len(self.sensor.axes))),) * 2, *(np.zeros(0),) * 2, np.zeros((0, 2)),
+            np.zeros(0, bool))
+        return known.from_poses(self.sensor, poses, self.settings.dwell_s, stage_rad, before)
+
+    def _entry(self, mean: dict[str, Any], target: Target) -> dict[str, Any]:
+        span = mean['start_ns'], mean['stop_ns']
+        alpha, beta = self._angle_between(*span, target)
+        return {'pose': self.index, 'alpha_rad': alpha, 'beta_rad': beta, 'check': target.check,
+                **mean, **self.surroundings.means(*span)}
+
+    def _moved_away(self, rest: Rest, entry: dict[str, Any]) -> str:
+        """Refuse a rest in another pose than the one in which the operator captured."""
+        if self.settings.stage_mode == 'commanded':
+            return ''
+        if self.settings.stage_mode == 'encoder':
+            seen = np.array([(a, b) for stamp, a, b in self._angles
+                             if entry['start_ns'] <= stamp <= entry['stop_ns']]).reshape(-1, 2)
+            alpha, beta = self.angles or (entry['alpha_rad'], entry['beta_rad'])
+            return (refusals.angles(self.targets[self.index], alpha, beta, self.settings.near_rad)
+                    or refusals.moved('alpha', seen[:, 0], self.settings.tolerance_rad)
+                    or refusals.moved('beta', seen[:, 1], self.settings.tolerance_rad))
+        before = self._dwell.volts(self._dwell.rests()[0]).mean(axis=0)
+        off_g = np.abs(np.array(entry['mean_v']) - before) / self.sensor.nominal_scale_v_per_g
+        axis = int(off_g.argmax())
+        return '' if off_g[axis] < np.sin(self.settings.near_rad) else (
+            f'the pose changed after the capture: {self.sensor.axes[axis]} moved by '
+            f'{off_g[axis]:.2f} g; hold the stage still until the pose is taken')
+
+    def _wrong(self, entry: dict[str, Any], volts: np.ndarray) -> str:
+        """Say what speaks against a pose with these samples, or ''."""
+        first = next((e['temperature_c'] for e in self.results() if 'temperature_c' in e), np.nan)
+        why = (refusals.saturated(self.sensor, volts)
+               or refusals.temperature(first, entry.get('temperature_c', np.nan),
+                                       self.settings.temperature_span_c))
+        if why or self.verifying:
+            return why
+        return refusals.reading(self.known, Target(entry['alpha_rad'], entry['beta_rad']),
+                                np.array(entry['mean_v']), self.settings.tolerance_rad)
+
+    def _refuse(self, why: str) -> None:
+        """Say why, once; what turns itself is looked at again, an operator captures again."""
+        if why != self._refusal:
+            self._unsaid = why
+        self._refusal = why
+        self._dwell = Dwell(self.sensor, (self.newest_ns or 0) + 1)
+        if self.settings.stage_mode != 'commanded':
+            self._captured = False
+
+    def _check_mounting(self, entry: dict[str, Any]) -> None:
+        assert self._verify is not None
+        stage_rad = self.sensor.stage_resolution_rad
+        if self.settings.stage_mode == 'manual':
+            stage_rad = max(stage_rad, self.settings.tolerance_rad)
+        elif self.settings.stage_mode == 'encoder':
+            # It is set by hand anew: what the encoder knows of the difference is allowed for.
+            stage_rad += max(abs(entry[name] - self._verify[name])
+                             for name in ('alpha_rad', 'beta_rad'))
+        why = refusals.mounting(self.sensor, np.array(self._verify['mean_v']),
+                                np.array(entry['mean_v']), self.index + 1, stage_rad)
+        if why and self.settings.stage_mode == 'manual':
+            self._refuse(f'{why}; or turn the stage to where it was, and capture again')
+            return
+        if why:
+            raise MountingError(why)
+        self._verify = None
+        self._go(self._next())
+
+    def _clocks(self) -> str:
+        if len(self._ahead_s) < _FEWEST_OFFSETS:
+            return ''
+        return refusals.clocks(min(self._ahead_s, key=abs))
 
     def _off_text(self, target: Target) -> str:
-        if not self._angles:
+        if self.angles is None:
             return 'nothing on stage/joint_states'
-        _, alpha, beta = self._angles[-1]
-        return ', '.join(
-            f'{name} is {np.degrees(abs(now - wanted)):.2f} deg off'
-            for name, now, wanted in (('alpha', alpha, target.alpha_rad),
-                                      ('beta', beta, target.beta_rad))
-            if abs(now - wanted) > self.settings.tolerance_rad) or 'arrived'
+        silent_s = ((self.newest_ns or 0) - self._angles[-1][0]) * 1e-9
+        if silent_s > _SILENT_S:
+            return f'nothing on stage/joint_states for {silent_s:.0f} s'
+        return refusals.angles(target, *self.angles, self.settings.tolerance_rad) or 'arrived'
 
     def _angle_between(self, first_ns: int, last_ns: int, target: Target) -> tuple[float, float]:
         if self.settings.stage_mode == 'manual':

@@ -17,14 +17,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from datetime import datetime, timezone
 import fcntl
 import json
 import os
 from pathlib import Path
+import shutil
 from typing import Any
 
 from adxl_ros.errors import UserError
-from adxl_ros.files.atomic import sync
+from adxl_ros.files.atomic import atomic_path, sync
 
 FORMAT = 1
 
@@ -41,6 +44,8 @@ class Journal:
         The file; made if it is not there.
     head
         What must be the same for entries to belong together: unit, mode, plan.
+    anew
+        Begin anew beside an interrupted calibration, which is kept under its time.
 
     Attributes
     ----------
@@ -54,9 +59,9 @@ class Journal:
 
     """
 
-    def __init__(self, path: str | os.PathLike, head: dict[str, Any]):
+    def __init__(self, path: str | os.PathLike, head: dict[str, Any], anew: bool = False):
         self.path = Path(path)
-        head = json.loads(json.dumps({'format': FORMAT, **head}))
+        head = _written(head)
         try:
             self._file = open(self.path, 'a+b', buffering=0)  # noqa: SIM115 (kept open)
         except OSError as error:
@@ -69,7 +74,7 @@ class Journal:
             raise UserError(f'{path}: another calibration is writing this journal; finish or '
                             'abort it, or choose another journal') from None
         try:
-            self.entries = self._resume(head)
+            self.entries = self._resume(head, anew)
         except UserError:
             self._file.close()
             raise
@@ -91,7 +96,8 @@ class Journal:
                 raise OSError(0, 'the disk is full')
             os.fsync(self._file.fileno())
         except OSError as error:
-            self._file.truncate(before)
+            with suppress(OSError):
+                self._file.truncate(before)
             raise UserError(f'{self.path}: cannot write the journal: {error.strerror}; make '
                             'room and try again') from None
 
@@ -99,25 +105,23 @@ class Journal:
         """Let the file go, for others to lock."""
         self._file.close()
 
-    def _resume(self, head: dict[str, Any]) -> list[dict[str, Any]]:
+    def _resume(self, head: dict[str, Any], anew: bool) -> list[dict[str, Any]]:
         known, whole = _parse(self.path)
-        if known and known[-1].get('done'):
-            # The finished one is kept beside the new one.
-            self._file.seek(0)
-            self.path.with_name(f'{self.path.name}.previous').write_bytes(self._file.read())
+        if known and (anew or known[-1].get('done')):
+            # A finished one is kept until the next is finished, an interrupted one for ever.
+            name = 'previous' if known[-1].get('done') else \
+                datetime.now(timezone.utc).strftime('%Y%m%dT%H%M%S.%fZ')
+            with atomic_path(self.path.with_name(f'{self.path.name}.{name}')) as kept:
+                shutil.copyfile(self.path, kept)
             known, whole = [], 0
+        if known and (changed := differences(known[0], head)):
+            raise UserError(f'{self.path}: holds an unfinished calibration of another kind: '
+                            f'{changed}; go back, or begin anew with resume:=anew (it is kept)')
         self._file.truncate(whole)
         if not known:
             self.append(head)
             sync(self.path.parent)
             return []
-        changed = [key for key in sorted(head.keys() | known[0].keys())
-                   if head.get(key) != known[0].get(key)]
-        if changed:
-            raise UserError(
-                f'{self.path}: holds an unfinished calibration of another kind: '
-                + ', '.join(f'{key} was {_short(known[0].get(key))}, is {_short(head.get(key))}'
-                            for key in changed) + '; go back, or remove the journal')
         return known[1:]
 
 
@@ -140,9 +144,51 @@ def read(path: str | os.PathLike) -> tuple[dict[str, Any], list[dict[str, Any]]]
     return lines[0], lines[1:]
 
 
+def unfinished(path: str | os.PathLike, head: dict[str, Any]) -> tuple[int, str] | None:
+    """
+    Look for an interrupted calibration, without a lock.
+
+    Returns
+    -------
+    poses, differences
+        How many poses it has, and how its head differs from this one; None where there is none.
+
+    Raises
+    ------
+    UserError
+        Not a journal, or not readable.
+
+    """
+    if not Path(path).exists():
+        return None
+    try:
+        lines, _ = _parse(Path(path))
+    except OSError as error:
+        raise UserError(f'{path}: cannot be read: {error.strerror}') from None
+    poses = len(accepted_poses(lines))
+    if not poses or lines[-1].get('done'):
+        return None
+    return poses, differences(lines[0], _written(head))
+
+
+def differences(was: dict[str, Any], now: dict[str, Any]) -> str:
+    """Say in which keys two heads differ."""
+    return ', '.join(f'{key} was {_short(was.get(key))}, is {_short(now.get(key))}'
+                     for key in sorted(was.keys() | now.keys()) if was.get(key) != now.get(key))
+
+
+def skipped_poses(entries: Sequence[dict[str, Any]]) -> set[int]:
+    """Return the poses that the operator left out."""
+    return {entry['skip'] for entry in entries if 'skip' in entry}
+
+
 def accepted_poses(entries: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Return the accepted poses in order; one that was taken again replaces the earlier one."""
-    poses = {entry['pose']: entry for entry in entries if 'pose' in entry}
+    poses: dict[int, dict[str, Any]] = {}
+    for entry in entries:
+        if 'pose' in entry:
+            poses[entry['pose']] = entry
+        poses.pop(entry.get('drop', -1), None)
     return [poses[number] for number in sorted(poses)]
 
 
@@ -166,6 +212,11 @@ def _parse(path: Path) -> tuple[list[dict[str, Any]], int]:
 
 def _whole_lines(data: bytes) -> Iterator[bytes]:
     yield from data.split(b'\n')[:-1]
+
+
+def _written(head: dict[str, Any]) -> dict[str, Any]:
+    """Return a head as it is read again."""
+    return json.loads(json.dumps({'format': FORMAT, **head}))
 
 
 def _short(value: Any) -> str:

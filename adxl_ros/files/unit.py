@@ -24,12 +24,16 @@ from adxl_ros.model.sensor import Sensor
 import numpy as np
 
 
+def same_unit(serial: str, other: str) -> bool:
+    """Tell whether serial numbers may be of one unit: `nominal` is none in particular."""
+    return serial == other or 'nominal' in (serial, other)
+
+
 def check_unit(info: Mapping[str, str], axes: str, sensor: Sensor, where: str) -> None:
     """
     Refuse samples of another unit than `sensor` describes.
 
-    The serial number `nominal` is no unit in particular and goes with every unit. What `info`
-    does not say is not checked.
+    What `info` does not say is not checked.
 
     Parameters
     ----------
@@ -54,7 +58,7 @@ def check_unit(info: Mapping[str, str], axes: str, sensor: Sensor, where: str) -
         raise UserError(f'{where}: format version {version}, but this package reads version '
                         f'{FORMAT}; update the package')
     serial = info.get('serial', 'nominal')
-    if serial != sensor.serial and 'nominal' not in (serial, sensor.serial):
+    if not same_unit(serial, sensor.serial):
         raise UserError(f'{where}: samples of the sensor with serial number {serial}, but the '
                         f'parameters are those of {sensor.serial}; name the parameter file of '
                         f'{serial}')

@@ -98,6 +98,13 @@ class Sensor:
         """Step of the ADC, V; 0 where it does not quantise."""
         return self.adc_vref_v / 2 ** self.adc_bits if self.adc_bits else 0.0
 
+    def saturated(self, volts: np.ndarray) -> np.ndarray:
+        """Tell where volts, (n, m), are at a rail of the ADC or beyond the range, (n, m)."""
+        beyond = np.abs(volts - self.nominal_zero_g_v) > self.range_g * self.nominal_scale_v_per_g
+        if self.adc_bits:
+            beyond |= (volts <= 0) | (volts >= self.adc_vref_v - self.lsb_v)
+        return beyond
+
     def _value(self, effect: str, parameter: str) -> np.ndarray:
         known = self.values.get(effect, {})
         return known.get(parameter, np.zeros(len(self.axes)))

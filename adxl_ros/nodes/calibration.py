@@ -16,32 +16,30 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 import os
-from pathlib import Path
-from typing import Any
 
-from adxl_ros.calibrate import plan, recorded, result
-from adxl_ros.calibrate.poses import Poses
-from adxl_ros.calibrate.sweep import Settings, STAGE_MODES, Sweep
-from adxl_ros.calibrate.tumble import Tumble
+from adxl_ros.calibrate import recorded
+from adxl_ros.calibrate.session import Session
+from adxl_ros.calibrate.stream import Newest
+from adxl_ros.calibrate.sweep import MountingError, Sweep
 from adxl_ros.errors import UserError
-from adxl_ros.files import cdr
-from adxl_ros.files.journal import accepted_poses, Journal
-from adxl_ros.model.sensor import Sensor, to_volts
-from adxl_ros.nodes import common
+from adxl_ros.model.sensor import Sensor
+from adxl_ros.nodes import announce, common
+from adxl_ros.nodes.asked import declare_plan
+from adxl_ros.nodes.console import Console, IDLE
+from adxl_ros.nodes.samples import Samples
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 import numpy as np
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.task import Future
-from sensor_msgs.msg import Imu, JointState
+from sensor_msgs.msg import BatteryState, JointState, Temperature
 from std_srvs.srv import Trigger
 
 _POLL_S = 0.05
-_REPEAT_COMMAND_S = 0.5
-_SILENT_S = 3.0
-_QUEUE = 20000
+_SERVICES = ('start', 'redo', 'skip', 'finish', 'abort')
 
 
 class Calibration(Node):
@@ -50,298 +48,351 @@ class Calibration(Node):
     def __init__(self) -> None:
         super().__init__('calibration')
         self.base = common.make_sensor(common.declare_sensor(self))
-        self._declare()
+        self.autostart = common.declare(self, 'autostart', False,
+                                        'start without a call of ~/start')
+        self.resume = common.declare(
+            self, 'resume', 'ask', 'go on with an interrupted calibration; ask where there is a '
+            'screen, else go on', choices=('ask', 'continue', 'anew'))
+        self.asked = declare_plan(self)
         self.unit: Sensor | None = None
-        self.walk: Sweep | Tumble | None = None
-        self.journal: Journal | None = None
-        self.outcome = ''
+        self.session: Session | None = None
+        self.outcome: list[str] = []
+        self.question = ''
+        self.said = self._hindrance = self._warned = self._foreign = ''
         self._wanted = self.autostart
-        self._raw: list[bytes] = []
-        self._accepted: list[dict[str, Any]] = []
+        self._anew = self.resume == 'anew'
+        self._newest: Newest | None = None
         self._captures: list[Future] = []
-        self._said = ''
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._heard_ns = self._commanded_ns = self._steady.now().nanoseconds
+        self._samples = Samples(self)
+        self._announcer = announce.Announcer(self)
         self._connect()
-
-    def _declare(self) -> None:
-        degrees = np.radians
-        declare = common.declare
-        self.mode = declare(self, 'mode', 'stage', 'what the reference is',
-                            choices=('stage', 'gravity'))
-        self.autostart = declare(self, 'autostart', False, 'start without a call of ~/start')
-        self.output = Path(declare(self, 'output', 'calibration.yaml', 'parameter file to write'))
-        self.journal_path = declare(self, 'journal', '',
-                                    'file of accepted poses; empty: beside the output')
-        self.report = declare(self, 'report', '', 'directory for the figures; empty: none')
-        self.planes = declare(self, 'sweep.planes_rad',
-                              [float(degrees(a)) for a in (30, 60, 90, 120, 150)],
-                              'planes alpha of the sweep, rad')
-        self.step = declare(self, 'sweep.step_rad', float(degrees(30)), 'step of beta', 'rad',
-                            0.005, 1.6)
-        self.dwell = declare(self, 'sweep.dwell_s', 5.0, 'time at rest a pose', 's', 0.5, 3600.0)
-        self.checks = declare(self, 'sweep.check_poses', 16,
-                              'poses kept out of the fit for the verdict', '', 0, 1000)
-        self.settings = Settings(
-            self.dwell,
-            declare(self, 'stage.tolerance_rad', float(degrees(0.2)),
-                    'arrived within this', 'rad', 1e-6, 0.2),
-            declare(self, 'stage.timeout_s', 60.0, 'a pose that takes longer is said to be late',
-                    's', 1.0, 86400.0),
-            declare(self, 'stage.mode', 'commanded', 'who turns the stage', choices=STAGE_MODES))
+        self.console = Console(self) if common.declare(
+            self, 'screen', True, 'show a screen, where the node runs in a terminal') else None
 
     def _connect(self) -> None:
-        self._command = common.publisher(self, JointState, 'stage/command', 1)
         self._diagnostics = common.publisher(self, DiagnosticArray, '/diagnostics', 10)
-        common.subscription(self, DiagnosticStatus, 'sensor_info', self._on_info, 1, latched=True)
-        common.subscription(self, Imu, 'imu/data_raw', self._raw.append, _QUEUE, raw=True)
-        common.subscription(self, JointState, 'stage/joint_states', self._on_stage, 1000)
-        for name in ('start', 'redo', 'finish', 'abort'):
-            self.create_service(Trigger, f'~/{name}', getattr(self, f'_on_{name}'))
+        subscribe = common.subscription
+        subscribe(self, DiagnosticStatus, 'sensor_info', self._on_info, 1, latched=True)
+        subscribe(self, JointState, 'stage/joint_states', self._on_stage, 1000)
+        subscribe(self, Temperature, 'temperature',
+                  lambda m: self._surround('temperature_c', m, m.temperature), 100)
+        subscribe(self, BatteryState, 'supply',
+                  lambda m: self._surround('supply_v', m, m.voltage), 100)
+        for name in _SERVICES:
+            self.create_service(Trigger, f'~/{name}', self._service(name))
         # It answers when the pose is on disk: samples must go on coming meanwhile.
         self.create_service(Trigger, '~/capture', self._on_capture,
                             callback_group=ReentrantCallbackGroup())
         self.create_timer(_POLL_S, self._poll, clock=self._steady)
         self.create_timer(1.0, self._report_state, clock=self._steady)
 
+    def _service(self, name: str) -> Callable[..., Trigger.Response]:
+        def answer(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+            response.success, response.message = getattr(self, name)()
+            return response
+        return answer
+
     def _on_info(self, message: DiagnosticStatus) -> None:
         info = {pair.key: pair.value for pair in message.values}
         try:
             unit = recorded.unit_of(self.base, info, 'sensor_info')
         except UserError as error:
-            self._fail(f'{error}')
+            self._foreign = f'{error}'
+            self.fail(self._foreign)
             return
-        if self.walk is not None and unit.serial != self.unit.serial:
-            self._stop(f'sensor_info: the unit changed from {self.unit.serial} to '
-                       f'{unit.serial} during the calibration; start again')
-        self.unit = unit
+        self._foreign = ''
+        if self.session is not None:
+            was, now = (self.asked.head(of) for of in (self.session.unit, unit))
+            changed = ', '.join(f'{key} was {was[key]}, is {now[key]}' for key in was
+                                if was[key] != now[key])
+            if changed:
+                self._stop(f'sensor_info: {changed}: changed during the calibration; put it back '
+                           'and start again, the poses are kept')
+        self.unit, self._newest = unit, Newest(unit)
 
     def _on_stage(self, message: JointState) -> None:
         angles = dict(zip(message.name, message.position))
         pair = angles.get('alpha'), angles.get('beta')
-        if isinstance(self.walk, Sweep) and None not in pair and np.isfinite(pair).all():
-            stamp = message.header.stamp
-            self.walk.stage(stamp.sec * 10 ** 9 + stamp.nanosec, *pair)
+        if self._sweep is not None and None not in pair and np.isfinite(pair).all():
+            self._sweep.stage(_stamp_ns(message), *pair)
 
-    def _on_start(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        if self.walk is not None:
-            return _answer(response, False, 'a calibration is running; finish or abort it first')
-        self._wanted = True
+    def _surround(self, name: str, message: Temperature | BatteryState, value: float) -> None:
+        if self.session is not None:
+            stamp_ns = _stamp_ns(message) or self.session.walk.newest_ns or 0
+            self.session.walk.surroundings.add(name, stamp_ns, value)
+
+    @property
+    def _sweep(self) -> Sweep | None:
+        walk = self.session.walk if self.session else None
+        return walk if isinstance(walk, Sweep) else None
+
+    def start(self, anew: bool | None = None) -> tuple[bool, str]:
+        """Begin, or go on with what was interrupted; returns whether, and what is said."""
+        if self.session is not None:
+            return False, 'a calibration is running; finish or abort it first'
+        self._wanted, self.question = True, ''
+        self._anew = self.resume == 'anew' if anew is None else anew
         self._try_to_start()
-        if self.walk is None and self._wanted:
-            return _answer(response, True, 'starts when sensor_info arrives')
-        return _answer(response, self.walk is not None, self._said)
+        if self.session is None and self._wanted:
+            return True, 'starts when sensor_info arrives'
+        return self.session is not None, self.said
+
+    def capture(self) -> tuple[bool, str]:
+        """Take the pose that the operator has reached; returns whether, and why not."""
+        if self.session is None:
+            return False, 'no calibration is running'
+        if self._sweep is not None and self.asked.settings.stage_mode == 'commanded':
+            return False, 'nothing to capture: the stage moves itself, and poses are taken when ' \
+                          'it has arrived'
+        if self._hindrance:
+            return False, self._hindrance
+        self._take_samples()
+        why = self.session.walk.capture()
+        if why:
+            self.warn(why)
+        return not why, why or 'averaging'
+
+    def redo(self) -> tuple[bool, str]:
+        """Take the pose before again."""
+        return self._act('redo', 'no pose to take again')
+
+    def skip(self) -> tuple[bool, str]:
+        """Leave the pose out."""
+        return self._act('skip', 'no pose to leave out')
+
+    def finish(self) -> tuple[bool, str]:
+        """Fit what there is and write the file."""
+        if self.session is None:
+            return False, 'no calibration is running'
+        self._take_samples()
+        return self._finish(), self.said
+
+    def abort(self) -> tuple[bool, str]:
+        """Stop; what was taken stays."""
+        if self.session is None and not self._wanted:
+            return False, 'no calibration is running'
+        kept = f'; its poses stay in {self.session.journal.path}' if self.session else ''
+        self._stop(f'aborted{kept}')
+        return True, self.said
+
+    def _act(self, name: str, otherwise: str) -> tuple[bool, str]:
+        if self.session is None:
+            return False, 'no calibration is running'
+        try:
+            text = getattr(self.session, name)()
+        except UserError as error:
+            text, otherwise = '', f'{error}'
+        if text:
+            self._answer_captures(False, text)
+            self.say(text)
+        return bool(text), text or otherwise
 
     async def _on_capture(self, _: Trigger.Request,
                           response: Trigger.Response) -> Trigger.Response:
-        if not isinstance(self.walk, Sweep) or self.settings.stage_mode == 'commanded':
-            return _answer(response, False, 'nothing to capture: no sweep is running whose stage '
-                                            'is turned by an operator')
-        self.walk.capture()
-        future = Future()
-        self._captures.append(future)
-        return _answer(response, *await future)
+        response.success, response.message = self.capture()
+        if response.success:
+            future = Future()
+            self._captures.append(future)
+            response.success, response.message = await future
+        return response
 
-    def _on_redo(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        if not isinstance(self.walk, Sweep) or not self.walk.index:
-            return _answer(response, False, 'no pose to take again')
-        self.walk.move(self.walk.index - 1)
-        return _answer(response, True, f'pose {self.walk.index + 1} will be taken again')
-
-    def _on_finish(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        if self.walk is None:
-            return _answer(response, False, 'no calibration is running')
-        self._take_samples()
-        return _answer(response, self._finish(), self._said)
-
-    def _on_abort(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        if self.walk is None and not self._wanted:
-            return _answer(response, False, 'no calibration is running')
-        kept = f'; its poses stay in {self.journal.path}' if self.journal else ''
-        self._stop(f'aborted{kept}')
-        return _answer(response, True, self._said)
+    def _answer_captures(self, success: bool, text: str) -> None:
+        for future in self._captures:
+            future.set_result((success, text))
+        self._captures.clear()
 
     def _try_to_start(self) -> None:
-        if self.unit is None:
+        if self.unit is None or self.question:
             return
-        self._wanted = False
         try:
+            if self.console is not None and self.console.asks and self._ask():
+                return
+            self._wanted = False
             self._start(self.unit)
         except UserError as error:
-            self._stop(f'{error}')
+            self._stop(f'{error}', failed=True)
+
+    def _ask(self) -> bool:
+        """Ask in the terminal what to do with an interrupted calibration, if there is one."""
+        if self.resume == 'ask':
+            self.question = self.asked.question(self.unit)
+        self.console.asks = False
+        return bool(self.question)
 
     def _start(self, unit: Sensor) -> None:
-        if not os.access(self.output.parent, os.W_OK):
-            raise UserError(f'output: {self.output}: {self.output.parent} is not a directory '
-                            'that can be written; choose another')
-        targets = plan.sweep(self.planes, self.step, self.checks) if self.mode == 'stage' else []
-        head = {'mode': self.mode, 'serial': unit.serial, 'axes': unit.axes,
-                'rate_hz': unit.rate_hz, 'nominal_zero_g_v': unit.nominal_zero_g_v.tolist(),
-                'nominal_scale_v_per_g': unit.nominal_scale_v_per_g.tolist(),
-                'dwell_s': self.dwell, 'stage_mode': self.settings.stage_mode,
-                'targets_rad': [[t.alpha_rad, t.beta_rad] for t in targets]}
-        self.journal = Journal(self.journal_path or f'{self.output}.journal', head)
-        self._accepted = accepted_poses(self.journal.entries)
-        done = len(self._accepted)
-        self.walk = Sweep(unit, targets, done, self.settings) if self.mode == 'stage' \
-            else Tumble(unit, done)
-        self._raw.clear()
-        self.outcome = ''
-        resumed = f', resumed after {done} poses' if done else ''
-        self._say(f'calibrating {unit.serial}: ' + (
-            f'{len(targets)} poses{resumed}' if targets else
+        self.session = session = Session(unit, self.asked, self._anew)
+        self._samples.clear()
+        self._samples.heard()
+        self.outcome = []
+        if session.resumed:
+            again = ' (the last one first, to see that the mounting is as it was)' \
+                if self._sweep is not None and self._sweep.verifying else ''
+            resumed = f', resumed after {session.resumed} poses{again}; ' \
+                      'resume:=anew puts them aside'
+        else:
+            resumed = ''
+        self.say(f'calibrating {unit.serial}: ' + (
+            f'{len(self._sweep.targets)} poses{resumed}' if self._sweep is not None else
             f'rest in 24 or more directions, then call ~/finish{resumed}'))
 
     def _poll(self) -> None:
-        if self.walk is None:
-            self._raw.clear()
+        if self.session is None:
             if self._wanted:
                 self._try_to_start()
-            return
-        self._take_samples()
-        try:
-            while self.walk is not None and (entry := self.walk.accept()) is not None:
-                self._take(entry)
-        except UserError as error:
-            self._fail(f'{error}')
-        if isinstance(self.walk, Sweep):
-            if self.walk.target is None:
+            self._watch()
+        else:
+            self._take_samples()
+            self._take_poses()
+        if self.session is not None:
+            if self.session.over:
                 self._finish()
             else:
-                self._repeat_command()
+                self._announcer.announce(self.session.walk, self._steady.now().nanoseconds)
+        if self.console is not None:
+            self.console.turn()
+
+    def _take_poses(self) -> None:
+        try:
+            for text in self.session.accepted():
+                self.say(text)
+                self._answer_captures(True, text)
+        except MountingError as error:
+            self._stop(f'{error}', failed=True)
+            return
+        except UserError as error:
+            self.fail(f'{error}')
+            self._answer_captures(False, f'{error}')
+        refused = self.session.walk.refused()
+        if refused:
+            self.warn(refused)
+            self._answer_captures(False, refused)
+
+    def _watch(self) -> None:
+        """Show the live reading while no calibration runs."""
+        if self._newest is not None and self.console is not None:
+            self._newest.feed(*self._samples.take(self.unit))
+        else:
+            self._samples.clear()
 
     def _take_samples(self) -> None:
-        if not self._raw:
+        stamps, volts = self._samples.take(self.unit)
+        if not len(stamps):
             return
-        batch = self._raw[:]
-        self._raw.clear()
-        self._heard_ns = self._steady.now().nanoseconds
-        stamps, accel = _decoded(batch)
-        accel = accel[:, :len(self.unit.axes)]
-        finite = np.isfinite(accel).all(axis=1)
-        self.walk.feed(stamps[finite], to_volts(accel[finite], self.unit))
-
-    def _take(self, entry: dict[str, Any]) -> None:
-        self.journal.append(entry)
-        self._accepted = [*self._accepted[:entry['pose']], entry,
-                          *self._accepted[entry['pose'] + 1:]]
-        self.walk.move(entry['pose'] + 1)
-        text = f'pose {entry["pose"] + 1} is on disk'
-        self.get_logger().info(text)
-        for future in self._captures:
-            future.set_result((True, text))
-        self._captures.clear()
-        self._commanded_ns = 0
-
-    def _repeat_command(self) -> None:
-        now = self._steady.now().nanoseconds
-        if self.settings.stage_mode != 'commanded' or \
-                now - self._commanded_ns < _REPEAT_COMMAND_S * 1e9:
-            return
-        self._commanded_ns = now
-        command = JointState(name=['alpha', 'beta'], position=[self.walk.target.alpha_rad,
-                                                               self.walk.target.beta_rad])
-        command.header.stamp = self.get_clock().now().to_msg()
-        self._command.publish(command)
+        hindrance = self._samples.compensated or self.session.feed(stamps, volts)
+        if hindrance and not self._hindrance:
+            self.fail(hindrance)
+        self._hindrance = hindrance
 
     def _finish(self) -> bool:
-        entries = self.walk.results(self._accepted)
+        if self.console is not None:
+            self.console.show('fit', 'fitting what was taken')
+        over = self.session.over
         try:
-            if not entries:
-                raise UserError('no pose is taken yet')
-            found = self._fit(entries)
-            if self.report:
-                Path(self.report).mkdir(parents=True, exist_ok=True)
-                found.draw(Path(self.report) / 'calibration.png')
-            found.save(self.output)
-            self.journal.append({'rests': entries, 'done': True})
+            found = self.session.finish()
         except (UserError, OSError) as error:
             # What was taken stays, so that more poses or another directory can save it.
-            self._fail(f'cannot finish: {error}')
-            if isinstance(self.walk, Sweep) and self.walk.target is None:
-                self._stop(self._said)
+            self.fail(f'cannot finish: {error}')
+            if over:
+                self._stop(self.said)
             return False
         for line in found.comments():
             self.get_logger().info(line)
-        self.outcome = '; '.join(found.verdict)
-        self._stop(f'wrote {self.output}')
+        self.outcome = found.verdict
+        self._stop(f'wrote {self.asked.output}')
         return True
 
-    def _fit(self, entries: list[dict[str, Any]]) -> result.Result:
-        poses = Poses.from_entries(entries)
-        source = Path(self.journal.path).name
-        return result.calibrate(self.unit, [poses], None, [source])
+    def _stop(self, text: str, failed: bool = False) -> None:
+        self._wanted, self.question, self._hindrance = False, '', ''
+        session, self.session = self.session, None
+        if session is not None:
+            session.close()
+        self._answer_captures(False, text)
+        if failed:
+            self.fail(text)
+        else:
+            self.say(text)
 
-    def _stop(self, text: str) -> None:
-        self.walk, self._wanted = None, False
-        if self.journal is not None:
-            self.journal.close()
-            self.journal = None
-        for future in self._captures:
-            future.set_result((False, text))
-        self._captures.clear()
-        self._say(text)
-
-    def _say(self, text: str) -> None:
-        if text != self._said:
+    def say(self, text: str) -> None:
+        """Log what is news."""
+        if text != self.said:
             self.get_logger().info(text)
-        self._said = text
+        self.said = text
 
-    def _fail(self, text: str) -> None:
-        if text != self._said:
+    def warn(self, text: str) -> None:
+        """Log what is refused."""
+        if text != self.said:
+            self.get_logger().warning(text)
+        self.said = text
+
+    def fail(self, text: str) -> None:
+        """Log what is wrong."""
+        if text != self.said:
             self.get_logger().error(text)
-        self._said = text
+        self.said = text
+
+    def state(self) -> tuple[str, str, bool]:
+        """Return the phase, what is waited for in words, and whether somebody should look."""
+        if self.question:
+            return 'question', self.question, True
+        if self.session is None:
+            if self._wanted and self._foreign:
+                return 'refused', self._foreign, True
+            if self._wanted:
+                silent = '; is the driver running?' if self._samples.silent() else ''
+                return 'info', f'waiting for sensor_info{silent}', True
+            return 'idle', self.said or IDLE, False
+        silent = self._samples.silent()
+        if silent:
+            return 'silent', silent, True
+        if self._hindrance:
+            return 'refused', self._hindrance, True
+        state = self.session.walk.state()
+        return state.phase, state.text, state.late
 
     def _report_state(self) -> None:
-        level, text, values = common.OK, self._said or 'idle; call ~/start', {}
-        if self.walk is not None:
-            state = self.walk.state()
-            silent_s = (self._steady.now().nanoseconds - self._heard_ns) * 1e-9
-            text = state.text
-            if silent_s > _SILENT_S:
-                text = f'nothing on {self.resolve_topic_name("imu/data_raw")} for {silent_s:.0f} s'
-            if state.late or silent_s > _SILENT_S:
-                level = common.WARN
-                self._warn(state.phase, text)
-            values = {'phase': state.phase, 'pose': str(self.walk.index + 1)}
-        elif self._wanted:
-            level, text = common.WARN, 'waiting for sensor_info'
-            self._warn('info', text)
-        values |= {'accepted': str(len(self._accepted)), 'output': str(self.output),
-                   'verdict': self.outcome}
+        phase, text, late = self.state()
+        if late:
+            self._warn_once(phase, text)
+        values = {'accepted': '0', 'output': str(self.asked.output),
+                  'verdict': '; '.join(self.outcome)}
+        if self.session is not None:
+            walk = self.session.walk
+            number = walk.index + 1 if isinstance(walk, Sweep) else len(walk.accepted) + 1
+            values |= {'phase': phase, 'pose': str(number), 'next': walk.where(),
+                       'accepted': str(self.session.done),
+                       'tilt_error_deg': float(np.degrees(walk.tilt_error_rad()))}
         serial = self.unit.serial if self.unit else ''
-        self._diagnostics.publish(common.diagnostics(
-            self, common.status(level, 'calibration', text, serial, values)))
+        self._diagnostics.publish(common.diagnostics(self, common.status(
+            common.WARN if late else common.OK, 'calibration', text, serial, values)))
 
-    def _warn(self, phase: str, text: str) -> None:
+    def _warn_once(self, phase: str, text: str) -> None:
         """Log what holds the calibration up once a pose and phase, not once a second."""
-        key = f'{phase} {self.walk.index if self.walk else ""}'
-        if key != self._warned:
+        walk = self.session.walk if self.session else None
+        key = f'{phase} {len(walk.accepted) if walk else ""}'
+        if key != self._warned and text != self.said:
             self.get_logger().warning(text)
         self._warned = key
 
-    _warned = ''
+    def newest(self) -> Newest | None:
+        """Return the newest samples; None before there is a unit."""
+        return self.session.newest if self.session else self._newest
 
     def close(self) -> None:
-        """Let the journal go."""
-        if self.journal is not None:
-            self.journal.close()
+        """Let the journal and the terminal go."""
+        if self.session is not None:
+            self.session.close()
+        if self.console is not None:
+            self.console.close()
 
 
-def _decoded(batch: list[bytes]) -> tuple[np.ndarray, np.ndarray]:
-    """Read stamps, ns, (n,), and linear acceleration, m/s², (n, 3), of serialized messages."""
-    stamps, accel = np.empty(len(batch), np.int64), np.empty((len(batch), 3))
-    for table in cdr.tables(batch, cdr.imu):
-        stamps[table.rows] = table.stamp_ns()
-        accel[table.rows] = table.numbers('linear_acceleration')
-    return stamps, accel
-
-
-def _answer(response: Trigger.Response, success: bool, message: str) -> Trigger.Response:
-    response.success, response.message = success, message
-    return response
+def _stamp_ns(message: JointState | Temperature | BatteryState) -> int:
+    return message.header.stamp.sec * 10 ** 9 + message.header.stamp.nanosec
 
 
 def main() -> int:
     """Run the node."""
+    # Through shared memory, Fast DDS does not reach a process again that was killed and started
+    # anew (eProsima/Fast-DDS issues 2811, 5053 and 5469): an interrupted sweep could not go on.
+    os.environ.setdefault('FASTDDS_BUILTIN_TRANSPORTS', 'UDPv4')
     return common.main(Calibration, __doc__)

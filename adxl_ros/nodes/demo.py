@@ -41,6 +41,7 @@ from std_srvs.srv import Trigger
 
 _SPEED = 12.0
 _SILENT_S = 60.0
+_UNATTENDED = ('-p', 'autostart:=true', '-p', 'screen:=false')
 _LOSSLESS = ('-p', 'qos_overrides./imu/data_raw.subscription.reliability:=reliable')
 """At many times real time a best-effort subscriber loses samples on a busy machine."""
 _DRAWN = {'bias': 0.5, 'scale_factor': 0.5, 'misalignment': 0.7, 'cross_axis': 0.7,
@@ -123,7 +124,7 @@ def _simulated(folder: Path, speed: float) -> list[str]:
     with _graph() as (start, watcher):
         start('driver', unit, '-p', f'link.speed:={speed}', *clock)
         start('stage', nominal, *clock)
-        start('calibration', nominal, *clock, *_LOSSLESS, '-p', 'autostart:=true', '-p',
+        start('calibration', nominal, *clock, *_LOSSLESS, *_UNATTENDED, '-p',
               f'output:={output}', '-p', f'report:={folder / "sweep"}')
         _wait(watcher, lambda: output.exists())
     return ['Simulated ADXL203, poses that the fit has not seen:', *_verdict(output),
@@ -137,7 +138,7 @@ def _real(folder: Path, recording: Path) -> list[str]:
     clock = ['-p', 'use_sim_time:=true']
     _fresh(output)
     with _graph() as (start, watcher):
-        start('calibration', nominal_path(), *clock, *_LOSSLESS, '-p', 'autostart:=true', '-p',
+        start('calibration', nominal_path(), *clock, *_LOSSLESS, *_UNATTENDED, '-p',
               'mode:=gravity', '-p', f'output:={output}', '-p',
               f'report:={folder / recording.stem}')
         start('driver', nominal_path(), '-p', 'link.type:=replay', '-p',

@@ -53,11 +53,7 @@ class ImuWriter:
 
     def saturated(self, volts: np.ndarray) -> np.ndarray:
         """Tell which samples are at a rail of the ADC or beyond the sensor's range, (n,)."""
-        s = self._sensor
-        beyond = np.abs(volts - s.nominal_zero_g_v) > s.range_g * s.nominal_scale_v_per_g
-        if s.adc_bits:
-            beyond |= (volts <= 0) | (volts >= s.adc_vref_v - s.lsb_v)
-        return beyond.any(axis=1)
+        return self._sensor.saturated(volts).any(axis=1)
 
 
 def imu_message(sensor: Sensor, frame_id: str) -> Imu:

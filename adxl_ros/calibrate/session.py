@@ -1,0 +1,210 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""A guided calibration from its start to its file, free of ROS: poses, journal, fit."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+import os
+from pathlib import Path
+from typing import Any
+
+from adxl_ros.calibrate import plan, refusals, result
+from adxl_ros.calibrate.poses import Poses
+from adxl_ros.calibrate.state import Settings
+from adxl_ros.calibrate.stream import Newest
+from adxl_ros.calibrate.sweep import Sweep
+from adxl_ros.calibrate.tumble import Tumble
+from adxl_ros.errors import UserError
+from adxl_ros.files.journal import accepted_poses, Journal, skipped_poses, unfinished
+from adxl_ros.model.sensor import Sensor
+import numpy as np
+
+_FIGURES = ('serial', 'axes', 'rate_hz', 'nominal_zero_g_v', 'nominal_scale_v_per_g')
+
+
+@dataclass(frozen=True)
+class Plan:
+    """
+    What is asked for, whatever the unit.
+
+    Attributes
+    ----------
+    mode
+        'stage' or 'gravity'.
+    planes_rad, step_rad, checks
+        As `plan.guided` takes them.
+    settings
+        How poses are taken.
+    output, journal, report
+        Files: parameters, accepted poses; a folder for the figures, or ''.
+
+    """
+
+    mode: str
+    planes_rad: tuple[float, ...]
+    step_rad: float
+    checks: int
+    settings: Settings
+    output: Path
+    journal: Path
+    report: str
+
+    def targets(self) -> list[plan.Target]:
+        """Return the poses in the order of the visit; none without a stage."""
+        if self.mode == 'gravity':
+            return []
+        return plan.guided(self.planes_rad, self.step_rad, self.checks)
+
+    def head(self, unit: Sensor) -> dict[str, Any]:
+        """Return what must be the same for a calibration of this unit to go on."""
+        head = {'mode': self.mode,
+                **{name: np.asarray(getattr(unit, name)).tolist() for name in _FIGURES}}
+        if self.mode == 'gravity':
+            return head
+        return {**head, 'stage.mode': self.settings.stage_mode,
+                'sweep.dwell_s': self.settings.dwell_s, 'sweep.planes_rad': self.planes_rad,
+                'sweep.step_rad': self.step_rad, 'sweep.check_poses': self.checks,
+                'order': plan.ORDER}
+
+    def question(self, unit: Sensor) -> str:
+        """Ask what to do with an interrupted calibration; '' where there is none."""
+        found = unfinished(self.journal, self.head(unit))
+        if found is None:
+            return ''
+        poses, changed = found
+        then = f', which cannot go on: {changed}. Begin anew (n; it is kept), or abort (a) and ' \
+               'put that back?' if changed else \
+            ' of this unit. Go on with them (y), or begin anew (n; they are kept)?'
+        return f'{self.journal} holds {poses} poses of an interrupted calibration{then}'
+
+
+class Session:
+    """
+    One calibration of one unit.
+
+    Parameters
+    ----------
+    unit
+        The nominal sensor of the stream.
+    asked
+        What to do.
+    anew
+        Begin anew even if an interrupted calibration could go on.
+
+    Raises
+    ------
+    UserError
+        The output or the journal cannot be written, or the interrupted one is another's.
+
+    """
+
+    def __init__(self, unit: Sensor, asked: Plan, anew: bool) -> None:
+        if not os.access(asked.output.parent, os.W_OK):
+            raise UserError(f'output: {asked.output}: {asked.output.parent} is not a directory '
+                            'that can be written; choose another')
+        if asked.mode == 'gravity' and unit.axes != 'xyz':
+            raise UserError(f'mode: gravity needs the axes x, y and z, but the sensor has '
+                            f'{unit.axes}; use mode:=stage')
+        targets = asked.targets()
+        self.unit, self.asked = unit, asked
+        self.newest = Newest(unit)
+        self.journal = Journal(asked.journal, asked.head(unit), anew)
+        accepted = accepted_poses(self.journal.entries)
+        self.resumed = len(accepted)
+        self.walk = Sweep(unit, targets, asked.settings, accepted,
+                          skipped_poses(self.journal.entries)) if targets else \
+            Tumble(unit, asked.settings.temperature_span_c, accepted)
+
+    @property
+    def done(self) -> int:
+        """Count the accepted poses."""
+        return len(self.walk.accepted)
+
+    @property
+    def over(self) -> bool:
+        """Tell whether all poses of a sweep are taken or left out."""
+        return isinstance(self.walk, Sweep) and self.walk.target is None
+
+    def feed(self, stamps_ns: np.ndarray, volts: np.ndarray) -> str:
+        """Take samples, ns, (n,), and V, (n, m); return why they are of no use, or ''."""
+        self.newest.feed(stamps_ns, volts)
+        wrong = refusals.rate(self.newest.rate_hz(), self.unit.rate_hz)
+        if not wrong:
+            self.walk.feed(stamps_ns, volts)
+        return wrong
+
+    def accepted(self) -> Iterator[str]:
+        """
+        Take the poses that are ready, each on disk before it is named.
+
+        Raises
+        ------
+        MountingError
+            See `Sweep.accept`.
+        UserError
+            The disk does not take a pose; it is taken anew.
+
+        """
+        verifying = isinstance(self.walk, Sweep) and self.walk.verifying
+        while (entry := self.walk.accept()) is not None:
+            try:
+                self.journal.append(entry)
+            except UserError:
+                self.walk.retry()
+                raise
+            self.walk.take(entry)
+            yield f'pose {entry["pose"] + 1} is on disk'
+        if verifying and isinstance(self.walk, Sweep) and not self.walk.verifying:
+            yield 'the sensor is mounted as it was'
+
+    def skip(self) -> str:
+        """Leave the pose at hand out; return what is done."""
+        if isinstance(self.walk, Sweep) and not self.walk.verifying and not self.over:
+            self.journal.append({'skip': self.walk.index, 'drop': self.walk.index})
+        return self.walk.skip() if not self.over else 'there is no pose left to skip'
+
+    def redo(self) -> str:
+        """Take the pose before again; return what is done, or '' where there is none."""
+        if isinstance(self.walk, Tumble) and self.walk.accepted:
+            self.journal.append({'drop': max(self.walk.accepted)})
+        return self.walk.redo()
+
+    def finish(self) -> result.Result:
+        """
+        Fit what there is, and write the parameter file and the figures.
+
+        Raises
+        ------
+        UserError
+            There are too few poses, or a file cannot be written; what was taken stays.
+
+        """
+        entries = self.walk.results()
+        if not entries:
+            raise UserError('no pose is taken yet')
+        found = result.calibrate(self.unit, [Poses.from_entries(entries)], None,
+                                 [self.journal.path.name])
+        if self.asked.report:
+            Path(self.asked.report).mkdir(parents=True, exist_ok=True)
+            found.draw(Path(self.asked.report) / 'calibration.png')
+        found.save(self.asked.output)
+        self.journal.append({'rests': entries, 'done': True})
+        return found
+
+    def close(self) -> None:
+        """Let the journal go."""
+        self.journal.close()

@@ -1,0 +1,65 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The parameters of the calibration node that say what is asked for."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from adxl_ros.calibrate.session import Plan
+from adxl_ros.calibrate.state import Settings, STAGE_MODES
+from adxl_ros.nodes import common
+import numpy as np
+from rclpy.node import Node
+
+
+def declare_plan(node: Node) -> Plan:
+    """
+    Declare the parameters and return what they ask for.
+
+    Raises
+    ------
+    UserError
+        A parameter is out of range, or they make no plan.
+
+    """
+    degrees, declare = np.radians, common.declare
+    mode = declare(node, 'mode', 'stage', 'what the reference is', choices=('stage', 'gravity'))
+    output = Path(declare(node, 'output', 'calibration.yaml', 'parameter file to write'))
+    journal = declare(node, 'journal', '', 'file of accepted poses; empty: beside the output')
+    report = declare(node, 'report', '', 'directory for the figures; empty: none')
+    planes = declare(node, 'sweep.planes_rad',
+                     [float(degrees(a)) for a in (30, 60, 90, 120, 150)],
+                     'planes alpha of the sweep, rad')
+    step = declare(node, 'sweep.step_rad', float(degrees(30)), 'step of beta', 'rad', 0.005, 1.6)
+    dwell = declare(node, 'sweep.dwell_s', 5.0, 'time at rest a pose', 's', 0.5, 3600.0)
+    checks = declare(node, 'sweep.check_poses', 16,
+                     'poses kept out of the fit for the verdict', '', 0, 1000)
+    settings = Settings(
+        dwell,
+        declare(node, 'stage.tolerance_rad', float(degrees(0.2)), 'arrived within this', 'rad',
+                1e-6, 0.2),
+        declare(node, 'stage.timeout_s', 60.0, 'a pose that takes longer is said to be late', 's',
+                1.0, 86400.0),
+        declare(node, 'stage.mode', 'commanded', 'who turns the stage', choices=STAGE_MODES),
+        declare(node, 'stage.near_rad', float(degrees(2)),
+                'a stage turned by hand is captured within this of the pose', 'rad', 1e-4, 0.5),
+        declare(node, 'sweep.temperature_span_c', 3.0,
+                'how far the temperature may be from that of the first pose', 'degC', 0.1,
+                1000.0))
+    asked = Plan(mode, tuple(planes), step, checks, settings, output,
+                 Path(journal or f'{output}.journal'), report)
+    asked.targets()
+    return asked

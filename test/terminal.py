@@ -1,0 +1,102 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""A real terminal for a program under test: a pty, and an emulator that knows what it shows."""
+
+import fcntl
+import os
+import pty
+import signal
+import struct
+import subprocess
+import termios
+import threading
+import time
+
+import pyte
+import pytest
+
+
+class Terminal:
+    """A program in a terminal of its own, which it controls."""
+
+    def __init__(self, command, env, cwd, lines=40, columns=110):
+        self.screen = pyte.Screen(columns, lines)
+        self._stream = pyte.ByteStream(self.screen)
+        self._lock = threading.Lock()
+        self.raw = b''
+        self._master, slave = pty.openpty()
+        self._size(lines, columns)
+        # The test keeps the other end, to see what is left of its settings.
+        self.slave = slave
+        self.before = termios.tcgetattr(slave)
+        self.popen = subprocess.Popen(
+            command, env={**env, 'TERM': 'xterm-256color'}, cwd=cwd, stdin=slave, stdout=slave,
+            stderr=slave, start_new_session=True,
+            preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0))
+        self._thread = threading.Thread(target=self._read, daemon=True)
+        self._thread.start()
+
+    def _size(self, lines, columns):
+        fcntl.ioctl(self._master, termios.TIOCSWINSZ, struct.pack('HHHH', lines, columns, 0, 0))
+
+    def _read(self):
+        while True:
+            try:
+                data = os.read(self._master, 65536)
+            except OSError:
+                return
+            with self._lock:
+                self.raw += data
+                self._stream.feed(data)
+
+    def resize(self, lines, columns):
+        """Give the window another size, as a user's mouse does."""
+        with self._lock:
+            self.screen.resize(lines, columns)
+        self._size(lines, columns)
+        os.killpg(os.tcgetpgrp(self._master), signal.SIGWINCH)
+
+    def text(self):
+        """Return what is on the screen."""
+        with self._lock:
+            return '\n'.join(line.rstrip() for line in self.screen.display)
+
+    def press(self, key):
+        """Press a key, or a control character such as that of Ctrl-C."""
+        os.write(self._master, key.encode())
+
+    def wait_for(self, *texts, timeout_s=30.0):
+        """Wait until the screen shows all of some texts, and return it."""
+        end = time.monotonic() + timeout_s
+        while not all(text in (shown := self.text()) for text in texts):
+            if time.monotonic() > end:
+                pytest.fail(f'no {texts} on the screen after {timeout_s} s:\n{shown}')
+            time.sleep(0.05)
+        return shown
+
+    def restored(self):
+        """Tell whether settings, screen and cursor are as they were."""
+        with self._lock:
+            left = self.raw.count(b'\x1b[?1049h') == self.raw.count(b'\x1b[?1049l')
+            hidden = self.screen.cursor.hidden
+        return left and not hidden and termios.tcgetattr(self.slave) == self.before
+
+    def close(self):
+        """End what is still running."""
+        if self.popen.poll() is None:
+            os.killpg(self.popen.pid, signal.SIGKILL)
+            self.popen.wait()
+        os.close(self.slave)
+        os.close(self._master)

@@ -1,0 +1,149 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Full disks, drivers that are started anew, other units and settings: no pose is lost."""
+
+import os
+import resource
+
+from adxl_ros.files import journal, params
+from graph import Graph
+import numpy as np
+from units import drawn, nominal
+
+FAST = ('-p', 'use_sim_time:=true')
+PLAN = ('-p', 'sweep.planes_rad:=[0.785, 1.5707963267948966, 2.356]', '-p',
+        'sweep.step_rad:=0.7853981633974483', '-p', 'sweep.dwell_s:=1.0', '-p',
+        'sweep.check_poses:=4', '-p', 'output:=unit.yaml', '-p', 'autostart:=true', '-p',
+        'qos_overrides./imu/data_raw.subscription.reliability:=reliable')
+
+
+def _driver(start, tmp_path, serial='N1'):
+    base = nominal(serial=serial)
+    params.save(tmp_path / f'{serial}.yaml', drawn(np.random.default_rng(3), base))
+    return start('driver', '--ros-args', '--params-file', tmp_path / f'{serial}.yaml', '-p',
+                 'link.speed:=4.0', *FAST)
+
+
+def _stage(start, tmp_path):
+    params.save(tmp_path / 'bare.yaml', nominal())
+    return start('stage', '--ros-args', '--params-file', tmp_path / 'bare.yaml', *FAST, '-p',
+                 'slew_rate_rad_s:=3.0')
+
+
+def _calibration(start, tmp_path, *more):
+    return start('calibration', '--ros-args', '--params-file', tmp_path / 'bare.yaml', *FAST,
+                 *PLAN, *more)
+
+
+def _accepted(graph):
+    return int(graph.value('calibration', 'accepted')) if 'calibration' in graph.diagnostics else 0
+
+
+def _on_disk(tmp_path):
+    return journal.accepted_poses(journal.read(tmp_path / 'unit.yaml.journal')[1])
+
+
+def test_a_full_disk_is_said_and_waited_for(start, tmp_path):
+    """What the disk does not take is not acknowledged; with room again the sweep goes on."""
+    with Graph() as graph:
+        _driver(start, tmp_path)
+        _stage(start, tmp_path)
+        node = _calibration(start, tmp_path)
+        graph.spin_until(lambda: _accepted(graph) >= 2, 60, 'two poses')
+        size = (tmp_path / 'unit.yaml.journal').stat().st_size
+        # Files cannot grow: what a full disk does to the journal, without being root.
+        unlimited = resource.prlimit(node.popen.pid, resource.RLIMIT_FSIZE)
+        resource.prlimit(node.popen.pid, resource.RLIMIT_FSIZE, (size + 100, unlimited[1]))
+        node.wait_for('cannot write the journal: the disk is full; make room and try again')
+        full = len(_on_disk(tmp_path))
+        graph.spin(2.0)
+        assert len(_on_disk(tmp_path)) == full
+        resource.prlimit(node.popen.pid, resource.RLIMIT_FSIZE, unlimited)
+        graph.spin_until(lambda: _accepted(graph) >= full + 3, 60, 'more poses')
+        assert node.popen.poll() is None and 'Traceback' not in node.output()
+    assert [entry['pose'] for entry in _on_disk(tmp_path)][:full + 3] == list(range(full + 3))
+
+
+def test_a_driver_that_is_started_anew_is_followed_and_another_unit_is_not(start, tmp_path):
+    """The clock of a new driver may be behind; the pose at hand begins anew, the rest stays."""
+    with Graph() as graph:
+        driver = _driver(start, tmp_path)
+        _stage(start, tmp_path)
+        node = _calibration(start, tmp_path)
+        graph.spin_until(lambda: _accepted(graph) >= 2, 60, 'two poses')
+        driver.stop()
+        before = _on_disk(tmp_path)
+        graph.spin_until(lambda: graph.said('calibration', 'nothing on /imu/data_raw'), 20, 'why')
+        assert 'and nobody publishes it' in graph.diagnostics['calibration'].message
+        driver = _driver(start, tmp_path)
+        graph.spin_until(lambda: _accepted(graph) >= len(before) + 3, 60, 'more poses')
+        assert _on_disk(tmp_path)[:len(before)] == before
+        driver.stop()
+        _driver(start, tmp_path, 'N2')
+        node.wait_for('serial was N1, is N2: changed during the calibration')
+    assert len(_on_disk(tmp_path)) >= len(before) + 3
+
+
+def test_a_new_start_resumes_or_says_what_changed_or_begins_anew(start, tmp_path):
+    """Without a terminal: it goes on by itself, refuses other settings, and obeys resume:=anew."""
+    with Graph() as graph:
+        _driver(start, tmp_path)
+        _stage(start, tmp_path)
+        first = _calibration(start, tmp_path)
+        graph.spin_until(lambda: _accepted(graph) >= 3, 60, 'three poses')
+        os.kill(first.popen.pid, 9)
+        first.wait()
+        poses = _on_disk(tmp_path)
+
+        other = _calibration(start, tmp_path, '-p', 'sweep.step_rad:=0.5235987755982988')
+        other.wait_for('holds an unfinished calibration of another kind')
+        assert 'sweep.step_rad was 0.7853981633974483, is 0.5235987755982988' in other.output()
+        assert 'resume:=anew' in other.output()
+        other.stop()
+        assert _on_disk(tmp_path) == poses
+
+        again = _calibration(start, tmp_path)
+        again.wait_for(f'resumed after {len(poses)} poses (the last one first, to see that the '
+                       'mounting is as it was); resume:=anew puts them aside')
+        again.wait_for('the sensor is mounted as it was')
+        again.wait_for(f'pose {len(poses) + 1} is on disk')
+        again.stop()
+        assert _on_disk(tmp_path)[:len(poses)] == poses
+
+        anew = _calibration(start, tmp_path, '-p', 'resume:=anew')
+        anew.wait_for('pose 1 is on disk')
+        kept, = tmp_path.glob('unit.yaml.journal.2*')
+        assert journal.accepted_poses(journal.read(kept)[1])[:len(poses)] == poses
+
+
+def test_another_mounting_stops_before_a_pose_is_taken(start, tmp_path):
+    """The sensor was taken off and put back 2° turned: the last pose tells, with figures."""
+    with Graph() as graph:
+        driver = _driver(start, tmp_path)
+        _stage(start, tmp_path)
+        first = _calibration(start, tmp_path)
+        graph.spin_until(lambda: _accepted(graph) >= 3, 60, 'three poses')
+        os.kill(first.popen.pid, 9)
+        driver.stop()
+        poses = _on_disk(tmp_path)
+        unit = params.load(tmp_path / 'N1.yaml')
+        unit.values['misalignment']['beta_rad'] += np.radians([-2.0, 2.0])
+        params.save(tmp_path / 'N1.yaml', unit)
+        start('driver', '--ros-args', '--params-file', tmp_path / 'N1.yaml', '-p',
+              'link.speed:=4.0', *FAST)
+        again = _calibration(start, tmp_path)
+        again.wait_for(f'mounting changed: in pose {len(poses)} ', 60)
+        assert 'before the interruption' in again.output()
+    assert _on_disk(tmp_path) == poses

@@ -1,0 +1,197 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The terminal screen, in a real terminal: what it shows, its keys, and that it leaves."""
+
+import os
+from pathlib import Path
+import signal
+
+from adxl_ros.files import journal, params
+from conftest import executable
+from graph import Graph
+import numpy as np
+import pytest
+from sensor_msgs.msg import JointState
+from terminal import Terminal
+from test_core_only import run_without_extras
+from units import drawn, nominal
+
+FAST = ('-p', 'use_sim_time:=true')
+PLAN = ('-p', 'sweep.planes_rad:=[0.7853981633974483, 1.5707963267948966]', '-p',
+        'sweep.step_rad:=1.5707963267948966', '-p', 'sweep.dwell_s:=1.5', '-p',
+        'sweep.check_poses:=2', '-p', 'output:=unit.yaml', '-p',
+        'qos_overrides./imu/data_raw.subscription.reliability:=reliable')
+
+
+@pytest.fixture
+def terminal(ros_env, tmp_path):
+    """Give a function that runs the calibration in a terminal; all are closed at the end."""
+    opened = []
+    base = nominal(serial='T1')
+    params.save(tmp_path / 'truth.yaml', drawn(np.random.default_rng(3), base))
+    params.save(tmp_path / 'bare.yaml', base)
+
+    def begin(*more, **size):
+        opened.append(Terminal(
+            [executable('calibration'), '--ros-args', '--params-file', tmp_path / 'bare.yaml',
+             *PLAN, *more], ros_env, tmp_path, **size))
+        return opened[-1]
+
+    yield begin
+    for one in opened:
+        print(one.text())
+        one.close()
+
+
+class Hands(Graph):
+    """Somebody who turns the stage."""
+
+    def __enter__(self):
+        super().__enter__()
+        self.shown = self.listen(JointState, 'stage/joint_states')
+        self.command = self.node.create_publisher(JointState, 'stage/command', 10)
+        return self
+
+    def turn(self, alpha_deg, beta_deg):
+        """Turn the stage until it is there and rests."""
+        def there():
+            self.command.publish(JointState(name=['alpha', 'beta'], position=[
+                np.radians(alpha_deg), np.radians(beta_deg)]))
+            self.spin(0.1)
+            last = self.shown[-1] if self.shown else None
+            return last and np.abs(last.velocity).max() < 1e-4 and np.allclose(
+                np.degrees(last.position[:2]), [alpha_deg, beta_deg], atol=0.1)
+        self.spin_until(there, 30, f'the stage at {alpha_deg}, {beta_deg}')
+
+
+def bench(start, tmp_path):
+    """Start the sensor on its stage, at four times real time."""
+    start('driver', '--ros-args', '--params-file', tmp_path / 'truth.yaml', '-p',
+          'link.speed:=4.0', *FAST)
+    start('stage', '--ros-args', '--params-file', tmp_path / 'bare.yaml', *FAST, '-p',
+          'slew_rate_rad_s:=3.0')
+
+
+def test_an_operator_is_led_through_a_sweep_by_the_screen(start, terminal, tmp_path):
+    """Begin, a mistake, poses, a skip, a redo, the end: all by keys, all to be seen."""
+    bench(start, tmp_path)
+    (tmp_path / 'unit.yaml').write_text('the earlier one\n')
+    with Hands() as hands:
+        seen = terminal(*FAST, '-p', 'stage.mode:=encoder')
+        seen.wait_for('press b to begin', 'calibration of T1 (xy) into unit.yaml', '1000 Hz')
+        seen.press('b')
+        shown = seen.wait_for('turn the stage to alpha 45.0°, beta 0.0°, then capture',
+                              'alpha 0.00° (-45.00°)', '0 done, 22 left', 'tilt error',
+                              'must be below', 'misalignment.beta_rad', '45° 0/10', 'c  capture')
+        assert 'check poses 0/2' in ' '.join(shown.split())
+        seen.press('c')
+        seen.wait_for('alpha is 45.0° from the asked 45°')
+        before = _tilt(shown)
+        for number, beta in enumerate((0, 90, 180, 270), 1):
+            hands.turn(45, beta)
+            seen.wait_for(f'{number} of 22', f'beta {beta:.2f}° (+0.00°)')
+            seen.press('c')
+            seen.wait_for(f'{number} done', timeout_s=40)
+        shown = seen.wait_for('45° 4/10', 'beta forth 3/8', 'at rest')
+        assert _tilt(shown) < before / 2
+        seen.press('s')
+        seen.wait_for('1 left out', 'alpha 90.0°, beta 360.0°')
+        seen.press('r')
+        seen.wait_for('turn the stage to alpha 45.0°, beta 360.0°')
+        seen.press('a')
+        seen.wait_for('aborted; its poses stay in unit.yaml.journal', 'b  begin')
+        seen.press('b')
+        seen.wait_for('unit.yaml.journal holds 4 poses of an interrupted calibration', 'y  go on')
+        seen.press('y')
+        seen.wait_for('once more, to see that the mounting is', 'alpha 45.0°, beta 270.0°')
+        seen.press('c')
+        seen.wait_for('alpha 90.0°, beta 360.0°')
+        hands.turn(90, 360)
+        seen.press('c')
+        seen.wait_for('5 done')
+        seen.resize(24, 80)
+        seen.wait_for('5 done', 'c  capture')
+        seen.press('f')
+        seen.wait_for('wrote unit.yaml', 'held out', 'linear')
+        seen.press('q')
+        assert seen.popen.wait(20) == 0
+        assert seen.restored()
+        assert 'pose 6 is on disk' in seen.raw.decode().split('\x1b[?1049l')[-1]
+    assert params.load(tmp_path / 'unit.yaml').serial == 'T1'
+    assert (tmp_path / 'unit.yaml.previous').read_text() == 'the earlier one\n'
+    _, entries = journal.read(tmp_path / 'unit.yaml.journal')
+    poses = journal.accepted_poses(entries)
+    assert len(poses) == 5 and journal.skipped_poses(entries) == {4}
+    # The screen costs no samples: every pose is gapless.
+    assert all(e['stop_ns'] - e['start_ns'] == 1_000_000 * (e['samples'] - 1) for e in poses)
+
+
+def _tilt(shown):
+    line = next(line for line in shown.splitlines() if line.startswith('tilt error'))
+    return float(line.split()[2].rstrip('°'))
+
+
+def children(pid):
+    """Return the processes that a process has started."""
+    return [int(n) for task in Path(f'/proc/{pid}/task').iterdir()
+            for n in (task / 'children').read_text().split()]
+
+
+@pytest.mark.parametrize('how', ['ctrl-c', 'term', 'kill', 'kill of the screen'])
+def test_the_terminal_is_given_back(terminal, how):
+    """However the node ends, settings, screen and cursor are as they were."""
+    seen = terminal()
+    seen.wait_for('press b to begin')
+    screen, = children(seen.popen.pid)
+    if how == 'ctrl-c':
+        seen.press('\x03')
+    elif how == 'kill of the screen':
+        os.kill(screen, signal.SIGKILL)
+        seen.wait_for('the screen has ended; plain lines from here on')
+        assert seen.restored() and seen.popen.poll() is None
+        seen.press('\x03')
+    else:
+        os.kill(seen.popen.pid, signal.SIGTERM if how == 'term' else signal.SIGKILL)
+    assert seen.popen.wait(20) == (-signal.SIGKILL if how == 'kill' else 0)
+    with Graph() as graph:
+        graph.spin_until(lambda: seen.restored() and not Path(f'/proc/{screen}').exists(), 20,
+                         'the terminal as it was')
+
+
+def test_what_changed_is_said_and_asked_about(start, terminal, tmp_path):
+    """An interrupted calibration of other settings: what differs, and anew only if told."""
+    old = journal.Journal(tmp_path / 'unit.yaml.journal', {'mode': 'stage', 'serial': 'T0'})
+    old.append({'pose': 0})
+    old.close()
+    bench(start, tmp_path)
+    seen = terminal(*FAST, '-p', 'autostart:=true')
+    seen.wait_for('holds 1 poses of an interrupted calibration, which cannot go on',
+                  'serial was "T0", is "T1"', 'n  begin anew')
+    seen.press('n')
+    seen.wait_for('0 done, 22 left')
+    kept, = tmp_path.glob('unit.yaml.journal.2*')
+    assert journal.read(kept)[0]['serial'] == 'T0'
+
+
+def test_without_rich_there_are_plain_lines():
+    """The screen is an extra: one line says what it needs."""
+    done = run_without_extras("""
+import os
+from adxl_ros.screen.terminal import open_terminal
+sys.stdin.isatty = sys.stdout.isatty = lambda: True
+os.tcgetpgrp = lambda fd: os.getpgrp()
+print(open_terminal())
+""")
+    assert done.stdout == "(None, 'no screen, plain lines: it needs rich; pip install rich')\n"

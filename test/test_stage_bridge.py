@@ -1,0 +1,142 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The bridge to a real stage, before a controller that the test plays."""
+
+import math
+
+from diagnostic_msgs.msg import DiagnosticStatus
+from graph import Graph
+import numpy as np
+import pytest
+from sensor_msgs.msg import JointState
+from trajectory_msgs.msg import JointTrajectory
+
+NAMES = ('-p', 'bridge.alpha.joint:=tilt', '-p', 'bridge.beta.joint:=turn')
+MOUNTED = ('-p', 'bridge.beta.sign:=-1', '-p', 'bridge.alpha.offset_rad:=0.5')
+
+
+class Controller(Graph):
+    """A controller of two joints, which counts in (-pi, pi] and obeys at once, and a user."""
+
+    def __init__(self, kind):
+        super().__init__()
+        self.kind = kind
+        self.angles = {'gripper': 0.2, 'turn': 0.0, 'tilt': 0.0}
+        self.told = []
+
+    def __enter__(self):
+        super().__enter__()
+        make = self.node.create_publisher
+        self.states = make(JointState, '/joint_states', 10)
+        self.command = make(JointState, 'stage/command', 10)
+        self.shown = self.listen(JointState, 'stage/joint_states')
+        if self.kind == 'trajectory':
+            self.node.create_subscription(
+                JointTrajectory, '/joint_trajectory_controller/joint_trajectory', self.told.append,
+                10)
+        else:
+            self.node.create_subscription(JointState, '/joint_commands', self.told.append, 10)
+        self.node.create_timer(0.02, self.publish)
+        return self
+
+    def publish(self):
+        """Say where the joints are."""
+        message = JointState(name=list(self.angles), position=[
+            math.remainder(angle, 2 * math.pi) for angle in self.angles.values()])
+        message.header.stamp = self.node.get_clock().now().to_msg()
+        self.states.publish(message)
+
+    def goal(self):
+        """Return the joints' angles of the newest command."""
+        newest = self.told[-1]
+        return dict(zip(newest.joint_names, newest.points[0].positions)) \
+            if self.kind == 'trajectory' else dict(zip(newest.name, newest.position))
+
+    def ask(self, alpha, beta):
+        """Ask the stage to go somewhere."""
+        self.command.publish(JointState(name=['alpha', 'beta'], position=[alpha, beta]))
+
+    def at(self):
+        """Return where the stage says it is."""
+        return dict(zip(self.shown[-1].name, self.shown[-1].position)) if self.shown else {}
+
+
+@pytest.mark.parametrize('kind', ['trajectory', 'joint_state'])
+def test_commands_and_states_pass_with_names_signs_and_offsets(start, kind):
+    """What is asked of the stage reaches the controller's joints, and their states come back."""
+    with Controller(kind) as graph:
+        start('stage', '--ros-args', '-p', f'stage.type:={kind}', *NAMES, *MOUNTED)
+        graph.spin_until(graph.at, 30, 'the stage')
+        assert graph.at() == {'alpha': 0.5, 'beta': 0.0}
+        graph.ask(0.7, 0.3)
+        graph.spin_until(lambda: graph.told, 10, 'a command')
+        assert graph.goal() == pytest.approx({'tilt': 0.2, 'turn': -0.3})
+        if kind == 'trajectory':
+            point = graph.told[0].points[0]
+            seconds = point.time_from_start.sec + point.time_from_start.nanosec * 1e-9
+            assert seconds == pytest.approx(0.3 / 0.3)  # the longer way at 0.3 rad/s
+            assert graph.told[0].header.stamp.sec == 0  # at once
+        graph.angles.update(graph.goal())
+        graph.spin_until(lambda: graph.at()['beta'] > 0.29, 10, 'the new place')
+        assert graph.at() == pytest.approx({'alpha': 0.7, 'beta': 0.3})
+        count = len(graph.told)
+        for _ in range(10):
+            graph.ask(0.7, 0.3)
+            graph.spin(0.1)
+        assert len(graph.told) == count, 'a command that is followed was sent again'
+
+
+def test_a_turn_beyond_half_is_unwrapped(start):
+    """A controller that counts to pi and on from -pi is followed through a whole turn."""
+    with Controller('trajectory') as graph:
+        start('stage', '--ros-args', '-p', 'stage.type:=trajectory', *NAMES)
+        for beta in np.arange(0, 6.5, 0.5):
+            graph.angles['turn'] = beta
+            graph.spin_until(lambda wanted=beta: abs(graph.at().get('beta', -1) - wanted) < 1e-9,
+                             20, f'beta {beta}')
+
+
+def test_a_command_that_is_lost_is_sent_again(start):
+    """A controller that starts later, or ignores a goal, is told again after a while."""
+    with Controller('trajectory') as graph:
+        start('stage', '--ros-args', '-p', 'stage.type:=trajectory', *NAMES, '-p',
+              'bridge.speed_rad_s:=10.0')
+        graph.spin_until(graph.at, 30, 'the stage')
+
+        def told_twice():
+            graph.ask(0.4, 0.0)
+            return len(graph.told) >= 2
+        graph.spin_until(told_twice, 20, 'a second time')
+
+
+def test_wrong_names_are_told(start):
+    """A joint that the controller does not have is named, with those that it has."""
+    with Controller('trajectory') as graph:
+        start('stage', '--ros-args', '-p', 'stage.type:=trajectory', '-p',
+              'bridge.alpha.joint:=tilt', '-p', 'bridge.beta.joint:=spin')
+        graph.spin_until(lambda: graph.said('stage', 'no joint spin; it has gripper, tilt, turn'),
+                         30, 'the names')
+        assert graph.diagnostics['stage'].level == DiagnosticStatus.ERROR
+        assert not graph.shown
+
+
+@pytest.mark.parametrize('more, words', [
+    (('-p', 'bridge.alpha.joint:=tilt'), 'bridge.beta.joint: is not set'),
+    ((*NAMES, '-p', 'bridge.beta.sign:=0'), 'bridge.beta.sign: 0 is not 1 or -1')])
+def test_what_is_missing_ends_the_node(start, more, words):
+    """Without the joints' names nothing could work: one line says which is missing."""
+    stage = start('stage', '--ros-args', '-p', 'stage.type:=joint_state', *more)
+    assert stage.wait() == 1
+    assert words in stage.output() and 'Traceback' not in stage.output()
