@@ -58,6 +58,21 @@ def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
         shutil.rmtree(folder, ignore_errors=True)
 
 
+def keep_previous(path: str | os.PathLike) -> None:
+    """
+    Keep the file at `path`, if there is one, as `path`.previous, before it is replaced.
+
+    Raises
+    ------
+    UserError
+        See `atomic_path`.
+
+    """
+    if Path(path).is_file():
+        with atomic_path(f'{path}.previous') as kept:
+            shutil.copyfile(path, kept)
+
+
 def _exchange(fresh: Path, target: Path, folder: Path) -> None:
     if fresh.is_dir() and target.is_dir():
         # A directory cannot be renamed over one that holds files: the old one moves out first.

@@ -25,7 +25,7 @@ from adxl_ros.calibrate.poses import Poses
 from adxl_ros.calibrate.sweep import Settings, STAGE_MODES, Sweep
 from adxl_ros.calibrate.tumble import Tumble
 from adxl_ros.errors import UserError
-from adxl_ros.files import cdr
+from adxl_ros.files import cdr, store
 from adxl_ros.files.journal import accepted_poses, Journal
 from adxl_ros.model.sensor import Sensor, to_volts
 from adxl_ros.nodes import common
@@ -73,7 +73,9 @@ class Calibration(Node):
         self.output = Path(declare(self, 'output', 'calibration.yaml', 'parameter file to write'))
         self.journal_path = declare(self, 'journal', '',
                                     'file of accepted poses; empty: beside the output')
-        self.report = declare(self, 'report', '', 'directory for the figures; empty: none')
+        self.report = declare(self, 'report', '', 'directory for the report; empty: none')
+        self.store = declare(self, 'store', str(store.default_folder()),
+                             'folder of calibrations that gets a copy; empty: none')
         self.planes = declare(self, 'sweep.planes_rad',
                               [float(degrees(a)) for a in (30, 60, 90, 120, 150)],
                               'planes alpha of the sweep, rad')
@@ -250,9 +252,6 @@ class Calibration(Node):
             if not entries:
                 raise UserError('no pose is taken yet')
             found = self._fit(entries)
-            if self.report:
-                Path(self.report).mkdir(parents=True, exist_ok=True)
-                found.draw(Path(self.report) / 'calibration.png')
             found.save(self.output)
             self.journal.append({'rests': entries, 'done': True})
         except (UserError, OSError) as error:
@@ -261,11 +260,23 @@ class Calibration(Node):
             if isinstance(self.walk, Sweep) and self.walk.target is None:
                 self._stop(self._said)
             return False
+        self.get_logger().info(found.keep(self.store))
+        self._leave_report(found)
         for line in found.comments():
             self.get_logger().info(line)
         self.outcome = '; '.join(found.verdict)
         self._stop(f'wrote {self.output}')
         return True
+
+    def _leave_report(self, found: result.Result) -> None:
+        """Write the report; without it the calibration stands all the same."""
+        if not self.report:
+            return
+        try:
+            Path(self.report).mkdir(parents=True, exist_ok=True)
+            found.report(self.report, self.store)
+        except (UserError, OSError) as error:
+            self._fail(f'no report: {error}')
 
     def _fit(self, entries: list[dict[str, Any]]) -> result.Result:
         poses = Poses.from_entries(entries)
