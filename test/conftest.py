@@ -49,6 +49,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.xdist_group('graph'))
 
 
+@pytest.fixture(autouse=True)
+def store_of_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Keep the store of calibrations, and whatever else is the user's, out of the tests."""
+    monkeypatch.setenv('ROS_HOME', str(tmp_path / 'ros_home'))
+
+
 @pytest.fixture
 def ros_env(tmp_path: Path) -> Iterator[dict[str, str]]:
     """Set the environment of a graph of this test's own, for this process and its children."""

@@ -61,16 +61,21 @@ def test_a_sweep_ends_with_a_file_and_fit_agrees_on_its_bag(start, run_tool, tmp
              '/sensor_info': DiagnosticStatus}
     with Graph() as graph:
         kept = {topic: _record(graph, kind, topic) for topic, kind in kinds.items()}
-        _sweep(start, truth, bare, '-p', 'output:=unit.yaml')
+        node = _sweep(start, truth, bare, '-p', 'output:=unit.yaml', '-p', 'report:=report')
         # The record begins before the sweep does.
         graph.spin_until(lambda: all(kept.values()), 60, 'all topics')
         assert graph.call(Trigger, 'calibration/start', Trigger.Request()).success
         graph.spin_until((tmp_path / 'unit.yaml').exists, 120, 'the parameter file')
+        node.wait_for('wrote unit.yaml', 60)
     found = params.load(tmp_path / 'unit.yaml')
     want = params.load(truth)
     assert (found.model, found.serial) == ('full', 'T1')
     np.testing.assert_allclose(found.zero_g_v, want.zero_g_v, atol=1e-3)
     np.testing.assert_allclose(found.scale_v_per_g, want.scale_v_per_g, atol=1e-3)
+    copy, = (tmp_path / 'ros_home' / 'adxl_ros' / 'calibrations' / 'T1').iterdir()
+    assert copy.read_text() == (tmp_path / 'unit.yaml').read_text()
+    assert copy.stem == found.provenance['id']
+    assert 'held out' in (tmp_path / 'report' / 'report.html').read_text()
     head = (tmp_path / 'unit.yaml').read_text().split('/**')[0]
     assert all(f'# {model}' in head for model in ('linear', 'physical', 'full'))
 

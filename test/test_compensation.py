@@ -16,10 +16,13 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from datetime import datetime, timedelta, timezone
 from pathlib import Path
 import signal
 
-from adxl_ros.files import params
+from adxl_ros.calibrate.poses import Poses
+from adxl_ros.calibrate.provenance import envelope
+from adxl_ros.files import params, store
 from adxl_ros.files.columns import sensor_info
 from adxl_ros.model import chain, paper_inverse, unfilter
 from adxl_ros.model.coefficients import put, with_neutral
@@ -209,6 +212,114 @@ def test_supply_and_temperature_are_taken_out(robot: Robot, start: Start, tmp_pa
 
     robot.graph.spin_until(corrected, 10.0, 'corrected for the surroundings')
     robot.level(DiagnosticStatus.OK, 'compensating')
+
+
+def stored(folder: Path, sensor: Sensor, days_old: float) -> Path:
+    """Put a calibration of some age into a store."""
+    made = datetime.now(timezone.utc) - timedelta(days=days_old)
+    path = store.put(folder, replace(sensor, provenance={
+        'date': made.isoformat(timespec='seconds'), 'data_sha256': f'{days_old:064.3f}'}))
+    assert path is not None
+    return path
+
+
+def test_the_newest_calibration_of_the_unit_is_taken(robot: Robot, start: Start, tmp_path: Path
+                                                     ) -> None:
+    """By serial and date; what does not fit is passed over, and a newer one is announced."""
+    folder = tmp_path / 'calibrations'
+    old, newest = unit(seed=1), unit(seed=2)
+    stored(folder, old, 30.0)
+    path = stored(folder, newest, 10.0)
+    stored(folder, unit('18', seed=3), 1.0)
+    three = stored(folder, unit(axes='xyz', seed=4), 5.0)
+    (folder / '17' / '17-29990101T000000Z-0.yaml').write_text('half of a fi')
+    process = start(NODE, '--ros-args', '-p', f'store:={folder}')
+    robot.connected()
+    robot.level(DiagnosticStatus.WARN, 'no samples')
+    assert robot.graph.value(NODE, 'validity') == 'not calibrated'
+    robot.inform(newest)
+    process.wait_for(f'compensating by {path}')
+    assert f'passed over: {three}: ' in process.output()
+    assert '17-29990101T000000Z-0.yaml:1:1: ' in process.output()
+    force = pose(0.7, -1.2)
+    np.testing.assert_allclose(accel(robot.answer(felt(newest, force))), force, atol=1e-7)
+    robot.graph.spin_until(lambda: robot.graph.value(NODE, 'validity') == 'valid', 10, 'validity')
+    assert robot.graph.value(NODE, 'calibration_id') == path.stem
+    assert float(robot.graph.value(NODE, 'age_days')) == pytest.approx(10.0, abs=0.01)
+    (folder / '17' / '17-29990101T000000Z-0.yaml').unlink()
+    fresh = stored(folder, unit(seed=5), 0.0)
+
+    def announced() -> bool:
+        robot.send(felt(newest, force))
+        return robot.graph.said(NODE, f'a newer calibration is in the store: {fresh}')
+    robot.graph.spin_until(announced, 10, 'the newer one')
+    # It is not taken in the middle of a run, but when the driver starts again.
+    np.testing.assert_allclose(accel(robot.answer(felt(newest, force))), force, atol=1e-7)
+    robot.inform(newest)
+    process.wait_for(f'compensating by {fresh}')
+
+
+def test_a_named_calibration_stands(robot: Robot, start: Start, tmp_path: Path) -> None:
+    """Whatever the store has; without one it is the store's default folder that is asked."""
+    sensor = unit(seed=1)
+    stored(store.default_folder(), unit(seed=2), 0.0)
+    process = started(start, tmp_path, sensor)
+    robot.inform(sensor)
+    robot.connected()
+    force = pose(0.7, -1.2)
+    np.testing.assert_allclose(accel(robot.answer(felt(sensor, force))), force, atol=1e-7)
+    robot.level(DiagnosticStatus.OK, 'compensating')
+    assert process.output().count('compensating by') == 1
+    nominal_file = tmp_path / 'nominal.yaml'
+    params.save(nominal_file, nominal(serial='17'))
+    process.stop()
+    # Figures without coefficients name no calibration.
+    other = start(NODE, '--ros-args', '--params-file', nominal_file, '-r', '__node:=other')
+    other.wait_for(f'compensating by {store.default_folder()}')
+
+
+def test_outside_of_what_was_calibrated_the_covariance_is_raised(
+        robot: Robot, start: Start, tmp_path: Path) -> None:
+    """By temperature and by pose, as much as the documentation says, and diagnostics say so."""
+    sensor = unit(axes='xyz')
+    sensor = replace(sensor, covariance_names=tuple(
+        f'{name}.{axis}' for name in ('bias.offset_v', 'scale_factor.offset_v_per_g')
+        for axis in 'xyz'), covariance=np.diag([1e-8] * 3 + [1e-6] * 3))
+    force = np.array([pose(a, b) for a in np.radians([0, 15, 30]) for b in (0.0, 2.0, 4.0)])
+    nothing = np.zeros((9, 3))
+    poses = Poses(nothing, nothing, nothing[:, 0], nothing[:, 0], nothing[:, :2],
+                  nothing[:, 0] > 0, np.linspace(20, 25, 9))
+    # The sensor of the poses sees no more than 30°; a small force tells less of the scale.
+    sensor = replace(sensor, envelope=envelope(sensor, force, poses, 0.02))
+    started(start, tmp_path, sensor)
+    robot.inform(sensor)
+    robot.connected()
+    temperature = robot.graph.node.create_publisher(Temperature, 'temperature', 1)
+    inside = felt(sensor, pose(0.4, 0.4))
+
+    def variances(shown: list[float], at_c: float, said: str) -> np.ndarray:
+        """Return those of a sample at a temperature, once diagnostics say what they must."""
+        def there() -> bool:
+            temperature.publish(Temperature(temperature=at_c))
+            robot.answer(shown)
+            return robot.graph.value(NODE, 'validity').startswith(said)
+        robot.graph.spin_until(there, 15, f'{at_c} degC: {said}')
+        return np.array(robot.data[-1].linear_acceleration_covariance).reshape(3, 3).diagonal()
+
+    before = variances(inside, 23.0, 'valid')
+    np.testing.assert_array_equal(variances(inside, 26.5, 'valid'), before)
+    warm = variances(inside, 40.0, 'outside: temperature 40.0 degC, calibrated at 20.0 to 25.0')
+    robot.level(DiagnosticStatus.WARN, 'covariance raised: temperature 40.0 degC')
+    # By the datasheet 0.1 mg/K and 3e-5/K of the force, over the 13 K beyond 25 + 2 degC.
+    added = (13 * 1e-4 * G) ** 2 + (13 * 3e-5 * np.array(pose(0.4, 0.4))) ** 2
+    np.testing.assert_allclose(warm - before, added, rtol=0.1)
+    tilted = variances(felt(sensor, [2 * G, 0.0, 0.0]), 23.0,
+                       'outside: force near 19.5, 0.0, 0.0 m/s^2')
+    assert tilted[0] > before[0] + 0.02 ** 2 * 0.5
+    # Nor was 85 deg visited, however little the force along x alone would tell of it.
+    variances(felt(sensor, pose(1.48, 0.4)), 23.0, 'outside: force near')
+    assert float(robot.graph.value(NODE, 'outside')) >= 3
+    np.testing.assert_allclose(variances(inside, 23.0, 'valid'), before)
 
 
 def test_without_a_file_the_nominal_sensor_applies(robot: Robot, start: Start) -> None:

@@ -17,17 +17,32 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from datetime import datetime, timezone
-from importlib.metadata import PackageNotFoundError, version
 import os
+from pathlib import Path
 
-from adxl_ros.calibrate import figures, full_terms, full_words, gravity, linear, physical, verdict
+from adxl_ros.calibrate import (
+    figures,
+    full_terms,
+    full_words,
+    gravity,
+    judge,
+    limits,
+    linear,
+    physical,
+    report,
+    verdict,
+)
 from adxl_ros.calibrate.agree import require_one_mounting
 from adxl_ros.calibrate.filter_noise import FilterNoise, with_filter
+from adxl_ros.calibrate.full import FullFit
+from adxl_ros.calibrate.judge import Judged
 from adxl_ros.calibrate.poses import check_polarity, Poses, reference_force, together
+from adxl_ros.calibrate.provenance import envelope, with_provenance
+from adxl_ros.calibrate.verdict import Score
 from adxl_ros.errors import UserError
-from adxl_ros.files import params
+from adxl_ros.files import params, store
 from adxl_ros.files.atomic import keep_previous
 from adxl_ros.model import chain
 from adxl_ros.model.constants import G0_MPS2
@@ -41,39 +56,126 @@ STAGE_FITS = {'linear': linear.fit, 'physical': physical.fit, 'full': full_terms
 
 @dataclass(frozen=True)
 class Result:
-    """A fitted sensor, its verdict line by line, and the poses behind it."""
+    """
+    A fitted sensor and what is known of it.
+
+    Attributes
+    ----------
+    nominal, fitted
+        The unit as it was stated and as it is.
+    verdict
+        How good it is, line by line.
+    poses
+        What it was made of and judged by.
+    judged
+        Each model beside the datasheet and the noise, the one that was taken last.
+    scores
+        Their errors on poses held out.
+    gravity_fit
+        Of a calibration against gravity.
+    knocked
+        Numbers of the poses that were left out as disturbed.
+
+    """
 
     nominal: Sensor
     fitted: Sensor
     verdict: list[str]
     poses: Poses
+    judged: tuple[Judged, ...] = ()
+    scores: tuple[Score, ...] = ()
     gravity_fit: gravity.GravityFit | None = None
+    knocked: tuple[int, ...] = ()
 
     def comments(self) -> list[str]:
         """Lay out coefficients and verdict for people: the head of the parameter file."""
         return [*coefficients(self.fitted), '', *self.verdict]
 
     def save(self, path: str | os.PathLike) -> None:
-        """Write the parameter file, whole or not at all; one that was there is kept beside it."""
+        """
+        Write the parameter file, whole or not at all; one that it replaces is kept beside it.
+
+        Parameters
+        ----------
+        path
+            The file; an older one becomes NAME.previous.
+
+        Raises
+        ------
+        UserError
+            It cannot be written; the older one is as it was.
+
+        """
         keep_previous(path)
         params.save(path, self.fitted, self.comments())
+
+    def keep(self, folder: str | os.PathLike) -> str:
+        """
+        Keep a copy in the store, and say in a line where it is, or why there is none.
+
+        A store that cannot be written is no reason to lose a calibration that is saved.
+
+        Parameters
+        ----------
+        folder
+            The store; empty for none.
+
+        """
+        if not str(folder):
+            return 'not kept in a store'
+        try:
+            path = store.put(folder, self.fitted, self.comments())
+        except UserError as error:
+            return f'no copy in the store: {error}'
+        return f'kept as {path}' if path else \
+            f'not kept in {folder}: the serial number {store.NO_UNIT} is no unit in particular'
+
+    def report(self, folder: str | os.PathLike, kept: str | os.PathLike = '') -> None:
+        """
+        Leave the page `report.html`, and the figures of the unit as `calibration.png`.
+
+        Parameters
+        ----------
+        folder
+            Which is there.
+        kept
+            The store with the history of the unit; empty for none.
+
+        """
+        past = store.history(kept, self.fitted.serial)[0] if str(kept) else []
+        report.write(Path(folder) / 'report.html', self, past)
+        # Poses that do not show the paper's figures have a page, which says why.
+        with suppress(UserError):
+            self.draw(Path(folder) / 'calibration.png')
 
     def draw(self, path: str | os.PathLike) -> None:
         """Write the figures of this unit as PNG."""
         if self.gravity_fit is not None:
-            fit = self.gravity_fit
-            name = f'{self.fitted.serial} ({self.fitted.provenance["source"]})'
-            figures.draw_gravity(path, name, fit.before_mps2, fit.residual_mps2,
-                                 fit.expected_mps2)
+            figures.write(figures.gravity_rests(self.name, self.gravity_fit), path)
         else:
-            fitted = self.fitted if self.fitted.model in ('physical', 'full') else \
-                physical.fit(self.nominal, self.poses.subset(~self.poses.check))
-            figures.draw_sweep(path, self.nominal, fitted, self.poses)
+            figures.draw_sweep(path, self.nominal, self.modelled, self.poses)
+
+    @property
+    def name(self) -> str:
+        """Name the unit and where its poses come from."""
+        return f'{self.fitted.serial} ({self.fitted.provenance["source"]})'
+
+    @property
+    def sound(self) -> np.ndarray:
+        """Tell the poses that were not knocked, which `scores` counts, (k,)."""
+        return ~np.isin(np.arange(len(self.poses)), self.knocked)
+
+    @property
+    def modelled(self) -> Sensor:
+        """Return the unit by a model that the paper's figures can show."""
+        return self.fitted if self.fitted.model in ('physical', 'full') else \
+            physical.fit(self.nominal, self.poses.subset(~self.poses.check))
 
 
 def calibrate(sensor: Sensor, parts: Sequence[Poses], model: str | None,
               sources: Sequence[str], effects: Sequence[str] = (),
-              filters: Sequence[Sequence[FilterNoise | None]] = ()) -> Result:
+              filters: Sequence[Sequence[FilterNoise | None]] = (),
+              data_sha256: str = '') -> Result:
     """
     Fit the poses of one unit: against the stage where there are angles, else gravity.
 
@@ -91,6 +193,8 @@ def calibrate(sensor: Sensor, parts: Sequence[Poses], model: str | None,
         What the full model is to hold beside its terms.
     filters
         What the noise says of the filter, by recording and axis, for the full model.
+    data_sha256
+        Of the recordings' files; empty takes the hash of the poses.
 
     Raises
     ------
@@ -101,7 +205,7 @@ def calibrate(sensor: Sensor, parts: Sequence[Poses], model: str | None,
     poses, source = together(list(parts)), ', '.join(sources)
     if np.isfinite(poses.alpha_rad).all():
         model = model or ('full' if effects else None)
-        return _against_stage(sensor, parts, model, sources, effects, filters)
+        return _against_stage(sensor, parts, model, sources, effects, filters, data_sha256)
     if model not in (None, 'full'):
         raise UserError(f'{source}: the {model} model is fitted against stage angles (alpha_rad '
                         'and beta_rad), which are not there; leave --model out to calibrate a '
@@ -109,12 +213,12 @@ def calibrate(sensor: Sensor, parts: Sequence[Poses], model: str | None,
     if sensor.axes != 'xyz':
         raise UserError(f'{source}: no stage angles and only the axes {sensor.axes}: the '
                         'magnitude of gravity needs x, y and z; record alpha_rad and beta_rad')
-    return _against_gravity(sensor, poses, source)
+    return _against_gravity(sensor, poses, source, data_sha256)
 
 
 def _against_stage(sensor: Sensor, parts: Sequence[Poses], model: str | None,
                    sources: Sequence[str], effects: Sequence[str],
-                   filters: Sequence[Sequence[FilterNoise | None]]) -> Result:
+                   filters: Sequence[Sequence[FilterNoise | None]], data_sha256: str) -> Result:
     poses = together(list(parts))
     check_polarity(sensor, poses)
     fitting = poses.subset(~poses.check)
@@ -129,9 +233,17 @@ def _against_stage(sensor: Sensor, parts: Sequence[Poses], model: str | None,
             refusals.append(f'not {name}: {error}')
     fitted = found.fitted
     simpler = list(STAGE_FITS)[:list(STAGE_FITS).index(fitted.model)]
+    # What was knocked says nothing of the models.
+    knocked = tuple(np.flatnonzero(~poses.check)[list(found.full.knocked)].tolist()) \
+        if found.full else ()
+    sound = poses.subset(~np.isin(np.arange(len(poses)), knocked))
     scores = verdict.held_out({'nominal': lambda sensor, _: sensor,
                                **{name: STAGE_FITS[name] for name in simpler},
-                               fitted.model: found.fit}, sensor, poses)
+                               fitted.model: found.fit}, sensor, sound)
+    stage = found.full.unit if found.full else None
+    judgements = tuple(judge.judge(score.model, *limits.parts(
+        score, sound, stage if score.model == 'full' else None), sensor)
+        for score in scores if score.model != 'nominal')
     predicted = np.column_stack(chain.static_response(fitted)(
         reference_force(fitting, fitted.local_gravity_mps2), fitting.environment))
     residual = (fitting.volts - predicted) / fitted.scale_v_per_g * 1e3
@@ -139,9 +251,16 @@ def _against_stage(sensor: Sensor, parts: Sequence[Poses], model: str | None,
     if fitted.model == 'full':
         fitted, more = with_filter(fitted, filters)
         said = [*said, *more]
-    fitted = replace(fitted, provenance=_provenance(', '.join(sources), poses, {
-        'reference': 'stage', 'residual_mg': f'{np.sqrt(np.mean(residual ** 2)):.4f}'}))
-    return Result(sensor, fitted, [*refusals, *verdict.table(scores), *said], poses)
+    own = [one for one in judgements if one.model == fitted.model]
+    force = np.column_stack(reference_force(poses, fitted.local_gravity_mps2))
+    fitted = replace(fitted, envelope=envelope(
+        fitted, force, poses, np.nan_to_num(np.sqrt(own[0].accel.own)).item() if own else 0.0))
+    fitted = with_provenance(fitted, ', '.join(sources), poses, data_sha256, {
+        'reference': 'stage', 'residual_mg': f'{np.sqrt(np.mean(residual ** 2)):.4f}',
+        **judge.figures(own[0] if own else None, scores)})
+    lines = [*refusals, *verdict.table(scores), *judge.table(judgements, scores),
+             *(judge.words(own[0], fitted) if own else []), *said]
+    return Result(sensor, fitted, lines, poses, judgements, tuple(scores), None, knocked)
 
 
 def _fit(model: str, sensor: Sensor, fitting: Poses, parts: Sequence[Poses],
@@ -149,11 +268,11 @@ def _fit(model: str, sensor: Sensor, fitting: Poses, parts: Sequence[Poses],
     """Fit one model; the full one with the terms more that poses held out ask for."""
     if model != 'full':
         return _Found(STAGE_FITS[model](sensor, fitting), STAGE_FITS[model], [])
-    found, judged = full_terms.fit_judged(sensor, fitting, effects)
+    found, terms = full_terms.fit_judged(sensor, fitting, effects)
     if len(parts) > 1:
         require_one_mounting(found, parts, sources)
     return _Found(found.fitted, lambda sensor, poses: full_terms.fit_judged(
-        sensor, poses, effects)[0].fitted, full_words.words(found, fitting, judged))
+        sensor, poses, effects)[0].fitted, full_words.words(found, fitting, terms), found)
 
 
 @dataclass(frozen=True)
@@ -161,9 +280,10 @@ class _Found:
     fitted: Sensor
     fit: verdict.Fit
     said: list[str]
+    full: FullFit | None = None
 
 
-def _against_gravity(sensor: Sensor, poses: Poses, source: str) -> Result:
+def _against_gravity(sensor: Sensor, poses: Poses, source: str, data_sha256: str) -> Result:
     found = gravity.fit_gravity(poses.volts, poses.std_v, sensor)
     kept = np.setdiff1d(np.arange(len(poses)), found.outliers)
     before, after, out = (_rms_mg(values[kept]) for values in (
@@ -175,11 +295,18 @@ def _against_gravity(sensor: Sensor, poses: Poses, source: str) -> Result:
         lines.append(f'left out, disturbed: rest {named}')
     fitted = replace(
         sensor, model='gravity', effects=('bias', 'scale_factor', 'misalignment'),
-        values=found.values, covariance=found.covariance, covariance_names=gravity.NAMES,
-        provenance=_provenance(source, poses, {'reference': 'gravity',
-                                               'residual_mg': f'{after:.4f}',
-                                               'leave_one_out_mg': f'{out:.4f}'}))
-    return Result(sensor, fitted, lines, poses, found)
+        values=found.values, covariance=found.covariance, covariance_names=gravity.NAMES)
+    force = np.column_stack(chain.inverse(fitted)(list(poses.volts.T), poses.environment))
+    accel, tilt = limits.gravity_parts(found, fitted, force, kept)
+    own = judge.judge('gravity', accel, tilt, fitted)
+    fitted = replace(fitted, envelope=envelope(fitted, force[kept], poses,
+                                               float(np.sqrt(accel.model))))
+    fitted = with_provenance(fitted, source, poses, data_sha256, {
+        'reference': 'gravity', 'residual_mg': f'{after:.4f}', 'leave_one_out_mg': f'{out:.4f}',
+        **judge.figures(own, ())})
+    lines += [judge.gravity_line(own, found.leave_one_out_mps2[kept]),
+              *judge.words(own, fitted)]
+    return Result(sensor, fitted, lines, poses, (own,), (), found)
 
 
 def coefficients(sensor: Sensor) -> list[str]:
@@ -199,21 +326,6 @@ def coefficients(sensor: Sensor) -> list[str]:
             if entries:
                 lines.append(f'  {label:34} {"   ".join(entries)} {units[parameter]}')
     return lines
-
-
-def package_version() -> str:
-    """Return the version of this package; 'unknown' when it runs from its source."""
-    try:
-        return version('adxl_ros')
-    except PackageNotFoundError:
-        return 'unknown'
-
-
-def _provenance(source: str, poses: Poses, more: dict[str, str]) -> dict[str, str]:
-    return {'date': datetime.now(timezone.utc).isoformat(timespec='seconds'),
-            'package_version': package_version(), 'source': source,
-            'poses': str(int((~poses.check).sum())),
-            'check_poses': str(int(poses.check.sum())), **more}
 
 
 def _rms_mg(values_mps2: np.ndarray) -> float:

@@ -49,8 +49,10 @@ class Plan:
         As `plan.guided` takes them.
     settings
         How poses are taken.
-    output, journal, report
-        Files: parameters, accepted poses; a folder for the figures, or ''.
+    output, journal
+        Files: parameters, accepted poses.
+    report, store
+        Folders for the report and for a copy of the calibration, or ''.
 
     """
 
@@ -62,6 +64,7 @@ class Plan:
     output: Path
     journal: Path
     report: str
+    store: str
 
     def targets(self) -> list[plan.Target]:
         """Return the poses in the order of the visit; none without a stage."""
@@ -185,7 +188,7 @@ class Session:
 
     def finish(self) -> result.Result:
         """
-        Fit what there is, and write the parameter file and the figures.
+        Fit what there is, and write the parameter file.
 
         Raises
         ------
@@ -198,9 +201,6 @@ class Session:
             raise UserError('no pose is taken yet')
         found = result.calibrate(self.unit, [Poses.from_entries(entries)], None,
                                  [self.journal.path.name])
-        if self.asked.report:
-            Path(self.asked.report).mkdir(parents=True, exist_ok=True)
-            found.draw(Path(self.asked.report) / 'calibration.png')
         found.save(self.asked.output)
         self.journal.append({'rests': entries, 'done': True})
         return found

@@ -26,6 +26,7 @@ from adxl_ros.errors import UserError
 from adxl_ros.files.atomic import atomic_path
 from adxl_ros.model.coefficients import names_of, neutral
 from adxl_ros.model.effects import effect_named
+from adxl_ros.model.envelope import Envelope
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 import yaml
@@ -37,6 +38,26 @@ UNITS = 'V, V/g, 1/g, rad'
 """Units of the coefficients, written into every file and checked."""
 
 FIGURES = {f.metadata['key']: f for f in fields(Sensor) if f.metadata}
+
+ENVELOPE = {
+    'temperature_c': 'lowest and highest temperature of the poses, degC',
+    'zero_g_per_k': 'drift of the zero-g beyond them, g/K',
+    'scale_per_k': 'drift of the scale factor beyond them, 1/K',
+    'leverage': 'largest leverage of the poses, (m/s^2)^2',
+    'misfit_mps2': 'what poses held out showed beyond noise and stage, m/s^2',
+    'force_low_mps2': 'least specific force of the poses by component, m/s^2',
+    'force_high_mps2': 'greatest specific force of the poses by component, m/s^2',
+}
+"""Keys of `envelope.*`, those of `model.envelope.Envelope`; each may be missing."""
+ENVELOPE_LISTS = {'temperature_c': 2, 'force_low_mps2': 3, 'force_high_mps2': 3}
+
+DATASHEET = {
+    'name': 'what the figures are of',
+    'figures': 'effect.parameter that the datasheet bounds',
+    'typical': 'typical departures, 0.0 where not stated',
+    'maximum': 'greatest departures, 0.0 where not stated',
+}
+"""Keys of `datasheet.*`; all of them or none."""
 
 
 def load(path: str | os.PathLike) -> Sensor:
@@ -93,8 +114,10 @@ def from_flat(flat: dict[str, Any], fail: Any) -> Sensor:
     covariance, covariance_names = _covariance(flat, values, figures['axes'], fail)
     provenance = {key.removeprefix('provenance.'): str(value) for key, value in flat.items()
                   if key.startswith('provenance.')}
+    name, datasheet = _datasheet(flat, fail)
     return Sensor(**figures, effects=names, values=values, covariance=covariance,
-                  covariance_names=covariance_names, provenance=provenance)
+                  covariance_names=covariance_names, provenance=provenance,
+                  envelope=_envelope(flat, fail), datasheet_name=name, datasheet=datasheet)
 
 
 def to_flat(sensor: Sensor) -> dict[str, Any]:
@@ -111,8 +134,17 @@ def to_flat(sensor: Sensor) -> dict[str, Any]:
     if sensor.covariance_names:
         flat['covariance_names'] = list(sensor.covariance_names)
         flat['covariance'] = [float(v) for v in sensor.covariance.ravel()]
+    for key in ENVELOPE:
+        figure = getattr(sensor.envelope, key)
+        if figure:
+            flat[f'envelope.{key}'] = list(figure) if key in ENVELOPE_LISTS else figure
     for key, text in sensor.provenance.items():
         flat[f'provenance.{key}'] = text
+    if sensor.datasheet:
+        typical, maximum = zip(*sensor.datasheet.values())
+        flat |= {'datasheet.name': sensor.datasheet_name,
+                 'datasheet.figures': list(sensor.datasheet),
+                 'datasheet.typical': list(typical), 'datasheet.maximum': list(maximum)}
     return flat
 
 
@@ -321,3 +353,43 @@ def _covariance(flat: dict, values: dict, axes: str, fail: Any) -> tuple:
         raise fail('covariance', f'not positive: its smallest eigenvalue is {smallest:.3g} in '
                                  'units of the variances')
     return matrix, names
+
+
+def _envelope(flat: dict, fail: Any) -> Envelope:
+    found: dict[str, Any] = {}
+    for key in ENVELOPE:
+        name = f'envelope.{key}'
+        if name not in flat:
+            continue
+        values = _floats(name, flat[name], fail)
+        count = ENVELOPE_LISTS.get(key, 1)
+        if len(values) != count or (count == 1 and values[0] < 0) or \
+                (key == 'temperature_c' and values[0] > values[1]):
+            raise fail(name, f'{flat[name]} is not the {ENVELOPE[key]}')
+        found[key] = float(values[0]) if count == 1 else tuple(values.tolist())
+    return Envelope(**found)
+
+
+def _datasheet(flat: dict, fail: Any) -> tuple[str, dict[str, tuple[float, float]]]:
+    if 'datasheet.figures' not in flat:
+        return '', {}
+    names = _strings('datasheet.figures', flat, fail)
+    columns = []
+    for key in ('typical', 'maximum'):
+        of = f'datasheet.{key}'
+        if of not in flat:
+            raise fail(of, f'missing; {len(names)} names stand in datasheet.figures')
+        values = _floats(of, flat[of], fail)
+        if len(values) != len(names) or (values < 0).any():
+            raise fail(of, f'{len(values)} values, but {len(names)} names need as many, of 0 or '
+                           'more')
+        columns.append(values.tolist())
+    for name in names:
+        effect, _, parameter = name.partition('.')
+        try:
+            known = {p.name for p in effect_named(effect).parameters}
+        except UserError as error:
+            raise fail('datasheet.figures', str(error)) from None
+        if parameter not in known:
+            raise fail('datasheet.figures', f'{name!r} is no parameter of {effect}')
+    return str(flat.get('datasheet.name', '')), dict(zip(names, zip(*columns)))

@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 from adxl_ros.model import chain, noise, paper_inverse, unfilter
@@ -24,7 +25,12 @@ from adxl_ros.model.effects.base import Components, Environment
 from adxl_ros.model.maths import FLOATS
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.model.tilt import angles, roll_pitch_covariance
-from adxl_ros.model.uncertainty import equation_5, measured_covariance, UNMEASURED_VARIANCE
+from adxl_ros.model.uncertainty import (
+    equation_5,
+    leverage,
+    measured_covariance,
+    UNMEASURED_VARIANCE,
+)
 import numpy as np
 
 _CELL_MPS2 = 0.5
@@ -60,6 +66,8 @@ class Estimate(NamedTuple):
         Covariance of roll and pitch, rad².
     saturated
         Whether the ADC was at a rail, so that the variances are those of no measurement.
+    outside
+        What lies outside of what was calibrated, in words; the variances have it.
 
     """
 
@@ -70,11 +78,13 @@ class Estimate(NamedTuple):
     inclination: tuple[float, float]
     roll_pitch: float
     saturated: bool
+    outside: tuple[str, ...]
 
 
 class _Cell(NamedTuple):
     at: chain.Tangent
     measured: tuple[float, ...]
+    outside: tuple[str, ...]
 
 
 class Live:
@@ -114,7 +124,9 @@ class Live:
         self._respond = chain.static_response(sensor)
         self._step = chain.step(sensor.axes, chain.gravity_mps2(sensor), sensor.z_sign, FLOATS)
         self._invert = chain.inverse(sensor)
-        self._measured = measured_covariance(sensor, variance_v2)
+        self._variance_v2 = variance_v2
+        # Until it is known, the temperature is neither within nor outside.
+        self._within(replace(sensor, envelope=replace(sensor.envelope, temperature_c=None)))
         self._cells: dict[tuple[int, int, int], _Cell] = {}
         quiet = np.sqrt(variance_v2) / sensor.scale_v_per_g * G0_MPS2
         self._noise = (quiet[:2] ** 2).tolist()
@@ -161,7 +173,8 @@ class Live:
                  spread[5] if self._derives_z else spread[5] + motion)
         roll, pitch, inclination, _ = angles(force, loose, FLOATS)
         return Estimate(force, spread, roll, pitch, inclination,
-                        roll_pitch_covariance(force, loose, FLOATS), saturated)
+                        roll_pitch_covariance(force, loose, FLOATS), saturated,
+                        self._cell(force).outside)
 
     def surround(self, temperature_c: float | None = None, supply_v: float | None = None
                  ) -> None:
@@ -176,6 +189,9 @@ class Live:
             Of the sensor, V.
 
         """
+        if temperature_c is not None and not self._knows_temperature:
+            self._within(self.sensor)
+            self._cells.clear()
         self._around = self._around._replace(**{name: value for name, value in (
             ('temperature_c', temperature_c), ('supply_v', supply_v)) if value is not None})
         if any(abs(now - then) > near for now, then, near in zip(
@@ -183,6 +199,11 @@ class Live:
             self._cells.clear()
             self._cells_around = self._around
         self._last_volts = self._respond(self._force, self._around)
+
+    def _within(self, sensor: Sensor) -> None:
+        self._measured = measured_covariance(sensor, self._variance_v2)
+        self._leverage, self._envelope = leverage(sensor), sensor.envelope
+        self._knows_temperature = sensor is self.sensor
 
     def _inverse(self, volts: Components) -> Components | None:
         """Start where the last sample ended: its volts are the response to its force."""
@@ -253,10 +274,13 @@ class Live:
         if cell is None:
             if len(self._cells) >= _MOST_CELLS:
                 self._cells.clear()
-            covariance, at = self._measured([float(k * _CELL_MPS2) for k in key],
-                                            self._around)
+            middle = [float(k * _CELL_MPS2) for k in key]
+            covariance, at = self._measured(middle, self._around)
+            outside = self._envelope.outside(self._around.temperature_c, middle,
+                                             float(self._leverage(middle)[0]))
             full = np.diag([0.0, UNMEASURED_VARIANCE, UNMEASURED_VARIANCE])
             axes = [AXES.index(a) for a in self.sensor.axes]
             full[np.ix_(axes, axes)] = covariance[:, :, 0]
-            cell = self._cells[key] = _Cell(at, tuple(full[np.triu_indices(3)].tolist()))
+            cell = self._cells[key] = _Cell(at, tuple(full[np.triu_indices(3)].tolist()),
+                                            outside)
         return cell

@@ -21,6 +21,7 @@ from typing import Any
 
 from adxl_ros.errors import UserError
 from adxl_ros.model.constants import G0_MPS2
+from adxl_ros.model.envelope import Envelope
 import numpy as np
 
 MODELS = ('nominal', 'linear', 'physical', 'full', 'gravity')
@@ -41,6 +42,10 @@ class Sensor:
     The metadata of each field is the only description of the figure: the parameter file, the
     nodes' parameters and the error messages all read it. Arrays marked (m,) have one entry an
     axis of `axes`.
+
+    `datasheet` has the typical and the greatest departure by `effect.parameter` as the maker
+    states them, in the parameter's unit, 0 where he does not; `datasheet_name` is what they are
+    of.
     """
 
     serial: str = _figure('sensor.serial', 'serial number; nominal is no unit in particular')
@@ -77,6 +82,9 @@ class Sensor:
     covariance: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
     covariance_names: tuple[str, ...] = ()
     provenance: dict[str, str] = field(default_factory=dict)
+    envelope: Envelope = Envelope()
+    datasheet_name: str = ''
+    datasheet: dict[str, tuple[float, float]] = field(default_factory=dict)
 
     @property
     def zero_g_v(self) -> np.ndarray:
@@ -135,14 +143,17 @@ def with_axes(sensor: Sensor, axes: str) -> Sensor:
     if sensor.effects:
         raise UserError(f'the parameters of {sensor.serial} are calibrated for the axes '
                         f'{sensor.axes}, not {axes}; name the parameter file of this sensor')
-    figures = {name: getattr(sensor, name) for name in (
+    figures: dict[str, Any] = {name: getattr(sensor, name) for name in (
         'nominal_zero_g_v', 'nominal_scale_v_per_g', 'noise_density_g_per_rthz')}
-    for name, of in figures.items():
+    for name, of in list(figures.items()):
         if len(axes) > len(of) and np.ptp(of) > 0:
             raise UserError(f'sensor.{name}: {of.tolist()} for {sensor.axes} does not tell the '
                             f'figure of the other axes of {axes}; name a parameter file for '
                             f'{axes}')
         figures[name] = np.array([*of, *[of[0]] * 3])[:len(axes)]
+    if len(axes) > len(sensor.axes):
+        # A part with more axes is another part.
+        figures |= {'datasheet_name': '', 'datasheet': {}}
     return replace(sensor, axes=axes, **figures)
 
 

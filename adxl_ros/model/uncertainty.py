@@ -12,14 +12,18 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Covariance of a sample's specific force: its noise and what the calibration left unknown."""
+"""
+Covariance of a sample's specific force: its noise and what the calibration left unknown.
+
+Where a sample lies outside of what was calibrated, `envelope` adds to it.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
 from adxl_ros.model import chain, coefficients, noise
-from adxl_ros.model.constants import AXES
+from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.effects.base import Components, Environment, Value
 from adxl_ros.model.maths import ARRAYS, Maths
 from adxl_ros.model.sensor import Sensor
@@ -91,6 +95,7 @@ def measured_covariance(sensor: Sensor, sample_variance_v2: np.ndarray | None = 
         sample_variance_v2 = noise.sigma_v(sensor) ** 2
     m = len(sensor.axes)
     respond, by_parameter = chain.static_response(sensor), _parameter_tangent(sensor)
+    at_leverage = leverage(sensor)
 
     def covariance(force: Components, environment: Environment = chain.NOMINAL
                    ) -> tuple[np.ndarray, chain.Tangent]:
@@ -101,9 +106,42 @@ def measured_covariance(sensor: Sensor, sample_variance_v2: np.ndarray | None = 
             of = np.moveaxis(of, 2, 0)
             volts = volts + of @ sensor.covariance @ np.swapaxes(of, 1, 2)
         back: np.ndarray = np.moveaxis(np.array(at.back).reshape(m, m, -1), 2, 0)
-        return np.moveaxis(back @ volts @ np.swapaxes(back, 1, 2), 0, 2), at
+        found = np.moveaxis(back @ volts @ np.swapaxes(back, 1, 2), 0, 2)
+        if sensor.envelope.temperature_c or sensor.envelope.leverage:
+            far = sensor.envelope.reach(
+                force, at_leverage(force) if sensor.envelope.leverage else 0.0)
+            for d, axis in enumerate(sensor.axes):
+                found[d, d] += sensor.envelope.added(
+                    force[AXES.index(axis)], environment.temperature_c, far, G0_MPS2)
+        return found, at
 
     return covariance
+
+
+def leverage(sensor: Sensor) -> Callable[[Components], np.ndarray]:
+    """
+    Prepare what the calibration's covariance alone makes of a force; see `envelope`.
+
+    Returns
+    -------
+    callable
+        Maps specific force, m/s², three arrays (n,) or floats, to the trace of its covariance
+        over the measured axes at nominal surroundings, (m/s²)², (n,); 0 without a covariance.
+
+    """
+    m = len(sensor.axes)
+    respond, by_parameter = chain.static_response(sensor), _parameter_tangent(sensor)
+
+    def of(force: Components) -> np.ndarray:
+        if not sensor.covariance_names:
+            return np.zeros(np.shape(force[0]) or 1)
+        slope = np.moveaxis(by_parameter(force).reshape(m, len(sensor.covariance), -1), 2, 0)
+        at = chain.tangent(respond, sensor.axes, force)
+        back: np.ndarray = np.moveaxis(np.array(at.back).reshape(m, m, -1), 2, 0)
+        by_force = back @ slope
+        return np.einsum('nap,pq,naq->n', by_force, sensor.covariance, by_force)
+
+    return of
 
 
 def equation_5(force: Components, measured: tuple[Value, Value, Value], slope: Components,

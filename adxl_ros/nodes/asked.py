@@ -20,6 +20,7 @@ from pathlib import Path
 
 from adxl_ros.calibrate.session import Plan
 from adxl_ros.calibrate.state import Settings, STAGE_MODES
+from adxl_ros.files import store
 from adxl_ros.nodes import common
 import numpy as np
 from rclpy.node import Node
@@ -39,7 +40,9 @@ def declare_plan(node: Node) -> Plan:
     mode = declare(node, 'mode', 'stage', 'what the reference is', choices=('stage', 'gravity'))
     output = Path(declare(node, 'output', 'calibration.yaml', 'parameter file to write'))
     journal = declare(node, 'journal', '', 'file of accepted poses; empty: beside the output')
-    report = declare(node, 'report', '', 'directory for the figures; empty: none')
+    report = declare(node, 'report', '', 'directory for the report; empty: none')
+    kept = declare(node, 'store', str(store.default_folder()),
+                   'folder of calibrations that gets a copy; empty: none')
     planes = declare(node, 'sweep.planes_rad',
                      [float(degrees(a)) for a in (30, 60, 90, 120, 150)],
                      'planes alpha of the sweep, rad')
@@ -60,6 +63,6 @@ def declare_plan(node: Node) -> Plan:
                 'how far the temperature may be from that of the first pose', 'degC', 0.1,
                 1000.0))
     asked = Plan(mode, tuple(planes), step, checks, settings, output,
-                 Path(journal or f'{output}.journal'), report)
+                 Path(journal or f'{output}.journal'), report, kept)
     asked.targets()
     return asked

@@ -18,8 +18,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 import os
+from pathlib import Path
 
 from adxl_ros.calibrate import recorded
+from adxl_ros.calibrate.result import Result
 from adxl_ros.calibrate.session import Session
 from adxl_ros.calibrate.stream import Newest
 from adxl_ros.calibrate.sweep import MountingError, Sweep
@@ -296,11 +298,23 @@ class Calibration(Node):
             if over:
                 self._stop(self.said)
             return False
+        self.get_logger().info(found.keep(self.asked.store))
+        self._leave_report(found)
         for line in found.comments():
             self.get_logger().info(line)
         self.outcome = found.verdict
         self._stop(f'wrote {self.asked.output}')
         return True
+
+    def _leave_report(self, found: Result) -> None:
+        """Write the report; without it the calibration stands all the same."""
+        if not self.asked.report:
+            return
+        try:
+            Path(self.asked.report).mkdir(parents=True, exist_ok=True)
+            found.report(self.asked.report, self.asked.store)
+        except (UserError, OSError) as error:
+            self.fail(f'no report: {error}')
 
     def _stop(self, text: str, failed: bool = False) -> None:
         self._wanted, self.question, self._hindrance = False, '', ''

@@ -206,8 +206,15 @@ def declare_sensor(node: Node, live: bool = False) -> dict[str, Any]:
     coefficients += [
         ('covariance_names', kind.STRING_ARRAY, 'coefficients in the covariance', '', None, None),
         ('covariance', kind.DOUBLE_ARRAY, 'of the coefficients, rows flattened', '', None, None)]
+    coefficients += [(f'envelope.{key}', kind.DOUBLE_ARRAY if key in params.ENVELOPE_LISTS
+                      else kind.DOUBLE, doc, '', None, None)
+                     for key, doc in params.ENVELOPE.items()]
+    for key, doc in params.DATASHEET.items():
+        of_kind = {'name': kind.STRING, 'figures': kind.STRING_ARRAY}.get(key, kind.DOUBLE_ARRAY)
+        coefficients.append((f'datasheet.{key}', of_kind, doc, '', None, None))
     for key, of_kind, doc, unit, lower, upper in coefficients:
-        flat[key] = declare(node, key, of_kind, doc, unit, lower, upper, live=live)
+        flat[key] = declare(node, key, nominal.get(key, of_kind), doc, unit, lower, upper,
+                            live=live)
     return {key: value for key, value in flat.items() if value is not None}
 
 

@@ -17,11 +17,13 @@
 from __future__ import annotations
 
 from collections import Counter
+from datetime import datetime, timezone
 from math import cos, isfinite, sin
+from pathlib import Path
 from typing import Any
 
 from adxl_ros.errors import UserError
-from adxl_ros.files import imu_bytes
+from adxl_ros.files import imu_bytes, store
 from adxl_ros.files.cdr import CdrError
 from adxl_ros.files.unit import check_unit
 from adxl_ros.model import chain, noise, unfilter
@@ -36,6 +38,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import Vector3Stamped
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from sensor_msgs.msg import BatteryState, Imu, Temperature
 
 _DEPTH = 100
@@ -48,6 +51,10 @@ _UNKNOWN_RAD2 = 1e6
 yaw = 0 before long; 1e6, as for an axis that is not there, never counts."""
 
 
+_CLOCK_DAYS = 0.01
+"""Clocks that differ by a quarter of an hour make no calibration one of the future."""
+
+
 class Compensation(Node):
     """The node; what it makes of a sample is in `model.live`, ROS-free."""
 
@@ -58,6 +65,10 @@ class Compensation(Node):
         self._counts: Counter[str] = Counter()
         self._reported: Counter[str] = Counter()
         self._angles = [0.0, 0.0, 0.0]
+        self._outside: tuple[str, ...] = ()
+        # The file that was taken from the store, and what was said of the store.
+        self._picked: str | None = None
+        self._said_of_store = ''
         # Surroundings to be taken up, and those that are.
         self._around: dict[str, float] = {}
         self._known: dict[str, float] = {}
@@ -67,6 +78,9 @@ class Compensation(Node):
         self._undo_filter = common.declare(
             self, 'undo_filter', False, 'take the RC filter out, amplitude and phase; a sample '
             f'is published {unfilter.HALF} samples late, with its own stamp')
+        self._store = common.declare(
+            self, 'store', str(store.default_folder()), 'folder of calibrations, of which the '
+            'newest of the unit is taken where none is named; empty: none')
         LiveSensor(self, self._check_unit, self._use)
         self._data = common.publisher(self, Imu, 'imu/data', _DEPTH)
         self._tilt = common.publisher(self, Vector3Stamped, 'tilt', _DEPTH)
@@ -115,8 +129,43 @@ class Compensation(Node):
 
     def _on_info(self, message: DiagnosticStatus) -> None:
         self._info = {pair.key: pair.value for pair in message.values}
+        self._pick()
         self._delayed = self._new_delayed(self._live.sensor)
         self._judge()
+
+    def _named(self) -> bool:
+        """Tell whether a calibration was named, in place of the store's newest."""
+        path = self.get_parameter('calibration').value
+        return path != self._picked if path else bool(self._live.sensor.effects)
+
+    def _pick(self) -> None:
+        """Take the newest calibration of the stream's unit, unless one was named."""
+        serial = (self._info or {}).get('serial', store.NO_UNIT)
+        if not self._store or serial == store.NO_UNIT or self._named():
+            return
+        path, refused = store.newest(self._store, serial, self._check_unit)
+        for why in refused:
+            self._say_of_store(f'passed over: {why}')
+        if path is None:
+            self._say_of_store(f'no calibration of {serial} in {self._store}')
+        elif str(path) != self._picked:
+            before, self._picked = self._picked, str(path)
+            result = self.set_parameters([Parameter('calibration', value=str(path))])[0]
+            if not result.successful:
+                self._picked = before
+                self._say_of_store(f'not taken: {result.reason}')
+
+    def _say_of_store(self, text: str) -> None:
+        if text not in self._said_of_store:
+            self.get_logger().warning(text)
+            self._said_of_store += f'{text}\n'
+
+    def _newer(self) -> Path | None:
+        """Return a calibration of the unit that was put into the store after the active one."""
+        sensor = self._live.sensor
+        if not self._store or not sensor.effects or sensor.serial == store.NO_UNIT:
+            return None
+        return store.newer(self._store, sensor)
 
     def _on_temperature(self, message: Temperature) -> None:
         self._surround('temperature_c', message.temperature)
@@ -170,6 +219,9 @@ class Compensation(Node):
             self._counts['dropped'] += 1
             return
         self._counts['saturated'] += estimate.saturated
+        if estimate.outside:
+            self._counts['outside'] += 1
+            self._outside = estimate.outside
         orientation = self._orientation(estimate)
         xx, xy, xz, yy, yz, zz = estimate.covariance
         self._data.publish(imu_bytes.corrected(
@@ -201,20 +253,43 @@ class Compensation(Node):
         new = {name: counts[name] - self._reported[name] for name in counts}
         self._reported = counts
         sensor = self._live.sensor
-        level, text = self._state(new)
+        newer = self._newer()
+        level, text = self._state(new, newer)
         unit = 'other' if self._refusal else 'confirmed' if self._info else 'not confirmed'
         values: dict[str, Any] = {
             'rate_in_hz': round(new.get('received', 0) / passed_s, 1),
             'rate_out_hz': round(new.get('published', 0) / passed_s, 1),
-            **{name: counts[name] for name in ('received', 'published', 'dropped', 'saturated')},
+            **{name: counts[name] for name in ('received', 'published', 'dropped', 'saturated',
+                                               'outside')},
             'delay_s': unfilter.HALF / self._rate_hz(sensor) if self._undo_filter else 0.0,
             'unit': unit, 'calibration': self._source, 'serial': sensor.serial,
             'axes': sensor.axes, 'model': sensor.model, 'effects': ', '.join(sensor.effects),
+            **self._calibration(new), 'newer': str(newer or ''),
             **{f'provenance.{key}': value for key, value in sensor.provenance.items()}}
         self._diagnostics.publish(common.diagnostics(
             self, common.status(level, 'compensation', text, sensor.serial, values)))
 
-    def _state(self, new: dict[str, int]) -> tuple[bytes, str]:
+    def _calibration(self, new: dict[str, int]) -> dict[str, Any]:
+        """Say which calibration is active, how old it is and whether it holds here."""
+        sensor = self._live.sensor
+        if not sensor.effects:
+            return {'calibration_id': '', 'age_days': '', 'validity': 'not calibrated'}
+        made = store.date_of(sensor)
+        days = (datetime.now(timezone.utc) - made).total_seconds() / 86400 if made else None
+        if self._refusal:
+            valid = f'of another unit: {self._refusal}'
+        elif new.get('outside'):
+            valid = f'outside: {"; ".join(self._outside)}'
+        elif days is not None and days < -_CLOCK_DAYS:
+            valid = 'dated in the future: the clock here, or there, is wrong'
+        elif not sensor.covariance_names:
+            valid = 'within, as far as is known: it states no covariance'
+        else:
+            valid = 'valid'
+        return {'calibration_id': store.calibration_id(sensor),
+                'age_days': '' if days is None else round(days, 3), 'validity': valid}
+
+    def _state(self, new: dict[str, int], newer: Path | None) -> tuple[bytes, str]:
         if self._refusal:
             return common.ERROR, f'publishing nothing: {self._refusal}'
         if not new.get('received'):
@@ -231,6 +306,12 @@ class Compensation(Node):
             return common.WARN, lacks
         if not self._live.sensor.effects:
             return common.WARN, 'not calibrated: the nominal figures apply'
+        if new.get('outside'):
+            return common.WARN, (f'{new["outside"]} samples outside of what was calibrated, their '
+                                 f'covariance raised: {"; ".join(self._outside)}')
+        if newer is not None and not self._named():
+            return common.WARN, (f'a newer calibration is in the store: {newer}; set calibration '
+                                 'to it, or start again')
         return common.OK, 'compensating'
 
     def _lacks(self) -> str:

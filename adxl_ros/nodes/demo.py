@@ -125,10 +125,11 @@ def _simulated(folder: Path, speed: float) -> list[str]:
         start('driver', unit, '-p', f'link.speed:={speed}', *clock)
         start('stage', nominal, *clock)
         start('calibration', nominal, *clock, *_LOSSLESS, *_UNATTENDED, '-p',
-              f'output:={output}', '-p', f'report:={folder / "sweep"}')
+              f'output:={output}', '-p', f'report:={folder / "sweep"}', '-p',
+              f'store:={folder / "calibrations"}')
         _wait(watcher, lambda: output.exists())
     return ['Simulated ADXL203, poses that the fit has not seen:', *_verdict(output),
-            f'Coefficients: {output}; figures 2 to 8: {folder / "sweep" / "calibration.png"}']
+            f'Coefficients: {output}; report: {folder / "sweep" / "report.html"}']
 
 
 def _real(folder: Path, recording: Path) -> list[str]:
@@ -140,7 +141,7 @@ def _real(folder: Path, recording: Path) -> list[str]:
     with _graph() as (start, watcher):
         start('calibration', nominal_path(), *clock, *_LOSSLESS, *_UNATTENDED, '-p',
               'mode:=gravity', '-p', f'output:={output}', '-p',
-              f'report:={folder / recording.stem}')
+              f'report:={folder / recording.stem}', '-p', f'store:={folder / "calibrations"}')
         start('driver', nominal_path(), '-p', 'link.type:=replay', '-p',
               f'link.recording:={recording}', '-p', 'link.speed:=20.0', *clock)
         _wait(watcher, lambda: watcher.of('driver').get('link_state') == 'ended')
@@ -148,7 +149,7 @@ def _real(folder: Path, recording: Path) -> list[str]:
     if not output.exists():
         raise UserError(f'{recording}: {answer}')
     return ['', f'{recording.stem}, a real sensor:', *_verdict(output),
-            f'Coefficients: {output}; figure: {folder / recording.stem / "calibration.png"}']
+            f'Coefficients: {output}; report: {folder / recording.stem / "report.html"}']
 
 
 def _drawn(sensor: Sensor) -> Sensor:

@@ -29,7 +29,9 @@ from rcl_interfaces.msg import SetParametersResult
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-_FIXED = {'format', 'units', *params.FIGURES}
+_FIXED = {'format', 'units', *params.FIGURES,
+          *(f'{kind}.{key}' for kind, keys in (('envelope', params.ENVELOPE),
+                                               ('datasheet', params.DATASHEET)) for key in keys)}
 _EFFECTS = {f'{effect.name}.{p.name}': effect.name
             for effect in library().values() for p in effect.parameters}
 _NEUTRAL = {f'{effect.name}.{p.name}': p.neutral
@@ -117,7 +119,7 @@ class LiveSensor:
     def _parameter(self, name: str, value: Any) -> Parameter:
         kind = Parameter.Type(self._node.describe_parameter(name).type)
         # One figure cannot be empty; that of an effect which is not listed means nothing.
-        nothing: Any = {Parameter.Type.STRING: '', Parameter.Type.DOUBLE: _NEUTRAL.get(name)}
+        nothing: Any = {Parameter.Type.STRING: '', Parameter.Type.DOUBLE: _NEUTRAL.get(name, 0.0)}
         return Parameter(name, kind, nothing.get(kind, []) if value is None else value)
 
     def _check(self, parameters: Sequence[Parameter]) -> SetParametersResult:
@@ -149,6 +151,8 @@ class LiveSensor:
             return
         self._flat |= changes
         if self._file is None:
+            # The leverage is that of the fit; other coefficients have another.
+            self._flat['envelope.leverage'] = 0.0
             self._source = f'{self._source.removesuffix(_CHANGED)}{_CHANGED}'
         else:
             self._source = self._node.get_parameter('calibration').value

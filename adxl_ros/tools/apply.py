@@ -35,7 +35,7 @@ from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Place
 from adxl_ros.model.sensor import Sensor, with_axes
 from adxl_ros.model.tilt import Tilt, tilt
-from adxl_ros.model.uncertainty import force_covariance
+from adxl_ros.model.uncertainty import force_covariance, leverage
 from adxl_ros.tools.common import default_params, progress, run, say_notes
 import numpy as np
 
@@ -74,6 +74,9 @@ def apply(options: argparse.Namespace) -> int:
             sensor = replace(sensor, rate_hz=rate_hz(first) if len(first) > 1 else sensor.rate_hz)
             began_s = float(first.time_s[0])
             _say_unknown(first, sensor, options.undo_filter)
+            if 'temperature_c' not in first.columns:
+                # What is not known is neither within nor outside.
+                sensor = replace(sensor, envelope=replace(sensor.envelope, temperature_c=None))
             blocks = itertools.chain([first], blocks)
         estimate = Estimates(sensor, options.inverse == 'paper', options.undo_filter)
         for block, volts in _with_volts(blocks, sensor, options.undo_filter):
@@ -85,6 +88,8 @@ def apply(options: argparse.Namespace) -> int:
             saturated += int(at_rail.sum())
             show(block.done)
     _say(lost, rows, 'have no solution: their cells are empty')
+    _say(estimate.outside, rows, 'lie outside of what was calibrated (temperature or force): '
+         'their standard deviations are raised')
     _say(saturated, rows, 'have the ADC at its rail: their standard deviations are inf')
     if block is not None:
         say_notes('apply', block)
@@ -162,6 +167,8 @@ class Estimates:
                             'out')
         self._sensor = sensor
         self._invert = (paper_inverse if paper else chain).inverse(sensor)
+        self._leverage = leverage(sensor)
+        self.outside = 0
         self._variance_v2 = unfilter.variance_v2(sensor) if undo_filter else None
 
     def __call__(self, volts: np.ndarray, at_rail: np.ndarray,
@@ -183,6 +190,9 @@ class Estimates:
         with np.errstate(all='ignore'):  # volts that no force explains
             force = self._invert(list(volts.T), around)
             covariance = force_covariance(sensor, force, self._variance_v2, around)
+            self.outside += int(np.sum(np.isfinite(force[0]) & sensor.envelope.lies_outside(
+                around.temperature_c, force,
+                self._leverage(force) if sensor.envelope.leverage else 0.0)))
             covariance[:, :, at_rail] = np.inf
             angles = tilt(force, covariance, 'z' in sensor.axes)
         return _columns(sensor, force, covariance, angles)

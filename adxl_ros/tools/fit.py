@@ -18,10 +18,12 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+import sys
 
 from adxl_ros.calibrate import recorded, result
 from adxl_ros.errors import UserError
-from adxl_ros.files import journal, params, recording
+from adxl_ros.files import journal, params, recording, store
+from adxl_ros.files.hashed import sha256
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.tools.common import default_params, make_folder, run, say_notes
 
@@ -42,7 +44,11 @@ def parser() -> argparse.ArgumentParser:
     parse.add_argument('--journal', metavar='FILE',
                        help='use the rests that the journal of this very run names')
     parse.add_argument('-o', dest='output', metavar='FILE.yaml', required=True)
-    parse.add_argument('--report', metavar='DIR', help='leave the figures there')
+    parse.add_argument('--report', metavar='DIR',
+                       help='leave a page there, report.html, and the figures')
+    parse.add_argument('--store', metavar='DIR', default=str(store.default_folder()),
+                       help="the folder of all units' calibrations, which gets a copy (default: "
+                            '%(default)s); empty for none')
     return parse
 
 
@@ -63,13 +69,14 @@ def fit(options: argparse.Namespace) -> int:
         filters.append(recorded.filter_noise_of(read, unit, parts[-1]))
     found = result.calibrate(unit, parts, options.model,
                              [Path(path).name for path in options.recording],
-                             options.effect, filters)
+                             options.effect, filters, sha256(options.recording))
     if options.report:
-        folder = Path(options.report)
-        make_folder(folder)
-        found.draw(folder / 'calibration.png')
+        make_folder(Path(options.report))
+        found.report(options.report, options.store)
     found.save(options.output)
+    kept = found.keep(options.store)
     print('\n'.join(found.comments()))
+    print(f'fit: {kept}', file=sys.stderr)
     return 0
 
 

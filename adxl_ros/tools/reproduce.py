@@ -21,7 +21,7 @@ from collections.abc import Sequence
 from datetime import date
 from pathlib import Path
 
-from adxl_ros.calibrate import figures as sweep_figures, recorded, result
+from adxl_ros.calibrate import figures as sweep_figures, provenance, recorded, result
 from adxl_ros.errors import UserError
 from adxl_ros.files import params, recording
 from adxl_ros.files.atomic import atomic_path
@@ -96,7 +96,7 @@ def _simulated(sensor: Sensor, options: argparse.Namespace, folder: Path) -> str
     figures.draw_components(pictures / 'components.png', truth, unit.fitted['physical'],
                             unit.fitted['linear'])
     drawn = 'one unit' if sensor.effects else f'{options.units} units'
-    made = (f'adxl_ros {result.package_version()}, {date.today()}, {drawn} on each stage, '
+    made = (f'adxl_ros {provenance.package_version()}, {date.today()}, {drawn} on each stage, '
             f'seed {options.seed}.')
     return page.page(found, score.motion_bound_mmps2(sensor), made)
 

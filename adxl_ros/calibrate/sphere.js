@@ -1,0 +1,185 @@
+// Residuals over the sphere of poses: drag or arrow keys turn it, the wheel zooms, a pose under the
+// pointer says what it is. Data: {models: [name], quantities: [[label, unit]], poses:
+// [{u: [x, y, z], says, held, values: by model, by quantity, null where not shown}]}.
+'use strict';
+(function () {
+  const data = JSON.parse(document.getElementById('sphere-data').textContent);
+  const canvas = document.getElementById('sphere');
+  const pen = canvas.getContext('2d');
+  const model = document.getElementById('sphere-model');
+  const quantity = document.getElementById('sphere-quantity');
+  const about = document.getElementById('sphere-about');
+  const SIZE = [900, 520], CENTRE = [400, 260], RADIUS = 215;
+  let yaw = -0.7, pitch = 0.45, zoom = 1, drag = null, shown = [];
+
+  function option(list, texts, chosen) {
+    texts.forEach(function (text, i) { list.add(new Option(text, i, false, i === chosen)); });
+  }
+  option(model, data.models, data.models.length - 1);
+  option(quantity, data.quantities.map(function (q) { return q[0] + ', ' + q[1]; }), 0);
+
+  function turned(u) {
+    const a = Math.cos(yaw) * u[0] - Math.sin(yaw) * u[1];
+    const b = Math.sin(yaw) * u[0] + Math.cos(yaw) * u[1];
+    // Seen from the side: z is up, the third is towards the eye.
+    return [a, Math.cos(pitch) * u[2] + Math.sin(pitch) * b,
+            -Math.cos(pitch) * b + Math.sin(pitch) * u[2]];
+  }
+  function placed(v) {
+    return [CENTRE[0] + RADIUS * zoom * v[0], CENTRE[1] - RADIUS * zoom * v[1]];
+  }
+  function colour(share) {
+    // Blue, white, red: told apart by colour-blind eyes, too.
+    const s = Math.max(-1, Math.min(1, share)), f = 1 - Math.abs(s);
+    const end = s < 0 ? [33, 102, 172] : [178, 24, 43];
+    const mixed = end.map(function (c) { return Math.round(c + (247 - c) * f); });
+    return 'rgb(' + mixed.join(',') + ')';
+  }
+  function line(points) {
+    [false, true].forEach(function (front) {
+      pen.strokeStyle = front ? '#bbb' : '#eee';
+      pen.beginPath();
+      for (let i = 1; i < points.length; i++) {
+        if ((points[i][2] > 0) !== front) { continue; }
+        pen.moveTo.apply(pen, placed(points[i - 1]));
+        pen.lineTo.apply(pen, placed(points[i]));
+      }
+      pen.stroke();
+    });
+  }
+  function circle(make) {
+    const points = [];
+    for (let i = 0; i <= 72; i++) { points.push(turned(make(i * Math.PI / 36))); }
+    line(points);
+  }
+  function values() {
+    return data.poses.map(function (p) { return p.values[model.value][quantity.value]; });
+  }
+  function limit(all) {
+    const sizes = all.filter(function (v) { return v !== null; }).map(Math.abs);
+    sizes.sort(function (a, b) { return a - b; });
+    // One wild pose must not pale all others.
+    return sizes.length ? sizes[Math.floor(0.95 * (sizes.length - 1))] || 1e-12 : 1;
+  }
+  function legend(most, least, unit) {
+    for (let i = 0; i < 200; i++) {
+      pen.fillStyle = colour(1 - (1 - least) * i / 199);
+      pen.fillRect(690, 160 + i, 22, 1.5);
+    }
+    pen.fillStyle = '#222';
+    [[1, 165], [0, least < 0 ? 264 : 363], [-1, 363]].forEach(function (at) {
+      if (at[0] < least) { return; }
+      pen.fillText((at[0] * most).toPrecision(2) + ' ' + unit + (at[0] ? ' and beyond' : ''), 720,
+                   at[1]);
+    });
+    pen.fillText('● in the fit   ■ only judges it', 690, 395);
+    pen.fillText('× does not show it', 690, 415);
+  }
+  function mark(one, size, most) {
+    const x = one.at[0], y = one.at[1];
+    pen.strokeStyle = '#444';
+    pen.beginPath();
+    if (one.value === null) {
+      pen.moveTo(x - size, y - size);
+      pen.lineTo(x + size, y + size);
+      pen.moveTo(x - size, y + size);
+      pen.lineTo(x + size, y - size);
+    } else if (one.pose.held) {
+      pen.rect(x - size, y - size, 2 * size, 2 * size);
+    } else {
+      pen.arc(x, y, size, 0, 7);
+    }
+    if (one.value !== null) {
+      pen.fillStyle = colour(one.value / most);
+      pen.fill();
+    }
+    pen.stroke();
+  }
+  function draw() {
+    const ratio = window.devicePixelRatio > 2 ? window.devicePixelRatio : 2;
+    canvas.width = SIZE[0] * ratio;
+    canvas.height = SIZE[1] * ratio;
+    pen.setTransform(ratio, 0, 0, ratio, 0, 0);
+    pen.font = '13px system-ui, sans-serif';
+    pen.lineWidth = 1;
+    for (let k = 0; k < 6; k++) {
+      const t = k * Math.PI / 6;
+      circle(function (s) {
+        return [Math.sin(s) * Math.cos(t), Math.sin(s) * Math.sin(t), Math.cos(s)];
+      });
+    }
+    [30, 60, 90, 120, 150].forEach(function (deg) {
+      const a = deg * Math.PI / 180;
+      circle(function (s) {
+        return [Math.sin(a) * Math.cos(s), Math.sin(a) * Math.sin(s), Math.cos(a)];
+      });
+    });
+    ['x', 'y', 'z'].forEach(function (name, i) {
+      const end = [0, 0, 0];
+      end[i] = 1.14;
+      const tip = turned(end), at = placed(tip);
+      pen.strokeStyle = pen.fillStyle = tip[2] > 0 ? '#222' : '#aaa';
+      pen.beginPath();
+      pen.moveTo.apply(pen, placed([0, 0, 0]));
+      pen.lineTo.apply(pen, at);
+      pen.stroke();
+      pen.fillText(name + ' up', at[0] + 4, at[1] - 4);
+    });
+    const all = values(), most = limit(all), unit = data.quantities[quantity.value][1];
+    shown = data.poses.map(function (pose, i) {
+      const v = turned(pose.u);
+      return {pose: pose, value: all[i], depth: v[2], at: placed(v)};
+    });
+    shown.sort(function (a, b) { return a.depth - b.depth; });
+    shown.forEach(function (one) {
+      pen.globalAlpha = one.depth > 0 ? 1 : 0.45;
+      mark(one, one.depth > 0 ? 6 : 3.5, most);
+      pen.globalAlpha = 1;
+    });
+    legend(most, all.some(function (v) { return v < 0; }) ? -1 : 0, unit);
+    canvas.dataset.turn = yaw.toFixed(3) + ' ' + pitch.toFixed(3) + ' ' + zoom.toFixed(2);
+  }
+  function say(event) {
+    const box = canvas.getBoundingClientRect(), scale = SIZE[0] / box.width;
+    const x = (event.clientX - box.left) * scale, y = (event.clientY - box.top) * scale;
+    const near = shown.filter(function (one) {
+      return one.depth > 0 && Math.hypot(one.at[0] - x, one.at[1] - y) < 10;
+    }).pop();
+    about.textContent = !near ? 'Drag to turn, wheel to zoom, point at a pose.' :
+        near.pose.says + ': ' + (near.value === null ? 'does not show it' :
+            near.value.toPrecision(3) + ' ' + data.quantities[quantity.value][1]);
+  }
+  function turn(right, up) {
+    yaw += right;
+    pitch = Math.max(-1.57, Math.min(1.57, pitch + up));
+    draw();
+  }
+  canvas.addEventListener('pointerdown', function (event) {
+    drag = [event.clientX, event.clientY];
+    canvas.setPointerCapture(event.pointerId);
+  });
+  canvas.addEventListener('pointermove', function (event) {
+    if (drag) {
+      turn((event.clientX - drag[0]) * 0.008, (event.clientY - drag[1]) * 0.008);
+      drag = [event.clientX, event.clientY];
+    }
+    say(event);
+  });
+  canvas.addEventListener('pointerup', function () { drag = null; });
+  canvas.addEventListener('wheel', function (event) {
+    event.preventDefault();
+    zoom = Math.max(0.6, Math.min(4, zoom * Math.exp(-event.deltaY * 0.001)));
+    draw();
+  }, {passive: false});
+  canvas.addEventListener('keydown', function (event) {
+    const step = {ArrowLeft: [-0.1, 0], ArrowRight: [0.1, 0], ArrowUp: [0, -0.1],
+                  ArrowDown: [0, 0.1]}[event.key];
+    if (step) {
+      event.preventDefault();
+      turn(step[0], step[1]);
+    }
+  });
+  model.addEventListener('change', draw);
+  quantity.addEventListener('change', draw);
+  draw();
+}());

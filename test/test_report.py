@@ -1,0 +1,194 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The report of a calibration in a browser: it opens offline, says nothing wrong, and turns."""
+
+from dataclasses import replace
+from itertools import product
+import re
+import shutil
+import subprocess
+
+from adxl_ros.files import params, store
+from conftest import executable
+import numpy as np
+import pytest
+from units import NOMINAL
+
+CHROMIUM = next(filter(None, map(shutil.which, (
+    'chromium', 'chromium-browser', 'google-chrome'))), None)
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason='no Chromium to open pages with')
+
+
+@pytest.fixture(scope='module')
+def browser():
+    """Give a headless Chromium."""
+    driver = pytest.importorskip('playwright.sync_api', reason='playwright is not installed')
+    with driver.sync_playwright() as playwright:
+        launched = playwright.chromium.launch(executable_path=CHROMIUM, args=['--no-sandbox'])
+        yield launched
+        launched.close()
+
+
+@pytest.fixture
+def opened(browser):
+    """Give a function that opens a file as a laptop does, and what the browser says to it."""
+    pages = []
+
+    def begin(path):
+        page = browser.new_page(viewport={'width': 1366, 'height': 768})
+        pages.append(page)
+        said = []
+        page.on('console', lambda message: said.append(f'{message.type}: {message.text}'))
+        page.on('pageerror', lambda error: said.append(f'error: {error}'))
+        page.on('request', lambda request: said.append(f'loads {request.url}')
+                if not request.url.startswith(('data:', f'file://{path}')) else None)
+        page.goto(f'file://{path}')
+        return page, said
+
+    yield begin
+    for page in pages:
+        page.close()
+
+
+@pytest.fixture(scope='module')
+def reported(tmp_path_factory):
+    """Give the folder of a report of a unit that has drifted since its last calibration."""
+    folder = tmp_path_factory.mktemp('reported')
+    text = NOMINAL.read_text().replace('serial: nominal', "serial: '<U&7>'")
+    (folder / 'u7.yaml').write_text(text)
+
+    def run(name, *arguments):
+        done = subprocess.run([executable(name), *arguments, '--params', 'u7.yaml'], cwd=folder,
+                              capture_output=True, text=True, timeout=120)
+        assert done.returncode == 0, done.stderr
+
+    run('simulate', 'sweep', '--rate', '100', '--effect', 'bias', '--effect', 'cross_axis_z',
+        '--seed', '5', '-o', 'sweep.csv')
+    run('fit', 'sweep.csv', '--model', 'physical', '-o', 'unit.yaml', '--store', 'store',
+        '--report', 'first')
+    (path, sensor), = store.history(folder / 'store', '<U&7>')[0]
+    path.unlink()
+    bias = sensor.values['bias']['offset_v'] - [0.004, 0.0]
+    old = replace(sensor, values={**sensor.values, 'bias': {'offset_v': bias}}, provenance={
+        **sensor.provenance, 'id': 'last-year', 'date': '2026-01-01T00:00:00+00:00',
+        'data_sha256': '0' * 64, 'temperature_c': '25.00'})
+    store.put(folder / 'store', old)
+    run('fit', 'sweep.csv', '-o', 'unit.yaml', '--store', 'store', '--report', 'report')
+    return folder
+
+
+def test_the_browser_tells_what_is_wrong(opened, tmp_path):
+    """A page with faults of each kind: without this the tests below could not fail."""
+    path = tmp_path / 'bad.html'
+    path.write_text('<script>console.error("ouch"); nowhere();</script><img src="gone.png">')
+    page, said = opened(path)
+    page.wait_for_timeout(200)
+    text = '\n'.join(said)
+    assert 'error: ouch' in text and 'nowhere is not defined' in text
+    assert 'gone.png' in text
+
+
+def test_the_report_holds_what_it_should(opened, reported):
+    """Verdict by model, coefficients beside the datasheet, drift, figures; nothing is loaded."""
+    page, said = opened(reported / 'report' / 'report.html')
+    assert said == []
+    text = page.locator('body').inner_text()
+    assert 'Calibration of <U&7>' in text
+    rows = page.locator('table').nth(0).locator('tbody tr')
+    assert rows.locator('td:first-child').all_inner_texts() == [
+        'nominal', 'linear', 'physical', 'full']
+    assert 'PASS' in rows.nth(3).inner_text() and 'FAIL' in rows.nth(1).inner_text()
+    coefficients = page.locator('table').nth(1).inner_text()
+    sensor = params.load(reported / 'unit.yaml')
+    assert all(name in coefficients for name in sensor.covariance_names)
+    line = next(line for line in coefficients.splitlines()
+                if line.startswith('nonlinearity.cubic_per_g2.x'))
+    assert '\t0.00069\t0.0043\t' in line
+    assert re.search(r'In [\d.]+ days since last-year: zero-g of x by \+[34]\.\d+', text), text
+    assert 'zero-g of y' not in text
+    assert page.locator('img').count() == 5
+    assert page.evaluate('[...document.images].every(i => i.complete && i.naturalWidth > 500)')
+    # Nothing sticks out of a laptop's window.
+    assert page.evaluate('document.documentElement.scrollWidth <= innerWidth')
+    for value in (sensor.provenance['id'], sensor.provenance['data_sha256']):
+        assert value in text
+
+
+def test_the_sphere_turns(opened, reported):
+    """By mouse, wheel and keys; it says the pose under the pointer, and shows other figures."""
+    page, said = opened(reported / 'report' / 'report.html')
+    sphere = page.locator('#sphere')
+    sphere.scroll_into_view_if_needed()
+    box = sphere.bounding_box()
+    pictures = [sphere.screenshot()]
+
+    def changed():
+        pictures.append(sphere.screenshot())
+        return pictures[-1] != pictures[-2]
+
+    assert len(set(np.frombuffer(pictures[0], np.uint8))) > 100
+    page.mouse.move(box['x'] + 300, box['y'] + 200)
+    page.mouse.down()
+    page.mouse.move(box['x'] + 380, box['y'] + 260, steps=4)
+    page.mouse.up()
+    assert changed()
+    yaw, pitch, zoom = map(float, sphere.get_attribute('data-turn').split())
+    assert (yaw, pitch, zoom) == pytest.approx((-0.7 + 0.64, 0.45 + 0.48, 1.0), abs=0.02)
+    page.mouse.move(box['x'] + 500, box['y'] + 260)
+    assert sphere.get_attribute('data-turn').startswith(f'{yaw:.3f}')
+    page.mouse.wheel(0, -300)
+    page.wait_for_function('document.getElementById("sphere").dataset.turn.endsWith("1.35")')
+    assert changed()
+    sphere.press('ArrowLeft')
+    assert changed()
+    page.select_option('#sphere-model', label='linear')
+    assert changed()
+    page.select_option('#sphere-quantity', label='error of x, mg')
+    assert changed()
+    found = page.locator('#sphere-about')
+    sphere.scroll_into_view_if_needed()
+    box = sphere.bounding_box()
+    for x, y in product(range(300, 520, 10), range(180, 360, 10)):
+        page.mouse.move(box['x'] + x, box['y'] + y)
+        if found.inner_text().startswith('pose'):
+            break
+    assert re.match(r'pose \d+, alpha [\d.]+, beta [\d.]+ deg: -?[\d.]+(e-\d)? mg',
+                    found.inner_text())
+    assert said == []
+
+
+def test_the_report_prints(opened, reported, tmp_path):
+    """All of it, on A4, the sphere too; the boxes to choose from stay on the screen."""
+    page, said = opened(reported / 'report' / 'report.html')
+    page.emulate_media(media='print')
+    assert not page.locator('#sphere-model').is_visible()
+    assert page.locator('#sphere').is_visible()
+    page.pdf(path=tmp_path / 'page.pdf', format='A4')
+    pages = (tmp_path / 'page.pdf').read_bytes().count(b'/Type /Page\n')
+    assert 4 <= pages <= 12
+    assert said == []
+
+
+def test_a_first_calibration_and_one_by_hand(opened, reported, run_tool, shared_dir, tmp_path):
+    """Without history, and without a stage."""
+    page, said = opened(reported / 'first' / 'report.html')
+    assert 'No earlier calibration of this unit' in page.locator('body').inner_text()
+    done = run_tool('fit', shared_dir / 'real' / 'mpu9150_0.csv', '-o', 'u.yaml', '--report',
+                    'by_hand')
+    assert done.returncode == 0, done.stderr
+    by_hand, said_by_hand = opened(tmp_path / 'by_hand' / 'report.html')
+    text = by_hand.locator('body').inner_text()
+    assert 'magnitude less gravity, mg' in text and 'magnitude of gravity over 23 rests' in text
+    assert said == said_by_hand == []

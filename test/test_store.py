@@ -1,0 +1,184 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Provenance and the store, through `fit`: copies by serial and date, the previous file kept."""
+
+from dataclasses import replace
+import hashlib
+import shutil
+import subprocess
+
+from adxl_ros.files import params, store
+from adxl_ros.model.envelope import Envelope
+from conftest import executable
+import numpy as np
+import pytest
+from units import drawn, NOMINAL, nominal
+
+DATED = {'date': '2026-01-02T03:04:05+00:00', 'data_sha256': 'ab' * 32}
+
+
+@pytest.fixture(scope='module')
+def swept_csv(tmp_path_factory):
+    """Give a swept recording of the unit U/7, warm, with its supply; and its nominal file."""
+    folder = tmp_path_factory.mktemp('swept')
+    (folder / 'u7.yaml').write_text(
+        NOMINAL.read_text().replace('serial: nominal', 'serial: U/7'))
+    done = subprocess.run([executable('simulate'), 'sweep', '--params', 'u7.yaml', '--rate', '100',
+                           '--effect', 'bias', '--effect', 'misalignment', '--seed', '5', '-o',
+                           'sweep.csv'], cwd=folder, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    lines = (folder / 'sweep.csv').read_text().splitlines()
+    head = next(i for i, line in enumerate(lines) if line.startswith('time_s'))
+    first = [name for name in lines[head].split(',') if name not in ('temperature_c', 'supply_v')]
+    kept = [lines[head].split(',').index(name) for name in first]
+    rows = [','.join([*first, 'temperature_c', 'supply_v'])]
+    for i, line in enumerate(lines[head + 1:]):
+        cells = line.split(',')
+        rows.append(','.join([*(cells[k] for k in kept), f'{22 + i / len(lines):.3f}', '4.95']))
+    (folder / 'sweep.csv').write_text('\n'.join([*lines[:head], *rows]) + '\n')
+    return folder
+
+
+def test_provenance_store_and_the_previous_file(run_tool, swept_csv, tmp_path):
+    """What the YAML says of its calibration; a second one keeps the first; both are stored."""
+    shutil.copytree(swept_csv, tmp_path, dirs_exist_ok=True)
+    done = run_tool('fit', 'sweep.csv', '--params', 'u7.yaml', '--model', 'physical', '-o',
+                    'u.yaml')
+    assert done.returncode == 0, done.stderr
+    first = (tmp_path / 'u.yaml').read_text()
+    sensor = params.load(tmp_path / 'u.yaml')
+    said = sensor.provenance
+    raw = (tmp_path / 'sweep.csv').read_bytes()
+    assert said['data_sha256'] == hashlib.sha256(raw).hexdigest()
+    assert said['temperature_c'] == '22.50'
+    assert said['supply_v'] == '4.9500'
+    assert said['sweep'] == ('125 poses: alpha 30, 60, 90, 120, 150 deg; beta 0 to 360 deg, steps '
+                             'of 30, both directions')
+    assert said['package_version'] and said['date'] and said['residual_mg']
+    assert float(said['held_out_tilt_rms_deg']) > 0
+    assert said['id'].startswith('U/7-20') and said['id'].endswith(said['data_sha256'][:8])
+    assert sensor.envelope.temperature_c == pytest.approx((22.0, 23.0), abs=0.05)
+    assert sensor.envelope.leverage > 0
+    assert (sensor.serial, sensor.model) == ('U/7', 'physical')
+    folder = tmp_path / 'ros_home' / 'adxl_ros' / 'calibrations' / 'U%2F7'
+    kept, = folder.iterdir()
+    assert kept.read_text() == first
+    assert f'kept as {kept}' in done.stderr
+
+    done = run_tool('fit', 'sweep.csv', '--params', 'u7.yaml', '--model', 'linear', '-o', 'u.yaml',
+                    '--store', 'elsewhere')
+    assert done.returncode == 0, done.stderr
+    assert params.load(tmp_path / 'u.yaml').model == 'linear'
+    assert (tmp_path / 'u.yaml.previous').read_text() == first
+    assert len(list((tmp_path / 'elsewhere').rglob('*.yaml'))) == 1
+    assert len(list(folder.iterdir())) == 1
+    # What it leaves is a set of parameters that nodes and tools load.
+    done = run_tool('apply', 'sweep.csv', '--params', 'u.yaml', '-o', 'out.csv')
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_store_that_cannot_be_written_loses_nothing(run_tool, swept_csv, tmp_path):
+    """The file is there, and one line says why there is no copy."""
+    shutil.copytree(swept_csv, tmp_path, dirs_exist_ok=True)
+    (tmp_path / 'file').write_text('')
+    done = run_tool('fit', 'sweep.csv', '--params', 'u7.yaml', '--model', 'linear', '-o', 'u.yaml',
+                    '--store', 'file')
+    assert done.returncode == 0
+    assert params.load(tmp_path / 'u.yaml').model == 'linear'
+    assert 'fit: no copy in the store: file/U%2F7: cannot be made' in done.stderr
+    assert done.stderr.count('\n') == 1
+
+
+def test_no_unit_in_particular_is_not_stored(run_tool, tmp_path):
+    """Serial `nominal`: the copy would be of nobody."""
+    run_tool('simulate', 'sweep', '--rate', '100', '-o', 'a.csv')
+    done = run_tool('fit', 'a.csv', '--model', 'linear', '-o', 'u.yaml')
+    assert done.returncode == 0 and 'is no unit in particular' in done.stderr
+    assert not (tmp_path / 'ros_home').exists()
+
+
+def test_apply_says_what_lies_outside(run_tool, swept_csv, tmp_path):
+    """And raises its standard deviations as much as `compensation` does."""
+    shutil.copytree(swept_csv, tmp_path, dirs_exist_ok=True)
+    run_tool('fit', 'sweep.csv', '--params', 'u7.yaml', '--model', 'linear', '-o', 'u.yaml')
+    head = (tmp_path / 'sweep.csv').read_text().split('\ntime_s')[0]
+    rows = '\n'.join(f'{i / 100},2.6,2.5,{c}' for i, c in enumerate([22.5, 22.5, 60.0, 60.0]))
+    (tmp_path / 'run.csv').write_text(f'{head}\ntime_s,x_v,y_v,temperature_c\n{rows}\n')
+    done = run_tool('apply', 'run.csv', '--params', 'u.yaml', '-o', 'out.csv')
+    assert done.returncode == 0
+    assert '2 of 4 samples lie outside of what was calibrated' in done.stderr
+    out = np.genfromtxt(tmp_path / 'out.csv', delimiter=',', names=True)['ax_std_mps2']
+    sensor = params.load(tmp_path / 'u.yaml')
+    off_k = 60 - sensor.envelope.temperature_c[1] - 2
+    assert np.sqrt(out[2] ** 2 - out[0] ** 2) == pytest.approx(off_k * 1e-4 * 9.80665, rel=0.05)
+    assert out[0] == out[1]
+
+
+def test_the_file_holds_envelope_and_datasheet(tmp_path):
+    """They round-trip; an older file without them loads, and says that nothing is known."""
+    sensor = replace(drawn(np.random.default_rng(1), nominal(serial='17')), model='full',
+                     envelope=Envelope((20.5, 23.25), 1e-4, 3e-5, 2e-7, 1e-3, (-9.0, -9.5, 0.5),
+                                       (9.0, 9.5, 8.0)))
+    params.save(tmp_path / 'u.yaml', sensor)
+    again = params.load(tmp_path / 'u.yaml')
+    assert again.envelope == sensor.envelope
+    assert again.datasheet == sensor.datasheet and len(sensor.datasheet) == 10
+    assert again.datasheet_name == sensor.datasheet_name
+    bare = replace(sensor, envelope=Envelope(), datasheet={}, datasheet_name='')
+    params.save(tmp_path / 'old.yaml', bare)
+    assert 'envelope' not in (tmp_path / 'old.yaml').read_text()
+    assert params.load(tmp_path / 'old.yaml').envelope == Envelope()
+
+
+@pytest.mark.parametrize('serial', ['17', 'A/B', '..', 'ä €', '-x', 'ä' * 200])
+def test_any_serial_has_a_folder_of_its_own(tmp_path, serial):
+    """Inside the store, whatever the serial number is."""
+    sensor = replace(drawn(np.random.default_rng(1), nominal(serial=serial)), provenance=DATED)
+    path = store.put(tmp_path / 'store', sensor)
+    assert path.parent.parent == tmp_path / 'store'
+    assert store.newer(tmp_path / 'store', sensor) is None
+    old = replace(sensor, provenance={'date': '2025-01-02T03:04:05+00:00'})
+    assert store.newer(tmp_path / 'store', old) == path
+    (found, again), = store.history(tmp_path / 'store', serial)[0]
+    assert found == path and again.serial == serial
+
+
+def test_history_is_by_date_and_tells_what_it_cannot_read(tmp_path):
+    """A file that is half or of another unit does not hide the others."""
+    sensor = drawn(np.random.default_rng(1), nominal(serial='17'))
+    dates = ['2026-03-01T00:00:00+00:00', '2025-12-24T00:00:00+00:00', '2026-02-01T00:00:00']
+    for date in dates:
+        store.put(tmp_path, replace(sensor, provenance={'date': date}))
+    params.save(tmp_path / '17' / 'other.yaml', replace(sensor, serial='18'))
+    (tmp_path / '17' / 'half.yaml').write_text('/**:\n  ros__par')
+    found, refused = store.history(tmp_path, '17')
+    assert [s.provenance['date'] for _, s in found] == [dates[1], dates[2], dates[0]]
+    assert len(refused) == 2 and 'half.yaml:' in refused[0] and 'unit 18' in refused[1]
+
+
+def test_a_full_disk_keeps_the_old_file(swept_csv, tmp_path):
+    """No file can grow beyond a kilobyte: the old one stands to the byte, and nothing is left."""
+    shutil.copytree(swept_csv, tmp_path, dirs_exist_ok=True)
+    (tmp_path / 'u.yaml').write_text('old')
+    there = {path.name for path in tmp_path.iterdir()}
+    done = subprocess.run(
+        ['bash', '-c', 'ulimit -f 1; trap "" XFSZ; exec "$@"', 'bash', executable('fit'),
+         'sweep.csv', '--params', 'u7.yaml', '--model', 'linear', '-o', 'u.yaml'],
+        cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 1
+    assert 'u.yaml: cannot write: File too large' in done.stderr
+    assert done.stderr.count('\n') == 1
+    assert (tmp_path / 'u.yaml').read_text() == 'old'
+    assert {path.name for path in tmp_path.iterdir()} == there | {'u.yaml.previous'}

@@ -1,0 +1,156 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The verdict on simulated units, whose truth is known: its figures are true, and its blame."""
+
+from dataclasses import replace
+
+from adxl_ros.calibrate import judge, result, verdict
+from adxl_ros.calibrate.full import TERMS
+from adxl_ros.calibrate.limits import Parts
+from adxl_ros.model import chain
+from adxl_ros.model.constants import G0_MPS2
+from adxl_ros.model.stage import specific_force
+import numpy as np
+import pytest
+from units import drawn, nominal, swept
+
+
+def calibrated(seed, model=None, axes='xy', check=16, stage_rad=None, effects=TERMS, **figures):
+    """Calibrate a drawn unit on a stage that may err by another step than it states."""
+    rng = np.random.default_rng([seed, 81])
+    sensor = nominal(axes, serial='S', **figures)
+    truth = drawn(rng, sensor, effects)
+    on = truth if stage_rad is None else replace(truth, stage_resolution_rad=stage_rad)
+    poses = swept(rng, on, check_poses=check)
+    return truth, result.calibrate(sensor, [poses], model, ['made'])
+
+
+def true_errors(truth, found):
+    """Return what the units that were scored err by without noise and stage: mg and deg rms."""
+    score = found.scores[-1]
+    poses = found.poses.subset(found.sound).subset(score.index)
+    force = np.column_stack(specific_force(poses.alpha_rad, poses.beta_rad,
+                                           truth.local_gravity_mps2))
+    volts = np.column_stack(chain.static_response(truth)(list(force.T)))
+    got = np.empty_like(force)
+    for number, unit in enumerate(score.fitted):
+        own = score.fold == number
+        up = np.where(force[own, 2] < 0, -1, 1)
+        got[own] = np.column_stack(chain.inverse(unit, up)(list(volts[own].T)))
+    shown = np.isfinite(score.errors.tilt_rad)
+    mg = (got - force)[shown, :len(truth.axes)] / G0_MPS2 * 1e3
+    return (np.sqrt(np.mean(mg ** 2)),
+            np.degrees(np.sqrt(np.mean(verdict.between(got, force)[shown] ** 2))))
+
+
+@pytest.mark.parametrize(('check', 'units', 'within'), [(16, 4, 0.35), (0, 2, 0.5)],
+                         ids=['check poses', 'folds'])
+def test_the_error_that_is_stated_is_true(check, units, within):
+    """Noise and stage taken out, rms over units; what is seen is more."""
+    own, true, seen = [], [], []
+    for seed in range(units):
+        truth, found = calibrated(seed, 'full', check=check)
+        judged = found.judged[-1]
+        own.append((judged.own_mg, judged.own_deg))
+        true.append(true_errors(truth, found))
+        seen.append(found.scores[-1].accel_rms_mg)
+        assert judged.limit == 'stage'
+        assert (judged.datasheet, judged.noise) == ('PASS', 'PASS')
+        said = found.fitted.provenance
+        assert float(said['own_accel_mg']) == pytest.approx(judged.own_mg, rel=1e-3)
+        assert float(said['held_out_accel_rms_mg']) == pytest.approx(seen[-1], rel=1e-3)
+    own, true = (np.sqrt(np.mean(np.square(one), axis=0)) for one in (own, true))
+    np.testing.assert_allclose(true, own, rtol=within)
+    assert np.sqrt(np.mean(np.square(seen))) > 2 * own[0]
+
+
+CASES = {
+    'a fine stage': ('noise', {'stage_resolution_rad': 0.0}),
+    'a stage as stated': ('stage', {}),
+    'a stage worse than stated': ('stage', {'stage_rad': np.radians(2.0)}),
+    'a stage worse than stated, three axes': (
+        'stage', {'stage_rad': np.radians(2.0), 'axes': 'xyz'}),
+    'a model that lacks terms': ('model', {'model': 'linear'}),
+    'a model that lacks terms, three axes': ('model', {'model': 'linear', 'axes': 'xyz'}),
+}
+
+
+@pytest.mark.parametrize('name', CASES)
+def test_what_limits_it_is_named(name):
+    """By one of two units at least: chance moves a verdict once in a hundred."""
+    limit, settings = CASES[name]
+    named = [calibrated(seed, **settings)[1].judged[-1].limit for seed in range(2)]
+    assert limit in named, named
+
+
+def test_a_linear_model_fails_and_says_why():
+    """Where the unit has the paper's terms; the full model of the same poses passes."""
+    _, found = calibrated(1)
+    outcomes = {one.model: (one.datasheet, one.noise, one.limit) for one in found.judged}
+    assert outcomes['linear'] == ('FAIL', 'FAIL', 'model')
+    assert outcomes['full'][:2] == ('PASS', 'PASS')
+    lines = '\n'.join(found.comments())
+    assert 'at most 3.4 mg by the datasheet' in lines
+    assert 'unit within ADXL203' in lines
+
+
+def test_a_unit_beyond_the_datasheet_is_named():
+    """By the whole of its interval; the greatest zero-g is 100 mV from nominal."""
+    _, found = calibrated(2, effects=())
+    assert judge.beyond_datasheet(found.fitted) == []
+    off = replace(found.fitted, values={**found.fitted.values, 'bias': {
+        'offset_v': np.array([0.02, -0.11])}})
+    said, = judge.beyond_datasheet(off)
+    assert said.startswith('bias.offset_v.y is -0.11')
+
+
+def test_without_a_datasheet_there_is_no_bar():
+    """Figures of another sensor are not judged by those of the ADXL203."""
+    _, found = calibrated(3, datasheet={}, datasheet_name='')
+    assert {one.datasheet for one in found.judged} == {''}
+    assert 'no bar by a datasheet' in '\n'.join(found.verdict)
+
+
+@pytest.mark.parametrize(('parts', 'outcome'), [
+    ((1.0, 0.0, 0.9, 0.1, 0.0, 0.2), 'PASS'), ((9.0, 0.0, 8.9, 0.1, 0.0, 2.0), 'NOT SHOWN'),
+    ((9.0, 0.0, 0.1, 0.1, 8.8, 12.0), 'FAIL'), ((9.0, 0.0, 0.1, 0.1, 8.8, 12.0, False),
+                                                'NOT SHOWN')])
+def test_pass_fail_and_not_shown(parts, outcome):
+    """The bar is 1: an error that is below, that may be below, and that is beyond."""
+    bar = replace(nominal(), datasheet={'nonlinearity.cubic_per_g2': (
+        1 / G0_MPS2 / nominal().range_g ** 3, 0.0)})
+    judged = judge.judge('full', Parts(*parts), Parts(*parts), bar)
+    assert judged.datasheet == outcome
+    assert judged.limit == ('stage' if outcome in ('PASS', 'NOT SHOWN') and len(parts) == 6
+                            else 'model' if len(parts) == 6 else 'stage or model')
+
+
+@pytest.mark.parametrize(('together', 'least'), [(0.0, 0.82), (0.9, 0.7)])
+def test_intervals_hold_for_errors_that_go_together(together, least):
+    """Of 130 errors that follow each other; an interval for independent ones covers 35 %."""
+    rng = np.random.default_rng(82)
+    covered = naive = 0
+    for _ in range(400):
+        noise = rng.normal(size=230)
+        errors = np.empty(230)
+        errors[0] = noise[0]
+        for k in range(1, 230):
+            errors[k] = together * errors[k - 1] + np.sqrt(1 - together ** 2) * noise[k]
+        errors = errors[100:]
+        low, high = verdict.rms_interval(errors)
+        covered += low < 1 < high
+        naive += 1 / 1.11 < np.sqrt(np.mean(errors ** 2)) < 1.11
+    assert least < covered / 400 < 0.97
+    assert together == 0 or naive < 0.6 * covered
