@@ -133,7 +133,7 @@ def test_the_straight_part_of_an_effect_may_be_in_the_scale_factor():
 
 
 @pytest.mark.parametrize('option, effect', [
-    ('flicker:density_g_per_rthz=6e-4', 'flicker'),
+    ('flicker:density_g_per_rthz=3e-4', 'flicker'),
     ('bias_walk:density_g_per_rts=6e-4', 'bias_walk')])
 def test_kinds_of_drift_are_told_apart(option, effect):
     """1/f noise and a random walk, by their spectra, and by no other effect."""

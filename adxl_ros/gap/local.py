@@ -24,7 +24,7 @@ from adxl_ros.gap.evidence import Channel, Fit
 from adxl_ros.gap.series import Series
 from adxl_ros.gap.study import BEYOND, STRAIGHT, straight, Study
 from adxl_ros.gap.tangents import WIDE
-from adxl_ros.gap.whiten import drifts_among, near
+from adxl_ros.gap.whiten import drifts_among, flicker_g_per_rthz, near
 from adxl_ros.model.coefficients import get, names_of, parameter_of, put, with_neutral
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.sensor import Sensor
@@ -183,7 +183,8 @@ def local(of: Study, effects: Sequence[str], sensor: Sensor,
                 tried if noise is None else near(tried, noise[len(channels)])))
             count += more.shape[1]
     looks = straight(lines, does, 1)
-    prior += [float(np.hypot(of.tolerance(n), looks[i][0] if i in looks else 0.0))
+    prior += [float(np.hypot(of.tolerance(n, drifts_among(effects)),
+                              looks[i][0] if i in looks else 0.0))
               for i, n in enumerate(free, len(own))]
     return Local(tuple(effects), sensor, tuple(names), np.concatenate([middle, get(held, free)]),
                  np.array(prior), values, channels)
@@ -243,14 +244,47 @@ def refined(of: Study, effects: Sequence[str], start: dict[str, float],
     own = slice(len(here.values))
     fitted = here.fitted(found, False)
     for drift in drifts_among(effects):
-        chosen = [f[w] for f, w in zip(of.filters, found.walks)][:len(fitted.axes)]
+        densities = np.zeros(len(fitted.axes))
+        for d in range(len(densities)):
+            whiten = of.filters[d][found.walks[d]]
+            if whiten.drift == drift:
+                densities[d] = whiten.density if drift == 'bias_walk' else flicker_g_per_rthz(
+                    whiten, found.variance[d], of.series[0], d)
         fitted = replace(fitted, values={**fitted.values, drift: {
-            effect_named(drift).parameters[0].name: np.array([
-                f.density if f.drift == drift else 0.0 for f in chosen])}})
+            effect_named(drift).parameters[0].name: densities}})
     return Hypothesis(effects, fitted, here.names[own],
                       here.values - here.middle[own],
-                      evidence.robust_std(here.channels, found, here.prior)[own], reached,
-                      found, evidence.uneven(here.channels, found))
+                      evidence.robust_std(here.channels, found, here.prior)[own],
+                      reached + _of_those_that_show(here, found), found,
+                      evidence.uneven(here.channels, found))
+
+
+def _of_those_that_show(here: Local, found: Fit) -> float:
+    """
+    Return what the log-evidence gains where coefficients that do not show are not there, nats.
+
+    An effect need not act on all axes: each set of its coefficients is as likely beforehand as
+    any other. What leaving one out gains is the ratio of its posterior and prior densities at
+    nothing (Dickey 1971); they are left out one by one, at least one of an effect stays.
+    """
+    mean, covariance = found.values.copy(), found.covariance.copy()
+    gain = 0.0
+    for effect in here.effects:
+        own = [i for i, name in enumerate(here.names[:len(here.values)])
+               if name.split('.')[0] == effect and parameter_of(name).sized]
+        if own:
+            gain -= float(np.log(2.0 ** len(own) - 1))
+        while len(own) > 1:
+            spread = np.diag(covariance)[own]
+            gains = 0.5 * (np.log(here.prior[own] ** 2 / spread) - mean[own] ** 2 / spread)
+            if gains.max() <= 0:
+                break
+            gain += float(gains.max())
+            j = own.pop(int(np.argmax(gains)))
+            across = covariance[:, j] / covariance[j, j]
+            mean = mean - across * mean[j]
+            covariance = covariance - np.outer(across, covariance[j])
+    return gain
 
 
 def _within(names: Sequence[str], values: np.ndarray) -> np.ndarray:

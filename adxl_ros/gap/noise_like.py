@@ -20,12 +20,12 @@ from dataclasses import dataclass
 
 from adxl_ros.gap.evidence import bridged
 from adxl_ros.gap.floor import runs
+from adxl_ros.gap.likeness import simulated_noise
 from adxl_ros.gap.series import Series
 from adxl_ros.model import noise
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 from scipy.signal import lfilter, periodogram
-from scipy.stats import norm
 
 _MAINS_HZ = (50.0, 60.0)
 _MAINS_WITHIN_HZ = 0.6
@@ -216,15 +216,15 @@ def of_residual(residual_v: np.ndarray, used: np.ndarray, series: Series) -> lis
         signs.append(line)
     # Differences, so that a wandering zero-g is none of it; where it moves, what is not modelled
     # would pass for noise.
-    promised = np.sqrt(noise.analog_sigma_v(sensor) ** 2 * (1 - decay ** 2) * 2
-                       + sensor.lsb_v ** 2 / 12 * (1 + (1 + decay) ** 2 + decay ** 2))
-    step, still = np.diff(white, axis=0), (series.still & used)[2:]
-    chosen = step[still] if still.sum() > _FEWEST else step[used[2:]]
-    seen = np.median(np.abs(chosen), axis=0) / norm.ppf(0.75)
-    ratio = seen / promised
-    if still.sum() > _FEWEST:
+    made = simulated_noise(series, sensor, 0)
+    other = np.diff(np.column_stack([lfilter([1.0, -a], [1.0], r)[1:]
+                                     for r, a in zip(made.T, decay)]), axis=0)
+    chosen = rests if rests.sum() > _FEWEST else used[2:]
+    ratio = np.median(np.abs(apart[chosen]), axis=0) / np.median(np.abs(other[chosen]), axis=0)
+    if rests.sum() > _FEWEST:
         # Noise that the filter did not pass looks like more of it, sample by sample.
-        ratio = np.minimum(ratio, np.std(data[2:][still], axis=0) / noise.sigma_v(sensor))
+        ratio = np.minimum(ratio, np.std(data[2:][rests], axis=0) / np.std(made[2:][rests],
+                                                                           axis=0))
     if np.max(ratio) > _EXCESS and line is None:
         signs.append(Sign('noise_excess', {'ratio': ratio - 1},
                           len(white) * float(np.log(np.max(ratio)) ** 2),

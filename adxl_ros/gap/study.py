@@ -38,6 +38,7 @@ TOLERANCE = {'bias': 2.5e-4, 'scale_factor': 2.5e-4, 'bandwidth': 0.02, 'time_of
 zero-g in g, scale factor, resistance of the filter, and latency of the stamps in s."""
 STRAIGHT = ('bias', 'scale_factor')
 """Of these, what a straight line is made of."""
+_DRIFTED_G = 0.02
 BEYOND = 4.0
 """So many of these, and the unit is not healthy: it takes an effect."""
 
@@ -83,7 +84,8 @@ class Study:
         """Return the numbers of the columns of what is free in every hypothesis."""
         return [i for v, of in zip(self.variants, self.ids) if v.effect in TOLERANCE for i in of]
 
-    def priors(self, chosen: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+    def priors(self, chosen: Sequence[int], drifts: Sequence[str] = ()
+               ) -> tuple[np.ndarray, np.ndarray]:
         """
         Return prior deviations of all columns, and how large each may be.
 
@@ -96,16 +98,17 @@ class Study:
             name = self.names[i]
             if name.split('.')[0] not in effects:
                 looks = self.straight.get(name, np.zeros(len(prior)))[columns] * prior[columns]
-                prior[i] = np.hypot(self.tolerance(name), np.sqrt(np.sum(looks ** 2)))
+                prior[i] = np.hypot(self.tolerance(name, drifts), np.sqrt(np.sum(looks ** 2)))
                 # How large the chosen are is not known yet, nor is their straight part.
                 most[i] = np.inf if np.any(looks) else BEYOND * prior[i]
         return prior, most
 
-    def tolerance(self, name: str) -> float:
+    def tolerance(self, name: str, drifts: Sequence[str] = ()) -> float:
         """
         Return how far a coefficient may be from the file's in a healthy unit.
 
-        Where the sensor rests, its pose is not known, so that only changes of zero-g tell.
+        Where the sensor rests, its pose is not known, so that only changes of zero-g tell; where
+        its zero-g drifts, it has done so before, too.
         """
         effect, *_, axis = name.split('.')
         if effect not in STRAIGHT:
@@ -114,10 +117,10 @@ class Study:
         scale = float(sensor.scale_v_per_g[sensor.axes.index(axis)])
         if effect == 'bias' and any(one.reference == 'rest' for one in self.series):
             return scale
-        known = 0.0
+        known = (_DRIFTED_G * scale) ** 2 if effect == 'bias' and drifts else 0.0
         if name in sensor.covariance_names:
             i = sensor.covariance_names.index(name)
-            known = float(sensor.covariance[i, i])
+            known += float(sensor.covariance[i, i])
         return float(np.hypot(TOLERANCE[effect] * scale, np.sqrt(known)))
 
 
@@ -246,4 +249,5 @@ def on_tangents(of: Study, chosen: Sequence[int], start: Fit | None = None,
     """
     wanders = (*wanders, *whiten.drifts_among(of.series[0].sensor.effects))
     ids = set(of.nuisances()).union(*(of.ids[i] for i in chosen))
-    return evidence.fit(of.channels, sorted(ids), *of.priors(chosen), None, start, wanders)
+    return evidence.fit(of.channels, sorted(ids), *of.priors(chosen, wanders), None, start,
+                        wanders)

@@ -32,7 +32,7 @@ from dataclasses import dataclass
 from adxl_ros.gap.series import Series
 from adxl_ros.model import noise
 import numpy as np
-from scipy.signal import sosfilt, tf2sos, zpk2sos
+from scipy.signal import sosfilt, sosfreqz, tf2sos, zpk2sos
 
 DRIFTS = ('bias_walk', 'flicker')
 """The effects that let the zero-g wander."""
@@ -111,11 +111,27 @@ def whiteners(series: Series, d: int) -> list[Whitener]:
         out.append(_whitener(zpk2sos([a, *zeros], [-still[1], *poles], 1.0), 'flicker', density))
         if corner_hz > top_hz:
             break
+    # 1/f noise that the filter did not pass is all there is where it exceeds the rest at the
+    # filter's corner.
+    if a:
+        bends_hz = 0.4 / dt_s * 10.0 ** -np.arange(int(np.ceil(np.log10(span_s / dt_s))))
+        zeros, poles = (np.exp(-2 * np.pi * dt_s * bends_hz * by) for by in (10 ** -0.5, 1.0))
+        least = np.sqrt(white_v2_per_hz / (2 * np.pi * rc_s[d])) / scale
+        out.append(_whitener(zpk2sos(zeros, poles, 1.0), 'flicker',
+                             max(float(least), 2 * HEALTHY['flicker'])))
     return out
 
 
 def _whitener(sections: np.ndarray, drift: str, density: float) -> Whitener:
     return Whitener(sections, -0.5 * (np.log10(density / USUAL) / _DECADES) ** 2, drift, density)
+
+
+def flicker_g_per_rthz(whiten: Whitener, variance_v2: float, series: Series, d: int) -> float:
+    """Return the density at 1 Hz, root of one-sided, of noise that a filter makes white."""
+    dt_s = float(np.median(np.diff(series.time_s)))
+    _, gain = sosfreqz(whiten.sections, [2 * np.pi * dt_s])
+    at_1_hz_v = np.sqrt(2 * dt_s * variance_v2) / np.abs(gain[0])
+    return float(at_1_hz_v / series.sensor.scale_v_per_g[d])
 
 
 def near(filters: Sequence[Whitener], best: int) -> list[Whitener]:

@@ -76,7 +76,7 @@ def references_of(roles: Sequence[str]) -> tuple[str, ...]:
     return tuple(column for role, column in _COLUMNS.items() if role in roles)
 
 
-def split(values: Mapping[str, np.ndarray], sensor: Sensor, references: Sequence[str],
+def split(values: Mapping[str, np.ndarray], sensor: Sensor, columns: Sequence[str],
           supply_scale: float) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """
     Return the volts by axis, (n, m), and the references by column, (n,) each.
@@ -87,14 +87,14 @@ def split(values: Mapping[str, np.ndarray], sensor: Sensor, references: Sequence
         By role, (n,) each.
     sensor
         Whose axes.
-    references
-        Columns that are asked for; NaN where no channel gives them.
+    columns
+        References that are asked for; NaN where no channel gives them.
     supply_scale
         Supply by the volts of its channel.
 
     """
     volts = np.column_stack([values[axis] for axis in sensor.axes])
-    beside = {column: np.full(len(volts), np.nan) for column in references}
+    beside = {column: np.full(len(volts), np.nan) for column in columns}
     beside |= {column: values[role] * (supply_scale if role == SUPPLY else 1.0)
                for role, column in _COLUMNS.items() if role in values}
     return volts, beside
