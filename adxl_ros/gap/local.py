@@ -23,7 +23,7 @@ from adxl_ros.gap import evidence
 from adxl_ros.gap.evidence import Channel, Fit
 from adxl_ros.gap.series import Series
 from adxl_ros.gap.study import BEYOND, STRAIGHT, straight, Study
-from adxl_ros.gap.tangents import WIDE
+from adxl_ros.gap.tangents import limits, WIDE
 from adxl_ros.gap.whiten import drifts_among, flicker_g_per_rthz, near
 from adxl_ros.model.coefficients import get, names_of, parameter_of, put, with_neutral
 from adxl_ros.model.effects import effect_named
@@ -146,7 +146,7 @@ def local(of: Study, effects: Sequence[str], sensor: Sensor,
     """
     held = with_neutral(of.series[0].sensor, effects)
     own = [name for effect in effects for name in names_of(effect_named(effect), held.axes)
-           if not parameter_of(name).sized or name in of.names]
+           if not parameter_of(name).sized or name in of.names or limits(effect_named(effect))]
     free = [n for n in dict.fromkeys(n for names in of.free for n in names)
             if n.split('.')[0] not in effects]
     held = with_neutral(held, dict.fromkeys(n.split('.')[0] for n in free))

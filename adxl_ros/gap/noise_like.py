@@ -16,7 +16,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from adxl_ros.gap.evidence import bridged
 from adxl_ros.gap.floor import runs
@@ -216,7 +216,10 @@ def of_residual(residual_v: np.ndarray, used: np.ndarray, series: Series) -> lis
         signs.append(line)
     # Differences, so that a wandering zero-g is none of it; where it moves, what is not modelled
     # would pass for noise.
-    made = simulated_noise(series, sensor, 0)
+    humming = sensor if line is None or line.effect == 'unknown' else replace(
+        sensor, effects=(*sensor.effects, line.effect),
+        values={**sensor.values, line.effect: line.values})
+    made = simulated_noise(series, humming, 0)
     other = np.diff(np.column_stack([lfilter([1.0, -a], [1.0], r)[1:]
                                      for r, a in zip(made.T, decay)]), axis=0)
     chosen = rests if rests.sum() > _FEWEST else used[2:]
@@ -225,7 +228,7 @@ def of_residual(residual_v: np.ndarray, used: np.ndarray, series: Series) -> lis
         # Noise that the filter did not pass looks like more of it, sample by sample.
         ratio = np.minimum(ratio, np.std(data[2:][rests], axis=0) / np.std(made[2:][rests],
                                                                            axis=0))
-    if np.max(ratio) > _EXCESS and line is None:
+    if np.max(ratio) > _EXCESS and (line is None or line.effect != 'unknown'):
         signs.append(Sign('noise_excess', {'ratio': ratio - 1},
                           len(white) * float(np.log(np.max(ratio)) ** 2),
                           f'white noise is {np.max(ratio):.2f} of what is stated'))

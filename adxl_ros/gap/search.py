@@ -205,8 +205,9 @@ def _refine(of: Study, ranked: Iterable[tuple[float, tuple[int, ...], Fit]], non
 
 
 def _begin(variant: Variant) -> dict[str, float]:
-    """Return where a limit begins, as a departure from its typical value."""
-    return {name: value - parameter_of(name).scale for name, value in variant.begin.items()}
+    """Return where a limit begins, as departures from what they are held against."""
+    return {name: value - (0.0 if parameter_of(name).sized else parameter_of(name).scale)
+            for name, value in variant.begin.items()}
 
 
 def _resimulated(of: Study, effects: Sequence[str], start: dict[str, float],

@@ -107,18 +107,23 @@ def _limited(series: Series, effect: Effect, limit: Parameter, base: np.ndarray
     """Try a limit where it clips a small part of the samples, and more: one, or by axis."""
     axes = series.sensor.axes
     held = with_neutral(series.sensor, [effect.name])
+    names = names_of(replace(effect, parameters=(limit,)), axes)
+    # What else it has is no size until it clips.
+    beside = {name: p.scale for p in effect.parameters if p.sized
+              for name in names_of(replace(effect, parameters=(p,)), axes)}
     g = np.abs(base - series.sensor.zero_g_v) / series.sensor.scale_v_per_g
     levels = [level for part in _CLIPPED for level in (
         np.quantile(g, 1 - part, axis=0), np.full(len(axes), np.quantile(g, 1 - part)))]
     for number, level in enumerate(levels):
         values = np.clip(level, limit.lower, limit.upper)
-        does = series.simulated(put(held, names := names_of(effect, axes), values)) - base
+        does = series.simulated(put(held, names, values)) - base
         seen = [d for d in range(len(axes)) if np.any(np.abs(does[:, d]) > 1e-9)]
         if seen:
             yield Variant(effect.name, {}, float(number), tuple(names[d] for d in seen), np.ones(
                 len(seen)), tuple((np.array([seen.index(d)] if d in seen else [], int),
                                    does[:, [d]] if d in seen else np.zeros((len(base), 0)))
-                                  for d in range(len(axes))), dict(zip(names, values)))
+                                  for d in range(len(axes))),
+                          dict(zip(names, values)) | beside)
 
 
 def shapes(effect: Effect) -> list[dict[str, float]]:

@@ -19,9 +19,19 @@ import numpy as np
 
 
 def apply(signals: Signals, p: Parameters) -> None:
-    """Clip the output of each axis at plus and minus its limit, g."""
+    """
+    Clip the output of each axis at plus and minus its limit, g.
+
+    With a knee of w the clip is soft: x − w·ln(1 + exp((x − limit)/w)), and so on the other side.
+    """
+    knee_g = float(p['knee_g'])
     for d, limit in enumerate(p['limit_g']):
-        signals.output[d] = np.clip(signals.output[d], -limit, limit)
+        x = signals.output[d]
+        if not knee_g:
+            signals.output[d] = np.clip(x, -limit, limit)
+        else:
+            beyond = [np.logaddexp(0.0, (sign * x - limit) / knee_g) for sign in (1, -1)]
+            signals.output[d] = x - knee_g * (beyond[0] - beyond[1])
 
 
 EFFECT = Effect(
@@ -31,6 +41,8 @@ EFFECT = Effect(
         Parameter('limit_g', 'g', 0.1, 1000.0, 1.0,
                   'ADXL203 datasheet: range 1.7 g at least; lower with a low supply',
                   'largest output of either sign; 1000 is none', neutral=1000.0),
+        Parameter('knee_g', 'g', 0.0, 0.5, 0.02, 'physics: an amplifier near its rail',
+                  'how soft the clip is; 0 is hard', '', typical=0.0),
     ),
     apply=apply,
     smooth=False,
