@@ -140,6 +140,17 @@ def test_kinds_of_drift_are_told_apart(option, effect):
     assert named(diagnosed(unit(), option)[1]) == {effect}
 
 
+def test_a_soft_clip_is_saturation():
+    """A hyperbolic tangent's knee, in y alone."""
+    def change(columns):
+        g = columns['y_v'] - 2.5
+        return columns | {'y_v': 2.5 + np.where(
+            np.abs(g) < 0.85, g, np.sign(g) * (0.85 + 0.1 * np.tanh((np.abs(g) - 0.85) / 0.1)))}
+
+    told, _ = diagnosed(unit(), change=change)
+    assert (told['verdict']['status'], told['verdict']['effects']) == ('explained', ['saturation'])
+
+
 def test_what_shows_only_while_it_turns_is_no_drift():
     """A ripple of the gears, 40 periods a turn."""
     def change(columns):
