@@ -120,7 +120,8 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
             signs.append(coarse)
             bits = round(sensor.adc_bits - float(coarse.values['lost_bits']))
             one, thin = (replace(s, sensor=replace(s.sensor, adc_bits=bits)) for s in (one, thin))
-        good, of_samples = noise_like.bad_samples(one.volts, one.time_s, one.sensor)
+        good, of_samples = noise_like.bad_samples(one.volts, one.time_s, one.sensor,
+                                                  coarse is not None)
         full.append(one)
         series.append(thin)
         counted.append(good)

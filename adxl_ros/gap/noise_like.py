@@ -16,7 +16,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from adxl_ros.gap.evidence import bridged
 from adxl_ros.gap.floor import runs
@@ -65,7 +65,7 @@ class Sign:
     words: str
 
 
-def bad_samples(volts: np.ndarray, time_s: np.ndarray, sensor: Sensor
+def bad_samples(volts: np.ndarray, time_s: np.ndarray, sensor: Sensor, coarse: bool = False
                 ) -> tuple[np.ndarray, list[Sign]]:
     """
     Find samples that say nothing: stuck, spikes, missing.
@@ -76,6 +76,8 @@ def bad_samples(volts: np.ndarray, time_s: np.ndarray, sensor: Sensor
         As recorded, (n, m) and (n,).
     sensor
         The baseline.
+    coarse
+        Whether the steps of the ADC are so large that samples repeat by them.
 
     Returns
     -------
@@ -85,7 +87,7 @@ def bad_samples(volts: np.ndarray, time_s: np.ndarray, sensor: Sensor
     """
     finite = np.isfinite(volts).all(axis=1)
     good, signs = finite.copy(), []
-    stuck = _stuck(volts, sensor) & finite
+    stuck = _stuck(volts, sensor) & finite & (not coarse)
     if stuck.any():
         begins = runs(stuck)
         span = float(time_s[-1] - time_s[0])
@@ -216,10 +218,7 @@ def of_residual(residual_v: np.ndarray, used: np.ndarray, series: Series) -> lis
         signs.append(line)
     # Differences, so that a wandering zero-g is none of it; where it moves, what is not modelled
     # would pass for noise.
-    humming = sensor if line is None or line.effect == 'unknown' else replace(
-        sensor, effects=(*sensor.effects, line.effect),
-        values={**sensor.values, line.effect: line.values})
-    made = simulated_noise(series, humming, 0)
+    made = simulated_noise(series, sensor, 0)
     other = np.diff(np.column_stack([lfilter([1.0, -a], [1.0], r)[1:]
                                      for r, a in zip(made.T, decay)]), axis=0)
     chosen = rests if rests.sum() > _FEWEST else used[2:]
@@ -228,7 +227,7 @@ def of_residual(residual_v: np.ndarray, used: np.ndarray, series: Series) -> lis
         # Noise that the filter did not pass looks like more of it, sample by sample.
         ratio = np.minimum(ratio, np.std(data[2:][rests], axis=0) / np.std(made[2:][rests],
                                                                            axis=0))
-    if np.max(ratio) > _EXCESS and (line is None or line.effect != 'unknown'):
+    if np.max(ratio) > _EXCESS and line is None:
         signs.append(Sign('noise_excess', {'ratio': ratio - 1},
                           len(white) * float(np.log(np.max(ratio)) ** 2),
                           f'white noise is {np.max(ratio):.2f} of what is stated'))

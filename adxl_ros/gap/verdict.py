@@ -47,6 +47,9 @@ EXACT = ('bias', 'scale_factor', 'gravity', 'misalignment', 'stage_offset', 'bas
          'lever_arm', 'time_offset', 'clock_skew')
 """Effects whose form, geometry or a clock, is beyond doubt: they leave nothing that looks like
 another."""
+DRIFTING = 0.1
+"""Nor is a drift beside other effects that makes less of them than this: what is left of a form
+that is not quite the sensor's comes and goes like a drift."""
 TAKEN = 0.006
 """Nor is an effect more that takes less off the squares of the gap than this."""
 RIVAL = 0.05
@@ -151,7 +154,8 @@ def worthy(of: Study, found: Sequence[Hypothesis], noise_mps2: float) -> list[Hy
             taken = part * part
             if without is not None and effect not in (*DRIFTS, *TOLERANCE):
                 taken = without - here
-            if part < least or part * part < SHARE * whole or taken < least ** 2 \
+            share = DRIFTING if effect in DRIFTS else SHARE
+            if part < least or part * part < share * whole or taken < least ** 2 \
                     or taken < TAKEN * closes:
                 break
         else:
