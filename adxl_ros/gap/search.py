@@ -58,7 +58,7 @@ def search(of: Study, show: Callable[[float], None]) -> list[Hypothesis]:
     """
     found: dict[tuple[str, ...], Hypothesis] = {(): refined(of, (), {}, {})}
     none = on_tangents(of, [])
-    singles = _ranked(of, [(i,) for i in range(len(of.variants))], none)
+    singles = _ranked(of, [(i,) for i in _told(of)], none)
     _refine(of, singles[:_REFINED], none, found)
     show(0.3)
     best = _best(found)
@@ -77,6 +77,12 @@ def search(of: Study, show: Callable[[float], None]) -> list[Hypothesis]:
         _wandering(of, found)
     show(1.0)
     return sorted(found.values(), key=lambda h: -h.log_evidence)
+
+
+def _told(of: Study) -> list[int]:
+    """Number the variants that these recordings can tell: no zero-g where the pose is not known."""
+    rests = any(one.reference == 'rest' for one in of.series)
+    return [i for i, v in enumerate(of.variants) if not rests or v.effect not in STRAIGHT]
 
 
 def _best(found: dict[tuple[str, ...], Hypothesis]) -> Hypothesis:
@@ -107,7 +113,7 @@ def _wandering(of: Study, found: dict[tuple[str, ...], Hypothesis]) -> None:
         drifting = on_tangents(of, [], None, (drift,))
         alone = refined(of, (drift,), {}, {})
         found[alone.effects] = alone
-        beside = _ranked(of, [(i,) for i in range(len(of.variants))], drifting, (drift,))
+        beside = _ranked(of, [(i,) for i in _told(of)], drifting, (drift,))
         _refine(of, beside[:_REFINED // 2], drifting, found, (drift,))
     for h in list(found.values()):
         if drifts_among(h.effects) and h.uneven > _UNEVEN:
@@ -136,8 +142,8 @@ def _forward(of: Study, best: Hypothesis, found: dict[tuple[str, ...], Hypothesi
     wanders = drifts_among(best.effects)
     alone = on_tangents(there, own, None, wanders)
     gains = []
-    for i, more in enumerate(there.variants):
-        if more.effect in best.effects:
+    for i in _told(there):
+        if there.variants[i].effect in best.effects:
             continue
         fit = on_tangents(there, [*own, i], alone, wanders)
         gains.append((fit.log_evidence - alone.log_evidence, i, fit))

@@ -152,5 +152,5 @@ def _factor(spectrum: np.ndarray, order: int) -> np.ndarray:
     trimmed = np.trim_zeros(np.where(np.abs(spectrum) > 1e-14 * spectrum.max(), spectrum, 0.0))
     roots = np.roots(trimmed)
     inside = roots[np.argsort(np.abs(roots))[:len(roots) // 2]]
-    found = np.real(np.poly(inside))
+    found = np.atleast_1d(np.real(np.poly(inside)))
     return np.pad(found, (0, order + 1 - len(found)))
