@@ -80,7 +80,7 @@ def search(of: Study, show: Callable[[float], None]) -> list[Hypothesis]:
 
 
 def _told(of: Study) -> list[int]:
-    """Number the variants that these recordings can tell: no zero-g where the pose is not known."""
+    """Return numbers of variants that can be told: no zero-g where the pose is not known."""
     rests = any(one.reference == 'rest' for one in of.series)
     return [i for i, v in enumerate(of.variants) if not rests or v.effect not in STRAIGHT]
 
