@@ -80,7 +80,9 @@ class Terminal:
     def wait_for(self, *texts, timeout_s=30.0):
         """Wait until the screen shows all of some texts, and return it."""
         end = time.monotonic() + timeout_s
-        while not all(text in (shown := self.text()) for text in texts):
+        # Lines are folded where the terminal ends.
+        plain = [' '.join(text.split()) for text in texts]
+        while not all(text in ' '.join((shown := self.text()).split()) for text in plain):
             if time.monotonic() > end:
                 pytest.fail(f'no {texts} on the screen after {timeout_s} s:\n{shown}')
             time.sleep(0.05)

@@ -225,7 +225,7 @@ def test_where_it_cannot_write(run_tool: RunTool, tmp_path: Path) -> None:
 @pytest.mark.parametrize(('number', 'status'), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_interrupted_it_leaves_nothing(tmp_path: Path, number: int, status: int) -> None:
     sensor = unit()
-    path = record(tmp_path, sensor, felt(sensor, *np.full((2, 200000), 0.5)))
+    path = record(tmp_path, sensor, felt(sensor, *np.full((2, 500000), 0.5)))
     process = subprocess.Popen(
         [executable('apply'), path, '--params', tmp_path / 'unit.yaml', '-o',
          tmp_path / 'out.csv'], stderr=subprocess.PIPE, text=True)

@@ -142,12 +142,14 @@ def test_kinds_of_drift_are_told_apart(option, effect):
 
 def test_a_soft_clip_is_saturation():
     """A hyperbolic tangent's knee, in y alone."""
-    def change(columns):
-        g = columns['y_v'] - 2.5
-        return columns | {'y_v': 2.5 + np.where(
-            np.abs(g) < 0.85, g, np.sign(g) * (0.85 + 0.1 * np.tanh((np.abs(g) - 0.85) / 0.1)))}
+    sensor = unit()
 
-    told, _ = diagnosed(unit(), change=change)
+    def change(columns):
+        g = columns['y_v'] - sensor.zero_g_v[1]
+        return columns | {'y_v': sensor.zero_g_v[1] + np.where(
+            np.abs(g) < 0.9, g, np.sign(g) * (0.9 + 0.1 * np.tanh((np.abs(g) - 0.9) / 0.1)))}
+
+    told, _ = diagnosed(sensor, change=change)
     assert (told['verdict']['status'], told['verdict']['effects']) == ('explained', ['saturation'])
 
 

@@ -183,8 +183,8 @@ def local(of: Study, effects: Sequence[str], sensor: Sensor,
                 tried if noise is None else near(tried, noise[len(channels)])))
             count += more.shape[1]
     looks = straight(lines, does, 1)
-    prior += [float(np.hypot(of.tolerance(n, drifts_among(effects)),
-                              looks[i][0] if i in looks else 0.0))
+    drifts = drifts_among(effects)
+    prior += [float(np.hypot(of.tolerance(n, drifts), looks[i][0] if i in looks else 0.0))
               for i, n in enumerate(free, len(own))]
     return Local(tuple(effects), sensor, tuple(names), np.concatenate([middle, get(held, free)]),
                  np.array(prior), values, channels)
