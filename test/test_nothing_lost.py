@@ -55,13 +55,19 @@ def _on_disk(tmp_path):
     return journal.accepted_poses(journal.read(tmp_path / 'unit.yaml.journal')[1])
 
 
+def _begun(graph, start, tmp_path, poses):
+    """Begin a sweep, and return driver and calibration after some poses."""
+    driver = _driver(start, tmp_path)
+    _stage(start, tmp_path)
+    node = _calibration(start, tmp_path)
+    graph.spin_until(lambda: _accepted(graph) >= poses, 60, f'{poses} poses')
+    return driver, node
+
+
 def test_a_full_disk_is_said_and_waited_for(start, tmp_path):
     """What the disk does not take is not acknowledged; with room again the sweep goes on."""
     with Graph() as graph:
-        _driver(start, tmp_path)
-        _stage(start, tmp_path)
-        node = _calibration(start, tmp_path)
-        graph.spin_until(lambda: _accepted(graph) >= 2, 60, 'two poses')
+        _, node = _begun(graph, start, tmp_path, 2)
         size = (tmp_path / 'unit.yaml.journal').stat().st_size
         # Files cannot grow: what a full disk does to the journal, without being root.
         unlimited = resource.prlimit(node.popen.pid, resource.RLIMIT_FSIZE)
@@ -79,10 +85,7 @@ def test_a_full_disk_is_said_and_waited_for(start, tmp_path):
 def test_a_driver_that_is_started_anew_is_followed_and_another_unit_is_not(start, tmp_path):
     """The clock of a new driver may be behind; the pose at hand begins anew, the rest stays."""
     with Graph() as graph:
-        driver = _driver(start, tmp_path)
-        _stage(start, tmp_path)
-        node = _calibration(start, tmp_path)
-        graph.spin_until(lambda: _accepted(graph) >= 2, 60, 'two poses')
+        driver, node = _begun(graph, start, tmp_path, 2)
         driver.stop()
         before = _on_disk(tmp_path)
         graph.spin_until(lambda: graph.said('calibration', 'nothing on /imu/data_raw'), 20, 'why')
@@ -99,10 +102,7 @@ def test_a_driver_that_is_started_anew_is_followed_and_another_unit_is_not(start
 def test_a_new_start_resumes_or_says_what_changed_or_begins_anew(start, tmp_path):
     """Without a terminal: it goes on by itself, refuses other settings, and obeys resume:=anew."""
     with Graph() as graph:
-        _driver(start, tmp_path)
-        _stage(start, tmp_path)
-        first = _calibration(start, tmp_path)
-        graph.spin_until(lambda: _accepted(graph) >= 3, 60, 'three poses')
+        _, first = _begun(graph, start, tmp_path, 3)
         os.kill(first.popen.pid, 9)
         first.wait()
         poses = _on_disk(tmp_path)

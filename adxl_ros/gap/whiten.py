@@ -106,20 +106,25 @@ def whiteners(series: Series, d: int) -> list[Whitener]:
         corner_hz = (density * scale) ** 2 / white_v2_per_hz
         top_hz = min(corner_hz, 0.25 / dt_s)
         decades = int(np.ceil(max(np.log10(top_hz * span_s), 0.0)))
-        bends_hz = top_hz * 10.0 ** -np.arange(decades)
-        zeros, poles = (np.exp(-2 * np.pi * dt_s * bends_hz * by) for by in (10 ** -0.5, 1.0))
+        zeros, poles = _in_turn(top_hz, decades, dt_s)
         out.append(_whitener(zpk2sos([a, *zeros], [-still[1], *poles], 1.0), 'flicker', density))
         if corner_hz > top_hz:
             break
     # 1/f noise that the filter did not pass is all there is where it exceeds the rest at the
     # filter's corner.
     if a:
-        bends_hz = 0.4 / dt_s * 10.0 ** -np.arange(int(np.ceil(np.log10(span_s / dt_s))))
-        zeros, poles = (np.exp(-2 * np.pi * dt_s * bends_hz * by) for by in (10 ** -0.5, 1.0))
+        zeros, poles = _in_turn(0.4 / dt_s, int(np.ceil(np.log10(span_s / dt_s))), dt_s)
         least = np.sqrt(white_v2_per_hz / (2 * np.pi * rc_s[d])) / scale
         out.append(_whitener(zpk2sos(zeros, poles, 1.0), 'flicker',
                              max(float(least), 2 * HEALTHY['flicker'])))
     return out
+
+
+def _in_turn(top_hz: float, decades: int, dt_s: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return zeros and poles, one pair a decade, that rise as the root of frequency to the top."""
+    bends_hz = top_hz * 10.0 ** -np.arange(decades)
+    return (np.exp(-2 * np.pi * dt_s * bends_hz * 10 ** -0.5),
+            np.exp(-2 * np.pi * dt_s * bends_hz))
 
 
 def _whitener(sections: np.ndarray, drift: str, density: float) -> Whitener:
