@@ -32,9 +32,15 @@ import time
 
 from ament_index_python.packages import get_package_prefix
 from domain import own_domain
+from hypothesis import settings
 import pytest
 
 REPO = Path(__file__).resolve().parents[1]
+
+# The same examples in each run; to look for new ones: make test ARGS='--hypothesis-profile search'
+settings.register_profile('same', deadline=None, derandomize=True)
+settings.register_profile('search', deadline=None, max_examples=2000)
+settings.load_profile('same')
 
 
 def pytest_configure(config: pytest.Config) -> None:

@@ -25,7 +25,7 @@ from adxl_ros.model.sensor import Sensor, with_axes
 from adxl_ros.model.stage import specific_force
 from adxl_ros.model.tilt import angles, roll_pitch_covariance, tilt
 from adxl_ros.model.uncertainty import force_covariance, parameter_tangent
-from hypothesis import given, settings, strategies as st
+from hypothesis import given, strategies as st
 import numpy as np
 import pytest
 from units import nominal
@@ -68,7 +68,20 @@ def direction(draw: st.DrawFn) -> np.ndarray:
     return vector / np.linalg.norm(vector)
 
 
-@settings(deadline=None)
+def bits_off_v(sensor: Sensor) -> float:
+    """Return by how much the wrong weights of bits can move volts, V."""
+    return float(sum(abs(value) for name, value in sensor.values['adc_inl'].items()
+                     if name.endswith('bit_v')))
+
+
+def at_a_step(sensor: Sensor, force: np.ndarray) -> bool:
+    """Tell whether the ADC's input is so near a step that another input may give its volts."""
+    input_v = np.array(chain.static_response(sensor, False)([float(f) for f in force]))
+    step_v = sensor.adc_vref_v / 64
+    off_v = np.abs(input_v - np.rint(input_v / step_v) * step_v)
+    return bool((off_v <= 2 * bits_off_v(sensor)).any())
+
+
 @given(st.data(), st.sampled_from(AXES))
 def test_inverse_undoes_the_chain(data: st.DataObject, axes: str) -> None:
     sensor = data.draw(sensors(axes))
@@ -82,12 +95,12 @@ def test_inverse_undoes_the_chain(data: st.DataObject, axes: str) -> None:
         force *= G / np.linalg.norm(force)
     volts = chain.static_response(sensor)([float(f) for f in force])
     found = chain.inverse(sensor)(volts)
-    np.testing.assert_allclose(found, force, rtol=0, atol=1e-9)
+    apart_mps2 = 4 * bits_off_v(sensor) * G if at_a_step(sensor, force) else 0.0
+    np.testing.assert_allclose(found, force, rtol=0, atol=1e-9 + apart_mps2)
     many = chain.inverse(sensor)([np.full(3, v) for v in volts])
     np.testing.assert_array_equal(np.array(many), np.array(found)[:, None] * np.ones(3))
 
 
-@settings(deadline=None)
 @given(st.data(), st.floats(-1, 1), st.floats(-np.pi, np.pi), st.floats(-3, 3))
 def test_inverse_holds_at_the_vertical(data: st.DataObject, tilted: float, beta: float,
                                        sigmas: float) -> None:
@@ -98,7 +111,9 @@ def test_inverse_holds_at_the_vertical(data: st.DataObject, tilted: float, beta:
     volts = [v + sigmas * 1e-3 for v in volts]
     force = chain.inverse(sensor)(volts)
     assert np.isfinite(force).all()
-    np.testing.assert_allclose(chain.static_response(sensor)(force), volts, rtol=0, atol=1e-6)
+    # Between two codes whose bits are off lies a gap that no force reaches.
+    np.testing.assert_allclose(chain.static_response(sensor)(force), volts, rtol=0,
+                               atol=1e-6 + (bits_off_v(sensor) if sigmas else 0))
     # |f| is g; where noise puts more into the plane, it is the least that the volts allow.
     assert np.linalg.norm(force) > G - 1e-5
 

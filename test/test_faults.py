@@ -84,7 +84,8 @@ def test_every_fault_of_a_board_is_counted_exactly(start, tmp_path):
         reset = by_name['reset, away for 0.5 s']
         book, recovered_ms = run(reset, rig, driver.popen.pid, 1.0)
         assert book.wrong == 0
-        assert book.said == book.estimated == pytest.approx(book.missing, abs=3)
+        # A board that was reset has lost its count: the host's time tells, to the delay of a read.
+        assert book.said == book.estimated == pytest.approx(book.missing, rel=0.02)
         assert 450 < book.missing < 700
         assert recovered_ms < 1000
         assert rig.said('resets') == 1

@@ -78,7 +78,7 @@ def parameters(fit):
                      for effect, parameter, axis in (name.split('.') for name in NAMES)])
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(strategies.integers(0, 2**32 - 1))
 def test_exact_without_noise(seed):
     """The chain's own response is inverted, for any unit, scale and gravity."""

@@ -208,7 +208,7 @@ def test_the_devices_own_losses_are_counted_over_the_wrap():
     assert count.overruns == 10 + 10
 
 
-@settings(deadline=None, max_examples=200)
+@settings(max_examples=200)
 @given(st.lists(st.integers(0, 60), max_size=60))
 def test_no_frame_is_taken_twice_and_none_backwards(order):
     _, found = judged(*(data(10 * k) for k in order), arrived_us=lambda f: 0)

@@ -124,7 +124,7 @@ def damaged(rng, time_s, samples):
     return time_s, samples
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(strategies.integers(0, 2**32 - 1), strategies.integers(1, 3),
        strategies.sampled_from([1.0, 20.0, 100.0, 400.0]), strategies.booleans(),
        strategies.booleans())

@@ -116,7 +116,7 @@ def test_a_stream_without_an_end_is_skipped_and_not_kept():
     assert cut(FRAME[5:]) == [FRAME[:-1]]
 
 
-@settings(deadline=None, max_examples=300)
+@settings(max_examples=300)
 @given(st.binary(max_size=400))
 def test_any_bytes_are_a_frame_or_an_error(raw):
     try:
@@ -126,7 +126,7 @@ def test_any_bytes_are_a_frame_or_an_error(raw):
     assert isinstance(found, Info | Data)
 
 
-@settings(deadline=None, max_examples=200)
+@settings(max_examples=200)
 @given(st.lists(st.one_of(st.binary(max_size=50), st.just(FRAME)), max_size=20),
        st.integers(1, 30))
 def test_how_a_stream_is_cut_into_chunks_changes_nothing(parts, size):
@@ -137,7 +137,7 @@ def test_how_a_stream_is_cut_into_chunks_changes_nothing(parts, size):
     assert pieces == whole
 
 
-@settings(deadline=None, max_examples=200)
+@settings(max_examples=200)
 @given(st.integers(1, 12), st.integers(1, 8), st.integers(0, 2 ** 53), st.integers(0, 2 ** 40),
        st.randoms(use_true_random=False))
 def test_every_frame_comes_back_as_it_was(count, channels, time_us, index, random):

@@ -34,14 +34,22 @@ _TOLERANCE_MPS2 = 1e-10
 _LOST_MPS2 = 1e-6
 """Rounding moves the z of equation 5 by up to this near alpha = ±90°, where it is a root of 0."""
 _MOST_ITERATIONS = 60
+_SETTLED_V = 1e-13
 
 
-def static_response(sensor: Sensor) -> Callable[..., Components]:
+def static_response(sensor: Sensor, converted_by_adc: bool = True) -> Callable[..., Components]:
     """
     Prepare the chain from specific force to volts at rest: its invertible effects.
 
     Filter, noise, the steps of the ADC, the stage, and effects with a memory are left to
     `response`.
+
+    Parameters
+    ----------
+    sensor
+        The figures and effects.
+    converted_by_adc
+        With the effects of the ADC, or volts at its input.
 
     Returns
     -------
@@ -52,12 +60,13 @@ def static_response(sensor: Sensor) -> Callable[..., Components]:
 
     """
     run = {place: applied(sensor, place, True) for place in Place}
+    convert = _adc(sensor) if converted_by_adc else None
     zero_g_v = sensor.nominal_zero_g_v.tolist()
     scale_v_per_g = sensor.nominal_scale_v_per_g.tolist()
 
     def respond(force: Components, environment: Environment = NOMINAL) -> Components:
         signals = Signals(environment, sensed=[f / G0_MPS2 for f in force],
-                          nominal_scale_v_per_g=scale_v_per_g, vref_v=sensor.adc_vref_v)
+                          nominal_scale_v_per_g=scale_v_per_g)
         for apply, values in run[Place.MOUNTING]:
             apply(signals, values)
         signals.output = list(signals.sensed)
@@ -67,14 +76,51 @@ def static_response(sensor: Sensor) -> Callable[..., Components]:
         for apply, values in run[Place.ELECTRONICS]:
             apply(signals, values)
         volts = converted(signals)
-        if run[Place.ADC]:
-            signals.input_v, signals.volts = volts, list(volts)
-            for apply, values in run[Place.ADC]:
-                apply(signals, values)
-            volts = signals.volts
-        return volts
+        return convert(volts) if convert else volts
 
     return respond
+
+
+def _adc(sensor: Sensor) -> Callable[[Components], Components] | None:
+    """Prepare the ADC's effects at rest, volts at its input to volts; None without any."""
+    effects = applied(sensor, Place.ADC, True)
+    if not effects:
+        return None
+
+    def convert(volts: Components) -> Components:
+        signals = Signals(NOMINAL, input_v=volts, volts=list(volts), vref_v=sensor.adc_vref_v)
+        for apply, values in effects:
+            apply(signals, values)
+        return signals.volts
+
+    return convert
+
+
+def before_adc(sensor: Sensor) -> Callable[[Components], Components]:
+    """
+    Prepare the inverse of the ADC's effects: what it gave, V by axis, to volts at its input.
+
+    By itself and before the rest of the inverse, for a bit of a wrong weight makes steps, in
+    which Newton's method has no slope: two inputs near a step give the same volts, of which one
+    is taken, or none gives them, and the middle of the gap is taken.
+    """
+    convert = _adc(sensor)
+    if convert is None:
+        return list
+
+    def undo(volts: Components) -> Components:
+        before, after = list(volts), list(volts)
+        with np.errstate(all='ignore'):
+            for _ in range(_MOST_ITERATIONS):
+                moves = [v - c for v, c in zip(volts, convert(after))]
+                # What has settled stays, so that a sample does not depend on its neighbours.
+                moves = [m * (abs(m) >= _SETTLED_V) for m in moves]
+                before, after = after, [a + m for a, m in zip(after, moves)]
+                if not any(np.any(m) for m in moves):
+                    break
+        return [(a + b) / 2 for a, b in zip(after, before)]
+
+    return undo
 
 
 def converted(signals: Signals) -> Components:
@@ -162,7 +208,7 @@ def tangent(respond: Callable[..., Components], axes: str, force: Components,
     Parameters
     ----------
     respond
-        From `static_response`.
+        From `static_response`, to the input of the ADC, whose steps have no slope.
     axes
         Measured axes.
     force
@@ -265,11 +311,12 @@ def inverse(sensor: Sensor, z_sign: np.ndarray | None = None) -> Callable[..., C
         NaN.
 
     """
-    respond, gravity = static_response(sensor), gravity_mps2(sensor)
+    respond, gravity = static_response(sensor, False), gravity_mps2(sensor)
+    undo_adc = before_adc(sensor)
     up = np.asarray(sensor.z_sign if z_sign is None else z_sign)
 
     def invert(volts: Components, environment: Environment = NOMINAL) -> Components:
-        data = np.array(volts, float).reshape(len(volts), -1)
+        data = np.array(undo_adc(list(np.array(volts, float).reshape(len(volts), -1))))
         signs = np.broadcast_to(up, data.shape[1])
         force = np.zeros((3, data.shape[1]))
         lost = np.ones(data.shape[1], bool)

@@ -121,7 +121,8 @@ class Live:
         self._zero_v = sensor.nominal_zero_g_v.tolist()
         self._volts = (sensor.nominal_scale_v_per_g / G0_MPS2).tolist()
         self._rails = (0.0, sensor.adc_vref_v - sensor.lsb_v, sensor.lsb_v / 2)
-        self._respond = chain.static_response(sensor)
+        self._respond = chain.static_response(sensor, False)
+        self._before_adc = chain.before_adc(sensor)
         self._step = chain.step(sensor.axes, chain.gravity_mps2(sensor), sensor.z_sign, FLOATS)
         self._invert = chain.inverse(sensor)
         self._variance_v2 = variance_v2
@@ -131,7 +132,7 @@ class Live:
         quiet = np.sqrt(variance_v2) / sensor.scale_v_per_g * G0_MPS2
         self._noise = (quiet[:2] ** 2).tolist()
         self._derives_z = sensor.axes == 'xy'
-        # A force, and the volts that respond to it.
+        # A force, and the volts at the ADC's input that respond to it.
         self._force: Components = [0.0, 0.0, 0.0]
         self._around = self._cells_around = chain.NOMINAL
         self._last_volts = self._respond(self._force)
@@ -212,10 +213,10 @@ class Live:
             return self._force if abs(sum(self._force)) < float('inf') else None
         at = self._cell(self._force).at
         force, moved = self._force, 0.0
-        response = self._last_volts
+        response, input_v = self._last_volts, self._before_adc(volts)
         for _ in range(_MOST_STEPS):
             before, moved_before = force, moved
-            force = self._step([v - r for v, r in zip(volts, response)], before, at)
+            force = self._step([v - r for v, r in zip(input_v, response)], before, at)
             moved = max(abs(f - b) for f, b in zip(force, before))
             # Each step is shorter than the one before by the same factor, or a smaller one.
             if moved * moved <= _TOLERANCE_MPS2 * moved_before:
@@ -225,7 +226,7 @@ class Live:
             force = self._invert(volts, self._around)
         if not abs(force[0]) + abs(force[1]) + abs(force[2]) < float('inf'):
             return None
-        self._force, self._last_volts = force, volts
+        self._force, self._last_volts = force, input_v
         return force
 
     def _at_a_rail(self, volts: Components) -> bool:
