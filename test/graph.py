@@ -19,6 +19,8 @@ import time
 
 from adxl_ros.files import cdr
 from diagnostic_msgs.msg import DiagnosticArray
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
 import numpy as np
 import pytest
 import rclpy
@@ -107,6 +109,11 @@ class Graph:
         future = client.call_async(request)
         self.spin_until(future.done, timeout_s, f'answer of {service}')
         return future.result()
+
+    def change(self, node, transition):
+        """Put a managed node into another state; return whether it went."""
+        request = ChangeState.Request(transition=Transition(id=transition))
+        return self.call(ChangeState, f'{node}/change_state', request).success
 
     def said(self, node, text):
         """Tell whether the newest diagnostics of a node hold a text."""

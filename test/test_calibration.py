@@ -6,6 +6,7 @@ from adxl_ros.files import journal, params
 from conftest import wait_until
 from diagnostic_msgs.msg import DiagnosticStatus
 from graph import Graph
+from lifecycle_msgs.msg import Transition
 import numpy as np
 import pytest
 from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -177,7 +178,12 @@ def test_a_real_sensor_through_the_live_graph(start, run_tool, tmp_path, shared_
               '-p', 'autostart:=true', '-p', 'output:=live.yaml')
         graph.spin_until(lambda: graph.said('calibration', 'waiting for sensor_info'), 30, 'up')
         start('driver', '--ros-args', *FAST, '-p', 'link.type:=replay', '-p',
-              f'link.recording:={source}', '-p', 'link.speed:=30.0')
+              f'link.recording:={source}', '-p', 'link.speed:=30.0', '-p', 'autostart:=false',
+              '-p', 'qos_overrides./imu/data_raw.publisher.depth:=20000')
+        # The two have found each other before the first sample, and stalls are bridged.
+        assert graph.change('driver', Transition.TRANSITION_CONFIGURE)
+        graph.spin_until(lambda: graph.node.count_publishers('imu/data_raw'), 30, 'a publisher')
+        assert graph.change('driver', Transition.TRANSITION_ACTIVATE)
         graph.spin_until(lambda: 'driver' in graph.diagnostics
                          and graph.value('driver', 'link_state') == 'ended', 120, 'the end')
         answer = graph.call(Trigger, 'calibration/finish', Trigger.Request())

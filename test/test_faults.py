@@ -32,7 +32,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from faults import bytes_hurt, IIO, Row, run, SERIAL
 from graph import accel, Graph, stamp_ns
 from lifecycle_msgs.msg import Transition
-from lifecycle_msgs.srv import ChangeState, GetState
+from lifecycle_msgs.srv import GetState
 import numpy as np
 import pytest
 from rig import IioRig, memory_mib, SerialRig
@@ -215,11 +215,6 @@ def test_a_full_disk_for_the_log_stops_nothing(start, ros_env, tmp_path, monkeyp
         subprocess.run(['umount', '-l', folder], check=True)
 
 
-def change(graph, transition):
-    request = ChangeState.Request(transition=Transition(id=transition))
-    return graph.call(ChangeState, 'driver/change_state', request).success
-
-
 def test_a_manager_has_the_driver_in_its_hand(start, tmp_path):
     with board_rig(tmp_path) as rig:
         graph = rig.graph
@@ -232,7 +227,7 @@ def test_a_manager_has_the_driver_in_its_hand(start, tmp_path):
                                   (Transition.TRANSITION_DEACTIVATE, 'inactive'),
                                   (Transition.TRANSITION_CLEANUP, 'unconfigured'),
                                   (Transition.TRANSITION_UNCONFIGURED_SHUTDOWN, 'finalized')):
-            assert transition is None or change(graph, transition)
+            assert transition is None or graph.change('driver', transition)
             answer = graph.call(GetState, 'driver/get_state', GetState.Request())
             assert answer.current_state.label == state
             if state == 'active':

@@ -213,9 +213,9 @@ def test_six_hundred_poses_of_three_axes_take_two_seconds():
     """With errors of the stage and the comparison of terms."""
     sensor, _, poses = swept_unit(2, 'xyz', planes_rad=np.radians(np.linspace(0, 180, 23)))
     assert len(poses) > 600
-    began = time.perf_counter()
+    began = time.process_time()
     found, _ = full_terms.fit_judged(sensor, poses)
-    assert time.perf_counter() - began < 2.0
+    assert time.process_time() - began < 2.0
     assert len(found.names) >= 20
 
 

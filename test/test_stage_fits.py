@@ -114,9 +114,9 @@ def test_physical_takes_less_than_a_second():
     """The fit with its uncertainties is quick."""
     rng = np.random.default_rng(1)
     poses = swept(rng, drawn(rng, nominal()))
-    began = time.perf_counter()
+    began = time.process_time()
     physical.fit(nominal(), poses)
-    assert time.perf_counter() - began < 1.0
+    assert time.process_time() - began < 1.0
 
 
 @pytest.mark.parametrize('planes_deg, missing', [

@@ -224,7 +224,6 @@ class Calibration(Node):
 
     def _start(self, unit: Sensor) -> None:
         self.session = session = Session(unit, self.asked, self._anew)
-        self._samples.clear()
         self._samples.heard()
         self.outcome = []
         if session.resumed:
@@ -272,7 +271,10 @@ class Calibration(Node):
 
     def _watch(self) -> None:
         """Show the live reading while no calibration runs."""
-        if self._newest is not None and self.console is not None:
+        if self.unit is None and self._wanted:
+            # A driver that has just begun says what it is on another topic.
+            self._samples.keep_newest()
+        elif self._newest is not None and self.console is not None:
             self._newest.feed(*self._samples.take(self.unit))
         else:
             self._samples.clear()

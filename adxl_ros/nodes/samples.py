@@ -58,6 +58,10 @@ class Samples:
         """Forget what has come so far."""
         self._raw.clear()
 
+    def keep_newest(self) -> None:
+        """Forget what is older than a queue's length."""
+        del self._raw[:-_QUEUE]
+
     def take(self, unit: Sensor) -> tuple[np.ndarray, np.ndarray]:
         """Return what has come since: stamps, ns, (n,), and volts, (n, m), finite ones."""
         batch = self._raw[:]
