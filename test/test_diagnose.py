@@ -30,6 +30,7 @@ from adxl_ros.model.simulate import simulate
 from adxl_ros.tools.effect_option import with_effects
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 from units import nominal
 
 KEYS = {'schema', 'verdict', 'hypotheses', 'gap', 'where', 'candidates', 'next_experiment'}
@@ -138,6 +139,22 @@ def test_the_straight_part_of_an_effect_may_be_in_the_scale_factor():
 def test_kinds_of_drift_are_told_apart(option, effect):
     """1/f noise and a random walk, by their spectra, and by no other effect."""
     assert named(diagnosed(unit(), option)[1]) == {effect}
+
+
+def test_what_drifts_more_smoothly_than_any_drift_is_unknown():
+    """A warm draught: a zero-g that comes and goes within half a minute, and not faster."""
+    def change(columns):
+        rng = np.random.default_rng(8)
+        for axis in 'xyz':
+            wander = rng.normal(size=len(columns['time_s']))
+            for _ in range(3):
+                wander = lfilter([0.002], [1, -0.998], wander)
+            columns[f'{axis}_v'] = columns[f'{axis}_v'] + 4e-3 * wander / wander.std()
+        return columns
+
+    told, _ = diagnosed(unit(), change=change)
+    assert told['verdict']['status'] == 'unknown'
+    assert 'time_s' in told['unknown_where']
 
 
 def test_a_soft_clip_is_saturation():

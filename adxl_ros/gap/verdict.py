@@ -25,6 +25,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from adxl_ros.gap.drifting import crowding
 from adxl_ros.gap.far import Shrunk
 from adxl_ros.gap.local import Hypothesis
 from adxl_ros.gap.noise_like import Sign
@@ -59,6 +60,9 @@ UNKNOWN_OF_GAP, UNKNOWN_OF_NOISE = 0.3, 0.12
 """What a flexible term must find, by the rms of the gap and of the noise, to be unknown."""
 UNKNOWN_LEFT = 0.2
 """What must be left above the floor, by what is explained: less is another form of the same."""
+CROWDED_NATS = 30.0
+"""Gain of octaves with more or less than their share that shows a walk to be none: no sensor walks
+quite as the model."""
 LEFT_OF_GAP, LEFT_OF_NOISE = 0.7, 0.5
 """What is left above the floor, by what is explained and by the noise, to be unknown."""
 _TEMPER = 0.5
@@ -232,6 +236,9 @@ def judge(of: Study, found: Sequence[Hypothesis], discrepancy: Discrepancy | Non
         unknown = 0.9
         places = tuple(sorted((k for k, g in discrepancy.where.items() if g > UNKNOWN_NATS),
                               key=lambda k: -discrepancy.where[k]))
+    if drifts and crowding(of, best) > CROWDED_NATS:
+        unknown = 0.9
+        places = tuple(dict.fromkeys((*places, 'time_s')))
     # Nothing is left of a drift but what it is known by.
     if not drifts and left_mps2 > max(LEFT_OF_NOISE * noise_mps2, LEFT_OF_GAP * gap_mps2):
         unknown = 0.9
