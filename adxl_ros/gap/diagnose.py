@@ -156,7 +156,7 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
     explained = float(np.sqrt(max(far.before_mps2 ** 2 - far.within_mps2 ** 2, 0.0)))
     as_noise = float(np.sqrt(np.mean([one.sigma_mps2 ** 2 for one in alike[1]])))
     answer = verdict.judge(weighed, found, beside, signs, noise_mps2, explained,
-                           verdict.left(far, as_noise))
+                           verdict.left(weighed, best, far, as_noise))
     answer = _insufficient(answer, series)
     show(0.9)
     cells = map_of(series[0], series[0].residual(series[0].sensor), used[0], base.rms_mps2, seed)

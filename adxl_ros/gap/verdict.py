@@ -29,6 +29,7 @@ from adxl_ros.gap.drifting import crowding
 from adxl_ros.gap.far import Shrunk
 from adxl_ros.gap.local import Hypothesis
 from adxl_ros.gap.noise_like import Sign
+from adxl_ros.gap.series import Series
 from adxl_ros.gap.study import Study, TOLERANCE
 from adxl_ros.gap.unknown import Discrepancy, UNKNOWN_NATS
 from adxl_ros.gap.whiten import DRIFTS, drifts_among
@@ -65,6 +66,8 @@ CROWDED_NATS = 30.0
 quite as the model."""
 LEFT_OF_GAP, LEFT_OF_NOISE = 0.7, 0.5
 """What is left above the floor, by what is explained and by the noise, to be unknown."""
+_WANDERS = 2.0
+"""In nine of ten recordings a random walk has less than this times its expected mean square."""
 _TEMPER = 0.5
 """Nats count half: samples of a model that is nearly right are not quite independent."""
 
@@ -118,17 +121,21 @@ def contribution_mps2(of: Study, found: Hypothesis, effect: str) -> float:
 
 
 def _wandered_mps2(of: Study, found: Hypothesis, drift: str) -> float:
+    """Return the rms about its mean of a drift over the recordings, m/s²."""
+    density = np.sqrt(np.mean(next(iter(found.sensor.values[drift].values())) ** 2))
+    return float(np.sqrt(np.mean([_wander_mps2(one, drift, density) ** 2 for one in of.series])))
+
+
+def _wander_mps2(series: Series, drift: str, density: float) -> float:
     """
-    Return the rms about its mean of a drift over the recordings, m/s².
+    Return the expected rms about its mean of a drift over a recording, m/s².
 
     Of a random walk w·√(T/6); of 1/f noise its density by the root of ln of T by its highest
     frequency.
     """
-    density = np.sqrt(np.mean(next(iter(found.sensor.values[drift].values())) ** 2))
-    span_s = np.mean([one.time_s[-1] - one.time_s[0] for one in of.series])
-    highest_hz = of.series[0].sensor.rate_hz / 2
-    return float(G0_MPS2 * density * (np.sqrt(span_s / 6) if drift == 'bias_walk'
-                                      else np.sqrt(np.log(highest_hz * span_s))))
+    span_s = series.time_s[-1] - series.time_s[0]
+    return float(G0_MPS2 * density * (np.sqrt(span_s / 6) if drift == 'bias_walk' else np.sqrt(
+        np.log(series.sensor.rate_hz / 2 * span_s))))
 
 
 def _baseline(of: Study, effect: str, library: Effect) -> dict[str, np.ndarray]:
@@ -186,19 +193,28 @@ def _squares_mps2(of: Study, found: Hypothesis) -> float:
     return squares / max(count, 1)
 
 
-def left(far: Shrunk, noise_mps2: float) -> float:
+def left(of: Study, best: Hypothesis, far: Shrunk, noise_mps2: float) -> float:
     """
-    Return the rms of what is left above the floor, m/s².
+    Return the rms of what is left above the floor and the wandering of a healthy zero-g, m/s².
 
     Parameters
     ----------
+    of
+        The recordings.
+    best
+        The most probable hypothesis, whose noise may wander.
     far
-        About the fit.
+        About its fit.
     noise_mps2
         Rms of the noise that was found, lines, spikes and steps included.
 
     """
-    return float(np.sqrt(max(far.within_mps2 ** 2 - max(far.floor_mps2, noise_mps2) ** 2, 0.0)))
+    filters = [tried[walk] for tried, walk in zip(of.filters, best.fit.walks)]
+    series = [one for one in of.series for _ in one.sensor.axes]
+    wandered = float(np.mean([_wander_mps2(one, f.drift, f.density) ** 2
+                              for one, f in zip(series, filters)]))
+    floor = max(far.floor_mps2, noise_mps2) ** 2 + _WANDERS * wandered
+    return float(np.sqrt(max(far.within_mps2 ** 2 - floor, 0.0)))
 
 
 def judge(of: Study, found: Sequence[Hypothesis], discrepancy: Discrepancy | None,
