@@ -29,9 +29,9 @@ import pytest
 
 
 class Terminal:
-    """A program in a terminal of its own, which it controls."""
+    """A program in a terminal of its own, which controls it unless told otherwise."""
 
-    def __init__(self, command, env, cwd, lines=40, columns=110):
+    def __init__(self, command, env, cwd, lines=40, columns=110, controls=True):
         self.screen = pyte.Screen(columns, lines)
         self._stream = pyte.ByteStream(self.screen)
         self._lock = threading.Lock()
@@ -44,7 +44,7 @@ class Terminal:
         self.popen = subprocess.Popen(
             command, env={**env, 'TERM': 'xterm-256color'}, cwd=cwd, stdin=slave, stdout=slave,
             stderr=slave, start_new_session=True,
-            preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0))
+            preexec_fn=(lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0)) if controls else None)
         self._thread = threading.Thread(target=self._read, daemon=True)
         self._thread.start()
 

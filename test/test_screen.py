@@ -170,6 +170,15 @@ def test_the_terminal_is_given_back(terminal, how):
                          'the terminal as it was')
 
 
+def test_a_terminal_of_another_process_has_a_screen_too(terminal):
+    """As in a container or below an IDE: a terminal that does not control the node."""
+    seen = terminal(controls=False)
+    seen.wait_for('press b to begin', 'q  quit')
+    seen.press('q')
+    assert seen.popen.wait(20) == 0
+    assert seen.restored()
+
+
 def test_what_changed_is_said_and_asked_about(start, terminal, tmp_path):
     """An interrupted calibration of other settings: what differs, and anew only if told."""
     old = journal.Journal(tmp_path / 'unit.yaml.journal', {'mode': 'stage', 'serial': 'T0'})

@@ -41,13 +41,21 @@ def open_terminal() -> tuple[Terminal | None, str]:
     if not all(stream and stream.isatty() for stream in (sys.stdin, sys.stdout)) \
             or os.environ.get('TERM') == 'dumb':
         return None, ''
-    if os.tcgetpgrp(sys.stdin.fileno()) != os.getpgrp():
+    if _in_background():
         return None, ''
     try:
         import rich  # noqa: F401
     except ImportError:
         return None, 'no screen, plain lines: it needs rich; pip install rich'
     return Terminal(), ''
+
+
+def _in_background() -> bool:
+    try:
+        return os.tcgetpgrp(sys.stdin.fileno()) != os.getpgrp()
+    except OSError:
+        # A terminal that does not control this process has no background.
+        return False
 
 
 class Terminal:
