@@ -19,6 +19,7 @@ from pathlib import Path
 import signal
 
 from adxl_ros.files import journal, params
+from adxl_ros.screen.keys import Keys
 from conftest import executable
 from graph import Graph
 import numpy as np
@@ -53,6 +54,8 @@ def terminal(ros_env, tmp_path):
     for one in opened:
         print(one.text())
         one.close()
+OTHERS = '\x1b[A\x1b[1;5A\x1bOA\x1bOS\x1b[[A\x1b[M af\x1b[<65;10;10M\x1b[15~\x1bq'
+"""Arrow up, with Ctrl, of keypad mode; F4; F1 of a console; a mouse's wheel twice; F5; Alt-q."""
 
 
 class Hands(Graph):
@@ -96,6 +99,8 @@ def test_an_operator_is_led_through_a_sweep_by_the_screen(start, terminal, tmp_p
                               'alpha 0.00° (-45.00°)', '0 done, 22 left', 'tilt error',
                               'must be below', 'misalignment.beta_rad', '45° 0/10', 'c  capture')
         assert 'check poses 0/2' in ' '.join(shown.split())
+        # Arrows, a wheel and function keys are none of the keys; c comes after them.
+        seen.press(OTHERS)
         seen.press('c')
         seen.wait_for('alpha is 45.0° from the asked 45°')
         before = _tilt(shown)
@@ -192,6 +197,15 @@ def test_what_changed_is_said_and_asked_about(start, terminal, tmp_path):
     seen.wait_for('0 done, 22 left')
     kept, = tmp_path.glob('unit.yaml.journal.2*')
     assert journal.read(kept)[0]['serial'] == 'T0'
+
+
+@pytest.mark.parametrize('length', [1, 2, 3, 100])
+def test_what_comes_with_an_escape_is_no_key(length):
+    """However the terminal's bytes are cut, of which the letters of a mouse are any."""
+    keys, sent = Keys(), f'C{OTHERS}\xe4r{OTHERS} '.encode()
+    assert ''.join(keys.read(sent[i:i + length], i * 1e-3)
+                   for i in range(0, len(sent), length)) == 'cr '
+    assert keys.read(b'\x1b', 1.0) == '' and keys.read(b'f', 3.0) == 'f'
 
 
 def test_without_rich_there_are_plain_lines():

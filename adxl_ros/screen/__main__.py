@@ -30,10 +30,10 @@ import time
 from typing import Any
 
 from adxl_ros.screen.draw import draw
+from adxl_ros.screen.keys import Keys
 
 _FRAME_S = 0.2
 _KEPT_LINES = 1000
-_KEYS = 'abcdefghijklmnopqrstuvwxyz '
 _ESCAPES = re.compile(r'\x1b\[[0-9;]*m')
 
 
@@ -71,7 +71,7 @@ def run(talk: socket.socket, log: Log) -> None:
     signal.signal(signal.SIGWINCH, lambda *_: resized.append(True))
     figures: dict[str, Any] = {'phase': 'idle', 'text': 'starting'}
     console = Console()
-    drawn_s = 0.0
+    drawn_s, keys = 0.0, Keys()
     sources: list[Any] = [talk, log, sys.stdin]
     with Live(console=console, screen=True, auto_refresh=False) as live:
         while not ended:
@@ -83,7 +83,7 @@ def run(talk: socket.socket, log: Log) -> None:
                 if newest is None:
                     return
                 figures = newest or figures
-            if sys.stdin in ready and not _pass_keys(talk):
+            if sys.stdin in ready and not _pass_keys(talk, keys):
                 return
             if time.monotonic() - drawn_s > _FRAME_S:
                 drawn_s = time.monotonic()
@@ -109,16 +109,15 @@ def _newest(talk: socket.socket) -> dict[str, Any] | None:
     return newest
 
 
-def _pass_keys(talk: socket.socket) -> bool:
+def _pass_keys(talk: socket.socket, keys: Keys) -> bool:
     """Hand on what was pressed; return False when the terminal is gone."""
     try:
         data = os.read(sys.stdin.fileno(), 64)
     except OSError:
         return False
-    for key in data.decode(errors='ignore').lower():
-        if key in _KEYS:
-            with suppress(OSError):
-                talk.send(key.encode())
+    for key in keys.read(data, time.monotonic()):
+        with suppress(OSError):
+            talk.send(key.encode())
     return bool(data)
 
 
