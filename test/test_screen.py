@@ -16,6 +16,7 @@
 
 import os
 from pathlib import Path
+import re
 import signal
 
 from adxl_ros.files import journal, params
@@ -40,7 +41,7 @@ PLAN = ('-p', 'sweep.planes_rad:=[0.7853981633974483, 1.5707963267948966]', '-p'
 def terminal(ros_env, tmp_path):
     """Give a function that runs the calibration in a terminal; all are closed at the end."""
     opened = []
-    base = nominal(serial='T1')
+    base = nominal('xyz', serial='T1')
     params.save(tmp_path / 'truth.yaml', drawn(np.random.default_rng(3), base))
     params.save(tmp_path / 'bare.yaml', base)
 
@@ -93,7 +94,7 @@ def test_an_operator_is_led_through_a_sweep_by_the_screen(start, terminal, tmp_p
     (tmp_path / 'unit.yaml').write_text('the earlier one\n')
     with Hands() as hands:
         seen = terminal(*FAST, '-p', 'stage.mode:=encoder')
-        seen.wait_for('press b to begin', 'calibration of T1 (xy) into unit.yaml', '1000 Hz')
+        seen.wait_for('press b to begin', 'calibration of T1 (xyz) into unit.yaml', '1000 Hz')
         seen.press('b')
         shown = seen.wait_for('turn the stage to alpha 45.0°, beta 0.0°, then capture',
                               'alpha 0.00° (-45.00°)', '0 done, 22 left', 'tilt error',
@@ -127,9 +128,17 @@ def test_an_operator_is_led_through_a_sweep_by_the_screen(start, terminal, tmp_p
         seen.press('c')
         seen.wait_for('5 done')
         seen.resize(24, 80)
-        seen.wait_for('5 done', 'c  capture')
+        shown = seen.wait_for('5 done', 'c  capture')
+        # Each axis with its interval, whole.
+        assert re.search(r'(?m)^bias.* x \S+±\S+ y \S+±\S+ z \S+±\d\S*$', shown), shown
         seen.press('f')
-        seen.wait_for('wrote unit.yaml', 'held out', 'linear')
+        # The verdict first, and no line of its table is folded.
+        shown = seen.wait_for('wrote unit.yaml', 'held out: tilt')
+        assert re.search(r'(?m)^linear: datasheet (PASS|FAIL|NOT SHOWN), noise (PASS|FAIL|NOT '
+                         r'SHOWN); limited by the \w+\nheld out: tilt \S+° rms, \S+° max; accel '
+                         r'\S+ mg rms, \S+ mg max$', shown), shown
+        assert re.search(r'(?m)^linear +[\d.]+/[\d.]+( +(PASS|FAIL|NOT SHOWN)){2} +[\d.]+/[\d.]+'
+                         r'( +(PASS|FAIL|NOT SHOWN)){2}$', shown), shown
         seen.press('q')
         assert seen.popen.wait(20) == 0
         assert seen.restored()

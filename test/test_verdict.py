@@ -101,9 +101,16 @@ def test_a_linear_model_fails_and_says_why():
     outcomes = {one.model: (one.datasheet, one.noise, one.limit) for one in found.judged}
     assert outcomes['linear'] == ('FAIL', 'FAIL', 'model')
     assert outcomes['full'][:2] == ('PASS', 'PASS')
+    limit = outcomes['full'][2]
     lines = '\n'.join(found.comments())
     assert 'at most 3.4 mg by the datasheet' in lines
     assert 'unit within ADXL203' in lines
+    # What a screen shows first, in its 80 columns: the verdict, and a line a model.
+    assert found.brief[0] == f'full: datasheet PASS, noise PASS; limited by the {limit}'
+    assert found.brief[1].startswith('held out: tilt 0.')
+    models = [line for line in found.brief if line.split()[0] in outcomes]
+    assert [line.split()[2] for line in models] == ['FAIL', 'PASS', 'PASS']
+    assert max(map(len, [*found.brief[:2], *models])) < 80
 
 
 def test_a_unit_beyond_the_datasheet_is_named():
@@ -132,7 +139,11 @@ def test_pass_fail_and_not_shown(parts, outcome):
     bar = replace(nominal(), datasheet={'nonlinearity.cubic_per_g2': (
         1 / G0_MPS2 / nominal().range_g ** 3, 0.0)})
     judged = judge.judge('full', Parts(*parts), Parts(*parts), bar)
-    assert judged.datasheet == outcome
+    assert judged.datasheet == judged.worst('datasheet') == outcome
+    tilted = judge.judge('full', Parts(1.0, 0.0, 0.9, 0.1, 0.0, 0.2), replace(
+        Parts(*parts), per_axis=1.0), bar)
+    assert (tilted.datasheet, tilted.tilt_datasheet) == ('PASS', outcome)
+    assert tilted.worst('datasheet') == outcome
     assert judged.limit == ('stage' if outcome in ('PASS', 'NOT SHOWN') and len(parts) == 6
                             else 'model' if len(parts) == 6 else 'stage or model')
 

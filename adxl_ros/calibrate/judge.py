@@ -42,7 +42,9 @@ class Judged:
     accel, tilt
         What its errors are made of, (m/s²)² an axis and rad².
     datasheet, noise
-        PASS, FAIL or NOT SHOWN; empty where the parameter file has no such figure.
+        Of acceleration: PASS, FAIL or NOT SHOWN; empty where there is no such bar.
+    tilt_datasheet, tilt_noise
+        Of tilt.
     limit
         'noise', 'stage', 'model' or 'stage or model'.
 
@@ -54,6 +56,13 @@ class Judged:
     datasheet: str
     noise: str
     limit: str
+    tilt_datasheet: str = ''
+    tilt_noise: str = ''
+
+    def worst(self, bar: str) -> str:
+        """Return the worse of acceleration's and tilt's verdict against `datasheet` or `noise`."""
+        both = getattr(self, bar), getattr(self, f'tilt_{bar}')
+        return next((one for one in (FAIL, NOT_SHOWN, PASS) if one in both), '')
 
     @property
     def own_mg(self) -> float:
@@ -72,22 +81,25 @@ def judge(model: str, accel: Parts, tilt: Parts, sensor: Sensor) -> Judged:
 
     Against the datasheet: no more than the nonlinearity at full scale that the maker calls
     typical, the only error that his own calibration leaves. Against the noise: no more than that
-    of one sample, rms over the axes. An error whose 90 % interval reaches beyond the bar is not
-    shown to keep it.
+    of one sample, rms over the axes. Tilt: no more than such errors on each axis make of it. An
+    error whose 90 % interval reaches beyond the bar is not shown to keep it.
     """
-    bar = linearity_mps2(sensor)
+    bars = [bar ** 2 for bar in (linearity_mps2(sensor), own_noise_mps2(sensor))]
     limit = accel.limit
     if not accel.apart and max(accel.model, accel.fit) > max(accel.noise, accel.stage):
         limit = 'stage or model'
-    return Judged(model, accel, tilt, _against(accel, bar) if bar else '',
-                  _against(accel, own_noise_mps2(sensor)), limit)
+    datasheet, noise = (_against(accel, bar) for bar in bars)
+    tilted = [_against(tilt, bar * tilt.per_axis) for bar in bars]
+    return Judged(model, accel, tilt, datasheet, noise, limit, *tilted)
 
 
-def _against(accel: Parts, bar_mps2: float) -> str:
-    sure = accel.own if accel.apart else accel.fit
-    if sure > bar_mps2 ** 2:
+def _against(parts: Parts, bar: float) -> str:
+    if not bar > 0:
+        return ''
+    sure = parts.own if parts.apart else parts.fit
+    if sure > bar:
         return FAIL
-    return PASS if accel.own_most <= bar_mps2 ** 2 else NOT_SHOWN
+    return PASS if parts.own_most <= bar else NOT_SHOWN
 
 
 def linearity_mps2(sensor: Sensor) -> float:
@@ -143,13 +155,63 @@ def words(judged: Judged, sensor: Sensor) -> list[str]:
     else:
         lines.append(f'{judged.model}: {milli_g(accel.seen):.3f} mg are {made} in '
                      f'squares{turned}')
+    if judged.tilt_noise:
+        lines.append('tilt, by what such errors of the axes make of it: ' + ', '.join(
+            f'at most {_turned_deg(judged, bar):.2g} deg by the {name}: {said}'
+            for name, bar, said in (
+                ('datasheet', bar, judged.tilt_datasheet),
+                ('noise', own_noise_mps2(sensor), judged.tilt_noise)) if said))
     if not accel.apart:
         lines.append('no pose was visited twice: stage and model are not told apart')
-    if sensor.datasheet:
-        beyond = beyond_datasheet(sensor)
-        lines.append(f'unit within {sensor.datasheet_name or "its datasheet"}: '
-                     + (f'{FAIL}: {"; ".join(beyond)}' if beyond else PASS))
     return lines
+
+
+def _turned_deg(judged: Judged, bar_mps2: float) -> float:
+    return float(np.degrees(bar_mps2 * np.sqrt(judged.tilt.per_axis)))
+
+
+def unit_line(sensor: Sensor) -> list[str]:
+    """Say whether the unit itself is what its datasheet promises; nothing without one."""
+    if not sensor.datasheet:
+        return []
+    beyond = beyond_datasheet(sensor)
+    return [f'unit within {sensor.datasheet_name or "its datasheet"}: '
+            + (f'{FAIL}: {"; ".join(beyond)}' if beyond else PASS)]
+
+
+def headline(judged: Judged | None, scores: Sequence[Score]) -> list[str]:
+    """Say in one line how the model that was taken does, and in one what it errs by."""
+    if judged is None:
+        return ['not judged: too few poses to hold some of them out']
+    against = ', '.join(f'{bar} {worst}' for bar in ('datasheet', 'noise')
+                        if (worst := judged.worst(bar)))
+    limit = 'stage or model' if judged.limit == 'stage or model' else f'the {judged.limit}'
+    lines = [f'{judged.model}: {against}; limited by {limit}']
+    for score in scores:
+        if score.model == judged.model:
+            tilt = '' if np.isnan(score.tilt_rms_deg) else \
+                f'tilt {score.tilt_rms_deg:.2g}° rms, {score.tilt_max_deg:.2g}° max; '
+            lines.append(f'held out: {tilt}accel {score.accel_rms_mg:.2g} mg rms, '
+                         f'{score.accel_max_mg:.2g} mg max')
+    return lines
+
+
+def narrow_table(judged: Sequence[Judged], scores: Sequence[Score]) -> list[str]:
+    """Lay the models out in 79 columns, the simplest first; none without scores."""
+    of, bars = {one.model: one for one in judged}, f'{"datasheet":9} {"noise":9}'
+    lines = [f'{"held out":8} {"tilt rms/max°":>14} {bars} {"mg rms/max":>14} {bars}'.rstrip()]
+    for score in scores:
+        own = of.get(score.model)
+        tilted, accel = [(own.tilt_datasheet, own.tilt_noise), (own.datasheet, own.noise)] \
+            if own else [('', '')] * 2
+        lines.append(f'{score.model:8} {_pair(score.tilt_rms_deg, score.tilt_max_deg, *tilted)} '
+                     f'{_pair(score.accel_rms_mg, score.accel_max_mg, *accel)}'.rstrip())
+    return lines if scores else []
+
+
+def _pair(rms: float, most: float, datasheet: str, noise: str) -> str:
+    shown = '-' if np.isnan(rms) else f'{rms:.3f}/{most:.3f}'
+    return f'{shown:>14} {datasheet:9} {noise:9}'
 
 
 def gravity_line(judged: Judged, left_out_mps2: np.ndarray) -> str:
@@ -175,7 +237,10 @@ def figures(judged: Judged | None, scores: Sequence[Score]) -> dict[str, str]:
                       'held_out_accel_max_mg': score.accel_max_mg}
     return {**{key: f'{value:.4g}' for key, value in found.items() if np.isfinite(value)},
             **({'verdict_datasheet': judged.datasheet} if judged.datasheet else {}),
-            'verdict_noise': judged.noise, 'limited_by': judged.limit}
+            'verdict_noise': judged.noise,
+            **{f'verdict_tilt_{name}': said for name, said in (
+                ('datasheet', judged.tilt_datasheet), ('noise', judged.tilt_noise)) if said},
+            'limited_by': judged.limit}
 
 
 def _interval(rms: float, ends: tuple[float, float]) -> str:

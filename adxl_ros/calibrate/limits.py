@@ -34,7 +34,7 @@ What calibration itself errs by, noise and stage of the check taken out, is √(
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import sqrt
 
 from adxl_ros.calibrate.gravity import GravityFit
@@ -52,6 +52,7 @@ from scipy.stats import chi2
 _SAME_RAD = np.radians(0.5)
 """Poses whose joints agree so well are visits of the same."""
 _FEWEST_PAIRS = 6
+_SMALL_MPS2 = 1e-3 * G0_MPS2
 _CHANCE = 0.01
 KINDS = ('noise', 'stage', 'model')
 
@@ -71,6 +72,8 @@ class Parts:
         Upper end of the 90 % interval of `fit + model`.
     apart
         Whether stage and model could be told apart.
+    per_axis
+        Mean square of tilt that one of 1 (m/s²)² on each measured axis makes; of tilt alone.
 
     """
 
@@ -81,6 +84,7 @@ class Parts:
     model: float
     own_most: float
     apart: bool = True
+    per_axis: float = float('nan')
 
     @property
     def own(self) -> float:
@@ -127,7 +131,7 @@ def parts(score: Score, poses: Poses, stage: Sensor | None = None) -> tuple[Part
     # Where equation 5 has two roots, the wrong z shifts x and y: that is none of the parts.
     plain = shown if shown.any() else np.isfinite(score.errors.force_mps2).all(axis=1)
     off = (score.errors.force_mps2 - stood)[plain][:, axes]
-    of_noise, of_fit, of_stage = _covariances(score, held, promised)
+    of_noise, of_fit, of_stage, of_one = _covariances(score, held, promised)
     found = []
     scattered = _between_visits(sensor, poses.subset(~poses.check))
     for i, (after, before, weigh) in enumerate((
@@ -141,6 +145,9 @@ def parts(score: Score, poses: Poses, stage: Sensor | None = None) -> tuple[Part
         known = [weigh(covariance) for covariance in (of_noise, of_fit, of_stage)]
         found.append(_apart(after, float(np.mean(before ** 2)), known,
                             None if scattered is None else scattered[i](known[0])))
+    if shown.any() and found[1] is not _NOTHING:
+        per_axis = _across(promised, gravity, shown)(of_one) / _SMALL_MPS2 ** 2
+        found[1] = replace(found[1], per_axis=per_axis)
     return found[0], found[1]
 
 
@@ -162,8 +169,8 @@ def _apart(off: np.ndarray, seen: float, known: list[float], random: float | Non
 
 
 def _covariances(score: Score, held: Poses, promised: np.ndarray) -> list[np.ndarray]:
-    """Return those of the force by the mean's noise, the fit and the stated stage, (3, 3, k)."""
-    found = [np.zeros((3, 3, len(held))) for _ in range(3)]
+    """Return those of the force by the mean's noise, fit, stated stage and 1 mg, (3, 3, k)."""
+    found = [np.zeros((3, 3, len(held))) for _ in range(4)]
     for number, sensor in enumerate(score.fitted):
         own = score.fold == number
         force, around = list(promised[own].T), held.subset(own).environment
@@ -171,6 +178,9 @@ def _covariances(score: Score, held: Poses, promised: np.ndarray) -> list[np.nda
         both = force_covariance(sensor, force, std2, around)
         quiet = force_covariance(sensor, force, 0 * std2, around)
         found[0][:, :, own], found[1][:, :, own] = both - quiet, quiet
+        known = replace(sensor, covariance=np.zeros((0, 0)), covariance_names=())
+        found[3][:, :, own] = force_covariance(
+            known, force, (sensor.scale_v_per_g / G0_MPS2 * _SMALL_MPS2) ** 2, around)
     sensor = score.fitted[0]
     sigma2 = sensor.stage_resolution_rad ** 2 / 12 * sensor.local_gravity_mps2 ** 2
     a, b, nothing = held.alpha_rad, held.beta_rad, np.zeros(len(held))
@@ -255,7 +265,8 @@ def gravity_parts(found: GravityFit, fitted: Sensor, force: np.ndarray, kept: np
     by_fit = _along([0, 1, 2], shown)(covariance), _across(force[kept], gravity, shown)(covariance)
     return (Parts(seen, by_noise, 0.0, by_fit[0], excess, by_fit[0] + most),
             Parts(3 * seen / gravity ** 2, 2 * by_noise / gravity ** 2, 0.0, by_fit[1],
-                  2 * excess / gravity ** 2, by_fit[1] + 2 * most / gravity ** 2))
+                  2 * excess / gravity ** 2, by_fit[1] + 2 * most / gravity ** 2,
+                  per_axis=2 / gravity ** 2))
 
 
 def own_noise_mps2(sensor: Sensor) -> float:

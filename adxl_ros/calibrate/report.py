@@ -86,16 +86,19 @@ def _said(result: Result) -> str:
     beyond = beyond_datasheet(fitted)
     outcomes = {"its error against the datasheet's linearity": own.datasheet,
                 'its error against the noise': own.noise,
+                'its tilt against what those make of it': ', '.join(filter(
+                    None, (own.tilt_datasheet, own.tilt_noise))),
                 'the unit against the datasheet': (FAIL if beyond else PASS)
                 if fitted.datasheet else ''}
-    kind = 'bad' if FAIL in outcomes.values() else \
-        'open' if NOT_SHOWN in outcomes.values() else 'good'
+    said = ' '.join(outcomes.values())
+    kind = 'bad' if FAIL in said else 'open' if NOT_SHOWN in said else 'good'
     score = next((s for s in result.scores if s.model == fitted.model), None)
     lines = ['; '.join(f'{name}: {text}' for name, text in outcomes.items() if text) + '.']
     lines[0] = lines[0][0].upper() + lines[0][1:]
     if score is not None:
-        lines.append(f'On {score.poses} poses held out the {fitted.model} model errs by '
-                     f'{_with(score.tilt_rms_deg, score.intervals["tilt"])} deg of tilt and '
+        tilt = '' if np.isnan(score.tilt_rms_deg) else \
+            f'{_with(score.tilt_rms_deg, score.intervals["tilt"])} deg of tilt and '
+        lines.append(f'On {score.poses} poses held out the {fitted.model} model errs by {tilt}'
                      f'{_with(score.accel_rms_mg, score.intervals["accel"])} mg rms (90 %).')
     lines.append('By itself, noise and stage of the check taken out, it errs by '
                  f'{own.own_mg:.3g} mg' + ('' if np.isnan(own.own_deg) else
@@ -121,15 +124,20 @@ def _verdict(result: Result) -> str:
                 ('alpha', score.alpha_rms_deg, score.alpha_max_deg),
                 ('beta', score.beta_rms_deg, score.beta_max_deg),
                 ('accel', score.accel_rms_mg, score.accel_max_mg))),
-            f'{own.own_mg:.3g}' if own else '-', (own.datasheet or '-') if own else '-',
-            own.noise if own else '-', own.limit if own else '-'])
+            *(_judged(own) if own else ['-'] * 4)])
     if not rows:
         return f'<pre>{escape(chr(10).join(result.verdict))}</pre>'
     return page.table(['model', 'poses', 'tilt, deg', 'alpha, deg', 'beta, deg',
                        'acceleration, mg', 'own, mg', 'datasheet', 'noise', 'limited by'],
                       rows) + (
         '<p>rms with its 90 % interval, errors of neighbouring poses not taken as independent; '
-        'own: noise and stage of the check taken out.</p>')
+        'own: noise and stage of the check taken out; against datasheet and noise: acceleration, '
+        'then tilt.</p>')
+
+
+def _judged(own: Judged) -> list[str]:
+    return [f'{own.own_mg:.3g}', *(', '.join(filter(None, said)) or '-' for said in (
+        (own.datasheet, own.tilt_datasheet), (own.noise, own.tilt_noise))), own.limit]
 
 
 def _sphere(result: Result) -> str:

@@ -65,6 +65,8 @@ class Result:
         The unit as it was stated and as it is.
     verdict
         How good it is, line by line.
+    brief
+        The same for a terminal of 80 columns, what matters most first.
     poses
         What it was made of and judged by.
     judged
@@ -81,6 +83,7 @@ class Result:
     nominal: Sensor
     fitted: Sensor
     verdict: list[str]
+    brief: list[str]
     poses: Poses
     judged: tuple[Judged, ...] = ()
     scores: tuple[Score, ...] = ()
@@ -258,9 +261,12 @@ def _against_stage(sensor: Sensor, parts: Sequence[Poses], model: str | None,
     fitted = with_provenance(fitted, ', '.join(sources), poses, data_sha256, {
         'reference': 'stage', 'residual_mg': f'{np.sqrt(np.mean(residual ** 2)):.4f}',
         **judge.figures(own[0] if own else None, scores)})
-    lines = [*refusals, *verdict.table(scores), *judge.table(judgements, scores),
-             *(judge.words(own[0], fitted) if own else []), *said]
-    return Result(sensor, fitted, lines, poses, judgements, tuple(scores), None, knocked)
+    words, unit = judge.words(own[0], fitted) if own else [], judge.unit_line(fitted)
+    lines = [*refusals, *verdict.table(scores), *judge.table(judgements, scores), *words, *unit,
+             *said]
+    brief = [*judge.headline(own[0] if own else None, scores), *unit,
+             *judge.narrow_table(judgements, scores), *words, *said, *refusals]
+    return Result(sensor, fitted, lines, brief, poses, judgements, tuple(scores), None, knocked)
 
 
 def _fit(model: str, sensor: Sensor, fitting: Poses, parts: Sequence[Poses],
@@ -305,8 +311,9 @@ def _against_gravity(sensor: Sensor, poses: Poses, source: str, data_sha256: str
         'reference': 'gravity', 'residual_mg': f'{after:.4f}', 'leave_one_out_mg': f'{out:.4f}',
         **judge.figures(own, ())})
     lines += [judge.gravity_line(own, found.leave_one_out_mps2[kept]),
-              *judge.words(own, fitted)]
-    return Result(sensor, fitted, lines, poses, (own,), (), found)
+              *judge.words(own, fitted), *judge.unit_line(fitted)]
+    return Result(sensor, fitted, lines, [*judge.headline(own, ()), *lines], poses, (own,), (),
+                  found)
 
 
 def coefficients(sensor: Sensor) -> list[str]:

@@ -304,7 +304,7 @@ class Calibration(Node):
         self._leave_report(found)
         for line in found.comments():
             self.get_logger().info(line)
-        self.outcome = found.verdict
+        self.outcome = found.brief
         self._stop(f'wrote {self.asked.output}')
         return True
 

@@ -30,6 +30,7 @@ _COLOURS = {'dwell': 'green', 'refused': 'red', 'silent': 'red', 'question': 'ye
 _PREFIX = re.compile(r'^\[(\w+)\] \[[\d.]+\] \[[^]]*\]: ')
 _LABEL = 10
 _MESSAGES = 3
+_LEAST_NAME = 24
 
 
 def draw(figures: Mapping[str, Any], log: Sequence[str], size: ConsoleDimensions) -> Group:
@@ -82,8 +83,8 @@ def _pose(figures: Mapping[str, Any], width: int) -> list[Text]:
 def _reading(figures: Mapping[str, Any], width: int) -> list[Text]:
     if not figures.get('live'):
         return []
-    shown = '   '.join(f'{axis} {mean:+.3f} ± {rms:.3f}' for axis, mean, rms in figures['live'])
-    lines = [_row('reads', f'{shown} m/s²   {figures["rate_hz"]:.0f} Hz')]
+    shown = '  '.join(f'{axis} {mean:+.3f} ± {rms:.3f}' for axis, mean, rms in figures['live'])
+    lines = [_row('reads', f'{shown} m/s²  {figures["rate_hz"]:.0f} Hz')]
     rest = figures.get('rest')
     if rest:
         share = rest['value'] / rest['limit'] if rest['limit'] else 1.0
@@ -119,13 +120,29 @@ def _progress(figures: Mapping[str, Any], width: int) -> list[Text]:
 
 
 def _learned(figures: Mapping[str, Any], width: int) -> list[Text]:
-    return [_text(f'{name:36.36} {_bar(share, 6)} {"  ".join(shown)}')
-            for name, shown, share in figures.get('coefficients', ())]
+    rows = figures.get('coefficients', ())
+    between, bar, values = '  ', 6, [list(shown) for _, shown, _ in rows]
+
+    def room() -> int:
+        longest = max((len(between.join(shown)) for shown in values), default=0)
+        return min(width - bar - 2 - longest, 36)
+
+    if room() < _LEAST_NAME:
+        # Of three axes: what is left out is less than the interval of the last.
+        between, bar = ' ', 3
+        values = [[one.replace(' ± ', '±') for one in shown] for shown in values]
+    name_width = max(room(), 8)
+    return [_text(f'{_cut(name, name_width):{name_width}} {_bar(share, bar)} '
+                  f'{between.join(shown)}') for (name, _, share), shown in zip(rows, values)]
+
+
+def _cut(name: str, width: int) -> str:
+    return name if len(name) <= width else f'{name[:width - 1]}…'
 
 
 def _outcome(figures: Mapping[str, Any], width: int) -> list[Text]:
     return [_text(part) for line in figures.get('outcome', ())
-            for part in (wrap(line, width - 1) if len(line) > width else [line])]
+            for part in (wrap(line, width - 1) if len(line) >= width else [line])]
 
 
 def _log(log: Sequence[str]) -> list[Text]:
