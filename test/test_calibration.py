@@ -22,9 +22,9 @@ QUICK = ('-p', 'sweep.planes_rad:=[0.785, 1.5707963267948966, 2.356]', '-p',
          'sweep.check_poses:=6')
 
 
-def _files(tmp_path, seed=3):
+def _files(tmp_path, seed=3, axes='xy'):
     """Write the file of a drawn unit and of its nominal sensor."""
-    base = nominal(serial='T1')
+    base = nominal(axes, serial='T1')
     truth, bare = tmp_path / 'truth.yaml', tmp_path / 'nominal.yaml'
     params.save(truth, drawn(np.random.default_rng(seed), base))
     params.save(bare, base)
@@ -200,8 +200,9 @@ def test_a_real_sensor_through_the_live_graph(start, run_tool, tmp_path, shared_
 
 def test_an_operator_captures(start, tmp_path):
     """Without a motor nothing is taken before ~/capture, which answers when it is on disk."""
-    truth, bare = _files(tmp_path)
+    truth, bare = _files(tmp_path, axes='x')
     with Graph() as graph:
+        announced = graph.listen(DiagnosticStatus, 'calibration/next_pose', latched=True)
         start('driver', '--ros-args', '--params-file', truth, '-p', 'link.speed:=4.0', *FAST,
               '-p', 'link.alpha_rad:=0.785', '-p', 'link.beta_rad:=0.0')
         start('calibration', '--ros-args', '--params-file', bare, *FAST, *QUICK,
@@ -213,3 +214,14 @@ def test_an_operator_captures(start, tmp_path):
         assert entries[0]['alpha_rad'] == 0.785
         wait_until(lambda: graph.call(Trigger, 'calibration/redo', Trigger.Request()).success,
                    10, 'redo')
+        # One axis shows no tilt: there is no figure, and it is not NaN.
+        graph.spin_until(lambda: graph.value('calibration', 'accepted') == '1', 10, 'the pose')
+        values = {p.key: p.value for p in graph.diagnostics['calibration'].values}
+        assert 'tilt_error_deg' not in values and 'nan' not in values.values()
+        # What was announced is taken back, for those, too, who listen later.
+        assert announced[-1].message.startswith('pose 1 of')
+        assert graph.call(Trigger, 'calibration/abort', Trigger.Request()).success
+        late = graph.listen(DiagnosticStatus, '/calibration/next_pose', latched=True)
+        graph.spin_until(lambda: late, 10, 'the announcement')
+        assert late[-1].message.startswith('no pose: aborted; its poses stay in')
+        assert not late[-1].values

@@ -160,6 +160,8 @@ def tilt_error_rad(sensor: Sensor, pose_std_v: np.ndarray) -> float:
     """
     Return the rms error to expect of alpha and beta over the sphere, rad.
 
+    NaN where no pose shows them, as for a sensor of one axis.
+
     Parameters
     ----------
     sensor
@@ -177,7 +179,7 @@ def tilt_error_rad(sensor: Sensor, pose_std_v: np.ndarray) -> float:
 
     perfect = stds(replace(sensor, covariance=np.zeros((0, 0)), covariance_names=()))
     errors = np.minimum(stds(sensor)[perfect < _SHOWN_RAD], np.pi / 2)
-    return float(np.sqrt(np.mean(errors ** 2)))
+    return float(np.sqrt(np.mean(errors ** 2))) if errors.size else float('nan')
 
 
 def in_g(sensor: Sensor, volts: np.ndarray) -> np.ndarray:

@@ -113,8 +113,12 @@ def _of_sweep(walk: Sweep) -> dict[str, Any]:
     return {'coverage': _planes(walk),
             'coefficients': known.by_term(told.names, get(told.unit, told.names), told.std,
                                           told.prior),
-            'tilt_deg': float(np.degrees(walk.tilt_error_rad())),
-            'tilt_end_deg': float(np.degrees(told.after(left).tilt_error_rad()))}
+            'tilt_deg': _degrees(walk.tilt_error_rad()),
+            'tilt_end_deg': _degrees(told.after(left).tilt_error_rad())}
+
+
+def _degrees(angle_rad: float) -> float | None:
+    return float(np.degrees(angle_rad)) if np.isfinite(angle_rad) else None
 
 
 def _of_tumble(walk: Tumble) -> dict[str, Any]:
@@ -125,7 +129,7 @@ def _of_tumble(walk: Tumble) -> dict[str, Any]:
                      for i in np.flatnonzero(walk.covered & (sides == 1)))
     return {'coverage': rows, 'covered': faces,
             'coefficients': known.by_term(walk.names, walk.values, walk.std, walk.prior),
-            'tilt_deg': float(np.degrees(walk.tilt_error_rad())), 'tilt_end_deg': None}
+            'tilt_deg': _degrees(walk.tilt_error_rad()), 'tilt_end_deg': None}
 
 
 def _planes(walk: Sweep) -> list[list[Any]]:

@@ -65,6 +65,12 @@ class Announcer:
             command.header.stamp = self._node.get_clock().now().to_msg()
             self._command.publish(command)
 
+    def end(self, why: str) -> None:
+        """Take the pose back that was announced, if one was: it is latched."""
+        if self._said:
+            self._next.publish(common.status(common.OK, 'next_pose', f'no pose: {why}', '', {}))
+        self._said = ''
+
     def _say(self, text: str, values: dict[str, str | float]) -> None:
         if text != self._said:
             self._node.get_logger().info(text)

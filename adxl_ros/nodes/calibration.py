@@ -324,6 +324,7 @@ class Calibration(Node):
         if session is not None:
             session.close()
         self._answer_captures(False, text)
+        self._announcer.end(text)
         if failed:
             self.fail(text)
         else:
@@ -370,14 +371,16 @@ class Calibration(Node):
         phase, text, late = self.state()
         if late:
             self._warn_once(phase, text)
-        values = {'accepted': '0', 'output': str(self.asked.output),
-                  'verdict': '; '.join(self.outcome)}
+        values: dict[str, str | float] = {'accepted': '0', 'output': str(self.asked.output),
+                                          'verdict': '; '.join(self.outcome)}
         if self.session is not None:
             walk = self.session.walk
             number = walk.index + 1 if isinstance(walk, Sweep) else len(walk.accepted) + 1
             values |= {'phase': phase, 'pose': str(number), 'next': walk.where(),
-                       'accepted': str(self.session.done),
-                       'tilt_error_deg': float(np.degrees(walk.tilt_error_rad()))}
+                       'accepted': str(self.session.done)}
+            tilt_rad = walk.tilt_error_rad()
+            if np.isfinite(tilt_rad):
+                values['tilt_error_deg'] = float(np.degrees(tilt_rad))
         serial = self.unit.serial if self.unit else ''
         self._diagnostics.publish(common.diagnostics(self, common.status(
             common.WARN if late else common.OK, 'calibration', text, serial, values)))

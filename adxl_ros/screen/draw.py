@@ -114,6 +114,8 @@ def _progress(figures: Mapping[str, Any], width: int) -> list[Text]:
         covered += f' ({figures["covered"]} up)'
     lines += _wrapped('coverage', covered, width)
     end = figures.get('tilt_end_deg')
+    if figures['tilt_deg'] is None:
+        return [*lines, _row('tilt error', 'no pose shows both angles to one axis')]
     lines.append(_row('tilt error', f'{_degrees(figures["tilt_deg"])} expected now' + (
         '' if end is None else f', {_degrees(end)} after all poses'), 'bold'))
     return lines
