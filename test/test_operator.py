@@ -174,8 +174,12 @@ def test_a_compensated_stream_and_a_wrong_rate_are_refused(start, tmp_path):
         raw = operator.listen(Imu, 'imu/data_raw')
         half = operator.node.create_publisher(Imu, 'half', 1000)
 
+        dead = []
+
         def feed_half():
             for message in raw[::2]:
+                if dead:
+                    message.linear_acceleration.x = float('nan')
                 half.publish(message)
             raw.clear()
         operator.node.create_timer(0.1, feed_half)
@@ -183,6 +187,9 @@ def test_a_compensated_stream_and_a_wrong_rate_are_refused(start, tmp_path):
                                                   'compensated'), 60, 'why')
         assert operator.ask()[1].startswith('/imu/data: this stream is already compensated')
         operator.spin_until(lambda: operator.said('other', 'samples are 500 a second'), 60, 'why')
+        dead.append('x')
+        operator.spin_until(lambda: operator.said('other', 'x is not a number in all samples'),
+                            60, 'which axis')
 
 
 def test_a_temperature_that_moved_is_refused_until_it_is_back(start, tmp_path):

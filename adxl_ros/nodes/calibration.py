@@ -281,9 +281,9 @@ class Calibration(Node):
 
     def _take_samples(self) -> None:
         stamps, volts = self._samples.take(self.unit)
-        if not len(stamps):
+        if not len(stamps) and not self._samples.useless:
             return
-        hindrance = self._samples.compensated or self.session.feed(stamps, volts)
+        hindrance = self._samples.useless or self.session.feed(stamps, volts)
         if hindrance and not self._hindrance:
             self.fail(hindrance)
         self._hindrance = hindrance

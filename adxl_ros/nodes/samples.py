@@ -37,7 +37,7 @@ class Samples:
 
     Attributes
     ----------
-    compensated
+    useless
         Why the newest samples are of no use, or ''.
 
     """
@@ -46,7 +46,7 @@ class Samples:
         self._node = node
         self._raw: list[bytes] = []
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.compensated = ''
+        self.useless = ''
         self.heard()
         common.subscription(node, Imu, _TOPIC, self._raw.append, _QUEUE, raw=True)
 
@@ -74,13 +74,18 @@ class Samples:
             yaw_rad2 = max(yaw_rad2, float(np.max(variances[:, 8] * (variances[:, 0] >= 0))))
         if batch:
             self.heard()
-            self.compensated = '' if yaw_rad2 < _COMPENSATED_RAD2 else (
-                f'{self._node.resolve_topic_name(_TOPIC)}: this stream is already compensated '
-                '(it carries an orientation, as imu/data does); remap it to imu/data_raw of the '
-                'driver')
         accel = accel[:, :len(unit.axes)]
-        finite = np.isfinite(accel).all(axis=1)
-        return stamps[finite], to_volts(accel[finite], unit)
+        finite = np.isfinite(accel)
+        if batch:
+            self.useless = self._compensated(yaw_rad2) or _no_number(finite, unit)
+        whole = finite.all(axis=1)
+        return stamps[whole], to_volts(accel[whole], unit)
+
+    def _compensated(self, yaw_rad2: float) -> str:
+        return '' if yaw_rad2 < _COMPENSATED_RAD2 else (
+            f'{self._node.resolve_topic_name(_TOPIC)}: this stream is already compensated '
+            '(it carries an orientation, as imu/data does); remap it to imu/data_raw of the '
+            'driver')
 
     def silent(self) -> str:
         """Say for how long nothing has come; '' while samples come."""
@@ -90,3 +95,12 @@ class Samples:
         topic = self._node.resolve_topic_name(_TOPIC)
         who = '' if self._node.count_publishers(topic) else ', and nobody publishes it'
         return f'nothing on {topic} for {for_s:.0f} s{who}'
+
+
+def _no_number(finite: np.ndarray, unit: Sensor) -> str:
+    """Name the axes that make all samples useless, (n, m), or return ''."""
+    if finite.all(axis=1).any():
+        return ''
+    dead = ' and '.join(axis for axis, ever in zip(unit.axes, finite.any(axis=0)) if not ever)
+    return f'{dead or "one axis or another"} is not a number in all samples; check its wiring ' \
+           'and the driver'
