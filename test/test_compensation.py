@@ -30,6 +30,7 @@ from adxl_ros.model.maths import FLOATS
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
 from adxl_ros.model.stage import specific_force
 from adxl_ros.model.uncertainty import force_covariance
+from builtin_interfaces.msg import Time
 from conftest import Started
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Vector3Stamped
@@ -39,6 +40,7 @@ import pytest
 from rcl_interfaces.srv import DescribeParameters, GetParameters, SetParametersAtomically
 from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import BatteryState, Imu, Temperature
 from units import drawn, nominal
 
@@ -193,10 +195,11 @@ def test_supply_and_temperature_are_taken_out(robot: Robot, start: Start, tmp_pa
     sensor = put(sensor, ['temperature_bias.per_k.x', *(
         f'supply.{figure}_exponent.{axis}' for figure in ('zero_g', 'scale')
         for axis in sensor.axes)], [1e-3, *[1.0] * 2, *[1.135] * 2])
-    started(start, tmp_path, sensor)
+    started(start, tmp_path, sensor, '-p', 'use_sim_time:=true')
     robot.inform(sensor)
     robot.connected()
     node = robot.graph.node
+    clock = node.create_publisher(Clock, '/clock', 10)
     supply = node.create_publisher(BatteryState, 'supply', 1)
     temperature = node.create_publisher(Temperature, 'temperature', 1)
     force, around = pose(0.7, 0.4), chain.NOMINAL._replace(temperature_c=35.0, supply_v=4.8)
@@ -212,6 +215,15 @@ def test_supply_and_temperature_are_taken_out(robot: Robot, start: Start, tmp_pa
 
     robot.graph.spin_until(corrected, 10.0, 'corrected for the surroundings')
     robot.level(DiagnosticStatus.OK, 'compensating')
+
+    def old() -> bool:
+        clock.publish(Clock(clock=Time(sec=3600)))
+        temperature.publish(Temperature(temperature=35.0))
+        robot.answer(shown)
+        return robot.graph.said(NODE, 'supply is taken at 4.8: nothing on /supply for 3600 s')
+    # What was true an hour ago is not known any more.
+    robot.graph.spin_until(old, 10.0, 'an hour later')
+    assert robot.graph.diagnostics[NODE].level == DiagnosticStatus.WARN
 
 
 def stored(folder: Path, sensor: Sensor, days_old: float) -> Path:
@@ -243,7 +255,8 @@ def test_the_newest_calibration_of_the_unit_is_taken(robot: Robot, start: Start,
     assert '17-29990101T000000Z-0.yaml:1:1: ' in process.output()
     force = pose(0.7, -1.2)
     np.testing.assert_allclose(accel(robot.answer(felt(newest, force))), force, atol=1e-7)
-    robot.graph.spin_until(lambda: robot.graph.value(NODE, 'validity') == 'valid', 10, 'validity')
+    robot.graph.spin_until(lambda: robot.graph.value(NODE, 'validity')
+                           == 'valid, temperature not known', 10, 'validity')
     assert robot.graph.value(NODE, 'calibration_id') == path.stem
     assert float(robot.graph.value(NODE, 'age_days')) == pytest.approx(10.0, abs=0.01)
     (folder / '17' / '17-29990101T000000Z-0.yaml').unlink()
@@ -302,10 +315,14 @@ def test_outside_of_what_was_calibrated_the_covariance_is_raised(
         def there() -> bool:
             temperature.publish(Temperature(temperature=at_c))
             robot.answer(shown)
-            return robot.graph.value(NODE, 'validity').startswith(said)
+            found = robot.graph.value(NODE, 'validity')
+            return found == said or (said != 'valid' and found.startswith(said))
         robot.graph.spin_until(there, 15, f'{at_c} degC: {said}')
         return np.array(robot.data[-1].linear_acceleration_covariance).reshape(3, 3).diagonal()
 
+    robot.answer(inside)
+    robot.graph.spin_until(lambda: robot.graph.value(NODE, 'validity')
+                           == 'valid, temperature not known', 10, 'what is not known')
     before = variances(inside, 23.0, 'valid')
     np.testing.assert_array_equal(variances(inside, 26.5, 'valid'), before)
     warm = variances(inside, 40.0, 'outside: temperature 40.0 degC, calibrated at 20.0 to 25.0')

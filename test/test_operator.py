@@ -15,11 +15,13 @@
 """A hand-turned stage, and an operator who makes mistakes: what is said, and what is taken."""
 
 from adxl_ros.files import journal, params
+from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus
 from graph import Graph
 import numpy as np
 import pytest
 from sensor_msgs.msg import Imu, JointState, Temperature
+from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 from units import drawn, nominal
 
@@ -197,7 +199,10 @@ def test_a_temperature_that_moved_is_refused_until_it_is_back(start, tmp_path):
     with Operator() as operator:
         warm = operator.node.create_publisher(Temperature, 'temperature', 10)
         now = [23.0]
-        operator.node.create_timer(0.05, lambda: warm.publish(Temperature(temperature=now[0])))
+        # Its clock is not that of the samples.
+        stamped = Header(stamp=Time(sec=2_000_000_000))
+        operator.node.create_timer(0.05, lambda: warm.publish(Temperature(
+            header=stamped, temperature=now[0])))
         node = _bench(start, tmp_path, 'commanded')
         operator.spin_until(lambda: any('temperature_c' in entry for entry in _taken(tmp_path)),
                             60, 'a pose with its temperature')
@@ -208,6 +213,7 @@ def test_a_temperature_that_moved_is_refused_until_it_is_back(start, tmp_path):
         operator.spin_until(lambda: operator.diagnostics.get('calibration') and int(
             operator.value('calibration', 'accepted')) >= 4, 60, 'more poses')
     assert node.popen.poll() is None
+    assert node.output().count('temperature is stamped ') == 1
     measured = [e['temperature_c'] for e in _taken(tmp_path) if 'temperature_c' in e]
     assert measured[0] == pytest.approx(23.0) and max(measured) < 26.0
 

@@ -41,6 +41,8 @@ from sensor_msgs.msg import BatteryState, JointState, Temperature
 from std_srvs.srv import Trigger
 
 _POLL_S = 0.05
+_APART_NS = 60_000_000_000
+"""Surroundings that are stamped so far from the samples have another clock."""
 _SERVICES = ('start', 'redo', 'skip', 'finish', 'abort')
 
 
@@ -65,6 +67,7 @@ class Calibration(Node):
         self._anew = self.resume == 'anew'
         self._newest: Newest | None = None
         self._captures: list[Future] = []
+        self._misdated: set[str] = set()
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._samples = Samples(self)
         self._announcer = announce.Announcer(self)
@@ -120,9 +123,19 @@ class Calibration(Node):
             self._sweep.stage(_stamp_ns(message), *pair)
 
     def _surround(self, name: str, message: Temperature | BatteryState, value: float) -> None:
-        if self.session is not None:
-            stamp_ns = _stamp_ns(message) or self.session.walk.newest_ns or 0
-            self.session.walk.surroundings.add(name, stamp_ns, value)
+        if self.session is None:
+            return
+        stamp_ns, newest_ns = _stamp_ns(message), self.session.walk.newest_ns or 0
+        ahead_ns = stamp_ns - newest_ns
+        if stamp_ns and newest_ns and abs(ahead_ns) > _APART_NS:
+            if name not in self._misdated:
+                self._misdated.add(name)
+                self.get_logger().warning(
+                    f'{name.split("_")[0]} is stamped {abs(ahead_ns) * 1e-9:.0f} s '
+                    f'{"ahead of" if ahead_ns > 0 else "behind"} imu/data_raw: it counts from '
+                    'when it arrives; put both on one clock')
+            stamp_ns = 0
+        self.session.walk.surroundings.add(name, stamp_ns or newest_ns, value)
 
     @property
     def _sweep(self) -> Sweep | None:

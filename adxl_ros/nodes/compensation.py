@@ -51,6 +51,9 @@ _UNKNOWN_RAD2 = 1e6
 yaw = 0 before long; 1e6, as for an axis that is not there, never counts."""
 
 
+_OLD_S = 60.0
+"""A temperature or supply that was said so long ago is not known any more."""
+
 _CLOCK_DAYS = 0.01
 """Clocks that differ by a quarter of an hour make no calibration one of the future."""
 
@@ -72,6 +75,7 @@ class Compensation(Node):
         # Surroundings to be taken up, and those that are.
         self._around: dict[str, float] = {}
         self._known: dict[str, float] = {}
+        self._heard_ns: dict[str, int] = {}
         self._paper = common.declare(
             self, 'inverse', 'exact', "of the model: exact, or the paper's approximation",
             choices=('exact', 'paper')) == 'paper'
@@ -177,6 +181,11 @@ class Compensation(Node):
         # The receiving thread takes it up with its next sample.
         if isfinite(value):
             self._around[name] = value
+            self._heard_ns[name] = self.get_clock().now().nanoseconds
+
+    def _age_s(self, name: str) -> float:
+        """Return how long ago it was said, by the clock of the graph."""
+        return (self.get_clock().now().nanoseconds - self._heard_ns.get(name, 0)) * 1e-9
 
     def _judge(self) -> None:
         """Find out whether the parameters are those of the stream, and say so on a change."""
@@ -284,6 +293,9 @@ class Compensation(Node):
             valid = 'dated in the future: the clock here, or there, is wrong'
         elif not sensor.covariance_names:
             valid = 'within, as far as is known: it states no covariance'
+        elif sensor.envelope.temperature_c is None or 'temperature_c' not in self._known \
+                or self._age_s('temperature_c') > _OLD_S:
+            valid = 'valid, temperature not known'
         else:
             valid = 'valid'
         return {'calibration_id': store.calibration_id(sensor),
@@ -319,10 +331,15 @@ class Compensation(Node):
         topics = {'temperature_c': 'temperature', 'supply_v': 'supply'}
         for effect in map(effect_named, self._live.sensor.effects):
             for name in effect.follows:
-                if name in topics and name not in self._known:
-                    nominal = getattr(chain.NOMINAL, name)
-                    return (f'{effect.name} is taken at {nominal:g}: nothing on '
-                            f'{self.resolve_topic_name(topics[name])}')
+                if name not in topics:
+                    continue
+                topic = self.resolve_topic_name(topics[name])
+                if name not in self._known:
+                    return (f'{effect.name} is taken at {getattr(chain.NOMINAL, name):g}: '
+                            f'nothing on {topic}')
+                if self._age_s(name) > _OLD_S:
+                    return (f'{effect.name} is taken at {self._known[name]:g}: nothing on '
+                            f'{topic} for {self._age_s(name):.0f} s')
         return ''
 
 
