@@ -168,6 +168,22 @@ def test_history_is_by_date_and_tells_what_it_cannot_read(tmp_path):
     assert len(refused) == 2 and 'half.yaml:' in refused[0] and 'unit 18' in refused[1]
 
 
+def test_a_file_that_was_named_by_hand_counts_by_its_date(tmp_path):
+    """A copy is not newer than itself, nor is an old backup whose name sorts last."""
+    sensor = replace(drawn(np.random.default_rng(1), nominal(serial='17')), provenance=DATED)
+    path = store.put(tmp_path, sensor)
+    shutil.copy(path, tmp_path / '17' / 'unit_17.yaml')
+    (tmp_path / '17' / 'zz_half.yaml').write_text('/**:\n  ros__par')
+    backup = tmp_path / '17' / 'zz_backup.yaml'
+    params.save(backup, replace(sensor, provenance={'date': '2020-01-02T03:04:05+00:00'}))
+    assert store.newer(tmp_path, sensor) is None
+    params.save(backup, replace(sensor, provenance={'date': '2027-01-02T03:04:05+00:00'}))
+    assert store.newer(tmp_path, sensor) == backup
+    params.save(backup, replace(sensor, serial='18', provenance={
+        'date': '2027-01-02T03:04:05+00:00'}))
+    assert store.newer(tmp_path, sensor) is None
+
+
 def test_a_full_disk_keeps_the_old_file(swept_csv, tmp_path):
     """No file can grow beyond a kilobyte: the old one stands to the byte, and nothing is left."""
     shutil.copytree(swept_csv, tmp_path, dirs_exist_ok=True)

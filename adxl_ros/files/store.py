@@ -23,7 +23,9 @@ as a whole and never changed; others that are put beside them count by the date 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from datetime import datetime, timezone
+from functools import lru_cache
 import hashlib
 import os
 from pathlib import Path
@@ -36,7 +38,8 @@ from adxl_ros.model.sensor import Sensor
 NO_UNIT = 'nominal'
 """Serial number of no unit in particular; what is of no unit is not stored."""
 
-
+_DATE = '%Y%m%dT%H%M%SZ'
+_OLDEST = datetime.min.replace(tzinfo=timezone.utc)
 _LONGEST = 120
 """Characters of a serial number in names, which file systems end at 255."""
 
@@ -55,7 +58,7 @@ def calibration_id(sensor: Sensor) -> str:
 def _version(sensor: Sensor) -> str:
     """Return date and hash, which tell the calibrations of a unit apart and sort by date."""
     made = date_of(sensor)
-    when = f'{made:%Y%m%dT%H%M%SZ}' if made else '00000000T000000Z'
+    when = f'{made:{_DATE}}' if made else '00000000T000000Z'
     return '-'.join(filter(None, (when, sensor.provenance.get('data_sha256', '')[:8])))
 
 
@@ -135,8 +138,7 @@ def history(folder: str | os.PathLike, serial: str) -> tuple[list[tuple[Path, Se
             refused.append(str(error))
             continue
         found.append((path, sensor))
-    oldest = datetime.min.replace(tzinfo=timezone.utc)
-    return sorted(found, key=lambda one: date_of(one[1]) or oldest), refused
+    return sorted(found, key=lambda one: date_of(one[1]) or _OLDEST), refused
 
 
 def newest(folder: str | os.PathLike, serial: str, fits: Callable[[Sensor], None]
@@ -170,13 +172,39 @@ def newest(folder: str | os.PathLike, serial: str, fits: Callable[[Sensor], None
 
 def newer(folder: str | os.PathLike, sensor: Sensor) -> Path | None:
     """
-    Return the newest file of a unit if its name says that it is newer than a calibration.
+    Return the newest file of a unit if it is of a later date than a calibration.
 
-    The file is not read: this is quick.
+    This is quick: the names that the store gives say the date, other files are read once.
     """
-    own = unit_folder(folder, sensor.serial)
-    last = max((path.name for path in own.glob('*.yaml')), default='')
-    return own / last if last > _file_name(sensor) else None
+    dated = {path: _dated(path, sensor.serial)
+             for path in unit_folder(folder, sensor.serial).glob('*.yaml')}
+    last = max(dated, key=lambda path: (dated[path], path), default=None)
+    return last if last is not None and dated[last] > _second_of(sensor) else None
+
+
+def _dated(path: Path, serial: str) -> datetime:
+    named = path.name.removeprefix(f'{_name(serial)}-').split('-')[0].removesuffix('.yaml')
+    with suppress(ValueError):
+        return datetime.strptime(named, _DATE).replace(tzinfo=timezone.utc)
+    try:
+        return _date_inside(path, path.stat().st_mtime_ns, serial)
+    except OSError:
+        return _OLDEST
+
+
+@lru_cache(maxsize=256)
+def _date_inside(path: Path, _: int, serial: str) -> datetime:
+    """Return the date of a file that was named by hand; it is read again when it has changed."""
+    try:
+        sensor = params.load(path)
+    except UserError:
+        return _OLDEST
+    return _second_of(sensor) if sensor.serial == serial else _OLDEST
+
+
+def _second_of(sensor: Sensor) -> datetime:
+    """Return the date as names have it, which end at seconds."""
+    return (date_of(sensor) or _OLDEST).replace(microsecond=0)
 
 
 def _file_name(sensor: Sensor) -> str:
