@@ -108,6 +108,21 @@ def test_a_turn_beyond_half_is_unwrapped(start):
                              20, f'beta {beta}')
 
 
+def test_a_stage_that_begins_beyond_half_a_turn_arrives(start):
+    """330 deg is -30 deg to a controller that counts to pi: it does not move, and is there."""
+    with Controller('trajectory') as graph:
+        graph.angles['turn'] = np.radians(330)
+        start('stage', '--ros-args', '-p', 'stage.type:=trajectory', *NAMES, '-p',
+              'bridge.speed_rad_s:=10.0')
+        graph.spin_until(graph.at, 30, 'the stage')
+        graph.ask(0.0, np.radians(330))
+        graph.spin_until(lambda: graph.at()['beta'] == pytest.approx(np.radians(330)), 20,
+                         'beta 330')
+        graph.angles['turn'] = np.radians(300)
+        graph.spin_until(lambda: graph.at()['beta'] == pytest.approx(np.radians(300)), 20,
+                         'beta 300, counted on')
+
+
 def test_a_command_that_is_lost_is_sent_again(start):
     """A controller that starts later, or ignores a goal, is told again after a while."""
     with Controller('trajectory') as graph:
@@ -119,6 +134,10 @@ def test_a_command_that_is_lost_is_sent_again(start):
             graph.ask(0.4, 0.0)
             return len(graph.told) >= 2
         graph.spin_until(told_twice, 20, 'a second time')
+        graph.spin_until(lambda: graph.said('stage', 'the controller has not followed for ')
+                         and graph.said('stage', ' s: alpha is at 0.0° of 22.9°, beta is'), 20,
+                         'the warning')
+        assert graph.diagnostics['stage'].level == DiagnosticStatus.WARN
 
 
 def test_wrong_names_are_told(start):

@@ -62,6 +62,18 @@ class _Joint:
             angle += 2 * np.pi * np.round((self.angle_rad - angle) / (2 * np.pi))
         self.angle_rad = float(angle)
 
+    def turn_to(self, goal_rad: float) -> None:
+        """
+        Count from the goal where the joint has stopped whole turns off it.
+
+        The first angle of a controller that counts from −π to π leaves open how many turns it
+        has made, and such a controller may take the shorter way round.
+        """
+        if self.angle_rad is not None:
+            turns = 2 * np.pi * round((goal_rad - self.angle_rad) / (2 * np.pi))
+            if abs(self.angle_rad + turns - goal_rad) < _ARRIVED_RAD:
+                self.angle_rad += turns
+
 
 class Bridge:
     """
@@ -94,7 +106,7 @@ class Bridge:
                               10.0)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._goal: dict[str, float] = {}
-        self._due_ns = self._heard_ns = 0
+        self._due_ns = self._heard_ns = self._late_ns = self._asked_ns = 0
         self._names: set[str] = set()
         self._refusal = ''
         self._shown = common.publisher(node, JointState, 'stage/joint_states', 100)
@@ -135,9 +147,11 @@ class Bridge:
         # It comes again and again: a controller would begin its trajectory anew each time.
         if goal == self._goal and (self._arrived() or now_ns < self._due_ns):
             return
-        self._goal, self._refusal = goal, ''
-        seconds = self._duration_s()
+        seconds = self._duration_s(goal)
         self._due_ns = now_ns + round(seconds * 1e9) + _AGAIN_NS
+        if goal != self._goal:
+            self._asked_ns, self._late_ns = now_ns, self._due_ns
+        self._goal, self._refusal = goal, ''
         self._send(seconds)
 
     def _send(self, seconds: float) -> None:
@@ -154,10 +168,14 @@ class Bridge:
                 positions=positions, time_from_start=Duration(sec=whole, nanosec=part))])
         self._out.publish(message)
 
-    def _duration_s(self) -> float:
-        ways = [abs(self._goal[name] - joint.angle_rad) for name, joint in self._joints.items()
+    def _duration_s(self, goal: dict[str, float]) -> float:
+        ways = [abs(goal[name] - joint.angle_rad) for name, joint in self._joints.items()
                 if joint.angle_rad is not None]
         return max(max(ways, default=np.pi) / self._speed, _LEAST_S)
+
+    def _late(self) -> bool:
+        return bool(self._goal) and self._steady.now().nanoseconds > self._late_ns \
+            and not self._arrived()
 
     def _arrived(self) -> bool:
         return all(joint.angle_rad is not None
@@ -171,6 +189,9 @@ class Bridge:
                  and np.isfinite(positions[joint.name])]
         for joint in known:
             joint.read(positions[joint.name])
+        if self._late():
+            for name, joint in self._joints.items():
+                joint.turn_to(self._goal[name])
         if not known or any(joint.angle_rad is None for joint in self._joints.values()):
             return
         self._heard_ns = self._steady.now().nanoseconds
@@ -199,6 +220,12 @@ class Bridge:
             level, text = common.WARN, f'nothing on {topic}; is the controller running?'
         elif not self._node.count_subscribers(self._out.topic_name):
             level, text = common.WARN, f'nobody listens to {self._out.topic_name}'
+        elif self._late():
+            for_s = (self._steady.now().nanoseconds - self._asked_ns) * 1e-9
+            off = ', '.join(f'{name} is at {np.degrees(joint.angle_rad):.1f}° of '
+                            f'{np.degrees(self._goal[name]):.1f}°'
+                            for name, joint in self._joints.items())
+            level, text = common.WARN, f'the controller has not followed for {for_s:.0f} s: {off}'
         values = {name: joint.angle_rad for name, joint in self._joints.items()
                   if joint.angle_rad is not None}
         self._diagnostics.publish(common.diagnostics(self._node, common.status(
