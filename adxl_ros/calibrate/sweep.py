@@ -251,7 +251,8 @@ class Sweep:
             return State('refused', self._refusal, True)
         if not self._captured:
             if self.settings.stage_mode != 'commanded':
-                return State('operator', f'turn the stage to {self.where()}, then capture{since}',
+                waited = f' (waited {waited_s:.0f} s)' if late else ''
+                return State('operator', f'turn the stage to {self.where()}, then capture{waited}',
                              False)
             return State('stage', f'the stage has not arrived at {self.where()}{since}: '
                                   f'{self._off_text(target)}', late)
