@@ -158,12 +158,14 @@ def test_an_output_that_cannot_be_written_is_refused_at_the_start(start, tmp_pat
         graph.spin_until(lambda: graph.said('calibration', 'output: none/unit.yaml'), 30, 'why')
 
 
-def test_settings_out_of_range_end_the_node(start, tmp_path):
-    """A step of 0 is refused at the start, in one line."""
+@pytest.mark.parametrize('setting, words', [
+    ('sweep.step_rad:=0.0', 'sweep.step_rad'), ('output:=.', 'output: . is a directory; name a')])
+def test_settings_out_of_range_end_the_node(start, tmp_path, setting, words):
+    """A step of 0, or a directory for a file, is refused at the start, in one line."""
     _, bare = _files(tmp_path)
-    node = start('calibration', '--ros-args', '--params-file', bare, '-p', 'sweep.step_rad:=0.0')
+    node = start('calibration', '--ros-args', '--params-file', bare, '-p', setting)
     assert node.wait() == 1
-    assert 'sweep.step_rad' in node.output()
+    assert words in node.output()
     assert 'Traceback' not in node.output()
 
 

@@ -276,6 +276,8 @@ def test_by_hand_directions_are_asked_for_in_words_until_all_are_covered():
         errors.append(tumble.tilt_error_rad())
     assert len(tumble.accepted) == 16
     assert asked[0].startswith('turn it so that +') and 'points up' in asked[0]
+    edges = [words for words in asked if ' and ' in words.split(', and hold')[0]]
+    assert edges and all(' point up equally' in words for words in edges)
     assert len(set(asked)) == 16, 'a direction was asked for twice'
     assert errors[-1] < errors[0] / 20
     assert tumble.redo() == 'rest 16 is forgotten; hold the sensor in that direction again'

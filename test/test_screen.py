@@ -26,6 +26,7 @@ from graph import Graph
 import numpy as np
 import pytest
 from sensor_msgs.msg import JointState
+from std_srvs.srv import Trigger
 from terminal import Terminal
 from test_core_only import run_without_extras
 from units import drawn, nominal
@@ -188,6 +189,11 @@ def test_a_terminal_of_another_process_has_a_screen_too(terminal):
     """As in a container or below an IDE: a terminal that does not control the node."""
     seen = terminal(controls=False)
     seen.wait_for('press b to begin', 'q  quit')
+    # No driver is there: what was begun can be taken back.
+    seen.press('b')
+    seen.wait_for('waiting for sensor_info', 'a  abort')
+    seen.press('a')
+    seen.wait_for('aborted', 'b  begin')
     seen.press('q')
     assert seen.popen.wait(20) == 0
     assert seen.restored()
@@ -202,6 +208,10 @@ def test_what_changed_is_said_and_asked_about(start, terminal, tmp_path):
     seen = terminal(*FAST, '-p', 'autostart:=true')
     seen.wait_for('holds 1 poses of an interrupted calibration, which cannot go on',
                   'serial was "T0", is "T1"', 'n  begin anew')
+    with Graph() as graph:
+        # Who calls the service is told that somebody at the screen is asked.
+        answer = graph.call(Trigger, 'calibration/start', Trigger.Request())
+        assert not answer.success and 'which cannot go on' in answer.message
     seen.press('n')
     seen.wait_for('0 done, 22 left')
     kept, = tmp_path.glob('unit.yaml.journal.2*')

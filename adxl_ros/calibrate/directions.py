@@ -101,6 +101,13 @@ def name_up(candidate: int) -> str:
     return axes[0] if len(axes) == 1 else f'{" and ".join(axes)} equally'
 
 
+def points_up(name: str) -> str:
+    """Make a sentence of a name: '+x points up', '+x and −y point up equally'."""
+    if ' and ' not in name:
+        return f'{name} points up'
+    return f'{name.removesuffix(" equally")} point up equally'
+
+
 def name_nearest(up: np.ndarray) -> str:
     """Name the candidate nearest a direction, (3,)."""
     return name_up(int(np.argmax(UP @ up)))

@@ -27,6 +27,7 @@ from adxl_ros.model.sensor import Sensor
 import numpy as np
 
 PASS, FAIL, NOT_SHOWN = 'PASS', 'FAIL', 'NOT SHOWN'
+_CLOSE = 0.2
 _LINEARITY = 'nonlinearity.cubic_per_g2'
 
 
@@ -153,8 +154,12 @@ def words(judged: Judged, sensor: Sensor) -> list[str]:
                      f'parameters leave {milli_g(accel.model):.3f} mg, the fit, each direction, '
                      f'{milli_g(accel.fit):.3f} mg{turned}')
     else:
-        lines.append(f'{judged.model}: {milli_g(accel.seen):.3f} mg are {made} in '
-                     f'squares{turned}')
+        known = accel.noise + accel.stage + accel.fit + accel.model
+        # The fit's covariance may promise more than these poses happened to show, or less.
+        chance = '' if abs(known - accel.seen) < _CLOSE * accel.seen else \
+            ' (by their covariances: what is seen departs from that by chance)'
+        lines.append(f'{judged.model}: {milli_g(accel.seen):.3f} mg seen, of {made} in '
+                     f'squares{chance}{turned}')
     if judged.tilt_noise:
         lines.append('tilt, by what such errors of the axes make of it: ' + ', '.join(
             f'at most {_turned_deg(judged, bar):.2g} deg by the {name}: {said}'

@@ -186,7 +186,8 @@ class Tumble:
         """Name the direction to turn to, in words."""
         if self.next_up is None:
             return 'turn it to any direction not yet covered, and hold it still'
-        return f'turn it so that {directions.name_up(self.next_up)} points up, and hold it still'
+        return f'turn it so that {directions.points_up(directions.name_up(self.next_up))}, ' \
+               'and hold it still'
 
     def state(self) -> State:
         """Say what is waited for, and by how much it is off."""

@@ -59,7 +59,7 @@ class View:
         walk = self._session.walk
         if isinstance(walk, Tumble):
             up = walk.up()
-            now = '' if up is None else f'{directions.name_nearest(up)} points up now'
+            now = '' if up is None else f'{directions.points_up(directions.name_nearest(up))} now'
             return {'done': len(walk.accepted), 'total': ENOUGH_RESTS, 'skipped': 0,
                     'number': len(walk.accepted) + 1, 'now': now, 'off': '', 'left_s': None,
                     'dwell': None}

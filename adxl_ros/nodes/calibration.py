@@ -142,14 +142,23 @@ class Calibration(Node):
         walk = self.session.walk if self.session else None
         return walk if isinstance(walk, Sweep) else None
 
+    @property
+    def waiting(self) -> bool:
+        """Tell whether a calibration is to start that cannot yet."""
+        return self.session is None and self._wanted
+
     def start(self, anew: bool | None = None) -> tuple[bool, str]:
         """Begin, or go on with what was interrupted; returns whether, and what is said."""
         if self.session is not None:
             return False, 'a calibration is running; finish or abort it first'
+        if self.question and anew is None:
+            return False, self.question
         self._wanted, self.question = True, ''
         self._anew = self.resume == 'anew' if anew is None else anew
         self._try_to_start()
-        if self.session is None and self._wanted:
+        if self.question:
+            return False, self.question
+        if self.waiting:
             return True, 'starts when sensor_info arrives'
         return self.session is not None, self.said
 

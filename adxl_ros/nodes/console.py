@@ -32,6 +32,7 @@ _EVERY = 4
 _RUNNING = {'r': 'redo', 's': 'skip', 'f': 'finish', 'a': 'abort', 'q': 'quit'}
 _BY_HAND = {'c': 'capture', **_RUNNING}
 _IDLE = {'b': 'begin', 'q': 'quit'}
+_WAITING = {'a': 'abort', 'q': 'quit'}
 _ASKED = {'y': 'go on', 'n': 'begin anew', 'a': 'abort', 'q': 'quit'}
 
 
@@ -57,7 +58,7 @@ class Console:
             self._terminal, self.asks = None, False
             self._node.get_logger().warning('the screen has ended; plain lines from here on')
             if self._node.question:
-                self._node.start()
+                self._node.start(anew=False)
             return
         for key in self._terminal.pressed():
             self._press(key)
@@ -97,7 +98,7 @@ class Console:
         if self._node.question:
             return _ASKED
         if self._node.session is None:
-            return _IDLE
+            return _WAITING if self._node.waiting else _IDLE
         asked = self._node.asked
         by_hand = asked.mode == 'stage' and asked.settings.stage_mode != 'commanded'
         return _BY_HAND if by_hand else _RUNNING
