@@ -36,6 +36,8 @@ PLAN = ('-p', 'sweep.planes_rad:=[0.7853981633974483, 1.5707963267948966]', '-p'
         'sweep.step_rad:=1.5707963267948966', '-p', 'sweep.dwell_s:=1.5', '-p',
         'sweep.check_poses:=2', '-p', 'output:=unit.yaml', '-p',
         'qos_overrides./imu/data_raw.subscription.reliability:=reliable')
+OTHERS = '\x1b[A\x1b[1;5A\x1bOA\x1bOS\x1b[[A\x1b[M af\x1b[<65;10;10M\x1b[15~\x1bq'
+"""Arrow up, with Ctrl, of keypad mode; F4; F1 of a console; a mouse's wheel twice; F5; Alt-q."""
 
 
 @pytest.fixture
@@ -56,8 +58,6 @@ def terminal(ros_env, tmp_path):
     for one in opened:
         print(one.text())
         one.close()
-OTHERS = '\x1b[A\x1b[1;5A\x1bOA\x1bOS\x1b[[A\x1b[M af\x1b[<65;10;10M\x1b[15~\x1bq'
-"""Arrow up, with Ctrl, of keypad mode; F4; F1 of a console; a mouse's wheel twice; F5; Alt-q."""
 
 
 class Hands(Graph):
