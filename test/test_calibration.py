@@ -214,16 +214,16 @@ def test_an_operator_captures(start, tmp_path):
         assert answer.success and 'pose 1 is on disk' in answer.message
         _, entries = journal.read(tmp_path / 'calibration.yaml.journal')
         assert entries[0]['alpha_rad'] == 0.785
-        wait_until(lambda: graph.call(Trigger, 'calibration/redo', Trigger.Request()).success,
-                   10, 'redo')
         # One axis shows no tilt: there is no figure, and it is not NaN.
         graph.spin_until(lambda: graph.value('calibration', 'accepted') == '1', 10, 'the pose')
         values = {p.key: p.value for p in graph.diagnostics['calibration'].values}
         assert 'tilt_error_deg' not in values and 'nan' not in values.values()
+        wait_until(lambda: graph.call(Trigger, 'calibration/redo', Trigger.Request()).success,
+                   10, 'redo')
         # What was announced is taken back, for those, too, who listen later.
-        assert announced[-1].message.startswith('pose 1 of')
+        graph.spin_until(lambda: announced[-1].message.startswith('pose 1 of'), 10, 'pose 1')
         assert graph.call(Trigger, 'calibration/abort', Trigger.Request()).success
         late = graph.listen(DiagnosticStatus, '/calibration/next_pose', latched=True)
-        graph.spin_until(lambda: late, 10, 'the announcement')
-        assert late[-1].message.startswith('no pose: aborted; its poses stay in')
+        graph.spin_until(lambda: late and late[-1].message.startswith(
+            'no pose: aborted; its poses stay in'), 10, 'the announcement')
         assert not late[-1].values
