@@ -52,7 +52,7 @@ def crowding(of: Study, found: Hypothesis) -> float:
             tried, chosen = of.filters[number], found.fit.walks[number]
             if tried[chosen].drift == 'bias_walk' and not tried[chosen].healthy:
                 total += _nats(*_beside_walk(column, mask, tried[chosen], tried,
-                                              float(found.fit.variance[number])))
+                                             float(found.fit.variance[number])))
             number += 1
     return total
 
