@@ -249,6 +249,7 @@ def test_redo_and_skip_walk_the_plan():
     walk.sweep.take(walk.run(5, np.pi / 2, np.pi / 6))
     assert sorted(walk.sweep.accepted) == [0, 1] and walk.sweep.index == 2
     assert walk.sweep.redo() == 'pose 2 will be taken again'
+    assert sorted(walk.sweep.accepted) == [0] and len(walk.sweep.results()) == 1
     again = walk.run(5, np.pi / 2, np.pi / 6)
     walk.sweep.take(again)
     assert walk.sweep.accepted[1] == again

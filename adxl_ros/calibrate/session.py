@@ -142,6 +142,12 @@ class Session:
         """Tell whether all poses of a sweep are taken or left out."""
         return isinstance(self.walk, Sweep) and self.walk.target is None
 
+    @property
+    def left(self) -> int:
+        """Count the poses of a sweep that are still open."""
+        return len(self.walk.targets) - len(self.walk.accepted.keys() | self.walk.skipped) \
+            if isinstance(self.walk, Sweep) else 0
+
     def feed(self, stamps_ns: np.ndarray, volts: np.ndarray) -> str:
         """Take samples, ns, (n,), and V, (n, m); return why they are of no use, or ''."""
         self.newest.feed(stamps_ns, volts)
@@ -182,13 +188,15 @@ class Session:
 
     def redo(self) -> str:
         """Take the pose before again; return what is done, or '' where there is none."""
-        if isinstance(self.walk, Tumble) and self.walk.accepted:
-            self.journal.append({'drop': max(self.walk.accepted)})
+        number = self.walk.before
+        if number is not None:
+            # It is bad, and no part of a fit even if it is not taken again.
+            self.journal.append({'drop': number})
         return self.walk.redo()
 
     def finish(self) -> result.Result:
         """
-        Fit what there is, and write the parameter file.
+        Fit what there is, and write the parameter file; a sweep with open poses can go on.
 
         Raises
         ------
@@ -202,7 +210,7 @@ class Session:
         found = result.calibrate(self.unit, [Poses.from_entries(entries)], None,
                                  [self.journal.path.name])
         found.save(self.asked.output)
-        self.journal.append({'rests': entries, 'done': True})
+        self.journal.append({'rests': entries, 'done': not self.left})
         return found
 
     def close(self) -> None:

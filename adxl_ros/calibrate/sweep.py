@@ -126,15 +126,25 @@ class Sweep:
         self._go(self._next())
         return f'pose {number} is left out'
 
+    @property
+    def before(self) -> int | None:
+        """Return the number of the pose before, taken or left out; None where there is none."""
+        if self._verify is not None:
+            return None
+        return max((i for i in self.accepted.keys() | self.skipped if i < self.index),
+                   default=None)
+
     def redo(self) -> str:
-        """Go back to the pose before; return what is done, or '' where there is none."""
-        taken = [i for i in range(self.index) if i in self.accepted or i in self.skipped]
-        if not taken or self._verify is not None:
+        """Forget the pose before and go back; return what is done, or '' if there is none."""
+        number = self.before
+        if number is None:
             return ''
+        self.accepted.pop(number, None)
+        self.skipped.discard(number)
         # Its earlier reading must not speak against the new one.
-        self.known = self._learned(None, without=taken[-1])
-        self._go(taken[-1])
-        return f'pose {self.index + 1} will be taken again'
+        self.known = self._learned(None)
+        self._go(number)
+        return f'pose {number + 1} will be taken again'
 
     def stage(self, stamp_ns: int, alpha_rad: float, beta_rad: float) -> None:
         """Take an encoder reading."""
@@ -279,9 +289,9 @@ class Sweep:
         self._captured = False
         self._dwell = Dwell(self.sensor, self._angles[-1][0] if self._angles else 0)
 
-    def _learned(self, before: known.Known | None, without: int | None = None) -> known.Known:
+    def _learned(self, before: known.Known | None) -> known.Known:
         stage_rad = self.sensor.stage_resolution_rad / np.sqrt(12)
-        entries = [e for e in self.results() if not e.get('check') and e['pose'] != without]
+        entries = [e for e in self.results() if not e.get('check')]
         poses = Poses.from_entries(entries) if entries else Poses(
             *(np.zeros((0, len(self.sensor.axes))),) * 2, *(np.zeros(0),) * 2, np.zeros((0, 2)),
             np.zeros(0, bool))

@@ -137,11 +137,16 @@ class Tumble:
         self._choose()
         return f'{left_out} up is left out'
 
+    @property
+    def before(self) -> int | None:
+        """Return the number of the newest rest."""
+        return max(self.accepted, default=None)
+
     def redo(self) -> str:
         """Forget the newest rest; return what is done, or '' where there is none."""
-        if not self.accepted:
+        number = self.before
+        if number is None:
             return ''
-        number = max(self.accepted)
         self.drop(self.accepted[number])
         return f'rest {number + 1} is forgotten; hold the sensor in that direction again'
 

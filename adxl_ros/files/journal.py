@@ -107,7 +107,7 @@ class Journal:
 
     def _resume(self, head: dict[str, Any], anew: bool) -> list[dict[str, Any]]:
         known, whole = _parse(self.path)
-        if known and (anew or known[-1].get('done')):
+        if known and (anew or _ended(known, head)):
             # A finished one is kept until the next is finished, an interrupted one for ever.
             name = 'previous' if known[-1].get('done') else \
                 datetime.now(timezone.utc).strftime('%Y%m%dT%H%M%S.%fZ')
@@ -165,10 +165,10 @@ def unfinished(path: str | os.PathLike, head: dict[str, Any]) -> tuple[int, str]
         lines, _ = _parse(Path(path))
     except OSError as error:
         raise UserError(f'{path}: cannot be read: {error.strerror}') from None
-    poses = len(accepted_poses(lines))
-    if not poses or lines[-1].get('done'):
+    poses, head = len(accepted_poses(lines)), _written(head)
+    if not poses or _ended(lines, head):
         return None
-    return poses, differences(lines[0], _written(head))
+    return poses, differences(lines[0], head)
 
 
 def differences(was: dict[str, Any], now: dict[str, Any]) -> str:
@@ -177,9 +177,24 @@ def differences(was: dict[str, Any], now: dict[str, Any]) -> str:
                      for key in sorted(was.keys() | now.keys()) if was.get(key) != now.get(key))
 
 
+def _ended(lines: Sequence[dict[str, Any]], head: dict[str, Any]) -> bool:
+    """
+    Tell whether a calibration is over, so that another may begin.
+
+    One that was fitted with poses left open (`done` is false) can go on, but is in nobody's way.
+    """
+    done = lines[-1].get('done')
+    return bool(done) or (done is not None and bool(differences(lines[0], head)))
+
+
 def skipped_poses(entries: Sequence[dict[str, Any]]) -> set[int]:
-    """Return the poses that the operator left out."""
-    return {entry['skip'] for entry in entries if 'skip' in entry}
+    """Return the poses that the operator left out and did not ask for again."""
+    found: set[int] = set()
+    for entry in entries:
+        found.discard(entry.get('drop', -1))
+        if 'skip' in entry:
+            found.add(entry['skip'])
+    return found
 
 
 def accepted_poses(entries: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -305,7 +305,9 @@ class Calibration(Node):
         for line in found.comments():
             self.get_logger().info(line)
         self.outcome = found.verdict
-        self._stop(f'wrote {self.asked.output}')
+        left = self.session.left
+        self._stop(f'wrote {self.asked.output}' + (
+            f'; {left} poses are open: start again to go on' if left else ''))
         return True
 
     def _leave_report(self, found: Result) -> None:

@@ -1,0 +1,89 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""A calibration from its poses to its file, without ROS: what ends in the fit and on the disk."""
+
+from adxl_ros.calibrate.session import Plan, Session
+from adxl_ros.calibrate.state import Settings
+from adxl_ros.files import journal
+from adxl_ros.model import chain
+from adxl_ros.model.stage import specific_force
+import numpy as np
+import pytest
+from units import drawn, nominal
+
+UNIT = nominal(serial='S1')
+TRUTH = drawn(np.random.default_rng(3), UNIT)
+
+
+@pytest.fixture
+def begin(tmp_path):
+    """Give a function that begins or resumes a calibration of 20 poses and 2 check poses."""
+    begun = []
+
+    def begin(anew=False, **changes):
+        if begun:
+            begun[-1].close()
+        settings = Settings(1.0, 0.0035, 20.0, 'manual')
+        asked = Plan(**{**dict(
+            mode='stage', planes_rad=(np.pi / 4, np.pi / 2), step_rad=np.pi / 2, checks=2,
+            settings=settings, output=tmp_path / 'unit.yaml', journal=tmp_path / 'journal',
+            report='', store=''), **changes})
+        begun.append(Session(UNIT, asked, anew))
+        return begun[-1]
+    yield begin
+    begun[-1].close()
+
+
+def take(session, count, off_v=0.0):
+    """Take poses, as `Session.accepted` does with those that the stream gives."""
+    for _ in range(count):
+        target, walk = session.walk.target, session.walk
+        volts = np.column_stack(chain.static_response(TRUTH)(specific_force(
+            np.array([target.alpha_rad]), np.array([target.beta_rad]), 9.80665)))[0] + off_v
+        entry = {'pose': walk.index, 'alpha_rad': target.alpha_rad, 'beta_rad': target.beta_rad,
+                 'check': target.check, 'start_ns': 2 * walk.index, 'stop_ns': 2 * walk.index + 1,
+                 'samples': 1000, 'mean_v': volts.tolist(), 'std_v': [5e-5, 5e-5]}
+        session.journal.append(entry)
+        walk.take(entry)
+
+
+def kept(session):
+    """Return the numbers of the poses on disk."""
+    return [e['pose'] for e in journal.accepted_poses(journal.read(session.journal.path)[1])]
+
+
+def test_a_pose_to_be_taken_again_is_in_no_fit_and_not_resumed(begin):
+    """`redo` and then a finish or a kill: the pose that was bad is gone."""
+    session = begin()
+    take(session, 2)
+    take(session, 1, 0.3)
+    assert session.redo() == 'pose 3 will be taken again'
+    assert kept(session) == [0, 1]
+    assert [e['pose'] for e in session.walk.results()] == [0, 1]
+    session = begin()
+    assert session.resumed == 2 and kept(session) == [0, 1]
+
+
+def test_finished_early_it_goes_on_and_at_its_end_it_is_over(begin):
+    """The file is of the poses so far; the next start has them, and ends with all."""
+    session = begin()
+    take(session, 12)
+    assert session.finish().fitted.provenance['poses'] == '12'
+    session = begin()
+    assert session.resumed == 12 and session.left == 10
+    session.walk.skip()
+    take(session, 10)
+    assert session.over and session.finish().fitted.provenance['check_poses'] == '2'
+    assert begin().resumed == 0
