@@ -16,7 +16,8 @@
 
 from adxl_ros.calibrate.session import Plan, Session
 from adxl_ros.calibrate.state import Settings
-from adxl_ros.files import journal
+from adxl_ros.errors import UserError
+from adxl_ros.files import atomic, journal
 from adxl_ros.model import chain
 from adxl_ros.model.stage import specific_force
 import numpy as np
@@ -81,9 +82,74 @@ def test_finished_early_it_goes_on_and_at_its_end_it_is_over(begin):
     session = begin()
     take(session, 12)
     assert session.finish().fitted.provenance['poses'] == '12'
+    session.end()
     session = begin()
     assert session.resumed == 12 and session.left == 10
     session.walk.skip()
     take(session, 10)
     assert session.over and session.finish().fitted.provenance['check_poses'] == '2'
+    session.end()
     assert begin().resumed == 0
+
+
+def test_a_finish_that_comes_twice_keeps_the_calibration_before(begin, tmp_path, monkeypatch):
+    """The journal took no `done`: the same fit again is no other calibration."""
+    (tmp_path / 'unit.yaml').write_text('the one before\n')
+    session = begin(store=str(tmp_path / 'store'))
+    take(session, 12)
+    with monkeypatch.context() as patch:
+        patch.setattr(session.journal, 'append', _full)
+        found = session.finish()
+        copy = found.keep(session.asked.store)
+        with pytest.raises(UserError, match='unit.yaml is written, but .*make room'):
+            session.end()
+    again = session.finish()
+    assert again.keep(session.asked.store) == copy and copy.startswith('kept as')
+    assert (tmp_path / 'unit.yaml.previous').read_text() == 'the one before\n'
+    first = (tmp_path / 'unit.yaml').read_text()
+    take(session, 1)
+    session.finish().keep(session.asked.store)
+    assert (tmp_path / 'unit.yaml.previous').read_text() == first
+    assert len(list((tmp_path / 'store' / 'S1').iterdir())) == 2
+
+
+def _full(_):
+    raise UserError('journal: cannot write the journal: the disk is full; make room and try again')
+
+
+def test_what_a_killed_writer_left_is_cleared_and_what_is_being_written_stays(begin, tmp_path):
+    """Hidden folders of a write that was killed go at the next start."""
+    for name in ('unit.yaml', 'unit.yaml.previous', 'journal.previous'):
+        (tmp_path / f'.{name}.abcd1234.part').mkdir()
+        (tmp_path / f'.{name}.abcd1234.part' / name).write_text('half')
+    (tmp_path / '.unit.yaml.mine').mkdir()
+    with atomic.atomic_path(tmp_path / 'unit.yaml') as fresh:
+        begin()
+        fresh.write_text('whole')
+        assert len(list(tmp_path.glob('.*.part'))) == 1
+    assert (tmp_path / 'unit.yaml').read_text() == 'whole'
+    assert {p.name for p in tmp_path.glob('.*')} == {'.unit.yaml.mine'}
+
+
+def test_check_poses_alone_are_no_calibration(begin):
+    """They judge a fit: without poses to fit it is refused, and what was taken stays."""
+    session = begin()
+    for _ in range(20):
+        session.skip()
+    take(session, 1)
+    with pytest.raises(UserError, match='only check poses are taken'):
+        session.finish()
+    assert kept(session) == [20]
+
+
+@pytest.mark.parametrize('count', [1, 2, 3, 5, 8])
+def test_few_poses_are_fitted_or_refused(begin, count):
+    """Never a traceback, whenever an operator has had enough."""
+    session = begin()
+    take(session, count)
+    session.walk.skipped.update(range(count, 20))
+    session.walk.retry()
+    try:
+        assert session.finish().fitted.provenance['poses'] == f'{count}'
+    except UserError as error:
+        assert str(error)

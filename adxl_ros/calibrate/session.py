@@ -29,6 +29,8 @@ from adxl_ros.calibrate.stream import Newest
 from adxl_ros.calibrate.sweep import Sweep
 from adxl_ros.calibrate.tumble import Tumble
 from adxl_ros.errors import UserError
+from adxl_ros.files import store
+from adxl_ros.files.atomic import clear_left
 from adxl_ros.files.journal import accepted_poses, Journal, skipped_poses, unfinished
 from adxl_ros.model.sensor import Sensor
 import numpy as np
@@ -126,6 +128,11 @@ class Session:
         self.unit, self.asked = unit, asked
         self.newest = Newest(unit)
         self.journal = Journal(asked.journal, asked.head(unit), anew)
+        for path in asked.output, asked.journal:
+            clear_left(path.parent, path.name)
+        if asked.store:
+            clear_left(store.unit_folder(asked.store, unit.serial), '')
+        self._fitted: list[dict[str, Any]] = []
         accepted = accepted_poses(self.journal.entries)
         self.resumed = len(accepted)
         self.walk = Sweep(unit, targets, asked.settings, accepted,
@@ -196,22 +203,42 @@ class Session:
 
     def finish(self) -> result.Result:
         """
-        Fit what there is, and write the parameter file; a sweep with open poses can go on.
+        Fit what there is, and write the parameter file; `end` is due when all is written.
 
         Raises
         ------
         UserError
-            There are too few poses, or a file cannot be written; what was taken stays.
+            There are too few poses, or the file cannot be written; what was taken stays.
 
         """
         entries = self.walk.results()
         if not entries:
             raise UserError('no pose is taken yet')
+        if all(entry.get('check') for entry in entries):
+            raise UserError('only check poses are taken, which judge a fit and are no part of '
+                            'it; take poses of the planes, too')
         found = result.calibrate(self.unit, [Poses.from_entries(entries)], None,
                                  [self.journal.path.name])
         found.save(self.asked.output)
-        self.journal.append({'rests': entries, 'done': not self.left})
+        self._fitted = entries
         return found
+
+    def end(self) -> None:
+        """
+        Note that what was fitted is written; a sweep with open poses can go on.
+
+        Until then a new start fits and writes once more.
+
+        Raises
+        ------
+        UserError
+            The disk does not take it.
+
+        """
+        try:
+            self.journal.append({'rests': self._fitted, 'done': not self.left})
+        except UserError as error:
+            raise UserError(f'{self.asked.output} is written, but {error}') from None
 
     def close(self) -> None:
         """Let the journal go."""

@@ -60,7 +60,7 @@ class Calibration(Node):
         self.session: Session | None = None
         self.outcome: list[str] = []
         self.question = ''
-        self.said = self._hindrance = self._warned = self._foreign = ''
+        self.said = self._hindrance = self._warned = self._foreign = self._stuck = ''
         self._wanted = self.autostart
         self._anew = self.resume == 'anew'
         self._newest: Newest | None = None
@@ -186,6 +186,7 @@ class Calibration(Node):
         except UserError as error:
             text, otherwise = '', f'{error}'
         if text:
+            self._stuck = ''
             self._answer_captures(False, text)
             self.say(text)
         return bool(text), text or otherwise
@@ -247,7 +248,8 @@ class Calibration(Node):
             self._take_poses()
         if self.session is not None:
             if self.session.over:
-                self._finish()
+                if not self._stuck:
+                    self._finish()
             else:
                 self._announcer.announce(self.session.walk, self._steady.now().nanoseconds)
         if self.console is not None:
@@ -289,19 +291,22 @@ class Calibration(Node):
         self._hindrance = hindrance
 
     def _finish(self) -> bool:
+        self.say(f'fitting {self.session.done} poses')
         if self.console is not None:
-            self.console.show('fit', 'fitting what was taken')
-        over = self.session.over
+            self.console.show('fit', self.said)
+        self._stuck = ''
         try:
             found = self.session.finish()
+            self.get_logger().info(found.keep(self.asked.store))
+            self._leave_report(found)
+            self.session.end()
         except (UserError, OSError) as error:
-            # What was taken stays, so that more poses or another directory can save it.
-            self.fail(f'cannot finish: {error}')
-            if over:
-                self._stop(self.said)
+            # What was taken stays: other poses, or room on the disk, can save it.
+            text = f'cannot finish: {error}'
+            if self.session.over:
+                self._stuck = text = f'{text}; finish again, redo or abort'
+            self.fail(text)
             return False
-        self.get_logger().info(found.keep(self.asked.store))
-        self._leave_report(found)
         for line in found.comments():
             self.get_logger().info(line)
         self.outcome = found.verdict
@@ -321,7 +326,7 @@ class Calibration(Node):
             self.fail(f'no report: {error}')
 
     def _stop(self, text: str, failed: bool = False) -> None:
-        self._wanted, self.question, self._hindrance = False, '', ''
+        self._wanted, self.question, self._hindrance, self._stuck = False, '', '', ''
         session, self.session = self.session, None
         if session is not None:
             session.close()
@@ -365,6 +370,8 @@ class Calibration(Node):
             return 'silent', silent, True
         if self._hindrance:
             return 'refused', self._hindrance, True
+        if self._stuck:
+            return 'refused', self._stuck, True
         state = self.session.walk.state()
         return state.phase, state.text, state.late
 
