@@ -86,6 +86,33 @@ def test_what_is_no_journal(tmp_path, text, words):
         read(path)
 
 
+@pytest.mark.parametrize('text, poses', [
+    (b'%s\n{"pose": 0}\n{"po#e": \xff}\n{"pose": 2}\n', 1), (b'a list of mine', 0)])
+def test_a_damaged_one_is_said_and_begun_anew_only_if_told(tmp_path, text, poses):
+    """Nothing is cut from it, and it is no dead end."""
+    path, head = tmp_path / 'j', json.dumps({'format': 1, **HEAD}).encode()
+    text = text.replace(b'%s', head)
+    path.write_bytes(text)
+    with pytest.raises(UserError, match=f'not a journal: .*; {poses} poses before it can be read; '
+                       'name another journal, or begin anew with resume:=anew'):
+        Journal(path, HEAD)
+    assert path.read_bytes() == text
+    found, why = unfinished(path, HEAD)
+    assert found == poses and 'is not of a journal' in why
+    Journal(path, HEAD, anew=True).close()
+    assert read(path) == ({'format': 1, **HEAD}, [])
+    kept, = tmp_path.glob('j.2*')
+    assert kept.read_bytes() == text
+
+
+def test_a_head_that_a_crash_cut_is_written_anew(tmp_path):
+    """It held no pose: nothing to ask about."""
+    for text in (b'{"form', bytes(40)):
+        (tmp_path / 'j').write_bytes(text)
+        Journal(tmp_path / 'j', HEAD).close()
+        assert read(tmp_path / 'j')[0]['serial'] == 'A1'
+
+
 def test_unwritable(tmp_path):
     """A journal in a folder that is not there is refused."""
     with pytest.raises(UserError, match='cannot write the journal'):
