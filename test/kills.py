@@ -70,7 +70,7 @@ class Sweeps:
         self.rng = np.random.default_rng(seed)
         self.kills = self.sweeps = self.poses = 0
         self.lost, self.broken, self.moments = [], [], {}
-        base = nominal(serial='K1')
+        base = nominal(serial='K1', rate_hz=200.0)
         params.save(self.folder / 'truth.yaml', drawn(np.random.default_rng(3), base))
         params.save(self.folder / 'bare.yaml', base)
         self._known, self._written, self._stored, self._left = {}, '', set(), set()
