@@ -101,6 +101,10 @@ class Calibration(Node):
             unit = recorded.unit_of(self.base, info, 'sensor_info')
         except UserError as error:
             self._foreign = f'{error}'
+            # Of that sensor nothing is taken or shown.
+            self.unit = self._newest = None
+            if self.session is not None:
+                self._stop(f'{error}; the poses are kept', failed=True)
             self.fail(self._foreign)
             return
         self._foreign = ''
