@@ -35,7 +35,9 @@ from adxl_ros.files.journal import accepted_poses, Journal, skipped_poses, unfin
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
-_FIGURES = ('serial', 'axes', 'rate_hz', 'nominal_zero_g_v', 'nominal_scale_v_per_g')
+_FIGURES = ('serial', 'axes', 'rate_hz', 'nominal_zero_g_v', 'nominal_scale_v_per_g',
+            'noise_density_g_per_rthz', 'rc_resistance_ohm', 'rc_capacitance_f', 'adc_bits',
+            'adc_vref_v', 'range_g', 'local_gravity_mps2', 'stage_resolution_rad')
 
 
 @dataclass(frozen=True)
@@ -78,9 +80,12 @@ class Plan:
         """Return what must be the same for a calibration of this unit to go on."""
         head = {'mode': self.mode,
                 **{name: np.asarray(getattr(unit, name)).tolist() for name in _FIGURES}}
+        head['sweep.temperature_span_c'] = self.settings.temperature_span_c
         if self.mode == 'gravity':
             return head
         return {**head, 'stage.mode': self.settings.stage_mode,
+                'stage.tolerance_rad': self.settings.tolerance_rad,
+                'stage.near_rad': self.settings.near_rad,
                 'sweep.dwell_s': self.settings.dwell_s, 'sweep.planes_rad': self.planes_rad,
                 'sweep.step_rad': self.step_rad, 'sweep.check_poses': self.checks,
                 'order': plan.ORDER}
