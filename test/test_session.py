@@ -14,10 +14,12 @@
 
 """A calibration from its poses to its file, without ROS: what ends in the fit and on the disk."""
 
+from dataclasses import replace
+
 from adxl_ros.calibrate.session import Plan, Session
 from adxl_ros.calibrate.state import Settings
 from adxl_ros.errors import UserError
-from adxl_ros.files import atomic, journal
+from adxl_ros.files import atomic, journal, params
 from adxl_ros.model import chain
 from adxl_ros.model.stage import specific_force
 import numpy as np
@@ -37,10 +39,9 @@ def begin(tmp_path):
         if begun:
             begun[-1].close()
         settings = Settings(1.0, 0.0035, 20.0, 'manual')
-        asked = Plan(**{**dict(
-            mode='stage', planes_rad=(np.pi / 4, np.pi / 2), step_rad=np.pi / 2, checks=2,
-            settings=settings, output=tmp_path / 'unit.yaml', journal=tmp_path / 'journal',
-            report='', store=''), **changes})
+        asked = replace(Plan(
+            'stage', (np.pi / 4, np.pi / 2), np.pi / 2, 2, settings, tmp_path / 'unit.yaml',
+            tmp_path / 'journal', '', ''), **changes)
         begun.append(Session(UNIT, asked, anew))
         return begun[-1]
     yield begin
@@ -153,3 +154,30 @@ def test_few_poses_are_fitted_or_refused(begin, count):
         assert session.finish().fitted.provenance['poses'] == f'{count}'
     except UserError as error:
         assert str(error)
+
+
+@pytest.mark.parametrize('mode', ['stage', 'gravity'])
+def test_a_calibration_goes_on_only_with_the_figures_and_settings_it_began_with(begin, mode):
+    """What changes the poses or the fit is in the head; what was changed is said."""
+    asked, unit = begin().asked, nominal('xyz')
+    asked = replace(asked, mode=mode)
+    changed = [(asked, replace(unit, **{name: np.asarray(getattr(unit, name)) * 2}))
+               for name in ('noise_density_g_per_rthz', 'rc_capacitance_f', 'adc_vref_v',
+                            'range_g', 'local_gravity_mps2', 'stage_resolution_rad')]
+    names = ['temperature_span_c'] + ['tolerance_rad', 'near_rad'] * (mode == 'stage')
+    changed += [(replace(asked, settings=replace(asked.settings, **{name: 0.1})), unit)
+                for name in names]
+    before = asked.head(unit)
+    for plan, sensor in changed:
+        assert len([key for key, value in plan.head(sensor).items() if value != before[key]]) == 1
+
+
+def test_a_mounting_that_was_not_checked_is_said_in_the_file(begin, tmp_path):
+    """`skip` goes on without the check, and who uses the calibration can see it."""
+    take(begin(), 12)
+    session = begin()
+    assert session.skip() == 'pose 12 is not taken again: the mounting is not checked'
+    session = begin()
+    session.skip()
+    assert session.finish().fitted.provenance['mounting'] == 'not checked after an interruption'
+    assert params.load(tmp_path / 'unit.yaml').provenance['mounting'].startswith('not checked')

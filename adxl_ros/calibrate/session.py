@@ -17,7 +17,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import os
 from pathlib import Path
 from typing import Any
@@ -138,6 +138,7 @@ class Session:
         if asked.store:
             clear_left(store.unit_folder(asked.store, unit.serial), '')
         self._fitted: list[dict[str, Any]] = []
+        self._unchecked = any('mounting' in entry for entry in self.journal.entries)
         accepted = accepted_poses(self.journal.entries)
         self.resumed = len(accepted)
         self.walk = Sweep(unit, targets, asked.settings, accepted,
@@ -160,6 +161,10 @@ class Session:
         return len(self.walk.targets) - len(self.walk.accepted.keys() | self.walk.skipped) \
             if isinstance(self.walk, Sweep) else 0
 
+    @property
+    def _unverified(self) -> int:
+        return self.walk.to_verify if isinstance(self.walk, Sweep) else 0
+
     def feed(self, stamps_ns: np.ndarray, volts: np.ndarray) -> str:
         """Take samples, ns, (n,), and V, (n, m); return why they are of no use, or ''."""
         self.newest.feed(stamps_ns, volts)
@@ -180,7 +185,7 @@ class Session:
             The disk does not take a pose; it is taken anew.
 
         """
-        verifying = isinstance(self.walk, Sweep) and self.walk.verifying
+        unverified = self._unverified
         while (entry := self.walk.accept()) is not None:
             try:
                 self.journal.append(entry)
@@ -189,12 +194,16 @@ class Session:
                 raise
             self.walk.take(entry)
             yield f'pose {entry["pose"] + 1} is on disk'
-        if verifying and isinstance(self.walk, Sweep) and not self.walk.verifying:
-            yield 'the sensor is mounted as it was'
+        if unverified > self._unverified:
+            yield 'the sensor is mounted as it was' if not self._unverified else \
+                'this pose reads what it did before; one more shows the mounting as a whole'
 
     def skip(self) -> str:
         """Leave the pose at hand out; return what is done."""
-        if isinstance(self.walk, Sweep) and not self.walk.verifying and not self.over:
+        if self._unverified:
+            self.journal.append({'mounting': 'not checked'})
+            self._unchecked = True
+        elif isinstance(self.walk, Sweep) and not self.over:
             self.journal.append({'skip': self.walk.index, 'drop': self.walk.index})
         return self.walk.skip() if not self.over else 'there is no pose left to skip'
 
@@ -224,6 +233,9 @@ class Session:
                             'it; take poses of the planes, too')
         found = result.calibrate(self.unit, [Poses.from_entries(entries)], None,
                                  [self.journal.path.name])
+        if self._unchecked:
+            found = replace(found, fitted=replace(found.fitted, provenance={
+                **found.fitted.provenance, 'mounting': 'not checked after an interruption'}))
         found.save(self.asked.output)
         self._fitted = entries
         return found

@@ -112,9 +112,13 @@ class Calibration(Node):
             was, now = (self.asked.head(of) for of in (self.session.unit, unit))
             changed = ', '.join(f'{key} was {was[key]}, is {now[key]}' for key in was
                                 if was[key] != now[key])
-            if changed:
+            if not changed and self._sweep is not None:
+                # A driver that was started anew: the sensor may have been taken off.
+                self._sweep.verify()
+                self._answer_captures(False, 'the driver began anew; capture again')
+            elif changed:
                 self._stop(f'sensor_info: {changed}: changed during the calibration; put it back '
-                           'and start again, the poses are kept')
+                           'and start again, the poses are kept', failed=True)
         self.unit, self._newest = unit, Newest(unit)
 
     def _on_stage(self, message: JointState) -> None:
