@@ -113,8 +113,9 @@ def test_a_fit_that_fails_at_the_end_waits_and_another_unit_ends_the_session(sta
     for i, target in enumerate(asked.targets()):
         interrupted.append({
             'pose': i, 'alpha_rad': target.alpha_rad, 'beta_rad': target.beta_rad, 'check': False,
-            'start_ns': i, 'stop_ns': i, 'samples': 500, 'mean_v': [2.5, 2.5],
-            'std_v': [1e-4, 1e-4]})
+            'start_ns': i, 'stop_ns': i, 'samples': 500, 'std_v': [1e-4, 1e-4],
+            # Inverted: a unit that no fit takes.
+            'mean_v': [2.5 - np.cos(target.beta_rad), 2.5 - np.sin(target.beta_rad)]})
     interrupted.close()
     with Graph() as graph:
         driver = _driver(start, tmp_path)
@@ -123,7 +124,7 @@ def test_a_fit_that_fails_at_the_end_waits_and_another_unit_ends_the_session(sta
             'output:=unit.yaml', '-p', 'autostart:=true', '-p', 'stage.mode:=manual', '-p',
             f'sweep.planes_rad:=[{np.pi / 2}]', '-p', f'sweep.step_rad:={np.pi / 2}', '-p',
             'sweep.dwell_s:=0.5', '-p', 'sweep.check_poses:=0')
-        graph.spin_until(lambda: graph.said('calibration', 'cannot finish: '), 40, 'why')
+        graph.spin_until(lambda: graph.said('calibration', 'cannot finish: '), 60, 'why')
         assert graph.said('calibration', '; finish again, redo or abort')
         assert node.output().count('fitting 10 poses') == 1
         answer = graph.call(Trigger, 'calibration/redo', Trigger.Request())
@@ -131,7 +132,7 @@ def test_a_fit_that_fails_at_the_end_waits_and_another_unit_ends_the_session(sta
         driver.stop()
         _driver(start, tmp_path, 'N2')
         node.wait_for('sensor_info: is of the sensor N2, but the parameters are of N1; give the '
-                      'parameters of that sensor, or nominal ones; the poses are kept')
+                      'parameters of that sensor, or nominal ones; the poses are kept', 60)
         answer = graph.call(Trigger, 'calibration/capture', Trigger.Request())
         assert (answer.success, answer.message) == (False, 'no calibration is running')
     assert len(_on_disk(tmp_path)) == 9 and not (tmp_path / 'unit.yaml').exists()
@@ -162,7 +163,7 @@ def test_a_new_start_resumes_or_says_what_changed_or_begins_anew(start, tmp_path
         assert _on_disk(tmp_path)[:len(poses)] == poses
 
         anew = _calibration(start, tmp_path, '-p', 'resume:=anew')
-        anew.wait_for('pose 1 is on disk')
+        anew.wait_for('pose 1 is on disk', 60)
         kept, = tmp_path.glob('unit.yaml.journal.2*')
         assert journal.accepted_poses(journal.read(kept)[1])[:len(poses)] == poses
 

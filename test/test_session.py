@@ -123,11 +123,13 @@ def test_what_a_killed_writer_left_is_cleared_and_what_is_being_written_stays(be
     for name in ('unit.yaml', 'unit.yaml.previous', 'journal.previous'):
         (tmp_path / f'.{name}.abcd1234.part').mkdir()
         (tmp_path / f'.{name}.abcd1234.part' / name).write_text('half')
+    for inner in ('report/.report.html', 'store/S1/.S1-2026.yaml'):
+        (tmp_path / f'{inner}.abcd1234.part').mkdir(parents=True)
     (tmp_path / '.unit.yaml.mine').mkdir()
     with atomic.atomic_path(tmp_path / 'unit.yaml') as fresh:
-        begin()
+        begin(report=str(tmp_path / 'report'), store=str(tmp_path / 'store'))
         fresh.write_text('whole')
-        assert len(list(tmp_path.glob('.*.part'))) == 1
+        assert len(list(tmp_path.rglob('.*.part'))) == 1
     assert (tmp_path / 'unit.yaml').read_text() == 'whole'
     assert {p.name for p in tmp_path.glob('.*')} == {'.unit.yaml.mine'}
 

@@ -133,10 +133,7 @@ class Session:
         self.unit, self.asked = unit, asked
         self.newest = Newest(unit)
         self.journal = Journal(asked.journal, asked.head(unit), anew)
-        for path in asked.output, asked.journal:
-            clear_left(path.parent, path.name)
-        if asked.store:
-            clear_left(store.unit_folder(asked.store, unit.serial), '')
+        self._clear_left()
         self._fitted: list[dict[str, Any]] = []
         self._unchecked = any('mounting' in entry for entry in self.journal.entries)
         accepted = accepted_poses(self.journal.entries)
@@ -144,6 +141,17 @@ class Session:
         self.walk = Sweep(unit, targets, asked.settings, accepted,
                           skipped_poses(self.journal.entries)) if targets else \
             Tumble(unit, asked.settings.temperature_span_c, accepted)
+
+    def _clear_left(self) -> None:
+        """Clear what a kill within a write has left."""
+        asked = self.asked
+        places = [(path.parent, path.name) for path in (asked.output, asked.journal)]
+        if asked.report:
+            places += [(Path(asked.report), name) for name in ('report.html', 'calibration.png')]
+        if asked.store:
+            places.append((store.unit_folder(asked.store, self.unit.serial), ''))
+        for folder, name in places:
+            clear_left(folder, name)
 
     @property
     def done(self) -> int:
@@ -199,13 +207,13 @@ class Session:
                 'this pose reads what it did before; one more shows the mounting as a whole'
 
     def skip(self) -> str:
-        """Leave the pose at hand out; return what is done."""
+        """Leave the pose at hand out; return what is done, or '' where none is left."""
         if self._unverified:
             self.journal.append({'mounting': 'not checked'})
             self._unchecked = True
         elif isinstance(self.walk, Sweep) and not self.over:
             self.journal.append({'skip': self.walk.index, 'drop': self.walk.index})
-        return self.walk.skip() if not self.over else 'there is no pose left to skip'
+        return self.walk.skip() if not self.over else ''
 
     def redo(self) -> str:
         """Take the pose before again; return what is done, or '' where there is none."""

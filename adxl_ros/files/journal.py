@@ -192,9 +192,9 @@ def unfinished(path: str | os.PathLike, head: dict[str, Any]) -> tuple[int, str]
 
 
 def differences(was: dict[str, Any], now: dict[str, Any]) -> str:
-    """Say in which keys two heads differ."""
+    """Say in which keys two heads differ, in the order of the present one: the unit first."""
     return ', '.join(f'{key} was {_short(was.get(key))}, is {_short(now.get(key))}'
-                     for key in sorted(was.keys() | now.keys()) if was.get(key) != now.get(key))
+                     for key in {**now, **was} if was.get(key) != now.get(key))
 
 
 def _ended(lines: Sequence[dict[str, Any]], head: dict[str, Any]) -> bool:

@@ -155,8 +155,8 @@ class Calibration(Node):
         if self._sweep is not None and self.asked.settings.stage_mode == 'commanded':
             return False, 'nothing to capture: the stage moves itself, and poses are taken when ' \
                           'it has arrived'
-        if self._hindrance:
-            return False, self._hindrance
+        if self._hindrance or self._stuck:
+            return False, self._hindrance or self._stuck
         self._take_samples()
         why = self.session.walk.capture()
         if why:
