@@ -43,7 +43,7 @@ def to_take_again(entries: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def changed(sensor: Sensor, before: Mapping[str, Any], now: Mapping[str, Any],
-             tolerance_rad: float) -> str:
+            tolerance_rad: float) -> str:
     """
     Refuse to go on where a pose that was taken before reads something else now.
 
