@@ -16,6 +16,9 @@
 A sweep that is killed again and again, at random moments: no accepted pose is lost.
 
     make soak ARGS='--minutes 0'     200 kills, a table for docs/guided.md
+
+Of five kills two come within the first two seconds, one while all poses are fitted, one while a
+file is written, and one when the sweep has ended.
 """
 
 import json
@@ -32,11 +35,15 @@ import numpy as np
 from units import drawn, nominal
 
 SIM = ('-p', 'use_sim_time:=true')
-SWEEP = ('-p', 'autostart:=true', '-p', 'sweep.planes_rad:=[0.785, 1.5707963267948966, 2.356]',
-         '-p', 'sweep.step_rad:=0.7853981633974483', '-p', 'sweep.dwell_s:=0.5', '-p',
-         'sweep.check_poses:=4', '-p', 'output:=unit.yaml', '-p',
+SWEEP = ('-p', 'autostart:=true', '-p', 'sweep.planes_rad:=[1.5707963267948966]',
+         '-p', 'sweep.step_rad:=1.5707963267948966', '-p', 'sweep.dwell_s:=0.5', '-p',
+         'sweep.check_poses:=2', '-p', 'output:=unit.yaml', '-p', 'store:=store', '-p',
+         'report:=report', '-p',
          'qos_overrides./imu/data_raw.subscription.reliability:=reliable')
-_LONGEST_S = 60.0
+_LONGEST_S = 90.0
+_POSES_S, _FIT_S, _WRITE_S = 2.0, 1.0, 0.005
+_MOMENTS = ('poses', 'fit', 'poses', 'write', 'end')
+_FILES = ('unit.yaml.previous', 'unit.yaml', 'store', 'report.html', 'calibration.png')
 
 
 class Sweeps:
@@ -50,7 +57,8 @@ class Sweeps:
     poses
         Poses that were acknowledged.
     lost, broken
-        What went wrong: acknowledged poses that were gone or changed, files that were not whole.
+        What went wrong: acknowledged poses or an earlier calibration that were gone or changed,
+        files that were not whole.
     moments
         Kills by what the node was doing.
 
@@ -62,12 +70,12 @@ class Sweeps:
         self.rng = np.random.default_rng(seed)
         self.kills = self.sweeps = self.poses = 0
         self.lost, self.broken, self.moments = [], [], {}
-        base = nominal(serial='K1')
+        base = nominal(serial='K1', rate_hz=200.0)
         params.save(self.folder / 'truth.yaml', drawn(np.random.default_rng(3), base))
         params.save(self.folder / 'bare.yaml', base)
-        self._known = {}
+        self._known, self._written, self._stored, self._left = {}, '', set(), set()
         self._others = [self._start('driver', 'truth.yaml', '-p', 'link.speed:=10.0'),
-                        self._start('stage', 'bare.yaml', '-p', 'slew_rate_rad_s:=3.0')]
+                        self._start('stage', 'bare.yaml', '-p', 'slew_rate_rad_s:=6.0')]
 
     def _start(self, name, file, *more):
         with open(self.folder / f'{name}.log', 'wb') as log:
@@ -84,55 +92,100 @@ class Sweeps:
             process.wait(20)
 
     def kill_once(self):
-        """Let the node go on with the sweep for a random time, kill it, and look."""
+        """Let the node go on with the sweep until a moment or the end, kill it, and look."""
+        moment = _MOMENTS[self.kills % len(_MOMENTS)]
+        after_s = self.rng.uniform() * {'poses': _POSES_S, 'fit': _FIT_S, 'write': _WRITE_S,
+                                        'end': 0.0}[moment]
+        file = self.rng.choice(_FILES)
         node = self._start('calibration', 'bare.yaml', *SWEEP)
         began, log = time.monotonic(), self.folder / 'calibration.log'
-        after_s, since = self.rng.uniform(0.0, 2.0), None
         try:
-            while time.monotonic() - began < _LONGEST_S:
-                text = log.read_text(errors='replace')
-                if since is None and 'calibrating' in text:
-                    since = time.monotonic()
-                if 'wrote unit.yaml' in text or (
-                        since is not None and time.monotonic() - since > after_s):
-                    break
-                time.sleep(0.005)
+            while not self._come(moment, file, log.read_text(errors='replace')) \
+                    and time.monotonic() - began < _LONGEST_S:
+                time.sleep(0.005 if moment != 'write' else 0.001)
+            time.sleep(after_s)
         finally:
             os.kill(node.pid, signal.SIGKILL)
             node.wait()
         self.kills += 1
-        self._look(log.read_text(errors='replace'), since is not None)
+        self._look(log.read_text(errors='replace'))
 
-    def _look(self, said, begun):
-        path = self.folder / 'unit.yaml.journal'
+    def _come(self, moment, file, said):
+        """Tell whether a moment has come, or the end."""
+        return 'wrote unit.yaml' in said or {
+            'poses': 'calibrating' in said, 'fit': 'fitting' in said, 'end': False,
+            'write': 'fitting' in said and file in map(_file, self._unfinished())}[moment]
+
+    def _unfinished(self):
+        """Return the hidden folders in which files are written."""
+        return set(self.folder.glob('.unit*.part')) | set(self.folder.glob('*/.*.part')) | set(
+            self.folder.glob('store/K1/.*.part'))
+
+    def _look(self, said):
         acknowledged = [int(n) - 1 for n in re.findall(r'pose (\d+) is on disk', said)]
         self.poses += len(acknowledged)
-        moment = 'start' if not begun else 'the end' if 'wrote' in said else (
+        left = self._unfinished()
+        moment = (
+            'start' if 'calibrating' not in said else
+            'the end' if 'wrote' in said else
+            f'a file is written ({_file(min(left))})' if left else
+            'the fit, or between files' if 'fitting' in said else
             'the mounting is checked' if not acknowledged and self._known else 'poses')
         self.moments[moment] = self.moments.get(moment, 0) + 1
-        if not begun:
+        if moment == 'start':
             self.broken.append(f'kill {self.kills}: it did not begin: {said[-300:]}')
             return
+        if self._left & left:
+            self.broken.append(f'kill {self.kills}: not cleared: {self._left & left}')
+        self._left = left
         try:
-            _, entries = journal.read(path)
-            if (self.folder / 'unit.yaml').exists():
-                params.load(self.folder / 'unit.yaml')
+            self._look_at_poses(acknowledged)
+            self._look_at_files()
         except Exception as error:
             self.broken.append(f'kill {self.kills}: {error}')
-            return
-        left = [p.name for p in self.folder.iterdir() if p.name.startswith('.unit')]
+
+    def _look_at_poses(self, acknowledged):
+        _, entries = journal.read(self.folder / 'unit.yaml.journal')
         kept = {entry['pose']: json.dumps(entry) for entry in journal.accepted_poses(entries)}
         gone = [n for n in {*self._known, *acknowledged} if n not in kept]
         changed = [n for n in self._known if n in kept and kept[n] != self._known[n]]
         if gone or changed:
             self.lost.append(f'kill {self.kills}: gone {gone}, changed {changed}')
         self._known = kept
-        if any('done' in entry for entry in entries):
+        if any(entry.get('done') for entry in entries):
             self.sweeps += 1
             self._known = {}
-        for name in left:
-            # What a kill within a write leaves is beside the file and never read; tidy up.
-            subprocess.run(['rm', '-r', self.folder / name], check=True)
+            if _data(self.folder / 'unit.yaml') not in map(_data, self._in_store()):
+                self.lost.append(f'kill {self.kills}: the sweep has ended without a copy')
+
+    def _look_at_files(self):
+        """Load all that is there; the calibration before the newest is kept, as the store is."""
+        now = _data(self.folder / 'unit.yaml')
+        before = _data(self.folder / 'unit.yaml.previous')
+        if now != self._written and before != self._written:
+            self.lost.append(f'kill {self.kills}: the calibration before is not kept')
+        stored = self._in_store()
+        for path in stored:
+            params.load(path)
+        page = self.folder / 'report' / 'report.html'
+        if page.exists() and '</html>' not in page.read_text()[-20:]:
+            self.broken.append(f'kill {self.kills}: {page} is cut')
+        if self._stored - stored:
+            self.lost.append(f'kill {self.kills}: gone from the store: {self._stored - stored}')
+        self._written, self._stored = now, stored
+
+    def _in_store(self):
+        return set((self.folder / 'store' / 'K1').glob('*.yaml'))
+
+
+def _data(path):
+    """Return the hash of the poses behind a parameter file; '' where there is none."""
+    return params.load(path).provenance['data_sha256'] if path.exists() else ''
+
+
+def _file(left):
+    """Name what was written in a hidden folder."""
+    return 'store' if 'K1' in left.parts else left.name.removesuffix('.part')[1:-9]
 
 
 def kill(folder, env, kills, seed):

@@ -117,7 +117,8 @@ def sweeps(options):
         print(f'| {moment} | {times} |')
     print(f'\n{told.poses} poses were acknowledged, {told.sweeps} sweeps came to their end; '
           f'lost or changed: {len(told.lost)}, broken files: {len(told.broken)}.')
-    return [*told.lost, *told.broken]
+    few = [f'only {told.sweeps} sweeps ended'] if told.sweeps < told.kills // 10 else []
+    return [*told.lost, *told.broken, *few]
 
 
 if __name__ == '__main__':

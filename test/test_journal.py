@@ -20,6 +20,7 @@ import os
 
 from adxl_ros.errors import UserError
 from adxl_ros.files.journal import accepted_poses, Journal, read, skipped_poses, unfinished
+from adxl_ros.tools import fit
 import pytest
 
 HEAD = {'serial': 'A1', 'mode': 'stage'}
@@ -85,6 +86,33 @@ def test_what_is_no_journal(tmp_path, text, words):
         read(path)
 
 
+@pytest.mark.parametrize('text, poses', [
+    (b'%s\n{"pose": 0}\n{"po#e": \xff}\n{"pose": 2}\n', 1), (b'a list of mine', 0)])
+def test_a_damaged_one_is_said_and_begun_anew_only_if_told(tmp_path, text, poses):
+    """Nothing is cut from it, and it is no dead end."""
+    path, head = tmp_path / 'j', json.dumps({'format': 1, **HEAD}).encode()
+    text = text.replace(b'%s', head)
+    path.write_bytes(text)
+    with pytest.raises(UserError, match=f'not a journal: .*; {poses} poses before it can be read; '
+                       'name another journal, or begin anew with resume:=anew'):
+        Journal(path, HEAD)
+    assert path.read_bytes() == text
+    found, why = unfinished(path, HEAD)
+    assert found == poses and 'is not of a journal' in why
+    Journal(path, HEAD, anew=True).close()
+    assert read(path) == ({'format': 1, **HEAD}, [])
+    kept, = tmp_path.glob('j.2*')
+    assert kept.read_bytes() == text
+
+
+def test_a_head_that_a_crash_cut_is_written_anew(tmp_path):
+    """It held no pose: nothing to ask about."""
+    for text in (b'{"form', bytes(40)):
+        (tmp_path / 'j').write_bytes(text)
+        Journal(tmp_path / 'j', HEAD).close()
+        assert read(tmp_path / 'j')[0]['serial'] == 'A1'
+
+
 def test_unwritable(tmp_path):
     """A journal in a folder that is not there is refused."""
     with pytest.raises(UserError, match='cannot write the journal'):
@@ -115,6 +143,38 @@ def _no_room(_):
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
+def test_one_that_was_fitted_early_goes_on_and_is_in_nobodys_way(tmp_path):
+    """With poses left open it is offered again; to another unit it is a finished one."""
+    path = tmp_path / 'j'
+    journal = Journal(path, HEAD)
+    journal.append({'pose': 0})
+    journal.append({'rests': [], 'done': False})
+    journal.close()
+    assert unfinished(path, HEAD) == (1, '')
+    other = {**HEAD, 'serial': 'B2'}
+    assert unfinished(path, other) is None
+    journal = Journal(path, HEAD)
+    assert accepted_poses(journal.entries) == [{'pose': 0}]
+    journal.close()
+    journal = Journal(path, other)
+    assert journal.entries == []
+    journal.close()
+    kept, = tmp_path.glob('j.2*')
+    assert accepted_poses(read(kept)[1]) == [{'pose': 0}]
+
+
+def test_fit_takes_the_rests_that_were_fitted_unless_the_sweep_went_on(tmp_path):
+    """`fit --journal` has all poses that the sweep ended with."""
+    path = tmp_path / 'j'
+    journal = Journal(path, HEAD)
+    journal.append({'pose': 0})
+    journal.append({'rests': [{'pose': 0, 'whole': True}], 'done': False})
+    assert fit._entries(path) == [{'pose': 0, 'whole': True}]
+    journal.append({'pose': 1})
+    journal.close()
+    assert fit._entries(path) == [{'pose': 0}, {'pose': 1}]
+
+
 def test_anew_keeps_the_interrupted_one(tmp_path):
     """Poses of an interrupted calibration are put aside, not away."""
     path = tmp_path / 'j'
@@ -133,9 +193,10 @@ def test_anew_keeps_the_interrupted_one(tmp_path):
 
 def test_poses_that_were_dropped_or_left_out():
     """A rest that is forgotten counts no more; a pose that is left out is known as such."""
-    entries = [{'pose': 0}, {'pose': 1}, {'drop': 1}, {'skip': 4}, {'pose': 2}]
+    entries = [{'pose': 0}, {'pose': 1}, {'drop': 1}, {'skip': 4, 'drop': 4}, {'pose': 2},
+               {'skip': 5, 'drop': 5}, {'drop': 5}]
     assert accepted_poses(entries) == [{'pose': 0}, {'pose': 2}]
-    assert skipped_poses(entries) == {4}
+    assert skipped_poses(entries) == {4}, 'what is taken again after all is not left out'
 
 
 def test_what_a_power_cut_leaves_at_the_end_is_no_pose(tmp_path):

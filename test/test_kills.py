@@ -18,7 +18,9 @@ from kills import kill
 
 
 def test_no_kill_loses_a_pose_or_breaks_a_file(ros_env, tmp_path):
-    """Ten kills, each at another moment of a sweep that goes on where it was."""
+    """Ten kills, each at another moment of a sweep that goes on where it was, to its end."""
     told = kill(tmp_path, ros_env, 10, 1)
     assert told.lost == [] and told.broken == []
-    assert told.poses >= 10, 'hardly a pose was taken: the kills tell nothing'
+    assert told.poses >= 20 and told.sweeps >= 2, 'the kills tell nothing of poses, or of the end'
+    assert told.moments.keys() - {'poses', 'the mounting is checked', 'the end'}, \
+        'no kill while it was fitted or written'

@@ -17,9 +17,12 @@
 import os
 import resource
 
+from adxl_ros.calibrate.session import Plan
+from adxl_ros.calibrate.state import Settings
 from adxl_ros.files import journal, params
 from graph import Graph
 import numpy as np
+from std_srvs.srv import Trigger
 from units import drawn, nominal
 
 FAST = ('-p', 'use_sim_time:=true')
@@ -99,6 +102,43 @@ def test_a_driver_that_is_started_anew_is_followed_and_another_unit_is_not(start
     assert len(_on_disk(tmp_path)) >= len(before) + 3
 
 
+def test_a_fit_that_fails_at_the_end_waits_and_another_unit_ends_the_session(start, tmp_path):
+    """No dead end: redo, finish and abort are still there; no pose of 18 in the journal of 17."""
+    base = nominal(serial='N1')
+    params.save(tmp_path / 'bare.yaml', base)
+    asked = Plan('stage', (np.pi / 2,), np.pi / 2, 0, Settings(0.5, np.radians(0.2), 60.0,
+                 'manual', np.radians(2)), tmp_path / 'unit.yaml',
+                 tmp_path / 'unit.yaml.journal', '', '')
+    interrupted = journal.Journal(asked.journal, asked.head(base))
+    for i, target in enumerate(asked.targets()):
+        interrupted.append({
+            'pose': i, 'alpha_rad': target.alpha_rad, 'beta_rad': target.beta_rad, 'check': False,
+            'start_ns': i, 'stop_ns': i, 'samples': 500, 'std_v': [1e-4, 1e-4],
+            # Inverted: a unit that no fit takes.
+            'mean_v': [2.5 - np.cos(target.beta_rad), 2.5 - np.sin(target.beta_rad)]})
+    interrupted.close()
+    with Graph() as graph:
+        driver = _driver(start, tmp_path)
+        node = start(
+            'calibration', '--ros-args', '--params-file', tmp_path / 'bare.yaml', *FAST, '-p',
+            'output:=unit.yaml', '-p', 'autostart:=true', '-p', 'stage.mode:=manual', '-p',
+            f'sweep.planes_rad:=[{np.pi / 2}]', '-p', f'sweep.step_rad:={np.pi / 2}', '-p',
+            'sweep.dwell_s:=0.5', '-p', 'sweep.check_poses:=0')
+        graph.spin_until(lambda: graph.said('calibration', 'cannot finish: '), 60, 'why')
+        assert graph.said('calibration', '; finish again, redo or abort')
+        assert node.output().count('fitting 10 poses') == 1
+        answer = graph.call(Trigger, 'calibration/redo', Trigger.Request())
+        assert answer.success and answer.message == 'pose 10 will be taken again'
+        driver.stop()
+        _driver(start, tmp_path, 'N2')
+        node.wait_for('sensor_info: is of the sensor N2, but the parameters are of N1; give the '
+                      'parameters of that sensor, or nominal ones; the poses are kept', 60)
+        answer = graph.call(Trigger, 'calibration/capture', Trigger.Request())
+        assert (answer.success, answer.message) == (False, 'no calibration is running')
+    assert len(_on_disk(tmp_path)) == 9 and not (tmp_path / 'unit.yaml').exists()
+    assert 'Traceback' not in node.output()
+
+
 def test_a_new_start_resumes_or_says_what_changed_or_begins_anew(start, tmp_path):
     """Without a terminal: it goes on by itself, refuses other settings, and obeys resume:=anew."""
     with Graph() as graph:
@@ -123,7 +163,7 @@ def test_a_new_start_resumes_or_says_what_changed_or_begins_anew(start, tmp_path
         assert _on_disk(tmp_path)[:len(poses)] == poses
 
         anew = _calibration(start, tmp_path, '-p', 'resume:=anew')
-        anew.wait_for('pose 1 is on disk')
+        anew.wait_for('pose 1 is on disk', 60)
         kept, = tmp_path.glob('unit.yaml.journal.2*')
         assert journal.accepted_poses(journal.read(kept)[1])[:len(poses)] == poses
 

@@ -80,6 +80,29 @@ def test_a_stage_that_is_turned_during_the_dwell_is_told():
     assert slow.run(3, np.pi / 2, 0.0)
 
 
+def test_an_encoder_that_falls_silent_is_told_and_its_last_angle_is_no_pose():
+    """Before the capture, and during the dwell: nothing is taken until it is heard again."""
+    dead = bench('encoder')
+    dead.run(0.5, np.pi / 2, 0.0)
+    dead.run(4, np.pi / 2, 0.0, encoder=False)
+    words = 'nothing on stage/joint_states for 4 s'
+    assert dead.sweep.capture() == f'{words}: in stage.mode encoder its angle counts'
+    state = dead.sweep.state()
+    assert state.text == words and state.late
+    for mode in ('encoder', 'commanded'):
+        dead = bench(mode)
+        dead.run(0.2, np.pi / 2, 0.0)
+        assert dead.sweep.capture() == ''
+        assert dead.run(5, np.pi / 2, 0.0, encoder=False) is None
+        state = dead.sweep.state()
+        assert state.text == 'nothing on stage/joint_states for 5 s' and state.late
+        said = f'{words.replace("4", "3")}; capture again when it is back'
+        assert dead.sweep.refused() == (said if mode == 'encoder' else '')
+        dead.run(0.5, np.pi / 2, 0.0)
+        dead.sweep.capture()
+        assert dead.run(3, np.pi / 2, 0.0)
+
+
 def test_by_hand_without_encoder_the_sensor_tells_that_the_pose_changed():
     """In mode manual only the sensor can tell that the operator went on too early."""
     blind = bench('manual')
@@ -216,6 +239,38 @@ def test_the_mounting_is_looked_at_after_an_interruption(by_rad, words):
         after.run(4, np.pi / 2, 0.0)
 
 
+def test_a_turn_about_the_vertical_shows_in_a_second_pose():
+    """One level axis reads the same; the pose a quarter turn away tells, to 3 mg."""
+    targets = (UP, Target(np.pi / 2, np.pi / 2), NEXT)
+    before = bench(targets=targets)
+    for target in targets[:2]:
+        before.sweep.take(before.run(5, target.alpha_rad, target.beta_rad))
+    for off_v, words in ((0.002, ''), (0.008, 'mounting changed: in pose 1 y reads')):
+        after = bench(targets=targets, accepted=before.sweep.results())
+        assert after.sweep.target == targets[1] and after.sweep.to_verify == 2
+        assert after.run(4, np.pi / 2, np.pi / 2) is None
+        assert after.sweep.target == UP and after.sweep.verifying
+        after.fed = Fed(replace(nominal(), effects=('bias',), values={
+            'bias': {'offset_v': np.array([0.0, off_v])}}))
+        if words:
+            with pytest.raises(MountingError, match=words):
+                after.run(4, np.pi / 2, 0.0)
+        else:
+            assert after.run(4, np.pi / 2, 0.0) is None and after.sweep.target == NEXT
+
+
+def test_a_clock_that_went_back_has_the_mounting_looked_at():
+    """The driver was started anew: perhaps somebody had the sensor in his hands."""
+    again = bench()
+    again.sweep.take(again.run(5, np.pi / 2, 0.0))
+    again.now_ns -= 3600 * 10 ** 9
+    again.run(0.5, np.pi / 2, np.pi / 6)
+    assert again.sweep.verifying and again.sweep.target == UP
+    assert again.sweep.refused().startswith('imu/data_raw went back in time by 3600 s')
+    again.run(3, np.pi / 2, 0.0)
+    assert not again.sweep.verifying and again.sweep.target == NEXT
+
+
 def test_what_shakes_for_minutes_is_forgotten_and_taken_when_it_is_still():
     """A long wait costs neither memory nor the pose."""
     shaken = bench()
@@ -249,6 +304,7 @@ def test_redo_and_skip_walk_the_plan():
     walk.sweep.take(walk.run(5, np.pi / 2, np.pi / 6))
     assert sorted(walk.sweep.accepted) == [0, 1] and walk.sweep.index == 2
     assert walk.sweep.redo() == 'pose 2 will be taken again'
+    assert sorted(walk.sweep.accepted) == [0] and len(walk.sweep.results()) == 1
     again = walk.run(5, np.pi / 2, np.pi / 6)
     walk.sweep.take(again)
     assert walk.sweep.accepted[1] == again

@@ -124,6 +124,11 @@ def test_an_operator_is_led_through_a_sweep_by_the_screen(start, terminal, tmp_p
         seen.press('y')
         seen.wait_for('once more, to see that the mounting is', 'alpha 45.0°, beta 270.0°')
         seen.press('c')
+        seen.wait_for('alpha 45.0°, beta 90.0° once more')
+        hands.turn(45, 90)
+        seen.press('c')
+        seen.wait_for('turn the stage to alpha 45.0°, beta 360.0°')
+        seen.press('s')
         seen.wait_for('alpha 90.0°, beta 360.0°')
         hands.turn(90, 360)
         seen.press('c')
@@ -133,6 +138,9 @@ def test_an_operator_is_led_through_a_sweep_by_the_screen(start, terminal, tmp_p
         # Each axis with its interval, whole.
         assert re.search(r'(?m)^bias.* x \S+±\S+ y \S+±\S+ z \S+±\d\S*$', shown), shown
         seen.press('f')
+        seen.wait_for('16 poses are open; press f again')
+        assert not (tmp_path / 'unit.yaml.previous').exists()
+        seen.press('f')
         # The verdict first, and no line of its table is folded.
         shown = seen.wait_for('wrote unit.yaml', 'held out: tilt')
         assert re.search(r'(?m)^linear: datasheet (PASS|FAIL|NOT SHOWN), noise (PASS|FAIL|NOT '
@@ -140,6 +148,8 @@ def test_an_operator_is_led_through_a_sweep_by_the_screen(start, terminal, tmp_p
                          r'\S+ mg rms, \S+ mg max$', shown), shown
         assert re.search(r'(?m)^linear +[\d.]+/[\d.]+( +(PASS|FAIL|NOT SHOWN)){2} +[\d.]+/[\d.]+'
                          r'( +(PASS|FAIL|NOT SHOWN)){2}$', shown), shown
+        seen.press('b')
+        seen.wait_for('unit.yaml.journal holds 5 poses of an interrupted calibration', 'y  go on')
         seen.press('q')
         assert seen.popen.wait(20) == 0
         assert seen.restored()

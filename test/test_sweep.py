@@ -125,8 +125,12 @@ def test_the_guided_order_saves_travel_and_comes_from_both_sides():
     paper = plan_sweep(sorted(planes), np.radians(30), 16)
 
     def poses(of):
-        return sorted((t.alpha_rad, t.beta_rad, t.check) for t in of)
-    np.testing.assert_allclose(poses(targets), poses(paper))
+        return sorted((t.check, t.alpha_rad, t.beta_rad) for t in of)
+    # Check poses are in whole degrees, as an operator without an encoder is asked for them.
+    off = np.abs(np.degrees(np.array(poses(targets)) - poses(paper)))
+    assert off[:130].max() < 1e-9 and 0.1 < off[130:].max() <= 0.5
+    checks = np.degrees([(t.alpha_rad, t.beta_rad) for t in targets if t.check])
+    np.testing.assert_allclose(checks, np.round(checks), atol=1e-9)
     assert travel_rad(targets) < 0.75 * travel_rad(paper)
     grid = [t for t in targets if not t.check]
     for joint, count in (('alpha_rad', 5), ('beta_rad', 13)):
@@ -144,20 +148,42 @@ def test_the_guided_order_saves_travel_and_comes_from_both_sides():
 
 def test_rests_by_hand_are_announced_as_they_end():
     """A tumble counts its rests and names what moves between them."""
-    sensor = nominal('xyz', noise_density_g_per_rthz=np.full(3, 300e-6))
-    tumble = Tumble(sensor, 3.0)
-    alphas = np.repeat(np.linspace(0, 2.5, 6), 4000) + np.concatenate(
-        [np.concatenate([np.zeros(3000), 0.2 * np.sin(np.linspace(0, 40, 1000))])
-         for _ in range(6)])
-    volts = Fed(sensor, 2)(specific_force(alphas, 0 * alphas, 9.80665))
-    found = []
-    for i in range(0, len(volts), 100):
-        tumble.feed(np.arange(i, i + 100) * 1_000_000 + 10 ** 18, volts[i:i + 100])
-        while (entry := tumble.accept()) is not None:
-            found.append(entry)
-            tumble.take(entry)
+    tumble, volts = _tumbled()
+    found = _rests(tumble, volts, 10 ** 18)
     assert len(found) == 5
     results = tumble.results()
     assert len(results) == 6
     assert all(2.0 < e['samples'] / 1000 < 3.1 for e in results)
     assert '5 rests (5 more at least)' in tumble.state().text
+
+
+def test_a_clock_that_goes_back_ends_no_tumble():
+    """A driver started anew, or NTP's step: rests go on, and those before it stay in the fit."""
+    tumble, volts = _tumbled()
+    assert len(_rests(tumble, volts, 10 ** 18)) == 5
+    assert len(_rests(tumble, volts, 10 ** 15)) == 5
+    assert sorted(tumble.accepted) == list(range(10)) and len(tumble.results()) == 11
+    tumble.drop(tumble.accepted[0])
+    assert len(tumble.results()) == 10
+    tumble.retry()
+    assert len(_rests(tumble, volts, 10 ** 15 + 25 * 10 ** 9)) >= 5
+
+
+def _tumbled():
+    """Return a tumble, and the volts of six rests of 3 s with motion between."""
+    sensor = nominal('xyz', noise_density_g_per_rthz=np.full(3, 300e-6))
+    alphas = np.repeat(np.linspace(0, 2.5, 6), 4000) + np.concatenate(
+        [np.concatenate([np.zeros(3000), 0.2 * np.sin(np.linspace(0, 40, 1000))])
+         for _ in range(6)])
+    return Tumble(sensor, 3.0), Fed(sensor, 2)(specific_force(alphas, 0 * alphas, 9.80665))
+
+
+def _rests(tumble, volts, begin_ns):
+    """Feed volts of 1 kHz; return the rests that were announced."""
+    found = []
+    for i in range(0, len(volts), 100):
+        tumble.feed(np.arange(i, i + 100) * 1_000_000 + begin_ns, volts[i:i + 100])
+        while (entry := tumble.accept()) is not None:
+            found.append(entry)
+            tumble.take(entry)
+    return found

@@ -23,7 +23,7 @@ from itertools import pairwise
 from adxl_ros.errors import UserError
 import numpy as np
 
-ORDER = 1
+ORDER = 2
 """To be raised with every change of `guided`: an interrupted sweep cannot go on in another."""
 _GOLDEN_RAD = np.pi * (3 - np.sqrt(5))
 
@@ -68,8 +68,8 @@ def guided(planes_rad: Sequence[float], step_rad: float, check_poses: int) -> li
 
     The planes are gone through upwards and then downwards, and beta turns forth in one plane and
     back in the next, so that each pose of the grid is reached in both directions of both joints,
-    and half of the sweep has all planes already. Check poses follow, each the nearest to the one
-    before.
+    and half of the sweep has all planes already. Check poses follow, in whole degrees, which can
+    be set by hand on a scale, each the nearest to the one before.
 
     Parameters
     ----------
@@ -87,7 +87,8 @@ def guided(planes_rad: Sequence[float], step_rad: float, check_poses: int) -> li
     there = [(alpha, forth[::-1] if i % 2 else forth) for i, alpha in enumerate(planes)]
     back = [(alpha, turn[::-1]) for alpha, turn in there[::-1]]
     grid = [Target(alpha, float(beta)) for alpha, turn in there + back for beta in turn]
-    return grid + _nearest(grid[-1], spread(check_poses))
+    checks = [Target(_whole(t.alpha_rad), _whole(t.beta_rad), True) for t in spread(check_poses)]
+    return grid + _nearest(grid[-1], checks)
 
 
 def travel_rad(targets: Sequence[Target]) -> float:
@@ -102,6 +103,10 @@ def _turn(planes_rad: Sequence[float], step_rad: float) -> np.ndarray:
     if not 2 * np.pi / 720 <= step_rad <= np.pi / 2 + 1e-9:
         raise UserError(f'sweep.step_rad: {step_rad:g} rad is not between 0.0087 and 1.5708')
     return np.arange(round(2 * np.pi / step_rad) + 1) * step_rad
+
+
+def _whole(angle_rad: float) -> float:
+    return float(np.radians(np.round(np.degrees(angle_rad))))
 
 
 def _apart(a: Target, b: Target) -> float:

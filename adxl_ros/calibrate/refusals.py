@@ -35,8 +35,6 @@ _SAME_G = 0.2
 """Readings within this are taken for the same when the kind of a mistake is told."""
 _TRUSTED = 4
 """Poses after which the axes are known to be the right ones."""
-_MOUNTED_G = 0.01
-"""A pose that is taken again after an interruption reads the same within this, g."""
 _CLOCKS_S = 2.0
 _RATE = 0.05
 
@@ -131,20 +129,6 @@ def reading(known: Known, target: Target, volts: np.ndarray, tolerance_rad: floa
     if off:
         return f'{said}: by the sensor, {off}; check the pose and the mounting{before}'
     return f'{said}; check the pose, the mounting and the wiring{before}'
-
-
-def mounting(sensor: Sensor, before_v: np.ndarray, now_v: np.ndarray, number: int,
-             tolerance_rad: float) -> str:
-    """Refuse to go on where a pose, (m,), that was taken before reads something else now."""
-    off_g = np.abs(now_v - before_v) / sensor.nominal_scale_v_per_g
-    allowed = _MOUNTED_G + 2 * tolerance_rad
-    if off_g.max() <= allowed:
-        return ''
-    axis = int(off_g.argmax())
-    return (f'mounting changed: in pose {number} {sensor.axes[axis]} reads {now_v[axis]:.4f} V, '
-            f'but read {before_v[axis]:.4f} V before the interruption ({off_g[axis] * 1e3:.0f} mg '
-            f'apart, {allowed * 1e3:.0f} mg are allowed); put the sensor back as it was, or begin '
-            'anew with resume:=anew')
 
 
 def degrees(angle_rad: float) -> str:

@@ -45,6 +45,7 @@ from adxl_ros.errors import UserError
 from adxl_ros.files import params, store
 from adxl_ros.files.atomic import keep_previous
 from adxl_ros.model import chain
+from adxl_ros.model.coefficients import get
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.sensor import Sensor
@@ -101,7 +102,7 @@ class Result:
         Parameters
         ----------
         path
-            The file; an older one becomes NAME.previous.
+            The file; an older one of another fit becomes NAME.previous.
 
         Raises
         ------
@@ -109,7 +110,9 @@ class Result:
             It cannot be written; the older one is as it was.
 
         """
-        keep_previous(path)
+        # A finish that was cut short and comes again must not push out the one before.
+        if not self._is_in(path):
+            keep_previous(path)
         params.save(path, self.fitted, self.comments())
 
     def keep(self, folder: str | os.PathLike) -> str:
@@ -126,12 +129,26 @@ class Result:
         """
         if not str(folder):
             return 'not kept in a store'
+        there = (path for path, _ in store.history(folder, self.fitted.serial)[0])
         try:
-            path = store.put(folder, self.fitted, self.comments())
+            path = next(filter(self._is_in, there), None) or \
+                store.put(folder, self.fitted, self.comments())
         except UserError as error:
             return f'no copy in the store: {error}'
         return f'kept as {path}' if path else \
             f'not kept in {folder}: the serial number {store.NO_UNIT} is no unit in particular'
+
+    def _is_in(self, path: str | os.PathLike) -> bool:
+        """Tell whether a file holds this very fit: the same data, model and coefficients."""
+        try:
+            there = params.load(path)
+        except UserError:
+            return False
+        names, own = self.fitted.covariance_names, self.fitted
+        return (there.model, there.effects, there.covariance_names) == (
+            own.model, own.effects, names) and \
+            there.provenance.get('data_sha256') == own.provenance['data_sha256'] and \
+            bool(np.allclose(get(there, names), get(own, names), rtol=1e-6))
 
     def report(self, folder: str | os.PathLike, kept: str | os.PathLike = '') -> None:
         """

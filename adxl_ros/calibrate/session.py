@@ -17,7 +17,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import os
 from pathlib import Path
 from typing import Any
@@ -29,11 +29,15 @@ from adxl_ros.calibrate.stream import Newest
 from adxl_ros.calibrate.sweep import Sweep
 from adxl_ros.calibrate.tumble import Tumble
 from adxl_ros.errors import UserError
+from adxl_ros.files import store
+from adxl_ros.files.atomic import clear_left
 from adxl_ros.files.journal import accepted_poses, Journal, skipped_poses, unfinished
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
-_FIGURES = ('serial', 'axes', 'rate_hz', 'nominal_zero_g_v', 'nominal_scale_v_per_g')
+_FIGURES = ('serial', 'axes', 'rate_hz', 'nominal_zero_g_v', 'nominal_scale_v_per_g',
+            'noise_density_g_per_rthz', 'rc_resistance_ohm', 'rc_capacitance_f', 'adc_bits',
+            'adc_vref_v', 'range_g', 'local_gravity_mps2', 'stage_resolution_rad')
 
 
 @dataclass(frozen=True)
@@ -76,9 +80,12 @@ class Plan:
         """Return what must be the same for a calibration of this unit to go on."""
         head = {'mode': self.mode,
                 **{name: np.asarray(getattr(unit, name)).tolist() for name in _FIGURES}}
+        head['sweep.temperature_span_c'] = self.settings.temperature_span_c
         if self.mode == 'gravity':
             return head
         return {**head, 'stage.mode': self.settings.stage_mode,
+                'stage.tolerance_rad': self.settings.tolerance_rad,
+                'stage.near_rad': self.settings.near_rad,
                 'sweep.dwell_s': self.settings.dwell_s, 'sweep.planes_rad': self.planes_rad,
                 'sweep.step_rad': self.step_rad, 'sweep.check_poses': self.checks,
                 'order': plan.ORDER}
@@ -126,11 +133,25 @@ class Session:
         self.unit, self.asked = unit, asked
         self.newest = Newest(unit)
         self.journal = Journal(asked.journal, asked.head(unit), anew)
+        self._clear_left()
+        self._fitted: list[dict[str, Any]] = []
+        self._unchecked = any('mounting' in entry for entry in self.journal.entries)
         accepted = accepted_poses(self.journal.entries)
         self.resumed = len(accepted)
         self.walk = Sweep(unit, targets, asked.settings, accepted,
                           skipped_poses(self.journal.entries)) if targets else \
             Tumble(unit, asked.settings.temperature_span_c, accepted)
+
+    def _clear_left(self) -> None:
+        """Clear what a kill within a write has left."""
+        asked = self.asked
+        places = [(path.parent, path.name) for path in (asked.output, asked.journal)]
+        if asked.report:
+            places += [(Path(asked.report), name) for name in ('report.html', 'calibration.png')]
+        if asked.store:
+            places.append((store.unit_folder(asked.store, self.unit.serial), ''))
+        for folder, name in places:
+            clear_left(folder, name)
 
     @property
     def done(self) -> int:
@@ -141,6 +162,16 @@ class Session:
     def over(self) -> bool:
         """Tell whether all poses of a sweep are taken or left out."""
         return isinstance(self.walk, Sweep) and self.walk.target is None
+
+    @property
+    def left(self) -> int:
+        """Count the poses of a sweep that are still open."""
+        return len(self.walk.targets) - len(self.walk.accepted.keys() | self.walk.skipped) \
+            if isinstance(self.walk, Sweep) else 0
+
+    @property
+    def _unverified(self) -> int:
+        return self.walk.to_verify if isinstance(self.walk, Sweep) else 0
 
     def feed(self, stamps_ns: np.ndarray, volts: np.ndarray) -> str:
         """Take samples, ns, (n,), and V, (n, m); return why they are of no use, or ''."""
@@ -162,7 +193,7 @@ class Session:
             The disk does not take a pose; it is taken anew.
 
         """
-        verifying = isinstance(self.walk, Sweep) and self.walk.verifying
+        unverified = self._unverified
         while (entry := self.walk.accept()) is not None:
             try:
                 self.journal.append(entry)
@@ -171,39 +202,68 @@ class Session:
                 raise
             self.walk.take(entry)
             yield f'pose {entry["pose"] + 1} is on disk'
-        if verifying and isinstance(self.walk, Sweep) and not self.walk.verifying:
-            yield 'the sensor is mounted as it was'
+        if unverified > self._unverified:
+            yield 'the sensor is mounted as it was' if not self._unverified else \
+                'this pose reads what it did before; one more shows the mounting as a whole'
 
     def skip(self) -> str:
-        """Leave the pose at hand out; return what is done."""
-        if isinstance(self.walk, Sweep) and not self.walk.verifying and not self.over:
+        """Leave the pose at hand out; return what is done, or '' where none is left."""
+        if self._unverified:
+            self.journal.append({'mounting': 'not checked'})
+            self._unchecked = True
+        elif isinstance(self.walk, Sweep) and not self.over:
             self.journal.append({'skip': self.walk.index, 'drop': self.walk.index})
-        return self.walk.skip() if not self.over else 'there is no pose left to skip'
+        return self.walk.skip() if not self.over else ''
 
     def redo(self) -> str:
         """Take the pose before again; return what is done, or '' where there is none."""
-        if isinstance(self.walk, Tumble) and self.walk.accepted:
-            self.journal.append({'drop': max(self.walk.accepted)})
+        number = self.walk.before
+        if number is not None:
+            # It is bad, and no part of a fit even if it is not taken again.
+            self.journal.append({'drop': number})
         return self.walk.redo()
 
     def finish(self) -> result.Result:
         """
-        Fit what there is, and write the parameter file.
+        Fit what there is, and write the parameter file; `end` is due when all is written.
 
         Raises
         ------
         UserError
-            There are too few poses, or a file cannot be written; what was taken stays.
+            There are too few poses, or the file cannot be written; what was taken stays.
 
         """
         entries = self.walk.results()
         if not entries:
             raise UserError('no pose is taken yet')
+        if all(entry.get('check') for entry in entries):
+            raise UserError('only check poses are taken, which judge a fit and are no part of '
+                            'it; take poses of the planes, too')
         found = result.calibrate(self.unit, [Poses.from_entries(entries)], None,
                                  [self.journal.path.name])
+        if self._unchecked:
+            found = replace(found, fitted=replace(found.fitted, provenance={
+                **found.fitted.provenance, 'mounting': 'not checked after an interruption'}))
         found.save(self.asked.output)
-        self.journal.append({'rests': entries, 'done': True})
+        self._fitted = entries
         return found
+
+    def end(self) -> None:
+        """
+        Note that what was fitted is written; a sweep with open poses can go on.
+
+        Until then a new start fits and writes once more.
+
+        Raises
+        ------
+        UserError
+            The disk does not take it.
+
+        """
+        try:
+            self.journal.append({'rests': self._fitted, 'done': not self.left})
+        except UserError as error:
+            raise UserError(f'{self.asked.output} is written, but {error}') from None
 
     def close(self) -> None:
         """Let the journal go."""

@@ -26,7 +26,7 @@ from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from adxl_ros.calibrate import known, refusals
+from adxl_ros.calibrate import known, mounting, refusals
 from adxl_ros.calibrate.dwell import Dwell
 from adxl_ros.calibrate.plan import Target
 from adxl_ros.calibrate.poses import Poses
@@ -40,6 +40,10 @@ import numpy as np
 _KEPT_ANGLES = 100000
 _OFFSETS, _FEWEST_OFFSETS = 20, 4
 _BACK_NS = 1_000_000_000
+_OFFSETS, _FEWEST_OFFSETS = 20, 4
+_BACK_NS = 1_000_000_000
+_ACROSS = 0.94
+"""Cosine of 20°: poses whose verticals are closer than this tell the same of the mounting."""
 _OLD_S, _SILENT_S = 60.0, 3.0
 
 
@@ -60,8 +64,7 @@ class Sweep:
     settings
         How poses are taken.
     accepted, skipped
-        What an interrupted sweep has left: the last of its poses is taken again first, to see
-        that the sensor is mounted as it was.
+        What an interrupted sweep has left; see `verify`.
 
     """
 
@@ -71,19 +74,23 @@ class Sweep:
         self.accepted: dict[int, dict[str, Any]] = {e['pose']: dict(e) for e in accepted}
         self.skipped = set(skipped) - set(self.accepted)
         self.surroundings = Surroundings()
-        self._verify: dict[str, Any] | None = None
+        self._verify: list[dict[str, Any]] = []
+        self.newest_ns: int | None = None
         self._angles: deque[tuple[int, float, float]] = deque(maxlen=_KEPT_ANGLES)
         self._ahead_s: deque[float] = deque(maxlen=_OFFSETS)
         self._since_ns: int | None = None
-        self.newest_ns: int | None = None
         self._refusal = self._unsaid = ''
         self._fresh = False
         self.known = self._learned(None)
         self.index = self._next()
-        if accepted and self.index < len(targets):
-            self._verify = self.accepted[max(accepted, key=lambda e: e['stop_ns'])['pose']]
-            self.index = self._verify['pose']
         self._begin()
+        self.verify()
+
+    def verify(self) -> None:
+        """Take poses again before others, to see that the sensor is mounted as it was."""
+        if self.target is not None and self.accepted:
+            self._verify = mounting.to_take_again(list(self.accepted.values()))
+            self._go(self._verify[0]['pose'])
 
     @property
     def target(self) -> Target | None:
@@ -93,7 +100,12 @@ class Sweep:
     @property
     def verifying(self) -> bool:
         """Tell whether a pose is taken again to see that the mounting is as it was."""
-        return self._verify is not None
+        return bool(self._verify)
+
+    @property
+    def to_verify(self) -> int:
+        """Count the poses that are still to be taken again for that."""
+        return len(self._verify)
 
     @property
     def angles(self) -> tuple[float, float] | None:
@@ -104,8 +116,8 @@ class Sweep:
         """Take the pose in which the operator has put the sensor; return why not, or ''."""
         target = self.target
         if target is not None and self.settings.stage_mode == 'encoder':
-            if self.angles is None:
-                return 'nothing on stage/joint_states: in stage.mode encoder its angle counts'
+            if self.angles is None or self._silent():
+                return f'{self._silent()}: in stage.mode encoder its angle counts'
             off = self._clocks() or refusals.angles(target, *self.angles, self.settings.near_rad)
             if off:
                 return f'{off}; turn the stage there and capture again'
@@ -117,8 +129,8 @@ class Sweep:
     def skip(self) -> str:
         """Leave the pose out; return what is done, for people."""
         number = self.index + 1
-        if self._verify is not None:
-            self._verify = None
+        if self._verify:
+            self._verify = []
             self._go(self._next())
             return f'pose {number} is not taken again: the mounting is not checked'
         self.skipped.add(self.index)
@@ -126,15 +138,25 @@ class Sweep:
         self._go(self._next())
         return f'pose {number} is left out'
 
+    @property
+    def before(self) -> int | None:
+        """Return the number of the pose before, taken or left out; None where there is none."""
+        if self._verify:
+            return None
+        return max((i for i in self.accepted.keys() | self.skipped if i < self.index),
+                   default=None)
+
     def redo(self) -> str:
-        """Go back to the pose before; return what is done, or '' where there is none."""
-        taken = [i for i in range(self.index) if i in self.accepted or i in self.skipped]
-        if not taken or self._verify is not None:
+        """Forget the pose before and go back; return what is done, or '' if there is none."""
+        number = self.before
+        if number is None:
             return ''
+        self.accepted.pop(number, None)
+        self.skipped.discard(number)
         # Its earlier reading must not speak against the new one.
-        self.known = self._learned(None, without=taken[-1])
-        self._go(taken[-1])
-        return f'pose {self.index + 1} will be taken again'
+        self.known = self._learned(None)
+        self._go(number)
+        return f'pose {number + 1} will be taken again'
 
     def stage(self, stamp_ns: int, alpha_rad: float, beta_rad: float) -> None:
         """Take an encoder reading."""
@@ -157,6 +179,9 @@ class Sweep:
             return
         if self.newest_ns is not None and stamps_ns[0] < self.newest_ns - _BACK_NS:
             # A driver that was started anew, on a clock of its own: the pose begins anew.
+            self._unsaid = f'imu/data_raw went back in time by ' \
+                f'{(self.newest_ns - int(stamps_ns[0])) * 1e-9:.0f} s: the pose begins anew'
+            self.verify()
             self._since_ns, self._ahead_s = None, deque(maxlen=_OFFSETS)
             self._captured, self._dwell = False, Dwell(self.sensor, 0)
         self.newest_ns = int(stamps_ns[-1])
@@ -190,12 +215,18 @@ class Sweep:
                     not self._dwell.at_rest():
                 self._dwell = Dwell(self.sensor, (self.newest_ns or 0) + 1)
             return None
-        entry = self._entry(self._dwell.mean(rest, wanted), target)
+        mean = self._dwell.mean(rest, wanted)
+        if self.settings.stage_mode != 'manual' and self._angles[-1][0] < mean['stop_ns']:
+            # What the stage did to the end of the dwell is still to come, or never will.
+            if self.settings.stage_mode == 'encoder' and (silent := self._silent()):
+                self._refuse(f'{silent}; capture again when it is back')
+            return None
+        entry = self._entry(mean, target)
         why = self._moved_away(rest, entry) or self._wrong(entry, self._dwell.volts(rest))
         if why:
             self._refuse(why)
             return None
-        if self._verify is not None:
+        if self._verify:
             self._check_mounting(entry)
             return None
         return entry
@@ -247,6 +278,9 @@ class Sweep:
         since = f' for {waited_s:.0f} s' if late else ''
         if self.settings.stage_mode != 'manual' and (apart := self._clocks()):
             return State('stage', apart, True)
+        silent = '' if self.settings.stage_mode == 'manual' else self._silent()
+        if silent and (self._captured or self.settings.stage_mode == 'encoder'):
+            return State('stage', silent, waited_s > _SILENT_S)
         if self._refusal:
             return State('refused', self._refusal, True)
         if not self._captured:
@@ -280,9 +314,9 @@ class Sweep:
         self._captured = False
         self._dwell = Dwell(self.sensor, self._angles[-1][0] if self._angles else 0)
 
-    def _learned(self, before: known.Known | None, without: int | None = None) -> known.Known:
+    def _learned(self, before: known.Known | None) -> known.Known:
         stage_rad = self.sensor.stage_resolution_rad / np.sqrt(12)
-        entries = [e for e in self.results() if not e.get('check') and e['pose'] != without]
+        entries = [e for e in self.results() if not e.get('check')]
         poses = Poses.from_entries(entries) if entries else Poses(
             *(np.zeros((0, len(self.sensor.axes))),) * 2, *(np.zeros(0),) * 2, np.zeros((0, 2)),
             np.zeros(0, bool))
@@ -333,36 +367,39 @@ class Sweep:
             self._captured = False
 
     def _check_mounting(self, entry: dict[str, Any]) -> None:
-        assert self._verify is not None
-        stage_rad = self.sensor.stage_resolution_rad
+        before, stage_rad = self._verify[0], self.sensor.stage_resolution_rad
         if self.settings.stage_mode == 'manual':
             stage_rad = max(stage_rad, self.settings.tolerance_rad)
-        elif self.settings.stage_mode == 'encoder':
-            # It is set by hand anew: what the encoder knows of the difference is allowed for.
-            stage_rad += max(abs(entry[name] - self._verify[name])
-                             for name in ('alpha_rad', 'beta_rad'))
-        why = refusals.mounting(self.sensor, np.array(self._verify['mean_v']),
-                                np.array(entry['mean_v']), self.index + 1, stage_rad)
+        else:
+            # The stage is elsewhere within its tolerance: what the encoder knows is allowed for.
+            stage_rad += max(abs(entry[name] - before[name]) for name in ('alpha_rad', 'beta_rad'))
+        why = mounting.changed(self.sensor, before, entry, stage_rad)
         if why and self.settings.stage_mode == 'manual':
             self._refuse(f'{why}; or turn the stage to where it was, and capture again')
             return
         if why:
             raise MountingError(why)
-        self._verify = None
-        self._go(self._next())
+        del self._verify[0]
+        self._go(self._verify[0]['pose'] if self._verify else self._next())
 
     def _clocks(self) -> str:
         if len(self._ahead_s) < _FEWEST_OFFSETS:
             return ''
         return refusals.clocks(min(self._ahead_s, key=abs))
 
-    def _off_text(self, target: Target) -> str:
+    def _silent(self) -> str:
+        """Say that the encoder is silent, and for how long by the samples' time; '' if not."""
         if self.angles is None:
             return 'nothing on stage/joint_states'
         silent_s = ((self.newest_ns or 0) - self._angles[-1][0]) * 1e-9
-        if silent_s > _SILENT_S:
-            return f'nothing on stage/joint_states for {silent_s:.0f} s'
-        return refusals.angles(target, *self.angles, self.settings.tolerance_rad) or 'arrived'
+        return f'nothing on stage/joint_states for {silent_s:.0f} s' if silent_s > _SILENT_S \
+            else ''
+
+    def _off_text(self, target: Target) -> str:
+        if self.angles is None:
+            return self._silent()
+        return self._silent() or \
+            refusals.angles(target, *self.angles, self.settings.tolerance_rad) or 'arrived'
 
     def _angle_between(self, first_ns: int, last_ns: int, target: Target) -> tuple[float, float]:
         if self.settings.stage_mode == 'manual':

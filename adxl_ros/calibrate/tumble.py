@@ -40,6 +40,7 @@ from adxl_ros.calibrate.stream import Newest, Surroundings
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
+_BACK_NS = 1_000_000_000
 _ENDED_S = 1.0
 """A rest is announced when the stream has gone on for this long after it."""
 ENOUGH_RESTS = 24
@@ -76,22 +77,29 @@ class Tumble:
         self.surroundings = Surroundings()
         self.newest_ns: int | None = None
         self._span_c = temperature_span_c
-        self._resumed = list(accepted)
+        self._passed = np.zeros(len(directions.UP), bool)
+        self._unsaid = ''
+        self._begin()
+        self._learn()
+
+    def _begin(self) -> None:
+        """Begin to listen: what is accepted so far is of another stream."""
+        self._resumed = list(self.accepted.values())
         self._stamps: list[np.ndarray] = []
-        self._newest = Newest(sensor)
+        self._newest = Newest(self.sensor)
         self._said_ns = self._judge_ns = 0
         self._dropped: list[tuple[int, int]] = []
         self._saturated: list[int] = []
-        self._passed = np.zeros(len(directions.UP), bool)
-        self._unsaid = ''
-        self._finder = RestFinder(sensor.rate_hz, len(sensor.axes), known_noise(sensor),
-                                  learn=True)
-        self._learn()
+        self._finder = RestFinder(self.sensor.rate_hz, len(self.sensor.axes),
+                                  known_noise(self.sensor), learn=True)
 
     def feed(self, stamps_ns: np.ndarray, volts: np.ndarray) -> None:
         """Take samples: stamps, ns, (n,), and volts, (n, m)."""
         if not len(stamps_ns):
             return
+        if self.newest_ns is not None and stamps_ns[0] < self.newest_ns - _BACK_NS:
+            # A driver that was started anew, on a clock of its own, or a clock that was set.
+            self._begin()
         self.newest_ns = int(stamps_ns[-1])
         self._stamps.append(stamps_ns)
         self._newest.feed(stamps_ns, volts)
@@ -121,7 +129,9 @@ class Tumble:
 
     def retry(self) -> None:
         """Announce the newest rest once more."""
-        self._said_ns = max((e['stop_ns'] for e in self.accepted.values()), default=0)
+        before = {e['pose'] for e in self._resumed}
+        self._said_ns = max((e['stop_ns'] for number, e in self.accepted.items()
+                             if number not in before), default=0)
         self._judge_ns = (self.newest_ns or 0) + 2 * _JUDGE_NS
 
     def capture(self) -> str:
@@ -137,19 +147,26 @@ class Tumble:
         self._choose()
         return f'{left_out} up is left out'
 
+    @property
+    def before(self) -> int | None:
+        """Return the number of the newest rest."""
+        return max(self.accepted, default=None)
+
     def redo(self) -> str:
         """Forget the newest rest; return what is done, or '' where there is none."""
-        if not self.accepted:
+        number = self.before
+        if number is None:
             return ''
-        number = max(self.accepted)
         self.drop(self.accepted[number])
         return f'rest {number + 1} is forgotten; hold the sensor in that direction again'
 
     def drop(self, entry: dict[str, Any]) -> None:
         """Leave a rest out."""
         del self.accepted[entry['pose']]
-        self._resumed = [e for e in self._resumed if e['pose'] != entry['pose']]
-        self._dropped.append((entry['start_ns'], entry['stop_ns']))
+        resumed = [e for e in self._resumed if e['pose'] != entry['pose']]
+        if len(resumed) == len(self._resumed):
+            self._dropped.append((entry['start_ns'], entry['stop_ns']))
+        self._resumed = resumed
         self._learn()
 
     def results(self) -> list[dict[str, Any]]:

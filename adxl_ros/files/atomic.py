@@ -17,13 +17,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+import fcntl
+from glob import escape
 import os
 from pathlib import Path
 import shutil
 import tempfile
 
 from adxl_ros.errors import UserError
+
+_LEFT = '.part'
 
 
 @contextmanager
@@ -42,20 +46,43 @@ def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
     """
     target = Path(path)
     try:
-        folder = Path(tempfile.mkdtemp(prefix=f'.{target.name}.', dir=target.parent or '.'))
+        folder = Path(tempfile.mkdtemp(_LEFT, f'.{target.name}.', target.parent or '.'))
     except OSError as error:
         raise UserError(f'{target}: cannot write into {target.parent}: {error.strerror}; '
                         'choose a directory that exists and can be written') from None
     fresh = folder / target.name
     try:
-        yield fresh
-        _sync(fresh)
-        _exchange(fresh, target, folder)
-        sync(target.parent)
+        with _locked(folder):
+            yield fresh
+            _sync(fresh)
+            _exchange(fresh, target, folder)
+            sync(target.parent)
     except OSError as error:
         raise UserError(f'{target}: cannot write: {error.strerror or error}') from None
     finally:
         shutil.rmtree(folder, ignore_errors=True)
+
+
+def clear_left(folder: str | os.PathLike, name: str) -> None:
+    """
+    Remove what writers that were killed have left of files whose names begin with `name`.
+
+    What another process is writing is locked, and stays.
+    """
+    for left in Path(folder).glob(f'.{escape(name)}*{_LEFT}'):
+        with suppress(OSError), _locked(left):
+            shutil.rmtree(left, ignore_errors=True)
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Lock a directory for as long as this process lives, or raise `OSError`."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield
+    finally:
+        os.close(descriptor)
 
 
 def keep_previous(path: str | os.PathLike) -> None:

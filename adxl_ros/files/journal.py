@@ -32,6 +32,14 @@ from adxl_ros.files.atomic import atomic_path, sync
 FORMAT = 1
 
 
+class NotJournalError(UserError):
+    """A line is none of a journal; `lines` are those before it."""
+
+    def __init__(self, path: Path, number: int, why: object, lines: list[dict[str, Any]]) -> None:
+        self.why, self.lines = f'line {number} is not of a journal ({why})', lines
+        super().__init__(f'{path}:{number}: not a journal: {why}')
+
+
 class Journal:
     """
     An append-only file of JSON lines: a head that says what is calibrated, then entries.
@@ -55,7 +63,8 @@ class Journal:
     Raises
     ------
     UserError
-        Locked by another calibration, of another head (says what differs), or not writable.
+        Locked by another calibration, of another head (says what differs), not a journal, or not
+        writable.
 
     """
 
@@ -106,9 +115,17 @@ class Journal:
         self._file.close()
 
     def _resume(self, head: dict[str, Any], anew: bool) -> list[dict[str, Any]]:
-        known, whole = _parse(self.path)
-        if known and (anew or known[-1].get('done')):
-            # A finished one is kept until the next is finished, an interrupted one for ever.
+        try:
+            known, whole = _parse(self.path)
+        except NotJournalError as error:
+            if not anew:
+                raise UserError(
+                    f'{error}; {len(accepted_poses(error.lines))} poses before it can be read; '
+                    'name another journal, or begin anew with resume:=anew (this file is kept)'
+                ) from None
+            known, whole = [{}], 0
+        if known and (anew or _ended(known, head)):
+            # A finished one is kept until the next is finished, all else for ever.
             name = 'previous' if known[-1].get('done') else \
                 datetime.now(timezone.utc).strftime('%Y%m%dT%H%M%S.%fZ')
             with atomic_path(self.path.with_name(f'{self.path.name}.{name}')) as kept:
@@ -151,35 +168,53 @@ def unfinished(path: str | os.PathLike, head: dict[str, Any]) -> tuple[int, str]
     Returns
     -------
     poses, differences
-        How many poses it has, and how its head differs from this one; None where there is none.
+        How many poses it has, and how its head differs from this one, or which line is none of a
+        journal; None where there is none.
 
     Raises
     ------
     UserError
-        Not a journal, or not readable.
+        Not readable.
 
     """
     if not Path(path).exists():
         return None
     try:
         lines, _ = _parse(Path(path))
+    except NotJournalError as error:
+        return len(accepted_poses(error.lines)), error.why
     except OSError as error:
         raise UserError(f'{path}: cannot be read: {error.strerror}') from None
-    poses = len(accepted_poses(lines))
-    if not poses or lines[-1].get('done'):
+    poses, head = len(accepted_poses(lines)), _written(head)
+    if not poses or _ended(lines, head):
         return None
-    return poses, differences(lines[0], _written(head))
+    return poses, differences(lines[0], head)
 
 
 def differences(was: dict[str, Any], now: dict[str, Any]) -> str:
-    """Say in which keys two heads differ."""
+    """Say in which keys two heads differ, in the order of the present one: the unit first."""
     return ', '.join(f'{key} was {_short(was.get(key))}, is {_short(now.get(key))}'
-                     for key in sorted(was.keys() | now.keys()) if was.get(key) != now.get(key))
+                     for key in {**now, **was} if was.get(key) != now.get(key))
+
+
+def _ended(lines: Sequence[dict[str, Any]], head: dict[str, Any]) -> bool:
+    """
+    Tell whether a calibration is over, so that another may begin.
+
+    One that was fitted with poses left open (`done` is false) can go on, but is in nobody's way.
+    """
+    done = lines[-1].get('done')
+    return bool(done) or (done is not None and bool(differences(lines[0], head)))
 
 
 def skipped_poses(entries: Sequence[dict[str, Any]]) -> set[int]:
-    """Return the poses that the operator left out."""
-    return {entry['skip'] for entry in entries if 'skip' in entry}
+    """Return the poses that the operator left out and did not ask for again."""
+    found: set[int] = set()
+    for entry in entries:
+        found.discard(entry.get('drop', -1))
+        if 'skip' in entry:
+            found.add(entry['skip'])
+    return found
 
 
 def accepted_poses(entries: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -195,18 +230,22 @@ def accepted_poses(entries: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 def _parse(path: Path) -> tuple[list[dict[str, Any]], int]:
     """Return the whole lines and their length in bytes; a last line cut by a crash is left."""
     lines, whole = [], 0
-    for number, raw in enumerate(_whole_lines(path.read_bytes()), 1):
+    data = path.read_bytes()
+    # A crash may have left the beginning of the head, or its length without its bytes.
+    if b'\n' not in data and data.strip(b'\0') and not data.startswith(b'{'):
+        raise NotJournalError(path, 1, 'it does not begin with {', lines)
+    for number, raw in enumerate(_whole_lines(data), 1):
         try:
             entry = json.loads(raw)
             if not isinstance(entry, dict):
                 raise ValueError('not an object')
         except ValueError as error:
-            raise UserError(f'{path}:{number}: not a journal: {error}') from None
+            raise NotJournalError(path, number, error, lines) from None
         lines.append(entry)
         whole += len(raw) + 1
     if lines and lines[0].get('format') != FORMAT:
-        raise UserError(f'{path}:1: format {lines[0].get("format")!r}, but this package reads '
-                        f'version {FORMAT}')
+        raise NotJournalError(path, 1, f'format {lines[0].get("format")!r}, but this package '
+                              f'reads version {FORMAT}', [])
     return lines, whole
 
 

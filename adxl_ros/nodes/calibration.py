@@ -62,7 +62,7 @@ class Calibration(Node):
         self.session: Session | None = None
         self.outcome: list[str] = []
         self.question = ''
-        self.said = self._hindrance = self._warned = self._foreign = ''
+        self.said = self._hindrance = self._warned = self._foreign = self._stuck = ''
         self._wanted = self.autostart
         self._anew = self.resume == 'anew'
         self._newest: Newest | None = None
@@ -104,6 +104,10 @@ class Calibration(Node):
             unit = recorded.unit_of(self.base, info, 'sensor_info')
         except UserError as error:
             self._foreign = f'{error}'
+            # Of that sensor nothing is taken or shown.
+            self.unit = self._newest = None
+            if self.session is not None:
+                self._stop(f'{error}; the poses are kept', failed=True)
             self.fail(self._foreign)
             return
         self._foreign = ''
@@ -111,9 +115,13 @@ class Calibration(Node):
             was, now = (self.asked.head(of) for of in (self.session.unit, unit))
             changed = ', '.join(f'{key} was {was[key]}, is {now[key]}' for key in was
                                 if was[key] != now[key])
-            if changed:
+            if not changed and self._sweep is not None:
+                # A driver that was started anew: the sensor may have been taken off.
+                self._sweep.verify()
+                self._answer_captures(False, 'the driver began anew; capture again')
+            elif changed:
                 self._stop(f'sensor_info: {changed}: changed during the calibration; put it back '
-                           'and start again, the poses are kept')
+                           'and start again, the poses are kept', failed=True)
         self.unit, self._newest = unit, Newest(unit)
 
     def _on_stage(self, message: JointState) -> None:
@@ -169,8 +177,8 @@ class Calibration(Node):
         if self._sweep is not None and self.asked.settings.stage_mode == 'commanded':
             return False, 'nothing to capture: the stage moves itself, and poses are taken when ' \
                           'it has arrived'
-        if self._hindrance:
-            return False, self._hindrance
+        if self._hindrance or self._stuck:
+            return False, self._hindrance or self._stuck
         self._take_samples()
         why = self.session.walk.capture()
         if why:
@@ -208,6 +216,7 @@ class Calibration(Node):
         except UserError as error:
             text, otherwise = '', f'{error}'
         if text:
+            self._stuck = ''
             self._answer_captures(False, text)
             self.say(text)
         return bool(text), text or otherwise
@@ -269,7 +278,8 @@ class Calibration(Node):
             self._take_poses()
         if self.session is not None:
             if self.session.over:
-                self._finish()
+                if not self._stuck:
+                    self._finish()
             else:
                 self._announcer.announce(self.session.walk, self._steady.now().nanoseconds)
         if self.console is not None:
@@ -311,23 +321,28 @@ class Calibration(Node):
         self._hindrance = hindrance
 
     def _finish(self) -> bool:
+        self.say(f'fitting {self.session.done} poses')
         if self.console is not None:
-            self.console.show('fit', 'fitting what was taken')
-        over = self.session.over
+            self.console.show('fit', self.said)
+        self._stuck = ''
         try:
             found = self.session.finish()
+            self.get_logger().info(found.keep(self.asked.store))
+            self._leave_report(found)
+            self.session.end()
         except (UserError, OSError) as error:
-            # What was taken stays, so that more poses or another directory can save it.
-            self.fail(f'cannot finish: {error}')
-            if over:
-                self._stop(self.said)
+            # What was taken stays: other poses, or room on the disk, can save it.
+            text = f'cannot finish: {error}'
+            if self.session.over:
+                self._stuck = text = f'{text}; finish again, redo or abort'
+            self.fail(text)
             return False
-        self.get_logger().info(found.keep(self.asked.store))
-        self._leave_report(found)
         for line in found.comments():
             self.get_logger().info(line)
         self.outcome = found.brief
-        self._stop(f'wrote {self.asked.output}')
+        left = self.session.left
+        self._stop(f'wrote {self.asked.output}' + (
+            f'; {left} poses are open: start again to go on' if left else ''))
         return True
 
     def _leave_report(self, found: Result) -> None:
@@ -341,7 +356,7 @@ class Calibration(Node):
             self.fail(f'no report: {error}')
 
     def _stop(self, text: str, failed: bool = False) -> None:
-        self._wanted, self.question, self._hindrance = False, '', ''
+        self._wanted, self.question, self._hindrance, self._stuck = False, '', '', ''
         session, self.session = self.session, None
         if session is not None:
             session.close()
@@ -386,6 +401,8 @@ class Calibration(Node):
             return 'silent', silent, True
         if self._hindrance:
             return 'refused', self._hindrance, True
+        if self._stuck:
+            return 'refused', self._stuck, True
         state = self.session.walk.state()
         return state.phase, state.text, state.late
 

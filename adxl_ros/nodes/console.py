@@ -47,6 +47,7 @@ class Console:
             node.get_logger().info(why_not)
         self.asks = self._terminal is not None
         self._turns = 0
+        self._sure = False
         self._view: tuple[Session, View] | None = None
 
     def turn(self) -> None:
@@ -106,6 +107,12 @@ class Console:
     def _press(self, key: str) -> None:
         action = self._keys().get('c' if key == ' ' else key)
         node = self._node
+        left = node.session.left if node.session is not None else 0
+        if action == 'finish' and left and not self._sure:
+            self._sure = True
+            node.say(f'{left} poses are open; press f again to fit what there is')
+            return
+        self._sure = False
         if action == 'quit':
             rclpy.try_shutdown()
         elif action == 'begin':

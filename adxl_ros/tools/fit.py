@@ -84,8 +84,9 @@ def _entries(path: str | None) -> list[dict] | None:
     if path is None:
         return None
     _, entries = journal.read(path)
-    final = next((e['rests'] for e in reversed(entries) if 'rests' in e), None)
-    return final if final is not None else journal.accepted_poses(entries)
+    # Rests that were fitted, unless the sweep has gone on since.
+    last = next((e for e in reversed(entries) if e.keys() & {'rests', 'pose', 'drop'}), {})
+    return last['rests'] if 'rests' in last else journal.accepted_poses(entries)
 
 
 def main() -> int:

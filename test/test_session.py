@@ -1,0 +1,185 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""A calibration from its poses to its file, without ROS: what ends in the fit and on the disk."""
+
+from dataclasses import replace
+
+from adxl_ros.calibrate.session import Plan, Session
+from adxl_ros.calibrate.state import Settings
+from adxl_ros.errors import UserError
+from adxl_ros.files import atomic, journal, params
+from adxl_ros.model import chain
+from adxl_ros.model.stage import specific_force
+import numpy as np
+import pytest
+from units import drawn, nominal
+
+UNIT = nominal(serial='S1')
+TRUTH = drawn(np.random.default_rng(3), UNIT)
+
+
+@pytest.fixture
+def begin(tmp_path):
+    """Give a function that begins or resumes a calibration of 20 poses and 2 check poses."""
+    begun = []
+
+    def begin(anew=False, **changes):
+        if begun:
+            begun[-1].close()
+        settings = Settings(1.0, 0.0035, 20.0, 'manual')
+        asked = replace(Plan(
+            'stage', (np.pi / 4, np.pi / 2), np.pi / 2, 2, settings, tmp_path / 'unit.yaml',
+            tmp_path / 'journal', '', ''), **changes)
+        begun.append(Session(UNIT, asked, anew))
+        return begun[-1]
+    yield begin
+    begun[-1].close()
+
+
+def take(session, count, off_v=0.0):
+    """Take poses, as `Session.accepted` does with those that the stream gives."""
+    for _ in range(count):
+        target, walk = session.walk.target, session.walk
+        volts = np.column_stack(chain.static_response(TRUTH)(specific_force(
+            np.array([target.alpha_rad]), np.array([target.beta_rad]), 9.80665)))[0] + off_v
+        entry = {'pose': walk.index, 'alpha_rad': target.alpha_rad, 'beta_rad': target.beta_rad,
+                 'check': target.check, 'start_ns': 2 * walk.index, 'stop_ns': 2 * walk.index + 1,
+                 'samples': 1000, 'mean_v': volts.tolist(), 'std_v': [5e-5, 5e-5]}
+        session.journal.append(entry)
+        walk.take(entry)
+
+
+def kept(session):
+    """Return the numbers of the poses on disk."""
+    return [e['pose'] for e in journal.accepted_poses(journal.read(session.journal.path)[1])]
+
+
+def test_a_pose_to_be_taken_again_is_in_no_fit_and_not_resumed(begin):
+    """`redo` and then a finish or a kill: the pose that was bad is gone."""
+    session = begin()
+    take(session, 2)
+    take(session, 1, 0.3)
+    assert session.redo() == 'pose 3 will be taken again'
+    assert kept(session) == [0, 1]
+    assert [e['pose'] for e in session.walk.results()] == [0, 1]
+    session = begin()
+    assert session.resumed == 2 and kept(session) == [0, 1]
+
+
+def test_finished_early_it_goes_on_and_at_its_end_it_is_over(begin):
+    """The file is of the poses so far; the next start has them, and ends with all."""
+    session = begin()
+    take(session, 12)
+    assert session.finish().fitted.provenance['poses'] == '12'
+    session.end()
+    session = begin()
+    assert session.resumed == 12 and session.left == 10
+    session.walk.skip()
+    take(session, 10)
+    assert session.over and session.finish().fitted.provenance['check_poses'] == '2'
+    session.end()
+    assert begin().resumed == 0
+
+
+def test_a_finish_that_comes_twice_keeps_the_calibration_before(begin, tmp_path, monkeypatch):
+    """The journal took no `done`: the same fit again is no other calibration."""
+    (tmp_path / 'unit.yaml').write_text('the one before\n')
+    session = begin(store=str(tmp_path / 'store'))
+    take(session, 12)
+    with monkeypatch.context() as patch:
+        patch.setattr(session.journal, 'append', _full)
+        found = session.finish()
+        copy = found.keep(session.asked.store)
+        with pytest.raises(UserError, match='unit.yaml is written, but .*make room'):
+            session.end()
+    again = session.finish()
+    assert again.keep(session.asked.store) == copy and copy.startswith('kept as')
+    assert (tmp_path / 'unit.yaml.previous').read_text() == 'the one before\n'
+    first = (tmp_path / 'unit.yaml').read_text()
+    take(session, 1)
+    session.finish().keep(session.asked.store)
+    assert (tmp_path / 'unit.yaml.previous').read_text() == first
+    assert len(list((tmp_path / 'store' / 'S1').iterdir())) == 2
+
+
+def _full(_):
+    raise UserError('journal: cannot write the journal: the disk is full; make room and try again')
+
+
+def test_what_a_killed_writer_left_is_cleared_and_what_is_being_written_stays(begin, tmp_path):
+    """Hidden folders of a write that was killed go at the next start."""
+    for name in ('unit.yaml', 'unit.yaml.previous', 'journal.previous'):
+        (tmp_path / f'.{name}.abcd1234.part').mkdir()
+        (tmp_path / f'.{name}.abcd1234.part' / name).write_text('half')
+    for inner in ('report/.report.html', 'store/S1/.S1-2026.yaml'):
+        (tmp_path / f'{inner}.abcd1234.part').mkdir(parents=True)
+    (tmp_path / '.unit.yaml.mine').mkdir()
+    with atomic.atomic_path(tmp_path / 'unit.yaml') as fresh:
+        begin(report=str(tmp_path / 'report'), store=str(tmp_path / 'store'))
+        fresh.write_text('whole')
+        assert len(list(tmp_path.rglob('.*.part'))) == 1
+    assert (tmp_path / 'unit.yaml').read_text() == 'whole'
+    assert {p.name for p in tmp_path.glob('.*')} == {'.unit.yaml.mine'}
+
+
+def test_check_poses_alone_are_no_calibration(begin):
+    """They judge a fit: without poses to fit it is refused, and what was taken stays."""
+    session = begin()
+    for _ in range(20):
+        session.skip()
+    take(session, 1)
+    with pytest.raises(UserError, match='only check poses are taken'):
+        session.finish()
+    assert kept(session) == [20]
+
+
+@pytest.mark.parametrize('count', [1, 2, 3, 5, 8])
+def test_few_poses_are_fitted_or_refused(begin, count):
+    """Never a traceback, whenever an operator has had enough."""
+    session = begin()
+    take(session, count)
+    session.walk.skipped.update(range(count, 20))
+    session.walk.retry()
+    try:
+        assert session.finish().fitted.provenance['poses'] == f'{count}'
+    except UserError as error:
+        assert str(error)
+
+
+@pytest.mark.parametrize('mode', ['stage', 'gravity'])
+def test_a_calibration_goes_on_only_with_the_figures_and_settings_it_began_with(begin, mode):
+    """What changes the poses or the fit is in the head; what was changed is said."""
+    asked, unit = begin().asked, nominal('xyz')
+    asked = replace(asked, mode=mode)
+    changed = [(asked, replace(unit, **{name: np.asarray(getattr(unit, name)) * 2}))
+               for name in ('noise_density_g_per_rthz', 'rc_capacitance_f', 'adc_vref_v',
+                            'range_g', 'local_gravity_mps2', 'stage_resolution_rad')]
+    names = ['temperature_span_c'] + ['tolerance_rad', 'near_rad'] * (mode == 'stage')
+    changed += [(replace(asked, settings=replace(asked.settings, **{name: 0.1})), unit)
+                for name in names]
+    before = asked.head(unit)
+    for plan, sensor in changed:
+        assert len([key for key, value in plan.head(sensor).items() if value != before[key]]) == 1
+
+
+def test_a_mounting_that_was_not_checked_is_said_in_the_file(begin, tmp_path):
+    """`skip` goes on without the check, and who uses the calibration can see it."""
+    take(begin(), 12)
+    session = begin()
+    assert session.skip() == 'pose 12 is not taken again: the mounting is not checked'
+    session = begin()
+    session.skip()
+    assert session.finish().fitted.provenance['mounting'] == 'not checked after an interruption'
+    assert params.load(tmp_path / 'unit.yaml').provenance['mounting'].startswith('not checked')
