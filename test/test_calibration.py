@@ -130,7 +130,9 @@ def test_services_and_refusals(start, tmp_path):
 
         assert ask('start')[0]
         graph.spin_until(lambda: int(graph.value('calibration', 'accepted')) >= 3, 60, 'resumed')
-        assert ask('finish') == (True, 'wrote calibration.yaml')
+        done, words = ask('finish')
+        assert done and words.startswith('wrote calibration.yaml; '), words
+        assert words.endswith(' poses are open: start again to go on')
         # Three poses of one plane determine the linear model alone, and the log says so.
         assert params.load(tmp_path / 'calibration.yaml').model == 'linear'
 

@@ -93,7 +93,9 @@ def test_no_gap():
 @pytest.mark.parametrize('option, parameter, value', [
     ('temperature_bias:per_k=4e-4', 'per_k.x', 4e-4),
     ('backlash:alpha_rad=0.004,beta_rad=0.004', 'beta_rad', 0.004),
-    ('misalignment:alpha_rad=0.003,beta_rad=-0.002', 'alpha_rad.y', 0.003)])
+    ('misalignment:alpha_rad=0.003,beta_rad=-0.002', 'alpha_rad.y', 0.003),
+    # As in the parameter file: with what the baseline has of it.
+    ('bias:offset_v=0.04', 'offset_v.y', 0.04)])
 def test_one_effect_is_named_and_the_gap_closed(option, parameter, value):
     """Name, parameter, and nearly all of the gap closed."""
     name = option.split(':')[0]

@@ -36,6 +36,7 @@ BLOCKS = 48
 """Stretches that a recording is cut into, to hold some out."""
 _ROUNDS = 3
 _TINY = 1e-300
+_ALIKE = 1e-12
 
 
 @dataclass(frozen=True)
@@ -182,35 +183,44 @@ def fit(channels: Sequence[Channel], ids: Sequence[int], prior: np.ndarray, most
         for (at, g), w, s2 in zip(grams, walks, variance):
             precision[np.ix_(at, at)] += g[w, 1:, 1:] / s2
             pull[at] += g[w, 1:, 0] / s2
-        values, held, covariance, factor = _bounded(precision, pull, bound)
+        values, held, covariance, half_log_det = _bounded(precision, pull, bound)
         left = [_left(g, values[at]) for at, g in grams]
         walks = [int(np.argmax(-n / 2 * np.log(np.maximum(r, _TINY)) + p))
                  for r, n, p in zip(left, counts, priors)]
         variance = np.array([max(r[w], _TINY) / n for r, w, n in zip(left, walks, counts)])
     log_evidence = -0.5 * float(np.sum(known * values ** 2)) \
-        - float(np.log(np.diag(factor)).sum()) + 0.5 * float(np.log(known[~held]).sum())
+        - half_log_det + 0.5 * float(np.log(known[~held]).sum())
     for n, s2, w, c in zip(counts, variance, walks, channels):
         log_evidence += float(-n / 2 * (np.log(s2) + 1) + c.log_priors[w])
     return Fit(own, values, covariance, held, log_evidence, tuple(walks), variance)
 
 
 def _bounded(precision: np.ndarray, pull: np.ndarray, bound: np.ndarray
-             ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Solve for values within bounds; give which are held, the others' covariance and factor."""
+             ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """
+    Solve for values within bounds.
+
+    Gives the values, which are held, the others' covariance, and half the logarithm of the
+    determinant of their precision. Columns of all sizes that are nearly alike are no obstacle:
+    they are scaled, and told apart to a millionth.
+    """
+    size = 1 / np.sqrt(np.diag(precision))
+    scaled = precision * size[:, None] * size + _ALIKE * np.eye(len(size))
     values, held = np.zeros(len(bound)), np.zeros(len(bound), bool)
     while True:
         free = ~held
-        factor = np.linalg.cholesky(precision[np.ix_(free, free)])
-        values[free] = cho_solve((factor, True), (pull - precision @ np.where(held, values, 0.0))[
-            free])
+        factor = np.linalg.cholesky(scaled[np.ix_(free, free)])
+        rest = pull - precision @ np.where(held, values, 0.0)
+        values[free] = size[free] * cho_solve((factor, True), (size * rest)[free])
         beyond = np.abs(values) > bound * (1 + 1e-9)
         if not beyond.any():
             break
         values[beyond] = np.sign(values[beyond]) * bound[beyond]
         held |= beyond
     covariance = np.zeros_like(precision)
-    covariance[np.ix_(free, free)] = cho_solve((factor, True), np.eye(int(free.sum())))
-    return values, held, covariance, factor
+    covariance[np.ix_(free, free)] = (cho_solve((factor, True), np.eye(int(free.sum())))
+                                      * size[free][:, None] * size[free])
+    return values, held, covariance, float(np.log(np.diag(factor) / size[free]).sum())
 
 
 def _left(grams: np.ndarray, values: np.ndarray) -> np.ndarray:

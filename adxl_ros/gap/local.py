@@ -254,9 +254,18 @@ def refined(of: Study, effects: Sequence[str], start: dict[str, float],
             effect_named(drift).parameters[0].name: densities}})
     return Hypothesis(effects, fitted, here.names[own],
                       here.values - here.middle[own],
-                      evidence.robust_std(here.channels, found, here.prior)[own],
+                      np.hypot(evidence.robust_std(here.channels, found, here.prior)[own],
+                               _of_stage(of, here.names[own])),
                       reached + _of_those_that_show(here, found), found,
                       evidence.uneven(here.channels, found))
+
+
+def _of_stage(of: Study, names: Sequence[str]) -> np.ndarray:
+    """Return standard deviations below which the stage's step tells no angle, (k,)."""
+    step_rad = max(one.sensor.stage_resolution_rad if one.reference == 'stage' else 0.0
+                   for one in of.series)
+    return np.array([step_rad / 12 ** 0.5 if parameter_of(n).unit == 'rad' else 0.0
+                     for n in names])
 
 
 def _of_those_that_show(here: Local, found: Fit) -> float:

@@ -22,7 +22,7 @@ from typing import Any
 from adxl_ros.gap.diagnose import Diagnosis
 from adxl_ros.gap.local import Hypothesis
 from adxl_ros.gap.where import SHOWS_P
-from adxl_ros.model.coefficients import parameter_of
+from adxl_ros.model.coefficients import get, parameter_of
 from adxl_ros.model.effects import effect_named, library
 import numpy as np
 
@@ -146,11 +146,12 @@ def _parameters(h: Hypothesis | None, effect: str) -> dict[str, Any]:
     if h is None:
         return {}
     out = {}
-    for name, value, std in zip(h.names, h.values, h.std):
+    for name, std in zip(h.names, h.std):
         if not name.startswith(f'{effect}.'):
             continue
         p = parameter_of(name)
-        middle = value + (0.0 if p.sized else p.scale)
+        # As in the parameter file, what the baseline has of it included.
+        middle = float(get(h.sensor, [name])[0])
         out[name.split('.', 1)[1]] = {
             'value': _round(middle), 'ci': [_round(middle - _NINETY * std),
                                             _round(middle + _NINETY * std)], 'unit': p.unit}

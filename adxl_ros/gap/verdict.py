@@ -245,9 +245,12 @@ def judge(of: Study, found: Sequence[Hypothesis], discrepancy: Discrepancy | Non
     unknown = 0.02
     places: tuple[str, ...] = ()
     drifts = bool(drifts_among(best.effects))
+    # Where codes are coarser than the noise, their rounding follows the signal.
+    rounded_mps2 = max(float(one.sensor.lsb_v / np.min(one.scale_v_per_mps2)) / 12 ** 0.5
+                       for one in of.series)
     if discrepancy is not None and discrepancy.gain > UNKNOWN_NATS \
             and discrepancy.rms_mps2 > max(UNKNOWN_OF_NOISE * noise_mps2,
-                                           UNKNOWN_OF_GAP * gap_mps2) \
+                                           UNKNOWN_OF_GAP * gap_mps2, rounded_mps2) \
             and (drifts or left_mps2 > UNKNOWN_LEFT * gap_mps2):
         unknown = 0.9
         places = tuple(sorted((k for k, g in discrepancy.where.items() if g > UNKNOWN_NATS),
@@ -256,7 +259,8 @@ def judge(of: Study, found: Sequence[Hypothesis], discrepancy: Discrepancy | Non
         unknown = 0.9
         places = tuple(dict.fromkeys((*places, 'time_s')))
     # Nothing is left of a drift but what it is known by.
-    if not drifts and left_mps2 > max(LEFT_OF_NOISE * noise_mps2, LEFT_OF_GAP * gap_mps2):
+    if not drifts and left_mps2 > max(LEFT_OF_NOISE * noise_mps2, LEFT_OF_GAP * gap_mps2,
+                                      rounded_mps2):
         unknown = 0.9
         places = places or ('frequency',)
     known = share / share.sum() * (1 - unknown)
