@@ -30,7 +30,7 @@ _STYLE = """
 body{font:15px/1.45 system-ui,sans-serif;max-width:60em;margin:2em auto;padding:0 1em;color:#222}
 h1{font-size:1.3em}h2{font-size:1.1em;margin-top:2em;border-bottom:1px solid #ccc}
 table{border-collapse:collapse;font-size:13px}td,th{padding:.25em .6em;text-align:left;
-border-bottom:1px solid #ddd;vertical-align:top}img{width:100%}
+border-bottom:1px solid #ddd;vertical-align:top}img{max-width:100%}
 .said{background:#eef4fb;padding:.8em 1em;border-left:5px solid #36c}
 .leak{background:#fbeeee;border-color:#c33}@media print{body{margin:0}}
 """

@@ -40,10 +40,6 @@ import numpy as np
 _KEPT_ANGLES = 100000
 _OFFSETS, _FEWEST_OFFSETS = 20, 4
 _BACK_NS = 1_000_000_000
-_OFFSETS, _FEWEST_OFFSETS = 20, 4
-_BACK_NS = 1_000_000_000
-_ACROSS = 0.94
-"""Cosine of 20°: poses whose verticals are closer than this tell the same of the mounting."""
 _OLD_S, _SILENT_S = 60.0, 3.0
 
 
