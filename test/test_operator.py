@@ -49,6 +49,11 @@ class Operator(Graph):
         return (int(told['pose']), float(told['alpha_rad']), float(told['beta_rad']),
                 newest.message)
 
+    def is_told_where(self):
+        """Tell whether the newest diagnostics ask for a pose, or say how far off it is."""
+        said = self.diagnostics['calibration'].message if 'calibration' in self.diagnostics else ''
+        return 'then capture' in said or 'from the asked' in said
+
     def command(self, alpha, beta, shift=0.0):
         """Let go of the stage somewhere on its way to a pose."""
         self.commands.publish(JointState(name=['alpha', 'beta', 'shift'],
@@ -98,6 +103,7 @@ def test_an_operator_who_makes_mistakes_ends_with_a_good_file(start, tmp_path):
         assert words == 'pose 1 of 20: turn the stage to alpha 45.0°, beta 0.0°, then capture'
         # A wrong pose.
         operator.turn(alpha, np.radians(3.2))
+        operator.spin_until(operator.is_told_where, 20, 'an angle that calibration has heard')
         assert operator.ask() == (
             False, 'beta is 3.2° from the asked 0°; turn the stage there and capture again')
         # Too early: the stage is still turning.
@@ -119,9 +125,7 @@ def test_an_operator_who_makes_mistakes_ends_with_a_good_file(start, tmp_path):
         assert not done and 'beta is 45.0° from the asked 90°' in said
         # Walks away: nothing is lost, nothing ends, and what is waited for is still said.
         operator.turn(alpha, beta)
-        operator.spin_until(lambda: 'then capture' in operator.diagnostics['calibration'].message
-                            or 'from the asked' in operator.diagnostics['calibration'].message,
-                            20, 'what is waited for')
+        operator.spin_until(operator.is_told_where, 20, 'what is waited for')
         operator.spin(2.0)
         assert node.popen.poll() is None
         # And then does it right.
