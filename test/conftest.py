@@ -31,7 +31,7 @@ import subprocess
 import time
 
 from ament_index_python.packages import get_package_prefix
-from domain import own_domain
+from domain import BY_UDP, own_domain
 from hypothesis import settings
 import pytest
 
@@ -44,15 +44,25 @@ settings.load_profile('same')
 
 
 def pytest_configure(config: pytest.Config) -> None:
+    config.addinivalue_line('markers', 'kills: kills processes, which therefore talk by UDP')
     # A run that is told to end stops the processes it has started, as after Ctrl-C.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
+    # A shell's background job ignores Ctrl-C, and so would the processes of the tests.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Keep the tests that run a graph in one worker, after each other: they need their core."""
+    """
+    Keep together what is dear to make: in one worker, after each other.
+
+    Tests that run a graph need their core; what a module makes once is made once a worker.
+    """
     for item in items:
-        if 'ros_env' in getattr(item, 'fixturenames', ()):
+        names = set(getattr(item, 'fixturenames', ()))
+        if 'ros_env' in names:
             item.add_marker(pytest.mark.xdist_group('graph'))
+        elif names & {'original', 'found', 'reported'}:
+            item.add_marker(pytest.mark.xdist_group(item.path.stem))
 
 
 @pytest.fixture(autouse=True)
@@ -62,14 +72,14 @@ def store_of_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def ros_env(tmp_path: Path) -> Iterator[dict[str, str]]:
-    """Set the environment of a graph of this test's own, for this process and its children."""
+def ros_env(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[dict[str, str]]:
+    """Set the environment of a graph of this test's own, and return that of its processes."""
     with own_domain() as domain, pytest.MonkeyPatch.context() as patch:
         patch.setenv('ROS_DOMAIN_ID', str(domain))
         patch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
         patch.delenv('ROS_LOCALHOST_ONLY', raising=False)
         patch.setenv('ROS_LOG_DIR', str(tmp_path / 'ros_log'))
-        yield dict(os.environ)
+        yield os.environ | (BY_UDP if request.node.get_closest_marker('kills') else {})
 
 
 def wait_until(condition: Callable[[], object], timeout_s: float, what: str) -> None:

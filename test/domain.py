@@ -23,6 +23,13 @@ import socket
 import tempfile
 
 DOMAINS = range(1, 102)  # 0 is everybody's; above 101 lie ports that the system hands out
+BY_UDP = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SUBNET', 'FASTRTPS_DEFAULT_PROFILES_FILE':
+          str(Path(__file__).with_name('udp_of_this_host.xml'))}
+"""
+Variables for the processes of tests that kill one of them. Fast DDS's shared memory that a process
+is killed in stays locked for others, and where rmw_fastrtps keeps to LOCALHOST it takes shared
+memory in any case; the profile keeps them to this host, too.
+"""
 
 
 def domain_in_use(domain: int) -> bool:

@@ -44,29 +44,6 @@ _LONGEST_S = 90.0
 _POSES_S, _FIT_S, _WRITE_S = 2.0, 1.0, 0.005
 _MOMENTS = ('poses', 'fit', 'poses', 'write', 'end')
 _FILES = ('unit.yaml.previous', 'unit.yaml', 'store', 'report.html', 'calibration.png')
-_UDP_OF_THIS_HOST = """<?xml version="1.0" encoding="UTF-8"?>
-<profiles xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles">
-  <transport_descriptors>
-    <transport_descriptor>
-      <transport_id>udp</transport_id>
-      <type>UDPv4</type>
-      <interfaceWhiteList><address>127.0.0.1</address></interfaceWhiteList>
-      <maxInitialPeersRange>32</maxInitialPeersRange>
-    </transport_descriptor>
-  </transport_descriptors>
-  <participant profile_name="udp" is_default_profile="true">
-    <rtps>
-      <builtin>
-        <initialPeersList>
-          <locator><udpv4><address>127.0.0.1</address></udpv4></locator>
-        </initialPeersList>
-      </builtin>
-      <userTransports><transport_id>udp</transport_id></userTransports>
-      <useBuiltinTransports>false</useBuiltinTransports>
-    </rtps>
-  </participant>
-</profiles>
-"""
 
 
 class Sweeps:
@@ -88,13 +65,7 @@ class Sweeps:
     """
 
     def __init__(self, folder, env, seed):
-        # A process that is killed within Fast DDS's shared memory leaves it locked for others, and
-        # where rmw_fastrtps keeps to this host itself, it takes shared memory in any case.
-        self.folder = Path(folder)
-        udp = self.folder / 'udp.xml'
-        udp.write_text(_UDP_OF_THIS_HOST)
-        self.env = {**env, 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SUBNET',
-                    'FASTRTPS_DEFAULT_PROFILES_FILE': str(udp)}
+        self.folder, self.env = Path(folder), env
         self.rng = np.random.default_rng(seed)
         self.kills = self.sweeps = self.poses = 0
         self.lost, self.broken, self.moments = [], [], {}

@@ -27,6 +27,7 @@ import sys
 import tempfile
 import time
 
+from domain import BY_UDP
 from faults import driver, line, Row, run, SERIAL
 from kills import kill
 import numpy as np
@@ -110,7 +111,7 @@ def links(options):
 def sweeps(options):
     """Kill a sweep again and again, print what came of it, and return what went wrong."""
     with tempfile.TemporaryDirectory() as folder, graph_of_own():
-        told = kill(folder, dict(os.environ), options.kills, options.seed)
+        told = kill(folder, os.environ | BY_UDP, options.kills, options.seed)
     print(dated(options, f'{told.kills} kills'))
     print('| killed while | times |\n|---|---|')
     for moment, times in sorted(told.moments.items()):

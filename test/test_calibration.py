@@ -15,8 +15,10 @@ from std_srvs.srv import Trigger
 from units import drawn, nominal
 
 FAST = ('-p', 'use_sim_time:=true')
-# At many times real time a best-effort subscriber loses samples on a busy machine.
-LOSSLESS = ('-p', 'qos_overrides./imu/data_raw.subscription.reliability:=reliable')
+# At many times real time a best-effort subscriber, or one with a short queue, loses samples on a
+# busy machine.
+LOSSLESS = ('-p', 'qos_overrides./imu/data_raw.subscription.reliability:=reliable',
+            '-p', 'qos_overrides./imu/data_raw.subscription.depth:=20000')
 QUICK = ('-p', 'sweep.planes_rad:=[0.785, 1.5707963267948966, 2.356]', '-p',
          'sweep.step_rad:=0.7853981633974483', '-p', 'sweep.dwell_s:=1.0', '-p',
          'sweep.check_poses:=6')
@@ -182,7 +184,7 @@ def test_a_real_sensor_through_the_live_graph(start, run_tool, tmp_path, shared_
               '-p', 'autostart:=true', '-p', 'output:=live.yaml')
         graph.spin_until(lambda: graph.said('calibration', 'waiting for sensor_info'), 30, 'up')
         start('driver', '--ros-args', *FAST, '-p', 'link.type:=replay', '-p',
-              f'link.recording:={source}', '-p', 'link.speed:=30.0', '-p', 'autostart:=false',
+              f'link.recording:={source}', '-p', 'link.speed:=15.0', '-p', 'autostart:=false',
               '-p', 'qos_overrides./imu/data_raw.publisher.depth:=20000')
         # The two have found each other before the first sample, and stalls are bridged.
         assert graph.change('driver', Transition.TRANSITION_CONFIGURE)

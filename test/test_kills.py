@@ -15,8 +15,10 @@
 """A sweep that is killed at random moments; 200 times in `make soak`."""
 
 from kills import kill
+import pytest
 
 
+@pytest.mark.kills
 def test_no_kill_loses_a_pose_or_breaks_a_file(ros_env, tmp_path):
     """Ten kills, each at another moment of a sweep that goes on where it was, to its end."""
     told = kill(tmp_path, ros_env, 10, 1)

@@ -22,6 +22,7 @@ from adxl_ros.calibrate.state import Settings
 from adxl_ros.files import journal, params
 from graph import Graph
 import numpy as np
+import pytest
 from std_srvs.srv import Trigger
 from units import drawn, nominal
 
@@ -139,6 +140,7 @@ def test_a_fit_that_fails_at_the_end_waits_and_another_unit_ends_the_session(sta
     assert 'Traceback' not in node.output()
 
 
+@pytest.mark.kills
 def test_a_new_start_resumes_or_says_what_changed_or_begins_anew(start, tmp_path):
     """Without a terminal: it goes on by itself, refuses other settings, and obeys resume:=anew."""
     with Graph() as graph:
@@ -168,6 +170,7 @@ def test_a_new_start_resumes_or_says_what_changed_or_begins_anew(start, tmp_path
         assert journal.accepted_poses(journal.read(kept)[1])[:len(poses)] == poses
 
 
+@pytest.mark.kills
 def test_another_mounting_stops_before_a_pose_is_taken(start, tmp_path):
     """The sensor was taken off and put back 2° turned: the last pose tells, with figures."""
     with Graph() as graph:

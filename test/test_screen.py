@@ -174,6 +174,7 @@ def children(pid):
             for n in (task / 'children').read_text().split()]
 
 
+@pytest.mark.kills
 @pytest.mark.parametrize('how', ['ctrl-c', 'term', 'kill', 'kill of the screen'])
 def test_the_terminal_is_given_back(terminal, how):
     """However the node ends, settings, screen and cursor are as they were."""

@@ -123,6 +123,7 @@ def test_the_simulated_sensor_feels_the_true_angles(start, speed):
     assert np.abs(measured[rows] - expected).max() < 1e-9
 
 
+@pytest.mark.kills
 def test_sensor_time_goes_on_without_the_stage_and_waits_for_it_again(start):
     start('driver', *SIM_TIME, '-p', 'link.speed:=5.0', *IDEAL)
     with Commander() as graph:
