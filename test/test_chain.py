@@ -76,7 +76,7 @@ def bits_off_v(sensor: Sensor) -> float:
 
 def at_a_step(sensor: Sensor, force: np.ndarray) -> bool:
     """Tell whether the ADC's input is so near a step that another input may give its volts."""
-    input_v = np.array(chain.static_response(sensor, False)([float(f) for f in force]))
+    input_v = np.array(chain.analog_response(sensor)([float(f) for f in force]))
     step_v = sensor.adc_vref_v / 64
     off_v = np.abs(input_v - np.rint(input_v / step_v) * step_v)
     return bool((off_v <= 2 * bits_off_v(sensor)).any())

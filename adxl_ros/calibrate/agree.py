@@ -57,7 +57,7 @@ def require_one_mounting(found: full.FullFit, parts: Sequence[Poses], names: Seq
     fitted = found.unit
     for poses, name in zip(parts, names):
         force = reference_force(poses, fitted.local_gravity_mps2)
-        slope = np.moveaxis(chain.jacobian(chain.static_response(fitted, False), force,
+        slope = np.moveaxis(chain.jacobian(chain.analog_response(fitted), force,
                                            poses.environment), 2, 0)
         f = np.column_stack(force)
         turns = np.stack([np.cross(axis, f) for axis in np.eye(3)], axis=2)

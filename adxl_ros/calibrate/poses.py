@@ -135,6 +135,8 @@ def check_polarity(sensor: Sensor, poses: Poses) -> None:
         An axis moves against its reference, or with that of another axis: inverted or swapped.
 
     """
+    if len(poses) < 2:
+        return
     reference = np.column_stack(reference_force(poses, sensor.local_gravity_mps2))
     for d, axis in enumerate(sensor.axes):
         with np.errstate(invalid='ignore', divide='ignore'):

@@ -26,7 +26,14 @@ import numpy as np
 
 _JUDGED_S, _SHOWN_S = 1.2, 0.5
 _SAMPLES = 20
-_STALE_NS = 60_000_000_000
+_BACK_NS = 1_000_000_000
+STALE_NS = 60_000_000_000
+"""A temperature or supply that is stamped so far from the samples is not theirs."""
+
+
+def went_back(newest_ns: int, stamp_ns: int) -> bool:
+    """Tell whether stamps go back: a driver that was started anew, or a clock that was set."""
+    return stamp_ns < newest_ns - _BACK_NS
 
 
 class Newest:
@@ -93,7 +100,7 @@ class Surroundings:
         found = {}
         for name, (stamps, values) in self._kept.items():
             begin, end = bisect_left(stamps, first_ns), bisect_right(stamps, last_ns)
-            if begin == end and end and first_ns - stamps[end - 1] < _STALE_NS:
+            if begin == end and end and first_ns - stamps[end - 1] < STALE_NS:
                 begin = end - 1
             if begin < end:
                 found[name] = float(np.mean([values[i] for i in range(begin, end)]))

@@ -32,14 +32,13 @@ from adxl_ros.calibrate.plan import Target
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.calibrate.rests import Rest
 from adxl_ros.calibrate.state import Settings, State
-from adxl_ros.calibrate.stream import Surroundings
+from adxl_ros.calibrate.stream import Surroundings, went_back
 from adxl_ros.errors import UserError
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
 _KEPT_ANGLES = 100000
 _OFFSETS, _FEWEST_OFFSETS = 20, 4
-_BACK_NS = 1_000_000_000
 _OLD_S, _SILENT_S = 60.0, 3.0
 
 
@@ -156,7 +155,7 @@ class Sweep:
 
     def stage(self, stamp_ns: int, alpha_rad: float, beta_rad: float) -> None:
         """Take an encoder reading."""
-        if self._angles and stamp_ns < self._angles[-1][0] - _BACK_NS:
+        if self._angles and went_back(self._angles[-1][0], stamp_ns):
             self._angles.clear()
         self._angles.append((stamp_ns, alpha_rad, beta_rad))
         self._fresh = True
@@ -173,8 +172,7 @@ class Sweep:
         """Take samples: stamps, ns, (n,), and volts, (n, m)."""
         if not len(stamps_ns):
             return
-        if self.newest_ns is not None and stamps_ns[0] < self.newest_ns - _BACK_NS:
-            # A driver that was started anew, on a clock of its own: the pose begins anew.
+        if self.newest_ns is not None and went_back(self.newest_ns, stamps_ns[0]):
             self._unsaid = f'imu/data_raw went back in time by ' \
                 f'{(self.newest_ns - int(stamps_ns[0])) * 1e-9:.0f} s: the pose begins anew'
             self.verify()
@@ -392,10 +390,10 @@ class Sweep:
             else ''
 
     def _off_text(self, target: Target) -> str:
-        if self.angles is None:
-            return self._silent()
-        return self._silent() or \
-            refusals.angles(target, *self.angles, self.settings.tolerance_rad) or 'arrived'
+        silent = self._silent()
+        if silent or self.angles is None:
+            return silent
+        return refusals.angles(target, *self.angles, self.settings.tolerance_rad) or 'arrived'
 
     def _angle_between(self, first_ns: int, last_ns: int, target: Target) -> tuple[float, float]:
         if self.settings.stage_mode == 'manual':

@@ -36,11 +36,10 @@ from adxl_ros.calibrate.magnitude import (
 from adxl_ros.calibrate.recorded import known_noise
 from adxl_ros.calibrate.rests import Rest, RestFinder, Stillness
 from adxl_ros.calibrate.state import State
-from adxl_ros.calibrate.stream import Newest, Surroundings
+from adxl_ros.calibrate.stream import Newest, Surroundings, went_back
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
-_BACK_NS = 1_000_000_000
 _ENDED_S = 1.0
 """A rest is announced when the stream has gone on for this long after it."""
 ENOUGH_RESTS = 24
@@ -97,8 +96,7 @@ class Tumble:
         """Take samples: stamps, ns, (n,), and volts, (n, m)."""
         if not len(stamps_ns):
             return
-        if self.newest_ns is not None and stamps_ns[0] < self.newest_ns - _BACK_NS:
-            # A driver that was started anew, on a clock of its own, or a clock that was set.
+        if self.newest_ns is not None and went_back(self.newest_ns, stamps_ns[0]):
             self._begin()
         self.newest_ns = int(stamps_ns[-1])
         self._stamps.append(stamps_ns)

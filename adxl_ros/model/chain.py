@@ -37,19 +37,12 @@ _MOST_ITERATIONS = 60
 _SETTLED_V = 1e-13
 
 
-def static_response(sensor: Sensor, converted_by_adc: bool = True) -> Callable[..., Components]:
+def static_response(sensor: Sensor) -> Callable[..., Components]:
     """
     Prepare the chain from specific force to volts at rest: its invertible effects.
 
     Filter, noise, the steps of the ADC, the stage, and effects with a memory are left to
     `response`.
-
-    Parameters
-    ----------
-    sensor
-        The figures and effects.
-    converted_by_adc
-        With the effects of the ADC, or volts at its input.
 
     Returns
     -------
@@ -59,8 +52,15 @@ def static_response(sensor: Sensor, converted_by_adc: bool = True) -> Callable[.
         volts of each measured axis.
 
     """
+    respond, convert = analog_response(sensor), _adc(sensor)
+    if convert is None:
+        return respond
+    return lambda force, environment=NOMINAL: convert(respond(force, environment))
+
+
+def analog_response(sensor: Sensor) -> Callable[..., Components]:
+    """Prepare `static_response` as far as the input of the ADC, whose steps have no slope."""
     run = {place: applied(sensor, place, True) for place in Place}
-    convert = _adc(sensor) if converted_by_adc else None
     zero_g_v = sensor.nominal_zero_g_v.tolist()
     scale_v_per_g = sensor.nominal_scale_v_per_g.tolist()
 
@@ -75,8 +75,7 @@ def static_response(sensor: Sensor, converted_by_adc: bool = True) -> Callable[.
         signals.zero_g_v, signals.scale_v_per_g = list(zero_g_v), list(scale_v_per_g)
         for apply, values in run[Place.ELECTRONICS]:
             apply(signals, values)
-        volts = converted(signals)
-        return convert(volts) if convert else volts
+        return converted(signals)
 
     return respond
 
@@ -208,7 +207,7 @@ def tangent(respond: Callable[..., Components], axes: str, force: Components,
     Parameters
     ----------
     respond
-        From `static_response`, to the input of the ADC, whose steps have no slope.
+        From `analog_response`.
     axes
         Measured axes.
     force
@@ -311,7 +310,7 @@ def inverse(sensor: Sensor, z_sign: np.ndarray | None = None) -> Callable[..., C
         NaN.
 
     """
-    respond, gravity = static_response(sensor, False), gravity_mps2(sensor)
+    respond, gravity = analog_response(sensor), gravity_mps2(sensor)
     undo_adc = before_adc(sensor)
     up = np.asarray(sensor.z_sign if z_sign is None else z_sign)
 

@@ -121,7 +121,7 @@ class Live:
         self._zero_v = sensor.nominal_zero_g_v.tolist()
         self._volts = (sensor.nominal_scale_v_per_g / G0_MPS2).tolist()
         self._rails = (0.0, sensor.adc_vref_v - sensor.lsb_v, sensor.lsb_v / 2)
-        self._respond = chain.static_response(sensor, False)
+        self._respond = chain.analog_response(sensor)
         self._before_adc = chain.before_adc(sensor)
         self._step = chain.step(sensor.axes, chain.gravity_mps2(sensor), sensor.z_sign, FLOATS)
         self._invert = chain.inverse(sensor)

@@ -94,7 +94,7 @@ def measured_covariance(sensor: Sensor, sample_variance_v2: np.ndarray | None = 
     if sample_variance_v2 is None:
         sample_variance_v2 = noise.sigma_v(sensor) ** 2
     m = len(sensor.axes)
-    respond, by_parameter = chain.static_response(sensor, False), _parameter_tangent(sensor)
+    respond, by_parameter = chain.analog_response(sensor), _parameter_tangent(sensor)
     at_leverage = leverage(sensor)
 
     def covariance(force: Components, environment: Environment = chain.NOMINAL
@@ -130,7 +130,7 @@ def leverage(sensor: Sensor) -> Callable[[Components], np.ndarray]:
 
     """
     m = len(sensor.axes)
-    respond, by_parameter = chain.static_response(sensor, False), _parameter_tangent(sensor)
+    respond, by_parameter = chain.analog_response(sensor), _parameter_tangent(sensor)
 
     def of(force: Components) -> np.ndarray:
         if not sensor.covariance_names:
