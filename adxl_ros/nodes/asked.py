@@ -62,10 +62,10 @@ def declare_plan(node: Node) -> Plan:
         declare(node, 'sweep.temperature_span_c', 3.0,
                 'how far the temperature may be from that of the first pose', 'degC', 0.1,
                 1000.0))
-    for name, path in (('output', output), ('journal', Path(journal or f'{output}.journal'))):
+    journal = Path(journal or f'{output}.journal')
+    for name, path in (('output', output), ('journal', journal)):
         if path.is_dir():
             raise common.fail(name, f'{path} is a directory; name a file')
-    asked = Plan(mode, tuple(planes), step, checks, settings, output,
-                 Path(journal or f'{output}.journal'), report, kept)
+    asked = Plan(mode, tuple(planes), step, checks, settings, output, journal, report, kept)
     asked.targets()
     return asked

@@ -23,7 +23,7 @@ from pathlib import Path
 from adxl_ros.calibrate import recorded
 from adxl_ros.calibrate.result import Result
 from adxl_ros.calibrate.session import Session
-from adxl_ros.calibrate.stream import Newest
+from adxl_ros.calibrate.stream import Newest, STALE_NS
 from adxl_ros.calibrate.sweep import MountingError, Sweep
 from adxl_ros.errors import UserError
 from adxl_ros.model.sensor import Sensor
@@ -41,8 +41,6 @@ from sensor_msgs.msg import BatteryState, JointState, Temperature
 from std_srvs.srv import Trigger
 
 _POLL_S = 0.05
-_APART_NS = 60_000_000_000
-"""Surroundings that are stamped so far from the samples have another clock."""
 _SERVICES = ('start', 'redo', 'skip', 'finish', 'abort')
 
 
@@ -135,7 +133,7 @@ class Calibration(Node):
             return
         stamp_ns, newest_ns = _stamp_ns(message), self.session.walk.newest_ns or 0
         ahead_ns = stamp_ns - newest_ns
-        if stamp_ns and newest_ns and abs(ahead_ns) > _APART_NS:
+        if stamp_ns and newest_ns and abs(ahead_ns) > STALE_NS:
             if name not in self._misdated:
                 self._misdated.add(name)
                 self.get_logger().warning(
