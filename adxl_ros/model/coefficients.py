@@ -41,6 +41,12 @@ def names_of(effect: Effect, axes: str) -> tuple[str, ...]:
                  for end in ([f'.{a}' for a in axes if a in p.axes] if p.axes else ['']))
 
 
+def fitted_of(effect: Effect, axes: str) -> tuple[str, ...]:
+    """Name the coefficients of an effect that a fit of its own finds."""
+    return names_of(replace(effect, parameters=tuple(
+        p for p in effect.parameters if not p.held)), axes)
+
+
 def parameter_of(name: str) -> Parameter:
     """Return the description of a coefficient."""
     effect, parameter = name.split('.')[:2]

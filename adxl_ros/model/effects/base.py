@@ -156,6 +156,8 @@ class Parameter:
         constant), which means nothing while its amplitude is neutral, has its typical value.
     typical
         The value that the effect takes where only its name is given; `scale` unless stated.
+    held
+        Whether fits leave it as it is: what it does, zero-g and scale factor do as well.
 
     """
 
@@ -169,6 +171,7 @@ class Parameter:
     axes: str = 'xyz'
     neutral: float = 0.0
     typical: float | None = None
+    held: bool = False
 
     @property
     def shape(self) -> bool:
@@ -204,6 +207,8 @@ class Effect:
         One sentence for a report: what causes it and what to do about it.
     smooth
         Whether the output is differentiable in the parameters.
+    exact
+        Whether its form, geometry or a clock, is beyond doubt: what it leaves looks like no other.
     acts_on
         'mean' where it shows in the mean of the output, 'noise' where only statistics show it.
     invertible
@@ -222,6 +227,7 @@ class Effect:
     apply: Callable[[Signals, Parameters], None]
     cause: str
     smooth: bool = True
+    exact: bool = False
     acts_on: str = 'mean'
     invertible: bool = False
     needs: tuple[str, ...] = ()

@@ -39,6 +39,7 @@ EFFECT = Effect(
                   ''),
     ),
     apply=apply,
+    exact=True,
     needs=('stage',),
     cause='The base of the stage is not level; level it, or measure its tilt.',
 )

@@ -31,6 +31,7 @@ EFFECT = Effect(
                   'zero-g output minus the nominal one'),
     ),
     apply=apply,
+    exact=True,
     invertible=True,
     cause='The zero-g output of this unit is not the nominal one; calibrate the unit.',
 )

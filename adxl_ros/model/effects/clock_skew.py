@@ -30,5 +30,6 @@ EFFECT = Effect(
                   "by how much the stamps' clock runs fast", ''),
     ),
     apply=apply,
+    exact=True,
     cause='The clocks of sensor and stage drift apart; discipline them by one source.',
 )

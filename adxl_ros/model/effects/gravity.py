@@ -31,6 +31,7 @@ EFFECT = Effect(
                   'local gravity minus the stated one', ''),
     ),
     apply=apply,
+    exact=True,
     invertible=True,
     needs=('stage',),
     cause='Local gravity is not the stated one; look it up for latitude and height.',

@@ -34,6 +34,7 @@ EFFECT = Effect(
                   f"from the axis to the sensor along the sensor's {axis}", '')
         for axis in 'xyz'),
     apply=apply,
+    exact=True,
     needs=('stage',),
     cause='The sensor is off the axis of rotation; mount it on the axis, or state the arm.',
 )

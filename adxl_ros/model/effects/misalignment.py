@@ -52,6 +52,7 @@ EFFECT = Effect(
                   'turn of the sensing axis in the plane (z: about y), equations 18 and 19'),
     ),
     apply=apply,
+    exact=True,
     invertible=True,
     cause='The sensing axes are not those of the case; calibrate, or mount the package better.',
 )

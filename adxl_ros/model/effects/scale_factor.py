@@ -31,6 +31,7 @@ EFFECT = Effect(
                   'ADXL203 datasheet: 960 to 1040 mV/g', 'scale factor minus the nominal one'),
     ),
     apply=apply,
+    exact=True,
     invertible=True,
     cause='The scale factor of this unit is not the nominal one; calibrate the unit.',
 )

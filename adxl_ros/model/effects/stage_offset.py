@@ -34,6 +34,7 @@ EFFECT = Effect(
                   'true beta minus the encoder', ''),
     ),
     apply=apply,
+    exact=True,
     needs=('stage',),
     cause='The zero of an encoder is off; set it by a level, or remount the sensor by 180 deg.',
 )

@@ -38,7 +38,7 @@ EFFECT = Effect(
                   'ADXL203 datasheet: 560 mV/g at 3 V, not 600',
                   'power of the supply that the scale factor follows; 0 is not at all'),
         Parameter('nominal_v', 'V', 1.0, 30.0, 5.0, 'ADXL203 datasheet: figures at 5 V',
-                  'supply at which the figures hold', '', neutral=5.0),
+                  'supply at which the figures hold', '', neutral=5.0, held=True),
     ),
     apply=apply,
     invertible=True,

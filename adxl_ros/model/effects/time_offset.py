@@ -30,5 +30,6 @@ EFFECT = Effect(
                   'how late the data come', ''),
     ),
     apply=apply,
+    exact=True,
     cause='The stamps of sensor and stage differ; synchronise the clocks, or state the delay.',
 )
