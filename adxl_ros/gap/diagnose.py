@@ -32,9 +32,11 @@ from adxl_ros.gap.next_step import Next, proposed
 from adxl_ros.gap.noise_like import Sign
 from adxl_ros.gap.scores import Score, scores
 from adxl_ros.gap.series import Series, series_of, thinned
-from adxl_ros.gap.study import study, TOLERANCE
+from adxl_ros.gap.study import STRAIGHT, study, TOLERANCE
 from adxl_ros.gap.verdict import Verdict
 from adxl_ros.gap.where import Cell, covered, map_of
+from adxl_ros.gap.whiten import DRIFTS, drifts_among
+from adxl_ros.model.effects import effect_named
 from adxl_ros.model.motion import Motion
 from adxl_ros.model.sensor import Sensor, with_axes
 import numpy as np
@@ -107,7 +109,9 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
     """
     if not sensor.effects:
         sensor = with_axes(sensor, recordings[0].axes)
-    full, series, counted, used, signs = [], [], [], [], []
+    full, series, counted, used = [], [], [], []
+    signs: list[Sign] = []
+    alone: list[Sign | None] = []
     for read in recordings:
         check_unit(read.info, read.axes, sensor, read.path)
         one = series_of(read, replace(sensor, rate_hz=rate_hz(read)), sim)
@@ -126,26 +130,24 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
         series.append(thin)
         counted.append(good)
         used.append(good[::round(one.sensor.rate_hz / thin.sensor.rate_hz)])
-        signs += of_samples
+        signs += [sign for sign in of_samples if sign.effect != 'spikes']
+        alone.append(next((sign for sign in of_samples if sign.effect == 'spikes'), None))
     show(0.05)
     weighed = study(series, used, lambda done: show(0.05 + 0.25 * done))
     base = floor(full, counted)
     noise_mps2 = float(np.sqrt(np.mean((base.noise_v / series[0].scale_v_per_mps2) ** 2)))
     found = verdict.worthy(weighed, search.search(
         weighed, lambda done: show(0.3 + 0.4 * done)), noise_mps2)
-    far = shrunk(weighed, full, counted, found[0], base, seed)
-    # What does not hold on stretches held out is not the cause; zero-g, scale, filter and latency
-    # follow the recording within limits in any case.
-    while found[0].effects and (far.harm or (
-            far.predicted <= 0 and not set(found[0].effects) <= set(TOLERANCE))):
-        found = found[1:]
-        far = shrunk(weighed, full, counted, found[0], base, seed)
+    found, far = _holding(found, lambda one: shrunk(weighed, full, counted, one, base, seed))
     best = found[0]
     show(0.8)
     beside = unknown.discrepancy(weighed, best)
+    instead = unknown.instead_of_drift(weighed, found)
     left = [one.residual(best.sensor) for one in full]
-    for one, mask, off in zip(full, counted, left):
+    for one, mask, off, spikes in zip(full, counted, left, alone):
         there = replace(best.sensor, rate_hz=one.sensor.rate_hz)
+        if spikes is not None and noise_like.still_alone(spikes, off, mask, there):
+            signs.append(spikes)
         signs += noise_like.of_residual(off, mask, replace(one, sensor=there))
     signs = list({sign.effect: sign for sign in sorted(signs, key=lambda s: s.nats)}.values())
     loud = _with_signs(best, signs, sensor)
@@ -155,19 +157,45 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
              for offs, whole in ((before, sensor), (left, loud))]
     explained = float(np.sqrt(max(far.before_mps2 ** 2 - far.within_mps2 ** 2, 0.0)))
     as_noise = float(np.sqrt(np.mean([one.sigma_mps2 ** 2 for one in alike[1]])))
-    answer = verdict.judge(weighed, found, beside, signs, noise_mps2, explained,
+    answer = verdict.judge(weighed, found, beside, instead, signs, noise_mps2, explained,
                            verdict.left(weighed, best, far, as_noise))
     answer = _insufficient(answer, series)
     show(0.9)
     cells = map_of(series[0], series[0].residual(series[0].sensor), used[0], base.rms_mps2, seed)
     missing = covered(series)
-    alone = scores(weighed, seed)
+    by_effect = scores(weighed, seed)
     show(1.0)
     return Diagnosis(None, series, used, base, answer, tuple(found), tuple(signs), far,
                      tuple(cells), tuple(missing), proposed(answer, missing, seed),
                      {effect: verdict.contribution_mps2(weighed, answer.best, effect)
-                      for effect in answer.best.effects}, alone, (alike[0], alike[1]),
+                      for effect in answer.best.effects}, by_effect, (alike[0], alike[1]),
                      sensor if answer.status in ('no_gap', 'unknown', 'insufficient') else loud)
+
+
+def _holding(found: list[Hypothesis], held_out: Callable[[Hypothesis], Shrunk]
+             ) -> tuple[list[Hypothesis], Shrunk]:
+    """
+    Leave out what does not hold on stretches held out: it is not the cause.
+
+    Zero-g, scale, filter and latency follow the recording within limits in any case. A drift may
+    only take up what the form of the effects beside it lacks: it must predict more than they do.
+    """
+    known: dict[frozenset[str], Shrunk] = {}
+
+    def of(one: Hypothesis) -> Shrunk:
+        if (effects := frozenset(one.effects)) not in known:
+            known[effects] = held_out(one)
+        return known[effects]
+
+    while (effects := frozenset(found[0].effects)):
+        far = of(found[0])
+        steady = [one for one in found[1:] if 0 < len(one.effects) < len(effects)
+                  and frozenset(one.effects) == effects - frozenset(DRIFTS)]
+        if not far.harm and (far.predicted > 0 or effects <= set(TOLERANCE)) and not any(
+                far.predicted - of(one).predicted < search.WORTH for one in steady):
+            break
+        found = found[1:]
+    return found, of(found[0])
 
 
 def _insufficient(answer: Verdict, series: Sequence[Series]) -> Verdict:
@@ -187,10 +215,14 @@ def _insufficient(answer: Verdict, series: Sequence[Series]) -> Verdict:
 def _with_signs(best: Hypothesis, signs: Sequence[Sign], baseline: Sensor) -> Sensor:
     """Put the noise-like effects beside those of the mean, at the baseline's rate."""
     found = best.sensor
-    # Filter and latency within their tolerance are not worth an effect.
+    # Filter and latency within their tolerance are not worth an effect. Where no effect of the
+    # mean is named, nothing is; and where zero-g wandered here says nothing of the next recording.
+    by_mean = any(effect_named(effect).acts_on == 'mean' for effect in best.effects)
+    wandered = {'bias'} if drifts_among(best.effects) else set()
+    as_filed = (wandered if by_mean else set(TOLERANCE)) - set(best.effects)
     effects = [e for e in found.effects if e in (*baseline.effects, *best.effects)
-               or e in ('bias', 'scale_factor')]
-    values = {name: of for name, of in found.values.items() if name in effects}
+               or e in set(STRAIGHT) - as_filed]
+    values = {name: (baseline if name in as_filed else found).values[name] for name in effects}
     for sign in signs:
         if sign.effect != 'unknown':
             if sign.effect not in effects:

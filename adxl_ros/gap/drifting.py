@@ -68,7 +68,8 @@ def _beside_walk(residual: np.ndarray, used: np.ndarray, walk: Whitener,
     still = next(f for f in tried if f.density == WALKS_G_PER_RTS[0])
     gain, at_rest = (np.abs(sosfreqz(f.sections, angle)[1]) ** 2 for f in (walk, still))
     # What does not walk has this share of the whitened power.
-    share = np.minimum(gain / at_rest * (at_rest[-1] / gain[-1]), 1.0)
+    share = np.zeros(len(power))
+    share[1:] = np.minimum(gain[1:] / at_rest[1:] * (at_rest[-1] / gain[-1]), 1.0)
     top = int(np.argmax(share > 0.5))
     band = slice(1, 4 * top)
 

@@ -35,6 +35,8 @@ from scipy.linalg import cho_solve
 BLOCKS = 48
 """Stretches that a recording is cut into, to hold some out."""
 _ROUNDS = 3
+SIZES = 10.0 ** np.arange(0, -2.5, -0.5)
+"""Of typical sizes, alike beforehand: an effect may be as strong as usual or hardly show."""
 _TINY = 1e-300
 _ALIKE = 1e-12
 
@@ -195,6 +197,39 @@ def fit(channels: Sequence[Channel], ids: Sequence[int], prior: np.ndarray, most
     return Fit(own, values, covariance, held, log_evidence, tuple(walks), variance)
 
 
+def of_any_size(mean: np.ndarray, covariance: np.ndarray, prior: np.ndarray) -> float:
+    """Return what the log-evidence gains where an effect may be of any of `SIZES`, nats."""
+    gains = by_size(mean, covariance, prior)
+    return float(np.logaddexp.reduce(gains) - np.log(len(gains)))
+
+
+def by_size(mean: np.ndarray, covariance: np.ndarray, prior: np.ndarray) -> np.ndarray:
+    """
+    Return what the log-evidence gains where the prior is narrower, by `SIZES`, nats.
+
+    The posterior's mean of the ratio of the narrower and the given prior, in closed form.
+
+    Parameters
+    ----------
+    mean, covariance
+        Of coefficients, (k,), (k, k), with the given prior.
+    prior
+        Its standard deviations, (k,).
+
+    """
+    # In units of the prior, so that volts and radians are alike.
+    inverse = np.linalg.inv(covariance / prior[:, None] / prior)
+    pull = inverse @ (mean / prior)
+    here, whole = float(pull @ (mean / prior)), np.linalg.slogdet(inverse)[1]
+    gains = []
+    for size in SIZES:
+        there = inverse + (size ** -2 - 1) * np.eye(len(prior))
+        gains.append(-len(prior) * np.log(size) + 0.5 * (
+            whole - np.linalg.slogdet(there)[1]
+            + float(pull @ np.linalg.solve(there, pull)) - here))
+    return np.array(gains)
+
+
 def _bounded(precision: np.ndarray, pull: np.ndarray, bound: np.ndarray
              ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     """
@@ -247,6 +282,26 @@ def robust_std(channels: Sequence[Channel], found: Fit, prior: np.ndarray) -> np
     sandwich = found.covariance @ (scores.T @ scores) @ found.covariance * BLOCKS / (BLOCKS - 1)
     return np.sqrt(np.maximum(np.diag(found.covariance),
                               np.minimum(np.diag(sandwich), prior[found.ids] ** 2)))
+
+
+def given(found: Fit, held: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """
+    Return the posterior mean of all coefficients where some have given values.
+
+    Parameters
+    ----------
+    found
+        The fit, (k,).
+    held, values
+        Places of those that are given in it, and their values, (j,) each.
+
+    """
+    out = found.values.copy()
+    others = np.setdiff1d(np.arange(len(out)), held)
+    out[others] += found.covariance[np.ix_(others, held)] @ np.linalg.lstsq(
+        found.covariance[np.ix_(held, held)], values - out[held])[0]
+    out[held] = values
+    return out
 
 
 def predicted(channels: Sequence[Channel], found: Fit, blocks: np.ndarray) -> np.ndarray:

@@ -25,15 +25,20 @@ from adxl_ros.gap.series import Series
 from adxl_ros.gap.study import BEYOND, STRAIGHT, straight, Study
 from adxl_ros.gap.tangents import limits, WIDE
 from adxl_ros.gap.whiten import drifts_among, flicker_g_per_rthz, near
-from adxl_ros.model.coefficients import get, names_of, parameter_of, put, with_neutral
+from adxl_ros.model.coefficients import fitted_of, get, parameter_of, put, with_neutral
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
-_STEPS = 5
+_STEPS = {True: 10, False: 5}
+"""Of smooth effects, and of others, whose slopes are those of a wide step and never quite true."""
+_HALVED = 2
 _CHANGED = 1e-3
-_GAINS = 0.05
-"""A step that gains less, in nats, is the last."""
+_FORM = 0.03
+"""No form but geometry's is quite the sensor's: a coefficient is not known better than this."""
+_GAINS, _SHARE = 0.05, 1e-4
+"""A step that gains less, in nats, is the last; one that would, or less than this of what all have
+gained, is not made."""
 
 
 @dataclass(frozen=True)
@@ -112,11 +117,36 @@ class Local:
         return np.where(own, np.inf, BEYOND * self.prior)
 
     def fitted(self, found: Fit, moved: bool = True) -> Sensor:
-        """Return the sensor after a fit, within bounds; the effects as they are if not moved."""
-        values = self.middle + found.values
-        if not moved:
-            values[:len(self.values)] = self.values
-        return put(self.sensor, self.names, _within(self.names, values))
+        """
+        Return the sensor after a fit, within bounds; the effects as they are if not moved.
+
+        What is free beside them is then at its posterior mean given them: they may differ much
+        from the fit's along what zero-g and scale factor can take up.
+        """
+        if moved:
+            values = self.moved(found)
+        else:
+            own = np.arange(len(self.values))
+            values = np.clip(evidence.given(found, own, self.values - self.middle[own]),
+                             -self.most, self.most)
+        return put(self.sensor, self.names, _within(self.names, self.middle + values))
+
+    def moved(self, found: Fit) -> np.ndarray:
+        """
+        Return departures from the mean beforehand after a fit, (k,).
+
+        A limit or a shape that the samples do not determine stays, for its mean beforehand is
+        nowhere in particular; one that they do moves by half or double at most.
+        """
+        own = slice(len(self.values))
+        of = [parameter_of(name) for name in self.names[own]]
+        lost = np.sqrt(np.diag(found.covariance)[own]) > self.prior[own] / 2
+        there = self.middle[own] + found.values[own]
+        there = np.where(lost & ~np.array([p.sized for p in of], bool), self.values, there)
+        near = np.where([p.shape for p in of], np.clip(
+            there, *np.sort([self.values / 2, self.values * 2], axis=0)), there)
+        held = np.flatnonzero(near != self.middle[own] + found.values[own])
+        return evidence.given(found, held, near[held] - self.middle[held])
 
     def log_evidence(self, found: Fit) -> float:
         """Return the log-evidence at the values themselves, nats."""
@@ -145,7 +175,7 @@ def local(of: Study, effects: Sequence[str], sensor: Sensor,
 
     """
     held = with_neutral(of.series[0].sensor, effects)
-    own = [name for effect in effects for name in names_of(effect_named(effect), held.axes)
+    own = [name for effect in effects for name in fitted_of(effect_named(effect), held.axes)
            if not parameter_of(name).sized or name in of.names or limits(effect_named(effect))]
     free = [n for n in dict.fromkeys(n for names in of.free for n in names)
             if n.split('.')[0] not in effects]
@@ -171,7 +201,8 @@ def local(of: Study, effects: Sequence[str], sensor: Sensor,
                   if len(n.split('.')) == 2 or held.axes.index(n.split('.')[2]) == d]
             known = of.free[len(channels)]
             also = [n for n in free if n in known]
-            lines.append({names.index(n): known[n] for n in also if n.split('.')[0] in STRAIGHT})
+            lines.append({names.index(n): column for n, column in known.items()
+                          if n.split('.')[0] in STRAIGHT})
             does.append([(0, there[:, d] - of.base[number][:, d])])
             design = columns[:, d, at]
             residual = one.volts[:, d] - there[:, d] + design @ (values - middle)[at]
@@ -212,7 +243,7 @@ def refined(of: Study, effects: Sequence[str], start: dict[str, float],
     """
     effects = tuple(dict.fromkeys(effects))
     sensor = with_neutral(of.series[0].sensor, effects)
-    names = [n for effect in effects for n in names_of(effect_named(effect), sensor.axes)]
+    names = [n for effect in effects for n in fitted_of(effect_named(effect), sensor.axes)]
     begin = []
     for name in names:
         p = parameter_of(name)
@@ -222,21 +253,25 @@ def refined(of: Study, effects: Sequence[str], start: dict[str, float],
                      else middle + start.get(name, 0.0))
     sensor = put(sensor, names, _within(names, np.array(begin)))
     best: tuple[float, Local, Fit] | None = None
-    step = np.zeros(0)
-    for _ in range(_STEPS):
+    step, first, halved = np.zeros(0), 0.0, 0
+    for _ in range(_STEPS[all(effect_named(effect).smooth for effect in effects)]):
         here = local(of, effects, sensor)
         found = here.fit()
         reached = here.log_evidence(found)
+        first = reached if best is None else first
         own = slice(len(here.values))
         if best is not None and reached < best[0] - _CHANGED:
-            step = step / 2
+            step, halved = step / 2, halved + 1
+            if halved > _HALVED:
+                break
             sensor = put(sensor, here.names[own], _within(here.names[own],
                                                           best[1].values + step))
             continue
         done = best is not None and reached - best[0] < _GAINS
-        best = (reached, here, found)
-        step = (here.middle + found.values)[own] - here.values
-        if done or np.all(np.abs(step) < _CHANGED * here.prior[own]):
+        best, halved = (reached, here, found), 0
+        step = here.moved(found)[own] + here.middle[own] - here.values
+        if done or found.log_evidence - reached < max(_GAINS, _SHARE * (reached - first)) \
+                or np.all(np.abs(step) < _CHANGED * here.prior[own]):
             break
         sensor = put(sensor, here.names[own], _within(here.names[own], here.values + step))
     assert best is not None
@@ -254,27 +289,34 @@ def refined(of: Study, effects: Sequence[str], start: dict[str, float],
             effect_named(drift).parameters[0].name: densities}})
     return Hypothesis(effects, fitted, here.names[own],
                       here.values - here.middle[own],
-                      np.hypot(evidence.robust_std(here.channels, found, here.prior)[own],
-                               _of_stage(of, here.names[own])),
+                      np.sqrt(evidence.robust_std(here.channels, found, here.prior)[own] ** 2
+                              + _of_stage(of, here.names[own]) ** 2
+                              + _of_form(here, found) ** 2),
                       reached + _of_those_that_show(here, found), found,
                       evidence.uneven(here.channels, found))
 
 
 def _of_stage(of: Study, names: Sequence[str]) -> np.ndarray:
     """Return standard deviations below which the stage's step tells no angle, (k,)."""
-    step_rad = max(one.sensor.stage_resolution_rad if one.reference == 'stage' else 0.0
-                   for one in of.series)
-    return np.array([step_rad / 12 ** 0.5 if parameter_of(n).unit == 'rad' else 0.0
-                     for n in names])
+    return np.where([parameter_of(n).unit == 'rad' for n in names], of.least_angle_rad(), 0.0)
+
+
+def _of_form(here: Local, found: Fit) -> np.ndarray:
+    """Return standard deviations of coefficients by a form that is not quite true, (k,)."""
+    names = here.names[:len(here.values)]
+    whole = np.where([parameter_of(n).sized for n in names], found.values[:len(names)],
+                     here.values)
+    return np.where([effect_named(n.split('.')[0]).exact for n in names], 0.0, _FORM * whole)
 
 
 def _of_those_that_show(here: Local, found: Fit) -> float:
     """
-    Return what the log-evidence gains where coefficients that do not show are not there, nats.
+    Return what the log-evidence gains by what an effect need not be, nats.
 
-    An effect need not act on all axes: each set of its coefficients is as likely beforehand as
-    any other. What leaving one out gains is the ratio of its posterior and prior densities at
-    nothing (Dickey 1971); they are left out one by one, at least one of an effect stays.
+    It may be smaller than usual, and need not act on all axes: each set of its coefficients is as
+    likely beforehand as any other. What leaving one out gains is the ratio of its posterior and
+    prior densities at nothing (Dickey 1971); they are left out one by one, at least one of an
+    effect stays.
     """
     mean, covariance = found.values.copy(), found.covariance.copy()
     gain = 0.0
@@ -293,6 +335,9 @@ def _of_those_that_show(here: Local, found: Fit) -> float:
             across = covariance[:, j] / covariance[j, j]
             mean = mean - across * mean[j]
             covariance = covariance - np.outer(across, covariance[j])
+        if own:
+            gain += evidence.of_any_size(mean[own], covariance[np.ix_(own, own)],
+                                         here.prior[own])
     return gain
 
 

@@ -108,6 +108,27 @@ def bad_samples(volts: np.ndarray, time_s: np.ndarray, sensor: Sensor, coarse: b
     return good, signs
 
 
+def still_alone(spikes: Sign, residual_v: np.ndarray, used: np.ndarray, sensor: Sensor) -> bool:
+    """
+    Tell whether spikes also leave the line in what the best hypothesis leaves.
+
+    The sensor's own motion may look like spikes until it is taken off.
+
+    Parameters
+    ----------
+    spikes
+        As found in the recording.
+    residual_v, used
+        V, (n, m), and samples that count, (n,): spikes are not among them.
+    sensor
+        Of the hypothesis.
+
+    """
+    alone, _ = _spikes(residual_v, np.isfinite(residual_v).all(axis=1), sensor)
+    expected = float(spikes.values['rate_hz']) * len(sensor.axes) * len(used) / sensor.rate_hz
+    return bool(alone[~used].sum() > expected / 2)
+
+
 def _stuck(volts: np.ndarray, sensor: Sensor) -> np.ndarray:
     """Tell samples that repeat the one before in all axes, longer than chance does."""
     same = np.concatenate([[False], (np.diff(volts, axis=0) == 0).all(axis=1)])
@@ -227,11 +248,19 @@ def of_residual(residual_v: np.ndarray, used: np.ndarray, series: Series) -> lis
         # Noise that the filter did not pass looks like more of it, sample by sample.
         ratio = np.minimum(ratio, np.std(data[2:][rests], axis=0) / np.std(made[2:][rests],
                                                                            axis=0))
-    if np.max(ratio) > _EXCESS and line is None:
+    # A line is no noise: the median over frequencies does not see it.
+    ratio = np.minimum(ratio, _level(apart, sensor) / _level(other, sensor))
+    if np.max(ratio) > _EXCESS:
         signs.append(Sign('noise_excess', {'ratio': ratio - 1},
                           len(white) * float(np.log(np.max(ratio)) ** 2),
                           f'white noise is {np.max(ratio):.2f} of what is stated'))
     return signs
+
+
+def _level(white: np.ndarray, sensor: Sensor) -> np.ndarray:
+    """Return the level of noise by its spectrum's median, (m,)."""
+    _, power = periodogram(white, sensor.rate_hz, 'hann', axis=0)
+    return np.sqrt(np.median(power, axis=0))
 
 
 def _line(white: np.ndarray, sensor: Sensor, residual_v: np.ndarray, time_s: np.ndarray

@@ -36,8 +36,8 @@ import numpy as np
 
 MOST_EFFECTS = 3
 _REFINED, _PAIRED = 8, 8
-_WORTH = 5.0
-"""Nats that a hypothesis must gain on tangents to be fitted in full."""
+WORTH = 5.0
+"""Nats that a hypothesis must gain on tangents to be fitted in full, and a drift held out."""
 _UNEVEN = 1.4
 
 
@@ -61,13 +61,16 @@ def search(of: Study, show: Callable[[float], None]) -> list[Hypothesis]:
     singles = _ranked(of, [(i,) for i in _told(of)], none)
     _refine(of, singles[:_REFINED], none, found)
     show(0.3)
+    # A file of stated figures lacks both, and what lacks both may not look like either.
+    line = [i for i in _told(of) if of.variants[i].effect in STRAIGHT]
+    _refine(of, _ranked(of, list(combinations(line, 2)), none), none, found)
     best = _best(found)
     if best.effects:
         _forward(of, best, found)
         show(0.6)
         first = [chosen[0] for _, chosen, _ in singles[:_PAIRED]]
         pairs = _ranked(of, list(combinations(sorted(first), 2)), none)
-        worth = _best(found).log_evidence - none.log_evidence + _WORTH
+        worth = _best(found).log_evidence - none.log_evidence + WORTH
         _refine(of, [one for one in pairs if one[0] > worth][:_REFINED // 2], none, found)
         best = _best(found)
         if 1 < len(best.effects) < MOST_EFFECTS:
@@ -92,7 +95,7 @@ def _best(found: dict[tuple[str, ...], Hypothesis]) -> Hypothesis:
 def _drifts(of: Study, best: Hypothesis) -> bool:
     """Tell whether what a hypothesis leaves is likelier with a zero-g that wanders."""
     here = local(of, best.effects, best.sensor)
-    return here.fit(wanders=DRIFTS).log_evidence - here.fit().log_evidence > _WORTH
+    return here.fit(wanders=DRIFTS).log_evidence - here.fit().log_evidence > WORTH
 
 
 def _wandering(of: Study, found: dict[tuple[str, ...], Hypothesis]) -> None:
@@ -149,7 +152,7 @@ def _forward(of: Study, best: Hypothesis, found: dict[tuple[str, ...], Hypothesi
         gains.append((fit.log_evidence - alone.log_evidence, i, fit))
     base = {v.effect for v in of.variants}
     for gain, i, fit in sorted(gains, key=lambda one: -one[0])[:_REFINED // 2]:
-        if gain < _WORTH:
+        if gain < WORTH:
             break
         effects = (*best.effects, there.variants[i].effect)
         if not all(e in base or e in DRIFTS for e in effects):
@@ -195,7 +198,7 @@ def _refine(of: Study, ranked: Iterable[tuple[float, tuple[int, ...], Fit]], non
             found: dict[tuple[str, ...], Hypothesis], also: tuple[str, ...] = ()) -> None:
     """Fit the best on tangents in full; those that gain less than is worth it are left."""
     for gain, chosen, fit in ranked:
-        if gain < _WORTH:
+        if gain < WORTH:
             continue
         start = dict(zip([of.names[i] for i in fit.ids], fit.values))
         for i in chosen:

@@ -33,7 +33,7 @@ from adxl_ros.gap.series import Series
 from adxl_ros.gap.tangents import candidates, Variant, variants
 import numpy as np
 
-TOLERANCE = {'bias': 2.5e-4, 'scale_factor': 2.5e-4, 'bandwidth': 0.02, 'time_offset': 1e-4}
+TOLERANCE = {'bias': 1e-4, 'scale_factor': 1e-4, 'bandwidth': 0.02, 'time_offset': 1e-4}
 """What a healthy unit shows from day to day, beside the file's covariance, as standard deviations:
 zero-g in g, scale factor, resistance of the filter, and latency of the stamps in s."""
 STRAIGHT = ('bias', 'scale_factor')
@@ -83,6 +83,11 @@ class Study:
     def nuisances(self) -> list[int]:
         """Return the numbers of the columns of what is free in every hypothesis."""
         return [i for v, of in zip(self.variants, self.ids) if v.effect in TOLERANCE for i in of]
+
+    def least_angle_rad(self) -> float:
+        """Return the standard deviation below which the stage's step tells no angle."""
+        return max(one.sensor.stage_resolution_rad if one.reference == 'stage' else 0.0
+                   for one in self.series) / 12 ** 0.5
 
     def priors(self, chosen: Sequence[int], drifts: Sequence[str] = ()
                ) -> tuple[np.ndarray, np.ndarray]:
@@ -249,5 +254,11 @@ def on_tangents(of: Study, chosen: Sequence[int], start: Fit | None = None,
     """
     wanders = (*wanders, *whiten.drifts_among(of.series[0].sensor.effects))
     ids = set(of.nuisances()).union(*(of.ids[i] for i in chosen))
-    return evidence.fit(of.channels, sorted(ids), *of.priors(chosen, wanders), None, start,
-                        wanders)
+    prior, most = of.priors(chosen, wanders)
+    found = evidence.fit(of.channels, sorted(ids), prior, most, None, start, wanders)
+    gain = 0.0
+    for i in chosen:
+        own = np.flatnonzero(np.isin(found.ids, of.ids[i]))
+        gain += evidence.of_any_size(found.values[own], found.covariance[np.ix_(own, own)],
+                                     prior[found.ids[own]])
+    return replace(found, log_evidence=found.log_evidence + gain)

@@ -128,7 +128,7 @@ def _limited(series: Series, effect: Effect, limit: Parameter, base: np.ndarray
 
 def shapes(effect: Effect) -> list[dict[str, float]]:
     """Return the shapes of an effect that are tried: each parameter of shape by a few factors."""
-    of_shape = [p for p in effect.parameters if p.shape]
+    of_shape = [p for p in effect.parameters if p.shape and not p.held]
     if not of_shape:
         return [{}]
     first, rest = of_shape[0], {p.name: p.scale for p in of_shape[1:]}

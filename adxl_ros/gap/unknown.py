@@ -23,7 +23,7 @@ cannot. They are never offered first: a flexible term would steal what an effect
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from adxl_ros.gap import evidence
 from adxl_ros.gap.evidence import Fit
@@ -40,7 +40,7 @@ from scipy.interpolate import BSpline
 
 _CREEP_S = (2.0, 10.0, 50.0)
 PRIOR_G = 2e-3
-"""Standard deviation of what one basis function does."""
+"""Standard deviation of what one basis function does, at the most."""
 UNKNOWN_NATS = 15.0
 """Gain of a flexible term that shows something to be there."""
 
@@ -71,31 +71,59 @@ def discrepancy(of: Study, best: Hypothesis) -> Discrepancy:
     bases = [flexible(one) for one in of.series]
     here = local(of, best.effects, best.sensor,
                  [np.column_stack(list(basis.values())) for basis in bases], best.fit.walks)
-    own, sd, most = list(range(len(here.names))), list(here.prior), list(here.most)
+    own, sd = list(range(len(here.names))), list(here.prior)
     kinds: dict[str, list[int]] = {}
     for one, basis in zip(of.series, bases):
         for scale in one.sensor.scale_v_per_g:
             for kind, columns in basis.items():
                 kinds.setdefault(kind, []).extend(range(len(sd), len(sd) + columns.shape[1]))
                 sd += [PRIOR_G * float(scale)] * columns.shape[1]
-                most += [np.inf] * columns.shape[1]
+    prior = np.array(sd)
+    most = np.concatenate([here.most, np.full(len(prior) - len(own), np.inf)])
 
     def fit(ids: Sequence[int], start: Fit | None = None) -> Fit:
-        return evidence.fit(here.channels, ids, np.array(sd), np.array(most), None, start,
+        return evidence.fit(here.channels, ids, prior, most, None, start,
                             drifts_among(best.sensor.effects))
 
     alone = fit(own)
-    gains = {kind: fit([*own, *ids], alone).log_evidence - alone.log_evidence
-             for kind, ids in kinds.items()}
+    gains, blind = {}, float(np.log(len(evidence.SIZES)))
+    for kind, ids in kinds.items():
+        found = fit([*own, *ids], alone)
+        at = np.searchsorted(found.ids, ids)
+        sizes = evidence.by_size(found.values[at], found.covariance[np.ix_(at, at)], prior[ids])
+        gains[kind] = found.log_evidence + float(sizes.max()) - alone.log_evidence - blind
+        prior[ids] *= evidence.SIZES[np.argmax(sizes)]
     kept = [kind for kind, gain in gains.items() if gain > 0]
     if not kept:
         return Discrepancy(0.0, 0.0, gains)
-    chosen = [*own, *(i for kind in kept for i in kinds[kind])]
-    whole = fit(chosen, alone)
-    value = np.zeros(len(sd))
+    whole = fit([*own, *(i for kind in kept for i in kinds[kind])], alone)
+    value = np.zeros(len(prior))
     value[whole.ids] = whole.values
-    return Discrepancy(whole.log_evidence - alone.log_evidence,
+    return Discrepancy(whole.log_evidence - alone.log_evidence - blind * len(kept),
                        _rms(of, bases, value[len(own):]), gains)
+
+
+def instead_of_drift(of: Study, found: Sequence[Hypothesis]) -> Discrepancy | None:
+    """
+    Return what a flexible term finds in place of a drift, where it is more likely than that.
+
+    What follows force or direction by an unknown law looks like a drift to the evidence; a drift
+    follows nothing. None where the most probable hypothesis does not drift.
+
+    Parameters
+    ----------
+    of
+        The recordings.
+    found
+        Hypotheses, the most probable first.
+
+    """
+    if not drifts_among(found[0].effects):
+        return None
+    still = next(h for h in found if not drifts_among(h.effects))
+    other = discrepancy(of, still)
+    gain = still.log_evidence + other.gain - found[0].log_evidence
+    return replace(other, gain=gain) if gain > 0 else None
 
 
 def _rms(of: Study, bases: Sequence[dict[str, np.ndarray]], value: np.ndarray) -> float:
@@ -119,9 +147,9 @@ def flexible(series: Series) -> dict[str, np.ndarray]:
         alpha, beta = motion.alpha(time_s), motion.beta(time_s)
         rates = [motion.alpha(time_s, 1), motion.beta(time_s, 1)]
         f = np.array(specific_force(alpha, beta, 1.0))
-        out['force'] = _products(f)
-        out['alpha_rad'] = _splines(alpha, 6)
-        out['beta_rad'] = np.column_stack([g(k * beta) for k in (1, 2, 3, 4)
+        out['force'] = np.column_stack([_products(f), *(_splines(part, 12) for part in f)])
+        out['alpha_rad'] = _splines(alpha, 12)
+        out['beta_rad'] = np.column_stack([g(k * beta) for k in range(1, 9)
                                            for g in (np.sin, np.cos)])
         scale = [max(float(np.abs(r).max()), 1e-9) for r in rates]
         parts = [r / s for r, s in zip(rates, scale) if s > 1e-3]

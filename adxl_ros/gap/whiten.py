@@ -36,12 +36,12 @@ from scipy.signal import sosfilt, sosfreqz, tf2sos, zpk2sos
 
 DRIFTS = ('bias_walk', 'flicker')
 """The effects that let the zero-g wander."""
-WALKS_G_PER_RTS = (1e-7, 3e-6, 1e-5, 3e-5, 1e-4, 1.3e-4, 1.8e-4, 3e-4, 1e-3, 3e-3)
+WALKS_G_PER_RTS = (1e-7, 3e-6, 1e-5, 3e-5, 3.8e-5, 5e-5, 8e-5, 2e-4, 6e-4, 2e-3)
 """Densest where healthy ends: between two steps a walk would look like something unknown."""
-FLICKERS_G_PER_RTHZ = (3e-5, 6e-5, 1.2e-4, 2.5e-4, 5e-4, 1e-3, 2e-3, 4e-3)
-HEALTHY = {'bias_walk': 1e-4, 'flicker': 1.5e-4}
-"""What a unit without these effects may show: 1 mg within 100 s, 0.5 mg over five decades."""
-USUAL, _DECADES = 2e-5, 1.0
+FLICKERS_G_PER_RTHZ = (3e-5, 6e-5, 8e-5, 1.2e-4, 2.5e-4, 5e-4, 1e-3, 2e-3, 4e-3)
+HEALTHY = {'bias_walk': 3e-5, 'flicker': 6e-5}
+"""What a unit without these effects may show: 0.3 mg within 100 s, 0.2 mg over five decades."""
+USUAL, _DECADES = 1e-5, 1.0
 """What is usual of both, and how far it may be from that, as a standard deviation."""
 _LOWEST_NOISE_V = 1e-7
 
