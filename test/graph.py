@@ -53,6 +53,7 @@ class Graph:
         self.got = defaultdict(list)
         self.diagnostics = {}
         self._context = Context()
+        self._clients = {}
 
     def __enter__(self):
         rclpy.init(args=[], context=self._context)
@@ -104,7 +105,10 @@ class Graph:
 
     def call(self, kind, service, request, timeout_s=20.0):
         """Call a service and return its answer."""
-        client = self.node.create_client(kind, service)
+        # The answer to a client that is new may come before it can be heard.
+        client = self._clients.get(service)
+        if client is None:
+            client = self._clients[service] = self.node.create_client(kind, service)
         assert client.wait_for_service(timeout_s), f'no service {service}'
         future = client.call_async(request)
         self.spin_until(future.done, timeout_s, f'answer of {service}')

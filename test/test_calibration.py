@@ -3,8 +3,10 @@
 import time
 
 from adxl_ros.files import journal, params
+from adxl_ros.files.columns import sensor_info
+from adxl_ros.model.constants import G0_MPS2
 from conftest import wait_until
-from diagnostic_msgs.msg import DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from graph import Graph
 from lifecycle_msgs.msg import Transition
 import numpy as np
@@ -184,7 +186,7 @@ def test_a_real_sensor_through_the_live_graph(start, run_tool, tmp_path, shared_
               '-p', 'autostart:=true', '-p', 'output:=live.yaml')
         graph.spin_until(lambda: graph.said('calibration', 'waiting for sensor_info'), 30, 'up')
         start('driver', '--ros-args', *FAST, '-p', 'link.type:=replay', '-p',
-              f'link.recording:={source}', '-p', 'link.speed:=15.0', '-p', 'autostart:=false',
+              f'link.recording:={source}', '-p', 'link.speed:=30.0', '-p', 'autostart:=false',
               '-p', 'qos_overrides./imu/data_raw.publisher.depth:=20000')
         # The two have found each other before the first sample, and stalls are bridged.
         assert graph.change('driver', Transition.TRANSITION_CONFIGURE)
@@ -202,6 +204,38 @@ def test_a_real_sensor_through_the_live_graph(start, run_tool, tmp_path, shared_
     for effect, values in live.values.items():
         for parameter, value in values.items():
             np.testing.assert_allclose(offline.values[effect][parameter], value, atol=1e-9)
+
+
+def test_what_came_before_the_driver_said_what_it_is_counts(start, tmp_path):
+    """Topics find each other in any order: the first rest is not lost by it."""
+    base = nominal('xyz', serial='T5')
+    params.save(tmp_path / 'bare.yaml', base)
+    rng = np.random.default_rng(1)
+    with Graph() as graph:
+        raw = graph.node.create_publisher(Imu, 'imu/data_raw', 20000)
+        info = graph.node.create_publisher(DiagnosticStatus, 'sensor_info', QoSProfile(
+            depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL))
+        start('calibration', '--ros-args', '--params-file', tmp_path / 'bare.yaml', *LOSSLESS,
+              '-p', 'mode:=gravity', '-p', 'autostart:=true', '-p', 'output:=unit.yaml')
+        graph.spin_until(lambda: raw.get_subscription_count() and graph.said(
+            'calibration', 'waiting for sensor_info'), 30, 'up')
+        rests = [np.tile(G0_MPS2 * np.eye(3)[d], (3000, 1)) for d in (2, 0)]
+        moving = 5 * rng.standard_normal((1500, 3))
+        for i, a in enumerate(np.vstack([rests[0], moving, rests[1], moving])):
+            message = Imu()
+            message.header.stamp.sec, ms = divmod(100_000 + i, 1000)
+            message.header.stamp.nanosec = ms * 1_000_000
+            at = message.linear_acceleration
+            at.x, at.y, at.z = (a + 0.005 * rng.standard_normal(3)).tolist()
+            raw.publish(message)
+        # Heard, not only sent.
+        graph.spin(1.0)
+        info.publish(DiagnosticStatus(values=[
+            KeyValue(key=k, value=v) for k, v in sensor_info(base).items()]))
+        graph.spin_until(lambda: graph.value('calibration', 'accepted') == '2', 30, 'both rests')
+    _, entries = journal.read(tmp_path / 'unit.yaml.journal')
+    # The ends of a rest are left out.
+    assert min(entry['samples'] for entry in journal.accepted_poses(entries)) > 2500
 
 
 def test_an_operator_captures(start, tmp_path):

@@ -67,18 +67,21 @@ class Robot:
         self._info = graph.node.create_publisher(DiagnosticStatus, 'sensor_info', QoSProfile(
             depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL))
         self._sent = 0
+        self._informed = False
 
     def inform(self, sensor: Sensor, **changes: str) -> None:
         """Publish sensor_info."""
+        self._informed = True
         self._info.publish(DiagnosticStatus(values=[
             KeyValue(key=k, value=v) for k, v in {**sensor_info(sensor), **changes}.items()]))
 
     def connected(self, timeout_s: float = 20.0) -> None:
-        """Wait until the compensation hears and is heard."""
+        """Wait until the compensation hears and is heard, and knows what it was told."""
         self.graph.spin_until(
             lambda: self._raw.get_subscription_count()
             and self.graph.node.count_publishers('tilt')
-            and self.graph.node.count_publishers('imu/data') and NODE in self.graph.diagnostics,
+            and self.graph.node.count_publishers('imu/data') and NODE in self.graph.diagnostics
+            and (not self._informed or self.graph.value(NODE, 'unit') != 'not confirmed'),
             timeout_s, 'compensation connected')
 
     def send(self, values: list[float]) -> None:
@@ -129,9 +132,17 @@ def robot(ros_env: dict[str, str]) -> Iterator[Robot]:
         yield Robot(graph)
 
 
+def _saved(folder: Path, sensor: Sensor) -> Path:
+    params.save(folder / 'unit.yaml', sensor)
+    return folder / 'unit.yaml'
+
+
+# A publisher knows whom it reaches before a best-effort subscriber takes what it sends.
+RELIABLE = ('-p', 'qos_overrides./imu/data_raw.subscription.reliability:=reliable')
+
+
 def started(start: Start, tmp_path: Path, sensor: Sensor, *more: object) -> Started:
-    params.save(tmp_path / 'unit.yaml', sensor)
-    return start(NODE, '--ros-args', '--params-file', tmp_path / 'unit.yaml', *more)
+    return start(NODE, '--ros-args', '--params-file', _saved(tmp_path, sensor), *RELIABLE, *more)
 
 
 def felt(sensor: Sensor, force: list[float]) -> list[float]:
@@ -245,7 +256,7 @@ def test_the_newest_calibration_of_the_unit_is_taken(robot: Robot, start: Start,
     stored(folder, unit('18', seed=3), 1.0)
     three = stored(folder, unit(axes='xyz', seed=4), 5.0)
     (folder / '17' / '17-29990101T000000Z-0.yaml').write_text('half of a fi')
-    process = start(NODE, '--ros-args', '-p', f'store:={folder}')
+    process = start(NODE, '--ros-args', '-p', f'store:={folder}', *RELIABLE)
     robot.connected()
     robot.level(DiagnosticStatus.WARN, 'no samples')
     assert robot.graph.value(NODE, 'validity') == 'not calibrated'
@@ -340,7 +351,7 @@ def test_outside_of_what_was_calibrated_the_covariance_is_raised(
 
 
 def test_without_a_file_the_nominal_sensor_applies(robot: Robot, start: Start) -> None:
-    process = start(NODE)
+    process = start(NODE, '--ros-args', *RELIABLE)
     robot.connected()
     process.wait_for('adxl203.yaml: nominal, which is not calibrated')
     np.testing.assert_allclose(accel(robot.answer([3.0, 4.0, 0.0])),
@@ -502,13 +513,8 @@ def test_parameters_are_described(robot: Robot, start: Start, tmp_path: Path) ->
     assert robot.get('sensor.serial', 'sensor.axes') == ['17', 'xy']
 
 
-def _saved(folder: Path, sensor: Sensor) -> Path:
-    params.save(folder / 'given.yaml', sensor)
-    return folder / 'given.yaml'
-
-
 def test_best_effort_publishers_are_heard(robot: Robot, start: Start, tmp_path: Path) -> None:
-    started(start, tmp_path, unit())
+    start(NODE, '--ros-args', '--params-file', _saved(tmp_path, unit()))
     robot._raw = robot.graph.node.create_publisher(Imu, 'imu/data_raw', QoSProfile(
         depth=10, reliability=ReliabilityPolicy.BEST_EFFORT))
     robot.connected()

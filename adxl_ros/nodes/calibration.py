@@ -267,9 +267,9 @@ class Calibration(Node):
             f'rest in 24 or more directions, then call ~/finish{resumed}'))
 
     def _poll(self) -> None:
+        if self.waiting:
+            self._try_to_start()
         if self.session is None:
-            if self._wanted:
-                self._try_to_start()
             self._watch()
         else:
             self._take_samples()
