@@ -51,17 +51,11 @@ def pytest_configure(config: pytest.Config) -> None:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """
-    Keep together what is dear to make: in one worker, after each other.
-
-    Tests that run a graph need their core; what a module makes once is made once a worker.
-    """
+    """Keep in one worker what a module makes once; first, for xdist reads the groups here, too."""
     for item in items:
-        names = set(getattr(item, 'fixturenames', ()))
-        if 'ros_env' in names:
-            item.add_marker(pytest.mark.xdist_group('graph'))
-        elif names & {'original', 'found', 'reported'}:
+        if {'original', 'found', 'reported'} & set(getattr(item, 'fixturenames', ())):
             item.add_marker(pytest.mark.xdist_group(item.path.stem))
 
 
