@@ -21,9 +21,11 @@ from adxl_ros.files import params, recording
 from adxl_ros.files.columns import Recording, sensor_info
 from adxl_ros.gap import report
 from adxl_ros.gap.diagnose import diagnose
-from adxl_ros.gap.local import Hypothesis
+from adxl_ros.gap.far import held_out
+from adxl_ros.gap.local import Hypothesis, refined
 from adxl_ros.gap.next_step import proposed
 from adxl_ros.gap.series import series_of
+from adxl_ros.gap.study import study
 from adxl_ros.gap.verdict import Verdict
 from adxl_ros.model import trajectory
 from adxl_ros.model.motion import Held, Knots, Motion
@@ -95,6 +97,8 @@ def test_no_gap():
     ('temperature_bias:per_k=4e-4', 'per_k.x', 4e-4),
     ('backlash:alpha_rad=0.004,beta_rad=0.004', 'beta_rad', 0.004),
     ('misalignment:alpha_rad=0.003,beta_rad=-0.002', 'alpha_rad.y', 0.003),
+    # Nothing but a straight line, which zero-g and scale factor could take up.
+    ('gravity:offset_mps2=0.02', 'offset_mps2', 0.02),
     # As in the parameter file: with what the baseline has of it.
     ('bias:offset_v=0.04', 'offset_v.y', 0.04)])
 def test_one_effect_is_named_and_the_gap_closed(option, parameter, value):
@@ -205,6 +209,29 @@ def test_a_soft_clip_is_saturation():
 
     told, _ = diagnosed(sensor, change=change)
     assert (told['verdict']['status'], told['verdict']['effects']) == ('explained', ['saturation'])
+
+
+def test_a_limit_that_one_stretch_alone_reaches_is_not_guessed_from_the_others():
+    """A soft clip of y, which comes near it once: what is held out there is closed, too."""
+    script, limit_g, knee_g = trajectory.Script(np.pi / 2, 0.0), 1.1, 0.036
+    for turn in range(14):
+        for to, speed in ((0.8, 1.0), (-0.8, 1.3), *([(1.57, 1.2)] if turn == 7 else [])):
+            script.run('beta', to, speed)
+            script.rest(1.0)
+    sensor = unit()
+    columns = simulate(sensor, Motion(script.now, *script.joints()), 3)
+    g = (columns['y_v'] - sensor.zero_g_v[1]) / sensor.scale_v_per_g[1]
+    beyond = [knee_g * np.logaddexp(0.0, (sign * g - limit_g) / knee_g) for sign in (1, -1)]
+    columns['y_v'] -= sensor.scale_v_per_g[1] * (beyond[0] - beyond[1])
+    one = series_of(Recording('made', columns.pop('time_s'), columns, sensor_info(sensor)), sensor)
+    used = [np.ones(len(one), bool)]
+    of = study([one], used, lambda done: None, only=['saturation'])
+    found = refined(of, ['saturation'], {'saturation.limit_g.y': limit_g - 1.0,
+                                         'saturation.knee_g': knee_g}, {})
+    without, held = (held_out(of, [one], used, effects, there).squares for effects, there in (
+        ([], sensor), (found.effects, found.sensor)))
+    assert without.max() > 3 * np.median(without)
+    assert held.max() < 1.3 * np.median(held)
 
 
 def test_what_shows_only_while_it_turns_is_no_drift():

@@ -23,7 +23,7 @@ from adxl_ros.calibrate.recorded import rate_hz
 from adxl_ros.files.columns import Recording
 from adxl_ros.files.unit import check_unit
 from adxl_ros.gap import faults, noise_like, search, unknown, verdict
-from adxl_ros.gap.far import Shrunk, shrunk
+from adxl_ros.gap.far import held_out, Shrunk, shrunk
 from adxl_ros.gap.faults import Fault
 from adxl_ros.gap.floor import Floor, floor
 from adxl_ros.gap.likeness import Likeness, likeness
@@ -32,7 +32,7 @@ from adxl_ros.gap.next_step import Next, proposed
 from adxl_ros.gap.noise_like import Sign
 from adxl_ros.gap.scores import Score, scores
 from adxl_ros.gap.series import Series, series_of, thinned
-from adxl_ros.gap.study import STRAIGHT, study, TOLERANCE
+from adxl_ros.gap.study import FOLLOWED, STRAIGHT, study, TOLERANCE
 from adxl_ros.gap.verdict import Verdict
 from adxl_ros.gap.where import Cell, covered, map_of
 from adxl_ros.gap.whiten import DRIFTS, drifts_among
@@ -138,7 +138,9 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
     noise_mps2 = float(np.sqrt(np.mean((base.noise_v / series[0].scale_v_per_mps2) ** 2)))
     found = verdict.worthy(weighed, search.search(
         weighed, lambda done: show(0.3 + 0.4 * done)), noise_mps2)
-    found, far = _holding(found, lambda one: shrunk(weighed, full, counted, one, base, seed))
+    without = held_out(weighed, full, counted, (), series[0].sensor)
+    found, far = _holding(found, lambda one: shrunk(weighed, full, counted, one, without, base,
+                                                    seed))
     best = found[0]
     show(0.8)
     beside = unknown.discrepancy(weighed, best)
@@ -172,26 +174,27 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
                      sensor if answer.status in ('no_gap', 'unknown', 'insufficient') else loud)
 
 
-def _holding(found: list[Hypothesis], held_out: Callable[[Hypothesis], Shrunk]
+def _holding(found: list[Hypothesis], compared: Callable[[Hypothesis], Shrunk]
              ) -> tuple[list[Hypothesis], Shrunk]:
     """
     Leave out what does not hold on stretches held out: it is not the cause.
 
-    Zero-g, scale, filter and latency follow the recording within limits in any case. A drift may
-    only take up what the form of the effects beside it lacks: it must predict more than they do.
+    Zero-g, scale, filter and latency follow the recording within limits in any case, scale what
+    gravity does. A drift may only take up what the form of the effects beside it lacks: it must
+    predict more than they do.
     """
     known: dict[frozenset[str], Shrunk] = {}
 
     def of(one: Hypothesis) -> Shrunk:
         if (effects := frozenset(one.effects)) not in known:
-            known[effects] = held_out(one)
+            known[effects] = compared(one)
         return known[effects]
 
     while (effects := frozenset(found[0].effects)):
         far = of(found[0])
         steady = [one for one in found[1:] if 0 < len(one.effects) < len(effects)
                   and frozenset(one.effects) == effects - frozenset(DRIFTS)]
-        if not far.harm and (far.predicted > 0 or effects <= set(TOLERANCE)) and not any(
+        if not far.harm and (far.predicted > 0 or effects <= set(FOLLOWED)) and not any(
                 far.predicted - of(one).predicted < search.WORTH for one in steady):
             break
         found = found[1:]

@@ -68,8 +68,26 @@ class Shrunk:
     predicted: float
 
 
-def shrunk(of: Study, full: Sequence[Series], counted: Sequence[np.ndarray], best: Hypothesis,
-           floor: Floor, seed: int) -> Shrunk:
+@dataclass(frozen=True)
+class HeldOut:
+    """
+    What a hypothesis leaves on stretches that it was not fitted to.
+
+    Attributes
+    ----------
+    squares
+        Sums over samples of the mean square over axes, (m/s²)², by block, (b,).
+    log_likelihood
+        Of all stretches, nats.
+
+    """
+
+    squares: np.ndarray
+    log_likelihood: float
+
+
+def held_out(of: Study, full: Sequence[Series], counted: Sequence[np.ndarray],
+             effects: Sequence[str], sensor: Sensor) -> HeldOut:
     """
     Fit on three quarters of the stretches and simulate the others at the full rate, in turn.
 
@@ -79,39 +97,57 @@ def shrunk(of: Study, full: Sequence[Series], counted: Sequence[np.ndarray], bes
         The recordings as searched.
     full, counted
         The same at their full rate, and the samples that count.
+    effects, sensor
+        Whose parameters are fitted anew, and which has them as fitted to all stretches.
+
+    """
+    number = np.arange(BLOCKS)
+    here, free = local(of, effects, sensor), 'bias' in effects
+    whole = here.fit()
+    squares, log_likelihood = np.zeros(BLOCKS), 0.0
+    for fold in range(_FOLDS):
+        out = (number // _RUN) % _FOLDS == fold
+        near = np.convolve(out, np.ones(3), 'same') > 0
+        fit = here.fit(~near)
+        log_likelihood += float(evidence.predicted(here.channels, fit, np.flatnonzero(out)).sum())
+        refitted = here.fitted(fit, whole=whole)
+        for one, mask in zip(full, counted):
+            squares[out] += _by_block(one, mask, one.residual(refitted), ~near, of, free)[out]
+    return HeldOut(squares, log_likelihood)
+
+
+def shrunk(of: Study, full: Sequence[Series], counted: Sequence[np.ndarray], best: Hypothesis,
+           without: HeldOut, floor: Floor, seed: int) -> Shrunk:
+    """
+    Compare a hypothesis with none, on stretches held out.
+
+    Parameters
+    ----------
+    of
+        The recordings as searched.
+    full, counted
+        The same at their full rate, and the samples that count.
     best
         Effects whose parameters are fitted anew.
+    without
+        What is left without effects.
     floor
         From `floor`.
     seed
         Of the bootstrap.
 
     """
-    number = np.arange(BLOCKS)
-    before, after, counts = np.zeros(BLOCKS), np.zeros(BLOCKS), np.zeros(BLOCKS)
-    plain = local(of, (), of.series[0].sensor)
+    found = held_out(of, full, counted, best.effects, best.sensor) if best.effects else without
+    before, after = without.squares, found.squares
     # What only makes noise leaves the mean, and the gap, as they are.
-    by_mean = any(effect_named(effect).acts_on == 'mean' for effect in best.effects)
-    found = local(of, best.effects, best.sensor)
-    predicted = 0.0
-    for fold in range(_FOLDS):
-        out = (number // _RUN) % _FOLDS == fold
-        near = np.convolve(out, np.ones(3), 'same') > 0
-        fits = [here.fit(~near) for here in (plain, found)]
-        without, with_it = (float(evidence.predicted(here.channels, fit, np.flatnonzero(
-            out)).sum()) for here, fit in zip((plain, found), fits))
-        predicted += with_it - without
-        sensors = plain.fitted(fits[0]), found.fitted(fits[1])
-        for one, mask in zip(full, counted):
-            squares = _by_block(one, mask, sensors[0], ~near, of, False)
-            before[out] += squares[out]
-            if by_mean:
-                squares = _by_block(one, mask, sensors[1], ~near, of, 'bias' in best.effects)
-            after[out] += squares[out]
-            counts[out] += np.add.reduceat(mask, evidence.block_edges(len(mask))[:-1])[out]
+    if all(effect_named(effect).acts_on != 'mean' for effect in best.effects):
+        after = before
+    counts = np.zeros(BLOCKS)
+    for mask in counted:
+        counts += np.add.reduceat(mask, evidence.block_edges(len(mask))[:-1])
     everywhere = np.ones(BLOCKS, bool)
-    within = sum(_by_block(one, mask, best.sensor, everywhere, of, 'bias' in best.effects).sum()
-                 for one, mask in zip(full, counted))
+    within = sum(_by_block(one, mask, one.residual(best.sensor), everywhere, of,
+                           'bias' in best.effects).sum() for one, mask in zip(full, counted))
     f2 = floor.rms_mps2 ** 2
     b2, a2 = before.sum() / counts.sum(), after.sum() / counts.sum()
     rng = np.random.default_rng(seed)
@@ -125,19 +161,19 @@ def shrunk(of: Study, full: Sequence[Series], counted: Sequence[np.ndarray], bes
     low, high = np.quantile(np.clip(np.nan_to_num(shares), -1, 1), [0.05, 0.95])
     return Shrunk(float(np.sqrt(b2)), float(np.sqrt(a2)), floor.rms_mps2, float(min(closed, 1.0)),
                   (float(low), float(high)), bool(a2 > b2 * _HARM),
-                  float(np.sqrt(within / counts.sum())), predicted)
+                  float(np.sqrt(within / counts.sum())),
+                  found.log_likelihood - without.log_likelihood)
 
 
-def _by_block(series: Series, used: np.ndarray, sensor: Sensor, blocks: np.ndarray, of: Study,
+def _by_block(series: Series, used: np.ndarray, off: np.ndarray, blocks: np.ndarray, of: Study,
               free: bool) -> np.ndarray:
     """
-    Return the sum over samples of the mean square over axes, (m/s²)², by block, (b,).
+    Return the sum over samples of the mean square over axes of what is left, (m/s²)², (b,).
 
     The level of a zero-g that wanders is that of the stretches that are not held out, within its
     tolerance; where it is an effect, wherever they say.
     """
     edges = evidence.block_edges(len(series))
-    off = series.residual(sensor)
     fitted = used & np.repeat(blocks, np.diff(edges))
     if fitted.any():
         span_s = float(series.time_s[-1] - series.time_s[0])

@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 from adxl_ros.gap import evidence
 from adxl_ros.gap.evidence import Channel, Fit
 from adxl_ros.gap.series import Series
-from adxl_ros.gap.study import BEYOND, STRAIGHT, straight, Study
+from adxl_ros.gap.study import BEYOND, of_sensor, STRAIGHT, straight, Study
 from adxl_ros.gap.tangents import limits, WIDE
 from adxl_ros.gap.whiten import drifts_among, flicker_g_per_rthz, near
 from adxl_ros.model.coefficients import fitted_of, get, parameter_of, put, with_neutral
@@ -36,6 +36,8 @@ _HALVED = 2
 _CHANGED = 1e-3
 _FORM = 0.03
 """No form but geometry's is quite the sensor's: a coefficient is not known better than this."""
+_ELSEWHERE = 3.0
+"""By how much less sure of a coefficient some blocks are than all, that others determine it."""
 _GAINS, _SHARE = 0.05, 1e-4
 """A step that gains less, in nats, is the last; one that would, or less than this of what all have
 gained, is not made."""
@@ -116,31 +118,37 @@ class Local:
         own = np.arange(len(self.names)) < len(self.values)
         return np.where(own, np.inf, BEYOND * self.prior)
 
-    def fitted(self, found: Fit, moved: bool = True) -> Sensor:
+    def fitted(self, found: Fit, moved: bool = True, whole: Fit | None = None) -> Sensor:
         """
         Return the sensor after a fit, within bounds; the effects as they are if not moved.
 
         What is free beside them is then at its posterior mean given them: they may differ much
-        from the fit's along what zero-g and scale factor can take up.
+        from the fit's along what zero-g and scale factor can take up. `whole` is a fit to all
+        blocks, see `moved`.
         """
         if moved:
-            values = self.moved(found)
+            values = self.moved(found, whole)
         else:
             own = np.arange(len(self.values))
             values = np.clip(evidence.given(found, own, self.values - self.middle[own]),
                              -self.most, self.most)
         return put(self.sensor, self.names, _within(self.names, self.middle + values))
 
-    def moved(self, found: Fit) -> np.ndarray:
+    def moved(self, found: Fit, whole: Fit | None = None) -> np.ndarray:
         """
         Return departures from the mean beforehand after a fit, (k,).
 
         A limit or a shape that the samples do not determine stays, for its mean beforehand is
-        nowhere in particular; one that they do moves by half or double at most.
+        nowhere in particular, and so does one that only other blocks than those of the fit do:
+        where they alone clip, the others tell nothing of it. One that is determined moves by half
+        or double at most.
         """
         own = slice(len(self.values))
         of = [parameter_of(name) for name in self.names[own]]
-        lost = np.sqrt(np.diag(found.covariance)[own]) > self.prior[own] / 2
+        spread = np.sqrt(np.diag(found.covariance)[own])
+        lost = spread > self.prior[own] / 2
+        if whole is not None:
+            lost |= spread > _ELSEWHERE * np.sqrt(np.diag(whole.covariance)[own])
         there = self.middle[own] + found.values[own]
         there = np.where(lost & ~np.array([p.sized for p in of], bool), self.values, there)
         near = np.where([p.shape for p in of], np.clip(
@@ -196,6 +204,7 @@ def local(of: Study, effects: Sequence[str], sensor: Sensor,
         at_rate = replace(sensor, rate_hz=one.sensor.rate_hz)
         there = one.simulated(at_rate)
         columns = columns_at(one, at_rate, own, values, there)
+        taken_up = there - _else(of, number, at_rate, held, effects)
         for d in range(len(held.axes)):
             at = [i for i, n in enumerate(own)
                   if len(n.split('.')) == 2 or held.axes.index(n.split('.')[2]) == d]
@@ -203,7 +212,7 @@ def local(of: Study, effects: Sequence[str], sensor: Sensor,
             also = [n for n in free if n in known]
             lines.append({names.index(n): column for n, column in known.items()
                           if n.split('.')[0] in STRAIGHT})
-            does.append([(0, there[:, d] - of.base[number][:, d])])
+            does.append([(0, taken_up[:, d])])
             design = columns[:, d, at]
             residual = one.volts[:, d] - there[:, d] + design @ (values - middle)[at]
             tried = of.filters[len(channels)]
@@ -219,6 +228,16 @@ def local(of: Study, effects: Sequence[str], sensor: Sensor,
               for i, n in enumerate(free, len(own))]
     return Local(tuple(effects), sensor, tuple(names), np.concatenate([middle, get(held, free)]),
                  np.array(prior), values, channels)
+
+
+def _else(of: Study, number: int, sensor: Sensor, baseline: Sensor,
+          effects: Sequence[str]) -> np.ndarray:
+    """Simulate a recording with those effects alone that no calibration takes up, V, (n, m)."""
+    own = [effect for effect in effects if of_sensor(effect)]
+    if len(own) == len(effects):
+        return of.base[number]
+    values = {**sensor.values, **{effect: baseline.values[effect] for effect in own}}
+    return of.series[number].simulated(replace(sensor, values=values))
 
 
 def refined(of: Study, effects: Sequence[str], start: dict[str, float],

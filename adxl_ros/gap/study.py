@@ -18,8 +18,10 @@ Recordings of one unit beside the baseline, differentiated by the whole library.
 Some coefficients are never exactly those of the file: zero-g and scale factor age, the resistor
 and capacitor of the filter have tolerances, stamps have a latency. They are free in every
 hypothesis, within what a healthy unit shows, so that they neither steal from an effect nor lend
-to it, and are only named where they go beyond that. Whatever an effect does in a straight line,
-calibration has taken up, or not: zero-g and scale factor are as free as that beside it.
+to it, and are only named where they go beyond that. Whatever an effect of the sensor does in a
+straight line, calibration has taken up, or not: zero-g and scale factor are as free as that beside
+it. What stage and place do is no part of the sensor's figures: gravity that is not the stated one
+is nothing but a straight line.
 """
 
 from __future__ import annotations
@@ -31,6 +33,8 @@ from adxl_ros.gap import evidence, whiten
 from adxl_ros.gap.evidence import Channel, Fit
 from adxl_ros.gap.series import Series
 from adxl_ros.gap.tangents import candidates, Variant, variants
+from adxl_ros.model.effects import effect_named
+from adxl_ros.model.effects.base import Place
 import numpy as np
 
 TOLERANCE = {'bias': 1e-4, 'scale_factor': 1e-4, 'bandwidth': 0.02, 'time_offset': 1e-4}
@@ -38,6 +42,8 @@ TOLERANCE = {'bias': 1e-4, 'scale_factor': 1e-4, 'bandwidth': 0.02, 'time_offset
 zero-g in g, scale factor, resistance of the filter, and latency of the stamps in s."""
 STRAIGHT = ('bias', 'scale_factor')
 """Of these, what a straight line is made of."""
+FOLLOWED = (*TOLERANCE, 'gravity')
+"""What they take up whole, so that leaving it out leaves no more: gravity scales all axes."""
 _DRIFTED_G = 0.02
 BEYOND = 4.0
 """So many of these, and the unit is not healthy: it takes an effect."""
@@ -98,7 +104,7 @@ class Study:
         """
         prior, most = self.prior.copy(), np.full(len(self.prior), np.inf)
         effects = {self.variants[i].effect for i in chosen}
-        columns = [k for i in chosen for k in self.ids[i]]
+        columns = [k for i in chosen if of_sensor(self.variants[i].effect) for k in self.ids[i]]
         for i in self.nuisances():
             name = self.names[i]
             if name.split('.')[0] not in effects:
@@ -127,6 +133,11 @@ class Study:
             i = sensor.covariance_names.index(name)
             known += float(sensor.covariance[i, i])
         return float(np.hypot(TOLERANCE[effect] * scale, np.sqrt(known)))
+
+
+def of_sensor(effect: str) -> bool:
+    """Tell whether a calibration takes up what an effect does in a straight line."""
+    return effect_named(effect).place not in (Place.STAGE, Place.FORCE)
 
 
 def study(series: Sequence[Series], used: Sequence[np.ndarray],

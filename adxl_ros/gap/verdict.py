@@ -30,7 +30,7 @@ from adxl_ros.gap.far import Shrunk
 from adxl_ros.gap.local import Hypothesis
 from adxl_ros.gap.noise_like import Sign
 from adxl_ros.gap.series import Series
-from adxl_ros.gap.study import STRAIGHT, Study, TOLERANCE
+from adxl_ros.gap.study import FOLLOWED, STRAIGHT, Study
 from adxl_ros.gap.unknown import Discrepancy, UNKNOWN_NATS
 from adxl_ros.gap.whiten import DRIFTS, drifts_among
 from adxl_ros.model.coefficients import neutral
@@ -173,7 +173,7 @@ def _each_counts(of: Study, one: Hypothesis, squares: dict[frozenset[str], float
         least = _least_mps2(of, effect, noise_mps2)
         fewer = frozenset(one.effects) - {effect}
         taken = part * part
-        if fewer in squares and effect not in (*DRIFTS, *TOLERANCE):
+        if fewer in squares and effect not in (*DRIFTS, *FOLLOWED):
             taken = squares[fewer] - here
         share = DRIFTING if effect in DRIFTS else SHARE
         if part < least or part * part < share * whole or taken < least ** 2 \
