@@ -18,9 +18,11 @@ from units import drawn, nominal
 
 FAST = ('-p', 'use_sim_time:=true')
 # At many times real time a best-effort subscriber, or one with a short queue, loses samples on a
-# busy machine.
+# busy machine: this one is 25 s long.
+QUEUE = 100000
 LOSSLESS = ('-p', 'qos_overrides./imu/data_raw.subscription.reliability:=reliable',
-            '-p', 'qos_overrides./imu/data_raw.subscription.depth:=20000')
+            '-p', f'qos_overrides./imu/data_raw.subscription.depth:={QUEUE}')
+KEPT = ('-p', f'qos_overrides./imu/data_raw.publisher.depth:={QUEUE}')
 QUICK = ('-p', 'sweep.planes_rad:=[0.785, 1.5707963267948966, 2.356]', '-p',
          'sweep.step_rad:=0.7853981633974483', '-p', 'sweep.dwell_s:=1.0', '-p',
          'sweep.check_poses:=6')
@@ -38,7 +40,7 @@ def _files(tmp_path, seed=3, axes='xy'):
 def _record(graph, kind, topic):
     """Keep the arrival and the bytes of a topic's messages, as a bag does."""
     kept = []
-    qos = QoSProfile(depth=20000)
+    qos = QoSProfile(depth=QUEUE)
     if topic == '/sensor_info':
         qos.durability = DurabilityPolicy.TRANSIENT_LOCAL
 
@@ -53,7 +55,8 @@ def _record(graph, kind, topic):
 
 def _sweep(start, truth, bare, *more):
     """Return the processes of driver and calibration."""
-    driver = start('driver', '--ros-args', '--params-file', truth, '-p', 'link.speed:=4.0', *FAST)
+    driver = start('driver', '--ros-args', '--params-file', truth, '-p', 'link.speed:=4.0', *FAST,
+                   *KEPT)
     start('stage', '--ros-args', '--params-file', bare, *FAST)
     return driver, start('calibration', '--ros-args', '--params-file', bare, *FAST, *LOSSLESS,
                          *QUICK, *more)
@@ -191,7 +194,7 @@ def test_a_real_sensor_through_the_live_graph(start, run_tool, tmp_path, shared_
         graph.spin_until(lambda: graph.said('calibration', 'waiting for sensor_info'), 30, 'up')
         start('driver', '--ros-args', *FAST, '-p', 'link.type:=replay', '-p',
               f'link.recording:={source}', '-p', 'link.speed:=30.0', '-p', 'autostart:=false',
-              '-p', 'qos_overrides./imu/data_raw.publisher.depth:=20000')
+              *KEPT)
         # The two have found each other before the first sample, and stalls are bridged.
         assert graph.change('driver', Transition.TRANSITION_CONFIGURE)
         graph.spin_until(lambda: graph.node.count_publishers('imu/data_raw'), 30, 'a publisher')
@@ -216,7 +219,7 @@ def test_what_came_before_the_driver_said_what_it_is_counts(start, tmp_path):
     params.save(tmp_path / 'bare.yaml', base)
     rng = np.random.default_rng(1)
     with Graph() as graph:
-        raw = graph.node.create_publisher(Imu, 'imu/data_raw', 20000)
+        raw = graph.node.create_publisher(Imu, 'imu/data_raw', QUEUE)
         info = graph.node.create_publisher(DiagnosticStatus, 'sensor_info', QoSProfile(
             depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL))
         start('calibration', '--ros-args', '--params-file', tmp_path / 'bare.yaml', *LOSSLESS,
