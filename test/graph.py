@@ -28,6 +28,10 @@ from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
+RELIABLE = ('-p', 'qos_overrides./imu/data_raw.subscription.reliability:=reliable')
+"""A best-effort subscriber loses the first samples, for its publisher knows it before it knows the
+publisher, and at many times real time any others."""
+
 
 def stamp_ns(message):
     """Return the stamp of a message's header, ns."""

@@ -31,6 +31,7 @@ import time
 
 from adxl_ros.files import journal, params
 from conftest import executable
+from graph import RELIABLE
 import numpy as np
 from units import drawn, nominal
 
@@ -38,8 +39,7 @@ SIM = ('-p', 'use_sim_time:=true')
 SWEEP = ('-p', 'autostart:=true', '-p', 'sweep.planes_rad:=[1.5707963267948966]',
          '-p', 'sweep.step_rad:=1.5707963267948966', '-p', 'sweep.dwell_s:=0.5', '-p',
          'sweep.check_poses:=2', '-p', 'output:=unit.yaml', '-p', 'store:=store', '-p',
-         'report:=report', '-p',
-         'qos_overrides./imu/data_raw.subscription.reliability:=reliable')
+         'report:=report', *RELIABLE)
 _LONGEST_S = 90.0
 _POSES_S, _FIT_S, _WRITE_S = 2.0, 1.0, 0.005
 _MOMENTS = ('poses', 'fit', 'poses', 'write', 'end')

@@ -7,7 +7,7 @@ from adxl_ros.files.columns import sensor_info
 from adxl_ros.model.constants import G0_MPS2
 from conftest import wait_until
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
-from graph import Graph
+from graph import Graph, RELIABLE
 from lifecycle_msgs.msg import Transition
 import numpy as np
 import pytest
@@ -20,8 +20,7 @@ FAST = ('-p', 'use_sim_time:=true')
 # At many times real time a best-effort subscriber, or one with a short queue, loses samples on a
 # busy machine: this one is 25 s long.
 QUEUE = 100000
-LOSSLESS = ('-p', 'qos_overrides./imu/data_raw.subscription.reliability:=reliable',
-            '-p', f'qos_overrides./imu/data_raw.subscription.depth:={QUEUE}')
+LOSSLESS = (*RELIABLE, '-p', f'qos_overrides./imu/data_raw.subscription.depth:={QUEUE}')
 KEPT = ('-p', f'qos_overrides./imu/data_raw.publisher.depth:={QUEUE}')
 QUICK = ('-p', 'sweep.planes_rad:=[0.785, 1.5707963267948966, 2.356]', '-p',
          'sweep.step_rad:=0.7853981633974483', '-p', 'sweep.dwell_s:=1.0', '-p',

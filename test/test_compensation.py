@@ -34,7 +34,7 @@ from builtin_interfaces.msg import Time
 from conftest import Started
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Vector3Stamped
-from graph import accel, Graph, stamp_ns
+from graph import accel, Graph, RELIABLE, stamp_ns
 import numpy as np
 import pytest
 from rcl_interfaces.srv import DescribeParameters, GetParameters, SetParametersAtomically
@@ -135,10 +135,6 @@ def robot(ros_env: dict[str, str]) -> Iterator[Robot]:
 def _saved(folder: Path, sensor: Sensor) -> Path:
     params.save(folder / 'unit.yaml', sensor)
     return folder / 'unit.yaml'
-
-
-# A publisher knows whom it reaches before a best-effort subscriber takes what it sends.
-RELIABLE = ('-p', 'qos_overrides./imu/data_raw.subscription.reliability:=reliable')
 
 
 def started(start: Start, tmp_path: Path, sensor: Sensor, *more: object) -> Started:

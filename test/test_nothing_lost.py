@@ -20,7 +20,7 @@ import resource
 from adxl_ros.calibrate.session import Plan
 from adxl_ros.calibrate.state import Settings
 from adxl_ros.files import journal, params
-from graph import Graph
+from graph import Graph, RELIABLE
 import numpy as np
 import pytest
 from std_srvs.srv import Trigger
@@ -29,8 +29,7 @@ from units import drawn, nominal
 FAST = ('-p', 'use_sim_time:=true')
 PLAN = ('-p', 'sweep.planes_rad:=[0.785, 1.5707963267948966, 2.356]', '-p',
         'sweep.step_rad:=0.7853981633974483', '-p', 'sweep.dwell_s:=1.0', '-p',
-        'sweep.check_poses:=4', '-p', 'output:=unit.yaml', '-p', 'autostart:=true', '-p',
-        'qos_overrides./imu/data_raw.subscription.reliability:=reliable')
+        'sweep.check_poses:=4', '-p', 'output:=unit.yaml', '-p', 'autostart:=true', *RELIABLE)
 
 
 def _driver(start, tmp_path, serial='N1'):

@@ -17,7 +17,7 @@
 from adxl_ros.files import journal, params
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus
-from graph import Graph
+from graph import Graph, RELIABLE
 import numpy as np
 import pytest
 from sensor_msgs.msg import Imu, JointState, Temperature
@@ -26,7 +26,6 @@ from std_srvs.srv import Trigger
 from units import drawn, nominal
 
 FAST = ('-p', 'use_sim_time:=true')
-LOSSLESS = ('-p', 'qos_overrides./imu/data_raw.subscription.reliability:=reliable')
 PLAN = ('-p', 'sweep.planes_rad:=[0.7853981633974483, 1.5707963267948966]', '-p',
         'sweep.step_rad:=1.5707963267948966', '-p', 'sweep.dwell_s:=2.0', '-p',
         'sweep.check_poses:=0', '-p', 'output:=unit.yaml', '-p', 'autostart:=true')
@@ -90,7 +89,7 @@ def _bench(start, tmp_path, mode):
     start('stage', '--ros-args', '--params-file', tmp_path / 'bare.yaml', *FAST, '-p',
           'slew_rate_rad_s:=1.5', '-p', 'slew_rate_m_s:=2.0', '-p', 'settling_time_s:=0.1')
     return start('calibration', '--ros-args', '--params-file', tmp_path / 'bare.yaml', *FAST,
-                 *LOSSLESS, *PLAN, '-p', f'stage.mode:={mode}', '-p', 'stage.timeout_s:=3.0')
+                 *RELIABLE, *PLAN, '-p', f'stage.mode:={mode}', '-p', 'stage.timeout_s:=3.0')
 
 
 def test_an_operator_who_makes_mistakes_ends_with_a_good_file(start, tmp_path):

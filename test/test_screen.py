@@ -22,7 +22,7 @@ import signal
 from adxl_ros.files import journal, params
 from adxl_ros.screen.keys import Keys
 from conftest import executable
-from graph import Graph
+from graph import Graph, RELIABLE
 import numpy as np
 import pytest
 from sensor_msgs.msg import JointState
@@ -34,8 +34,7 @@ from units import drawn, nominal
 FAST = ('-p', 'use_sim_time:=true')
 PLAN = ('-p', 'sweep.planes_rad:=[0.7853981633974483, 1.5707963267948966]', '-p',
         'sweep.step_rad:=1.5707963267948966', '-p', 'sweep.dwell_s:=1.5', '-p',
-        'sweep.check_poses:=2', '-p', 'output:=unit.yaml', '-p',
-        'qos_overrides./imu/data_raw.subscription.reliability:=reliable')
+        'sweep.check_poses:=2', '-p', 'output:=unit.yaml', *RELIABLE)
 OTHERS = '\x1b[A\x1b[1;5A\x1bOA\x1bOS\x1b[[A\x1b[M af\x1b[<65;10;10M\x1b[15~\x1bq'
 """Arrow up, with Ctrl, of keypad mode; F4; F1 of a console; a mouse's wheel twice; F5; Alt-q."""
 
