@@ -267,7 +267,7 @@ def _stage_sigma(unit: Sensor, poses: Poses, names: Sequence[str], stated: float
         # Beyond the bound a pose's surprise grows as its root (Huber 1964).
         tamed = np.where(distance < bound, distance,
                          2 * np.sqrt(bound * np.maximum(distance, bound)) - bound)
-        information = np.einsum('kip,kij,kjq->pq', design, inverse, design) + known
+        information = np.tensordot(design, inverse @ design, ((0, 1), (0, 1))) + known
         return float(np.sum(tamed) + np.linalg.slogdet(covariance)[1].sum()
                      + np.linalg.slogdet(information)[1])
 

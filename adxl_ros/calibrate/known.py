@@ -226,5 +226,6 @@ def _information(unit: Sensor, poses: Poses, names: Sequence[str], stage_rad: fl
     inverse = np.linalg.inv(posed.pose_covariance(unit, poses, stage_rad))
     design = posed.by_coefficients(unit, poses, names)
     off = poses.volts - posed.response(unit, poses)
-    return (np.einsum('kip,kij,kjq->pq', design, inverse, design),
-            np.einsum('kip,kij,kj->p', design, inverse, off))
+    weighted = inverse @ design
+    return (np.tensordot(weighted, design, ((0, 1), (0, 1))),
+            np.tensordot(weighted, off, ((0, 1), (0, 1))))
