@@ -15,7 +15,6 @@
 """The full model: intervals that hold, the gauge, bad poses, bad stages, contradictions."""
 
 from dataclasses import replace
-import time
 
 from adxl_ros.calibrate import full, full_terms, full_words, result
 from adxl_ros.errors import UserError
@@ -24,6 +23,7 @@ from adxl_ros.model import chain
 from adxl_ros.model.coefficients import get, put, with_neutral
 from adxl_ros.model.stage import specific_force
 import numpy as np
+from pace import within
 import pytest
 from units import drawn, NOMINAL, nominal, PLANES_RAD, swept
 
@@ -210,16 +210,12 @@ def test_recordings_that_contradict_each_other_are_refused(change, words):
 
 
 def test_six_hundred_poses_of_three_axes_take_two_seconds():
-    """With errors of the stage and the comparison of terms; other work on the core slows it."""
+    """With errors of the stage and the comparison of terms."""
     sensor, _, poses = swept_unit(2, 'xyz', planes_rad=np.radians(np.linspace(0, 180, 23)))
     assert len(poses) > 600
-
-    def takes_s():
-        began = time.process_time()
+    with within(2.0):
         found, _ = full_terms.fit_judged(sensor, poses)
-        assert len(found.names) >= 20
-        return time.process_time() - began
-    assert any(takes_s() < 2.0 for _ in range(3))
+    assert len(found.names) >= 20
 
 
 def test_the_filter_is_found_in_the_noise(run_tool, tmp_path):

@@ -15,7 +15,6 @@
 """Nine parameters from gravity: made units with known truth, refusals, and real recordings."""
 
 from dataclasses import replace
-import time
 
 from adxl_ros.calibrate import magnitude
 from adxl_ros.calibrate.gravity import fit_gravity, NAMES
@@ -27,6 +26,7 @@ from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.sensor import to_volts
 from hypothesis import given, settings, strategies
 import numpy as np
+from pace import within
 import pytest
 from scipy.optimize import least_squares
 from units import nominal
@@ -351,6 +351,5 @@ def test_speed():
     rng = np.random.default_rng(11)
     sensor, _ = unit(rng)
     means, errors = rested(rng, sensor, directions(rng, 40), 5e-5, 1e-4)
-    began = time.process_time()
-    fit_gravity(means, errors, bare(sensor))
-    assert time.process_time() - began < 1
+    with within(1.0):
+        fit_gravity(means, errors, bare(sensor))

@@ -14,8 +14,6 @@
 
 """Rests in made streams whose motion is known, in real ones, and live against offline."""
 
-import time
-
 from adxl_ros.calibrate.rests import find_rests, Rest, rest_means, RestFinder
 from adxl_ros.calibrate.stillness import Noise
 from adxl_ros.errors import UserError
@@ -23,6 +21,7 @@ from adxl_ros.files import recording
 from adxl_ros.model.constants import G0_MPS2
 from hypothesis import given, settings, strategies
 import numpy as np
+from pace import within
 import pytest
 from scipy.signal import lfilter
 
@@ -417,15 +416,14 @@ def test_a_rest_without_samples_is_refused():
 
 
 def test_speed():
-    """Three million samples of three axes in two seconds of an idle core."""
+    """Three million samples of three axes in two seconds."""
     rng = np.random.default_rng(22)
     _, samples, _, _ = tumbled(rng, 1000.0, [5.0] * 100)
     time_s = np.arange(5 * len(samples)) / 1000
     samples = np.tile(samples, (5, 1))
     assert len(samples) == 3_000_000
-    began = time.process_time()
-    rests = find_rests(time_s, samples, 1000.0)
-    assert time.process_time() - began < 4
+    with within(2.0):
+        rests = find_rests(time_s, samples, 1000.0)
     assert len(rests) == 500
 
 
