@@ -161,7 +161,8 @@ class SerialRig(Rig):
         super().__init__(graph, self.tell, self.taken)
 
     def end(self):
-        """Take the board away."""
+        """Take the board away, its name first: a terminal's number may soon be another's."""
+        self.path.unlink(missing_ok=True)
         self.board.kill()
         self.raws.clear()
 

@@ -55,6 +55,8 @@ class Line:
         self.path.symlink_to(os.ttyname(self.theirs))
 
     def unplug(self):
+        # Its name first: a terminal's number may soon be another's.
+        self.path.unlink(missing_ok=True)
         os.close(self.ours)
         os.close(self.theirs)
 
