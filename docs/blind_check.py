@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Write the tables of a blind check into docs/blind-check.md: blind.json, first, second or third."""
+"""Write the tables of a blind check, blind.json, into docs/blind-check.md under a name."""
 
 import json
 from pathlib import Path
