@@ -47,7 +47,7 @@ def test_ament(linter: str, paths: tuple[str, ...]) -> None:
 
 
 def test_ruff() -> None:
-    run_module('ruff', 'check', '--output-format', 'concise', *PYTHON_SOURCES)
+    run_module('ruff', 'check', '--output-format', 'concise', 'docs', *PYTHON_SOURCES)
 
 
 def test_mypy() -> None:
