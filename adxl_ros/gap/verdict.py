@@ -176,7 +176,8 @@ def _each_counts(of: Study, one: Hypothesis, squares: dict[frozenset[str], float
         if fewer in squares and effect not in (*DRIFTS, *FOLLOWED):
             taken = squares[fewer] - here
         share = DRIFTING if effect in DRIFTS else SHARE
-        if part < least or part * part < share * whole or taken < least ** 2 \
+        # Beside nothing there is no form that could be wrong: what it makes need not be left.
+        if part < least or part * part < share * whole or (fewer and taken < least ** 2) \
                 or taken < TAKEN * closes:
             return False
         if fewer in evidence and effect not in DRIFTS and drifts_among(fewer) \
