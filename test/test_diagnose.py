@@ -182,6 +182,29 @@ def test_kinds_of_drift_are_told_apart(option, effect):
     assert named(diagnosed(unit(), option)[1]) == {effect}
 
 
+def test_strong_flicker_of_another_colour_is_flicker():
+    """Relaxations from a third of a second to minutes, a hundred times the noise's power."""
+    def change(columns):
+        rng, dt_s = np.random.default_rng(8), 1 / unit().rate_hz
+        for axis in 'xyz':
+            total = np.zeros(len(columns['time_s']))
+            for tau_s in 10.0 ** np.arange(-0.5, 2.5, 0.5):
+                a = np.exp(-dt_s / tau_s)
+                total += lfilter([np.sqrt(1 - a * a)], [1, -a], rng.normal(size=len(total)))
+            columns[f'{axis}_v'] = columns[f'{axis}_v'] + 0.01 * total / total.std()
+        return columns
+
+    assert named(diagnosed(unit(), change=change)[1]) == {'flicker'}
+
+
+def test_a_weak_effect_shows_in_long_recordings():
+    """A twentieth of the noise, of which a latency within its tolerance takes up most."""
+    sensor = unit()
+    found = diagnose([made(sensor, ['clock_skew:ratio=1.4e-6'], seed) for seed in (3, 4, 5, 6)],
+                     sensor)
+    assert (found.verdict.status, named(found)) == ('explained', {'clock_skew'})
+
+
 def test_what_drifts_more_smoothly_than_any_drift_is_unknown():
     """A warm draught: a zero-g that comes and goes within half a minute, and not faster."""
     def change(columns):
@@ -395,8 +418,7 @@ def test_noise_is_compared_where_the_mean_is_blind():
 def test_the_next_manoeuvre_is_the_one_that_tells_most():
     """Temperature or warm-up: heating tells, a shaker does not; both are simulated."""
     sensor = with_effects(unit('xy'), ['temperature_bias:per_k=3e-4'])
-    best = Hypothesis(('temperature_bias',), sensor, (), np.zeros(0), np.zeros(0), 0.0,
-                      None, 1.0)
+    best = Hypothesis(('temperature_bias',), sensor, (), np.zeros(0), np.zeros(0), 0.0, None)
     answer = Verdict('inseparable', (), (('temperature_bias', 'warm_up'),), 0.9, (), best)
     asked = proposed(answer, [], 0)
     worth = {words: rate for words, _, rate in asked.menu}

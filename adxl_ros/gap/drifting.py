@@ -13,18 +13,21 @@
 # limitations under the License.
 
 """
-Whether what passes for a random walk is one.
+Whether what passes for a zero-g that wanders is one.
 
-The evidence takes whatever comes and goes slowly for a random walk. That has its share in every
-octave; a warm draught or a floor that sways crowds a few of them.
+The evidence takes whatever comes and goes slowly for a drift. A drift is the same all the time,
+and a random walk has its share in every octave; a warm draught or a floor that sways crowds a few
+of them.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from itertools import combinations, pairwise
 
-from adxl_ros.gap.evidence import bridged
+from adxl_ros.gap.evidence import block_edges, bridged
 from adxl_ros.gap.local import Hypothesis
+from adxl_ros.gap.series import Series
 from adxl_ros.gap.study import Study
 from adxl_ros.gap.whiten import WALKS_G_PER_RTS, Whitener
 import numpy as np
@@ -35,6 +38,34 @@ _FEW = 4.0
 """Octaves with more than so many times the walk's power, or so many times less, are not of it."""
 _TAPERED = 0.6
 """Of neighbouring frequencies under a Hann window so many are independent (Harris 1978)."""
+_COLOUR_S = 0.1
+"""Strong noise of another colour than the filter's stays correlated so long."""
+
+
+def unevenness(of: Study, found: Hypothesis) -> float:
+    """
+    Return how unlike each other the stretches are: 1 where the noise is the same in all of them.
+
+    The rms, over stretches, of what each one's squares depart from the mean by, in standard
+    deviations of such a sum (of correlated samples Bartlett 1946); of the axis where it is
+    largest.
+    """
+    most = 0.0
+    for one, mask, column, walk in _channels(of, found):
+        white = walk(column[None])[0] * mask
+        white[0] = 0.0
+        if not white.any():
+            continue
+        spectrum = np.abs(np.fft.rfft(white, 2 * len(white))) ** 2
+        alike = np.fft.irfft(spectrum)[:1 + int(_COLOUR_S * one.sensor.rate_hz)]
+        times = 1 + 2 * float(np.sum((alike[1:] / alike[0]) ** 2))
+        edges = block_edges(len(white))[:-1]
+        counts = np.add.reduceat(mask, edges).astype(float)
+        squares = np.add.reduceat(white ** 2, edges)[counts > 0]
+        counts = counts[counts > 0]
+        depart = (squares / counts * mask.sum() / squares.sum() - 1) * np.sqrt(counts / 2 / times)
+        most = max(most, float(np.sqrt(np.mean(depart ** 2))))
+    return most
 
 
 def crowding(of: Study, found: Hypothesis) -> float:
@@ -45,16 +76,20 @@ def crowding(of: Study, found: Hypothesis) -> float:
     healthy unit's: a periodogram of the walk's own mean against one of the mean that is seen,
     over the run of octaves that tells most. 0 where nothing walks.
     """
-    total, number = 0.0, 0
+    return sum(_nats(*_beside_walk(column, mask, walk, of.filters[number],
+                                   float(found.fit.variance[number])))
+               for number, (_, mask, column, walk) in enumerate(_channels(of, found))
+               if walk.drift == 'bias_walk' and not walk.healthy)
+
+
+def _channels(of: Study, found: Hypothesis
+              ) -> Iterator[tuple[Series, np.ndarray, np.ndarray, Whitener]]:
+    """Give by axis of each recording it, samples that count, what is left, V, and its filter."""
+    number = 0
     for one, mask in zip(of.series, of.used):
-        residual = bridged(one.residual(found.sensor), mask)
-        for column in residual.T:
-            tried, chosen = of.filters[number], found.fit.walks[number]
-            if tried[chosen].drift == 'bias_walk' and not tried[chosen].healthy:
-                total += _nats(*_beside_walk(column, mask, tried[chosen], tried,
-                                             float(found.fit.variance[number])))
+        for column in bridged(one.residual(found.sensor), mask).T:
+            yield one, mask, column, of.filters[number][found.fit.walks[number]]
             number += 1
-    return total
 
 
 def _beside_walk(residual: np.ndarray, used: np.ndarray, walk: Whitener,

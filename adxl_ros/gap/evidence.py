@@ -313,21 +313,6 @@ def predicted(channels: Sequence[Channel], found: Fit, blocks: np.ndarray) -> np
     return out
 
 
-def uneven(channels: Sequence[Channel], found: Fit) -> float:
-    """
-    Return how unlike each other the blocks are: 1 where the noise is the same in all of them.
-
-    The rms, over blocks, of what each block's squares depart from the mean by, in standard
-    deviations of such a sum of white noise; of the channel where it is largest.
-    """
-    most = 0.0
-    for c, w, s2 in zip(channels, found.walks, found.variance):
-        counts = np.maximum(c.counts, 1.0)
-        depart = (_by_block(c, found, w) / (s2 * counts) - 1) * np.sqrt(counts / 2)
-        most = max(most, float(np.sqrt(np.mean(depart[c.counts > 0] ** 2))))
-    return most
-
-
 def _by_block(c: Channel, found: Fit, walk: int) -> np.ndarray:
     """Return the squares that a fit leaves, by block, (b,)."""
     at = np.flatnonzero(np.isin(c.ids, found.ids))

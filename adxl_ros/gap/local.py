@@ -60,8 +60,6 @@ class Hypothesis:
         Nats.
     fit
         The last linear step.
-    uneven
-        Of what it leaves; see `evidence.uneven`.
 
     """
 
@@ -72,7 +70,6 @@ class Hypothesis:
     std: np.ndarray
     log_evidence: float
     fit: Fit
-    uneven: float
 
 
 @dataclass(frozen=True)
@@ -311,8 +308,7 @@ def refined(of: Study, effects: Sequence[str], start: dict[str, float],
                       np.sqrt(evidence.robust_std(here.channels, found, here.prior)[own] ** 2
                               + _of_stage(of, here.names[own]) ** 2
                               + _of_form(here, found) ** 2),
-                      reached + _of_those_that_show(here, found), found,
-                      evidence.uneven(here.channels, found))
+                      reached + _of_those_that_show(here, found), found)
 
 
 def _of_stage(of: Study, names: Sequence[str]) -> np.ndarray:

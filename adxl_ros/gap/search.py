@@ -26,6 +26,7 @@ from dataclasses import replace
 from itertools import combinations
 
 from adxl_ros.errors import UserError
+from adxl_ros.gap.drifting import unevenness
 from adxl_ros.gap.evidence import Fit
 from adxl_ros.gap.local import Hypothesis, local, refined
 from adxl_ros.gap.study import on_tangents, STRAIGHT, Study, study, TOLERANCE
@@ -119,7 +120,7 @@ def _wandering(of: Study, found: dict[tuple[str, ...], Hypothesis]) -> None:
         beside = _ranked(of, [(i,) for i in _told(of)], drifting, (drift,))
         _refine(of, beside[:_REFINED // 2], drifting, found, (drift,))
     for h in list(found.values()):
-        if drifts_among(h.effects) and h.uneven > _UNEVEN:
+        if drifts_among(h.effects) and unevenness(of, h) > _UNEVEN:
             del found[h.effects]
 
 

@@ -43,6 +43,9 @@ PRIOR_G = 2e-3
 """Standard deviation of what one basis function does, at the most."""
 UNKNOWN_NATS = 15.0
 """Gain of a flexible term that shows something to be there."""
+_ELSEWHERE, _BY_CHANCE = 0.382, 2.0
+"""How far in the recording a term is moved that shall follow nothing; how much more than that one
+gains the other must."""
 
 
 @dataclass(frozen=True)
@@ -67,8 +70,22 @@ class Discrepancy:
 
 
 def discrepancy(of: Study, best: Hypothesis) -> Discrepancy:
-    """Fit the flexible term beside the best hypothesis."""
+    """
+    Fit the flexible term beside the best hypothesis.
+
+    A strong drift has not quite the colour of its model: what is slow then gains whatever it
+    follows. The same term at other times, where it follows nothing, says how much that is.
+    """
     bases = [flexible(one) for one in of.series]
+    found = _fitted(of, best, bases)
+    if not drifts_among(best.effects) or found.gain < UNKNOWN_NATS:
+        return found
+    elsewhere = _fitted(of, best, [{kind: np.roll(values, round(_ELSEWHERE * len(values)), axis=0)
+                                    for kind, values in basis.items()} for basis in bases])
+    return replace(found, gain=found.gain - _BY_CHANCE * max(elsewhere.gain, 0.0))
+
+
+def _fitted(of: Study, best: Hypothesis, bases: Sequence[dict[str, np.ndarray]]) -> Discrepancy:
     here = local(of, best.effects, best.sensor,
                  [np.column_stack(list(basis.values())) for basis in bases], best.fit.walks)
     own, sd = list(range(len(here.names))), list(here.prior)
