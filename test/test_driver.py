@@ -81,11 +81,12 @@ def test_sim_publishes_every_sample_as_the_interfaces_say(start):
         samples = graph.listen(Imu, 'imu/data_raw')
         info = graph.listen(DiagnosticStatus, 'sensor_info', latched=True)
         graph.spin_until(lambda: len(samples) >= 3000 and info, 30, '3000 samples')
-        graph.spin_until(lambda: 'driver' in graph.diagnostics, 5, 'diagnostics')
+        # A machine that is busy may keep the driver from a second's samples, not for long.
+        graph.spin_until(lambda: 'driver' in graph.diagnostics and abs(
+            float(graph.value('driver', 'rate_hz')) - 1000) < 100, 15, 'the rate')
         status = graph.diagnostics['driver']
         assert status.level == DiagnosticStatus.OK
         assert status.hardware_id == 'A7'
-        assert float(graph.value('driver', 'rate_hz')) == pytest.approx(1000, rel=0.1)
         assert graph.value('driver', 'missing') == graph.value('driver', 'saturated') == '0'
         assert 0 <= float(graph.value('driver', 'age_s')) < 1
     stamps = np.array([stamp_ns(message) for message in samples])
