@@ -63,6 +63,7 @@ class Robot:
         self.graph = graph
         self.data = graph.listen(Imu, 'imu/data')
         self.tilt = graph.listen(Vector3Stamped, 'tilt')
+        self._told = graph.listen(DiagnosticArray, '/diagnostics')
         self._raw = graph.node.create_publisher(Imu, 'imu/data_raw', 100)
         self._info = graph.node.create_publisher(DiagnosticStatus, 'sensor_info', QoSProfile(
             depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL))
@@ -124,6 +125,13 @@ class Robot:
         self.graph.spin_until(
             lambda: self.graph.said(NODE, text)
             and self.graph.diagnostics[NODE].level == level, 10.0, f'{level!r} {text}')
+
+
+    def warned(self, of: str, count: int) -> None:
+        """Wait until so many samples were warned of: what is said of a second is gone in the next."""
+        self.graph.spin_until(lambda: count == sum(
+            int(status.message.split()[0]) for array in self._told for status in array.status
+            if status.level == DiagnosticStatus.WARN and of in status.message), 10.0, of)
 
 
 @pytest.fixture
@@ -381,22 +389,16 @@ def test_nan_never_leaves(robot: Robot, start: Start, tmp_path: Path) -> None:
     started(start, tmp_path, sensor)
     robot.inform(sensor)
     robot.connected()
-    # All of them: what is said of a second is gone in the next.
-    every = robot.graph.listen(DiagnosticArray, '/diagnostics')
     good = felt(sensor, pose(0.5, 0.5))
     before = accel(robot.answer(good))
     for bad in (float('nan'), float('inf'), 1e38, -1e300, 5e3):
         robot.send([bad, good[1], 0.0])
     np.testing.assert_array_equal(accel(robot.answer(good)), before)
     assert len(robot.data) == len(robot.tilt) == 2
-
-    def warned(text: str) -> bool:
-        return any(text in status.message and status.level == DiagnosticStatus.WARN
-                   for array in every for status in array.status)
-    robot.graph.spin_until(lambda: warned('samples dropped'), 10.0, 'dropped')
-    robot.graph.spin_until(lambda: robot.graph.value(NODE, 'dropped') == '5', 10.0, 'all five')
+    robot.warned('samples dropped', 5)
+    assert robot.graph.value(NODE, 'dropped') == '5'
     robot.answer([-2.5 * G, good[1], 0.0])
-    robot.graph.spin_until(lambda: warned('1 samples with the ADC at its rail'), 10.0, 'rail')
+    robot.warned('samples with the ADC at its rail', 1)
 
 
 @pytest.mark.parametrize(('key', 'value', 'reason'), [
