@@ -3,6 +3,7 @@
 # make test     every test         (make test ARGS='-k fit')
 # make bench    rate, missing samples, latency and CPU of the live nodes
 # make gallery  docs/effects.md and its plots, from the library of effects
+# make coverage do the intervals hold? 300 drawn units and stages, as a table
 # make faults   the links under every fault, as a table
 # make soak     half an hour of random faults, and 200 kills of a sweep
 # make fuzz     the decoder and the serial link, two minutes of hostile bytes
@@ -11,7 +12,7 @@
 # make lint     the linters alone
 # make clean    remove what these made
 
-.PHONY: build demo test bench gallery reproduction long faults soak fuzz blind lint clean \
+.PHONY: build demo test bench gallery reproduction coverage long faults soak fuzz blind lint clean \
     FORCE
 .DEFAULT_GOAL := build
 
@@ -110,7 +111,10 @@ gallery: build
 	./run --exec python docs/gallery.py docs
 
 reproduction: build
-	./run reproduce --units 40 -o docs $(ARGS)
+	./run reproduce --units 40 --draws 300 -o docs $(ARGS)
+
+coverage: build
+	./run reproduce --units 0 --draws 300 -o coverage_output $(ARGS)
 
 # Its executables are found as `ros2 run` finds them.
 long: build
@@ -122,5 +126,5 @@ blind: build
 	./run blind -o blind_output $(ARGS)
 
 clean:
-	rm -rf .venv build install log demo_output blind_output .*_cache .hypothesis
+	rm -rf .venv build install log demo_output blind_output coverage_output .*_cache .hypothesis
 	find adxl_ros launch test -name __pycache__ -prune -exec rm -rf {} +

@@ -2,7 +2,8 @@
 
 import time
 
-from adxl_ros.files import journal, params
+from adxl_ros.calibrate import recorded
+from adxl_ros.files import journal, params, recording
 from adxl_ros.files.columns import sensor_info
 from adxl_ros.model.constants import G0_MPS2
 from conftest import wait_until
@@ -14,13 +15,15 @@ import pytest
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import Imu, JointState
 from std_srvs.srv import Trigger
+from test_joint_settings import check_all_agree
 from units import drawn, nominal
 
 FAST = ('-p', 'use_sim_time:=true')
 # At many times real time a best-effort subscriber, or one with a short queue, loses samples on a
 # busy machine: this one is 25 s long.
 QUEUE = 100000
-LOSSLESS = (*RELIABLE, '-p', f'qos_overrides./imu/data_raw.subscription.depth:={QUEUE}')
+LOSSLESS = (*RELIABLE, '-p', f'qos_overrides./imu/data_raw.subscription.depth:={QUEUE}',
+            '-p', 'qos_overrides./stage/command.publisher.depth:=1000')
 KEPT = ('-p', f'qos_overrides./imu/data_raw.publisher.depth:={QUEUE}')
 QUICK = ('-p', 'sweep.planes_rad:=[0.785, 1.5707963267948966, 2.356]', '-p',
          'sweep.step_rad:=0.7853981633974483', '-p', 'sweep.dwell_s:=1.0', '-p',
@@ -66,13 +69,14 @@ def test_a_sweep_ends_with_a_file_and_fit_agrees_on_its_bag(start, run_tool, tmp
     rosbags = pytest.importorskip('bags', reason='rosbags is not installed')
     truth, bare = _files(tmp_path)
     kinds = {'/imu/data_raw': Imu, '/stage/joint_states': JointState,
-             '/sensor_info': DiagnosticStatus}
+             '/sensor_info': DiagnosticStatus, '/stage/command': JointState}
     with Graph() as graph:
         kept = {topic: _record(graph, kind, topic) for topic, kind in kinds.items()}
         driver, node = _sweep(start, truth, bare, '-p', 'output:=unit.yaml', '-p',
                               'report:=report')
         # The record begins before the sweep does.
-        graph.spin_until(lambda: all(kept.values()), 60, 'all topics')
+        graph.spin_until(lambda: all(kept[topic] for topic in kinds if topic != '/stage/command'),
+                         60, 'all topics')
         assert graph.call(Trigger, 'calibration/start', Trigger.Request()).success
         graph.spin_until((tmp_path / 'unit.yaml').exists, 120, 'the parameter file')
         # 4000 samples a second would take the report's time from it.
@@ -92,7 +96,7 @@ def test_a_sweep_ends_with_a_file_and_fit_agrees_on_its_bag(start, run_tool, tmp
 
     sent = []
     for topic, kind in (('/imu/data_raw', rosbags.IMU), ('/stage/joint_states', rosbags.JOINTS),
-                        ('/sensor_info', rosbags.INFO)):
+                        ('/sensor_info', rosbags.INFO), ('/stage/command', rosbags.JOINTS)):
         sent += [rosbags.Sent(topic, kind, at, raw=raw) for at, raw in kept[topic]]
     bag = rosbags.bag_of(tmp_path / 'bag', sorted(sent, key=lambda one: one.stamp_ns))
     done = run_tool('fit', bag, '--params', bare, '--journal', 'unit.yaml.journal',
@@ -111,6 +115,17 @@ def test_a_sweep_ends_with_a_file_and_fit_agrees_on_its_bag(start, run_tool, tmp
     assert entries[-1]['done']
     assert sum(entry['check'] for entry in entries[-1]['rests']) == 6
     assert all(entry['samples'] == 1000 for entry in entries[-1]['rests'])
+
+    # The bag and its CSV number the settings of the joints as the sweep did.
+    read = recording.read(bag)
+    recording.write(tmp_path / 'bag.csv', read, want)
+    for path in (bag, tmp_path / 'bag.csv'):
+        read = recording.read(path)
+        check_all_agree(read, recorded.recorded_unit(nominal(serial='T1'), read),
+                        entries[-1]['rests'])
+    counts = [len({entry[f'{joint}_setting'] for entry in entries[-1]['rests']})
+              for joint in ('alpha', 'beta')]
+    assert 5 <= min(counts) < len(entries[-1]['rests']) / 2, 'neighbours share one joint'
 
 
 def test_services_and_refusals(start, tmp_path):

@@ -126,9 +126,8 @@ class Robot:
             lambda: self.graph.said(NODE, text)
             and self.graph.diagnostics[NODE].level == level, 10.0, f'{level!r} {text}')
 
-
     def warned(self, of: str, count: int) -> None:
-        """Wait until so many samples were warned of: what is said of a second is gone in the next."""
+        """Wait until so many samples were warned of; each message counts one second."""
         self.graph.spin_until(lambda: count == sum(
             int(status.message.split()[0]) for array in self._told for status in array.status
             if status.level == DiagnosticStatus.WARN and of in status.message), 10.0, of)

@@ -106,11 +106,11 @@ def test_a_fit_that_fails_at_the_end_waits_and_another_unit_ends_the_session(sta
     """No dead end: redo, finish and abort are still there; no pose of 18 in the journal of 17."""
     base = nominal(serial='N1')
     params.save(tmp_path / 'bare.yaml', base)
-    asked = Plan('stage', (np.pi / 2,), np.pi / 2, 0, Settings(0.5, np.radians(0.2), 60.0,
-                 'manual', np.radians(2)), tmp_path / 'unit.yaml',
-                 tmp_path / 'unit.yaml.journal', '', '')
+    asked = Plan('stage', 'full', (np.pi / 2,), np.pi / 2, float(np.radians(0.1)), 0,
+                 Settings(0.5, np.radians(0.2), 60.0, 'manual', np.radians(2)),
+                 tmp_path / 'unit.yaml', tmp_path / 'unit.yaml.journal', '', '')
     interrupted = journal.Journal(asked.journal, asked.head(base))
-    for i, target in enumerate(asked.targets()):
+    for i, target in enumerate(asked.targets(base)):
         interrupted.append({
             'pose': i, 'alpha_rad': target.alpha_rad, 'beta_rad': target.beta_rad, 'check': False,
             'start_ns': i, 'stop_ns': i, 'samples': 500, 'std_v': [1e-4, 1e-4],

@@ -238,6 +238,57 @@ def test_references_at_another_rate_are_interpolated(tmp_path: Path) -> None:
         assert blocks[-1].done == 1.0
 
 
+def test_a_command_is_in_force_until_the_next_one(tmp_path: Path) -> None:
+    """By its stamp, or where it has none from when it was recorded; no sample waits for it."""
+    times = stamps(1000)
+    messages = [m for i, t in enumerate(times) for m in (
+        imu(t), *([joints(t, alpha=0.0, beta=0.0)] if i % 10 == 0 else []))]
+
+    def at(row: int) -> int:
+        return next(i for i, m in enumerate(messages) if m.message.header == imu(times[row])
+                    .message.header and m.kind == IMU) + 1
+
+    for row, late_ns, positions in (
+            (100, 500_000, {'alpha': 1.0}), (200, 0, {'beta': 2.0, 'other': 5.0}),
+            (300, -times[300], {'alpha': 3.0, 'beta': np.nan}), (400, 0, {'alpha': np.inf}),
+            (500, 0, {}), (600, -3_000_000, {'alpha': 1e7, 'beta': 4.0})):
+        messages.insert(at(row), joints(times[row] + late_ns, '/stage/command', **positions))
+    path = bags.bag_of(tmp_path / 'run', messages)
+    got = recording.read(path)
+    nan = np.nan
+    assert np.array_equal(got.columns['alpha_command_rad'], np.repeat(
+        [nan, 1.0, 3.0], [101, 199, 700]), equal_nan=True)
+    assert np.array_equal(got.columns['beta_command_rad'], np.repeat(
+        [nan, 2.0, 4.0], [200, 397, 403]), equal_nan=True)
+    assert not any('command' in note for note in got.notes)
+    for rows in (7, 100, 1000):
+        blocks = list(recording.blocks(path, rows))
+        assert max(map(len, blocks)) <= rows
+        for name in ('alpha_command_rad', 'beta_command_rad'):
+            joined = np.concatenate([b.columns[name] for b in blocks])
+            # One that is recorded 3 ms late may miss the samples before it.
+            assert np.count_nonzero(~((joined == got.columns[name]) | np.isnan(joined))) <= 3
+            assert (np.isnan(joined) == np.isnan(got.columns[name])).all()
+
+
+def test_commands_are_those_of_the_stage_and_of_the_right_type(tmp_path: Path) -> None:
+    """Others use the name, too: that is no error, and no column."""
+    commands = [joints(T[0], '/b/stage/command', alpha=1.0),
+                joints(T[0], '/a/stage/command', alpha=2.0)]
+    stage = [joints(t, '/b/stage/joint_states', alpha=0.0) for t in T]
+    got = recording.read(bags.bag_of(tmp_path / 'two', [*map(imu, T), *stage, *commands]))
+    assert got.columns['alpha_command_rad'].tolist() == [1.0] * 3
+    assert 'beta_command_rad' not in got.columns
+    got = recording.read(bags.bag_of(tmp_path / 'other', [*map(imu, T), *commands]))
+    assert not any('command' in name for name in got.columns)
+    text = Sent('/stage/command', STRING, T[0], TYPES[STRING](data='go'))
+    got = recording.read(bags.bag_of(tmp_path / 'text', [*map(imu, T), text]))
+    assert not any('command' in name for name in got.columns)
+    messages = [imu(T[0]), Sent('/stage/command', JOINTS, T[0], raw=b'\0\1\0\0\7')]
+    assert refusal(bags.bag_of(tmp_path / 'cut', messages)).startswith(
+        ': topic /stage/command: a message is damaged')
+
+
 def test_a_stage_that_dies_does_not_hold_up_the_samples(
         tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bag_file, '_HOLD_ROWS', 500)

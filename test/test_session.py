@@ -40,8 +40,8 @@ def begin(tmp_path):
             begun[-1].close()
         settings = Settings(1.0, 0.0035, 20.0, 'manual')
         asked = replace(Plan(
-            'stage', (np.pi / 4, np.pi / 2), np.pi / 2, 2, settings, tmp_path / 'unit.yaml',
-            tmp_path / 'journal', '', ''), **changes)
+            'stage', 'full', (np.pi / 4, np.pi / 2), np.pi / 2, float(np.radians(0.1)), 2,
+            settings, tmp_path / 'unit.yaml', tmp_path / 'journal', '', ''), **changes)
         begun.append(Session(UNIT, asked, anew))
         return begun[-1]
     yield begin

@@ -17,6 +17,7 @@
 from dataclasses import replace
 from pathlib import Path
 
+from adxl_ros.calibrate import posed
 from adxl_ros.calibrate.physical import EFFECTS
 from adxl_ros.calibrate.plan import sweep
 from adxl_ros.calibrate.poses import Poses
@@ -49,19 +50,29 @@ def drawn(rng, sensor, effects=EFFECTS):
             rng.normal() * 0.5 * p.scale
             * (a in p.axes and (name, p.name) not in {('cross_axis', 'linear'),
                                                       ('cross_axis_z', 'linear')})
-            for a in sensor.axes]) for p in effect_named(name).parameters}
+            for a in sensor.axes]) if p.axes else np.array(rng.normal() * p.scale)
+            for p in effect_named(name).parameters}
     return replace(sensor, effects=tuple(effects), values=values)
 
 
-def swept(rng, truth, planes_rad=PLANES_RAD, check_poses=16, noisy=True):
-    """Sweep a unit: poses with the noise of 5 s means and a stage that errs within a step."""
-    targets = sweep(planes_rad, np.radians(30), check_poses)
+def swept(rng, truth, planes_rad=PLANES_RAD, check_poses=16, noisy=True, per_setting=False,
+          targets=None):
+    """
+    Sweep a unit: poses with the noise of 5 s means and a stage with an error within a step.
+
+    A joint has a new error in each pose, or only after each move.
+    """
+    targets = targets or sweep(planes_rad, np.radians(30), check_poses)
     alpha, beta = (np.array([getattr(t, name) for t in targets])
                    for name in ('alpha_rad', 'beta_rad'))
     slack = truth.stage_resolution_rad * noisy
-    force = specific_force(alpha + slack * rng.uniform(-0.5, 0.5, len(alpha)),
-                           beta + slack * rng.uniform(-0.5, 0.5, len(beta)),
-                           truth.local_gravity_mps2)
+
+    def error(angle):
+        drawn = slack * rng.uniform(-0.5, 0.5, len(angle))
+        setting = np.cumsum(np.abs(np.diff(angle, prepend=angle[0])) > 1e-9)
+        return drawn[setting] if per_setting else drawn
+    off = error(alpha), error(beta)
+    force = posed.force_on(truth, alpha + off[0], beta + off[1])
     volts = np.column_stack(chain.static_response(truth)(force))
     count = noise.effective_samples(5000, 1e-3, truth.rc_s)
     std = np.broadcast_to(noise.sigma_v(truth) / np.sqrt(count), volts.shape)

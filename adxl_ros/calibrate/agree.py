@@ -63,21 +63,20 @@ def require_one_mounting(found: full.FullFit, parts: Sequence[Poses], names: Seq
         turns = np.stack([np.cross(axis, f) for axis in np.eye(3)], axis=2)
         shifts = np.broadcast_to(np.diag(fitted.scale_v_per_g),
                                  (len(poses), len(fitted.axes), len(fitted.axes)))
-        covariance = posed.pose_covariance(fitted, poses, found.stage_sigma_rad)
-        white = np.linalg.inv(np.linalg.cholesky(covariance))
-        design = (white @ np.concatenate([slope @ turns, shifts], axis=2)).reshape(
-            -1, 3 + len(fitted.axes))
         off = poses.volts - posed.response(fitted, poses)
-        spread = np.linalg.pinv(design.T @ design, rcond=1e-10)
-        asked = spread @ design.T @ (white @ off[:, :, None]).ravel()
+        products = posed.covariance(fitted, poses, found.stage).products(
+            np.concatenate([slope @ turns, shifts, off[:, :, None]], axis=2))
+        spread = np.linalg.pinv(products[:-1, :-1], rcond=1e-10)
+        asked = spread @ products[:-1, -1]
         sigma = np.sqrt(np.maximum(np.diag(spread), 1e-30))
-        for values, errors, limit, what, unit, shown in (
-                (asked[:3], sigma[:3], _FARTHEST_RAD, 'is turned by', 'deg', 180 / np.pi),
-                (asked[3:], sigma[3:], _FARTHEST_G, 'has its zero-g off by', 'mg', 1e3)):
-            worst = int(np.argmax(np.abs(values)))
-            if abs(values[worst]) > max(limit, _SURE * errors[worst]):
-                axis = 'xyz'[worst] if unit == 'deg' else fitted.axes[worst]
-                raise UserError(
-                    f'{name}: {what} {values[worst] * shown:.2f} {unit} ({axis}) about the fit of '
-                    f'all recordings, {abs(values[worst]) / errors[worst]:.0f} standard '
-                    'deviations: another unit or another mounting; fit it alone')
+        count = len(fitted.axes)
+        limit = np.repeat([_FARTHEST_RAD, _FARTHEST_G], [3, count])
+        deviations = np.where(np.abs(asked) > limit, np.abs(asked) / sigma, 0.0)
+        worst = int(np.argmax(deviations))
+        if deviations[worst] > _SURE:
+            text = f'is turned by {np.degrees(asked[worst]):.2f} deg ({"xyz"[worst]})' \
+                if worst < 3 else \
+                f'has its zero-g off by {1e3 * asked[worst]:.2f} mg ({fitted.axes[worst - 3]})'
+            raise UserError(
+                f'{name}: {text} about the fit of all recordings, {deviations[worst]:.0f} '
+                'standard deviations: another unit or another mounting; fit it alone')

@@ -16,11 +16,12 @@
 The full model: one maximum-likelihood fit of all poses, all axes, with errors of the stage.
 
 The volts of a pose are the chain's at angles that the stage has not quite reached,
-V = h(f(α + δα, β + δβ; tilt); θ) + noise of the mean, with δ ~ N(0, σ²) a joint and pose, and the
-level of the base known to `LEVEL_RAD`. The δ are integrated out: a pose weighs by the inverse of
-S = diag(std²) + σ²·JJᵀ, J = ∂V/∂(α, β) (errors in variables; Fuller 1987, section 3.2), where J is
-taken at the most likely angles, so that a stage that is off by degrees is still straight. The tilt
-of the base is fitted beside the sensor, with its prior, and left out of the result.
+V = h(f(α + δα, β + δβ; tilt); θ) + noise of the mean. A joint has one error for each of its
+settings, and may have one for each pose beside it (`stage_error`). The errors are integrated out:
+poses weigh by the inverse of their common covariance S (errors in variables; Fuller 1987, section
+3.2), taken at the most likely angles, so that a stage that is off by degrees is still straight.
+The levels of the stage's error are those of the greatest restricted likelihood (`linearised`).
+The tilt of the base is fitted beside the sensor, with its prior, and left out of the result.
 
 Gauge: p0, q0 of (11) and (13) belong to the zero-g and r0 of (15) to the scale factor; p1 and q1
 are the misalignment to first order, so that `cross_axis.linear` and `cross_axis_z.linear` stay 0.
@@ -28,6 +29,10 @@ Products tell them apart, by r1·p1·z·c and the like: where poses held out ask
 `full_terms`), the two are fitted, too, with the datasheet's 1.5 % for prior. At rest x² + y² + z²
 is g², so that a square of the own axis is those of the others and `quadratic` stays out. The
 case's x is where beta = 0 points, so that an offset of beta is part of the misalignment.
+
+A three-axis unit has the same kinds of terms on each axis: squares of both other axes
+(`cross_axis`, `cross_axis_z`), a scale factor that depends on either (`scale_factor_cross`,
+`scale_factor_z`), and a cube. A two-axis unit has those of the paper.
 """
 
 from __future__ import annotations
@@ -35,25 +40,25 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from adxl_ros.calibrate import linear
-from adxl_ros.calibrate.posed import (
-    by_angles,
-    by_coefficients,
-    pose_covariance,
-    response,
-)
+from adxl_ros.calibrate import d_optimal, linear, posed
+from adxl_ros.calibrate.linearised import linearised
+from adxl_ros.calibrate.posed import response
 from adxl_ros.calibrate.poses import Poses
+from adxl_ros.calibrate.stage_error import AngleErrors, StageError
 from adxl_ros.errors import UserError
 from adxl_ros.model.coefficients import get, names_of, parameter_of, put, with_neutral
 from adxl_ros.model.effects import effect_named
-from adxl_ros.model.effects.base import Place
+from adxl_ros.model.effects.base import Parameter, Place
 from adxl_ros.model.sensor import Sensor
 import numpy as np
-from scipy.optimize import minimize_scalar
 from scipy.stats import chi2
 
 TERMS = ('bias', 'scale_factor', 'misalignment', 'cross_axis', 'cross_axis_z', 'scale_factor_z',
          'nonlinearity')
+_THREE_AXES = ('scale_factor_cross',)
+"""Terms that a three-axis unit has beside those of the paper."""
+_OPTIONAL = ('nonlinearity',)
+"""Terms that may stay as open as their prior leaves them: most units hardly have them."""
 GAUGE = ('cross_axis.linear', 'cross_axis_z.linear')
 LEVEL_RAD = np.radians(0.1)
 """Standard deviation of the level of the base, each way: the paper's 0.1°."""
@@ -62,13 +67,28 @@ _HARDLY = 5.0
 _KNOCKED = 1e-6
 """A pose less likely than this is disturbed, as long as such poses are few."""
 _MOST_KNOCKED = 0.2
-_ROUNDS, _STEPS = 16, 12
+_ROUNDS = 16
+"""Rounds of levels, coefficients and angles."""
+_STEPS = 12
+"""Gauss-Newton steps to the first solution."""
+_STEPS_A_ROUND = 2
 _SHRINK, _STRAIGHT = 0.2, 0.1
 _CONVERGED = 1e-4
+"""A step shorter than this, in standard deviations of each coefficient, is the last."""
+_SHORT = 1e-2
+"""Coefficients that move by less in a round, in standard deviations, have settled."""
+_SETTLED = 1e-2
+"""The levels have settled when the deviance changes by less in a round."""
+_GRID_RAD = np.radians(15.0)
+"""Step of the grid from which further poses are chosen."""
+_SHAPE_STEP, _SHAPE_STEPS = 1.05, 60
+"""Figures of shape are searched by steps of 5 %, up to 19 times the typical one each way."""
+_FINE = 15
+"""Values tried between the neighbours of the likeliest."""
+_FEW = 3
+"""Starts of a figure of shape."""
 _LONGEST = 3.0
 """Longest step, in typical sizes."""
-_FEWEST_SPARE = 40
-"""Residuals beyond the parameters that are needed to judge the stage's errors by them."""
 
 
 @dataclass(frozen=True)
@@ -84,35 +104,59 @@ class FullFit:
         The same with what was fitted of the stage, which belongs to no sensor.
     names
         Fitted coefficients, those of the stage last.
-    stage_sigma_rad
-        Standard deviation of a joint's error from pose to pose; the stated one is step/√12.
+    stage
+        Levels of the stage's error.
     stated_sigma_rad
-        That.
+        Standard deviation of a joint's error as it is stated: step/√12, rad.
     knocked
         Numbers of the poses that were left out as disturbed.
     information
         Inverse covariance of `names`, priors included.
     distances
-        Squared Mahalanobis distance of each pose, (k,).
+        Squared Mahalanobis distance of each pose, given its settings, (k,).
     at
         The poses turned to the most likely angles, in which the model is straight.
+    deviance
+        −2 times the logarithm of the restricted likelihood, but for a constant.
+    converged
+        Whether coefficients, levels and the choice of disturbed poses settled.
 
     """
 
     fitted: Sensor
     unit: Sensor
     names: tuple[str, ...]
-    stage_sigma_rad: float
+    stage: StageError
     stated_sigma_rad: float
     knocked: tuple[int, ...]
     information: np.ndarray
     distances: np.ndarray
     at: Poses
+    deviance: float
+    converged: bool
+
+    @property
+    def stage_sigma_rad(self) -> float:
+        """Return the standard deviation of a joint's error in one pose, rad."""
+        return self.stage.total_rad
+
+    @property
+    def kept(self) -> np.ndarray:
+        """Tell which poses were not left out, (k,)."""
+        return ~np.isin(np.arange(len(self.at)), self.knocked)
 
 
-def fit_full(sensor: Sensor, poses: Poses, terms: Sequence[str] = TERMS) -> FullFit:
+def terms_of(axes: str) -> tuple[str, ...]:
+    """Return the terms of the full model for a unit with these axes."""
+    return TERMS + (_THREE_AXES if axes == 'xyz' else ())
+
+
+def fit_full(sensor: Sensor, poses: Poses, terms: Sequence[str] | None = None) -> FullFit:
     """
     Fit the terms to the poses; see the module.
+
+    A term that is not convex, in a figure of shape, is started several times; the fit of the
+    greatest likelihood counts.
 
     Parameters
     ----------
@@ -121,7 +165,8 @@ def fit_full(sensor: Sensor, poses: Poses, terms: Sequence[str] = TERMS) -> Full
     poses
         Of one unit on one stage.
     terms
-        Effects to fit, of the sensor or of the stage, and names of `GAUGE`.
+        Effects to fit, of the sensor or of the stage, and names of `GAUGE`; `terms_of` the
+        sensor's axes unless given.
 
     Raises
     ------
@@ -129,40 +174,106 @@ def fit_full(sensor: Sensor, poses: Poses, terms: Sequence[str] = TERMS) -> Full
         A coefficient is not determined; says which and which poses would help.
 
     """
+    terms = terms_of(sensor.axes) if terms is None else terms
     start = linear.fit(sensor, poses)
     effects = [term.split('.')[0] for term in terms]
     unit = with_neutral(replace(start, covariance=np.zeros((0, 0)), covariance_names=()), effects)
     unit = with_neutral(unit, ['base_tilt'])
     names = coefficients(unit.axes, terms)
-    stated = sensor.stage_resolution_rad / np.sqrt(12)
-    require_determined(unit, poses, names, stated)
-    kept, sigma, at, used = np.ones(len(poses), bool), stated, poses, poses
-    unit = _solved(unit, poses, names, sigma, kept)
+    stated = StageError(sensor.stage_resolution_rad / np.sqrt(12))
+    fits, failure = [], None
+    for begin in _starts(unit, poses, names, effects, stated):
+        try:
+            require_determined(begin, poses, names, stated)
+            fits.append(_fit_from(begin, poses, names, stated))
+        except UserError as error:
+            failure = failure or error
+    if not fits:
+        assert failure is not None
+        raise failure
+    return min(fits, key=lambda fit: fit.deviance)
+
+
+def _starts(unit: Sensor, poses: Poses, names: Sequence[str], effects: Sequence[str],
+            stage: StageError) -> list[Sensor]:
+    """
+    Return the units from which a fit begins: several where a term is not convex.
+
+    The volts are nearly linear in all coefficients but in figures of shape (periods, time
+    constants). Those are searched over their range, and the likeliest few are the starts.
+    """
+    starts = [unit]
+    for name in effects:
+        for p in effect_named(name).parameters:
+            if not p.shape or p.held or not effect_named(name).invertible:
+                continue
+            coarse = p.scale * _SHAPE_STEP ** np.arange(-_SHAPE_STEPS, _SHAPE_STEPS + 1)
+            likely = _likeliest(unit, poses, names, (name, p), coarse, stage)[:_FEW]
+            fine = likely[0] * _SHAPE_STEP ** np.linspace(-1, 1, _FINE)
+            best = _likeliest(unit, poses, names, (name, p), fine, stage)[0]
+            starts += [_shaped(unit, (name, p), shape) for shape in (best, *likely[1:])]
+    return starts
+
+
+def _likeliest(unit: Sensor, poses: Poses, names: Sequence[str], shape: tuple[str, Parameter],
+               values: np.ndarray, stage: StageError) -> list[float]:
+    """Return values of a figure of shape within its bounds, the likeliest first."""
+    _, parameter = shape
+    within = values[(parameter.lower <= values) & (values <= parameter.upper)]
+    misfit = [linearised(_shaped(unit, shape, value), poses, names, priors(names)).misfit(stage)
+              for value in within]
+    return [float(value) for value in within[np.argsort(misfit)]]
+
+
+def _shaped(unit: Sensor, shape: tuple[str, Parameter], value: float) -> Sensor:
+    name, parameter = shape
+    values = unit.values[name]
+    changed = {**values, parameter.name: np.full(np.shape(values[parameter.name]), value)}
+    return replace(unit, values={**unit.values, name: changed})
+
+
+def _fit_from(unit: Sensor, poses: Poses, names: tuple[str, ...], stated: StageError) -> FullFit:
+    """Fit from a start: levels, coefficients and angles in turn, until all of them settle."""
+    known, everything = priors(names), np.ones(len(poses), bool)
+    kept, stage, at, std_v = everything, stated, poses, poses.std_v
+    unit = _solved(unit, poses, names, stage, kept, _STEPS)
+    error_rad = AngleErrors(*(np.zeros((len(poses), 2)),) * 2, np.zeros(len(poses)), 0.0)
+    converged, deviance = False, np.inf
     for i in range(_ROUNDS):
-        before = kept, sigma
+        kept_before, deviance_before = kept, deviance
         for _ in range(1 if i else 3):
-            sigma = _stage_sigma(unit, used, names, stated, kept)
+            about = linearised(unit, replace(at, std_v=std_v), names, known, kept)
+            stage = about.stage_error(stated.total_rad, stage)
             # Angles off by δ leave δ²/2 of g beside the straight line, until they are found.
-            bent = sensor.nominal_scale_v_per_g * sigma ** 2 * _SHRINK ** i
-            used = replace(at, std_v=np.hypot(at.std_v, bent))
-        unit, at = _stepped(unit, poses, used, names, sigma, kept)
-        if np.any(bent > _STRAIGHT * poses.std_v.mean(axis=0)):
+            bent_v = unit.nominal_scale_v_per_g * stage.total_rad ** 2 * _SHRINK ** i
+            std_v = np.hypot(poses.std_v, bent_v)
+        unit, error_rad, length = _stepped(unit, poses, replace(at, std_v=std_v), names, stage,
+                                           kept, error_rad)
+        at = _moved(unit, poses, error_rad.total_rad)
+        if np.any(bent_v > _STRAIGHT * poses.std_v.mean(axis=0)):
             continue
-        distances = _distances(unit, at, sigma)
+        about = linearised(unit, at, names, known, kept)
+        deviance = about.deviance(stage)
+        distances = about.covariance(stage).predicted(about.residual).distances
         kept = distances < chi2.isf(_KNOCKED, len(unit.axes))
         if kept.mean() < 1 - _MOST_KNOCKED:
-            kept = np.ones(len(poses), bool)
-        if np.array_equal(kept, before[0]) and abs(sigma - before[1]) <= 1e-3 * max(sigma, 1e-9):
+            kept = everything
+        if np.array_equal(kept, kept_before) and length < _SHORT and \
+                abs(deviance - deviance_before) < _SETTLED:
+            converged = True
             break
-    known = information(unit, at.subset(kept), names, sigma)
-    covariance = np.linalg.inv(known)
+    about = linearised(unit, at, names, known, kept)
+    covariance = about.covariance(stage)
+    _, fisher = about.solve(covariance)
     of_sensor = [i for i, name in enumerate(names) if not of_stage(name)]
     fitted = replace(
         _without_stage(unit), model='full',
-        covariance=covariance[np.ix_(of_sensor, of_sensor)],
+        covariance=np.linalg.inv(fisher)[np.ix_(of_sensor, of_sensor)],
         covariance_names=tuple(names[i] for i in of_sensor))
-    return FullFit(fitted, unit, names, sigma, stated, tuple(np.flatnonzero(~kept).tolist()),
-                   known, distances, at)
+    return FullFit(fitted, unit, names, stage, stated.total_rad,
+                   tuple(np.flatnonzero(~kept).tolist()), fisher,
+                   covariance.predicted(about.residual).distances, at, about.deviance(stage),
+                   converged)
 
 
 def coefficients(axes: str, terms: Sequence[str]) -> tuple[str, ...]:
@@ -193,7 +304,8 @@ def priors(names: Sequence[str]) -> np.ndarray:
     return 1 / np.square(spread)
 
 
-def information(unit: Sensor, poses: Poses, names: Sequence[str], sigma_rad: float) -> np.ndarray:
+def information(unit: Sensor, poses: Poses, names: Sequence[str], stage: StageError
+                ) -> np.ndarray:
     """
     Fisher information of poses about coefficients, priors of the stage included, (p, p).
 
@@ -203,106 +315,76 @@ def information(unit: Sensor, poses: Poses, names: Sequence[str], sigma_rad: flo
     ----------
     unit
         Where it is taken.
-    poses, names, sigma_rad
+    poses
+        With the noise of their means, angles and settings.
+    names, stage
         As `FullFit` has them.
 
     """
-    return _normal(unit, poses, names, sigma_rad, np.ones(len(poses), bool))[0]
+    about = linearised(unit, poses, names, priors(names))
+    return about.solve(about.covariance(stage))[1]
 
 
-def _normal(unit: Sensor, poses: Poses, names: Sequence[str], sigma: float, kept: np.ndarray
-            ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the information matrix and the gradient of the log-likelihood with priors."""
-    used = poses.subset(kept)
-    white = _whitener(unit, used, sigma)
-    design = white @ by_coefficients(unit, used, names)
-    off = (white @ (used.volts - response(unit, used))[:, :, None])
-    flat, residual = design.reshape(-1, len(names)), off.reshape(-1)
-    known = priors(names)
-    return flat.T @ flat + np.diag(known), flat.T @ residual - known * get(unit, names)
-
-
-def _whitener(unit: Sensor, poses: Poses, sigma: float) -> np.ndarray:
-    return np.linalg.inv(np.linalg.cholesky(pose_covariance(unit, poses, sigma)))
-
-
-def _solved(unit: Sensor, poses: Poses, names: Sequence[str], sigma: float, kept: np.ndarray
-            ) -> Sensor:
+def _solved(unit: Sensor, poses: Poses, names: Sequence[str], stage: StageError,
+            kept: np.ndarray, steps: int) -> Sensor:
     """Gauss-Newton steps to the maximum; the chain is nearly linear in its coefficients."""
-    typical = np.array([parameter_of(name).scale for name in names])
-    for _ in range(_STEPS):
-        information, gradient = _normal(unit, poses, names, sigma, kept)
-        scale = 1 / np.sqrt(np.diag(information))
-        step = scale * np.linalg.solve(information * np.outer(scale, scale), scale * gradient)
-        step *= min(1.0, _LONGEST / np.abs(step / typical).max())
+    sizes = np.array([parameter_of(name).scale for name in names])
+    for _ in range(steps):
+        about = linearised(unit, poses, names, priors(names), kept)
+        step, fisher = about.solve(about.covariance(stage))
+        step *= min(1.0, _LONGEST / np.abs(step / sizes).max())
         unit = put(unit, names, get(unit, names) + step)
-        if np.abs(step / scale).max() < _CONVERGED:
+        if np.abs(step * np.sqrt(np.diag(fisher))).max() < _CONVERGED:
             break
     return unit
 
 
-def _stage_sigma(unit: Sensor, poses: Poses, names: Sequence[str], stated: float,
-                 kept: np.ndarray) -> float:
-    """
-    Estimate the stage's error from the residuals: restricted maximum likelihood.
-
-    The stated one stands where too few residuals are left to judge it. Poses that are knocked
-    must not pass for a bad stage: while a few are far off, the middle of the rest decides.
-    """
-    if kept.sum() * len(unit.axes) - len(names) < _FEWEST_SPARE:
-        return stated
-    used = poses.subset(kept)
-    off = used.volts - response(unit, used)
-    slope = by_angles(unit, used)
-    design = by_coefficients(unit, used, names)
-    noise = used.std_v[:, :, None] ** 2 * np.eye(len(unit.axes))
-    spread = slope @ np.swapaxes(slope, 1, 2)
-    known = np.diag(priors(names))
-    bound = chi2.isf(1e-3, len(unit.axes))
-
-    def cost(log_sigma: float) -> float:
-        covariance = noise + np.exp(2 * log_sigma) * spread
-        inverse = np.linalg.inv(covariance)
-        distance = np.einsum('ki,kij,kj->k', off, inverse, off)
-        # Beyond the bound a pose's surprise grows as its root (Huber 1964).
-        tamed = np.where(distance < bound, distance,
-                         2 * np.sqrt(bound * np.maximum(distance, bound)) - bound)
-        information = np.tensordot(design, inverse @ design, ((0, 1), (0, 1))) + known
-        return float(np.sum(tamed) + np.linalg.slogdet(covariance)[1].sum()
-                     + np.linalg.slogdet(information)[1])
-
-    found = minimize_scalar(cost, bounds=(np.log(1e-6), np.log(0.3)), method='bounded')
-    return float(np.exp(found.x))
-
-
-def _stepped(unit: Sensor, poses: Poses, at: Poses, names: Sequence[str], sigma: float,
-             kept: np.ndarray) -> tuple[Sensor, Poses]:
+def _stepped(unit: Sensor, poses: Poses, at: Poses, names: Sequence[str], stage: StageError,
+             kept: np.ndarray, before: AngleErrors) -> tuple[Sensor, AngleErrors, float]:
     """
     Go to the most likely coefficients and angles, or as far on the way as it gets better.
 
-    `poses` are as measured, `at` the same about the angles before, see `_moved`.
+    Parameters
+    ----------
+    unit
+        Where the round begins.
+    poses, at
+        As measured, and the same turned to the angles before; see `_moved`.
+    names, stage, kept
+        Coefficients, levels of the stage's error, and poses that count.
+    before
+        Errors of the angles before.
+
+    Returns
+    -------
+    tuple
+        The unit, the errors of the angles, and the longest step of a coefficient in its standard
+        deviations.
+
     """
-    before = get(unit, names), np.column_stack([at.alpha_rad - poses.alpha_rad,
-                                                at.beta_rad - poses.beta_rad])
-    solved = _solved(unit, at, names, sigma, kept)
-    slope = by_angles(solved, at)
-    off = (at.volts - response(solved, at))[:, :, None]
-    inverse = np.linalg.inv(pose_covariance(solved, at, sigma))
-    after = get(solved, names), (sigma ** 2 * np.swapaxes(slope, 1, 2) @ inverse @ off)[:, :, 0]
+    solved = _solved(unit, at, names, stage, kept, _STEPS_A_ROUND)
+    about = linearised(solved, at, names, priors(names), kept)
+    covariance = about.covariance(stage)
+    errors = covariance.predicted(about.residual)
+    start, end = get(unit, names), get(solved, names)
     known = priors(names)
 
-    def cost(values: np.ndarray, step: np.ndarray) -> float:
-        left = poses.volts - response(put(unit, names, values), _turned(poses, step))
-        return float(np.sum((left / at.std_v)[kept] ** 2) + np.sum(known * values ** 2)
-                     + np.sum((step / max(sigma, 1e-9))[kept] ** 2))
+    def between(share: float) -> tuple[np.ndarray, AngleErrors]:
+        return start + share * (end - start), before.towards(errors, share)
 
-    worst = cost(*before)
+    def cost(values: np.ndarray, angles: AngleErrors) -> float:
+        left = poses.volts - response(put(unit, names, values), _turned(poses, angles.total_rad))
+        return float(np.sum((left / at.std_v)[kept] ** 2) + np.sum(known * values ** 2)
+                     + covariance.penalty(angles))
+
+    worst = cost(start, before)
     for share in 0.5 ** np.arange(8):
-        values, step = (b + share * (a - b) for b, a in zip(before, after))
-        if cost(values, step) <= worst:
+        values, angles = between(share)
+        if cost(values, angles) <= worst:
             break
-    unit = put(unit, names, values)
-    return unit, _moved(unit, poses, step)
+    fisher = about.solve(covariance)[1]
+    length = np.abs((values - start) * np.sqrt(np.diag(fisher))).max()
+    return put(unit, names, values), angles, float(length)
 
 
 def _turned(poses: Poses, step_rad: np.ndarray) -> Poses:
@@ -318,13 +400,8 @@ def _moved(unit: Sensor, poses: Poses, step_rad: np.ndarray) -> Poses:
     of the measured angles.
     """
     there = _turned(poses, step_rad)
-    return replace(there, volts=poses.volts + (by_angles(unit, there)
+    return replace(there, volts=poses.volts + (posed.by_angles(unit, there)
                                                @ step_rad[:, :, None])[:, :, 0])
-
-
-def _distances(unit: Sensor, poses: Poses, sigma: float) -> np.ndarray:
-    off = (poses.volts - response(unit, poses))[:, :, None]
-    return np.sum((_whitener(unit, poses, sigma) @ off) ** 2, axis=(1, 2))
 
 
 def of_stage(name: str) -> bool:
@@ -337,7 +414,8 @@ def _without_stage(unit: Sensor) -> Sensor:
     return replace(unit, effects=effects, values={e: unit.values[e] for e in effects})
 
 
-def require_determined(unit: Sensor, poses: Poses, names: Sequence[str], sigma: float) -> None:
+def require_determined(unit: Sensor, poses: Poses, names: Sequence[str],
+                       stage: StageError) -> None:
     """
     Refuse poses that tell less of a coefficient than its typical size does.
 
@@ -348,51 +426,41 @@ def require_determined(unit: Sensor, poses: Poses, names: Sequence[str], sigma: 
 
     """
     scale = np.array([parameter_of(name).scale for name in names])
-    vague = [not of_stage(name) and term_of(name) not in GAUGE for name in names]
-    told = information(unit, poses, names, sigma) - np.diag(priors(names) * vague)
+    vague = [not of_stage(name) and term_of(name) not in (*GAUGE, *_OPTIONAL) for name in names]
+    told = information(unit, poses, names, stage) - np.diag(priors(names) * vague)
     known = told * np.outer(scale, scale)
     weak = np.linalg.inv(known + 1e-6 * np.eye(len(names)))
     lost = [name for name, variance, need in zip(names, np.diag(weak), vague)
             if variance > 1.0 and need]
     if lost or poses.volts.size <= len(names):
         add = ', '.join(f'({np.degrees(a):.0f}, {np.degrees(b):.0f})'
-                        for a, b in next_poses(unit, poses, names, sigma))
+                        for a, b in next_poses(unit, poses, names, stage))
         raise UserError(
             f'the full model is not determined by {len(poses)} poses: they do not tell '
             f'{", ".join(lost) or "more than they have figures"}; add poses (alpha, beta) = {add} '
             'deg, or fit --model physical or linear')
 
 
-def next_poses(unit: Sensor, poses: Poses, names: Sequence[str], sigma: float, count: int = 4
-               ) -> list[tuple[float, float]]:
+def next_poses(unit: Sensor, poses: Poses, names: Sequence[str], stage: StageError,
+               count: int = 4) -> list[tuple[float, float]]:
     """
     Choose poses that would help most, one after the other: alpha and beta, rad.
 
     Each is the one of a grid of 15° that shrinks the volume of the joint interval of all
-    coefficients, in units of their typical size, the most (D-optimality; Fedorov 1972).
+    coefficients, in units of their typical size, the most (D-optimality; Fedorov 1972). Each is a
+    new setting of both joints.
 
     Parameters
     ----------
-    unit, poses, names, sigma
+    unit, poses, names, stage
         As the fit has them.
     count
         How many.
 
     """
-    alpha, beta = (g.ravel() for g in np.meshgrid(np.radians(np.arange(0, 181, 15.0)),
-                                                  np.radians(np.arange(0, 360, 15.0))))
-    grid = Poses(np.zeros((len(alpha), len(unit.axes))),
-                 np.tile(np.median(poses.std_v, axis=0), (len(alpha), 1)), alpha, beta,
-                 np.zeros((len(alpha), 2)), np.zeros(len(alpha), bool))
+    grid = d_optimal.grid(np.median(poses.std_v, axis=0), _GRID_RAD)
     scale = np.array([parameter_of(name).scale for name in names])
-    rows = _whitener(unit, grid, sigma) @ by_coefficients(unit, grid, names) * scale
-    known = information(unit, poses, names, sigma) * np.outer(scale, scale)
-    chosen = []
-    for _ in range(count):
-        covariance = np.linalg.inv(known + 1e-6 * np.eye(len(names)))
-        gain = np.linalg.slogdet(np.eye(rows.shape[1])
-                                 + rows @ covariance @ np.swapaxes(rows, 1, 2))[1]
-        best = int(np.argmax(gain))
-        chosen.append((float(alpha[best]), float(beta[best])))
-        known = known + rows[best].T @ rows[best]
-    return chosen
+    rows = d_optimal.rows_of(unit, grid, tuple(names), stage) * scale
+    known = information(unit, poses, names, stage) * np.outer(scale, scale)
+    return [(float(grid.alpha_rad[i]), float(grid.beta_rad[i])) for i in
+            d_optimal.choose(rows, known + 1e-6 * np.eye(len(names)), count)]

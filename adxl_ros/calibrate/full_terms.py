@@ -12,57 +12,64 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Which terms earn their place in the full model: a comparison on poses held out."""
+"""
+Which terms the full model holds: a comparison by Bayes factors.
+
+A term is weighed by the marginal likelihood of the poses with it and without it: coefficients are
+integrated over their priors, at the levels of the stage's error of the richer of the two models.
+A candidate gets levels of its own, so that what it explains is no error of the stage.
+Poses that share a setting of a joint share its error, so that a term that follows alpha, which is
+set a few times only, must explain more than that error does by chance.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from adxl_ros.calibrate import full, posed
+from adxl_ros.calibrate import full
+from adxl_ros.calibrate.linearised import Linearised, linearised
 from adxl_ros.calibrate.poses import Poses
-from adxl_ros.model.coefficients import get, with_neutral
+from adxl_ros.model.coefficients import with_neutral
 from adxl_ros.model.effects import library
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 from scipy.stats import chi2
 
-ALWAYS = ('bias', 'scale_factor', 'base_tilt')
-"""What every fit has; other terms are judged by leaving them out, or by adding them."""
+ALWAYS = ('bias', 'scale_factor')
+"""What every fit has; other terms are weighed by leaving them out, or by adding them."""
 _MOVED = {'temperature_c': 0.5, 'supply_v': 0.02}
-"""Surroundings that moved by more than this are asked whether the sensor follows them."""
-_FOLDS = 5
+"""Surroundings that moved by more than this, °C and V, may have moved the sensor."""
 _ROUNDS = 6
-_GAUGE_CHANCE = 0.1
-_EARNS_NATS, _EARNS_Z = 3.0, 2.0
-"""What a term must gain on poses held out: "any gain" is found in most of pure noise."""
+"""Terms that are added at most."""
+_GAUGE_CHANCE = 0.01
+"""Chance at which the linear cross-axis terms are freed although they are 0."""
 
 
 @dataclass(frozen=True)
 class Term:
     """
-    What a term is worth on poses held out.
+    What a term is worth.
 
     Attributes
     ----------
+    name
+        Effect, or one of `full.GAUGE`.
     inside
         Whether the fit has it.
-    gain_nats
-        Log-likelihood of the poses held out with the term minus that without.
-    z
-        The gain by its standard deviation over poses.
+    log_bayes_factor
+        Log marginal likelihood of the poses with the term minus that without, nats.
 
     """
 
     name: str
     inside: bool
-    gain_nats: float
-    z: float
+    log_bayes_factor: float
 
     @property
     def earns(self) -> bool:
-        """Tell whether the gain is more than chance gives."""
-        return self.gain_nats > _EARNS_NATS and self.z > _EARNS_Z
+        """Tell whether the poses are more likely with the term than without it."""
+        return self.log_bayes_factor > 0.0
 
 
 def candidates(poses: Poses) -> tuple[str, ...]:
@@ -82,14 +89,14 @@ def fit(sensor: Sensor, poses: Poses) -> Sensor:
 def fit_judged(sensor: Sensor, poses: Poses, effects: Sequence[str] = ()
                ) -> tuple[full.FullFit, list[Term]]:
     """
-    Fit the full model with the terms more that poses held out ask for.
+    Fit the full model with the further terms that the poses speak for.
 
     Parameters
     ----------
     sensor, poses
         As for `full.fit_full`.
     effects
-        Terms more in any case.
+        Further terms in any case.
 
     Returns
     -------
@@ -102,46 +109,46 @@ def fit_judged(sensor: Sensor, poses: Poses, effects: Sequence[str] = ()
         See `full.fit_full`.
 
     """
-    terms = tuple(dict.fromkeys((*full.TERMS, *effects)))
+    terms = tuple(dict.fromkeys((*full.terms_of(sensor.axes), *effects)))
     found = full.fit_full(sensor, poses, terms)
     if gauge_shows(found):
         terms = (*terms, *full.GAUGE)
-    for _ in range(_ROUNDS):
         found = full.fit_full(sensor, poses, terms)
-        judged = judge(found)
+    judged = judge(found)
+    for _ in range(_ROUNDS):
         asked = [term for term in judged if not term.inside and term.earns]
         if not asked:
             break
         # One after the other: what one term explains, another need not.
-        terms = (*terms, max(asked, key=lambda term: term.gain_nats).name)
+        terms = (*terms, max(asked, key=lambda term: term.log_bayes_factor).name)
+        found = full.fit_full(sensor, poses, terms)
+        judged = judge(found)
     return found, judged
 
 
 def judge(found: full.FullFit) -> list[Term]:
     """
-    Compare the fit on poses held out with those without a term, and with one more.
+    Compare the fit with those without a term, and with one more.
 
-    Linearised at the fit, where the chain is linear in its coefficients to far below the noise:
-    a comparison is then linear least squares, in five folds.
-
+    Linearised at the fit, where the chain is linear in its coefficients to far below the noise.
     """
-    asked = candidates(found.at)
-    linear = _linear(found, asked)
-    with_all = linear.held_out(linear.base)
+    about, term = _linearised(found, ())
+    inside = -about.deviance(found.stage) / 2
     judged = []
-    for name in dict.fromkeys(linear.term):
+    for name in dict.fromkeys(term):
         if name in ALWAYS or name in full.GAUGE:
             continue
-        own = linear.term == name
+        own = term == name
         if name == 'misalignment':
             # The linear cross-axis terms would stand in for it.
-            own = own | (np.isin(linear.term, full.GAUGE) & linear.base)
-        inside = linear.base[own].all()
-        changed = linear.base & ~own if inside else linear.base | own
-        gain = (linear.held_out(changed) - with_all) / 2 * (1 if inside else -1)
-        spread = max(float(np.std(gain)) * np.sqrt(len(gain)), 1e-12)
-        judged.append(Term(str(name), bool(inside), float(gain.sum()),
-                           float(gain.sum()) / spread))
+            own = own | np.isin(term, full.GAUGE)
+        poorer = -about.without(own).deviance(found.stage) / 2
+        judged.append(Term(str(name), True, inside - poorer))
+    for name in candidates(found.at):
+        if name not in term:
+            richer, _ = _linearised(found, [name])
+            stage = richer.stage_error(found.stated_sigma_rad, found.stage)
+            judged.append(Term(name, False, -richer.deviance(stage) / 2 - inside))
     return judged
 
 
@@ -149,72 +156,19 @@ def gauge_shows(found: full.FullFit) -> bool:
     """
     Tell whether the poses show the linear cross-axis terms apart from the misalignment.
 
-    By the likelihood ratio of all four (two on a sensor of one axis): a fit without them is off
-    by their products with the other terms, and no longer by much where the ratio is that of
-    chance.
+    By the likelihood ratio of all of them (two an axis): a fit without them is off by their
+    products with the other terms, and no longer by much where the ratio is that of chance.
     """
-    linear = _linear(found, full.GAUGE)
-    apart = np.isin(linear.term, full.GAUGE)
-    ratio = linear.distance(linear.base & ~apart) - linear.distance(linear.base | apart)
-    return bool(ratio > chi2.isf(_GAUGE_CHANCE, apart.sum()))
+    about, term = _linearised(found, full.GAUGE)
+    gauge = np.isin(term, full.GAUGE)
+    ratio = about.without(gauge).misfit(found.stage) - about.misfit(found.stage)
+    return bool(ratio > chi2.isf(_GAUGE_CHANCE, gauge.sum()))
 
 
-@dataclass(frozen=True)
-class _Linear:
-    """
-    The fit and terms more as linear least squares, where k poses have m axes.
-
-    Attributes
-    ----------
-    design, target
-        Whitened, (k, m, p) and (k, m).
-    known
-        Inverse prior variances, (p,).
-    term, base
-        Term of each coefficient, and whether the fit has it, (p,).
-
-    """
-
-    design: np.ndarray
-    target: np.ndarray
-    known: np.ndarray
-    term: np.ndarray
-    base: np.ndarray
-
-    def distance(self, used: np.ndarray) -> float:
-        """Return the squared distance of all poses and priors from the best fit to them."""
-        best = self._best(used, np.ones(len(self.design), bool))
-        off = self.target - self.design[:, :, used] @ best
-        return float(np.sum(off ** 2) + np.sum(self.known[used] * best ** 2))
-
-    def held_out(self, used: np.ndarray) -> np.ndarray:
-        """Return the squared distance of each pose from a fit to the other folds, (k,)."""
-        fold = np.arange(len(self.design)) % _FOLDS
-        out = np.empty(len(self.design))
-        for i in range(_FOLDS):
-            best = self._best(used, fold != i)
-            off = self.target[fold == i] - self.design[fold == i][:, :, used] @ best
-            out[fold == i] = np.sum(off ** 2, axis=1)
-        return out
-
-    def _best(self, used: np.ndarray, poses: np.ndarray) -> np.ndarray:
-        columns = self.design[poses][:, :, used].reshape(-1, used.sum())
-        information = columns.T @ columns + np.diag(self.known[used])
-        # A fold may not determine all: a billionth of each information holds the rest.
-        information += np.diag(1e-9 * np.diag(information))
-        return np.linalg.solve(information, columns.T @ self.target[poses].ravel())
-
-
-def _linear(found: full.FullFit, asked: Sequence[str]) -> _Linear:
-    kept = found.at.subset(np.setdiff1d(np.arange(len(found.at)), found.knocked))
-    unit = with_neutral(found.unit, [name.split('.')[0] for name in asked])
-    more = tuple(n for name in asked for n in full.coefficients(unit.axes, (name,))
-                 if n not in found.names)
-    names = (*found.names, *more)
-    covariance = posed.pose_covariance(unit, kept, found.stage_sigma_rad)
-    white = np.linalg.inv(np.linalg.cholesky(covariance))
-    design = white @ posed.by_coefficients(unit, kept, names)
-    off = kept.volts - posed.response(unit, kept)
-    return _Linear(design, (white @ off[:, :, None])[:, :, 0] + design @ get(unit, names),
-                   full.priors(names), np.array([full.term_of(name) for name in names]),
-                   np.isin(names, found.names))
+def _linearised(found: full.FullFit, more: Sequence[str]) -> tuple[Linearised, np.ndarray]:
+    """Linearise the fit with further terms; returns the term of each coefficient, too."""
+    unit = with_neutral(found.unit, [name.split('.')[0] for name in more])
+    names = (*found.names, *(n for name in more for n in full.coefficients(unit.axes, (name,))
+                             if n not in found.names))
+    return (linearised(unit, found.at, names, full.priors(names), found.kept),
+            np.array([full.term_of(name) for name in names]))

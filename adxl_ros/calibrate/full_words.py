@@ -27,6 +27,10 @@ import numpy as np
 
 _WARMED_K = 3.0
 """Temperature that moved by more is worth a word: 0.3 mg by the datasheet's 0.1 mg/°C."""
+_SMALL_SHARE = 0.1
+"""An error new with each pose is named from this share of that of a setting on."""
+NOT_CONVERGED = ('the fit did not converge: coefficients and intervals are those of its last '
+                 'step; add poses, or leave out terms')
 _WORSE = 1.5
 """A stage that errs by so much more than stated is said to."""
 
@@ -62,9 +66,14 @@ def words(found: full.FullFit, poses: Poses, judged: Sequence[Term]) -> list[str
         That it was made of.
 
     """
-    sigma, stated = np.degrees(found.stage_sigma_rad), np.degrees(found.stated_sigma_rad)
-    lines = [f'stage: a joint errs by {sigma:.2g} deg rms from pose to pose (stated '
-             f'{stated:.2g}){_of_the_stage(found)}']
+    setting, pose, stated = (np.degrees(angle) for angle in (
+        found.stage.setting_rad, found.stage.pose_rad, found.stated_sigma_rad))
+    beside = f', and {pose:.2g} deg rms new with each pose' \
+        if pose > _SMALL_SHARE * setting else ''
+    lines = [f'stage: each setting of a joint has an error of {setting:.2g} deg rms{beside} '
+             f'(stated {stated:.2g}){_of_the_stage(found)}']
+    if not found.converged:
+        lines.append(NOT_CONVERGED)
     if found.stage_sigma_rad > _WORSE * found.stated_sigma_rad + 1e-5:
         lines.append('the reference is worse than stated, or the model lacks something that '
                      'looks like it: poses weigh accordingly, and the sensor is not blamed')
@@ -77,7 +86,7 @@ def words(found: full.FullFit, poses: Poses, judged: Sequence[Term]) -> list[str
     direction = ' '.join(f'{value:+.2f} {name}' for name, value in parts)
     lines.append(f'condition number {condition:.0f}; known least ({spread:.2g} of typical '
                  f'sizes): {direction}')
-    helpful = full.next_poses(found.unit, poses, found.names, found.stage_sigma_rad)
+    helpful = full.next_poses(found.unit, poses, found.names, found.stage)
     add = ', '.join(f'({np.degrees(a):.0f}, {np.degrees(b):.0f})' for a, b in helpful)
     lines.append(f'next poses that would help most, (alpha, beta) in deg: {add}')
     warmed = np.ptp(poses.environment.temperature_c)
@@ -86,9 +95,9 @@ def words(found: full.FullFit, poses: Poses, judged: Sequence[Term]) -> list[str
             f'temperature moved by {warmed:.1f} degC, which the model does not know: by the '
             f'datasheet up to {0.1 * warmed:.1f} mg; keep it steady, or fit --effect '
             'temperature_bias')
-    lines.append('terms by what they gain on poses held out, in nats (z):')
-    lines += [f'  {term.name:20} {term.gain_nats:10.1f} ({term.z:.1f})'
-              f'{"" if term.earns else "   does not earn its place"}' for term in judged]
+    lines.append('terms by the evidence for them, log Bayes factor in nats:')
+    lines += [f'  {term.name:20} {term.log_bayes_factor:10.1f}'
+              f'{"" if term.earns else "   not shown by these poses"}' for term in judged]
     return lines
 
 

@@ -79,6 +79,8 @@ class GravityFit:
         The part of it that the noise of the means leaves unexplained.
     outliers
         Numbers of the rests that do not fit the others, and were left out.
+    converged
+        Whether parameters and excess variance settled.
 
     """
 
@@ -90,6 +92,7 @@ class GravityFit:
     expected_mps2: np.ndarray
     excess_mps2: float
     outliers: tuple[int, ...]
+    converged: bool = True
 
 
 def fit_gravity(mean_v: np.ndarray, standard_error_v: np.ndarray, sensor: Sensor) -> GravityFit:
@@ -119,7 +122,7 @@ def fit_gravity(mean_v: np.ndarray, standard_error_v: np.ndarray, sensor: Sensor
     nominal = np.zeros(len(NAMES))
     _require_determined(rests, nominal, 0.0)
     kept = _inliers(rests, nominal)
-    found, excess = _fit(rests[kept], nominal)
+    found, excess, converged = _fit(rests[kept], nominal)
     _require_determined(rests[kept], found, excess)
     variance = magnitude_variance(rests, found) + excess
     jacobian = jacobian_of(rests[kept].mean, found) / np.sqrt(variance[kept, None])
@@ -135,29 +138,39 @@ def fit_gravity(mean_v: np.ndarray, standard_error_v: np.ndarray, sensor: Sensor
         leave_one_out_mps2=G0_MPS2 * _leave_one_out(rests, kept, found, variance, residual),
         expected_mps2=G0_MPS2 * np.sqrt(variance),
         excess_mps2=G0_MPS2 * float(np.sqrt(excess)),
-        outliers=tuple(int(i) for i in np.flatnonzero(~kept)))
+        outliers=tuple(int(i) for i in np.flatnonzero(~kept)),
+        converged=converged)
 
 
-def _solve(rests: Rests, start: np.ndarray, variance: np.ndarray) -> np.ndarray:
-    """Fit with given variances of the magnitudes, g², (k,)."""
+def _solve(rests: Rests, start: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, bool]:
+    """Fit with given variances of the magnitudes, g², (k,); tells whether it converged, too."""
     sigma = np.sqrt(variance)
-    return least_squares(lambda p: (magnitude(rests.mean, p) - rests.gravity) / sigma, start,
-                         lambda p: jacobian_of(rests.mean, p) / sigma[:, None], method='lm',
-                         xtol=1e-12, ftol=1e-12, gtol=1e-12).x
+    found = least_squares(lambda p: (magnitude(rests.mean, p) - rests.gravity) / sigma, start,
+                          lambda p: jacobian_of(rests.mean, p) / sigma[:, None], method='lm',
+                          xtol=1e-12, ftol=1e-12, gtol=1e-12)
+    return found.x, bool(found.success)
 
 
-def _fit(rests: Rests, start: np.ndarray) -> tuple[np.ndarray, float]:
-    """Fit the parameters, and the excess variance, g², that makes chi-squared its freedom."""
+def _fit(rests: Rests, start: np.ndarray) -> tuple[np.ndarray, float, bool]:
+    """
+    Fit the parameters, and the excess variance, g², that makes chi-squared its freedom.
+
+    Returns
+    -------
+    tuple
+        Parameters, (9,); excess variance, g²; whether both converged.
+
+    """
     found, excess = start, 0.0
     freedom = len(rests.mean) - len(NAMES)
     for _ in range(20):
         variance = magnitude_variance(rests, found)
-        found = _solve(rests, found, variance + excess)
+        found, solved = _solve(rests, found, variance + excess)
         squares = (magnitude(rests.mean, found) - rests.gravity) ** 2
         before, excess = excess, _excess(squares, variance, freedom)
         if abs(excess - before) <= 1e-6 * (excess + variance.min()):
-            break
-    return found, excess
+            return found, excess, solved
+    return found, excess, False
 
 
 def _excess(squares: np.ndarray, variance: np.ndarray, freedom: int) -> float:
@@ -214,7 +227,7 @@ def _exchanged(rests: Rests, kept: np.ndarray, start: np.ndarray, most: int) -> 
 
 def _unlikeliness(rests: Rests, kept: np.ndarray, start: np.ndarray) -> float:
     """Negative logarithm of the residual likelihood, knocks being anywhere within KNOCK."""
-    found, excess = _fit(rests[kept], start)
+    found, excess, _ = _fit(rests[kept], start)
     variance = magnitude_variance(rests[kept], found).mean() + excess
     count, knocks = len(kept), (~kept).sum()
     ways = gammaln(count + 1) - gammaln(knocks + 1) - gammaln(count - knocks + 1)
@@ -249,7 +262,7 @@ def _robust_inliers(rests: Rests, start: np.ndarray, most: int) -> np.ndarray:
 
 def _studentised(rests: Rests, kept: np.ndarray, start: np.ndarray) -> np.ndarray:
     """Distance of each rest from the fit to the others, in its standard deviations, (k,)."""
-    found, excess = _fit(rests[kept], start)
+    found, excess, _ = _fit(rests[kept], start)
     variance = magnitude_variance(rests, found) + excess
     covariance = np.linalg.inv(information_of(rests[kept], found, excess))
     jacobian = jacobian_of(rests.mean, found)
@@ -270,7 +283,7 @@ def _leave_one_out(rests: Rests, kept: np.ndarray, found: np.ndarray, variance: 
     for i in np.flatnonzero(kept):
         others = kept.copy()
         others[i] = False
-        without = _solve(rests[others], found, variance[others])
+        without, _ = _solve(rests[others], found, variance[others])
         errors[i] = magnitude(rests.mean[i:i + 1], without)[0] - rests.gravity
     return errors
 

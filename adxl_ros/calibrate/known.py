@@ -20,8 +20,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from adxl_ros.calibrate import full, posed
+from adxl_ros.calibrate.linearised import linearised
 from adxl_ros.calibrate.plan import spread, Target
 from adxl_ros.calibrate.poses import Poses
+from adxl_ros.calibrate.stage_error import StageError
 from adxl_ros.model import noise
 from adxl_ros.model.coefficients import get, parameter_of, put, with_neutral
 from adxl_ros.model.sensor import Sensor
@@ -51,8 +53,8 @@ class Known:
         Of those coefficients; the inverse of their Fisher information and the datasheet's.
     prior
         Standard deviation of each by the datasheet alone, (p,).
-    stage_rad
-        Standard deviation of a joint's error.
+    stage
+        Levels of the stage's error, by the stated one and by the poses.
     pose_std_v
         Noise of the mean of one pose, (m,).
     poses
@@ -64,7 +66,7 @@ class Known:
     names: tuple[str, ...]
     covariance: np.ndarray
     prior: np.ndarray
-    stage_rad: float
+    stage: StageError
     pose_std_v: np.ndarray
     poses: int
 
@@ -77,8 +79,8 @@ class Known:
         """Predict the volts of a pose and their standard deviations, (m,) each."""
         pose = _at(np.array([alpha_rad]), np.array([beta_rad]), self.pose_std_v)
         slope = posed.by_coefficients(self.unit, pose, self.names)[0]
-        covariance = slope @ self.covariance @ slope.T + posed.pose_covariance(
-            self.unit, pose, self.stage_rad)[0]
+        covariance = slope @ self.covariance @ slope.T + posed.covariance(
+            self.unit, pose, self.stage).blocks[0]
         return posed.response(self.unit, pose)[0], np.sqrt(np.diag(covariance))
 
     def seen_at(self, alpha_rad: float, beta_rad: float, volts: np.ndarray, slack_v: np.ndarray
@@ -107,7 +109,9 @@ class Known:
             return self
         poses = _at(np.array([t.alpha_rad for t in targets]),
                     np.array([t.beta_rad for t in targets]), self.pose_std_v)
-        told = _information(self.unit, poses, self.names, self.stage_rad)[0]
+        nothing = np.zeros(len(self.names))
+        about = linearised(self.unit, poses, self.names, nothing)
+        told = about.solve(about.covariance(self.stage))[1]
         return replace(self, covariance=np.linalg.inv(np.linalg.inv(self.covariance) + told))
 
     def sensor(self) -> Sensor:
@@ -135,24 +139,26 @@ def from_poses(sensor: Sensor, poses: Poses, dwell_s: float, stage_rad: float,
     dwell_s
         Time that a pose is averaged, s.
     stage_rad
-        Standard deviation of a joint's error from pose to pose.
+        Stated standard deviation of a joint's error, rad.
     before
         What was known before the last of them: the fit begins there.
 
     """
-    names = full.coefficients(sensor.axes, full.TERMS)
-    unit = before.unit if before else with_neutral(sensor, (*full.TERMS, 'base_tilt'))
+    terms = full.terms_of(sensor.axes)
+    names = full.coefficients(sensor.axes, terms)
+    unit = before.unit if before else with_neutral(sensor, (*terms, 'base_tilt'))
     prior = np.array([full.LEVEL_RAD if full.of_stage(name) else parameter_of(name).scale
                       for name in names])
-    information = np.diag(1 / prior ** 2)
+    information, stage = np.diag(1 / prior ** 2), before.stage if before else StageError(stage_rad)
+    poses = replace(poses, std_v=np.maximum(poses.std_v, _LEAST_STD_V))
     for _ in range(_ROUNDS if len(poses) else 0):
-        told, gradient = _information(unit, poses, names, stage_rad)
-        information = told + np.diag(1 / prior ** 2)
-        at = get(unit, names)
-        unit = put(unit, names, at + np.linalg.solve(information, gradient - at / prior ** 2))
+        about = linearised(unit, poses, names, 1 / prior ** 2)
+        stage = about.stage_error(stage_rad, stage)
+        step, information = about.solve(about.covariance(stage))
+        unit = put(unit, names, get(unit, names) + step)
     count = noise.effective_samples(round(dwell_s * sensor.rate_hz), 1 / sensor.rate_hz,
                                     sensor.rc_s)
-    return Known(unit, names, np.linalg.inv(information), prior, stage_rad,
+    return Known(unit, names, np.linalg.inv(information), prior, stage,
                  np.maximum(noise.sigma_v(sensor) / np.sqrt(count), _LEAST_STD_V), len(poses))
 
 
@@ -217,15 +223,3 @@ def _at(alpha_rad: np.ndarray, beta_rad: np.ndarray, std_v: np.ndarray) -> Poses
     count = len(alpha_rad)
     return Poses(np.zeros((count, len(std_v))), np.tile(std_v, (count, 1)), alpha_rad, beta_rad,
                  np.zeros((count, 2)), np.zeros(count, bool))
-
-
-def _information(unit: Sensor, poses: Poses, names: Sequence[str], stage_rad: float
-                 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return what poses tell of coefficients, (p, p), and the gradient of their likelihood."""
-    poses = replace(poses, std_v=np.maximum(poses.std_v, _LEAST_STD_V))
-    inverse = np.linalg.inv(posed.pose_covariance(unit, poses, stage_rad))
-    design = posed.by_coefficients(unit, poses, names)
-    off = poses.volts - posed.response(unit, poses)
-    weighted = inverse @ design
-    return (np.tensordot(weighted, design, ((0, 1), (0, 1))),
-            np.tensordot(weighted, off, ((0, 1), (0, 1))))

@@ -21,8 +21,9 @@ stage:
     seen = noise of the means + stage + fit + model
 
 - noise: of the pose's mean, by the inverse's tangent.
-- stage: its level and its form as the full model found them; a random error of each joint, up to
-  the stated σ = step/√12; and what poses of the same angles differ by beyond that.
+- stage: a random error of each joint, up to the stated σ = step/√12; and what poses of the same
+  angles differ by beyond that. Its level and its form, as the full model found them, are taken out
+  of the reference.
 - fit: the covariance of the calibration, which noise and stage have brought about.
 - model: what is left, as far as it is more than chance makes once in a hundred (with the freedom
   of correlated poses) and no scatter between visits of the same pose. Where no pose was visited

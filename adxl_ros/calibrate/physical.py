@@ -189,8 +189,8 @@ def _covariance(sensor: Sensor, fitted: Sensor, poses: Poses) -> np.ndarray:
 
     The stages weigh the poses in their own way, so that no least-squares formula holds: the
     sweep is drawn anew from the fitted model, with the noise of the means and an encoder error
-    uniform within its step, and fitted again. Deviations are widened by what the residuals show
-    beyond noise and encoder (effects that the model does not hold).
+    uniform within its step for each setting of a joint, and fitted again. Deviations are widened
+    by what the residuals show beyond noise and encoder (effects that the model does not hold).
     """
     respond = chain.static_response(fitted)
     predicted = np.column_stack(respond(reference_force(poses, fitted.local_gravity_mps2)))
@@ -200,7 +200,9 @@ def _covariance(sensor: Sensor, fitted: Sensor, poses: Poses) -> np.ndarray:
     rng = np.random.default_rng(0)
     drawn = []
     for _ in range(_REPLICAS):
-        slack = widen * fitted.stage_resolution_rad * rng.uniform(-0.5, 0.5, (2, len(poses)))
+        slack = [widen * fitted.stage_resolution_rad * rng.uniform(
+            -0.5, 0.5, int(setting.max()) + 1)[setting]
+            for setting in (poses.alpha_setting, poses.beta_setting)]
         volts = np.column_stack(respond(specific_force(
             poses.alpha_rad + slack[0], poses.beta_rad + slack[1], fitted.local_gravity_mps2)))
         volts += widen * poses.std_v * rng.standard_normal(volts.shape)

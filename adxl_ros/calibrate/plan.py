@@ -23,8 +23,16 @@ from itertools import pairwise
 from adxl_ros.errors import UserError
 import numpy as np
 
-ORDER = 2
+ORDER = 3
 """To be raised with every change of `guided`: an interrupted sweep cannot go on in another."""
+KINDS = ('full', 'quick')
+"""Plans of a stage: the paper's planes, or the fewest poses that reach a tilt error."""
+STEP_RAD = float(np.radians(30.0))
+"""Step of beta of the paper."""
+MOVE_S = 5.0
+"""Time from a pose to the next, beside the dwell, until there is some experience, s."""
+_FLAT = 0.2
+"""Planes with |sin α| below this hardly show beta; the paper leaves them out of (15), too."""
 _GOLDEN_RAD = np.pi * (3 - np.sqrt(5))
 
 
@@ -62,14 +70,27 @@ def sweep(planes_rad: Sequence[float], step_rad: float, check_poses: int) -> lis
     return grid + spread(check_poses)
 
 
+def default_planes_rad(axes: str) -> tuple[float, ...]:
+    """
+    Return the planes alpha of a sweep, rad: 30° to 150° by 30°, with z 0° to 180°.
+
+    Without level planes a z axis is calibrated to 0.87 g only.
+    """
+    ends = (0.0, 180.0) if 'z' in axes else (30.0, 150.0)
+    return tuple(float(angle) for angle in np.radians(np.arange(ends[0], ends[1] + 1, 30.0)))
+
+
 def guided(planes_rad: Sequence[float], step_rad: float, check_poses: int) -> list[Target]:
     """
-    Order the poses of `sweep` for a real stage: little travel, each plane from both sides.
+    Order the poses of `sweep` for a real stage, whose joints keep their error until they move.
 
-    The planes are gone through upwards and then downwards, and beta turns forth in one plane and
-    back in the next, so that each pose of the grid is reached in both directions of both joints,
-    and half of the sweep has all planes already. Check poses follow, in whole degrees, which can
-    be set by hand on a scale, each the nearest to the one before.
+    Beta turns forth and then back, and at each of its angles alpha goes through all planes, up
+    and down in turn. A joint takes a new error with each move, so that a plane has as many as it
+    has poses: with one setting a plane, the error of that setting would count in full. All planes
+    are there after half of the sweep, and each pose is reached in both directions of both joints.
+    Where |sin alpha| < 0.2 beta hardly shows, and quarter turns of beta are enough. Check poses
+    follow, in whole degrees, which can be set by hand on a scale, each the nearest to the one
+    before.
 
     Parameters
     ----------
@@ -83,12 +104,20 @@ def guided(planes_rad: Sequence[float], step_rad: float, check_poses: int) -> li
 
     """
     forth = _turn(planes_rad, step_rad)
-    planes = sorted({float(alpha) for alpha in planes_rad})
-    there = [(alpha, forth[::-1] if i % 2 else forth) for i, alpha in enumerate(planes)]
-    back = [(alpha, turn[::-1]) for alpha, turn in there[::-1]]
-    grid = [Target(alpha, float(beta)) for alpha, turn in there + back for beta in turn]
+    planes = np.array(sorted({float(alpha) for alpha in planes_rad}))
+    inclined = np.abs(np.sin(planes)) >= _FLAT
+    grid = []
+    for i, beta in enumerate((*forth, *forth[::-1])):
+        quarter = abs(np.sin(2 * beta)) < 1e-6
+        visited = planes if quarter or not inclined.any() else planes[inclined]
+        grid += [Target(float(alpha), float(beta)) for alpha in visited[::-1 if i % 2 else 1]]
+    return with_checks(grid, check_poses)
+
+
+def with_checks(targets: list[Target], check_poses: int) -> list[Target]:
+    """Add check poses in whole degrees, each the nearest to the one before."""
     checks = [Target(_whole(t.alpha_rad), _whole(t.beta_rad), True) for t in spread(check_poses)]
-    return grid + _nearest(grid[-1], checks)
+    return targets + nearest(targets[-1], checks)
 
 
 def travel_rad(targets: Sequence[Target]) -> float:
@@ -113,7 +142,7 @@ def _apart(a: Target, b: Target) -> float:
     return max(abs(a.alpha_rad - b.alpha_rad), abs(a.beta_rad - b.beta_rad))
 
 
-def _nearest(start: Target, targets: list[Target]) -> list[Target]:
+def nearest(start: Target, targets: list[Target]) -> list[Target]:
     """Order targets by the nearest neighbour of the one before."""
     left, way = list(targets), [start]
     while left:

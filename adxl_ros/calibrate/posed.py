@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from adxl_ros.calibrate.poses import Poses
+from adxl_ros.calibrate.stage_error import PoseCovariance, shared_settings, StageError
 from adxl_ros.model import chain
 from adxl_ros.model.coefficients import get, parameter_of, put
 from adxl_ros.model.effects.base import Components, Joint, Place, Signals
@@ -63,8 +64,21 @@ def by_coefficients(unit: Sensor, poses: Poses, names: Sequence[str]) -> np.ndar
     return np.stack(columns, axis=2)
 
 
-def pose_covariance(unit: Sensor, poses: Poses, sigma_rad: float) -> np.ndarray:
-    """Covariance of the volts of each pose about the model, V², (k, m, m); see the module."""
-    slope = by_angles(unit, poses)
-    noise = poses.std_v[:, :, None] ** 2 * np.eye(len(unit.axes))
-    return noise + sigma_rad ** 2 * slope @ np.swapaxes(slope, 1, 2)
+def covariance(unit: Sensor, poses: Poses, error: StageError,
+               kept: np.ndarray | None = None) -> PoseCovariance:
+    """
+    Return the covariance of the volts of all poses about the model.
+
+    Parameters
+    ----------
+    unit
+        Where the volts are differentiated by the angles.
+    poses
+        Noise of the means, angles and settings.
+    error
+        Standard deviations of the stage.
+    kept
+        Poses that count, (k,) bool; None for all.
+
+    """
+    return PoseCovariance(by_angles(unit, poses), poses, shared_settings(poses), error, kept)

@@ -17,7 +17,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 from adxl_ros.errors import UserError
@@ -27,6 +27,9 @@ from adxl_ros.model.effects.base import Components, Environment, Value
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.model.stage import specific_force
 import numpy as np
+
+SAME_ANGLE_RAD = 1e-5
+"""Angles that differ by less are the same, rad: rounding in a file is no motion."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +49,10 @@ class Poses:
         True for a pose that is kept out of the fit to judge it, (k,).
     temperature_c, supply_v
         Means over each rest, (k,); NaN where they were not measured.
+    alpha_setting, beta_setting
+        Number of the setting of each joint, (k,) int. Poses of one setting were taken without a
+        move of the joint between them, so that they share its error; see `joint_settings`. Where
+        they are not given, each change of the angle from one pose to the next in time is a move.
 
     """
 
@@ -57,12 +64,18 @@ class Poses:
     check: np.ndarray
     temperature_c: np.ndarray = None  # type: ignore[assignment]
     supply_v: np.ndarray = None  # type: ignore[assignment]
+    alpha_setting: np.ndarray = None  # type: ignore[assignment]
+    beta_setting: np.ndarray = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
-        """Take what was not measured as unknown."""
+        """Take what was not measured as unknown, and settings from changes of the angles."""
         for name in ('temperature_c', 'supply_v'):
             if getattr(self, name) is None:
                 object.__setattr__(self, name, np.full(len(self.volts), np.nan))
+        for joint in ('alpha', 'beta'):
+            if getattr(self, f'{joint}_setting') is None:
+                object.__setattr__(self, f'{joint}_setting', _settings_by_angle(
+                    getattr(self, f'{joint}_rad'), self.time_s[:, 0]))
 
     def __len__(self) -> int:
         """Count the poses."""
@@ -75,8 +88,12 @@ class Poses:
             return np.array([entry.get(name, missing) for entry in entries])
 
         times = np.column_stack([column('start_ns'), column('stop_ns')]) * 1e-9
-        return Poses(column('mean_v'), column('std_v'), column('alpha_rad'), column('beta_rad'),
-                     times, column('check', False), column('temperature_c'), column('supply_v'))
+        poses = Poses(column('mean_v'), column('std_v'), column('alpha_rad'), column('beta_rad'),
+                      times, column('check', False), column('temperature_c'), column('supply_v'))
+        # Journals of earlier versions have no numbers of settings.
+        numbers = {name: _numbered(column(name, -1).astype(int), getattr(poses, name))
+                   for name in ('alpha_setting', 'beta_setting')}
+        return replace(poses, **numbers)
 
     def subset(self, chosen: np.ndarray) -> Poses:
         """Keep some of the poses, by mask or index."""
@@ -91,9 +108,32 @@ class Poses:
 
 
 def together(parts: list[Poses]) -> Poses:
-    """Join the poses of several recordings of one unit."""
-    return Poses(*(np.concatenate([getattr(part, field.name) for part in parts])
-                   for field in fields(Poses)))
+    """Join the poses of several recordings of one unit; no setting outlasts its recording."""
+    joined = {field.name: np.concatenate([getattr(part, field.name) for part in parts])
+              for field in fields(Poses)}
+    for name in ('alpha_setting', 'beta_setting'):
+        first = 0
+        numbers = []
+        for part in parts:
+            setting = getattr(part, name)
+            numbers.append(setting + first)
+            first += int(setting.max(initial=-1)) + 1
+        joined[name] = np.concatenate(numbers)
+    return Poses(**joined)
+
+
+def _settings_by_angle(angle_rad: np.ndarray, start_s: np.ndarray) -> np.ndarray:
+    """Tell settings apart by the changes of the angle, in the order of time, (k,) int."""
+    order = np.argsort(start_s, kind='stable')
+    settings = np.zeros(len(order), int)
+    settings[order[1:]] = np.cumsum(np.abs(np.diff(angle_rad[order])) > SAME_ANGLE_RAD)
+    return settings
+
+
+def _numbered(given: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
+    """Return numbers of settings; a negative one gives way to a number that no other has."""
+    missing = given < 0
+    return np.where(missing, otherwise, given + otherwise.max() + 1) if missing.any() else given
 
 
 def _known(values: np.ndarray, otherwise: Value) -> np.ndarray:

@@ -20,12 +20,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from adxl_ros.calibrate import filter_noise
+from adxl_ros.calibrate import filter_noise, joint_settings
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.calibrate.rests import find_rests, Rest, rest_means
 from adxl_ros.calibrate.stillness import Noise
 from adxl_ros.errors import UserError
-from adxl_ros.files.columns import nominal_figures, Recording
+from adxl_ros.files.columns import COMMANDS, JOINTS, nominal_figures, Recording
 from adxl_ros.files.unit import same_unit
 from adxl_ros.model import noise
 from adxl_ros.model.sensor import Sensor, with_axes
@@ -155,7 +155,8 @@ def poses_of(recording: Recording, sensor: Sensor,
     sensor
         From `recorded_unit`.
     entries
-        Poses of the journal of the run, which name the rests, the angles and the check poses.
+        Poses of the journal of the run, which name the rests, the angles, the settings of the
+        joints and the check poses.
 
     Raises
     ------
@@ -183,9 +184,24 @@ def poses_of(recording: Recording, sensor: Sensor,
                            for e in entries])
         check = np.array([bool(e.get('check', False)) for e in entries])
     times = np.array([[r.time_start_s, r.time_stop_s] for r in rests])
+    settings = [_settings(recording, sensor, rests, joint, entries) for joint in ('alpha', 'beta')]
     return Poses(mean, std, middle[:, 0], middle[:, 1], times, check,
                  *(_means(recording.columns.get(name), rests)
-                   for name in ('temperature_c', 'supply_v')))
+                   for name in ('temperature_c', 'supply_v')), *settings)
+
+
+def _settings(recording: Recording, sensor: Sensor, rests: Sequence[Rest], joint: str,
+              entries: Sequence[Mapping[str, Any]] | None) -> np.ndarray | None:
+    """Return the settings of a joint, (k,): by the journal, else by its encoder and commands."""
+    name = f'{joint}_setting'
+    if entries is not None and all(name in entry for entry in entries):
+        return np.array([entry[name] for entry in entries])
+    readings, commands = (recording.columns.get(name) for name in (JOINTS[joint], COMMANDS[joint]))
+    if readings is None and commands is None:
+        return None
+    return joint_settings.recorded_settings(
+        np.array([[rest.start, rest.stop] for rest in rests]), readings, commands,
+        joint_settings.angle_tolerance_rad(sensor))
 
 
 def rest_angles(angles: np.ndarray | None, rests: Sequence[Rest]) -> np.ndarray:

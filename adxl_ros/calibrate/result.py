@@ -257,13 +257,13 @@ def _against_stage(sensor: Sensor, parts: Sequence[Poses], model: str | None,
     knocked = tuple(np.flatnonzero(~poses.check)[list(found.full.knocked)].tolist()) \
         if found.full else ()
     sound = poses.subset(~np.isin(np.arange(len(poses)), knocked))
+    # What the full model found of the stage is no error of the sensor, by any model.
+    stage = found.full.unit if found.full else None
     scores = verdict.held_out({'nominal': lambda sensor, _: sensor,
                                **{name: STAGE_FITS[name] for name in simpler},
-                               fitted.model: found.fit}, sensor, sound)
-    stage = found.full.unit if found.full else None
-    judgements = tuple(judge.judge(score.model, *limits.parts(
-        score, sound, stage if score.model == 'full' else None), sensor)
-        for score in scores if score.model != 'nominal')
+                               fitted.model: found.fit}, sensor, sound, stage)
+    judgements = tuple(judge.judge(score.model, *limits.parts(score, sound, stage), sensor)
+                       for score in scores if score.model != 'nominal')
     predicted = np.column_stack(chain.static_response(fitted)(
         reference_force(fitting, fitted.local_gravity_mps2), fitting.environment))
     residual = (fitting.volts - predicted) / fitted.scale_v_per_g * 1e3
@@ -277,6 +277,7 @@ def _against_stage(sensor: Sensor, parts: Sequence[Poses], model: str | None,
         fitted, force, poses, np.nan_to_num(np.sqrt(own[0].accel.own)).item() if own else 0.0))
     fitted = with_provenance(fitted, ', '.join(sources), poses, data_sha256, {
         'reference': 'stage', 'residual_mg': f'{np.sqrt(np.mean(residual ** 2)):.4f}',
+        **({'converged': _yes(found.full.converged)} if found.full else {}),
         **judge.figures(own[0] if own else None, scores)})
     words, unit = judge.words(own[0], fitted) if own else [], judge.unit_line(fitted)
     lines = [*refusals, *verdict.table(scores), *judge.table(judgements, scores), *words, *unit,
@@ -313,6 +314,8 @@ def _against_gravity(sensor: Sensor, poses: Poses, source: str, data_sha256: str
         found.before_mps2, found.residual_mps2, found.leave_one_out_mps2))
     lines = [f'magnitude of gravity over {len(kept)} rests, rms in mg: nominal {before:.2f}, '
              f'nine parameters {after:.3f}, leave-one-out {out:.3f}']
+    if not found.converged:
+        lines.append(full_words.NOT_CONVERGED)
     if found.outliers:
         named = ', '.join(f'{i + 1} (from {poses.time_s[i, 0]:.1f} s)' for i in found.outliers)
         lines.append(f'left out, disturbed: rest {named}')
@@ -326,6 +329,7 @@ def _against_gravity(sensor: Sensor, poses: Poses, source: str, data_sha256: str
                                                float(np.sqrt(accel.model))))
     fitted = with_provenance(fitted, source, poses, data_sha256, {
         'reference': 'gravity', 'residual_mg': f'{after:.4f}', 'leave_one_out_mg': f'{out:.4f}',
+        'converged': _yes(found.converged),
         **judge.figures(own, ())})
     lines += [judge.gravity_line(own, found.leave_one_out_mps2[kept]),
               *judge.words(own, fitted), *judge.unit_line(fitted)]
@@ -350,6 +354,10 @@ def coefficients(sensor: Sensor) -> list[str]:
             if entries:
                 lines.append(f'  {label:34} {"   ".join(entries)} {units[parameter]}')
     return lines
+
+
+def _yes(whether: bool) -> str:
+    return 'yes' if whether else 'no'
 
 
 def _rms_mg(values_mps2: np.ndarray) -> float:

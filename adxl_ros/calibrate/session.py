@@ -22,7 +22,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from adxl_ros.calibrate import plan, refusals, result
+from adxl_ros.calibrate import plan, quick_plan, refusals, result
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.calibrate.state import Settings
 from adxl_ros.calibrate.stream import Newest
@@ -49,8 +49,16 @@ class Plan:
     ----------
     mode
         'stage' or 'gravity'.
-    planes_rad, step_rad, checks
-        As `plan.guided` takes them.
+    kind
+        'full' or 'quick'.
+    planes_rad
+        Planes alpha of the plan full; none takes those that the unit's axes need.
+    step_rad
+        Step of beta of the plan full.
+    tilt_error_rad
+        Rms error of the tilt that the plan quick is to reach.
+    checks
+        Poses that judge the fit and stay out of it.
     settings
         How poses are taken.
     output, journal
@@ -61,8 +69,10 @@ class Plan:
     """
 
     mode: str
+    kind: str
     planes_rad: tuple[float, ...]
     step_rad: float
+    tilt_error_rad: float
     checks: int
     settings: Settings
     output: Path
@@ -70,11 +80,38 @@ class Plan:
     report: str
     store: str
 
-    def targets(self) -> list[plan.Target]:
-        """Return the poses in the order of the visit; none without a stage."""
+    def targets(self, unit: Sensor) -> list[plan.Target]:
+        """
+        Return the poses in the order of the visit; none without a stage.
+
+        Raises
+        ------
+        UserError
+            The parameters make no plan.
+
+        """
         if self.mode == 'gravity':
             return []
-        return plan.guided(self.planes_rad, self.step_rad, self.checks)
+        if self.kind == 'quick':
+            return quick_plan.quick(unit, self.settings.dwell_s, self.tilt_error_rad, self.checks)
+        planes = self.planes_rad or plan.default_planes_rad(unit.axes)
+        return plan.guided(planes, self.step_rad, self.checks)
+
+    def outlook(self, unit: Sensor) -> str:
+        """Say how many poses there are, how long they take and what tilt error to expect."""
+        targets = self.targets(unit)
+        if not targets:
+            return ''
+        minutes = max(round(len(targets) * (self.settings.dwell_s + plan.MOVE_S) / 60), 1)
+        error_rad = quick_plan.expected_tilt_error_rad(unit, self.settings.dwell_s, targets)
+        text = f'plan {self.kind}: {len(targets)} poses, about {minutes} min'
+        if not np.isfinite(error_rad):
+            return text
+        text += f', expected tilt error {np.degrees(error_rad):.2g}°'
+        if self.kind == 'quick' and error_rad > self.tilt_error_rad:
+            text += f' (sweep.tilt_error_deg asks for {np.degrees(self.tilt_error_rad):.2g}°: ' \
+                    'too little for this stage and this dwell)'
+        return text
 
     def head(self, unit: Sensor) -> dict[str, Any]:
         """Return what must be the same for a calibration of this unit to go on."""
@@ -86,8 +123,9 @@ class Plan:
         return {**head, 'stage.mode': self.settings.stage_mode,
                 'stage.tolerance_rad': self.settings.tolerance_rad,
                 'stage.near_rad': self.settings.near_rad,
-                'sweep.dwell_s': self.settings.dwell_s, 'sweep.planes_rad': self.planes_rad,
-                'sweep.step_rad': self.step_rad, 'sweep.check_poses': self.checks,
+                'sweep.dwell_s': self.settings.dwell_s, 'sweep.plan': self.kind,
+                'sweep.planes_rad': self.planes_rad, 'sweep.step_rad': self.step_rad,
+                'sweep.tilt_error_rad': self.tilt_error_rad, 'sweep.check_poses': self.checks,
                 'order': plan.ORDER}
 
     def question(self, unit: Sensor) -> str:
@@ -129,7 +167,7 @@ class Session:
         if asked.mode == 'gravity' and unit.axes != 'xyz':
             raise UserError(f'mode: gravity needs the axes x, y and z, but the sensor has '
                             f'{unit.axes}; use mode:=stage')
-        targets = asked.targets()
+        targets = asked.targets(unit)
         self.unit, self.asked = unit, asked
         self.newest = Newest(unit)
         self.journal = Journal(asked.journal, asked.head(unit), anew)

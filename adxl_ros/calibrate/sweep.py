@@ -28,6 +28,7 @@ from typing import Any
 
 from adxl_ros.calibrate import known, mounting, refusals
 from adxl_ros.calibrate.dwell import Dwell
+from adxl_ros.calibrate.joint_settings import angle_tolerance_rad, SettingTracker
 from adxl_ros.calibrate.plan import Target
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.calibrate.rests import Rest
@@ -59,7 +60,8 @@ class Sweep:
     settings
         How poses are taken.
     accepted, skipped
-        What an interrupted sweep has left; see `verify`.
+        What an interrupted sweep has left; see `verify`. Its stage may have lost power: the next
+        pose has new settings of both joints, numbered on from the highest of `accepted`.
 
     """
 
@@ -76,9 +78,12 @@ class Sweep:
         self._since_ns: int | None = None
         self._refusal = self._unsaid = ''
         self._fresh = False
+        self._tracker = SettingTracker(angle_tolerance_rad(sensor), (
+            self._highest('alpha_setting'), self._highest('beta_setting')))
         self.known = self._learned(None)
         self.index = self._next()
         self._begin()
+        self._command_target()
         self.verify()
 
     def verify(self) -> None:
@@ -156,7 +161,11 @@ class Sweep:
     def stage(self, stamp_ns: int, alpha_rad: float, beta_rad: float) -> None:
         """Take an encoder reading."""
         if self._angles and went_back(self._angles[-1][0], stamp_ns):
+            # A stage that was started anew may have moved unseen.
             self._angles.clear()
+            self._tracker.lose_track()
+        if self.settings.stage_mode != 'manual':
+            self._tracker.read(stamp_ns, alpha_rad, beta_rad)
         self._angles.append((stamp_ns, alpha_rad, beta_rad))
         self._fresh = True
         target = self.target
@@ -168,6 +177,15 @@ class Sweep:
             self._dwell = Dwell(self.sensor, stamp_ns)
         self._captured = arrived
 
+    def command(self, alpha_rad: float, beta_rad: float) -> None:
+        """
+        Take a command that somebody gave the stage; NaN for a joint that it does not name.
+
+        Only in stage mode 'encoder': elsewhere the targets are the commands.
+        """
+        if self.settings.stage_mode == 'encoder':
+            self._tracker.command(self.newest_ns or 0, alpha_rad, beta_rad)
+
     def feed(self, stamps_ns: np.ndarray, volts: np.ndarray) -> None:
         """Take samples: stamps, ns, (n,), and volts, (n, m)."""
         if not len(stamps_ns):
@@ -176,6 +194,7 @@ class Sweep:
             self._unsaid = f'imu/data_raw went back in time by ' \
                 f'{(self.newest_ns - int(stamps_ns[0])) * 1e-9:.0f} s: the pose begins anew'
             self.verify()
+            self._tracker.lose_track()
             self._since_ns, self._ahead_s = None, deque(maxlen=_OFFSETS)
             self._captured, self._dwell = False, Dwell(self.sensor, 0)
         self.newest_ns = int(stamps_ns[-1])
@@ -229,6 +248,8 @@ class Sweep:
         """Count a pose that is on disk, and go on to the next that is open."""
         self.accepted[entry['pose']] = entry
         self.skipped.discard(entry['pose'])
+        self._tracker.take(*(entry[name] for name in (
+            'start_ns', 'stop_ns', 'alpha_rad', 'beta_rad')))
         self.known = self._learned(self.known)
         self._go(self._next())
 
@@ -303,6 +324,16 @@ class Sweep:
         self._since_ns = self.newest_ns
         self._refusal = ''
         self._begin()
+        self._command_target()
+
+    def _command_target(self) -> None:
+        """Note the target as a command, where it is one for the stage or for the operator."""
+        if self.target is not None and self.settings.stage_mode != 'encoder':
+            self._tracker.command(self.newest_ns or 0, self.target.alpha_rad,
+                                  self.target.beta_rad)
+
+    def _highest(self, name: str) -> int:
+        return max((entry.get(name, -1) for entry in self.accepted.values()), default=-1)
 
     def _begin(self) -> None:
         self._captured = False
@@ -319,8 +350,10 @@ class Sweep:
     def _entry(self, mean: dict[str, Any], target: Target) -> dict[str, Any]:
         span = mean['start_ns'], mean['stop_ns']
         alpha, beta = self._angle_between(*span, target)
-        return {'pose': self.index, 'alpha_rad': alpha, 'beta_rad': beta, 'check': target.check,
-                **mean, **self.surroundings.means(*span)}
+        alpha_setting, beta_setting = self._tracker.settings(*span, alpha, beta)
+        return {'pose': self.index, 'alpha_rad': alpha, 'beta_rad': beta,
+                'alpha_setting': alpha_setting, 'beta_setting': beta_setting,
+                'check': target.check, **mean, **self.surroundings.means(*span)}
 
     def _moved_away(self, rest: Rest, entry: dict[str, Any]) -> str:
         """Refuse a rest in another pose than the one in which the operator captured."""

@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
+from adxl_ros.calibrate.posed import force_on
 from adxl_ros.calibrate.poses import Poses, reference_force
 from adxl_ros.errors import UserError
 from adxl_ros.model import chain
@@ -99,25 +100,36 @@ class Score:
     fold: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
 
 
-def errors(sensor: Sensor, poses: Poses) -> Errors:
+def errors(sensor: Sensor, poses: Poses, stage: Sensor | None = None) -> Errors:
     """
     Compare a calibrated sensor with the stage, pose by pose.
 
     Angles are taken to the equivalent pose nearest the reference: f(−α, β + π) = f(α, β), and a
     sensor without z cannot tell α from π − α. The sign of its z comes from the stage.
+
+    Parameters
+    ----------
+    sensor
+        The unit as it is calibrated.
+    poses
+        Not fitted.
+    stage
+        The unit with what was found of the stage (its level), which no sensor is blamed for;
+        None takes the stage to be as it says.
+
     """
-    up = np.where(np.cos(poses.alpha_rad) < 0, -1, 1)
+    reference = reference_force(poses, sensor.local_gravity_mps2) if stage is None else \
+        force_on(stage, poses.alpha_rad, poses.beta_rad)
+    up = np.where(reference[2] < 0, -1, 1)
     force = chain.inverse(sensor, up)(list(poses.volts.T), poses.environment)
     covariance = force_covariance(sensor, force, np.mean(poses.std_v, axis=0) ** 2,
                                   poses.environment)
     measures_z = 'z' in sensor.axes
     angles = tilt(force, covariance, measures_z)
-    turned = poses.alpha_rad - 2 * np.pi * np.round(poses.alpha_rad / (2 * np.pi))
-    alpha = np.abs(turned)
+    alpha = np.arctan2(np.hypot(*reference[:2]), reference[2])
     if not measures_z:
         alpha = np.minimum(alpha, np.pi - alpha)
-    beta = poses.beta_rad + np.where(turned < 0, np.pi, 0.0)
-    reference = reference_force(poses, sensor.local_gravity_mps2)
+    beta = np.arctan2(-reference[1], reference[0])
     measured = [AXES.index(a) for a in sensor.axes]
     shown = angles.alpha_std < _BLIND_RAD
     return Errors(
@@ -191,8 +203,8 @@ def rms_interval(values: np.ndarray) -> tuple[float, float]:
         rms * float(np.sqrt(nu / chi2.isf(0.95, nu)))
 
 
-def held_out(fits: dict[str, Fit], sensor: Sensor,
-             poses: Poses) -> list[Score]:
+def held_out(fits: dict[str, Fit], sensor: Sensor, poses: Poses,
+             stage: Sensor | None = None) -> list[Score]:
     """
     Score models on poses kept out of their fit.
 
@@ -208,6 +220,8 @@ def held_out(fits: dict[str, Fit], sensor: Sensor,
         The nominal sensor that they start from.
     poses
         All of them, check poses too.
+    stage
+        As for `errors`.
 
     """
     scores = []
@@ -218,7 +232,7 @@ def held_out(fits: dict[str, Fit], sensor: Sensor,
                 units.append(fit(sensor, poses.subset(~out)))
             except UserError:
                 continue
-            parts.append(errors(units[-1], poses.subset(out)))
+            parts.append(errors(units[-1], poses.subset(out), stage))
             index.append(np.flatnonzero(out))
         if parts:
             scores.append(_joined(model, parts, index, units))

@@ -19,6 +19,7 @@ from __future__ import annotations
 from typing import Any
 
 from adxl_ros.calibrate import directions, known
+from adxl_ros.calibrate.plan import MOVE_S
 from adxl_ros.calibrate.rests import Stillness
 from adxl_ros.calibrate.session import Session
 from adxl_ros.calibrate.stream import Newest
@@ -28,9 +29,6 @@ from adxl_ros.model.coefficients import get
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.sensor import Sensor
 import numpy as np
-
-_MOVE_S = 5.0
-"""Time from a pose to the next, beside the dwell, until there is some experience."""
 
 
 class View:
@@ -79,7 +77,7 @@ class View:
         """Return the time that a pose takes, by those of this session, s."""
         ends = [e['stop_ns'] for e in list(walk.accepted.values())[self._first:]]
         if len(ends) < 3:
-            return walk.settings.dwell_s + _MOVE_S
+            return walk.settings.dwell_s + MOVE_S
         return float(np.median(np.abs(np.diff(ends)))) * 1e-9
 
     def _learned(self) -> dict[str, Any]:

@@ -141,3 +141,46 @@ class Track:
         if not self._gap_ns or not self._square_count:
             return 0.0
         return (self._square_sum / self._square_count) ** 0.5
+
+
+class Command:
+    """
+    One joint's commands over time: each is in force from its stamp to the stamp of the next.
+
+    Commands are few and far between, so that samples are not held back for them: a command that
+    is read after later samples have been handed on counts from the next sample on.
+    """
+
+    def __init__(self) -> None:
+        """Start with no message."""
+        self._stamp_ns = np.zeros(0, np.int64)
+        self._value = np.zeros(0)
+
+    def add(self, stamp_ns: np.ndarray, value: np.ndarray) -> None:
+        """
+        Append messages.
+
+        Parameters
+        ----------
+        stamp_ns
+            Stamps, ns, (k,), in any order. Of messages with the same stamp the last one counts.
+        value
+            Where the joint shall go, (k,); NaN in a message that does not say it.
+
+        """
+        given = ~np.isnan(value)
+        stamps = np.concatenate([self._stamp_ns, stamp_ns[given]])
+        order = np.argsort(stamps, kind='stable')
+        self._stamp_ns = stamps[order]
+        self._value = np.concatenate([self._value, value[given]])[order]
+
+    def at(self, stamp_ns: np.ndarray) -> np.ndarray:
+        """Return the command in force at stamps, ns, (n,): (n,), NaN before the first one."""
+        return np.concatenate([[np.nan], self._value])[
+            np.searchsorted(self._stamp_ns, stamp_ns, 'right')]
+
+    def forget(self, stamp_ns: int) -> None:
+        """Drop what no sample from `stamp_ns` on needs."""
+        start = int(np.searchsorted(self._stamp_ns, stamp_ns, 'right')) - 1
+        if start > 0:
+            self._stamp_ns, self._value = self._stamp_ns[start:], self._value[start:]

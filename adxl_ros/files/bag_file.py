@@ -16,15 +16,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 import os
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import cdr
-from adxl_ros.files.align import seconds, Track
+from adxl_ros.files.align import Command, seconds, Track
 from adxl_ros.files.bag_storage import Bag, open_bag
 from adxl_ros.files.bag_topics import find_ideal, find_topics, read_info, Topics
-from adxl_ros.files.columns import ACCEL, JOINTS, LIMIT, Recording
+from adxl_ros.files.columns import ACCEL, COMMANDS, JOINTS, LIMIT, Recording
 from adxl_ros.model.constants import AXES
 import numpy as np
 
@@ -62,29 +63,44 @@ def blocks(path: str | os.PathLike, rows: int, ideal: bool = False) -> Iterator[
         info = read_info(bag, topics.info)
         samples = _Samples(f'{bag.path}: topic {topics.imu}', 'xyz' if ideal else info.get('axes'))
         tracks = _tracks(bag, topics)
-        for messages, is_last in _batches(bag, topics, rows):
-            samples.add(messages.pop(topics.imu, []))
-            _add_references(bag, topics, tracks, messages)
+        commands = {column: Command() for column in COMMANDS.values() if topics.command}
+        for batch, is_last in _batches(bag, topics, rows):
+            samples.add(batch.messages.pop(topics.imu, []))
+            if topics.command:
+                _add_commands(f'{bag.path}: topic {topics.command}', commands,
+                              batch.messages.pop(topics.command),
+                              samples.arrived_ns[batch.samples_before])
+            _add_references(bag, topics, tracks, batch.messages)
             ready = len(samples.stamp_ns) if is_last else samples.ready(tracks)
             for start in range(0, ready, rows):
-                yield _block(bag, samples, tracks, info, slice(start, min(start + rows, ready)))
+                yield _block(bag, samples, tracks, commands, info,
+                             slice(start, min(start + rows, ready)))
             samples.drop(ready)
     if not samples.count:
         raise UserError(f'{samples.where}: holds no message')
 
 
-def _batches(bag: Bag, topics: Topics,
-             rows: int) -> Iterator[tuple[dict[str, list[bytes]], bool]]:
-    """Yield messages by topic, `rows` of the sensor at a time, and whether they are the last."""
+@dataclass
+class _Batch:
+    """Messages by topic, and how many samples of the batch came before each command."""
+
+    messages: dict[str, list[bytes]]
+    samples_before: list[int]
+
+
+def _batches(bag: Bag, topics: Topics, rows: int) -> Iterator[tuple[_Batch, bool]]:
+    """Yield batches, each with `rows` samples of the sensor, and whether it is the last."""
     names = topics.sampled()
-    batch: dict[str, list[bytes]] = {name: [] for name in names}
-    imu = batch[topics.imu]
+    batch = _Batch({name: [] for name in names}, [])
+    imu = batch.messages[topics.imu]
     for topic, raw in bag.messages(names):
-        batch[topic].append(raw)
+        batch.messages[topic].append(raw)
+        if topic == topics.command:
+            batch.samples_before.append(len(imu))
         if len(imu) == rows:
             yield batch, False
-            batch = {name: [] for name in names}
-            imu = batch[topics.imu]
+            batch = _Batch({name: [] for name in names}, [])
+            imu = batch.messages[topics.imu]
     yield batch, True
 
 
@@ -98,12 +114,15 @@ class _Samples:
         self.count = 0
         self.stamp_ns = np.zeros(0, np.int64)
         self.accel = np.zeros((0, 3))
+        self.arrived_ns = np.zeros(1, np.int64)
+        """Stamps of the newest samples, the last one of those before them first; 0 is none."""
         self._last_ns: int | None = None
         self._frame: str | None = None
 
     def add(self, raws: list[bytes]) -> None:
         """Decode and check further messages."""
         if not raws:
+            self.arrived_ns = self.arrived_ns[-1:]
             return
         stamp_ns = np.empty(len(raws), np.int64)
         accel = np.empty((len(raws), 3))
@@ -116,6 +135,7 @@ class _Samples:
         self._check_time(stamp_ns)
         self._check_values(stamp_ns, accel)
         self.count += len(raws)
+        self.arrived_ns = np.concatenate([self.arrived_ns[-1:], stamp_ns])
         self.stamp_ns = np.concatenate([self.stamp_ns, stamp_ns])
         self.accel = np.concatenate([self.accel, accel])
 
@@ -192,7 +212,7 @@ def _add_references(bag: Bag, topics: Topics, tracks: dict[str, Track],
     for topic, raws in messages.items():
         where = f'{bag.path}: topic {topic}'
         if topic == topics.joints:
-            columns = _joints(where, raws)
+            columns = _joints(where, raws, JOINTS)
         elif topic == topics.temperature:
             columns = {'temperature_c': _scalar(where, raws, cdr.temperature, 'temperature')}
         else:
@@ -205,6 +225,18 @@ def _add_references(bag: Bag, topics: Topics, tracks: dict[str, Track],
             tracks[column].add(stamp_ns, value)
 
 
+def _add_commands(where: str, commands: dict[str, Command], raws: list[bytes],
+                  arrived_ns: np.ndarray) -> None:
+    """
+    Add commands; one without a stamp counts from the newest sample that was recorded before it.
+
+    What is no angle is no command: the stage refuses it.
+    """
+    for column, (stamp_ns, value) in _joints(where, raws, COMMANDS).items():
+        commands[column].add(np.where(stamp_ns == 0, arrived_ns, stamp_ns),
+                             np.where(np.abs(value) <= LIMIT, value, np.nan))
+
+
 def _scalar(where: str, raws: list[bytes], find: Callable[[bytes], cdr.Layout],
             name: str) -> tuple[np.ndarray, np.ndarray]:
     stamp_ns, value = np.empty(len(raws), np.int64), np.empty(len(raws))
@@ -214,24 +246,25 @@ def _scalar(where: str, raws: list[bytes], find: Callable[[bytes], cdr.Layout],
     return stamp_ns, value
 
 
-def _joints(where: str, raws: list[bytes]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+def _joints(where: str, raws: list[bytes], names: Mapping[str, str]
+            ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Return stamps and positions by column; a joint that a message does not name is NaN there."""
     stamp_ns = np.empty(len(raws), np.int64)
-    values = {column: np.full(len(raws), np.nan) for column in JOINTS.values()}
+    values = {column: np.full(len(raws), np.nan) for column in names.values()}
     for table in _tables(where, raws, cdr.joint_state):
         stamp_ns[table.rows] = table.stamp_ns()
-        names = [text for key, text in table.layout.texts.items() if key != 'frame_id']
+        joints = [text for key, text in table.layout.texts.items() if key != 'frame_id']
         if 'position' not in table.layout.fields:
             continue
         position = table.numbers('position')
-        for name, value in zip(names, position.T):
-            if name in JOINTS:
-                values[JOINTS[name]][table.rows] = value
+        for joint, value in zip(joints, position.T):
+            if joint in names:
+                values[names[joint]][table.rows] = value
     return {column: (stamp_ns, value) for column, value in values.items()}
 
 
-def _block(bag: Bag, samples: _Samples, tracks: dict[str, Track], info: dict[str, str],
-           part: slice) -> Recording:
+def _block(bag: Bag, samples: _Samples, tracks: dict[str, Track], commands: dict[str, Command],
+           info: dict[str, str], part: slice) -> Recording:
     stamp_ns = samples.stamp_ns[part]
     accel = samples.accel[part]
     columns = {name: np.ascontiguousarray(accel[:, i])
@@ -242,6 +275,9 @@ def _block(bag: Bag, samples: _Samples, tracks: dict[str, Track], info: dict[str
         track.forget(int(stamp_ns[-1]))
         notes[f'{name}_residual'] = track.residual
         notes[f'{name}_gap_s'] = track.gap_s
+    for name, command in commands.items():
+        columns[name] = command.at(stamp_ns)
+        command.forget(int(stamp_ns[-1]))
     # Divided, not multiplied by 1e-9: that gives the float64 nearest to the decimal figure.
     time_s = (stamp_ns - samples.epoch_ns) / 1e9
     if bag.cut:
@@ -250,8 +286,9 @@ def _block(bag: Bag, samples: _Samples, tracks: dict[str, Track], info: dict[str
 
 
 def drop_unsampled(recording: Recording) -> None:
-    """Take out the joints that the stage does not have: those without a single position."""
-    for column in JOINTS.values():
+    """Take out the joints without a single position, and those without a single command."""
+    for column in (*JOINTS.values(), *COMMANDS.values()):
         if column in recording.columns and np.isnan(recording.columns[column]).all():
             del recording.columns[column]
-            del recording.notes[f'{column}_residual'], recording.notes[f'{column}_gap_s']
+            for note in (f'{column}_residual', f'{column}_gap_s'):
+                recording.notes.pop(note, None)

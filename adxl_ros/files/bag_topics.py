@@ -40,10 +40,12 @@ class Topics:
     info: str | None = None
     temperature: str | None = None
     supply: str | None = None
+    command: str | None = None
 
     def sampled(self) -> list[str]:
         """Return the topics to read sample by sample."""
-        return [topic for topic in (self.imu, self.joints, self.temperature, self.supply) if topic]
+        return [topic for topic in (self.imu, self.joints, self.temperature, self.supply,
+                                    self.command) if topic]
 
 
 def find_topics(bag: Bag) -> Topics:
@@ -60,12 +62,14 @@ def find_topics(bag: Bag) -> Topics:
     if imu is None:
         raise UserError(f'{bag.path}: no topic imu/data_raw of type {IMU}; it holds {_held(bag)}')
     space = imu.removesuffix('imu/data_raw')
-    return Topics(imu,
-                  _beside(bag, space, 'stage/joint_states', JOINT_STATE),
+    joints = _beside(bag, space, 'stage/joint_states', JOINT_STATE)
+    stage = (joints or f'{space}stage/joint_states').removesuffix('joint_states')
+    return Topics(imu, joints,
                   _beside(bag, space, 'sensor_info', DIAGNOSTIC_STATUS),
-                  # Others use these two names as well: only the right type is the sensor's.
+                  # Others use these names as well: only the right type is meant.
                   _typed(bag, space + 'temperature', TEMPERATURE),
-                  _typed(bag, space + 'supply', BATTERY_STATE))
+                  _typed(bag, space + 'supply', BATTERY_STATE),
+                  _typed(bag, stage + 'command', JOINT_STATE))
 
 
 def find_ideal(bag: Bag) -> Topics:

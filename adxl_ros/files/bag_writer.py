@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from contextlib import ExitStack
 import os
 from pathlib import Path
@@ -34,7 +35,7 @@ from adxl_ros.files.bag_topics import (
     TEMPERATURE,
     typestore,
 )
-from adxl_ros.files.columns import converted_info, JOINTS, Recording
+from adxl_ros.files.columns import COMMANDS, converted_info, JOINTS, Recording
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.noise import sigma_v
 from adxl_ros.model.sensor import Sensor
@@ -56,7 +57,8 @@ class BagWriter:
 
     A context manager: the bag appears under its name when the block ends without an error. Each
     sample becomes a message of `imu/data_raw` and, where the references were sampled, one of
-    `stage/joint_states`, `temperature` and `supply` with the same stamp. The voltage of
+    `stage/joint_states`, `temperature` and `supply` with the same stamp. Where a command changes,
+    and once every 65536 samples, it becomes a message of `stage/command`. The voltage of
     sensor_msgs/BatteryState is float32. Columns that are none of the package's are left out.
     """
 
@@ -125,7 +127,10 @@ class BagWriter:
             part = slice(start, start + _ROWS_AT_ONCE)
             references = {name: values[part] for name, values in recording.columns.items()}
             batches = [self._imu_batch(stamp_ns[part], accel[part]),
-                       *self._joint_batches(stamp_ns[part], references),
+                       *self._joint_batches(stamp_ns[part], references, JOINTS,
+                                            '/stage/joint_states'),
+                       *self._joint_batches(stamp_ns[part], _changes(references), COMMANDS,
+                                            '/stage/command'),
                        *self._scalar_batches(stamp_ns[part], references)]
             self._write_in_order(stamp_ns[part], batches)
 
@@ -152,11 +157,10 @@ class BagWriter:
         data = cdr.fill(self._imu, cdr.imu(self._imu), stamp_ns, {'linear_acceleration': force})
         return self._connection('/imu/data_raw', IMU), np.arange(len(accel)), data
 
-    def _joint_batches(self, stamp_ns: np.ndarray,
-                       references: dict[str, np.ndarray]) -> list[_Batch]:
+    def _joint_batches(self, stamp_ns: np.ndarray, columns: dict[str, np.ndarray],
+                       names: Mapping[str, str], topic: str) -> list[_Batch]:
         """Return one batch for each set of joints that were sampled together."""
-        joints = {joint: references[column] for joint, column in JOINTS.items()
-                  if column in references}
+        joints = {joint: columns[column] for joint, column in names.items() if column in columns}
         if not joints:
             return []
         values = np.column_stack(list(joints.values()))
@@ -164,12 +168,12 @@ class BagWriter:
         batches = []
         for pattern in np.unique(sampled, axis=0):
             rows = np.flatnonzero((sampled == pattern).all(axis=1))
-            names = [joint for joint, is_there in zip(joints, pattern) if is_there]
-            if names:
-                template = _joint_template(self._types, names)
+            sampled_joints = [joint for joint, is_there in zip(joints, pattern) if is_there]
+            if sampled_joints:
+                template = _joint_template(self._types, sampled_joints)
                 data = cdr.fill(template, cdr.joint_state(template), stamp_ns[rows],
                                 {'position': values[rows][:, pattern]})
-                batches.append((self._connection('/stage/joint_states', JOINT_STATE), rows, data))
+                batches.append((self._connection(topic, JOINT_STATE), rows, data))
         return batches
 
     def _scalar_batches(self, stamp_ns: np.ndarray,
@@ -198,6 +202,17 @@ class BagWriter:
         for row, k, i in zip(rows[order].tolist(), owner[order].tolist(), place[order].tolist()):
             connection, _, data = batches[k]
             write(connection, stamps[row], data[i * sizes[k]:(i + 1) * sizes[k]])
+
+
+def _changes(columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return commands where they change and in the first row, NaN elsewhere."""
+    changed = {}
+    for name in COMMANDS.values():
+        if name in columns:
+            values = columns[name]
+            new = np.concatenate([[True], values[1:] != values[:-1]])
+            changed[name] = np.where(new & np.isfinite(values), values, np.nan)
+    return changed
 
 
 def _keep_file(file: Path, target: Path) -> None:

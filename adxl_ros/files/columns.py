@@ -30,6 +30,8 @@ VOLTS = ('x_v', 'y_v', 'z_v')
 ACCEL = ('ax_mps2', 'ay_mps2', 'az_mps2')
 JOINTS = {'alpha': 'alpha_rad', 'beta': 'beta_rad', 'shift': 'shift_m'}
 REFERENCES = (*JOINTS.values(), 'temperature_c', 'supply_v')
+COMMANDS = {'alpha': 'alpha_command_rad', 'beta': 'beta_command_rad'}
+"""Where a stage has been told to go: no reference, but it tells when a joint has been moved."""
 
 FORMAT = '1'
 """Version of the recording format, the `format` of sensor_info."""
@@ -53,8 +55,10 @@ class Recording:
     columns
         Arrays (n,) by column name: `x_v ...` in V or `ax_mps2 ...` in m/s² (nominal conversion),
         the references `alpha_rad`, `beta_rad`, `shift_m`, `temperature_c`, `supply_v` with NaN
-        where the reference was not sampled, and the other numeric columns of a CSV file. Where a
-        file has both, the volts are the sensor's output and m/s² is one of the other columns.
+        where the reference was not sampled, the commands in force `alpha_command_rad`,
+        `beta_command_rad` with NaN before the first one, and the other numeric columns of a CSV
+        file. Where a file has both, the volts are the sensor's output and m/s² is one of the other
+        columns.
     info
         The keys of `sensor_info` and other `# key: value` lines.
     notes : dict

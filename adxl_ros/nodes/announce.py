@@ -38,7 +38,8 @@ class Announcer:
 
     def __init__(self, node: Node) -> None:
         self._node = node
-        self._command = common.publisher(node, JointState, 'stage/command', 1)
+        # A recorder that stalls for seconds still gets each command: a bag tells what has moved.
+        self._command = common.publisher(node, JointState, 'stage/command', 10)
         self._next = common.publisher(node, DiagnosticStatus, '~/next_pose', 1, latched=True)
         self._said = ''
         self._commanded: tuple[int, int] = (-1, 0)

@@ -18,12 +18,16 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from adxl_ros.calibrate import plan
 from adxl_ros.calibrate.session import Plan
 from adxl_ros.calibrate.state import Settings, STAGE_MODES
 from adxl_ros.files import store
 from adxl_ros.nodes import common
 import numpy as np
 from rclpy.node import Node
+
+_CHECKS = {'full': 16, 'quick': 8}
+"""Poses that judge the fit and stay out of it, by plan."""
 
 
 def declare_plan(node: Node) -> Plan:
@@ -43,13 +47,7 @@ def declare_plan(node: Node) -> Plan:
     report = declare(node, 'report', '', 'directory for the report; empty: none')
     kept = declare(node, 'store', str(store.default_folder()),
                    'folder of calibrations that gets a copy; empty: none')
-    planes = declare(node, 'sweep.planes_rad',
-                     [float(degrees(a)) for a in (30, 60, 90, 120, 150)],
-                     'planes alpha of the sweep, rad')
-    step = declare(node, 'sweep.step_rad', float(degrees(30)), 'step of beta', 'rad', 0.005, 1.6)
     dwell = declare(node, 'sweep.dwell_s', 5.0, 'time at rest a pose', 's', 0.5, 3600.0)
-    checks = declare(node, 'sweep.check_poses', 16,
-                     'poses kept out of the fit for the verdict', '', 0, 1000)
     settings = Settings(
         dwell,
         declare(node, 'stage.tolerance_rad', float(degrees(0.2)), 'arrived within this', 'rad',
@@ -62,10 +60,41 @@ def declare_plan(node: Node) -> Plan:
         declare(node, 'sweep.temperature_span_c', 3.0,
                 'how far the temperature may be from that of the first pose', 'degC', 0.1,
                 1000.0))
+    kind, planes, step, checks = _poses(node, settings.stage_mode != 'commanded')
+    tilt_error = declare(node, 'sweep.tilt_error_deg', 0.1,
+                         'rms tilt error that the plan quick is to reach', 'deg', 1e-3, 10.0)
     journal = Path(journal or f'{output}.journal')
     for name, path in (('output', output), ('journal', journal)):
         if path.is_dir():
             raise common.fail(name, f'{path} is a directory; name a file')
-    asked = Plan(mode, tuple(planes), step, checks, settings, output, journal, report, kept)
-    asked.targets()
-    return asked
+    return Plan(mode, kind, planes, step, float(degrees(tilt_error)), checks, settings, output,
+                journal, report, kept)
+
+
+def _poses(node: Node, by_hand: bool) -> tuple[str, tuple[float, ...], float, int]:
+    """Return the kind of the plan, its planes and step of beta, rad, and its check poses."""
+    declare = common.declare
+    kind = declare(node, 'sweep.plan', 'auto', 'poses: full (planes), quick (the fewest for '
+                   'sweep.tilt_error_deg), or auto: quick where the stage is turned by hand and '
+                   'no planes are given', choices=('auto', *plan.KINDS))
+    usual = list(plan.default_planes_rad('xy'))
+    planes = list(declare(node, 'sweep.planes_rad', usual,
+                          'planes alpha of the plan full, rad; the default becomes 0 to pi for a '
+                          'sensor with a z axis'))
+    step_rad = declare(node, 'sweep.step_rad', plan.STEP_RAD, 'step of beta', 'rad', 0.005, 1.6)
+    step_deg = declare(node, 'sweep.step_deg', 0.0,
+                       'step of beta in degrees; 0: sweep.step_rad counts', 'deg', 0.0, 90.0)
+    checks = declare(node, 'sweep.check_poses', -1, 'poses kept out of the fit for the verdict; '
+                     '-1: 16, or 8 in the plan quick', '', -1, 1000)
+    if step_deg and step_rad != plan.STEP_RAD:
+        raise common.fail('sweep.step_deg', f'{step_deg:g} deg and sweep.step_rad {step_rad:g} '
+                          'rad are both given; keep one')
+    if step_deg:
+        step_rad = float(np.radians(step_deg))
+    default = planes == usual and step_rad == plan.STEP_RAD
+    if kind == 'auto':
+        kind = 'quick' if by_hand and default else 'full'
+    # A bad plan is refused before there is a sensor.
+    plan.guided(planes, step_rad, 0)
+    chosen = () if planes == usual else tuple(planes)
+    return kind, chosen, step_rad, (_CHECKS[kind] if checks < 0 else checks)

@@ -59,7 +59,7 @@ class Calibration(Node):
         self.unit: Sensor | None = None
         self.session: Session | None = None
         self.outcome: list[str] = []
-        self.question = ''
+        self.question = self._outlook = ''
         self.said = self._hindrance = self._warned = self._foreign = self._stuck = ''
         self._wanted = self.autostart
         self._anew = self.resume == 'anew'
@@ -78,6 +78,7 @@ class Calibration(Node):
         subscribe = common.subscription
         subscribe(self, DiagnosticStatus, 'sensor_info', self._on_info, 1, latched=True)
         subscribe(self, JointState, 'stage/joint_states', self._on_stage, 1000)
+        subscribe(self, JointState, 'stage/command', self._on_command, 100)
         subscribe(self, Temperature, 'temperature',
                   lambda m: self._surround('temperature_c', m, m.temperature), 100)
         subscribe(self, BatteryState, 'supply',
@@ -121,12 +122,18 @@ class Calibration(Node):
                 self._stop(f'sensor_info: {changed}: changed during the calibration; put it back '
                            'and start again, the poses are kept', failed=True)
         self.unit, self._newest = unit, Newest(unit)
+        self._outlook = self.asked.outlook(unit)
 
     def _on_stage(self, message: JointState) -> None:
         angles = dict(zip(message.name, message.position))
         pair = angles.get('alpha'), angles.get('beta')
         if self._sweep is not None and None not in pair and np.isfinite(pair).all():
             self._sweep.stage(_stamp_ns(message), *pair)
+
+    def _on_command(self, message: JointState) -> None:
+        angles = dict(zip(message.name, message.position))
+        if self._sweep is not None:
+            self._sweep.command(*(angles.get(joint, np.nan) for joint in ('alpha', 'beta')))
 
     def _surround(self, name: str, message: Temperature | BatteryState, value: float) -> None:
         if self.session is None:
@@ -263,7 +270,7 @@ class Calibration(Node):
         else:
             resumed = ''
         self.say(f'calibrating {unit.serial}: ' + (
-            f'{len(self._sweep.targets)} poses{resumed}' if self._sweep is not None else
+            f'{self._outlook}{resumed}' if self._sweep is not None else
             f'rest in 24 or more directions, then call ~/finish{resumed}'))
 
     def _poll(self) -> None:
@@ -393,7 +400,7 @@ class Calibration(Node):
             if self._wanted:
                 silent = '; is the driver running?' if self._samples.silent() else ''
                 return 'info', f'waiting for sensor_info{silent}', True
-            return 'idle', self.said or IDLE, False
+            return 'idle', self.said or '; '.join(filter(None, (IDLE, self._outlook))), False
         silent = self._samples.silent()
         if silent:
             return 'silent', silent, True

@@ -66,7 +66,7 @@ class Console:
         self._turns += 1
         if self._turns % _EVERY == 0:
             phase, text, _ = self._node.state()
-            self.show(phase, 'press b to begin' if text == IDLE else text)
+            self.show(phase, text.replace(IDLE, 'press b to begin'))
 
     def show(self, phase: str, text: str) -> None:
         """Show the figures now."""

@@ -17,9 +17,10 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+import math
 import os
 from pathlib import Path
 import signal
@@ -27,11 +28,16 @@ import subprocess
 import sys
 import time
 
+from adxl_ros.calibrate import against_truth, gravity, judge, linear, plan, verdict
+from adxl_ros.calibrate.against_truth import Comparison
+from adxl_ros.calibrate.poses import Poses
 from adxl_ros.errors import UserError
-from adxl_ros.files import params
+from adxl_ros.files import journal, params, recording
+from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.nodes.common import nominal_path
+from adxl_ros.screen import steps
 from diagnostic_msgs.msg import DiagnosticArray
 import numpy as np
 import rclpy
@@ -40,13 +46,38 @@ from rclpy.node import Node
 from std_srvs.srv import Trigger
 
 _SPEED = 12.0
+"""Sensor time per real time of the simulated sweep."""
+_REPLAY_SPEED = 20.0
+"""Sensor time per real time of a recording."""
+_SWEEP_S = 1060.0
+"""Sensor time of the sweep, s; measured."""
+_OVERHEAD_S = 7.0
+"""Real time of start, fit and report, s; measured."""
+_POLL_S = 0.2
+"""Time between two looks at the journal, s."""
 _SILENT_S = 60.0
+"""Longest time without news while poses are taken, s."""
+_FIT_S = 600.0
+"""Longest time of a fit, s."""
+_PLANES_RAD = tuple(float(np.radians(alpha)) for alpha in (30, 60, 90, 120, 150))
+"""Planes alpha of the sweep."""
+_STEP_RAD = float(np.radians(30))
+"""Step of beta in each plane."""
+_CHECKS = 16
+"""Number of poses that are kept out of the fit."""
 _UNATTENDED = ('-p', 'autostart:=true', '-p', 'screen:=false')
 _LOSSLESS = ('-p', 'qos_overrides./imu/data_raw.subscription.reliability:=reliable')
 """At many times real time a best-effort subscriber loses samples on a busy machine."""
 _DRAWN = {'bias': 0.5, 'scale_factor': 0.5, 'misalignment': 0.7, 'cross_axis': 0.7,
           'cross_axis_z': 1.0, 'scale_factor_z': 0.7}
 """Effects of the demonstrated unit, in multiples of their typical scale."""
+_MODELS = {'nominal': 'datasheet values', 'linear': 'linear calibration',
+           'physical': 'physical calibration', 'full': 'full calibration'}
+_LONGEST_LABEL = 26
+"""Columns that a coefficient's name may take, so that its line has at most 79."""
+_COLOURS = {judge.PASS: '\x1b[32m', judge.FAIL: '\x1b[31m'}
+NEXT_PAGE = 'docs/guided.md'
+"""Page that a user reads next."""
 
 
 class Watcher(Node):
@@ -54,7 +85,7 @@ class Watcher(Node):
 
     def __init__(self) -> None:
         super().__init__('demo')
-        self.said: dict[str, dict[str, str]] = {}
+        self.reports: dict[str, dict[str, str]] = {}
         self.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 10)
         self._finish = self.create_client(Trigger, 'calibration/finish')
         self._executor = SingleThreadedExecutor()
@@ -62,12 +93,12 @@ class Watcher(Node):
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
-            self.said[status.name] = {'message': status.message,
-                                      **{pair.key: pair.value for pair in status.values}}
+            values = {pair.key: pair.value for pair in status.values}
+            self.reports[status.name] = {'message': status.message, **values}
 
-    def of(self, node: str) -> dict[str, str]:
+    def report_of(self, node: str) -> dict[str, str]:
         """Return the newest diagnostics of a node."""
-        return next((values for name, values in self.said.items() if name.startswith(node)), {})
+        return next((values for name, values in self.reports.items() if name.startswith(node)), {})
 
     def watch(self, seconds: float) -> None:
         """Listen for so long."""
@@ -76,10 +107,91 @@ class Watcher(Node):
     def finish(self) -> str:
         """Ask the calibration to fit what it has; returns its answer."""
         future = self._finish.call_async(Trigger.Request())
-        self._executor.spin_until_future_complete(future, timeout_sec=60.0)
+        self._executor.spin_until_future_complete(future, timeout_sec=_FIT_S)
         if not future.done():
-            raise UserError('calibration/finish: no answer for 60 s')
+            raise UserError(f'calibration/finish: no answer for {_FIT_S:g} s')
         return future.result().message
+
+
+@dataclass
+class Graph:
+    """
+    The nodes that the demonstration runs, each in a process of its own.
+
+    Attributes
+    ----------
+    watcher
+        Hears what they report.
+    log
+        File that takes what they print.
+
+    """
+
+    watcher: Watcher
+    log: Path
+    processes: dict[str, subprocess.Popen] = field(default_factory=dict)
+
+    def start(self, name: str, params_file: Path, *arguments: str) -> None:
+        """
+        Start a node.
+
+        Parameters
+        ----------
+        name
+            Its executable.
+        params_file
+            Its parameter file.
+        arguments
+            Further ROS arguments.
+
+        """
+        command = [str(Path(sys.argv[0]).with_name(name)), '--ros-args', '--log-level', 'warn',
+                   '--params-file', str(params_file), *arguments]
+        with self.log.open('ab') as log:
+            self.processes[name] = subprocess.Popen(command, stdout=log, stderr=log)
+
+    def close(self) -> None:
+        """End the nodes."""
+        end(list(self.processes.values()))
+        self.processes.clear()
+
+    def wait(self, finished: Callable[[], bool], progress: Callable[[], object],
+             silent_s: float = _SILENT_S) -> None:
+        """
+        Wait until a condition holds.
+
+        Parameters
+        ----------
+        finished
+            The condition.
+        progress
+            Shows how far it is, and returns what changes as long as it goes on.
+        silent_s
+            Longest time without a change, s.
+
+        Raises
+        ------
+        UserError
+            A node has ended, the fit has failed, or nothing has changed for too long.
+
+        """
+        newest: object = None
+        heard_s = time.monotonic()
+        while not finished():
+            self.watcher.watch(_POLL_S)
+            message = self.watcher.report_of('calibration').get('message', '')
+            ended = [name for name, process in self.processes.items()
+                     if process.poll() is not None]
+            if ended:
+                raise UserError(f'the node {ended[0]} has ended; see {self.log}')
+            if message.startswith('cannot finish'):
+                raise UserError(f'{message}; see {self.log}')
+            news = (progress(), message)
+            if news != newest:
+                newest, heard_s = news, time.monotonic()
+            if time.monotonic() - heard_s > silent_s:
+                raise UserError(f'no progress for {silent_s:g} s; the calibration reported: '
+                                f'{message or "nothing"}; see {self.log}')
 
 
 def main() -> int:
@@ -95,10 +207,14 @@ def main() -> int:
     os.environ.setdefault('ROS_DOMAIN_ID', str(60 + os.getpid() % 40))
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
     try:
+        # A recording that cannot be read is refused before the sweep.
+        length_s = 0.0 if options.real is None else \
+            float(np.ptp(recording.read(options.real).time_s))
         options.output.mkdir(parents=True, exist_ok=True)
-        lines = _simulated(options.output, options.speed)
+        _simulated(options.output, options.speed)
         if options.real is not None:
-            lines += _real(options.output, options.real)
+            _real(options.output, options.real, length_s)
+        _print('', *file_lines({'Next': f'your own sensor: {NEXT_PAGE}'}))
     except UserError as error:
         print(f'demo: {error}', file=sys.stderr)
         return 1
@@ -107,49 +223,210 @@ def main() -> int:
         return 1
     except KeyboardInterrupt:
         return 130
-    print('\n' + '\n'.join(lines))
     return 0
 
 
-def _simulated(folder: Path, speed: float) -> list[str]:
+def _simulated(folder: Path, speed: float) -> None:
     """Sweep a simulated ADXL203 whose coefficients are drawn at datasheet spread."""
     unit, nominal = folder / 'simulated_unit.yaml', folder / 'nominal.yaml'
     sensor = replace(params.load(nominal_path()), serial='demo')
+    truth = _drawn(sensor)
     params.save(nominal, sensor)
-    params.save(unit, _drawn(sensor), ['The truth of the simulated unit.'])
-    output = folder / 'adxl203_demo.yaml'
-    print(f'A simulated ADXL203 on a simulated two-axis stage, {speed:g} times real time:')
-    clock = ['-p', 'use_sim_time:=true']
+    params.save(unit, truth, ['The truth of the simulated unit.'])
+    output, report = folder / 'adxl203_demo.yaml', folder / 'sweep'
+    _print(title('Demo: calibrate a simulated ADXL203 whose true coefficients are known',
+                 _SWEEP_S / speed + _OVERHEAD_S), '')
     _fresh(output)
-    with _graph() as (start, watcher):
-        start('driver', unit, '-p', f'link.speed:={speed}', *clock)
-        start('stage', nominal, *clock)
-        start('calibration', nominal, *clock, *_LOSSLESS, *_UNATTENDED, '-p',
-              f'output:={output}', '-p', f'report:={folder / "sweep"}', '-p',
-              f'store:={folder / "calibrations"}')
-        _wait(watcher, lambda: output.exists())
-    return ['Simulated ADXL203, poses that the fit has not seen:', *_verdict(output),
-            f'Coefficients: {output}; report: {folder / "sweep" / "report.html"}']
+    clock = ('-p', 'use_sim_time:=true')
+    with _graph(folder / 'sweep.log') as graph:
+        graph.start('driver', unit, '-p', f'link.speed:={speed}', *clock)
+        graph.start('stage', nominal, *clock)
+        graph.start('calibration', nominal, *clock, *_LOSSLESS, *_UNATTENDED, *_plan(),
+                    '-p', f'output:={output}', '-p', f'report:={report}',
+                    '-p', f'store:={folder / "calibrations"}')
+        poses = _sweep(graph, output)
+    fitted, held_out = params.load(output), poses.subset(poses.check)
+    models = {'nominal': sensor, 'linear': linear.fit(sensor, poses.subset(~poses.check)),
+              fitted.model: fitted}
+    scores = [verdict.score(model, verdict.errors(calibrated, held_out))
+              for model, calibrated in models.items()]
+    _print('', *scores_table(scores), '', *truth_table(against_truth.compare(fitted, truth)), '',
+           *verdict_lines(fitted), *added_lines(against_truth.added_effects(fitted, truth)), '',
+           *file_lines({'Page': report / 'report.html', 'Calibration': output}))
 
 
-def _real(folder: Path, recording: Path) -> list[str]:
+def _sweep(graph: Graph, output: Path) -> Poses:
+    """Show the sweep, the fit and the check while they run; return the poses."""
+    path = _journal(output)
+    total = len(plan.guided(_PLANES_RAD, _STEP_RAD, _CHECKS))
+    with steps.step('1/3 sweep', 'starting', total) as step:
+        def taken() -> int:
+            count = len(_poses(path))
+            if count:
+                step.show(f'{count} of {total} poses', count)
+            return count
+
+        graph.wait(lambda: taken() == total, taken)
+    fitting = f'{total - _CHECKS} poses'
+    with steps.step('2/3 fit', fitting) as step:
+        graph.wait(output.exists, lambda: None, _FIT_S)
+        step.show(f'{fitting}, {params.load(output).model} model')
+    with steps.step('3/3 check', f'{_CHECKS} poses that the fit has not seen'):
+        graph.wait(lambda: bool(_fitted_poses(path)), lambda: None, _FIT_S)
+        graph.close()
+    return Poses.from_entries(_fitted_poses(path))
+
+
+def _real(folder: Path, path: Path, length_s: float) -> None:
     """Calibrate a recorded sensor against gravity, replayed through the graph."""
-    output = folder / f'{recording.stem}.yaml'
-    print(f'{recording.name}, a real sensor turned by hand, 20 times real time:')
-    clock = ['-p', 'use_sim_time:=true']
+    output, report = folder / f'{path.stem}.yaml', folder / path.stem
+    _print('', title(f'Real recording {path.name}: a sensor turned by hand',
+                     length_s / _REPLAY_SPEED + _OVERHEAD_S), '')
+    clock = ('-p', 'use_sim_time:=true')
     _fresh(output)
-    with _graph() as (start, watcher):
-        start('calibration', nominal_path(), *clock, *_LOSSLESS, *_UNATTENDED, '-p',
-              'mode:=gravity', '-p', f'output:={output}', '-p',
-              f'report:={folder / recording.stem}', '-p', f'store:={folder / "calibrations"}')
-        start('driver', nominal_path(), '-p', 'link.type:=replay', '-p',
-              f'link.recording:={recording}', '-p', 'link.speed:=20.0', *clock)
-        _wait(watcher, lambda: watcher.of('driver').get('link_state') == 'ended')
-        answer = watcher.finish()
-    if not output.exists():
-        raise UserError(f'{recording}: {answer}')
-    return ['', f'{recording.stem}, a real sensor:', *_verdict(output),
-            f'Coefficients: {output}; report: {folder / recording.stem / "report.html"}']
+    with _graph(folder / f'{path.stem}.log') as graph:
+        graph.start('calibration', nominal_path(), *clock, *_LOSSLESS, *_UNATTENDED,
+                    '-p', 'mode:=gravity', '-p', f'output:={output}', '-p', f'report:={report}',
+                    '-p', f'store:={folder / "calibrations"}')
+        graph.start('driver', nominal_path(), '-p', 'link.type:=replay',
+                    '-p', f'link.recording:={path}', '-p', f'link.speed:={_REPLAY_SPEED}', *clock)
+        with steps.step('1/2 replay', 'starting') as step:
+            def rests() -> int:
+                count = len(_poses(_journal(output)))
+                if count:
+                    step.show(f'{count} rests')
+                return count
+
+            def replayed() -> bool:
+                return graph.watcher.report_of('driver').get('link_state') == 'ended'
+
+            graph.wait(replayed, rests)
+        with steps.step('2/2 fit', f'{rests()} rests') as step:
+            answer = graph.watcher.finish()
+            if not output.exists():
+                raise UserError(f'{path}: {answer}')
+            poses = Poses.from_entries(_fitted_poses(_journal(output)))
+            step.show(f'{len(poses)} rests, magnitude of gravity')
+            graph.close()
+    fitted = params.load(output)
+    nominal = replace(fitted, effects=(), values={}, covariance=np.zeros((0, 0)),
+                      covariance_names=())
+    _print('', *gravity_lines(gravity.fit_gravity(poses.volts, poses.std_v, nominal)), '',
+           *file_lines({'Page': report / 'report.html', 'Calibration': output}))
+
+
+def title(text: str, seconds: float) -> str:
+    """
+    Return a title with the time that its part takes.
+
+    Parameters
+    ----------
+    text
+        The title.
+    seconds
+        The time, s.
+
+    """
+    takes = f'{seconds / 60:.0f} min' if seconds >= 90 else f'{math.ceil(seconds / 10) * 10} s'
+    return f'{text}   ({takes})'
+
+
+def scores_table(scores: Sequence[verdict.Score]) -> list[str]:
+    """Lay out the errors of the models on held-out poses; the file holds the last model."""
+    lines = [f' {"":24}tilt error     acceleration error     (rms)']
+    lines += [f' {_MODELS[score.model]:22} {_three_digits(score.tilt_rms_deg):>9} ° '
+              f'{_three_digits(score.accel_rms_mg):>18} mg' for score in scores]
+    lines[-1] += '           <- saved'
+    return lines
+
+
+def _three_digits(value: float) -> str:
+    """Write a value so that the decimal points of a right-aligned column stand in one line."""
+    if np.isnan(value):
+        return '-   '
+    decimals = 1 if value >= 10 else 2 if value >= 1 else 3
+    return f'{value:.{decimals}f}'.ljust(len(f'{value:.3f}'))
+
+
+def truth_table(compared: Sequence[Comparison]) -> list[str]:
+    """Lay out each fitted coefficient beside the true one, in 79 columns."""
+    width = min(max((len(row.label) for row in compared), default=0) + 1, _LONGEST_LABEL)
+    width = max(width, len('coefficient'))
+    lines = [f' {"coefficient":{width}}     fitted (90 %) {"":16}true']
+    for row in compared:
+        decimals = _decimals(row.half_width)
+        fitted, half, truth = (f'{round(value, decimals) + 0.0:.{decimals}f}'
+                               for value in (row.fitted, row.half_width, row.truth))
+        truth = '0' if row.truth == 0 else truth
+        lines.append(f' {row.label[:width]:{width}} {row.axis:1} {fitted:>10} ± {half:8} '
+                     f'{row.unit:5} {truth:>10}   {"ok" if row.inside else "MISSED"}')
+    inside = sum(row.inside for row in compared)
+    return [*lines, f' ({inside} of {len(compared)} inside their 90 % intervals; about '
+            f'{0.9 * len(compared):.0f} are expected)']
+
+
+def _decimals(half_width: float) -> int:
+    """Return how many decimals show two digits of an interval."""
+    if not half_width > 0:
+        return 4
+    exponent = int(f'{half_width:.1e}'.partition('e')[2])
+    return min(max(1 - exponent, 0), 7)
+
+
+def verdict_lines(fitted: Sensor) -> list[str]:
+    """Say whether the calibration is as good as the datasheet, with figure, limit and meaning."""
+    figures = fitted.provenance
+    if 'own_accel_mg' not in figures:
+        return [f' {judge.NOT_SHOWN}  no pose was kept out of the fit to judge it']
+    error_mg = float(figures['own_accel_mg'])
+    limit = f'{1e3 * judge.linearity_mps2(fitted) / G0_MPS2:.2g} mg'
+    accel, tilt = (figures.get(f'verdict_{name}', '') for name in ('datasheet', 'tilt_datasheet'))
+    shown = f'calibration error {error_mg:#.2g} mg; the datasheet allows {limit}'
+    if judge.FAIL in (accel, tilt):
+        if accel != judge.FAIL:
+            shown = f'tilt error {float(figures["own_tilt_deg"]):.2g}°, more than {limit} causes'
+        return [f' {judge.FAIL}  {shown}',
+                '       The sensor is worse than its datasheet states: do not use this file.']
+    if judge.NOT_SHOWN in (accel, tilt):
+        return [f' {judge.NOT_SHOWN}  {shown}',
+                '            The check poses are too few to show that the limit is kept.']
+    return [f' {judge.PASS}  {shown}']
+
+
+def added_lines(effects: Sequence[str]) -> list[str]:
+    """Name each effect that the fit has and the simulated unit has not."""
+    return [f'       The fit has the term {effect}, which this unit does not have.'
+            for effect in effects]
+
+
+def gravity_lines(fit: gravity.GravityFit) -> list[str]:
+    """Lay out the errors of a calibration against gravity, before and after."""
+    kept = np.setdiff1d(np.arange(len(fit.before_mps2)), fit.outliers)
+    before, after, held_out = (
+        _three_digits(1e3 * float(np.sqrt(np.mean(values[kept] ** 2))) / G0_MPS2)
+        for values in (fit.before_mps2, fit.residual_mps2, fit.leave_one_out_mps2))
+    lines = [f' error of the magnitude of gravity, rms over {len(kept)} rests',
+             f' {"datasheet values":22} {before:>9} mg',
+             f' {"gravity calibration":22} {after:>9} mg   '
+             f'(on held-out rests {held_out.strip()} mg)    <- saved']
+    if fit.outliers:
+        count = len(fit.outliers)
+        lines.append(f' {count} disturbed {"rest was" if count == 1 else "rests were"} left out')
+    return lines
+
+
+def file_lines(named: dict[str, object]) -> list[str]:
+    """Lay out the files that are written, and what to do next."""
+    return [f' {name:12} {value}' for name, value in named.items()]
+
+
+def _print(*lines: str) -> None:
+    """Print lines; a verdict is coloured in a terminal."""
+    for line in lines:
+        word = line.split()[0] if line.split() else ''
+        if word in _COLOURS and steps.drawable() and 'NO_COLOR' not in os.environ:
+            line = line.replace(word, f'{_COLOURS[word]}{word}\x1b[0m', 1)
+        print(line, flush=True)
 
 
 def _drawn(sensor: Sensor) -> Sensor:
@@ -161,37 +438,52 @@ def _drawn(sensor: Sensor) -> Sensor:
     return replace(sensor, effects=tuple(_DRAWN), values=values)
 
 
-def _verdict(path: Path) -> list[str]:
-    """Return the verdict that stands in the head of a parameter file, after the coefficients."""
-    head = [line[2:] for line in path.read_text(encoding='utf-8').splitlines()
-            if line.startswith('#')]
-    return head[head.index('') + 1:]
+def _plan() -> tuple[str, ...]:
+    planes = ', '.join(str(alpha) for alpha in _PLANES_RAD)
+    return ('-p', f'sweep.planes_rad:=[{planes}]', '-p', f'sweep.step_rad:={_STEP_RAD}',
+            '-p', f'sweep.check_poses:={_CHECKS}')
+
+
+def _journal(output: Path) -> Path:
+    return output.with_name(f'{output.name}.journal')
+
+
+def _poses(path: Path) -> list[dict]:
+    """Return the poses that a journal has so far."""
+    return journal.accepted_poses(_entries(path))
+
+
+def _fitted_poses(path: Path) -> list[dict]:
+    """Return the poses that were fitted; the journal has them when everything is written."""
+    return next((entry['rests'] for entry in _entries(path) if 'rests' in entry), [])
+
+
+def _entries(path: Path) -> list[dict]:
+    try:
+        return journal.read(path)[1]
+    except UserError:
+        # Its head is not written yet.
+        return []
 
 
 def _fresh(output: Path) -> None:
     """Remove what an earlier demonstration left, so that this one's result can be told."""
-    for path in (output, output.with_name(f'{output.name}.journal')):
+    for path in (output, _journal(output)):
         path.unlink(missing_ok=True)
 
 
 @contextmanager
-def _graph() -> Iterator[tuple]:
-    """Yield a function that starts nodes, and a watcher; end them all at the end."""
-    processes: list[subprocess.Popen] = []
-
-    def start(name: str, parameters: Path, *arguments: str) -> None:
-        command = [str(Path(sys.argv[0]).with_name(name)), '--ros-args', '--log-level', 'warn',
-                   '--params-file', str(parameters), *arguments]
-        processes.append(subprocess.Popen(command))
-
+def _graph(log: Path) -> Iterator[Graph]:
+    """Make a graph without nodes; end its nodes at the end."""
+    log.unlink(missing_ok=True)
     rclpy.init(args=[])
-    watcher = Watcher()
+    graph = Graph(Watcher(), log)
     try:
-        yield start, watcher
+        yield graph
     finally:
-        watcher.destroy_node()
+        graph.watcher.destroy_node()
         rclpy.try_shutdown()
-        end(processes)
+        graph.close()
 
 
 def end(processes: Sequence[subprocess.Popen]) -> None:
@@ -203,23 +495,3 @@ def end(processes: Sequence[subprocess.Popen]) -> None:
             process.wait(10)
         except subprocess.TimeoutExpired:
             process.kill()
-
-
-def _wait(watcher: Watcher, finished: object) -> None:
-    """Show the calibration's progress until it has finished; raises when it falls silent."""
-    shown, tenth, heard = '', '', time.monotonic()
-    while not finished():
-        watcher.watch(0.2)
-        said = watcher.of('calibration')
-        text = f'  pose {said.get("pose", "-")}: {said.get("message", "starting")}'
-        if text != shown:
-            heard = time.monotonic()
-            if sys.stdout.isatty():
-                print(f'\r{text[:98]:98}', end='', flush=True)
-            elif said.get('pose', '')[:-1] != tenth:
-                print(text, flush=True)
-        shown, tenth = text, said.get('pose', '')[:-1]
-        if time.monotonic() - heard > _SILENT_S:
-            raise UserError(f'no progress for {_SILENT_S:g} s; the calibration said: {text}')
-    if sys.stdout.isatty():
-        print()

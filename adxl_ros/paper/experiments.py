@@ -16,8 +16,8 @@
 The experiments: a unit is drawn, swept, calibrated and tried, all through the simulator.
 
 Stage, filter, ADC and averaging are the paper's (its section III): an encoder of 5 arcmin within
-whose steps the stage stands anywhere, a base level to 0.1°, 32 kΩ ± 25 % and 0.33 µF, 16 bits at
-1 kHz, means of 5 s.
+whose steps a joint stands anywhere, anew after each move, a base level to 0.1°, 32 kΩ ± 25 % and
+0.33 µF, 16 bits at 1 kHz, means of 5 s.
 """
 
 from __future__ import annotations
@@ -130,7 +130,11 @@ def poses_at(truth: Sensor, read_rad: np.ndarray, seed: int
     rng = np.random.default_rng([seed, 1])
     step = truth.stage_resolution_rad
     on_grid = np.rint(read_rad / step) * step if step else read_rad
-    true = on_grid + step * rng.uniform(-0.5, 0.5, read_rad.shape)
+    # A joint that does not move keeps its error.
+    moved = np.diff(on_grid, axis=0, prepend=np.nan) != 0
+    errors = step * rng.uniform(-0.5, 0.5, read_rad.shape)
+    held = np.maximum.accumulate(np.where(moved, np.arange(len(moved))[:, None], 0), axis=0)
+    true = on_grid + np.take_along_axis(errors, held, axis=0)
     motion, ends_s = visited(true)
     columns = simulate(truth, motion, seed)
     time_s = columns.pop('time_s')

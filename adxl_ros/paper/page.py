@@ -28,7 +28,9 @@ TABLE_I = {('alpha', 'linear'): (2.88, 3.95), ('alpha', 'physical'): (0.32, 0.82
            ('beta', 'linear'): (1.64, 2.36), ('beta', 'physical'): (0.60, 0.82)}
 """The paper's rms and greatest error, deg."""
 MOTION_MMPS2 = {'linear': 299.8, 'physical': 20.8}
-_STAGE_WORDS = {'perfect': 'perfect stage', 'paper': "the paper's stage (5 arcmin, level 0.1°)"}
+_STAGE_WORDS = {
+    'perfect': 'perfect stage',
+    'paper': "the paper's stage (5 arcmin, a new error with each move of a joint, level 0.1°)"}
 FIGURES = 'reproduction'
 """Folder of the figures, beside the page."""
 NOTES = """\
@@ -57,7 +59,7 @@ NOTES = """\
 """
 
 
-def page(found: dict[str, list[Unit]], bound_mmps2: float, made: str) -> str:
+def page(found: dict[str, list[Unit]], bound_mmps2: float, made: str, coverage: str = '') -> str:
     """
     Lay out the page, Markdown.
 
@@ -69,6 +71,8 @@ def page(found: dict[str, list[Unit]], bound_mmps2: float, made: str) -> str:
         The floor of the motion experiment.
     made
         How it was made: version, date, seed.
+    coverage
+        The section of `coverage.page`; empty for none.
 
     """
     parts = ["# The paper's experiments, on simulated units", made,
@@ -78,6 +82,7 @@ def page(found: dict[str, list[Unit]], bound_mmps2: float, made: str) -> str:
     for stage, units in found.items():
         parts += [f'## {_STAGE_WORDS[stage][0].upper()}{_STAGE_WORDS[stage][1:]}', _tilt(units),
                   _to_reach(units), _motion(units, bound_mmps2)]
+    parts += [coverage] if coverage else []
     parts += ['## Direction of the x axis by (18)', _directions(found['paper']),
               '## Figures', _DRAWN, NOTES]
     return '\n\n'.join(part.strip('\n') for part in parts) + '\n'

@@ -16,10 +16,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from adxl_ros.calibrate import full, posed
 from adxl_ros.calibrate.poses import Poses
+from adxl_ros.calibrate.stage_error import StageError
 from adxl_ros.model import chain, noise, unfilter
 from adxl_ros.model.coefficients import put, with_neutral
 from adxl_ros.model.constants import AXES, G0_MPS2
@@ -77,14 +79,30 @@ class Angles:
         return (self.error / bound)[self.shown]
 
 
-def known_bound(truth: Sensor, swept: Poses, true_rad: np.ndarray) -> Sensor:
-    """Return the truth with the Cramér-Rao bound of a sweep for covariance."""
-    names = full.coefficients(truth.axes, (*full.TERMS, *full.GAUGE))
-    at = with_neutral(truth, (*full.TERMS, 'base_tilt'))
-    level = full.LEVEL_RAD if truth.stage_resolution_rad else 1e-9
-    stated = max(truth.stage_resolution_rad / np.sqrt(12), 1e-9)
+def known_bound(truth: Sensor, swept: Poses, true_rad: np.ndarray, stage: StageError,
+                terms: Sequence[str]) -> Sensor:
+    """
+    Return the truth with the Cramér-Rao bound of a sweep for covariance.
+
+    Parameters
+    ----------
+    truth
+        The unit on its stage.
+    swept
+        The poses of the sweep, with their settings.
+    true_rad
+        Where the stage really stood in them, rad, (k, 2).
+    stage
+        Levels of the stage's error; without any, the base is level, too.
+    terms
+        That are to be found.
+
+    """
+    names = full.coefficients(truth.axes, terms)
+    at = with_neutral(truth, (*(term.split('.')[0] for term in terms), 'base_tilt'))
+    level = full.LEVEL_RAD if stage.total_rad else 1e-9
     there = replace(swept, alpha_rad=true_rad[:, 0], beta_rad=true_rad[:, 1])
-    known = full.information(at, there, names, stated)
+    known = full.information(at, there, names, stage)
     of_base = [i for i, name in enumerate(names) if name.startswith('base_tilt')]
     known[of_base, of_base] += 1 / level ** 2 - 1 / full.LEVEL_RAD ** 2
     covariance = np.linalg.inv(known)

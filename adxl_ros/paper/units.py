@@ -22,6 +22,8 @@ from dataclasses import dataclass
 from functools import partial
 import os
 
+from adxl_ros.calibrate import full
+from adxl_ros.calibrate.stage_error import StageError
 from adxl_ros.model.coefficients import get
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.paper import experiments, misalignment, score
@@ -76,7 +78,9 @@ def judge(nominal: Sensor, stage: experiments.Stage, seed: int) -> Unit:
     rng = np.random.default_rng([seed, 0])
     truth = experiments.draw(nominal, stage, rng)
     run = experiments.calibrated(truth, seed)
-    bound = score.known_bound(truth, run.poses, run.true_rad)
+    bound = score.known_bound(
+        truth, run.poses, run.true_rad, StageError(truth.stage_resolution_rad / np.sqrt(12)),
+        (*full.terms_of(truth.axes), *full.GAUGE))
     anywhere = np.column_stack([np.arccos(rng.uniform(-1, 1, RANDOM_POSES)),
                                 rng.uniform(0, 2 * np.pi, RANDOM_POSES)])
     asked = {'random': anywhere, **{name: np.radians(deg) for name, deg in RUNS.items()}}

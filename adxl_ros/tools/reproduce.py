@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from dataclasses import replace
 from datetime import date
 from pathlib import Path
 
@@ -26,7 +27,7 @@ from adxl_ros.errors import UserError
 from adxl_ros.files import params, recording
 from adxl_ros.files.atomic import atomic_path
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.paper import experiments, figures, page, score, units
+from adxl_ros.paper import coverage, experiments, figures, page, score, units
 from adxl_ros.paper.page import FIGURES
 from adxl_ros.tools.common import default_params, make_folder, progress, run, say_notes
 import numpy as np
@@ -42,13 +43,18 @@ def parser() -> argparse.ArgumentParser:
                             '(default: the nominal ADXL203)')
     parse.add_argument('--seed', type=int, default=0)
     parse.add_argument('--units', type=int, default=20, help='how many are drawn')
+    parse.add_argument('--draws', type=int, default=0,
+                       help='units and stages more that are drawn to check the intervals '
+                            '(default: none; 300 take some 3 minutes on two cores)')
     parse.add_argument('-o', dest='output', metavar='DIR', required=True)
     return parse
 
 
 def reproduce(options: argparse.Namespace) -> int:
     """Run the tool; see `parser`."""
-    if options.units < 1:
+    if options.draws < 0:
+        raise UserError(f'--draws {options.draws}: must not be negative')
+    if options.units < (0 if options.draws else 1):
         raise UserError(f'--units {options.units}: at least 1 is needed')
     if options.seed < 0:
         raise UserError(f'--seed {options.seed}: must not be negative')
@@ -82,6 +88,9 @@ def _of_recordings(sensor: Sensor, paths: Sequence[str], folder: Path) -> str:
 def _simulated(sensor: Sensor, options: argparse.Namespace, folder: Path) -> str:
     if not sensor.axes.startswith('xy'):
         raise UserError(f'the paper has a sensor of the axes x and y, not {sensor.axes}')
+    coverage_part = _coverage(sensor, options) if options.draws else ''
+    if not options.units:
+        return coverage_part
     with progress('reproduce') as show:
         found = units.judge_all(sensor, options.units, options.seed, show)
     first = 1000 * options.seed
@@ -98,7 +107,15 @@ def _simulated(sensor: Sensor, options: argparse.Namespace, folder: Path) -> str
     drawn = 'one unit' if sensor.effects else f'{options.units} units'
     made = (f'adxl_ros {provenance.package_version()}, {date.today()}, {drawn} on each stage, '
             f'seed {options.seed}.')
-    return page.page(found, score.motion_bound_mmps2(sensor), made)
+    return page.page(found, score.motion_bound_mmps2(sensor), made, coverage_part)
+
+
+def _coverage(sensor: Sensor, options: argparse.Namespace) -> str:
+    with progress('coverage') as show:
+        draws = coverage.draw_all(replace(sensor, effects=(), values={}), options.draws,
+                                  options.seed, show)
+    return coverage.page(draws, f'adxl_ros {provenance.package_version()}, {date.today()}, seed '
+                                f'{options.seed}; `make coverage`.')
 
 
 def main() -> int:

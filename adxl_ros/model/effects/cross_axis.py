@@ -12,15 +12,18 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Bias from the other in-plane axis: g(V_c) of equations 10 and 11, centred and in g."""
+"""Bias from the other in-plane axis: g(V_c) of (10) and (11), centred and in g; z: from x."""
 
 from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
 
+OTHER = (1, 0, 0)
+"""Number of the axis c by the number of the own axis: x has y, y has x, and z has x."""
+
 
 def apply(signals: Signals, p: Parameters) -> None:
-    """Add p1·A_c + p2·A_c² to the x and y axes, c being the other of the two."""
-    for d, (p1, p2) in enumerate(zip(p['linear'][:2], p['quadratic_per_g'][:2])):
-        other = signals.sensed[1 - d]
+    """Add p1·A_c + p2·A_c² to each measured axis, c being its `OTHER`."""
+    for d, (p1, p2) in enumerate(zip(p['linear'], p['quadratic_per_g'])):
+        other = signals.sensed[OTHER[d]]
         signals.output[d] = signals.output[d] + (p1 + p2 * other) * other
 
 
@@ -29,9 +32,9 @@ EFFECT = Effect(
     place=Place.ELEMENT,
     parameters=(
         Parameter('linear', 'g/g', -0.3, 0.3, 0.015, 'ADXL203 datasheet: cross-axis 1.5 %',
-                  'p1 of equation 11; to first order the same as a misalignment', 'xy'),
+                  'p1 of equation 11; to first order the same as a misalignment'),
         Parameter('quadratic_per_g', '1/g', -0.3, 0.3, 0.01, 'paper, figure 4',
-                  'p2 of equation 11', 'xy'),
+                  'p2 of equation 11'),
     ),
     apply=apply,
     invertible=True,

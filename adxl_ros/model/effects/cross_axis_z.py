@@ -12,16 +12,19 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Bias from the out-of-plane axis: h(V_z) of equations 12 and 13, centred and in g."""
+"""Bias from the out-of-plane axis: h(V_z) of equations 12 and 13, centred, in g; z: from y."""
 
 from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
 
+OTHER = (2, 2, 1)
+"""Number of the other axis by the number of the own axis: x and y have z, and z has y."""
+
 
 def apply(signals: Signals, p: Parameters) -> None:
-    """Add q1·A_z + q2·A_z² to the x and y axes."""
-    az = signals.sensed[2]
-    for d, (q1, q2) in enumerate(zip(p['linear'][:2], p['quadratic_per_g'][:2])):
-        signals.output[d] = signals.output[d] + (q1 + q2 * az) * az
+    """Add q1·A_z + q2·A_z² to the x and y axes, and the same of A_y to the z axis."""
+    for d, (q1, q2) in enumerate(zip(p['linear'], p['quadratic_per_g'])):
+        other = signals.sensed[OTHER[d]]
+        signals.output[d] = signals.output[d] + (q1 + q2 * other) * other
 
 
 EFFECT = Effect(
@@ -29,9 +32,9 @@ EFFECT = Effect(
     place=Place.ELEMENT,
     parameters=(
         Parameter('linear', 'g/g', -0.3, 0.3, 0.015, 'ADXL203 datasheet: cross-axis 1.5 %',
-                  'q1 of equation 13; to first order the same as a misalignment', 'xy'),
+                  'q1 of equation 13; to first order the same as a misalignment'),
         Parameter('quadratic_per_g', '1/g', -0.3, 0.3, 0.01, 'paper, figure 6',
-                  'q2 of equation 13', 'xy'),
+                  'q2 of equation 13'),
     ),
     apply=apply,
     invertible=True,

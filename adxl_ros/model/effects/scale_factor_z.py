@@ -12,16 +12,23 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Scale factor that depends on the out-of-plane axis: equations 15 and 17, centred and in g."""
+"""
+Scale factor that depends on the out-of-plane axis: equations 15 and 17, centred and in g.
+
+For the z axis it is the scale factor that depends on y.
+"""
 
 from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
 
+OTHER = (2, 2, 1)
+"""Number of the other axis by the number of the own axis: x and y have z, and z has y."""
+
 
 def apply(signals: Signals, p: Parameters) -> None:
-    """Add A_d·(r1·A_z + r2·A_z²) to the x and y axes."""
-    az = signals.sensed[2]
-    for d, (r1, r2) in enumerate(zip(p['linear_per_g'][:2], p['quadratic_per_g2'][:2])):
-        signals.output[d] = signals.output[d] + signals.sensed[d] * (r1 + r2 * az) * az
+    """Add A_d·(r1·A_z + r2·A_z²) to the x and y axes, and the same with A_y to the z axis."""
+    for d, (r1, r2) in enumerate(zip(p['linear_per_g'], p['quadratic_per_g2'])):
+        other = signals.sensed[OTHER[d]]
+        signals.output[d] = signals.output[d] + signals.sensed[d] * (r1 + r2 * other) * other
 
 
 EFFECT = Effect(
@@ -29,9 +36,9 @@ EFFECT = Effect(
     place=Place.ELEMENT,
     parameters=(
         Parameter('linear_per_g', '1/g', -0.3, 0.3, 0.01, 'paper, figure 8',
-                  'r1 over r0 of equation 15', 'xy'),
+                  'r1 over r0 of equation 15'),
         Parameter('quadratic_per_g2', '1/g^2', -0.3, 0.3, 0.01, 'paper, figure 8',
-                  'r2 over r0 of equation 15', 'xy'),
+                  'r2 over r0 of equation 15'),
     ),
     apply=apply,
     invertible=True,

@@ -1,0 +1,47 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Scale factor that depends on the other in-plane axis; of the z axis, on x.
+
+The paper has only the dependence on z (15). At rest A_c² of the other axis is g² less the squares
+of the two others, so that a quadratic term here would be `nonlinearity`, `scale_factor_z` and
+`scale_factor` together: the effect has none.
+"""
+
+from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
+
+OTHER = (1, 0, 0)
+"""Number of the axis c by the number of the own axis: x has y, y has x, and z has x."""
+
+
+def apply(signals: Signals, p: Parameters) -> None:
+    """Add s·A_d·A_c to each measured axis, c being its `OTHER`."""
+    for d, s in enumerate(p['linear_per_g']):
+        signals.output[d] = signals.output[d] + s * signals.sensed[d] * signals.sensed[OTHER[d]]
+
+
+EFFECT = Effect(
+    name='scale_factor_cross',
+    place=Place.ELEMENT,
+    parameters=(
+        Parameter('linear_per_g', '1/g', -0.3, 0.3, 0.01,
+                  'as scale_factor_z: paper, figure 8',
+                  'relative change of the scale factor for 1 g on the other axis'),
+    ),
+    apply=apply,
+    invertible=True,
+    cause='The other in-plane axis changes the scale factor; calibrate with several planes '
+          'alpha.',
+)

@@ -1,0 +1,145 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The steps of a job in a terminal: what is done, how far it is, how long it has taken."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+import os
+import sys
+import time
+from typing import Any
+
+_BAR_WIDTH = 30
+"""Columns of the bar. A line with its bar has 79 columns."""
+_NAME_WIDTH, _TEXT_WIDTH, _LINE_WIDTH = 11, 16, 69
+_TENTHS = 10
+"""Where there is no terminal, so many lines show a step from its beginning to its end."""
+
+
+@contextmanager
+def step(name: str, text: str, total: int = 0) -> Iterator[Step]:
+    """
+    Show one step of a job while it runs.
+
+    A terminal shows one line with the time and, where the total is known, a bar. Elsewhere, and
+    without rich, there is a line for each tenth of the total and one at the end.
+
+    Parameters
+    ----------
+    name
+        Number and name of the step.
+    text
+        What it begins with.
+    total
+        How much there is to do; 0 if that is not known.
+
+    """
+    shown = (_InTerminal if drawable() else _AsLines)(name, text, total)
+    try:
+        yield shown
+        shown.end()
+    finally:
+        shown.close()
+
+
+def drawable() -> bool:
+    """Tell whether stdout is a terminal that can draw, and rich is installed."""
+    if not sys.stdout.isatty() or os.environ.get('TERM') == 'dumb':
+        return False
+    try:
+        import rich  # noqa: F401
+    except ImportError:
+        return False
+    return True
+
+
+class Step:
+    """One step, wherever it is shown."""
+
+    def __init__(self, name: str, text: str, total: int) -> None:
+        self._name, self._text, self._total, self._done = name, text, total, 0
+
+    def show(self, text: str, done: int = 0) -> None:
+        """
+        Show how far the step is.
+
+        Parameters
+        ----------
+        text
+            What is done.
+        done
+            How much of the total that is.
+
+        """
+        self._text, self._done = text, done
+
+    def end(self) -> None:
+        """Show that the step has succeeded."""
+
+    def close(self) -> None:
+        """Stop drawing, whether it has succeeded or not."""
+
+    def _line(self) -> str:
+        width = _TEXT_WIDTH if self._total else _LINE_WIDTH - _NAME_WIDTH - 2
+        return f' {self._name:{_NAME_WIDTH}} {self._text:{width}}'
+
+
+class _AsLines(Step):
+    """Prints a line for each tenth, and one at the end."""
+
+    def __init__(self, name: str, text: str, total: int) -> None:
+        super().__init__(name, text, total)
+        self._begin_s, self._tenth = time.monotonic(), 0
+
+    def show(self, text: str, done: int = 0) -> None:
+        super().show(text, done)
+        tenth = _TENTHS * done // self._total if self._total else 0
+        if self._tenth < tenth < _TENTHS:
+            self._print()
+        self._tenth = max(tenth, self._tenth)
+
+    def end(self) -> None:
+        self._print()
+
+    def _print(self) -> None:
+        share = f' {100 * self._done / self._total:3.0f} %' if self._total else ''
+        print(f'{self._line()}{share} {time.monotonic() - self._begin_s:4.0f} s', flush=True)
+
+
+class _InTerminal(Step):
+    """Draws a line anew ten times a second, also while the caller waits."""
+
+    def __init__(self, name: str, text: str, total: int) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, TextColumn
+
+        super().__init__(name, text, total)
+        columns: list[Any] = [TextColumn('{task.description}', markup=False)]
+        if total:
+            columns += [BarColumn(_BAR_WIDTH), TextColumn('{task.percentage:3.0f} %')]
+        self._bar = Progress(*columns, TextColumn('{task.elapsed:4.0f} s'),
+                             console=Console(file=sys.stdout, highlight=False))
+        self._task = self._bar.add_task(self._line(), total=total or None)
+        self._bar.start()
+
+    def show(self, text: str, done: int = 0) -> None:
+        super().show(text, done)
+        self._bar.update(self._task, description=self._line(),
+                         completed=done if self._total else None)
+
+    def close(self) -> None:
+        self._bar.stop()

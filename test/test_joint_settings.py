@@ -1,0 +1,457 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Settings of a joint: the rule, and the same numbers from sweep, journal, bag and CSV."""
+
+from dataclasses import replace
+import json
+
+from adxl_ros.calibrate import joint_settings, recorded
+from adxl_ros.calibrate.joint_settings import recorded_settings, SettingTracker
+from adxl_ros.calibrate.plan import Target
+from adxl_ros.calibrate.poses import Poses, together
+from adxl_ros.calibrate.state import Settings
+from adxl_ros.calibrate.sweep import Sweep
+from adxl_ros.files import recording
+from adxl_ros.files.columns import COMMANDS, Recording, sensor_info
+from adxl_ros.links.sim_stage import SimulatedStage
+from adxl_ros.model.sensor import to_nominal_mps2
+from adxl_ros.model.stage import specific_force
+import numpy as np
+import pytest
+from units import Bench, Fed, nominal
+
+NAN = float('nan')
+STEP = 1e-3
+TOLERANCE = 1.5 * STEP
+RESTS = ((0, 10), (20, 30), (40, 50))
+
+
+def by_rows(readings, commands, rests):
+    """Return the settings as in a recording."""
+    return recorded_settings(np.array(rests), np.array(readings), np.array(commands),
+                             TOLERANCE).tolist()
+
+
+def one_by_one(readings, commands, rests):
+    """Return the settings as in a live sweep: readings and commands come one by one."""
+    tracker = SettingTracker(TOLERANCE)
+    numbers = []
+    for row, (reading, command) in enumerate(zip(readings, commands)):
+        tracker.read(row, reading, NAN)
+        tracker.command(row, command, NAN)
+        for start, stop in rests:
+            # A pose is taken some time after its end.
+            if row == stop + 3:
+                seen = [a for a in readings[start:stop] if np.isfinite(a)]
+                pose = start, stop - 1, np.mean(seen) if seen else NAN, NAN
+                numbers.append(tracker.settings(*pose)[0])
+                tracker.take(*pose)
+    return numbers
+
+
+def changed(**parts):
+    """Return 60 values of 0, but for rows `from_to=value`, named r20_30 for rows 20 to 30."""
+    values = [0.0] * 60
+    for rows, value in parts.items():
+        first, stop = map(int, rows[1:].split('_'))
+        values[first:stop] = [value] * (stop - first)
+    return values
+
+
+@pytest.mark.parametrize('number', [by_rows, one_by_one])
+@pytest.mark.parametrize(('readings', 'commands', 'settings'), [
+    (changed(), changed(), [0, 0, 0]),
+    # The encoder.
+    (changed(r12_14=0.3), changed(), [0, 1, 1]),
+    (changed(r12_13=1.6 * STEP), changed(), [0, 1, 1]),
+    (changed(r12_14=STEP, r16_18=-STEP), changed(), [0, 0, 0]),
+    (changed(r15_60=STEP), changed(), [0, 0, 0]),
+    (changed(r15_60=2 * STEP), changed(), [0, 1, 1]),
+    (changed(r15_35=0.3), changed(), [0, 1, 2]),
+    # The end of a rest that is found in a recording may hold the beginning of the next move.
+    (changed(r29_60=2 * STEP), changed(), [0, 0, 1]),
+    (changed(r14_22=-2 * STEP), changed(), [0, 1, 1]),
+    # Where it is not sampled.
+    (changed(r11_19=NAN), changed(), [0, 0, 0]),
+    (changed(r11_40=NAN), changed(), [0, 0, 0]),
+    (changed(r11_40=NAN, r40_60=0.3), changed(), [0, 0, 1]),
+    (changed(r18_40=NAN, r12_14=0.3), changed(), [0, 1, 1]),
+    (changed(r0_60=NAN), changed(), [0, 0, 0]),
+    # The command.
+    (changed(), changed(r15_60=0.3), [0, 1, 1]),
+    (changed(), changed(r12_14=0.3), [0, 1, 1]),
+    (changed(), changed(r12_14=2e-9), [0, 1, 1]),
+    # A controller takes its time: a rest goes on after the next command.
+    (changed(), changed(r22_60=0.3), [0, 0, 1]),
+    (changed(), changed(r12_14=1e-10), [0, 0, 0]),
+    (changed(), changed(r0_12=0.1, r12_20=NAN, r20_60=0.1), [0, 0, 0]),
+    (changed(), changed(r0_12=0.1, r12_20=NAN, r20_60=0.2), [0, 1, 1]),
+    (changed(), changed(r1_32=NAN), [0, 0, 0]),
+    (changed(), changed(r0_60=NAN), [0, 0, 0]),
+    (changed(), changed(r0_32=NAN), [0, 0, 1]),
+    (changed(r0_60=NAN), changed(r15_30=0.1), [0, 1, 2]),
+])
+def test_a_joint_has_moved_when_its_encoder_or_its_command_has(
+        number, readings, commands, settings):
+    assert number(readings, commands, RESTS) == settings
+
+
+def test_the_live_tracker_and_a_recording_agree_whatever_comes(monkeypatch):
+    """Random walks of encoder and command, with gaps; the tracker remembers few readings."""
+    monkeypatch.setattr(joint_settings, '_KEPT', 12)
+    rng = np.random.default_rng(5)
+    moves = 0
+    for _ in range(300):
+        walk = np.cumsum(rng.choice([0] * 30 + [1, -1, 2], 60)) * STEP
+        readings = np.where(rng.random(60) < rng.choice([0, 0.3]), NAN, walk).tolist()
+        told = rng.integers(0, 3, 60) * 0.1
+        commands = np.where(rng.random(60) < 0.98, NAN, told).tolist()
+        found = by_rows(readings, commands, RESTS)
+        assert one_by_one(readings, commands, RESTS) == found
+        moves += found[-1]
+    assert 200 < moves < 580
+
+
+def test_rests_may_come_in_any_order():
+    readings, commands = np.array(changed(r15_60=0.3)), np.array(changed(r35_60=0.1))
+    assert recorded_settings(np.array(RESTS)[[2, 0, 1]], readings, commands,
+                             TOLERANCE).tolist() == [2, 0, 1]
+    assert recorded_settings(np.array(RESTS), None, commands, TOLERANCE).tolist() == [0, 0, 1]
+    assert recorded_settings(np.array(RESTS), readings, None, TOLERANCE).tolist() == [0, 1, 1]
+    assert recorded_settings(np.array(RESTS[:1]), readings, None, TOLERANCE).tolist() == [0]
+
+
+def test_the_tolerance_is_one_and_a_half_steps_of_the_encoder():
+    assert joint_settings.angle_tolerance_rad(nominal(stage_resolution_rad=2e-3)) == 3e-3
+    assert joint_settings.angle_tolerance_rad(nominal(stage_resolution_rad=0.0)) == 1e-5
+
+
+ALPHA, BETA = np.pi / 2, np.pi / 6
+PLAN = [Target(ALPHA, 0.0), Target(ALPHA, BETA), Target(1.2, BETA), Target(1.2, BETA),
+        Target(1.2, 0.0)]
+
+
+def bench(mode='commanded', targets=PLAN, accepted=(), **settings):
+    """Return a sweep with poses of 1 s, on a bench."""
+    chosen = Settings(1.0, np.radians(0.2), 20.0, mode, **settings)
+    return Bench(Sweep(nominal(), targets, chosen, accepted), nominal())
+
+
+def take(on, alpha=None, beta=None):
+    """Rest where the sweep wants it, or a little beside; return the entry of the pose."""
+    target = on.sweep.target
+    alpha, beta = (wanted if given is None else given for wanted, given in (
+        (target.alpha_rad, alpha), (target.beta_rad, beta)))
+    on.run(0.2, alpha, beta)
+    on.sweep.capture()
+    entry = on.run(5, alpha, beta)
+    # As it is in a journal.
+    entry = json.loads(json.dumps(entry))
+    on.sweep.take(entry)
+    return entry
+
+
+def numbers(entries):
+    """Return the settings of both joints, in the order of time."""
+    by_time = sorted(entries, key=lambda e: e['start_ns'])
+    return [e['alpha_setting'] for e in by_time], [e['beta_setting'] for e in by_time]
+
+
+@pytest.mark.parametrize('mode', ['commanded', 'encoder', 'manual'])
+def test_a_sweep_numbers_its_settings(mode):
+    """A joint that the next target leaves where it is keeps its setting."""
+    on = bench(mode)
+    entries = [take(on) for _ in PLAN]
+    assert numbers(entries) == ([0, 0, 1, 1, 1], [0, 1, 1, 1, 2])
+    assert on.sweep.target is None
+
+
+def test_what_the_operator_turns_by_the_way_has_moved():
+    """With an encoder a turn away and back is seen, and flicker is none."""
+    step = nominal().stage_resolution_rad
+    on = bench('encoder', [Target(ALPHA, 0.0)] * 4)
+    entries = [take(on)]
+    on.run(0.2, ALPHA + 0.1, 0.0)
+    entries.append(take(on))
+    on.run(0.2, ALPHA + step, -step)
+    entries.append(take(on, ALPHA + step))
+    on.run(0.2, ALPHA, 2 * step)
+    entries.append(take(on))
+    assert numbers(entries) == ([0, 1, 1, 1], [0, 0, 0, 1])
+
+
+def test_a_command_that_the_encoder_does_not_show_is_a_move():
+    """A stage draws a new error: below a step of the encoder, and after a way there and back."""
+    tiny = nominal().stage_resolution_rad / 10
+    on = bench('commanded', [Target(ALPHA, 0.0), Target(ALPHA, tiny), Target(ALPHA, tiny)])
+    assert numbers([take(on, beta=0.0) for _ in range(3)]) == ([0, 0, 0], [0, 1, 1])
+    by_others = bench('encoder', [Target(ALPHA, 0.0)] * 5)
+    entries = []
+    for commands in ([(ALPHA, 0.0)], [(ALPHA, 0.0), (ALPHA, NAN)], [(ALPHA, 0.1), (NAN, 0.0)],
+                     [(ALPHA, np.inf)], [(1.0, 0.0)]):
+        for command in commands:
+            by_others.sweep.command(*command)
+        entries.append(take(by_others))
+    assert numbers(entries) == ([0, 0, 0, 0, 1], [0, 0, 1, 1, 1])
+
+
+@pytest.mark.parametrize('mode', ['commanded', 'manual'])
+def test_a_target_that_is_left_again_was_a_command(mode):
+    """Skip and redo send the stage, or the operator, away and back."""
+    on = bench(mode)
+    entries = [take(on)]
+    on.sweep.skip()
+    assert on.sweep.target == PLAN[2]
+    on.sweep.skip()
+    entries.append(take(on))
+    assert numbers(entries) == ([0, 1], [0, 1])
+    # The pose before is taken again: its own joints have gone to the last target and back.
+    on.sweep.redo()
+    entries.append(take(on))
+    entries.append(take(on))
+    assert numbers(entries) == ([0, 1, 1, 1], [0, 1, 2, 3])
+
+
+def test_a_refused_pose_and_readings_after_the_dwell_move_nothing():
+    """What is taken counts; a stage that goes on early moves for the next pose."""
+    on = bench('encoder', [Target(ALPHA, 0.0)] * 3, temperature_span_c=1.0)
+    on.sweep.surroundings.add('temperature_c', on.now_ns, 20.0)
+    entries = [take(on)]
+    on.sweep.surroundings.add('temperature_c', on.now_ns, 30.0)
+    on.run(0.2, ALPHA, 0.0)
+    assert on.sweep.capture() == ''
+    assert on.run(3, ALPHA, 0.0) is None
+    assert 'temperature moved' in on.sweep.refused()
+    on.sweep.surroundings.add('temperature_c', on.now_ns, 20.0)
+    on.sweep.capture()
+    entry = on.run(3, ALPHA, 0.0)
+    on.sweep.stage(entry['stop_ns'] + 10_000_000, ALPHA + 0.02, 0.0)
+    again = on.sweep.accept()
+    assert again['alpha_setting'] == entry['alpha_setting'] == 0
+    on.sweep.take(again)
+    entries += [again, take(on)]
+    assert numbers(entries) == ([0, 0, 1], [0, 0, 0])
+
+
+def test_after_an_interruption_both_joints_have_moved():
+    """The stage may have lost power. Numbers go on; the mounting check counts as a way."""
+    on = bench(targets=[Target(ALPHA, 0.0), *[Target(ALPHA, BETA)] * 5])
+    before = [take(on) for _ in range(3)]
+    assert numbers(before) == ([0, 0, 0], [0, 1, 1])
+    begun, on = on, bench(targets=on.sweep.targets, accepted=before)
+    on.now_ns = begun.now_ns
+    while on.sweep.verifying:
+        target = on.sweep.target
+        assert on.run(3, target.alpha_rad, target.beta_rad) is None
+    after = [take(on) for _ in range(3)]
+    assert numbers(after) == ([1, 1, 1], [2, 2, 2])
+    poses = Poses.from_entries([*after, *before])
+    assert poses.alpha_setting.tolist() == [1, 1, 1, 0, 0, 0]
+    # A driver that was started anew: the way to the check and back is by command.
+    on = bench(targets=on.sweep.targets, accepted=())
+    entries = [take(on) for _ in range(2)]
+    on.sweep.verify()
+    while on.sweep.verifying:
+        target = on.sweep.target
+        assert on.run(3, target.alpha_rad, target.beta_rad) is None
+    entries.append(take(on))
+    assert numbers(entries) == ([0, 0, 0], [0, 1, 2])
+
+
+@pytest.mark.parametrize('back_s', [5, 86400])
+@pytest.mark.parametrize('mode', ['commanded', 'encoder', 'manual'])
+def test_a_clock_that_goes_back_leaves_open_whether_the_stage_has_moved(mode, back_s):
+    """Both joints count as moved, and later poses are numbered as before."""
+    on = bench(mode, [Target(ALPHA, 0.0), *[Target(ALPHA, BETA)] * 5])
+    entries = [take(on) for _ in range(3)]
+    on.now_ns -= back_s * 10 ** 9
+    on.run(0.2, ALPHA, BETA)
+    while on.sweep.verifying:
+        target = on.sweep.target
+        on.sweep.capture()
+        assert on.run(3, target.alpha_rad, target.beta_rad) is None
+    after = [take(on) for _ in range(3)]
+    assert numbers(entries) == ([0, 0, 0], [0, 1, 1])
+    assert numbers(after) == ([1, 1, 1], [2, 2, 2])
+
+
+def test_journals_of_earlier_versions_are_numbered_by_their_angles():
+    """In the order of time, whatever the order of the entries; beside new ones, too."""
+    entries = [{'mean_v': [2.5], 'std_v': [1e-5], 'alpha_rad': alpha, 'beta_rad': beta,
+                'start_ns': 10 * i, 'stop_ns': 10 * i + 5}
+               for i, (alpha, beta) in enumerate([(1, 0), (1, 1), (1, 0), (2, 0)])]
+    poses = Poses.from_entries([entries[i] for i in (2, 0, 3, 1)])
+    assert poses.alpha_setting.tolist() == [0, 0, 1, 0]
+    assert poses.beta_setting.tolist() == [2, 0, 2, 1]
+    new = [{**entries[3], 'start_ns': 100 + i, 'alpha_setting': 0, 'beta_setting': i}
+           for i in range(2)]
+    mixed = Poses.from_entries([*entries, *new])
+    assert mixed.alpha_setting.tolist() == [0, 0, 0, 1, 2, 2]
+    assert len(set(mixed.beta_setting.tolist())) == 5
+    both = together([poses, Poses.from_entries(new)])
+    assert both.alpha_setting.tolist() == [0, 0, 1, 0, 2, 2]
+    assert Poses.from_entries([{**entries[0], 'alpha_rad': NAN}]).alpha_setting.tolist() == [0]
+
+
+class Run:
+    """A commanded sweep on the simulated stage, recorded as a bag would be."""
+
+    def __init__(self, targets, seed=2, rate_hz=200.0):
+        self.sensor = nominal(serial='S1', rate_hz=rate_hz)
+        step = self.sensor.stage_resolution_rad
+        self.stage = SimulatedStage(np.zeros(3), np.array([2.0, 2.0, 0.01]), 0.2,
+                                    np.array([step, step, 0.0]), seed)
+        self.sweep = Sweep(self.sensor, targets, Settings(1.0, np.radians(0.2), 20.0,
+                                                          'commanded'))
+        self.fed = Fed(self.sensor, seed)
+        self.now_ns, self.commanded = 1_750_000_000_000_000_000, None
+        self.samples, self.joints, self.commands, self.entries = [], [], [], []
+
+    def turn(self):
+        """Go on by 10 ms."""
+        target = self.sweep.target
+        if target != self.commanded or self.now_ns % 500_000_000 == 0:
+            self.commanded = target
+            self.stage.command({'alpha': target.alpha_rad, 'beta': target.beta_rad})
+            self.commands.append((self.now_ns, target.alpha_rad, target.beta_rad))
+        before = self.stage.position.copy()
+        self.stage.step(0.01)
+        count = round(self.sensor.rate_hz / 100)
+        stamps = self.now_ns + np.arange(count) * round(1e9 / self.sensor.rate_hz)
+        way = np.linspace(before, self.stage.position, count, endpoint=False).T
+        volts = self.fed(specific_force(way[0], way[1], 9.80665))
+        self.samples += zip(stamps.tolist(), volts)
+        alpha, beta, _ = self.stage.encoder()
+        self.joints.append((self.now_ns + 3_000_000, alpha, beta))
+        self.sweep.stage(*self.joints[-1])
+        self.sweep.feed(stamps, volts)
+        self.now_ns += 10_000_000
+        entry = self.sweep.accept()
+        if entry is not None:
+            self.entries.append(json.loads(json.dumps(entry)))
+            self.sweep.take(entry)
+
+    def pose(self):
+        """Go on until a pose is taken."""
+        done = len(self.entries)
+        while len(self.entries) == done:
+            self.turn()
+
+    def bag(self, path):
+        """Write what came to a bag, in the order of arrival."""
+        bags = pytest.importorskip('bags', reason='rosbags is not installed')
+        sent = [bags.imu(t, [*to_nominal_mps2(v[None], self.sensor)[0], 0.0])
+                for t, v in self.samples]
+        sent += [bags.joints(t, alpha=a, beta=b) for t, a, b in self.joints]
+        sent += [bags.joints(t, '/stage/command', alpha=a, beta=b) for t, a, b in self.commands]
+        return bags.bag_of(path, [bags.info(**sensor_info(self.sensor)),
+                                  *sorted(sent, key=lambda one: one.stamp_ns)])
+
+
+def same_partition(some, others):
+    """Tell whether two lists of numbers put the same poses together."""
+    pairs = set(zip(some, others))
+    return len(pairs) == len(set(some)) == len(set(others))
+
+
+def by_rests(read, unit, entries):
+    """Find the rests without a journal; return the settings of those of a journal's poses."""
+    poses = recorded.poses_of(read, unit)
+    begin, end = (read.epoch_ns + np.rint(poses.time_s * 1e9).astype(np.int64)).T
+    middle = [(e['start_ns'] + e['stop_ns']) // 2 for e in entries]
+    rest = [int(np.flatnonzero((begin <= m) & (m <= end))[0]) for m in middle]
+    return poses.alpha_setting[rest], poses.beta_setting[rest]
+
+
+def check_all_agree(read, unit, entries):
+    """Assert that a recording numbers the settings as its journal does."""
+    alpha, beta = (np.array([e[f'{joint}_setting'] for e in entries])
+                   for joint in ('alpha', 'beta'))
+    by_journal = recorded.poses_of(read, unit, entries)
+    assert (by_journal.alpha_setting == alpha).all() and (by_journal.beta_setting == beta).all()
+    bare = [{k: v for k, v in e.items() if not k.endswith('_setting')} for e in entries]
+    named = recorded.poses_of(read, unit, bare)
+    for found in ((named.alpha_setting, named.beta_setting), by_rests(read, unit, entries)):
+        assert same_partition(found[0].tolist(), alpha.tolist())
+        assert same_partition(found[1].tolist(), beta.tolist())
+
+
+def test_sweep_journal_bag_and_csv_give_the_same_settings(tmp_path):
+    """With poses taken again and left out, and commands that the encoder does not show."""
+    tiny = nominal().stage_resolution_rad / 10
+    targets = [Target(a, b) for a in (0.5, 1.0) for b in (0.0, 0.8, 1.6)]
+    targets += [Target(1.3, 1.6 + tiny), Target(1.0, 1.6 + tiny), Target(1.0, 1.6 + tiny),
+                Target(1.0, 0.3)]
+    run = Run(targets)
+    for _ in range(3):
+        run.pose()
+    # The stage is on its way to the next pose when the one before is to be taken again.
+    for _ in range(20):
+        run.turn()
+    run.sweep.redo()
+    for _ in range(2):
+        run.pose()
+    run.turn()
+    run.sweep.skip()
+    while run.sweep.target is not None:
+        run.pose()
+    entries = [run.sweep.accepted[number] for number in sorted(run.sweep.accepted)]
+    assert len(entries) == 9
+    live = Poses.from_entries(entries)
+    assert live.alpha_setting.tolist() == [0, 0, 1, 2, 2, 3, 4, 4, 4]
+    assert live.beta_setting.tolist() == [0, 1, 3, 4, 5, 6, 6, 6, 7]
+    read = recording.read(run.bag(tmp_path / 'bag'))
+    unit = recorded.recorded_unit(run.sensor, read)
+    check_all_agree(read, unit, entries)
+    recording.write(tmp_path / 'run.csv', read, unit)
+    of_csv = recording.read(tmp_path / 'run.csv')
+    check_all_agree(of_csv, unit, entries)
+    # By way of a CSV into a bag again.
+    recording.write(tmp_path / 'again.mcap', of_csv, unit)
+    again = recording.read(tmp_path / 'again.mcap')
+    check_all_agree(again, unit, entries)
+    for name in COMMANDS.values():
+        assert np.array_equal(again.columns[name], read.columns[name], equal_nan=True)
+    # Without commands, the encoder tells of all moves that it shows.
+    for name in COMMANDS.values():
+        del read.columns[name]
+    poses = recorded.poses_of(read, unit, [{**e, 'alpha_setting': -1} for e in entries])
+    assert (poses.alpha_setting == -1).all(), 'the numbers of a journal stand'
+    _, beta = by_rests(read, unit, entries)
+    assert same_partition(beta.tolist(), [0, 1, 3, 4, 5, 5, 5, 5, 7])
+
+
+def test_a_sweep_with_a_journal_of_an_earlier_version_is_numbered_by_the_recording(tmp_path):
+    """Its entries tell the rests, and the samples tell what has moved."""
+    run = Run([Target(0.5, 0.0), Target(0.5, 0.8), Target(0.5, 0.8)])
+    for _ in range(2):
+        run.pose()
+    # Something turns beta away and back.
+    run.stage.position[1] += 0.1
+    run.pose()
+    read = recording.read(run.bag(tmp_path / 'bag'))
+    unit = recorded.recorded_unit(run.sensor, read)
+    bare = [{k: v for k, v in e.items() if not k.endswith('_setting')} for e in run.entries]
+    poses = recorded.poses_of(read, unit, bare)
+    assert poses.alpha_setting.tolist() == [0, 0, 0]
+    assert poses.beta_setting.tolist() == [0, 1, 2]
+    assert Poses.from_entries(run.entries).beta_setting.tolist() == [0, 1, 2]
+
+
+def test_a_recording_without_a_stage_has_one_setting():
+    columns = {'x_v': np.random.default_rng(0).normal(2.5, 1e-3, 5000)}
+    read = Recording('made', np.arange(5000) / 1000, columns, sensor_info(nominal('x')))
+    poses = recorded.poses_of(read, replace(nominal('x'), rate_hz=1000.0))
+    assert set(poses.alpha_setting.tolist()) == {0}

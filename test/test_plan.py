@@ -1,0 +1,84 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""Plans of a sweep: what they cost, what they promise, and that they keep it."""
+
+from adxl_ros.calibrate import full, plan, quick_plan
+import numpy as np
+import pytest
+from units import drawn, nominal, swept
+
+STEP = np.radians(30)
+
+
+def promised_deg(axes, targets, resolution_deg=5 / 60):
+    """Return the tilt error to expect, deg."""
+    sensor = nominal(axes, stage_resolution_rad=np.radians(resolution_deg))
+    return np.degrees(quick_plan.expected_tilt_error_rad(sensor, 5.0, targets))
+
+
+@pytest.mark.parametrize('axes', ['xy', 'xyz'])
+def test_the_guided_order_beats_the_papers_on_a_stage_that_keeps_its_errors(axes):
+    """The same poses promise at most half of the tilt error, on a way that is no longer."""
+    planes = plan.default_planes_rad('xy')
+    guided, paper = plan.guided(planes, STEP, 0), plan.sweep(planes, STEP, 0)
+    assert sorted(map(str, guided)) == sorted(map(str, paper))
+    assert promised_deg(axes, guided) < 0.5 * promised_deg(axes, paper)
+    assert plan.travel_rad(guided) < 1.05 * plan.travel_rad(paper)
+
+
+@pytest.mark.parametrize('axes, fewest', [('xy', 30), ('xyz', 24)])
+def test_the_quick_plan_reaches_its_tilt_error(axes, fewest):
+    """About 30 poses on a usual stage, more where more is asked, whole steps of 15°."""
+    sensor = nominal(axes)
+    targets = quick_plan.quick(sensor, 5.0, np.radians(0.1), 8)
+    fitted = [t for t in targets if not t.check]
+    assert len(fitted) == fewest and len(targets) == fewest + 8
+    assert promised_deg(axes, fitted) <= 0.1
+    angles = np.degrees([(t.alpha_rad, t.beta_rad) for t in fitted])
+    np.testing.assert_allclose(angles / 15, np.rint(angles / 15), atol=1e-9)
+    finer = np.radians(0.95 * promised_deg(axes, fitted))
+    more = quick_plan.quick(sensor, 5.0, finer, 0)
+    assert len(more) > fewest
+    assert np.radians(promised_deg(axes, more)) <= finer
+
+
+@pytest.mark.parametrize('axes', ['xy', 'xyz'])
+@pytest.mark.parametrize('kind', plan.KINDS)
+def test_fits_reach_the_intervals_that_a_plan_promises(axes, kind):
+    """The standard deviations of the coefficients are the promised ones, on average."""
+    sensor = nominal(axes)
+    targets = plan.guided(plan.default_planes_rad(axes), STEP, 0) if kind == 'full' else \
+        quick_plan.quick(sensor, 5.0, np.radians(0.1), 0)
+    ratios = []
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        truth = drawn(rng, sensor, full.terms_of(axes))
+        poses = swept(rng, truth, per_setting=True, targets=targets)
+        found = full.fit_full(sensor, poses)
+        spread = np.sqrt(np.diag(found.fitted.covariance))
+        promised = quick_plan.nothing_known(sensor, 5.0).after(targets)
+        stds = dict(zip(promised.names, promised.std))
+        ratios += [s / stds[name] for s, name in zip(spread, found.fitted.covariance_names)]
+    assert np.exp(np.mean(np.log(ratios))) == pytest.approx(1.0, abs=0.15)
+
+
+def test_planes_of_a_z_axis_are_level_too():
+    """A three-axis unit sees 1 g on each axis; in level planes beta makes quarter turns."""
+    planes = plan.default_planes_rad('xyz')
+    assert np.degrees(planes[0]) == 0 and np.degrees(planes[-1]) == pytest.approx(180)
+    targets = plan.guided(planes, STEP, 0)
+    assert sum(t.alpha_rad == 0 for t in targets) == 10
+    assert len(targets) == 130 + 20

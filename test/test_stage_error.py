@@ -1,0 +1,110 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+
+"""The covariance of all poses against its closed form, and the levels of the stage's error."""
+
+from dataclasses import replace
+
+from adxl_ros.calibrate import full, linearised, posed
+from adxl_ros.calibrate.poses import Poses, together
+from adxl_ros.calibrate.stage_error import PoseCovariance, shared_settings, StageError
+from adxl_ros.model.coefficients import with_neutral
+import numpy as np
+import pytest
+from units import drawn, nominal, swept
+
+ERROR = StageError(4e-4, 2e-4)
+
+
+@pytest.fixture(scope='module')
+def poses():
+    """Return a sweep whose joints keep their errors."""
+    rng = np.random.default_rng(3)
+    return swept(rng, drawn(rng, nominal()), per_setting=True, check_poses=4)
+
+
+def dense(slope, poses, error):
+    """Write the covariance out: noise, an error a pose, and an error a setting, joint by joint."""
+    count, axes = slope.shape[:2]
+    found = np.diag((poses.std_v ** 2).ravel())
+    for joint, setting in enumerate((poses.alpha_setting, poses.beta_setting)):
+        angles = error.setting_rad ** 2 * (setting[:, None] == setting) \
+            + error.pose_rad ** 2 * np.eye(count)
+        part = np.einsum('km,kl,ln->kmln', slope[:, :, joint], angles, slope[:, :, joint])
+        found += part.reshape(count * axes, count * axes)
+    return found
+
+
+def test_products_and_determinant_are_those_of_the_dense_covariance(poses):
+    """Woodbury's formula gives what the inverse of the whole matrix gives."""
+    slope = posed.by_angles(nominal(), poses)
+    columns = np.random.default_rng(1).normal(size=(len(poses), 2, 5))
+    whole = dense(slope, poses, ERROR)
+    covariance = PoseCovariance(slope, poses, shared_settings(poses), ERROR)
+    flat = columns.reshape(-1, 5)
+    np.testing.assert_allclose(covariance.products(columns),
+                               flat.T @ np.linalg.solve(whole, flat), rtol=1e-8)
+    assert covariance.log_determinant() == pytest.approx(np.linalg.slogdet(whole)[1], abs=1e-6)
+
+
+def test_predicted_errors_are_the_best_linear_ones(poses):
+    """Errors of setting and pose are those of the conditional normal distribution."""
+    slope = posed.by_angles(nominal(), poses)
+    residual = np.random.default_rng(2).normal(size=poses.volts.shape) * 1e-4
+    covariance = PoseCovariance(slope, poses, shared_settings(poses), ERROR)
+    weighted = np.linalg.solve(dense(slope, poses, ERROR), residual.ravel()).reshape(
+        residual.shape)
+    felt = np.einsum('kmj,km->kj', slope, weighted)
+    expected = ERROR.pose_rad ** 2 * felt
+    for joint, setting in enumerate((poses.alpha_setting, poses.beta_setting)):
+        expected[:, joint] += ERROR.setting_rad ** 2 * (
+            setting[:, None] == setting) @ felt[:, joint]
+    np.testing.assert_allclose(covariance.predicted(residual).total_rad, expected, rtol=1e-7,
+                               atol=1e-15)
+
+
+def test_poses_that_do_not_count_change_nothing(poses):
+    """Products of some poses are those of these alone."""
+    slope = posed.by_angles(nominal(), poses)
+    columns = np.random.default_rng(1).normal(size=(len(poses), 2, 3))
+    kept = np.arange(len(poses)) % 7 != 0
+    some = PoseCovariance(slope, poses, shared_settings(poses), ERROR, kept)
+    own = poses.subset(kept)
+    alone = PoseCovariance(slope[kept], own, shared_settings(own), ERROR)
+    np.testing.assert_allclose(some.products(columns), alone.products(columns[kept]), rtol=1e-8)
+    assert some.log_determinant() == pytest.approx(alone.log_determinant(), abs=1e-6)
+
+
+def test_a_stated_error_counts_where_poses_do_not_tell(poses):
+    """Few poses leave the level at the stated one; many decide it themselves."""
+    unit = with_neutral(nominal(), ('bias', 'scale_factor', 'base_tilt'))
+    names = full.coefficients('xy', ('bias', 'scale_factor'))
+    few = linearised.linearised(unit, poses.subset(np.arange(4)), names, full.priors(names))
+    assert few.stage_error(1e-3).total_rad == pytest.approx(1e-3, rel=1.0)
+    quiet = replace(poses, volts=posed.response(unit, poses))
+    many = linearised.linearised(unit, quiet, names, full.priors(names))
+    assert many.stage_error(1e-3).total_rad < 1e-4
+
+
+def test_settings_without_numbers_follow_the_angles():
+    """Each change of the angle is a move, and no setting outlasts its recording."""
+    alpha, beta = np.array([0.0, 0.0, 1.0, 0.0]), np.array([0.0, 1.0, 1.0, 1.0])
+    nothing = np.zeros((4, 2))
+    one = Poses(nothing, nothing, alpha, beta, nothing, np.zeros(4, bool))
+    assert one.alpha_setting.tolist() == [0, 0, 1, 2]
+    assert one.beta_setting.tolist() == [0, 1, 1, 1]
+    both = together([one, one])
+    assert both.alpha_setting.tolist() == [0, 0, 1, 2, 3, 3, 4, 5]
+    assert both.subset(np.array([3, 4])).beta_setting.tolist() == [1, 2]
