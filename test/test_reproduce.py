@@ -66,8 +66,12 @@ def test_motion_reaches_the_floor(found):
 @pytest.mark.parametrize('stage', ['perfect', 'paper'])
 def test_promised_deviations_hold(found, stage):
     """90 % intervals of the acceleration in poses that were not fitted."""
-    z = np.concatenate([unit.models['full'].force_z.ravel() for unit in found[stage]])
-    assert 0.86 < np.mean(np.abs(z) < score.NINETY) < 0.95
+    # Poses of one unit share the errors of its few settings of alpha: units are independent.
+    inside = np.array([np.mean(np.abs(unit.models['full'].force_z) < score.NINETY)
+                       for unit in found[stage]])
+    assert abs(inside.mean() - 0.9) < 0.02 + 2.5 * inside.std() / np.sqrt(len(inside))
+    spread = np.sqrt(np.mean([np.mean(unit.models['full'].force_z ** 2) for unit in found[stage]]))
+    assert 0.7 < spread < 1.4
 
 
 def test_null_crossings_beat_the_flat_maximum(found):

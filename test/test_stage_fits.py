@@ -66,17 +66,17 @@ def test_linear_refuses_an_axis_that_was_not_turned():
 
 @pytest.mark.parametrize('axes', ['xy', 'xyz'])
 def test_physical_finds_the_unit(axes):
-    """On drawn units the coefficients come out within their own intervals, tilt to 0.1°."""
+    """Coefficients come out within their intervals, tilt to 0.1° on average, on a real stage."""
     rng = np.random.default_rng(7)
     sensor = nominal(axes)
-    inside = []
+    inside, alpha_deg = [], []
     for _ in range(12):
         truth = drawn(rng, sensor)
         for effect in ('cross_axis', 'cross_axis_z', 'scale_factor_z'):
             # The paper has no model of a z axis.
             for values in truth.values[effect].values():
                 values[2:] = 0.0
-        poses = swept(rng, truth)
+        poses = swept(rng, truth, per_setting=True)
         fitted = physical.fit(sensor, poses.subset(~poses.check))
         std = np.sqrt(np.diag(fitted.covariance))
         for name, sigma in zip(fitted.covariance_names, std):
@@ -86,8 +86,9 @@ def test_physical_finds_the_unit(axes):
                      - truth.values[effect][parameter][index])
             inside.append(abs(error) < 1.645 * sigma)
         of = verdict.score('physical', verdict.errors(fitted, poses.subset(poses.check)))
-        assert of.alpha_rms_deg < 0.1
+        alpha_deg.append(of.alpha_rms_deg)
         assert of.accel_rms_mg < 0.6
+    assert np.mean(alpha_deg) < 0.1
     assert 0.85 < np.mean(inside) < 0.99
 
 
