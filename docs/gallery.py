@@ -77,6 +77,7 @@ TILTING = Scene(Motion(18.0, turning(0.0).beta, Held(np.radians(30))), 'alpha_ra
 OVER_TIME = Scene(REST, noisy=True, axes='x')
 SCENES = {
     'misalignment': plane(90), 'cross_axis_z': TILTING, 'scale_factor_z': plane(30),
+    'scale_factor_cross': plane(90),
     'gravity': plane(45, 'xyz'), 'base_tilt': plane(90, 'xyz'), 'stage_offset': plane(45, 'xyz'),
     'saturation': Scene(turning(90), 'beta_rad', 'beta at alpha = 90°, deg', 180 / np.pi),
     'lever_arm': Scene(SWING), 'time_offset': Scene(SWING), 'bandwidth': Scene(SWING),
