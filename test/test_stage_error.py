@@ -17,7 +17,7 @@
 
 from dataclasses import replace
 
-from adxl_ros.calibrate import full, linearised, posed
+from adxl_ros.calibrate import full, linearised, plan, posed
 from adxl_ros.calibrate.poses import Poses, together
 from adxl_ros.calibrate.stage_error import PoseCovariance, shared_settings, StageError
 from adxl_ros.model.coefficients import with_neutral
@@ -25,7 +25,7 @@ import numpy as np
 import pytest
 from units import drawn, nominal, swept
 
-ERROR = StageError(4e-4, 2e-4)
+ERROR = StageError(4e-4, 2e-4, 1.3)
 
 
 @pytest.fixture(scope='module')
@@ -40,8 +40,9 @@ def dense(slope, poses, error):
     count, axes = slope.shape[:2]
     found = np.diag((poses.std_v ** 2).ravel())
     for joint, setting in enumerate((poses.alpha_setting, poses.beta_setting)):
-        angles = error.setting_rad ** 2 * (setting[:, None] == setting) \
-            + error.pose_rad ** 2 * np.eye(count)
+        angles = error.joints[joint] ** 2 * (
+            error.setting_rad ** 2 * (setting[:, None] == setting)
+            + error.pose_rad ** 2 * np.eye(count))
         part = np.einsum('km,kl,ln->kmln', slope[:, :, joint], angles, slope[:, :, joint])
         found += part.reshape(count * axes, count * axes)
     return found
@@ -71,6 +72,7 @@ def test_predicted_errors_are_the_best_linear_ones(poses):
     for joint, setting in enumerate((poses.alpha_setting, poses.beta_setting)):
         expected[:, joint] += ERROR.setting_rad ** 2 * (
             setting[:, None] == setting) @ felt[:, joint]
+    expected *= ERROR.joints ** 2
     np.testing.assert_allclose(covariance.predicted(residual).total_rad, expected, rtol=1e-7,
                                atol=1e-15)
 
@@ -96,6 +98,23 @@ def test_a_stated_error_counts_where_poses_do_not_tell(poses):
     quiet = replace(poses, volts=posed.response(unit, poses))
     many = linearised.linearised(unit, quiet, names, full.priors(names))
     assert many.stage_error(1e-3).total_rad < 1e-4
+
+
+def test_a_joint_that_is_worse_than_the_other_is_found():
+    """Alpha with nine times the variance of beta, where the sweep moves both often."""
+    rng = np.random.default_rng(5)
+    truth = drawn(rng, nominal())
+    targets = plan.guided(plan.default_planes_rad('xy'), plan.STEP_RAD, 0)
+    poses = swept(rng, truth, targets=targets, noisy=False)
+    step = np.radians(5 / 60)
+    off = [factor * step * rng.uniform(-0.5, 0.5, len(poses))[setting]
+           for factor, setting in ((3, poses.alpha_setting), (1, poses.beta_setting))]
+    volts = posed.response(truth, replace(poses, alpha_rad=poses.alpha_rad + off[0],
+                                          beta_rad=poses.beta_rad + off[1]))
+    found = full.fit_full(nominal(), replace(
+        poses, volts=volts + poses.std_v * rng.normal(size=volts.shape)))
+    alpha, beta = found.stage.setting_rad * found.stage.joints * np.sqrt(12) / step
+    assert alpha == pytest.approx(3, rel=0.2) and beta == pytest.approx(1, rel=0.4)
 
 
 def test_settings_without_numbers_follow_the_angles():

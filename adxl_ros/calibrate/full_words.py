@@ -66,12 +66,13 @@ def words(found: full.FullFit, poses: Poses, judged: Sequence[Term]) -> list[str
         That it was made of.
 
     """
-    setting, pose, stated = (np.degrees(angle) for angle in (
-        found.stage.setting_rad, found.stage.pose_rad, found.stated_sigma_rad))
-    beside = f', and {pose:.2g} deg rms new with each pose' \
-        if pose > _SMALL_SHARE * setting else ''
-    lines = [f'stage: each setting of a joint has an error of {setting:.2g} deg rms{beside} '
-             f'(stated {stated:.2g}){_of_the_stage(found)}']
+    setting, pose = (np.degrees(level * found.stage.joints) for level in (
+        found.stage.setting_rad, found.stage.pose_rad))
+    beside = f', and {pose[0]:.2g} and {pose[1]:.2g} deg new with each pose' \
+        if pose[0] > _SMALL_SHARE * setting[0] else ''
+    lines = [f'stage: a setting of alpha has an error of {setting[0]:.2g} deg rms, of beta '
+             f'{setting[1]:.2g} deg{beside} (stated {np.degrees(found.stated_sigma_rad):.2g})'
+             f'{_of_the_stage(found)}']
     if not found.converged:
         lines.append(NOT_CONVERGED)
     if found.stage_sigma_rad > _WORSE * found.stated_sigma_rad + 1e-5:

@@ -46,6 +46,11 @@ _LEVELS_RAD = (1e-7, 0.3)
 _PRIOR_SPREAD = 1.0
 """Standard deviation of the logarithm of a level about the stated one: within a factor of 2.7.
 It decides only where the poses do not."""
+_RATIO_SPREAD = 0.35
+"""Standard deviation of the logarithm of `StageError.ratio`: the joints of a stage are alike to
+within a factor of two."""
+_MOST_RATIO = 1.5
+"""Largest logarithm of the ratio: a joint is at most twenty times as good as the other."""
 _UNIT = 0.05
 """How well some hundred poses tell the logarithm of a level, and a share: the unit of a step."""
 _OPTIONS = {'eps': 0.02, 'ftol': 1e-6, 'gtol': 0.1}
@@ -157,20 +162,22 @@ class Linearised:
 
         def cost(x: np.ndarray) -> float:
             prior = (x[0] - np.log(stated_rad)) / _PRIOR_SPREAD if stated_rad > 0 else 0.0
-            return self.deviance(_levels(x)) + prior ** 2
+            return self.deviance(_levels(x)) + prior ** 2 + (x[2] / _RATIO_SPREAD) ** 2
 
         level = float(np.log(np.clip(start.total_rad, 10 * _LEVELS_RAD[0], _LEVELS_RAD[1])))
         share = (start.pose_rad / max(start.total_rad, _LEVELS_RAD[0])) ** 2
-        found = minimize(lambda x: cost(x * _UNIT), np.array([level, share]) / _UNIT,
-                         method='L-BFGS-B', options=_OPTIONS,
-                         bounds=np.array([np.log(_LEVELS_RAD), (0.0, 1.0)]) / _UNIT)
+        bounds = np.array([np.log(_LEVELS_RAD), (0.0, 1.0), (-_MOST_RATIO, _MOST_RATIO)])
+        found = minimize(lambda x: cost(x * _UNIT),
+                         np.array([level, share, np.log(start.ratio)]) / _UNIT,
+                         method='L-BFGS-B', options=_OPTIONS, bounds=bounds / _UNIT)
         return _levels(found.x * _UNIT)
 
 
 def _levels(x: np.ndarray) -> StageError:
-    """Return levels by the logarithm of their total and the share of the poses in its square."""
+    """Return levels by the logarithms of total and ratio, and the poses' share in the square."""
     total = np.exp(x[0])
-    return StageError(float(total * np.sqrt(1 - x[1])), float(total * np.sqrt(x[1])))
+    return StageError(float(total * np.sqrt(1 - x[1])), float(total * np.sqrt(x[1])),
+                      float(np.exp(x[2])))
 
 
 @cache

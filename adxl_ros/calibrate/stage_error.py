@@ -17,7 +17,8 @@ The error of the stage's angles: one for each setting of a joint, and one for ea
 
 A joint that has not moved keeps its error; after a move it has a new one. The true angles of pose
 k are those of the encoder plus u[i(k)] + ε_k a joint, where i(k) numbers the settings of the
-joint, u ~ N(0, σ_s²) and ε ~ N(0, σ_p²). With J = ∂V/∂(α, β) the volts of all poses have the
+joint, u ~ N(0, σ_s²) and ε ~ N(0, σ_p²). Both joints have these levels, alpha's times r and
+beta's over r. With J = ∂V/∂(α, β)·diag(r, 1/r) the volts of all poses have the
 covariance
 
     S = diag(std²) + σ_p²·JJᵀ (block by block) + σ_s²·ZZᵀ,
@@ -52,11 +53,19 @@ class StageError:
         Of the part that is common to the poses of one setting of the joint, σ_s.
     pose_rad
         Of the part that is new with each pose, σ_p.
+    ratio
+        Of alpha's levels to their geometric mean with beta's, r.
 
     """
 
     setting_rad: float
     pose_rad: float = 0.0
+    ratio: float = 1.0
+
+    @property
+    def joints(self) -> np.ndarray:
+        """Return the levels of alpha and beta over their geometric mean, (2,)."""
+        return np.array([self.ratio, 1 / self.ratio])
 
     @property
     def total_rad(self) -> float:
@@ -102,7 +111,9 @@ class PoseCovariance:
 
     def __init__(self, slope: np.ndarray, poses: Poses, shared: SharedSettings,
                  error: StageError, kept: np.ndarray | None = None) -> None:
-        self._slope, self._error = slope, error
+        # Errors of either joint in units of the common levels.
+        self._slope, self._error = slope * error.joints, error
+        slope = self._slope
         self._kept = np.ones(len(poses), bool) if kept is None else kept
         self._number, self._shared = shared
         # A setting of one pose is as good as an error of the pose.
@@ -154,12 +165,13 @@ class PoseCovariance:
 
     def penalty(self, errors: AngleErrors) -> float:
         """Return the sum of squared errors of the angles over their variances."""
-        total = np.sum((errors.of_pose_rad ** 2 / np.maximum(self._own_rad2, _NO_VARIANCE))
-                       [self._kept])
+        of_pose, of_setting = (part / self._error.joints for part in (
+            errors.of_pose_rad, errors.of_setting_rad))
+        total = np.sum((of_pose ** 2 / np.maximum(self._own_rad2, _NO_VARIANCE))[self._kept])
         for joint in range(2):
             _, first = np.unique(self._number[:, joint], return_index=True)
             shared = first[self._number[first, joint] >= 0]
-            total += np.sum(errors.of_setting_rad[shared, joint] ** 2) / max(
+            total += np.sum(of_setting[shared, joint] ** 2) / max(
                 self._error.setting_rad ** 2, _NO_VARIANCE)
         return float(total)
 
@@ -182,7 +194,8 @@ class PoseCovariance:
         # ε = σ²·Jᵀ·B⁻¹·(what the settings leave).
         weighted = np.swapaxes(self._white, 1, 2) @ left[:, :, None]
         own = self._own_rad2 * (np.swapaxes(self._slope, 1, 2) @ weighted)[:, :, 0]
-        return AngleErrors(np.where(self._number >= 0, setting, 0.0), own,
+        joints = self._error.joints
+        return AngleErrors(np.where(self._number >= 0, setting, 0.0) * joints, own * joints,
                            np.sum(left ** 2, axis=1), float(factor @ factor))
 
 
