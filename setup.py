@@ -38,7 +38,7 @@ setup(
     name=PACKAGE,
     version='0.1.0',
     packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*']),
-    package_data={PACKAGE: ['calibrate/*.js']},
+    package_data={PACKAGE: ['calibrate/report/*.js']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
         (f'share/{PACKAGE}', ['package.xml']),
@@ -56,7 +56,8 @@ setup(
     license='Apache-2.0',
     entry_points={
         'console_scripts': [
-            *scripts('nodes', ('driver', 'stage', 'calibration', 'compensation', 'demo', 'bench')),
+            *scripts('nodes', ('driver', 'stage', 'calibration', 'compensation', 'demo')),
+            f'bench = {PACKAGE}.nodes.benchmark:main',
             *scripts('tools', ('simulate', 'fit', 'apply', 'diagnose', 'blind', 'reproduce')),
         ],
     },

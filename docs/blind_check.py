@@ -19,14 +19,14 @@ from pathlib import Path
 import re
 import sys
 
-from adxl_ros.blind import page
+from adxl_ros.blind import report_html
 
 
 def main() -> None:
     """Replace what stands between the run's marks."""
     source, run = sys.argv[1:]
     path = Path(__file__).with_name('blind-check.md')
-    tables = page.markdown(json.loads(Path(source).read_text(encoding='utf-8')))
+    tables = report_html.markdown(json.loads(Path(source).read_text(encoding='utf-8')))
     text, found = re.subn(f'<!-- {run} -->.*<!-- /{run} -->',
                           lambda match: f'<!-- {run} -->\n{tables}\n<!-- /{run} -->',
                           path.read_text(encoding='utf-8'), flags=re.DOTALL)

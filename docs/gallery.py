@@ -18,14 +18,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 import sys
 
-from adxl_ros.files import params
+from adxl_ros.files import parameter_file
 from adxl_ros.model.coefficients import put, typical
 from adxl_ros.model.effects import library
 from adxl_ros.model.effects.base import Effect, Place
-from adxl_ros.model.motion import Held, Knots, Motion
 from adxl_ros.model.sensor import Sensor, with_axes
-from adxl_ros.model.simulate import Columns, simulate
-from adxl_ros.model.trajectory import Steps, SweptSine
+from adxl_ros.simulate.motion import Held, Knots, Motion
+from adxl_ros.simulate.simulator import Columns, simulate
+from adxl_ros.simulate.trajectories import Steps, SweptSine
 import matplotlib
 
 matplotlib.use('Agg')
@@ -99,7 +99,7 @@ LOUDER = {'stuck.rate_hz': 1.0, 'stuck.duration_s': 0.2, 'saturation.limit_g.x':
 
 def main(output: Path) -> None:
     """Draw every effect and write the page."""
-    nominal = with_axes(params.load(DOCS.parent / 'params' / 'adxl203.yaml'), 'xyz')
+    nominal = with_axes(parameter_file.load(DOCS.parent / 'params' / 'adxl203.yaml'), 'xyz')
     nominal = replace(nominal, rate_hz=500.0)
     (output / 'effects').mkdir(parents=True, exist_ok=True)
     lines = ['# Gallery of effects', '', 'Made by `make gallery` from the library itself: '

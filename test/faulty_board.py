@@ -42,7 +42,7 @@ import sys
 import time
 import tty
 
-from adxl_ros.links.wire import Encoder, Info
+from adxl_ros.links.support.wire_format import Encoder, Info
 import numpy as np
 
 BLOCK = 10

@@ -37,9 +37,11 @@ except ImportError:
 
 if atheris:
     with atheris.instrument_imports(include=['adxl_ros.links']):
-        from adxl_ros.links import serial, wire
+        from adxl_ros.links import serial
+        from adxl_ros.links.support import wire_format
 else:
-    from adxl_ros.links import serial, wire
+    from adxl_ros.links import serial
+    from adxl_ros.links.support import wire_format
 import numpy as np
 from units import nominal
 
@@ -78,13 +80,13 @@ def frames_of(data):
         if kind == 0:
             chunks.append(part)
         elif kind == 1:
-            chunks.append(wire.frame(part))
+            chunks.append(wire_format.frame(part))
         elif kind == 2:
             chunks.append(None)
         elif kind == 3:
             fields = part[:12].ljust(12, b'\1')
             rate, bits, channels = struct.unpack('<fBB', fields[:6])
-            chunks.append(wire.frame(struct.pack(
+            chunks.append(wire_format.frame(struct.pack(
                 '<BBHIfBBf16s', 2, 1, fields[6], 0, rate, bits % 18, channels % 9, 5.0, b'fuzz')))
         else:
             fields = part[:16].ljust(16, b'\2')
@@ -93,7 +95,7 @@ def frames_of(data):
                 index, time_us = index % 1000, time_us % 10 ** 6
             count, channels = shape % 16 + 1, shape // 16 % 4 + 1
             codes = (part * 130)[:2 * count * channels].ljust(2 * count * channels, b'\3')
-            chunks.append(wire.frame(struct.pack(
+            chunks.append(wire_format.frame(struct.pack(
                 '<BBHIQIHBB', 1, 1, flags, 0, time_us, index, overruns, count, channels) + codes))
     return chunks
 
@@ -119,7 +121,7 @@ def one(data):
         counts['samples'] += len(samples.stamp_ns)
         if done:
             break
-    assert len(link._splitter._rest) <= wire.MOST_BYTES
+    assert len(link._splitter._rest) <= wire_format.MOST_BYTES
     link.state()
     counts['inputs'] += 1
 

@@ -21,6 +21,7 @@ Of five kills two come within the first two seconds, one while all poses are fit
 file is written, and one when the sweep has ended.
 """
 
+from contextlib import suppress
 import json
 import os
 from pathlib import Path
@@ -29,7 +30,7 @@ import signal
 import subprocess
 import time
 
-from adxl_ros.files import journal, params
+from adxl_ros.files import parameter_file, sweep_journal
 from conftest import executable
 from graph import RELIABLE
 import numpy as np
@@ -70,8 +71,8 @@ class Sweeps:
         self.kills = self.sweeps = self.poses = 0
         self.lost, self.broken, self.moments = [], [], {}
         base = nominal(serial='K1', rate_hz=200.0)
-        params.save(self.folder / 'truth.yaml', drawn(np.random.default_rng(3), base))
-        params.save(self.folder / 'bare.yaml', base)
+        parameter_file.save(self.folder / 'truth.yaml', drawn(np.random.default_rng(3), base))
+        parameter_file.save(self.folder / 'bare.yaml', base)
         self._known, self._written, self._stored, self._left = {}, '', set(), set()
         self._others = [self._start('driver', 'truth.yaml', '-p', 'link.speed:=10.0'),
                         self._start('stage', 'bare.yaml', '-p', 'slew_rate_rad_s:=6.0')]
@@ -117,8 +118,11 @@ class Sweeps:
 
     def _unfinished(self):
         """Return the hidden folders in which files are written."""
-        return set(self.folder.glob('.unit*.part')) | set(self.folder.glob('*/.*.part')) | set(
-            self.folder.glob('store/K1/.*.part'))
+        while True:
+            # One that is finished while it is looked into is none any more.
+            with suppress(FileNotFoundError):
+                return {path for pattern in ('.unit*.part', '*/.*.part', 'store/K1/.*.part')
+                        for path in self.folder.glob(pattern)}
 
     def _look(self, said):
         acknowledged = [int(n) - 1 for n in re.findall(r'pose (\d+) is on disk', said)]
@@ -144,8 +148,9 @@ class Sweeps:
             self.broken.append(f'kill {self.kills}: {error}')
 
     def _look_at_poses(self, acknowledged):
-        _, entries = journal.read(self.folder / 'unit.yaml.journal')
-        kept = {entry['pose']: json.dumps(entry) for entry in journal.accepted_poses(entries)}
+        _, entries = sweep_journal.read(self.folder / 'unit.yaml.journal')
+        kept = {entry['pose']: json.dumps(entry)
+                for entry in sweep_journal.accepted_poses(entries)}
         gone = [n for n in {*self._known, *acknowledged} if n not in kept]
         changed = [n for n in self._known if n in kept and kept[n] != self._known[n]]
         if gone or changed:
@@ -165,7 +170,7 @@ class Sweeps:
             self.lost.append(f'kill {self.kills}: the calibration before is not kept')
         stored = self._in_store()
         for path in stored:
-            params.load(path)
+            parameter_file.load(path)
         page = self.folder / 'report' / 'report.html'
         if page.exists() and '</html>' not in page.read_text()[-20:]:
             self.broken.append(f'kill {self.kills}: {page} is cut')
@@ -179,7 +184,7 @@ class Sweeps:
 
 def _data(path):
     """Return the hash of the poses behind a parameter file; '' where there is none."""
-    return params.load(path).provenance['data_sha256'] if path.exists() else ''
+    return parameter_file.load(path).provenance['data_sha256'] if path.exists() else ''
 
 
 def _file(left):

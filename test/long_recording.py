@@ -28,8 +28,8 @@ import sys
 import tempfile
 import time
 
-from adxl_ros.files import params, recording
-from adxl_ros.files.columns import Recording, sensor_info
+from adxl_ros.files import parameter_file, recording
+from adxl_ros.files.recording_columns import Recording, sensor_info
 import numpy as np
 from units import drawn, nominal
 
@@ -63,7 +63,7 @@ def main() -> None:
     signal.signal(signal.SIGINT, signal.default_int_handler)
     with tempfile.TemporaryDirectory(dir=options.folder) as folder:
         unit = Path(folder) / 'unit.yaml'
-        params.save(unit, drawn(np.random.default_rng(1), nominal('xyz')))
+        parameter_file.save(unit, drawn(np.random.default_rng(1), nominal('xyz')))
         print(f'{date.today()}, {options.hours:g} h of three axes at 1 kHz, seed 0\n')
         print('| recording | rows | written in, s | applied in, s | greatest memory, MB |')
         print('|---|---|---|---|---|', flush=True)

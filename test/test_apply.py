@@ -21,11 +21,11 @@ from pathlib import Path
 import signal
 import subprocess
 
-from adxl_ros.files import params, recording
-from adxl_ros.files.columns import Recording, sensor_info
-from adxl_ros.model import chain
+from adxl_ros.files import parameter_file, recording
+from adxl_ros.files.recording_columns import Recording, sensor_info
+from adxl_ros.model import signal_chain
+from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
-from adxl_ros.model.stage import specific_force
 from conftest import executable, wait_until
 import numpy as np
 import pytest
@@ -56,12 +56,12 @@ def record(folder: Path, sensor: Sensor, volts: np.ndarray, info: dict[str, str]
                      dict(zip(names, data.T)),
                      sensor_info(sensor) if info is None else info)
     recording.write(folder / 'made.csv', part, sensor)
-    params.save(folder / 'unit.yaml', sensor)
+    parameter_file.save(folder / 'unit.yaml', sensor)
     return folder / 'made.csv'
 
 
 def felt(sensor: Sensor, alpha: np.ndarray = ALPHA, beta: np.ndarray = BETA) -> np.ndarray:
-    return np.column_stack(chain.static_response(sensor)(specific_force(alpha, beta, G)))
+    return np.column_stack(signal_chain.static_response(sensor)(specific_force(alpha, beta, G)))
 
 
 def applied(run_tool: RunTool, path: Path, parameters: Path | None = None) -> tuple:
@@ -150,7 +150,7 @@ def test_samples_without_a_solution_are_kept_and_counted(run_tool: RunTool,
 def test_a_nominal_file_fits_any_axes_and_unit(run_tool: RunTool, tmp_path: Path) -> None:
     made = nominal('xyz', serial='mpu')
     path = record(tmp_path, made, felt(made), units='mps2')
-    params.save(tmp_path / 'nominal.yaml', nominal('xy'))
+    parameter_file.save(tmp_path / 'nominal.yaml', nominal('xy'))
     table, _ = applied(run_tool, path, tmp_path / 'nominal.yaml')
     np.testing.assert_allclose(numbers(table, 'az_mps2')[0], G * np.cos(ALPHA), atol=1e-9)
 
@@ -192,7 +192,7 @@ def test_another_unit_is_refused(run_tool: RunTool, tmp_path: Path, key: str, va
 def test_other_axes_are_refused(run_tool: RunTool, tmp_path: Path) -> None:
     made = unit('xyz')
     path = record(tmp_path, made, felt(made))
-    params.save(tmp_path / 'unit.yaml', unit('xy'))
+    parameter_file.save(tmp_path / 'unit.yaml', unit('xy'))
     said = refused(run_tool, path)
     assert 'calibrated for the axes xy, not xyz' in said or 'are for xy' in said
 

@@ -22,11 +22,21 @@ from pathlib import Path
 import shutil
 import sys
 
-from adxl_ros.blind import cases, check, controls, marks, page, real, run, scores, seal
-from adxl_ros.blind.cases import Label
-from adxl_ros.blind.world import chain, kinds, motion, sight, unit
-from adxl_ros.calibrate.figures import pyplot
+from adxl_ros.blind import (
+    blind_check,
+    diagnosis_runs,
+    grading,
+    label_commitment,
+    negative_controls,
+    real_recordings,
+    report_html,
+    scores,
+    trials,
+)
+from adxl_ros.blind.trials import Label
+from adxl_ros.blind.world import chain, fault_table, ideal_observer, motion, unit
 from adxl_ros.errors import UserError
+from adxl_ros.files.figure_file import pyplot
 import numpy as np
 import pytest
 import yaml
@@ -97,9 +107,9 @@ def state(tmp_path_factory):
 @pytest.fixture(scope='module')
 def original(tmp_path_factory, state):
     folder = tmp_path_factory.mktemp('check') / 'blind'
-    with run.workers(None) as pool:
-        seal.seal(folder, SEED, cases.plans(SEED, TRIALS, SECONDS), TRIALS, pool,
-                  show(''))
+    with diagnosis_runs.workers(None) as pool:
+        label_commitment.seal(folder, SEED, trials.plans(SEED, TRIALS, SECONDS), TRIALS, pool,
+                              show(''))
     return folder
 
 
@@ -108,7 +118,8 @@ def known_nothing(original, tmp_path_factory, pool):
     """Score a diagnosis that never finds anything, once for all tests that build on it."""
     folder = tmp_path_factory.mktemp('nothing')
     shutil.copytree(original, folder / 'blind')
-    return folder / 'blind', check.scored(folder / 'blind', script(folder, NOTHING), pool, show)
+    return folder / 'blind', blind_check.scored(folder / 'blind', script(folder, NOTHING), pool,
+                                                show)
 
 
 def copied(original, known_nothing, folder):
@@ -124,7 +135,7 @@ def test_a_sealed_check_tells_nothing(original):
     assert names == sorted(f'r{i:04d}.{suffix}' for i in range(count)
                            for suffix in ('csv', 'yaml'))
     assert {path.stat().st_mtime for path in (original / 'recordings').iterdir()} == {0}
-    effects = [name.encode() for name in kinds.KINDS if name not in (
+    effects = [name.encode() for name in fault_table.KINDS if name not in (
         'bias', 'gravity', 'scale_factor', 'supply')]
     for path in original.rglob('*'):
         data = path.read_bytes() if path.is_file() else b''
@@ -137,15 +148,15 @@ def test_labels_are_those_of_the_hash(original, known_nothing, tmp_path, pool):
     text = (folder / 'labels' / 'labels.json').read_bytes()
     digest = json.loads((original / 'seal.json').read_bytes())['sha256_of_salt_and_labels']
     assert hashlib.sha256(text).hexdigest() == digest == made['hash']
-    drawn = [cases.draw(plan) for plan in cases.plans(SEED, TRIALS, SECONDS)[:1]]
-    opened = seal.unseal(folder).labels[:1]
+    drawn = [trials.draw(plan) for plan in trials.plans(SEED, TRIALS, SECONDS)[:1]]
+    opened = label_commitment.unseal(folder).labels[:1]
     assert [label.effects for label in drawn] == [label.effects for label in opened]
     assert [one['size'] for label in drawn for one in label.faults] == pytest.approx(
         [one['size'] for label in opened for one in label.faults])
     other = copied(original, known_nothing, tmp_path)
     (other / 'labels' / 'labels.json').write_bytes(text.replace(b'"single"', b'"pair"'))
     with pytest.raises(UserError, match='not those whose hash'):
-        check.scored(other, script(tmp_path, NOTHING), pool, show)
+        blind_check.scored(other, script(tmp_path, NOTHING), pool, show)
 
 
 def test_nothing_found_scores_as_it_should(known_nothing):
@@ -163,18 +174,18 @@ def test_nothing_found_scores_as_it_should(known_nothing):
 def test_a_cheat_finds_no_labels(original, known_nothing, tmp_path, pool):
     folder = copied(original, known_nothing, tmp_path)
     cheat = script(tmp_path, CHEAT.format(folder=str(folder)))
-    sealed = check.scored(folder, cheat, pool, show)
+    sealed = blind_check.scored(folder, cheat, pool, show)
     assert not any(row['named'] for row in sealed['rows'])
     # The same diagnosis does cheat where labels lie open.
     shutil.rmtree(folder / 'reports')
-    opened = check.scored(folder, cheat, pool, show)
+    opened = blind_check.scored(folder, cheat, pool, show)
     assert all(sorted(row['named']) == sorted(row['effects']) for row in opened['rows']
                if row['group'] != 'zero')
 
 
 def test_always_one_effect_scores_as_it_should(original, known_nothing, tmp_path, pool):
     folder = copied(original, known_nothing, tmp_path)
-    made = check.scored(folder, script(tmp_path, ALWAYS), pool, show)
+    made = blind_check.scored(folder, script(tmp_path, ALWAYS), pool, show)
     score = made['scores']
     assert score['false_alarms']['value'] == 1
     singles = [row for row in made['rows'] if row['group'] == 'single']
@@ -189,9 +200,9 @@ def test_always_one_effect_scores_as_it_should(original, known_nothing, tmp_path
     assert not made['leaks']
     permuted = made['controls']['labels_permuted']
     assert permuted['score'] == pytest.approx(permuted['chance'], abs=0.02)
-    text = page.page(made, pyplot())
+    text = report_html.page(made, pyplot())
     assert text.count('<img') == 3 and 'http' not in text.replace('http-equiv', '')
-    assert '| false alarms | 1 (' in page.markdown(made)
+    assert '| false alarms | 1 (' in report_html.markdown(made)
 
 
 def test_a_process_is_given_its_recording_and_no_more(original, tmp_path):
@@ -201,7 +212,7 @@ def said(recording, parameters):
     return 'no_gap', [[[], 1.0], [[json.dumps(seen)], 0.0]]
 """
     csv = original / 'recordings' / 'r0000.csv'
-    name, result = run.diagnose('r0000', csv.read_bytes(), b'', script(tmp_path, body))
+    name, result = diagnosis_runs.diagnose('r0000', csv.read_bytes(), b'', script(tmp_path, body))
     files, environment = json.loads(result['report']['hypotheses'][1]['effects'][0])
     assert name == 'r0000' and files == ['r0000.csv', 'r0000.yaml']
     assert not any(str(original.parent) in value for value in environment.values())
@@ -220,39 +231,39 @@ def test_resumes_where_it_was_cut(original, known_nothing, tmp_path, pool):
             raise Cut
 
     with pytest.raises(Cut):
-        run.diagnose_all(folder, command, pool, cut)
+        diagnosis_runs.diagnose_all(folder, command, pool, cut)
     before = {path: path.stat().st_mtime_ns for path in (folder / 'reports').glob('r*.json')}
     assert 0 < len(before) < TRIALS
-    assert len(run.diagnose_all(folder, command, pool, show(''))) == TRIALS + 2
+    assert len(diagnosis_runs.diagnose_all(folder, command, pool, show(''))) == TRIALS + 2
     assert all(path.stat().st_mtime_ns == time for path, time in before.items())
     with pytest.raises(UserError, match='another version'):
-        run.diagnose_all(folder, script(tmp_path, ALWAYS), pool, show(''))
+        diagnosis_runs.diagnose_all(folder, script(tmp_path, ALWAYS), pool, show(''))
 
 
 def test_drawing_resumes(tmp_path, pool, state):
-    plans = cases.plans(3, 2, SECONDS)
+    plans = trials.plans(3, 2, SECONDS)
 
     def twice(plan):
         if plan.name == 'r0002' and not (tmp_path / 'again').exists():
             raise KeyboardInterrupt
-        return seal.draw(plan)
+        return label_commitment.draw(plan)
 
     with pytest.raises(KeyboardInterrupt):
-        seal.seal(tmp_path / 'blind', 3, plans, 2, pool, show(''), twice)
+        label_commitment.seal(tmp_path / 'blind', 3, plans, 2, pool, show(''), twice)
     (tmp_path / 'again').touch()
-    digest = seal.seal(tmp_path / 'blind', 3, plans, 2, pool, show(''), twice)
-    opened = seal.unseal(tmp_path / 'blind')
-    assert digest == seal.published(tmp_path / 'blind')
+    digest = label_commitment.seal(tmp_path / 'blind', 3, plans, 2, pool, show(''), twice)
+    opened = label_commitment.unseal(tmp_path / 'blind')
+    assert digest == label_commitment.published(tmp_path / 'blind')
     assert [label.name for label in opened.labels] == ['r0000', 'r0001', 'r0002']
 
 
 def test_a_failed_diagnosis_counts_as_such(tmp_path):
     command = [sys.executable, '-c', 'import sys; sys.exit("no such thing")']
-    result = run.diagnose('r0', b'time_s,x_v\n', b'', command)[1]
-    given = marks.answer(result)
+    result = diagnosis_runs.diagnose('r0', b'time_s,x_v\n', b'', command)[1]
+    given = grading.answer(result)
     assert (given.status, given.gap, result['error']) == ('failed', False, 'no such thing')
     for report in ({}, {'verdict': None}, {'verdict': {'status': 'explained'}}, []):
-        assert marks.answer({'report': report, 'seconds': 1.0}).status == 'failed'
+        assert grading.answer({'report': report, 'seconds': 1.0}).status == 'failed'
 
 
 def padded(label, recording):
@@ -269,7 +280,7 @@ def said(recording, parameters):
 
 def test_a_leaky_generator_is_caught(known_nothing, tmp_path, pool):
     """The same cases again, by a generator whose files tell which have an effect."""
-    folder, labels = tmp_path / 'blind', seal.unseal(known_nothing[0]).labels
+    folder, labels = tmp_path / 'blind', label_commitment.unseal(known_nothing[0]).labels
     recordings = known_nothing[0] / 'recordings'
 
     def leaking(plan):
@@ -278,11 +289,12 @@ def test_a_leaky_generator_is_caught(known_nothing, tmp_path, pool):
                             for suffix in ('csv', 'yaml'))
         return label, padded(label, text), parameters
 
-    seal.seal(folder, SEED, cases.plans(SEED, TRIALS, SECONDS), TRIALS, pool, show(''), leaking)
+    label_commitment.seal(folder, SEED, trials.plans(SEED, TRIALS, SECONDS), TRIALS, pool,
+                          show(''), leaking)
     shutil.copytree(known_nothing[0] / 'labels' / 'held', folder / 'labels' / 'held')
-    made = check.scored(folder, script(tmp_path, PADDED), pool, show)
+    made = blind_check.scored(folder, script(tmp_path, PADDED), pool, show)
     assert made['controls']['metadata_only']['leaks'] and made['leaks']
-    assert 'LEAKS' in page.summary(made) and 'LEAKS' in page.page(made, pyplot())
+    assert 'LEAKS' in report_html.summary(made) and 'LEAKS' in report_html.page(made, pyplot())
 
 
 def test_an_effect_at_strength_zero_must_not_show(tmp_path):
@@ -290,16 +302,16 @@ def test_an_effect_at_strength_zero_must_not_show(tmp_path):
     labels, answers = drawn_labels(), []
     for label in labels:
         text = padded(label, 'time_s,x_v\n0.0,2.5\n')
-        answers.append(marks.answer(run.diagnose(
+        answers.append(grading.answer(diagnosis_runs.diagnose(
             label.name, text.encode(), b'', script(tmp_path, PADDED))[1]))
-    assert controls.strength_zero(labels, answers)['leaks']
+    assert negative_controls.strength_zero(labels, answers)['leaks']
 
 
 def drawn_labels():
     """Return labels of a fair mix, without their recordings."""
     at = {'manoeuvre': 'rich', 'axes': 'xyz', 'floor_mps2': 0.01}
     rows = []
-    for plan in cases.plans(1, 60):
+    for plan in trials.plans(1, 60):
         faults = [{'effect': name, 'size': 1.0, 'shape': {'w': [0.0] * 6, 'hertz': 9.0},
                    'strength_mps2': 0.01 * (i + 1), 'power': 1.0, 'told': 1.0, 'inseparable': []}
                   for i, name in enumerate(plan.effects)]
@@ -310,9 +322,10 @@ def drawn_labels():
 
 def answered(label, wrong=False):
     """Answer rightly, or with an effect that is not there."""
-    said = frozenset({'bias', 'gravity'}) if wrong else marks.truth(label)
+    said = frozenset({'bias', 'gravity'}) if wrong else grading.truth(label)
     status = 'no_gap' if not said else 'unknown' if 'unknown' in said else 'explained'
-    return marks.Answer(status, said, (), 0.95, ((said, 0.95), (frozenset({'x'}), 0.05)), {}, 1.0)
+    return grading.Answer(status, said, (), 0.95, ((said, 0.95),
+                          (frozenset({'x'}), 0.05)), {}, 1.0)
 
 
 def test_perfect_and_wrong_answers():
@@ -340,35 +353,36 @@ def test_groups_hold_the_truth_or_not():
         return replace(given, status='inseparable', certain=frozenset(certain),
                        groups=tuple(frozenset(group) for group in groups))
 
-    assert marks.verdict_right(says([one], [two, 'a']), label)
-    assert marks.verdict_right(says([], [two, 'a'], [one, 'b']), label)
-    assert not marks.verdict_right(says([one], ['a', 'b']), label)
-    assert not marks.verdict_right(says([], [one, two]), label)
-    assert not marks.verdict_right(says([one, two], ['a', 'b']), label)
+    assert grading.verdict_right(says([one], [two, 'a']), label)
+    assert grading.verdict_right(says([], [two, 'a'], [one, 'b']), label)
+    assert not grading.verdict_right(says([one], ['a', 'b']), label)
+    assert not grading.verdict_right(says([], [one, two]), label)
+    assert not grading.verdict_right(says([one, two], ['a', 'b']), label)
     label.faults[0]['power'] = 0.1
-    assert marks.verdict_right(says([two]), label)
-    assert not marks.verdict_right(says([one]), label)
+    assert grading.verdict_right(says([two]), label)
+    assert not grading.verdict_right(says([one]), label)
 
 
 def test_the_curve_finds_the_strength():
     rng = np.random.default_rng(0)
     strength = np.exp(rng.uniform(-7, -1, 600))
     seen = rng.random(600) < 1 / (1 + np.exp(-(np.log(strength) + 4) / 0.5))
-    found = scores.figures.curve(strength, seen, 0.0)
+    found = scores.score_statistics.curve(strength, seen, 0.0)
     assert found['at_50']['ci'][0] < np.exp(-4) < found['at_50']['ci'][1]
     assert found['at_90']['ci'][0] < np.exp(-4 + 0.5 * np.log(9)) < found['at_90']['ci'][1]
 
 
-@pytest.mark.parametrize('name', kinds.KINDS)
+@pytest.mark.parametrize('name', fault_table.KINDS)
 def test_every_fault_changes_a_recording(name):
     """In proportion to its size or more, and not at all at size zero; one rich manoeuvre."""
-    at = sight.Scene(unit.draw(np.random.default_rng(0)), motion.draw(
+    at = ideal_observer.Scene(unit.draw(np.random.default_rng(0)), motion.draw(
         np.random.default_rng(2), (60.0, 62.0), 125.0, 'rich'), 1)
-    kind = kinds.KINDS[name]
+    kind = fault_table.KINDS[name]
     shape = kind.draw(np.random.default_rng(1), at.unit)
 
     def size(times):
-        return sight.rms(at.response([kinds.Fault(kind, times * kind.start, shape)], True))
+        return ideal_observer.rms(at.response(
+            [fault_table.Fault(kind, times * kind.start, shape)], True))
 
     assert size(0.0) == pytest.approx(0, abs=1e-9)
     assert 0 < size(1.0) < size(2.0)
@@ -377,11 +391,11 @@ def test_every_fault_changes_a_recording(name):
 
 def test_ideal_observer(state):
     """What is strong is seen, what is weak is not, and a tilted bench is an offset of alpha."""
-    at = sight.Scene(unit.draw(np.random.default_rng(0)), motion.draw(
+    at = ideal_observer.Scene(unit.draw(np.random.default_rng(0)), motion.draw(
         np.random.default_rng(2), (60.0, 62.0), 125.0, 'one_plane'), 1)
-    eye = sight.Eye(at)
-    kind = kinds.KINDS['stage_offset']
-    seen = [sight.power(float(np.sum(eye.seen(at.response([kinds.Fault(
+    eye = ideal_observer.Eye(at)
+    kind = fault_table.KINDS['stage_offset']
+    seen = [ideal_observer.power(float(np.sum(eye.seen(at.response([fault_table.Fault(
         kind, size, {'w': [0.0, 1.0]})])) ** 2))) for size in (1e-7, 3e-3)]
     assert seen[0] < 0.05 and seen[1] > 0.99
     clean = eye.seen(np.zeros_like(eye.force))
@@ -404,18 +418,18 @@ def said(recording, parameters):
     return ('explained', [[missing, 1.0]]) if missing else ('no_gap', [[[], 1.0]])
 """
     csv = original / 'recordings' / 'r0000.csv'
-    rows = real.put_back([real.arm(f'{csv}:{tmp_path / "unit.yaml"}')], script(tmp_path, body),
-                         pool, show(''))
+    rows = real_recordings.put_back([real_recordings.arm(f'{csv}:{tmp_path / "unit.yaml"}')],
+                                    script(tmp_path, body), pool, show(''))
     assert [(row['deleted'], row['put_back']) for row in rows] == [
         (None, None), ('bias', True), ('scale_factor', True)]
-    left = real.without(keys, 'bias')['/**']['ros__parameters']
+    left = real_recordings.without(keys, 'bias')['/**']['ros__parameters']
     count = len(left['sensor']['axes'])
     assert left['effects'] == ['scale_factor'] and 'bias' not in left
     assert len(left['covariance']) == count ** 2
     assert left['covariance_names'] == [f'scale_factor.offset_v_per_g.{axis}'
                                         for axis in left['sensor']['axes']]
     with pytest.raises(UserError, match='no such file'):
-        real.arm(f'{csv}:nowhere.yaml')
+        real_recordings.arm(f'{csv}:nowhere.yaml')
 
 
 def test_on_a_cluster(original, known_nothing, tmp_path):
@@ -423,8 +437,8 @@ def test_on_a_cluster(original, known_nothing, tmp_path):
     folder = copied(original, known_nothing, tmp_path)
     with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None,
                                   local_directory=str(tmp_path)) as cluster, \
-            run.workers(cluster.scheduler_address) as pool:
-        found = run.diagnose_all(folder, script(tmp_path, NOTHING), pool, show(''))
+            diagnosis_runs.workers(cluster.scheduler_address) as pool:
+        found = diagnosis_runs.diagnose_all(folder, script(tmp_path, NOTHING), pool, show(''))
     assert len(found) == TRIALS + 2 and all(one['report'] for one in found.values())
 
 

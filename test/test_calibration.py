@@ -2,9 +2,9 @@
 
 import time
 
-from adxl_ros.calibrate import recorded
-from adxl_ros.files import journal, params, recording
-from adxl_ros.files.columns import sensor_info
+from adxl_ros.files import parameter_file, recording, sweep_journal
+from adxl_ros.files.recorded_unit import recorded_unit
+from adxl_ros.files.recording_columns import sensor_info
 from adxl_ros.model.constants import G0_MPS2
 from conftest import wait_until
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
@@ -34,8 +34,8 @@ def _files(tmp_path, seed=3, axes='xy'):
     """Write the file of a drawn unit and of its nominal sensor."""
     base = nominal(axes, serial='T1')
     truth, bare = tmp_path / 'truth.yaml', tmp_path / 'nominal.yaml'
-    params.save(truth, drawn(np.random.default_rng(seed), base))
-    params.save(bare, base)
+    parameter_file.save(truth, drawn(np.random.default_rng(seed), base))
+    parameter_file.save(bare, base)
     return truth, bare
 
 
@@ -82,8 +82,8 @@ def test_a_sweep_ends_with_a_file_and_fit_agrees_on_its_bag(start, run_tool, tmp
         # 4000 samples a second would take the report's time from it.
         driver.stop()
         node.wait_for('wrote unit.yaml', 120)
-    found = params.load(tmp_path / 'unit.yaml')
-    want = params.load(truth)
+    found = parameter_file.load(tmp_path / 'unit.yaml')
+    want = parameter_file.load(truth)
     assert (found.model, found.serial) == ('full', 'T1')
     np.testing.assert_allclose(found.zero_g_v, want.zero_g_v, atol=1e-3)
     np.testing.assert_allclose(found.scale_v_per_g, want.scale_v_per_g, atol=1e-3)
@@ -102,7 +102,7 @@ def test_a_sweep_ends_with_a_file_and_fit_agrees_on_its_bag(start, run_tool, tmp
     done = run_tool('fit', bag, '--params', bare, '--journal', 'unit.yaml.journal',
                     '-o', 'offline.yaml')
     assert done.returncode == 0, done.stderr
-    offline = params.load(tmp_path / 'offline.yaml')
+    offline = parameter_file.load(tmp_path / 'offline.yaml')
     for effect, values in found.values.items():
         for name, value in values.items():
             np.testing.assert_allclose(offline.values[effect][name], value, rtol=0, atol=1e-9)
@@ -111,7 +111,7 @@ def test_a_sweep_ends_with_a_file_and_fit_agrees_on_its_bag(start, run_tool, tmp
     assert offline.covariance_names[:both] == found.covariance_names
     np.testing.assert_allclose(offline.covariance[:both, :both], found.covariance, rtol=1e-5)
 
-    _, entries = journal.read(tmp_path / 'unit.yaml.journal')
+    _, entries = sweep_journal.read(tmp_path / 'unit.yaml.journal')
     assert entries[-1]['done']
     assert sum(entry['check'] for entry in entries[-1]['rests']) == 6
     assert all(entry['samples'] == 1000 for entry in entries[-1]['rests'])
@@ -121,7 +121,7 @@ def test_a_sweep_ends_with_a_file_and_fit_agrees_on_its_bag(start, run_tool, tmp
     recording.write(tmp_path / 'bag.csv', read, want)
     for path in (bag, tmp_path / 'bag.csv'):
         read = recording.read(path)
-        check_all_agree(read, recorded.recorded_unit(nominal(serial='T1'), read),
+        check_all_agree(read, recorded_unit(nominal(serial='T1'), read),
                         entries[-1]['rests'])
     counts = [len({entry[f'{joint}_setting'] for entry in entries[-1]['rests']})
               for joint in ('alpha', 'beta')]
@@ -159,7 +159,7 @@ def test_services_and_refusals(start, tmp_path):
         assert done and words.startswith('wrote calibration.yaml; '), words
         assert words.endswith(' poses are open: start again to go on')
         # Three poses of one plane determine the linear model alone, and the log says so.
-        assert params.load(tmp_path / 'calibration.yaml').model == 'linear'
+        assert parameter_file.load(tmp_path / 'calibration.yaml').model == 'linear'
 
 
 def test_a_stage_that_never_arrives_is_said(start, tmp_path):
@@ -217,11 +217,11 @@ def test_a_real_sensor_through_the_live_graph(start, run_tool, tmp_path, shared_
                          and graph.value('driver', 'link_state') == 'ended', 120, 'the end')
         answer = graph.call(Trigger, 'calibration/finish', Trigger.Request())
         assert answer.success, answer.message
-    live = params.load(tmp_path / 'live.yaml')
+    live = parameter_file.load(tmp_path / 'live.yaml')
     assert float(live.provenance['residual_mg']) < most_mg
     done = run_tool('fit', source, '-o', 'offline.yaml')
     assert done.returncode == 0, done.stderr
-    offline = params.load(tmp_path / 'offline.yaml')
+    offline = parameter_file.load(tmp_path / 'offline.yaml')
     for effect, values in live.values.items():
         for parameter, value in values.items():
             np.testing.assert_allclose(offline.values[effect][parameter], value, atol=1e-9)
@@ -230,7 +230,7 @@ def test_a_real_sensor_through_the_live_graph(start, run_tool, tmp_path, shared_
 def test_what_came_before_the_driver_said_what_it_is_counts(start, tmp_path):
     """Topics find each other in any order: the first rest is not lost by it."""
     base = nominal('xyz', serial='T5')
-    params.save(tmp_path / 'bare.yaml', base)
+    parameter_file.save(tmp_path / 'bare.yaml', base)
     rng = np.random.default_rng(1)
     with Graph() as graph:
         raw = graph.node.create_publisher(Imu, 'imu/data_raw', QUEUE)
@@ -254,9 +254,9 @@ def test_what_came_before_the_driver_said_what_it_is_counts(start, tmp_path):
         info.publish(DiagnosticStatus(values=[
             KeyValue(key=k, value=v) for k, v in sensor_info(base).items()]))
         graph.spin_until(lambda: graph.value('calibration', 'accepted') == '2', 30, 'both rests')
-    _, entries = journal.read(tmp_path / 'unit.yaml.journal')
+    _, entries = sweep_journal.read(tmp_path / 'unit.yaml.journal')
     # The ends of a rest are left out.
-    assert min(entry['samples'] for entry in journal.accepted_poses(entries)) > 2500
+    assert min(entry['samples'] for entry in sweep_journal.accepted_poses(entries)) > 2500
 
 
 def test_an_operator_captures(start, tmp_path):
@@ -271,7 +271,7 @@ def test_an_operator_captures(start, tmp_path):
         graph.spin_until(lambda: graph.said('calibration', 'then capture'), 30, 'the request')
         answer = graph.call(Trigger, 'calibration/capture', Trigger.Request(), 30)
         assert answer.success and 'pose 1 is on disk' in answer.message
-        _, entries = journal.read(tmp_path / 'calibration.yaml.journal')
+        _, entries = sweep_journal.read(tmp_path / 'calibration.yaml.journal')
         assert entries[0]['alpha_rad'] == 0.785
         # One axis shows no tilt: there is no figure, and it is not NaN.
         graph.spin_until(lambda: graph.value('calibration', 'accepted') == '1', 10, 'the pose')

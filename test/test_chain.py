@@ -17,14 +17,14 @@
 from dataclasses import replace
 
 from adxl_ros.errors import UserError
-from adxl_ros.model import chain, noise
+from adxl_ros.model import noise, signal_chain
 from adxl_ros.model.coefficients import get, names_of, parameter_of, put, with_neutral
+from adxl_ros.model.covariance import force_covariance, parameter_tangent
 from adxl_ros.model.effects import library
-from adxl_ros.model.maths import ARRAYS, FLOATS
+from adxl_ros.model.kinematics import specific_force
+from adxl_ros.model.scalar_or_array import ARRAYS, FLOATS
 from adxl_ros.model.sensor import Sensor, with_axes
-from adxl_ros.model.stage import specific_force
 from adxl_ros.model.tilt import angles, roll_pitch_covariance, tilt
-from adxl_ros.model.uncertainty import force_covariance, parameter_tangent
 from hypothesis import given, strategies as st
 import numpy as np
 import pytest
@@ -76,7 +76,7 @@ def bits_off_v(sensor: Sensor) -> float:
 
 def at_a_step(sensor: Sensor, force: np.ndarray) -> bool:
     """Tell whether the ADC's input is so near a step that another input may give its volts."""
-    input_v = np.array(chain.analog_response(sensor)([float(f) for f in force]))
+    input_v = np.array(signal_chain.analog_response(sensor)([float(f) for f in force]))
     step_v = sensor.adc_vref_v / 64
     off_v = np.abs(input_v - np.rint(input_v / step_v) * step_v)
     return bool((off_v <= 2 * bits_off_v(sensor)).any())
@@ -93,11 +93,11 @@ def test_inverse_undoes_the_chain(data: st.DataObject, axes: str) -> None:
         # Nearer to the plane, another z with the same volts may be the upper one.
         force[2] = abs(force[2]) + 0.4 * G
         force *= G / np.linalg.norm(force)
-    volts = chain.static_response(sensor)([float(f) for f in force])
-    found = chain.inverse(sensor)(volts)
+    volts = signal_chain.static_response(sensor)([float(f) for f in force])
+    found = signal_chain.inverse(sensor)(volts)
     apart_mps2 = 4 * bits_off_v(sensor) * G if at_a_step(sensor, force) else 0.0
     np.testing.assert_allclose(found, force, rtol=0, atol=1e-9 + apart_mps2)
-    many = chain.inverse(sensor)([np.full(3, v) for v in volts])
+    many = signal_chain.inverse(sensor)([np.full(3, v) for v in volts])
     np.testing.assert_array_equal(np.array(many), np.array(found)[:, None] * np.ones(3))
 
 
@@ -107,12 +107,13 @@ def test_inverse_holds_at_the_vertical(data: st.DataObject, tilted: float, beta:
     """Near alpha = ±90°, with noise or without, a finite force explains the volts."""
     sensor = data.draw(sensors('xy'))
     alpha = np.pi / 2 + tilted ** 5
-    volts = chain.static_response(sensor)([float(f) for f in specific_force(alpha, beta, G)])
+    volts = signal_chain.static_response(sensor)(
+        [float(f) for f in specific_force(alpha, beta, G)])
     volts = [v + sigmas * 1e-3 for v in volts]
-    force = chain.inverse(sensor)(volts)
+    force = signal_chain.inverse(sensor)(volts)
     assert np.isfinite(force).all()
     # Between two codes whose bits are off lies a gap that no force reaches.
-    np.testing.assert_allclose(chain.static_response(sensor)(force), volts, rtol=0,
+    np.testing.assert_allclose(signal_chain.static_response(sensor)(force), volts, rtol=0,
                                atol=1e-6 + (bits_off_v(sensor) if sigmas else 0))
     # |f| is g; where noise puts more into the plane, it is the least that the volts allow.
     assert np.linalg.norm(force) > G - 1e-5
@@ -122,11 +123,11 @@ def test_inverse_holds_at_the_vertical(data: st.DataObject, tilted: float, beta:
 @pytest.mark.parametrize('axes', AXES)
 def test_what_no_force_explains_is_nan_and_spoils_nothing(axes: str, bad: float) -> None:
     sensor = one_of(axes, 1)
-    good = chain.static_response(sensor)([1.0, 0.0, 0.0])
+    good = signal_chain.static_response(sensor)([1.0, 0.0, 0.0])
     volts = [np.array([v, bad, v]) for v in good]
-    force = np.array(chain.inverse(sensor)(volts))
+    force = np.array(signal_chain.inverse(sensor)(volts))
     assert np.isnan(force[:, 1]).all() or not np.isfinite(bad) or np.abs(force[:, 1]).max() > 1e3
-    alone = np.array(chain.inverse(sensor)(good))
+    alone = np.array(signal_chain.inverse(sensor)(good))
     np.testing.assert_array_equal(force[:, 0], alone)
     np.testing.assert_array_equal(force[:, 2], alone)
 
@@ -135,10 +136,10 @@ def test_z_sign_by_sample() -> None:
     sensor = one_of('xy', 2)
     alpha, beta = np.array([0.5, np.pi - 0.5]), np.array([1.0, 1.0])
     force = specific_force(alpha, beta, G)
-    volts = chain.static_response(sensor)(force)
-    found = chain.inverse(sensor, np.array([1, -1]))(volts)
+    volts = signal_chain.static_response(sensor)(force)
+    found = signal_chain.inverse(sensor, np.array([1, -1]))(volts)
     np.testing.assert_allclose(found, force, rtol=0, atol=1e-9)
-    upside_down = chain.inverse(replace(sensor, z_sign=-1))([float(v[1]) for v in volts])
+    upside_down = signal_chain.inverse(replace(sensor, z_sign=-1))([float(v[1]) for v in volts])
     np.testing.assert_allclose(upside_down, [f[1] for f in force], rtol=0, atol=1e-9)
 
 
@@ -154,12 +155,12 @@ def test_intervals_cover_what_they_promise(axes: str) -> None:
     volts = []
     for _ in range(draws):
         drawn = get(sensor, sensor.covariance_names) + root @ rng.normal(size=len(root))
-        volts.append(chain.static_response(put(sensor, sensor.covariance_names, drawn))(
+        volts.append(signal_chain.static_response(put(sensor, sensor.covariance_names, drawn))(
             list(force)))
     volts = np.array(volts) + noise.sigma_v(sensor)[:, None] * rng.normal(
         size=(draws, len(axes), len(beta)))
     volts = np.moveaxis(volts, 1, 0).reshape(len(axes), -1)
-    found = chain.inverse(sensor)(list(volts))
+    found = signal_chain.inverse(sensor)(list(volts))
     covariance = force_covariance(sensor, found)
     truth = np.tile(force, draws)
     for d in range(3):
@@ -192,7 +193,7 @@ def test_vertical_z_scatters_as_promised() -> None:
     rng = np.random.default_rng(6)
     volts = 2.5 + np.array([[1.0], [0.0]]) + rng.normal(size=(2, 50000)) * \
         noise.sigma_v(sensor)[:, None]
-    force = chain.inverse(sensor)(list(volts))
+    force = signal_chain.inverse(sensor)(list(volts))
     covariance = force_covariance(sensor, [np.array([v]) for v in (G, 0.0, 0.0)])
     assert np.sqrt(np.mean(force[2] ** 2)) == pytest.approx(np.sqrt(covariance[2, 2, 0]), rel=0.02)
 
@@ -265,5 +266,5 @@ def test_rails() -> None:
     sensor = nominal()
     low, high, inside, beyond = 0.0, 5.0 - 5.0 / 65536, 2.5, 7.0
     volts = np.array([[low, inside], [inside, high], [inside, inside], [beyond, inside]])
-    assert chain.at_a_rail(volts, sensor).tolist() == [True, True, False, False]
-    assert not chain.at_a_rail(volts, replace(sensor, adc_bits=0)).any()
+    assert signal_chain.at_a_rail(volts, sensor).tolist() == [True, True, False, False]
+    assert not signal_chain.at_a_rail(volts, replace(sensor, adc_bits=0)).any()

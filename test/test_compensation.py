@@ -22,14 +22,15 @@ import signal
 
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.calibrate.provenance import envelope
-from adxl_ros.files import params, store
-from adxl_ros.files.columns import sensor_info
-from adxl_ros.model import chain, paper_inverse, unfilter
+from adxl_ros.compensate import filter_inversion, paper_inverse
+from adxl_ros.files import calibration_store, parameter_file
+from adxl_ros.files.recording_columns import sensor_info
+from adxl_ros.model import signal_chain
 from adxl_ros.model.coefficients import put, with_neutral
-from adxl_ros.model.maths import FLOATS
+from adxl_ros.model.covariance import force_covariance
+from adxl_ros.model.kinematics import specific_force
+from adxl_ros.model.scalar_or_array import FLOATS
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
-from adxl_ros.model.stage import specific_force
-from adxl_ros.model.uncertainty import force_covariance
 from builtin_interfaces.msg import Time
 from conftest import Started
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -140,7 +141,7 @@ def robot(ros_env: dict[str, str]) -> Iterator[Robot]:
 
 
 def _saved(folder: Path, sensor: Sensor) -> Path:
-    params.save(folder / 'unit.yaml', sensor)
+    parameter_file.save(folder / 'unit.yaml', sensor)
     return folder / 'unit.yaml'
 
 
@@ -150,7 +151,7 @@ def started(start: Start, tmp_path: Path, sensor: Sensor, *more: object) -> Star
 
 def felt(sensor: Sensor, force: list[float]) -> list[float]:
     """Return the nominal acceleration of a sensor that feels a force, m/s², three floats."""
-    volts = np.array([chain.static_response(sensor)(force)])
+    volts = np.array([signal_chain.static_response(sensor)(force)])
     return [*to_nominal_mps2(volts, sensor)[0].tolist(), 0.0][:3]
 
 
@@ -216,8 +217,8 @@ def test_supply_and_temperature_are_taken_out(robot: Robot, start: Start, tmp_pa
     clock = node.create_publisher(Clock, '/clock', 10)
     supply = node.create_publisher(BatteryState, 'supply', 1)
     temperature = node.create_publisher(Temperature, 'temperature', 1)
-    force, around = pose(0.7, 0.4), chain.NOMINAL._replace(temperature_c=35.0, supply_v=4.8)
-    volts = np.array([chain.static_response(sensor)(force, around)])
+    force, around = pose(0.7, 0.4), signal_chain.NOMINAL._replace(temperature_c=35.0, supply_v=4.8)
+    volts = np.array([signal_chain.static_response(sensor)(force, around)])
     shown = [*to_nominal_mps2(volts, sensor)[0].tolist(), 0.0]
     robot.answer(shown)
     robot.level(DiagnosticStatus.WARN, 'supply is taken at 5: nothing on /supply')
@@ -243,7 +244,7 @@ def test_supply_and_temperature_are_taken_out(robot: Robot, start: Start, tmp_pa
 def stored(folder: Path, sensor: Sensor, days_old: float) -> Path:
     """Put a calibration of some age into a store."""
     made = datetime.now(timezone.utc) - timedelta(days=days_old)
-    path = store.put(folder, replace(sensor, provenance={
+    path = calibration_store.put(folder, replace(sensor, provenance={
         'date': made.isoformat(timespec='seconds'), 'data_sha256': f'{days_old:064.3f}'}))
     assert path is not None
     return path
@@ -289,7 +290,7 @@ def test_the_newest_calibration_of_the_unit_is_taken(robot: Robot, start: Start,
 def test_a_named_calibration_stands(robot: Robot, start: Start, tmp_path: Path) -> None:
     """Whatever the store has; without one it is the store's default folder that is asked."""
     sensor = unit(seed=1)
-    stored(store.default_folder(), unit(seed=2), 0.0)
+    stored(calibration_store.default_folder(), unit(seed=2), 0.0)
     process = started(start, tmp_path, sensor)
     robot.inform(sensor)
     robot.connected()
@@ -298,11 +299,11 @@ def test_a_named_calibration_stands(robot: Robot, start: Start, tmp_path: Path) 
     robot.level(DiagnosticStatus.OK, 'compensating')
     assert process.output().count('compensating by') == 1
     nominal_file = tmp_path / 'nominal.yaml'
-    params.save(nominal_file, nominal(serial='17'))
+    parameter_file.save(nominal_file, nominal(serial='17'))
     process.stop()
     # Figures without coefficients name no calibration.
     other = start(NODE, '--ros-args', '--params-file', nominal_file, '-r', '__node:=other')
-    other.wait_for(f'compensating by {store.default_folder()}')
+    other.wait_for(f'compensating by {calibration_store.default_folder()}')
 
 
 def test_outside_of_what_was_calibrated_the_covariance_is_raised(
@@ -406,6 +407,8 @@ def test_nan_never_leaves(robot: Robot, start: Start, tmp_path: Path) -> None:
     ('nominal_zero_g_v', '1.65, 1.65', 'nominal_zero_g_v is [1.65, 1.65], but [2.5, 2.5]'),
     ('nominal_scale_v_per_g', '0.3, 0.3', 'nominal_scale_v_per_g is [0.3, 0.3], but [1.0, 1.0]'),
     ('format', '99', 'format version 99, but this package reads version 1'),
+    ('rate_hz', 'nan', "rate_hz is 'nan', expected samples a second"),
+    ('rate_hz', '-1', "rate_hz is '-1', expected samples a second"),
 ])
 def test_another_unit_is_refused(robot: Robot, start: Start, tmp_path: Path, key: str,
                                  value: str, reason: str) -> None:
@@ -475,8 +478,8 @@ def test_calibration_loads_a_whole_file_or_nothing(robot: Robot, start: Start,
     second = replace(second, effects=('bias',), values={'bias': second.values['bias']},
                      provenance={'date': '2026-02-03'})
     other = tmp_path / 'other.yaml'
-    params.save(other, second)
-    params.save(tmp_path / 'foreign.yaml', unit('18'))
+    parameter_file.save(other, second)
+    parameter_file.save(tmp_path / 'foreign.yaml', unit('18'))
     broken = tmp_path / 'broken.yaml'
     broken.write_text(other.read_text().replace('rate_hz: 1000.0', 'rate_hz: 1000'))
     started(start, tmp_path, first)
@@ -492,7 +495,7 @@ def test_calibration_loads_a_whole_file_or_nothing(robot: Robot, start: Start,
     np.testing.assert_allclose(accel(robot.answer(felt(first, force))), force, atol=1e-7)
     assert robot.assign(calibration=str(other)) == ''
     np.testing.assert_allclose(accel(robot.answer(felt(second, force))), force, atol=1e-7)
-    flat = params.to_flat(second)
+    flat = parameter_file.to_flat(second)
     found = robot.get('calibration', *flat)
     assert found == [str(other), *flat.values()]
     assert robot.get('misalignment.alpha_rad', 'provenance.source') == [[], '']
@@ -557,13 +560,13 @@ def test_the_filter_is_undone_late_and_with_own_stamps(robot: Robot, start: Star
     values = {pair.key: pair.value for pair in robot.graph.diagnostics[NODE].values}
     assert values['delay_s'] == '8.0'
     alpha = 0.6 + 0.1 * np.sin(0.2 * np.arange(40))
-    volts = np.column_stack(chain.static_response(sensor)(specific_force(alpha, 0.3, G)))
+    volts = np.column_stack(signal_chain.static_response(sensor)(specific_force(alpha, 0.3, G)))
     for row in to_nominal_mps2(volts, sensor):
         robot.send([*row.tolist(), 0.0])
     robot.graph.spin_until(lambda: len(robot.data) == 32, 10.0, '32 of 40 samples')
     assert [stamp_ns(m) for m in robot.data] == [k * 10 ** 9 for k in range(1, 33)]
-    back = unfilter.undone(volts, np.arange(1.0, 41.0), np.full(2, sensor.rc_s), 1.0)
-    expected = np.transpose(chain.inverse(sensor)(list(back.T)))[:32]
+    back = filter_inversion.undone(volts, np.arange(1.0, 41.0), np.full(2, sensor.rc_s), 1.0)
+    expected = np.transpose(signal_chain.inverse(sensor)(list(back.T)))[:32]
     got = np.array([accel(m) for m in robot.data])
     np.testing.assert_allclose(got[8:, :2], expected[8:, :2], atol=1e-5)
 
@@ -575,6 +578,7 @@ def test_the_papers_inverse_by_choice(robot: Robot, start: Start, tmp_path: Path
     robot.inform(sensor)
     robot.connected()
     values = felt(sensor, pose(0.7, 0.4))
-    volts = [v[0] for v in chain.static_response(sensor)([np.array([f]) for f in pose(0.7, 0.4)])]
+    volts = [v[0] for v in signal_chain.static_response(
+        sensor)([np.array([f]) for f in pose(0.7, 0.4)])]
     expected = paper_inverse.inverse(sensor, maths=FLOATS)([float(v) for v in volts])
     assert accel(robot.answer(values)) == pytest.approx(expected, abs=1e-6)

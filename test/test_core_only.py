@@ -88,13 +88,13 @@ def test_every_core_module_imports() -> None:
 def test_a_real_link_says_what_to_install() -> None:
     code = """
 from adxl_ros.errors import UserError
-from adxl_ros.files import params
-from adxl_ros.links import base
+from adxl_ros.files import parameter_file
+from adxl_ros.links.support import base
 for name, given in (('serial', {'port': '/dev/null'}), ('iio', {})):
     module = base.module_of(name)
     options = {option.name: option.default for option in module.OPTIONS}
     try:
-        module.open_link(params.load(sys.argv[1]), options | given)
+        module.open_link(parameter_file.load(sys.argv[1]), options | given)
     except UserError as error:
         print(error)
 """

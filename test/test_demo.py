@@ -19,16 +19,17 @@ import io
 import re
 import sys
 
-from adxl_ros.calibrate import gravity, judge, verdict
-from adxl_ros.calibrate.against_truth import added_effects, compare
-from adxl_ros.calibrate.full import TERMS
+from adxl_ros.calibrate.fits import gravity_fit
+from adxl_ros.calibrate.fits.full_model import TERMS
+from adxl_ros.calibrate.report import acceptance, cross_validation
+from adxl_ros.calibrate.report.against_truth import added_effects, compare
 from adxl_ros.errors import UserError
-from adxl_ros.model import chain
+from adxl_ros.model import signal_chain
 from adxl_ros.model.coefficients import get, names_of, put, with_neutral
 from adxl_ros.model.effects import effect_named
-from adxl_ros.model.stage import specific_force
+from adxl_ros.model.kinematics import specific_force
 from adxl_ros.nodes import demo
-from adxl_ros.screen import steps
+from adxl_ros.nodes.terminal import steps
 from conftest import executable, REPO
 import numpy as np
 import pytest
@@ -109,8 +110,8 @@ def test_linear_terms_that_the_fit_lacks_are_misalignment(axes: str) -> None:
     bare = put(fitted, linear, np.zeros(len(linear)))
     same = put(bare, fitted.covariance_names, values)
     force = specific_force(rng.uniform(0, np.pi, 50), rng.uniform(0, 2 * np.pi, 50), 9.80665)
-    np.testing.assert_allclose(chain.static_response(same)(force),
-                               chain.static_response(truth)(force), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(signal_chain.static_response(same)(force),
+                               signal_chain.static_response(truth)(force), rtol=0, atol=1e-12)
 
 
 def test_linear_terms_that_the_fit_has_are_compared() -> None:
@@ -163,9 +164,9 @@ def test_table_of_the_truth_has_room() -> None:
 
 
 def test_table_of_scores() -> None:
-    errors = verdict.Errors(*np.zeros((2, 3)), np.full((3, 2), 0.45), np.radians(np.full(3, 7.2)),
-                            np.zeros((3, 3)))
-    scores = [verdict.score('nominal', errors), verdict.score('full', replace(
+    errors = cross_validation.Errors(*np.zeros((2, 3)), np.full((3, 2), 0.45),
+                                     np.radians(np.full(3, 7.2)), np.zeros((3, 3)))
+    scores = [cross_validation.score('nominal', errors), cross_validation.score('full', replace(
         errors, accel_mps2=errors.accel_mps2 / 100, tilt_rad=np.full(3, np.nan)))]
     lines = demo.scores_table(scores)
     assert lines[1].split() == ['datasheet', 'values', '7.20', '°', '45.9', 'mg']
@@ -188,13 +189,13 @@ def test_verdict(accel: str, tilt: str, begin: list[str]) -> None:
     lines = demo.verdict_lines(replace(made()[0], provenance=said))
     assert len(lines) == len(begin) and max(map(len, lines)) <= 79
     assert all(text in line for text, line in zip(begin, lines))
-    assert demo.verdict_lines(made()[0])[0].startswith(f' {judge.NOT_SHOWN}')
+    assert demo.verdict_lines(made()[0])[0].startswith(f' {acceptance.NOT_SHOWN}')
 
 
 def test_table_of_gravity() -> None:
     rests = np.full(24, 1e-3 * 9.80665)
-    fit = gravity.GravityFit({}, np.zeros((0, 0)), 21.3 * rests, 0.16 * rests,
-                             np.where(np.arange(24) == 3, 9.9, 0.24) * rests, rests, 0.0, (3,))
+    fit = gravity_fit.GravityFit({}, np.zeros((0, 0)), 21.3 * rests, 0.16 * rests,
+                                 np.where(np.arange(24) == 3, 9.9, 0.24) * rests, rests, 0.0, (3,))
     lines = demo.gravity_lines(fit)
     assert lines[0].endswith('over 23 rests') and lines[3] == ' 1 disturbed rest was left out'
     assert lines[1].split() == ['datasheet', 'values', '21.3', 'mg']

@@ -17,19 +17,19 @@
 from dataclasses import replace
 import json
 
-from adxl_ros.files import params, recording
-from adxl_ros.files.columns import Recording, sensor_info
-from adxl_ros.gap import report
-from adxl_ros.gap.diagnose import diagnose
-from adxl_ros.gap.far import held_out
-from adxl_ros.gap.local import Hypothesis, refined
-from adxl_ros.gap.next_step import proposed
-from adxl_ros.gap.series import series_of
-from adxl_ros.gap.study import study
-from adxl_ros.gap.verdict import Verdict
-from adxl_ros.model import trajectory
-from adxl_ros.model.motion import Held, Knots, Motion
-from adxl_ros.model.simulate import simulate
+from adxl_ros.diagnose import report_json
+from adxl_ros.diagnose.baseline_comparison import series_of
+from adxl_ros.diagnose.decision import Verdict
+from adxl_ros.diagnose.diagnosis import diagnose
+from adxl_ros.diagnose.gap_closure import held_out
+from adxl_ros.diagnose.hypothesis_fit import Hypothesis, refined
+from adxl_ros.diagnose.linear_model import study
+from adxl_ros.diagnose.next_experiment import proposed
+from adxl_ros.files import parameter_file, recording
+from adxl_ros.files.recording_columns import Recording, sensor_info
+from adxl_ros.simulate import trajectories
+from adxl_ros.simulate.motion import Held, Knots, Motion
+from adxl_ros.simulate.simulator import simulate
 from adxl_ros.tools.effect_option import with_effects
 import numpy as np
 import pytest
@@ -55,7 +55,7 @@ def unit(axes='xyz', rate_hz=125.0):
 
 def turned():
     """Turn beta in two planes at two speeds, with rests, and warm up by 12 degC."""
-    script = trajectory.Script(np.pi / 2, 0.0)
+    script = trajectories.Script(np.pi / 2, 0.0)
     for alpha in (np.pi / 2, np.pi / 4, 2.0):
         script.go(alpha, 0.0)
         script.rest(3.0)
@@ -79,7 +79,7 @@ def made(sensor, effects=(), seed=3, change=None):
 def diagnosed(sensor, *effects, change=None):
     """Diagnose such a recording by the library call."""
     found = diagnose([made(sensor, effects, change=change)], sensor)
-    told = report.as_json(found)
+    told = report_json.as_json(found)
     assert set(told) >= KEYS
     return told, found
 
@@ -150,7 +150,7 @@ def test_a_shape_far_from_the_typical_is_found_and_the_zero_g_fits_it(amplitude_
 
     recorded = made(unit(), change=change)
     found = diagnose([recorded], unit())
-    told = report.as_json(found)
+    told = report_json.as_json(found)
     assert told['verdict']['effects'] == ['warm_up']
     assert told['gap']['closed'] > 0.9
     tau = next(c for c in told['candidates'] if c['effect'] == 'warm_up')['parameters']['tau_s']
@@ -241,7 +241,7 @@ def test_a_soft_clip_is_saturation():
 
 def test_a_limit_that_one_stretch_alone_reaches_is_not_guessed_from_the_others():
     """A soft clip of y, which comes near it once: what is held out there is closed, too."""
-    script, limit_g, knee_g = trajectory.Script(np.pi / 2, 0.0), 1.1, 0.036
+    script, limit_g, knee_g = trajectories.Script(np.pi / 2, 0.0), 1.1, 0.036
     for turn in range(14):
         for to, speed in ((0.8, 1.0), (-0.8, 1.3), *([(1.57, 1.2)] if turn == 7 else [])):
             script.run('beta', to, speed)
@@ -320,7 +320,7 @@ def test_the_command_leaves_report_page_and_parameters(run_tool, tmp_path):
     sensor = unit('xy')
     read = made(sensor, ['temperature_bias:per_k=4e-4'])
     recording.write(tmp_path / 'run.csv', read, sensor)
-    params.save(tmp_path / 'unit.yaml', sensor)
+    parameter_file.save(tmp_path / 'unit.yaml', sensor)
     files = []
     for name in ('a', 'b'):
         done = run_tool('diagnose', 'run.csv', '--params', 'unit.yaml', '-o', name)
@@ -338,7 +338,7 @@ def test_the_command_leaves_report_page_and_parameters(run_tool, tmp_path):
 def test_several_recordings_and_bags(run_tool, tmp_path):
     """A CSV file and a bag of one unit are one diagnosis."""
     sensor = unit('xy')
-    params.save(tmp_path / 'unit.yaml', sensor)
+    parameter_file.save(tmp_path / 'unit.yaml', sensor)
     for name, seed in (('a.csv', 3), ('b.mcap', 4)):
         recording.write(tmp_path / name, made(sensor, ['time_offset:offset_s=0.004'], seed),
                         sensor)
@@ -350,7 +350,7 @@ def test_several_recordings_and_bags(run_tool, tmp_path):
 
 def turning(alphas, speeds, rests_s=2.0):
     """Turn beta forth and back in some planes at some speeds."""
-    script = trajectory.Script(alphas[0], 0.0)
+    script = trajectories.Script(alphas[0], 0.0)
     for alpha in alphas:
         script.go(alpha, 0.0)
         script.rest(rests_s)
@@ -370,7 +370,7 @@ def recorded(sensor, motion, effects=(), seed=3):
 
 def named(found):
     """Return all that a verdict names, for certain or in a group."""
-    verdict = report.as_json(found)['verdict']
+    verdict = report_json.as_json(found)['verdict']
     return {*verdict['effects'], *(e for group in verdict['groups'] for e in group)}
 
 
@@ -392,7 +392,7 @@ def test_what_does_not_move_is_not_called_free_of_a_gap():
     """A minute at rest: no verdict, and what was not covered."""
     sensor = unit('xy')
     found = diagnose([recorded(sensor, Motion(60.0, Held(1.0), Held(0.5)))], sensor)
-    told = report.as_json(found)
+    told = report_json.as_json(found)
     assert told['verdict']['status'] == 'insufficient'
     assert 'motion' in told['not_covered'] and told['next_experiment']
 
@@ -405,7 +405,7 @@ def test_repeats_tell_the_floor_where_nothing_rests():
         rate * time_s)) for rate in (0.31, 0.53))
     motion = Motion(65.0, alpha, beta)
     found = diagnose([recorded(sensor, motion, seed=seed) for seed in (1, 2)], sensor)
-    told = report.as_json(found)
+    told = report_json.as_json(found)
     assert told['gap']['floor_source'] == 'repeats'
     # 110 ug/rtHz behind 15 Hz and 16 bit at 5 V.
     assert told['gap']['floor'] == pytest.approx(5.3e-3, rel=0.1)

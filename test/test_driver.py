@@ -17,10 +17,10 @@
 import os
 import signal
 
-from adxl_ros.files.columns import sensor_info
+from adxl_ros.files.recording_columns import sensor_info
 from adxl_ros.model import noise
 from adxl_ros.model.sensor import to_nominal_mps2, to_volts
-from adxl_ros.nodes.outputs import imu_message, ImuWriter, References
+from adxl_ros.nodes.support.driver_publishers import imu_message, ImuWriter, References
 from diagnostic_msgs.msg import DiagnosticStatus
 from graph import accel, Graph, stamp_ns
 import numpy as np

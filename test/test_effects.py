@@ -17,7 +17,7 @@
 from dataclasses import replace
 
 from adxl_ros.errors import UserError
-from adxl_ros.model import chain
+from adxl_ros.model import signal_chain
 from adxl_ros.model.coefficients import (
     get,
     names_of,
@@ -29,12 +29,12 @@ from adxl_ros.model.coefficients import (
 )
 from adxl_ros.model.effects import library
 from adxl_ros.model.filters import low_pass, resonator
-from adxl_ros.model.motion import Held, Knots, Motion
-from adxl_ros.model.play import play
-from adxl_ros.model.response import Response
-from adxl_ros.model.simulate import simulate
-from adxl_ros.model.stage import specific_force
-from adxl_ros.model.trajectory import Sine, Steps
+from adxl_ros.model.kinematics import specific_force
+from adxl_ros.model.play_operator import play
+from adxl_ros.simulate.motion import Held, Knots, Motion
+from adxl_ros.simulate.response import Response
+from adxl_ros.simulate.simulator import simulate
+from adxl_ros.simulate.trajectories import Sine, Steps
 import numpy as np
 import pytest
 from scipy.signal import welch
@@ -201,8 +201,8 @@ def test_lever_arm_is_centripetal_and_tangential():
 
 def test_supply_is_not_quite_ratiometric():
     """The ADXL203 gives 560 mV/g and 1.5 V at 3 V."""
-    respond = chain.static_response(having('supply'))
-    around = chain.NOMINAL._replace(supply_v=3.0)
+    respond = signal_chain.static_response(having('supply'))
+    around = signal_chain.NOMINAL._replace(supply_v=3.0)
     zero, one = (respond([f, 0.0, 0.0], around)[0] for f in (0.0, G))
     assert zero == pytest.approx(1.5, abs=1e-12)
     assert one - zero == pytest.approx(0.560, abs=2e-4)
@@ -210,11 +210,11 @@ def test_supply_is_not_quite_ratiometric():
 
 def test_temperature_moves_zero_g_and_scale():
     """0.1 mg/K from 25 °C on, and the scale factor by its part."""
-    around = chain.NOMINAL._replace(temperature_c=35.0)
-    assert chain.static_response(having('temperature_bias'))([0.0, 0.0, 0.0], around)[0] == \
-        pytest.approx(2.501, abs=1e-12)
-    assert chain.static_response(having('temperature_scale'))([G, 0.0, 0.0], around)[0] == \
-        pytest.approx(3.501, abs=1e-12)
+    around = signal_chain.NOMINAL._replace(temperature_c=35.0)
+    bias, scale = (signal_chain.static_response(having(name))
+                   for name in ('temperature_bias', 'temperature_scale'))
+    assert bias([0.0, 0.0, 0.0], around)[0] == pytest.approx(2.501, abs=1e-12)
+    assert scale([G, 0.0, 0.0], around)[0] == pytest.approx(3.501, abs=1e-12)
 
 
 def test_vibration_shifts_by_its_mean_square():
@@ -285,18 +285,20 @@ def test_inverse_by_surroundings():
     sensor = with_neutral(nominal('xyz'), names)
     sensor = replace(sensor, values={n: typical(library()[n], 'xyz') for n in names})
     rng = np.random.default_rng(0)
-    around = chain.Environment(rng.uniform(0, 900, 400), rng.uniform(-20, 60, 400),
-                               rng.uniform(4.5, 5.5, 400))
+    around = signal_chain.Environment(rng.uniform(0, 900, 400), rng.uniform(-20, 60, 400),
+                                      rng.uniform(4.5, 5.5, 400))
     truth = rng.normal(size=(3, 400)) * 5
-    found = chain.inverse(sensor)(chain.static_response(sensor)(list(truth), around), around)
+    found = signal_chain.inverse(sensor)(
+        signal_chain.static_response(sensor)(list(truth), around), around)
     np.testing.assert_allclose(np.array(found), truth, atol=1e-9 * G)
 
 
 def test_local_gravity_is_used_by_equation_5():
     """A two-axis sensor takes its z from the corrected gravity."""
     sensor = having('gravity', nominal('xy'))
-    force = specific_force(0.6, 0.3, chain.gravity_mps2(sensor))
-    found = chain.inverse(sensor)(chain.static_response(sensor)([float(f) for f in force]))
+    force = specific_force(0.6, 0.3, signal_chain.gravity_mps2(sensor))
+    found = signal_chain.inverse(sensor)(
+        signal_chain.static_response(sensor)([float(f) for f in force]))
     assert found == pytest.approx([float(f) for f in force], abs=1e-9)
 
 

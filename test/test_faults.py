@@ -25,8 +25,8 @@ import threading
 import time
 
 from adxl_ros.errors import UserError
-from adxl_ros.files import params
-from adxl_ros.links import board, iio_device
+from adxl_ros.files import parameter_file
+from adxl_ros.links.support import emulated_board, iio_device
 from adxl_ros.model.effects import effect_named
 from diagnostic_msgs.msg import DiagnosticStatus
 from faults import bytes_hurt, IIO, Row, run, SERIAL
@@ -256,8 +256,8 @@ def feeding(tmp_path, sensor, columns):
     ready = threading.Event()
 
     def feed():
-        with board.opened(path) as fd:
-            sender = board.Board(sensor, board.roles_of(sensor, columns), fd)
+        with emulated_board.opened(path) as fd:
+            sender = emulated_board.Board(sensor, emulated_board.roles_of(sensor, columns), fd)
             ready.set()
             while not stop.is_set():
                 sender.send(columns)
@@ -272,7 +272,7 @@ def test_a_measured_supply_takes_the_supply_out(start, tmp_path):
     effect = effect_named('supply')
     sensor = replace(nominal(), effects=('supply',), values={'supply': {
         p.name: np.full(2, 1.0) if p.axes else np.array(5.0) for p in effect.parameters}})
-    params.save(tmp_path / 'unit.yaml', sensor)
+    parameter_file.save(tmp_path / 'unit.yaml', sensor)
     columns = {'x_v': np.full(200, 2.4), 'y_v': np.full(200, 2.4 + 0.96 / 2),
                'supply_v': np.full(200, 4.8), 'temperature_c': np.full(200, 31.0)}
     path, end = feeding(tmp_path, nominal(), columns)

@@ -19,7 +19,7 @@ from pathlib import Path
 import shutil
 import subprocess
 
-from adxl_ros.links.wire import AFTER_RESET, decode, Encoder, Info, RAIL
+from adxl_ros.links.support.wire_format import AFTER_RESET, decode, Encoder, Info, RAIL
 import numpy as np
 import pytest
 

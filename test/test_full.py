@@ -16,26 +16,27 @@
 
 from dataclasses import replace
 
-from adxl_ros.calibrate import full, full_terms, full_words, result
+from adxl_ros.calibrate import calibration
+from adxl_ros.calibrate.fits import full_fit_text, full_model, term_selection
 from adxl_ros.errors import UserError
-from adxl_ros.files import params
-from adxl_ros.model import chain
+from adxl_ros.files import parameter_file
+from adxl_ros.model import signal_chain
 from adxl_ros.model.coefficients import get, put, with_neutral
-from adxl_ros.model.stage import specific_force
+from adxl_ros.model.constants import NINETY
+from adxl_ros.model.kinematics import specific_force
 import numpy as np
 from pace import within
 import pytest
 from units import drawn, NOMINAL, nominal, PLANES_RAD, swept
 
-NINETY = 1.6449
-TERMS = full.TERMS
+TERMS = full_model.TERMS
 
 
 def swept_unit(seed, axes='xy', stage_deg=5 / 60, **options):
     """Draw a unit of all terms and sweep it; return nominal figures, the unit, its poses."""
     rng = np.random.default_rng(seed)
     sensor = nominal(axes)
-    truth = drawn(rng, sensor, full.terms_of(axes))
+    truth = drawn(rng, sensor, full_model.terms_of(axes))
     poses = swept(rng, replace(truth, stage_resolution_rad=np.radians(stage_deg)), **options)
     return sensor, truth, poses
 
@@ -52,7 +53,7 @@ def errors(found, truth):
     ('xy', 70, False), ('xy', 70, True), ('xyz', 40, True)])
 def test_ninety_percent_intervals_cover_ninety_percent(axes, units, per_setting):
     """Over more than a thousand intervals of drawn units, whatever the stage's errors."""
-    z = np.concatenate([np.divide(*errors(full.fit_full(sensor, poses), truth))
+    z = np.concatenate([np.divide(*errors(full_model.fit_full(sensor, poses), truth))
                         for sensor, truth, poses in (
                             swept_unit(k, axes, per_setting=per_setting) for k in range(units))])
     assert len(z) > 1000
@@ -65,7 +66,7 @@ def test_the_kind_of_the_stages_error_is_found(per_setting):
     levels = []
     for k in range(8):
         sensor, _, poses = swept_unit(k, per_setting=per_setting)
-        stage = full.fit_full(sensor, poses).stage
+        stage = full_model.fit_full(sensor, poses).stage
         levels.append((stage.setting_rad, stage.pose_rad))
     setting, pose = np.degrees(np.median(levels, axis=0))
     wanted, other = (setting, pose) if per_setting else (pose, setting)
@@ -79,9 +80,9 @@ def test_an_eccentric_stage_is_found_and_a_sound_one_is_not_blamed(eccentric):
     for seed in range(8):
         rng = np.random.default_rng(seed)
         truth = drawn(rng, nominal(), (*TERMS, 'stage_eccentricity'))
-        names = full.coefficients('xy', ('stage_eccentricity',))[2:]
+        names = full_model.coefficients('xy', ('stage_eccentricity',))[2:]
         truth = put(truth, names, eccentric * 1e-3 * rng.choice([-1, 1], len(names)))
-        found, _ = full_terms.fit_judged(nominal(), swept(rng, truth, per_setting=True))
+        found, _ = term_selection.fit_judged(nominal(), swept(rng, truth, per_setting=True))
         assert any('eccentricity' in name for name in found.names) == eccentric
         off, std = errors(found, truth)
         assert np.sqrt(np.mean((off / std) ** 2)) < 2
@@ -91,7 +92,7 @@ def test_each_axis_of_a_three_axis_unit_bends():
     """A z that bends like x and y is fitted to the noise, and the stage is not blamed for it."""
     sensor, truth, poses = swept_unit(4, 'xyz', 0.0, check_poses=0,
                                       planes_rad=np.radians(np.arange(0, 181, 30)))
-    found, _ = full_terms.fit_judged(sensor, poses)
+    found, _ = term_selection.fit_judged(sensor, poses)
     bent = truth.values['cross_axis']['quadratic_per_g'][2]
     assert abs(bent) > 1e-3
     assert found.fitted.values['cross_axis']['quadratic_per_g'][2] == pytest.approx(bent, abs=2e-4)
@@ -103,13 +104,13 @@ def test_each_axis_of_a_three_axis_unit_bends():
 def test_a_fit_that_does_not_converge_says_so(monkeypatch):
     """It says so in its words; one that converges does not."""
     sensor, _, poses = swept_unit(2)
-    found, judged = full_terms.fit_judged(sensor, poses)
+    found, judged = term_selection.fit_judged(sensor, poses)
     assert found.converged
-    assert full_words.NOT_CONVERGED not in full_words.words(found, poses, judged)
-    monkeypatch.setattr(full, '_ROUNDS', 1)
-    found, judged = full_terms.fit_judged(sensor, poses)
+    assert full_fit_text.NOT_CONVERGED not in full_fit_text.words(found, poses, judged)
+    monkeypatch.setattr(full_model, '_ROUNDS', 1)
+    found, judged = term_selection.fit_judged(sensor, poses)
     assert not found.converged
-    assert full_words.NOT_CONVERGED in full_words.words(found, poses, judged)
+    assert full_fit_text.NOT_CONVERGED in full_fit_text.words(found, poses, judged)
 
 
 def test_a_term_that_is_not_convex_is_found_from_several_starts():
@@ -119,7 +120,7 @@ def test_a_term_that_is_not_convex_is_found_from_several_starts():
     values = {**truth.values['adc_inl'], 'amplitude_v': np.array(1e-3), 'cycles': np.array(17.3)}
     truth = replace(truth, values={**truth.values, 'adc_inl': values})
     poses = swept(np.random.default_rng(1), truth, check_poses=0)
-    found = full.fit_full(sensor, poses, (*TERMS, 'adc_inl')).unit.values['adc_inl']
+    found = full_model.fit_full(sensor, poses, (*TERMS, 'adc_inl')).unit.values['adc_inl']
     assert found['cycles'] == pytest.approx(17.3, rel=0.01)
     assert found['amplitude_v'] == pytest.approx(1e-3, rel=0.15)
 
@@ -127,7 +128,7 @@ def test_a_term_that_is_not_convex_is_found_from_several_starts():
 def test_one_axis():
     """A sensor of one axis is fitted, too."""
     sensor, truth, poses = swept_unit(1, 'x')
-    off, std = errors(full.fit_full(sensor, poses), truth)
+    off, std = errors(full_model.fit_full(sensor, poses), truth)
     assert np.abs(off / std).max() < 4
 
 
@@ -138,8 +139,9 @@ def test_the_gauge_is_fixed_where_only_the_sum_shows():
     truth = with_neutral(truth, ['cross_axis', 'cross_axis_z'])
     truth = put(truth, ['cross_axis.linear.x', 'cross_axis_z.linear.y'], [0.012, -0.02])
     poses = swept(rng, truth)
-    found, _ = full_terms.fit_judged(nominal(), poses)
-    assert not set(full.GAUGE) & {full.term_of(name) for name in found.fitted.covariance_names}
+    found, _ = term_selection.fit_judged(nominal(), poses)
+    assert not set(full_model.GAUGE) & {full_model.term_of(name)
+                                        for name in found.fitted.covariance_names}
     assert found.fitted.values['cross_axis']['linear'].tolist() == [0, 0]
     turned = found.fitted.values['misalignment']['beta_rad'][0]
     assert turned == pytest.approx(
@@ -156,12 +158,12 @@ def test_the_gauge_is_freed_where_products_show_the_parts():
     poses = swept(rng, replace(truth, stage_resolution_rad=0.0))
     held = np.radians([[40, 10], [75, 200], [130, 300], [20, 100]])
     force = specific_force(*held.T, truth.local_gravity_mps2)
-    volts = chain.static_response(truth)(force)
+    volts = signal_chain.static_response(truth)(force)
     worst = {}
-    for name, found in (('fixed', full.fit_full(nominal(), poses)),
-                        ('judged', full_terms.fit_judged(nominal(), poses)[0])):
+    for name, found in (('fixed', full_model.fit_full(nominal(), poses)),
+                        ('judged', term_selection.fit_judged(nominal(), poses)[0])):
         up = np.where(np.cos(held[:, 0]) < 0, -1, 1)
-        off = np.subtract(chain.inverse(found.fitted, up)(volts), force)[:2]
+        off = np.subtract(signal_chain.inverse(found.fitted, up)(volts), force)[:2]
         worst[name] = np.abs(off).max()
     assert worst['judged'] < 3e-4 and worst['fixed'] > 2 * worst['judged']
 
@@ -172,48 +174,48 @@ def test_knocked_poses_are_named_and_left_out():
     bad = [7, 40, 90]
     volts = poses.volts.copy()
     volts[bad] += [[0.01, 0.0], [0.0, -0.02], [0.03, 0.01]]
-    found, judged = full_terms.fit_judged(sensor, replace(poses, volts=volts))
+    found, judged = term_selection.fit_judged(sensor, replace(poses, volts=volts))
     assert found.knocked == tuple(bad)
     off, std = errors(found, truth)
     assert np.sqrt(np.mean((off / std) ** 2)) < 1.6
     assert any('left out, disturbed: pose 8 (alpha' in line
-               for line in full_words.words(found, poses, judged))
+               for line in full_fit_text.words(found, poses, judged))
 
 
 @pytest.mark.parametrize('stage_deg', [1.0, 3.0])
 def test_a_bad_stage_is_found_and_the_sensor_is_not_blamed(stage_deg):
     """The stage's error is estimated, and zero-g is as good as the magnitude of gravity tells."""
     sensor, truth, poses = swept_unit(6, 'xyz', stage_deg * np.sqrt(12))
-    found, judged = full_terms.fit_judged(sensor, poses)
+    found, judged = term_selection.fit_judged(sensor, poses)
     assert np.degrees(found.stage_sigma_rad) == pytest.approx(stage_deg, rel=0.15)
     off, std = errors(found, truth)
     assert np.sqrt(np.mean((off / std) ** 2)) < 1.6
     zero_g = [name.startswith('bias') for name in found.fitted.covariance_names]
     assert np.abs(off[zero_g]).max() < 1e-4
     assert any('the reference is worse than stated' in line
-               for line in full_words.words(found, poses, judged))
+               for line in full_fit_text.words(found, poses, judged))
 
 
 def test_terms_that_are_not_there_do_not_earn_their_place():
     """A unit of zero-g, scale and misalignment alone: nothing else gains on poses held out."""
     rng = np.random.default_rng(8)
     truth = drawn(rng, nominal(), ('bias', 'scale_factor', 'misalignment'))
-    judged = full_terms.fit_judged(nominal(), swept(rng, truth))[1]
+    judged = term_selection.fit_judged(nominal(), swept(rng, truth))[1]
     assert [term.name for term in judged if term.earns] == ['misalignment']
 
 
 def test_the_next_poses_help_more_than_others():
     """Poses that the fit asks for shrink the joint interval more than as many of the sweep."""
     sensor, _, poses = swept_unit(9, check_poses=0)
-    found = full.fit_full(sensor, poses)
-    asked = full.next_poses(found.unit, poses, found.names, found.stage)
+    found = full_model.fit_full(sensor, poses)
+    asked = full_model.next_poses(found.unit, poses, found.names, found.stage)
 
     def volume(angles_rad):
         more, alone = poses.subset(np.arange(len(angles_rad))), np.arange(len(angles_rad))
         more = replace(more, alpha_rad=angles_rad[:, 0], beta_rad=angles_rad[:, 1],
                        alpha_setting=alone, beta_setting=alone)
-        known = found.information + full.information(
-            found.unit, more, found.names, found.stage) - np.diag(full.priors(found.names))
+        known = found.information + full_model.information(
+            found.unit, more, found.names, found.stage) - np.diag(full_model.priors(found.names))
         return -np.linalg.slogdet(known)[1]
 
     others = np.column_stack([poses.alpha_rad, poses.beta_rad])[[5, 30, 60, 100]]
@@ -224,14 +226,14 @@ def test_temperature_that_moved_is_said_and_fitted():
     """15 degC of warming during the sweep: the verdict says so, or the term takes it."""
     sensor, truth, poses = swept_unit(10, check_poses=0)
     warm = replace(poses, temperature_c=np.linspace(20, 35, len(poses)))
-    found, judged = full_terms.fit_judged(sensor, warm)
-    words = full_words.words(found, warm, judged)
+    found, judged = term_selection.fit_judged(sensor, warm)
+    words = full_fit_text.words(found, warm, judged)
     assert any('temperature moved by 15.0 degC' in line for line in words)
     drift = 1e-3 * truth.scale_v_per_g * (warm.temperature_c[:, None] - 25)
-    found, judged = full_terms.fit_judged(sensor, replace(warm, volts=warm.volts + drift))
+    found, judged = term_selection.fit_judged(sensor, replace(warm, volts=warm.volts + drift))
     assert found.fitted.values['temperature_bias']['per_k'] == pytest.approx([1e-3] * 2, rel=0.1)
     assert not any('temperature moved' in line
-                   for line in full_words.words(found, warm, judged))
+                   for line in full_fit_text.words(found, warm, judged))
 
 
 @pytest.mark.parametrize('planes_deg, lost', [
@@ -240,13 +242,13 @@ def test_poses_of_too_few_planes_are_refused(planes_deg, lost):
     """The message names what is open and which poses to add."""
     sensor, _, poses = swept_unit(1, planes_rad=np.radians(planes_deg), check_poses=0)
     with pytest.raises(UserError, match=rf'do not tell .*{lost}.*add poses \(alpha, beta\) = '):
-        full.fit_full(sensor, poses)
+        full_model.fit_full(sensor, poses)
 
 
 def test_what_is_not_determined_falls_back_and_says_so():
     """Without a choice the richest model that the poses determine is fitted."""
     sensor, _, poses = swept_unit(1, planes_rad=PLANES_RAD[2:3], check_poses=0)
-    found = result.calibrate(sensor, [poses], None, ['made'])
+    found = calibration.calibrate(sensor, [poses], None, ['made'])
     assert found.fitted.model == 'linear'
     assert found.verdict[0].startswith('not full: the full model is not determined')
     assert found.verdict[1].startswith('not physical: ')
@@ -257,8 +259,8 @@ def test_several_recordings_of_one_unit():
     rng = np.random.default_rng(12)
     truth = drawn(rng, nominal(), TERMS)
     parts = [swept(rng, truth, check_poses=0) for _ in range(2)]
-    one = result.calibrate(nominal(), parts[:1], 'full', ['a'])
-    both = result.calibrate(nominal(), parts, 'full', ['a', 'b'])
+    one = calibration.calibrate(nominal(), parts[:1], 'full', ['a'])
+    both = calibration.calibrate(nominal(), parts, 'full', ['a', 'b'])
     assert np.trace(both.fitted.covariance) < 0.7 * np.trace(one.fitted.covariance)
 
 
@@ -273,7 +275,7 @@ def test_recordings_that_contradict_each_other_are_refused(change, words):
     truth = drawn(rng, nominal(), TERMS)
     parts = [swept(rng, unit, check_poses=0) for unit in (truth, truth, change(truth))]
     with pytest.raises(UserError, match=rf'{words} .* standard deviations: another unit'):
-        result.calibrate(nominal(), parts, 'full', ['a.csv', 'b.csv', 'c.csv'])
+        calibration.calibrate(nominal(), parts, 'full', ['a.csv', 'b.csv', 'c.csv'])
 
 
 def test_six_hundred_poses_of_three_axes_take_two_seconds():
@@ -281,7 +283,7 @@ def test_six_hundred_poses_of_three_axes_take_two_seconds():
     sensor, _, poses = swept_unit(2, 'xyz', planes_rad=np.radians(np.linspace(0, 180, 23)))
     assert len(poses) > 600
     with within(2.0):
-        found, _ = full_terms.fit_judged(sensor, poses)
+        found, _ = term_selection.fit_judged(sensor, poses)
     assert len(found.names) >= 20
 
 
@@ -292,7 +294,7 @@ def test_the_filter_is_found_in_the_noise(run_tool, tmp_path):
              'misalignment', '-o', tmp_path / 'sweep.csv')
     done = run_tool('fit', tmp_path / 'sweep.csv', '-o', tmp_path / 'unit.yaml')
     assert 'bandwidth.resistance_ratio' in done.stdout
-    fitted = params.load(tmp_path / 'unit.yaml')
+    fitted = parameter_file.load(tmp_path / 'unit.yaml')
     assert fitted.model == 'full'
     ratio = fitted.values['bandwidth']['resistance_ratio']
     assert ratio == pytest.approx([0.2, -0.15], abs=0.04)

@@ -16,14 +16,14 @@
 
 from dataclasses import replace
 
-from adxl_ros.calibrate import magnitude
-from adxl_ros.calibrate.gravity import fit_gravity, NAMES
-from adxl_ros.calibrate.rests import find_rests, rest_means
+from adxl_ros.calibrate.fits import gravity_model
+from adxl_ros.calibrate.fits.gravity_fit import fit_gravity, NAMES
 from adxl_ros.errors import UserError
 from adxl_ros.files import recording
-from adxl_ros.model import chain
+from adxl_ros.model import signal_chain
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.sensor import to_volts
+from adxl_ros.signals.rest_detection import find_rests, rest_means
 from hypothesis import given, settings, strategies
 import numpy as np
 from pace import within
@@ -63,7 +63,7 @@ def rested(rng, sensor, poses, error_v=5e-5, excess_g=0.0):
     """Make the rests of a unit in `poses`: means and standard errors, V, through the chain."""
     force = poses * (sensor.local_gravity_mps2
                      + G0_MPS2 * excess_g * rng.normal(size=(len(poses), 1)))
-    volts = np.column_stack(chain.static_response(sensor)(list(force.T)))
+    volts = np.column_stack(signal_chain.static_response(sensor)(list(force.T)))
     errors = error_v * rng.uniform(0.5, 2, (len(poses), 1)) * np.ones(3)
     return volts + errors * rng.normal(size=volts.shape), errors
 
@@ -97,11 +97,12 @@ def test_jacobian_against_differences():
     rng = np.random.default_rng(1)
     mean, found = directions(rng, 20) * 1.05, rng.normal(0, 0.05, 9)
     step = 1e-6
-    for k, column in enumerate(magnitude.jacobian_of(mean, found).T):
+    for k, column in enumerate(gravity_model.jacobian_of(mean, found).T):
         up, down = found.copy(), found.copy()
         up[k] += step
         down[k] -= step
-        wanted = (magnitude.magnitude(mean, up) - magnitude.magnitude(mean, down)) / (2 * step)
+        wanted = (gravity_model.magnitude(mean, up)
+                  - gravity_model.magnitude(mean, down)) / (2 * step)
         assert column == pytest.approx(wanted, abs=1e-9)
 
 
@@ -167,7 +168,7 @@ def test_leave_one_out_is_that():
         others = np.arange(16) != i
         without = replace(sensor, values=fit_gravity(means[others], errors[others],
                                                      bare(sensor)).values)
-        force = np.array(chain.inverse(without)(list(means[i:i + 1].T)))
+        force = np.array(signal_chain.inverse(without)(list(means[i:i + 1].T)))
         off = np.linalg.norm(force) - sensor.local_gravity_mps2
         # The excess is estimated anew without the rest, the weights change a little.
         assert fit.leave_one_out_mps2[i] == pytest.approx(off, abs=2e-4)
@@ -319,7 +320,7 @@ def test_real_unit_on_rests_kept_out(shared_dir):
     sensor, _, means, errors = real(shared_dir, 'xsens_multiposition', XSENS_MPS2)
     fit = fit_gravity(means[:24], errors[:24], sensor)
     fitted = replace(sensor, effects=EFFECTS, values=fit.values)
-    force = np.array(chain.inverse(fitted)(list(means[24:].T)))
+    force = np.array(signal_chain.inverse(fitted)(list(means[24:].T)))
     assert MG * rms(np.linalg.norm(force, axis=0) - XSENS_MPS2) < 0.125
 
 
@@ -332,7 +333,7 @@ def test_three_real_units_turn_alike(shared_dir):
     for k, (sensor, rests, means, errors) in enumerate(units):
         fit = fit_gravity(means, errors, sensor)
         fitted = replace(sensor, effects=EFFECTS, values=fit.values)
-        force = np.array(chain.inverse(fitted)(list(means.T)))[
+        force = np.array(signal_chain.inverse(fitted)(list(means.T)))[
             :, [rests.index(same[k]) for same in common]]
         along = force / np.linalg.norm(force, axis=0)
         turned.append(np.degrees(np.arccos((along[:, 1:] * along[:, :-1]).sum(axis=0))))

@@ -18,7 +18,8 @@ import json
 import time
 
 from adxl_ros.errors import UserError
-from adxl_ros.links import iio, iio_device
+from adxl_ros.links import iio
+from adxl_ros.links.support import iio_device
 import iiod
 import numpy as np
 import pytest

@@ -17,17 +17,18 @@
 from dataclasses import replace
 from itertools import pairwise
 
-from adxl_ros.files import params, recording
-from adxl_ros.files.columns import Recording, sensor_info
-from adxl_ros.model import chain, noise, paper_inverse, unfilter
+from adxl_ros.compensate import filter_inversion, paper_inverse
+from adxl_ros.compensate.sample_by_sample import Live
+from adxl_ros.files import parameter_file, recording
+from adxl_ros.files.recording_columns import Recording, sensor_info
+from adxl_ros.model import noise, signal_chain
 from adxl_ros.model.coefficients import put, with_neutral
 from adxl_ros.model.filters import low_pass
-from adxl_ros.model.live import Live
-from adxl_ros.model.maths import FLOATS
-from adxl_ros.model.motion import Held, Motion
-from adxl_ros.model.response import Response
-from adxl_ros.model.stage import specific_force
-from adxl_ros.model.trajectory import Sine
+from adxl_ros.model.kinematics import specific_force
+from adxl_ros.model.scalar_or_array import FLOATS
+from adxl_ros.simulate.motion import Held, Motion
+from adxl_ros.simulate.response import Response
+from adxl_ros.simulate.trajectories import Sine
 import numpy as np
 import pytest
 from units import drawn, nominal
@@ -49,7 +50,7 @@ def test_amplitude_and_phase_come_back():
         return np.sin(62.8 * t) + 0.5 * np.cos(377 * t) + 0.2 * np.sin(942 * t)
 
     time_s, volts = filtered([felt, lambda t: 2 * felt(t)])
-    back = unfilter.undone(volts, time_s, RC_S, RATE_HZ)[300:-20]
+    back = filter_inversion.undone(volts, time_s, RC_S, RATE_HZ)[300:-20]
     expected = np.column_stack([felt(time_s), 2 * felt(time_s)])[300:-20]
     assert np.abs(back - expected).max() < 2e-3
 
@@ -59,8 +60,8 @@ def test_a_gap_is_not_bridged():
     time_s, volts = filtered([np.sin, np.cos])
     kept = np.ones(len(time_s), bool)
     kept[900:1400] = False
-    back = unfilter.undone(volts[kept], time_s[kept], RC_S, RATE_HZ)
-    whole = unfilter.undone(volts, time_s, RC_S, RATE_HZ)[kept]
+    back = filter_inversion.undone(volts[kept], time_s[kept], RC_S, RATE_HZ)
+    whole = filter_inversion.undone(volts, time_s, RC_S, RATE_HZ)[kept]
     assert np.abs(back - whole)[500:].max() < 0.03
     np.testing.assert_array_equal(back[900], volts[kept][900])
 
@@ -71,11 +72,11 @@ def test_blocks_give_what_the_whole_gives(sizes):
     time_s, volts = filtered([np.sin, np.cos])
     cuts = np.cumsum([0, *sizes])
     blocks = [(i, time_s[a:b], volts[a:b]) for i, (a, b) in enumerate(pairwise(cuts))]
-    parts = list(unfilter.undone_blocks(blocks, RC_S, RATE_HZ))
+    parts = list(filter_inversion.undone_blocks(blocks, RC_S, RATE_HZ))
     assert [token for token, _ in parts] == list(range(len(sizes)))
     back = np.concatenate([part for _, part in parts])
-    whole = unfilter.undone(volts, time_s, RC_S, RATE_HZ)
-    if min(sizes) >= unfilter.HALF:
+    whole = filter_inversion.undone(volts, time_s, RC_S, RATE_HZ)
+    if min(sizes) >= filter_inversion.HALF:
         np.testing.assert_allclose(back, whole, atol=1e-12)
     assert np.abs(back - whole)[50:].max() < 1e-3
 
@@ -84,7 +85,7 @@ def test_a_stream_gives_the_same_eight_samples_later():
     """Delayed is the zero-phase inverse, sample by sample, with the samples' own stamps."""
     time_s, volts = filtered([np.sin, np.cos])
     kept = np.r_[0:500, 700:1200]
-    delayed = unfilter.Delayed(RC_S, RATE_HZ)
+    delayed = filter_inversion.Delayed(RC_S, RATE_HZ)
     out, late = [], []
     for i in kept:
         for stamp, back, token in delayed(float(time_s[i]), volts[i].tolist(), i):
@@ -94,10 +95,10 @@ def test_a_stream_gives_the_same_eight_samples_later():
     out = np.array(out)
     count = len(out)
     np.testing.assert_array_equal(out[:, 0], kept[:count])
-    assert count == len(kept) - unfilter.HALF
-    expected = unfilter.undone(volts[kept], time_s[kept], RC_S, RATE_HZ)[:count]
+    assert count == len(kept) - filter_inversion.HALF
+    expected = filter_inversion.undone(volts[kept], time_s[kept], RC_S, RATE_HZ)[:count]
     np.testing.assert_allclose(out[:, 1:], expected, atol=1e-9)
-    assert sorted(late)[len(late) // 2] == unfilter.HALF
+    assert sorted(late)[len(late) // 2] == filter_inversion.HALF
 
 
 def test_the_variance_is_that_of_the_noise_that_comes_back():
@@ -106,9 +107,9 @@ def test_the_variance_is_that_of_the_noise_that_comes_back():
                  ['bandwidth.resistance_ratio.x'], [-0.2])
     time_s = np.arange(200_000) / sensor.rate_hz
     volts = Response(sensor, Motion(200.0, Held(0.5), Held(0.7)), 3)(time_s)
-    back = unfilter.undone(volts, time_s, noise.electronics(sensor)[0], sensor.rate_hz)
+    back = filter_inversion.undone(volts, time_s, noise.electronics(sensor)[0], sensor.rate_hz)
     assert back[100:-100].std(axis=0) ** 2 == pytest.approx(
-        unfilter.variance_v2(sensor), rel=0.02)
+        filter_inversion.variance_v2(sensor), rel=0.02)
 
 
 def test_motion_through_apply(run_tool, tmp_path):
@@ -117,7 +118,7 @@ def test_motion_through_apply(run_tool, tmp_path):
     motion = Motion(4.0, Held(np.pi / 4), Held(np.pi / 2), Sine(30e-6, 10.0))
     time_s = np.arange(4000) / 1000
     volts = Response(sensor, motion, 0)(time_s)
-    params.save(tmp_path / 'unit.yaml', sensor)
+    parameter_file.save(tmp_path / 'unit.yaml', sensor)
     recording.write(tmp_path / 'made.csv', Recording(
         'made', time_s, dict(zip(('x_v', 'y_v'), volts.T)), sensor_info(sensor)), sensor)
     reach = {}
@@ -152,8 +153,8 @@ def test_the_papers_inverse_is_near_and_the_exact_one_exact(axes):
     """(14) to (21) are off by second order: more than 1e-6, less than some mg; exact: 1e-9."""
     sensor = unit(np.random.default_rng(2), axes=axes)
     force = poses()
-    volts = chain.static_response(sensor)(force)
-    exact = np.subtract(chain.inverse(sensor)(volts), force)
+    volts = signal_chain.static_response(sensor)(force)
+    exact = np.subtract(signal_chain.inverse(sensor)(volts), force)
     paper = np.subtract(paper_inverse.inverse(sensor)(volts), force)
     assert np.abs(exact).max() < 1e-9
     assert 1e-4 < np.abs(paper[:2]).max() < 0.05
@@ -163,14 +164,14 @@ def test_the_papers_inverse_is_exact_for_a_linear_unit():
     """Without cross-axis terms nothing is approximate."""
     sensor = drawn(np.random.default_rng(2), nominal(), ('bias', 'scale_factor'))
     force = poses()
-    back = paper_inverse.inverse(sensor)(chain.static_response(sensor)(force))
+    back = paper_inverse.inverse(sensor)(signal_chain.static_response(sensor)(force))
     np.testing.assert_allclose(back, force, atol=1e-9)
 
 
 def test_the_papers_inverse_live_is_that_of_arrays():
     """Sample by sample in floats as in arrays."""
     sensor = unit(np.random.default_rng(4))
-    volts = chain.static_response(sensor)(poses(5))
+    volts = signal_chain.static_response(sensor)(poses(5))
     whole = np.transpose(paper_inverse.inverse(sensor)(volts))
     single = paper_inverse.inverse(sensor, maths=FLOATS)
     live = Live(sensor, paper=True)
@@ -183,7 +184,7 @@ def test_the_papers_inverse_live_is_that_of_arrays():
 def test_the_papers_inverse_needs_two_axes(run_tool, tmp_path):
     """A sensor of one axis is refused in one line."""
     sensor = nominal('x')
-    params.save(tmp_path / 'unit.yaml', sensor)
+    parameter_file.save(tmp_path / 'unit.yaml', sensor)
     recording.write(tmp_path / 'made.csv', Recording(
         'made', np.arange(10) / 1000, {'x_v': np.full(10, 2.5)}, sensor_info(sensor)), sensor)
     done = run_tool('apply', tmp_path / 'made.csv', '--params', tmp_path / 'unit.yaml',

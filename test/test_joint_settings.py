@@ -17,17 +17,18 @@
 from dataclasses import replace
 import json
 
-from adxl_ros.calibrate import joint_settings, recorded
+from adxl_ros.calibrate import joint_settings, pose_extraction
+from adxl_ros.calibrate.guided.capture_settings import Settings
+from adxl_ros.calibrate.guided.pose_plan import Target
+from adxl_ros.calibrate.guided.stage_guide import Sweep
 from adxl_ros.calibrate.joint_settings import recorded_settings, SettingTracker
-from adxl_ros.calibrate.plan import Target
 from adxl_ros.calibrate.poses import Poses, together
-from adxl_ros.calibrate.state import Settings
-from adxl_ros.calibrate.sweep import Sweep
 from adxl_ros.files import recording
-from adxl_ros.files.columns import COMMANDS, Recording, sensor_info
-from adxl_ros.links.sim_stage import SimulatedStage
+from adxl_ros.files.recorded_unit import recorded_unit
+from adxl_ros.files.recording_columns import COMMANDS, Recording, sensor_info
+from adxl_ros.links.support.simulated_stage import SimulatedStage
+from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.sensor import to_nominal_mps2
-from adxl_ros.model.stage import specific_force
 import numpy as np
 import pytest
 from units import Bench, Fed, nominal
@@ -368,7 +369,7 @@ def same_partition(some, others):
 
 def by_rests(read, unit, entries):
     """Find the rests without a journal; return the settings of those of a journal's poses."""
-    poses = recorded.poses_of(read, unit)
+    poses = pose_extraction.poses_of(read, unit)
     begin, end = (read.epoch_ns + np.rint(poses.time_s * 1e9).astype(np.int64)).T
     middle = [(e['start_ns'] + e['stop_ns']) // 2 for e in entries]
     rest = [int(np.flatnonzero((begin <= m) & (m <= end))[0]) for m in middle]
@@ -379,10 +380,10 @@ def check_all_agree(read, unit, entries):
     """Assert that a recording numbers the settings as its journal does."""
     alpha, beta = (np.array([e[f'{joint}_setting'] for e in entries])
                    for joint in ('alpha', 'beta'))
-    by_journal = recorded.poses_of(read, unit, entries)
+    by_journal = pose_extraction.poses_of(read, unit, entries)
     assert (by_journal.alpha_setting == alpha).all() and (by_journal.beta_setting == beta).all()
     bare = [{k: v for k, v in e.items() if not k.endswith('_setting')} for e in entries]
-    named = recorded.poses_of(read, unit, bare)
+    named = pose_extraction.poses_of(read, unit, bare)
     for found in ((named.alpha_setting, named.beta_setting), by_rests(read, unit, entries)):
         assert same_partition(found[0].tolist(), alpha.tolist())
         assert same_partition(found[1].tolist(), beta.tolist())
@@ -413,7 +414,7 @@ def test_sweep_journal_bag_and_csv_give_the_same_settings(tmp_path):
     assert live.alpha_setting.tolist() == [0, 0, 1, 2, 2, 3, 4, 4, 4]
     assert live.beta_setting.tolist() == [0, 1, 3, 4, 5, 6, 6, 6, 7]
     read = recording.read(run.bag(tmp_path / 'bag'))
-    unit = recorded.recorded_unit(run.sensor, read)
+    unit = recorded_unit(run.sensor, read)
     check_all_agree(read, unit, entries)
     recording.write(tmp_path / 'run.csv', read, unit)
     of_csv = recording.read(tmp_path / 'run.csv')
@@ -427,7 +428,7 @@ def test_sweep_journal_bag_and_csv_give_the_same_settings(tmp_path):
     # Without commands, the encoder tells of all moves that it shows.
     for name in COMMANDS.values():
         del read.columns[name]
-    poses = recorded.poses_of(read, unit, [{**e, 'alpha_setting': -1} for e in entries])
+    poses = pose_extraction.poses_of(read, unit, [{**e, 'alpha_setting': -1} for e in entries])
     assert (poses.alpha_setting == -1).all(), 'the numbers of a journal stand'
     _, beta = by_rests(read, unit, entries)
     assert same_partition(beta.tolist(), [0, 1, 3, 4, 5, 5, 5, 5, 7])
@@ -442,9 +443,9 @@ def test_a_sweep_with_a_journal_of_an_earlier_version_is_numbered_by_the_recordi
     run.stage.position[1] += 0.1
     run.pose()
     read = recording.read(run.bag(tmp_path / 'bag'))
-    unit = recorded.recorded_unit(run.sensor, read)
+    unit = recorded_unit(run.sensor, read)
     bare = [{k: v for k, v in e.items() if not k.endswith('_setting')} for e in run.entries]
-    poses = recorded.poses_of(read, unit, bare)
+    poses = pose_extraction.poses_of(read, unit, bare)
     assert poses.alpha_setting.tolist() == [0, 0, 0]
     assert poses.beta_setting.tolist() == [0, 1, 2]
     assert Poses.from_entries(run.entries).beta_setting.tolist() == [0, 1, 2]
@@ -453,5 +454,5 @@ def test_a_sweep_with_a_journal_of_an_earlier_version_is_numbered_by_the_recordi
 def test_a_recording_without_a_stage_has_one_setting():
     columns = {'x_v': np.random.default_rng(0).normal(2.5, 1e-3, 5000)}
     read = Recording('made', np.arange(5000) / 1000, columns, sensor_info(nominal('x')))
-    poses = recorded.poses_of(read, replace(nominal('x'), rate_hz=1000.0))
+    poses = pose_extraction.poses_of(read, replace(nominal('x'), rate_hz=1000.0))
     assert set(poses.alpha_setting.tolist()) == {0}

@@ -19,7 +19,7 @@ import json
 import os
 
 from adxl_ros.errors import UserError
-from adxl_ros.files.journal import accepted_poses, Journal, read, skipped_poses, unfinished
+from adxl_ros.files.sweep_journal import accepted_poses, Journal, read, skipped_poses, unfinished
 from adxl_ros.tools import fit
 import pytest
 

@@ -17,10 +17,10 @@
 from dataclasses import replace
 
 from adxl_ros.errors import UserError
-from adxl_ros.links import board, channels, clock_map
-from adxl_ros.links.clock_map import ClockMap, RosClock
-from adxl_ros.links.count import Count
-from adxl_ros.links.wire import AFTER_RESET, Data
+from adxl_ros.links.support import channels, clock_sync, emulated_board
+from adxl_ros.links.support.clock_sync import ClockMap, RosClock
+from adxl_ros.links.support.frame_counter import Count
+from adxl_ros.links.support.wire_format import AFTER_RESET, Data
 from hypothesis import given, settings, strategies as st
 import numpy as np
 import pytest
@@ -125,8 +125,8 @@ def test_a_clock_that_stood_still_is_a_step_and_a_gap():
 
 def test_ros_time_follows_the_system_clock_when_it_is_set(monkeypatch):
     now = {'monotonic': 10 * S, 'time': 1000 * S}
-    monkeypatch.setattr(clock_map.time, 'monotonic_ns', lambda: now['monotonic'])
-    monkeypatch.setattr(clock_map.time, 'time_ns', lambda: now['time'])
+    monkeypatch.setattr(clock_sync.time, 'monotonic_ns', lambda: now['monotonic'])
+    monkeypatch.setattr(clock_sync.time, 'time_ns', lambda: now['time'])
     clock = RosClock()
     assert clock(np.array([11 * S])) == [1001 * S]
     for name in now:
@@ -248,4 +248,4 @@ def test_slow_values_are_means_of_a_tenth_of_a_second():
                                          ({'serial': 'x' * 17}, 'serial')])
 def test_a_sensor_that_no_board_can_be_is_refused(change, why):
     with pytest.raises(UserError, match=why):
-        board.check(replace(nominal(), **change))
+        emulated_board.check(replace(nominal(), **change))

@@ -18,12 +18,13 @@ from dataclasses import replace
 import time
 
 from adxl_ros.errors import UserError
-from adxl_ros.links import base, replay, sim
-from adxl_ros.links.sim_stage import SimulatedStage
+from adxl_ros.links import replay, sim
+from adxl_ros.links.support import base
+from adxl_ros.links.support.simulated_stage import SimulatedStage
 from adxl_ros.model import noise
 from adxl_ros.model.effects.base import Joint
+from adxl_ros.model.kinematics import felt, specific_force
 from adxl_ros.model.sensor import to_nominal_mps2
-from adxl_ros.model.stage import felt, specific_force
 import numpy as np
 import pytest
 from units import nominal

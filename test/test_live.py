@@ -16,15 +16,16 @@
 
 from dataclasses import replace
 
-from adxl_ros.files import imu_bytes
+from adxl_ros.compensate import sample_by_sample
+from adxl_ros.compensate.sample_by_sample import Live
+from adxl_ros.files import imu_message
 from adxl_ros.files.cdr import CdrError
-from adxl_ros.model import chain, live
-from adxl_ros.model.live import Live
+from adxl_ros.model import signal_chain
+from adxl_ros.model.covariance import force_covariance, UNMEASURED_VARIANCE
+from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.noise import sigma_v
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
-from adxl_ros.model.stage import specific_force
 from adxl_ros.model.tilt import tilt
-from adxl_ros.model.uncertainty import force_covariance, UNMEASURED_VARIANCE
 from geometry_msgs.msg import Vector3Stamped
 import numpy as np
 import pytest
@@ -68,7 +69,7 @@ def test_agrees_with_blocks(axes: str) -> None:
     found = [follow(a, i / 1000) for i, a in enumerate(accel)]
     volts = sensor.nominal_zero_g_v + np.array(accel)[:, :len(axes)] / G * \
         sensor.nominal_scale_v_per_g
-    force = chain.inverse(sensor)(list(volts.T))
+    force = signal_chain.inverse(sensor)(list(volts.T))
     np.testing.assert_allclose([f.force for f in found], np.array(force).T, rtol=0, atol=2e-8)
     covariance = force_covariance(sensor, force)
     measured = np.sqrt(covariance[[0, 0], [0, 0]] if axes == 'x' else
@@ -132,7 +133,7 @@ def test_at_the_vertical_it_differs_by_less_than_its_uncertainty() -> None:
     follow = Live(sensor)
     found = [follow(a, i / 1000) for i, a in enumerate(accel)]
     volts = sensor.nominal_zero_g_v + np.array(accel)[:, :2] / G * sensor.nominal_scale_v_per_g
-    force = np.array(chain.inverse(sensor)(list(volts.T)))
+    force = np.array(signal_chain.inverse(sensor)(list(volts.T)))
     off = np.abs(np.array([f.force for f in found]) - force.T)
     std = np.sqrt([[f.covariance[0], f.covariance[3], f.covariance[5]] for f in found])
     assert np.isfinite(off).all()
@@ -165,7 +166,7 @@ def test_at_a_rail_nothing_is_sure() -> None:
 
 
 def test_memory_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(live, '_MOST_CELLS', 10)
+    monkeypatch.setattr(sample_by_sample, '_MOST_CELLS', 10)
     follow = Live(nominal('xyz'))
     for a in np.random.default_rng(3).normal(size=(100, 3)) * 5:
         assert follow(a.tolist(), 0.0).force == pytest.approx(a.tolist())
@@ -200,16 +201,16 @@ def test_bytes_are_the_messages(frame_id: str, order: str) -> None:
     raw = serialize_message(message)
     if order == 'big':
         raw = big_endian(raw)
-    assert imu_bytes.read(raw) == (-2.5, (1.0, -2.0, 9.0))
+    assert imu_message.read(raw) == (-2.5, (1.0, -2.0, 9.0))
     orientation, acceleration = [float(v) for v in range(13)], [float(v) for v in range(20, 32)]
-    made = imu_bytes.corrected(raw, orientation, acceleration)
+    made = imu_message.corrected(raw, orientation, acceleration)
     o, a = message.orientation, message.linear_acceleration
     o.x, o.y, o.z, o.w = orientation[:4]
     a.x, a.y, a.z = acceleration[:3]
     message.orientation_covariance = orientation[4:]
     message.linear_acceleration_covariance = acceleration[3:]
     assert deserialize_message(made, Imu) == message
-    tilted = imu_bytes.vector3_stamped(raw, (0.1, 0.2, 0.3))
+    tilted = imu_message.vector3_stamped(raw, (0.1, 0.2, 0.3))
     expected = Vector3Stamped(header=message.header)
     v = expected.vector
     v.x, v.y, v.z = 0.1, 0.2, 0.3
@@ -224,6 +225,6 @@ def test_bytes_are_the_messages(frame_id: str, order: str) -> None:
                                    lambda raw: raw[:12] + b'\xff\xff\xff\x7f' + raw[16:]])
 def test_bytes_that_are_no_imu(spoil: object) -> None:
     raw = serialize_message(imu('imu_link'))
-    imu_bytes.read(raw)
+    imu_message.read(raw)
     with pytest.raises(CdrError):
-        imu_bytes.read(spoil(raw))
+        imu_message.read(spoil(raw))

@@ -14,11 +14,11 @@
 
 """The model beside figures that others gave: the paper, the datasheet, closed forms."""
 
-from adxl_ros.model import chain, noise
+from adxl_ros.model import noise, signal_chain
 from adxl_ros.model.coefficients import with_neutral
 from adxl_ros.model.effects import library
 from adxl_ros.model.effects.misalignment import direction
-from adxl_ros.model.stage import specific_force
+from adxl_ros.model.kinematics import specific_force
 import numpy as np
 import pytest
 from units import Fed, nominal
@@ -87,8 +87,8 @@ def test_neutral_effect_is_identity(name):
     plain = nominal('xyz')
     neutral = with_neutral(plain, [name])
     force = specific_force(np.linspace(-3, 3, 50), np.linspace(-2, 4, 50), 9.8)
-    for before, after in zip(chain.static_response(plain)(force),
-                             chain.static_response(neutral)(force)):
+    for before, after in zip(signal_chain.static_response(plain)(force),
+                             signal_chain.static_response(neutral)(force)):
         np.testing.assert_array_equal(before, after)
 
 

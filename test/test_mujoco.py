@@ -18,7 +18,7 @@ from pathlib import Path
 import subprocess
 import sys
 
-from adxl_ros.files import params, recording
+from adxl_ros.files import parameter_file, recording
 import numpy as np
 import pytest
 from units import nominal
@@ -31,7 +31,7 @@ def test_mujoco_s_accelerometer_agrees_to_a_tenth_of_a_mg(run_tool, tmp_path):
     pytest.importorskip('mujoco', reason='mujoco is not installed')
     ideal, joints = tmp_path / 'ideal.csv', tmp_path / 'joints.csv'
     subprocess.run([sys.executable, str(SCRIPT), str(ideal), str(joints)], check=True)
-    params.save(tmp_path / 'exact.yaml', nominal(
+    parameter_file.save(tmp_path / 'exact.yaml', nominal(
         'xyz', noise_density_g_per_rthz=np.zeros(3), adc_bits=0, stage_resolution_rad=0.0))
     found = []
     for args in (('imu', '--force', ideal),

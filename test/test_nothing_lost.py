@@ -17,9 +17,9 @@
 import os
 import resource
 
-from adxl_ros.calibrate.session import Plan
-from adxl_ros.calibrate.state import Settings
-from adxl_ros.files import journal, params
+from adxl_ros.calibrate.guided.capture_settings import Settings
+from adxl_ros.calibrate.guided.session import Plan
+from adxl_ros.files import parameter_file, sweep_journal
 from graph import Graph, RELIABLE
 import numpy as np
 import pytest
@@ -34,13 +34,13 @@ PLAN = ('-p', 'sweep.planes_rad:=[0.785, 1.5707963267948966, 2.356]', '-p',
 
 def _driver(start, tmp_path, serial='N1'):
     base = nominal(serial=serial)
-    params.save(tmp_path / f'{serial}.yaml', drawn(np.random.default_rng(3), base))
+    parameter_file.save(tmp_path / f'{serial}.yaml', drawn(np.random.default_rng(3), base))
     return start('driver', '--ros-args', '--params-file', tmp_path / f'{serial}.yaml', '-p',
                  'link.speed:=4.0', *FAST)
 
 
 def _stage(start, tmp_path):
-    params.save(tmp_path / 'bare.yaml', nominal())
+    parameter_file.save(tmp_path / 'bare.yaml', nominal())
     return start('stage', '--ros-args', '--params-file', tmp_path / 'bare.yaml', *FAST, '-p',
                  'slew_rate_rad_s:=3.0')
 
@@ -55,7 +55,7 @@ def _accepted(graph):
 
 
 def _on_disk(tmp_path):
-    return journal.accepted_poses(journal.read(tmp_path / 'unit.yaml.journal')[1])
+    return sweep_journal.accepted_poses(sweep_journal.read(tmp_path / 'unit.yaml.journal')[1])
 
 
 def _begun(graph, start, tmp_path, poses):
@@ -105,11 +105,11 @@ def test_a_driver_that_is_started_anew_is_followed_and_another_unit_is_not(start
 def test_a_fit_that_fails_at_the_end_waits_and_another_unit_ends_the_session(start, tmp_path):
     """No dead end: redo, finish and abort are still there; no pose of 18 in the journal of 17."""
     base = nominal(serial='N1')
-    params.save(tmp_path / 'bare.yaml', base)
+    parameter_file.save(tmp_path / 'bare.yaml', base)
     asked = Plan('stage', 'full', (np.pi / 2,), np.pi / 2, float(np.radians(0.1)), 0,
                  Settings(0.5, np.radians(0.2), 60.0, 'manual', np.radians(2)),
                  tmp_path / 'unit.yaml', tmp_path / 'unit.yaml.journal', '', '')
-    interrupted = journal.Journal(asked.journal, asked.head(base))
+    interrupted = sweep_journal.Journal(asked.journal, asked.head(base))
     for i, target in enumerate(asked.targets(base)):
         interrupted.append({
             'pose': i, 'alpha_rad': target.alpha_rad, 'beta_rad': target.beta_rad, 'check': False,
@@ -166,7 +166,7 @@ def test_a_new_start_resumes_or_says_what_changed_or_begins_anew(start, tmp_path
         anew = _calibration(start, tmp_path, '-p', 'resume:=anew')
         anew.wait_for('pose 1 is on disk', 60)
         kept, = tmp_path.glob('unit.yaml.journal.2*')
-        assert journal.accepted_poses(journal.read(kept)[1])[:len(poses)] == poses
+        assert sweep_journal.accepted_poses(sweep_journal.read(kept)[1])[:len(poses)] == poses
 
 
 @pytest.mark.kills
@@ -180,9 +180,9 @@ def test_another_mounting_stops_before_a_pose_is_taken(start, tmp_path):
         os.kill(first.popen.pid, 9)
         driver.stop()
         poses = _on_disk(tmp_path)
-        unit = params.load(tmp_path / 'N1.yaml')
+        unit = parameter_file.load(tmp_path / 'N1.yaml')
         unit.values['misalignment']['beta_rad'] += np.radians([-2.0, 2.0])
-        params.save(tmp_path / 'N1.yaml', unit)
+        parameter_file.save(tmp_path / 'N1.yaml', unit)
         start('driver', '--ros-args', '--params-file', tmp_path / 'N1.yaml', '-p',
               'link.speed:=4.0', *FAST)
         again = _calibration(start, tmp_path)

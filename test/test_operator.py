@@ -14,7 +14,7 @@
 
 """A hand-turned stage, and an operator who makes mistakes: what is said, and what is taken."""
 
-from adxl_ros.files import journal, params
+from adxl_ros.files import parameter_file, sweep_journal
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus
 from graph import Graph, RELIABLE
@@ -82,8 +82,8 @@ class Operator(Graph):
 
 def _bench(start, tmp_path, mode):
     base = nominal(serial='T1')
-    params.save(tmp_path / 'truth.yaml', drawn(np.random.default_rng(3), base))
-    params.save(tmp_path / 'bare.yaml', base)
+    parameter_file.save(tmp_path / 'truth.yaml', drawn(np.random.default_rng(3), base))
+    parameter_file.save(tmp_path / 'bare.yaml', base)
     start('driver', '--ros-args', '--params-file', tmp_path / 'truth.yaml', '-p',
           'link.speed:=4.0', *FAST)
     start('stage', '--ros-args', '--params-file', tmp_path / 'bare.yaml', *FAST, '-p',
@@ -141,11 +141,11 @@ def test_an_operator_who_makes_mistakes_ends_with_a_good_file(start, tmp_path):
             operator.spin_until(lambda number=number: (tmp_path / 'unit.yaml').exists()
                                 or operator.asked()[0] > number, 30, 'the next pose')
         operator.spin_until((tmp_path / 'unit.yaml').exists, 60, 'the file')
-    want = params.load(tmp_path / 'truth.yaml')
-    found = params.load(tmp_path / 'unit.yaml')
+    want = parameter_file.load(tmp_path / 'truth.yaml')
+    found = parameter_file.load(tmp_path / 'unit.yaml')
     np.testing.assert_allclose(found.zero_g_v, want.zero_g_v, atol=0.01)
-    _, entries = journal.read(tmp_path / 'unit.yaml.journal')
-    poses = journal.accepted_poses(entries)
+    _, entries = sweep_journal.read(tmp_path / 'unit.yaml.journal')
+    poses = sweep_journal.accepted_poses(entries)
     assert all(e['samples'] == 2000 for e in poses)
     # Pose 2 was reached by other ways, and for pose 4 only the command tells of the second joint.
     turned, moved = (np.abs(np.diff([[e[f'alpha_{what}'], e[f'beta_{what}']] for e in poses],
@@ -157,7 +157,7 @@ def test_an_operator_who_makes_mistakes_ends_with_a_good_file(start, tmp_path):
 def test_by_hand_the_next_direction_is_announced_in_words(start, tmp_path):
     """No stage: what is to point up, on the topic and in the log."""
     base = nominal('xyz', serial='T3')
-    params.save(tmp_path / 'bare.yaml', base)
+    parameter_file.save(tmp_path / 'bare.yaml', base)
     with Operator() as operator:
         start('driver', '--ros-args', '--params-file', tmp_path / 'bare.yaml')
         node = start('calibration', '--ros-args', '--params-file', tmp_path / 'bare.yaml', '-p',
@@ -178,7 +178,7 @@ def test_by_hand_the_next_direction_is_announced_in_words(start, tmp_path):
 def test_a_compensated_stream_and_a_wrong_rate_are_refused(start, tmp_path):
     """What is no raw stream of the unit is told at once, and taken again when it is right."""
     base = nominal(serial='T4')
-    params.save(tmp_path / 'bare.yaml', base)
+    parameter_file.save(tmp_path / 'bare.yaml', base)
     with Operator() as operator:
         start('driver', '--ros-args', '--params-file', tmp_path / 'bare.yaml')
         start('compensation', '--ros-args', '--params-file', tmp_path / 'bare.yaml')
@@ -235,4 +235,4 @@ def test_a_temperature_that_moved_is_refused_until_it_is_back(start, tmp_path):
 def _taken(tmp_path):
     path = tmp_path / 'unit.yaml.journal'
     begun = path.exists() and path.stat().st_size
-    return journal.accepted_poses(journal.read(path)[1]) if begun else []
+    return sweep_journal.accepted_poses(sweep_journal.read(path)[1]) if begun else []

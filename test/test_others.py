@@ -14,8 +14,10 @@
 
 """Calibration against gravity beside others' on the same rests of real sensors."""
 
-from adxl_ros.calibrate import gravity, recorded
-from adxl_ros.files import params, recording
+from adxl_ros.calibrate import pose_extraction
+from adxl_ros.calibrate.fits import gravity_fit
+from adxl_ros.files import parameter_file, recording
+from adxl_ros.files.recorded_unit import recorded_unit
 from adxl_ros.model.constants import G0_MPS2
 import numpy as np
 import pytest
@@ -60,9 +62,9 @@ def ferraris(accel, gravity_mps2):
 def test_never_worse_than_others(name, shared_dir, record_property):
     """In-sample and leave-one-out rms of the magnitude: a plain fit and imucal beside ours."""
     read = recording.read(shared_dir / 'real' / f'{name}.csv')
-    unit = recorded.recorded_unit(params.load(NOMINAL), read)
-    poses = recorded.poses_of(read, unit)
-    found = gravity.fit_gravity(poses.volts, poses.std_v, unit)
+    unit = recorded_unit(parameter_file.load(NOMINAL), read)
+    poses = pose_extraction.poses_of(read, unit)
+    found = gravity_fit.fit_gravity(poses.volts, poses.std_v, unit)
     kept = np.setdiff1d(np.arange(len(poses)), found.outliers)
     g = unit.local_gravity_mps2
     accel = ((poses.volts - unit.nominal_zero_g_v) / unit.nominal_scale_v_per_g * G0_MPS2)[kept]

@@ -20,7 +20,7 @@ import re
 import subprocess
 import sys
 
-from adxl_ros.files import params, recording
+from adxl_ros.files import parameter_file, recording
 import numpy as np
 from units import nominal
 
@@ -53,7 +53,7 @@ def test_the_page_s_package_works(tmp_path, monkeypatch, run_tool):
     # 2 Ohm · 0.7 mA; its growth with the output averages out over a whole turn.
     assert abs(np.mean(read[0] - read[1]) - 1.4e-3) < 2e-5
     path = tmp_path / 'unit.yaml'
-    params.save(path, nominal('xy'))
+    parameter_file.save(path, nominal('xy'))
     text = path.read_text().rstrip() + ('\n    effects: [cable_sag]\n    cable_sag:\n'
                                         '      resistance_ohm: 2.0\n      current_a: 7.0e-4\n'
                                         '      growth_per_g: [0.05, 0.05]\n')

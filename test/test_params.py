@@ -19,7 +19,7 @@ from pathlib import Path
 import re
 
 from adxl_ros.errors import UserError
-from adxl_ros.files import params
+from adxl_ros.files import parameter_file
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 import pytest
@@ -127,7 +127,7 @@ BAD = {
 
 def refusal(path: Path) -> str:
     with pytest.raises(UserError) as error:
-        params.load(path)
+        parameter_file.load(path)
     message = str(error.value)
     assert '\n' not in message
     assert message.startswith(f'{path}')
@@ -159,30 +159,30 @@ def test_file_that_cannot_be_read(tmp_path: Path) -> None:
 
 def test_calibrated_file_is_read() -> None:
     path = NOMINAL.with_name('adxl203.yaml')
-    assert params.load(path).serial == 'nominal'
+    assert parameter_file.load(path).serial == 'nominal'
 
 
 def equal(one: Sensor, other: Sensor) -> None:
-    assert params.to_flat(one) == params.to_flat(other)
+    assert parameter_file.to_flat(one) == parameter_file.to_flat(other)
     np.testing.assert_array_equal(one.covariance, other.covariance)
 
 
 def test_round_trip(tmp_path: Path) -> None:
     (tmp_path / 'text.yaml').write_text(CALIBRATED, encoding='utf-8')
-    sensor = params.load(tmp_path / 'text.yaml')
+    sensor = parameter_file.load(tmp_path / 'text.yaml')
     assert sensor.zero_g_v.tolist() == [2.52, 2.47]
     assert sensor.provenance == {'date': '2026-01-01'}
     units = [sensor, drawn(np.random.default_rng(1), nominal('xyz')),
              replace(sensor, serial='007', provenance={'source': 'a: b # c', 'poses': '12'})]
     for unit in units:
-        params.save(tmp_path / 'saved.yaml', unit, ['words: for', '/** people'])
-        equal(params.load(tmp_path / 'saved.yaml'), unit)
+        parameter_file.save(tmp_path / 'saved.yaml', unit, ['words: for', '/** people'])
+        equal(parameter_file.load(tmp_path / 'saved.yaml'), unit)
 
 
 def test_saved_numbers_are_doubles_for_ros(tmp_path: Path) -> None:
     """What rcl reads as text or as an integer, 1e-06 and 1, is not written so."""
     unit = nominal(rc_capacitance_f=1e-6, rate_hz=1.0, adc_vref_v=1e2)
-    params.save(tmp_path / 'saved.yaml', unit)
+    parameter_file.save(tmp_path / 'saved.yaml', unit)
     text = (tmp_path / 'saved.yaml').read_text(encoding='utf-8')
     for key in ('rc_capacitance_f', 'rate_hz', 'adc_vref_v'):
         assert re.search(rf'{key}: \d+\.\d+(e[-+]\d+)?$', text, re.MULTILINE)
@@ -191,11 +191,11 @@ def test_saved_numbers_are_doubles_for_ros(tmp_path: Path) -> None:
 
 def test_failed_save_leaves_the_old_file(tmp_path: Path) -> None:
     path = tmp_path / 'unit.yaml'
-    params.save(path, nominal())
+    parameter_file.save(path, nominal())
     before = path.read_bytes()
     with pytest.raises(ZeroDivisionError):
-        params.save(path, nominal('x'), (str(1 / 0) for _ in 'x'))
+        parameter_file.save(path, nominal('x'), (str(1 / 0) for _ in 'x'))
     assert path.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ['unit.yaml']
     with pytest.raises(UserError, match=f'{tmp_path}/none'):
-        params.save(tmp_path / 'none' / 'unit.yaml', nominal())
+        parameter_file.save(tmp_path / 'none' / 'unit.yaml', nominal())

@@ -15,7 +15,8 @@
 
 """Plans of a sweep: what they cost, what they promise, and that they keep it."""
 
-from adxl_ros.calibrate import full, plan, quick_plan
+from adxl_ros.calibrate.fits import full_model
+from adxl_ros.calibrate.guided import pose_plan, quick_plan
 import numpy as np
 import pytest
 from units import drawn, nominal, swept
@@ -32,11 +33,11 @@ def promised_deg(axes, targets, resolution_deg=5 / 60):
 @pytest.mark.parametrize('axes', ['xy', 'xyz'])
 def test_the_guided_order_beats_the_papers_on_a_stage_that_keeps_its_errors(axes):
     """The same poses promise at most half of the tilt error, on a way that is no longer."""
-    planes = plan.default_planes_rad('xy')
-    guided, paper = plan.guided(planes, STEP, 0), plan.sweep(planes, STEP, 0)
+    planes = pose_plan.default_planes_rad('xy')
+    guided, paper = pose_plan.guided(planes, STEP, 0), pose_plan.sweep(planes, STEP, 0)
     assert sorted(map(str, guided)) == sorted(map(str, paper))
     assert promised_deg(axes, guided) < 0.5 * promised_deg(axes, paper)
-    assert plan.travel_rad(guided) < 1.05 * plan.travel_rad(paper)
+    assert pose_plan.travel_rad(guided) < 1.05 * pose_plan.travel_rad(paper)
 
 
 @pytest.mark.parametrize('axes, fewest', [('xy', 30), ('xyz', 24)])
@@ -56,18 +57,18 @@ def test_the_quick_plan_reaches_its_tilt_error(axes, fewest):
 
 
 @pytest.mark.parametrize('axes', ['xy', 'xyz'])
-@pytest.mark.parametrize('kind', plan.KINDS)
+@pytest.mark.parametrize('kind', pose_plan.KINDS)
 def test_fits_reach_the_intervals_that_a_plan_promises(axes, kind):
     """The standard deviations of the coefficients are the promised ones, on average."""
     sensor = nominal(axes)
-    targets = plan.guided(plan.default_planes_rad(axes), STEP, 0) if kind == 'full' else \
-        quick_plan.quick(sensor, 5.0, np.radians(0.1), 0)
+    targets = pose_plan.guided(pose_plan.default_planes_rad(axes), STEP, 0) \
+        if kind == 'full' else quick_plan.quick(sensor, 5.0, np.radians(0.1), 0)
     ratios = []
     for seed in range(6):
         rng = np.random.default_rng(seed)
-        truth = drawn(rng, sensor, full.terms_of(axes))
+        truth = drawn(rng, sensor, full_model.terms_of(axes))
         poses = swept(rng, truth, per_setting=True, targets=targets)
-        found = full.fit_full(sensor, poses)
+        found = full_model.fit_full(sensor, poses)
         spread = np.sqrt(np.diag(found.fitted.covariance))
         promised = quick_plan.nothing_known(sensor, 5.0).after(targets)
         stds = dict(zip(promised.names, promised.std))
@@ -77,8 +78,8 @@ def test_fits_reach_the_intervals_that_a_plan_promises(axes, kind):
 
 def test_planes_of_a_z_axis_are_level_too():
     """A three-axis unit sees 1 g on each axis; in level planes beta makes quarter turns."""
-    planes = plan.default_planes_rad('xyz')
+    planes = pose_plan.default_planes_rad('xyz')
     assert np.degrees(planes[0]) == 0 and np.degrees(planes[-1]) == pytest.approx(180)
-    targets = plan.guided(planes, STEP, 0)
+    targets = pose_plan.guided(planes, STEP, 0)
     assert sum(t.alpha_rad == 0 for t in targets) == 10
     assert len(targets) == 130 + 20

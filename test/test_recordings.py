@@ -22,8 +22,8 @@ import sys
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import csv_file, recording
-from adxl_ros.files.columns import ACCEL
 from adxl_ros.files.recording import CsvWriter, Recording
+from adxl_ros.files.recording_columns import ACCEL
 from adxl_ros.model.constants import G0_MPS2
 import numpy as np
 from pace import within

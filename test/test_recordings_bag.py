@@ -19,9 +19,9 @@ from pathlib import Path
 import sys
 
 from adxl_ros.errors import UserError
-from adxl_ros.files import bag_file, cdr, recording
-from adxl_ros.files.columns import ACCEL, REFERENCES
+from adxl_ros.files import bag_reader, cdr, recording
 from adxl_ros.files.recording import Recording
+from adxl_ros.files.recording_columns import ACCEL, REFERENCES
 import numpy as np
 import pytest
 from test_recordings import growth_mb, refusal
@@ -291,7 +291,7 @@ def test_commands_are_those_of_the_stage_and_of_the_right_type(tmp_path: Path) -
 
 def test_a_stage_that_dies_does_not_hold_up_the_samples(
         tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bag_file, '_HOLD_ROWS', 500)
+    monkeypatch.setattr(bag_reader, '_HOLD_ROWS', 500)
     messages = [m for t in stamps(3000) for m in (imu(t), joints(t, alpha=1.0))
                 if m.kind == IMU or t < stamps(200)[-1]]
     path = bags.bag_of(tmp_path / 'run', messages)

@@ -16,15 +16,16 @@
 
 from dataclasses import replace
 
-from adxl_ros.calibrate import known, refusals, verdict
-from adxl_ros.calibrate.plan import guided, spread, Target
+from adxl_ros.calibrate.guided import pose_checks, running_estimate
+from adxl_ros.calibrate.guided.capture_settings import Settings
+from adxl_ros.calibrate.guided.hand_guide import Tumble
+from adxl_ros.calibrate.guided.pose_plan import guided, spread, Target
+from adxl_ros.calibrate.guided.stage_guide import MountingError, Sweep
 from adxl_ros.calibrate.poses import Poses
-from adxl_ros.calibrate.state import Settings
-from adxl_ros.calibrate.sweep import MountingError, Sweep
-from adxl_ros.calibrate.tumble import Tumble
-from adxl_ros.model import chain
+from adxl_ros.calibrate.report import cross_validation
+from adxl_ros.model import signal_chain
 from adxl_ros.model.coefficients import parameter_of
-from adxl_ros.model.stage import specific_force
+from adxl_ros.model.kinematics import specific_force
 import numpy as np
 import pytest
 from units import Bench, drawn, Fed, nominal, swept
@@ -156,10 +157,11 @@ def test_units_at_the_edge_of_the_datasheet_are_never_refused():
         order = rng.permutation(len(poses))[:12]
         told = None
         for count in range(len(order)):
-            told = known.from_poses(nominal('xyz'), poses.subset(order[:count]), 5.0, 4.2e-4, told)
+            told = running_estimate.from_poses(
+                nominal('xyz'), poses.subset(order[:count]), 5.0, 4.2e-4, told)
             i = order[count]
             there = Target(poses.alpha_rad[i], poses.beta_rad[i])
-            assert refusals.reading(told, there, poses.volts[i], np.radians(0.2)) == ''
+            assert pose_checks.reading(told, there, poses.volts[i], np.radians(0.2)) == ''
 
 
 def _edge(name, value):
@@ -203,9 +205,9 @@ def test_clocks_apart(ahead_s, words):
 
 def test_rate():
     """Samples at another rate than sensor_info states."""
-    assert refusals.rate(999.0, 1000.0) == refusals.rate(float('nan'), 1000.0) == ''
+    assert pose_checks.rate(999.0, 1000.0) == pose_checks.rate(float('nan'), 1000.0) == ''
     assert 'samples are 500 a second by their stamps, but sensor_info states rate_hz 1000' in \
-        refusals.rate(500.0, 1000.0)
+        pose_checks.rate(500.0, 1000.0)
 
 
 def test_time_that_runs_backwards_begins_the_pose_anew():
@@ -342,7 +344,7 @@ def test_by_hand_directions_are_asked_for_in_words_until_all_are_covered():
 
 
 def _direction(tumble):
-    from adxl_ros.calibrate.directions import UP as EACH
+    from adxl_ros.calibrate.fits.orientations import UP as EACH
     return EACH[tumble.next_up]
 
 
@@ -357,14 +359,15 @@ def test_what_is_known_is_what_the_fits_find():
     """The intervals that are shown along the way hold the truth, and the tilt gets better."""
     truth = drawn(np.random.default_rng(11), nominal('xyz'))
     poses = swept(np.random.default_rng(12), truth, check_poses=0)
-    told = known.from_poses(nominal('xyz'), poses, 5.0, truth.stage_resolution_rad / 12 ** 0.5)
-    for name, at, std in zip(told.names, known.get(told.unit, told.names), told.std):
+    told = running_estimate.from_poses(nominal('xyz'), poses, 5.0,
+                                       truth.stage_resolution_rad / 12 ** 0.5)
+    for name, at, std in zip(told.names, running_estimate.get(told.unit, told.names), told.std):
         effect, parameter, *axis = name.split('.')
         if axis:
             wanted = truth.values.get(effect, {}).get(parameter, np.zeros(3))[
                 truth.axes.index(axis[0])]
             assert abs(at - wanted) < 5 * std + 1e-6, name
-    few = known.from_poses(nominal('xyz'), poses.subset(np.arange(20)), 5.0, 4e-4)
+    few = running_estimate.from_poses(nominal('xyz'), poses.subset(np.arange(20)), 5.0, 4e-4)
     assert told.tilt_error_rad() < 0.05 * few.tilt_error_rad()
     assert np.degrees(told.tilt_error_rad()) < 0.02
 
@@ -377,14 +380,16 @@ def test_the_tilt_to_expect_is_that_of_poses_not_seen():
         truth = drawn(rng, nominal('xyz'))
         half = swept(rng, truth, np.radians([30, 60, 90, 120, 150]), 0).subset(
             np.arange(130) % 26 < 13)
-        told = known.from_poses(nominal('xyz'), half, 5.0, truth.stage_resolution_rad / 12 ** 0.5)
+        told = running_estimate.from_poses(nominal('xyz'), half, 5.0,
+                                           truth.stage_resolution_rad / 12 ** 0.5)
         promised.append(told.tilt_error_rad())
         alpha, beta = np.array([(t.alpha_rad, t.beta_rad) for t in spread(48)]).T
-        volts = np.column_stack(chain.static_response(truth)(specific_force(alpha, beta, 9.80665)))
+        volts = np.column_stack(
+            signal_chain.static_response(truth)(specific_force(alpha, beta, 9.80665)))
         std_v = np.tile(told.pose_std_v, (48, 1))
         unseen = Poses(volts + std_v * rng.normal(size=volts.shape), std_v, alpha, beta,
                        np.zeros((48, 2)), np.zeros(48, bool))
-        off = verdict.errors(told.sensor(), unseen)
+        off = cross_validation.errors(told.sensor(), unseen)
         found.append(np.nanmean(np.concatenate([off.alpha_rad, off.beta_rad]) ** 2))
     assert np.sqrt(np.mean(found)) == pytest.approx(np.mean(promised), rel=0.4)
 
@@ -392,5 +397,5 @@ def test_the_tilt_to_expect_is_that_of_poses_not_seen():
 def test_stage_vectors_agree_with_directions():
     """What points up is the direction of the specific force."""
     force = np.array(specific_force(np.pi / 2, 0.0, 1.0))
-    from adxl_ros.calibrate.directions import name_nearest
+    from adxl_ros.calibrate.fits.orientations import name_nearest
     assert name_nearest(force) == '+x'

@@ -20,7 +20,7 @@ import re
 import shutil
 import subprocess
 
-from adxl_ros.files import params, store
+from adxl_ros.files import calibration_store, parameter_file
 from conftest import executable
 import numpy as np
 import pytest
@@ -78,13 +78,13 @@ def reported(tmp_path_factory):
         '--seed', '5', '-o', 'sweep.csv')
     run('fit', 'sweep.csv', '--model', 'physical', '-o', 'unit.yaml', '--store', 'store',
         '--report', 'first')
-    (path, sensor), = store.history(folder / 'store', '<U&7>')[0]
+    (path, sensor), = calibration_store.history(folder / 'store', '<U&7>')[0]
     path.unlink()
     bias = sensor.values['bias']['offset_v'] - [0.004, 0.0]
     old = replace(sensor, values={**sensor.values, 'bias': {'offset_v': bias}}, provenance={
         **sensor.provenance, 'id': 'last-year', 'date': '2026-01-01T00:00:00+00:00',
         'data_sha256': '0' * 64, 'temperature_c': '25.00'})
-    store.put(folder / 'store', old)
+    calibration_store.put(folder / 'store', old)
     run('fit', 'sweep.csv', '-o', 'unit.yaml', '--store', 'store', '--report', 'report')
     return folder
 
@@ -111,7 +111,7 @@ def test_the_report_holds_what_it_should(opened, reported):
         'nominal', 'linear', 'physical', 'full']
     assert 'PASS' in rows.nth(3).inner_text() and 'FAIL' in rows.nth(1).inner_text()
     coefficients = page.locator('table').nth(1).inner_text()
-    sensor = params.load(reported / 'unit.yaml')
+    sensor = parameter_file.load(reported / 'unit.yaml')
     assert all(name in coefficients for name in sensor.covariance_names)
     line = next(line for line in coefficients.splitlines()
                 if line.startswith('nonlinearity.cubic_per_g2.x'))

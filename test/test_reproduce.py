@@ -14,18 +14,21 @@
 
 """`reproduce`: the paper's experiments, each figure that is to be reached."""
 
-from adxl_ros.files import params
-from adxl_ros.paper import experiments, score, units
+from adxl_ros.files import parameter_file
+from adxl_ros.model.constants import NINETY
+from adxl_ros.reproduction import experiments, scoring, units
 import numpy as np
 import pytest
 from units import NOMINAL
 
+_UNITS = {'perfect': 8, 'paper': 16}
+
 
 @pytest.fixture(scope='module')
 def found():
-    """Judge eight units on each stage."""
-    nominal = params.load(NOMINAL)
-    return {name: [units.judge(nominal, stage, seed) for seed in range(8)]
+    """Judge units on each stage, more where poses share the errors of a few settings."""
+    nominal = parameter_file.load(NOMINAL)
+    return {name: [units.judge(nominal, stage, seed) for seed in range(_UNITS[name])]
             for name, stage in units.STAGES.items()}
 
 
@@ -56,8 +59,8 @@ def test_alpha_gains_on_linear(found, stage):
 
 def test_motion_reaches_the_floor(found):
     """RC undone by the resistor that the noise shows: 1.05 of 5.08 mm/s²."""
-    nominal = params.load(NOMINAL)
-    bound = score.motion_bound_mmps2(nominal)
+    nominal = parameter_file.load(NOMINAL)
+    bound = scoring.motion_bound_mmps2(nominal)
     assert bound == pytest.approx(5.08, abs=0.01)
     off = [unit.models['full'].shaken.rmse_mmps2 for of in found.values() for unit in of]
     assert np.sqrt(np.mean(np.square(off))) < 1.05 * bound
@@ -67,7 +70,7 @@ def test_motion_reaches_the_floor(found):
 def test_promised_deviations_hold(found, stage):
     """90 % intervals of the acceleration in poses that were not fitted."""
     # Poses of one unit share the errors of its few settings of alpha: units are independent.
-    inside = np.array([np.mean(np.abs(unit.models['full'].force_z) < score.NINETY)
+    inside = np.array([np.mean(np.abs(unit.models['full'].force_z) < NINETY)
                        for unit in found[stage]])
     assert abs(inside.mean() - 0.9) < 0.02 + 2.5 * inside.std() / np.sqrt(len(inside))
     spread = np.sqrt(np.mean([np.mean(unit.models['full'].force_z ** 2) for unit in found[stage]]))

@@ -14,11 +14,11 @@
 
 """Rests in made streams whose motion is known, in real ones, and live against offline."""
 
-from adxl_ros.calibrate.rests import find_rests, Rest, rest_means, RestFinder
-from adxl_ros.calibrate.stillness import Noise
 from adxl_ros.errors import UserError
 from adxl_ros.files import recording
 from adxl_ros.model.constants import G0_MPS2
+from adxl_ros.signals.noise_limits import Noise
+from adxl_ros.signals.rest_detection import find_rests, Rest, rest_means, RestFinder
 from hypothesis import given, settings, strategies
 import numpy as np
 from pace import within

@@ -19,8 +19,8 @@ from pathlib import Path
 import re
 import signal
 
-from adxl_ros.files import journal, params
-from adxl_ros.screen.keys import Keys
+from adxl_ros.files import parameter_file, sweep_journal
+from adxl_ros.nodes.terminal.keys import Keys
 from conftest import executable
 from graph import Graph, RELIABLE
 import numpy as np
@@ -44,8 +44,8 @@ def terminal(ros_env, tmp_path):
     """Give a function that runs the calibration in a terminal; all are closed at the end."""
     opened = []
     base = nominal('xyz', serial='T1')
-    params.save(tmp_path / 'truth.yaml', drawn(np.random.default_rng(3), base))
-    params.save(tmp_path / 'bare.yaml', base)
+    parameter_file.save(tmp_path / 'truth.yaml', drawn(np.random.default_rng(3), base))
+    parameter_file.save(tmp_path / 'bare.yaml', base)
 
     def begin(*more, **size):
         opened.append(Terminal(
@@ -155,11 +155,11 @@ def test_an_operator_is_led_through_a_sweep_by_the_screen(start, terminal, tmp_p
         assert seen.popen.wait(20) == 0
         assert seen.restored()
         assert 'pose 6 is on disk' in seen.raw.decode().split('\x1b[?1049l')[-1]
-    assert params.load(tmp_path / 'unit.yaml').serial == 'T1'
+    assert parameter_file.load(tmp_path / 'unit.yaml').serial == 'T1'
     assert (tmp_path / 'unit.yaml.previous').read_text() == 'the earlier one\n'
-    _, entries = journal.read(tmp_path / 'unit.yaml.journal')
-    poses = journal.accepted_poses(entries)
-    assert len(poses) == 5 and journal.skipped_poses(entries) == {4}
+    _, entries = sweep_journal.read(tmp_path / 'unit.yaml.journal')
+    poses = sweep_journal.accepted_poses(entries)
+    assert len(poses) == 5 and sweep_journal.skipped_poses(entries) == {4}
     # The screen costs no samples: every pose is gapless.
     assert all(e['stop_ns'] - e['start_ns'] == 1_000_000 * (e['samples'] - 1) for e in poses)
 
@@ -213,7 +213,7 @@ def test_a_terminal_of_another_process_has_a_screen_too(terminal):
 
 def test_what_changed_is_said_and_asked_about(start, terminal, tmp_path):
     """An interrupted calibration of other settings: what differs, and anew only if told."""
-    old = journal.Journal(tmp_path / 'unit.yaml.journal', {'mode': 'stage', 'serial': 'T0'})
+    old = sweep_journal.Journal(tmp_path / 'unit.yaml.journal', {'mode': 'stage', 'serial': 'T0'})
     old.append({'pose': 0})
     old.close()
     bench(start, tmp_path)
@@ -227,7 +227,7 @@ def test_what_changed_is_said_and_asked_about(start, terminal, tmp_path):
     seen.press('n')
     seen.wait_for('0 done, 22 left')
     kept, = tmp_path.glob('unit.yaml.journal.2*')
-    assert journal.read(kept)[0]['serial'] == 'T0'
+    assert sweep_journal.read(kept)[0]['serial'] == 'T0'
 
 
 @pytest.mark.parametrize('length', [1, 2, 3, 100])
@@ -243,7 +243,7 @@ def test_without_rich_there_are_plain_lines():
     """The screen is an extra: one line says what it needs."""
     done = run_without_extras("""
 import os
-from adxl_ros.screen.terminal import open_terminal
+from adxl_ros.nodes.terminal.terminal_process import open_terminal
 sys.stdin.isatty = sys.stdout.isatty = lambda: True
 os.tcgetpgrp = lambda fd: os.getpgrp()
 print(open_terminal())

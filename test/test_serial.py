@@ -23,8 +23,9 @@ import time
 import tty
 
 from adxl_ros.errors import UserError
-from adxl_ros.links import base, board, serial
-from adxl_ros.links.wire import Encoder, frame, Info
+from adxl_ros.links import serial
+from adxl_ros.links.support import base, emulated_board
+from adxl_ros.links.support.wire_format import Encoder, frame, Info
 import numpy as np
 import pytest
 from units import nominal
@@ -389,8 +390,8 @@ def test_a_board_on_a_terminal_is_read_to_the_last_sample(tmp_path):
     rng = np.random.default_rng(0)
     columns = {'x_v': rng.uniform(1, 4, 1000), 'y_v': rng.uniform(1, 4, 1000),
                'supply_v': np.full(1000, 4.9)}
-    with board.opened(path) as fd:
-        sender = board.Board(sensor, board.roles_of(sensor, columns), fd)
+    with emulated_board.opened(path) as fd:
+        sender = emulated_board.Board(sensor, emulated_board.roles_of(sensor, columns), fd)
         link = serial.open_link(sensor, {**DEFAULTS, 'port': path, 'supply_scale': 2.0,
                                          'channels': 'x,y,supply'})
         link.read(0)

@@ -16,12 +16,12 @@
 
 from dataclasses import replace
 
-from adxl_ros.calibrate.session import Plan, Session
-from adxl_ros.calibrate.state import Settings
+from adxl_ros.calibrate.guided.capture_settings import Settings
+from adxl_ros.calibrate.guided.session import Plan, Session
 from adxl_ros.errors import UserError
-from adxl_ros.files import atomic, journal, params
-from adxl_ros.model import chain
-from adxl_ros.model.stage import specific_force
+from adxl_ros.files import atomic_write, parameter_file, sweep_journal
+from adxl_ros.model import signal_chain
+from adxl_ros.model.kinematics import specific_force
 import numpy as np
 import pytest
 from units import drawn, nominal
@@ -52,7 +52,7 @@ def take(session, count, off_v=0.0):
     """Take poses, as `Session.accepted` does with those that the stream gives."""
     for _ in range(count):
         target, walk = session.walk.target, session.walk
-        volts = np.column_stack(chain.static_response(TRUTH)(specific_force(
+        volts = np.column_stack(signal_chain.static_response(TRUTH)(specific_force(
             np.array([target.alpha_rad]), np.array([target.beta_rad]), 9.80665)))[0] + off_v
         entry = {'pose': walk.index, 'alpha_rad': target.alpha_rad, 'beta_rad': target.beta_rad,
                  'check': target.check, 'start_ns': 2 * walk.index, 'stop_ns': 2 * walk.index + 1,
@@ -63,7 +63,8 @@ def take(session, count, off_v=0.0):
 
 def kept(session):
     """Return the numbers of the poses on disk."""
-    return [e['pose'] for e in journal.accepted_poses(journal.read(session.journal.path)[1])]
+    return [e['pose'] for e in sweep_journal.accepted_poses(
+        sweep_journal.read(session.journal.path)[1])]
 
 
 def test_a_pose_to_be_taken_again_is_in_no_fit_and_not_resumed(begin):
@@ -126,7 +127,7 @@ def test_what_a_killed_writer_left_is_cleared_and_what_is_being_written_stays(be
     for inner in ('report/.report.html', 'store/S1/.S1-2026.yaml'):
         (tmp_path / f'{inner}.abcd1234.part').mkdir(parents=True)
     (tmp_path / '.unit.yaml.mine').mkdir()
-    with atomic.atomic_path(tmp_path / 'unit.yaml') as fresh:
+    with atomic_write.atomic_path(tmp_path / 'unit.yaml') as fresh:
         begin(report=str(tmp_path / 'report'), store=str(tmp_path / 'store'))
         fresh.write_text('whole')
         assert len(list(tmp_path.rglob('.*.part'))) == 1
@@ -182,4 +183,5 @@ def test_a_mounting_that_was_not_checked_is_said_in_the_file(begin, tmp_path):
     session = begin()
     session.skip()
     assert session.finish().fitted.provenance['mounting'] == 'not checked after an interruption'
-    assert params.load(tmp_path / 'unit.yaml').provenance['mounting'].startswith('not checked')
+    provenance = parameter_file.load(tmp_path / 'unit.yaml').provenance
+    assert provenance['mounting'].startswith('not checked')

@@ -16,15 +16,15 @@
 
 from dataclasses import replace
 
-from adxl_ros.files import params, recording
+from adxl_ros.files import parameter_file, recording
 from adxl_ros.model import noise
 from adxl_ros.model.coefficients import put, typical, with_neutral
 from adxl_ros.model.effects import library
-from adxl_ros.model.follow import Smoothed
-from adxl_ros.model.motion import Knots, Motion
-from adxl_ros.model.response import Response
-from adxl_ros.model.simulate import simulate
-from adxl_ros.model.trajectory import rich, sweep, TRAJECTORIES
+from adxl_ros.simulate.motion import Knots, Motion
+from adxl_ros.simulate.response import Response
+from adxl_ros.simulate.simulator import simulate
+from adxl_ros.simulate.smoothed_paths import Smoothed
+from adxl_ros.simulate.trajectories import rich, sweep, TRAJECTORIES
 import numpy as np
 from pace import within
 import pytest
@@ -247,7 +247,7 @@ def test_apply_takes_temperature_and_supply_out(run_tool, tmp_path):
     sensor = with_neutral(nominal('xy'), ['supply', 'temperature_bias'])
     sensor = replace(sensor, values={**sensor.values, 'supply': typical(library()['supply'], 'xy'),
                                      'temperature_bias': {'per_k': np.full(2, 1e-3)}})
-    params.save(tmp_path / 'unit.yaml', sensor)
+    parameter_file.save(tmp_path / 'unit.yaml', sensor)
     done = run_tool('apply', 'soak.csv', '--params', 'unit.yaml', '-o', 'out.csv')
     assert done.returncode == 0 and not done.stderr
     ax = np.genfromtxt(tmp_path / 'out.csv', delimiter=',', names=True)['ax_mps2']

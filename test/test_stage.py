@@ -17,7 +17,7 @@
 import os
 import signal
 
-from adxl_ros.model.stage import specific_force
+from adxl_ros.model.kinematics import specific_force
 from diagnostic_msgs.msg import DiagnosticStatus
 from graph import Graph, imu_table, stamp_ns
 import numpy as np

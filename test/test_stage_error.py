@@ -17,7 +17,9 @@
 
 from dataclasses import replace
 
-from adxl_ros.calibrate import full, linearised, plan, posed
+from adxl_ros.calibrate import pose_response
+from adxl_ros.calibrate.fits import full_model, linearised
+from adxl_ros.calibrate.guided import pose_plan
 from adxl_ros.calibrate.poses import Poses, together
 from adxl_ros.calibrate.stage_error import PoseCovariance, shared_settings, StageError
 from adxl_ros.model.coefficients import with_neutral
@@ -50,7 +52,7 @@ def dense(slope, poses, error):
 
 def test_products_and_determinant_are_those_of_the_dense_covariance(poses):
     """Woodbury's formula gives what the inverse of the whole matrix gives."""
-    slope = posed.by_angles(nominal(), poses)
+    slope = pose_response.by_angles(nominal(), poses)
     columns = np.random.default_rng(1).normal(size=(len(poses), 2, 5))
     whole = dense(slope, poses, ERROR)
     covariance = PoseCovariance(slope, poses, shared_settings(poses), ERROR)
@@ -62,7 +64,7 @@ def test_products_and_determinant_are_those_of_the_dense_covariance(poses):
 
 def test_predicted_errors_are_the_best_linear_ones(poses):
     """Errors of setting and pose are those of the conditional normal distribution."""
-    slope = posed.by_angles(nominal(), poses)
+    slope = pose_response.by_angles(nominal(), poses)
     residual = np.random.default_rng(2).normal(size=poses.volts.shape) * 1e-4
     covariance = PoseCovariance(slope, poses, shared_settings(poses), ERROR)
     weighted = np.linalg.solve(dense(slope, poses, ERROR), residual.ravel()).reshape(
@@ -79,7 +81,7 @@ def test_predicted_errors_are_the_best_linear_ones(poses):
 
 def test_poses_that_do_not_count_change_nothing(poses):
     """Products of some poses are those of these alone."""
-    slope = posed.by_angles(nominal(), poses)
+    slope = pose_response.by_angles(nominal(), poses)
     columns = np.random.default_rng(1).normal(size=(len(poses), 2, 3))
     kept = np.arange(len(poses)) % 7 != 0
     some = PoseCovariance(slope, poses, shared_settings(poses), ERROR, kept)
@@ -92,11 +94,11 @@ def test_poses_that_do_not_count_change_nothing(poses):
 def test_a_stated_error_counts_where_poses_do_not_tell(poses):
     """Few poses leave the level at the stated one; many decide it themselves."""
     unit = with_neutral(nominal(), ('bias', 'scale_factor', 'base_tilt'))
-    names = full.coefficients('xy', ('bias', 'scale_factor'))
-    few = linearised.linearised(unit, poses.subset(np.arange(4)), names, full.priors(names))
+    names = full_model.coefficients('xy', ('bias', 'scale_factor'))
+    few = linearised.linearised(unit, poses.subset(np.arange(4)), names, full_model.priors(names))
     assert few.stage_error(1e-3).total_rad == pytest.approx(1e-3, rel=1.0)
-    quiet = replace(poses, volts=posed.response(unit, poses))
-    many = linearised.linearised(unit, quiet, names, full.priors(names))
+    quiet = replace(poses, volts=pose_response.response(unit, poses))
+    many = linearised.linearised(unit, quiet, names, full_model.priors(names))
     assert many.stage_error(1e-3).total_rad < 1e-4
 
 
@@ -104,14 +106,14 @@ def test_a_joint_that_is_worse_than_the_other_is_found():
     """Alpha with nine times the variance of beta, where the sweep moves both often."""
     rng = np.random.default_rng(5)
     truth = drawn(rng, nominal())
-    targets = plan.guided(plan.default_planes_rad('xy'), plan.STEP_RAD, 0)
+    targets = pose_plan.guided(pose_plan.default_planes_rad('xy'), pose_plan.STEP_RAD, 0)
     poses = swept(rng, truth, targets=targets, noisy=False)
     step = np.radians(5 / 60)
     off = [factor * step * rng.uniform(-0.5, 0.5, len(poses))[setting]
            for factor, setting in ((3, poses.alpha_setting), (1, poses.beta_setting))]
-    volts = posed.response(truth, replace(poses, alpha_rad=poses.alpha_rad + off[0],
-                                          beta_rad=poses.beta_rad + off[1]))
-    found = full.fit_full(nominal(), replace(
+    volts = pose_response.response(truth, replace(poses, alpha_rad=poses.alpha_rad + off[0],
+                                                  beta_rad=poses.beta_rad + off[1]))
+    found = full_model.fit_full(nominal(), replace(
         poses, volts=volts + poses.std_v * rng.normal(size=volts.shape)))
     alpha, beta = found.stage.setting_rad * found.stage.joints * np.sqrt(12) / step
     assert alpha == pytest.approx(3, rel=0.2) and beta == pytest.approx(1, rel=0.4)

@@ -16,8 +16,10 @@
 
 from dataclasses import replace
 
-from adxl_ros.calibrate import linear, physical, result, verdict
+from adxl_ros.calibrate import calibration
+from adxl_ros.calibrate.fits import linear, paper_regression
 from adxl_ros.calibrate.poses import Poses
+from adxl_ros.calibrate.report import cross_validation
 from adxl_ros.errors import UserError
 import numpy as np
 from pace import within
@@ -77,7 +79,7 @@ def test_physical_finds_the_unit(axes):
             for values in truth.values[effect].values():
                 values[2:] = 0.0
         poses = swept(rng, truth, per_setting=True)
-        fitted = physical.fit(sensor, poses.subset(~poses.check))
+        fitted = paper_regression.fit(sensor, poses.subset(~poses.check))
         std = np.sqrt(np.diag(fitted.covariance))
         for name, sigma in zip(fitted.covariance_names, std):
             effect, parameter, axis = name.split('.')
@@ -85,7 +87,8 @@ def test_physical_finds_the_unit(axes):
             error = (fitted.values[effect][parameter][index]
                      - truth.values[effect][parameter][index])
             inside.append(abs(error) < 1.645 * sigma)
-        of = verdict.score('physical', verdict.errors(fitted, poses.subset(poses.check)))
+        of = cross_validation.score(
+            'physical', cross_validation.errors(fitted, poses.subset(poses.check)))
         alpha_deg.append(of.alpha_rms_deg)
         assert of.accel_rms_mg < 0.6
     assert np.mean(alpha_deg) < 0.1
@@ -99,8 +102,8 @@ def test_physical_reduces_the_tilt_error_as_the_paper_does():
     ratios = []
     for _ in range(10):
         poses = swept(rng, drawn(rng, sensor))
-        linear_score, physical_score = verdict.held_out(
-            {'linear': linear.fit, 'physical': physical.fit}, sensor, poses)
+        linear_score, physical_score = cross_validation.held_out(
+            {'linear': linear.fit, 'physical': paper_regression.fit}, sensor, poses)
         ratios.append(physical_score.alpha_rms_deg / linear_score.alpha_rms_deg)
     assert np.mean(ratios) < 1 - 0.889
 
@@ -110,8 +113,8 @@ def test_physical_is_exact_without_noise():
     rng = np.random.default_rng(3)
     truth = drawn(rng, nominal())
     poses = swept(rng, truth, noisy=False)
-    fitted = physical.fit(nominal(), poses.subset(~poses.check))
-    errors = verdict.errors(fitted, poses.subset(poses.check))
+    fitted = paper_regression.fit(nominal(), poses.subset(~poses.check))
+    errors = cross_validation.errors(fitted, poses.subset(poses.check))
     assert np.abs(errors.accel_mps2).max() < 0.3e-3 * 9.8
 
 
@@ -120,7 +123,7 @@ def test_physical_takes_less_than_a_second():
     rng = np.random.default_rng(1)
     poses = swept(rng, drawn(rng, nominal()))
     with within(1.0):
-        physical.fit(nominal(), poses)
+        paper_regression.fit(nominal(), poses)
 
 
 @pytest.mark.parametrize('planes_deg, missing', [
@@ -131,7 +134,7 @@ def test_physical_says_which_planes_are_missing(planes_deg, missing):
     rng = np.random.default_rng(1)
     poses = swept(rng, drawn(rng, nominal()), np.radians(planes_deg), 0)
     with pytest.raises(UserError, match=missing):
-        physical.fit(nominal(), poses)
+        paper_regression.fit(nominal(), poses)
 
 
 def test_z_dependence_and_hysteresis_like_paths():
@@ -151,14 +154,15 @@ def test_wrong_polarity_is_named(change, words):
     rng = np.random.default_rng(4)
     poses = swept(rng, nominal())
     with pytest.raises(UserError, match=words):
-        result.calibrate(nominal(), [replace(poses, volts=change(poses.volts))], None, ['made'])
+        calibration.calibrate(nominal(), [replace(poses, volts=change(poses.volts))], None,
+                              ['made'])
 
 
 def test_verdict_without_check_poses_holds_out_folds():
     """A recording without check poses is judged by fits that leave a fifth out."""
     rng = np.random.default_rng(6)
     poses = swept(rng, drawn(rng, nominal()), check_poses=0)
-    found = result.calibrate(nominal(), [poses], None, ['made'])
+    found = calibration.calibrate(nominal(), [poses], None, ['made'])
     assert found.fitted.model == 'full'
     first_words = [line.split()[0] for line in found.verdict[:5]]
     assert first_words == ['held', 'nominal', 'linear', 'physical', 'full']

@@ -19,8 +19,8 @@ import hashlib
 import shutil
 import subprocess
 
-from adxl_ros.files import params, store
-from adxl_ros.model.envelope import Envelope
+from adxl_ros.files import calibration_store, parameter_file
+from adxl_ros.model.validity import Envelope
 from conftest import executable
 import numpy as np
 import pytest
@@ -58,7 +58,7 @@ def test_provenance_store_and_the_previous_file(run_tool, swept_csv, tmp_path):
                     'u.yaml')
     assert done.returncode == 0, done.stderr
     first = (tmp_path / 'u.yaml').read_text()
-    sensor = params.load(tmp_path / 'u.yaml')
+    sensor = parameter_file.load(tmp_path / 'u.yaml')
     said = sensor.provenance
     raw = (tmp_path / 'sweep.csv').read_bytes()
     assert said['data_sha256'] == hashlib.sha256(raw).hexdigest()
@@ -80,7 +80,7 @@ def test_provenance_store_and_the_previous_file(run_tool, swept_csv, tmp_path):
     done = run_tool('fit', 'sweep.csv', '--params', 'u7.yaml', '--model', 'linear', '-o', 'u.yaml',
                     '--store', 'elsewhere')
     assert done.returncode == 0, done.stderr
-    assert params.load(tmp_path / 'u.yaml').model == 'linear'
+    assert parameter_file.load(tmp_path / 'u.yaml').model == 'linear'
     assert (tmp_path / 'u.yaml.previous').read_text() == first
     assert len(list((tmp_path / 'elsewhere').rglob('*.yaml'))) == 1
     assert len(list(folder.iterdir())) == 1
@@ -96,7 +96,7 @@ def test_a_store_that_cannot_be_written_loses_nothing(run_tool, swept_csv, tmp_p
     done = run_tool('fit', 'sweep.csv', '--params', 'u7.yaml', '--model', 'linear', '-o', 'u.yaml',
                     '--store', 'file')
     assert done.returncode == 0
-    assert params.load(tmp_path / 'u.yaml').model == 'linear'
+    assert parameter_file.load(tmp_path / 'u.yaml').model == 'linear'
     assert 'fit: no copy in the store: file/U%2F7: cannot be made' in done.stderr
     assert done.stderr.count('\n') == 1
 
@@ -120,7 +120,7 @@ def test_apply_says_what_lies_outside(run_tool, swept_csv, tmp_path):
     assert done.returncode == 0
     assert '2 of 4 samples lie outside of what was calibrated' in done.stderr
     out = np.genfromtxt(tmp_path / 'out.csv', delimiter=',', names=True)['ax_std_mps2']
-    sensor = params.load(tmp_path / 'u.yaml')
+    sensor = parameter_file.load(tmp_path / 'u.yaml')
     off_k = 60 - sensor.envelope.temperature_c[1] - 2
     assert np.sqrt(out[2] ** 2 - out[0] ** 2) == pytest.approx(off_k * 1e-4 * 9.80665, rel=0.05)
     assert out[0] == out[1]
@@ -131,27 +131,27 @@ def test_the_file_holds_envelope_and_datasheet(tmp_path):
     sensor = replace(drawn(np.random.default_rng(1), nominal(serial='17')), model='full',
                      envelope=Envelope((20.5, 23.25), 1e-4, 3e-5, 2e-7, 1e-3, (-9.0, -9.5, 0.5),
                                        (9.0, 9.5, 8.0)))
-    params.save(tmp_path / 'u.yaml', sensor)
-    again = params.load(tmp_path / 'u.yaml')
+    parameter_file.save(tmp_path / 'u.yaml', sensor)
+    again = parameter_file.load(tmp_path / 'u.yaml')
     assert again.envelope == sensor.envelope
     assert again.datasheet == sensor.datasheet and len(sensor.datasheet) == 10
     assert again.datasheet_name == sensor.datasheet_name
     bare = replace(sensor, envelope=Envelope(), datasheet={}, datasheet_name='')
-    params.save(tmp_path / 'old.yaml', bare)
+    parameter_file.save(tmp_path / 'old.yaml', bare)
     assert 'envelope' not in (tmp_path / 'old.yaml').read_text()
-    assert params.load(tmp_path / 'old.yaml').envelope == Envelope()
+    assert parameter_file.load(tmp_path / 'old.yaml').envelope == Envelope()
 
 
 @pytest.mark.parametrize('serial', ['17', 'A/B', '..', 'ä €', '-x', 'ä' * 200])
 def test_any_serial_has_a_folder_of_its_own(tmp_path, serial):
     """Inside the store, whatever the serial number is."""
     sensor = replace(drawn(np.random.default_rng(1), nominal(serial=serial)), provenance=DATED)
-    path = store.put(tmp_path / 'store', sensor)
+    path = calibration_store.put(tmp_path / 'store', sensor)
     assert path.parent.parent == tmp_path / 'store'
-    assert store.newer(tmp_path / 'store', sensor) is None
+    assert calibration_store.newer(tmp_path / 'store', sensor) is None
     old = replace(sensor, provenance={'date': '2025-01-02T03:04:05+00:00'})
-    assert store.newer(tmp_path / 'store', old) == path
-    (found, again), = store.history(tmp_path / 'store', serial)[0]
+    assert calibration_store.newer(tmp_path / 'store', old) == path
+    (found, again), = calibration_store.history(tmp_path / 'store', serial)[0]
     assert found == path and again.serial == serial
 
 
@@ -160,10 +160,10 @@ def test_history_is_by_date_and_tells_what_it_cannot_read(tmp_path):
     sensor = drawn(np.random.default_rng(1), nominal(serial='17'))
     dates = ['2026-03-01T00:00:00+00:00', '2025-12-24T00:00:00+00:00', '2026-02-01T00:00:00']
     for date in dates:
-        store.put(tmp_path, replace(sensor, provenance={'date': date}))
-    params.save(tmp_path / '17' / 'other.yaml', replace(sensor, serial='18'))
+        calibration_store.put(tmp_path, replace(sensor, provenance={'date': date}))
+    parameter_file.save(tmp_path / '17' / 'other.yaml', replace(sensor, serial='18'))
     (tmp_path / '17' / 'half.yaml').write_text('/**:\n  ros__par')
-    found, refused = store.history(tmp_path, '17')
+    found, refused = calibration_store.history(tmp_path, '17')
     assert [s.provenance['date'] for _, s in found] == [dates[1], dates[2], dates[0]]
     assert len(refused) == 2 and 'half.yaml:' in refused[0] and 'unit 18' in refused[1]
 
@@ -171,17 +171,17 @@ def test_history_is_by_date_and_tells_what_it_cannot_read(tmp_path):
 def test_a_file_that_was_named_by_hand_counts_by_its_date(tmp_path):
     """A copy is not newer than itself, nor is an old backup whose name sorts last."""
     sensor = replace(drawn(np.random.default_rng(1), nominal(serial='17')), provenance=DATED)
-    path = store.put(tmp_path, sensor)
+    path = calibration_store.put(tmp_path, sensor)
     shutil.copy(path, tmp_path / '17' / 'unit_17.yaml')
     (tmp_path / '17' / 'zz_half.yaml').write_text('/**:\n  ros__par')
     backup = tmp_path / '17' / 'zz_backup.yaml'
-    params.save(backup, replace(sensor, provenance={'date': '2020-01-02T03:04:05+00:00'}))
-    assert store.newer(tmp_path, sensor) is None
-    params.save(backup, replace(sensor, provenance={'date': '2027-01-02T03:04:05+00:00'}))
-    assert store.newer(tmp_path, sensor) == backup
-    params.save(backup, replace(sensor, serial='18', provenance={
+    parameter_file.save(backup, replace(sensor, provenance={'date': '2020-01-02T03:04:05+00:00'}))
+    assert calibration_store.newer(tmp_path, sensor) is None
+    parameter_file.save(backup, replace(sensor, provenance={'date': '2027-01-02T03:04:05+00:00'}))
+    assert calibration_store.newer(tmp_path, sensor) == backup
+    parameter_file.save(backup, replace(sensor, serial='18', provenance={
         'date': '2027-01-02T03:04:05+00:00'}))
-    assert store.newer(tmp_path, sensor) is None
+    assert calibration_store.newer(tmp_path, sensor) is None
 
 
 def test_a_full_disk_keeps_the_old_file(swept_csv, tmp_path):

@@ -14,12 +14,12 @@
 
 """The guided sweep without ROS: what it waits for, says and accepts."""
 
-from adxl_ros.calibrate.plan import guided, sweep as plan_sweep, Target, travel_rad
-from adxl_ros.calibrate.state import Settings
-from adxl_ros.calibrate.sweep import Sweep
-from adxl_ros.calibrate.tumble import Tumble
+from adxl_ros.calibrate.guided.capture_settings import Settings
+from adxl_ros.calibrate.guided.hand_guide import Tumble
+from adxl_ros.calibrate.guided.pose_plan import guided, sweep as plan_sweep, Target, travel_rad
+from adxl_ros.calibrate.guided.stage_guide import Sweep
 from adxl_ros.errors import UserError
-from adxl_ros.model.stage import specific_force
+from adxl_ros.model.kinematics import specific_force
 import numpy as np
 import pytest
 from units import Bench, Fed, nominal

@@ -1,6 +1,6 @@
 """`simulate` and `fit` through the front door: what they write, repeat and refuse."""
 
-from adxl_ros.files import params, recording
+from adxl_ros.files import parameter_file, recording
 import numpy as np
 import pytest
 from units import drawn, NOMINAL, nominal
@@ -11,8 +11,8 @@ HEAD = 'time_s,x_v,y_v,alpha_rad,beta_rad\n'
 def test_simulate_fit_and_apply_make_one_path(run_tool, tmp_path):
     """A simulated sweep is fitted to its coefficients, and apply brings its angles back."""
     truth = drawn(np.random.default_rng(8), nominal(serial='S8'))
-    params.save(tmp_path / 'truth.yaml', truth)
-    params.save(tmp_path / 'nominal.yaml', nominal(serial='S8'))
+    parameter_file.save(tmp_path / 'truth.yaml', truth)
+    parameter_file.save(tmp_path / 'nominal.yaml', nominal(serial='S8'))
     for name, trajectory in (('sweep', 'sweep'), ('tilt', 'tilt_alpha')):
         done = run_tool('simulate', trajectory, '--params', 'truth.yaml', '--rate', 200,
                         '--seed', 5, '-o', f'{name}.csv')
@@ -22,7 +22,7 @@ def test_simulate_fit_and_apply_make_one_path(run_tool, tmp_path):
     assert done.returncode == 0, done.stderr
     assert 'full model' in done.stdout and 'held out' in done.stdout
     assert (tmp_path / 'figures' / 'calibration.png').stat().st_size > 20000
-    fitted = params.load(tmp_path / 'unit.yaml')
+    fitted = parameter_file.load(tmp_path / 'unit.yaml')
     np.testing.assert_allclose(fitted.zero_g_v, truth.zero_g_v, atol=5e-4)
     np.testing.assert_allclose(fitted.scale_v_per_g, truth.scale_v_per_g, atol=5e-4)
     done = run_tool('apply', 'tilt.csv', '--params', 'unit.yaml', '-o', 'tilt_out.csv')
@@ -40,7 +40,8 @@ def test_several_recordings_of_one_unit_are_fitted_together(run_tool, tmp_path):
     run_tool('fit', '1.csv', '-o', 'one.yaml')
     done = run_tool('fit', '1.csv', '2.csv', '-o', 'both.yaml')
     assert done.returncode == 0, done.stderr
-    one, both = params.load(tmp_path / 'one.yaml'), params.load(tmp_path / 'both.yaml')
+    one, both = parameter_file.load(
+        tmp_path / 'one.yaml'), parameter_file.load(tmp_path / 'both.yaml')
     assert np.mean(np.diag(both.covariance) / np.diag(one.covariance)) < 0.8
     assert both.provenance['source'] == '1.csv, 2.csv'
 
@@ -120,7 +121,7 @@ def test_real_recordings_reach_what_a_plain_fit_does(run_tool, tmp_path, shared_
     """The magnitude of gravity over the rests of real sensors, rms in mg."""
     done = run_tool('fit', shared_dir / 'real' / f'{name}.csv', '-o', 'unit.yaml')
     assert done.returncode == 0, done.stderr
-    provenance = params.load(tmp_path / 'unit.yaml').provenance
+    provenance = parameter_file.load(tmp_path / 'unit.yaml').provenance
     assert float(provenance['residual_mg']) < in_sample + 0.005
     assert float(provenance['leave_one_out_mg']) < left_out + 0.005
 

@@ -16,12 +16,13 @@
 
 from dataclasses import replace
 
-from adxl_ros.calibrate import judge, result, verdict
-from adxl_ros.calibrate.full import TERMS
-from adxl_ros.calibrate.limits import Parts
-from adxl_ros.model import chain
+from adxl_ros.calibrate import calibration
+from adxl_ros.calibrate.fits.full_model import TERMS
+from adxl_ros.calibrate.report import acceptance, cross_validation
+from adxl_ros.calibrate.report.error_budget import Parts
+from adxl_ros.model import signal_chain
 from adxl_ros.model.constants import G0_MPS2
-from adxl_ros.model.stage import specific_force
+from adxl_ros.model.kinematics import specific_force
 import numpy as np
 import pytest
 from units import drawn, nominal, swept
@@ -34,7 +35,7 @@ def calibrated(seed, model=None, axes='xy', check=16, stage_rad=None, effects=TE
     truth = drawn(rng, sensor, effects)
     on = truth if stage_rad is None else replace(truth, stage_resolution_rad=stage_rad)
     poses = swept(rng, on, check_poses=check)
-    return truth, result.calibrate(sensor, [poses], model, ['made'])
+    return truth, calibration.calibrate(sensor, [poses], model, ['made'])
 
 
 def true_errors(truth, found):
@@ -43,16 +44,16 @@ def true_errors(truth, found):
     poses = found.poses.subset(found.sound).subset(score.index)
     force = np.column_stack(specific_force(poses.alpha_rad, poses.beta_rad,
                                            truth.local_gravity_mps2))
-    volts = np.column_stack(chain.static_response(truth)(list(force.T)))
+    volts = np.column_stack(signal_chain.static_response(truth)(list(force.T)))
     got = np.empty_like(force)
     for number, unit in enumerate(score.fitted):
         own = score.fold == number
         up = np.where(force[own, 2] < 0, -1, 1)
-        got[own] = np.column_stack(chain.inverse(unit, up)(list(volts[own].T)))
+        got[own] = np.column_stack(signal_chain.inverse(unit, up)(list(volts[own].T)))
     shown = np.isfinite(score.errors.tilt_rad)
     mg = (got - force)[shown, :len(truth.axes)] / G0_MPS2 * 1e3
     return (np.sqrt(np.mean(mg ** 2)),
-            np.degrees(np.sqrt(np.mean(verdict.between(got, force)[shown] ** 2))))
+            np.degrees(np.sqrt(np.mean(cross_validation.between(got, force)[shown] ** 2))))
 
 
 @pytest.mark.parametrize(('check', 'units', 'within'), [(16, 4, 0.35), (0, 2, 0.5)],
@@ -116,10 +117,10 @@ def test_a_linear_model_fails_and_says_why():
 def test_a_unit_beyond_the_datasheet_is_named():
     """By the whole of its interval; the greatest zero-g is 100 mV from nominal."""
     _, found = calibrated(2, effects=())
-    assert judge.beyond_datasheet(found.fitted) == []
+    assert acceptance.beyond_datasheet(found.fitted) == []
     off = replace(found.fitted, values={**found.fitted.values, 'bias': {
         'offset_v': np.array([0.02, -0.11])}})
-    said, = judge.beyond_datasheet(off)
+    said, = acceptance.beyond_datasheet(off)
     assert said.startswith('bias.offset_v.y is -0.11')
 
 
@@ -138,9 +139,9 @@ def test_pass_fail_and_not_shown(parts, outcome):
     """The bar is 1: an error that is below, that may be below, and that is beyond."""
     bar = replace(nominal(), datasheet={'nonlinearity.cubic_per_g2': (
         1 / G0_MPS2 / nominal().range_g ** 3, 0.0)})
-    judged = judge.judge('full', Parts(*parts), Parts(*parts), bar)
+    judged = acceptance.judge('full', Parts(*parts), Parts(*parts), bar)
     assert judged.datasheet == judged.worst('datasheet') == outcome
-    tilted = judge.judge('full', Parts(1.0, 0.0, 0.9, 0.1, 0.0, 0.2), replace(
+    tilted = acceptance.judge('full', Parts(1.0, 0.0, 0.9, 0.1, 0.0, 0.2), replace(
         Parts(*parts), per_axis=1.0), bar)
     assert (tilted.datasheet, tilted.tilt_datasheet) == ('PASS', outcome)
     assert tilted.worst('datasheet') == outcome
@@ -160,7 +161,7 @@ def test_intervals_hold_for_errors_that_go_together(together, least):
         for k in range(1, 230):
             errors[k] = together * errors[k - 1] + np.sqrt(1 - together ** 2) * noise[k]
         errors = errors[100:]
-        low, high = verdict.rms_interval(errors)
+        low, high = cross_validation.rms_interval(errors)
         covered += low < 1 < high
         naive += 1 / 1.11 < np.sqrt(np.mean(errors ** 2)) < 1.11
     assert least < covered / 400 < 0.97

@@ -17,7 +17,7 @@
 from dataclasses import replace
 import zlib
 
-from adxl_ros.links.wire import (
+from adxl_ros.links.support.wire_format import (
     AFTER_RESET,
     Data,
     decode,

@@ -17,16 +17,16 @@
 from dataclasses import replace
 from pathlib import Path
 
-from adxl_ros.calibrate import posed
-from adxl_ros.calibrate.physical import EFFECTS
-from adxl_ros.calibrate.plan import sweep
+from adxl_ros.calibrate import pose_response
+from adxl_ros.calibrate.fits.paper_regression import EFFECTS
+from adxl_ros.calibrate.guided.pose_plan import sweep
 from adxl_ros.calibrate.poses import Poses
-from adxl_ros.files import params
-from adxl_ros.model import chain, noise
+from adxl_ros.files import parameter_file
+from adxl_ros.model import noise, signal_chain
 from adxl_ros.model.effects import effect_named
-from adxl_ros.model.motion import Motion
-from adxl_ros.model.response import Response
-from adxl_ros.model.stage import specific_force
+from adxl_ros.model.kinematics import specific_force
+from adxl_ros.simulate.motion import Motion
+from adxl_ros.simulate.response import Response
 import numpy as np
 
 NOMINAL = Path(__file__).resolve().parents[1] / 'params' / 'adxl203.yaml'
@@ -35,7 +35,7 @@ PLANES_RAD = np.radians([30, 60, 90, 120, 150])
 
 def nominal(axes='xy', **changes):
     """Return the nominal ADXL203, with that many axes."""
-    sensor = params.load(NOMINAL)
+    sensor = parameter_file.load(NOMINAL)
     count = len(axes)
     arrays = {name: np.full(count, getattr(sensor, name)[0]) for name in (
         'nominal_zero_g_v', 'nominal_scale_v_per_g', 'noise_density_g_per_rthz')}
@@ -72,8 +72,8 @@ def swept(rng, truth, planes_rad=PLANES_RAD, check_poses=16, noisy=True, per_set
         setting = np.cumsum(np.abs(np.diff(angle, prepend=angle[0])) > 1e-9)
         return drawn[setting] if per_setting else drawn
     off = error(alpha), error(beta)
-    force = posed.force_on(truth, alpha + off[0], beta + off[1])
-    volts = np.column_stack(chain.static_response(truth)(force))
+    force = pose_response.force_on(truth, alpha + off[0], beta + off[1])
+    volts = np.column_stack(signal_chain.static_response(truth)(force))
     count = noise.effective_samples(5000, 1e-3, truth.rc_s)
     std = np.broadcast_to(noise.sigma_v(truth) / np.sqrt(count), volts.shape)
     volts = volts + noisy * std * rng.normal(size=volts.shape)

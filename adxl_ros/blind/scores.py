@@ -21,10 +21,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from adxl_ros.blind import figures, marks
-from adxl_ros.blind.cases import Label
-from adxl_ros.blind.held import NOISE_LIKE
-from adxl_ros.blind.marks import Answer, UNKNOWN
+from adxl_ros.blind import grading, score_statistics
+from adxl_ros.blind.grading import Answer, UNKNOWN
+from adxl_ros.blind.held_out_gap import NOISE_LIKE
+from adxl_ros.blind.trials import Label
 import numpy as np
 
 # Bars: name, words, at most (-1) or at least (+1) or within (0), figures.
@@ -59,37 +59,42 @@ def scores(trials: Sequence[Trial]) -> dict[str, Any]:
     def group(name: str, test: Callable[[Label], bool] = lambda label: True) -> list[Trial]:
         return [trial for trial in real if trial.label.group == name and test(trial.label)]
 
-    alarms = figures.share([trial.given.gap for trial in group('none')])
-    confidences = [(trial.given.probability, marks.verdict_right(trial.given, trial.label))
+    alarms = score_statistics.share([trial.given.gap for trial in group('none')])
+    confidences = [(trial.given.probability, grading.verdict_right(trial.given, trial.label))
                    for trial in real]
-    seen = group('single', marks.visible)
+    seen = group('single', grading.visible)
     return {
         'false_alarms': alarms,
         'detection': _detection(real, alarms['value'] or 0.0),
-        'top_1': figures.share([_top(trial) for trial in group('single', marks.sure)]),
-        'top_1_all_singles': figures.share([_top(trial) for trial in group('single')]),
-        'leading': figures.share([_effect(trial) in trial.given.top for trial in seen]),
-        'set_recall': figures.share([_effect(trial) in trial.given.named for trial in seen]),
-        'set_size': figures.resampled([len(trial.given.named) for trial in seen], np.mean),
-        'inseparable_size': figures.resampled(
+        'top_1': score_statistics.share([_top(trial) for trial in group('single', grading.sure)]),
+        'top_1_all_singles': score_statistics.share([_top(trial) for trial in group('single')]),
+        'leading': score_statistics.share([_effect(trial) in trial.given.top for trial in seen]),
+        'set_recall': score_statistics.share([_effect(trial) in trial.given.named
+                                              for trial in seen]),
+        'set_size': score_statistics.resampled([len(trial.given.named) for trial in seen],
+                                               np.mean),
+        'inseparable_size': score_statistics.resampled(
             [1 + len(trial.label.faults[0]['inseparable']) for trial in seen], np.mean),
-        'verdict_right': figures.share([right for _, right in confidences]),
-        'brier': figures.resampled([marks.brier(trial.given, trial.label) for trial in real],
-                                   np.mean),
-        'calibration_error': figures.resampled(confidences, figures.calibration_error),
-        'reliability': figures.reliability(confidences),
+        'verdict_right': score_statistics.share([right for _, right in confidences]),
+        'brier': score_statistics.resampled(
+            [grading.brier(trial.given, trial.label) for trial in real], np.mean),
+        'calibration_error': score_statistics.resampled(confidences,
+                                                        score_statistics.calibration_error),
+        'reliability': score_statistics.reliability(confidences),
         'coverage': _coverage(real),
         **_held(real),
-        'unknown_recall': figures.share([
+        'unknown_recall': score_statistics.share([
             _unknown(trial) for trial in group('outside', lambda label: label.flexible >= 0.9)]),
-        'unknown_recall_all': figures.share([_unknown(trial) for trial in group('outside')]),
-        'unknown_wrongly': figures.share([_unknown(trial) for trial in real
-                                          if trial.label.group != 'outside']),
+        'unknown_recall_all': score_statistics.share([_unknown(trial)
+                                                      for trial in group('outside')]),
+        'unknown_wrongly': score_statistics.share([_unknown(trial) for trial in real
+                                                   if trial.label.group != 'outside']),
         'pairs': _pairs(group('pair')),
         'by_effect': _by_effect(real),
         'confusion': _confusion(real),
         'baselines': _baselines(real),
-        'seconds': figures.resampled([trial.given.seconds for trial in trials], np.median),
+        'seconds': score_statistics.resampled([trial.given.seconds for trial in trials],
+                                              np.median),
         'longest_s': max((trial.given.seconds for trial in trials), default=0.0),
         'status': dict(Counter(trial.given.status for trial in real)),
     }
@@ -118,7 +123,7 @@ def _effect(trial: Trial) -> str:
 
 
 def _top(trial: Trial) -> bool:
-    return trial.given.top == marks.truth(trial.label)
+    return trial.given.top == grading.truth(trial.label)
 
 
 def _unknown(trial: Trial) -> bool:
@@ -135,8 +140,9 @@ def _detection(real: Sequence[Trial], alarms: float) -> dict[str, Any]:
     out = {}
     for name, some in parts.items():
         strength = np.array([trial.label.faults[0]['strength_mps2'] for trial in some])
-        out[name] = figures.curve(strength, np.array([trial.given.gap for trial in some]), alarms)
-        out[name]['oracle'] = figures.bins(strength, np.array(
+        out[name] = score_statistics.curve(strength, np.array(
+            [trial.given.gap for trial in some]), alarms)
+        out[name]['oracle'] = score_statistics.bins(strength, np.array(
             [trial.label.faults[0]['power'] > 0.5 for trial in some]))
     return out
 
@@ -146,9 +152,9 @@ def _coverage(real: Sequence[Trial]) -> dict[str, Any]:
     rows: list[tuple[int, int]] = []
     for trial in real:
         if trial.label.group not in ('single', 'pair') or \
-                trial.given.certain != marks.truth(trial.label) or trial.given.groups:
+                trial.given.certain != grading.truth(trial.label) or trial.given.groups:
             continue
-        true = marks.true_parameters(trial.label)
+        true = grading.true_parameters(trial.label)
         inside = [low <= true[name] <= high
                   for name, (_, low, high) in trial.given.parameters.items() if name in true]
         if inside:
@@ -157,7 +163,7 @@ def _coverage(real: Sequence[Trial]) -> dict[str, Any]:
     def covered(some: list[tuple[int, int]]) -> float:
         table = np.array(some)
         return float(table[:, 0].sum() / table[:, 1].sum())
-    return figures.resampled(rows, covered)
+    return score_statistics.resampled(rows, covered)
 
 
 def _held(real: Sequence[Trial]) -> dict[str, Any]:
@@ -167,33 +173,33 @@ def _held(real: Sequence[Trial]) -> dict[str, Any]:
         held = trial.held
         harm.append(held is not None and held['harm_ci'][0] > _HARM * held['floor'])
         if held is None or trial.label.group not in ('single', 'pair') \
-                or held['gap_ci'][0] <= 0 or not marks.visible(trial.label):
+                or held['gap_ci'][0] <= 0 or not grading.visible(trial.label):
             continue
         gap = held['before'] - held['floor']
         own, oracle = (1 - (held[name] - held['floor']) / gap for name in ('after', 'oracle'))
         closed.append(own)
         if oracle > 0:
             ratio.append(own / oracle)
-    return {'closed': figures.resampled(closed, np.median),
-            'closed_by_oracle': figures.resampled(ratio, np.median),
-            'harm': figures.share(harm)}
+    return {'closed': score_statistics.resampled(closed, np.median),
+            'closed_by_oracle': score_statistics.resampled(ratio, np.median),
+            'harm': score_statistics.share(harm)}
 
 
 def _pairs(pairs: Sequence[Trial]) -> dict[str, Any]:
-    seen = [trial for trial in pairs if marks.visible(trial.label)]
-    found = [len(trial.given.named & marks.truth(trial.label)) for trial in seen]
-    return {'whole': figures.share([n == 2 for n in found]),
-            'in_part': figures.share([n == 1 for n in found]),
-            'exactly': figures.share([_top(trial) for trial in seen])}
+    seen = [trial for trial in pairs if grading.visible(trial.label)]
+    found = [len(trial.given.named & grading.truth(trial.label)) for trial in seen]
+    return {'whole': score_statistics.share([n == 2 for n in found]),
+            'in_part': score_statistics.share([n == 1 for n in found]),
+            'exactly': score_statistics.share([_top(trial) for trial in seen])}
 
 
 def _by_effect(real: Sequence[Trial]) -> dict[str, dict[str, int]]:
     """Count for each effect that the ideal observer sees: trials, detected, in the set, top."""
     table: dict[str, Counter] = {}
     for trial in real:
-        if trial.label.group in ('single', 'outside') and marks.visible(trial.label):
+        if trial.label.group in ('single', 'outside') and grading.visible(trial.label):
             row = table.setdefault(_effect(trial), Counter(trials=0, detected=0, named=0, top=0))
-            wanted = marks.truth(trial.label)
+            wanted = grading.truth(trial.label)
             row.update(trials=1, detected=int(trial.given.gap), top=int(_top(trial)),
                        named=int(wanted <= trial.given.named))
     return {name: dict(row) for name, row in sorted(table.items())}
@@ -216,7 +222,7 @@ def _confusion(real: Sequence[Trial]) -> dict[str, dict[str, int]]:
 
 def _baselines(real: Sequence[Trial]) -> dict[str, dict[str, Any]]:
     """Score what is simpler: wholly right answers of all cases, and false alarms."""
-    mix = Counter('+'.join(sorted(marks.truth(trial.label))) for trial in real)
+    mix = Counter('+'.join(sorted(grading.truth(trial.label))) for trial in real)
     out = {'guess by prior': {
         'right': {'value': sum(n * n for n in mix.values()) / max(len(real), 1) ** 2, 'ci': None,
                   'count': len(real)},
@@ -229,8 +235,8 @@ def _baselines(real: Sequence[Trial]) -> dict[str, dict[str, Any]]:
         'diagnose': lambda trial: trial.given.top}
     for name, choose in chosen.items():
         out[name] = {
-            'right': figures.share([choose(trial) in marks.right(trial.label)
-                                    for trial in real]),
-            'false_alarms': figures.share([bool(choose(trial)) for trial in real
-                                           if trial.label.group == 'none'])}
+            'right': score_statistics.share([choose(trial) in grading.right(trial.label)
+                                             for trial in real]),
+            'false_alarms': score_statistics.share([bool(choose(trial)) for trial in real
+                                                    if trial.label.group == 'none'])}
     return out

@@ -21,11 +21,11 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 
 from adxl_ros.errors import UserError
-from adxl_ros.model import chain
+from adxl_ros.model import signal_chain
 from adxl_ros.model.constants import AXES
 from adxl_ros.model.effects.base import Components, Environment, Value
+from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.model.stage import specific_force
 import numpy as np
 
 SAME_ANGLE_RAD = 1e-5
@@ -102,9 +102,9 @@ class Poses:
     @property
     def environment(self) -> Environment:
         """Temperature and supply of each rest; the nominal ones where they were not measured."""
-        return chain.NOMINAL._replace(
-            temperature_c=_known(self.temperature_c, chain.NOMINAL.temperature_c),
-            supply_v=_known(self.supply_v, chain.NOMINAL.supply_v))
+        return signal_chain.NOMINAL._replace(
+            temperature_c=_known(self.temperature_c, signal_chain.NOMINAL.temperature_c),
+            supply_v=_known(self.supply_v, signal_chain.NOMINAL.supply_v))
 
 
 def together(parts: list[Poses]) -> Poses:
@@ -151,7 +151,7 @@ def pose_variance(sensor: Sensor, poses: Poses) -> np.ndarray:
 
     An encoder of step r leaves the true angle uniform within it: variance r²/12 a joint.
     """
-    respond = chain.static_response(sensor)
+    respond = signal_chain.static_response(sensor)
     variance = poses.std_v ** 2
     step = 1e-4
     for joint in range(2):

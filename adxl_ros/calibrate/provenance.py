@@ -22,13 +22,13 @@ from datetime import datetime, timezone
 import hashlib
 from importlib.metadata import PackageNotFoundError, version
 
-from adxl_ros.calibrate.physical import planes
+from adxl_ros.calibrate.fits.paper_regression import planes
 from adxl_ros.calibrate.poses import Poses
-from adxl_ros.files import store
+from adxl_ros.files import calibration_store
+from adxl_ros.model.covariance import leverage
 from adxl_ros.model.effects import effect_named
-from adxl_ros.model.envelope import Envelope, STRETCH
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.model.uncertainty import leverage
+from adxl_ros.model.validity import Envelope, STRETCH
 import numpy as np
 
 
@@ -66,7 +66,7 @@ def with_provenance(fitted: Sensor, source: str, poses: Poses, data_sha256: str,
             'sweep': sweep_in_words(poses), 'temperature_c': _around(poses.temperature_c, '.2f'),
             'supply_v': _around(poses.supply_v, '.4f'), **more}
     made = replace(fitted, provenance=said)
-    return replace(made, provenance={'id': store.calibration_id(made), **said})
+    return replace(made, provenance={'id': calibration_store.calibration_id(made), **said})
 
 
 def poses_sha256(poses: Poses) -> str:
@@ -104,7 +104,7 @@ def _around(values: np.ndarray, digits: str) -> str:
 
 def envelope(fitted: Sensor, force: np.ndarray, poses: Poses, misfit_mps2: float) -> Envelope:
     """
-    Return where a calibration holds; see `model.envelope`.
+    Return where a calibration holds; see `model.validity`.
 
     Parameters
     ----------

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from adxl_ros.errors import UserError
-from adxl_ros.files.bag_storage import Bag
+from adxl_ros.files.bag_messages import Bag
 
 IMU = 'sensor_msgs/msg/Imu'
 JOINT_STATE = 'sensor_msgs/msg/JointState'

@@ -25,8 +25,8 @@ from typing import Any
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import cdr
-from adxl_ros.files.atomic import atomic_path
-from adxl_ros.files.bag_storage import import_rosbags
+from adxl_ros.files.atomic_write import atomic_path
+from adxl_ros.files.bag_messages import import_rosbags
 from adxl_ros.files.bag_topics import (
     BATTERY_STATE,
     DIAGNOSTIC_STATUS,
@@ -35,7 +35,7 @@ from adxl_ros.files.bag_topics import (
     TEMPERATURE,
     typestore,
 )
-from adxl_ros.files.columns import COMMANDS, converted_info, JOINTS, Recording
+from adxl_ros.files.recording_columns import COMMANDS, converted_info, JOINTS, Recording
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.noise import sigma_v
 from adxl_ros.model.sensor import Sensor

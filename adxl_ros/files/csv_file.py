@@ -30,8 +30,8 @@ from typing import BinaryIO
 import warnings
 
 from adxl_ros.errors import UserError
-from adxl_ros.files.columns import LIMIT, Recording, TIME
 from adxl_ros.files.csv_header import Header, parse_header
+from adxl_ros.files.recording_columns import LIMIT, Recording, TIME
 import numpy as np
 
 _CHUNK_BYTES = 1 << 22

@@ -20,7 +20,7 @@ from collections import Counter
 from dataclasses import dataclass
 
 from adxl_ros.errors import UserError
-from adxl_ros.files.columns import ACCEL, REFERENCES, sensor_columns, TIME, VOLTS
+from adxl_ros.files.recording_columns import ACCEL, REFERENCES, sensor_columns, TIME, VOLTS
 
 # Names by which people write other units; the canonical column's own unit comes first.
 _UNITS = (

@@ -22,8 +22,8 @@ import os
 from types import TracebackType
 from typing import TextIO
 
-from adxl_ros.files.atomic import atomic_path
-from adxl_ros.files.columns import Recording, TIME
+from adxl_ros.files.atomic_write import atomic_path
+from adxl_ros.files.recording_columns import Recording, TIME
 import numpy as np
 
 _ROWS_AT_ONCE = 65536

@@ -27,16 +27,16 @@ import os
 from pathlib import Path
 
 from adxl_ros.errors import UserError
-from adxl_ros.files import bag_file, csv_file, unit
+from adxl_ros.files import bag_reader, csv_file, unit_check
 from adxl_ros.files.bag_writer import BagWriter, write_bag
-from adxl_ros.files.columns import (
+from adxl_ros.files.csv_writer import CsvWriter, recording_columns, recording_info, write_csv
+from adxl_ros.files.recording_columns import (
     ACCEL,
     concatenate,
     converted_info,
     Recording,
     sensor_info,
 )
-from adxl_ros.files.csv_writer import CsvWriter, recording_columns, recording_info, write_csv
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
@@ -61,7 +61,7 @@ def read(path: str | os.PathLike) -> Recording:
     """
     whole = concatenate(blocks(path, _BLOCK_ROWS))
     if _is_bag(path):
-        bag_file.drop_unsampled(whole)
+        bag_reader.drop_unsampled(whole)
     return whole
 
 
@@ -78,7 +78,7 @@ def blocks(path: str | os.PathLike, rows: int) -> Iterator[Recording]:
         It cannot be read, or holds something that no sensor gives.
 
     """
-    return bag_file.blocks(path, rows) if _is_bag(path) else csv_file.blocks(path, rows)
+    return bag_reader.blocks(path, rows) if _is_bag(path) else csv_file.blocks(path, rows)
 
 
 def read_ideal(path: str | os.PathLike, epoch_ns: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -103,7 +103,7 @@ def read_ideal(path: str | os.PathLike, epoch_ns: int = 0) -> tuple[np.ndarray, 
         It cannot be read, or an axis is missing.
 
     """
-    parts = (bag_file.blocks(path, _BLOCK_ROWS, ideal=True) if _is_bag(path)
+    parts = (bag_reader.blocks(path, _BLOCK_ROWS, ideal=True) if _is_bag(path)
              else csv_file.blocks(path, _BLOCK_ROWS, needed=ACCEL))
     ideal = concatenate(parts)
     time_s = ideal.time_s + (ideal.epoch_ns - epoch_ns) / 1e9
@@ -112,7 +112,7 @@ def read_ideal(path: str | os.PathLike, epoch_ns: int = 0) -> tuple[np.ndarray, 
 
 def check_unit(recording: Recording, sensor: Sensor) -> None:
     """
-    Refuse a recording of another unit than `sensor` describes; see `unit.check_unit`.
+    Refuse a recording of another unit than `sensor` describes; see `unit_check.check_unit`.
 
     Raises
     ------
@@ -120,7 +120,7 @@ def check_unit(recording: Recording, sensor: Sensor) -> None:
         The serial numbers, the axes or the nominal figures differ.
 
     """
-    unit.check_unit(recording.info, recording.axes, sensor, recording.path)
+    unit_check.check_unit(recording.info, recording.axes, sensor, recording.path)
 
 
 @contextmanager

@@ -22,12 +22,12 @@ import time
 from typing import Any
 
 from adxl_ros.errors import UserError
-from adxl_ros.links import channels
-from adxl_ros.links.base import nothing, Option, Samples, State
-from adxl_ros.links.clock_map import ClockMap, HostStamps
-from adxl_ros.links.iio_device import library, open_stream, ReadError, Stream
-from adxl_ros.links.retry import Retry
-from adxl_ros.links.timeline import Block, Timeline
+from adxl_ros.links.support import channels
+from adxl_ros.links.support.backoff import Retry
+from adxl_ros.links.support.base import nothing, Option, Samples, State
+from adxl_ros.links.support.clock_sync import ClockMap, HostStamps
+from adxl_ros.links.support.iio_device import library, open_stream, ReadError, Stream
+from adxl_ros.links.support.sample_stamps import Block, Timeline
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 

@@ -22,8 +22,8 @@ from typing import Any
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import recording
-from adxl_ros.files.columns import nominal_figures, Recording, REFERENCES
-from adxl_ros.links.base import nothing, Option, Samples, State
+from adxl_ros.files.recording_columns import nominal_figures, Recording, REFERENCES
+from adxl_ros.links.support.base import nothing, Option, Samples, State
 from adxl_ros.model.sensor import Sensor, with_axes
 import numpy as np
 

@@ -23,13 +23,13 @@ import time
 from typing import Any
 
 from adxl_ros.errors import UserError
-from adxl_ros.links import channels
-from adxl_ros.links.base import nothing, Option, Samples, State
-from adxl_ros.links.clock_map import ClockMap
-from adxl_ros.links.count import Count
-from adxl_ros.links.port import Port, SILENT
-from adxl_ros.links.timeline import Block, Timeline
-from adxl_ros.links.wire import (
+from adxl_ros.links.support import channels
+from adxl_ros.links.support.base import nothing, Option, Samples, State
+from adxl_ros.links.support.clock_sync import ClockMap
+from adxl_ros.links.support.frame_counter import Count
+from adxl_ros.links.support.sample_stamps import Block, Timeline
+from adxl_ros.links.support.serial_port import Port, SILENT
+from adxl_ros.links.support.wire_format import (
     AFTER_RESET,
     Data,
     decode,

@@ -22,11 +22,11 @@ from math import inf
 import time
 from typing import Any
 
-from adxl_ros.links.base import Option, Samples, State
-from adxl_ros.links.sim_stage import JOINTS
-from adxl_ros.model.motion import Motion
-from adxl_ros.model.response import Response
+from adxl_ros.links.support.base import Option, Samples, State
+from adxl_ros.links.support.simulated_stage import JOINTS
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.simulate.motion import Motion
+from adxl_ros.simulate.response import Response
 import numpy as np
 
 OPTIONS = (

@@ -19,3 +19,6 @@ G0_MPS2 = 9.80665
 
 AXES = 'xyz'
 """Axis letters in the order of every array."""
+
+NINETY = 1.6449
+"""Half of a 90 % interval, in standard deviations."""

@@ -21,7 +21,7 @@ from typing import Any
 
 from adxl_ros.errors import UserError
 from adxl_ros.model.constants import G0_MPS2
-from adxl_ros.model.envelope import Envelope
+from adxl_ros.model.validity import Envelope
 import numpy as np
 
 MODELS = ('nominal', 'linear', 'physical', 'full', 'gravity')

@@ -19,7 +19,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from adxl_ros.model.effects.base import Components, Value
-from adxl_ros.model.maths import ARRAYS, Maths
+from adxl_ros.model.scalar_or_array import ARRAYS, Maths
 import numpy as np
 
 UNOBSERVABLE_RAD2 = 1.0

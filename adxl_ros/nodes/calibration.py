@@ -20,17 +20,17 @@ from collections.abc import Callable
 import os
 from pathlib import Path
 
-from adxl_ros.calibrate import recorded
-from adxl_ros.calibrate.result import Result
-from adxl_ros.calibrate.session import Session
-from adxl_ros.calibrate.stream import Newest, STALE_NS
-from adxl_ros.calibrate.sweep import MountingError, Sweep
+from adxl_ros.calibrate.calibration import Result
+from adxl_ros.calibrate.guided.live_window import Newest, STALE_NS
+from adxl_ros.calibrate.guided.session import Session
+from adxl_ros.calibrate.guided.stage_guide import MountingError, Sweep
 from adxl_ros.errors import UserError
+from adxl_ros.files.recorded_unit import unit_of
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.nodes import announce, common
-from adxl_ros.nodes.asked import declare_plan
-from adxl_ros.nodes.console import Console, IDLE
-from adxl_ros.nodes.samples import Samples
+from adxl_ros.nodes.support import next_pose, node_support
+from adxl_ros.nodes.support.calibration_console import Console, IDLE
+from adxl_ros.nodes.support.calibration_parameters import declare_plan
+from adxl_ros.nodes.support.imu_subscription import Samples
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 import numpy as np
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -49,10 +49,10 @@ class Calibration(Node):
 
     def __init__(self) -> None:
         super().__init__('calibration')
-        self.base = common.make_sensor(common.declare_sensor(self))
-        self.autostart = common.declare(self, 'autostart', False,
-                                        'start without a call of ~/start')
-        self.resume = common.declare(
+        self.base = node_support.make_sensor(node_support.declare_sensor(self))
+        self.autostart = node_support.declare(self, 'autostart', False,
+                                              'start without a call of ~/start')
+        self.resume = node_support.declare(
             self, 'resume', 'ask', 'go on with an interrupted calibration; ask where there is a '
             'screen, else go on', choices=('ask', 'continue', 'anew'))
         self.asked = declare_plan(self)
@@ -68,14 +68,14 @@ class Calibration(Node):
         self._misdated: set[str] = set()
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._samples = Samples(self)
-        self._announcer = announce.Announcer(self)
+        self._announcer = next_pose.Announcer(self)
         self._connect()
-        self.console = Console(self) if common.declare(
+        self.console = Console(self) if node_support.declare(
             self, 'screen', True, 'show a screen, where the node runs in a terminal') else None
 
     def _connect(self) -> None:
-        self._diagnostics = common.publisher(self, DiagnosticArray, '/diagnostics', 10)
-        subscribe = common.subscription
+        self._diagnostics = node_support.publisher(self, DiagnosticArray, '/diagnostics', 10)
+        subscribe = node_support.subscription
         subscribe(self, DiagnosticStatus, 'sensor_info', self._on_info, 1, latched=True)
         subscribe(self, JointState, 'stage/joint_states', self._on_stage, 1000)
         subscribe(self, JointState, 'stage/command', self._on_command, 100)
@@ -100,7 +100,7 @@ class Calibration(Node):
     def _on_info(self, message: DiagnosticStatus) -> None:
         info = {pair.key: pair.value for pair in message.values}
         try:
-            unit = recorded.unit_of(self.base, info, 'sensor_info')
+            unit = unit_of(self.base, info, 'sensor_info')
         except UserError as error:
             self._foreign = f'{error}'
             # Of that sensor nothing is taken or shown.
@@ -426,8 +426,8 @@ class Calibration(Node):
             if np.isfinite(tilt_rad):
                 values['tilt_error_deg'] = float(np.degrees(tilt_rad))
         serial = self.unit.serial if self.unit else ''
-        self._diagnostics.publish(common.diagnostics(self, common.status(
-            common.WARN if late else common.OK, 'calibration', text, serial, values)))
+        self._diagnostics.publish(node_support.diagnostics(self, node_support.status(
+            node_support.WARN if late else node_support.OK, 'calibration', text, serial, values)))
 
     def _warn_once(self, phase: str, text: str) -> None:
         """Log what holds the calibration up once a pose and phase, not once a second."""
@@ -458,4 +458,4 @@ def main() -> int:
     # Through shared memory, Fast DDS does not reach a process again that was killed and started
     # anew (eProsima/Fast-DDS issues 2811, 5053 and 5469): an interrupted sweep could not go on.
     os.environ.setdefault('FASTDDS_BUILTIN_TRANSPORTS', 'UDPv4')
-    return common.main(Calibration, __doc__)
+    return node_support.main(Calibration, __doc__)

@@ -20,20 +20,21 @@ from collections import Counter
 from datetime import datetime, timezone
 from math import cos, isfinite, sin
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+from adxl_ros.compensate import filter_inversion
+from adxl_ros.compensate.sample_by_sample import Estimate, Live
 from adxl_ros.errors import UserError
-from adxl_ros.files import imu_bytes, store
+from adxl_ros.files import calibration_store, imu_message, recorded_unit
 from adxl_ros.files.cdr import CdrError
-from adxl_ros.files.unit import check_unit
-from adxl_ros.model import chain, noise, unfilter
+from adxl_ros.files.unit_check import check_unit
+from adxl_ros.model import noise, signal_chain
 from adxl_ros.model.effects import effect_named
-from adxl_ros.model.live import Estimate, Live
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.model.tilt import UNOBSERVABLE_RAD2
-from adxl_ros.nodes import common
-from adxl_ros.nodes.live_sensor import LiveSensor
-from adxl_ros.nodes.loop import Loop, Received
+from adxl_ros.nodes.support import node_support
+from adxl_ros.nodes.support.receive_thread import Loop, Received
+from adxl_ros.nodes.support.sensor_parameters import LiveSensor
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import Vector3Stamped
 from rclpy.clock import Clock, ClockType
@@ -58,8 +59,15 @@ _CLOCK_DAYS = 0.01
 """Clocks that differ by a quarter of an hour make no calibration one of the future."""
 
 
+class _Chain(NamedTuple):
+    """What corrects a sample; replaced as one."""
+
+    live: Live
+    delayed: filter_inversion.Delayed
+
+
 class Compensation(Node):
-    """The node; what it makes of a sample is in `model.live`, ROS-free."""
+    """The node; what it makes of a sample is in `compensate.sample_by_sample`, ROS-free."""
 
     def __init__(self) -> None:
         super().__init__('compensation')
@@ -76,22 +84,24 @@ class Compensation(Node):
         self._around: dict[str, float] = {}
         self._known: dict[str, float] = {}
         self._heard_ns: dict[str, int] = {}
-        self._paper = common.declare(
+        self._paper = node_support.declare(
             self, 'inverse', 'exact', "of the model: exact, or the paper's approximation",
             choices=('exact', 'paper')) == 'paper'
-        self._undo_filter = common.declare(
+        self._undo_filter = node_support.declare(
             self, 'undo_filter', False, 'take the RC filter out, amplitude and phase; a sample '
-            f'is published {unfilter.HALF} samples late, with its own stamp')
-        self._store = common.declare(
-            self, 'store', str(store.default_folder()), 'folder of calibrations, of which the '
-            'newest of the unit is taken where none is named; empty: none')
+            f'is published {filter_inversion.HALF} samples late, with its own stamp')
+        self._store = node_support.declare(
+            self, 'store', str(calibration_store.default_folder()),
+            'folder of calibrations, of which the newest of the unit is taken where none is '
+            'named; empty: none')
         LiveSensor(self, self._check_unit, self._use)
-        self._data = common.publisher(self, Imu, 'imu/data', _DEPTH)
-        self._tilt = common.publisher(self, Vector3Stamped, 'tilt', _DEPTH)
-        self._diagnostics = common.publisher(self, DiagnosticArray, '/diagnostics', 10)
-        common.subscription(self, DiagnosticStatus, 'sensor_info', self._on_info, 1, latched=True)
-        common.subscription(self, Temperature, 'temperature', self._on_temperature, 1)
-        common.subscription(self, BatteryState, 'supply', self._on_supply, 1)
+        self._data = node_support.publisher(self, Imu, 'imu/data', _DEPTH)
+        self._tilt = node_support.publisher(self, Vector3Stamped, 'tilt', _DEPTH)
+        self._diagnostics = node_support.publisher(self, DiagnosticArray, '/diagnostics', 10)
+        node_support.subscription(self, DiagnosticStatus, 'sensor_info', self._on_info, 1,
+                                  latched=True)
+        node_support.subscription(self, Temperature, 'temperature', self._on_temperature, 1)
+        node_support.subscription(self, BatteryState, 'supply', self._on_supply, 1)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._reported_ns = self._steady.now().nanoseconds
         self.create_timer(1.0, self._report, clock=self._steady)
@@ -103,51 +113,55 @@ class Compensation(Node):
         self._loop.close()
 
     def _use(self, sensor: Sensor, source: str) -> None:
-        # One assignment: the receiving thread has the old coefficients or the new ones.
         live = Live(sensor, self._paper, self._undo_filter)
         live.surround(**self._known)
-        self._live = live
-        self._delayed = self._new_delayed(sensor)
         self._source = source
+        self._chain = _Chain(live, self._new_delayed(sensor))
         of = f'{sensor.serial}, model {sensor.model}' if sensor.effects else \
             f'{sensor.serial}, which is not calibrated'
         self.get_logger().info(f'compensating by {source}: {of}')
         self._judge()
 
-    def _new_delayed(self, sensor: Sensor) -> unfilter.Delayed:
-        return unfilter.Delayed(noise.electronics(sensor)[0], self._rate_hz(sensor))
+    @property
+    def _sensor(self) -> Sensor:
+        return self._chain.live.sensor
+
+    def _new_delayed(self, sensor: Sensor) -> filter_inversion.Delayed:
+        return filter_inversion.Delayed(noise.electronics(sensor)[0], self._rate_hz(sensor))
 
     def _rate_hz(self, sensor: Sensor) -> float:
         """Return the rate that the stream states, else that of the calibration."""
         try:
-            return float((self._info or {})['rate_hz']) or sensor.rate_hz
-        except (KeyError, ValueError):
+            return recorded_unit.stated_rate_hz(self._info or {}, sensor, '')
+        except UserError:
+            # Nothing is published then; see `_check_unit`.
             return sensor.rate_hz
 
     def _check_unit(self, sensor: Sensor) -> None:
         if self._paper and sensor.axes == 'x':
             raise UserError("inverse: the paper's needs the axes x and y, the sensor has x")
         if self._info is not None:
-            check_unit(self._info, self._info.get('axes', sensor.axes), sensor,
-                       self.resolve_topic_name('sensor_info'))
+            topic = self.resolve_topic_name('sensor_info')
+            check_unit(self._info, self._info.get('axes', sensor.axes), sensor, topic)
+            recorded_unit.stated_rate_hz(self._info, sensor, topic)
 
     def _on_info(self, message: DiagnosticStatus) -> None:
         self._info = {pair.key: pair.value for pair in message.values}
         self._pick()
-        self._delayed = self._new_delayed(self._live.sensor)
+        self._chain = self._chain._replace(delayed=self._new_delayed(self._sensor))
         self._judge()
 
     def _named(self) -> bool:
         """Tell whether a calibration was named, in place of the store's newest."""
         path = self.get_parameter('calibration').value
-        return path != self._picked if path else bool(self._live.sensor.effects)
+        return path != self._picked if path else bool(self._sensor.effects)
 
     def _pick(self) -> None:
         """Take the newest calibration of the stream's unit, unless one was named."""
-        serial = (self._info or {}).get('serial', store.NO_UNIT)
-        if not self._store or serial == store.NO_UNIT or self._named():
+        serial = (self._info or {}).get('serial', calibration_store.NO_UNIT)
+        if not self._store or serial == calibration_store.NO_UNIT or self._named():
             return
-        path, refused = store.newest(self._store, serial, self._check_unit)
+        path, refused = calibration_store.newest(self._store, serial, self._check_unit)
         for why in refused:
             self._say_of_store(f'passed over: {why}')
         if path is None:
@@ -166,10 +180,10 @@ class Compensation(Node):
 
     def _newer(self) -> Path | None:
         """Return a calibration of the unit that was put into the store after the active one."""
-        sensor = self._live.sensor
-        if not self._store or not sensor.effects or sensor.serial == store.NO_UNIT:
+        sensor = self._sensor
+        if not self._store or not sensor.effects or sensor.serial == calibration_store.NO_UNIT:
             return None
-        return store.newer(self._store, sensor)
+        return calibration_store.newer(self._store, sensor)
 
     def _on_temperature(self, message: Temperature) -> None:
         self._surround('temperature_c', message.temperature)
@@ -191,7 +205,7 @@ class Compensation(Node):
         """Find out whether the parameters are those of the stream, and say so on a change."""
         before, self._refusal = self._refusal, ''
         try:
-            self._check_unit(self._live.sensor)
+            self._check_unit(self._sensor)
         except UserError as error:
             self._refusal = str(error)
         if self._refusal and self._refusal != before:
@@ -205,25 +219,27 @@ class Compensation(Node):
         if self._refusal:
             return
         try:
-            time_s, accel = imu_bytes.read(raw)
+            time_s, accel = imu_message.read(raw)
         except CdrError:
             self._counts['dropped'] += 1
             return
+        # One reading: a sample has the old coefficients or the new ones.
+        chain = self._chain
         if self._around:
             around, self._around = self._around, {}
-            self._live.surround(**around)
+            chain.live.surround(**around)
             self._known |= around
-        volts = self._live.volts(accel)
+        volts = chain.live.volts(accel)
         if not volts:
             self._counts['dropped'] += 1
         elif self._undo_filter:
-            for ready in self._delayed(time_s, volts, raw):
-                self._estimate(*ready)
+            for ready in chain.delayed(time_s, volts, raw):
+                self._estimate(chain.live, *ready)
         else:
-            self._estimate(time_s, volts, raw)
+            self._estimate(chain.live, time_s, volts, raw)
 
-    def _estimate(self, time_s: float, volts: list[float], raw: bytes) -> None:
-        estimate = self._live.of_volts(volts, time_s)
+    def _estimate(self, live: Live, time_s: float, volts: list[float], raw: bytes) -> None:
+        estimate = live.of_volts(volts, time_s)
         if estimate is None:
             self._counts['dropped'] += 1
             return
@@ -233,9 +249,9 @@ class Compensation(Node):
             self._outside = estimate.outside
         orientation = self._orientation(estimate)
         xx, xy, xz, yy, yz, zz = estimate.covariance
-        self._data.publish(imu_bytes.corrected(
+        self._data.publish(imu_message.corrected(
             raw, orientation, (*estimate.force, xx, xy, xz, xy, yy, yz, xz, yz, zz)))
-        self._tilt.publish(imu_bytes.vector3_stamped(raw, self._angles))
+        self._tilt.publish(imu_message.vector3_stamped(raw, self._angles))
         self._counts['published'] += 1
 
     def _orientation(self, estimate: Estimate) -> tuple[float, ...]:
@@ -261,7 +277,7 @@ class Compensation(Node):
         counts = self._counts.copy()
         new = {name: counts[name] - self._reported[name] for name in counts}
         self._reported = counts
-        sensor = self._live.sensor
+        sensor = self._sensor
         newer = self._newer()
         level, text = self._state(new, newer)
         unit = 'other' if self._refusal else 'confirmed' if self._info else 'not confirmed'
@@ -270,20 +286,20 @@ class Compensation(Node):
             'rate_out_hz': round(new.get('published', 0) / passed_s, 1),
             **{name: counts[name] for name in ('received', 'published', 'dropped', 'saturated',
                                                'outside')},
-            'delay_s': unfilter.HALF / self._rate_hz(sensor) if self._undo_filter else 0.0,
+            'delay_s': filter_inversion.HALF / self._rate_hz(sensor) if self._undo_filter else 0.0,
             'unit': unit, 'calibration': self._source, 'serial': sensor.serial,
             'axes': sensor.axes, 'model': sensor.model, 'effects': ', '.join(sensor.effects),
             **self._calibration(new), 'newer': str(newer or ''),
             **{f'provenance.{key}': value for key, value in sensor.provenance.items()}}
-        self._diagnostics.publish(common.diagnostics(
-            self, common.status(level, 'compensation', text, sensor.serial, values)))
+        self._diagnostics.publish(node_support.diagnostics(
+            self, node_support.status(level, 'compensation', text, sensor.serial, values)))
 
     def _calibration(self, new: dict[str, int]) -> dict[str, Any]:
         """Say which calibration is active, how old it is and whether it holds here."""
-        sensor = self._live.sensor
+        sensor = self._sensor
         if not sensor.effects:
             return {'calibration_id': '', 'age_days': '', 'validity': 'not calibrated'}
-        made = store.date_of(sensor)
+        made = calibration_store.date_of(sensor)
         days = (datetime.now(timezone.utc) - made).total_seconds() / 86400 if made else None
         if self._refusal:
             valid = f'of another unit: {self._refusal}'
@@ -298,44 +314,46 @@ class Compensation(Node):
             valid = 'valid, temperature not known'
         else:
             valid = 'valid'
-        return {'calibration_id': store.calibration_id(sensor),
+        return {'calibration_id': calibration_store.calibration_id(sensor),
                 'age_days': '' if days is None else round(days, 3), 'validity': valid}
 
     def _state(self, new: dict[str, int], newer: Path | None) -> tuple[bytes, str]:
         if self._refusal:
-            return common.ERROR, f'publishing nothing: {self._refusal}'
+            return node_support.ERROR, f'publishing nothing: {self._refusal}'
         if not new.get('received'):
-            return common.WARN, f'no samples on {self.resolve_topic_name("imu/data_raw")}'
+            return node_support.WARN, f'no samples on {self.resolve_topic_name("imu/data_raw")}'
         for name, what in (('dropped', 'samples dropped that no force explains'),
                            ('saturated', 'samples with the ADC at its rail')):
             if new.get(name):
-                return common.WARN, f'{new[name]} {what}'
+                return node_support.WARN, f'{new[name]} {what}'
         if self._info is None:
-            return common.WARN, (f'unit not confirmed: nothing on '
-                                 f'{self.resolve_topic_name("sensor_info")}')
+            return node_support.WARN, (f'unit not confirmed: nothing on '
+                                       f'{self.resolve_topic_name("sensor_info")}')
         lacks = self._lacks()
         if lacks:
-            return common.WARN, lacks
-        if not self._live.sensor.effects:
-            return common.WARN, 'not calibrated: the nominal figures apply'
+            return node_support.WARN, lacks
+        if not self._sensor.effects:
+            return node_support.WARN, 'not calibrated: the nominal figures apply'
         if new.get('outside'):
-            return common.WARN, (f'{new["outside"]} samples outside of what was calibrated, their '
-                                 f'covariance raised: {"; ".join(self._outside)}')
+            return node_support.WARN, (
+                f'{new["outside"]} samples outside of what was calibrated, their covariance '
+                f'raised: {"; ".join(self._outside)}')
         if newer is not None and not self._named():
-            return common.WARN, (f'a newer calibration is in the store: {newer}; set calibration '
-                                 'to it, or start again')
-        return common.OK, 'compensating'
+            return node_support.WARN, (
+                f'a newer calibration is in the store: {newer}; set calibration to it, or start '
+                'again')
+        return node_support.OK, 'compensating'
 
     def _lacks(self) -> str:
         """Name what the calibration follows and nobody says."""
         topics = {'temperature_c': 'temperature', 'supply_v': 'supply'}
-        for effect in map(effect_named, self._live.sensor.effects):
+        for effect in map(effect_named, self._sensor.effects):
             for name in effect.follows:
                 if name not in topics:
                     continue
                 topic = self.resolve_topic_name(topics[name])
                 if name not in self._known:
-                    return (f'{effect.name} is taken at {getattr(chain.NOMINAL, name):g}: '
+                    return (f'{effect.name} is taken at {getattr(signal_chain.NOMINAL, name):g}: '
                             f'nothing on {topic}')
                 if self._age_s(name) > _OLD_S:
                     return (f'{effect.name} is taken at {self._known[name]:g}: nothing on '
@@ -345,4 +363,4 @@ class Compensation(Node):
 
 def main() -> int:
     """Run the node."""
-    return common.main(Compensation, __doc__)
+    return node_support.main(Compensation, __doc__)

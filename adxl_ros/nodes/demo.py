@@ -28,16 +28,18 @@ import subprocess
 import sys
 import time
 
-from adxl_ros.calibrate import against_truth, gravity, judge, linear, plan, verdict
-from adxl_ros.calibrate.against_truth import Comparison
+from adxl_ros.calibrate.fits import gravity_fit, linear
+from adxl_ros.calibrate.guided import pose_plan
 from adxl_ros.calibrate.poses import Poses
+from adxl_ros.calibrate.report import acceptance, against_truth, cross_validation
+from adxl_ros.calibrate.report.against_truth import Comparison
 from adxl_ros.errors import UserError
-from adxl_ros.files import journal, params, recording
+from adxl_ros.files import parameter_file, recording, sweep_journal
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.nodes.common import nominal_path
-from adxl_ros.screen import steps
+from adxl_ros.nodes.support.node_support import nominal_path
+from adxl_ros.nodes.terminal import steps
 from diagnostic_msgs.msg import DiagnosticArray
 import numpy as np
 import rclpy
@@ -75,7 +77,7 @@ _MODELS = {'nominal': 'datasheet values', 'linear': 'linear calibration',
            'physical': 'physical calibration', 'full': 'full calibration'}
 _LONGEST_LABEL = 26
 """Columns that a coefficient's name may take, so that its line has at most 79."""
-_COLOURS = {judge.PASS: '\x1b[32m', judge.FAIL: '\x1b[31m'}
+_COLOURS = {acceptance.PASS: '\x1b[32m', acceptance.FAIL: '\x1b[31m'}
 NEXT_PAGE = 'docs/guided.md'
 """Page that a user reads next."""
 
@@ -229,10 +231,10 @@ def main() -> int:
 def _simulated(folder: Path, speed: float) -> None:
     """Sweep a simulated ADXL203 whose coefficients are drawn at datasheet spread."""
     unit, nominal = folder / 'simulated_unit.yaml', folder / 'nominal.yaml'
-    sensor = replace(params.load(nominal_path()), serial='demo')
+    sensor = replace(parameter_file.load(nominal_path()), serial='demo')
     truth = _drawn(sensor)
-    params.save(nominal, sensor)
-    params.save(unit, truth, ['The truth of the simulated unit.'])
+    parameter_file.save(nominal, sensor)
+    parameter_file.save(unit, truth, ['The truth of the simulated unit.'])
     output, report = folder / 'adxl203_demo.yaml', folder / 'sweep'
     _print(title('Demo: calibrate a simulated ADXL203 whose true coefficients are known',
                  _SWEEP_S / speed + _OVERHEAD_S), '')
@@ -245,10 +247,10 @@ def _simulated(folder: Path, speed: float) -> None:
                     '-p', f'output:={output}', '-p', f'report:={report}',
                     '-p', f'store:={folder / "calibrations"}')
         poses = _sweep(graph, output)
-    fitted, held_out = params.load(output), poses.subset(poses.check)
+    fitted, held_out = parameter_file.load(output), poses.subset(poses.check)
     models = {'nominal': sensor, 'linear': linear.fit(sensor, poses.subset(~poses.check)),
               fitted.model: fitted}
-    scores = [verdict.score(model, verdict.errors(calibrated, held_out))
+    scores = [cross_validation.score(model, cross_validation.errors(calibrated, held_out))
               for model, calibrated in models.items()]
     _print('', *scores_table(scores), '', *truth_table(against_truth.compare(fitted, truth)), '',
            *verdict_lines(fitted), *added_lines(against_truth.added_effects(fitted, truth)), '',
@@ -258,7 +260,7 @@ def _simulated(folder: Path, speed: float) -> None:
 def _sweep(graph: Graph, output: Path) -> Poses:
     """Show the sweep, the fit and the check while they run; return the poses."""
     path = _journal(output)
-    total = len(plan.guided(_PLANES_RAD, _STEP_RAD, _CHECKS))
+    total = len(pose_plan.guided(_PLANES_RAD, _STEP_RAD, _CHECKS))
     with steps.step('1/3 sweep', 'starting', total) as step:
         def taken() -> int:
             count = len(_poses(path))
@@ -270,7 +272,7 @@ def _sweep(graph: Graph, output: Path) -> Poses:
     fitting = f'{total - _CHECKS} poses'
     with steps.step('2/3 fit', fitting) as step:
         graph.wait(output.exists, lambda: None, _FIT_S)
-        step.show(f'{fitting}, {params.load(output).model} model')
+        step.show(f'{fitting}, {parameter_file.load(output).model} model')
     with steps.step('3/3 check', f'{_CHECKS} poses that the fit has not seen'):
         graph.wait(lambda: bool(_fitted_poses(path)), lambda: None, _FIT_S)
         graph.close()
@@ -308,10 +310,10 @@ def _real(folder: Path, path: Path, length_s: float) -> None:
             poses = Poses.from_entries(_fitted_poses(_journal(output)))
             step.show(f'{len(poses)} rests, magnitude of gravity')
             graph.close()
-    fitted = params.load(output)
+    fitted = parameter_file.load(output)
     nominal = replace(fitted, effects=(), values={}, covariance=np.zeros((0, 0)),
                       covariance_names=())
-    _print('', *gravity_lines(gravity.fit_gravity(poses.volts, poses.std_v, nominal)), '',
+    _print('', *gravity_lines(gravity_fit.fit_gravity(poses.volts, poses.std_v, nominal)), '',
            *file_lines({'Page': report / 'report.html', 'Calibration': output}))
 
 
@@ -331,7 +333,7 @@ def title(text: str, seconds: float) -> str:
     return f'{text}   ({takes})'
 
 
-def scores_table(scores: Sequence[verdict.Score]) -> list[str]:
+def scores_table(scores: Sequence[cross_validation.Score]) -> list[str]:
     """Lay out the errors of the models on held-out poses; the file holds the last model."""
     lines = [f' {"":24}tilt error     acceleration error     (rms)']
     lines += [f' {_MODELS[score.model]:22} {_three_digits(score.tilt_rms_deg):>9} ° '
@@ -377,20 +379,20 @@ def verdict_lines(fitted: Sensor) -> list[str]:
     """Say whether the calibration is as good as the datasheet, with figure, limit and meaning."""
     figures = fitted.provenance
     if 'own_accel_mg' not in figures:
-        return [f' {judge.NOT_SHOWN}  no pose was kept out of the fit to judge it']
+        return [f' {acceptance.NOT_SHOWN}  no pose was kept out of the fit to judge it']
     error_mg = float(figures['own_accel_mg'])
-    limit = f'{1e3 * judge.linearity_mps2(fitted) / G0_MPS2:.2g} mg'
+    limit = f'{1e3 * acceptance.linearity_mps2(fitted) / G0_MPS2:.2g} mg'
     accel, tilt = (figures.get(f'verdict_{name}', '') for name in ('datasheet', 'tilt_datasheet'))
     shown = f'calibration error {error_mg:#.2g} mg; the datasheet allows {limit}'
-    if judge.FAIL in (accel, tilt):
-        if accel != judge.FAIL:
+    if acceptance.FAIL in (accel, tilt):
+        if accel != acceptance.FAIL:
             shown = f'tilt error {float(figures["own_tilt_deg"]):.2g}°, more than {limit} causes'
-        return [f' {judge.FAIL}  {shown}',
+        return [f' {acceptance.FAIL}  {shown}',
                 '       The sensor is worse than its datasheet states: do not use this file.']
-    if judge.NOT_SHOWN in (accel, tilt):
-        return [f' {judge.NOT_SHOWN}  {shown}',
+    if acceptance.NOT_SHOWN in (accel, tilt):
+        return [f' {acceptance.NOT_SHOWN}  {shown}',
                 '            The check poses are too few to show that the limit is kept.']
-    return [f' {judge.PASS}  {shown}']
+    return [f' {acceptance.PASS}  {shown}']
 
 
 def added_lines(effects: Sequence[str]) -> list[str]:
@@ -399,7 +401,7 @@ def added_lines(effects: Sequence[str]) -> list[str]:
             for effect in effects]
 
 
-def gravity_lines(fit: gravity.GravityFit) -> list[str]:
+def gravity_lines(fit: gravity_fit.GravityFit) -> list[str]:
     """Lay out the errors of a calibration against gravity, before and after."""
     kept = np.setdiff1d(np.arange(len(fit.before_mps2)), fit.outliers)
     before, after, held_out = (
@@ -450,7 +452,7 @@ def _journal(output: Path) -> Path:
 
 def _poses(path: Path) -> list[dict]:
     """Return the poses that a journal has so far."""
-    return journal.accepted_poses(_entries(path))
+    return sweep_journal.accepted_poses(_entries(path))
 
 
 def _fitted_poses(path: Path) -> list[dict]:
@@ -460,7 +462,7 @@ def _fitted_poses(path: Path) -> list[dict]:
 
 def _entries(path: Path) -> list[dict]:
     try:
-        return journal.read(path)[1]
+        return sweep_journal.read(path)[1]
     except UserError:
         # Its head is not written yet.
         return []

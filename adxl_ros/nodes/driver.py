@@ -22,12 +22,12 @@ import traceback
 from typing import Any
 
 from adxl_ros.errors import UserError
-from adxl_ros.files.columns import sensor_info
-from adxl_ros.links import base
+from adxl_ros.files.recording_columns import sensor_info
+from adxl_ros.links.support import base
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.nodes import common
-from adxl_ros.nodes.loop import Loop, Steadily
-from adxl_ros.nodes.outputs import ImuWriter, References, stamp, Tally
+from adxl_ros.nodes.support import node_support
+from adxl_ros.nodes.support.driver_publishers import ImuWriter, References, stamp, Tally
+from adxl_ros.nodes.support.receive_thread import Loop, Steadily
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 import numpy as np
 from rclpy.clock import Clock, ClockType
@@ -47,7 +47,7 @@ _JUMP_NS = 2_000_000_000
 _QUEUE = 5000
 _DEAF_NS = 300_000_000
 """A listener that has just appeared may not hear yet for so long."""
-_LEVELS = {'ok': common.OK, 'warn': common.WARN, 'error': common.ERROR}
+_LEVELS = {'ok': node_support.OK, 'warn': node_support.WARN, 'error': node_support.ERROR}
 
 
 class Driver(LifecycleNode):
@@ -60,19 +60,21 @@ class Driver(LifecycleNode):
 
     def __init__(self) -> None:
         super().__init__('driver')
-        self._given = common.make_sensor(common.declare_sensor(self))
-        self._frame = common.declare(self, 'frame_id', 'imu_link', 'frame of the case')
-        self._offset_ns = round(1e9 * common.declare(
+        self._given = node_support.make_sensor(node_support.declare_sensor(self))
+        self._frame = node_support.declare(self, 'frame_id', 'imu_link', 'frame of the case')
+        self._offset_ns = round(1e9 * node_support.declare(
             self, 'stamp_offset', 0.0, 'delay of the sensor, such as that of its RC filter, that '
             'is taken out of the stamps: they are earlier by this', 's', -10.0, 10.0))
-        self._type = common.declare(self, 'link.type', 'sim', 'where the samples come from',
-                                    choices=base.names())
+        self._type = node_support.declare(self, 'link.type', 'sim', 'where the samples come from',
+                                          choices=base.names())
         self._module = base.module_of(self._type)
         self._options = {
-            one.name: common.declare(self, f'link.{one.name}', one.default, one.doc, one.unit,
-                                     one.lower, one.upper) for one in self._module.OPTIONS}
-        autostart = common.declare(self, 'autostart', True, 'configure and activate at the start; '
-                                   'else a system manager does')
+            one.name: node_support.declare(self, f'link.{one.name}', one.default, one.doc,
+                                           one.unit, one.lower, one.upper)
+            for one in self._module.OPTIONS}
+        autostart = node_support.declare(
+            self, 'autostart', True, 'configure and activate at the start; else a system manager '
+            'does')
         self._speed = self._options.get('speed', 1.0)
         # Sensor time that is not real time must be everybody's: then this node is the clock.
         self._is_clock = self._speed != 1 or ('speed' in self._options
@@ -88,7 +90,7 @@ class Driver(LifecycleNode):
         self._references: References | None = None
         self._stage: Subscription | None = None
         self._adopt(self._given, known=False)
-        self._diagnostics = common.publisher(self, DiagnosticArray, '/diagnostics', 10)
+        self._diagnostics = node_support.publisher(self, DiagnosticArray, '/diagnostics', 10)
         self.create_timer(1.0, self._report, clock=self._steady)
         if autostart:
             self.trigger_configure()
@@ -142,7 +144,7 @@ class Driver(LifecycleNode):
         return TransitionCallbackReturn.SUCCESS
 
     def _configure(self) -> None:
-        publisher = common.publisher
+        publisher = node_support.publisher
         self._data = publisher(self, Imu, 'imu/data_raw', _QUEUE)
         self._info = publisher(self, DiagnosticStatus, 'sensor_info', 1, latched=True)
         self._topics = [self._data, self._info]
@@ -171,7 +173,7 @@ class Driver(LifecycleNode):
         if hasattr(self._link, 'feel'):
             self._stage = self.create_subscription(
                 JointState, 'stage/true_joint_states', self._feel, QoSProfile(depth=_QUEUE),
-                callback_group=common.NotForExecutors())
+                callback_group=node_support.NotForExecutors())
         turn = self._live_turn if self._link.live else Steadily(self._tick, _TICK_S)
         self._loop = Loop(self, turn, 'link')
 
@@ -180,8 +182,8 @@ class Driver(LifecycleNode):
         self._sensor = sensor
         self._imu = ImuWriter(sensor, self._frame)
         if known:
-            self._info.publish(common.status(common.OK, 'sensor_info', '', sensor.serial,
-                                             sensor_info(sensor)))
+            self._info.publish(node_support.status(node_support.OK, 'sensor_info', '',
+                                                   sensor.serial, sensor_info(sensor)))
 
     def _take_from_stage(self) -> None:
         with self._stage.handle:
@@ -279,9 +281,9 @@ class Driver(LifecycleNode):
         if now_ns is not None and not self._is_clock:
             now_ns = self._wall.now().nanoseconds
         values, warning = self._tally.report(self._steady.now().nanoseconds, now_ns or 0)
-        level = common.WARN if warning and state.level == 'ok' else _LEVELS[state.level]
+        level = node_support.WARN if warning and state.level == 'ok' else _LEVELS[state.level]
         text = ', '.join(filter(None, (f'{self._type}: {state.text}', warning)))
-        self._diagnostics.publish(common.diagnostics(self, common.status(
+        self._diagnostics.publish(node_support.diagnostics(self, node_support.status(
             level, 'link', text, self._imu.serial, {
                 **values, 'link_type': self._type, 'link_state': state.text, **state.values})))
 
@@ -339,4 +341,4 @@ class StateLog:
 
 def main() -> int:
     """Run the node."""
-    return common.main(Driver, __doc__)
+    return node_support.main(Driver, __doc__)

@@ -16,9 +16,9 @@
 
 from __future__ import annotations
 
-from adxl_ros.nodes import common
-from adxl_ros.nodes.simulated_stage import Simulated
-from adxl_ros.nodes.stage_bridge import Bridge
+from adxl_ros.nodes.support import node_support
+from adxl_ros.nodes.support.simulated_stage_node import Simulated
+from adxl_ros.nodes.support.stage_bridge import Bridge
 from rclpy.node import Node
 
 
@@ -27,7 +27,7 @@ class Stage(Node):
 
     def __init__(self) -> None:
         super().__init__('stage')
-        kind = common.declare(
+        kind = node_support.declare(
             self, 'stage.type', 'simulated', 'the simulated stage, or the bridge to a controller '
             'that takes joint states or trajectories',
             choices=('simulated', 'joint_state', 'trajectory'))
@@ -36,4 +36,4 @@ class Stage(Node):
 
 def main() -> int:
     """Run the node."""
-    return common.main(Stage, __doc__)
+    return node_support.main(Stage, __doc__)

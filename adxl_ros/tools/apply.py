@@ -23,19 +23,20 @@ import itertools
 from pathlib import Path
 import sys
 
-from adxl_ros.calibrate.recorded import rate_hz
+from adxl_ros.compensate import filter_inversion, paper_inverse
 from adxl_ros.errors import UserError
-from adxl_ros.files import params, recording
+from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.csv_writer import CsvWriter
+from adxl_ros.files.recorded_unit import rate_hz
 from adxl_ros.files.recording import Recording
-from adxl_ros.files.unit import check_unit
-from adxl_ros.model import chain, noise, paper_inverse, unfilter
+from adxl_ros.files.unit_check import check_unit
+from adxl_ros.model import noise, signal_chain
 from adxl_ros.model.constants import AXES
+from adxl_ros.model.covariance import force_covariance, leverage
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Place
 from adxl_ros.model.sensor import Sensor, with_axes
 from adxl_ros.model.tilt import Tilt, tilt
-from adxl_ros.model.uncertainty import force_covariance, leverage
 from adxl_ros.tools.common import default_params, progress, run, say_notes
 import numpy as np
 
@@ -62,7 +63,7 @@ def apply(options: argparse.Namespace) -> int:
     """Run the tool; see `parser`."""
     if Path(options.output).resolve() == Path(options.recording).resolve():
         raise UserError(f'{options.output}: is the recording itself; choose another output')
-    sensor = params.load(options.params or default_params())
+    sensor = parameter_file.load(options.params or default_params())
     lost = saturated = rows = 0
     began_s = 0.0
     block = None
@@ -80,7 +81,7 @@ def apply(options: argparse.Namespace) -> int:
             blocks = itertools.chain([first], blocks)
         estimate = Estimates(sensor, options.inverse == 'paper', options.undo_filter)
         for block, volts in _with_volts(blocks, sensor, options.undo_filter):
-            at_rail = chain.at_a_rail(block.volts(sensor), sensor)
+            at_rail = signal_chain.at_a_rail(block.volts(sensor), sensor)
             columns = estimate(volts, at_rail, _around(block, began_s))
             out.write({'time_s': block.epoch_ns * 1e-9 + block.time_s, **columns})
             rows += len(block)
@@ -100,8 +101,9 @@ def _with_volts(blocks: Iterable[Recording], sensor: Sensor, undo_filter: bool
                 ) -> Iterator[tuple[Recording, np.ndarray]]:
     if not undo_filter:
         return ((block, block.volts(sensor)) for block in blocks)
-    return unfilter.undone_blocks(((block, block.time_s, block.volts(sensor)) for block in blocks),
-                                  noise.electronics(sensor)[0], sensor.rate_hz)
+    return filter_inversion.undone_blocks(
+        ((block, block.time_s, block.volts(sensor)) for block in blocks),
+        noise.electronics(sensor)[0], sensor.rate_hz)
 
 
 def _of_unit(block: Recording, sensor: Sensor) -> Sensor:
@@ -116,12 +118,12 @@ def _say(count: int, rows: int, what: str) -> None:
         print(f'apply: {count} of {rows} samples {what}', file=sys.stderr)
 
 
-def _around(block: Recording, began_s: float) -> chain.Environment:
+def _around(block: Recording, began_s: float) -> signal_chain.Environment:
     """Return what is around the samples; nominal where it was not measured."""
     measured = {name: values for name in ('temperature_c', 'supply_v')
                 if (values := block.columns.get(name)) is not None}
-    return chain.Environment(block.time_s - began_s, **{
-        name: np.where(np.isfinite(values), values, getattr(chain.NOMINAL, name))
+    return signal_chain.Environment(block.time_s - began_s, **{
+        name: np.where(np.isfinite(values), values, getattr(signal_chain.NOMINAL, name))
         for name, values in measured.items()})
 
 
@@ -137,7 +139,7 @@ def _say_unknown(block: Recording, sensor: Sensor, undo_filter: bool) -> None:
         for name in effect.follows:
             if name != 'time_s' and not np.isfinite(block.columns.get(name, np.nan)).all():
                 print(f'apply: {block.path}: {name} is not there or has gaps: {effect.name} is '
-                      f'taken at {getattr(chain.NOMINAL, name):g} there', file=sys.stderr)
+                      f'taken at {getattr(signal_chain.NOMINAL, name):g} there', file=sys.stderr)
 
 
 class Estimates:
@@ -166,13 +168,13 @@ class Estimates:
             raise UserError('--inverse paper: needs the axes x and y, the sensor has x; leave it '
                             'out')
         self._sensor = sensor
-        self._invert = (paper_inverse if paper else chain).inverse(sensor)
+        self._invert = (paper_inverse if paper else signal_chain).inverse(sensor)
         self._leverage = leverage(sensor)
         self.outside = 0
-        self._variance_v2 = unfilter.variance_v2(sensor) if undo_filter else None
+        self._variance_v2 = filter_inversion.variance_v2(sensor) if undo_filter else None
 
     def __call__(self, volts: np.ndarray, at_rail: np.ndarray,
-                 around: chain.Environment = chain.NOMINAL) -> dict[str, np.ndarray]:
+                 around: signal_chain.Environment = signal_chain.NOMINAL) -> dict[str, np.ndarray]:
         """
         Estimate, (n,) each; NaN with standard deviation inf is what a sample does not show.
 

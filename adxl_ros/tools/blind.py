@@ -21,10 +21,10 @@ import json
 from pathlib import Path
 import sys
 
-from adxl_ros.blind import check, page, real, run as running
-from adxl_ros.calibrate.figures import pyplot
+from adxl_ros.blind import blind_check, diagnosis_runs as running, real_recordings, report_html
 from adxl_ros.errors import UserError
-from adxl_ros.files.atomic import atomic_path
+from adxl_ros.files.atomic_write import atomic_path
+from adxl_ros.files.figure_file import pyplot
 from adxl_ros.tools.common import make_folder, progress, run
 
 PROG = 'blind'
@@ -55,7 +55,7 @@ def blind(options: argparse.Namespace) -> int:
         raise UserError(f'--trials {options.trials}: at least 1 is needed')
     if options.seed is not None and options.seed < 0:
         raise UserError(f'--seed {options.seed}: must not be negative')
-    arms = [real.arm(words) for words in options.real]
+    arms = [real_recordings.arm(words) for words in options.real]
     folder = Path(options.output or options.seal or options.open)
     try:
         return _check(options, folder, arms)
@@ -64,26 +64,27 @@ def blind(options: argparse.Namespace) -> int:
         return 130
 
 
-def _check(options: argparse.Namespace, folder: Path, arms: list[real.Arm]) -> int:
+def _check(options: argparse.Namespace, folder: Path, arms: list[real_recordings.Arm]) -> int:
     draw = pyplot()
     if not options.open:
         make_folder(folder)
     with running.workers(options.scheduler) as pool:
         if not options.open:
             with progress('draw') as show:
-                digest = check.sealed(folder, options.seed, options.trials, pool, show)
+                digest = blind_check.sealed(folder, options.seed, options.trials, pool, show)
             print(f'SHA-256 of salt and labels: {digest}', flush=True)
         if options.seal:
             return 0
-        made = check.scored(folder, None, pool, progress)
+        made = blind_check.scored(folder, None, pool, progress)
         if arms:
             with progress('real') as show:
-                made['real'] = real.put_back(arms, None, pool, show)
+                made['real'] = real_recordings.put_back(arms, None, pool, show)
     for name, text in (('blind.json', json.dumps(made, indent=1, allow_nan=False) + '\n'),
-                       ('blind.md', page.markdown(made)), ('blind.html', page.page(made, draw))):
+                       ('blind.md', report_html.markdown(made)),
+                       ('blind.html', report_html.page(made, draw))):
         with atomic_path(folder / name) as fresh:
             fresh.write_text(text, encoding='utf-8')
-    print(page.summary(made))
+    print(report_html.summary(made))
     print(f'\n{folder / "blind.html"} is written')
     return 0
 

@@ -26,7 +26,7 @@ import sys
 from types import FrameType
 
 from adxl_ros.errors import UserError
-from adxl_ros.files.columns import Recording, REFERENCES
+from adxl_ros.files.recording_columns import Recording, REFERENCES
 from ament_index_python.packages import get_package_share_directory
 
 

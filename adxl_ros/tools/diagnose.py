@@ -20,11 +20,11 @@ import argparse
 import json
 from pathlib import Path
 
+from adxl_ros.diagnose import diagnosis as gap, report_html, report_json
 from adxl_ros.errors import UserError
-from adxl_ros.files import params, recording
-from adxl_ros.files.atomic import atomic_path
-from adxl_ros.files.followed import felt
-from adxl_ros.gap import diagnose as gap, page, report
+from adxl_ros.files import parameter_file, recording
+from adxl_ros.files.atomic_write import atomic_path
+from adxl_ros.simulate.from_recording import felt
 from adxl_ros.tools.common import default_params, make_folder, progress, run, say_notes
 
 
@@ -50,7 +50,7 @@ def diagnose(options: argparse.Namespace) -> int:
     if options.sim and len(options.recording) > 1:
         raise UserError(f'--sim {options.sim}: goes with one recording, but '
                         f'{len(options.recording)} are given')
-    sensor = params.load(options.params or default_params())
+    sensor = parameter_file.load(options.params or default_params())
     sim = felt(options.sim, False)[0] if options.sim else None
     recordings = []
     for path in options.recording:
@@ -60,13 +60,13 @@ def diagnose(options: argparse.Namespace) -> int:
         found = gap.diagnose(recordings, sensor, sim, options.seed, show)
     folder = Path(options.output)
     make_folder(folder)
-    text = json.dumps(report.as_json(found), indent=1, allow_nan=False) + '\n'
+    text = json.dumps(report_json.as_json(found), indent=1, allow_nan=False) + '\n'
     _write(folder / 'report.json', text)
-    _write(folder / 'report.html', page.page(found, ', '.join(
+    _write(folder / 'report.html', report_html.page(found, ', '.join(
         Path(path).name for path in options.recording)))
     if found.sensor is not None:
-        params.save(folder / 'params.yaml', found.sensor, report.screenful(found))
-    print(text if options.json else '\n'.join(report.screenful(found)))
+        parameter_file.save(folder / 'params.yaml', found.sensor, report_json.screenful(found))
+    print(text if options.json else '\n'.join(report_json.screenful(found)))
     return 0
 
 

@@ -20,10 +20,11 @@ import argparse
 from pathlib import Path
 import sys
 
-from adxl_ros.calibrate import recorded, result
+from adxl_ros.calibrate import calibration, pose_extraction
 from adxl_ros.errors import UserError
-from adxl_ros.files import journal, params, recording, store
-from adxl_ros.files.hashed import sha256
+from adxl_ros.files import calibration_store, parameter_file, recording, sweep_journal
+from adxl_ros.files.checksum import sha256
+from adxl_ros.files.recorded_unit import recorded_unit
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.tools.common import default_params, make_folder, run, say_notes
 
@@ -35,7 +36,7 @@ def parser() -> argparse.ArgumentParser:
                        help='rosbag2 directory, .mcap or CSV, all of one unit')
     parse.add_argument('--params', metavar='FILE', default=None,
                        help='figures that are not fitted (default: the nominal ADXL203)')
-    parse.add_argument('--model', choices=list(result.STAGE_FITS),
+    parse.add_argument('--model', choices=list(calibration.STAGE_FITS),
                        help='against stage angles (default: the richest that the poses '
                             'determine); a three-axis recording without them is '
                             'calibrated against gravity')
@@ -46,7 +47,7 @@ def parser() -> argparse.ArgumentParser:
     parse.add_argument('-o', dest='output', metavar='FILE.yaml', required=True)
     parse.add_argument('--report', metavar='DIR',
                        help='leave a page there, report.html, and the figures')
-    parse.add_argument('--store', metavar='DIR', default=str(store.default_folder()),
+    parse.add_argument('--store', metavar='DIR', default=str(calibration_store.default_folder()),
                        help="the folder of all units' calibrations, which gets a copy (default: "
                             '%(default)s); empty for none')
     return parse
@@ -57,19 +58,19 @@ def fit(options: argparse.Namespace) -> int:
     if options.journal and len(options.recording) != 1:
         raise UserError(f'--journal {options.journal}: names the rests of one recording, but '
                         f'{len(options.recording)} are given')
-    sensor = params.load(options.params or default_params())
+    sensor = parameter_file.load(options.params or default_params())
     entries = _entries(options.journal)
     unit: Sensor | None = None
     parts, filters = [], []
     for path in options.recording:
         read = recording.read(path)
         say_notes('fit', read)
-        unit = recorded.recorded_unit(unit or sensor, read)
-        parts.append(recorded.poses_of(read, unit, entries))
-        filters.append(recorded.filter_noise_of(read, unit, parts[-1]))
-    found = result.calibrate(unit, parts, options.model,
-                             [Path(path).name for path in options.recording],
-                             options.effect, filters, sha256(options.recording))
+        unit = recorded_unit(unit or sensor, read)
+        parts.append(pose_extraction.poses_of(read, unit, entries))
+        filters.append(pose_extraction.filter_noise_of(read, unit, parts[-1]))
+    found = calibration.calibrate(unit, parts, options.model,
+                                  [Path(path).name for path in options.recording],
+                                  options.effect, filters, sha256(options.recording))
     if options.report:
         make_folder(Path(options.report))
         found.report(options.report, options.store)
@@ -83,10 +84,10 @@ def fit(options: argparse.Namespace) -> int:
 def _entries(path: str | None) -> list[dict] | None:
     if path is None:
         return None
-    _, entries = journal.read(path)
+    _, entries = sweep_journal.read(path)
     # Rests that were fitted, unless the sweep has gone on since.
     last = next((e for e in reversed(entries) if e.keys() & {'rests', 'pose', 'drop'}), {})
-    return last['rests'] if 'rests' in last else journal.accepted_poses(entries)
+    return last['rests'] if 'rests' in last else sweep_journal.accepted_poses(entries)
 
 
 def main() -> int:

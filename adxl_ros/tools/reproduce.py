@@ -22,13 +22,15 @@ from dataclasses import replace
 from datetime import date
 from pathlib import Path
 
-from adxl_ros.calibrate import figures as sweep_figures, provenance, recorded, result
+from adxl_ros.calibrate import calibration, pose_extraction, provenance
+from adxl_ros.calibrate.report import plots as sweep_figures
 from adxl_ros.errors import UserError
-from adxl_ros.files import params, recording
-from adxl_ros.files.atomic import atomic_path
+from adxl_ros.files import parameter_file, recording
+from adxl_ros.files.atomic_write import atomic_path
+from adxl_ros.files.recorded_unit import recorded_unit
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.paper import coverage, experiments, figures, page, score, units
-from adxl_ros.paper.page import FIGURES
+from adxl_ros.reproduction import coverage, experiments, plots, report_page, scoring, units
+from adxl_ros.reproduction.report_page import FIGURES
 from adxl_ros.tools.common import default_params, make_folder, progress, run, say_notes
 import numpy as np
 
@@ -58,7 +60,7 @@ def reproduce(options: argparse.Namespace) -> int:
         raise UserError(f'--units {options.units}: at least 1 is needed')
     if options.seed < 0:
         raise UserError(f'--seed {options.seed}: must not be negative')
-    sensor = params.load(options.params or default_params())
+    sensor = parameter_file.load(options.params or default_params())
     folder = Path(options.output)
     make_folder(folder / FIGURES)
     text = _of_recordings(sensor, options.recording, folder) if options.recording \
@@ -75,13 +77,14 @@ def _of_recordings(sensor: Sensor, paths: Sequence[str], folder: Path) -> str:
     for path in paths:
         read = recording.read(path)
         say_notes('reproduce', read)
-        unit = recorded.recorded_unit(unit, read)
-        parts.append(recorded.poses_of(read, unit))
-    found = result.calibrate(unit, parts, 'full', [Path(path).name for path in paths])
+        unit = recorded_unit(unit, read)
+        parts.append(pose_extraction.poses_of(read, unit))
+    found = calibration.calibrate(unit, parts, 'full', [Path(path).name for path in paths])
     found.draw(folder / FIGURES / 'sweep.png')
     lines = '\n'.join(found.comments())
     return (f"# The paper's calibration of {', '.join(paths)}\n\n```\n{lines}\n```\n\n"
-            f'The paper: alpha {page.in_words("alpha")}; beta {page.in_words("beta")}.\n\n'
+            f'The paper: alpha {report_page.in_words("alpha")}; '
+            f'beta {report_page.in_words("beta")}.\n\n'
             f'## Figures\n\n![Figures 2 to 8]({FIGURES}/sweep.png)\n')
 
 
@@ -99,15 +102,15 @@ def _simulated(sensor: Sensor, options: argparse.Namespace, folder: Path) -> str
     pictures = folder / FIGURES
     sweep_figures.draw_sweep(pictures / 'sweep.png', experiments.bare(truth),
                              unit.fitted['physical'], unit.poses)
-    figures.draw_misalignment(pictures / 'misalignment.png', found['paper'][0].directions)
-    figures.draw_tilt(pictures / 'tilt.png', found['paper'][0])
-    figures.draw_motion(pictures / 'motion.png', unit.fitted, experiments.shaken(truth, first))
-    figures.draw_components(pictures / 'components.png', truth, unit.fitted['physical'],
-                            unit.fitted['linear'])
+    plots.draw_misalignment(pictures / 'misalignment.png', found['paper'][0].directions)
+    plots.draw_tilt(pictures / 'tilt.png', found['paper'][0])
+    plots.draw_motion(pictures / 'motion.png', unit.fitted, experiments.shaken(truth, first))
+    plots.draw_components(pictures / 'components.png', truth, unit.fitted['physical'],
+                          unit.fitted['linear'])
     drawn = 'one unit' if sensor.effects else f'{options.units} units'
     made = (f'adxl_ros {provenance.package_version()}, {date.today()}, {drawn} on each stage, '
             f'seed {options.seed}.')
-    return page.page(found, score.motion_bound_mmps2(sensor), made, coverage_part)
+    return report_page.page(found, scoring.motion_bound_mmps2(sensor), made, coverage_part)
 
 
 def _coverage(sensor: Sensor, options: argparse.Namespace) -> str:

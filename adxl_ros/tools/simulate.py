@@ -24,17 +24,17 @@ from difflib import get_close_matches
 from pathlib import Path
 import sys
 
-from adxl_ros.calibrate.recorded import rate_hz
 from adxl_ros.errors import UserError
-from adxl_ros.files import params, recording
-from adxl_ros.files.columns import Recording, REFERENCES, sensor_info
-from adxl_ros.files.followed import felt, followed
-from adxl_ros.links import board
-from adxl_ros.model import simulate as simulator
-from adxl_ros.model.motion import Motion
-from adxl_ros.model.response import Response
+from adxl_ros.files import parameter_file, recording
+from adxl_ros.files.recorded_unit import rate_hz
+from adxl_ros.files.recording_columns import Recording, REFERENCES, sensor_info
+from adxl_ros.links.support import emulated_board
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.model.trajectory import TRAJECTORIES
+from adxl_ros.simulate import simulator
+from adxl_ros.simulate.from_recording import felt, followed
+from adxl_ros.simulate.motion import Motion
+from adxl_ros.simulate.response import Response
+from adxl_ros.simulate.trajectories import TRAJECTORIES
 from adxl_ros.tools.common import default_params, progress, run, say_notes
 from adxl_ros.tools.effect_option import SYNTAX, with_effects
 import numpy as np
@@ -80,7 +80,7 @@ def simulate(options: argparse.Namespace) -> int:
                        f'{", ".join(TRAJECTORIES)}, imu')
     if not options.output and not options.port:
         parser().error('the following arguments are required: -o, or --port')
-    sensor = params.load(options.params or default_params())
+    sensor = parameter_file.load(options.params or default_params())
     if options.rate is not None:
         if not 0.01 <= options.rate <= 1e5:
             raise UserError(f'--rate {options.rate:g}: outside 0.01 to 100000 Hz')
@@ -117,15 +117,15 @@ def _writer(stack: ExitStack, sensor: Sensor, path: str) -> Taker:
 
 
 def _sender(stack: ExitStack, sensor: Sensor, port: str) -> Taker:
-    board.check(sensor)
-    fd = stack.enter_context(board.opened(port))
-    sending: list[board.Board] = []
+    emulated_board.check(sensor)
+    fd = stack.enter_context(emulated_board.opened(port))
+    sending: list[emulated_board.Board] = []
 
     def take(columns: simulator.Columns) -> None:
         if not sending:
-            roles = board.roles_of(sensor, columns)
-            sending.append(board.Board(sensor, roles, fd))
-            print(f'simulate: sending: {board.reading(port, roles)}', file=sys.stderr)
+            roles = emulated_board.roles_of(sensor, columns)
+            sending.append(emulated_board.Board(sensor, roles, fd))
+            print(f'simulate: sending: {emulated_board.reading(port, roles)}', file=sys.stderr)
         sending[0].send(columns)
 
     return take

@@ -29,7 +29,7 @@ from scipy.interpolate import CubicSpline
 from scipy.signal import lfilter
 
 if TYPE_CHECKING:
-    from adxl_ros.blind.world.kinds import Fault
+    from adxl_ros.blind.world.fault_table import Fault
 
 # Steps of the simulation a second, at least; a whole number a sample.
 FINE_HZ = 2000.0

@@ -20,7 +20,7 @@ import math
 from typing import Any
 
 from adxl_ros.blind.world.chain import Run
-from adxl_ros.blind.world.shapes import Act, by_axis, column, low_pass, ones, Shape, weights
+from adxl_ros.blind.world.fault_shapes import Act, by_axis, column, low_pass, ones, Shape, weights
 from adxl_ros.blind.world.unit import G0, Unit
 import numpy as np
 from scipy.signal import butter, sosfilt

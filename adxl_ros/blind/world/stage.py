@@ -17,7 +17,7 @@
 from __future__ import annotations
 
 from adxl_ros.blind.world.chain import Run
-from adxl_ros.blind.world.shapes import memory, Shape, vector, weights
+from adxl_ros.blind.world.fault_shapes import memory, Shape, vector, weights
 from adxl_ros.blind.world.unit import G0, Unit
 import numpy as np
 from scipy.signal import bilinear, lfilter

@@ -15,7 +15,7 @@
 """Backlash of the stage: the joint follows its encoder with play."""
 
 from adxl_ros.model.effects.base import Effect, Joint, Parameter, Parameters, Place, Signals
-from adxl_ros.model.play import play
+from adxl_ros.model.play_operator import play
 
 
 def apply(signals: Signals, p: Parameters) -> None:

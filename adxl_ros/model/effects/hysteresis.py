@@ -15,7 +15,7 @@
 """Hysteresis of the sensing element: a Prandtl-Ishlinskii operator of the acceleration."""
 
 from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
-from adxl_ros.model.play import play
+from adxl_ros.model.play_operator import play
 
 _THRESHOLDS = (0.25, 0.5, 0.75, 1.0)
 """Of the reach: one stop operator each, with equal weights."""

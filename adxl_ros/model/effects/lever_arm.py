@@ -15,7 +15,7 @@
 """Lever arm: a sensor off the axes of the stage feels the turning."""
 
 from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
-from adxl_ros.model.stage import angular_motion, carried
+from adxl_ros.model.kinematics import angular_motion, carried
 
 
 def apply(signals: Signals, p: Parameters) -> None:

@@ -1,0 +1,245 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""A check as one page that opens offline, and as a table for the documentation."""
+
+from __future__ import annotations
+
+from base64 import b64encode
+from html import escape
+from io import BytesIO
+from typing import Any
+
+from adxl_ros.blind.grading import UNKNOWN
+from adxl_ros.blind.score_statistics import detection
+from adxl_ros.blind.world.unit import G0
+import numpy as np
+
+_STYLE = """
+body{font:15px/1.45 system-ui,sans-serif;max-width:60em;margin:2em auto;padding:0 1em;color:#222}
+h1{font-size:1.3em}h2{font-size:1.1em;margin-top:2em;border-bottom:1px solid #ccc}
+table{border-collapse:collapse;font-size:13px}td,th{padding:.25em .6em;text-align:left;
+border-bottom:1px solid #ddd;vertical-align:top}img{max-width:100%}
+.said{background:#eef4fb;padding:.8em 1em;border-left:5px solid #36c}
+.leak{background:#fbeeee;border-color:#c33}@media print{body{margin:0}}
+"""
+Table = tuple[list[str], list[list[str]]]
+
+
+def summary(made: dict[str, Any]) -> str:
+    """Say in a few lines how the check came out."""
+    rows = [f'{words:52s}{figure:34s}{bar:16s}{met}'
+            for words, figure, bar, met in _bars(made)[1]]
+    return '\n'.join([_drawn(made), '', *rows, '', _leaks(made)])
+
+
+def markdown(made: dict[str, Any]) -> str:
+    """Write all tables for the documentation."""
+    out = [_drawn(made), '', _leaks(made), '']
+    for title, (head, rows) in _tables(made).items():
+        if rows:
+            out += [f'### {title}', '', f'| {" | ".join(head)} |', '|' + '---|' * len(head)]
+            out += [f'| {" | ".join(row)} |' for row in rows] + ['']
+    return '\n'.join(out)
+
+
+def page(made: dict[str, Any], pyplot: Any) -> str:
+    """Lay out the page; its pictures are drawn with matplotlib's `pyplot`."""
+    tables = _tables(made)
+    pictures = {'Detection against strength': _curves, 'Calibration': _calibration,
+                'What was taken for what': _confusion}
+    parts = ['<h1>Blind check of diagnose</h1>', f'<p class="said">{escape(_drawn(made))}</p>',
+             f'<p class="said{" leak" if made["leaks"] else ""}">{escape(_leaks(made))}</p>']
+    for title, draw in pictures.items():
+        figure, out = draw(made, pyplot), BytesIO()
+        figure.savefig(out, dpi=90, format='png', metadata={'Software': None})
+        pyplot.close(figure)
+        parts += [f'<h2>{escape(title)}</h2>', '<img alt="" src="data:image/png;base64,'
+                  f'{b64encode(out.getvalue()).decode()}">']
+    for title, table in tables.items():
+        if table[1]:
+            parts += [f'<h2>{escape(title)}</h2>', _html(table)]
+    return ('<!doctype html><html lang="en"><head><meta charset="utf-8"><title>Blind check</title>'
+            f'<style>{_STYLE}</style></head><body>{"".join(parts)}</body></html>\n')
+
+
+def _drawn(made: dict[str, Any]) -> str:
+    return (f'{made["trials"]} trials and {made["cases"] - made["trials"]} at strength zero, seed '
+            f'{made["seed"]}, {made["date"]}; SHA-256 of salt and labels {made["hash"]}; code of '
+            f'the diagnosis {made["version"]}, {made["diagnose_code"][:16]}.')
+
+
+def _leaks(made: dict[str, Any]) -> str:
+    bad = [name.replace('_', ' ') for name, one in made['controls'].items() if one['leaks']]
+    if bad:
+        return f'THE CHECK ITSELF LEAKS: off chance is {", ".join(bad)}. Its scores mean nothing.'
+    return 'The controls came out at chance.'
+
+
+def _tables(made: dict[str, Any]) -> dict[str, Table]:
+    scores = made['scores']
+    return {'Bars': _bars(made), 'Scores': _scores(scores), 'Strength that is detected':
+            _strengths(scores), 'Baselines': _baselines(scores), 'Controls': _controls(made),
+            'Effect by effect, where the oracle sees it': _by_effect(scores),
+            'Real sensors: what is deleted, is it put back?': _real(made),
+            'Runs that failed': (['case', 'error'], [
+                [name, str(error)] for name, error in made['failed'].items()])}
+
+
+def _figure(one: dict[str, Any] | None, scale: float = 1.0, unit: str = '') -> str:
+    if one is None or one['value'] is None:
+        return '-'
+    text = f'{scale * one["value"]:.3g}{unit}'
+    if one.get('ci'):
+        ends = ('∞' if end is None else f'{scale * end:.3g}' for end in one['ci'])
+        text += f' ({" to ".join(ends)})'
+    return text + (f', n = {one["count"]}' if 'count' in one else '')
+
+
+def _bars(made: dict[str, Any]) -> Table:
+    sign = {-1: 'at most ', 1: 'at least ', 0: ''}
+    return ['score', 'figure (90 % interval)', 'bar', 'met'], [
+        [row['words'], _figure(row), sign[row['way']] + ' to '.join(
+            f'{bar:g}' for bar in row['bar']),
+         'no trial' if row['met'] is None else 'yes' if row['met'] else 'NO']
+        for row in made['bars']]
+
+
+_WORDS = {
+    'top_1_all_singles': 'top-1, all single effects, seen or not',
+    'leading': 'true effect within the top hypothesis, where the oracle sees it',
+    'set_size': 'effects in the named set', 'inseparable_size':
+    'effects that the recording does not tell apart (fixed by the generator)',
+    'verdict_right': 'verdict wholly right, all cases', 'brier': 'Brier score, all hypotheses',
+    'closed': 'gap closed on a held-out recording, median',
+    'unknown_recall_all': 'recall of unknown, visible or not',
+    'unknown_wrongly': 'unknown said where the library holds the effect, or there is none',
+    'seconds': 'run time, median, s',
+}
+
+
+def _scores(scores: dict[str, Any]) -> Table:
+    rows = [[words, _figure(scores[name])] for name, words in _WORDS.items()]
+    rows += [[f'pairs: {name.replace("_", " ")}', _figure(one)]
+             for name, one in scores['pairs'].items()]
+    rows += [['run time, longest, s', f'{scores["longest_s"]:.0f}'],
+             ['verdicts', ', '.join(f'{name} {n}' for name, n in scores['status'].items())]]
+    return ['score', 'figure (90 % interval)'], rows
+
+
+def _strengths(scores: dict[str, Any]) -> Table:
+    return ['effects', '50 %, mg rms', '90 %, mg rms'], [
+        [name.replace('_', ' '), *(
+            _figure(one.get(level), 1e3 / G0) if one.get(level) else 'not reached'
+            for level in ('at_50', 'at_90'))] for name, one in scores['detection'].items()]
+
+
+def _baselines(scores: dict[str, Any]) -> Table:
+    return ['', 'right, all cases', 'false alarms'], [
+        [name, _figure(one['right']), _figure(one['false_alarms'])]
+        for name, one in scores['baselines'].items()]
+
+
+def _controls(made: dict[str, Any]) -> Table:
+    def number(value: float | None) -> str:
+        return '-' if value is None else f'{value:.3f}'
+
+    return ['control', 'score', 'at chance', 'p', 'leaks'], [
+        [name.replace('_', ' '), number(one['score']), number(one['chance']),
+         number(one.get('p')), 'YES' if one['leaks'] else 'no']
+        for name, one in made['controls'].items()]
+
+
+def _by_effect(scores: dict[str, Any]) -> Table:
+    names = ('trials', 'detected', 'named', 'top')
+    return ['effect', *names], [[effect, *(str(row[name]) for name in names)]
+                                for effect, row in scores['by_effect'].items()]
+
+
+def _real(made: dict[str, Any]) -> Table:
+    rows = []
+    for one in made.get('real', []):
+        figures = '; '.join(
+            f'{name.split(".", 1)[1]}: {row["deleted"]:.3g}' + (
+                f', found {row["found"][0]:.3g} ({row["found"][1]:.3g} to {row["found"][2]:.3g})'
+                if row['found'] else '') for name, row in one['parameters'].items())
+        rows.append([one['recording'], one['against'], one['deleted'] or 'nothing',
+                     {None: '-', True: 'yes', False: 'NO'}[one['put_back']],
+                     ', '.join(one['named']) or one['status'], figures])
+    return ['recording', 'against', 'deleted', 'put back', 'named', 'parameters'], rows
+
+
+def _html(table: Table) -> str:
+    head, rows = table
+    top = ''.join(f'<th>{escape(cell)}</th>' for cell in head)
+    body = ''.join('<tr>' + ''.join(f'<td>{escape(cell)}</td>' for cell in row) + '</tr>'
+                   for row in rows)
+    return f'<table><tr>{top}</tr>{body}</table>'
+
+
+def _curves(made: dict[str, Any], pyplot: Any) -> Any:
+    figure, axis = pyplot.subplots(figsize=(10, 4), layout='constrained')
+    for i, (name, one) in enumerate(made['scores']['detection'].items()):
+        if not one['bins']:
+            continue
+        x = np.array([row['strength'] for row in one['bins']])
+        y = np.array([row['value'] for row in one['bins']])
+        off = np.abs(np.array([row['ci'] for row in one['bins']]).T - y)
+        axis.errorbar(1e3 * x / G0, y, yerr=off, fmt='o', ms=4, lw=0.8, color=f'C{i}',
+                      label=name.replace('_', ' '))
+        if 'middle' in one:
+            fine = np.linspace(np.log(x.min()), np.log(x.max()), 100)
+            axis.plot(1e3 * np.exp(fine) / G0, detection(
+                fine, one['middle'], one['width'], one['missed'], one['by_chance']),
+                color=f'C{i}')
+        if name == 'every':
+            axis.plot(1e3 * x / G0, [row['value'] for row in one['oracle']], 'k--', lw=0.8,
+                      label='oracle')
+    axis.set(xscale='log', xlabel='strength, mg rms beyond zero-g and scale',
+             ylabel='share detected', ylim=(-0.03, 1.03))
+    axis.legend(fontsize=8)
+    return figure
+
+
+def _calibration(made: dict[str, Any], pyplot: Any) -> Any:
+    figure, axis = pyplot.subplots(figsize=(5, 4), layout='constrained')
+    rows = made['scores']['reliability']
+    axis.plot([0, 1], [0, 1], 'k:', lw=0.8)
+    axis.scatter([row['confidence'] for row in rows], [row['right'] for row in rows],
+                 [8 + row['count'] for row in rows])
+    axis.set(xlabel='probability that the verdict gives itself', ylabel='share right',
+             xlim=(-0.03, 1.03), ylim=(-0.03, 1.03))
+    return figure
+
+
+def _confusion(made: dict[str, Any], pyplot: Any) -> Any:
+    table = made['scores']['confusion']
+    rows = [name for name in ('none', UNKNOWN) if name in table] + [
+        name for name in table if name not in ('none', UNKNOWN)]
+    said = {name for row in table.values() for name in row}
+    columns = [name for name in rows if name in said] + sorted(said - set(rows))
+    shares = np.array([[table[row].get(column, 0) / sum(table[row].values())
+                        for column in columns] for row in rows]).reshape(len(rows), -1)
+    figure, axis = pyplot.subplots(figsize=(11, 10), layout='constrained')
+    axis.imshow(shares, cmap='Blues', vmin=0, vmax=1, aspect='auto')
+    axis.set_xticks(range(len(columns)), columns, rotation=90, fontsize=7)
+    axis.set_yticks(range(len(rows)), [f'{row} ({sum(table[row].values())})' for row in rows],
+                    fontsize=7)
+    for i, row in enumerate(rows):
+        for j, column in enumerate(columns):
+            if table[row].get(column):
+                axis.text(j, i, table[row][column], ha='center', va='center', fontsize=6,
+                          color='white' if shares[i, j] > 0.6 else 'black')
+    axis.set(xlabel='said', ylabel='true (cases)')
+    return figure

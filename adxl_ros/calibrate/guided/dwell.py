@@ -1,0 +1,90 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""One pose while it is averaged: the samples since the arrival, and the rests among them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from adxl_ros.model.sensor import Sensor
+from adxl_ros.signals.noise_limits import known_noise
+from adxl_ros.signals.rest_detection import Rest, rest_means, RestFinder, Stillness
+import numpy as np
+
+
+class Dwell:
+    """
+    Samples from an arrival on.
+
+    Parameters
+    ----------
+    sensor
+        The nominal sensor of the stream; its noise decides what is at rest.
+    arrived_ns
+        What was sampled before is no part of the pose.
+
+    """
+
+    def __init__(self, sensor: Sensor, arrived_ns: int) -> None:
+        self.arrived_ns = arrived_ns
+        self._sensor = sensor
+        self._finder = RestFinder(sensor.rate_hz, len(sensor.axes), known_noise(sensor),
+                                  learn=False)
+        self._stamps: list[np.ndarray] = []
+        self._volts: list[np.ndarray] = []
+
+    def feed(self, stamps_ns: np.ndarray, volts: np.ndarray) -> None:
+        """Take samples: stamps, ns, (n,), and volts, (n, m)."""
+        new = stamps_ns >= self.arrived_ns
+        self._stamps.append(stamps_ns[new])
+        self._volts.append(volts[new])
+        # From the arrival: float64 seconds since 1970 resolve only 0.2 µs.
+        self._finder.feed((stamps_ns[new] - self.arrived_ns) * 1e-9, volts[new])
+
+    def rests(self) -> list[Rest]:
+        """List the rests so far; the last may still go on."""
+        return self._finder.rests() if self._stamps else []
+
+    def stillness(self) -> Stillness | None:
+        """Judge the newest samples; None while there are too few of them."""
+        return self._finder.stillness()
+
+    def at_rest_s(self) -> float:
+        """Return for how long the newest rest has lasted, s."""
+        rests = self.rests()
+        return (rests[-1].stop - rests[-1].start) / self._sensor.rate_hz if rests else 0.0
+
+    def at_rest(self) -> bool:
+        """Tell whether the newest samples are at rest."""
+        still = self.stillness()
+        return still is not None and still.still
+
+    def age_s(self) -> float:
+        """Return for how long there have been samples, s."""
+        return sum(map(len, self._stamps)) / self._sensor.rate_hz
+
+    def volts(self, rest: Rest) -> np.ndarray:
+        """Return the samples of a rest, V, (n, m)."""
+        return np.concatenate(self._volts)[rest.start:rest.stop]
+
+    def mean(self, rest: Rest, samples: int) -> dict[str, Any]:
+        """Average that many samples from the beginning of a rest: part of a journal's entry."""
+        stamps, start, stop = np.concatenate(self._stamps), rest.start, rest.start + samples
+        times = (stamps - self.arrived_ns) * 1e-9
+        mean, std = rest_means(times, np.concatenate(self._volts),
+                               [Rest(start, stop, times[start], times[stop - 1])],
+                               self._sensor.rate_hz, known_noise(self._sensor))
+        return {'start_ns': int(stamps[start]), 'stop_ns': int(stamps[stop - 1]),
+                'samples': samples, 'mean_v': mean[0].tolist(), 'std_v': std[0].tolist()}

@@ -1,0 +1,120 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The paper's compensation, equations 14 to 21: its neighbours are not corrected.
+
+Kept to compare with: the default is `signal_chain.inverse`, which is exact. Both read the same
+effects.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from adxl_ros.model import signal_chain
+from adxl_ros.model.constants import AXES, G0_MPS2
+from adxl_ros.model.effects.base import Components, Environment, Place, Signals, Value
+from adxl_ros.model.scalar_or_array import ARRAYS, Maths
+from adxl_ros.model.sensor import Sensor
+import numpy as np
+
+_NEAR_ZERO_G = 1e-6
+"""Below this the scale factor is that of this input."""
+
+
+def inverse(sensor: Sensor, z_sign: np.ndarray | None = None, maths: Maths = ARRAYS
+            ) -> Callable[..., Components]:
+    """
+    Prepare the paper's approximate inverse; as `signal_chain.inverse`, without iterations.
+
+    Each axis is first taken as linear (3), z by equation 5 where it is not measured. The terms of
+    the others at those inputs are subtracted, and the rest divided by the scale factor there
+    (14, 16); the misalignment is taken out one axis after the other (20, 21).
+
+    Parameters
+    ----------
+    sensor
+        The figures and effects to undo; measures x and y at least.
+    z_sign
+        Which way up, by sample, (n,), where it is known better than `sensor.z_sign`.
+    maths
+        For arrays or for floats.
+
+    Returns
+    -------
+    callable
+        Maps the volts of each axis and, if it is not the nominal one, an `Environment` to three
+        components, m/s².
+
+    """
+    measured = [AXES.index(axis) for axis in sensor.axes]
+    gravity_g = signal_chain.gravity_mps2(sensor) / G0_MPS2
+    up: Value = sensor.z_sign if z_sign is None else z_sign
+    directions = _directions(sensor)
+    element = signal_chain.applied(sensor, Place.ELEMENT, True)
+    electronics = signal_chain.applied(sensor, Place.ELECTRONICS, True)
+    zero_g_v = sensor.nominal_zero_g_v.tolist()
+    scale_v_per_g = sensor.nominal_scale_v_per_g.tolist()
+
+    def respond(inputs: Components) -> Components:
+        signals = Signals(signal_chain.NOMINAL, sensed=inputs, output=list(inputs))
+        for apply, values in element:
+            apply(signals, values)
+        return signals.output
+
+    def converted(output: Components, environment: Environment) -> Components:
+        signals = Signals(environment, output=output, zero_g_v=list(zero_g_v),
+                          scale_v_per_g=list(scale_v_per_g))
+        for apply, values in electronics:
+            apply(signals, values)
+        return signal_chain.converted(signals)
+
+    def invert(volts: Components, environment: Environment = signal_chain.NOMINAL) -> Components:
+        zero = converted([0.0 * volts[0]] * 3, environment)
+        one = converted([0.0 * volts[0] + 1.0] * 3, environment)
+        linear = [0.0 * volts[0]] * 3
+        for d, v, v0, v1 in zip(measured, volts, zero, one):
+            linear[d] = (v - v0) / (v1 - v0)                                        # (3)
+        if 2 not in measured:
+            rest = gravity_g ** 2 - linear[0] ** 2 - linear[1] ** 2
+            linear[2] = up * maths.sqrt(maths.most(rest, 0.0))                      # (5)
+        sensed = list(linear)
+        for d in measured:
+            inputs = list(linear)
+            inputs[d] = 0.0 * linear[d]
+            bias = respond(inputs)[d]
+            inputs[d] = _away_from_zero(linear[d])
+            scale = (respond(inputs)[d] - bias) / inputs[d]
+            sensed[d] = (linear[d] - bias) / scale                                  # (14), (16)
+        force = list(sensed)
+        for d in measured:                                                          # (20), (21)
+            others = sum(directions[d][c] * force[c] for c in range(3) if c != d)
+            force[d] = (sensed[d] - others) / directions[d][d]
+        return [f * G0_MPS2 for f in force]
+
+    return invert
+
+
+def _away_from_zero(value: Value) -> Value:
+    small = abs(value) < _NEAR_ZERO_G
+    return value + _NEAR_ZERO_G * 2 * small
+
+
+def _directions(sensor: Sensor) -> list[list[float]]:
+    """Rows Θ of the measured axes, (18) and (19), as the mounting effects have them."""
+    signals = Signals(signal_chain.NOMINAL, sensed=[np.array(row) for row in np.eye(3)])
+    for apply, values in signal_chain.applied(sensor, Place.MOUNTING, True):
+        apply(signals, values)
+    return [np.asarray(row).tolist() for row in signals.sensed]

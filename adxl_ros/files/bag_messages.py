@@ -1,0 +1,246 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The messages of a rosbag2 recording, whatever keeps them.
+
+Each file of it is read by the library rosbags or, where a recorder that was killed left an MCAP
+file without its end, record by record up to the cut. metadata.yaml gives no more than the list of
+the files: a killed recorder leaves none, and compressed files and messages show as such.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager, ExitStack
+import os
+from pathlib import Path
+import re
+import shutil
+from tempfile import TemporaryDirectory
+from typing import Any, Protocol
+
+from adxl_ros.errors import UserError
+from adxl_ros.files import mcap_recovery
+import yaml
+
+_ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
+_ENDINGS = ('.mcap', '.db3', '.mcap.zstd', '.db3.zstd')
+
+
+class Part(Protocol):
+    """One file of a recording."""
+
+    done: float
+    types: set[tuple[str, str]]
+
+    def messages(self, topics: Collection[str]) -> Iterator[tuple[str, bytes]]:
+        """Yield topic and bytes of each message of some topics, in the order of recording."""
+
+
+class Bag:
+    """
+    An open recording.
+
+    Attributes
+    ----------
+    path
+        Where it is, for messages.
+    types
+        Topics that hold messages, each with its type.
+    cut
+        Where a damaged file ends, if one does.
+
+    """
+
+    def __init__(self, path: str, parts: list[Part], cut: str) -> None:
+        """Take the files in the order of time."""
+        self.path = path
+        self.cut = cut
+        self.types: set[tuple[str, str]] = set().union(*(part.types for part in parts))
+        self._parts = parts
+        self._read = 0
+
+    @property
+    def done(self) -> float:
+        """Fraction of the recording that has been read."""
+        if self._read == len(self._parts):
+            return 1.0
+        return (self._read + self._parts[self._read].done) / len(self._parts)
+
+    def messages(self, topics: Collection[str]) -> Iterator[tuple[str, bytes]]:
+        """
+        Yield topic and CDR of each message of some topics, in the order of recording.
+
+        Raises
+        ------
+        UserError
+            A file or a message is damaged.
+
+        """
+        self._read = 0
+        for part in self._parts:
+            for topic, raw in part.messages(topics):
+                # `--compression-mode message`: no CDR begins as compressed data does.
+                yield topic, self._unpacked(topic, raw) if raw[:4] == _ZSTD_MAGIC else raw
+            self._read += 1
+
+    def _unpacked(self, topic: str, raw: bytes) -> bytes:
+        try:
+            return mcap_recovery.unpack('zstd', raw)
+        except ValueError as error:
+            raise UserError(f'{self.path}: topic {topic}: {error}') from None
+
+
+class _Whole:
+    """A file that rosbags reads."""
+
+    def __init__(self, path: Path, reader: Any) -> None:
+        self.done = 0.0
+        self.types = {(c.topic, c.msgtype) for c in reader.connections if c.msgcount}
+        self._path = path
+        self._reader = reader
+
+    def messages(self, topics: Collection[str]) -> Iterator[tuple[str, bytes]]:
+        connections = [c for c in self._reader.connections if c.topic in topics and c.msgcount]
+        if not connections:
+            return  # rosbags takes an empty choice for all of them
+        for connection in connections:
+            if connection.ext.serialization_format != 'cdr':
+                raise UserError(f'{self._path}: topic {connection.topic} is serialized as '
+                                f'{connection.ext.serialization_format}, expected cdr')
+        share = 1 / sum(c.msgcount for c in connections)
+        count = 0
+        try:
+            for connection, _, raw in self._reader.messages(connections):
+                count += 1
+                self.done = count * share
+                yield connection.topic, raw
+        except Exception as error:
+            # A damaged file shows in as many kinds of errors as rosbags has lines.
+            raise _unreadable(self._path, error) from error
+
+
+def _unreadable(path: Path, error: Exception) -> UserError:
+    said = ' '.join(str(error).split()) or f'damaged ({type(error).__name__})'
+    return UserError(f'{path}: cannot read it as a rosbag2 recording: {said}')
+
+
+def import_rosbags() -> Any:
+    """
+    Return the module rosbags.rosbag2.
+
+    Raises
+    ------
+    UserError
+        It is not installed.
+
+    """
+    try:
+        import rosbags.rosbag2
+    except ImportError:
+        raise UserError('rosbag2 recordings need the Python package rosbags: '
+                        'pip install "rosbags>=0.11.8,<0.12"') from None
+    return rosbags.rosbag2
+
+
+@contextmanager
+def open_bag(path: str | os.PathLike) -> Iterator[Bag]:
+    """
+    Open a rosbag2 directory, or one .mcap or .db3 file.
+
+    Raises
+    ------
+    UserError
+        There is no recording, or it cannot be read.
+
+    """
+    place = Path(path)
+    rosbag2 = import_rosbags()
+    with ExitStack() as stack:
+        parts: list[Part] = []
+        cuts = []
+        for name in _files(place):
+            file = _unzipped(stack, name) if name.suffix == '.zstd' else name
+            part = _opened(stack, rosbag2, name, file)
+            parts.append(part)
+            if isinstance(part, mcap_recovery.ScannedMcap) and part.cut:
+                cuts.append(f'{name}: {part.cut}')
+        yield Bag(str(place), parts, '; '.join(cuts))
+
+
+def _opened(stack: ExitStack, rosbag2: Any, name: Path, file: Path) -> Part:
+    is_mcap = file.suffix == '.mcap'
+    if is_mcap and not mcap_recovery.is_whole(file):
+        return stack.enter_context(mcap_recovery.open_scan(file))
+    try:
+        reader = stack.enter_context(rosbag2.Reader(file))
+    except Exception as error:
+        raise _unreadable(name, error) from error
+    if is_mcap and not reader.storage.chunks:
+        # Without an index, rosbags wants the messages of all topics in the order of time.
+        return stack.enter_context(mcap_recovery.open_scan(file))
+    return _Whole(name, reader)
+
+
+def _unzipped(stack: ExitStack, path: Path) -> Path:
+    """Unpack what `--compression-mode file` packed, as far as it goes."""
+    from backports import zstd
+    folder = stack.enter_context(TemporaryDirectory())
+    file = Path(folder, path.stem)
+    try:
+        with zstd.open(path, 'rb') as packed, open(file, 'wb') as unpacked:
+            shutil.copyfileobj(packed, unpacked)
+    except EOFError:
+        pass  # it is cut off, which shows again in the file inside
+    except (OSError, zstd.ZstdError) as error:
+        raise _unreadable(path, error) from error
+    return file
+
+
+def _files(path: Path) -> list[Path]:
+    """Return the files of a recording in the order of time."""
+    if not path.is_dir():
+        return [path]
+    listed = _listed_files(path)
+    files = sorted((file for file in path.iterdir() if file.name.endswith(_ENDINGS)),
+                   key=_file_number) if listed is None else listed
+    if not files:
+        raise UserError(f'{path}: is a directory without metadata.yaml, .mcap or .db3 files; '
+                        'expected a rosbag2 recording')
+    for file in files:
+        if not file.exists():
+            raise UserError(f'{path}: metadata.yaml names {file.name}, which is not there')
+    return files
+
+
+def _listed_files(path: Path) -> list[Path] | None:
+    """Return the files that metadata.yaml names; None where it does not exist."""
+    metadata = path / 'metadata.yaml'
+    try:
+        with open(metadata, encoding='utf-8') as file:
+            content = yaml.safe_load(file)
+        names = content['rosbag2_bagfile_information']['relative_file_paths']
+        return [path / Path(name).name for name in names]
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, TypeError, KeyError, yaml.YAMLError) as error:
+        raise UserError(f'{metadata}: does not list the files of a recording: '
+                        f'{" ".join(str(error).split())}; run ros2 bag reindex') from None
+
+
+def _file_number(path: Path) -> tuple[int, str]:
+    """Sort name_10.mcap behind name_9.mcap, as ros2 bag numbers them."""
+    number = re.search(r'_(\d+)\.(mcap|db3)', path.name)
+    return (int(number[1]) if number else 0, path.name)

@@ -1,0 +1,294 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Bags, read in blocks: the sensor's samples with the references brought to their stamps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+import os
+
+from adxl_ros.errors import UserError
+from adxl_ros.files import cdr
+from adxl_ros.files.bag_messages import Bag, open_bag
+from adxl_ros.files.bag_topics import find_ideal, find_topics, read_info, Topics
+from adxl_ros.files.recording_columns import ACCEL, COMMANDS, JOINTS, LIMIT, Recording
+from adxl_ros.files.reference_alignment import Command, seconds, Track
+from adxl_ros.model.constants import AXES
+import numpy as np
+
+# Samples held back for the references to come; after that many they are handed on without.
+_HOLD_ROWS = 1 << 19
+
+_ABSENT_VARIANCE = 1e5
+"""An axis that the sensor does not have is published with variance 1e6."""
+
+# Up to here float64 seconds resolve single nanoseconds.
+_EXACT_NS = 1 << 53
+
+
+def blocks(path: str | os.PathLike, rows: int, ideal: bool = False) -> Iterator[Recording]:
+    """
+    Read a bag in blocks of at most `rows` samples.
+
+    Parameters
+    ----------
+    path
+        A rosbag2 directory, or one .mcap or .db3 file.
+    rows
+        Largest number of samples of a block.
+    ideal
+        Whether it is another simulator's specific force: any sensor_msgs/Imu, all three axes.
+
+    Raises
+    ------
+    UserError
+        With the topic and the figure that is wrong.
+
+    """
+    with open_bag(path) as bag:
+        topics = find_ideal(bag) if ideal else find_topics(bag)
+        info = read_info(bag, topics.info)
+        samples = _Samples(f'{bag.path}: topic {topics.imu}', 'xyz' if ideal else info.get('axes'))
+        tracks = _tracks(bag, topics)
+        commands = {column: Command() for column in COMMANDS.values() if topics.command}
+        for batch, is_last in _batches(bag, topics, rows):
+            samples.add(batch.messages.pop(topics.imu, []))
+            if topics.command:
+                _add_commands(f'{bag.path}: topic {topics.command}', commands,
+                              batch.messages.pop(topics.command),
+                              samples.arrived_ns[batch.samples_before])
+            _add_references(bag, topics, tracks, batch.messages)
+            ready = len(samples.stamp_ns) if is_last else samples.ready(tracks)
+            for start in range(0, ready, rows):
+                yield _block(bag, samples, tracks, commands, info,
+                             slice(start, min(start + rows, ready)))
+            samples.drop(ready)
+    if not samples.count:
+        raise UserError(f'{samples.where}: holds no message')
+
+
+@dataclass
+class _Batch:
+    """Messages by topic, and how many samples of the batch came before each command."""
+
+    messages: dict[str, list[bytes]]
+    samples_before: list[int]
+
+
+def _batches(bag: Bag, topics: Topics, rows: int) -> Iterator[tuple[_Batch, bool]]:
+    """Yield batches, each with `rows` samples of the sensor, and whether it is the last."""
+    names = topics.sampled()
+    batch = _Batch({name: [] for name in names}, [])
+    imu = batch.messages[topics.imu]
+    for topic, raw in bag.messages(names):
+        batch.messages[topic].append(raw)
+        if topic == topics.command:
+            batch.samples_before.append(len(imu))
+        if len(imu) == rows:
+            yield batch, False
+            batch = _Batch({name: [] for name in names}, [])
+            imu = batch.messages[topics.imu]
+    yield batch, True
+
+
+class _Samples:
+    """The sensor's samples that have been read but not yet handed on."""
+
+    def __init__(self, where: str, axes: str | None) -> None:
+        self.where = where
+        self.axes = axes
+        self.epoch_ns = 0
+        self.count = 0
+        self.stamp_ns = np.zeros(0, np.int64)
+        self.accel = np.zeros((0, 3))
+        self.arrived_ns = np.zeros(1, np.int64)
+        """Stamps of the newest samples, the last one of those before them first; 0 is none."""
+        self._last_ns: int | None = None
+        self._frame: str | None = None
+
+    def add(self, raws: list[bytes]) -> None:
+        """Decode and check further messages."""
+        if not raws:
+            self.arrived_ns = self.arrived_ns[-1:]
+            return
+        stamp_ns = np.empty(len(raws), np.int64)
+        accel = np.empty((len(raws), 3))
+        for table in _tables(self.where, raws, cdr.imu):
+            stamp_ns[table.rows] = table.stamp_ns()
+            accel[table.rows] = table.numbers('linear_acceleration')
+            self._check_frame(table)
+        if self._last_ns is None:
+            self._begin(raws[0], int(stamp_ns[0]))
+        self._check_time(stamp_ns)
+        self._check_values(stamp_ns, accel)
+        self.count += len(raws)
+        self.arrived_ns = np.concatenate([self.arrived_ns[-1:], stamp_ns])
+        self.stamp_ns = np.concatenate([self.stamp_ns, stamp_ns])
+        self.accel = np.concatenate([self.accel, accel])
+
+    def ready(self, tracks: dict[str, Track]) -> int:
+        """Return how many samples no reference can add to any more; never the last one."""
+        seen_ns = min([track.seen_ns for track in tracks.values()] or [self.stamp_ns[-1]])
+        known = int(np.searchsorted(self.stamp_ns, seen_ns, 'right'))
+        return max(min(known, len(self.stamp_ns) - 1), len(self.stamp_ns) - _HOLD_ROWS)
+
+    def drop(self, count: int) -> None:
+        """Forget the oldest samples."""
+        self.stamp_ns, self.accel = self.stamp_ns[count:], self.accel[count:]
+
+    def _begin(self, raw: bytes, stamp_ns: int) -> None:
+        if stamp_ns > _EXACT_NS:
+            self.epoch_ns = stamp_ns // 1_000_000_000 * 1_000_000_000
+        table = next(_tables(self.where, [raw], cdr.imu))
+        variance = table.numbers('linear_acceleration_covariance')[0, [0, 4, 8]]
+        if variance[0] == -1:
+            raise UserError(f'{self.where}: says that it has no linear acceleration: '
+                            'linear_acceleration_covariance[0] is -1')
+        if self.axes is None:
+            present = variance < _ABSENT_VARIANCE
+            self.axes = ''.join(axis for axis, is_there in zip(AXES, present) if is_there)
+        if self.axes not in ('x', 'xy', 'xyz'):
+            raise UserError(f'{self.where}: linear_acceleration_covariance gives the axes '
+                            f'{self.axes or "none"}, expected x, xy or xyz; record sensor_info')
+
+    def _check_frame(self, table: cdr.Table) -> None:
+        frame = table.layout.texts['frame_id']
+        if self._frame not in (None, frame):
+            raise UserError(f'{self.where}: frame_id changes from {self._frame!r} to {frame!r}; '
+                            'record each sensor on a topic of its own')
+        self._frame = frame
+
+    def _check_time(self, stamp_ns: np.ndarray) -> None:
+        before = stamp_ns[0] - 1 if self._last_ns is None else self._last_ns
+        earlier = np.concatenate([[before], stamp_ns[:-1]])
+        wrong = stamp_ns <= earlier
+        if wrong.any():
+            i = int(wrong.argmax())
+            verb = 'stands still' if stamp_ns[i] == earlier[i] else 'runs backwards'
+            raise UserError(f'{self.where}: time {verb}: message {self.count + i + 1} is stamped '
+                            f'{seconds(stamp_ns[i])} after {seconds(earlier[i])}')
+        self._last_ns = int(stamp_ns[-1])
+
+    def _check_values(self, stamp_ns: np.ndarray, accel: np.ndarray) -> None:
+        wrong = ~(np.abs(accel) <= LIMIT)
+        if wrong.any():
+            i, axis = np.argwhere(wrong)[0].tolist()
+            raise UserError(f'{self.where}: message {self.count + i + 1}, stamped '
+                            f'{seconds(stamp_ns[i])}: linear_acceleration.{AXES[axis]} is '
+                            f'{accel[i, axis]:g} m/s², expected a number within ±{LIMIT:g}')
+
+
+def _tables(where: str, raws: list[bytes],
+            find: Callable[[bytes], cdr.Layout]) -> Iterator[cdr.Table]:
+    try:
+        yield from cdr.tables(raws, find)
+    except cdr.CdrError as error:
+        raise UserError(f'{where}: a message is damaged: {error}') from None
+
+
+def _tracks(bag: Bag, topics: Topics) -> dict[str, Track]:
+    """Return a track for each reference column that the bag can fill."""
+    columns = dict.fromkeys(JOINTS.values(), topics.joints)
+    columns.update(temperature_c=topics.temperature, supply_v=topics.supply)
+    return {column: Track(f'{bag.path}: topic {topic}')
+            for column, topic in columns.items() if topic}
+
+
+def _add_references(bag: Bag, topics: Topics, tracks: dict[str, Track],
+                    messages: dict[str, list[bytes]]) -> None:
+    for topic, raws in messages.items():
+        where = f'{bag.path}: topic {topic}'
+        if topic == topics.joints:
+            columns = _joints(where, raws, JOINTS)
+        elif topic == topics.temperature:
+            columns = {'temperature_c': _scalar(where, raws, cdr.temperature, 'temperature')}
+        else:
+            columns = {'supply_v': _scalar(where, raws, cdr.battery_state, 'voltage')}
+        for column, (stamp_ns, value) in columns.items():
+            wrong = np.abs(value) > LIMIT
+            if wrong.any():
+                raise UserError(f'{where}: {column} is {value[wrong.argmax()]:g} at '
+                                f'{seconds(stamp_ns[wrong.argmax()])}, beyond ±{LIMIT:g}')
+            tracks[column].add(stamp_ns, value)
+
+
+def _add_commands(where: str, commands: dict[str, Command], raws: list[bytes],
+                  arrived_ns: np.ndarray) -> None:
+    """
+    Add commands; one without a stamp counts from the newest sample that was recorded before it.
+
+    What is no angle is no command: the stage refuses it.
+    """
+    for column, (stamp_ns, value) in _joints(where, raws, COMMANDS).items():
+        commands[column].add(np.where(stamp_ns == 0, arrived_ns, stamp_ns),
+                             np.where(np.abs(value) <= LIMIT, value, np.nan))
+
+
+def _scalar(where: str, raws: list[bytes], find: Callable[[bytes], cdr.Layout],
+            name: str) -> tuple[np.ndarray, np.ndarray]:
+    stamp_ns, value = np.empty(len(raws), np.int64), np.empty(len(raws))
+    for table in _tables(where, raws, find):
+        stamp_ns[table.rows] = table.stamp_ns()
+        value[table.rows] = table.numbers(name)[:, 0]
+    return stamp_ns, value
+
+
+def _joints(where: str, raws: list[bytes], names: Mapping[str, str]
+            ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Return stamps and positions by column; a joint that a message does not name is NaN there."""
+    stamp_ns = np.empty(len(raws), np.int64)
+    values = {column: np.full(len(raws), np.nan) for column in names.values()}
+    for table in _tables(where, raws, cdr.joint_state):
+        stamp_ns[table.rows] = table.stamp_ns()
+        joints = [text for key, text in table.layout.texts.items() if key != 'frame_id']
+        if 'position' not in table.layout.fields:
+            continue
+        position = table.numbers('position')
+        for joint, value in zip(joints, position.T):
+            if joint in names:
+                values[names[joint]][table.rows] = value
+    return {column: (stamp_ns, value) for column, value in values.items()}
+
+
+def _block(bag: Bag, samples: _Samples, tracks: dict[str, Track], commands: dict[str, Command],
+           info: dict[str, str], part: slice) -> Recording:
+    stamp_ns = samples.stamp_ns[part]
+    accel = samples.accel[part]
+    columns = {name: np.ascontiguousarray(accel[:, i])
+               for i, name in enumerate(ACCEL[:len(samples.axes or '')])}
+    notes: dict[str, float | str] = {}
+    for name, track in tracks.items():
+        columns[name] = track.at(stamp_ns)
+        track.forget(int(stamp_ns[-1]))
+        notes[f'{name}_residual'] = track.residual
+        notes[f'{name}_gap_s'] = track.gap_s
+    for name, command in commands.items():
+        columns[name] = command.at(stamp_ns)
+        command.forget(int(stamp_ns[-1]))
+    # Divided, not multiplied by 1e-9: that gives the float64 nearest to the decimal figure.
+    time_s = (stamp_ns - samples.epoch_ns) / 1e9
+    if bag.cut:
+        notes['cut'] = f'{bag.cut}; the last sample read is at {seconds(stamp_ns[-1])}'
+    return Recording(bag.path, time_s, columns, dict(info), notes, samples.epoch_ns, bag.done)
+
+
+def drop_unsampled(recording: Recording) -> None:
+    """Take out the joints without a single position, and those without a single command."""
+    for column in (*JOINTS.values(), *COMMANDS.values()):
+        if column in recording.columns and np.isnan(recording.columns[column]).all():
+            del recording.columns[column]
+            for note in (f'{column}_residual', f'{column}_gap_s'):
+                recording.notes.pop(note, None)

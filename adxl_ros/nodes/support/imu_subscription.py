@@ -1,0 +1,106 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The samples that the calibration node hears, as volts of its unit."""
+
+from __future__ import annotations
+
+from adxl_ros.files import cdr
+from adxl_ros.model.sensor import Sensor, to_volts
+from adxl_ros.nodes.support import node_support
+import numpy as np
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+from sensor_msgs.msg import Imu
+
+_TOPIC = 'imu/data_raw'
+_SILENT_S = 3.0
+_QUEUE = 20000
+_COMPENSATED_RAD2 = 1e5
+"""Variance of a yaw that is not known: a mark of compensation's output."""
+
+
+class Samples:
+    """
+    Takes serialized messages as they come, and decodes them many at a time.
+
+    Attributes
+    ----------
+    useless
+        Why the newest samples are of no use, or ''.
+
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._raw: list[bytes] = []
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.useless = ''
+        self.heard()
+        node_support.subscription(node, Imu, _TOPIC, self._raw.append, _QUEUE, raw=True)
+
+    def heard(self) -> None:
+        """Begin to wait anew."""
+        self._heard_ns = self._steady.now().nanoseconds
+
+    def clear(self) -> None:
+        """Forget what has come so far."""
+        self._raw.clear()
+
+    def keep_newest(self) -> None:
+        """Forget what is older than a queue's length."""
+        del self._raw[:-_QUEUE]
+
+    def take(self, unit: Sensor) -> tuple[np.ndarray, np.ndarray]:
+        """Return what has come since: stamps, ns, (n,), and volts, (n, m), finite ones."""
+        batch = self._raw[:]
+        self._raw.clear()
+        stamps, accel, yaw_rad2 = np.empty(len(batch), np.int64), np.empty((len(batch), 3)), 0.0
+        for table in cdr.tables(batch, cdr.imu):
+            stamps[table.rows] = table.stamp_ns()
+            accel[table.rows] = table.numbers('linear_acceleration')
+            variances = table.numbers('orientation_covariance')
+            yaw_rad2 = max(yaw_rad2, float(np.max(variances[:, 8] * (variances[:, 0] >= 0))))
+        if batch:
+            self.heard()
+        accel = accel[:, :len(unit.axes)]
+        finite = np.isfinite(accel)
+        if batch:
+            self.useless = self._compensated(yaw_rad2) or _no_number(finite, unit)
+        whole = finite.all(axis=1)
+        return stamps[whole], to_volts(accel[whole], unit)
+
+    def _compensated(self, yaw_rad2: float) -> str:
+        return '' if yaw_rad2 < _COMPENSATED_RAD2 else (
+            f'{self._node.resolve_topic_name(_TOPIC)}: this stream is already compensated '
+            '(it carries an orientation, as imu/data does); remap it to imu/data_raw of the '
+            'driver')
+
+    def silent(self) -> str:
+        """Say for how long nothing has come; '' while samples come."""
+        for_s = (self._steady.now().nanoseconds - self._heard_ns) * 1e-9
+        if for_s < _SILENT_S:
+            return ''
+        topic = self._node.resolve_topic_name(_TOPIC)
+        who = '' if self._node.count_publishers(topic) else ', and nobody publishes it'
+        return f'nothing on {topic} for {for_s:.0f} s{who}'
+
+
+def _no_number(finite: np.ndarray, unit: Sensor) -> str:
+    """Name the axes that make all samples useless, (n, m), or return ''."""
+    if finite.all(axis=1).any():
+        return ''
+    dead = ' and '.join(axis for axis, ever in zip(unit.axes, finite.any(axis=0)) if not ever)
+    return f'{dead or "one axis or another"} is not a number in all samples; check its wiring ' \
+           'and the driver'

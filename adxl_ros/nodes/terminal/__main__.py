@@ -1,0 +1,152 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The process that draws the screen and reads the keys; `terminal_process` starts it."""
+
+from __future__ import annotations
+
+from collections import deque
+from contextlib import suppress
+import json
+import os
+import re
+import select
+import signal
+import socket
+import sys
+import termios
+import time
+from typing import Any
+
+from adxl_ros.nodes.terminal.draw import draw
+from adxl_ros.nodes.terminal.keys import Keys
+
+_FRAME_S = 0.2
+_KEPT_LINES = 1000
+_ESCAPES = re.compile(r'\x1b\[[0-9;]*m')
+
+
+class Log:
+    """Lines that arrive in pieces."""
+
+    def __init__(self, fd: int) -> None:
+        self.lines: deque[str] = deque(maxlen=_KEPT_LINES)
+        self._fd, self._rest = fd, b''
+
+    def fileno(self) -> int:
+        """Return what to wait for."""
+        return self._fd
+
+    def read(self) -> bool:
+        """Take what is there; return False when nothing will come any more."""
+        with suppress(BlockingIOError):
+            data = os.read(self._fd, 65536)
+            if not data:
+                return False
+            *whole, self._rest = (self._rest + data).split(b'\n')
+            self.lines.extend(_ESCAPES.sub('', line.decode(errors='replace')) for line in whole)
+        return True
+
+
+def run(talk: socket.socket, log: Log) -> None:
+    """Draw and read keys until the other side is gone, or a signal comes."""
+    from rich.console import Console
+    from rich.live import Live
+
+    ended = []
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, lambda *_: ended.append(True))
+    resized = [True]
+    signal.signal(signal.SIGWINCH, lambda *_: resized.append(True))
+    figures: dict[str, Any] = {'phase': 'idle', 'text': 'starting'}
+    console = Console()
+    drawn_s, keys = 0.0, Keys()
+    sources: list[Any] = [talk, log, sys.stdin]
+    with Live(console=console, screen=True, auto_refresh=False) as live:
+        while not ended:
+            ready = _ready(sources)
+            if log in ready and not log.read():
+                sources.remove(log)
+            if talk in ready:
+                newest = _newest(talk)
+                if newest is None:
+                    return
+                figures = newest or figures
+            if sys.stdin in ready and not _pass_keys(talk, keys):
+                return
+            if time.monotonic() - drawn_s > _FRAME_S:
+                drawn_s = time.monotonic()
+                live.update(draw(figures, list(log.lines), console.size), refresh=True)
+
+
+def _ready(sources: list[Any]) -> list[Any]:
+    return select.select(sources, [], [], _FRAME_S)[0]
+
+
+def _newest(talk: socket.socket) -> dict[str, Any] | None:
+    """Return the newest figures, {} where there are none; None when the other side is gone."""
+    newest = {}
+    with suppress(BlockingIOError):
+        while True:
+            try:
+                data = talk.recv(1 << 20)
+            except ConnectionError:
+                return None
+            if not data:
+                return None
+            newest = json.loads(data)
+    return newest
+
+
+def _pass_keys(talk: socket.socket, keys: Keys) -> bool:
+    """Hand on what was pressed; return False when the terminal is gone."""
+    try:
+        data = os.read(sys.stdin.fileno(), 64)
+    except OSError:
+        return False
+    for key in keys.read(data, time.monotonic()):
+        with suppress(OSError):
+            talk.send(key.encode())
+    return bool(data)
+
+
+def main() -> int:
+    """Run the process: arguments are the numbers of its socket and of the log's pipe."""
+    # Ctrl-C is for the other process; this one ends when that has.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    talk = socket.socket(fileno=int(sys.argv[1]))
+    talk.setblocking(False)
+    log = Log(int(sys.argv[2]))
+    os.set_blocking(log.fileno(), False)
+    terminal = sys.stdin.fileno()
+    saved = termios.tcgetattr(terminal)
+    keys = termios.tcgetattr(terminal)
+    keys[3] &= ~(termios.ICANON | termios.ECHO)
+    # A sweep that is stopped in the middle would leave the screen behind.
+    for name in (termios.VSUSP, termios.VQUIT):
+        keys[6][name] = b'\0'
+    termios.tcsetattr(terminal, termios.TCSANOW, keys)
+    try:
+        run(talk, log)
+    finally:
+        with suppress(OSError, termios.error):
+            termios.tcsetattr(terminal, termios.TCSANOW, saved)
+        log.read()
+        with suppress(OSError):
+            print('\n'.join(log.lines), flush=True)
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

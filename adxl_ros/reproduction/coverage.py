@@ -1,0 +1,280 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Simulation-based calibration: whether intervals hold the truth as often as they state.
+
+Units and stages are drawn, swept and fitted; the rank of the truth in its posterior must be
+uniform (Talts et al. 2018, arXiv:1804.06788), and 90 % intervals must hold it in 90 % of the
+draws.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import product
+import os
+
+from adxl_ros.calibrate import pose_response
+from adxl_ros.calibrate.fits import full_model, term_selection
+from adxl_ros.calibrate.guided import pose_plan, quick_plan
+from adxl_ros.calibrate.poses import Poses
+from adxl_ros.calibrate.stage_error import StageError
+from adxl_ros.model import noise
+from adxl_ros.model.coefficients import get, parameter_of, put, with_neutral
+from adxl_ros.model.constants import NINETY
+from adxl_ros.model.sensor import Sensor, with_axes
+from adxl_ros.reproduction import scoring
+import numpy as np
+from scipy.special import ndtr
+from scipy.stats import beta, chisquare
+
+STAGES = ('errors per pose', 'errors per setting', 'eccentric', 'tilted base')
+"""Errors of a joint are new with each pose, or with each move; the last two are per setting."""
+AXES = ('xy', 'xyz')
+_RESOLUTION_DEG = (0.01, 0.1)
+"""Steps of the encoders that are drawn, log-uniformly."""
+_STATED = (0.5, 2.0)
+"""True error of a stage over the stated one, log-uniformly."""
+_QUICK_RAD = float(np.radians(0.1))
+"""Tilt error that the plan quick is asked for."""
+_DWELL_S = 5.0
+_HELD_OUT = 8
+"""Poses of each draw that are not fitted."""
+BINS = 10
+
+
+@dataclass(frozen=True)
+class Draw:
+    """
+    One unit on one stage.
+
+    Attributes
+    ----------
+    stage, axes, plan
+        What was drawn.
+    names
+        Fitted coefficients of the sensor, (p,).
+    z
+        Their errors over the stated standard deviations, (p,).
+    bound_ratio
+        Their errors over the Cramér-Rao bound of the true error model, (p,); empty where the fit
+        has other terms than were drawn.
+    tilt_z, force_z
+        The same as `z` of alpha and beta, and of the measured axes, over held-out poses.
+    converged
+        Whether the fit says so.
+
+    """
+
+    stage: str
+    axes: str
+    plan: str
+    names: tuple[str, ...]
+    z: np.ndarray
+    bound_ratio: np.ndarray
+    tilt_z: np.ndarray
+    force_z: np.ndarray
+    converged: bool
+
+
+def draw_all(nominal: Sensor, draws: int, seed: int, show: Callable[[float], None]
+             ) -> list[Draw]:
+    """
+    Draw and fit units on all kinds of stage, over the cores.
+
+    Parameters
+    ----------
+    nominal
+        Figures that units are drawn about.
+    draws
+        How many; stages, axes and plans take turns.
+    seed
+        Of all randomness.
+    show
+        Takes the fraction that is done.
+
+    """
+    kinds = list(product(STAGES, AXES, pose_plan.KINDS))
+    found = []
+    with ProcessPoolExecutor(os.cpu_count()) as pool:
+        for one in pool.map(partial(draw, nominal, kinds=kinds, seed=seed), range(draws)):
+            found.append(one)
+            show(len(found) / draws)
+    return found
+
+
+def draw(nominal: Sensor, number: int, kinds: Sequence[tuple[str, str, str]], seed: int) -> Draw:
+    """
+    Draw one unit and one stage, sweep, and fit.
+
+    Parameters
+    ----------
+    nominal
+        Figures that the unit is drawn about.
+    number
+        Of the draw.
+    kinds
+        Stage, axes and plan, which take turns.
+    seed
+        Of all randomness.
+
+    """
+    stage, axes, kind = kinds[number % len(kinds)]
+    rng = np.random.default_rng([seed, number])
+    stated = np.radians(np.exp(rng.uniform(*np.log(_RESOLUTION_DEG))))
+    sensor = replace(with_axes(nominal, axes), stage_resolution_rad=float(stated))
+    truth = _unit(sensor, stage, rng)
+    step = float(stated * np.exp(rng.uniform(*np.log(_STATED))))
+    targets = pose_plan.guided(pose_plan.default_planes_rad(axes), pose_plan.STEP_RAD, 0) \
+        if kind == 'full' else quick_plan.quick(sensor, _DWELL_S, _QUICK_RAD, 0)
+    poses, true_rad = _swept(truth, targets, stage == STAGES[0], step, rng)
+    found, _ = term_selection.fit_judged(sensor, poses)
+    names = found.fitted.covariance_names
+    known = with_neutral(truth, {name.split('.')[0] for name in names})
+    error = get(found.fitted, names) - get(known, names)
+    sigma = step / np.sqrt(12)
+    levels = StageError(0.0, sigma) if stage == STAGES[0] else StageError(sigma)
+    bound = scoring.known_bound(truth, poses, true_rad, levels,
+                                (*full_model.terms_of(axes), *_extra(stage)))
+    anywhere = _anywhere(truth, rng)
+    tilt = scoring.angles(found.fitted, bound, *anywhere)
+    force, force_std = scoring.forces(found.fitted, truth, *anywhere)
+    return Draw(stage, axes, kind, names, error / np.sqrt(np.diag(found.fitted.covariance)),
+                _by_bound(names, error, bound), (tilt.error / tilt.std)[tilt.shown],
+                (force / force_std).ravel(), found.converged)
+
+
+def _extra(stage: str) -> tuple[str, ...]:
+    return ('stage_eccentricity',) if stage == 'eccentric' else ()
+
+
+def _by_bound(names: Sequence[str], error: np.ndarray, bound: Sensor) -> np.ndarray:
+    std = dict(zip(bound.covariance_names, np.sqrt(np.diag(bound.covariance))))
+    if set(names) != set(std):
+        return np.zeros(0)
+    return np.array([e / std[name] for name, e in zip(names, error)])
+
+
+def _unit(sensor: Sensor, stage: str, rng: np.random.Generator) -> Sensor:
+    """Draw a unit: each coefficient is normal with its typical size, in the gauge of the fit."""
+    effects = (*full_model.terms_of(sensor.axes), *_extra(stage), 'base_tilt')
+    unit = with_neutral(replace(sensor, effects=(), values={}), effects)
+    names = [name for name in full_model.coefficients(sensor.axes, effects)
+             if full_model.term_of(name) not in full_model.GAUGE
+             and (stage == 'tilted base' or not name.startswith('base_tilt'))]
+    sizes = np.array([full_model.LEVEL_RAD if name.startswith('base_tilt') else
+                      parameter_of(name).scale for name in names])
+    return put(unit, names, sizes * rng.normal(size=len(names)))
+
+
+def _swept(truth: Sensor, targets: Sequence[pose_plan.Target], per_pose: bool, step_rad: float,
+           rng: np.random.Generator) -> tuple[Poses, np.ndarray]:
+    """Return the poses of a sweep, and where the stage really stood, rad, (k, 2)."""
+    read = np.array([[t.alpha_rad, t.beta_rad] for t in targets])
+    poses = _resting(truth, read, rng)
+    off = np.empty_like(read)
+    for joint, setting in enumerate((poses.alpha_setting, poses.beta_setting)):
+        number = np.arange(len(read)) if per_pose else setting
+        off[:, joint] = step_rad * rng.uniform(-0.5, 0.5, len(read))[number]
+    return _read(truth, poses, read + off, rng), read + off
+
+
+def _anywhere(truth: Sensor, rng: np.random.Generator) -> tuple[Poses, np.ndarray]:
+    """Return poses drawn evenly over the sphere, and their angles, rad, (k, 2)."""
+    angles = np.column_stack([np.arccos(rng.uniform(-1, 1, _HELD_OUT)),
+                              rng.uniform(0, 2 * np.pi, _HELD_OUT)])
+    return _read(truth, _resting(truth, angles, rng), angles, rng), angles
+
+
+def _resting(truth: Sensor, read_rad: np.ndarray, rng: np.random.Generator) -> Poses:
+    samples = round(_DWELL_S * truth.rate_hz)
+    count = noise.effective_samples(samples, 1 / truth.rate_hz, truth.rc_s)
+    std_v = np.tile(noise.sigma_v(truth) / np.sqrt(count), (len(read_rad), 1))
+    return Poses(np.zeros_like(std_v), std_v, read_rad[:, 0], read_rad[:, 1],
+                 np.zeros((len(read_rad), 2)), np.zeros(len(read_rad), bool))
+
+
+def _read(truth: Sensor, poses: Poses, true_rad: np.ndarray, rng: np.random.Generator) -> Poses:
+    there = replace(poses, alpha_rad=true_rad[:, 0], beta_rad=true_rad[:, 1])
+    volts = pose_response.response(truth, there)
+    return replace(poses, volts=volts + poses.std_v * rng.normal(size=volts.shape))
+
+
+def interval(inside: int, count: int) -> tuple[float, float]:
+    """Return the 90 % interval of a share by `inside` of `count` (Clopper and Pearson 1934)."""
+    low = beta.ppf(0.05, inside, count - inside + 1) if inside else 0.0
+    high = beta.ppf(0.95, inside + 1, count - inside) if inside < count else 1.0
+    return float(low), float(high)
+
+
+def page(draws: Sequence[Draw], made: str) -> str:
+    """
+    Lay the result out, Markdown.
+
+    Parameters
+    ----------
+    draws
+        From `draw_all`.
+    made
+        How it was made: version, date, seed.
+
+    """
+    ratio = np.concatenate([one.bound_ratio for one in draws])
+    lines = [f'## Do the intervals hold? {len(draws)} drawn units and stages', '', made, '',
+             'A unit is drawn at datasheet spread, a stage with an encoder of 0.01° to 0.1° whose '
+             'true error is 0.5 to 2 times the stated one. Plans, axes and stages take turns. '
+             'Coverage is the share of 90 % intervals that hold the truth; in brackets its own '
+             '90 % interval, by the binomial distribution, or by bootstrap over draws where one '
+             'draw has several values. Ranks are counts of the truth in the ten tenths of its '
+             'posterior; p is that of a uniform distribution.', '',
+             f'Error over the Cramér-Rao bound of the same error model, rms over {len(ratio)} '
+             f'coefficients of {sum(len(one.bound_ratio) > 0 for one in draws)} fits with the '
+             f'terms that were drawn: {np.sqrt(np.mean(ratio ** 2)):.3f}. '
+             f'Fits that converged: {sum(one.converged for one in draws)} of {len(draws)}.', '',
+             '| | coverage, % | rms of error / stated | ranks | p |', '|---|---|---|---|---|',
+             _several('all coefficients', [one.z for one in draws]),
+             _several('tilt', [one.tilt_z for one in draws]),
+             _several('acceleration', [one.force_z for one in draws])]
+    for field in ('stage', 'axes', 'plan'):
+        for value in dict.fromkeys(getattr(one, field) for one in draws):
+            lines.append(_several(f'{field} {value}: coefficients', [
+                one.z for one in draws if getattr(one, field) == value]))
+    lines += ['', '| coefficient | coverage, % | rms of error / stated | ranks | p |',
+              '|---|---|---|---|---|']
+    for name in dict.fromkeys(name for one in draws for name in one.names):
+        z = np.array([one.z[one.names.index(name)] for one in draws if name in one.names])
+        inside = int(np.sum(np.abs(z) < NINETY))
+        low, high = interval(inside, len(z))
+        lines.append(_row(f'{name} ({len(z)})', inside / len(z), (low, high), z))
+    return '\n'.join(lines) + '\n'
+
+
+def _several(label: str, parts: Sequence[np.ndarray]) -> str:
+    inside = np.array([[np.sum(np.abs(z) < NINETY), len(z)] for z in parts])
+    rng = np.random.default_rng(0)
+    again = inside[rng.integers(0, len(parts), (1000, len(parts)))].sum(axis=1)
+    low, high = np.quantile(again[:, 0] / again[:, 1], [0.05, 0.95])
+    total = inside.sum(axis=0)
+    return _row(label, total[0] / total[1], (low, high), np.concatenate(parts))
+
+
+def _row(label: str, share: float, ends: tuple[float, float], z: np.ndarray) -> str:
+    counts = np.histogram(ndtr(z), BINS, (0, 1))[0]
+    return (f'| {label} | {100 * share:.1f} ({100 * ends[0]:.1f} to {100 * ends[1]:.1f}) | '
+            f'{np.sqrt(np.mean(z ** 2)):.2f} | {" ".join(map(str, counts))} | '
+            f'{chisquare(counts).pvalue:.2f} |')

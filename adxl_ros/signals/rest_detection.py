@@ -1,0 +1,395 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Rests: the stretches of a stream in which the sensor lies still.
+
+One search serves recordings and live streams: it works on the sums over short blocks that a
+stream leaves behind, so that the rests of a finished stream are the same however it was fed. A
+block is quiet if the variance around it is the noise's. A row of quiet blocks is a rest if its
+mean does not move either: neither over 0.5 s to 4 s anywhere in it, nor at its ends, where a
+filter or a stage settles. A knock that leaves the mean where it was does not end a rest, but it
+is left out of the mean; a live stage, which only goes by known noise, begins its dwell anew. The
+noise is known (a parameter file's), learned from the quietest parts of the stream itself, or both.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from adxl_ros.errors import UserError
+from adxl_ros.model.constants import G0_MPS2
+from adxl_ros.model.noise import effective_samples
+from adxl_ros.model.sensor import Sensor
+from adxl_ros.signals.block_statistics import angle_bounds, BlockCutter, Blocks, runs_of
+from adxl_ros.signals.noise_limits import (
+    adc_step,
+    batch_scatter,
+    DRIFT_OCTAVES,
+    END_SIGMAS,
+    half_differences,
+    known_limits,
+    learned_limits,
+    Limits,
+    Noise,
+    quiet_blocks,
+    quiet_variance,
+    Spans,
+    undithered,
+    unlike_beginning,
+    window_variance,
+)
+import numpy as np
+
+HELD_S, STAGED_S = 1.4, 0.6
+"""Shortest rest, s, less its margins of 0.3 s in all: a hand only pauses for less."""
+KNOCK_S = 1.0
+"""Longest disturbance within a rest, s."""
+BATCHES = 20
+"""Parts of a rest whose scatter tells the error of its mean; at least 0.1 s long."""
+DRIFT_SIGMAS = 5.0
+"""A drift counts above this many of its standard deviations: one false alarm in hours."""
+SETTLE_TAUS = 8.0
+"""What the filter still shows of a step then, 0.03 %, is below the noise of a rest's mean."""
+
+
+@dataclass(frozen=True)
+class Rest:
+    """Rows `start` to `stop` (exclusive) of a stream, and the times of its first and last."""
+
+    start: int
+    stop: int
+    time_start_s: float
+    time_stop_s: float
+
+
+@dataclass(frozen=True)
+class Stillness:
+    """
+    Whether the newest samples are at rest, and by which figure not.
+
+    Attributes
+    ----------
+    still
+        Whether all figures are within their limits.
+    axis
+        Number of the axis that moves most.
+    figure
+        'rms' of the samples about their mean over 0.25 s, or 'drift' of the mean over 0.5 s.
+    value, limit
+        In the unit of the samples.
+
+    """
+
+    still: bool
+    axis: int
+    figure: str
+    value: float
+    limit: float
+
+    def describe(self, unit: str, scale: float = 1.0, axes: str = 'xyz') -> str:
+        """Say what moves and by how much; `scale` is `unit`s a unit of the samples."""
+        how = 'at rest' if self.still else {'rms': 'moving', 'drift': 'drifting'}[self.figure]
+        return (f'{how}: {self.value * scale:.2g} {unit} on {axes[self.axis]}, '
+                f'must be below {self.limit * scale:.2g}')
+
+    def in_mps2(self, sensor: Sensor) -> str:
+        """Say it in m/s², for samples that are a sensor's volts."""
+        scale = G0_MPS2 / float(sensor.nominal_scale_v_per_g[self.axis])
+        return self.describe('m/s²', scale, sensor.axes)
+
+
+class RestFinder:
+    """
+    Finds the rests in a stream while it runs.
+
+    Parameters
+    ----------
+    rate_hz
+        Nominal sample rate, Hz, 1 to 10 000.
+    axes
+        Number of measured axes, m.
+    noise
+        Known noise; without it, the noise is learned.
+    learn
+        Learn the noise, with the known one as its least: for recordings of a unit that may be
+        noisier than its parameter file. A live stage knows its noise and need not wait.
+    angle_tolerance_rad
+        With it, the stream has two encoder angles, and a rest ends where one of them is farther
+        than this from their middle.
+    min_rest_s
+        Shortest rest, s; HELD_S where noise is learned and there are no angles, else STAGED_S.
+
+    """
+
+    def __init__(self, rate_hz: float, axes: int, noise: Noise | None = None,
+                 learn: bool | None = None, angle_tolerance_rad: float | None = None,
+                 min_rest_s: float | None = None):
+        self.noise = noise
+        self.learn = noise is None if learn is None else learn
+        staged = not self.learn or angle_tolerance_rad is not None
+        self.angle_tolerance_rad = angle_tolerance_rad
+        self._spans = Spans.at(rate_hz)
+        shortest_s = (STAGED_S if staged else HELD_S) if min_rest_s is None else min_rest_s
+        self._least = max(round(shortest_s / self._spans.block_s), self._spans.window)
+        # What is left of a motion that dies out below the limits is in the first block at least.
+        settle_s = SETTLE_TAUS * noise.tau_s if noise is not None else 0.0
+        self._settle = max(int(np.ceil(settle_s / self._spans.block_s)), 1)
+        self._cutter = BlockCutter(rate_hz, axes, 0 if angle_tolerance_rad is None else 2)
+        self._parts = [self._cutter.none()]
+        self._judged: tuple[int, Limits | None, list[Rest]] | None = None
+
+    def feed(self, time_s: np.ndarray, samples: np.ndarray,
+             angles_rad: np.ndarray | None = None) -> None:
+        """Take the next rows: time s (n,), samples (n, m) and, if asked for, angles (n, 2)."""
+        self._parts.append(self._cutter.feed(time_s, samples, angles_rad))
+
+    def blocks(self) -> Blocks:
+        """Give what the stream left behind."""
+        if len(self._parts) > 1:
+            self._parts = [Blocks.join(self._parts)]
+        return self._parts[0]
+
+    def rests(self) -> list[Rest]:
+        """List the rests so far; the last may still go on."""
+        return list(self._judge()[1])
+
+    def means(self, rests: list[Rest]) -> tuple[np.ndarray, np.ndarray]:
+        """Mean and its standard error of every rest, (k, m) each, as `rest_means` gives them."""
+        blocks = self.blocks()
+        ends = [np.searchsorted(blocks.start, [rest.start, rest.stop]) for rest in rests]
+        return _means([blocks[slice(*end)] for end in ends], self._spans, self.noise)
+
+    def stillness(self) -> Stillness | None:
+        """Judge the newest samples; None while there are too few of them."""
+        limits, _ = self._judge()
+        half = self._spans.half
+        least = max(2 * half, self._spans.window)
+        newest = self.blocks()[-least:]
+        if limits is None or len(newest) < least or newest.run[0] != newest.run[-1]:
+            return None
+        rms = np.sqrt(window_variance(newest, self._spans)[-1])
+        halves = newest.mean[-2 * half:].reshape(2, half, -1).mean(axis=1)
+        values = np.nan_to_num(np.concatenate([rms, np.abs(halves[1] - halves[0])]), nan=np.inf)
+        allowed = np.concatenate([np.sqrt(limits.variance),
+                                  DRIFT_SIGMAS * limits.drift[0] + limits.step])
+        worst = int(np.argmax(values / allowed))
+        figure, axis = divmod(worst, len(rms))
+        return Stillness(bool(values[worst] <= allowed[worst]), axis, ('rms', 'drift')[figure],
+                         float(values[worst]), float(allowed[worst]))
+
+    def _judge(self) -> tuple[Limits | None, list[Rest]]:
+        """Judge the stream so far, once for every new block."""
+        blocks = self.blocks()
+        if self._judged is None or self._judged[0] != len(blocks):
+            windows = window_variance(blocks, self._spans)
+            limits = self._limits(blocks, windows)
+            rests = [] if limits is None else self._rests(blocks, windows, limits)
+            self._judged = len(blocks), limits, rests
+        return self._judged[1:]
+
+    def _limits(self, blocks: Blocks, windows: np.ndarray) -> Limits | None:
+        """Say what noise explains, known, learned or the larger; None if too little is known."""
+        step = adc_step(blocks)
+        known = known_limits(self.noise, step, self._spans) if self.noise is not None else None
+        learned = learned_limits(blocks, windows, step, self._spans) if self.learn else None
+        return known.or_more(learned) if known and learned else known or learned
+
+    def _rests(self, blocks: Blocks, windows: np.ndarray, limits: Limits) -> list[Rest]:
+        """Find the rests among the blocks of the whole stream."""
+        quiet = quiet_blocks(blocks, windows, limits.variance, self._spans.window)
+        still = quiet & ~self._drifting(blocks, quiet, limits)
+        bounds = None if self.angle_tolerance_rad is None else angle_bounds(blocks)
+        posed = [part for run in runs_of(still, blocks.run) for part in self._turned(bounds, *run)]
+        parts = [self._without_ends(blocks.mean, first + self._settle, stop, limits)
+                 for first, stop in posed]
+        parts = [part for part in parts if part[1] - part[0] >= self._spans.window]
+        return [Rest(int(blocks.start[first]), int(blocks.start[stop - 1]) + self._spans.size,
+                     float(blocks.time_s[first, 0]), float(blocks.time_s[stop - 1, 1]))
+                for first, stop in (self._joined(blocks, bounds, parts, limits)
+                                    if self.learn else parts)
+                if stop - first >= self._least]
+
+    def _drifting(self, blocks: Blocks, quiet: np.ndarray, limits: Limits) -> np.ndarray:
+        """
+        Tell which blocks lie where the mean moves, (k,), by comparing neighbouring halves.
+
+        Short halves come first, and longer ones look only where those saw nothing: a slip costs
+        its surroundings, and only a drift too slow for them costs more. What is left between two
+        drifting parts drifts as well, unless it is long enough for the longest halves.
+        """
+        drifting = np.zeros(len(blocks), bool)
+        for octave in range(DRIFT_OCTAVES):
+            half = self._spans.half << octave
+            moved, valid = half_differences(blocks, quiet & ~drifting, half)
+            allowed = DRIFT_SIGMAS * limits.drift[octave] + limits.step
+            places = half + np.flatnonzero(valid & (np.abs(moved) > allowed).any(axis=1))
+            marks = np.zeros(len(blocks) + 1)
+            np.add.at(marks, places - half // 2, 1)
+            np.add.at(marks, places + half // 2, -1)
+            drifting |= np.cumsum(marks)[:-1] > 0
+        for first, stop in runs_of(quiet & ~drifting, blocks.run):
+            between = first and stop < len(blocks) and drifting[first - 1] and drifting[stop]
+            if between and stop - first < self._spans.longest:
+                drifting[first:stop] = True
+        return drifting
+
+    def _without_ends(self, means: np.ndarray, first: int, stop: int,
+                      limits: Limits) -> tuple[int, int]:
+        """Cut the ends that differ from the bulk: settling, or a hand that comes."""
+        longest = min((stop - first) // 4, self._spans.longest // 2)
+        if longest > 0:
+            noise = limits.block_noise(self._spans), limits.flicker, limits.step
+            first += unlike_beginning(means[first:stop], longest, *noise)
+            stop -= unlike_beginning(means[first:stop][::-1], longest, *noise)
+        return first, stop
+
+    def _turned(self, bounds: np.ndarray | None, first: int, stop: int) -> list[tuple[int, int]]:
+        """Split blocks `first` to `stop` where an encoder angle leaves its tolerance."""
+        if bounds is None:
+            return [(first, stop)]
+        parts, begin, widest = [], first, bounds[first]
+        changed = (bounds[first + 1:stop] != bounds[first:stop - 1]).any(axis=(1, 2))
+        for i in first + 1 + np.flatnonzero(changed):
+            widest = np.fmax(widest, bounds[i])
+            if not self._constant(widest):
+                parts.append((begin, int(i)))
+                begin, widest = int(i), bounds[i]
+        return [*parts, (begin, stop)]
+
+    def _constant(self, bounds: np.ndarray) -> bool:
+        """Tell whether the angles within `bounds`, (2, a), count as one pose."""
+        assert self.angle_tolerance_rad is not None
+        allowed = 2 * self.angle_tolerance_rad * (1 + 1e-9)
+        return not (bounds.sum(axis=0) > allowed).any()
+
+    def _joined(self, blocks: Blocks, bounds: np.ndarray | None, parts: list[tuple[int, int]],
+                limits: Limits) -> list[tuple[int, int]]:
+        """Join parts between which a knock left the mean, and the angles, where they were."""
+        joined: list[tuple[int, int]] = []
+        for first, stop in parts:
+            begin, end = joined[-1] if joined else (0, 0)
+            if (joined and self._near(blocks, end, first)
+                    and (bounds is None or self._constant(np.fmax.reduce(bounds[begin:stop])))
+                    and not self._moved(blocks.mean, (begin, end), (first, stop), limits)):
+                joined[-1] = begin, stop
+            else:
+                joined.append((first, stop))
+        return joined
+
+    def _near(self, blocks: Blocks, end: int, first: int) -> bool:
+        """Tell whether what begins at `first` follows shortly on what stops at `end`."""
+        longest = max(KNOCK_S / self._spans.block_s, self._spans.window)
+        return first - end <= longest and bool(blocks.run[end - 1] == blocks.run[first])
+
+    def _moved(self, means: np.ndarray, before: tuple[int, int], after: tuple[int, int],
+               limits: Limits) -> bool:
+        """Tell whether the mean beside a disturbance is another before it than after it."""
+        reach = self._spans.longest // 2
+        return limits.tells_apart(means[max(before[0], before[1] - reach):before[1]],
+                                  means[after[0]:min(after[1], after[0] + reach)],
+                                  self._spans, END_SIGMAS)
+
+
+def find_rests(time_s: np.ndarray, samples: np.ndarray, rate_hz: float,
+               angles_rad: np.ndarray | None = None, noise: Noise | None = None,
+               learn: bool | None = None, angle_tolerance_rad: float | None = None,
+               min_rest_s: float | None = None) -> list[Rest]:
+    """
+    Find the rests of a recording: a `RestFinder` that is fed all of it.
+
+    Parameters
+    ----------
+    time_s, samples, angles_rad
+        Time s (n,), samples (n, m) in any unit, encoder angles rad (n, 2).
+    rate_hz, noise, learn, angle_tolerance_rad, min_rest_s
+        As `RestFinder` takes them.
+
+    """
+    finder = RestFinder(rate_hz, samples.shape[1], noise, learn, angle_tolerance_rad, min_rest_s)
+    finder.feed(time_s, samples, angles_rad)
+    return finder.rests()
+
+
+def rest_means(time_s: np.ndarray, samples: np.ndarray, rests: list[Rest], rate_hz: float,
+               noise: Noise | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Average the rests of a recording; the same figures as those of the live `RestFinder.means`.
+
+    Parameters
+    ----------
+    time_s, samples
+        Time s (n,), samples (n, m).
+    rests
+        Rests in rows of the recording.
+    rate_hz, noise
+        As the finder of the rests had them.
+
+    Returns
+    -------
+    mean, standard_error
+        In the unit of the samples, (k, m). The error is that of the scatter between parts of the
+        rest, and not below that of the known noise. Other rests tell the step of the ADC only.
+
+    Raises
+    ------
+    UserError
+        If a rest holds no samples.
+
+    """
+    parts = [BlockCutter(rate_hz, samples.shape[1]).feed(
+        time_s[rest.start:rest.stop], samples[rest.start:rest.stop]) for rest in rests]
+    for rest, part in zip(rests, parts):
+        if not part.count.sum():
+            raise UserError(f'the rest from {rest.time_start_s:.3f} s to {rest.time_stop_s:.3f} '
+                            's holds no samples: name rests of this recording')
+    return _means(parts, Spans.at(rate_hz), noise)
+
+
+def _means(parts: list[Blocks], spans: Spans,
+           noise: Noise | None) -> tuple[np.ndarray, np.ndarray]:
+    """Average the blocks of each rest, (k, m), with standard errors, (k, m)."""
+    # One ADC made them all: its step does not show in a rest where nothing changes.
+    step = adc_step(Blocks.join(parts)) if parts else np.empty(0)
+    pairs = [_mean(_without_knocks(part, step, spans), step, spans, noise) for part in parts]
+    mean, error = zip(*pairs) if pairs else ((), ())
+    return np.array(mean), np.array(error)
+
+
+def _mean(part: Blocks, step: np.ndarray, spans: Spans,
+          noise: Noise | None) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Average the blocks of a rest, (m,), with the standard error, (m,).
+
+    The noise may have any spectrum: the means of up to twenty batches of the rest, so long that
+    they are nearly independent, scatter by its long-run variance.
+    """
+    mean = part.count @ part.mean / part.count.sum()
+    white = part.squares.sum(axis=0) / max((part.count - 1).sum(), 1)
+    squares, freedom = batch_scatter(part.mean, max(-(-len(part) // BATCHES), 2))
+    variance = np.maximum(squares / max(freedom, 1), white / spans.size) / len(part)
+    if noise is not None:
+        count = effective_samples(len(part) * spans.size, spans.dt_s, noise.tau_s)
+        variance = np.maximum(variance, noise.sigma ** 2 / count)
+    rounding = undithered(step, np.sqrt(white)) ** 2 / 12
+    return mean, np.sqrt(variance + rounding)
+
+
+def _without_knocks(part: Blocks, step: np.ndarray, spans: Spans) -> Blocks:
+    """Leave out the blocks of a rest where the variance is not that of most of it."""
+    part = part[part.count > 0]
+    windows = window_variance(part, spans)
+    _, limit = quiet_variance(part, windows, step)
+    calm = part[quiet_blocks(part, windows, limit, spans.window)]
+    return calm if 2 * len(calm) > len(part) else part
