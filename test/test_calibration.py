@@ -154,11 +154,11 @@ def test_services_and_refusals(start, tmp_path):
         assert not (tmp_path / 'calibration.yaml').exists()
 
         assert ask('start')[0]
-        graph.spin_until(lambda: int(graph.value('calibration', 'accepted')) >= 3, 60, 'resumed')
+        graph.spin_until(lambda: int(graph.value('calibration', 'accepted')) >= 4, 60, 'resumed')
         done, words = ask('finish')
         assert done and words.startswith('wrote calibration.yaml; '), words
         assert words.endswith(' poses are open: start again to go on')
-        # Three poses of one plane determine the linear model alone, and the log says so.
+        # Poses at two angles beta determine the linear model alone, and the log says so.
         assert parameter_file.load(tmp_path / 'calibration.yaml').model == 'linear'
 
 
