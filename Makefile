@@ -111,10 +111,10 @@ gallery: build
 	./run --exec python docs/gallery.py docs
 
 reproduction: build
-	./run reproduce --units 40 --draws 300 -o docs $(ARGS)
+	OPENBLAS_NUM_THREADS=1 ./run reproduce --units 40 --draws 300 -o docs $(ARGS)
 
 coverage: build
-	./run reproduce --units 0 --draws 300 -o coverage_output $(ARGS)
+	OPENBLAS_NUM_THREADS=1 ./run reproduce --units 0 --draws 300 -o coverage_output $(ARGS)
 
 # Its executables are found as `ros2 run` finds them.
 long: build

@@ -47,7 +47,7 @@ def parser() -> argparse.ArgumentParser:
     parse.add_argument('--units', type=int, default=20, help='how many are drawn')
     parse.add_argument('--draws', type=int, default=0,
                        help='units and stages more that are drawn to check the intervals '
-                            '(default: none; 300 take some 3 minutes on two cores)')
+                            '(default: none; 300 take about a minute on two cores)')
     parse.add_argument('-o', dest='output', metavar='DIR', required=True)
     return parse
 

@@ -53,8 +53,8 @@ _MOST_RATIO = 1.5
 """Largest logarithm of the ratio: a joint is at most twenty times as good as the other."""
 _UNIT = 0.05
 """How well some hundred poses tell the logarithm of a level, and a share: the unit of a step."""
-_OPTIONS = {'eps': 0.02, 'ftol': 1e-6, 'gtol': 0.1}
-"""Of the search for the levels: to some hundredths of the deviance, whose unit is that of χ²."""
+_OPTIONS = {'eps': 1e-3, 'ftol': 1e-8, 'gtol': 0.5, 'maxiter': 20, 'maxls': 5}
+"""Of the search for the levels: to a tenth of the deviance, whose unit is that of χ²."""
 _SURPRISE = 1e-3
 """Poses less likely than this count with the root of their distance (Huber 1964)."""
 
