@@ -22,7 +22,7 @@ from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
 from adxl_ros.model import signal_chain
 from adxl_ros.model.coefficients import get, put, with_neutral
-from adxl_ros.model.constants import NINETY
+from adxl_ros.model.constants import Z_90
 from adxl_ros.model.kinematics import specific_force
 import numpy as np
 from pace import within
@@ -57,7 +57,7 @@ def test_ninety_percent_intervals_cover_ninety_percent(axes, units, per_setting)
                         for sensor, truth, poses in (
                             swept_unit(k, axes, per_setting=per_setting) for k in range(units))])
     assert len(z) > 1000
-    assert 0.875 < np.mean(np.abs(z) < NINETY) < 0.93
+    assert 0.875 < np.mean(np.abs(z) < Z_90) < 0.93
 
 
 @pytest.mark.parametrize('per_setting', [True, False])

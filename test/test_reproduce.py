@@ -15,7 +15,7 @@
 """`reproduce`: the paper's experiments, each figure that is to be reached."""
 
 from adxl_ros.files import parameter_file
-from adxl_ros.model.constants import NINETY
+from adxl_ros.model.constants import Z_90
 from adxl_ros.reproduction import experiments, scoring, units
 import numpy as np
 import pytest
@@ -70,7 +70,7 @@ def test_motion_reaches_the_floor(found):
 def test_promised_deviations_hold(found, stage):
     """90 % intervals of the acceleration in poses that were not fitted."""
     # Poses of one unit share the errors of its few settings of alpha: units are independent.
-    inside = np.array([np.mean(np.abs(unit.models['full'].force_z) < NINETY)
+    inside = np.array([np.mean(np.abs(unit.models['full'].force_z) < Z_90)
                        for unit in found[stage]])
     assert abs(inside.mean() - 0.9) < 0.02 + 2.5 * inside.std() / np.sqrt(len(inside))
     spread = np.sqrt(np.mean([np.mean(unit.models['full'].force_z ** 2) for unit in found[stage]]))

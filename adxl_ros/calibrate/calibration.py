@@ -48,7 +48,7 @@ from adxl_ros.files.atomic_write import keep_previous
 from adxl_ros.files.figure_file import write
 from adxl_ros.model import signal_chain
 from adxl_ros.model.coefficients import get
-from adxl_ros.model.constants import G0_MPS2, NINETY
+from adxl_ros.model.constants import G0_MPS2, Z_90
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals.filter_time_constant import FilterNoise, with_filter
@@ -353,7 +353,7 @@ def coefficients(sensor: Sensor) -> list[str]:
         for parameter, values in of_effect.items():
             label, shown = absolute.get((effect, parameter), (f'{effect}.{parameter}', values))
             ends = list(sensor.axes) if np.ndim(values) else ['']
-            entries = [f'{axis} {value:.6g} +- {NINETY * std[key]:.2g}'.lstrip()
+            entries = [f'{axis} {value:.6g} +- {Z_90 * std[key]:.2g}'.lstrip()
                        for axis, value in zip(ends, np.ravel(shown))
                        if (key := f'{effect}.{parameter}.{axis}'.rstrip('.')) in std]
             if entries:

@@ -23,7 +23,7 @@ from adxl_ros.diagnose.diagnosis import Diagnosis
 from adxl_ros.diagnose.hypothesis_fit import Hypothesis
 from adxl_ros.diagnose.residual_map import SHOWS_P
 from adxl_ros.model.coefficients import get, parameter_of
-from adxl_ros.model.constants import NINETY
+from adxl_ros.model.constants import Z_90
 from adxl_ros.model.effects import effect_named, library
 import numpy as np
 
@@ -153,8 +153,8 @@ def _parameters(h: Hypothesis | None, effect: str) -> dict[str, Any]:
         # As in the parameter file, what the baseline has of it included.
         middle = float(get(h.sensor, [name])[0])
         out[name.split('.', 1)[1]] = {
-            'value': _round(middle), 'ci': [_round(middle - NINETY * std),
-                                            _round(middle + NINETY * std)], 'unit': p.unit}
+            'value': _round(middle), 'ci': [_round(middle - Z_90 * std),
+                                            _round(middle + Z_90 * std)], 'unit': p.unit}
     return out
 
 

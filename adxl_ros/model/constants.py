@@ -20,5 +20,5 @@ G0_MPS2 = 9.80665
 AXES = 'xyz'
 """Axis letters in the order of every array."""
 
-NINETY = 1.6449
-"""Half of a 90 % interval, in standard deviations."""
+Z_90 = 1.6449
+"""Half of a 90 % interval in standard deviations: the 95 % quantile of the normal distribution."""

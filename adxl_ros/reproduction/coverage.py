@@ -36,7 +36,7 @@ from adxl_ros.calibrate.poses import Poses
 from adxl_ros.calibrate.stage_error import StageError
 from adxl_ros.model import noise
 from adxl_ros.model.coefficients import get, parameter_of, put, with_neutral
-from adxl_ros.model.constants import NINETY
+from adxl_ros.model.constants import Z_90
 from adxl_ros.model.sensor import Sensor, with_axes
 from adxl_ros.reproduction import scoring
 import numpy as np
@@ -258,14 +258,14 @@ def page(draws: Sequence[Draw], made: str) -> str:
               '|---|---|---|---|---|']
     for name in dict.fromkeys(name for one in draws for name in one.names):
         z = np.array([one.z[one.names.index(name)] for one in draws if name in one.names])
-        inside = int(np.sum(np.abs(z) < NINETY))
+        inside = int(np.sum(np.abs(z) < Z_90))
         low, high = interval(inside, len(z))
         lines.append(_row(f'{name} ({len(z)})', inside / len(z), (low, high), z))
     return '\n'.join(lines) + '\n'
 
 
 def _several(label: str, parts: Sequence[np.ndarray]) -> str:
-    inside = np.array([[np.sum(np.abs(z) < NINETY), len(z)] for z in parts])
+    inside = np.array([[np.sum(np.abs(z) < Z_90), len(z)] for z in parts])
     rng = np.random.default_rng(0)
     again = inside[rng.integers(0, len(parts), (1000, len(parts)))].sum(axis=1)
     low, high = np.quantile(again[:, 0] / again[:, 1], [0.05, 0.95])

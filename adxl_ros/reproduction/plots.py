@@ -22,7 +22,7 @@ from typing import Any
 
 from adxl_ros.files.figure_file import pyplot, write
 from adxl_ros.model import signal_chain
-from adxl_ros.model.constants import G0_MPS2, NINETY
+from adxl_ros.model.constants import G0_MPS2, Z_90
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.reproduction import scoring
 from adxl_ros.reproduction.misalignment import Found
@@ -63,7 +63,7 @@ def draw_tilt(path: str | os.PathLike, unit: Unit) -> None:
                 error = np.where(angles.shown[:, row], np.degrees(angles.error[:, row]), np.nan)
                 axis.plot(turned, error, 'o-', ms=4, lw=1, color=_COLOURS[name], label=name)
             bound = np.where(angles.shown[:, row], np.degrees(angles.bound[:, row]), np.nan)
-            axis.fill_between(turned, -NINETY * bound, NINETY * bound, color='0.8',
+            axis.fill_between(turned, -Z_90 * bound, Z_90 * bound, color='0.8',
                               label='90 % by the bound')
             axis.axhline(0, color='0.5', lw=0.8)
             axis.set_yscale('symlog', linthresh=0.1)

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from adxl_ros.model.constants import NINETY
+from adxl_ros.model.constants import Z_90
 from adxl_ros.reproduction import misalignment
 from adxl_ros.reproduction.experiments import MODELS
 from adxl_ros.reproduction.units import Judged, Unit
@@ -149,7 +149,7 @@ def _to_reach(units: Sequence[Unit]) -> str:
         cells = []
         for parts in over(of):
             z = np.concatenate(parts)
-            cells.append(f'{100 * np.mean(np.abs(z) < NINETY):.1f} (of {len(z)})' if len(z)
+            cells.append(f'{100 * np.mean(np.abs(z) < Z_90):.1f} (of {len(z)})' if len(z)
                          else '–')
         lines.append(f'| coverage of 90 % intervals, {text}, % | ' + ' | '.join(cells) + ' |')
     every = [a for unit in units for a in (unit.models['full'].random,

@@ -22,7 +22,7 @@ from adxl_ros.calibrate.fits import full_model
 from adxl_ros.calibrate.fits.term_selection import Term
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.model.coefficients import get, parameter_of
-from adxl_ros.model.constants import NINETY
+from adxl_ros.model.constants import Z_90
 import numpy as np
 
 _WARMED_K = 3.0
@@ -106,6 +106,6 @@ def _of_the_stage(found: full_model.FullFit) -> str:
     """Lay out what was found of the stage itself, with its 90 % intervals."""
     std = np.sqrt(np.diag(np.linalg.inv(found.information)))
     return ''.join(
-        f', {name} {value:.2g} +- {NINETY * s:.1g} {parameter_of(name).unit}'
+        f', {name} {value:.2g} +- {Z_90 * s:.1g} {parameter_of(name).unit}'
         for name, value, s in zip(found.names, get(found.unit, found.names), std)
         if full_model.of_stage(name))

@@ -27,7 +27,7 @@ from adxl_ros.calibrate.poses import Poses
 from adxl_ros.calibrate.stage_error import StageError
 from adxl_ros.model import noise
 from adxl_ros.model.coefficients import get, parameter_of, put, with_neutral
-from adxl_ros.model.constants import NINETY
+from adxl_ros.model.constants import Z_90
 from adxl_ros.model.covariance import force_covariance
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.sensor import Sensor
@@ -215,7 +215,7 @@ def by_term(names: Sequence[str], values: np.ndarray, std: np.ndarray, prior: np
         if full_model.of_stage(names[at[0]]):
             continue
         unit = parameter_of(names[at[0]]).unit
-        shown = [f'{names[i].split(".")[-1]} {values[i]:+.2g} ± {NINETY * std[i]:.1g}' for i in at]
+        shown = [f'{names[i].split(".")[-1]} {values[i]:+.2g} ± {Z_90 * std[i]:.1g}' for i in at]
         worst = float(np.min(1 - np.clip(std[at] / prior[at], 0, 1)))
         table.append((f'{term}, {unit}' if unit else term, shown, worst))
     return table

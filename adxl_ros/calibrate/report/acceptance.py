@@ -22,7 +22,7 @@ from dataclasses import dataclass
 from adxl_ros.calibrate.report.cross_validation import rms_interval, Score
 from adxl_ros.calibrate.report.error_budget import milli_g, own_noise_mps2, Parts
 from adxl_ros.model.coefficients import get, parameter_of
-from adxl_ros.model.constants import G0_MPS2, NINETY
+from adxl_ros.model.constants import G0_MPS2, Z_90
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
@@ -115,8 +115,8 @@ def beyond_datasheet(sensor: Sensor) -> list[str]:
     std = np.sqrt(np.diag(sensor.covariance))
     for name, value, s in zip(sensor.covariance_names, get(sensor, sensor.covariance_names), std):
         _, most = sensor.datasheet.get('.'.join(name.split('.')[:2]), (0.0, 0.0))
-        if most and abs(value) - NINETY * s > most:
-            found.append(f'{name} is {value:.4g} +- {NINETY * s:.2g} {parameter_of(name).unit}, '
+        if most and abs(value) - Z_90 * s > most:
+            found.append(f'{name} is {value:.4g} +- {Z_90 * s:.2g} {parameter_of(name).unit}, '
                          f'beyond {most:g}')
     return found
 

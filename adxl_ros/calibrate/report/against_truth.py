@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from adxl_ros.calibrate.fits import full_model
 from adxl_ros.errors import UserError
 from adxl_ros.model.coefficients import get, parameter_of, put, with_neutral
-from adxl_ros.model.constants import AXES, NINETY
+from adxl_ros.model.constants import AXES, Z_90
 from adxl_ros.model.effects import cross_axis, cross_axis_z, scale_factor_cross, scale_factor_z
 from adxl_ros.model.effects.misalignment import direction
 from adxl_ros.model.sensor import Sensor
@@ -115,7 +115,7 @@ def compare(fitted: Sensor, truth: Sensor) -> list[Comparison]:
                         'compare parameter files of one unit')
     names = fitted.covariance_names
     truth = _in_gauge_of_fit(truth, names)
-    half_widths = NINETY * np.sqrt(np.diag(fitted.covariance))
+    half_widths = Z_90 * np.sqrt(np.diag(fitted.covariance))
     return [_compared(name, *values) for name, *values in zip(
         names, _absolute(fitted, names), half_widths, _absolute(truth, names))]
 

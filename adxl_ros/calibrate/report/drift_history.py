@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from adxl_ros.files import calibration_store
-from adxl_ros.model.constants import NINETY
+from adxl_ros.model.constants import Z_90
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
@@ -82,8 +82,8 @@ class Past:
         for name, key, unit in _FIGURES:
             change, std = _change(before, now, key)
             for axis, by, s in zip(now.axes, change, std):
-                if abs(by) > NINETY * s:
-                    found.append(f'{name} of {axis} by {by:+.2f} +- {NINETY * s:.2f} {unit}')
+                if abs(by) > Z_90 * s:
+                    found.append(f'{name} of {axis} by {by:+.2f} +- {Z_90 * s:.2f} {unit}')
         days = _days(before, now)
         identity = calibration_store.calibration_id(before)
         since = f'In {days:.1f} days since {identity}' if days is not None else \

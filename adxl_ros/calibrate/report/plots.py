@@ -26,7 +26,7 @@ from adxl_ros.calibrate.poses import Poses, reference_force
 from adxl_ros.calibrate.report.cross_validation import Score
 from adxl_ros.files.figure_file import pyplot, write
 from adxl_ros.model import signal_chain
-from adxl_ros.model.constants import G0_MPS2, NINETY
+from adxl_ros.model.constants import G0_MPS2, Z_90
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
@@ -105,7 +105,7 @@ def gravity_rests(name: str, fit: GravityFit) -> Any:
                                 (axes[1], fit.residual_mps2, 'calibrated')):
         mg = values / G0_MPS2 * 1e3
         axis.axhline(0, color='0.7', lw=0.8)
-        axis.errorbar(rests, mg, yerr=NINETY * fit.expected_mps2 / G0_MPS2 * 1e3, fmt='o', ms=4,
+        axis.errorbar(rests, mg, yerr=Z_90 * fit.expected_mps2 / G0_MPS2 * 1e3, fmt='o', ms=4,
                       lw=1)
         axis.set(title=f'{title}: rms {np.sqrt(np.mean(mg ** 2)):.2f} mg', xlabel='rest',
                  ylabel='magnitude minus gravity, mg')
@@ -167,7 +167,7 @@ def drift(dates: Sequence[Any], axes: str, zero_mg: np.ndarray, scale_permille: 
                                      (row[1], scale_permille, scale_std_permille,
                                       'scale factor, ‰')):
         for d, name in enumerate(axes):
-            axis.errorbar(dates, values[:, d], yerr=NINETY * std[:, d], fmt='-' + 'os^'[d], ms=5,
+            axis.errorbar(dates, values[:, d], yerr=Z_90 * std[:, d], fmt='-' + 'os^'[d], ms=5,
                           lw=1, capsize=3, label=name)
         axis.axhline(0, color='0.7', lw=0.8)
         axis.set(ylabel=f'{label}, less the newest')

@@ -32,7 +32,7 @@ from adxl_ros.files.atomic_write import atomic_path
 from adxl_ros.files.figure_file import pyplot
 from adxl_ros.model import signal_chain
 from adxl_ros.model.coefficients import get, parameter_of
-from adxl_ros.model.constants import G0_MPS2, NINETY
+from adxl_ros.model.constants import G0_MPS2, Z_90
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
@@ -186,7 +186,7 @@ def _coefficients(fitted: Sensor) -> str:
     std = np.sqrt(np.diag(fitted.covariance))
     rows = []
     for name, value, s in zip(fitted.covariance_names, get(fitted, fitted.covariance_names), std):
-        half = NINETY * s
+        half = Z_90 * s
         typical, most = fitted.datasheet.get('.'.join(name.split('.')[:2]), (0.0, 0.0))
         place = '' if not (typical or most) else 'beyond the maximum' if most and \
             abs(value) - half > most else 'beyond typical' if typical and \
