@@ -14,6 +14,7 @@
 
 """Integral nonlinearity of the ADC: one curve over its codes for all channels."""
 
+from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre
 from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
 import numpy as np
 
@@ -53,4 +54,5 @@ EFFECT = Effect(
     apply=apply,
     invertible=True,
     cause='The ADC is not straight; calibrate it with a source of volts, or choose another.',
+    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.REMOUNT),
 )

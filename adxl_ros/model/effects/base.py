@@ -21,6 +21,7 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Any, NamedTuple
 
+from adxl_ros.model.diagnosis_hints import DiagnosisHints
 import numpy as np
 
 Value = Any
@@ -218,6 +219,8 @@ class Effect:
         What must be there for it to act: 'stage', 'filter', 'adc', 'noise'.
     follows
         The fields of `Environment` that it follows.
+    diagnosis
+        What only the diagnosis needs to know of it.
 
     """
 
@@ -232,3 +235,4 @@ class Effect:
     invertible: bool = False
     needs: tuple[str, ...] = ()
     follows: tuple[str, ...] = ()
+    diagnosis: DiagnosisHints = DiagnosisHints()

@@ -16,6 +16,7 @@
 
 from math import cos, sin
 
+from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre
 from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
 
 
@@ -42,4 +43,5 @@ EFFECT = Effect(
     exact=True,
     needs=('stage',),
     cause='The base of the stage is not level; level it, or measure its tilt.',
+    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.PLANES),
 )

@@ -14,6 +14,7 @@
 
 """Random walk of the zero-g: acceleration random walk, rate noise of an Allan deviation."""
 
+from adxl_ros.model.diagnosis_hints import DiagnosisHints, DriftSpectrum, Manoeuvre
 from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
 import numpy as np
 
@@ -44,4 +45,8 @@ EFFECT = Effect(
     apply=apply,
     acts_on='noise',
     cause='The zero-g wanders; take the zero again more often, or choose a quieter sensor.',
+    # A healthy unit drifts by 0.3 mg within 100 s at most (tuned by hand on simulated
+    # recordings).
+    diagnosis=DiagnosisHints(drift=DriftSpectrum.RANDOM_WALK, healthy_density=3e-5,
+                             revealed_by=Manoeuvre.HEAT),
 )

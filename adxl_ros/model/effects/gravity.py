@@ -14,6 +14,7 @@
 
 """Local gravity that is not the stated one."""
 
+from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre
 from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
 
 
@@ -35,4 +36,5 @@ EFFECT = Effect(
     invertible=True,
     needs=('stage',),
     cause='Local gravity is not the stated one; look it up for latitude and height.',
+    diagnosis=DiagnosisHints(imitated=True, revealed_by=Manoeuvre.REMOUNT),
 )

@@ -14,6 +14,7 @@
 
 """Hysteresis of the sensing element: a Prandtl-Ishlinskii operator of the acceleration."""
 
+from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre
 from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
 from adxl_ros.model.play_operator import play
 
@@ -53,4 +54,5 @@ EFFECT = Effect(
     smooth=False,
     cause='The reading depends on where the sensor comes from; approach poses from both sides '
           'and average, or relieve the package of mounting stress.',
+    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.SPEEDS),
 )

@@ -14,6 +14,7 @@
 
 """Lever arm: a sensor off the axes of the stage feels the turning."""
 
+from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre
 from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
 from adxl_ros.model.kinematics import angular_motion, carried
 
@@ -37,4 +38,5 @@ EFFECT = Effect(
     exact=True,
     needs=('stage',),
     cause='The sensor is off the axis of rotation; mount it on the axis, or state the arm.',
+    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.SPEEDS),
 )

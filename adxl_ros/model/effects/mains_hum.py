@@ -14,6 +14,7 @@
 
 """Mains hum: a sine at the input of the ADC."""
 
+from adxl_ros.model.diagnosis_hints import Detector, DiagnosisHints
 from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
 import numpy as np
 
@@ -39,4 +40,5 @@ EFFECT = Effect(
     apply=apply,
     acts_on='noise',
     cause='The mains couple in; shield and twist the cable, and ground it at one end.',
+    diagnosis=DiagnosisHints(detector=Detector.MAINS_LINE),
 )

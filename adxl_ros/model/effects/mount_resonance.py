@@ -14,6 +14,7 @@
 
 """Resonance of the mount: the sensor feels the motion through a spring and a damper."""
 
+from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre
 from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
 from adxl_ros.model.filters import resonator
 
@@ -41,4 +42,5 @@ EFFECT = Effect(
     ),
     apply=apply,
     cause='The mount is a spring; stiffen it, or keep the motion away from its resonance.',
+    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.SHAKE),
 )

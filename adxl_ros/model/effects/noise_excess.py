@@ -14,6 +14,7 @@
 
 """White noise beyond the stated density."""
 
+from adxl_ros.model.diagnosis_hints import Detector, DiagnosisHints
 from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
 
 
@@ -35,4 +36,5 @@ EFFECT = Effect(
     acts_on='noise',
     needs=('noise',),
     cause='The noise is not the stated one; look at the supply, its decoupling and the cable.',
+    diagnosis=DiagnosisHints(detector=Detector.NOISE_LEVEL),
 )

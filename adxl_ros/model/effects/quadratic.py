@@ -14,6 +14,7 @@
 
 """Even nonlinearity of an axis: the two directions differ in scale factor."""
 
+from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre
 from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
 
 
@@ -35,4 +36,5 @@ EFFECT = Effect(
     apply=apply,
     invertible=True,
     cause='Up and down differ in scale factor; calibrate, and let no supply clip one side.',
+    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.PLANES),
 )

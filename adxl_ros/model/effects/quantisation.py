@@ -14,6 +14,7 @@
 
 """Quantisation coarser than the ADC's bits."""
 
+from adxl_ros.model.diagnosis_hints import Detector, DiagnosisHints
 from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
 
 
@@ -34,4 +35,5 @@ EFFECT = Effect(
     acts_on='noise',
     needs=('adc',),
     cause='The ADC resolves less than stated; look at its setting, reference and format.',
+    diagnosis=DiagnosisHints(detector=Detector.COARSE_CODES),
 )

@@ -18,6 +18,7 @@ Scale factor that depends on the out-of-plane axis: equations 15 and 17, centred
 For the z axis it is the scale factor that depends on y.
 """
 
+from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre
 from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
 
 OTHER = (2, 2, 1)
@@ -43,4 +44,5 @@ EFFECT = Effect(
     apply=apply,
     invertible=True,
     cause='The out-of-plane axis changes the scale factor; calibrate with several planes alpha.',
+    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.PLANES),
 )

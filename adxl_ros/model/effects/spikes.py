@@ -14,6 +14,7 @@
 
 """Spikes: single samples that are far off."""
 
+from adxl_ros.model.diagnosis_hints import Detector, DiagnosisHints
 from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
 import numpy as np
 
@@ -42,4 +43,5 @@ EFFECT = Effect(
     smooth=False,
     acts_on='noise',
     cause='Single samples are far off; look for loose contacts and loads that switch.',
+    diagnosis=DiagnosisHints(detector=Detector.ISOLATED_SAMPLES),
 )

@@ -14,6 +14,7 @@
 
 """Eccentricity of the stage's encoder discs: an error of one period a turn."""
 
+from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre
 from adxl_ros.model.effects.base import Effect, Joint, Parameter, Parameters, Place, Signals
 import numpy as np
 
@@ -42,4 +43,5 @@ EFFECT = Effect(
     apply=apply,
     needs=('stage',),
     cause='The disc of an encoder is off its axis; use two reading heads, or a table of errors.',
+    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.PLANES),
 )

@@ -14,6 +14,7 @@
 
 """Offset of the stage's encoders."""
 
+from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre
 from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
 
 
@@ -37,4 +38,5 @@ EFFECT = Effect(
     exact=True,
     needs=('stage',),
     cause='The zero of an encoder is off; set it by a level, or remount the sensor by 180 deg.',
+    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.REMOUNT, half_turn='beta_rad'),
 )

@@ -14,6 +14,7 @@
 
 """Stuck samples: the link repeats its last sample for a while."""
 
+from adxl_ros.model.diagnosis_hints import Detector, DiagnosisHints
 from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
 import numpy as np
 
@@ -54,4 +55,5 @@ EFFECT = Effect(
     smooth=False,
     acts_on='noise',
     cause='The link repeats samples; look at the bus, its load and its buffers.',
+    diagnosis=DiagnosisHints(detector=Detector.REPEATED_SAMPLES),
 )

@@ -14,6 +14,7 @@
 
 """Supply: zero-g and scale factor follow it, but the ADXL203 is not exactly ratiometric."""
 
+from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre
 from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
 
 _SCALE_EXPONENT = 1.135
@@ -44,4 +45,5 @@ EFFECT = Effect(
     invertible=True,
     follows=('supply_v',),
     cause='The output follows the supply; measure the supply and correct, or regulate it.',
+    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.SUPPLY),
 )

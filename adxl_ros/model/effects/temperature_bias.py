@@ -14,6 +14,7 @@
 
 """Zero-g that moves with temperature."""
 
+from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre
 from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
 
 REFERENCE_C = 25.0
@@ -40,4 +41,5 @@ EFFECT = Effect(
     invertible=True,
     follows=('temperature_c',),
     cause='The zero-g follows the temperature; measure it and correct, or keep it steady.',
+    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.HEAT),
 )

@@ -14,6 +14,7 @@
 
 """Scale factor that moves with temperature."""
 
+from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre
 from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
 from adxl_ros.model.effects.temperature_bias import REFERENCE_C
 
@@ -37,4 +38,5 @@ EFFECT = Effect(
     invertible=True,
     follows=('temperature_c',),
     cause='The scale factor follows the temperature; measure it and correct, or keep it steady.',
+    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.HEAT),
 )

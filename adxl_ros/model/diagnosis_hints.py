@@ -1,0 +1,114 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What the diagnosis needs to know about an effect, declared in the file of the effect."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import auto, Enum
+
+
+class StraightLine(Enum):
+    """Part of the straight line between specific force and volts that an effect changes."""
+
+    ZERO_G = auto()
+    SCALE_FACTOR = auto()
+
+
+class DriftSpectrum(Enum):
+    """
+    Spectrum of a zero-g that drifts; it decides which filter makes the drift white.
+
+    The first parameter of such an effect is its density: g/√s of a random walk, g/√Hz at 1 Hz of
+    1/f noise.
+    """
+
+    RANDOM_WALK = auto()
+    FLICKER = auto()
+
+
+class Detector(Enum):
+    """
+    Statistic of the noise that shows an effect; an effect has all parameters that it estimates.
+
+    REPEATED_SAMPLES estimates `rate_hz` and `duration_s`, ISOLATED_SAMPLES `rate_hz` and
+    `amplitude_v`, COARSE_CODES `lost_bits`, MAINS_LINE `amplitude_v`, `frequency_hz` and
+    `phase_rad`, NOISE_LEVEL `ratio`.
+    """
+
+    REPEATED_SAMPLES = auto()
+    ISOLATED_SAMPLES = auto()
+    COARSE_CODES = auto()
+    MAINS_LINE = auto()
+    NOISE_LEVEL = auto()
+
+
+class Manoeuvre(Enum):
+    """A manoeuvre that the diagnosis can propose; `next_experiment` describes each."""
+
+    SHAKE = auto()
+    SPEEDS = auto()
+    PLANES = auto()
+    REMOUNT = auto()
+    HEAT = auto()
+    SUPPLY = auto()
+
+
+@dataclass(frozen=True)
+class DiagnosisHints:
+    """
+    Properties of an effect that only the diagnosis uses.
+
+    Attributes
+    ----------
+    straight_line
+        Part of the straight line that the effect is; None for all other effects.
+    healthy_std
+        Standard deviation from day to day of a healthy unit's coefficients, beside the covariance
+        of the parameter file. The unit is the parameter's, with g in place of V. An effect with a
+        value is a nuisance parameter of every hypothesis.
+    imitated
+        Whether zero-g and scale factor together imitate the effect completely.
+    drift
+        Spectrum, if the effect lets the zero-g drift.
+    healthy_density
+        Largest density of a healthy unit's drift, in the unit of the parameter.
+    detector
+        Statistic of the noise that shows the effect.
+    revealed_by
+        Manoeuvre that shows the effect best.
+    half_turn
+        Parameter, rad, that changes by π where the sensor is remounted turned about its z axis.
+
+    """
+
+    straight_line: StraightLine | None = None
+    healthy_std: float | None = None
+    imitated: bool = False
+    drift: DriftSpectrum | None = None
+    healthy_density: float = 0.0
+    detector: Detector | None = None
+    revealed_by: Manoeuvre | None = None
+    half_turn: str = ''
+
+    @property
+    def nuisance(self) -> bool:
+        """Whether the coefficients are free in every hypothesis, within their tolerance."""
+        return self.healthy_std is not None
+
+    @property
+    def absorbed(self) -> bool:
+        """Whether the nuisance parameters of a hypothesis without the effect take it up."""
+        return self.nuisance or self.imitated
