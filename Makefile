@@ -92,20 +92,25 @@ test: build
 	cd test && OPENBLAS_NUM_THREADS=1 ../run --exec python -m pytest -n 2 --dist loadgroup $(ARGS)
 
 lint: build
-	cd test && ../run --exec python -m pytest -q test_linters.py test_layering.py
+	cd test && ../run --exec python -m pytest -q project/test_linters.py project/test_layering.py
 
 bench: build
-	./run bench --iiod test/iiod.py $(ARGS)
+	./run bench --iiod test/support/iiod.py $(ARGS)
 
-# Each of these takes long: its tables go into docs/links.md and docs/guided.md.
-faults soak: build
-	cd test && ../run --exec python $@.py $(ARGS)
+# Each of the next takes long: its table goes into docs/links.md, docs/guided.md or docs/recordings.md.
+python_in_test = cd test && ../run --exec sh -c 'PYTHONPATH="support:$$PYTHONPATH" exec python "$$@"' -
+
+faults: build
+	$(python_in_test) support/faults.py $(ARGS)
+
+soak: build
+	$(python_in_test) long/soak.py $(ARGS)
 
 # With atheris where it installs; else by mutations of its own.
 fuzz: build
 	-.venv/bin/python -m pip install --quiet --disable-pip-version-check \
 	    --requirement requirements/fuzz.txt
-	cd test && ../run --exec python fuzz_links.py $(ARGS)
+	$(python_in_test) long/fuzz_links.py $(ARGS)
 
 gallery: build
 	./run --exec python docs/gallery.py docs
@@ -117,9 +122,9 @@ coverage: build
 	OPENBLAS_NUM_THREADS=1 ./run reproduce --units 0 --draws 300 -o coverage_output $(ARGS)
 
 # Its executables are found as `ros2 run` finds them.
+long: export PATH := $(CURDIR)/install/adxl_ros/lib/adxl_ros:$(PATH)
 long: build
-	cd test && PATH="$(CURDIR)/install/adxl_ros/lib/adxl_ros:$$PATH" \
-	    ../run --exec python long_recording.py $(ARGS)
+	$(python_in_test) long/long_recording.py $(ARGS)
 
 # Goes on where it was cut short; with a seed of its own in ARGS, into another folder.
 blind: build

@@ -22,20 +22,15 @@ loopback interface in a domain that no other run of these tests and no other gra
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import suppress
-from dataclasses import dataclass
 import os
 from pathlib import Path
 import signal
 import subprocess
-import time
 
-from ament_index_python.packages import get_package_prefix
 from domain import BY_UDP, own_domain
 from hypothesis import settings
+from processes import executable, REPO, Started
 import pytest
-
-REPO = Path(__file__).resolve().parents[1]
 
 # The same examples in each run; to look for new ones: make test ARGS='--hypothesis-profile search'
 settings.register_profile('same', deadline=None, derandomize=True)
@@ -76,55 +71,6 @@ def ros_env(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[dict[str
         yield os.environ | (BY_UDP if request.node.get_closest_marker('kills') else {})
 
 
-def wait_until(condition: Callable[[], object], timeout_s: float, what: str) -> None:
-    """Poll `condition` until it holds, and fail with `what` after `timeout_s` seconds."""
-    end = time.monotonic() + timeout_s
-    while not condition():
-        if time.monotonic() > end:
-            pytest.fail(f'{what}: not after {timeout_s} s')
-        time.sleep(0.02)
-
-
-@dataclass(frozen=True)
-class Started:
-    """A process that runs an installed executable, and the file that takes what it prints."""
-
-    name: str
-    popen: subprocess.Popen
-    log: Path
-
-    def output(self) -> str:
-        """Read what it has printed so far, on stdout and stderr."""
-        return self.log.read_text(encoding='utf-8', errors='replace')
-
-    def wait_for(self, text: str, timeout_s: float = 20.0) -> None:
-        """Wait until it has printed `text`; fail when it ends without, or after the time."""
-        def seen() -> bool:
-            ended = self.popen.poll() is not None
-            found = text in self.output()
-            if ended and not found:
-                pytest.fail(f'{self.name} ended with {self.popen.returncode} and without '
-                            f'printing {text!r}:\n{self.output()}')
-            return found
-        wait_until(seen, timeout_s, f'{self.name} printing {text!r}')
-
-    def wait(self, timeout_s: float = 20.0) -> int:
-        """Wait until it ends by itself and return its exit status."""
-        wait_until(lambda: self.popen.poll() is not None, timeout_s, f'{self.name} ending')
-        return self.popen.returncode
-
-    def stop(self) -> int:
-        """End it with its children, kindly first, and return its exit status."""
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
-            if self.popen.poll() is None:
-                os.killpg(self.popen.pid, number)
-                with suppress(subprocess.TimeoutExpired):
-                    self.popen.wait(5.0)
-        with suppress(ProcessLookupError):  # children that outlived it
-            os.killpg(self.popen.pid, signal.SIGKILL)
-        return self.popen.wait()
-
-
 @pytest.fixture
 def start(ros_env: dict[str, str], tmp_path: Path) -> Iterator[Callable[..., Started]]:
     """
@@ -150,11 +96,6 @@ def start(ros_env: dict[str, str], tmp_path: Path) -> Iterator[Callable[..., Sta
     for process in reversed(started):
         process.stop()
         print(f'--- {process.name}:\n{process.output()}')
-
-
-def executable(name: str) -> Path:
-    """Find an installed executable as `ros2 run` does."""
-    return Path(get_package_prefix('adxl_ros')) / 'lib' / 'adxl_ros' / name
 
 
 @pytest.fixture

@@ -31,9 +31,9 @@ import subprocess
 import time
 
 from adxl_ros.files import parameter_file, sweep_journal
-from conftest import executable
 from graph import RELIABLE
 import numpy as np
+from processes import executable
 from units import drawn, nominal
 
 SIM = ('-p', 'use_sim_time:=true')

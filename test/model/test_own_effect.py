@@ -15,16 +15,16 @@
 """The page about effects of one's own: its package, installed as written, works everywhere."""
 
 import os
-from pathlib import Path
 import re
 import subprocess
 import sys
 
 from adxl_ros.files import parameter_file, recording
 import numpy as np
+from processes import REPO
 from units import nominal
 
-PAGE = Path(__file__).resolve().parents[1] / 'docs' / 'own_effect.md'
+PAGE = REPO / 'docs' / 'own_effect.md'
 
 
 def test_the_page_s_package_works(tmp_path, monkeypatch, run_tool):

@@ -31,6 +31,7 @@ from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.sensor import to_nominal_mps2
 import numpy as np
 import pytest
+from setting_checks import by_rests, check_all_agree, same_partition
 from units import Bench, Fed, nominal
 
 NAN = float('nan')
@@ -359,34 +360,6 @@ class Run:
         sent += [bags.joints(t, '/stage/command', alpha=a, beta=b) for t, a, b in self.commands]
         return bags.bag_of(path, [bags.info(**sensor_info(self.sensor)),
                                   *sorted(sent, key=lambda one: one.stamp_ns)])
-
-
-def same_partition(some, others):
-    """Tell whether two lists of numbers put the same poses together."""
-    pairs = set(zip(some, others))
-    return len(pairs) == len(set(some)) == len(set(others))
-
-
-def by_rests(read, unit, entries):
-    """Find the rests without a journal; return the settings of those of a journal's poses."""
-    poses = pose_extraction.poses_of(read, unit)
-    begin, end = (read.epoch_ns + np.rint(poses.time_s * 1e9).astype(np.int64)).T
-    middle = [(e['start_ns'] + e['stop_ns']) // 2 for e in entries]
-    rest = [int(np.flatnonzero((begin <= m) & (m <= end))[0]) for m in middle]
-    return poses.alpha_setting[rest], poses.beta_setting[rest]
-
-
-def check_all_agree(read, unit, entries):
-    """Assert that a recording numbers the settings as its journal does."""
-    alpha, beta = (np.array([e[f'{joint}_setting'] for e in entries])
-                   for joint in ('alpha', 'beta'))
-    by_journal = pose_extraction.poses_of(read, unit, entries)
-    assert (by_journal.alpha_setting == alpha).all() and (by_journal.beta_setting == beta).all()
-    bare = [{k: v for k, v in e.items() if not k.endswith('_setting')} for e in entries]
-    named = pose_extraction.poses_of(read, unit, bare)
-    for found in ((named.alpha_setting, named.beta_setting), by_rests(read, unit, entries)):
-        assert same_partition(found[0].tolist(), alpha.tolist())
-        assert same_partition(found[1].tolist(), beta.tolist())
 
 
 def test_sweep_journal_bag_and_csv_give_the_same_settings(tmp_path):

@@ -21,7 +21,7 @@ import subprocess
 
 from ament_index_python.packages import get_package_prefix, get_package_share_directory
 from ament_index_python.resources import get_resource
-from conftest import executable, REPO
+from processes import executable, REPO
 import pytest
 
 SCRIPTS = [entry for entry in distribution('adxl_ros').entry_points

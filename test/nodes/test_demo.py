@@ -30,8 +30,8 @@ from adxl_ros.model.effects import effect_named
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.nodes import demo
 from adxl_ros.nodes.terminal import steps
-from conftest import executable, REPO
 import numpy as np
+from processes import executable, REPO
 import pytest
 from terminal import Terminal
 from units import drawn, nominal

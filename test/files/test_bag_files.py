@@ -24,7 +24,7 @@ from adxl_ros.files.recording import Recording
 from adxl_ros.files.recording_columns import ACCEL, REFERENCES
 import numpy as np
 import pytest
-from test_recordings import growth_mb, refusal
+from reading import growth_mb, refusal
 from units import nominal
 
 rosbag2 = pytest.importorskip('rosbags.rosbag2', reason='rosbags is not installed')

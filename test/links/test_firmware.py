@@ -15,15 +15,15 @@
 """The encoder of the firmware, compiled on the host: its frames are those of the reference."""
 
 import ctypes
-from pathlib import Path
 import shutil
 import subprocess
 
 from adxl_ros.links.support.wire_format import AFTER_RESET, decode, Encoder, Info, RAIL
 import numpy as np
+from processes import REPO
 import pytest
 
-SOURCE = Path(__file__).resolve().parents[1] / 'firmware' / 'adxl_board' / 'frame.c'
+SOURCE = REPO / 'firmware' / 'adxl_board' / 'frame.c'
 
 
 class Counts(ctypes.Structure):

@@ -6,16 +6,16 @@ from adxl_ros.files import parameter_file, recording, sweep_journal
 from adxl_ros.files.recorded_unit import recorded_unit
 from adxl_ros.files.recording_columns import sensor_info
 from adxl_ros.model.constants import G0_MPS2
-from conftest import wait_until
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from graph import Graph, RELIABLE
 from lifecycle_msgs.msg import Transition
 import numpy as np
+from processes import wait_until
 import pytest
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import Imu, JointState
+from setting_checks import check_all_agree
 from std_srvs.srv import Trigger
-from test_joint_settings import check_all_agree
 from units import drawn, nominal
 
 FAST = ('-p', 'use_sim_time:=true')

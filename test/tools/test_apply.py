@@ -26,8 +26,8 @@ from adxl_ros.files.recording_columns import Recording, sensor_info
 from adxl_ros.model import signal_chain
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
-from conftest import executable, wait_until
 import numpy as np
+from processes import executable, wait_until
 import pytest
 from units import drawn, nominal
 

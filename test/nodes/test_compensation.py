@@ -32,11 +32,11 @@ from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.scalar_or_array import FLOATS
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
 from builtin_interfaces.msg import Time
-from conftest import Started
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Vector3Stamped
 from graph import accel, Graph, RELIABLE, stamp_ns
 import numpy as np
+from processes import Started
 import pytest
 from rcl_interfaces.srv import DescribeParameters, GetParameters, SetParametersAtomically
 from rclpy.parameter import Parameter, parameter_value_to_python

@@ -17,8 +17,6 @@
 from dataclasses import replace
 import os
 from pathlib import Path
-import subprocess
-import sys
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import csv_file, recording
@@ -28,44 +26,16 @@ from adxl_ros.model.constants import G0_MPS2
 import numpy as np
 from pace import within
 import pytest
+from reading import growth_mb, refusal
 from units import nominal
 
 HEADER = 'time_s,x_v,y_v,alpha_rad,beta_rad'
 GOOD = '0.0,2.5,2.6,1.5,0.1\n0.001,2.51,2.61,,\n0.002,2.52,2.62,1.6,0.2\n'
 
-GROWTH = """
-from resource import getrusage, RUSAGE_SELF
-import sys
-from adxl_ros.files import recording
-peaks_kb = []
-for block in recording.blocks(sys.argv[1], 5000):
-    peaks_kb.append(getrusage(RUSAGE_SELF).ru_maxrss)
-print(peaks_kb[-1] - peaks_kb[len(peaks_kb) // 4])
-"""
-
-
 def written(tmp_path: Path, text: str | bytes, name: str = 'run.csv') -> Path:
     path = tmp_path / name
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
     return path
-
-
-def refusal(path: Path) -> str:
-    """Return what the user is told, which is one line and begins with the file."""
-    with pytest.raises(UserError) as raised:
-        recording.read(path)
-    text = str(raised.value)
-    assert text.startswith(str(path))
-    assert '\n' not in text
-    return text.removeprefix(str(path))
-
-
-def growth_mb(path: Path) -> float:
-    """Return by how much memory grows while all but the first blocks of a recording are read."""
-    done = subprocess.run([sys.executable, '-c', GROWTH, path], text=True, check=True,
-                          capture_output=True, env={**os.environ,
-                                                    'PYTHONPATH': os.pathsep.join(sys.path)})
-    return float(done.stdout) / 1024
 
 
 def made(rng: np.random.Generator, count: int = 3000, axes: str = 'xyz') -> Recording:

@@ -21,8 +21,8 @@ import shutil
 import subprocess
 
 from adxl_ros.files import calibration_store, parameter_file
-from conftest import executable
 import numpy as np
+from processes import executable
 import pytest
 from units import NOMINAL
 

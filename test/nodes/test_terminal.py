@@ -21,15 +21,15 @@ import signal
 
 from adxl_ros.files import parameter_file, sweep_journal
 from adxl_ros.nodes.terminal.keys import Keys
-from conftest import executable
 from graph import Graph, RELIABLE
 import numpy as np
+from processes import executable
 import pytest
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 from terminal import Terminal
-from test_core_only import run_without_extras
 from units import drawn, nominal
+from without_extras import run_without_extras
 
 FAST = ('-p', 'use_sim_time:=true')
 PLAN = ('-p', 'sweep.planes_rad:=[0.7853981633974483, 1.5707963267948966]', '-p',

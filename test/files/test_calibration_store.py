@@ -21,8 +21,8 @@ import subprocess
 
 from adxl_ros.files import calibration_store, parameter_file
 from adxl_ros.model.validity import Envelope
-from conftest import executable
 import numpy as np
+from processes import executable
 import pytest
 from units import drawn, NOMINAL, nominal
 

@@ -18,9 +18,9 @@ import ast
 from pathlib import Path
 import sys
 
+from processes import REPO
 import pytest
 
-REPO = Path(__file__).resolve().parents[1]
 PACKAGE = REPO / 'adxl_ros'
 CORE = {'adxl_ros', 'ament_index_python', 'numpy', 'scipy', 'yaml'}
 ROS = {'builtin_interfaces', 'diagnostic_msgs', 'geometry_msgs', 'rcl_interfaces', 'rclpy',

@@ -14,16 +14,16 @@
 
 """Another simulator's ideal reading through our chain, beside our own kinematics."""
 
-from pathlib import Path
 import subprocess
 import sys
 
 from adxl_ros.files import parameter_file, recording
 import numpy as np
+from processes import REPO
 import pytest
 from units import nominal
 
-SCRIPT = Path(__file__).resolve().parents[1] / 'docs' / 'examples' / 'mujoco_arm.py'
+SCRIPT = REPO / 'docs' / 'examples' / 'mujoco_arm.py'
 
 
 def test_mujoco_s_accelerometer_agrees_to_a_tenth_of_a_mg(run_tool, tmp_path):

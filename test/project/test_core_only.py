@@ -19,28 +19,11 @@ The environment without extras is made by a subprocess whose import of them fail
 where they are not installed.
 """
 
-from importlib.metadata import requires
 import json
 from pathlib import Path
-import re
-import subprocess
-import sys
 
-# Imported under other names than they are installed by, or not asked for by setup.py.
-OTHERS = ('PIL', 'arch', 'cobs', 'iio', 'jinja2', 'mcap', 'numba', 'pandas', 'rosbag2_py',
-          'ruamel', 'serial', 'tqdm')
-
-BLOCK = """
-import json, sys
-
-class Blocker:
-    def find_spec(self, name, path=None, target=None):
-        if name.partition('.')[0] in blocked:
-            raise ModuleNotFoundError(f'No module named {name!r}', name=name)
-
-blocked = set(json.loads(sys.argv.pop(1)))
-sys.meta_path.insert(0, Blocker())
-"""
+from processes import REPO
+from without_extras import extras, run_without_extras
 
 IMPORT_ALL = """
 from importlib import import_module
@@ -54,19 +37,6 @@ for name in modules:
     import_module(name)
 print(json.dumps({'modules': modules, 'blocked': sorted(blocked & set(sys.modules))}))
 """
-
-
-def extras() -> set[str]:
-    """Name the distributions that setup.py lists as extras."""
-    lines = [line for line in requires('adxl_ros') or () if 'extra ==' in line]
-    return {re.match(r'[\w.-]+', line)[0].replace('-', '_') for line in lines}
-
-
-def run_without_extras(code: str, *args: str) -> subprocess.CompletedProcess:
-    """Run `code` in a Python that finds none of the extras."""
-    blocked = json.dumps(sorted(extras().union(OTHERS)))
-    return subprocess.run([sys.executable, '-c', BLOCK + code, blocked, *args], text=True,
-                          capture_output=True, timeout=60)
 
 
 def test_blocking_blocks() -> None:
@@ -98,7 +68,7 @@ for name, given in (('serial', {'port': '/dev/null'}), ('iio', {})):
     except UserError as error:
         print(error)
 """
-    nominal = Path(__file__).resolve().parents[1] / 'params' / 'adxl203.yaml'
+    nominal = REPO / 'params' / 'adxl203.yaml'
     done = run_without_extras(code, str(nominal))
     assert done.returncode == 0, done.stderr
     serial, iio = done.stdout.splitlines()

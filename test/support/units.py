@@ -15,7 +15,6 @@
 """Made units and sweeps that the tests share."""
 
 from dataclasses import replace
-from pathlib import Path
 
 from adxl_ros.calibrate import pose_response
 from adxl_ros.calibrate.fits.paper_regression import EFFECTS
@@ -28,8 +27,9 @@ from adxl_ros.model.kinematics import specific_force
 from adxl_ros.simulate.motion import Motion
 from adxl_ros.simulate.response import Response
 import numpy as np
+from processes import REPO
 
-NOMINAL = Path(__file__).resolve().parents[1] / 'params' / 'adxl203.yaml'
+NOMINAL = REPO / 'params' / 'adxl203.yaml'
 PLANES_RAD = np.radians([30, 60, 90, 120, 150])
 
 

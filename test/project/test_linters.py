@@ -15,14 +15,13 @@
 """Style, types and manifest; ament's own linters where they are installed."""
 
 import importlib.util
-from pathlib import Path
 import re
 import subprocess
 import sys
 
+from processes import REPO
 import pytest
 
-REPO = Path(__file__).resolve().parents[1]
 PYTHON_SOURCES = ('adxl_ros', 'launch', 'test', 'setup.py')
 
 

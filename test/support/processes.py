@@ -1,0 +1,86 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Installed executables as processes of a test, and waiting for what they do."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+import os
+from pathlib import Path
+import signal
+import subprocess
+import time
+
+from ament_index_python.packages import get_package_prefix
+import pytest
+
+REPO = Path(__file__).resolve().parents[2]
+"""The root of the repository."""
+
+
+def wait_until(condition: Callable[[], object], timeout_s: float, what: str) -> None:
+    """Poll `condition` until it holds, and fail with `what` after `timeout_s` seconds."""
+    end = time.monotonic() + timeout_s
+    while not condition():
+        if time.monotonic() > end:
+            pytest.fail(f'{what}: not after {timeout_s} s')
+        time.sleep(0.02)
+
+
+@dataclass(frozen=True)
+class Started:
+    """A process that runs an installed executable, and the file that takes what it prints."""
+
+    name: str
+    popen: subprocess.Popen
+    log: Path
+
+    def output(self) -> str:
+        """Read what it has printed so far, on stdout and stderr."""
+        return self.log.read_text(encoding='utf-8', errors='replace')
+
+    def wait_for(self, text: str, timeout_s: float = 20.0) -> None:
+        """Wait until it has printed `text`; fail when it ends without, or after the time."""
+        def seen() -> bool:
+            ended = self.popen.poll() is not None
+            found = text in self.output()
+            if ended and not found:
+                pytest.fail(f'{self.name} ended with {self.popen.returncode} and without '
+                            f'printing {text!r}:\n{self.output()}')
+            return found
+        wait_until(seen, timeout_s, f'{self.name} printing {text!r}')
+
+    def wait(self, timeout_s: float = 20.0) -> int:
+        """Wait until it ends by itself and return its exit status."""
+        wait_until(lambda: self.popen.poll() is not None, timeout_s, f'{self.name} ending')
+        return self.popen.returncode
+
+    def stop(self) -> int:
+        """End it with its children, kindly first, and return its exit status."""
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
+            if self.popen.poll() is None:
+                os.killpg(self.popen.pid, number)
+                with suppress(subprocess.TimeoutExpired):
+                    self.popen.wait(5.0)
+        with suppress(ProcessLookupError):  # children that outlived it
+            os.killpg(self.popen.pid, signal.SIGKILL)
+        return self.popen.wait()
+
+
+def executable(name: str) -> Path:
+    """Find an installed executable as `ros2 run` does."""
+    return Path(get_package_prefix('adxl_ros')) / 'lib' / 'adxl_ros' / name

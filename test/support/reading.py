@@ -1,0 +1,52 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What reading a recording takes, and how it is refused."""
+
+import os
+from pathlib import Path
+import subprocess
+import sys
+
+from adxl_ros.errors import UserError
+from adxl_ros.files import recording
+import pytest
+
+GROWTH = """
+from resource import getrusage, RUSAGE_SELF
+import sys
+from adxl_ros.files import recording
+peaks_kb = []
+for block in recording.blocks(sys.argv[1], 5000):
+    peaks_kb.append(getrusage(RUSAGE_SELF).ru_maxrss)
+print(peaks_kb[-1] - peaks_kb[len(peaks_kb) // 4])
+"""
+
+
+def refusal(path: Path) -> str:
+    """Return what the user is told, which is one line and begins with the file."""
+    with pytest.raises(UserError) as raised:
+        recording.read(path)
+    text = str(raised.value)
+    assert text.startswith(str(path))
+    assert '\n' not in text
+    return text.removeprefix(str(path))
+
+
+def growth_mb(path: Path) -> float:
+    """Return by how much memory grows while all but the first blocks of a recording are read."""
+    done = subprocess.run([sys.executable, '-c', GROWTH, path], text=True, check=True,
+                          capture_output=True, env={**os.environ,
+                                                    'PYTHONPATH': os.pathsep.join(sys.path)})
+    return float(done.stdout) / 1024

@@ -1,0 +1,46 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Recording and journal of one sweep number the settings of its joints alike."""
+
+from adxl_ros.calibrate import pose_extraction
+import numpy as np
+
+
+def same_partition(some, others):
+    """Tell whether two lists of numbers put the same poses together."""
+    pairs = set(zip(some, others))
+    return len(pairs) == len(set(some)) == len(set(others))
+
+
+def by_rests(read, unit, entries):
+    """Find the rests without a journal; return the settings of those of a journal's poses."""
+    poses = pose_extraction.poses_of(read, unit)
+    begin, end = (read.epoch_ns + np.rint(poses.time_s * 1e9).astype(np.int64)).T
+    middle = [(e['start_ns'] + e['stop_ns']) // 2 for e in entries]
+    rest = [int(np.flatnonzero((begin <= m) & (m <= end))[0]) for m in middle]
+    return poses.alpha_setting[rest], poses.beta_setting[rest]
+
+
+def check_all_agree(read, unit, entries):
+    """Assert that a recording numbers the settings as its journal does."""
+    alpha, beta = (np.array([e[f'{joint}_setting'] for e in entries])
+                   for joint in ('alpha', 'beta'))
+    by_journal = pose_extraction.poses_of(read, unit, entries)
+    assert (by_journal.alpha_setting == alpha).all() and (by_journal.beta_setting == beta).all()
+    bare = [{k: v for k, v in e.items() if not k.endswith('_setting')} for e in entries]
+    named = pose_extraction.poses_of(read, unit, bare)
+    for found in ((named.alpha_setting, named.beta_setting), by_rests(read, unit, entries)):
+        assert same_partition(found[0].tolist(), alpha.tolist())
+        assert same_partition(found[1].tolist(), beta.tolist())

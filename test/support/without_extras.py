@@ -1,0 +1,50 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""A Python that finds none of the extras: importing them fails as where they are not installed."""
+
+from importlib.metadata import requires
+import json
+import re
+import subprocess
+import sys
+
+# Imported under other names than they are installed by, or not asked for by setup.py.
+OTHERS = ('PIL', 'arch', 'cobs', 'iio', 'jinja2', 'mcap', 'numba', 'pandas', 'rosbag2_py',
+          'ruamel', 'serial', 'tqdm')
+
+BLOCK = """
+import json, sys
+
+class Blocker:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition('.')[0] in blocked:
+            raise ModuleNotFoundError(f'No module named {name!r}', name=name)
+
+blocked = set(json.loads(sys.argv.pop(1)))
+sys.meta_path.insert(0, Blocker())
+"""
+
+
+def extras() -> set[str]:
+    """Name the distributions that setup.py lists as extras."""
+    lines = [line for line in requires('adxl_ros') or () if 'extra ==' in line]
+    return {re.match(r'[\w.-]+', line)[0].replace('-', '_') for line in lines}
+
+
+def run_without_extras(code: str, *args: str) -> subprocess.CompletedProcess:
+    """Run `code` in a Python that finds none of the extras."""
+    blocked = json.dumps(sorted(extras().union(OTHERS)))
+    return subprocess.run([sys.executable, '-c', BLOCK + code, blocked, *args], text=True,
+                          capture_output=True, timeout=60)
