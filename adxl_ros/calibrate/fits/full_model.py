@@ -42,14 +42,15 @@ from dataclasses import dataclass, replace
 
 from adxl_ros.calibrate import pose_response
 from adxl_ros.calibrate.fits import d_optimal, linear
-from adxl_ros.calibrate.fits.linearised import linearised
+from adxl_ros.calibrate.fits.linearised import Linearised, linearised
 from adxl_ros.calibrate.pose_response import response
 from adxl_ros.calibrate.poses import Poses
-from adxl_ros.calibrate.stage_error import AngleErrors, StageError
+from adxl_ros.calibrate.stage_error import AngleErrors, PoseCovariance, StageError
 from adxl_ros.errors import UserError
 from adxl_ros.model.coefficients import get, names_of, parameter_of, put, with_neutral
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Parameter, Place
+from adxl_ros.model.gauss_newton import gauss_newton, halve_until, Iterate, Solution
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 from scipy.stats import chi2
@@ -73,6 +74,7 @@ _ROUNDS = 16
 _STEPS = 12
 """Gauss-Newton steps to the first solution."""
 _STEPS_A_ROUND = 2
+_HALVINGS = 7
 _SHRINK, _STRAIGHT = 0.2, 0.1
 _CONVERGED = 1e-4
 """A step shorter than this, in standard deviations of each coefficient, is the last."""
@@ -237,7 +239,7 @@ def _fit_from(unit: Sensor, poses: Poses, names: tuple[str, ...], stated: StageE
     """Fit from a start: levels, coefficients and angles in turn, until all of them settle."""
     known, everything = priors(names), np.ones(len(poses), bool)
     kept, stage, at, std_v = everything, stated, poses, poses.std_v
-    unit = _solved(unit, poses, names, stage, kept, _STEPS)
+    unit = put(unit, names, _solved(unit, poses, names, stage, kept, _STEPS).last.values)
     error_rad = AngleErrors(*(np.zeros((len(poses), 2)),) * 2, np.zeros(len(poses)), 0.0)
     converged, deviance = False, np.inf
     for i in range(_ROUNDS):
@@ -326,18 +328,36 @@ def information(unit: Sensor, poses: Poses, names: Sequence[str], stage: StageEr
     return about.solve(about.covariance(stage))[1]
 
 
+@dataclass(frozen=True)
+class _Iterate(Iterate):
+    """An iterate with the linearised poses, their covariance, and the information, (p, p)."""
+
+    about: Linearised
+    covariance: PoseCovariance
+    information: np.ndarray
+
+    @property
+    def step_std(self) -> float:
+        """Return the longest component of the step in its standard deviations."""
+        return float(np.abs(self.step * np.sqrt(np.diag(self.information))).max())
+
+
 def _solved(unit: Sensor, poses: Poses, names: Sequence[str], stage: StageError,
-            kept: np.ndarray, steps: int) -> Sensor:
-    """Gauss-Newton steps to the maximum; the chain is nearly linear in its coefficients."""
+            kept: np.ndarray, steps: int) -> Solution[_Iterate]:
+    """Take Gauss-Newton steps; the chain is nearly linear in its coefficients."""
     sizes = np.array([parameter_of(name).scale for name in names])
-    for _ in range(steps):
-        about = linearised(unit, poses, names, priors(names), kept)
-        step, fisher = about.solve(about.covariance(stage))
+
+    def linearise(values: np.ndarray) -> _Iterate:
+        about = linearised(put(unit, names, values), poses, names, priors(names), kept)
+        covariance = about.covariance(stage)
+        step, information = about.solve(covariance)
         step *= min(1.0, _LONGEST / np.abs(step / sizes).max())
-        unit = put(unit, names, get(unit, names) + step)
-        if np.abs(step * np.sqrt(np.diag(fisher))).max() < _CONVERGED:
-            break
-    return unit
+        return _Iterate(values, step, 0.0, about, covariance, information)
+
+    return gauss_newton(
+        linearise, get(unit, names),
+        lambda _, previous, __: previous is not None and previous.step_std < _CONVERGED,
+        steps + 1)
 
 
 def _stepped(unit: Sensor, poses: Poses, at: Poses, names: Sequence[str], stage: StageError,
@@ -363,12 +383,10 @@ def _stepped(unit: Sensor, poses: Poses, at: Poses, names: Sequence[str], stage:
         deviations.
 
     """
-    solved = _solved(unit, at, names, stage, kept, _STEPS_A_ROUND)
-    about = linearised(solved, at, names, priors(names), kept)
-    covariance = about.covariance(stage)
-    errors = covariance.predicted(about.residual)
-    start, end = get(unit, names), get(solved, names)
-    known = priors(names)
+    solved = _solved(unit, at, names, stage, kept, _STEPS_A_ROUND).last
+    covariance, known = solved.covariance, priors(names)
+    errors = covariance.predicted(solved.about.residual)
+    start, end = get(unit, names), solved.values
 
     def between(share: float) -> tuple[np.ndarray, AngleErrors]:
         return start + share * (end - start), before.towards(errors, share)
@@ -378,13 +396,9 @@ def _stepped(unit: Sensor, poses: Poses, at: Poses, names: Sequence[str], stage:
         return float(np.sum((left / at.std_v)[kept] ** 2) + np.sum(known * values ** 2)
                      + covariance.penalty(angles))
 
-    worst = cost(start, before)
-    for share in 0.5 ** np.arange(8):
-        values, angles = between(share)
-        if cost(values, angles) <= worst:
-            break
-    fisher = about.solve(covariance)[1]
-    length = np.abs((values - start) * np.sqrt(np.diag(fisher))).max()
+    highest = cost(start, before)
+    (values, angles), _, _ = halve_until(between, lambda trial: cost(*trial) <= highest, _HALVINGS)
+    length = np.abs((values - start) * np.sqrt(np.diag(solved.information))).max()
     return put(unit, names, values), angles, float(length)
 
 

@@ -26,9 +26,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from adxl_ros.calibrate.fits.gravity_model import (
-    gauss_newton,
     in_units,
     information_of,
+    iterated,
     jacobian_of,
     magnitude,
     magnitude_variance,
@@ -50,8 +50,12 @@ MIN_RESTS = len(NAMES) + 1
 """One rest more than coefficients: with fewer, nothing says how good the fit is."""
 OUTLIER_CHANCE = 0.01
 """Chance that a fit without knocks takes any of its rests for one."""
-STARTS, STEPS = 20, 15
-"""Fits to ten rests each, that one of them may be without knocks, and steps of each."""
+STARTS = 20
+"""Fits to ten rests each, that one of them may be without knocks."""
+FIRST_STEPS = 4
+"""Gauss-Newton steps with the ten rests of a start."""
+STEPS = 11
+"""Gauss-Newton steps with the rests that fit best."""
 KNOCK = 0.03
 """Width of what a knock can make of a magnitude, g."""
 OUTLIERS = 0.25
@@ -244,15 +248,17 @@ def _robust_inliers(rests: Rests, start: np.ndarray, most: int) -> np.ndarray:
     """
     count = len(rests.mean)
     draw = np.random.default_rng(0)
+
+    def nearest(values: np.ndarray) -> Rests:
+        squares = (magnitude(rests.mean, values) - rests.gravity) ** 2
+        return rests[np.argsort(squares)[:count - most]]
+
     best, least = start, np.inf
     for _ in range(STARTS):
-        found, suited = start, draw.choice(count, MIN_RESTS, replace=False)
-        for step in range(STEPS):
-            found = gauss_newton(rests[suited], found)
-            squares = (magnitude(rests.mean, found) - rests.gravity) ** 2
-            if step > 2:
-                suited = np.argsort(squares)[:count - most]
-        left = np.sort(squares)[:count - most].sum()
+        few = rests[draw.choice(count, MIN_RESTS, replace=False)]
+        found = iterated(few, start, FIRST_STEPS)
+        found = iterated(nearest, found, STEPS)
+        left = np.sum((magnitude(nearest(found).mean, found) - rests.gravity) ** 2)
         if left < least:
             best, least = found, left
     freedom = max(count - most - len(NAMES), 1)

@@ -16,9 +16,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from adxl_ros.model.constants import AXES, G0_MPS2
+from adxl_ros.model.gauss_newton import gauss_newton, Iterate
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
@@ -31,6 +33,10 @@ DETERMINED = 0.01
 """A coefficient counts as determined below this: 10 mg, 1 %, 0.6°, what datasheets promise."""
 ROUNDING = 1e-9
 """Error of a mean without noise, g."""
+_LARGEST = 0.5
+"""Largest departure from nominal in a step, in g, of the scale factor and in rad."""
+_SHORTEST_STEP = 1e-12
+"""A step with no larger component is not taken, in g, of the scale factor and in rad."""
 TRIAL = 1e-4
 """Excess of a rest's magnitude, g, to begin with."""
 
@@ -120,13 +126,40 @@ def magnitude_variance(rests: Rests, found: np.ndarray) -> np.ndarray:
     return (by_output ** 2 * rests.variance).sum(axis=1)
 
 
-def gauss_newton(rests: Rests, found: np.ndarray) -> np.ndarray:
-    """Take one step of a fit that the prior holds where the rests do not."""
-    rows = jacobian_of(rests.mean, found)
-    weight = 1 / (magnitude_variance(rests, found).mean() + TRIAL ** 2)
-    slope = weight * rows.T @ (magnitude(rests.mean, found) - rests.gravity) + found / PRIOR ** 2
-    information = weight * rows.T @ rows + np.eye(len(NAMES)) / PRIOR ** 2
-    return np.clip(found - np.linalg.solve(information, slope), -0.5, 0.5)
+def iterated(rests: Rests | Callable[[np.ndarray], Rests], start: np.ndarray, steps: int
+             ) -> np.ndarray:
+    """
+    Take Gauss-Newton steps of a fit that the prior holds where the rests do not.
+
+    Parameters
+    ----------
+    rests
+        The rests to fit, or a function that selects them by the parameters.
+    start
+        First values of the nine parameters, (9,).
+    steps
+        Largest count of steps.
+
+    Returns
+    -------
+    np.ndarray
+        The nine parameters, (9,).
+
+    """
+    def linearise(values: np.ndarray) -> Iterate:
+        values = np.clip(values, -_LARGEST, _LARGEST)
+        part = rests if isinstance(rests, Rests) else rests(values)
+        rows = jacobian_of(part.mean, values)
+        weight = 1 / (magnitude_variance(part, values).mean() + TRIAL ** 2)
+        gradient = (weight * rows.T @ (magnitude(part.mean, values) - part.gravity)
+                    + values / PRIOR ** 2)
+        information = weight * rows.T @ rows + np.eye(len(NAMES)) / PRIOR ** 2
+        return Iterate(values, -np.linalg.solve(information, gradient), 0.0)
+
+    return gauss_newton(
+        linearise, start,
+        lambda _, __, present: bool(np.abs(present.step).max() < _SHORTEST_STEP),
+        steps + 1).last.values
 
 
 def information_of(rests: Rests, found: np.ndarray, excess: float) -> np.ndarray:

@@ -25,9 +25,9 @@ from adxl_ros.calibrate.fits import orientations
 from adxl_ros.calibrate.fits.gravity_fit import MIN_RESTS
 from adxl_ros.calibrate.fits.gravity_model import (
     force_of,
-    gauss_newton,
     in_units,
     information_of,
+    iterated,
     NAMES,
     PRIOR,
     rests_of,
@@ -224,8 +224,8 @@ class Tumble:
         rests = rests_of(mean, np.array([e['std_v'] for e in entries]).reshape(-1, 3),
                          self.sensor)
         self._found = np.zeros(len(NAMES))
-        for _ in range(_STEPS if len(mean) else 0):
-            self._found = gauss_newton(rests, self._found)
+        if len(mean):
+            self._found = iterated(rests, self._found, _STEPS)
         information = information_of(rests, self._found, TRIAL ** 2)
         values, to_units = in_units(self._found, self.sensor)
         self.names, self.values, self.prior = NAMES, self._found * to_units, PRIOR * to_units

@@ -1,0 +1,96 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Gauss-Newton: certified results of NIST, honest about convergence, halves steps that lose."""
+
+from collections.abc import Callable
+
+from adxl_ros.model.gauss_newton import gauss_newton, halve_until, Iterate, Solution
+import numpy as np
+import pytest
+
+# NIST Statistical Reference Datasets, Misra1a: y = b1·(1 − exp(−b2·x)), lower difficulty.
+MISRA_X = np.array([77.6, 114.9, 141.1, 190.8, 239.9, 289.0, 332.8, 378.4, 434.8, 477.3, 536.8,
+                    593.1, 689.1, 760.0])
+MISRA_Y = np.array([10.07, 14.73, 17.94, 23.93, 29.61, 35.18, 40.02, 44.82, 50.76, 55.05, 61.01,
+                    66.40, 75.47, 81.78])
+MISRA_CERTIFIED = (2.3894212918e2, 5.5015643181e-4)
+MISRA_STARTS = ([500.0, 1e-4], [250.0, 5e-4])
+
+
+def misra(values: np.ndarray) -> Iterate:
+    decay = np.exp(-values[1] * MISRA_X)
+    residual = MISRA_Y - values[0] * (1 - decay)
+    jacobian = np.column_stack([1 - decay, values[0] * MISRA_X * decay])
+    step = np.linalg.lstsq(jacobian, residual, rcond=None)[0]
+    return Iterate(values, step, float(np.sum(residual ** 2)))
+
+
+def is_short(_: Iterate, __: Iterate | None, present: Iterate) -> bool:
+    return bool(np.all(np.abs(present.step) <= 1e-10 * np.abs(present.values)))
+
+
+def solve(linearise: Callable[[np.ndarray], Iterate], start: list[float], evaluations: int,
+          halvings: int = 0) -> Solution[Iterate]:
+    return gauss_newton(linearise, np.array(start), is_short, evaluations, halvings)
+
+
+@pytest.mark.parametrize('start', MISRA_STARTS)
+def test_certified_values(start):
+    solution = solve(misra, start, 50, 8)
+    assert solution.converged
+    np.testing.assert_allclose(solution.last.values, MISRA_CERTIFIED, rtol=1e-9)
+    assert solution.last.cost == pytest.approx(1.2455138894e-1, rel=1e-9)
+
+
+def test_too_few_evaluations_are_reported():
+    solution = solve(misra, MISRA_STARTS[0], 3, 8)
+    assert not solution.converged and solution.evaluations <= 3
+
+
+def test_evaluations_include_those_of_halved_steps():
+    calls = []
+
+    def counted(values: np.ndarray) -> Iterate:
+        calls.append(values)
+        return misra(values)
+
+    solution = solve(counted, MISRA_STARTS[0], 50, 8)
+    assert solution.evaluations == len(calls)
+
+
+def arctangent(values: np.ndarray) -> Iterate:
+    """Find the root of arctan; the full step diverges from |x| > 1.39."""
+    x = values[0]
+    return Iterate(values, np.array([-np.arctan(x) * (1 + x * x)]), float(np.arctan(x) ** 2))
+
+
+def test_halving_makes_a_diverging_iteration_converge():
+    assert not solve(arctangent, [3.0], 8).converged
+    solution = solve(arctangent, [3.0], 50, 8)
+    assert solution.converged and abs(solution.last.values[0]) < 1e-9
+
+
+def test_no_share_of_a_step_that_lowers_the_cost_is_reported():
+    def uphill(values: np.ndarray) -> Iterate:
+        return Iterate(values, np.ones(1), float(values[0]))
+
+    solution = solve(uphill, [1.0], 50, 3)
+    assert not solution.converged and solution.evaluations == 5
+    assert solution.last.values == [1.0]
+
+
+def test_halve_until_returns_the_first_accepted_share():
+    assert halve_until(lambda share: share, lambda share: share < 0.3, 5) == (0.25, True, 3)
+    assert halve_until(lambda share: share, lambda share: False, 2) == (0.25, False, 3)
