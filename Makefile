@@ -1,6 +1,8 @@
 # make build    ROS 2 Jazzy (the sourced one, else its wheels in .venv) and the package in install/
 # make demo     the main job on a simulated sensor: a table, and plots in demo_output/
-# make test     every test         (make test ARGS='-k fit')
+# make check    linters, types and unit tests: what a change needs, in two minutes
+# make test     every test, in ten minutes        (make test ARGS='-k fit')
+# make perf     limits of processor time, for a quiet machine
 # make bench    rate, missing samples, latency and CPU of the live nodes
 # make gallery  docs/effects.md and its plots, from the library of effects
 # make coverage do the intervals hold? 300 drawn units and stages, as a table
@@ -12,7 +14,7 @@
 # make lint     the linters alone
 # make clean    remove what these made
 
-.PHONY: build demo test bench gallery reproduction coverage long faults soak fuzz blind lint clean \
+.PHONY: build demo check test perf bench gallery reproduction coverage long faults soak fuzz blind lint clean \
     FORCE
 .DEFAULT_GOAL := build
 
@@ -88,11 +90,19 @@ demo: build
 	./run demo -o demo_output $(if $(real),--real $(real))
 
 # In test/, so that Python imports the installed package and not the sources beside it.
+pytest = cd test && OPENBLAS_NUM_THREADS=1 ../run --exec python -m pytest -q
+
+check: build
+	$(pytest) -n 2 --dist loadgroup -m 'not (live or long or perf)' $(ARGS)
+
 test: build
-	cd test && OPENBLAS_NUM_THREADS=1 ../run --exec python -m pytest -n 2 --dist loadgroup $(ARGS)
+	$(pytest) -n 2 --dist loadgroup -m 'not perf' $(ARGS)
+
+perf: build
+	$(pytest) -m perf $(ARGS)
 
 lint: build
-	cd test && ../run --exec python -m pytest -q project/test_linters.py project/test_layering.py
+	$(pytest) project/test_linters.py project/test_layering.py
 
 bench: build
 	./run bench --iiod test/support/iiod.py $(ARGS)

@@ -21,6 +21,7 @@ loopback interface in a domain that no other run of these tests and no other gra
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator
 import os
 from pathlib import Path
@@ -39,7 +40,6 @@ settings.load_profile('same')
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    config.addinivalue_line('markers', 'kills: kills processes, which therefore talk by UDP')
     # A run that is told to end stops the processes it has started, as after Ctrl-C.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     # A shell's background job ignores Ctrl-C, and so would the processes of the tests.
@@ -48,10 +48,22 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Keep in one worker what a module makes once; first, for xdist reads the groups here, too."""
+    """Mark tests of a graph; keep what a module makes once in one worker, which xdist reads."""
     for item in items:
-        if {'original', 'found', 'reported'} & set(getattr(item, 'fixturenames', ())):
+        fixtures = set(getattr(item, 'fixturenames', ()))
+        if 'ros_env' in fixtures:
+            item.add_marker(pytest.mark.live)
+        if {'original', 'found', 'reported'} & fixtures:
             item.add_marker(pytest.mark.xdist_group(item.path.stem))
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """End with one line: how many tests were skipped, and what is missing."""
+    reasons = Counter(report.longrepr[2].removeprefix('Skipped: ')
+                      for report in terminalreporter.stats.get('skipped', ()))
+    if reasons:
+        terminalreporter.write_line(f'skipped {reasons.total()} tests: ' + '; '.join(
+            f'{count} × {reason}' for reason, count in reasons.most_common()))
 
 
 @pytest.fixture(autouse=True)

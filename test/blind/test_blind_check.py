@@ -433,7 +433,8 @@ def said(recording, parameters):
 
 
 def test_on_a_cluster(original, known_nothing, tmp_path):
-    distributed = pytest.importorskip('distributed')
+    distributed = pytest.importorskip(
+        'distributed', reason='distributed is not installed: pip install distributed')
     folder = copied(original, known_nothing, tmp_path)
     with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None,
                                   local_directory=str(tmp_path)) as cluster, \

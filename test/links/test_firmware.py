@@ -34,7 +34,7 @@ class Counts(ctypes.Structure):
 def library(tmp_path_factory):
     compiler = shutil.which('cc') or shutil.which('gcc') or shutil.which('clang')
     if compiler is None:
-        pytest.skip('no C compiler')
+        pytest.skip('no C compiler: apt install gcc')
     made = tmp_path_factory.mktemp('firmware') / 'frame.so'
     subprocess.run([compiler, '-std=c99', '-Wall', '-Wextra', '-Werror', '-pedantic', '-shared',
                     '-fPIC', '-o', made, SOURCE], check=True)

@@ -66,7 +66,7 @@ def _sweep(start, truth, bare, *more):
 
 def test_a_sweep_ends_with_a_file_and_fit_agrees_on_its_bag(start, run_tool, tmp_path):
     """The live sweep and `fit` on its bag, with its journal, give the same coefficients."""
-    rosbags = pytest.importorskip('bags', reason='rosbags is not installed')
+    rosbags = pytest.importorskip('bags', reason='rosbags is not installed: pip install rosbags')
     truth, bare = _files(tmp_path)
     kinds = {'/imu/data_raw': Imu, '/stage/joint_states': JointState,
              '/sensor_info': DiagnosticStatus, '/stage/command': JointState}

@@ -198,7 +198,7 @@ def test_a_full_disk_for_the_log_stops_nothing(start, ros_env, tmp_path, monkeyp
     folder.mkdir()
     mount = ['mount', '-t', 'tmpfs', '-o', 'size=4k', 'tmpfs', folder]
     if os.getuid() or subprocess.run(mount, capture_output=True).returncode:
-        pytest.skip('cannot mount a small file system')
+        pytest.skip('cannot mount a small file system: run the tests as the superuser')
     try:
         (folder / 'fill').write_bytes(b'x' * 4096)
         ros_env['ROS_LOG_DIR'] = str(folder)

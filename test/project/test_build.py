@@ -75,7 +75,7 @@ def test_run_passes_arguments_and_status(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize('name', LAUNCH_FILES)
 def test_launch_file_loads(name: str) -> None:
-    pytest.importorskip('launch_ros', reason='launch_ros is not installed')
+    pytest.importorskip('launch_ros', reason='launch_ros is not installed: source a ROS 2 Jazzy')
     from launch import LaunchContext
     from launch.launch_description_sources import PythonLaunchDescriptionSource
     path = Path(get_package_share_directory('adxl_ros')) / 'launch' / name

@@ -28,7 +28,8 @@ ROS = {'builtin_interfaces', 'diagnostic_msgs', 'geometry_msgs', 'rcl_interfaces
 
 
 def test_contracts(capsys: pytest.CaptureFixture) -> None:
-    cli = pytest.importorskip('importlinter.cli', reason='import-linter is not installed')
+    cli = pytest.importorskip(
+        'importlinter.cli', reason='import-linter is not installed: pip install import-linter')
     status = cli.lint_imports(config_filename=str(REPO / 'pyproject.toml'), no_cache=True)
     assert status == 0, capsys.readouterr().out
 

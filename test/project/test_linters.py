@@ -29,7 +29,8 @@ def run_module(name: str, *args: str) -> None:
     """Run `python -m name` over the sources; show what it found."""
     package = name.partition('.')[0]
     if importlib.util.find_spec(package) is None:
-        pytest.skip(f'{package} is not installed')
+        pytest.skip(f'{package} is not installed: pip install -r requirements/test.txt, or '
+                    '-r requirements/ros.txt')
     done = subprocess.run([sys.executable, '-m', name, *args], cwd=REPO, text=True,
                           stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
     assert done.returncode == 0, f'{name}:\n{done.stdout}'

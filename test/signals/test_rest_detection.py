@@ -415,6 +415,7 @@ def test_a_rest_without_samples_is_refused():
         rest_means(np.arange(100) / 100, np.zeros((100, 3)), [Rest(900, 1000, 9.0, 10.0)], 100.0)
 
 
+@pytest.mark.perf
 def test_speed():
     """Three million samples of three axes in two seconds."""
     rng = np.random.default_rng(22)

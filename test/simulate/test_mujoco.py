@@ -28,7 +28,7 @@ SCRIPT = REPO / 'docs' / 'examples' / 'mujoco_arm.py'
 
 def test_mujoco_s_accelerometer_agrees_to_a_tenth_of_a_mg(run_tool, tmp_path):
     """A swinging arm: MuJoCo's specific force and our stage with a lever arm, noise off."""
-    pytest.importorskip('mujoco', reason='mujoco is not installed')
+    pytest.importorskip('mujoco', reason='mujoco is not installed: pip install mujoco')
     ideal, joints = tmp_path / 'ideal.csv', tmp_path / 'joints.csv'
     subprocess.run([sys.executable, str(SCRIPT), str(ideal), str(joints)], check=True)
     parameter_file.save(tmp_path / 'exact.yaml', nominal(

@@ -74,6 +74,7 @@ def test_joints_have_their_own_derivatives(name):
             assert np.abs(joint(np.array([0.0, motion.duration_s]), 1)).max() < 1e-9
 
 
+@pytest.mark.perf
 def test_ten_minutes_of_everything_take_seconds():
     """10 min at 1 kHz, three axes, all effects: at most 3 s of processor time (the aim)."""
     sensor, motion = with_all(nominal('xyz')), rich(np.random.default_rng(0))

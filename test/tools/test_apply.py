@@ -255,7 +255,7 @@ def test_many_blocks_are_as_one(run_tool: RunTool, tmp_path: Path) -> None:
 
 
 def test_bag_gives_the_same(run_tool: RunTool, tmp_path: Path) -> None:
-    pytest.importorskip('rosbags', reason='rosbags is not installed')
+    pytest.importorskip('rosbags', reason='rosbags is not installed: pip install rosbags')
     sensor = unit()
     path = record(tmp_path, sensor, felt(sensor))
     from_csv, _ = applied(run_tool, path)

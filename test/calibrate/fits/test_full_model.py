@@ -278,6 +278,7 @@ def test_recordings_that_contradict_each_other_are_refused(change, words):
         calibration.calibrate(nominal(), parts, 'full', ['a.csv', 'b.csv', 'c.csv'])
 
 
+@pytest.mark.perf
 def test_six_hundred_poses_of_three_axes_take_two_seconds():
     """With errors of the stage and the comparison of terms."""
     sensor, _, poses = swept_unit(2, 'xyz', planes_rad=np.radians(np.linspace(0, 180, 23)))

@@ -348,6 +348,7 @@ def test_too_few_rests_are_said_in_one_line(run_tool, shared_dir):
     assert done.stderr.startswith('fit: gravity: ') and done.stderr.count('\n') == 1
 
 
+@pytest.mark.perf
 def test_speed():
     rng = np.random.default_rng(11)
     sensor, _ = unit(rng)

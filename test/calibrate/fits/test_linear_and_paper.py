@@ -118,6 +118,7 @@ def test_physical_is_exact_without_noise():
     assert np.abs(errors.accel_mps2).max() < 0.3e-3 * 9.8
 
 
+@pytest.mark.perf
 def test_physical_takes_less_than_a_second():
     """The fit with its uncertainties is quick."""
     rng = np.random.default_rng(1)

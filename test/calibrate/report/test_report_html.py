@@ -28,13 +28,14 @@ from units import NOMINAL
 
 CHROMIUM = next(filter(None, map(shutil.which, (
     'chromium', 'chromium-browser', 'google-chrome'))), None)
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason='no Chromium to open pages with')
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason='no Chromium: apt install chromium')
 
 
 @pytest.fixture(scope='module')
 def browser():
     """Give a headless Chromium."""
-    driver = pytest.importorskip('playwright.sync_api', reason='playwright is not installed')
+    driver = pytest.importorskip(
+        'playwright.sync_api', reason='playwright is not installed: pip install playwright')
     with driver.sync_playwright() as playwright:
         launched = playwright.chromium.launch(executable_path=CHROMIUM, args=['--no-sandbox'])
         yield launched
