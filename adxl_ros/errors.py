@@ -22,3 +22,8 @@ class UserError(Exception):
     The line names the file, line and column or the topic, the figure that is wrong, and what to
     do. Tools print it and exit with status 1; nodes log it and show it in diagnostics.
     """
+
+
+def one_line(error: BaseException) -> str:
+    """Return the text of an error in one line."""
+    return ' '.join(str(error).split())

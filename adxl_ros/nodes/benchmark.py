@@ -34,7 +34,7 @@ from adxl_ros.files.recorded_unit import recorded_unit
 from adxl_ros.files.recording_columns import Recording, sensor_info
 from adxl_ros.links.support import wire_format
 from adxl_ros.nodes.demo import end
-from adxl_ros.nodes.support.node_support import nominal_path
+from adxl_ros.nodes.support.sensor_parameters import nominal_path
 from adxl_ros.simulate.simulator import simulate
 from adxl_ros.simulate.trajectories import sweep
 import numpy as np

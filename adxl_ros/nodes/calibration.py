@@ -27,11 +27,16 @@ from adxl_ros.calibrate.guided.stage_guide import MountingError, Sweep
 from adxl_ros.errors import UserError
 from adxl_ros.files.recorded_unit import unit_of
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.nodes.support import next_pose, node_support
+from adxl_ros.nodes.support import next_pose
 from adxl_ros.nodes.support.calibration_console import Console, IDLE
 from adxl_ros.nodes.support.calibration_parameters import declare_plan
+from adxl_ros.nodes.support.diagnostics import DiagnosticsReporter, Level, Status
 from adxl_ros.nodes.support.imu_subscription import Samples
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from adxl_ros.nodes.support.parameters import declare
+from adxl_ros.nodes.support.run_node import run
+from adxl_ros.nodes.support.sensor_parameters import declare_sensor, make_sensor
+from adxl_ros.nodes.support.topics import create_subscription
+from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
@@ -49,10 +54,10 @@ class Calibration(Node):
 
     def __init__(self) -> None:
         super().__init__('calibration')
-        self.base = node_support.make_sensor(node_support.declare_sensor(self))
-        self.autostart = node_support.declare(self, 'autostart', False,
+        self.base = make_sensor(declare_sensor(self))
+        self.autostart = declare(self, 'autostart', False,
                                               'start without a call of ~/start')
-        self.resume = node_support.declare(
+        self.resume = declare(
             self, 'resume', 'ask', 'go on with an interrupted calibration; ask where there is a '
             'screen, else go on', choices=('ask', 'continue', 'anew'))
         self.asked = declare_plan(self)
@@ -70,12 +75,12 @@ class Calibration(Node):
         self._samples = Samples(self)
         self._announcer = next_pose.Announcer(self)
         self._connect()
-        self.console = Console(self) if node_support.declare(
+        self.console = Console(self) if declare(
             self, 'screen', True, 'show a screen, where the node runs in a terminal') else None
 
     def _connect(self) -> None:
-        self._diagnostics = node_support.publisher(self, DiagnosticArray, '/diagnostics', 10)
-        subscribe = node_support.subscription
+        self._diagnostics = DiagnosticsReporter(self, {'calibration': self._status})
+        subscribe = create_subscription
         subscribe(self, DiagnosticStatus, 'sensor_info', self._on_info, 1, latched=True)
         subscribe(self, JointState, 'stage/joint_states', self._on_stage, 1000)
         subscribe(self, JointState, 'stage/command', self._on_command, 100)
@@ -89,7 +94,6 @@ class Calibration(Node):
         self.create_service(Trigger, '~/capture', self._on_capture,
                             callback_group=ReentrantCallbackGroup())
         self.create_timer(_POLL_S, self._poll, clock=self._steady)
-        self.create_timer(1.0, self._report_state, clock=self._steady)
 
     def _service(self, name: str) -> Callable[..., Trigger.Response]:
         def answer(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
@@ -287,6 +291,7 @@ class Calibration(Node):
                     self._finish()
             else:
                 self._announcer.announce(self.session.walk, self._steady.now().nanoseconds)
+        self._diagnostics.notice('calibration', Level.WARN if self.state()[2] else Level.OK)
         if self.console is not None:
             self.console.turn()
 
@@ -411,7 +416,7 @@ class Calibration(Node):
         state = self.session.walk.state()
         return state.phase, state.text, state.late
 
-    def _report_state(self) -> None:
+    def _status(self) -> Status:
         phase, text, late = self.state()
         if late:
             self._warn_once(phase, text)
@@ -426,8 +431,7 @@ class Calibration(Node):
             if np.isfinite(tilt_rad):
                 values['tilt_error_deg'] = float(np.degrees(tilt_rad))
         serial = self.unit.serial if self.unit else ''
-        self._diagnostics.publish(node_support.diagnostics(self, node_support.status(
-            node_support.WARN if late else node_support.OK, 'calibration', text, serial, values)))
+        return Status(Level.WARN if late else Level.OK, text, serial, values)
 
     def _warn_once(self, phase: str, text: str) -> None:
         """Log what holds the calibration up once a pose and phase, not once a second."""
@@ -458,4 +462,4 @@ def main() -> int:
     # Through shared memory, Fast DDS does not reach a process again that was killed and started
     # anew (eProsima/Fast-DDS issues 2811, 5053 and 5469): an interrupted sweep could not go on.
     os.environ.setdefault('FASTDDS_BUILTIN_TRANSPORTS', 'UDPv4')
-    return node_support.main(Calibration, __doc__)
+    return run(Calibration, __doc__)

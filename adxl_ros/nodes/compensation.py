@@ -32,10 +32,13 @@ from adxl_ros.model import noise, signal_chain
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.model.tilt import UNOBSERVABLE_RAD2
-from adxl_ros.nodes.support import node_support
-from adxl_ros.nodes.support.receive_thread import Loop, Received
-from adxl_ros.nodes.support.sensor_parameters import LiveSensor
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from adxl_ros.nodes.support.diagnostics import DiagnosticsReporter, Level, Status
+from adxl_ros.nodes.support.exchangeable_sensor import ExchangeableSensor
+from adxl_ros.nodes.support.parameters import declare
+from adxl_ros.nodes.support.receive_thread import ReceiveTurn, RepeatingThread
+from adxl_ros.nodes.support.run_node import run
+from adxl_ros.nodes.support.topics import create_publisher, create_subscription
+from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import Vector3Stamped
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
@@ -84,29 +87,28 @@ class Compensation(Node):
         self._around: dict[str, float] = {}
         self._known: dict[str, float] = {}
         self._heard_ns: dict[str, int] = {}
-        self._paper = node_support.declare(
+        self._paper = declare(
             self, 'inverse', 'exact', "of the model: exact, or the paper's approximation",
             choices=('exact', 'paper')) == 'paper'
-        self._undo_filter = node_support.declare(
+        self._undo_filter = declare(
             self, 'undo_filter', False, 'take the RC filter out, amplitude and phase; a sample '
             f'is published {filter_inversion.HALF} samples late, with its own stamp')
-        self._store = node_support.declare(
+        self._store = declare(
             self, 'store', str(calibration_store.default_folder()),
             'folder of calibrations, of which the newest of the unit is taken where none is '
             'named; empty: none')
-        LiveSensor(self, self._check_unit, self._use)
-        self._data = node_support.publisher(self, Imu, 'imu/data', _DEPTH)
-        self._tilt = node_support.publisher(self, Vector3Stamped, 'tilt', _DEPTH)
-        self._diagnostics = node_support.publisher(self, DiagnosticArray, '/diagnostics', 10)
-        node_support.subscription(self, DiagnosticStatus, 'sensor_info', self._on_info, 1,
+        ExchangeableSensor(self, self._check_unit, self._use)
+        self._data = create_publisher(self, Imu, 'imu/data', _DEPTH)
+        self._tilt = create_publisher(self, Vector3Stamped, 'tilt', _DEPTH)
+        create_subscription(self, DiagnosticStatus, 'sensor_info', self._on_info, 1,
                                   latched=True)
-        node_support.subscription(self, Temperature, 'temperature', self._on_temperature, 1)
-        node_support.subscription(self, BatteryState, 'supply', self._on_supply, 1)
+        create_subscription(self, Temperature, 'temperature', self._on_temperature, 1)
+        create_subscription(self, BatteryState, 'supply', self._on_supply, 1)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._reported_ns = self._steady.now().nanoseconds
-        self.create_timer(1.0, self._report, clock=self._steady)
-        self._loop = Loop(self, Received(self, Imu, 'imu/data_raw', self._on_sample, _DEPTH),
-                          'imu/data_raw')
+        self._diagnostics = DiagnosticsReporter(self, {'compensation': self._status})
+        self._loop = RepeatingThread(
+            self, ReceiveTurn(self, Imu, 'imu/data_raw', self._on_sample, _DEPTH), 'imu/data_raw')
 
     def close(self) -> None:
         """End the thread that receives."""
@@ -270,8 +272,7 @@ class Compensation(Node):
         return (sr * cp, cr * sp, -sr * sp, cr * cp,
                 roll, both, 0.0, both, pitch, 0.0, 0.0, 0.0, _UNKNOWN_RAD2)
 
-    def _report(self) -> None:
-        """Publish diagnostics; once a second."""
+    def _status(self) -> Status:
         now_ns = self._steady.now().nanoseconds
         passed_s, self._reported_ns = (now_ns - self._reported_ns) * 1e-9, now_ns
         counts = self._counts.copy()
@@ -291,8 +292,7 @@ class Compensation(Node):
             'axes': sensor.axes, 'model': sensor.model, 'effects': ', '.join(sensor.effects),
             **self._calibration(new), 'newer': str(newer or ''),
             **{f'provenance.{key}': value for key, value in sensor.provenance.items()}}
-        self._diagnostics.publish(node_support.diagnostics(
-            self, node_support.status(level, 'compensation', text, sensor.serial, values)))
+        return Status(level, text, sensor.serial, values)
 
     def _calibration(self, new: dict[str, int]) -> dict[str, Any]:
         """Say which calibration is active, how old it is and whether it holds here."""
@@ -317,32 +317,32 @@ class Compensation(Node):
         return {'calibration_id': calibration_store.calibration_id(sensor),
                 'age_days': '' if days is None else round(days, 3), 'validity': valid}
 
-    def _state(self, new: dict[str, int], newer: Path | None) -> tuple[bytes, str]:
+    def _state(self, new: dict[str, int], newer: Path | None) -> tuple[Level, str]:
         if self._refusal:
-            return node_support.ERROR, f'publishing nothing: {self._refusal}'
+            return Level.ERROR, f'publishing nothing: {self._refusal}'
         if not new.get('received'):
-            return node_support.WARN, f'no samples on {self.resolve_topic_name("imu/data_raw")}'
+            return Level.WARN, f'no samples on {self.resolve_topic_name("imu/data_raw")}'
         for name, what in (('dropped', 'samples dropped that no force explains'),
                            ('saturated', 'samples with the ADC at its rail')):
             if new.get(name):
-                return node_support.WARN, f'{new[name]} {what}'
+                return Level.WARN, f'{new[name]} {what}'
         if self._info is None:
-            return node_support.WARN, (f'unit not confirmed: nothing on '
+            return Level.WARN, (f'unit not confirmed: nothing on '
                                        f'{self.resolve_topic_name("sensor_info")}')
         lacks = self._lacks()
         if lacks:
-            return node_support.WARN, lacks
+            return Level.WARN, lacks
         if not self._sensor.effects:
-            return node_support.WARN, 'not calibrated: the nominal figures apply'
+            return Level.WARN, 'not calibrated: the nominal figures apply'
         if new.get('outside'):
-            return node_support.WARN, (
+            return Level.WARN, (
                 f'{new["outside"]} samples outside of what was calibrated, their covariance '
                 f'raised: {"; ".join(self._outside)}')
         if newer is not None and not self._named():
-            return node_support.WARN, (
+            return Level.WARN, (
                 f'a newer calibration is in the store: {newer}; set calibration to it, or start '
                 'again')
-        return node_support.OK, 'compensating'
+        return Level.OK, 'compensating'
 
     def _lacks(self) -> str:
         """Name what the calibration follows and nobody says."""
@@ -363,4 +363,4 @@ class Compensation(Node):
 
 def main() -> int:
     """Run the node."""
-    return node_support.main(Compensation, __doc__)
+    return run(Compensation, __doc__)

@@ -38,7 +38,7 @@ from adxl_ros.files import parameter_file, recording, sweep_journal
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.nodes.support.node_support import nominal_path
+from adxl_ros.nodes.support.sensor_parameters import nominal_path
 from adxl_ros.nodes.terminal import steps
 from diagnostic_msgs.msg import DiagnosticArray
 import numpy as np

@@ -25,10 +25,15 @@ from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import sensor_info
 from adxl_ros.links.support import base
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.nodes.support import node_support
+from adxl_ros.nodes.support.diagnostics import DiagnosticsReporter, Level, Status, status_message
 from adxl_ros.nodes.support.driver_publishers import ImuWriter, References, stamp, Tally
-from adxl_ros.nodes.support.receive_thread import Loop, Steadily
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from adxl_ros.nodes.support.parameters import declare
+from adxl_ros.nodes.support.rclpy_internals import NotForExecutors, take_messages
+from adxl_ros.nodes.support.receive_thread import PeriodicTurn, RepeatingThread
+from adxl_ros.nodes.support.run_node import run
+from adxl_ros.nodes.support.sensor_parameters import declare_sensor, make_sensor
+from adxl_ros.nodes.support.topics import create_publisher
+from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
 from rclpy.clock import Clock, ClockType
 from rclpy.impl.rcutils_logger import RcutilsLogger
@@ -47,7 +52,7 @@ _JUMP_NS = 2_000_000_000
 _QUEUE = 5000
 _DEAF_NS = 300_000_000
 """A listener that has just appeared may not hear yet for so long."""
-_LEVELS = {'ok': node_support.OK, 'warn': node_support.WARN, 'error': node_support.ERROR}
+_LEVELS = {'ok': Level.OK, 'warn': Level.WARN, 'error': Level.ERROR}
 
 
 class Driver(LifecycleNode):
@@ -60,19 +65,19 @@ class Driver(LifecycleNode):
 
     def __init__(self) -> None:
         super().__init__('driver')
-        self._given = node_support.make_sensor(node_support.declare_sensor(self))
-        self._frame = node_support.declare(self, 'frame_id', 'imu_link', 'frame of the case')
-        self._offset_ns = round(1e9 * node_support.declare(
+        self._given = make_sensor(declare_sensor(self))
+        self._frame = declare(self, 'frame_id', 'imu_link', 'frame of the case')
+        self._offset_ns = round(1e9 * declare(
             self, 'stamp_offset', 0.0, 'delay of the sensor, such as that of its RC filter, that '
             'is taken out of the stamps: they are earlier by this', 's', -10.0, 10.0))
-        self._type = node_support.declare(self, 'link.type', 'sim', 'where the samples come from',
+        self._type = declare(self, 'link.type', 'sim', 'where the samples come from',
                                           choices=base.names())
         self._module = base.module_of(self._type)
         self._options = {
-            one.name: node_support.declare(self, f'link.{one.name}', one.default, one.doc,
+            one.name: declare(self, f'link.{one.name}', one.default, one.doc,
                                            one.unit, one.lower, one.upper)
             for one in self._module.OPTIONS}
-        autostart = node_support.declare(
+        autostart = declare(
             self, 'autostart', True, 'configure and activate at the start; else a system manager '
             'does')
         self._speed = self._options.get('speed', 1.0)
@@ -85,13 +90,12 @@ class Driver(LifecycleNode):
         self._now_ns: int | None = None
         self._fault = ''
         self._link: base.Link | None = None
-        self._loop: Loop | None = None
+        self._loop: RepeatingThread | None = None
         self._topics: list[Publisher] = []
         self._references: References | None = None
         self._stage: Subscription | None = None
         self._adopt(self._given, known=False)
-        self._diagnostics = node_support.publisher(self, DiagnosticArray, '/diagnostics', 10)
-        self.create_timer(1.0, self._report, clock=self._steady)
+        self._diagnostics = DiagnosticsReporter(self, {'link': self._status})
         if autostart:
             self.trigger_configure()
             self.trigger_activate()
@@ -144,7 +148,7 @@ class Driver(LifecycleNode):
         return TransitionCallbackReturn.SUCCESS
 
     def _configure(self) -> None:
-        publisher = node_support.publisher
+        publisher = create_publisher
         self._data = publisher(self, Imu, 'imu/data_raw', _QUEUE)
         self._info = publisher(self, DiagnosticStatus, 'sensor_info', 1, latched=True)
         self._topics = [self._data, self._info]
@@ -173,22 +177,21 @@ class Driver(LifecycleNode):
         if hasattr(self._link, 'feel'):
             self._stage = self.create_subscription(
                 JointState, 'stage/true_joint_states', self._feel, QoSProfile(depth=_QUEUE),
-                callback_group=node_support.NotForExecutors())
-        turn = self._live_turn if self._link.live else Steadily(self._tick, _TICK_S)
-        self._loop = Loop(self, turn, 'link')
+                callback_group=NotForExecutors())
+        turn = self._live_turn if self._link.live else PeriodicTurn(self._tick, _TICK_S)
+        self._loop = RepeatingThread(self, turn, 'link')
 
     def _adopt(self, sensor: Sensor, known: bool = True) -> None:
         """Publish samples by the figures of a sensor, and say what they are."""
         self._sensor = sensor
         self._imu = ImuWriter(sensor, self._frame)
         if known:
-            self._info.publish(node_support.status(node_support.OK, 'sensor_info', '',
-                                                   sensor.serial, sensor_info(sensor)))
+            self._info.publish(status_message('sensor_info', Status(
+                Level.OK, '', sensor.serial, sensor_info(sensor))))
 
     def _take_from_stage(self) -> None:
-        with self._stage.handle:
-            while (taken := self._stage.handle.take_message(JointState, False)) is not None:
-                self._feel(taken[0])
+        for message in take_messages(self._stage, JointState, False, _QUEUE):
+            self._feel(message)
 
     def _feel(self, message: JointState) -> None:
         at = message.header.stamp
@@ -275,17 +278,16 @@ class Driver(LifecycleNode):
         self._fault = str(error)
         self.get_logger().error(self._fault)
 
-    def _report(self) -> None:
+    def _status(self) -> Status:
         state = self._state()
         now_ns = self._now_ns
         if now_ns is not None and not self._is_clock:
             now_ns = self._wall.now().nanoseconds
         values, warning = self._tally.report(self._steady.now().nanoseconds, now_ns or 0)
-        level = node_support.WARN if warning and state.level == 'ok' else _LEVELS[state.level]
+        level = Level.WARN if warning and state.level == 'ok' else _LEVELS[state.level]
         text = ', '.join(filter(None, (f'{self._type}: {state.text}', warning)))
-        self._diagnostics.publish(node_support.diagnostics(self, node_support.status(
-            level, 'link', text, self._imu.serial, {
-                **values, 'link_type': self._type, 'link_state': state.text, **state.values})))
+        return Status(level, text, self._imu.serial, {
+            **values, 'link_type': self._type, 'link_state': state.text, **state.values})
 
     def _state(self) -> base.State:
         """Say how the link is, or why there is none."""
@@ -341,4 +343,4 @@ class StateLog:
 
 def main() -> int:
     """Run the node."""
-    return node_support.main(Driver, __doc__)
+    return run(Driver, __doc__)

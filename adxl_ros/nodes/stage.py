@@ -16,24 +16,25 @@
 
 from __future__ import annotations
 
-from adxl_ros.nodes.support import node_support
-from adxl_ros.nodes.support.simulated_stage_node import Simulated
-from adxl_ros.nodes.support.stage_bridge import Bridge
+from adxl_ros.nodes.support.parameters import declare
+from adxl_ros.nodes.support.run_node import run
+from adxl_ros.nodes.support.simulated_stage_node import SimulatedStageNode
+from adxl_ros.nodes.support.stage_bridge import StageBridge
 from rclpy.node import Node
 
 
 class Stage(Node):
-    """The node, and what it is by its parameter `stage.type`."""
+    """The node; its parameter `stage.type` chooses what it is."""
 
     def __init__(self) -> None:
         super().__init__('stage')
-        kind = node_support.declare(
+        kind = declare(
             self, 'stage.type', 'simulated', 'the simulated stage, or the bridge to a controller '
             'that takes joint states or trajectories',
             choices=('simulated', 'joint_state', 'trajectory'))
-        self.inside = Simulated(self) if kind == 'simulated' else Bridge(self, kind)
+        self._stage = SimulatedStageNode(self) if kind == 'simulated' else StageBridge(self, kind)
 
 
 def main() -> int:
     """Run the node."""
-    return node_support.main(Stage, __doc__)
+    return run(Stage, __doc__)

@@ -22,7 +22,7 @@ from adxl_ros.calibrate.guided import pose_plan
 from adxl_ros.calibrate.guided.capture_settings import Settings, STAGE_MODES
 from adxl_ros.calibrate.guided.session import Plan
 from adxl_ros.files import calibration_store
-from adxl_ros.nodes.support import node_support
+from adxl_ros.nodes.support.parameters import declare, parameter_error
 import numpy as np
 from rclpy.node import Node
 
@@ -40,7 +40,7 @@ def declare_plan(node: Node) -> Plan:
         A parameter is out of range, or they make no plan.
 
     """
-    degrees, declare = np.radians, node_support.declare
+    degrees = np.radians
     mode = declare(node, 'mode', 'stage', 'what the reference is', choices=('stage', 'gravity'))
     output = Path(declare(node, 'output', 'calibration.yaml', 'parameter file to write'))
     journal = declare(node, 'journal', '', 'file of accepted poses; empty: beside the output')
@@ -66,14 +66,13 @@ def declare_plan(node: Node) -> Plan:
     journal = Path(journal or f'{output}.journal')
     for name, path in (('output', output), ('journal', journal)):
         if path.is_dir():
-            raise node_support.fail(name, f'{path} is a directory; name a file')
+            raise parameter_error(name, f'{path} is a directory; name a file')
     return Plan(mode, kind, planes, step, float(degrees(tilt_error)), checks, settings, output,
                 journal, report, kept)
 
 
 def _poses(node: Node, by_hand: bool) -> tuple[str, tuple[float, ...], float, int]:
     """Return the kind of the plan, its planes and step of beta, rad, and its check poses."""
-    declare = node_support.declare
     kind = declare(node, 'sweep.plan', 'auto', 'poses: full (planes), quick (the fewest for '
                    'sweep.tilt_error_deg), or auto: quick where the stage is turned by hand and '
                    'no planes are given', choices=('auto', *pose_plan.KINDS))
@@ -88,7 +87,7 @@ def _poses(node: Node, by_hand: bool) -> tuple[str, tuple[float, ...], float, in
     checks = declare(node, 'sweep.check_poses', -1, 'poses kept out of the fit for the verdict; '
                      '-1: 16, or 8 in the plan quick', '', -1, 1000)
     if step_deg and step_rad != pose_plan.STEP_RAD:
-        raise node_support.fail('sweep.step_deg', f'{step_deg:g} deg and sweep.step_rad '
+        raise parameter_error('sweep.step_deg', f'{step_deg:g} deg and sweep.step_rad '
                                 f'{step_rad:g} rad are both given; keep one')
     if step_deg:
         step_rad = float(np.radians(step_deg))

@@ -25,7 +25,7 @@ from adxl_ros.model import noise
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.covariance import UNMEASURED_VARIANCE
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
-from adxl_ros.nodes.support import node_support
+from adxl_ros.nodes.support.topics import create_publisher
 from builtin_interfaces.msg import Time
 import numpy as np
 from rclpy.node import Node
@@ -117,7 +117,7 @@ class References:
         kinds = {'stage': (JointState, 'stage/joint_states', bool(self._joints)),
                  'temperature_c': (Temperature, 'temperature', 'temperature_c' in names),
                  'supply_v': (BatteryState, 'supply', 'supply_v' in names)}
-        self._publishers = {name: node_support.publisher(node, kind, topic, 1000)
+        self._publishers = {name: create_publisher(node, kind, topic, 1000)
                             for name, (kind, topic, there) in kinds.items() if there}
 
     def destroy(self) -> None:

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from adxl_ros.files import cdr
 from adxl_ros.model.sensor import Sensor, to_volts
-from adxl_ros.nodes.support import node_support
+from adxl_ros.nodes.support.topics import create_subscription
 import numpy as np
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
@@ -48,7 +48,7 @@ class Samples:
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.useless = ''
         self.heard()
-        node_support.subscription(node, Imu, _TOPIC, self._raw.append, _QUEUE, raw=True)
+        create_subscription(node, Imu, _TOPIC, self._raw.append, _QUEUE, raw=True)
 
     def heard(self) -> None:
         """Begin to wait anew."""

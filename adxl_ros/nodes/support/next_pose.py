@@ -19,7 +19,8 @@ from __future__ import annotations
 from adxl_ros.calibrate.fits import orientations
 from adxl_ros.calibrate.guided.hand_guide import Tumble
 from adxl_ros.calibrate.guided.stage_guide import Sweep
-from adxl_ros.nodes.support import node_support
+from adxl_ros.nodes.support.diagnostics import Level, Status, status_message
+from adxl_ros.nodes.support.topics import create_publisher
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
@@ -39,8 +40,8 @@ class Announcer:
     def __init__(self, node: Node) -> None:
         self._node = node
         # A recorder that stalls for seconds still gets each command: a bag tells what has moved.
-        self._command = node_support.publisher(node, JointState, 'stage/command', 10)
-        self._next = node_support.publisher(node, DiagnosticStatus, '~/next_pose', 1, latched=True)
+        self._command = create_publisher(node, JointState, 'stage/command', 10)
+        self._next = create_publisher(node, DiagnosticStatus, '~/next_pose', 1, latched=True)
         self._said = ''
         self._commanded: tuple[int, int] = (-1, 0)
 
@@ -69,15 +70,17 @@ class Announcer:
     def end(self, why: str) -> None:
         """Take the pose back that was announced, if one was: it is latched."""
         if self._said:
-            self._next.publish(node_support.status(node_support.OK, 'next_pose',
-                                                   f'no pose: {why}', '', {}))
+            self._publish(f'no pose: {why}', {})
         self._said = ''
 
     def _say(self, text: str, values: dict[str, str | float]) -> None:
         if text != self._said:
             self._node.get_logger().info(text)
-            self._next.publish(node_support.status(node_support.OK, 'next_pose', text, '', values))
+            self._publish(text, values)
         self._said = text
+
+    def _publish(self, text: str, values: dict[str, str | float]) -> None:
+        self._next.publish(status_message('next_pose', Status(Level.OK, text, '', values)))
 
 
 def _up(walk: Tumble) -> dict[str, str | float]:

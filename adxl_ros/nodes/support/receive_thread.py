@@ -13,11 +13,10 @@
 # limitations under the License.
 
 """
-What a node does in a thread of its own, beside the executor that spins it.
+Threads of a node beside the executor that spins it.
 
-A turn of rclpy's executor builds its wait set anew from all that the node has, its parameter
-services among them, and wakes twice for a timer: at 250 turns a second that alone is 5 to 10 % of
-a core, and three times what taking, compensating and publishing a sample costs.
+A turn of rclpy's executor costs more than a sample does: at 250 turns a second it takes 5 to 10 %
+of a core, three times what taking, compensating and publishing a sample costs.
 """
 
 from __future__ import annotations
@@ -27,31 +26,27 @@ import threading
 import time
 from typing import Any
 
-from adxl_ros.nodes.support import node_support
-from rclpy.impl.implementation_singleton import rclpy_implementation
+from adxl_ros.nodes.support.rclpy_internals import MessageWait, NotForExecutors
+from adxl_ros.nodes.support.topics import create_subscription
 from rclpy.node import Node
 
-_LOOK_UP_NS = 100_000_000
-"""Time after which a thread that waits for a message looks whether it shall end."""
 
+class RepeatingThread:
+    """
+    Calls a function again and again until closed; an exception from it ends the node.
 
-class Loop:
-    """Calls a function again and again, until closed; an exception from it ends the node."""
+    Parameters
+    ----------
+    node
+        The node that ends with an exception of the function.
+    turn
+        The function, called without a pause. It waits itself, for 0.1 s at most.
+    name
+        Name of the thread.
+
+    """
 
     def __init__(self, node: Node, turn: Callable[[], None], name: str) -> None:
-        """
-        Start the thread.
-
-        Parameters
-        ----------
-        node
-            Which ends with what the function raises.
-        turn
-            Called without a pause: it waits itself, and not for long.
-        name
-            Of the thread.
-
-        """
         self._turn, self._context = turn, node.context
         self._open = True
         self._failure: Exception | None = None
@@ -59,7 +54,7 @@ class Loop:
         self._thread.start()
 
     def close(self) -> None:
-        """End the thread; raises what ended it before."""
+        """End the thread; raise the exception that has ended it before."""
         self._open = False
         self._thread.join()
         if self._failure is not None:
@@ -70,71 +65,65 @@ class Loop:
             while self._open and self._context.ok():
                 self._turn()
         except Exception as error:
-            # After the signal nothing can be published: what fails then is the end, not an error.
+            # After the signal nothing can be published: a failure then belongs to the end.
             if self._context.ok():
                 self._failure = error
                 self._context.try_shutdown()
 
 
-class Steadily:
-    """A turn at a steady pace: a function, and the wait until it is due again."""
+class PeriodicTurn:
+    """
+    A turn of a thread: calls a function, and waits until it is due again.
+
+    Parameters
+    ----------
+    function
+        The function.
+    period_s
+        Time between two calls, s. After a late call the next ones follow from there.
+
+    """
 
     def __init__(self, function: Callable[[], None], period_s: float) -> None:
         self._function, self._period_s = function, period_s
         self._due_s = time.monotonic()
 
     def __call__(self) -> None:
-        """Do it and wait."""
+        """Call the function and wait."""
         self._function()
         now_s = time.monotonic()
         self._due_s = max(self._due_s + self._period_s, now_s)
         time.sleep(self._due_s - now_s)
 
 
-class Received:
+class ReceiveTurn:
     """
-    A turn that waits for the messages of one topic, and gives each, serialized, to a callback.
+    A turn of a thread: waits for the messages of one topic, and gives each to a callback.
 
-    Subscribes best effort, so that both kinds of publisher connect. A wait set of one
-    subscription makes a relay at 1 kHz two to three times cheaper than an executor.
+    Subscribes best effort, so that both kinds of publisher connect.
+
+    Parameters
+    ----------
+    node
+        The node that subscribes.
+    kind
+        Type of the messages.
+    topic
+        Its name.
+    callback
+        Takes the bytes of one message.
+    depth
+        Number of messages that are kept while the callback is busy, and the most of one turn.
+
     """
 
     def __init__(self, node: Node, kind: Any, topic: str, callback: Callable[[bytes], None],
                  depth: int) -> None:
-        """
-        Subscribe.
-
-        Parameters
-        ----------
-        node
-            Whose subscription it is.
-        kind
-            Type of the messages.
-        topic
-            Its name.
-        callback
-            Takes the bytes of a message.
-        depth
-            Messages that are kept while the callback is busy, and the most of a turn.
-
-        """
-        self._subscription = node_support.subscription(
-            node, kind, topic, callback, depth, raw=True, group=node_support.NotForExecutors())
+        subscription = create_subscription(node, kind, topic, callback, depth, raw=True,
+                                           group=NotForExecutors())
+        self._wait = MessageWait(subscription, node)
         self._kind, self._callback, self._depth = kind, callback, depth
-        self._context = node.context
-        self._waits: Any = None
 
     def __call__(self) -> None:
-        """Wait for a message, not for long, and take what is there."""
-        handle = self._subscription.handle
-        with handle, self._context.handle:
-            if self._waits is None:
-                self._waits = rclpy_implementation.WaitSet(1, 0, 0, 0, 0, 0, self._context.handle)
-            self._waits.clear_entities()
-            self._waits.add_subscription(handle)
-            self._waits.wait(_LOOK_UP_NS)
-            for _ in range(self._depth):
-                taken = handle.take_message(self._kind, True)
-                if taken is None:
-                    break
-                self._callback(taken[0])
+        """Wait for a message, and take all that have come."""
+        self._wait(self._kind, self._callback, self._depth)

@@ -12,168 +12,125 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""A sensor's parameters that can be exchanged while a node runs: all of them or none."""
+"""The parameters of a node that describe a sensor: those of a parameter file."""
 
 from __future__ import annotations
 
-from array import array
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
 from adxl_ros.model.effects import library
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.nodes.support import node_support
-from rcl_interfaces.msg import SetParametersResult
+from adxl_ros.nodes.support.parameters import declare, parameter_error
+from ament_index_python.packages import get_package_share_directory
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-_FIXED = {'format', 'units', *parameter_file.FIGURES,
-          *(f'{kind}.{key}' for kind, keys in (('envelope', parameter_file.ENVELOPE),
-                                               ('datasheet', parameter_file.DATASHEET))
-            for key in keys)}
-_EFFECTS = {f'{effect.name}.{p.name}': effect.name
-            for effect in library().values() for p in effect.parameters}
-_NEUTRAL = {f'{effect.name}.{p.name}': p.neutral
-            for effect in library().values() for p in effect.parameters}
-_CHANGED = ', with coefficients set since'
-_COEFFICIENTS = {'effects', 'covariance_names', 'covariance', *_EFFECTS}
+Kind = Parameter.Type
+
+_FIELD_KINDS = {'np.ndarray': Kind.DOUBLE_ARRAY, 'float': Kind.DOUBLE, 'int': Kind.INTEGER,
+                'str': Kind.STRING}
+"""Parameter types by the annotations of `Sensor`'s fields."""
+_DATASHEET_KINDS = {'name': Kind.STRING, 'figures': Kind.STRING_ARRAY}
+"""Parameter types of `datasheet.*`; the others are arrays of numbers."""
 
 
-class LiveSensor:
+class _Key(NamedTuple):
+    """One key of a parameter file, as a parameter without a default value."""
+
+    name: str
+    kind: Kind
+    description: str
+    unit: str = ''
+    lower: float | None = None
+    upper: float | None = None
+    choices: tuple[str, ...] = ()
+
+
+def declare_sensor(node: Node, live: bool = False) -> dict[str, Any]:
     """
-    The sensor that a node's parameters describe.
+    Declare everything that a parameter file holds and return what is given.
 
-    Coefficients can be set, several at once by `set_parameters_atomically`; the stated figures
-    belong to the file and come with it, when the parameter `calibration` is set to its path.
-    Then the parameters are those of the file. A set that is refused changes nothing.
+    Where `format` is given the parameters come from a parameter file, and `make_sensor` refuses
+    what the file lacks. Otherwise the installed nominal sensor gives the default values.
+
+    Parameters
+    ----------
+    node
+        The node that gets the parameters.
+    live
+        Whether they can be set while the node runs; the node's callbacks decide which, and how.
+
+    Returns
+    -------
+    dict
+        Values by dotted key.
+
     """
-
-    def __init__(self, node: Node, fits: Callable[[Sensor], None],
-                 use: Callable[[Sensor, str], None]) -> None:
-        """
-        Declare the parameters and take what is given.
-
-        Parameters
-        ----------
-        node
-            Whose parameters they are.
-        fits
-            Raises `UserError` if the node cannot use that sensor.
-        use
-            Called with the first and with each new sensor, and with where it comes from.
-
-        Raises
-        ------
-        UserError
-            What is given describes no sensor.
-
-        """
-        self._node, self._fits, self._use = node, fits, use
-        self._flat = node_support.declare_sensor(node, live=True)
-        node_support.make_sensor(self._flat)
-        given = node.get_parameter_or('format').value is not None
-        self._source = 'the parameters given' if given else \
-            f'the nominal {node_support.nominal_path()}'
-        # Names that no declaration knows are not in the node's public interface.
-        self._declare_provenance(node._parameter_overrides)
-        path = node_support.declare(
-            node, 'calibration', '', 'parameter file to use; setting it loads the whole file or '
-            'nothing of it', live=True)
-        # What the set that is under way loads, and whether it is a declaration instead.
-        self._file: dict[str, Any] | UserError | None = None
-        self._declaring = False
-        node.add_pre_set_parameters_callback(self._with_file)
-        node.add_on_set_parameters_callback(self._check)
-        node.add_post_set_parameters_callback(self._apply)
-        if not path:
-            use(_made(self._flat), self._source)
-            return
-        result = node.set_parameters([Parameter('calibration', value=path)])[0]
-        if not result.successful:
-            raise UserError(result.reason)
-
-    def _declare_provenance(self, given: Mapping[str, Any]) -> None:
-        self._declaring = True
-        for name in given:
-            if name.startswith('provenance.') and name not in self._flat:
-                value = given[name].value if isinstance(given[name], Parameter) else given[name]
-                self._flat[name] = node_support.declare(
-                    self._node, name, str(value), 'where the coefficients come from', live=True)
-        self._declaring = False
-
-    def _with_file(self, parameters: list[Parameter]) -> list[Parameter]:
-        """Let `calibration` stand for all that its file holds."""
-        self._file = None
-        if not any(p.name == 'calibration' and p.value for p in parameters):
-            return parameters
-        try:
-            if len(parameters) > 1:
-                raise UserError('calibration: cannot be set together with other parameters: its '
-                                'file holds all of them')
-            self._file = parameter_file.to_flat(parameter_file.load(parameters[0].value))
-        except UserError as error:
-            self._file = error
-            return parameters
-        names = [*_FIXED, *_COEFFICIENTS, *(n for n in self._flat if n.startswith('provenance.'))]
-        return parameters + [self._parameter(name, self._file.get(name)) for name in names]
-
-    def _parameter(self, name: str, value: Any) -> Parameter:
-        kind = Parameter.Type(self._node.describe_parameter(name).type)
-        # One figure cannot be empty; that of an effect which is not listed means nothing.
-        nothing: Any = {Parameter.Type.STRING: '', Parameter.Type.DOUBLE: _NEUTRAL.get(name, 0.0)}
-        return Parameter(name, kind, nothing.get(kind, []) if value is None else value)
-
-    def _check(self, parameters: Sequence[Parameter]) -> SetParametersResult:
-        """Say whether a set leads to a sensor that the node can use."""
-        if self._declaring:
-            return SetParametersResult(successful=True)
-        try:
-            if isinstance(self._file, UserError):
-                raise self._file
-            changes = self._changes(parameters)
-            if self._file is None:
-                _refuse_others(changes, self._flat | changes)
-            if changes:
-                self._fits(_made(self._flat | changes))
-        except UserError as error:
-            return SetParametersResult(successful=False, reason=' '.join(str(error).split()))
-        return SetParametersResult(successful=True)
-
-    def _changes(self, parameters: Sequence[Parameter]) -> dict[str, Any]:
-        return {p.name: p.value.tolist() if isinstance(p.value, array) else p.value
-                for p in parameters
-                if p.name in _FIXED or p.name in _COEFFICIENTS
-                or p.name.startswith('provenance.')}
-
-    def _apply(self, parameters: Sequence[Parameter]) -> None:
-        """Use what has been set."""
-        changes = self._changes(parameters)
-        if self._declaring or not changes:
-            return
-        self._flat |= changes
-        if self._file is None:
-            # The leverage is that of the fit; other coefficients have another.
-            self._flat['envelope.leverage'] = 0.0
-            self._source = f'{self._source.removesuffix(_CHANGED)}{_CHANGED}'
-        else:
-            self._source = self._node.get_parameter('calibration').value
-            self._declare_provenance(self._file)
-        self._use(_made(self._flat), self._source)
+    version = declare(node, 'format', Kind.INTEGER, 'version of the parameter file', live=live)
+    nominal = {} if version is not None else parameter_file.to_flat(
+        parameter_file.load(nominal_path()))
+    flat = {'format': nominal.get('format', version),
+            'units': declare(node, 'units', parameter_file.UNITS, 'units of the coefficients',
+                             live=live)}
+    for key in _keys():
+        flat[key.name] = declare(node, key.name, nominal.get(key.name, key.kind), *key[2:], live)
+    return {name: value for name, value in flat.items() if value is not None}
 
 
-def _refuse_others(changes: dict[str, Any], after: dict[str, Any]) -> None:
-    """Refuse what only a file can change, and coefficients that would do nothing."""
-    for name, value in changes.items():
-        if name in _FIXED or name.startswith('provenance.'):
-            raise UserError(f'{name}: belongs to the parameter file; set calibration to the path '
-                            'of another file')
-        effect = _EFFECTS.get(name)
-        if effect and value and effect not in (after.get('effects') or []):
-            raise UserError(f'{name}: effects does not list {effect}; set effects with it')
+def _keys() -> Iterator[_Key]:
+    """Yield the keys of a parameter file behind `format` and `units`."""
+    for name, field in parameter_file.FIGURES.items():
+        about = field.metadata
+        yield _Key(name, _FIELD_KINDS[str(field.type)], about['doc'], about['unit'],
+                   about['lower'], about['upper'], about['choices'])
+    yield _Key('effects', Kind.STRING_ARRAY, 'effects that this unit has')
+    for effect in library().values():
+        for p in effect.parameters:
+            yield _Key(f'{effect.name}.{p.name}', Kind.DOUBLE_ARRAY if p.axes else Kind.DOUBLE,
+                       f'{p.doc}, by axis' if p.axes else p.doc, p.unit, p.lower, p.upper)
+    yield _Key('covariance_names', Kind.STRING_ARRAY, 'coefficients in the covariance')
+    yield _Key('covariance', Kind.DOUBLE_ARRAY, 'of the coefficients, rows flattened')
+    for name, description in parameter_file.ENVELOPE.items():
+        kind = Kind.DOUBLE_ARRAY if name in parameter_file.ENVELOPE_LISTS else Kind.DOUBLE
+        yield _Key(f'envelope.{name}', kind, description)
+    for name, description in parameter_file.DATASHEET.items():
+        yield _Key(f'datasheet.{name}', _DATASHEET_KINDS.get(name, Kind.DOUBLE_ARRAY), description)
 
 
-def _made(flat: dict[str, Any]) -> Sensor:
-    known = {name: value for name, value in flat.items() if value not in ([], '', None)}
-    return node_support.make_sensor(known, lambda key, why: UserError(f'{key}: {why}'))
+def make_sensor(flat: Mapping[str, Any],
+                make_error: Callable[[str, str], UserError] = parameter_error) -> Sensor:
+    """
+    Check the parameters of a sensor and make it.
+
+    Parameters
+    ----------
+    flat
+        Values by dotted key, as `declare_sensor` returns them.
+    make_error
+        Makes the error of a parameter and a reason; by default it names the parameter file.
+
+    Returns
+    -------
+    Sensor
+        The sensor, without the coefficients of effects that are not listed.
+
+    Raises
+    ------
+    UserError
+        The parameters describe no sensor.
+
+    """
+    listed = flat.get('effects', [])
+    unused = {f'{effect.name}.{p.name}' for effect in library().values()
+              if effect.name not in listed for p in effect.parameters}
+    return parameter_file.from_flat(
+        {key: value for key, value in flat.items() if key not in unused}, make_error)
+
+
+def nominal_path() -> Path:
+    """Return the path of the installed parameter file of the nominal sensor."""
+    return Path(get_package_share_directory('adxl_ros')) / 'params' / 'adxl203.yaml'

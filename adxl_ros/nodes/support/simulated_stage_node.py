@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""A simulated two-axis stage that follows commands, by `links.support.simulated_stage`."""
+"""The simulated stage as topics: it follows commands and shows its encoders."""
 
 from __future__ import annotations
 
@@ -21,100 +21,117 @@ from collections import deque
 from adxl_ros.errors import UserError
 from adxl_ros.files.parameter_file import FIGURES
 from adxl_ros.links.support.simulated_stage import JOINTS, SimulatedStage
-from adxl_ros.nodes.support import node_support
+from adxl_ros.nodes.support.diagnostics import DiagnosticsReporter, Level, Status
+from adxl_ros.nodes.support.parameters import declare
+from adxl_ros.nodes.support.topics import create_publisher, create_subscription
 from builtin_interfaces.msg import Time
-from diagnostic_msgs.msg import DiagnosticArray
 import numpy as np
-from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
 _STEP_NS = 10_000_000
+"""Step of the simulation, ns; chosen: 100 poses a second, as a controller of a stage sends."""
 _JUMP_NS = 1_000_000_000
+"""Smallest jump of ROS time after which the motion goes on from there, ns; chosen."""
 _QUEUE = 1000
+"""Poses that are kept for a slow subscriber: 10 s of ROS time."""
+_RESOLUTION_RAD = float(5 / 60 * np.pi / 180)
+"""Default resolution of the encoders, rad: 5 minutes of arc, as on the paper's stage."""
+_START = (('alpha_rad', 'rad', 100.0), ('beta_rad', 'rad', 100.0), ('shift_m', 'm', 10.0))
+"""Parameters of the joints' start: name, unit, largest position either way."""
 
 
-class Simulated:
+class SimulatedStageNode:
     """
     The simulated stage: 100 poses a second of ROS time, on `stage/joint_states`, by its encoders.
 
-    A command takes effect after the delay of the controller. The true motion is thus known
-    ahead, and goes ahead of time to `stage/true_joint_states`, for a simulated sensor to feel.
+    A command takes effect after the delay of the controller. The true motion is thus known before
+    it happens: `stage/true_joint_states` has it ahead of time, for a simulated sensor to feel.
+
+    Parameters
+    ----------
+    node
+        The node that gets the parameters and topics.
+
+    Raises
+    ------
+    UserError
+        A parameter is out of range.
+
     """
 
     def __init__(self, node: Node) -> None:
         self._node = node
-        declare = node_support.declare
-        about = FIGURES['stage.resolution_rad'].metadata
-        nominal = 5 / 60 * np.pi / 180
-        step = declare(node, 'stage.resolution_rad', float(nominal), about['doc'], about['unit'],
-                       about['lower'], about['upper'])
-        slew = declare(node, 'slew_rate_rad_s', 0.5, 'fastest turn', 'rad/s', 1e-6, 100.0)
-        shift_slew = declare(node, 'slew_rate_m_s', 0.01, 'fastest shift', 'm/s', 1e-9, 10.0)
-        settling = declare(node, 'settling_time_s', 0.3, 'of a step, to 1 %', 's', 0.01, 60.0)
+        self._stage = _declare_stage(node)
         self._delay_ns = round(1e9 * declare(node, 'delay_s', 0.1, 'from a command to its effect',
                                              's', 0.02, 1.0))
-        pose = [declare(node, f'{name}_{unit}', 0.0, 'where it begins', unit, -reach, reach)
-                for name, unit, reach in (('alpha', 'rad', 100.0), ('beta', 'rad', 100.0),
-                                          ('shift', 'm', 10.0))]
-        seed = declare(node, 'seed', 0, "of where in the encoder's step it comes to rest", '',
-                       0, 2 ** 31 - 1)
-        self._stage = SimulatedStage(np.array(pose), np.array([slew, slew, shift_slew]), settling,
-                                     np.array([step, step, 0.0]), seed)
-        self._due: deque[tuple[int, JointState]] = deque()
-        self._known_ns = self._refusals = 0
+        self._unshown: deque[tuple[int, JointState]] = deque()
+        self._simulated_ns = 0
+        self._refusal_count = 0
         self._refusal = ''
-        self._connect()
-
-    def _connect(self) -> None:
-        node = self._node
-        self._shown = node_support.publisher(node, JointState, 'stage/joint_states', _QUEUE)
-        self._true = node_support.publisher(node, JointState, 'stage/true_joint_states', _QUEUE)
-        self._diagnostics = node_support.publisher(node, DiagnosticArray, '/diagnostics', 10)
-        node_support.subscription(node, JointState, 'stage/command', self._command, 10)
+        self._encoders = create_publisher(node, JointState, 'stage/joint_states', _QUEUE)
+        self._true = create_publisher(node, JointState, 'stage/true_joint_states', _QUEUE)
+        self._diagnostics = DiagnosticsReporter(node, {'stage': self._status})
+        create_subscription(node, JointState, 'stage/command', self._on_command, 10)
         # On ROS time: a clock that runs faster wakes the node with each of its messages.
         node.create_timer(_STEP_NS * 1e-9, self._tick)
-        node.create_timer(1.0, self._report, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
-    def _command(self, message: JointState) -> None:
+    def _on_command(self, message: JointState) -> None:
         try:
             if len(message.name) != len(message.position):
                 raise UserError(f'{len(message.name)} names, but {len(message.position)} '
                                 'positions')
             self._stage.command(dict(zip(message.name, message.position)))
         except UserError as error:
-            self._refusals += 1
+            self._refusal_count += 1
             self._refusal = f'{self._node.resolve_topic_name("stage/command")}: {error}'
             self._node.get_logger().warning(
-                f'{self._refusal}; the stage goes where it was told before')
+                f'{self._refusal}; the stage stays with the command before')
+            self._diagnostics.notice('stage', Level.WARN)
 
     def _tick(self) -> None:
-        """Go on to the time up to which the motion is certain, and show what is due."""
+        """Simulate up to the time at which a new command may take effect; show what is due."""
         now_ns = self._node.get_clock().now().nanoseconds
         if not now_ns:
             return
-        if not -_JUMP_NS < now_ns + self._delay_ns - self._known_ns < _JUMP_NS:
-            self._known_ns = now_ns // _STEP_NS * _STEP_NS
-            self._due.clear()
-        while self._known_ns + _STEP_NS <= now_ns + self._delay_ns:
-            self._known_ns += _STEP_NS
+        if not -_JUMP_NS < now_ns + self._delay_ns - self._simulated_ns < _JUMP_NS:
+            self._simulated_ns = now_ns // _STEP_NS * _STEP_NS
+            self._unshown.clear()
+        while self._simulated_ns + _STEP_NS <= now_ns + self._delay_ns:
+            self._simulated_ns += _STEP_NS
             self._stage.step(_STEP_NS * 1e-9)
             self._true.publish(self._message(self._stage.position))
-            self._due.append((self._known_ns, self._message(self._stage.encoder())))
-        while self._due and self._due[0][0] <= now_ns:
-            self._shown.publish(self._due.popleft()[1])
+            self._unshown.append((self._simulated_ns, self._message(self._stage.encoder())))
+        while self._unshown and self._unshown[0][0] <= now_ns:
+            self._encoders.publish(self._unshown.popleft()[1])
 
     def _message(self, position: np.ndarray) -> JointState:
+        """Make the message of joint positions, rad and m, (3,), at the simulated time."""
         message = JointState(name=JOINTS, position=position, velocity=self._stage.velocity)
-        sec, nanosec = divmod(self._known_ns, 10 ** 9)
+        sec, nanosec = divmod(self._simulated_ns, 10 ** 9)
         message.header.stamp = Time(sec=sec, nanosec=nanosec)
         return message
 
-    def _report(self) -> None:
-        level, text = node_support.OK, 'moving' if self._stage.moving() else 'at rest'
+    def _status(self) -> Status:
+        level, text = Level.OK, 'moving' if self._stage.moving() else 'at rest'
         if self._refusal:
-            level, text = node_support.WARN, f'refused {self._refusal}'
-        values = {name: float(p) for name, p in zip(JOINTS, self._stage.encoder())}
-        self._diagnostics.publish(node_support.diagnostics(self._node, node_support.status(
-            level, 'stage', text, 'simulated', {**values, 'refused': self._refusals})))
+            level, text = Level.WARN, f'refused {self._refusal}'
         self._refusal = ''
+        values = {name: float(p) for name, p in zip(JOINTS, self._stage.encoder())}
+        return Status(level, text, 'simulated', {**values, 'refused': self._refusal_count})
+
+
+def _declare_stage(node: Node) -> SimulatedStage:
+    """Declare the parameters of the stage and make it."""
+    about = FIGURES['stage.resolution_rad'].metadata
+    resolution_rad = declare(node, 'stage.resolution_rad', _RESOLUTION_RAD, about['doc'],
+                             about['unit'], about['lower'], about['upper'])
+    turn_rad_s = declare(node, 'slew_rate_rad_s', 0.5, 'fastest turn', 'rad/s', 1e-6, 100.0)
+    shift_m_s = declare(node, 'slew_rate_m_s', 0.01, 'fastest shift', 'm/s', 1e-9, 10.0)
+    settling_s = declare(node, 'settling_time_s', 0.3, 'of a step, to 1 %', 's', 0.01, 60.0)
+    start = [declare(node, name, 0.0, 'position at the start', unit, -reach, reach)
+             for name, unit, reach in _START]
+    seed = declare(node, 'seed', 0, "of where in the encoder's step it comes to rest", '', 0,
+                   2 ** 31 - 1)
+    return SimulatedStage(np.array(start), np.array([turn_rad_s, turn_rad_s, shift_m_s]),
+                          settling_s, np.array([resolution_rad, resolution_rad, 0.0]), seed)

@@ -13,22 +13,23 @@
 # limitations under the License.
 
 """
-The bridge to a real stage: its controller's joints on one side, alpha and beta on the other.
+The bridge to a real stage: it passes commands and positions between a controller and this package.
 
-`stage/command` goes to the controller, as sensor_msgs/JointState or as
-trajectory_msgs/JointTrajectory with one point, which is what ros2_control's
-joint_trajectory_controller takes; the controller's joint states come back as
-`stage/joint_states`. A joint's angle is sign · (stage angle − offset). Angles that the controller
-wraps are unwrapped.
+`stage/command` goes to the controller as sensor_msgs/JointState, or as
+trajectory_msgs/JointTrajectory with one point, which ros2_control's joint_trajectory_controller
+takes. The controller's joint states come back as `stage/joint_states`. The angle of a
+controller's joint is sign · (stage angle − offset). Angles that the controller wraps are
+unwrapped.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from adxl_ros.nodes.support import node_support
+from adxl_ros.nodes.support.diagnostics import DiagnosticsReporter, Level, Status
+from adxl_ros.nodes.support.parameters import declare, parameter_error
+from adxl_ros.nodes.support.topics import create_publisher, create_subscription
 from builtin_interfaces.msg import Duration
-from diagnostic_msgs.msg import DiagnosticArray
 import numpy as np
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
@@ -37,15 +38,36 @@ from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 _SILENT_NS = 2_000_000_000
-_AGAIN_NS = 2_000_000_000
-"""A command that has not been followed so long after it should have is sent once more."""
+"""Time without joint states after which diagnostics warn, ns; chosen."""
+_GRACE_NS = 2_000_000_000
+"""Time that a motion may take beyond its duration before its command is sent again, ns; chosen."""
 _ARRIVED_RAD = 0.01
-_LEAST_S = 0.2
+"""Largest distance from the goal of a joint that has arrived, rad; chosen."""
+_SHORTEST_S = 0.2
+"""Shortest duration of a trajectory, s; chosen."""
+_TURN_RAD = 2 * np.pi
+_DEFAULT_COMMANDS = {'trajectory': '/joint_trajectory_controller/joint_trajectory',
+                     'joint_state': '/joint_commands'}
+"""Usual topics of the controllers' commands, by kind."""
 
 
 @dataclass
 class _Joint:
-    """One joint of the stage: the controller's name for it, and how its angle is counted."""
+    """
+    One joint of the stage, and how the controller counts its angle.
+
+    Attributes
+    ----------
+    name
+        The controller's name of the joint.
+    sign
+        1.0 or -1.0: the direction in which the controller counts.
+    offset_rad
+        Stage angle where the controller's joint is at 0, rad.
+    angle_rad
+        Stage angle, rad; None before the first joint state.
+
+    """
 
     name: str
     sign: float
@@ -53,38 +75,40 @@ class _Joint:
     angle_rad: float | None = None
 
     def to_controller(self, stage_rad: float) -> float:
+        """Convert a stage angle to the controller's, rad."""
         return self.sign * (stage_rad - self.offset_rad)
 
-    def read(self, position_rad: float) -> None:
+    def update(self, position_rad: float) -> None:
+        """Take an angle of the controller, rad, and unwrap it."""
         angle = self.sign * position_rad + self.offset_rad
         if self.angle_rad is not None:
             # A controller that counts from −π to π jumps where the stage turns on.
-            angle += 2 * np.pi * np.round((self.angle_rad - angle) / (2 * np.pi))
+            angle += _TURN_RAD * np.round((self.angle_rad - angle) / _TURN_RAD)
         self.angle_rad = float(angle)
 
-    def turn_to(self, goal_rad: float) -> None:
+    def unwrap_to(self, goal_rad: float) -> None:
         """
-        Count from the goal where the joint has stopped whole turns off it.
+        Add whole turns to the angle where the joint then is at its goal, rad.
 
-        The first angle of a controller that counts from −π to π leaves open how many turns it
-        has made, and such a controller may take the shorter way round.
+        The first angle of a controller that counts from −π to π does not determine how many turns
+        it has made, and such a controller may take the shorter way round.
         """
         if self.angle_rad is not None:
-            turns = 2 * np.pi * round((goal_rad - self.angle_rad) / (2 * np.pi))
-            if abs(self.angle_rad + turns - goal_rad) < _ARRIVED_RAD:
-                self.angle_rad += turns
+            turns_rad = _TURN_RAD * round((goal_rad - self.angle_rad) / _TURN_RAD)
+            if abs(self.angle_rad + turns_rad - goal_rad) < _ARRIVED_RAD:
+                self.angle_rad += turns_rad
 
 
-class Bridge:
+class StageBridge:
     """
-    Both ways between a stage's controller and this package's topics.
+    The way from this package's topics to the controller of a stage, and back.
 
     Parameters
     ----------
     node
-        Whose parameters and topics they are.
+        The node that gets the parameters and topics.
     kind
-        'joint_state' or 'trajectory': what the controller takes.
+        'joint_state' or 'trajectory': the type of command that the controller takes.
 
     Raises
     ------
@@ -95,67 +119,52 @@ class Bridge:
 
     def __init__(self, node: Node, kind: str) -> None:
         self._node, self._kind = node, kind
-        self._joints = {name: self._declare_joint(name) for name in ('alpha', 'beta')}
-        declare = node_support.declare
-        states = declare(node, 'bridge.joint_states', '/joint_states',
-                         "topic of the controller's joint states")
-        default = '/joint_trajectory_controller/joint_trajectory' if kind == 'trajectory' else \
-            '/joint_commands'
-        command = declare(node, 'bridge.command', default, 'topic on which the controller listens')
-        self._speed = declare(node, 'bridge.speed_rad_s', 0.3, 'of a trajectory', 'rad/s', 1e-4,
-                              10.0)
+        self._joints = {name: _declare_joint(node, name) for name in ('alpha', 'beta')}
+        self._states_topic = declare(node, 'bridge.joint_states', '/joint_states',
+                                     "topic of the controller's joint states")
+        command_topic = declare(node, 'bridge.command', _DEFAULT_COMMANDS[kind],
+                                'topic on which the controller listens')
+        self._speed_rad_s = declare(node, 'bridge.speed_rad_s', 0.3, 'of a trajectory', 'rad/s',
+                                    1e-4, 10.0)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._goal: dict[str, float] = {}
-        self._due_ns = self._heard_ns = self._late_ns = self._asked_ns = 0
-        self._names: set[str] = set()
+        self._heard_ns = 0
+        self._resend_ns = 0
+        self._commanded_ns = 0
+        self._late_ns = 0
+        self._controller_joints: set[str] = set()
         self._refusal = ''
-        self._shown = node_support.publisher(node, JointState, 'stage/joint_states', 100)
-        self._out = node_support.publisher(
-            node, JointTrajectory if kind == 'trajectory' else JointState, command, 10)
-        self._diagnostics = node_support.publisher(node, DiagnosticArray, '/diagnostics', 10)
-        self._states = states
-        node_support.subscription(node, JointState, 'stage/command', self._command, 10)
-        node_support.subscription(node, JointState, states, self._state, 1000)
-        node.create_timer(1.0, self._report, clock=self._steady)
+        self._positions = create_publisher(node, JointState, 'stage/joint_states', 100)
+        self._commands = create_publisher(
+            node, JointTrajectory if kind == 'trajectory' else JointState, command_topic, 10)
+        self._diagnostics = DiagnosticsReporter(node, {'stage': self._status})
+        create_subscription(node, JointState, 'stage/command', self._on_command, 10)
+        create_subscription(node, JointState, self._states_topic, self._on_states, 1000)
 
-    def _declare_joint(self, name: str) -> _Joint:
-        declare = node_support.declare
-        joint = declare(self._node, f'bridge.{name}.joint', Parameter.Type.STRING,
-                        f"the controller's name of the joint {name}")
-        if not joint:
-            raise node_support.fail(f'bridge.{name}.joint',
-                                    "is not set; name the controller's joint")
-        sign = declare(self._node, f'bridge.{name}.sign', 1, 'which way it turns: 1 or -1', '',
-                       -1, 1)
-        if sign == 0:
-            raise node_support.fail(f'bridge.{name}.sign', '0 is not 1 or -1')
-        return _Joint(joint, float(sign), declare(
-            self._node, f'bridge.{name}.offset_rad', 0.0,
-            f"{name} where the controller's joint is at 0", 'rad', -100.0, 100.0))
-
-    def _command(self, message: JointState) -> None:
-        wanted = dict(zip(message.name, message.position))
-        if set(wanted) - set(self._joints) or len(message.name) != len(message.position) \
-                or not np.isfinite(list(wanted.values())).all():
-            self._refuse(f'stage/command: {wanted}: expected finite positions of alpha and beta')
+    def _on_command(self, message: JointState) -> None:
+        positions = dict(zip(message.name, message.position))
+        if set(positions) - set(self._joints) or len(message.name) != len(message.position) \
+                or not np.isfinite(list(positions.values())).all():
+            self._refuse(f'stage/command: {positions}: expected finite positions of alpha and '
+                         'beta')
             return
-        goal = {name: wanted.get(name, self._goal.get(name, joint.angle_rad))
+        goal = {name: positions.get(name, self._goal.get(name, joint.angle_rad))
                 for name, joint in self._joints.items()}
         if None in goal.values():
-            self._refuse('stage/command: where the stage is, is not known yet')
+            self._refuse('stage/command: the position of the stage is not known yet')
             return
         now_ns = self._steady.now().nanoseconds
-        # It comes again and again: a controller would begin its trajectory anew each time.
-        if goal == self._goal and (self._arrived() or now_ns < self._due_ns):
+        # The calibration repeats its command: a controller would begin its trajectory each time.
+        if goal == self._goal and (self._arrived() or now_ns < self._resend_ns):
             return
-        seconds = self._duration_s(goal)
-        self._due_ns = now_ns + round(seconds * 1e9) + _AGAIN_NS
+        duration_s = self._duration_s(goal)
+        self._resend_ns = now_ns + round(duration_s * 1e9) + _GRACE_NS
         if goal != self._goal:
-            self._asked_ns, self._late_ns = now_ns, self._due_ns
+            self._commanded_ns, self._late_ns = now_ns, self._resend_ns
         self._goal, self._refusal = goal, ''
-        self._send(seconds)
+        self._send(duration_s)
 
-    def _send(self, seconds: float) -> None:
+    def _send(self, duration_s: float) -> None:
         names = [joint.name for joint in self._joints.values()]
         positions = [float(joint.to_controller(self._goal[name]))
                      for name, joint in self._joints.items()]
@@ -163,16 +172,17 @@ class Bridge:
             message = JointState(name=names, position=positions)
             message.header.stamp = self._node.get_clock().now().to_msg()
         else:
-            whole, part = divmod(round(seconds * 1e9), 10 ** 9)
+            sec, nanosec = divmod(round(duration_s * 1e9), 10 ** 9)
             # A stamp of 0 begins it at once.
             message = JointTrajectory(joint_names=names, points=[JointTrajectoryPoint(
-                positions=positions, time_from_start=Duration(sec=whole, nanosec=part))])
-        self._out.publish(message)
+                positions=positions, time_from_start=Duration(sec=sec, nanosec=nanosec))])
+        self._commands.publish(message)
 
     def _duration_s(self, goal: dict[str, float]) -> float:
-        ways = [abs(goal[name] - joint.angle_rad) for name, joint in self._joints.items()
-                if joint.angle_rad is not None]
-        return max(max(ways, default=np.pi) / self._speed, _LEAST_S)
+        """Return the time that the longer way to a goal takes; half a turn if it is unknown."""
+        ways_rad = [abs(goal[name] - joint.angle_rad) for name, joint in self._joints.items()
+                    if joint.angle_rad is not None]
+        return max(max(ways_rad, default=np.pi) / self._speed_rad_s, _SHORTEST_S)
 
     def _late(self) -> bool:
         return bool(self._goal) and self._steady.now().nanoseconds > self._late_ns \
@@ -183,53 +193,72 @@ class Bridge:
                    and abs(joint.angle_rad - self._goal[name]) < _ARRIVED_RAD
                    for name, joint in self._joints.items())
 
-    def _state(self, message: JointState) -> None:
+    def _on_states(self, message: JointState) -> None:
         positions = dict(zip(message.name, message.position))
-        self._names |= set(positions)
-        known = [joint for joint in self._joints.values() if joint.name in positions
-                 and np.isfinite(positions[joint.name])]
-        for joint in known:
-            joint.read(positions[joint.name])
+        self._controller_joints |= set(positions)
+        joints = [joint for joint in self._joints.values() if joint.name in positions
+                  and np.isfinite(positions[joint.name])]
+        for joint in joints:
+            joint.update(positions[joint.name])
         if self._late():
             for name, joint in self._joints.items():
-                joint.turn_to(self._goal[name])
-        if not known or any(joint.angle_rad is None for joint in self._joints.values()):
+                joint.unwrap_to(self._goal[name])
+        if not joints or any(joint.angle_rad is None for joint in self._joints.values()):
             return
         self._heard_ns = self._steady.now().nanoseconds
         shown = JointState(name=list(self._joints),
                            position=[joint.angle_rad for joint in self._joints.values()])
         shown.header.stamp = message.header.stamp
-        self._shown.publish(shown)
+        self._positions.publish(shown)
 
-    def _refuse(self, text: str) -> None:
-        if text != self._refusal:
-            self._node.get_logger().warning(text)
-        self._refusal = text
+    def _refuse(self, reason: str) -> None:
+        if reason != self._refusal:
+            self._node.get_logger().warning(reason)
+        self._refusal = reason
+        self._diagnostics.notice('stage', Level.WARN)
 
-    def _report(self) -> None:
-        level = node_support.OK
-        text = 'on the way' if self._goal and not self._arrived() else 'at rest'
-        topic = self._node.resolve_topic_name(self._states)
-        missing = [joint.name for joint in self._joints.values() if joint.angle_rad is None]
-        if self._refusal:
-            level, text = node_support.WARN, f'refused {self._refusal}'
-        elif missing and self._names:
-            level, text = node_support.ERROR, (
-                f'{topic}: no joint {", ".join(missing)}; it has '
-                f'{", ".join(sorted(self._names))}; put bridge.alpha.joint and bridge.beta.joint '
-                'right')
-        elif self._steady.now().nanoseconds - self._heard_ns > _SILENT_NS:
-            level, text = node_support.WARN, f'nothing on {topic}; is the controller running?'
-        elif not self._node.count_subscribers(self._out.topic_name):
-            level, text = node_support.WARN, f'nobody listens to {self._out.topic_name}'
-        elif self._late():
-            for_s = (self._steady.now().nanoseconds - self._asked_ns) * 1e-9
-            off = ', '.join(f'{name} is at {np.degrees(joint.angle_rad):.1f}° of '
-                            f'{np.degrees(self._goal[name]):.1f}°'
-                            for name, joint in self._joints.items())
-            level, text = node_support.WARN, (
-                f'the controller has not followed for {for_s:.0f} s: {off}')
+    def _status(self) -> Status:
         values = {name: joint.angle_rad for name, joint in self._joints.items()
                   if joint.angle_rad is not None}
-        self._diagnostics.publish(node_support.diagnostics(self._node, node_support.status(
-            level, 'stage', text, self._kind, values)))
+        return Status(*self._state(), self._kind, values)
+
+    def _state(self) -> tuple[Level, str]:
+        """Return the level and one line: the motion, or why there is none."""
+        topic = self._node.resolve_topic_name(self._states_topic)
+        missing = [joint.name for joint in self._joints.values() if joint.angle_rad is None]
+        if self._refusal:
+            return Level.WARN, f'refused {self._refusal}'
+        if missing and self._controller_joints:
+            return Level.ERROR, (
+                f'{topic}: no joint {", ".join(missing)}; it has '
+                f'{", ".join(sorted(self._controller_joints))}; correct bridge.alpha.joint and '
+                'bridge.beta.joint')
+        if self._steady.now().nanoseconds - self._heard_ns > _SILENT_NS:
+            return Level.WARN, f'nothing on {topic}; is the controller running?'
+        if not self._node.count_subscribers(self._commands.topic_name):
+            return Level.WARN, f'nobody listens to {self._commands.topic_name}'
+        if self._late():
+            return Level.WARN, self._delay_text()
+        return Level.OK, 'on the way' if self._goal and not self._arrived() else 'at rest'
+
+    def _delay_text(self) -> str:
+        late_s = (self._steady.now().nanoseconds - self._commanded_ns) * 1e-9
+        angles = ', '.join(f'{name} is at {np.degrees(joint.angle_rad):.1f}° of '
+                           f'{np.degrees(self._goal[name]):.1f}°'
+                           for name, joint in self._joints.items())
+        return f'the controller has not followed for {late_s:.0f} s: {angles}'
+
+
+def _declare_joint(node: Node, name: str) -> _Joint:
+    """Declare the parameters of one joint and return it."""
+    joint = declare(node, f'bridge.{name}.joint', Parameter.Type.STRING,
+                    f"the controller's name of the joint {name}")
+    if not joint:
+        raise parameter_error(f'bridge.{name}.joint', "is not set; name the controller's joint")
+    sign = declare(node, f'bridge.{name}.sign', 1, 'direction in which it turns: 1 or -1', '', -1,
+                   1)
+    if sign == 0:
+        raise parameter_error(f'bridge.{name}.sign', '0 is not 1 or -1')
+    return _Joint(joint, float(sign), declare(
+        node, f'bridge.{name}.offset_rad', 0.0, f"{name} where the controller's joint is at 0",
+        'rad', -100.0, 100.0))

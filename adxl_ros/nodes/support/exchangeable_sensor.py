@@ -1,0 +1,182 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""A sensor's parameters that can be exchanged while a node runs: all of them or none."""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
+
+from adxl_ros.errors import one_line, UserError
+from adxl_ros.files import parameter_file
+from adxl_ros.model.effects import library
+from adxl_ros.model.sensor import Sensor
+from adxl_ros.nodes.support.parameters import declare
+from adxl_ros.nodes.support.rclpy_internals import given_parameters
+from adxl_ros.nodes.support.sensor_parameters import declare_sensor, make_sensor, nominal_path
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+_FILE_KEYS = {'format', 'units', *parameter_file.FIGURES,
+              *(f'envelope.{key}' for key in parameter_file.ENVELOPE),
+              *(f'datasheet.{key}' for key in parameter_file.DATASHEET)}
+"""Parameters that belong to a file and change with it alone."""
+_EFFECT_OF = {f'{effect.name}.{p.name}': effect.name
+              for effect in library().values() for p in effect.parameters}
+_NEUTRAL = {f'{effect.name}.{p.name}': p.neutral
+            for effect in library().values() for p in effect.parameters}
+_COEFFICIENT_KEYS = {'effects', 'covariance_names', 'covariance', *_EFFECT_OF}
+"""Parameters that can be set one by one, or several at once."""
+_CHANGED = ', with coefficients set since'
+"""Appended to the source of coefficients when some of them are set."""
+
+
+class ExchangeableSensor:
+    """
+    The sensor that a node's parameters describe.
+
+    Coefficients can be set, several at once by `set_parameters_atomically`. The nominal values
+    belong to the file and come with it, when the parameter `calibration` is set to its path; then
+    all parameters are those of the file. A set that is refused changes nothing.
+
+    Parameters
+    ----------
+    node
+        The node that gets the parameters.
+    check
+        Raises `UserError` if the node cannot use a sensor.
+    use
+        Called with the first and with each new sensor, and with its source in words.
+
+    Raises
+    ------
+    UserError
+        The given parameters describe no sensor.
+
+    """
+
+    def __init__(self, node: Node, check: Callable[[Sensor], None],
+                 use: Callable[[Sensor, str], None]) -> None:
+        self._node, self._check_use, self._use = node, check, use
+        self._flat = declare_sensor(node, live=True)
+        make_sensor(self._flat)
+        from_file = node.get_parameter_or('format').value is not None
+        self._source = 'the parameters given' if from_file else f'the nominal {nominal_path()}'
+        self._declare_provenance(given_parameters(node))
+        path = declare(
+            node, 'calibration', '', 'parameter file to use; setting it loads the whole file or '
+            'nothing of it', live=True)
+        # The file of the set that is under way, or why it cannot be loaded.
+        self._file: dict[str, Any] | UserError | None = None
+        self._declaring = False
+        node.add_pre_set_parameters_callback(self._add_file)
+        node.add_on_set_parameters_callback(self._check)
+        node.add_post_set_parameters_callback(self._apply)
+        if not path:
+            use(_sensor_of(self._flat), self._source)
+            return
+        result = node.set_parameters([Parameter('calibration', value=path)])[0]
+        if not result.successful:
+            raise UserError(result.reason)
+
+    def _declare_provenance(self, given: Iterable[tuple[str, Any]]) -> None:
+        """Declare what is given of a provenance, whose keys are free."""
+        self._declaring = True
+        for name, value in given:
+            if name.startswith('provenance.') and name not in self._flat:
+                self._flat[name] = declare(self._node, name, str(value),
+                                           'where the coefficients come from', live=True)
+        self._declaring = False
+
+    def _add_file(self, parameters: list[Parameter]) -> list[Parameter]:
+        """Add everything that the file of `calibration` holds to a set."""
+        self._file = None
+        if not any(p.name == 'calibration' and p.value for p in parameters):
+            return parameters
+        try:
+            if len(parameters) > 1:
+                raise UserError('calibration: cannot be set together with other parameters: its '
+                                'file holds all of them')
+            self._file = parameter_file.to_flat(parameter_file.load(parameters[0].value))
+        except UserError as error:
+            self._file = error
+            return parameters
+        names = [*_FILE_KEYS, *_COEFFICIENT_KEYS,
+                 *(name for name in self._flat if name.startswith('provenance.'))]
+        return parameters + [self._parameter(name, self._file.get(name)) for name in names]
+
+    def _parameter(self, name: str, value: Any) -> Parameter:
+        kind = Parameter.Type(self._node.describe_parameter(name).type)
+        # A number cannot be empty; that of an effect which is not listed has no meaning.
+        empty: Any = {Parameter.Type.STRING: '', Parameter.Type.DOUBLE: _NEUTRAL.get(name, 0.0)}
+        return Parameter(name, kind, empty.get(kind, []) if value is None else value)
+
+    def _check(self, parameters: Sequence[Parameter]) -> SetParametersResult:
+        """Refuse a set that leads to no sensor, or to one that the node cannot use."""
+        if self._declaring:
+            return SetParametersResult(successful=True)
+        try:
+            if isinstance(self._file, UserError):
+                raise self._file
+            changes = _changes(parameters)
+            if self._file is None:
+                _refuse_others(changes, self._flat | changes)
+            if changes:
+                self._check_use(_sensor_of(self._flat | changes))
+        except UserError as error:
+            return SetParametersResult(successful=False, reason=one_line(error))
+        return SetParametersResult(successful=True)
+
+    def _apply(self, parameters: Sequence[Parameter]) -> None:
+        """Use what has been set."""
+        changes = _changes(parameters)
+        if self._declaring or not changes:
+            return
+        self._flat |= changes
+        if isinstance(self._file, dict):
+            self._source = self._node.get_parameter('calibration').value
+            self._declare_provenance(self._file.items())
+        else:
+            # The leverage is that of the fit; other coefficients have another.
+            self._flat['envelope.leverage'] = 0.0
+            self._source = f'{self._source.removesuffix(_CHANGED)}{_CHANGED}'
+        self._use(_sensor_of(self._flat), self._source)
+
+
+def _changes(parameters: Sequence[Parameter]) -> dict[str, Any]:
+    """Return the values of a set that describe the sensor, by name."""
+    return {p.name: p.value.tolist() if isinstance(p.value, array) else p.value
+            for p in parameters
+            if p.name in _FILE_KEYS or p.name in _COEFFICIENT_KEYS
+            or p.name.startswith('provenance.')}
+
+
+def _refuse_others(changes: Mapping[str, Any], flat: Mapping[str, Any]) -> None:
+    """Refuse what only a file can change, and coefficients that would do nothing."""
+    for name, value in changes.items():
+        if name in _FILE_KEYS or name.startswith('provenance.'):
+            raise UserError(f'{name}: belongs to the parameter file; set calibration to the path '
+                            'of another file')
+        effect = _EFFECT_OF.get(name)
+        if effect and value and effect not in (flat.get('effects') or []):
+            raise UserError(f'{name}: effects does not list {effect}; set effects with it')
+
+
+def _sensor_of(flat: Mapping[str, Any]) -> Sensor:
+    """Make the sensor of parameters, where an empty value stands for none."""
+    filled = {name: value for name, value in flat.items() if value not in ([], '', None)}
+    return make_sensor(filled, lambda key, reason: UserError(f'{key}: {reason}'))

@@ -1,0 +1,114 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Parameters of nodes, each declared with its descriptor."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from adxl_ros.errors import one_line, UserError
+from adxl_ros.nodes.support.params_files import place_of
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.exceptions import ParameterException
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+
+def declare(node: Node, name: str, default: Any, description: str, unit: str = '',
+            lower: float | None = None, upper: float | None = None,
+            choices: Sequence[str] = (), live: bool = False) -> Any:
+    """
+    Declare one parameter with its descriptor and return its value.
+
+    Parameters
+    ----------
+    node
+        The node that gets the parameter.
+    name
+        Its name, with dots.
+    default
+        Its default value, or a `Parameter.Type` for a parameter without one. An empty tuple
+        stands for a list of strings, or one string with commas.
+    description
+        Its meaning, for the descriptor.
+    unit
+        Its unit, for the descriptor.
+    lower, upper
+        The range of a number; None for no limit.
+    choices
+        The values that a string may have; empty for any.
+    live
+        Whether it can be set while the node runs.
+
+    Returns
+    -------
+    Any
+        bool, int, float, str or a list of them; None where there is no value.
+
+    Raises
+    ------
+    UserError
+        The given value has another type, or is out of range or not among the choices.
+
+    """
+    text_or_list = isinstance(default, tuple)
+    if text_or_list:
+        default = ''
+    constraint = f'one of {", ".join(choices)}' if choices else \
+        '' if lower is None else f'{lower:g} to {upper:g}'
+    descriptor = ParameterDescriptor(
+        description=', '.join(filter(None, (description, unit))), read_only=not live,
+        dynamic_typing=text_or_list, additional_constraints=constraint)
+    if lower is not None and upper is not None:
+        _set_range(descriptor, default, lower, upper)
+    try:
+        value = node.declare_parameter(name, default, descriptor).value
+    except ParameterException as error:
+        raise parameter_error(name, one_line(error)) from None
+    if choices and value is not None and value not in choices:
+        raise parameter_error(name, f'{value!r} is not {constraint}')
+    return value
+
+
+def _set_range(descriptor: ParameterDescriptor, default: Any, lower: float, upper: float) -> None:
+    """Give the descriptor of a single number its range; one of a list can have none."""
+    kind = default if isinstance(default, Parameter.Type) else \
+        Parameter.Type.from_parameter_value(default)
+    if kind == Parameter.Type.DOUBLE:
+        descriptor.floating_point_range = [
+            FloatingPointRange(from_value=float(lower), to_value=float(upper))]
+    elif kind == Parameter.Type.INTEGER:
+        descriptor.integer_range = [IntegerRange(from_value=int(lower), to_value=int(upper))]
+
+
+def parameter_error(key: str, reason: str) -> UserError:
+    """
+    Make the error of a parameter, with its place where it comes from a file.
+
+    Parameters
+    ----------
+    key
+        Name of the parameter.
+    reason
+        What is wrong with it.
+
+    Returns
+    -------
+    UserError
+        The error, to be raised.
+
+    """
+    return UserError(f'{place_of(key)}{key}: {reason}')

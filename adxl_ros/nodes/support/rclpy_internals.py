@@ -1,0 +1,143 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Every use of undocumented parts of rclpy, each with its reason."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any
+
+from rclpy.callback_groups import CallbackGroup
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.node import Node
+from rclpy.subscription import Subscription
+
+_LONGEST_WAIT_NS = 100_000_000
+"""Longest wait for a message, ns; chosen: a thread that waits sees within it that it shall end."""
+
+
+class NotForExecutors(CallbackGroup):
+    """
+    Keeps a subscription out of the executor that spins its node.
+
+    A thread takes its messages instead. rclpy has no subscription without an executor, and does
+    not document what an executor asks of a callback group.
+    """
+
+    def can_execute(self, entity: Any) -> bool:
+        """Return False: no executor may take from the subscription."""
+        return False
+
+    def beginning_execution(self, entity: Any) -> bool:
+        """Return False: no executor may take from the subscription."""
+        return False
+
+    def ending_execution(self, entity: Any) -> None:
+        """Do nothing: nothing was executed."""
+
+
+def take_messages(subscription: Subscription, kind: Any, raw: bool, limit: int) -> Iterator[Any]:
+    """
+    Take the messages that wait in a subscription, without a turn of an executor.
+
+    A turn costs as much as ten messages, and rclpy takes one message a turn: a node cannot follow
+    10 kHz like that.
+
+    Parameters
+    ----------
+    subscription
+        The subscription.
+    kind
+        Type of its messages.
+    raw
+        Whether to return serialized messages.
+    limit
+        The largest number of messages.
+
+    Yields
+    ------
+    object
+        Messages, or their bytes.
+
+    """
+    with subscription.handle:
+        for _ in range(limit):
+            taken = subscription.handle.take_message(kind, raw)
+            if taken is None:
+                return
+            yield taken[0]
+
+
+class MessageWait:
+    """
+    Waits in a thread for the messages of one subscription.
+
+    A turn of rclpy's executor builds its wait set from all that the node has, its parameter
+    services among them. A wait set of one subscription makes a relay at 1 kHz two to three times
+    cheaper.
+    """
+
+    def __init__(self, subscription: Subscription, node: Node) -> None:
+        self._subscription, self._context = subscription, node.context
+        self._wait_set: Any = None
+
+    def __call__(self, kind: Any, callback: Callable[[bytes], None], limit: int) -> None:
+        """
+        Wait for a message for up to 0.1 s, and give all that have come to a function.
+
+        Parameters
+        ----------
+        kind
+            Type of the messages.
+        callback
+            Takes the bytes of one message.
+        limit
+            The largest number of messages.
+
+        """
+        handle = self._subscription.handle
+        with handle, self._context.handle:
+            if self._wait_set is None:
+                self._wait_set = rclpy_implementation.WaitSet(1, 0, 0, 0, 0, 0,
+                                                              self._context.handle)
+            self._wait_set.clear_entities()
+            self._wait_set.add_subscription(handle)
+            self._wait_set.wait(_LONGEST_WAIT_NS)
+            for _ in range(limit):
+                taken = handle.take_message(kind, True)
+                if taken is None:
+                    break
+                callback(taken[0])
+
+
+def given_parameters(node: Node) -> Iterable[tuple[str, Any]]:
+    """
+    Return the names and values of all parameters that a node is started with.
+
+    rclpy shows a given parameter only once it is declared. The keys of a provenance are free, so
+    that no declaration can know their names.
+    """
+    return ((name, getattr(given, 'value', given))
+            for name, given in node._parameter_overrides.items())
+
+
+def is_rclpy_error(error: BaseException) -> bool:
+    """Tell whether an error is one of rclpy's own, which have no common base class."""
+    return type(error).__module__.startswith('rclpy')
+
+
+def is_usage_error(error: BaseException) -> bool:
+    """Tell whether rclpy refuses the ROS arguments; the class is in its C++ module alone."""
+    return 'ROSArgs' in type(error).__name__

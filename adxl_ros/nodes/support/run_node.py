@@ -1,0 +1,90 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""One node as an executable: a clean start, and a clean end by a signal."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+import signal
+import sys
+
+from adxl_ros.errors import one_line, UserError
+from adxl_ros.nodes.support import rclpy_internals
+from adxl_ros.nodes.support.params_files import check_params_files
+import rclpy
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.utilities import remove_ros_args
+
+_USAGE = '%(prog)s [--ros-args -p NAME:=VALUE ... --params-file FILE -r FROM:=TO ...]'
+
+
+def run(make_node: Callable[[], Node], description: str | None) -> int:
+    """
+    Run one node until SIGINT or SIGTERM.
+
+    Parameters
+    ----------
+    make_node
+        Creates the node; it may raise `UserError`, and the node may have a method `close()`.
+    description
+        Text that `--help` prints.
+
+    Returns
+    -------
+    int
+        Exit status: 0 ended by a signal, 1 could not start (one line on stderr gives the reason),
+        2 wrong usage.
+
+    """
+    name = Path(sys.argv[0]).name
+    # rclpy's own handler ends the context; Python's would raise in the middle of any statement.
+    signal.signal(signal.SIGINT, lambda *_: None)
+    try:
+        check_params_files()
+        argparse.ArgumentParser(prog=name, description=description, usage=_USAGE).parse_args(
+            remove_ros_args(sys.argv)[1:])
+        rclpy.init()
+        node = make_node()
+    except Exception as error:
+        if not isinstance(error, UserError) and not rclpy_internals.is_rclpy_error(error):
+            raise
+        print(f'{name}: {one_line(error)}', file=sys.stderr)
+        return 2 if rclpy_internals.is_usage_error(error) else 1
+    try:
+        _spin(node)
+    finally:
+        getattr(node, 'close', lambda: None)()
+        rclpy.try_shutdown()
+        # A launch passes Ctrl-C on, which the terminal has sent, too: the second one may come
+        # when Python has already put its handlers away.
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.SIG_IGN)
+    return 0
+
+
+def _spin(node: Node) -> None:
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    try:
+        executor.spin()
+    except ExternalShutdownException:
+        pass
+    except Exception:
+        # After the signal nothing can be published: a failure then belongs to the end.
+        if rclpy.ok():
+            raise

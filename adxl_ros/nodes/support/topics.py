@@ -1,0 +1,106 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Publishers and subscriptions with the QoS of this package."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from adxl_ros.nodes.support.rclpy_internals import take_messages
+from rclpy.callback_groups import CallbackGroup
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.subscription import Subscription
+
+
+def create_publisher(node: Node, kind: Any, topic: str, depth: int, latched: bool = False
+                     ) -> Publisher:
+    """
+    Create a reliable keep-last publisher whose QoS can be overridden by parameters.
+
+    Parameters
+    ----------
+    node
+        The node that publishes.
+    kind
+        Type of the messages.
+    topic
+        Its name.
+    depth
+        Number of messages that are kept.
+    latched
+        Whether late subscribers get the last messages (transient local).
+
+    Returns
+    -------
+    Publisher
+        The publisher.
+
+    """
+    qos = QoSProfile(depth=depth)
+    if latched:
+        qos.durability = DurabilityPolicy.TRANSIENT_LOCAL
+    return node.create_publisher(
+        kind, topic, qos, qos_overriding_options=QoSOverridingOptions.with_default_policies())
+
+
+def create_subscription(node: Node, kind: Any, topic: str, callback: Callable[[Any], object],
+                        depth: int, latched: bool = False, raw: bool = False,
+                        group: CallbackGroup | None = None) -> Subscription:
+    """
+    Subscribe best effort, so that both kinds of publisher connect; QoS can be overridden.
+
+    One turn of the executor gives all waiting messages to the callback, one after the other.
+
+    Parameters
+    ----------
+    node
+        The node that subscribes.
+    kind
+        Type of the messages.
+    topic
+        Its name.
+    callback
+        Takes a message, or its bytes.
+    depth
+        Number of messages that are kept while the node is busy, and the most that one turn takes.
+    latched
+        Whether to get what was published before: reliable and transient local.
+    raw
+        Whether the callback gets serialized messages.
+    group
+        Callback group; None for the node's own.
+
+    Returns
+    -------
+    Subscription
+        The subscription.
+
+    """
+    def take_all(first: Any) -> None:
+        callback(first)
+        for message in take_messages(subscription, kind, raw, depth):
+            callback(message)
+
+    qos = QoSProfile(depth=depth, reliability=ReliabilityPolicy.BEST_EFFORT)
+    if latched:
+        qos = QoSProfile(depth=depth, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    subscription = node.create_subscription(
+        kind, topic, take_all, qos, raw=raw, callback_group=group,
+        qos_overriding_options=QoSOverridingOptions.with_default_policies())
+    return subscription
