@@ -55,8 +55,7 @@ class Calibration(Node):
     def __init__(self) -> None:
         super().__init__('calibration')
         self.base = make_sensor(declare_sensor(self))
-        self.autostart = declare(self, 'autostart', False,
-                                              'start without a call of ~/start')
+        self.autostart = declare(self, 'autostart', False, 'start without a call of ~/start')
         self.resume = declare(
             self, 'resume', 'ask', 'go on with an interrupted calibration; ask where there is a '
             'screen, else go on', choices=('ask', 'continue', 'anew'))
