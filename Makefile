@@ -5,6 +5,7 @@
 # make perf     limits of processor time, for a quiet machine
 # make bench    rate, missing samples, latency and CPU of the live nodes
 # make gallery  docs/effects.md and its plots, from the library of effects
+# make reproduction  docs/reproduction.md and its plots: the paper's experiments on simulated units
 # make coverage do the intervals hold? 300 drawn units and stages, as a table
 # make faults   the links under every fault, as a table
 # make soak     half an hour of random faults, and 200 kills of a sweep
@@ -14,7 +15,7 @@
 # make lint     the linters alone
 # make clean    remove what these made
 
-.PHONY: build demo check test perf bench gallery reproduction coverage long faults soak fuzz blind lint clean \
+.PHONY: build help demo check test perf bench gallery reproduction coverage long faults soak fuzz blind lint clean \
     FORCE
 .DEFAULT_GOAL := build
 
@@ -74,6 +75,9 @@ sources := package.xml setup.py setup.cfg \
     $(shell find adxl_ros launch params resource security -name __pycache__ -prune -o -print)
 
 build: install/.built
+
+help:
+	@sed -n 's/^# \(make .*\)/\1/p' Makefile
 
 # Made from nothing, so that a module that is gone from the sources is gone from install/.
 install/.built: .venv/.ready $(sources)
