@@ -46,6 +46,7 @@ from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store, parameter_file
 from adxl_ros.files.atomic_write import keep_previous
 from adxl_ros.files.figure_file import write
+from adxl_ros.files.stream_info import NO_UNIT
 from adxl_ros.model import signal_chain
 from adxl_ros.model.coefficients import get
 from adxl_ros.model.constants import G0_MPS2, Z_90
@@ -139,7 +140,7 @@ class Result:
         except UserError as error:
             return f'no copy in the store: {error}'
         return f'kept as {path}' if path else \
-            f'not kept in {folder}: the serial number {calibration_store.NO_UNIT} is no unit ' \
+            f'not kept in {folder}: the serial number {NO_UNIT} is no unit ' \
             'in particular'
 
     def _is_in(self, path: str | os.PathLike) -> bool:

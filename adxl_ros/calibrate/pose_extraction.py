@@ -22,7 +22,6 @@ from typing import Any
 from adxl_ros.calibrate import joint_settings
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.errors import UserError
-from adxl_ros.files.recorded_unit import stage_angles
 from adxl_ros.files.recording_columns import COMMANDS, JOINTS, Recording
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals import filter_time_constant
@@ -70,7 +69,7 @@ def poses_of(recording: Recording, sensor: Sensor,
     recording
         Read as a whole.
     sensor
-        From `recorded_unit.recorded_unit`.
+        From `stream_unit.recorded_unit`.
     entries
         Poses of the journal of the run, which name the rests, the angles, the settings of the
         joints and the check poses.
@@ -81,7 +80,7 @@ def poses_of(recording: Recording, sensor: Sensor,
         There is no rest.
 
     """
-    volts, angles = recording.volts(sensor), stage_angles(recording)
+    volts, angles = recording.volts(sensor), recording.stage_angles
     known = known_noise(sensor)
     if entries is None:
         tolerance = max(sensor.stage_resolution_rad, _FINEST_ANGLE_RAD)

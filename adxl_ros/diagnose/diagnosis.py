@@ -39,9 +39,8 @@ from adxl_ros.diagnose.noise_floor import Floor, floor
 from adxl_ros.diagnose.noise_whitening import DRIFTS, drifts_among
 from adxl_ros.diagnose.residual_map import Cell, covered, map_of
 from adxl_ros.diagnose.single_effect_scores import Score, scores
-from adxl_ros.files.recorded_unit import rate_hz
 from adxl_ros.files.recording_columns import Recording
-from adxl_ros.files.unit_check import check_unit
+from adxl_ros.files.stream_unit import check_unit
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.sensor import Sensor, with_axes
 from adxl_ros.simulate.motion import Motion
@@ -119,8 +118,8 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
     signs: list[Sign] = []
     alone: list[Sign | None] = []
     for read in recordings:
-        check_unit(read.info, read.axes, sensor, read.path)
-        one = series_of(read, replace(sensor, rate_hz=rate_hz(read)), sim)
+        check_unit(read.stream_info, read.axes, sensor)
+        one = series_of(read, replace(sensor, rate_hz=read.rate_hz), sim)
         thin = thinned(one)
         fault = data_checks.look(one, thin)
         if fault is not None:

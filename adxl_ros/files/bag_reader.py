@@ -24,7 +24,14 @@ from adxl_ros.errors import UserError
 from adxl_ros.files import cdr
 from adxl_ros.files.bag_messages import Bag, open_bag
 from adxl_ros.files.bag_topics import find_ideal, find_topics, read_info, Topics
-from adxl_ros.files.recording_columns import ACCEL, COMMANDS, JOINTS, LIMIT, Recording
+from adxl_ros.files.recording_columns import (
+    ACCEL,
+    Alignment,
+    COMMANDS,
+    JOINTS,
+    LIMIT,
+    Recording,
+)
 from adxl_ros.files.reference_alignment import Command, seconds, Track
 from adxl_ros.model.constants import AXES
 import numpy as np
@@ -269,20 +276,19 @@ def _block(bag: Bag, samples: _Samples, tracks: dict[str, Track], commands: dict
     accel = samples.accel[part]
     columns = {name: np.ascontiguousarray(accel[:, i])
                for i, name in enumerate(ACCEL[:len(samples.axes or '')])}
-    notes: dict[str, float | str] = {}
+    alignments = {}
     for name, track in tracks.items():
         columns[name] = track.at(stamp_ns)
         track.forget(int(stamp_ns[-1]))
-        notes[f'{name}_residual'] = track.residual
-        notes[f'{name}_gap_s'] = track.gap_s
+        alignments[name] = Alignment(track.residual, track.gap_s)
     for name, command in commands.items():
         columns[name] = command.at(stamp_ns)
         command.forget(int(stamp_ns[-1]))
     # Divided, not multiplied by 1e-9: that gives the float64 nearest to the decimal figure.
     time_s = (stamp_ns - samples.epoch_ns) / 1e9
-    if bag.cut:
-        notes['cut'] = f'{bag.cut}; the last sample read is at {seconds(stamp_ns[-1])}'
-    return Recording(bag.path, time_s, columns, dict(info), notes, samples.epoch_ns, bag.done)
+    cut = f'{bag.cut}; the last sample read is at {seconds(stamp_ns[-1])}' if bag.cut else ''
+    return Recording(bag.path, time_s, columns, dict(info), alignments, cut, samples.epoch_ns,
+                     bag.done)
 
 
 def drop_unsampled(recording: Recording) -> None:
@@ -290,5 +296,4 @@ def drop_unsampled(recording: Recording) -> None:
     for column in (*JOINTS.values(), *COMMANDS.values()):
         if column in recording.columns and np.isnan(recording.columns[column]).all():
             del recording.columns[column]
-            for note in (f'{column}_residual', f'{column}_gap_s'):
-                recording.notes.pop(note, None)
+            recording.alignments.pop(column, None)

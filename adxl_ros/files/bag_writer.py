@@ -35,7 +35,8 @@ from adxl_ros.files.bag_topics import (
     TEMPERATURE,
     typestore,
 )
-from adxl_ros.files.recording_columns import COMMANDS, converted_info, JOINTS, Recording
+from adxl_ros.files.recording_columns import COMMANDS, JOINTS, Recording
+from adxl_ros.files.stream_info import converted_info
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.noise import sigma_v
 from adxl_ros.model.sensor import Sensor
@@ -282,26 +283,3 @@ def _battery_template(types: Any) -> bytes:
         power_supply_status=0, power_supply_health=0, power_supply_technology=0, present=True,
         cell_voltage=none, cell_temperature=none, location='', serial_number='')
     return bytes(types.serialize_cdr(message, BATTERY_STATE))
-
-
-def write_bag(path: str | os.PathLike, recording: Recording, sensor: Sensor) -> None:
-    """
-    Write a recording as a bag.
-
-    Parameters
-    ----------
-    path
-        A rosbag2 directory, or one file for a name.mcap; replaced if it exists.
-    recording
-        The samples and references.
-    sensor
-        The unit whose nominal conversion `imu/data_raw` holds.
-
-    Raises
-    ------
-    UserError
-        The bag cannot be written.
-
-    """
-    with BagWriter(path, sensor) as bag:
-        bag.write(recording)

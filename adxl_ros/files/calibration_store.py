@@ -33,10 +33,8 @@ from urllib.parse import quote
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
+from adxl_ros.files.stream_info import NO_UNIT
 from adxl_ros.model.sensor import Sensor
-
-NO_UNIT = 'nominal'
-"""Serial number of no unit in particular; what is of no unit is not stored."""
 
 _DATE = '%Y%m%dT%H%M%SZ'
 _OLDEST = datetime.min.replace(tzinfo=timezone.utc)

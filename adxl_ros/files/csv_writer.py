@@ -118,17 +118,3 @@ def recording_info(recording: Recording) -> dict[str, str]:
 def recording_columns(recording: Recording) -> dict[str, np.ndarray]:
     """Return the columns of a recording's CSV file."""
     return {TIME: recording.time_s, **recording.columns}
-
-
-def write_csv(path: str | os.PathLike, recording: Recording) -> None:
-    """
-    Write a recording as CSV; reading it back gives the same numbers to the bit.
-
-    Raises
-    ------
-    UserError
-        The file cannot be written.
-
-    """
-    with CsvWriter(path) as file:
-        file.write(recording_columns(recording), recording_info(recording))

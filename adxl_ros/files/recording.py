@@ -27,22 +27,12 @@ import os
 from pathlib import Path
 
 from adxl_ros.errors import UserError
-from adxl_ros.files import bag_reader, csv_file, unit_check
-from adxl_ros.files.bag_writer import BagWriter, write_bag
-from adxl_ros.files.csv_writer import CsvWriter, recording_columns, recording_info, write_csv
-from adxl_ros.files.recording_columns import (
-    ACCEL,
-    concatenate,
-    converted_info,
-    Recording,
-    sensor_info,
-)
+from adxl_ros.files import bag_reader, csv_file
+from adxl_ros.files.bag_writer import BagWriter
+from adxl_ros.files.csv_writer import CsvWriter, recording_columns, recording_info
+from adxl_ros.files.recording_columns import ACCEL, concatenate, Recording
 from adxl_ros.model.sensor import Sensor
 import numpy as np
-
-__all__ = [
-    'BagWriter', 'CsvWriter', 'Recording', 'blocks', 'check_unit', 'converted_info', 'read',
-    'read_ideal', 'sensor_info', 'write', 'write_bag', 'write_csv', 'writer']
 
 _BLOCK_ROWS = 65536
 _MAGIC = {b'\x89MCAP': '.mcap', b'SQLite format 3': '.db3', b'\x28\xb5\x2f\xfd': '.zstd',
@@ -108,19 +98,6 @@ def read_ideal(path: str | os.PathLike, epoch_ns: int = 0) -> tuple[np.ndarray, 
     ideal = concatenate(parts)
     time_s = ideal.time_s + (ideal.epoch_ns - epoch_ns) / 1e9
     return time_s, np.column_stack([ideal.columns[name] for name in ACCEL])
-
-
-def check_unit(recording: Recording, sensor: Sensor) -> None:
-    """
-    Refuse a recording of another unit than `sensor` describes; see `unit_check.check_unit`.
-
-    Raises
-    ------
-    UserError
-        The serial numbers, the axes or the nominal figures differ.
-
-    """
-    unit_check.check_unit(recording.info, recording.axes, sensor, recording.path)
 
 
 @contextmanager

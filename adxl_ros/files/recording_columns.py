@@ -12,61 +12,86 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What a recording holds: samples by named column, and the figures that make them readable."""
+"""What a recording holds: samples by named column, with references and what was stated."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
-import re
+from typing import Any, NamedTuple
 
 from adxl_ros.errors import UserError
+from adxl_ros.files.stream_info import StreamInfo
 from adxl_ros.model.constants import AXES
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2, to_volts
 import numpy as np
 
 TIME = 'time_s'
-VOLTS = ('x_v', 'y_v', 'z_v')
-ACCEL = ('ax_mps2', 'ay_mps2', 'az_mps2')
-JOINTS = {'alpha': 'alpha_rad', 'beta': 'beta_rad', 'shift': 'shift_m'}
-REFERENCES = (*JOINTS.values(), 'temperature_c', 'supply_v')
-COMMANDS = {'alpha': 'alpha_command_rad', 'beta': 'beta_command_rad'}
-"""Where a stage has been told to go: no reference, but it tells when a joint has been moved."""
+"""Column of the stamps, s."""
 
-FORMAT = '1'
-"""Version of the recording format, the `format` of sensor_info."""
+VOLTS = ('x_v', 'y_v', 'z_v')
+"""Columns of the ADC volts by axis, V."""
+
+ACCEL = ('ax_mps2', 'ay_mps2', 'az_mps2')
+"""Columns of the specific force by axis after the nominal conversion, m/s²."""
+
+JOINTS = {'alpha': 'alpha_rad', 'beta': 'beta_rad', 'shift': 'shift_m'}
+"""Columns of the encoders by joint, rad and m."""
+
+REFERENCES = (*JOINTS.values(), 'temperature_c', 'supply_v')
+"""Columns of all references."""
+
+COMMANDS = {'alpha': 'alpha_command_rad', 'beta': 'beta_command_rad'}
+"""Columns of the commands of a stage, rad: no references, but they show when a joint moves."""
 
 LIMIT = 1e6
-"""Largest magnitude, in the column's unit, of a sensor's output or a reference."""
+"""Largest magnitude of a sensor's output or a reference, in the column's unit (chosen: beyond
+every sensor of the package, and far below what damaged bytes decode to)."""
+
+
+class Alignment(NamedTuple):
+    """
+    How well a reference was aligned with the stamps of the samples.
+
+    Attributes
+    ----------
+    residual
+        Rms difference between a message and the line between its neighbours, in the unit of the
+        reference. 0 where no sample needed an interpolation.
+    gap_s
+        Largest time between a sample and the message nearest to it, s.
+
+    """
+
+    residual: float
+    gap_s: float
 
 
 @dataclass
 class Recording:
     """
-    Samples of one sensor and of the references beside it.
+    Samples of one sensor, with references.
 
     Attributes
     ----------
     path
-        Where it was read from, for messages.
+        The file that it was read from, for messages.
     time_s
         Stamps of the samples, s since `epoch_ns`, (n,), strictly increasing. Missing samples are
         gaps in it.
     columns
-        Arrays (n,) by column name: `x_v ...` in V or `ax_mps2 ...` in m/s² (nominal conversion),
-        the references `alpha_rad`, `beta_rad`, `shift_m`, `temperature_c`, `supply_v` with NaN
-        where the reference was not sampled, the commands in force `alpha_command_rad`,
-        `beta_command_rad` with NaN before the first one, and the other numeric columns of a CSV
-        file. Where a file has both, the volts are the sensor's output and m/s² is one of the other
-        columns.
+        Arrays (n,) by column name. The sensor's output is `x_v ...`, V, or `ax_mps2 ...`, m/s²;
+        where a file has both, it is the volts. References are NaN where they were not sampled,
+        commands before the first one. A CSV file may have further columns of numbers.
     info
-        The keys of `sensor_info` and other `# key: value` lines.
-    notes : dict
-        What reading it showed: `<column>_residual` and `<column>_gap_s` of references that were
-        aligned (see `reference_alignment.Track`), `cut` where a damaged recording ended.
+        The keys and values of `sensor_info`, and other `# key: value` lines.
+    alignments
+        How well each reference was aligned, by column.
+    cut
+        Where a damaged recording ends; empty if it is whole.
     epoch_ns
-        What `time_s` counts from, ns. Whole seconds near the first stamp where the stamps of a
-        bag count from 1970, because float64 seconds since then resolve only 0.2 µs; else 0.
+        Origin of `time_s`, ns. Whole seconds near the first stamp where the stamps of a bag
+        count from 1970, because float64 seconds since then resolve only 0.2 µs; else 0.
     done
         Fraction of the file that has been read at the end of these samples.
 
@@ -76,7 +101,8 @@ class Recording:
     time_s: np.ndarray
     columns: dict[str, np.ndarray]
     info: dict[str, str] = field(default_factory=dict)
-    notes: dict[str, float | str] = field(default_factory=dict)
+    alignments: dict[str, Alignment] = field(default_factory=dict)
+    cut: str = ''
     epoch_ns: int = 0
     done: float = 1.0
 
@@ -99,17 +125,46 @@ class Recording:
         """Stamps, ns, (n,) int64: exactly those of a bag's messages."""
         return self.epoch_ns + np.rint(self.time_s * 1e9).astype(np.int64)
 
-    def volts(self, sensor: Sensor) -> np.ndarray:
-        """
-        Return the ADC volts of the axes of `sensor`, V, (n, m).
+    @property
+    def stream_info(self) -> StreamInfo:
+        """What the recording states about its sensor."""
+        return StreamInfo(self.info, self.path)
 
-        m/s² are converted back by the nominal figures that the recording carries, and by those
-        of `sensor` where it carries none.
+    @property
+    def rate_hz(self) -> float:
+        """
+        Sample rate by the stamps, Hz. Single gaps do not change it.
 
         Raises
         ------
         UserError
-            An axis is missing, or a figure of the recording cannot be read.
+            There are fewer than two samples.
+
+        """
+        if len(self) < 2:
+            raise UserError(f'{self.path}: {len(self)} samples; at least 2 are needed')
+        return stamped_rate_hz(self.time_s)
+
+    @property
+    def stage_angles(self) -> np.ndarray | None:
+        """Angles alpha and beta, rad, (n, 2), NaN where not sampled; None without a stage."""
+        names = (JOINTS['alpha'], JOINTS['beta'])
+        if not all(name in self.columns for name in names):
+            return None
+        angles = np.column_stack([self.columns[name] for name in names])
+        return None if np.isnan(angles).all(axis=0).any() else angles
+
+    def volts(self, sensor: Sensor) -> np.ndarray:
+        """
+        Return the ADC volts of the axes of `sensor`, V, (n, m).
+
+        Specific force is converted back by the nominal values that the recording states, and by
+        those of `sensor` where it states none.
+
+        Raises
+        ------
+        UserError
+            An axis is missing, or a nominal value of the recording cannot be read.
 
         """
         names, data = self._output(sensor)
@@ -117,16 +172,16 @@ class Recording:
 
     def accel_mps2(self, sensor: Sensor) -> np.ndarray:
         """
-        Return the specific force by the nominal figures of `sensor`, m/s², (n, m).
+        Return the specific force by the nominal values of `sensor`, m/s², (n, m).
 
         Raises
         ------
         UserError
-            An axis is missing, or a figure of the recording cannot be read.
+            An axis is missing, or a nominal value of the recording cannot be read.
 
         """
         names, data = self._output(sensor)
-        if names[0] in ACCEL and _same_figures(self._nominal(sensor), sensor):
+        if names[0] in ACCEL and _has_same_nominal_values(self._nominal(sensor), sensor):
             return data
         return to_nominal_mps2(self.volts(sensor), sensor)
 
@@ -139,54 +194,37 @@ class Recording:
         return names, np.column_stack([self.columns[name] for name in names])
 
     def _nominal(self, sensor: Sensor) -> Sensor:
-        figures = nominal_figures(self.info, self.axes, self.path)
-        return replace(sensor, **{name: of_all[:len(sensor.axes)]
-                                  for name, of_all in figures.items()})
+        stated: dict[str, Any] = {
+            name: values[:len(sensor.axes)]
+            for name, values in self.stream_info.nominal_values(self.axes).items()}
+        return replace(sensor, **stated)
 
 
-def nominal_figures(info: Mapping[str, str], axes: str, where: str) -> dict[str, np.ndarray]:
-    """
-    Read the nominal figures that `info` carries, by the names of `Sensor`'s fields, (m,) each.
-
-    Parameters
-    ----------
-    info
-        The keys of `sensor_info`.
-    axes
-        The axes that it should have figures of.
-    where
-        The file or topic, for messages.
-
-    Raises
-    ------
-    UserError
-        A figure cannot be read, or there is not one an axis.
-
-    """
-    found = {}
-    for key in ('nominal_zero_g_v', 'nominal_scale_v_per_g'):
-        if key not in info:
-            continue
-        words = [word for word in re.split(r'[\s,;\[\]()]+', info[key]) if word]
-        try:
-            figures = np.array([float(word) for word in words])
-        except ValueError:
-            figures = np.zeros(0)
-        if len(figures) != len(axes) or not np.isfinite(figures).all():
-            raise UserError(f'{where}: {key} is {info[key]!r}, expected {len(axes)} numbers, '
-                            'one an axis')
-        found[key] = figures
-    return found
+def stamped_rate_hz(time_s: np.ndarray) -> float:
+    """Return the sample rate of stamps, s, (n,), from their median step, Hz, to 1e-6 Hz."""
+    return round(float(1 / np.median(np.diff(time_s))), 6)
 
 
-def _same_figures(one: Sensor, other: Sensor) -> bool:
-    return (np.array_equal(one.nominal_zero_g_v, other.nominal_zero_g_v)
-            and np.array_equal(one.nominal_scale_v_per_g, other.nominal_scale_v_per_g))
+def _has_same_nominal_values(first: Sensor, second: Sensor) -> bool:
+    return (np.array_equal(first.nominal_zero_g_v, second.nominal_zero_g_v)
+            and np.array_equal(first.nominal_scale_v_per_g, second.nominal_scale_v_per_g))
 
 
 def sensor_columns(names: Iterable[str], where: str) -> tuple[str, ...]:
     """
-    Return which of `names` are the sensor's output: volts where there are any, else m/s².
+    Return which columns are the sensor's output: volts where there are any, else m/s².
+
+    Parameters
+    ----------
+    names
+        All columns.
+    where
+        The file or topic, for messages.
+
+    Returns
+    -------
+    tuple
+        The names in the order of the axes.
 
     Raises
     ------
@@ -196,50 +234,24 @@ def sensor_columns(names: Iterable[str], where: str) -> tuple[str, ...]:
     """
     names = tuple(names)
     kind = VOLTS if any(name in names for name in VOLTS) else ACCEL
-    found = tuple(name for name in kind if name in names)
+    present = tuple(name for name in kind if name in names)
     listed = ', '.join(names) or 'none'
-    if not found:
+    if not present:
         raise UserError(f'{where}: no column of a sensor: needs x_v[, y_v][, z_v] or '
                         f'ax_mps2[, ay_mps2][, az_mps2]; the columns are {listed}')
-    expected = kind[:len(found)]
-    if found != expected:
-        lost = next(name for name in expected if name not in found)
-        raise UserError(f'{where}: no column {lost} beside {", ".join(found)}; '
+    expected = kind[:len(present)]
+    if present != expected:
+        missing = next(name for name in expected if name not in present)
+        raise UserError(f'{where}: no column {missing} beside {", ".join(present)}; '
                         f'the columns are {listed}')
-    return found
-
-
-def sensor_info(sensor: Sensor) -> dict[str, str]:
-    """Return the keys and values of the topic `sensor_info` and of a CSV file's head."""
-    return {
-        'serial': sensor.serial,
-        'axes': sensor.axes,
-        'nominal_zero_g_v': _listed(sensor.nominal_zero_g_v),
-        'nominal_scale_v_per_g': _listed(sensor.nominal_scale_v_per_g),
-        'rate_hz': repr(float(sensor.rate_hz)),
-        'format': FORMAT,
-    }
-
-
-def _listed(values: np.ndarray) -> str:
-    return ', '.join(map(repr, np.asarray(values, dtype=float).tolist()))
-
-
-def converted_info(info: Mapping[str, str], sensor: Sensor) -> dict[str, str]:
-    """
-    Return the info of a recording with `info` after conversion by the figures of `sensor`.
-
-    The nominal figures become the sensor's; whose output it is and how fast stays.
-    """
-    kept = {key: info[key] for key in ('serial', 'rate_hz') if key in info}
-    return {**info, **sensor_info(sensor), **kept}
+    return present
 
 
 def concatenate(parts: Iterable[Recording]) -> Recording:
     """
-    Join the blocks of one recording; what the last block says of the whole stands.
+    Join the blocks of one recording; info, alignments and cut are those of the last block.
 
-    A column that only some of the blocks have (text further down in a CSV column) is left out.
+    A column that is missing in the last block (text further down in a CSV column) is left out.
     """
     blocks = list(parts)
     last = blocks[-1]

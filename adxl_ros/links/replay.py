@@ -22,9 +22,10 @@ from typing import Any
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import recording
-from adxl_ros.files.recording_columns import nominal_figures, Recording, REFERENCES
+from adxl_ros.files.recording_columns import Recording, REFERENCES
+from adxl_ros.files.stream_unit import uncalibrated
 from adxl_ros.links.support.base import nothing, Option, Samples, State
-from adxl_ros.model.sensor import Sensor, with_axes
+from adxl_ros.model.sensor import Sensor
 import numpy as np
 
 OPTIONS = (
@@ -121,21 +122,9 @@ class Replay:
 
 def _unit(sensor: Sensor, first: Recording) -> Sensor:
     """
-    Return the sensor of a recording: what it says of itself, the rest as the parameters.
+    Return the nominal sensor of a recording: what it states, the rest as the parameters.
 
     Calibrated coefficients have no part in the nominal conversion.
     """
-    bare = replace(sensor, model='nominal', effects=(), values={}, covariance_names=(),
-                   covariance=np.zeros((0, 0)))
-    try:
-        rate_hz = float(first.info['rate_hz'])
-    except KeyError:
-        rate_hz = float(1e9 / np.median(np.diff(first.stamp_ns))) if len(first) > 1 \
-            else sensor.rate_hz
-    except ValueError:
-        rate_hz = 0.0
-    if not 0 < rate_hz < np.inf:
-        raise UserError(f'{first.path}: rate_hz is {first.info["rate_hz"]!r}, not a sample rate')
-    return replace(with_axes(bare, first.axes), rate_hz=rate_hz,
-                   serial=first.info.get('serial', sensor.serial),
-                   **nominal_figures(first.info, first.axes, first.path))
+    rate_hz = first.stream_info.rate_hz or (first.rate_hz if len(first) > 1 else sensor.rate_hz)
+    return uncalibrated(sensor, first.stream_info, first.axes, rate_hz)

@@ -30,8 +30,9 @@ from adxl_ros.calibrate import pose_extraction
 from adxl_ros.calibrate.fits import paper_regression
 from adxl_ros.errors import UserError
 from adxl_ros.files import cdr, parameter_file, recording
-from adxl_ros.files.recorded_unit import recorded_unit
-from adxl_ros.files.recording_columns import Recording, sensor_info
+from adxl_ros.files.recording_columns import Recording
+from adxl_ros.files.stream_info import sensor_info
+from adxl_ros.files.stream_unit import recorded_unit
 from adxl_ros.links.support import wire_format
 from adxl_ros.nodes.demo import end
 from adxl_ros.nodes.support.sensor_parameters import nominal_path

@@ -25,7 +25,8 @@ from adxl_ros.calibrate.guided.live_window import Newest, STALE_NS
 from adxl_ros.calibrate.guided.session import Session
 from adxl_ros.calibrate.guided.stage_guide import MountingError, Sweep
 from adxl_ros.errors import UserError
-from adxl_ros.files.recorded_unit import unit_of
+from adxl_ros.files.stream_info import StreamInfo
+from adxl_ros.files.stream_unit import unit_of
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.nodes.support import next_pose
 from adxl_ros.nodes.support.calibration_console import Console, IDLE
@@ -103,7 +104,7 @@ class Calibration(Node):
     def _on_info(self, message: DiagnosticStatus) -> None:
         info = {pair.key: pair.value for pair in message.values}
         try:
-            unit = unit_of(self.base, info, 'sensor_info')
+            unit = unit_of(self.base, StreamInfo(info, 'sensor_info'))
         except UserError as error:
             self._foreign = f'{error}'
             # Of that sensor nothing is taken or shown.

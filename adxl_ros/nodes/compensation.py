@@ -25,9 +25,10 @@ from typing import Any, NamedTuple
 from adxl_ros.compensate import filter_inversion
 from adxl_ros.compensate.sample_by_sample import Estimate, Live
 from adxl_ros.errors import UserError
-from adxl_ros.files import calibration_store, imu_message, recorded_unit
+from adxl_ros.files import calibration_store, imu_message
 from adxl_ros.files.cdr import CdrError
-from adxl_ros.files.unit_check import check_unit
+from adxl_ros.files.stream_info import NO_UNIT, StreamInfo
+from adxl_ros.files.stream_unit import check_unit
 from adxl_ros.model import noise, signal_chain
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.sensor import Sensor
@@ -134,7 +135,7 @@ class Compensation(Node):
     def _rate_hz(self, sensor: Sensor) -> float:
         """Return the rate that the stream states, else that of the calibration."""
         try:
-            return recorded_unit.stated_rate_hz(self._info or {}, sensor, '')
+            return StreamInfo(self._info or {}, '').rate_hz or sensor.rate_hz
         except UserError:
             # Nothing is published then; see `_check_unit`.
             return sensor.rate_hz
@@ -143,9 +144,9 @@ class Compensation(Node):
         if self._paper and sensor.axes == 'x':
             raise UserError("inverse: the paper's needs the axes x and y, the sensor has x")
         if self._info is not None:
-            topic = self.resolve_topic_name('sensor_info')
-            check_unit(self._info, self._info.get('axes', sensor.axes), sensor, topic)
-            recorded_unit.stated_rate_hz(self._info, sensor, topic)
+            info = StreamInfo(self._info, self.resolve_topic_name('sensor_info'))
+            check_unit(info, info.axes or sensor.axes, sensor)
+            _ = info.rate_hz  # refuses what is no rate
 
     def _on_info(self, message: DiagnosticStatus) -> None:
         self._info = {pair.key: pair.value for pair in message.values}
@@ -160,8 +161,8 @@ class Compensation(Node):
 
     def _pick(self) -> None:
         """Take the newest calibration of the stream's unit, unless one was named."""
-        serial = (self._info or {}).get('serial', calibration_store.NO_UNIT)
-        if not self._store or serial == calibration_store.NO_UNIT or self._named():
+        serial = (self._info or {}).get('serial', NO_UNIT)
+        if not self._store or serial == NO_UNIT or self._named():
             return
         path, refused = calibration_store.newest(self._store, serial, self._check_unit)
         for why in refused:
@@ -183,7 +184,7 @@ class Compensation(Node):
     def _newer(self) -> Path | None:
         """Return a calibration of the unit that was put into the store after the active one."""
         sensor = self._sensor
-        if not self._store or not sensor.effects or sensor.serial == calibration_store.NO_UNIT:
+        if not self._store or not sensor.effects or sensor.serial == NO_UNIT:
             return None
         return calibration_store.newer(self._store, sensor)
 

@@ -22,7 +22,7 @@ import traceback
 from typing import Any
 
 from adxl_ros.errors import UserError
-from adxl_ros.files.recording_columns import sensor_info
+from adxl_ros.files.stream_info import sensor_info
 from adxl_ros.links.support import base
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.nodes.support.diagnostics import DiagnosticsReporter, Level, Status, status_message

@@ -29,7 +29,8 @@ from adxl_ros.calibrate import pose_extraction
 from adxl_ros.calibrate.fits import full_model, linear, paper_regression, term_selection
 from adxl_ros.calibrate.guided.pose_plan import sweep
 from adxl_ros.calibrate.poses import Poses
-from adxl_ros.files.recording_columns import Recording, sensor_info
+from adxl_ros.files.recording_columns import Recording
+from adxl_ros.files.stream_info import sensor_info
 from adxl_ros.model.coefficients import typical, with_neutral
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.sensor import Sensor

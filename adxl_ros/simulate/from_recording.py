@@ -21,7 +21,7 @@ from typing import Any
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import recording
-from adxl_ros.files.recording_columns import JOINTS, Recording
+from adxl_ros.files.recording_columns import JOINTS, Recording, stamped_rate_hz
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.simulate.motion import Held, Motion, Path
 from adxl_ros.simulate.smoothed_paths import Force, Smoothed
@@ -53,7 +53,7 @@ def felt(path: str | os.PathLike, resampled: bool) -> tuple[Motion, float]:
         raise UserError(f'{path}: {len(time_s)} samples of specific force; at least 4 are needed')
     begin_s = float(time_s[0])
     duration_s = float(time_s[-1] - begin_s)
-    rate = round(1 / float(np.median(np.diff(time_s))), 6)
+    rate = stamped_rate_hz(time_s)
     return Motion(duration_s + 1 / rate, force=Force(time_s, force),
                   internal_rate_hz=rate if resampled else max(rate, 1000.0)), begin_s
 

@@ -27,9 +27,8 @@ from adxl_ros.compensate import filter_inversion, paper_inverse
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.csv_writer import CsvWriter
-from adxl_ros.files.recorded_unit import rate_hz
-from adxl_ros.files.recording import Recording
-from adxl_ros.files.unit_check import check_unit
+from adxl_ros.files.recording_columns import Recording
+from adxl_ros.files.stream_unit import check_unit
 from adxl_ros.model import noise, signal_chain
 from adxl_ros.model.constants import AXES
 from adxl_ros.model.covariance import force_covariance, leverage
@@ -72,7 +71,7 @@ def apply(options: argparse.Namespace) -> int:
         first = next(blocks, None)
         if first is not None:
             sensor = _of_unit(first, sensor)
-            sensor = replace(sensor, rate_hz=rate_hz(first) if len(first) > 1 else sensor.rate_hz)
+            sensor = replace(sensor, rate_hz=first.rate_hz if len(first) > 1 else sensor.rate_hz)
             began_s = float(first.time_s[0])
             _say_unknown(first, sensor, options.undo_filter)
             if 'temperature_c' not in first.columns:
@@ -109,7 +108,7 @@ def _with_volts(blocks: Iterable[Recording], sensor: Sensor, undo_filter: bool
 def _of_unit(block: Recording, sensor: Sensor) -> Sensor:
     if not sensor.effects:
         sensor = with_axes(sensor, block.axes)
-    check_unit(block.info, block.axes, sensor, block.path)
+    check_unit(block.stream_info, block.axes, sensor)
     return sensor
 
 

@@ -26,7 +26,7 @@ import sys
 from types import FrameType
 
 from adxl_ros.errors import UserError
-from adxl_ros.files.recording_columns import Recording, REFERENCES
+from adxl_ros.files.recording_columns import Recording
 from ament_index_python.packages import get_package_share_directory
 
 
@@ -103,16 +103,15 @@ def say_notes(tool: str, read: Recording) -> None:
         The recording, or its last block.
 
     """
-    if 'cut' in read.notes:
-        print(f'{tool}: {read.notes["cut"]}', file=sys.stderr)
-    for name in REFERENCES:
+    if read.cut:
+        print(f'{tool}: {read.cut}', file=sys.stderr)
+    for name, alignment in read.alignments.items():
         # References with the sensor's own stamps need no alignment.
-        if read.notes.get(f'{name}_gap_s'):
+        if alignment.gap_s:
             unit = {'rad': 'rad', 'm': 'm', 'c': 'degC', 'v': 'V'}[name.rsplit('_', 1)[1]]
             print(f'{tool}: {read.path}: {name} aligned by its stamps: residual '
-                  f'{read.notes[f"{name}_residual"]:.3g} {unit} rms, '
-                  f'{read.notes[f"{name}_gap_s"]:.3g} s from the nearest message at most',
-                  file=sys.stderr)
+                  f'{alignment.residual:.3g} {unit} rms, nearest message at most '
+                  f'{alignment.gap_s:.3g} s away', file=sys.stderr)
 
 
 @contextmanager

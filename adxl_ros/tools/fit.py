@@ -24,7 +24,7 @@ from adxl_ros.calibrate import calibration, pose_extraction
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store, parameter_file, recording, sweep_journal
 from adxl_ros.files.checksum import sha256
-from adxl_ros.files.recorded_unit import recorded_unit
+from adxl_ros.files.stream_unit import recorded_unit
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.tools.common import default_params, make_folder, run, say_notes
 

@@ -27,7 +27,7 @@ from adxl_ros.calibrate.report import plots as sweep_figures
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.atomic_write import atomic_path
-from adxl_ros.files.recorded_unit import recorded_unit
+from adxl_ros.files.stream_unit import recorded_unit
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.reproduction import coverage, experiments, plots, report_page, scoring, units
 from adxl_ros.reproduction.report_page import FIGURES

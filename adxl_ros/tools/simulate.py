@@ -26,8 +26,8 @@ import sys
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file, recording
-from adxl_ros.files.recorded_unit import rate_hz
-from adxl_ros.files.recording_columns import Recording, REFERENCES, sensor_info
+from adxl_ros.files.recording_columns import Recording, REFERENCES
+from adxl_ros.files.stream_info import sensor_info
 from adxl_ros.links.support import emulated_board
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.simulate import simulator
@@ -155,7 +155,7 @@ def _run(sensor: Sensor, options: argparse.Namespace
     if options.rate is not None:
         return sensor, end_s - begin_s, begin_s, simulator.blocks(
             sensor, replace(motion, duration_s=end_s - begin_s), options.seed, begin_s)
-    sensor = replace(sensor, rate_hz=rate_hz(read))
+    sensor = replace(sensor, rate_hz=read.rate_hz)
     return sensor, end_s - begin_s, begin_s, _again(sensor, motion, read, options.seed)
 
 

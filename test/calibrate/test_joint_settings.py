@@ -24,8 +24,9 @@ from adxl_ros.calibrate.guided.stage_guide import Sweep
 from adxl_ros.calibrate.joint_settings import recorded_settings, SettingTracker
 from adxl_ros.calibrate.poses import Poses, together
 from adxl_ros.files import recording
-from adxl_ros.files.recorded_unit import recorded_unit
-from adxl_ros.files.recording_columns import COMMANDS, Recording, sensor_info
+from adxl_ros.files.recording_columns import COMMANDS, Recording
+from adxl_ros.files.stream_info import sensor_info
+from adxl_ros.files.stream_unit import recorded_unit
 from adxl_ros.links.support.simulated_stage import SimulatedStage
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.sensor import to_nominal_mps2

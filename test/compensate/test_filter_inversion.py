@@ -20,7 +20,8 @@ from itertools import pairwise
 from adxl_ros.compensate import filter_inversion, paper_inverse
 from adxl_ros.compensate.sample_by_sample import Live
 from adxl_ros.files import parameter_file, recording
-from adxl_ros.files.recording_columns import Recording, sensor_info
+from adxl_ros.files.recording_columns import Recording
+from adxl_ros.files.stream_info import sensor_info
 from adxl_ros.model import noise, signal_chain
 from adxl_ros.model.coefficients import put, with_neutral
 from adxl_ros.model.filters import low_pass

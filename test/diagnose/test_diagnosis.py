@@ -26,7 +26,8 @@ from adxl_ros.diagnose.hypothesis_fit import Hypothesis, refined
 from adxl_ros.diagnose.linear_model import study
 from adxl_ros.diagnose.next_experiment import proposed
 from adxl_ros.files import parameter_file, recording
-from adxl_ros.files.recording_columns import Recording, sensor_info
+from adxl_ros.files.recording_columns import Recording
+from adxl_ros.files.stream_info import sensor_info
 from adxl_ros.simulate import trajectories
 from adxl_ros.simulate.motion import Held, Knots, Motion
 from adxl_ros.simulate.simulator import simulate

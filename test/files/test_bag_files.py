@@ -20,8 +20,8 @@ import sys
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import bag_reader, cdr, recording
-from adxl_ros.files.recording import Recording
-from adxl_ros.files.recording_columns import ACCEL, REFERENCES
+from adxl_ros.files.recording_columns import ACCEL, Recording, REFERENCES
+from adxl_ros.files.stream_info import sensor_info
 import numpy as np
 import pytest
 from reading import growth_mb, refusal
@@ -43,7 +43,7 @@ def made(count: int = 3000, axes: str = 'xyz') -> Recording:
     columns['supply_v'] = columns['supply_v'].astype(np.float32).astype(float)
     steps = rng.integers(10**5, 10**7, count)
     return Recording('made', np.cumsum(steps) / 1e9, columns,
-                     {**recording.sensor_info(nominal(axes)), 'place': 'bench 3'},
+                     {**sensor_info(nominal(axes)), 'place': 'bench 3'},
                      epoch_ns=EPOCH_NS)
 
 
@@ -53,7 +53,7 @@ def test_round_trip_to_the_bit(tmp_path: Path, name: str, axes: str) -> None:
     sent = made(axes=axes)
     sensor = nominal(axes)
     for _ in range(2):  # the second one replaces the first
-        recording.write_bag(tmp_path / name, sent, sensor)
+        recording.write(tmp_path / name, sent, sensor)
     assert [path.name for path in tmp_path.iterdir()] == [name]
     got = recording.read(tmp_path / name)
     assert list(got.columns) == [*ACCEL[:len(axes)], *REFERENCES]
@@ -63,7 +63,7 @@ def test_round_trip_to_the_bit(tmp_path: Path, name: str, axes: str) -> None:
         assert (got.columns[column] == sent.columns[column]).all(), column
     assert (got.stamp_ns == sent.stamp_ns).all()
     assert got.info == sent.info
-    assert got.notes['alpha_rad_gap_s'] == got.notes['alpha_rad_residual'] == 0.0
+    assert got.alignments['alpha_rad'] == (0.0, 0.0)
     again = replace(got, path='again')
     recording.write(tmp_path / 'again', again, sensor)
     last = recording.read(tmp_path / 'again')
@@ -85,7 +85,7 @@ def test_bag_and_csv_say_the_same(tmp_path: Path) -> None:
 def test_what_is_written_is_what_others_read(tmp_path: Path) -> None:
     sensor = nominal('xy')
     sent = made(50, 'xy')
-    recording.write_bag(tmp_path / 'run', sent, sensor)
+    recording.write(tmp_path / 'run', sent, sensor)
     accel = sent.accel_mps2(sensor)
     count: dict[str, int] = {}
     with rosbag2.Reader(tmp_path / 'run') as reader:
@@ -139,7 +139,7 @@ def converted(source: Path, target: Path, storage: str, mode: str) -> None:
     ('MCAP', 'NONE'), ('MCAP', 'STORAGE'), ('MCAP', 'FILE'), ('MCAP', 'MESSAGE'),
     ('SQLITE3', 'NONE'), ('SQLITE3', 'FILE'), ('SQLITE3', 'MESSAGE')])
 def test_every_storage_and_compression(tmp_path: Path, storage: str, mode: str) -> None:
-    recording.write_bag(tmp_path / 'plain', made(), nominal('xyz'))
+    recording.write(tmp_path / 'plain', made(), nominal('xyz'))
     plain = recording.read(tmp_path / 'plain')
     target = tmp_path / 'recorded'
     converted(tmp_path / 'plain', target, storage, mode)
@@ -227,15 +227,15 @@ def test_references_at_another_rate_are_interpolated(tmp_path: Path) -> None:
     assert (got.columns['alpha_rad'][near & (times < there[0])] == alpha[0]).all()
     error = np.abs(got.columns['beta_rad'] - np.sin(2 * np.pi * s))[inside].max()
     # Twice the spacing misses four times as much, and its rms is 1/√2 of its largest.
-    assert error < got.notes['beta_rad_residual'] < 4.5 * error
-    assert got.notes['alpha_rad_residual'] < 1e-9
-    assert 0.019 < got.notes['alpha_rad_gap_s'] <= 0.02
+    assert error < got.alignments['beta_rad'].residual < 4.5 * error
+    assert got.alignments['alpha_rad'].residual < 1e-9
+    assert 0.019 < got.alignments['alpha_rad'].gap_s <= 0.02
     for rows in (100, 1000):
         blocks = list(recording.blocks(path, rows))
         assert np.array_equal(np.concatenate([b.columns['beta_rad'] for b in blocks]),
                               got.columns['beta_rad'], equal_nan=True)
-        assert blocks[-1].notes['beta_rad_residual'] == pytest.approx(
-            got.notes['beta_rad_residual'])
+        assert blocks[-1].alignments['beta_rad'].residual == pytest.approx(
+            got.alignments['beta_rad'].residual)
         assert blocks[-1].done == 1.0
 
 
@@ -261,7 +261,7 @@ def test_a_command_is_in_force_until_the_next_one(tmp_path: Path) -> None:
         [nan, 1.0, 3.0], [101, 199, 700]), equal_nan=True)
     assert np.array_equal(got.columns['beta_command_rad'], np.repeat(
         [nan, 2.0, 4.0], [200, 397, 403]), equal_nan=True)
-    assert not any('command' in note for note in got.notes)
+    assert not any('command' in column for column in got.alignments)
     for rows in (7, 100, 1000):
         blocks = list(recording.blocks(path, rows))
         assert max(map(len, blocks)) <= rows
@@ -306,7 +306,7 @@ def test_a_stage_that_dies_does_not_hold_up_the_samples(
 @pytest.mark.parametrize('name', ['run', 'run.mcap'])
 def test_a_cut_file_is_read_up_to_the_cut(tmp_path: Path, name: str) -> None:
     sensor = nominal('xyz')
-    recording.write_bag(tmp_path / name, made(9000), sensor)
+    recording.write(tmp_path / name, made(9000), sensor)
     file = tmp_path / name if name == 'run.mcap' else tmp_path / name / 'run.mcap'
     whole = recording.read(tmp_path / name)
     data = file.read_bytes()
@@ -318,9 +318,9 @@ def test_a_cut_file_is_read_up_to_the_cut(tmp_path: Path, name: str) -> None:
         assert (got.stamp_ns == whole.stamp_ns[:len(got)]).all()
         assert (got.columns['ay_mps2'] == whole.columns['ay_mps2'][:len(got)]).all()
         assert got.info == whole.info
-        assert f'{file}: cut off' in got.notes['cut']
-        assert f'of {size}; the last sample read is at 1750000' in got.notes['cut']
-        assert 'cut' in list(recording.blocks(tmp_path / name, 100))[-1].notes
+        assert f'{file}: cut off' in got.cut
+        assert f'of {size}; the last sample read is at 1750000' in got.cut
+        assert list(recording.blocks(tmp_path / name, 100))[-1].cut
     assert counts[0] == 9000
     assert 5000 < counts[1] < 7000
     assert 2000 < counts[2] < 4000
@@ -332,12 +332,12 @@ def test_a_cut_file_is_read_up_to_the_cut(tmp_path: Path, name: str) -> None:
 
 
 def test_damaged_files_are_refused(tmp_path: Path) -> None:
-    recording.write_bag(tmp_path / 'run.mcap', made(), nominal('xyz'))
+    recording.write(tmp_path / 'run.mcap', made(), nominal('xyz'))
     data = bytearray((tmp_path / 'run.mcap').read_bytes())
     data[-30] ^= 0xFF  # in the footer
     (tmp_path / 'footer.mcap').write_bytes(data)
     assert ': cannot read it as a rosbag2 recording: ' in refusal(tmp_path / 'footer.mcap')
-    recording.write_bag(tmp_path / 'plain', made(), nominal('xyz'))
+    recording.write(tmp_path / 'plain', made(), nominal('xyz'))
     converted(tmp_path / 'plain', tmp_path / 'sql', 'SQLITE3', 'NONE')
     file = tmp_path / 'sql' / 'sql.db3'
     file.write_bytes(file.read_bytes()[:100_000])
@@ -433,9 +433,9 @@ def test_writing_is_all_or_nothing(tmp_path: Path) -> None:
             raise KeyboardInterrupt
     early = replace(made(50), epoch_ns=-10**12)
     with pytest.raises(UserError, match='cannot be stamps of ROS messages'):
-        recording.write_bag(tmp_path / 'run', early, sensor)
+        recording.write(tmp_path / 'run', early, sensor)
     with pytest.raises(UserError, match='has the axes xy, but the sensor'):
-        recording.write_bag(tmp_path / 'run', made(50, 'xy'), sensor)
+        recording.write(tmp_path / 'run', made(50, 'xy'), sensor)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -445,13 +445,13 @@ def test_without_rosbags(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     with pytest.raises(UserError, match='pip install "rosbags'):
         recording.read(tmp_path / 'run')
     with pytest.raises(UserError, match='pip install "rosbags'):
-        recording.write_bag(tmp_path / 'run', made(5), nominal('xyz'))
+        recording.write(tmp_path / 'run', made(5), nominal('xyz'))
 
 
 def test_real_file_through_a_bag(shared_dir: Path, tmp_path: Path) -> None:
     sensor = nominal('xyz')
     real = recording.read(shared_dir / 'real' / 'two_axis_stand.csv')
-    recording.write_bag(tmp_path / 'run', real, sensor)
+    recording.write(tmp_path / 'run', real, sensor)
     got = recording.read(tmp_path / 'run')
     assert (got.time_s == real.time_s).all()
     assert all((got.columns[name] == real.columns[name]).all() for name in ACCEL)

@@ -20,8 +20,10 @@ from pathlib import Path
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import csv_file, recording
-from adxl_ros.files.recording import CsvWriter, Recording
-from adxl_ros.files.recording_columns import ACCEL
+from adxl_ros.files.csv_writer import CsvWriter
+from adxl_ros.files.recording_columns import ACCEL, Recording
+from adxl_ros.files.stream_info import sensor_info
+from adxl_ros.files.stream_unit import check_unit
 from adxl_ros.model.constants import G0_MPS2
 import numpy as np
 from pace import within
@@ -44,7 +46,7 @@ def made(rng: np.random.Generator, count: int = 3000, axes: str = 'xyz') -> Reco
     for name in ('alpha_rad', 'beta_rad', 'shift_m', 'temperature_c', 'supply_v'):
         columns[name] = np.where(rng.random(count) < 0.3, np.nan, rng.normal(size=count))
     time_s = np.cumsum(rng.uniform(1e-4, 1e-3, count))
-    return Recording('made', time_s, columns, recording.sensor_info(nominal(axes)))
+    return Recording('made', time_s, columns, sensor_info(nominal(axes)))
 
 
 def same_bits(one: np.ndarray, other: np.ndarray) -> bool:
@@ -58,7 +60,7 @@ def test_round_trip_to_the_bit(tmp_path: Path) -> None:
     sent.columns['x_v'][:6] = [0.1, -0.0, 5e-324, 1 / 3, -123456.789e-9, 2.0 ** 0.5]
     sent.columns['other'] = np.where(sent.time_s > 0.5, np.inf, 1e300)
     path = tmp_path / 'run.csv'
-    recording.write_csv(path, sent)
+    recording.write(path, sent, nominal('xyz'))
     got = recording.read(path)
     assert list(got.columns) == list(sent.columns)
     assert same_bits(got.time_s, sent.time_s)
@@ -73,7 +75,7 @@ def test_stamps_since_1970_keep_their_nanoseconds(tmp_path: Path) -> None:
     epoch_ns = 1_750_000_000_000_000_000
     stamps = epoch_ns + np.cumsum(np.random.default_rng(2).integers(1, 10**7, 500))
     sent = Recording('made', (stamps - epoch_ns) / 1e9, {'x_v': np.ones(500)}, epoch_ns=epoch_ns)
-    recording.write_csv(tmp_path / 'run.csv', sent)
+    recording.write(tmp_path / 'run.csv', sent, nominal('xyz'))
     got = recording.read(tmp_path / 'run.csv')
     assert (got.stamp_ns == stamps).all()
     assert got.epoch_ns == epoch_ns
@@ -81,7 +83,7 @@ def test_stamps_since_1970_keep_their_nanoseconds(tmp_path: Path) -> None:
 
 def test_blocks_are_the_whole(tmp_path: Path) -> None:
     path = tmp_path / 'run.csv'
-    recording.write_csv(path, made(np.random.default_rng(3), 5000))
+    recording.write(path, made(np.random.default_rng(3), 5000), nominal('xyz'))
     whole = recording.read(path)
     blocks = list(recording.blocks(path, 700))
     assert max(len(block) for block in blocks) <= 700
@@ -97,7 +99,8 @@ def test_writing_is_all_or_nothing(tmp_path: Path) -> None:
     assert path.read_text() == 'before'
     assert os.listdir(tmp_path) == ['run.csv']
     with pytest.raises(UserError, match='nowhere'):
-        recording.write_csv(tmp_path / 'nowhere' / 'run.csv', made(np.random.default_rng(4), 5))
+        recording.write(tmp_path / 'nowhere' / 'run.csv', made(np.random.default_rng(4), 5),
+                        nominal('xyz'))
 
 
 def test_nominal_conversion_uses_the_figures_of_the_recording() -> None:
@@ -106,7 +109,7 @@ def test_nominal_conversion_uses_the_figures_of_the_recording() -> None:
     volts = np.array([[2.4, 2.6], [3.4, 1.6]])
     accel = (volts - own.nominal_zero_g_v) * G0_MPS2
     columns = {name: accel[:, i] for i, name in enumerate(ACCEL[:2])}
-    carried = Recording('made', np.arange(2.0), columns, recording.sensor_info(own))
+    carried = Recording('made', np.arange(2.0), columns, sensor_info(own))
     np.testing.assert_allclose(carried.volts(sensor), volts, rtol=1e-15)
     np.testing.assert_allclose(carried.accel_mps2(sensor), (volts - 2.5) * G0_MPS2, atol=1e-14)
     assert (carried.accel_mps2(own) == accel).all()
@@ -120,12 +123,12 @@ def test_nominal_conversion_uses_the_figures_of_the_recording() -> None:
 def test_another_unit_is_refused() -> None:
     carried = made(np.random.default_rng(5), 5)
     carried.info['serial'] = 'A17'
-    recording.check_unit(carried, nominal('xyz'))
-    recording.check_unit(carried, nominal('xyz', serial='A17'))
+    check_unit(carried.stream_info, carried.axes, nominal('xyz'))
+    check_unit(carried.stream_info, carried.axes, nominal('xyz', serial='A17'))
     with pytest.raises(UserError, match=r'A17.*B4'):
-        recording.check_unit(carried, nominal('xyz', serial='B4'))
+        check_unit(carried.stream_info, carried.axes, nominal('xyz', serial='B4'))
     with pytest.raises(UserError, match=r'axes xyz, .*for xy'):
-        recording.check_unit(carried, nominal('xy'))
+        check_unit(carried.stream_info, carried.axes, nominal('xy'))
 
 
 @pytest.mark.parametrize('text', [
@@ -298,7 +301,7 @@ def test_real_files_are_read(shared_dir: Path, tmp_path: Path) -> None:
         assert len(got) == len(lines) - header - 1
         last = dict(zip(lines[header].split(','), map(float, lines[-1].split(','))))
         assert {'time_s': got.time_s[-1], **{k: v[-1] for k, v in got.columns.items()}} == last
-        recording.write_csv(tmp_path / 'again.csv', got)
+        recording.write(tmp_path / 'again.csv', got, nominal('xyz'))
         again = recording.read(tmp_path / 'again.csv')
         assert all(same_bits(again.columns[name], got.columns[name]) for name in got.columns)
 

@@ -29,7 +29,8 @@ import tempfile
 import time
 
 from adxl_ros.files import parameter_file, recording
-from adxl_ros.files.recording_columns import Recording, sensor_info
+from adxl_ros.files.recording_columns import Recording
+from adxl_ros.files.stream_info import sensor_info
 import numpy as np
 from units import drawn, nominal
 

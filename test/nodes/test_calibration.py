@@ -3,8 +3,8 @@
 import time
 
 from adxl_ros.files import parameter_file, recording, sweep_journal
-from adxl_ros.files.recorded_unit import recorded_unit
-from adxl_ros.files.recording_columns import sensor_info
+from adxl_ros.files.stream_info import sensor_info
+from adxl_ros.files.stream_unit import recorded_unit
 from adxl_ros.model.constants import G0_MPS2
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from graph import Graph, RELIABLE

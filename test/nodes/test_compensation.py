@@ -24,7 +24,7 @@ from adxl_ros.calibrate.poses import Poses
 from adxl_ros.calibrate.provenance import envelope
 from adxl_ros.compensate import filter_inversion, paper_inverse
 from adxl_ros.files import calibration_store, parameter_file
-from adxl_ros.files.recording_columns import sensor_info
+from adxl_ros.files.stream_info import sensor_info
 from adxl_ros.model import signal_chain
 from adxl_ros.model.coefficients import put, with_neutral
 from adxl_ros.model.covariance import force_covariance

@@ -17,7 +17,7 @@
 from adxl_ros.calibrate import pose_extraction
 from adxl_ros.calibrate.fits import gravity_fit
 from adxl_ros.files import parameter_file, recording
-from adxl_ros.files.recorded_unit import recorded_unit
+from adxl_ros.files.stream_unit import recorded_unit
 from adxl_ros.model.constants import G0_MPS2
 import numpy as np
 import pytest
