@@ -66,7 +66,7 @@ def check_unit(info: StreamInfo, axes: str, sensor: Sensor) -> None:
 def _check_serial(info: StreamInfo, sensor: Sensor) -> None:
     if info.serial != sensor.serial and NO_UNIT not in (info.serial, sensor.serial):
         raise UserError(f'{info.where}: is of the sensor {info.serial}, but the parameters are of '
-                        f'{sensor.serial}; give the parameters of {info.serial}, or nominal ones')
+                        f'{sensor.serial}; give the parameters of that sensor, or nominal ones')
 
 
 def uncalibrated(sensor: Sensor, info: StreamInfo, axes: str, rate_hz: float) -> Sensor:

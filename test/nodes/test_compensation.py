@@ -402,7 +402,7 @@ def test_nan_never_leaves(robot: Robot, start: Start, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(('key', 'value', 'reason'), [
-    ('serial', '18', 'serial number 18, but the parameters are those of 17'),
+    ('serial', '18', 'is of the sensor 18, but the parameters are of 17'),
     ('axes', 'xyz', 'axes xyz, but the parameters of 17 are for xy'),
     ('nominal_zero_g_v', '1.65, 1.65', 'nominal_zero_g_v is [1.65, 1.65], but [2.5, 2.5]'),
     ('nominal_scale_v_per_g', '0.3, 0.3', 'nominal_scale_v_per_g is [0.3, 0.3], but [1.0, 1.0]'),
@@ -487,7 +487,7 @@ def test_calibration_loads_a_whole_file_or_nothing(robot: Robot, start: Start,
     robot.connected()
     force = pose(0.6, 0.3)
     np.testing.assert_allclose(accel(robot.answer(felt(first, force))), force, atol=1e-7)
-    assert 'serial number 17, but the parameters are those of 18' in robot.assign(
+    assert 'is of the sensor 17, but the parameters are of 18' in robot.assign(
         calibration=str(tmp_path / 'foreign.yaml'))
     reason = robot.assign(calibration=str(broken))
     assert f'{broken}:' in reason

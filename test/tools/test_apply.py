@@ -175,7 +175,7 @@ def refused(run_tool: RunTool, path: Path, *more: object) -> str:
 
 
 @pytest.mark.parametrize(('key', 'value', 'message'), [
-    ('serial', '18', 'serial number 18, but the parameters are those of 17'),
+    ('serial', '18', 'is of the sensor 18, but the parameters are of 17'),
     ('nominal_zero_g_v', '1.5, 1.5', 'nominal_zero_g_v is [1.5, 1.5], but [2.5, 2.5]'),
     ('nominal_scale_v_per_g', '0.3, 0.3', 'nominal_scale_v_per_g is [0.3, 0.3], but [1.0, 1.0]'),
     ('nominal_zero_g_v', 'two, 2.5', 'nominal_zero_g_v'),
