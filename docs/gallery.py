@@ -21,7 +21,7 @@ import sys
 from adxl_ros.files import parameter_file
 from adxl_ros.model.coefficients import put, typical
 from adxl_ros.model.effects import library
-from adxl_ros.model.effects.base import Effect, Place
+from adxl_ros.model.effects.base import Coefficient, Effect, Place
 from adxl_ros.model.sensor import Sensor, with_axes
 from adxl_ros.simulate.motion import Held, Knots, Motion
 from adxl_ros.simulate.simulator import Columns, simulate
@@ -91,9 +91,10 @@ SCENES = {
                                                                          kind='spectrum'),
     'noise_excess': replace(OVER_TIME, kind='spectrum'),
     'quantisation': replace(OVER_TIME, kind='codes')}
-LOUDER = {'stuck.rate_hz': 1.0, 'stuck.duration_s': 0.2, 'saturation.limit_g.x': 0.9,
-          'saturation.limit_g.y': 0.9, 'saturation.limit_g.z': 0.9, 'clock_skew.ratio': 1e-3,
-          'mount_resonance.frequency_hz': 25.0}
+LOUDER = {Coefficient('stuck', 'rate_hz'): 1.0, Coefficient('stuck', 'duration_s'): 0.2,
+          **{Coefficient('saturation', 'limit_g', axis): 0.9 for axis in 'xyz'},
+          Coefficient('clock_skew', 'ratio'): 1e-3,
+          Coefficient('mount_resonance', 'frequency_hz'): 25.0}
 """Where a typical value would not be seen on the manoeuvre."""
 
 
@@ -142,7 +143,7 @@ def draw(nominal: Sensor, effect: Effect, path: Path) -> str:
             'adc' in effect.needs))
     with_it = replace(sensor, effects=(effect.name,),
                       values={effect.name: typical(effect, 'xyz')})
-    louder = {k: v for k, v in LOUDER.items() if k.startswith(f'{effect.name}.')}
+    louder = {name: value for name, value in LOUDER.items() if name.effect == effect.name}
     with_it = put(with_it, list(louder), list(louder.values()))
     clean, changed = (simulate(unit, scene.motion, 0) for unit in (sensor, with_it))
     figure, (above, below) = plt.subplots(2, 1, figsize=(7.5, 4.6), constrained_layout=True)
@@ -151,7 +152,8 @@ def draw(nominal: Sensor, effect: Effect, path: Path) -> str:
     above.set_title(effect.name, loc='left', fontweight='bold')
     figure.savefig(path, dpi=85)
     plt.close(figure)
-    stated = ', '.join(f'`{k.split(".", 1)[1]}` = {v:g}' for k, v in louder.items())
+    stated = ', '.join(f'`{str(name).removeprefix(f"{effect.name}.")}` = {value:g}'
+                       for name, value in louder.items())
     return f'Here with {stated}.' if stated else 'Typical values.'
 
 

@@ -51,6 +51,7 @@ from adxl_ros.model import signal_chain
 from adxl_ros.model.coefficients import get
 from adxl_ros.model.constants import G0_MPS2, Z_90
 from adxl_ros.model.effects import effect_named
+from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals.filter_time_constant import FilterNoise, with_filter
 import numpy as np
@@ -356,7 +357,7 @@ def coefficients(sensor: Sensor) -> list[str]:
             ends = list(sensor.axes) if np.ndim(values) else ['']
             entries = [f'{axis} {value:.6g} +- {Z_90 * std[key]:.2g}'.lstrip()
                        for axis, value in zip(ends, np.ravel(shown))
-                       if (key := f'{effect}.{parameter}.{axis}'.rstrip('.')) in std]
+                       if (key := Coefficient(effect, parameter, axis)) in std]
             if entries:
                 lines.append(f'  {label:34} {"   ".join(entries)} {units[parameter]}')
     return lines

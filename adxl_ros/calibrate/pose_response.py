@@ -22,7 +22,7 @@ from adxl_ros.calibrate.poses import Poses
 from adxl_ros.calibrate.stage_error import PoseCovariance, shared_settings, StageError
 from adxl_ros.model import signal_chain
 from adxl_ros.model.coefficients import get, parameter_of, put
-from adxl_ros.model.effects.base import Components, Joint, Place, Signals
+from adxl_ros.model.effects.base import Coefficient, Components, Joint, Place, Signals
 from adxl_ros.model.kinematics import specific_force, UPRIGHT
 from adxl_ros.model.sensor import Sensor
 import numpy as np
@@ -54,7 +54,7 @@ def by_angles(unit: Sensor, poses: Poses) -> np.ndarray:
     return np.stack([(above - below) / (2 * h) for above, below in ends], axis=2)
 
 
-def by_coefficients(unit: Sensor, poses: Poses, names: Sequence[str]) -> np.ndarray:
+def by_coefficients(unit: Sensor, poses: Poses, names: Sequence[Coefficient]) -> np.ndarray:
     """Differentiate volts by coefficients, V a unit, (k, m, p)."""
     columns = []
     for name in names:

@@ -27,6 +27,7 @@ from adxl_ros.calibrate.poses import Poses
 from adxl_ros.files import calibration_store
 from adxl_ros.model.covariance import leverage
 from adxl_ros.model.effects import effect_named
+from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.model.validity import Envelope, STRETCH
 import numpy as np
@@ -132,5 +133,5 @@ def envelope(fitted: Sensor, force: np.ndarray, poses: Poses, misfit_mps2: float
 
 def _typical_slope(sensor: Sensor, effect: str) -> float:
     """Return the datasheet's typical slope, else that of the library."""
-    typical, _ = sensor.datasheet.get(f'{effect}.per_k', (0.0, 0.0))
+    typical, _ = sensor.datasheet.get(Coefficient(effect, 'per_k'), (0.0, 0.0))
     return typical or effect_named(effect).parameters[0].scale

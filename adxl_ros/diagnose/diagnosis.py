@@ -237,7 +237,7 @@ def _with_signs(best: Hypothesis, signs: Sequence[Sign], baseline: Sensor) -> Se
                 effects.append(sign.effect)
             values[sign.effect] = sign.values
     known = [i for i, name in enumerate(baseline.covariance_names)
-             if name.split('.')[0] in effects]
+             if name.effect in effects]
     return replace(found, effects=tuple(effects), values=values, rate_hz=baseline.rate_hz,
                    adc_bits=baseline.adc_bits,
                    covariance=baseline.covariance[np.ix_(known, known)],

@@ -32,6 +32,7 @@ from adxl_ros.diagnose.linear_model import Study
 from adxl_ros.diagnose.noise_floor import Floor
 from adxl_ros.diagnose.noise_whitening import USUAL
 from adxl_ros.model.effects import effect_named
+from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
@@ -178,7 +179,7 @@ def _by_block(series: Series, used: np.ndarray, off: np.ndarray, blocks: np.ndar
     if fitted.any():
         span_s = float(series.time_s[-1] - series.time_s[0])
         drift = USUAL ** 2 * span_s / 6 * series.sensor.scale_v_per_g ** 2
-        known = np.array([np.inf if free else of.tolerance(f'bias.offset_v.{axis}')
+        known = np.array([np.inf if free else of.tolerance(Coefficient('bias', 'offset_v', axis))
                           for axis in series.sensor.axes]) ** 2
         off = off - off[fitted].mean(axis=0) / (1 + drift / known)
     squares = ((off / series.scale_v_per_mps2) ** 2).mean(axis=1)

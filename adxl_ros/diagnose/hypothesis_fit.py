@@ -27,6 +27,7 @@ from adxl_ros.diagnose.noise_whitening import drifts_among, flicker_g_per_rthz, 
 from adxl_ros.diagnose.sensitivities import limits, WIDE
 from adxl_ros.model.coefficients import fitted_of, get, parameter_of, put, with_neutral
 from adxl_ros.model.effects import effect_named
+from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
@@ -65,7 +66,7 @@ class Hypothesis:
 
     effects: tuple[str, ...]
     sensor: Sensor
-    names: tuple[str, ...]
+    names: tuple[Coefficient, ...]
     values: np.ndarray
     std: np.ndarray
     log_evidence: float
@@ -98,7 +99,7 @@ class Local:
 
     effects: tuple[str, ...]
     sensor: Sensor
-    names: tuple[str, ...]
+    names: tuple[Coefficient, ...]
     middle: np.ndarray
     prior: np.ndarray
     values: np.ndarray
@@ -183,8 +184,8 @@ def local(of: Study, effects: Sequence[str], sensor: Sensor,
     own = [name for effect in effects for name in fitted_of(effect_named(effect), held.axes)
            if not parameter_of(name).sized or name in of.names or limits(effect_named(effect))]
     free = [n for n in dict.fromkeys(n for names in of.free for n in names)
-            if n.split('.')[0] not in effects]
-    held = with_neutral(held, dict.fromkeys(n.split('.')[0] for n in free))
+            if n.effect not in effects]
+    held = with_neutral(held, dict.fromkeys(n.effect for n in free))
     parameters = [parameter_of(name) for name in own]
     middle = np.array([float(get(held, [name])[0]) if p.sized else p.scale
                        for name, p in zip(own, parameters)])
@@ -204,11 +205,11 @@ def local(of: Study, effects: Sequence[str], sensor: Sensor,
         taken_up = there - _else(of, number, at_rate, held, effects)
         for d in range(len(held.axes)):
             at = [i for i, n in enumerate(own)
-                  if len(n.split('.')) == 2 or held.axes.index(n.split('.')[2]) == d]
+                  if n.axis in ('', held.axes[d])]
             known = of.free[len(channels)]
             also = [n for n in free if n in known]
             lines.append({names.index(n): column for n, column in known.items()
-                          if n.split('.')[0] in STRAIGHT})
+                          if n.effect in STRAIGHT})
             does.append([(0, taken_up[:, d])])
             design = columns[:, d, at]
             residual = one.volts[:, d] - there[:, d] + design @ (values - middle)[at]
@@ -237,8 +238,8 @@ def _else(of: Study, number: int, sensor: Sensor, baseline: Sensor,
     return of.series[number].simulated(replace(sensor, values=values))
 
 
-def refined(of: Study, effects: Sequence[str], start: dict[str, float],
-            shapes: dict[str, float]) -> Hypothesis:
+def refined(of: Study, effects: Sequence[str], start: dict[Coefficient, float],
+            shapes: dict[Coefficient, float]) -> Hypothesis:
     """
     Fit a set of effects by re-simulation, parameters of shape included.
 
@@ -254,7 +255,7 @@ def refined(of: Study, effects: Sequence[str], start: dict[str, float],
     start
         Departures from the baseline to begin with, by coefficient.
     shapes
-        Parameters of shape to begin with, by `effect.parameter`.
+        Parameters of shape to begin with, by name without axis.
 
     """
     effects = tuple(dict.fromkeys(effects))
@@ -264,7 +265,7 @@ def refined(of: Study, effects: Sequence[str], start: dict[str, float],
     for name in names:
         p = parameter_of(name)
         middle = float(get(sensor, [name])[0]) if p.sized else p.scale
-        short = '.'.join(name.split('.')[:2])
+        short = name.without_axis
         begin.append(shapes[short] if not p.sized and short in shapes
                      else middle + start.get(name, 0.0))
     sensor = put(sensor, names, _within(names, np.array(begin)))
@@ -311,7 +312,7 @@ def refined(of: Study, effects: Sequence[str], start: dict[str, float],
                       reached + _of_those_that_show(here, found), found)
 
 
-def _of_stage(of: Study, names: Sequence[str]) -> np.ndarray:
+def _of_stage(of: Study, names: Sequence[Coefficient]) -> np.ndarray:
     """Return standard deviations below which the stage's step tells no angle, (k,)."""
     return np.where([parameter_of(n).unit == 'rad' for n in names], of.least_angle_rad(), 0.0)
 
@@ -321,7 +322,7 @@ def _of_form(here: Local, found: Fit) -> np.ndarray:
     names = here.names[:len(here.values)]
     whole = np.where([parameter_of(n).sized for n in names], found.values[:len(names)],
                      here.values)
-    return np.where([effect_named(n.split('.')[0]).exact for n in names], 0.0, _FORM * whole)
+    return np.where([effect_named(n.effect).exact for n in names], 0.0, _FORM * whole)
 
 
 def _of_those_that_show(here: Local, found: Fit) -> float:
@@ -337,7 +338,7 @@ def _of_those_that_show(here: Local, found: Fit) -> float:
     gain = 0.0
     for effect in here.effects:
         own = [i for i, name in enumerate(here.names[:len(here.values)])
-               if name.split('.')[0] == effect and parameter_of(name).sized]
+               if name.effect == effect and parameter_of(name).sized]
         if own:
             gain -= float(np.log(2.0 ** len(own) - 1))
         while len(own) > 1:
@@ -356,29 +357,29 @@ def _of_those_that_show(here: Local, found: Fit) -> float:
     return gain
 
 
-def _within(names: Sequence[str], values: np.ndarray) -> np.ndarray:
+def _within(names: Sequence[Coefficient], values: np.ndarray) -> np.ndarray:
     lower, upper = (np.array([getattr(parameter_of(n), side) for n in names])
                     for side in ('lower', 'upper'))
     return np.clip(values, lower, upper)
 
 
-def columns_at(series: Series, sensor: Sensor, names: Sequence[str], values: np.ndarray,
+def columns_at(series: Series, sensor: Sensor, names: Sequence[Coefficient], values: np.ndarray,
                there: np.ndarray) -> np.ndarray:
     """Differentiate volts by coefficients at their values, (n, m, p); all axes at once."""
     out = np.zeros((*there.shape, len(names)))
-    groups: dict[str, list[int]] = {}
+    groups: dict[Coefficient, list[int]] = {}
     for i, name in enumerate(names):
-        groups.setdefault('.'.join(name.split('.')[:2]), []).append(i)
+        groups.setdefault(name.without_axis, []).append(i)
     for of in groups.values():
         p = parameter_of(names[of[0]])
         by = p.scale * (0.3 if not p.limit and not effect_named(
-            names[of[0]].split('.')[0]).smooth else 0.02)
+            names[of[0]].effect).smooth else 0.02)
         if values[of[0]] + by > p.upper:
             by = -by
         moved = series.simulated(put(sensor, [names[i] for i in of], values[of] + by))
         for i in of:
-            parts = names[i].split('.')
-            axes = [sensor.axes.index(parts[2])] if len(parts) == 3 else range(len(sensor.axes))
+            axis = names[i].axis
+            axes = [sensor.axes.index(axis)] if axis else range(len(sensor.axes))
             for d in axes:
                 out[:, d, i] = (moved[:, d] - there[:, d]) / by
     return out

@@ -34,7 +34,7 @@ from adxl_ros.diagnose.baseline_comparison import Series
 from adxl_ros.diagnose.evidence import Channel, Fit
 from adxl_ros.diagnose.sensitivities import candidates, Variant, variants
 from adxl_ros.model.effects import effect_named
-from adxl_ros.model.effects.base import Place
+from adxl_ros.model.effects.base import Coefficient, Place
 import numpy as np
 
 TOLERANCE = {'bias': 1e-4, 'scale_factor': 1e-4, 'bandwidth': 0.02, 'time_offset': 1e-4}
@@ -79,12 +79,12 @@ class Study:
     base: list[np.ndarray]
     variants: list[Variant]
     ids: list[list[int]]
-    names: list[str]
+    names: list[Coefficient]
     prior: np.ndarray
     channels: list[Channel]
     filters: list[list[noise_whitening.Whitener]] = field(default_factory=list)
-    free: list[dict[str, np.ndarray]] = field(default_factory=list)
-    straight: dict[str, np.ndarray] = field(default_factory=dict)
+    free: list[dict[Coefficient, np.ndarray]] = field(default_factory=list)
+    straight: dict[Coefficient, np.ndarray] = field(default_factory=dict)
 
     def nuisances(self) -> list[int]:
         """Return the numbers of the columns of what is free in every hypothesis."""
@@ -107,25 +107,25 @@ class Study:
         columns = [k for i in chosen if of_sensor(self.variants[i].effect) for k in self.ids[i]]
         for i in self.nuisances():
             name = self.names[i]
-            if name.split('.')[0] not in effects:
+            if name.effect not in effects:
                 looks = self.straight.get(name, np.zeros(len(prior)))[columns] * prior[columns]
                 prior[i] = np.hypot(self.tolerance(name, drifts), np.sqrt(np.sum(looks ** 2)))
                 # How large the chosen are is not known yet, nor is their straight part.
                 most[i] = np.inf if np.any(looks) else BEYOND * prior[i]
         return prior, most
 
-    def tolerance(self, name: str, drifts: Sequence[str] = ()) -> float:
+    def tolerance(self, name: Coefficient, drifts: Sequence[str] = ()) -> float:
         """
         Return how far a coefficient may be from the file's in a healthy unit.
 
         Where the sensor rests, its pose is not known, so that only changes of zero-g tell; where
         its zero-g drifts, it has done so before, too.
         """
-        effect, *_, axis = name.split('.')
+        effect = name.effect
         if effect not in STRAIGHT:
             return TOLERANCE[effect]
         sensor = self.series[0].sensor
-        scale = float(sensor.scale_v_per_g[sensor.axes.index(axis)])
+        scale = float(sensor.scale_v_per_g[sensor.axes.index(name.axis)])
         if effect == 'bias' and any(one.reference == 'rest' for one in self.series):
             return scale
         known = (_DRIFTED_G * scale) ** 2 if effect == 'bias' and drifts else 0.0
@@ -169,14 +169,14 @@ def study(series: Sequence[Series], used: Sequence[np.ndarray],
                 key = (found.effect, tuple(found.shape.items()), found.size)
                 every.setdefault(key, {})[i] = found
             show((i + (k + 1) / len(effects)) / len(series))
-    names: list[str] = []
+    names: list[Coefficient] = []
     prior: list[float] = []
     kept, ids = [], []
     columns: list[list[list[tuple[int, np.ndarray]]]] = [
         [[] for _ in one.sensor.axes] for one in series]
     for of in every.values():
         first = next(iter(of.values()))
-        number: dict[str, int] = {}
+        number: dict[Coefficient, int] = {}
         for i, found in of.items():
             for name, sd in zip(found.names, found.prior):
                 if name not in number:
@@ -200,10 +200,10 @@ def study(series: Sequence[Series], used: Sequence[np.ndarray],
             channels.append(evidence.channel(
                 residual[:, d], np.column_stack([c for _, c in of_axis]),
                 np.array([i for i, _ in of_axis]), mask, filters[-1]))
-    free = [{names[i]: column for i, column in of_axis if names[i].split('.')[0] in TOLERANCE}
+    free = [{names[i]: column for i, column in of_axis if names[i].effect in TOLERANCE}
             for of_series in columns for of_axis in of_series]
     looks = straight([{names.index(name): column for name, column in of.items()
-                       if name.split('.')[0] in STRAIGHT} for of in free],
+                       if name.effect in STRAIGHT} for of in free],
                      [of_axis for of_series in columns for of_axis in of_series], len(names))
     return Study(list(series), list(used), bases, kept, ids, names, np.array(prior), channels,
                  filters, free, {names[i]: of for i, of in looks.items()})

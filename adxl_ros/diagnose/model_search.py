@@ -33,6 +33,7 @@ from adxl_ros.diagnose.noise_whitening import DRIFTS, drifts_among
 from adxl_ros.diagnose.sensitivities import Variant
 from adxl_ros.errors import UserError
 from adxl_ros.model.coefficients import parameter_of, with_neutral
+from adxl_ros.model.effects.base import Coefficient
 import numpy as np
 
 MOST_EFFECTS = 3
@@ -161,7 +162,7 @@ def _forward(of: Study, best: Hypothesis, found: dict[tuple[str, ...], Hypothesi
         start = dict(zip(best.names, best.values))
         start |= {there.names[k]: v for k, v in zip(fit.ids, fit.values)
                   if k in there.ids[i]} | _begin(there.variants[i])
-        shape = {f'{there.variants[i].effect}.{p}': v
+        shape = {Coefficient(there.variants[i].effect, p): v
                  for p, v in there.variants[i].shape.items()}
         one = _resimulated(of, effects, start, shape)
         if one is not None:
@@ -204,7 +205,7 @@ def _refine(of: Study, ranked: Iterable[tuple[float, tuple[int, ...], Fit]], non
         start = dict(zip([of.names[i] for i in fit.ids], fit.values))
         for i in chosen:
             start |= _begin(of.variants[i])
-        shapes = {f'{of.variants[i].effect}.{p}': value for i in chosen
+        shapes = {Coefficient(of.variants[i].effect, p): value for i in chosen
                   for p, value in of.variants[i].shape.items()}
         effects = (*(of.variants[i].effect for i in chosen), *also)
         if effects in found:
@@ -214,14 +215,14 @@ def _refine(of: Study, ranked: Iterable[tuple[float, tuple[int, ...], Fit]], non
             found[one.effects] = one
 
 
-def _begin(variant: Variant) -> dict[str, float]:
+def _begin(variant: Variant) -> dict[Coefficient, float]:
     """Return where a limit begins, as departures from what they are held against."""
     return {name: value - (0.0 if parameter_of(name).sized else parameter_of(name).scale)
             for name, value in variant.begin.items()}
 
 
-def _resimulated(of: Study, effects: Sequence[str], start: dict[str, float],
-                 shapes: dict[str, float]) -> Hypothesis | None:
+def _resimulated(of: Study, effects: Sequence[str], start: dict[Coefficient, float],
+                 shapes: dict[Coefficient, float]) -> Hypothesis | None:
     try:
         return refined(of, effects, start, shapes)
     except (UserError, np.linalg.LinAlgError):

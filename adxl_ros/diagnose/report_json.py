@@ -147,12 +147,13 @@ def _parameters(h: Hypothesis | None, effect: str) -> dict[str, Any]:
         return {}
     out = {}
     for name, std in zip(h.names, h.std):
-        if not name.startswith(f'{effect}.'):
+        if name.effect != effect:
             continue
         p = parameter_of(name)
         # As in the parameter file, what the baseline has of it included.
         middle = float(get(h.sensor, [name])[0])
-        out[name.split('.', 1)[1]] = {
+        key = f'{name.parameter}.{name.axis}' if name.axis else name.parameter
+        out[key] = {
             'value': _round(middle), 'ci': [_round(middle - Z_90 * std),
                                             _round(middle + Z_90 * std)], 'unit': p.unit}
     return out

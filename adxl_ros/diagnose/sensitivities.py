@@ -23,7 +23,7 @@ from adxl_ros.diagnose.baseline_comparison import Series
 from adxl_ros.errors import UserError
 from adxl_ros.model.coefficients import names_of, parameter_of, put, with_neutral
 from adxl_ros.model.effects import library
-from adxl_ros.model.effects.base import Effect, Parameter
+from adxl_ros.model.effects.base import Coefficient, Effect, Parameter
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
@@ -64,10 +64,10 @@ class Variant:
     effect: str
     shape: dict[str, float]
     size: float
-    names: tuple[str, ...]
+    names: tuple[Coefficient, ...]
     prior: np.ndarray
     columns: tuple[tuple[np.ndarray, np.ndarray], ...]
-    begin: dict[str, float] = field(default_factory=dict)
+    begin: dict[Coefficient, float] = field(default_factory=dict)
 
 
 def candidates() -> list[Effect]:
@@ -141,7 +141,7 @@ def variant(series: Series, effect: Effect, shape: dict[str, float], size: float
     """Differentiate by one effect's coefficients at one shape; None where nothing follows."""
     axes = series.sensor.axes
     held = _shaped(with_neutral(series.sensor, [effect.name]), effect, shape)
-    names: list[str] = []
+    names: list[Coefficient] = []
     prior: list[float] = []
     columns: list[list[tuple[int, np.ndarray]]] = [[] for _ in axes]
     start = base if not shape else series.simulated(held)
@@ -157,7 +157,7 @@ def variant(series: Series, effect: Effect, shape: dict[str, float], size: float
             moved -= moved.mean(axis=0)
         own = names_of(replace(effect, parameters=(p,)), axes)
         for name in own:
-            reach = [axes.index(name.split('.')[2])] if p.axes else range(len(axes))
+            reach = [axes.index(name.axis)] if p.axes else range(len(axes))
             if not np.any(np.abs(moved[:, list(reach)]) * p.scale > 1e-9):
                 continue
             for d in reach:

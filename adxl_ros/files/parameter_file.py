@@ -26,6 +26,7 @@ from adxl_ros.errors import UserError
 from adxl_ros.files.atomic_write import atomic_path
 from adxl_ros.model.coefficients import names_of, neutral
 from adxl_ros.model.effects import effect_named
+from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.model.validity import Envelope
 import numpy as np
@@ -130,9 +131,9 @@ def to_flat(sensor: Sensor) -> dict[str, Any]:
         flat['effects'] = list(sensor.effects)
     for name in sensor.effects:
         for parameter, value in sensor.values[name].items():
-            flat[f'{name}.{parameter}'] = np.asarray(value, float).tolist()
+            flat[str(Coefficient(name, parameter))] = np.asarray(value, float).tolist()
     if sensor.covariance_names:
-        flat['covariance_names'] = list(sensor.covariance_names)
+        flat['covariance_names'] = [str(name) for name in sensor.covariance_names]
         flat['covariance'] = [float(v) for v in sensor.covariance.ravel()]
     for key in ENVELOPE:
         figure = getattr(sensor.envelope, key)
@@ -143,7 +144,7 @@ def to_flat(sensor: Sensor) -> dict[str, Any]:
     if sensor.datasheet:
         typical, maximum = zip(*sensor.datasheet.values())
         flat |= {'datasheet.name': sensor.datasheet_name,
-                 'datasheet.figures': list(sensor.datasheet),
+                 'datasheet.figures': [str(name) for name in sensor.datasheet],
                  'datasheet.typical': list(typical), 'datasheet.maximum': list(maximum)}
     return flat
 
@@ -300,7 +301,7 @@ def _effect_values(name: str, axes: str, flat: dict, fail: Any) -> dict[str, np.
         raise fail('effects', str(error)) from None
     values = {}
     for parameter in effect.parameters:
-        key = f'{name}.{parameter.name}'
+        key = str(Coefficient(name, parameter.name))
         if key not in flat and parameter.optional:
             values[parameter.name] = neutral(effect, axes)[parameter.name]
             continue
@@ -328,7 +329,8 @@ def _effect_values(name: str, axes: str, flat: dict, fail: Any) -> dict[str, np.
 
 def _covariance(flat: dict, values: dict, axes: str, fail: Any) -> tuple:
     names = _strings('covariance_names', flat, fail)
-    known = {name for effect in values for name in names_of(effect_named(effect), axes)}
+    known = {str(name): name for effect in values
+             for name in names_of(effect_named(effect), axes)}
     for name in names:
         if name not in known:
             raise fail('covariance_names', f'{name!r} is no parameter of the listed effects')
@@ -352,7 +354,7 @@ def _covariance(flat: dict, values: dict, axes: str, fail: Any) -> tuple:
     if smallest < -1e-9:
         raise fail('covariance', f'not positive: its smallest eigenvalue is {smallest:.3g} in '
                                  'units of the variances')
-    return matrix, names
+    return matrix, tuple(known[name] for name in names)
 
 
 def _envelope(flat: dict, fail: Any) -> Envelope:
@@ -370,7 +372,7 @@ def _envelope(flat: dict, fail: Any) -> Envelope:
     return Envelope(**found)
 
 
-def _datasheet(flat: dict, fail: Any) -> tuple[str, dict[str, tuple[float, float]]]:
+def _datasheet(flat: dict, fail: Any) -> tuple[str, dict[Coefficient, tuple[float, float]]]:
     if 'datasheet.figures' not in flat:
         return '', {}
     names = _strings('datasheet.figures', flat, fail)
@@ -392,4 +394,5 @@ def _datasheet(flat: dict, fail: Any) -> tuple[str, dict[str, tuple[float, float
             raise fail('datasheet.figures', str(error)) from None
         if parameter not in known:
             raise fail('datasheet.figures', f'{name!r} is no parameter of {effect}')
-    return str(flat.get('datasheet.name', '')), dict(zip(names, zip(*columns)))
+    figures = dict(zip(map(Coefficient.parse, names), zip(*columns)))
+    return str(flat.get('datasheet.name', '')), figures

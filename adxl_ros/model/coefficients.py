@@ -20,37 +20,61 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 from adxl_ros.model.effects import effect_named
-from adxl_ros.model.effects.base import Effect, Parameter
+from adxl_ros.model.effects.base import Coefficient, Effect, Parameter
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
 
-def names_of(effect: Effect, axes: str) -> tuple[str, ...]:
+def names_of(effect: Effect, axes: str) -> tuple[Coefficient, ...]:
     """
-    Name the coefficients of an effect on a sensor with these axes.
+    Name the coefficients of an effect on a sensor.
 
     Parameters
     ----------
     effect
-        From the library.
+        An effect of the library.
     axes
-        Measured axes; those that a parameter means nothing for are left out.
+        Measured axes of the sensor. A parameter has coefficients for its own axes only.
+
+    Returns
+    -------
+    tuple
+        Names in the order of the parameters, axis by axis.
 
     """
-    return tuple(f'{effect.name}.{p.name}{end}' for p in effect.parameters
-                 for end in ([f'.{a}' for a in axes if a in p.axes] if p.axes else ['']))
+    return tuple(name for p in effect.parameters for name in _names_of_parameter(effect, p, axes))
 
 
-def fitted_of(effect: Effect, axes: str) -> tuple[str, ...]:
-    """Name the coefficients of an effect that a fit of its own finds."""
-    return names_of(replace(effect, parameters=tuple(
-        p for p in effect.parameters if not p.held)), axes)
+def _names_of_parameter(effect: Effect, parameter: Parameter, axes: str) -> list[Coefficient]:
+    if not parameter.axes:
+        return [Coefficient(effect.name, parameter.name)]
+    return [Coefficient(effect.name, parameter.name, a) for a in axes if a in parameter.axes]
 
 
-def parameter_of(name: str) -> Parameter:
-    """Return the description of a coefficient."""
-    effect, parameter = name.split('.')[:2]
-    return next(p for p in effect_named(effect).parameters if p.name == parameter)
+def fitted_of(effect: Effect, axes: str) -> tuple[Coefficient, ...]:
+    """
+    Name the coefficients of an effect that a fit of its own estimates.
+
+    Parameters
+    ----------
+    effect
+        An effect of the library.
+    axes
+        Measured axes of the sensor.
+
+    Returns
+    -------
+    tuple
+        Names as of `names_of`, without those of parameters that fits hold.
+
+    """
+    return tuple(name for p in effect.parameters if not p.held
+                 for name in _names_of_parameter(effect, p, axes))
+
+
+def parameter_of(name: Coefficient) -> Parameter:
+    """Return the description of a coefficient's parameter."""
+    return next(p for p in effect_named(name.effect).parameters if p.name == name.parameter)
 
 
 def neutral(effect: Effect, axes: str) -> dict[str, np.ndarray]:
@@ -75,38 +99,58 @@ def with_neutral(sensor: Sensor, effects: Iterable[str]) -> Sensor:
     return replace(sensor, effects=(*sensor.effects, *new), values={**sensor.values, **values})
 
 
-def get(sensor: Sensor, names: Sequence[str]) -> np.ndarray:
-    """Return the values of coefficients, (k,)."""
-    return np.array([sensor.values[name.split('.')[0]][name.split('.')[1]][_at(sensor, name)]
+def get(sensor: Sensor, names: Sequence[Coefficient]) -> np.ndarray:
+    """
+    Return the values of coefficients.
+
+    Parameters
+    ----------
+    sensor
+        A sensor with the effects of the coefficients.
+    names
+        Names of the coefficients, (k,).
+
+    Returns
+    -------
+    ndarray
+        Values, (k,), each in the unit of its parameter.
+
+    """
+    return np.array([sensor.values[name.effect][name.parameter][_index(sensor, name)]
                      for name in names], float)
 
 
-def put(sensor: Sensor, names: Sequence[str], coefficients: Sequence[float] | np.ndarray
-        ) -> Sensor:
+def put(sensor: Sensor, names: Sequence[Coefficient],
+        coefficients: Sequence[float] | np.ndarray) -> Sensor:
     """
     Return the sensor with other values of some coefficients.
 
     Parameters
     ----------
     sensor
-        Has the effects.
+        A sensor with the effects of the coefficients.
     names
-        Which, (k,).
+        Names of the coefficients, (k,).
     coefficients
-        Their values, (k,).
+        Their new values, (k,), each in the unit of its parameter.
+
+    Returns
+    -------
+    Sensor
+        A copy with arrays of its own for the parameters that change.
 
     """
-    values = {effect: dict(of) for effect, of in sensor.values.items()}
-    fresh = set()
+    values = {effect: dict(by_parameter) for effect, by_parameter in sensor.values.items()}
+    copied = set()
     for name, value in zip(names, coefficients):
-        effect, parameter = key = tuple(name.split('.')[:2])
-        if key not in fresh:
-            values[effect][parameter] = np.array(values[effect][parameter], float)
-            fresh.add(key)
-        values[effect][parameter][_at(sensor, name)] = value
+        by_parameter = values[name.effect]
+        if name.without_axis not in copied:
+            by_parameter[name.parameter] = np.array(by_parameter[name.parameter], float)
+            copied.add(name.without_axis)
+        by_parameter[name.parameter][_index(sensor, name)] = value
     return replace(sensor, values=values)
 
 
-def _at(sensor: Sensor, name: str) -> int | tuple[()]:
-    parts = name.split('.')
-    return sensor.axes.index(parts[2]) if len(parts) == 3 else ()
+def _index(sensor: Sensor, name: Coefficient) -> int | tuple[()]:
+    """Return where a coefficient stands in the array of its parameter."""
+    return sensor.axes.index(name.axis) if name.axis else ()

@@ -21,6 +21,7 @@ from typing import Any
 
 from adxl_ros.errors import UserError
 from adxl_ros.model.constants import G0_MPS2
+from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.validity import Envelope
 import numpy as np
 
@@ -80,11 +81,11 @@ class Sensor:
     effects: tuple[str, ...] = ()
     values: dict[str, dict[str, np.ndarray]] = field(default_factory=dict)
     covariance: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
-    covariance_names: tuple[str, ...] = ()
+    covariance_names: tuple[Coefficient, ...] = ()
     provenance: dict[str, str] = field(default_factory=dict)
     envelope: Envelope = Envelope()
     datasheet_name: str = ''
-    datasheet: dict[str, tuple[float, float]] = field(default_factory=dict)
+    datasheet: dict[Coefficient, tuple[float, float]] = field(default_factory=dict)
 
     @property
     def zero_g_v(self) -> np.ndarray:

@@ -37,6 +37,7 @@ from adxl_ros.calibrate.stage_error import StageError
 from adxl_ros.model import noise
 from adxl_ros.model.coefficients import get, parameter_of, put, with_neutral
 from adxl_ros.model.constants import Z_90
+from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import Sensor, with_axes
 from adxl_ros.reproduction import scoring
 import numpy as np
@@ -84,7 +85,7 @@ class Draw:
     stage: str
     axes: str
     plan: str
-    names: tuple[str, ...]
+    names: tuple[Coefficient, ...]
     z: np.ndarray
     bound_ratio: np.ndarray
     tilt_z: np.ndarray
@@ -145,7 +146,7 @@ def draw(nominal: Sensor, number: int, kinds: Sequence[tuple[str, str, str]], se
     poses, true_rad = _swept(truth, targets, stage == STAGES[0], step, rng)
     found, _ = term_selection.fit_judged(sensor, poses)
     names = found.fitted.covariance_names
-    known = with_neutral(truth, {name.split('.')[0] for name in names})
+    known = with_neutral(truth, {name.effect for name in names})
     error = get(found.fitted, names) - get(known, names)
     sigma = step / np.sqrt(12)
     levels = StageError(0.0, sigma) if stage == STAGES[0] else StageError(sigma)
@@ -163,7 +164,7 @@ def _extra(stage: str) -> tuple[str, ...]:
     return ('stage_eccentricity',) if stage == 'eccentric' else ()
 
 
-def _by_bound(names: Sequence[str], error: np.ndarray, bound: Sensor) -> np.ndarray:
+def _by_bound(names: Sequence[Coefficient], error: np.ndarray, bound: Sensor) -> np.ndarray:
     std = dict(zip(bound.covariance_names, np.sqrt(np.diag(bound.covariance))))
     if set(names) != set(std):
         return np.zeros(0)
@@ -176,8 +177,8 @@ def _unit(sensor: Sensor, stage: str, rng: np.random.Generator) -> Sensor:
     unit = with_neutral(replace(sensor, effects=(), values={}), effects)
     names = [name for name in full_model.coefficients(sensor.axes, effects)
              if full_model.term_of(name) not in full_model.GAUGE
-             and (stage == 'tilted base' or not name.startswith('base_tilt'))]
-    sizes = np.array([full_model.LEVEL_RAD if name.startswith('base_tilt') else
+             and (stage == 'tilted base' or name.effect != 'base_tilt')]
+    sizes = np.array([full_model.LEVEL_RAD if name.effect == 'base_tilt' else
                       parameter_of(name).scale for name in names])
     return put(unit, names, sizes * rng.normal(size=len(names)))
 

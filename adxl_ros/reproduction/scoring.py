@@ -28,7 +28,7 @@ from adxl_ros.model import noise, signal_chain
 from adxl_ros.model.coefficients import put, with_neutral
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.covariance import force_covariance
-from adxl_ros.model.effects.base import Components
+from adxl_ros.model.effects.base import Coefficient, Components
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.model.tilt import tilt
 import numpy as np
@@ -100,11 +100,11 @@ def known_bound(truth: Sensor, swept: Poses, true_rad: np.ndarray, stage: StageE
 
     """
     names = full_model.coefficients(truth.axes, terms)
-    at = with_neutral(truth, (*(term.split('.')[0] for term in terms), 'base_tilt'))
+    at = with_neutral(truth, (*map(full_model.effect_of, terms), 'base_tilt'))
     level = full_model.LEVEL_RAD if stage.total_rad else 1e-9
     there = replace(swept, alpha_rad=true_rad[:, 0], beta_rad=true_rad[:, 1])
     known = full_model.information(at, there, names, stage)
-    of_base = [i for i, name in enumerate(names) if name.startswith('base_tilt')]
+    of_base = [i for i, name in enumerate(names) if name.effect == 'base_tilt']
     known[of_base, of_base] += 1 / level ** 2 - 1 / full_model.LEVEL_RAD ** 2
     covariance = np.linalg.inv(known)
     own = [i for i, name in enumerate(names) if not full_model.of_stage(name)]
@@ -207,5 +207,5 @@ def with_stated_filter(fitted: Sensor) -> Sensor:
     """Return the unit with the stated filter resistor: what the paper corrected by."""
     if 'bandwidth' not in fitted.effects:
         return fitted
-    names = [f'bandwidth.resistance_ratio.{axis}' for axis in fitted.axes]
+    names = [Coefficient('bandwidth', 'resistance_ratio', axis) for axis in fitted.axes]
     return put(fitted, names, np.zeros(len(names)))

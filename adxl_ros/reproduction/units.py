@@ -98,7 +98,7 @@ def judge(nominal: Sensor, stage: experiments.Stage, seed: int) -> Unit:
 
 
 def _coefficients(fitted: Sensor, truth: Sensor) -> np.ndarray:
-    if not all(name.split('.')[0] in truth.effects for name in fitted.covariance_names):
+    if not all(name.effect in truth.effects for name in fitted.covariance_names):
         return np.zeros(0)
     off = get(fitted, fitted.covariance_names) - get(truth, fitted.covariance_names)
     return off / np.sqrt(np.diag(fitted.covariance))

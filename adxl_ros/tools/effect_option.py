@@ -23,7 +23,7 @@ from difflib import get_close_matches
 from adxl_ros.errors import UserError
 from adxl_ros.model import coefficients
 from adxl_ros.model.effects import effect_named
-from adxl_ros.model.effects.base import Effect, Parameter
+from adxl_ros.model.effects.base import Coefficient, Effect, Parameter
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
@@ -49,7 +49,7 @@ def with_effects(sensor: Sensor, texts: Sequence[str]) -> Sensor:
         or stated twice.
 
     """
-    stated: dict[str, str] = {}
+    stated: dict[Coefficient, str] = {}
     for text in texts:
         name, _, rest = text.partition(':')
         effect = _effect(name, text)
@@ -58,10 +58,11 @@ def with_effects(sensor: Sensor, texts: Sequence[str]) -> Sensor:
             sensor = _with(sensor, effect, values)
         for part in filter(None, rest.split(',')):
             key, _, figure = part.partition('=')
-            if f'{name}.{key}' in stated:
+            coefficient = Coefficient(name, *key.strip().split('.', 1))
+            if coefficient in stated:
                 raise UserError(f'--effect {text}: {key} of {name} is stated twice, in '
-                                f'{stated[f"{name}.{key}"]}, too; keep one')
-            stated[f'{name}.{key}'] = text
+                                f'{stated[coefficient]}, too; keep one')
+            stated[coefficient] = text
             sensor = _set(sensor, effect, key.strip(), figure.strip(), text)
     return sensor
 

@@ -24,6 +24,7 @@ from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.stream_info import sensor_info
 from adxl_ros.model import noise, signal_chain
 from adxl_ros.model.coefficients import put, with_neutral
+from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.filters import low_pass
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.scalar_or_array import FLOATS
@@ -105,7 +106,7 @@ def test_a_stream_gives_the_same_eight_samples_later():
 def test_the_variance_is_that_of_the_noise_that_comes_back():
     """Noise of a simulated sensor at rest behind the inverse, against `variance_v2`."""
     sensor = put(with_neutral(nominal(), ['bandwidth']),
-                 ['bandwidth.resistance_ratio.x'], [-0.2])
+                 [Coefficient('bandwidth', 'resistance_ratio', 'x')], [-0.2])
     time_s = np.arange(200_000) / sensor.rate_hz
     volts = Response(sensor, Motion(200.0, Held(0.5), Held(0.7)), 3)(time_s)
     back = filter_inversion.undone(volts, time_s, noise.electronics(sensor)[0], sensor.rate_hz)

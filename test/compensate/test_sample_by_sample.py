@@ -22,6 +22,7 @@ from adxl_ros.files import imu_message
 from adxl_ros.files.cdr import CdrError
 from adxl_ros.model import signal_chain
 from adxl_ros.model.covariance import force_covariance, UNMEASURED_VARIANCE
+from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.noise import sigma_v
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
@@ -39,7 +40,7 @@ G = 9.80665
 def unit(axes: str) -> Sensor:
     """Draw a unit with a covariance of its zero-g."""
     sensor = drawn(np.random.default_rng(1), nominal(axes))
-    names = tuple(f'bias.offset_v.{axis}' for axis in axes)
+    names = tuple(Coefficient('bias', 'offset_v', axis) for axis in axes)
     return replace(sensor, covariance_names=names,
                    covariance=1e-6 * (np.eye(len(axes)) + 0.3))
 

@@ -28,6 +28,7 @@ from adxl_ros.diagnose.next_experiment import proposed
 from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.stream_info import sensor_info
+from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.simulate import trajectories
 from adxl_ros.simulate.motion import Held, Knots, Motion
 from adxl_ros.simulate.simulator import simulate
@@ -44,8 +45,8 @@ def unit(axes='xyz', rate_hz=125.0):
     """Return a calibrated unit."""
     rng = np.random.default_rng(1)
     count = len(axes)
-    names = tuple(f'{p}.{a}' for p in ('bias.offset_v', 'scale_factor.offset_v_per_g')
-                  for a in axes)
+    names = tuple(Coefficient(effect, parameter, axis) for effect, parameter in (
+        ('bias', 'offset_v'), ('scale_factor', 'offset_v_per_g')) for axis in axes)
     return replace(
         nominal(axes), rate_hz=rate_hz, stage_resolution_rad=1e-4, model='linear',
         effects=('bias', 'scale_factor'), covariance_names=names,
@@ -258,8 +259,9 @@ def test_a_limit_that_one_stretch_alone_reaches_is_not_guessed_from_the_others()
     one = series_of(Recording('made', columns.pop('time_s'), columns, sensor_info(sensor)), sensor)
     used = [np.ones(len(one), bool)]
     of = study([one], used, lambda done: None, only=['saturation'])
-    found = refined(of, ['saturation'], {'saturation.limit_g.y': limit_g - 1.0,
-                                         'saturation.knee_g': knee_g}, {})
+    start = {Coefficient('saturation', 'limit_g', 'y'): limit_g - 1.0,
+             Coefficient('saturation', 'knee_g'): knee_g}
+    found = refined(of, ['saturation'], start, {})
     without, held = (held_out(of, [one], used, effects, there).squares for effects, there in (
         ([], sensor), (found.effects, found.sensor)))
     assert without.max() > 3 * np.median(without)

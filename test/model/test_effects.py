@@ -28,6 +28,7 @@ from adxl_ros.model.coefficients import (
     with_neutral,
 )
 from adxl_ros.model.effects import library
+from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.filters import low_pass, resonator
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.play_operator import play
@@ -91,9 +92,9 @@ def test_typical_values_show_and_join(name, plain):
     """A typical effect changes something, the same in one block and in many."""
     sensor = having(name, nominal('xyz'))
     if name == 'saturation':
-        sensor = put(sensor, ['saturation.limit_g.z'], [0.3])
+        sensor = put(sensor, [Coefficient('saturation', 'limit_g', 'z')], [0.3])
     if name == 'spikes' or name == 'stuck':
-        sensor = put(sensor, [f'{name}.rate_hz'], [3.0])
+        sensor = put(sensor, [Coefficient(name, 'rate_hz')], [3.0])
     whole = volts(sensor)
     assert np.abs(whole - plain).max() > 5e-5
     respond, stamps = Response(sensor, MOTION, 1), np.arange(len(whole)) / sensor.rate_hz

@@ -21,6 +21,7 @@ from adxl_ros.model import noise, signal_chain
 from adxl_ros.model.coefficients import get, names_of, parameter_of, put, with_neutral
 from adxl_ros.model.covariance import force_covariance, parameter_tangent
 from adxl_ros.model.effects import library
+from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.scalar_or_array import ARRAYS, FLOATS
 from adxl_ros.model.sensor import Sensor, with_axes
@@ -48,7 +49,7 @@ def sensors(draw: st.DrawFn, axes: str) -> Sensor:
         for n in names])
 
 
-def coefficients(sensor: Sensor) -> tuple[str, ...]:
+def coefficients(sensor: Sensor) -> tuple[Coefficient, ...]:
     return tuple(n for name in sensor.effects for n in names_of(library()[name], sensor.axes))
 
 
@@ -182,7 +183,8 @@ def test_parameter_tangent_is_the_paper_s() -> None:
         'bias': {'offset_v': np.array([0.1, 0.0])},
         'scale_factor': {'offset_v_per_g': np.array([0.02, 0.0])}},
         covariance=np.eye(2) * 1e-6,
-        covariance_names=('bias.offset_v.x', 'scale_factor.offset_v_per_g.x'))
+        covariance_names=(Coefficient('bias', 'offset_v', 'x'),
+                          Coefficient('scale_factor', 'offset_v_per_g', 'x')))
     found = parameter_tangent(sensor, [np.array([G / 2]), np.array([1.0]), np.array([0.0])])
     np.testing.assert_allclose(found[:, :, 0], [[1, 0.5], [0, 0]], atol=1e-9)
 

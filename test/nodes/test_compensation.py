@@ -28,6 +28,7 @@ from adxl_ros.files.stream_info import sensor_info
 from adxl_ros.model import signal_chain
 from adxl_ros.model.coefficients import put, with_neutral
 from adxl_ros.model.covariance import force_covariance
+from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.scalar_or_array import FLOATS
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
@@ -53,7 +54,7 @@ Start = Callable[..., Started]
 def unit(serial: str = '17', axes: str = 'xy', seed: int = 1) -> Sensor:
     sensor = drawn(np.random.default_rng(seed), nominal(axes))
     return replace(sensor, serial=serial, model='physical', provenance={'source': f'by {serial}'},
-                   covariance_names=('bias.offset_v.x', 'bias.offset_v.y'),
+                   covariance_names=tuple(Coefficient('bias', 'offset_v', axis) for axis in 'xy'),
                    covariance=np.array([[2e-6, 1e-6], [1e-6, 3e-6]]))
 
 
@@ -207,8 +208,8 @@ def test_corrected_stream(robot: Robot, start: Start, tmp_path: Path) -> None:
 def test_supply_and_temperature_are_taken_out(robot: Robot, start: Start, tmp_path: Path) -> None:
     """What `supply` and `temperature` say reaches the inverse; what is not said is named."""
     sensor = with_neutral(unit(), ['supply', 'temperature_bias'])
-    sensor = put(sensor, ['temperature_bias.per_k.x', *(
-        f'supply.{figure}_exponent.{axis}' for figure in ('zero_g', 'scale')
+    sensor = put(sensor, [Coefficient('temperature_bias', 'per_k', 'x'), *(
+        Coefficient('supply', f'{figure}_exponent', axis) for figure in ('zero_g', 'scale')
         for axis in sensor.axes)], [1e-3, *[1.0] * 2, *[1.135] * 2])
     started(start, tmp_path, sensor, '-p', 'use_sim_time:=true')
     robot.inform(sensor)
@@ -311,8 +312,9 @@ def test_outside_of_what_was_calibrated_the_covariance_is_raised(
     """By temperature and by pose, as much as the documentation says, and diagnostics say so."""
     sensor = unit(axes='xyz')
     sensor = replace(sensor, covariance_names=tuple(
-        f'{name}.{axis}' for name in ('bias.offset_v', 'scale_factor.offset_v_per_g')
-        for axis in 'xyz'), covariance=np.diag([1e-8] * 3 + [1e-6] * 3))
+        Coefficient(effect, parameter, axis) for effect, parameter in (
+            ('bias', 'offset_v'), ('scale_factor', 'offset_v_per_g')) for axis in 'xyz'),
+        covariance=np.diag([1e-8] * 3 + [1e-6] * 3))
     force = np.array([pose(a, b) for a in np.radians([0, 15, 30]) for b in (0.0, 2.0, 4.0)])
     nothing = np.zeros((9, 3))
     poses = Poses(nothing, nothing, nothing[:, 0], nothing[:, 0], nothing[:, :2],

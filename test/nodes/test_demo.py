@@ -27,6 +27,7 @@ from adxl_ros.errors import UserError
 from adxl_ros.model import signal_chain
 from adxl_ros.model.coefficients import get, names_of, put, with_neutral
 from adxl_ros.model.effects import effect_named
+from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.nodes import demo
 from adxl_ros.nodes.terminal import steps
@@ -36,20 +37,20 @@ import pytest
 from terminal import Terminal
 from units import drawn, nominal
 
-LINEAR = ('cross_axis.linear', 'cross_axis_z.linear')
+LINEAR = (Coefficient('cross_axis', 'linear'), Coefficient('cross_axis_z', 'linear'))
 STD = 1e-3
 
 
 def fitted_of(truth, names, off=0.0):
     """Return the unit as a fit of some coefficients finds it, each off by so much."""
-    unit = with_neutral(truth, [name.split('.')[0] for name in names])
+    unit = with_neutral(truth, [name.effect for name in names])
     return replace(put(unit, names, get(unit, names) + off), model='full', covariance_names=names,
                    covariance=STD ** 2 * np.eye(len(names)))
 
 
 def names_for(axes, terms=TERMS, without=()):
     return tuple(name for term in terms for name in names_of(effect_named(term), axes)
-                 if name.rpartition('.')[0] not in without)
+                 if name.without_axis not in without)
 
 
 def made(off=0.0, axes='xy', without=LINEAR):
@@ -64,7 +65,8 @@ def named(compared, name, axis):
 def test_each_fitted_coefficient_is_compared() -> None:
     fitted, truth = made()
     compared = compare(fitted, truth)
-    assert [f'{one.name}.{one.axis}' for one in compared] == list(fitted.covariance_names)
+    assert [f'{one.name}.{one.axis}' for one in compared] == \
+        list(map(str, fitted.covariance_names))
     assert all(one.fitted == pytest.approx(one.truth, abs=1e-9) and one.inside for one in compared)
     zero_g = named(compared, 'bias.offset_v', 'y')
     assert (zero_g.label, zero_g.unit) == ('zero-g', 'V')
@@ -99,7 +101,7 @@ def test_linear_terms_that_the_fit_lacks_are_misalignment(axes: str) -> None:
     rng = np.random.default_rng(2)
     truth = drawn(rng, nominal(axes), ('bias', 'scale_factor', 'misalignment'))
     linear = [name for name in names_for(axes, ('cross_axis', 'cross_axis_z'))
-              if name.rpartition('.')[0] in LINEAR]
+              if name.without_axis in LINEAR]
     truth = put(with_neutral(truth, ['cross_axis', 'cross_axis_z']), linear,
                 0.02 * rng.normal(size=len(linear)))
     fitted = fitted_of(truth, names_for(axes, ('bias', 'scale_factor', 'misalignment')))
@@ -116,7 +118,7 @@ def test_linear_terms_that_the_fit_lacks_are_misalignment(axes: str) -> None:
 
 def test_linear_terms_that_the_fit_has_are_compared() -> None:
     truth = drawn(np.random.default_rng(3), nominal())
-    truth = put(truth, ['cross_axis.linear.x'], [0.02])
+    truth = put(truth, [Coefficient('cross_axis', 'linear', 'x')], [0.02])
     compared = compare(fitted_of(truth, names_for('xy')), truth)
     linear = named(compared, 'cross_axis.linear', 'x')
     assert (linear.label, linear.truth, linear.inside) == ('bias, y', 0.02, True)
@@ -126,7 +128,7 @@ def test_linear_terms_that_the_fit_has_are_compared() -> None:
 
 def test_terms_that_the_unit_lacks_are_named() -> None:
     truth = drawn(np.random.default_rng(3), nominal())
-    fitted = fitted_of(truth, (*names_for('xy'), 'temperature_bias.per_k.x'))
+    fitted = fitted_of(truth, (*names_for('xy'), Coefficient('temperature_bias', 'per_k', 'x')))
     assert added_effects(fitted, truth) == ['temperature_bias']
     assert added_effects(fitted, with_neutral(truth, ['temperature_bias'])) == []
     assert demo.added_lines(added_effects(fitted, truth)) == [
@@ -135,7 +137,7 @@ def test_terms_that_the_unit_lacks_are_named() -> None:
 
 def test_table_of_the_truth() -> None:
     fitted, truth = made(without=())
-    fitted = put(fitted, ['scale_factor_z.quadratic_per_g2.x'], [
+    fitted = put(fitted, [Coefficient('scale_factor_z', 'quadratic_per_g2', 'x')], [
         truth.values['scale_factor_z']['quadratic_per_g2'][0] + 0.002])
     lines = demo.truth_table(compare(fitted, truth))
     rows = {re.sub(' +', ' ', line[:24]).strip(): line for line in lines}

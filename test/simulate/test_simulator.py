@@ -20,6 +20,7 @@ from adxl_ros.files import parameter_file, recording
 from adxl_ros.model import noise
 from adxl_ros.model.coefficients import put, typical, with_neutral
 from adxl_ros.model.effects import library
+from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.simulate.motion import Knots, Motion
 from adxl_ros.simulate.response import Response
 from adxl_ros.simulate.simulator import simulate
@@ -49,7 +50,8 @@ def test_rich_at_250_hz_is_rich_at_16_khz(everything):
     sensor = nominal('xyz', **CLEAN)
     if everything:
         sensor = with_all(sensor, ('mean',))
-        sensor = put(sensor, [f'saturation.limit_g.{a}' for a in 'xyz'], [1000.0] * 3)
+        sensor = put(sensor, [Coefficient('saturation', 'limit_g', axis) for axis in 'xyz'],
+                     [1000.0] * 3)
     motion = rich(np.random.default_rng(0))
     if everything:
         motion = replace(motion, duration_s=150.0)

@@ -25,6 +25,7 @@ from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.stream_info import sensor_info
 from adxl_ros.model import signal_chain
+from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
 import numpy as np
@@ -45,7 +46,7 @@ RunTool = Callable[..., subprocess.CompletedProcess]
 def unit(axes: str = 'xy') -> Sensor:
     sensor = replace(drawn(np.random.default_rng(1), nominal(axes)), serial='17')
     return replace(sensor, covariance=1e-6 * np.eye(len(axes)),
-                   covariance_names=tuple(f'bias.offset_v.{a}' for a in axes))
+                   covariance_names=tuple(Coefficient('bias', 'offset_v', a) for a in axes))
 
 
 def record(folder: Path, sensor: Sensor, volts: np.ndarray, info: dict[str, str] | None = None,

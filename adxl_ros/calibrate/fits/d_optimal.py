@@ -23,6 +23,7 @@ from __future__ import annotations
 from adxl_ros.calibrate import pose_response
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.calibrate.stage_error import StageError
+from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
@@ -77,7 +78,8 @@ def grid(std_v: np.ndarray, step_rad: float) -> Poses:
                  beta_setting=np.arange(count))
 
 
-def rows_of(unit: Sensor, poses: Poses, names: tuple[str, ...], stage: StageError) -> np.ndarray:
+def rows_of(unit: Sensor, poses: Poses, names: tuple[Coefficient, ...],
+            stage: StageError) -> np.ndarray:
     """
     Return the derivatives of single poses by coefficients, whitened, (k, m, p).
 

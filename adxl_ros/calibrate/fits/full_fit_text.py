@@ -23,6 +23,7 @@ from adxl_ros.calibrate.fits.term_selection import Term
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.model.coefficients import get, parameter_of
 from adxl_ros.model.constants import Z_90
+from adxl_ros.model.effects.base import Coefficient
 import numpy as np
 
 _WARMED_K = 3.0
@@ -35,7 +36,7 @@ _WORSE = 1.5
 """A stage that errs by so much more than stated is said to."""
 
 
-def weakest(found: full_model.FullFit) -> tuple[float, float, list[tuple[str, float]]]:
+def weakest(found: full_model.FullFit) -> tuple[float, float, list[tuple[Coefficient, float]]]:
     """
     Return the condition number, and the weakest direction of the sensor's coefficients.
 

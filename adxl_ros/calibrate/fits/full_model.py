@@ -49,7 +49,7 @@ from adxl_ros.calibrate.stage_error import AngleErrors, PoseCovariance, StageErr
 from adxl_ros.errors import UserError
 from adxl_ros.model.coefficients import get, names_of, parameter_of, put, with_neutral
 from adxl_ros.model.effects import effect_named
-from adxl_ros.model.effects.base import Parameter, Place
+from adxl_ros.model.effects.base import Coefficient, Parameter, Place
 from adxl_ros.model.gauss_newton import gauss_newton, halve_until, Iterate, Solution
 from adxl_ros.model.sensor import Sensor
 import numpy as np
@@ -62,9 +62,10 @@ _THREE_AXES = ('scale_factor_cross',)
 _OPTIONAL = ('nonlinearity',)
 """Terms that may stay as open as their prior leaves them: most units hardly have them."""
 GAUGE = ('cross_axis.linear', 'cross_axis_z.linear')
+"""Terms that are 0 unless the poses show them beside the misalignment."""
 LEVEL_RAD = np.radians(0.1)
 """Standard deviation of the level of the base, each way: the paper's 0.1°."""
-_STAGE = ('base_tilt.x_rad', 'base_tilt.y_rad')
+_STAGE = (Coefficient('base_tilt', 'x_rad'), Coefficient('base_tilt', 'y_rad'))
 _HARDLY = 5.0
 _KNOCKED = 1e-6
 """A pose less likely than this is disturbed, as long as such poses are few."""
@@ -128,7 +129,7 @@ class FullFit:
 
     fitted: Sensor
     unit: Sensor
-    names: tuple[str, ...]
+    names: tuple[Coefficient, ...]
     stage: StageError
     stated_sigma_rad: float
     knocked: tuple[int, ...]
@@ -179,7 +180,7 @@ def fit_full(sensor: Sensor, poses: Poses, terms: Sequence[str] | None = None) -
     """
     terms = terms_of(sensor.axes) if terms is None else terms
     start = linear.fit(sensor, poses)
-    effects = [term.split('.')[0] for term in terms]
+    effects = [effect_of(term) for term in terms]
     unit = with_neutral(replace(start, covariance=np.zeros((0, 0)), covariance_names=()), effects)
     unit = with_neutral(unit, ['base_tilt'])
     names = coefficients(unit.axes, terms)
@@ -197,7 +198,7 @@ def fit_full(sensor: Sensor, poses: Poses, terms: Sequence[str] | None = None) -
     return min(fits, key=lambda fit: fit.deviance)
 
 
-def _starts(unit: Sensor, poses: Poses, names: Sequence[str], effects: Sequence[str],
+def _starts(unit: Sensor, poses: Poses, names: Sequence[Coefficient], effects: Sequence[str],
             stage: StageError) -> list[Sensor]:
     """
     Return the units from which a fit begins: several where a term is not convex.
@@ -218,8 +219,9 @@ def _starts(unit: Sensor, poses: Poses, names: Sequence[str], effects: Sequence[
     return starts
 
 
-def _likeliest(unit: Sensor, poses: Poses, names: Sequence[str], shape: tuple[str, Parameter],
-               values: np.ndarray, stage: StageError) -> list[float]:
+def _likeliest(unit: Sensor, poses: Poses, names: Sequence[Coefficient],
+               shape: tuple[str, Parameter], values: np.ndarray, stage: StageError
+               ) -> list[float]:
     """Return values of a figure of shape within its bounds, the likeliest first."""
     _, parameter = shape
     within = values[(parameter.lower <= values) & (values <= parameter.upper)]
@@ -235,7 +237,8 @@ def _shaped(unit: Sensor, shape: tuple[str, Parameter], value: float) -> Sensor:
     return replace(unit, values={**unit.values, name: changed})
 
 
-def _fit_from(unit: Sensor, poses: Poses, names: tuple[str, ...], stated: StageError) -> FullFit:
+def _fit_from(unit: Sensor, poses: Poses, names: tuple[Coefficient, ...],
+              stated: StageError) -> FullFit:
     """Fit from a start: levels, coefficients and angles in turn, until all of them settle."""
     known, everything = priors(names), np.ones(len(poses), bool)
     kept, stage, at, std_v = everything, stated, poses, poses.std_v
@@ -279,9 +282,9 @@ def _fit_from(unit: Sensor, poses: Poses, names: tuple[str, ...], stated: StageE
                    converged)
 
 
-def coefficients(axes: str, terms: Sequence[str]) -> tuple[str, ...]:
+def coefficients(axes: str, terms: Sequence[str]) -> tuple[Coefficient, ...]:
     """Name what is fitted: the terms' coefficients but for the gauge, and the base's tilt."""
-    named = [name for effect in dict.fromkeys(term.split('.')[0] for term in terms)
+    named = [name for effect in dict.fromkeys(map(effect_of, terms))
              for name in names_of(effect_named(effect), axes)
              if not parameter_of(name).shape and not parameter_of(name).optional
              and term_of(name) in terms]
@@ -289,13 +292,18 @@ def coefficients(axes: str, terms: Sequence[str]) -> tuple[str, ...]:
             *(n for n in named if of_stage(n) and n not in _STAGE))
 
 
-def term_of(name: str) -> str:
+def term_of(name: Coefficient) -> str:
     """Return the term that a coefficient belongs to: its effect, or one of `GAUGE`."""
-    effect, parameter = name.split('.')[:2]
-    return f'{effect}.{parameter}' if f'{effect}.{parameter}' in GAUGE else effect
+    parameter = str(name.without_axis)
+    return parameter if parameter in GAUGE else name.effect
 
 
-def priors(names: Sequence[str]) -> np.ndarray:
+def effect_of(term: str) -> str:
+    """Return the effect of a term, which is its name or one of `GAUGE`."""
+    return Coefficient.parse(term).effect if term in GAUGE else term
+
+
+def priors(names: Sequence[Coefficient]) -> np.ndarray:
     """
     Return the inverse variances that are known beforehand, (p,).
 
@@ -307,7 +315,7 @@ def priors(names: Sequence[str]) -> np.ndarray:
     return 1 / np.square(spread)
 
 
-def information(unit: Sensor, poses: Poses, names: Sequence[str], stage: StageError
+def information(unit: Sensor, poses: Poses, names: Sequence[Coefficient], stage: StageError
                 ) -> np.ndarray:
     """
     Fisher information of poses about coefficients, priors of the stage included, (p, p).
@@ -342,7 +350,7 @@ class _Iterate(Iterate):
         return float(np.abs(self.step * np.sqrt(np.diag(self.information))).max())
 
 
-def _solved(unit: Sensor, poses: Poses, names: Sequence[str], stage: StageError,
+def _solved(unit: Sensor, poses: Poses, names: Sequence[Coefficient], stage: StageError,
             kept: np.ndarray, steps: int) -> Solution[_Iterate]:
     """Take Gauss-Newton steps; the chain is nearly linear in its coefficients."""
     sizes = np.array([parameter_of(name).scale for name in names])
@@ -360,8 +368,9 @@ def _solved(unit: Sensor, poses: Poses, names: Sequence[str], stage: StageError,
         steps + 1)
 
 
-def _stepped(unit: Sensor, poses: Poses, at: Poses, names: Sequence[str], stage: StageError,
-             kept: np.ndarray, before: AngleErrors) -> tuple[Sensor, AngleErrors, float]:
+def _stepped(unit: Sensor, poses: Poses, at: Poses, names: Sequence[Coefficient],
+             stage: StageError, kept: np.ndarray, before: AngleErrors
+             ) -> tuple[Sensor, AngleErrors, float]:
     """
     Go to the most likely coefficients and angles, or as far on the way as it gets better.
 
@@ -419,9 +428,9 @@ def _moved(unit: Sensor, poses: Poses, step_rad: np.ndarray) -> Poses:
                                                @ step_rad[:, :, None])[:, :, 0])
 
 
-def of_stage(name: str) -> bool:
+def of_stage(name: Coefficient) -> bool:
     """Tell whether a coefficient is the stage's and not the sensor's."""
-    return effect_named(name.split('.')[0]).place is Place.STAGE
+    return effect_named(name.effect).place is Place.STAGE
 
 
 def _without_stage(unit: Sensor) -> Sensor:
@@ -429,7 +438,7 @@ def _without_stage(unit: Sensor) -> Sensor:
     return replace(unit, effects=effects, values={e: unit.values[e] for e in effects})
 
 
-def require_determined(unit: Sensor, poses: Poses, names: Sequence[str],
+def require_determined(unit: Sensor, poses: Poses, names: Sequence[Coefficient],
                        stage: StageError) -> None:
     """
     Refuse poses that tell less of a coefficient than its typical size does.
@@ -445,7 +454,7 @@ def require_determined(unit: Sensor, poses: Poses, names: Sequence[str],
     told = information(unit, poses, names, stage) - np.diag(priors(names) * vague)
     known = told * np.outer(scale, scale)
     weak = np.linalg.inv(known + 1e-6 * np.eye(len(names)))
-    lost = [name for name, variance, need in zip(names, np.diag(weak), vague)
+    lost = [str(name) for name, variance, need in zip(names, np.diag(weak), vague)
             if variance > 1.0 and need]
     if lost or poses.volts.size <= len(names):
         add = ', '.join(f'({np.degrees(a):.0f}, {np.degrees(b):.0f})'
@@ -456,7 +465,7 @@ def require_determined(unit: Sensor, poses: Poses, names: Sequence[str],
             'deg, or fit --model physical or linear')
 
 
-def next_poses(unit: Sensor, poses: Poses, names: Sequence[str], stage: StageError,
+def next_poses(unit: Sensor, poses: Poses, names: Sequence[Coefficient], stage: StageError,
                count: int = 4) -> list[tuple[float, float]]:
     """
     Choose poses that would help most, one after the other: alpha and beta, rad.

@@ -305,7 +305,7 @@ def _require_determined(rests: Rests, found: np.ndarray, excess: float) -> None:
                         'nominal_scale_v_per_g or local_gravity_mps2 right')
     if count >= MIN_RESTS and not lost:
         return
-    what = 'all nine coefficients' if len(lost) == len(NAMES) else ', '.join(lost)
+    what = 'all nine coefficients' if len(lost) == len(NAMES) else ', '.join(map(str, lost))
     lacking = f'leave {what} open' if lost else f'are too few, {MIN_RESTS} are the least'
     scatter = f' and scatter by {1e3 * np.sqrt(excess):.2g} mg' if excess else ''
     poses = poses_to_add(max(MIN_RESTS - count, 0), information, found, rests.gravity,

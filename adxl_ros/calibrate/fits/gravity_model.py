@@ -20,13 +20,16 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from adxl_ros.model.constants import AXES, G0_MPS2
+from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.gauss_newton import gauss_newton, Iterate
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
-NAMES = (*(f'bias.offset_v.{axis}' for axis in AXES),
-         *(f'scale_factor.offset_v_per_g.{axis}' for axis in AXES),
-         'misalignment.beta_rad.y', 'misalignment.alpha_rad.z', 'misalignment.beta_rad.z')
+NAMES = (*(Coefficient('bias', 'offset_v', axis) for axis in AXES),
+         *(Coefficient('scale_factor', 'offset_v_per_g', axis) for axis in AXES),
+         Coefficient('misalignment', 'beta_rad', 'y'),
+         Coefficient('misalignment', 'alpha_rad', 'z'),
+         Coefficient('misalignment', 'beta_rad', 'z'))
 PRIOR = 0.1
 """Coefficients can be this far from nominal, in g, of the scale factor and in rad."""
 DETERMINED = 0.01
@@ -172,7 +175,7 @@ def information_of(rests: Rests, found: np.ndarray, excess: float) -> np.ndarray
     return information
 
 
-def open_names(information: np.ndarray) -> list[str]:
+def open_names(information: np.ndarray) -> list[Coefficient]:
     """Name the coefficients that the information does not determine."""
     sigma = np.sqrt(np.diag(np.linalg.inv(information)))
     return [name for name, s in zip(NAMES, sigma) if s > DETERMINED]

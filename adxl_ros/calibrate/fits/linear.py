@@ -21,6 +21,7 @@ from dataclasses import replace
 from adxl_ros.calibrate.poses import Poses, reference_force
 from adxl_ros.errors import UserError
 from adxl_ros.model.constants import AXES, G0_MPS2
+from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
@@ -57,8 +58,8 @@ def fit(sensor: Sensor, poses: Poses) -> Sensor:
         full[np.ix_([d, count + d], [d, count + d])] = c
     values = {'bias': {'offset_v': np.array(zero) - sensor.nominal_zero_g_v},
               'scale_factor': {'offset_v_per_g': np.array(scale) - sensor.nominal_scale_v_per_g}}
-    names = [f'bias.offset_v.{a}' for a in sensor.axes] + \
-            [f'scale_factor.offset_v_per_g.{a}' for a in sensor.axes]
+    names = [Coefficient('bias', 'offset_v', axis) for axis in sensor.axes] + \
+            [Coefficient('scale_factor', 'offset_v_per_g', axis) for axis in sensor.axes]
     return replace(sensor, model='linear', effects=('bias', 'scale_factor'), values=values,
                    covariance=full, covariance_names=tuple(names))
 

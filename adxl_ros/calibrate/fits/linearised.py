@@ -36,6 +36,7 @@ from adxl_ros.calibrate.stage_error import (
     StageError,
 )
 from adxl_ros.model.coefficients import get
+from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 from scipy.optimize import minimize
@@ -186,7 +187,7 @@ def _bound(axes: int) -> float:
     return float(chi2.isf(_SURPRISE, axes))
 
 
-def linearised(unit: Sensor, poses: Poses, names: Sequence[str], precision: np.ndarray,
+def linearised(unit: Sensor, poses: Poses, names: Sequence[Coefficient], precision: np.ndarray,
                kept: np.ndarray | None = None) -> Linearised:
     """
     Linearise the volts of poses about a unit.

@@ -32,6 +32,7 @@ from adxl_ros.errors import UserError
 from adxl_ros.model import signal_chain
 from adxl_ros.model.coefficients import get
 from adxl_ros.model.constants import G0_MPS2
+from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.sensor import Sensor
 import numpy as np
@@ -162,7 +163,7 @@ def _assemble(sensor: Sensor, poses: Poses, of: list[Stages]) -> Sensor:
     values['cross_axis'] = {'linear': np.zeros(count), 'quadratic_per_g': terms['p2']}
     values['cross_axis_z'] = {'linear': np.zeros(count), 'quadratic_per_g': terms['q2']}
     values['scale_factor_z'] = {'linear_per_g': terms['r1'], 'quadratic_per_g2': terms['r2']}
-    names = [f'{effect}.{parameter}.{axis}' for effect, of_effect in values.items()
+    names = [Coefficient(effect, parameter, axis) for effect, of_effect in values.items()
              for parameter in of_effect if (effect, parameter) not in _GAUGE
              for axis in sensor.axes
              if axis != 'z' or effect in ('bias', 'scale_factor', 'misalignment')]

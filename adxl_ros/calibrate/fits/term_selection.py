@@ -167,7 +167,7 @@ def gauge_shows(found: full_model.FullFit) -> bool:
 
 def _linearised(found: full_model.FullFit, more: Sequence[str]) -> tuple[Linearised, np.ndarray]:
     """Linearise the fit with further terms; returns the term of each coefficient, too."""
-    unit = with_neutral(found.unit, [name.split('.')[0] for name in more])
+    unit = with_neutral(found.unit, map(full_model.effect_of, more))
     names = (*found.names, *(n for name in more
                              for n in full_model.coefficients(unit.axes, (name,))
                              if n not in found.names))

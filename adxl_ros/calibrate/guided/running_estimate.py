@@ -29,6 +29,7 @@ from adxl_ros.model import noise
 from adxl_ros.model.coefficients import get, parameter_of, put, with_neutral
 from adxl_ros.model.constants import Z_90
 from adxl_ros.model.covariance import force_covariance
+from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.model.tilt import tilt
@@ -65,7 +66,7 @@ class Known:
     """
 
     unit: Sensor
-    names: tuple[str, ...]
+    names: tuple[Coefficient, ...]
     covariance: np.ndarray
     prior: np.ndarray
     stage: StageError
@@ -195,7 +196,7 @@ def in_g(sensor: Sensor, volts: np.ndarray) -> np.ndarray:
     return (volts - sensor.zero_g_v) / sensor.scale_v_per_g
 
 
-def by_term(names: Sequence[str], values: np.ndarray, std: np.ndarray, prior: np.ndarray
+def by_term(names: Sequence[Coefficient], values: np.ndarray, std: np.ndarray, prior: np.ndarray
             ) -> list[tuple[str, list[str], float]]:
     """
     Sum coefficients up for a display, term by term.
@@ -207,17 +208,18 @@ def by_term(names: Sequence[str], values: np.ndarray, std: np.ndarray, prior: np
         how much of what the datasheet leaves open is determined, 0 to 1, of the worst axis.
 
     """
-    rows: dict[str, list[int]] = {}
+    rows: dict[Coefficient, list[int]] = {}
     for i, name in enumerate(names):
-        rows.setdefault('.'.join(name.split('.')[:2]), []).append(i)
+        rows.setdefault(name.without_axis, []).append(i)
     table = []
     for term, at in rows.items():
         if full_model.of_stage(names[at[0]]):
             continue
         unit = parameter_of(names[at[0]]).unit
-        shown = [f'{names[i].split(".")[-1]} {values[i]:+.2g} ± {Z_90 * std[i]:.1g}' for i in at]
+        shown = [f'{names[i].axis or names[i].parameter} {values[i]:+.2g} ± '
+                 f'{Z_90 * std[i]:.1g}' for i in at]
         worst = float(np.min(1 - np.clip(std[at] / prior[at], 0, 1)))
-        table.append((f'{term}, {unit}' if unit else term, shown, worst))
+        table.append((f'{term}, {unit}' if unit else str(term), shown, worst))
     return table
 
 

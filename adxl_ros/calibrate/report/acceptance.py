@@ -23,12 +23,13 @@ from adxl_ros.calibrate.report.cross_validation import rms_interval, Score
 from adxl_ros.calibrate.report.error_budget import milli_g, own_noise_mps2, Parts
 from adxl_ros.model.coefficients import get, parameter_of
 from adxl_ros.model.constants import G0_MPS2, Z_90
+from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
 PASS, FAIL, NOT_SHOWN = 'PASS', 'FAIL', 'NOT SHOWN'
 _CLOSE = 0.2
-_LINEARITY = 'nonlinearity.cubic_per_g2'
+_LINEARITY = Coefficient('nonlinearity', 'cubic_per_g2')
 
 
 @dataclass(frozen=True)
@@ -114,7 +115,7 @@ def beyond_datasheet(sensor: Sensor) -> list[str]:
     found = []
     std = np.sqrt(np.diag(sensor.covariance))
     for name, value, s in zip(sensor.covariance_names, get(sensor, sensor.covariance_names), std):
-        _, most = sensor.datasheet.get('.'.join(name.split('.')[:2]), (0.0, 0.0))
+        _, most = sensor.datasheet.get(name.without_axis, (0.0, 0.0))
         if most and abs(value) - Z_90 * s > most:
             found.append(f'{name} is {value:.4g} +- {Z_90 * s:.2g} {parameter_of(name).unit}, '
                          f'beyond {most:g}')

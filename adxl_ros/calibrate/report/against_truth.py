@@ -16,19 +16,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 from adxl_ros.calibrate.fits import full_model
 from adxl_ros.errors import UserError
 from adxl_ros.model.coefficients import get, parameter_of, put, with_neutral
 from adxl_ros.model.constants import AXES, Z_90
 from adxl_ros.model.effects import cross_axis, cross_axis_z, scale_factor_cross, scale_factor_z
+from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.effects.misalignment import direction
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
-_ABSOLUTE = {'bias.offset_v': 'nominal_zero_g_v',
-             'scale_factor.offset_v_per_g': 'nominal_scale_v_per_g'}
+_SCALE = Coefficient('scale_factor', 'offset_v_per_g')
+_ABSOLUTE = {Coefficient('bias', 'offset_v'): 'nominal_zero_g_v',
+             _SCALE: 'nominal_scale_v_per_g'}
 """Coefficients that are departures from a nominal figure, and that figure."""
 _LABELS = {
     'bias.offset_v': 'zero-g',
@@ -47,9 +50,8 @@ _LABELS = {
 """Coefficients in words; {other} is the axis that acts on the own axis."""
 _OTHER = {effect.EFFECT.name: effect.OTHER
           for effect in (cross_axis, cross_axis_z, scale_factor_cross, scale_factor_z)}
-_ANGLES = ('misalignment.alpha_rad', 'misalignment.beta_rad')
-_LINEAR = ('cross_axis.linear', 'cross_axis_z.linear')
-_SCALE = 'scale_factor.offset_v_per_g'
+_ANGLES = (Coefficient('misalignment', 'alpha_rad'), Coefficient('misalignment', 'beta_rad'))
+_LINEAR = (Coefficient('cross_axis', 'linear'), Coefficient('cross_axis_z', 'linear'))
 
 
 @dataclass(frozen=True)
@@ -126,41 +128,46 @@ def added_effects(fitted: Sensor, truth: Sensor) -> list[str]:
     return [effect for effect in fitted.effects if effect not in expected]
 
 
-def _compared(name: str, fitted: float, half_width: float, truth: float) -> Comparison:
-    effect, parameter, axis = (*name.split('.'), '')[:3]
-    key = f'{effect}.{parameter}'
-    other = AXES[_OTHER[effect][AXES.index(axis)]] if axis and effect in _OTHER else ''
+def _compared(name: Coefficient, fitted: float, half_width: float, truth: float) -> Comparison:
+    key = str(name.without_axis)
+    acts = name.axis and name.effect in _OTHER
+    other = AXES[_OTHER[name.effect][AXES.index(name.axis)]] if acts else ''
     unit, scale = parameter_of(name).unit, 1.0
     if unit == 'rad':
         unit, scale = '°', float(np.degrees(1.0))
-    return Comparison(key, axis, _LABELS.get(key, key).format(other=other),
+    return Comparison(key, name.axis, _LABELS.get(key, key).format(other=other),
                       unit.replace('^2', '²'), *(float(scale * value) for value in (
                           fitted, half_width, truth)))
 
 
-def _absolute(sensor: Sensor, names: tuple[str, ...]) -> np.ndarray:
+def _absolute(sensor: Sensor, names: tuple[Coefficient, ...]) -> np.ndarray:
     """Return coefficients, zero-g and scale factor with their nominal figures, (p,)."""
     values = get(sensor, names)
     for i, name in enumerate(names):
-        key, _, axis = name.rpartition('.')
-        if key in _ABSOLUTE:
-            values[i] += getattr(sensor, _ABSOLUTE[key])[sensor.axes.index(axis)]
+        nominal = _ABSOLUTE.get(name.without_axis)
+        if nominal:
+            values[i] += getattr(sensor, nominal)[sensor.axes.index(name.axis)]
     return values
 
 
-def _in_gauge_of_fit(truth: Sensor, names: tuple[str, ...]) -> Sensor:
+def _in_gauge_of_fit(truth: Sensor, names: tuple[Coefficient, ...]) -> Sensor:
     """Return the true unit with every effect of the fit, and no linear term that it lacks."""
-    effects = [name.split('.')[0] for name in (*names, *_LINEAR, *_ANGLES, _SCALE)]
+    effects = [name.effect for name in (*names, *_LINEAR, *_ANGLES, _SCALE)]
     same = truth = with_neutral(truth, effects)
     for axis in truth.axes:
-        moved = [name for name in _LINEAR if f'{name}.{axis}' not in names]
-        if moved and all(f'{name}.{axis}' in names for name in _ANGLES):
+        moved = [name for name in _on(axis, _LINEAR) if name not in names]
+        if moved and all(name in names for name in _on(axis, _ANGLES)):
             same = put(same, *_as_misalignment(truth, axis, moved))
     return same
 
 
-def _as_misalignment(truth: Sensor, axis: str, moved: list[str]
-                     ) -> tuple[list[str], list[float]]:
+def _on(axis: str, parameters: Sequence[Coefficient]) -> list[Coefficient]:
+    """Name the coefficients of parameters on one axis."""
+    return [replace(parameter, axis=axis) for parameter in parameters]
+
+
+def _as_misalignment(truth: Sensor, axis: str, moved: list[Coefficient]
+                     ) -> tuple[list[Coefficient], list[float]]:
     """
     Move linear cross-axis terms of one axis into its misalignment and its scale factor.
 
@@ -176,12 +183,12 @@ def _as_misalignment(truth: Sensor, axis: str, moved: list[str]
     own = AXES.index(axis)
     along = _direction(truth, own)
     for name in moved:
-        linear, = get(truth, [f'{name}.{axis}'])
-        along = along + linear * _direction(truth, _OTHER[name.split('.')[0]][own])
+        linear, = get(truth, [name])
+        along = along + linear * _direction(truth, _OTHER[name.effect][own])
     length = float(np.linalg.norm(along))
     d = truth.axes.index(axis)
     scale = truth.scale_v_per_g[d] * length - truth.nominal_scale_v_per_g[d]
-    changed = [f'{name}.{axis}' for name in (*_ANGLES, _SCALE, *moved)]
+    changed = [*_on(axis, (*_ANGLES, _SCALE)), *moved]
     return changed, [*_alpha_beta(own, along / length), float(scale), *[0.0] * len(moved)]
 
 
@@ -189,7 +196,7 @@ def _direction(sensor: Sensor, axis: int) -> np.ndarray:
     """Return the direction of an axis in the case; one that is not measured is aligned."""
     if AXES[axis] not in sensor.axes:
         return np.eye(3)[axis]
-    return np.array(direction(axis, *get(sensor, [f'{name}.{AXES[axis]}' for name in _ANGLES])))
+    return np.array(direction(axis, *get(sensor, _on(AXES[axis], _ANGLES))))
 
 
 def _alpha_beta(axis: int, along: np.ndarray) -> tuple[float, float]:

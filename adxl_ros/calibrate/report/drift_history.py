@@ -17,16 +17,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from adxl_ros.files import calibration_store
 from adxl_ros.model.constants import Z_90
+from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
-_FIGURES = (('zero-g', 'bias.offset_v', 'mg'),
-            ('scale factor', 'scale_factor.offset_v_per_g', 'permille'))
+_FIGURES = (('zero-g', Coefficient('bias', 'offset_v'), 'mg'),
+            ('scale factor', Coefficient('scale_factor', 'offset_v_per_g'), 'permille'))
+_TEMPERATURE = Coefficient('temperature_bias', 'per_k')
 
 
 @dataclass(frozen=True)
@@ -92,7 +94,7 @@ class Past:
                  f'{since} nothing has changed beyond the 90 % intervals.']
         warmed = _temperature(now) - _temperature(before)
         if abs(warmed) > 1 and found:
-            slope, _ = now.datasheet.get('temperature_bias.per_k', (1e-4, 0.0))
+            slope, _ = now.datasheet.get(_TEMPERATURE, (1e-4, 0.0))
             lines.append(f"It was {warmed:+.1f} °C warmer: by the datasheet's typical slope "
                          f'{1e3 * slope * abs(warmed):.2f} mg of zero-g come of that.')
         return lines
@@ -108,19 +110,19 @@ class Past:
         return (dates, newest.axes, *columns, *spreads)
 
 
-def _absolute(sensor: Sensor, key: str) -> np.ndarray:
-    return sensor.zero_g_v if key.startswith('bias') else sensor.scale_v_per_g
+def _absolute(sensor: Sensor, key: Coefficient) -> np.ndarray:
+    return sensor.zero_g_v if key.effect == 'bias' else sensor.scale_v_per_g
 
 
-def _change(before: Sensor, now: Sensor, key: str) -> tuple[np.ndarray, np.ndarray]:
+def _change(before: Sensor, now: Sensor, key: Coefficient) -> tuple[np.ndarray, np.ndarray]:
     """Return the change of a figure and its standard deviation, mg or permille, (m,)."""
     by = (_absolute(now, key) - _absolute(before, key)) / now.scale_v_per_g * 1e3
     return by, np.hypot(_std(before, key), _std(now, key))
 
 
-def _std(sensor: Sensor, key: str) -> np.ndarray:
+def _std(sensor: Sensor, key: Coefficient) -> np.ndarray:
     std = dict(zip(sensor.covariance_names, np.sqrt(np.diag(sensor.covariance))))
-    return np.array([std.get(f'{key}.{axis}', 0.0) for axis in sensor.axes]) \
+    return np.array([std.get(replace(key, axis=axis), 0.0) for axis in sensor.axes]) \
         / sensor.scale_v_per_g * 1e3
 
 

@@ -187,11 +187,11 @@ def _coefficients(fitted: Sensor) -> str:
     rows = []
     for name, value, s in zip(fitted.covariance_names, get(fitted, fitted.covariance_names), std):
         half = Z_90 * s
-        typical, most = fitted.datasheet.get('.'.join(name.split('.')[:2]), (0.0, 0.0))
+        typical, most = fitted.datasheet.get(name.without_axis, (0.0, 0.0))
         place = '' if not (typical or most) else 'beyond the maximum' if most and \
             abs(value) - half > most else 'beyond typical' if typical and \
             abs(value) - half > typical else 'within'
-        rows.append([name, f'{value:.5g}', f'{value - half:.5g} to {value + half:.5g}',
+        rows.append([str(name), f'{value:.5g}', f'{value - half:.5g} to {value + half:.5g}',
                      f'{typical:g}' if typical else '-', f'{most:g}' if most else '-',
                      parameter_of(name).unit, place])
     absolute = [[f'{name} {axis}', f'{value:.6g}', '', f'nominal {nominal:g}', '', unit, '']

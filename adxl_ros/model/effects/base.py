@@ -140,6 +140,40 @@ class Signals:
     rng: np.random.Generator | None = None
 
 
+@dataclass(frozen=True, order=True)
+class Coefficient:
+    """
+    Name of one coefficient: a parameter of an effect, for one axis.
+
+    Files, messages and reports have it as text: `effect.parameter.axis`.
+
+    Attributes
+    ----------
+    effect, parameter
+        Their names.
+    axis
+        x, y or z; empty for a parameter without axes, or for all of its axes.
+
+    """
+
+    effect: str
+    parameter: str
+    axis: str = ''
+
+    @classmethod
+    def parse(cls, text: str) -> Coefficient:
+        """Read `effect.parameter.axis` or `effect.parameter`."""
+        return cls(*text.split('.'))
+
+    def __str__(self) -> str:
+        return '.'.join(part for part in (self.effect, self.parameter, self.axis) if part)
+
+    @property
+    def without_axis(self) -> Coefficient:
+        """Return the name of the parameter, for all of its axes."""
+        return Coefficient(self.effect, self.parameter)
+
+
 @dataclass(frozen=True)
 class Parameter:
     """

@@ -23,6 +23,7 @@ from typing import Any
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.files import parameter_file
 from adxl_ros.model.effects import library
+from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.nodes.support.parameters import declare
 from adxl_ros.nodes.support.rclpy_internals import given_parameters
@@ -35,9 +36,9 @@ _FILE_KEYS = {'format', 'units', *parameter_file.FIGURES,
               *(f'envelope.{key}' for key in parameter_file.ENVELOPE),
               *(f'datasheet.{key}' for key in parameter_file.DATASHEET)}
 """Parameters that belong to a file and change with it alone."""
-_EFFECT_OF = {f'{effect.name}.{p.name}': effect.name
+_EFFECT_OF = {str(Coefficient(effect.name, p.name)): effect.name
               for effect in library().values() for p in effect.parameters}
-_NEUTRAL = {f'{effect.name}.{p.name}': p.neutral
+_NEUTRAL = {str(Coefficient(effect.name, p.name)): p.neutral
             for effect in library().values() for p in effect.parameters}
 _COEFFICIENT_KEYS = {'effects', 'covariance_names', 'covariance', *_EFFECT_OF}
 """Parameters that can be set one by one, or several at once."""

@@ -23,6 +23,7 @@ from typing import Any, NamedTuple
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
 from adxl_ros.model.effects import library
+from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.nodes.support.parameters import declare, parameter_error
 from ament_index_python.packages import get_package_share_directory
@@ -90,7 +91,8 @@ def _keys() -> Iterator[_Key]:
     yield _Key('effects', Kind.STRING_ARRAY, 'effects that this unit has')
     for effect in library().values():
         for p in effect.parameters:
-            yield _Key(f'{effect.name}.{p.name}', Kind.DOUBLE_ARRAY if p.axes else Kind.DOUBLE,
+            yield _Key(str(Coefficient(effect.name, p.name)),
+                       Kind.DOUBLE_ARRAY if p.axes else Kind.DOUBLE,
                        f'{p.doc}, by axis' if p.axes else p.doc, p.unit, p.lower, p.upper)
     yield _Key('covariance_names', Kind.STRING_ARRAY, 'coefficients in the covariance')
     yield _Key('covariance', Kind.DOUBLE_ARRAY, 'of the coefficients, rows flattened')
@@ -125,7 +127,7 @@ def make_sensor(flat: Mapping[str, Any],
 
     """
     listed = flat.get('effects', [])
-    unused = {f'{effect.name}.{p.name}' for effect in library().values()
+    unused = {str(Coefficient(effect.name, p.name)) for effect in library().values()
               if effect.name not in listed for p in effect.parameters}
     return parameter_file.from_flat(
         {key: value for key, value in flat.items() if key not in unused}, make_error)

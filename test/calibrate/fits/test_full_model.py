@@ -23,6 +23,7 @@ from adxl_ros.files import parameter_file
 from adxl_ros.model import signal_chain
 from adxl_ros.model.coefficients import get, put, with_neutral
 from adxl_ros.model.constants import Z_90
+from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.kinematics import specific_force
 import numpy as np
 from pace import within
@@ -44,7 +45,7 @@ def swept_unit(seed, axes='xy', stage_deg=5 / 60, **options):
 def errors(found, truth):
     """Errors of the coefficients and their promised deviations, (p,) each."""
     names = found.fitted.covariance_names
-    truth = with_neutral(truth, {name.split('.')[0] for name in names})
+    truth = with_neutral(truth, {name.effect for name in names})
     return (get(found.fitted, names) - get(truth, names),
             np.sqrt(np.diag(found.fitted.covariance)))
 
@@ -83,7 +84,7 @@ def test_an_eccentric_stage_is_found_and_a_sound_one_is_not_blamed(eccentric):
         names = full_model.coefficients('xy', ('stage_eccentricity',))[2:]
         truth = put(truth, names, eccentric * 1e-3 * rng.choice([-1, 1], len(names)))
         found, _ = term_selection.fit_judged(nominal(), swept(rng, truth, per_setting=True))
-        assert any('eccentricity' in name for name in found.names) == eccentric
+        assert any('eccentricity' in name.effect for name in found.names) == eccentric
         off, std = errors(found, truth)
         assert np.sqrt(np.mean((off / std) ** 2)) < 2
 
@@ -137,7 +138,8 @@ def test_the_gauge_is_fixed_where_only_the_sum_shows():
     rng = np.random.default_rng(3)
     truth = drawn(rng, nominal(), ('bias', 'scale_factor', 'misalignment'))
     truth = with_neutral(truth, ['cross_axis', 'cross_axis_z'])
-    truth = put(truth, ['cross_axis.linear.x', 'cross_axis_z.linear.y'], [0.012, -0.02])
+    truth = put(truth, [Coefficient('cross_axis', 'linear', 'x'),
+                        Coefficient('cross_axis_z', 'linear', 'y')], [0.012, -0.02])
     poses = swept(rng, truth)
     found, _ = term_selection.fit_judged(nominal(), poses)
     assert not set(full_model.GAUGE) & {full_model.term_of(name)
@@ -152,8 +154,10 @@ def test_the_gauge_is_freed_where_products_show_the_parts():
     """With a scale factor that depends on z the same terms are fitted, to the noise."""
     rng = np.random.default_rng(3)
     truth = drawn(rng, nominal(), TERMS)
-    truth = put(truth, ['cross_axis.linear.x', 'cross_axis_z.linear.y',
-                        'scale_factor_z.linear_per_g.x', 'scale_factor_z.quadratic_per_g2.y'],
+    truth = put(truth, [Coefficient('cross_axis', 'linear', 'x'),
+                        Coefficient('cross_axis_z', 'linear', 'y'),
+                        Coefficient('scale_factor_z', 'linear_per_g', 'x'),
+                        Coefficient('scale_factor_z', 'quadratic_per_g2', 'y')],
                 [0.015, -0.02, 0.01, 0.01])
     poses = swept(rng, replace(truth, stage_resolution_rad=0.0))
     held = np.radians([[40, 10], [75, 200], [130, 300], [20, 100]])
@@ -190,7 +194,7 @@ def test_a_bad_stage_is_found_and_the_sensor_is_not_blamed(stage_deg):
     assert np.degrees(found.stage_sigma_rad) == pytest.approx(stage_deg, rel=0.15)
     off, std = errors(found, truth)
     assert np.sqrt(np.mean((off / std) ** 2)) < 1.6
-    zero_g = [name.startswith('bias') for name in found.fitted.covariance_names]
+    zero_g = [name.effect == 'bias' for name in found.fitted.covariance_names]
     assert np.abs(off[zero_g]).max() < 1e-4
     assert any('the reference is worse than stated' in line
                for line in full_fit_text.words(found, poses, judged))
@@ -265,9 +269,9 @@ def test_several_recordings_of_one_unit():
 
 
 @pytest.mark.parametrize('change, words', [
-    (lambda truth: put(truth, ['misalignment.alpha_rad.x', 'misalignment.alpha_rad.y'],
+    (lambda truth: put(truth, [Coefficient('misalignment', 'alpha_rad', axis) for axis in 'xy'],
                        truth.values['misalignment']['alpha_rad'] + [0.02, 0.02]), 'is turned by'),
-    (lambda truth: put(truth, ['bias.offset_v.x'],
+    (lambda truth: put(truth, [Coefficient('bias', 'offset_v', 'x')],
                        truth.values['bias']['offset_v'][:1] + 0.08), 'has its zero-g off by')])
 def test_recordings_that_contradict_each_other_are_refused(change, words):
     """Another mounting or another unit: the message has the figure and its significance."""

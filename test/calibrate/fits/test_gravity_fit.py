@@ -74,8 +74,8 @@ def bare(sensor):
 
 def parameters(fit):
     """Put the fitted values in the order of NAMES."""
-    return np.array([fit.values[effect][parameter]['xyz'.index(axis)]
-                     for effect, parameter, axis in (name.split('.') for name in NAMES)])
+    return np.array([fit.values[name.effect][name.parameter]['xyz'.index(name.axis)]
+                     for name in NAMES])
 
 
 @settings(max_examples=30)

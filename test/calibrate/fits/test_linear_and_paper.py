@@ -82,10 +82,9 @@ def test_physical_finds_the_unit(axes):
         fitted = paper_regression.fit(sensor, poses.subset(~poses.check))
         std = np.sqrt(np.diag(fitted.covariance))
         for name, sigma in zip(fitted.covariance_names, std):
-            effect, parameter, axis = name.split('.')
-            index = axes.index(axis)
-            error = (fitted.values[effect][parameter][index]
-                     - truth.values[effect][parameter][index])
+            index = axes.index(name.axis)
+            error = (fitted.values[name.effect][name.parameter][index]
+                     - truth.values[name.effect][name.parameter][index])
             inside.append(abs(error) < 1.645 * sigma)
         of = cross_validation.score(
             'physical', cross_validation.errors(fitted, poses.subset(poses.check)))

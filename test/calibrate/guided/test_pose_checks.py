@@ -25,6 +25,7 @@ from adxl_ros.calibrate.poses import Poses
 from adxl_ros.calibrate.report import cross_validation
 from adxl_ros.model import signal_chain
 from adxl_ros.model.coefficients import parameter_of
+from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.kinematics import specific_force
 import numpy as np
 import pytest
@@ -151,7 +152,7 @@ def test_units_at_the_edge_of_the_datasheet_are_never_refused():
     rng = np.random.default_rng(7)
     for _ in range(15):
         truth = drawn(rng, nominal('xyz'))
-        truth = replace(truth, values={e: {p: _edge(f'{e}.{p}', v) for p, v in of.items()}
+        truth = replace(truth, values={e: {p: _edge(Coefficient(e, p), v) for p, v in of.items()}
                                        for e, of in truth.values.items()})
         poses = swept(rng, truth, check_poses=0)
         order = rng.permutation(len(poses))[:12]
@@ -362,10 +363,9 @@ def test_what_is_known_is_what_the_fits_find():
     told = running_estimate.from_poses(nominal('xyz'), poses, 5.0,
                                        truth.stage_resolution_rad / 12 ** 0.5)
     for name, at, std in zip(told.names, running_estimate.get(told.unit, told.names), told.std):
-        effect, parameter, *axis = name.split('.')
-        if axis:
-            wanted = truth.values.get(effect, {}).get(parameter, np.zeros(3))[
-                truth.axes.index(axis[0])]
+        if name.axis:
+            wanted = truth.values.get(name.effect, {}).get(name.parameter, np.zeros(3))[
+                truth.axes.index(name.axis)]
             assert abs(at - wanted) < 5 * std + 1e-6, name
     few = running_estimate.from_poses(nominal('xyz'), poses.subset(np.arange(20)), 5.0, 4e-4)
     assert told.tilt_error_rad() < 0.05 * few.tilt_error_rad()

@@ -22,6 +22,7 @@ from adxl_ros.calibrate.report import acceptance, cross_validation
 from adxl_ros.calibrate.report.error_budget import Parts
 from adxl_ros.model import signal_chain
 from adxl_ros.model.constants import G0_MPS2
+from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.kinematics import specific_force
 import numpy as np
 import pytest
@@ -137,7 +138,7 @@ def test_without_a_datasheet_there_is_no_bar():
                                                 'NOT SHOWN')])
 def test_pass_fail_and_not_shown(parts, outcome):
     """The bar is 1: an error that is below, that may be below, and that is beyond."""
-    bar = replace(nominal(), datasheet={'nonlinearity.cubic_per_g2': (
+    bar = replace(nominal(), datasheet={Coefficient('nonlinearity', 'cubic_per_g2'): (
         1 / G0_MPS2 / nominal().range_g ** 3, 0.0)})
     judged = acceptance.judge('full', Parts(*parts), Parts(*parts), bar)
     assert judged.datasheet == judged.worst('datasheet') == outcome

@@ -113,7 +113,7 @@ def test_the_report_holds_what_it_should(opened, reported):
     assert 'PASS' in rows.nth(3).inner_text() and 'FAIL' in rows.nth(1).inner_text()
     coefficients = page.locator('table').nth(1).inner_text()
     sensor = parameter_file.load(reported / 'unit.yaml')
-    assert all(name in coefficients for name in sensor.covariance_names)
+    assert all(str(name) in coefficients for name in sensor.covariance_names)
     line = next(line for line in coefficients.splitlines()
                 if line.startswith('nonlinearity.cubic_per_g2.x'))
     assert '\t0.00069\t0.0043\t' in line
