@@ -30,7 +30,7 @@ from adxl_ros.calibrate.fits import (
     term_selection,
 )
 from adxl_ros.calibrate.fits.full_model import FullFit
-from adxl_ros.calibrate.poses import check_polarity, Poses, reference_force, together
+from adxl_ros.calibrate.poses import check_polarity, join_poses, Poses, reference_force
 from adxl_ros.calibrate.provenance import envelope, with_provenance
 from adxl_ros.calibrate.recording_consistency import require_one_mounting
 from adxl_ros.calibrate.report import (
@@ -61,7 +61,7 @@ STAGE_FITS = {'linear': linear.fit, 'physical': paper_regression.fit, 'full': te
 
 
 @dataclass(frozen=True)
-class Result:
+class CalibrationResult:
     """
     A fitted sensor and what is known of it.
 
@@ -69,36 +69,36 @@ class Result:
     ----------
     nominal, fitted
         The unit as it was stated and as it is.
-    verdict
+    report_lines
         How good it is, line by line.
-    brief
+    summary_lines
         The same for a terminal of 80 columns, what matters most first.
     poses
         What it was made of and judged by.
-    judged
+    assessments
         Each model beside the datasheet and the noise, the one that was taken last.
-    scores
+    held_out
         Their errors on poses held out.
     gravity_fit
         Of a calibration against gravity.
-    knocked
+    outliers
         Numbers of the poses that were left out as disturbed.
 
     """
 
     nominal: Sensor
     fitted: Sensor
-    verdict: list[str]
-    brief: list[str]
+    report_lines: list[str]
+    summary_lines: list[str]
     poses: Poses
-    judged: tuple[Judged, ...] = ()
-    scores: tuple[Score, ...] = ()
+    assessments: tuple[Judged, ...] = ()
+    held_out: tuple[Score, ...] = ()
     gravity_fit: gravity.GravityFit | None = None
-    knocked: tuple[int, ...] = ()
+    outliers: tuple[int, ...] = ()
 
     def comments(self) -> list[str]:
         """Lay out coefficients and verdict for people: the head of the parameter file."""
-        return [*coefficients(self.fitted), '', *self.verdict]
+        return [*coefficients(self.fitted), '', *self.report_lines]
 
     def save(self, path: str | os.PathLike) -> None:
         """
@@ -179,7 +179,7 @@ class Result:
         if self.gravity_fit is not None:
             write(plots.gravity_rests(self.name, self.gravity_fit), path)
         else:
-            plots.draw_sweep(path, self.nominal, self.modelled, self.poses)
+            plots.draw_sweep(path, self.nominal, self.paper_sensor, self.poses)
 
     @property
     def name(self) -> str:
@@ -187,12 +187,12 @@ class Result:
         return f'{self.fitted.serial} ({self.fitted.provenance["source"]})'
 
     @property
-    def sound(self) -> np.ndarray:
-        """Tell the poses that were not knocked, which `scores` counts, (k,)."""
-        return ~np.isin(np.arange(len(self.poses)), self.knocked)
+    def inliers(self) -> np.ndarray:
+        """Tell the poses that were not knocked, which `held_out` counts, (k,)."""
+        return ~np.isin(np.arange(len(self.poses)), self.outliers)
 
     @property
-    def modelled(self) -> Sensor:
+    def paper_sensor(self) -> Sensor:
         """Return the unit by a model that the paper's figures can show."""
         return self.fitted if self.fitted.model in ('physical', 'full') else \
             paper_regression.fit(self.nominal, self.poses.subset(~self.poses.check))
@@ -201,7 +201,7 @@ class Result:
 def calibrate(sensor: Sensor, parts: Sequence[Poses], model: str | None,
               sources: Sequence[str], effects: Sequence[str] = (),
               filters: Sequence[Sequence[FilterNoise | None]] = (),
-              data_sha256: str = '') -> Result:
+              data_sha256: str = '') -> CalibrationResult:
     """
     Fit the poses of one unit: against the stage where there are angles, else gravity.
 
@@ -228,7 +228,7 @@ def calibrate(sensor: Sensor, parts: Sequence[Poses], model: str | None,
         The poses do not determine the model, or the recordings contradict each other.
 
     """
-    poses, source = together(list(parts)), ', '.join(sources)
+    poses, source = join_poses(list(parts)), ', '.join(sources)
     if np.isfinite(poses.alpha_rad).all():
         model = model or ('full' if effects else None)
         return _against_stage(sensor, parts, model, sources, effects, filters, data_sha256)
@@ -244,8 +244,9 @@ def calibrate(sensor: Sensor, parts: Sequence[Poses], model: str | None,
 
 def _against_stage(sensor: Sensor, parts: Sequence[Poses], model: str | None,
                    sources: Sequence[str], effects: Sequence[str],
-                   filters: Sequence[Sequence[FilterNoise | None]], data_sha256: str) -> Result:
-    poses = together(list(parts))
+                   filters: Sequence[Sequence[FilterNoise | None]], data_sha256: str
+                   ) -> CalibrationResult:
+    poses = join_poses(list(parts))
     check_polarity(sensor, poses)
     fitting = poses.subset(~poses.check)
     refusals: list[str] = []
@@ -260,7 +261,7 @@ def _against_stage(sensor: Sensor, parts: Sequence[Poses], model: str | None,
     fitted = found.fitted
     simpler = list(STAGE_FITS)[:list(STAGE_FITS).index(fitted.model)]
     # What was knocked says nothing of the models.
-    knocked = tuple(np.flatnonzero(~poses.check)[list(found.full.knocked)].tolist()) \
+    knocked = tuple(np.flatnonzero(~poses.check)[list(found.full.outliers)].tolist()) \
         if found.full else ()
     sound = poses.subset(~np.isin(np.arange(len(poses)), knocked))
     # What the full model found of the stage is no error of the sensor, by any model.
@@ -291,7 +292,8 @@ def _against_stage(sensor: Sensor, parts: Sequence[Poses], model: str | None,
              *words, *unit, *said]
     brief = [*acceptance.headline(own[0] if own else None, scores), *unit,
              *acceptance.narrow_table(judgements, scores), *words, *said, *refusals]
-    return Result(sensor, fitted, lines, brief, poses, judgements, tuple(scores), None, knocked)
+    return CalibrationResult(sensor, fitted, lines, brief, poses, judgements, tuple(scores), None,
+                             knocked)
 
 
 def _fit(model: str, sensor: Sensor, fitting: Poses, parts: Sequence[Poses],
@@ -299,10 +301,10 @@ def _fit(model: str, sensor: Sensor, fitting: Poses, parts: Sequence[Poses],
     """Fit one model; the full one with the terms more that poses held out ask for."""
     if model != 'full':
         return _Found(STAGE_FITS[model](sensor, fitting), STAGE_FITS[model], [])
-    found, terms = term_selection.fit_judged(sensor, fitting, effects)
+    found, terms = term_selection.fit_selected(sensor, fitting, effects)
     if len(parts) > 1:
         require_one_mounting(found, parts, sources)
-    return _Found(found.fitted, lambda sensor, poses: term_selection.fit_judged(
+    return _Found(found.fitted, lambda sensor, poses: term_selection.fit_selected(
         sensor, poses, effects)[0].fitted, full_fit_text.words(found, fitting, terms), found)
 
 
@@ -314,7 +316,8 @@ class _Found:
     full: FullFit | None = None
 
 
-def _against_gravity(sensor: Sensor, poses: Poses, source: str, data_sha256: str) -> Result:
+def _against_gravity(sensor: Sensor, poses: Poses, source: str, data_sha256: str
+                     ) -> CalibrationResult:
     found = gravity.fit_gravity(poses.volts, poses.std_v, sensor)
     kept = np.setdiff1d(np.arange(len(poses)), found.outliers)
     before, after, out = (_rms_mg(values[kept]) for values in (
@@ -340,8 +343,8 @@ def _against_gravity(sensor: Sensor, poses: Poses, source: str, data_sha256: str
         **acceptance.figures(own, ())})
     lines += [acceptance.gravity_line(own, found.leave_one_out_mps2[kept]),
               *acceptance.words(own, fitted), *acceptance.unit_line(fitted)]
-    return Result(sensor, fitted, lines, [*acceptance.headline(own, ()), *lines], poses, (own,),
-                  (), found)
+    return CalibrationResult(sensor, fitted, lines, [*acceptance.headline(own, ()), *lines], poses,
+                             (own,), (), found)
 
 
 def coefficients(sensor: Sensor) -> list[str]:

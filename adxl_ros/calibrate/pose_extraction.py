@@ -25,7 +25,7 @@ from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import COMMANDS, JOINTS, Recording
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals import filter_time_constant
-from adxl_ros.signals.noise_limits import known_noise
+from adxl_ros.signals.noise_limits import datasheet_noise
 from adxl_ros.signals.rest_detection import find_rests, Rest, rest_means
 import numpy as np
 
@@ -59,7 +59,7 @@ def named_rests(recording: Recording, entries: Sequence[Mapping[str, Any]]) -> l
     return rests
 
 
-def poses_of(recording: Recording, sensor: Sensor,
+def extract_poses(recording: Recording, sensor: Sensor,
              entries: Sequence[Mapping[str, Any]] | None = None) -> Poses:
     """
     Find the rests of a recording, or take a journal's, and average each.
@@ -81,7 +81,7 @@ def poses_of(recording: Recording, sensor: Sensor,
 
     """
     volts, angles = recording.volts(sensor), recording.stage_angles
-    known = known_noise(sensor)
+    known = datasheet_noise(sensor)
     if entries is None:
         tolerance = max(sensor.stage_resolution_rad, _FINEST_ANGLE_RAD)
         rests = find_rests(recording.time_s, volts, sensor.rate_hz, angles, known, learn=True,
@@ -138,12 +138,13 @@ def _mean_of_known(values: np.ndarray) -> float:
     return float(known.mean()) if known.size else float('nan')
 
 
-def filter_noise_of(recording: Recording, sensor: Sensor, poses: Poses
+def estimate_filters(recording: Recording, sensor: Sensor, poses: Poses
                     ) -> list[filter_time_constant.FilterNoise | None]:
     """Estimate the filter of each axis from the noise of the poses; see `filter_time_constant`."""
     volts = recording.volts(sensor)
     first, last = np.searchsorted(recording.time_s, poses.time_s.T)
     rests = [volts[a:b + 1] for a, b in zip(first, last)
              if b > a and np.diff(recording.time_s[a:b + 1]).max() * sensor.rate_hz < _GAP]
-    return [filter_time_constant.estimate([r[:, d] for r in rests], sensor.rate_hz, sensor.rc_s,
-                                          sensor.lsb_v) for d in range(len(sensor.axes))]
+    return [filter_time_constant.estimate_filter(
+        [rest[:, d] for rest in rests], sensor.rate_hz, sensor.rc_s, sensor.lsb_v)
+        for d in range(len(sensor.axes))]

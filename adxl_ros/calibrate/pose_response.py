@@ -30,13 +30,14 @@ import numpy as np
 _ANGLE_STEP_RAD = 1e-4
 
 
-def response(unit: Sensor, poses: Poses, off_rad: tuple[float, float] = (0.0, 0.0)) -> np.ndarray:
+def predicted_volts(unit: Sensor, poses: Poses, off_rad: tuple[float, float] = (0.0, 0.0)
+                    ) -> np.ndarray:
     """Return the volts that the chain promises at the stage's angles and `off_rad`, (k, m)."""
-    force = force_on(unit, poses.alpha_rad + off_rad[0], poses.beta_rad + off_rad[1])
+    force = stage_force(unit, poses.alpha_rad + off_rad[0], poses.beta_rad + off_rad[1])
     return np.column_stack(signal_chain.static_response(unit)(force, poses.environment))
 
 
-def force_on(unit: Sensor, alpha_rad: np.ndarray, beta_rad: np.ndarray) -> Components:
+def stage_force(unit: Sensor, alpha_rad: np.ndarray, beta_rad: np.ndarray) -> Components:
     """Return the specific force at rest on the unit's stage with its errors, m/s², three (k,)."""
     signals = Signals(signal_chain.NOMINAL, alpha=Joint(alpha_rad), beta=Joint(beta_rad),
                       up=list(UPRIGHT), gravity_mps2=unit.local_gravity_mps2)
@@ -46,25 +47,25 @@ def force_on(unit: Sensor, alpha_rad: np.ndarray, beta_rad: np.ndarray) -> Compo
                           0.0, signals.up)
 
 
-def by_angles(unit: Sensor, poses: Poses) -> np.ndarray:
+def angle_jacobian(unit: Sensor, poses: Poses) -> np.ndarray:
     """Differentiate volts by alpha and beta, V/rad, (k, m, 2)."""
     h = _ANGLE_STEP_RAD
-    ends = [[response(unit, poses, (side * a, side * b)) for side in (h, -h)]
+    ends = [[predicted_volts(unit, poses, (side * a, side * b)) for side in (h, -h)]
             for a, b in ((1, 0), (0, 1))]
     return np.stack([(above - below) / (2 * h) for above, below in ends], axis=2)
 
 
-def by_coefficients(unit: Sensor, poses: Poses, names: Sequence[Coefficient]) -> np.ndarray:
+def coefficient_jacobian(unit: Sensor, poses: Poses, names: Sequence[Coefficient]) -> np.ndarray:
     """Differentiate volts by coefficients, V a unit, (k, m, p)."""
     columns = []
     for name in names:
         at, step = get(unit, [name]), 1e-3 * parameter_of(name).scale
-        above, below = (response(put(unit, [name], at + by), poses) for by in (step, -step))
+        above, below = (predicted_volts(put(unit, [name], at + by), poses) for by in (step, -step))
         columns.append((above - below) / (2 * step))
     return np.stack(columns, axis=2)
 
 
-def covariance(unit: Sensor, poses: Poses, error: StageError,
+def volts_covariance(unit: Sensor, poses: Poses, error: StageError,
                kept: np.ndarray | None = None) -> PoseCovariance:
     """
     Return the covariance of the volts of all poses about the model.
@@ -81,4 +82,4 @@ def covariance(unit: Sensor, poses: Poses, error: StageError,
         Poses that count, (k,) bool; None for all.
 
     """
-    return PoseCovariance(by_angles(unit, poses), poses, shared_settings(poses), error, kept)
+    return PoseCovariance(angle_jacobian(unit, poses), poses, shared_settings(poses), error, kept)

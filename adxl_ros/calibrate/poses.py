@@ -107,7 +107,7 @@ class Poses:
             supply_v=_known(self.supply_v, signal_chain.NOMINAL.supply_v))
 
 
-def together(parts: list[Poses]) -> Poses:
+def join_poses(parts: list[Poses]) -> Poses:
     """Join the poses of several recordings of one unit; no setting outlasts its recording."""
     joined = {field.name: np.concatenate([getattr(part, field.name) for part in parts])
               for field in fields(Poses)}

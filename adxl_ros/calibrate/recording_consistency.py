@@ -64,8 +64,8 @@ def require_one_mounting(found: full_model.FullFit, parts: Sequence[Poses], name
         turns = np.stack([np.cross(axis, f) for axis in np.eye(3)], axis=2)
         shifts = np.broadcast_to(np.diag(fitted.scale_v_per_g),
                                  (len(poses), len(fitted.axes), len(fitted.axes)))
-        off = poses.volts - pose_response.response(fitted, poses)
-        products = pose_response.covariance(fitted, poses, found.stage).products(
+        off = poses.volts - pose_response.predicted_volts(fitted, poses)
+        products = pose_response.volts_covariance(fitted, poses, found.stage).products(
             np.concatenate([slope @ turns, shifts, off[:, :, None]], axis=2))
         spread = np.linalg.pinv(products[:-1, :-1], rcond=1e-10)
         asked = spread @ products[:-1, -1]

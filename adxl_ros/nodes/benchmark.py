@@ -271,7 +271,7 @@ def _reading() -> None:
     once = Recording('bench', time_s[:count], {k: v[:count] for k, v in whole.items()},
                      sensor_info(sensor))
     began = time.perf_counter()
-    poses = pose_extraction.poses_of(once, recorded_unit(sensor, once))
+    poses = pose_extraction.extract_poses(once, recorded_unit(sensor, once))
     print(f'{"rests of a sweep":36} {count:8d} {time.perf_counter() - began:8.2f}')
     began = time.perf_counter()
     paper_regression.fit(sensor, poses)

@@ -20,7 +20,7 @@ from collections.abc import Callable
 import os
 from pathlib import Path
 
-from adxl_ros.calibrate.calibration import Result
+from adxl_ros.calibrate.calibration import CalibrationResult
 from adxl_ros.calibrate.guided.live_window import Newest, STALE_NS
 from adxl_ros.calibrate.guided.session import Session
 from adxl_ros.calibrate.guided.stage_guide import MountingError, Sweep
@@ -349,13 +349,13 @@ class Calibration(Node):
             return False
         for line in found.comments():
             self.get_logger().info(line)
-        self.outcome = found.brief
+        self.outcome = found.summary_lines
         left = self.session.left
         self._stop(f'wrote {self.asked.output}' + (
             f'; {left} poses are open: start again to go on' if left else ''))
         return True
 
-    def _leave_report(self, found: Result) -> None:
+    def _leave_report(self, found: CalibrationResult) -> None:
         """Write the report; without it the calibration stands all the same."""
         if not self.asked.report:
             return

@@ -144,14 +144,14 @@ def draw(nominal: Sensor, number: int, kinds: Sequence[tuple[str, str, str]], se
     targets = pose_plan.guided(pose_plan.default_planes_rad(axes), pose_plan.STEP_RAD, 0) \
         if kind == 'full' else quick_plan.quick(sensor, _DWELL_S, _QUICK_RAD, 0)
     poses, true_rad = _swept(truth, targets, stage == STAGES[0], step, rng)
-    found, _ = term_selection.fit_judged(sensor, poses)
+    found, _ = term_selection.fit_selected(sensor, poses)
     names = found.fitted.covariance_names
     known = with_neutral(truth, {name.effect for name in names})
     error = get(found.fitted, names) - get(known, names)
     sigma = step / np.sqrt(12)
     levels = StageError(0.0, sigma) if stage == STAGES[0] else StageError(sigma)
     bound = scoring.known_bound(truth, poses, true_rad, levels,
-                                (*full_model.terms_of(axes), *_extra(stage)))
+                                (*full_model.default_terms(axes), *_extra(stage)))
     anywhere = _anywhere(truth, rng)
     tilt = scoring.angles(found.fitted, bound, *anywhere)
     force, force_std = scoring.forces(found.fitted, truth, *anywhere)
@@ -173,12 +173,12 @@ def _by_bound(names: Sequence[Coefficient], error: np.ndarray, bound: Sensor) ->
 
 def _unit(sensor: Sensor, stage: str, rng: np.random.Generator) -> Sensor:
     """Draw a unit: each coefficient is normal with its typical size, in the gauge of the fit."""
-    effects = (*full_model.terms_of(sensor.axes), *_extra(stage), 'base_tilt')
+    effects = (*full_model.default_terms(sensor.axes), *_extra(stage), 'base_tilt')
     unit = with_neutral(replace(sensor, effects=(), values={}), effects)
-    names = [name for name in full_model.coefficients(sensor.axes, effects)
+    names = [name for name in full_model.fitted_coefficients(sensor.axes, effects)
              if full_model.term_of(name) not in full_model.GAUGE
              and (stage == 'tilted base' or name.effect != 'base_tilt')]
-    sizes = np.array([full_model.LEVEL_RAD if name.effect == 'base_tilt' else
+    sizes = np.array([full_model.LEVEL_STD_RAD if name.effect == 'base_tilt' else
                       parameter_of(name).scale for name in names])
     return put(unit, names, sizes * rng.normal(size=len(names)))
 
@@ -212,7 +212,7 @@ def _resting(truth: Sensor, read_rad: np.ndarray, rng: np.random.Generator) -> P
 
 def _read(truth: Sensor, poses: Poses, true_rad: np.ndarray, rng: np.random.Generator) -> Poses:
     there = replace(poses, alpha_rad=true_rad[:, 0], beta_rad=true_rad[:, 1])
-    volts = pose_response.response(truth, there)
+    volts = pose_response.predicted_volts(truth, there)
     return replace(poses, volts=volts + poses.std_v * rng.normal(size=volts.shape))
 
 

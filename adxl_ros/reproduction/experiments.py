@@ -62,7 +62,7 @@ class Stage:
 
 
 PERFECT = Stage(0.0, 0.0)
-PAPER = Stage(np.radians(5 / 60), full_model.LEVEL_RAD)
+PAPER = Stage(np.radians(5 / 60), full_model.LEVEL_STD_RAD)
 
 
 @dataclass(frozen=True)
@@ -145,7 +145,7 @@ def poses_at(truth: Sensor, read_rad: np.ndarray, seed: int
     entries = [{'start_ns': round((end - trajectories.DWELL_S) * 1e9), 'stop_ns': round(end * 1e9),
                 'samples': round(trajectories.DWELL_S * truth.rate_hz), 'alpha_rad': a,
                 'beta_rad': b} for end, (a, b) in zip(ends_s, on_grid)]
-    return pose_extraction.poses_of(recording, bare(truth), entries), true, recording
+    return pose_extraction.extract_poses(recording, bare(truth), entries), true, recording
 
 
 def visited(true_rad: np.ndarray) -> tuple[Motion, list[float]]:
@@ -168,7 +168,7 @@ def calibrated(truth: Sensor, seed: int, models: Sequence[str] = tuple(MODELS)) 
     nominal = bare(truth)
     fitted = {name: MODELS[name](nominal, poses) for name in models}
     if 'full' in fitted:
-        found = pose_extraction.filter_noise_of(recording, nominal, poses)
+        found = pose_extraction.estimate_filters(recording, nominal, poses)
         fitted['full'], _ = filter_time_constant.with_filter(fitted['full'], [found])
     return Run(truth, fitted, poses, true)
 

@@ -99,15 +99,15 @@ def known_bound(truth: Sensor, swept: Poses, true_rad: np.ndarray, stage: StageE
         That are to be found.
 
     """
-    names = full_model.coefficients(truth.axes, terms)
+    names = full_model.fitted_coefficients(truth.axes, terms)
     at = with_neutral(truth, (*map(full_model.effect_of, terms), 'base_tilt'))
-    level = full_model.LEVEL_RAD if stage.total_rad else 1e-9
+    level = full_model.LEVEL_STD_RAD if stage.total_rad else 1e-9
     there = replace(swept, alpha_rad=true_rad[:, 0], beta_rad=true_rad[:, 1])
-    known = full_model.information(at, there, names, stage)
+    known = full_model.fisher_information(at, there, names, stage)
     of_base = [i for i, name in enumerate(names) if name.effect == 'base_tilt']
-    known[of_base, of_base] += 1 / level ** 2 - 1 / full_model.LEVEL_RAD ** 2
+    known[of_base, of_base] += 1 / level ** 2 - 1 / full_model.LEVEL_STD_RAD ** 2
     covariance = np.linalg.inv(known)
-    own = [i for i, name in enumerate(names) if not full_model.of_stage(name)]
+    own = [i for i, name in enumerate(names) if not full_model.belongs_to_stage(name)]
     return replace(truth, covariance=covariance[np.ix_(own, own)],
                    covariance_names=tuple(names[i] for i in own))
 
@@ -128,7 +128,7 @@ def angles(fitted: Sensor, bound: Sensor, poses: Poses, true_rad: np.ndarray) ->
         Where the stage really stood, (k, 2).
 
     """
-    force = pose_response.force_on(bound, *true_rad.T)
+    force = pose_response.stage_force(bound, *true_rad.T)
     up = np.where(np.asarray(force[2]) < 0, -1, 1)
     variance_v2 = np.mean(poses.std_v, axis=0) ** 2
     true = _angles(bound, force, up, variance_v2)
@@ -159,7 +159,7 @@ def _angles(sensor: Sensor, force: Components, up: np.ndarray, variance_v2: np.n
 def forces(fitted: Sensor, truth: Sensor, poses: Poses, true_rad: np.ndarray
            ) -> tuple[np.ndarray, np.ndarray]:
     """Return errors of the measured axes of poses and their promised deviations, m/s², (k, m)."""
-    true = pose_response.force_on(truth, *true_rad.T)
+    true = pose_response.stage_force(truth, *true_rad.T)
     up = np.where(np.asarray(true[2]) < 0, -1, 1)
     found = signal_chain.inverse(fitted, up)(list(poses.volts.T))
     covariance = force_covariance(fitted, found, np.mean(poses.std_v, axis=0) ** 2)

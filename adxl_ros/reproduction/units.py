@@ -80,7 +80,7 @@ def judge(nominal: Sensor, stage: experiments.Stage, seed: int) -> Unit:
     run = experiments.calibrated(truth, seed)
     bound = scoring.known_bound(
         truth, run.poses, run.true_rad, StageError(truth.stage_resolution_rad / np.sqrt(12)),
-        (*full_model.terms_of(truth.axes), *full_model.GAUGE))
+        (*full_model.default_terms(truth.axes), *full_model.GAUGE))
     anywhere = np.column_stack([np.arccos(rng.uniform(-1, 1, RANDOM_POSES)),
                                 rng.uniform(0, 2 * np.pi, RANDOM_POSES)])
     asked = {'random': anywhere, **{name: np.radians(deg) for name, deg in RUNS.items()}}

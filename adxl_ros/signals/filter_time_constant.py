@@ -80,7 +80,7 @@ class FilterNoise:
         return self.scatter < _MOST_SCATTER and self.ratio_std < _MOST_STD
 
 
-def estimate(rests: Iterable[np.ndarray], rate_hz: float, rc_s: float, lsb_v: float
+def estimate_filter(rests: Iterable[np.ndarray], rate_hz: float, rc_s: float, lsb_v: float
              ) -> FilterNoise | None:
     """
     Estimate the time constant of one axis; None without noise or a rest that is long enough.

@@ -55,7 +55,7 @@ class Noise:
     tau_s: float = 0.0
 
 
-def known_noise(sensor: Sensor) -> Noise:
+def datasheet_noise(sensor: Sensor) -> Noise:
     """Return the noise that the figures of a sensor promise, V."""
     return Noise(sigma_v(sensor), sensor.rc_s)
 
@@ -101,7 +101,7 @@ class Spans:
 
 
 @dataclass(frozen=True)
-class Limits:
+class NoiseLimits:
     """
     What noise explains, by axis, (m,).
 
@@ -121,9 +121,9 @@ class Limits:
     drift: np.ndarray
     step: np.ndarray
 
-    def or_more(self, other: Limits) -> Limits:
+    def or_more(self, other: NoiseLimits) -> NoiseLimits:
         """Take the larger of each limit."""
-        return Limits(np.maximum(self.variance, other.variance),
+        return NoiseLimits(np.maximum(self.variance, other.variance),
                       np.maximum(self.drift, other.drift), np.maximum(self.step, other.step))
 
     @property
@@ -144,9 +144,9 @@ class Limits:
         return bool((np.abs(before.mean(axis=0) - after.mean(axis=0)) > allowed).any())
 
 
-def known_limits(noise: Noise, step: np.ndarray, spans: Spans) -> Limits:
+def known_limits(noise: Noise, step: np.ndarray, spans: Spans) -> NoiseLimits:
     """
-    Limits from known noise, and the ADC's step, (m,): a variance of samples is chi-squared.
+    NoiseLimits from known noise, and the ADC's step, (m,): a variance of samples is chi-squared.
 
     A first-order filter correlates neighbours by a = exp(−dt/τ), and the variance of n such
     samples scatters as that of n·(1 − a²)/(1 + a²) independent ones.
@@ -157,11 +157,11 @@ def known_limits(noise: Noise, step: np.ndarray, spans: Spans) -> Limits:
     sigma = np.hypot(noise.sigma, step / np.sqrt(12))
     halves = spans.half * spans.size << np.arange(DRIFT_OCTAVES)
     drift = np.sqrt(2 / effective_samples(halves, spans.dt_s, noise.tau_s))[:, None] * sigma
-    return Limits(ratio * sigma ** 2, drift, undithered(step, sigma))
+    return NoiseLimits(ratio * sigma ** 2, drift, undithered(step, sigma))
 
 
 def learned_limits(blocks: Blocks, windows: np.ndarray, step: np.ndarray,
-                   spans: Spans) -> Limits | None:
+                   spans: Spans) -> NoiseLimits | None:
     """
     Learn the limits from the quietest windows, never below what the ADC's step explains.
 
@@ -194,7 +194,7 @@ def learned_limits(blocks: Blocks, windows: np.ndarray, step: np.ndarray,
             shorter = drift[octave - 1]
             noise = shorter / np.sqrt(2) if noise is None else np.minimum(noise, shorter)
         drift[octave] = white if noise is None else np.maximum(noise, white)
-    return Limits(limit, drift, undithered(step, np.sqrt(variance)))
+    return NoiseLimits(limit, drift, undithered(step, np.sqrt(variance)))
 
 
 def _drift_noise(moved: np.ndarray, valid: np.ndarray, half: int) -> np.ndarray | None:

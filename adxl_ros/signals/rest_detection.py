@@ -41,8 +41,8 @@ from adxl_ros.signals.noise_limits import (
     half_differences,
     known_limits,
     learned_limits,
-    Limits,
     Noise,
+    NoiseLimits,
     quiet_blocks,
     quiet_variance,
     Spans,
@@ -94,17 +94,17 @@ class Stillness:
 
     still: bool
     axis: int
-    figure: str
+    statistic: str
     value: float
     limit: float
 
     def describe(self, unit: str, scale: float = 1.0, axes: str = 'xyz') -> str:
         """Say what moves and by how much; `scale` is `unit`s a unit of the samples."""
-        how = 'at rest' if self.still else {'rms': 'moving', 'drift': 'drifting'}[self.figure]
+        how = 'at rest' if self.still else {'rms': 'moving', 'drift': 'drifting'}[self.statistic]
         return (f'{how}: {self.value * scale:.2g} {unit} on {axes[self.axis]}, '
                 f'must be below {self.limit * scale:.2g}')
 
-    def in_mps2(self, sensor: Sensor) -> str:
+    def describe_mps2(self, sensor: Sensor) -> str:
         """Say it in m/s², for samples that are a sensor's volts."""
         scale = G0_MPS2 / float(sensor.nominal_scale_v_per_g[self.axis])
         return self.describe('m/s²', scale, sensor.axes)
@@ -148,7 +148,7 @@ class RestFinder:
         self._settle = max(int(np.ceil(settle_s / self._spans.block_s)), 1)
         self._cutter = BlockCutter(rate_hz, axes, 0 if angle_tolerance_rad is None else 2)
         self._parts = [self._cutter.none()]
-        self._judged: tuple[int, Limits | None, list[Rest]] | None = None
+        self._judged: tuple[int, NoiseLimits | None, list[Rest]] | None = None
 
     def feed(self, time_s: np.ndarray, samples: np.ndarray,
              angles_rad: np.ndarray | None = None) -> None:
@@ -185,11 +185,11 @@ class RestFinder:
         allowed = np.concatenate([np.sqrt(limits.variance),
                                   DRIFT_SIGMAS * limits.drift[0] + limits.step])
         worst = int(np.argmax(values / allowed))
-        figure, axis = divmod(worst, len(rms))
-        return Stillness(bool(values[worst] <= allowed[worst]), axis, ('rms', 'drift')[figure],
+        statistic, axis = divmod(worst, len(rms))
+        return Stillness(bool(values[worst] <= allowed[worst]), axis, ('rms', 'drift')[statistic],
                          float(values[worst]), float(allowed[worst]))
 
-    def _judge(self) -> tuple[Limits | None, list[Rest]]:
+    def _judge(self) -> tuple[NoiseLimits | None, list[Rest]]:
         """Judge the stream so far, once for every new block."""
         blocks = self.blocks()
         if self._judged is None or self._judged[0] != len(blocks):
@@ -199,14 +199,14 @@ class RestFinder:
             self._judged = len(blocks), limits, rests
         return self._judged[1:]
 
-    def _limits(self, blocks: Blocks, windows: np.ndarray) -> Limits | None:
+    def _limits(self, blocks: Blocks, windows: np.ndarray) -> NoiseLimits | None:
         """Say what noise explains, known, learned or the larger; None if too little is known."""
         step = adc_step(blocks)
         known = known_limits(self.noise, step, self._spans) if self.noise is not None else None
         learned = learned_limits(blocks, windows, step, self._spans) if self.learn else None
         return known.or_more(learned) if known and learned else known or learned
 
-    def _rests(self, blocks: Blocks, windows: np.ndarray, limits: Limits) -> list[Rest]:
+    def _rests(self, blocks: Blocks, windows: np.ndarray, limits: NoiseLimits) -> list[Rest]:
         """Find the rests among the blocks of the whole stream."""
         quiet = quiet_blocks(blocks, windows, limits.variance, self._spans.window)
         still = quiet & ~self._drifting(blocks, quiet, limits)
@@ -221,7 +221,7 @@ class RestFinder:
                                     if self.learn else parts)
                 if stop - first >= self._least]
 
-    def _drifting(self, blocks: Blocks, quiet: np.ndarray, limits: Limits) -> np.ndarray:
+    def _drifting(self, blocks: Blocks, quiet: np.ndarray, limits: NoiseLimits) -> np.ndarray:
         """
         Tell which blocks lie where the mean moves, (k,), by comparing neighbouring halves.
 
@@ -246,7 +246,7 @@ class RestFinder:
         return drifting
 
     def _without_ends(self, means: np.ndarray, first: int, stop: int,
-                      limits: Limits) -> tuple[int, int]:
+                      limits: NoiseLimits) -> tuple[int, int]:
         """Cut the ends that differ from the bulk: settling, or a hand that comes."""
         longest = min((stop - first) // 4, self._spans.longest // 2)
         if longest > 0:
@@ -275,7 +275,7 @@ class RestFinder:
         return not (bounds.sum(axis=0) > allowed).any()
 
     def _joined(self, blocks: Blocks, bounds: np.ndarray | None, parts: list[tuple[int, int]],
-                limits: Limits) -> list[tuple[int, int]]:
+                limits: NoiseLimits) -> list[tuple[int, int]]:
         """Join parts between which a knock left the mean, and the angles, where they were."""
         joined: list[tuple[int, int]] = []
         for first, stop in parts:
@@ -294,7 +294,7 @@ class RestFinder:
         return first - end <= longest and bool(blocks.run[end - 1] == blocks.run[first])
 
     def _moved(self, means: np.ndarray, before: tuple[int, int], after: tuple[int, int],
-               limits: Limits) -> bool:
+               limits: NoiseLimits) -> bool:
         """Tell whether the mean beside a disturbance is another before it than after it."""
         reach = self._spans.longest // 2
         return limits.tells_apart(means[max(before[0], before[1] - reach):before[1]],

@@ -66,8 +66,8 @@ def fit(options: argparse.Namespace) -> int:
         read = recording.read(path)
         say_notes('fit', read)
         unit = recorded_unit(unit or sensor, read)
-        parts.append(pose_extraction.poses_of(read, unit, entries))
-        filters.append(pose_extraction.filter_noise_of(read, unit, parts[-1]))
+        parts.append(pose_extraction.extract_poses(read, unit, entries))
+        filters.append(pose_extraction.estimate_filters(read, unit, parts[-1]))
     found = calibration.calibrate(unit, parts, options.model,
                                   [Path(path).name for path in options.recording],
                                   options.effect, filters, sha256(options.recording))

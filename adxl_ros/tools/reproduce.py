@@ -78,7 +78,7 @@ def _of_recordings(sensor: Sensor, paths: Sequence[str], folder: Path) -> str:
         read = recording.read(path)
         say_notes('reproduce', read)
         unit = recorded_unit(unit, read)
-        parts.append(pose_extraction.poses_of(read, unit))
+        parts.append(pose_extraction.extract_poses(read, unit))
     found = calibration.calibrate(unit, parts, 'full', [Path(path).name for path in paths])
     found.draw(folder / FIGURES / 'sweep.png')
     lines = '\n'.join(found.comments())

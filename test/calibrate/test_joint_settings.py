@@ -22,7 +22,7 @@ from adxl_ros.calibrate.guided.capture_settings import Settings
 from adxl_ros.calibrate.guided.pose_plan import Target
 from adxl_ros.calibrate.guided.stage_guide import Sweep
 from adxl_ros.calibrate.joint_settings import recorded_settings, SettingTracker
-from adxl_ros.calibrate.poses import Poses, together
+from adxl_ros.calibrate.poses import join_poses, Poses
 from adxl_ros.files import recording
 from adxl_ros.files.recording_columns import COMMANDS, Recording
 from adxl_ros.files.stream_info import sensor_info
@@ -303,7 +303,7 @@ def test_journals_of_earlier_versions_are_numbered_by_their_angles():
     mixed = Poses.from_entries([*entries, *new])
     assert mixed.alpha_setting.tolist() == [0, 0, 0, 1, 2, 2]
     assert len(set(mixed.beta_setting.tolist())) == 5
-    both = together([poses, Poses.from_entries(new)])
+    both = join_poses([poses, Poses.from_entries(new)])
     assert both.alpha_setting.tolist() == [0, 0, 1, 0, 2, 2]
     assert Poses.from_entries([{**entries[0], 'alpha_rad': NAN}]).alpha_setting.tolist() == [0]
 
@@ -402,7 +402,8 @@ def test_sweep_journal_bag_and_csv_give_the_same_settings(tmp_path):
     # Without commands, the encoder tells of all moves that it shows.
     for name in COMMANDS.values():
         del read.columns[name]
-    poses = pose_extraction.poses_of(read, unit, [{**e, 'alpha_setting': -1} for e in entries])
+    poses = pose_extraction.extract_poses(
+        read, unit, [{**e, 'alpha_setting': -1} for e in entries])
     assert (poses.alpha_setting == -1).all(), 'the numbers of a journal stand'
     _, beta = by_rests(read, unit, entries)
     assert same_partition(beta.tolist(), [0, 1, 3, 4, 5, 5, 5, 5, 7])
@@ -419,7 +420,7 @@ def test_a_sweep_with_a_journal_of_an_earlier_version_is_numbered_by_the_recordi
     read = recording.read(run.bag(tmp_path / 'bag'))
     unit = recorded_unit(run.sensor, read)
     bare = [{k: v for k, v in e.items() if not k.endswith('_setting')} for e in run.entries]
-    poses = pose_extraction.poses_of(read, unit, bare)
+    poses = pose_extraction.extract_poses(read, unit, bare)
     assert poses.alpha_setting.tolist() == [0, 0, 0]
     assert poses.beta_setting.tolist() == [0, 1, 2]
     assert Poses.from_entries(run.entries).beta_setting.tolist() == [0, 1, 2]
@@ -428,5 +429,5 @@ def test_a_sweep_with_a_journal_of_an_earlier_version_is_numbered_by_the_recordi
 def test_a_recording_without_a_stage_has_one_setting():
     columns = {'x_v': np.random.default_rng(0).normal(2.5, 1e-3, 5000)}
     read = Recording('made', np.arange(5000) / 1000, columns, sensor_info(nominal('x')))
-    poses = pose_extraction.poses_of(read, replace(nominal('x'), rate_hz=1000.0))
+    poses = pose_extraction.extract_poses(read, replace(nominal('x'), rate_hz=1000.0))
     assert set(poses.alpha_setting.tolist()) == {0}

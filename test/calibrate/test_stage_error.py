@@ -20,7 +20,7 @@ from dataclasses import replace
 from adxl_ros.calibrate import pose_response
 from adxl_ros.calibrate.fits import full_model, linearised
 from adxl_ros.calibrate.guided import pose_plan
-from adxl_ros.calibrate.poses import Poses, together
+from adxl_ros.calibrate.poses import join_poses, Poses
 from adxl_ros.calibrate.stage_error import PoseCovariance, shared_settings, StageError
 from adxl_ros.model.coefficients import with_neutral
 import numpy as np
@@ -52,7 +52,7 @@ def dense(slope, poses, error):
 
 def test_products_and_determinant_are_those_of_the_dense_covariance(poses):
     """Woodbury's formula gives what the inverse of the whole matrix gives."""
-    slope = pose_response.by_angles(nominal(), poses)
+    slope = pose_response.angle_jacobian(nominal(), poses)
     columns = np.random.default_rng(1).normal(size=(len(poses), 2, 5))
     whole = dense(slope, poses, ERROR)
     covariance = PoseCovariance(slope, poses, shared_settings(poses), ERROR)
@@ -64,7 +64,7 @@ def test_products_and_determinant_are_those_of_the_dense_covariance(poses):
 
 def test_predicted_errors_are_the_best_linear_ones(poses):
     """Errors of setting and pose are those of the conditional normal distribution."""
-    slope = pose_response.by_angles(nominal(), poses)
+    slope = pose_response.angle_jacobian(nominal(), poses)
     residual = np.random.default_rng(2).normal(size=poses.volts.shape) * 1e-4
     covariance = PoseCovariance(slope, poses, shared_settings(poses), ERROR)
     weighted = np.linalg.solve(dense(slope, poses, ERROR), residual.ravel()).reshape(
@@ -81,7 +81,7 @@ def test_predicted_errors_are_the_best_linear_ones(poses):
 
 def test_poses_that_do_not_count_change_nothing(poses):
     """Products of some poses are those of these alone."""
-    slope = pose_response.by_angles(nominal(), poses)
+    slope = pose_response.angle_jacobian(nominal(), poses)
     columns = np.random.default_rng(1).normal(size=(len(poses), 2, 3))
     kept = np.arange(len(poses)) % 7 != 0
     some = PoseCovariance(slope, poses, shared_settings(poses), ERROR, kept)
@@ -94,11 +94,12 @@ def test_poses_that_do_not_count_change_nothing(poses):
 def test_a_stated_error_counts_where_poses_do_not_tell(poses):
     """Few poses leave the level at the stated one; many decide it themselves."""
     unit = with_neutral(nominal(), ('bias', 'scale_factor', 'base_tilt'))
-    names = full_model.coefficients('xy', ('bias', 'scale_factor'))
-    few = linearised.linearised(unit, poses.subset(np.arange(4)), names, full_model.priors(names))
+    names = full_model.fitted_coefficients('xy', ('bias', 'scale_factor'))
+    precision = full_model.prior_precision(names)
+    few = linearised.linearised(unit, poses.subset(np.arange(4)), names, precision)
     assert few.stage_error(1e-3).total_rad == pytest.approx(1e-3, rel=1.0)
-    quiet = replace(poses, volts=pose_response.response(unit, poses))
-    many = linearised.linearised(unit, quiet, names, full_model.priors(names))
+    quiet = replace(poses, volts=pose_response.predicted_volts(unit, poses))
+    many = linearised.linearised(unit, quiet, names, precision)
     assert many.stage_error(1e-3).total_rad < 1e-4
 
 
@@ -111,7 +112,7 @@ def test_a_joint_that_is_worse_than_the_other_is_found():
     step = np.radians(5 / 60)
     off = [factor * step * rng.uniform(-0.5, 0.5, len(poses))[setting]
            for factor, setting in ((3, poses.alpha_setting), (1, poses.beta_setting))]
-    volts = pose_response.response(truth, replace(poses, alpha_rad=poses.alpha_rad + off[0],
+    volts = pose_response.predicted_volts(truth, replace(poses, alpha_rad=poses.alpha_rad + off[0],
                                                   beta_rad=poses.beta_rad + off[1]))
     found = full_model.fit_full(nominal(), replace(
         poses, volts=volts + poses.std_v * rng.normal(size=volts.shape)))
@@ -126,6 +127,6 @@ def test_settings_without_numbers_follow_the_angles():
     one = Poses(nothing, nothing, alpha, beta, nothing, np.zeros(4, bool))
     assert one.alpha_setting.tolist() == [0, 0, 1, 2]
     assert one.beta_setting.tolist() == [0, 1, 1, 1]
-    both = together([one, one])
+    both = join_poses([one, one])
     assert both.alpha_setting.tolist() == [0, 0, 1, 2, 3, 3, 4, 5]
     assert both.subset(np.array([3, 4])).beta_setting.tolist() == [1, 2]

@@ -320,7 +320,7 @@ def test_says_what_moves():
     finder.feed(time_s[1000:2000], volts[1000:2000])
     moving = finder.stillness()
     assert not moving.still
-    assert (moving.axis, moving.figure) == (1, 'rms')
+    assert (moving.axis, moving.statistic) == (1, 'rms')
     assert moving.value * scale == pytest.approx(0.3, rel=0.1)
     # 0.535 mg rms, and what chi-squared allows the variance of 0.25 s.
     assert 1.5 * 0.00525 < moving.limit * scale < 2 * 0.00525
@@ -330,7 +330,7 @@ def test_says_what_moves():
     volts[2000:, 2] += np.radians(0.5) * (time_s[2000:] - 2)
     finder.feed(time_s[2000:], volts[2000:])
     drifting = finder.stillness()
-    assert not drifting.still and (drifting.axis, drifting.figure) == (2, 'drift')
+    assert not drifting.still and (drifting.axis, drifting.statistic) == (2, 'drift')
     assert drifting.value == pytest.approx(np.radians(0.25), rel=0.2)
 
 

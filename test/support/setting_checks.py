@@ -26,7 +26,7 @@ def same_partition(some, others):
 
 def by_rests(read, unit, entries):
     """Find the rests without a journal; return the settings of those of a journal's poses."""
-    poses = pose_extraction.poses_of(read, unit)
+    poses = pose_extraction.extract_poses(read, unit)
     begin, end = (read.epoch_ns + np.rint(poses.time_s * 1e9).astype(np.int64)).T
     middle = [(e['start_ns'] + e['stop_ns']) // 2 for e in entries]
     rest = [int(np.flatnonzero((begin <= m) & (m <= end))[0]) for m in middle]
@@ -37,10 +37,10 @@ def check_all_agree(read, unit, entries):
     """Assert that a recording numbers the settings as its journal does."""
     alpha, beta = (np.array([e[f'{joint}_setting'] for e in entries])
                    for joint in ('alpha', 'beta'))
-    by_journal = pose_extraction.poses_of(read, unit, entries)
+    by_journal = pose_extraction.extract_poses(read, unit, entries)
     assert (by_journal.alpha_setting == alpha).all() and (by_journal.beta_setting == beta).all()
     bare = [{k: v for k, v in e.items() if not k.endswith('_setting')} for e in entries]
-    named = pose_extraction.poses_of(read, unit, bare)
+    named = pose_extraction.extract_poses(read, unit, bare)
     for found in ((named.alpha_setting, named.beta_setting), by_rests(read, unit, entries)):
         assert same_partition(found[0].tolist(), alpha.tolist())
         assert same_partition(found[1].tolist(), beta.tolist())

@@ -72,7 +72,7 @@ def swept(rng, truth, planes_rad=PLANES_RAD, check_poses=16, noisy=True, per_set
         setting = np.cumsum(np.abs(np.diff(angle, prepend=angle[0])) > 1e-9)
         return drawn[setting] if per_setting else drawn
     off = error(alpha), error(beta)
-    force = pose_response.force_on(truth, alpha + off[0], beta + off[1])
+    force = pose_response.stage_force(truth, alpha + off[0], beta + off[1])
     volts = np.column_stack(signal_chain.static_response(truth)(force))
     count = noise.effective_samples(5000, 1e-3, truth.rc_s)
     std = np.broadcast_to(noise.sigma_v(truth) / np.sqrt(count), volts.shape)

@@ -28,7 +28,7 @@ from adxl_ros.model.sensor import Sensor
 import numpy as np
 
 
-def choose(rows: np.ndarray, information: np.ndarray, count: int) -> list[int]:
+def choose_poses(rows: np.ndarray, information: np.ndarray, count: int) -> list[int]:
     """
     Choose poses one after the other, each that of the greatest gain in log |information|.
 
@@ -57,7 +57,7 @@ def choose(rows: np.ndarray, information: np.ndarray, count: int) -> list[int]:
     return chosen
 
 
-def grid(std_v: np.ndarray, step_rad: float) -> Poses:
+def candidate_poses(std_v: np.ndarray, step_rad: float) -> Poses:
     """
     Lay candidates over the sphere, each a new setting of both joints.
 
@@ -78,7 +78,7 @@ def grid(std_v: np.ndarray, step_rad: float) -> Poses:
                  beta_setting=np.arange(count))
 
 
-def rows_of(unit: Sensor, poses: Poses, names: tuple[Coefficient, ...],
+def whitened_jacobian(unit: Sensor, poses: Poses, names: tuple[Coefficient, ...],
             stage: StageError) -> np.ndarray:
     """
     Return the derivatives of single poses by coefficients, whitened, (k, m, p).
@@ -95,5 +95,6 @@ def rows_of(unit: Sensor, poses: Poses, names: tuple[Coefficient, ...],
         Levels of the stage's error.
 
     """
-    design = pose_response.by_coefficients(unit, poses, names)
-    return pose_response.covariance(unit, poses, stage).by_blocks(design).reshape(design.shape)
+    design = pose_response.coefficient_jacobian(unit, poses, names)
+    covariance = pose_response.volts_covariance(unit, poses, stage)
+    return covariance.by_blocks(design).reshape(design.shape)

@@ -62,7 +62,7 @@ def words(found: full_model.FullFit, poses: Poses, judged: Sequence[Term]) -> li
     Parameters
     ----------
     found, judged
-        From `term_selection.fit_judged`.
+        From `term_selection.fit_selected`.
     poses
         That it was made of.
 
@@ -72,17 +72,17 @@ def words(found: full_model.FullFit, poses: Poses, judged: Sequence[Term]) -> li
     beside = f', and {pose[0]:.2g} and {pose[1]:.2g} deg new with each pose' \
         if pose[0] > _SMALL_SHARE * setting[0] else ''
     lines = [f'stage: a setting of alpha has an error of {setting[0]:.2g} deg rms, of beta '
-             f'{setting[1]:.2g} deg{beside} (stated {np.degrees(found.stated_sigma_rad):.2g})'
+             f'{setting[1]:.2g} deg{beside} (stated {np.degrees(found.stated_std_rad):.2g})'
              f'{_of_the_stage(found)}']
     if not found.converged:
         lines.append(NOT_CONVERGED)
-    if found.stage_sigma_rad > _WORSE * found.stated_sigma_rad + 1e-5:
+    if found.stage_std_rad > _WORSE * found.stated_std_rad + 1e-5:
         lines.append('the reference is worse than stated, or the model lacks something that '
                      'looks like it: poses weigh accordingly, and the sensor is not blamed')
-    if found.knocked:
+    if found.outliers:
         worst = [f'{i + 1} (alpha {np.degrees(poses.alpha_rad[i]):.1f}, beta '
                  f'{np.degrees(poses.beta_rad[i]):.1f} deg, from {poses.time_s[i, 0]:.1f} s, '
-                 f'{np.sqrt(found.distances[i]):.0f} sigma)' for i in found.knocked[:8]]
+                 f'{np.sqrt(found.distances[i]):.0f} sigma)' for i in found.outliers[:8]]
         lines.append(f'left out, disturbed: pose {", ".join(worst)}')
     condition, spread, parts = weakest(found)
     direction = ' '.join(f'{value:+.2f} {name}' for name, value in parts)
@@ -109,4 +109,4 @@ def _of_the_stage(found: full_model.FullFit) -> str:
     return ''.join(
         f', {name} {value:.2g} +- {Z_90 * s:.1g} {parameter_of(name).unit}'
         for name, value, s in zip(found.names, get(found.unit, found.names), std)
-        if full_model.of_stage(name))
+        if full_model.belongs_to_stage(name))

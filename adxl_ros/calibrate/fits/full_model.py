@@ -43,7 +43,7 @@ from dataclasses import dataclass, replace
 from adxl_ros.calibrate import pose_response
 from adxl_ros.calibrate.fits import d_optimal, linear
 from adxl_ros.calibrate.fits.linearised import Linearised, linearised
-from adxl_ros.calibrate.pose_response import response
+from adxl_ros.calibrate.pose_response import predicted_volts
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.calibrate.stage_error import AngleErrors, PoseCovariance, StageError
 from adxl_ros.errors import UserError
@@ -63,7 +63,7 @@ _OPTIONAL = ('nonlinearity',)
 """Terms that may stay as open as their prior leaves them: most units hardly have them."""
 GAUGE = ('cross_axis.linear', 'cross_axis_z.linear')
 """Terms that are 0 unless the poses show them beside the misalignment."""
-LEVEL_RAD = np.radians(0.1)
+LEVEL_STD_RAD = np.radians(0.1)
 """Standard deviation of the level of the base, each way: the paper's 0.1°."""
 _STAGE = (Coefficient('base_tilt', 'x_rad'), Coefficient('base_tilt', 'y_rad'))
 _HARDLY = 5.0
@@ -110,9 +110,9 @@ class FullFit:
         Fitted coefficients, those of the stage last.
     stage
         Levels of the stage's error.
-    stated_sigma_rad
+    stated_std_rad
         Standard deviation of a joint's error as it is stated: step/√12, rad.
-    knocked
+    outliers
         Numbers of the poses that were left out as disturbed.
     information
         Inverse covariance of `names`, priors included.
@@ -131,8 +131,8 @@ class FullFit:
     unit: Sensor
     names: tuple[Coefficient, ...]
     stage: StageError
-    stated_sigma_rad: float
-    knocked: tuple[int, ...]
+    stated_std_rad: float
+    outliers: tuple[int, ...]
     information: np.ndarray
     distances: np.ndarray
     at: Poses
@@ -140,17 +140,17 @@ class FullFit:
     converged: bool
 
     @property
-    def stage_sigma_rad(self) -> float:
+    def stage_std_rad(self) -> float:
         """Return the standard deviation of a joint's error in one pose, rad."""
         return self.stage.total_rad
 
     @property
     def kept(self) -> np.ndarray:
         """Tell which poses were not left out, (k,)."""
-        return ~np.isin(np.arange(len(self.at)), self.knocked)
+        return ~np.isin(np.arange(len(self.at)), self.outliers)
 
 
-def terms_of(axes: str) -> tuple[str, ...]:
+def default_terms(axes: str) -> tuple[str, ...]:
     """Return the terms of the full model for a unit with these axes."""
     return TERMS + (_THREE_AXES if axes == 'xyz' else ())
 
@@ -169,7 +169,7 @@ def fit_full(sensor: Sensor, poses: Poses, terms: Sequence[str] | None = None) -
     poses
         Of one unit on one stage.
     terms
-        Effects to fit, of the sensor or of the stage, and names of `GAUGE`; `terms_of` the
+        Effects to fit, of the sensor or of the stage, and names of `GAUGE`; `default_terms` the
         sensor's axes unless given.
 
     Raises
@@ -178,12 +178,12 @@ def fit_full(sensor: Sensor, poses: Poses, terms: Sequence[str] | None = None) -
         A coefficient is not determined; says which and which poses would help.
 
     """
-    terms = terms_of(sensor.axes) if terms is None else terms
+    terms = default_terms(sensor.axes) if terms is None else terms
     start = linear.fit(sensor, poses)
     effects = [effect_of(term) for term in terms]
     unit = with_neutral(replace(start, covariance=np.zeros((0, 0)), covariance_names=()), effects)
     unit = with_neutral(unit, ['base_tilt'])
-    names = coefficients(unit.axes, terms)
+    names = fitted_coefficients(unit.axes, terms)
     stated = StageError(sensor.stage_resolution_rad / np.sqrt(12))
     fits, failure = [], None
     for begin in _starts(unit, poses, names, effects, stated):
@@ -225,7 +225,8 @@ def _likeliest(unit: Sensor, poses: Poses, names: Sequence[Coefficient],
     """Return values of a figure of shape within its bounds, the likeliest first."""
     _, parameter = shape
     within = values[(parameter.lower <= values) & (values <= parameter.upper)]
-    misfit = [linearised(_shaped(unit, shape, value), poses, names, priors(names)).misfit(stage)
+    precision = prior_precision(names)
+    misfit = [linearised(_shaped(unit, shape, value), poses, names, precision).misfit(stage)
               for value in within]
     return [float(value) for value in within[np.argsort(misfit)]]
 
@@ -240,7 +241,7 @@ def _shaped(unit: Sensor, shape: tuple[str, Parameter], value: float) -> Sensor:
 def _fit_from(unit: Sensor, poses: Poses, names: tuple[Coefficient, ...],
               stated: StageError) -> FullFit:
     """Fit from a start: levels, coefficients and angles in turn, until all of them settle."""
-    known, everything = priors(names), np.ones(len(poses), bool)
+    known, everything = prior_precision(names), np.ones(len(poses), bool)
     kept, stage, at, std_v = everything, stated, poses, poses.std_v
     unit = put(unit, names, _solved(unit, poses, names, stage, kept, _STEPS).last.values)
     error_rad = AngleErrors(*(np.zeros((len(poses), 2)),) * 2, np.zeros(len(poses)), 0.0)
@@ -271,7 +272,7 @@ def _fit_from(unit: Sensor, poses: Poses, names: tuple[Coefficient, ...],
     about = linearised(unit, at, names, known, kept)
     covariance = about.covariance(stage)
     _, fisher = about.solve(covariance)
-    of_sensor = [i for i, name in enumerate(names) if not of_stage(name)]
+    of_sensor = [i for i, name in enumerate(names) if not belongs_to_stage(name)]
     fitted = replace(
         _without_stage(unit), model='full',
         covariance=np.linalg.inv(fisher)[np.ix_(of_sensor, of_sensor)],
@@ -282,14 +283,14 @@ def _fit_from(unit: Sensor, poses: Poses, names: tuple[Coefficient, ...],
                    converged)
 
 
-def coefficients(axes: str, terms: Sequence[str]) -> tuple[Coefficient, ...]:
+def fitted_coefficients(axes: str, terms: Sequence[str]) -> tuple[Coefficient, ...]:
     """Name what is fitted: the terms' coefficients but for the gauge, and the base's tilt."""
     named = [name for effect in dict.fromkeys(map(effect_of, terms))
              for name in names_of(effect_named(effect), axes)
              if not parameter_of(name).shape and not parameter_of(name).optional
              and term_of(name) in terms]
-    return (*(n for n in named if not of_stage(n)), *_STAGE,
-            *(n for n in named if of_stage(n) and n not in _STAGE))
+    return (*(n for n in named if not belongs_to_stage(n)), *_STAGE,
+            *(n for n in named if belongs_to_stage(n) and n not in _STAGE))
 
 
 def term_of(name: Coefficient) -> str:
@@ -303,19 +304,20 @@ def effect_of(term: str) -> str:
     return Coefficient.parse(term).effect if term in GAUGE else term
 
 
-def priors(names: Sequence[Coefficient]) -> np.ndarray:
+def prior_precision(names: Sequence[Coefficient]) -> np.ndarray:
     """
     Return the inverse variances that are known beforehand, (p,).
 
     The level and the gauge are known; a coefficient of the sensor is hardly ever beyond five
     times its typical size, which says nothing where the poses say anything.
     """
-    spread = [LEVEL_RAD if name in _STAGE else parameter_of(name).scale * (
-        1 if term_of(name) in GAUGE else 3 if of_stage(name) else _HARDLY) for name in names]
+    spread = [LEVEL_STD_RAD if name in _STAGE else parameter_of(name).scale * (
+        1 if term_of(name) in GAUGE else 3 if belongs_to_stage(name) else _HARDLY)
+        for name in names]
     return 1 / np.square(spread)
 
 
-def information(unit: Sensor, poses: Poses, names: Sequence[Coefficient], stage: StageError
+def fisher_information(unit: Sensor, poses: Poses, names: Sequence[Coefficient], stage: StageError
                 ) -> np.ndarray:
     """
     Fisher information of poses about coefficients, priors of the stage included, (p, p).
@@ -332,7 +334,7 @@ def information(unit: Sensor, poses: Poses, names: Sequence[Coefficient], stage:
         As `FullFit` has them.
 
     """
-    about = linearised(unit, poses, names, priors(names))
+    about = linearised(unit, poses, names, prior_precision(names))
     return about.solve(about.covariance(stage))[1]
 
 
@@ -356,7 +358,7 @@ def _solved(unit: Sensor, poses: Poses, names: Sequence[Coefficient], stage: Sta
     sizes = np.array([parameter_of(name).scale for name in names])
 
     def linearise(values: np.ndarray) -> _Iterate:
-        about = linearised(put(unit, names, values), poses, names, priors(names), kept)
+        about = linearised(put(unit, names, values), poses, names, prior_precision(names), kept)
         covariance = about.covariance(stage)
         step, information = about.solve(covariance)
         step *= min(1.0, _LONGEST / np.abs(step / sizes).max())
@@ -393,7 +395,7 @@ def _stepped(unit: Sensor, poses: Poses, at: Poses, names: Sequence[Coefficient]
 
     """
     solved = _solved(unit, at, names, stage, kept, _STEPS_A_ROUND).last
-    covariance, known = solved.covariance, priors(names)
+    covariance, known = solved.covariance, prior_precision(names)
     errors = covariance.predicted(solved.about.residual)
     start, end = get(unit, names), solved.values
 
@@ -401,7 +403,8 @@ def _stepped(unit: Sensor, poses: Poses, at: Poses, names: Sequence[Coefficient]
         return start + share * (end - start), before.towards(errors, share)
 
     def cost(values: np.ndarray, angles: AngleErrors) -> float:
-        left = poses.volts - response(put(unit, names, values), _turned(poses, angles.total_rad))
+        left = poses.volts - predicted_volts(put(unit, names, values),
+                                             _turned(poses, angles.total_rad))
         return float(np.sum((left / at.std_v)[kept] ** 2) + np.sum(known * values ** 2)
                      + covariance.penalty(angles))
 
@@ -424,11 +427,11 @@ def _moved(unit: Sensor, poses: Poses, step_rad: np.ndarray) -> Poses:
     of the measured angles.
     """
     there = _turned(poses, step_rad)
-    return replace(there, volts=poses.volts + (pose_response.by_angles(unit, there)
+    return replace(there, volts=poses.volts + (pose_response.angle_jacobian(unit, there)
                                                @ step_rad[:, :, None])[:, :, 0])
 
 
-def of_stage(name: Coefficient) -> bool:
+def belongs_to_stage(name: Coefficient) -> bool:
     """Tell whether a coefficient is the stage's and not the sensor's."""
     return effect_named(name.effect).place is Place.STAGE
 
@@ -450,8 +453,9 @@ def require_determined(unit: Sensor, poses: Poses, names: Sequence[Coefficient],
 
     """
     scale = np.array([parameter_of(name).scale for name in names])
-    vague = [not of_stage(name) and term_of(name) not in (*GAUGE, *_OPTIONAL) for name in names]
-    told = information(unit, poses, names, stage) - np.diag(priors(names) * vague)
+    vague = [not belongs_to_stage(name) and term_of(name) not in (*GAUGE, *_OPTIONAL)
+             for name in names]
+    told = fisher_information(unit, poses, names, stage) - np.diag(prior_precision(names) * vague)
     known = told * np.outer(scale, scale)
     weak = np.linalg.inv(known + 1e-6 * np.eye(len(names)))
     lost = [str(name) for name, variance, need in zip(names, np.diag(weak), vague)
@@ -482,9 +486,9 @@ def next_poses(unit: Sensor, poses: Poses, names: Sequence[Coefficient], stage: 
         How many.
 
     """
-    grid = d_optimal.grid(np.median(poses.std_v, axis=0), _GRID_RAD)
+    grid = d_optimal.candidate_poses(np.median(poses.std_v, axis=0), _GRID_RAD)
     scale = np.array([parameter_of(name).scale for name in names])
-    rows = d_optimal.rows_of(unit, grid, tuple(names), stage) * scale
-    known = information(unit, poses, names, stage) * np.outer(scale, scale)
+    rows = d_optimal.whitened_jacobian(unit, grid, tuple(names), stage) * scale
+    known = fisher_information(unit, poses, names, stage) * np.outer(scale, scale)
     return [(float(grid.alpha_rad[i]), float(grid.beta_rad[i])) for i in
-            d_optimal.choose(rows, known + 1e-6 * np.eye(len(names)), count)]
+            d_optimal.choose_poses(rows, known + 1e-6 * np.eye(len(names)), count)]

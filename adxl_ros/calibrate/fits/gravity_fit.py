@@ -26,17 +26,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from adxl_ros.calibrate.fits.gravity_model import (
-    in_units,
-    information_of,
+    effect_values,
+    fisher_information,
     iterated,
-    jacobian_of,
     magnitude,
+    magnitude_jacobian,
     magnitude_variance,
     NAMES,
-    open_names,
+    nominal_rests,
     Rests,
-    rests_of,
-    TRIAL,
+    TRIAL_STD_G,
+    undetermined,
 )
 from adxl_ros.calibrate.fits.orientations import poses_to_add
 from adxl_ros.errors import UserError
@@ -122,17 +122,17 @@ def fit_gravity(mean_v: np.ndarray, standard_error_v: np.ndarray, sensor: Sensor
         what they read is not gravity at all.
 
     """
-    rests = rests_of(mean_v, standard_error_v, sensor)
+    rests = nominal_rests(mean_v, standard_error_v, sensor)
     nominal = np.zeros(len(NAMES))
     _require_determined(rests, nominal, 0.0)
     kept = _inliers(rests, nominal)
     found, excess, converged = _fit(rests[kept], nominal)
     _require_determined(rests[kept], found, excess)
     variance = magnitude_variance(rests, found) + excess
-    jacobian = jacobian_of(rests[kept].mean, found) / np.sqrt(variance[kept, None])
+    jacobian = magnitude_jacobian(rests[kept].mean, found) / np.sqrt(variance[kept, None])
     covariance = np.linalg.inv(jacobian.T @ jacobian)
     covariance *= _t_factor(excess, variance[kept])
-    values, to_units = in_units(found, sensor)
+    values, to_units = effect_values(found, sensor)
     residual = magnitude(rests.mean, found) - rests.gravity
     return GravityFit(
         values=values,
@@ -150,8 +150,8 @@ def _solve(rests: Rests, start: np.ndarray, variance: np.ndarray) -> tuple[np.nd
     """Fit with given variances of the magnitudes, g², (k,); tells whether it converged, too."""
     sigma = np.sqrt(variance)
     found = least_squares(lambda p: (magnitude(rests.mean, p) - rests.gravity) / sigma, start,
-                          lambda p: jacobian_of(rests.mean, p) / sigma[:, None], method='lm',
-                          xtol=1e-12, ftol=1e-12, gtol=1e-12)
+                          lambda p: magnitude_jacobian(rests.mean, p) / sigma[:, None],
+                          method='lm', xtol=1e-12, ftol=1e-12, gtol=1e-12)
     return found.x, bool(found.success)
 
 
@@ -270,8 +270,8 @@ def _studentised(rests: Rests, kept: np.ndarray, start: np.ndarray) -> np.ndarra
     """Distance of each rest from the fit to the others, in its standard deviations, (k,)."""
     found, excess, _ = _fit(rests[kept], start)
     variance = magnitude_variance(rests, found) + excess
-    covariance = np.linalg.inv(information_of(rests[kept], found, excess))
-    jacobian = jacobian_of(rests.mean, found)
+    covariance = np.linalg.inv(fisher_information(rests[kept], found, excess))
+    jacobian = magnitude_jacobian(rests.mean, found)
     leverage = np.einsum('ki,ij,kj->k', jacobian, covariance, jacobian) / variance
     distance = np.abs(magnitude(rests.mean, found) - rests.gravity) / np.sqrt(variance)
     inside = distance / np.sqrt(np.maximum(1 - leverage, 1e-9))
@@ -296,8 +296,8 @@ def _leave_one_out(rests: Rests, kept: np.ndarray, found: np.ndarray, variance: 
 
 def _require_determined(rests: Rests, found: np.ndarray, excess: float) -> None:
     """Refuse rests that leave a coefficient open, or read something else than gravity."""
-    information = information_of(rests, found, excess)
-    lost, count = open_names(information), len(rests.mean)
+    information = fisher_information(rests, found, excess)
+    lost, count = undetermined(information), len(rests.mean)
     read = np.median(magnitude(rests.mean, found)) if count else rests.gravity
     if not 0.5 < read / rests.gravity < 2:
         raise UserError(f'gravity: the rests read {read * G0_MPS2:.3g} m/s², not '
@@ -309,6 +309,6 @@ def _require_determined(rests: Rests, found: np.ndarray, excess: float) -> None:
     lacking = f'leave {what} open' if lost else f'are too few, {MIN_RESTS} are the least'
     scatter = f' and scatter by {1e3 * np.sqrt(excess):.2g} mg' if excess else ''
     poses = poses_to_add(max(MIN_RESTS - count, 0), information, found, rests.gravity,
-                         TRIAL ** 2 + excess)
+                         TRIAL_STD_G ** 2 + excess)
     raise UserError(f'gravity: the {count} rests that were found {lacking}{scatter}: add rests '
                     f'with {", ".join(poses)}')

@@ -40,7 +40,7 @@ _LARGEST = 0.5
 """Largest departure from nominal in a step, in g, of the scale factor and in rad."""
 _SHORTEST_STEP = 1e-12
 """A step with no larger component is not taken, in g, of the scale factor and in rad."""
-TRIAL = 1e-4
+TRIAL_STD_G = 1e-4
 """Excess of a rest's magnitude, g, to begin with."""
 
 
@@ -56,7 +56,7 @@ class Rests:
         return Rests(self.mean[part], self.variance[part], self.gravity)
 
 
-def rests_of(mean_v: np.ndarray, standard_error_v: np.ndarray, sensor: Sensor) -> Rests:
+def nominal_rests(mean_v: np.ndarray, standard_error_v: np.ndarray, sensor: Sensor) -> Rests:
     """
     Take means of rests by the nominal figures.
 
@@ -74,7 +74,7 @@ def rests_of(mean_v: np.ndarray, standard_error_v: np.ndarray, sensor: Sensor) -
                  sensor.local_gravity_mps2 / G0_MPS2)
 
 
-def in_units(found: np.ndarray, sensor: Sensor
+def effect_values(found: np.ndarray, sensor: Sensor
              ) -> tuple[dict[str, dict[str, np.ndarray]], np.ndarray]:
     """Return what was found in the effects' parameters, and the units of NAMES in it, (9,)."""
     scale = sensor.nominal_scale_v_per_g
@@ -93,7 +93,7 @@ def sensing_axes(found: np.ndarray) -> np.ndarray:
     return np.array([[1.0, 0.0, 0.0], [-sy, cy, 0.0], [sb, -sa * cb, ca * cb]])
 
 
-def force_of(mean: np.ndarray, found: np.ndarray) -> np.ndarray:
+def force_g(mean: np.ndarray, found: np.ndarray) -> np.ndarray:
     """Specific force of each rest in the case frame, g, (k, 3)."""
     sensed = (mean - found[:3]) / (1 + found[3:6])
     return np.linalg.solve(sensing_axes(found), sensed.T).T
@@ -101,19 +101,19 @@ def force_of(mean: np.ndarray, found: np.ndarray) -> np.ndarray:
 
 def magnitude(mean: np.ndarray, found: np.ndarray) -> np.ndarray:
     """Magnitude of each rest's specific force, g, (k,)."""
-    return np.linalg.norm(force_of(mean, found), axis=1)
+    return np.linalg.norm(force_g(mean, found), axis=1)
 
 
-def by_output_of(force: np.ndarray, found: np.ndarray) -> np.ndarray:
+def output_gradient(force: np.ndarray, found: np.ndarray) -> np.ndarray:
     """Differentiate each magnitude by what the axes sense: Θ⁻ᵀ·f/|f|, (k, 3)."""
     along = force / np.linalg.norm(force, axis=1, keepdims=True)
     return np.linalg.solve(sensing_axes(found).T, along.T).T
 
 
-def jacobian_of(mean: np.ndarray, found: np.ndarray) -> np.ndarray:
+def magnitude_jacobian(mean: np.ndarray, found: np.ndarray) -> np.ndarray:
     """Differentiate each magnitude by the nine parameters, (k, 9)."""
-    force = force_of(mean, found)
-    by_sensed = by_output_of(force, found)
+    force = force_g(mean, found)
+    by_sensed = output_gradient(force, found)
     by_output = by_sensed / (1 + found[3:6])
     sensed = (mean - found[:3]) / (1 + found[3:6])
     sy, cy = np.sin(found[6]), np.cos(found[6])
@@ -125,7 +125,7 @@ def jacobian_of(mean: np.ndarray, found: np.ndarray) -> np.ndarray:
 
 def magnitude_variance(rests: Rests, found: np.ndarray) -> np.ndarray:
     """Variance of each magnitude that the noise of the means explains, g², (k,)."""
-    by_output = by_output_of(force_of(rests.mean, found), found) / (1 + found[3:6])
+    by_output = output_gradient(force_g(rests.mean, found), found) / (1 + found[3:6])
     return (by_output ** 2 * rests.variance).sum(axis=1)
 
 
@@ -152,8 +152,8 @@ def iterated(rests: Rests | Callable[[np.ndarray], Rests], start: np.ndarray, st
     def linearise(values: np.ndarray) -> Iterate:
         values = np.clip(values, -_LARGEST, _LARGEST)
         part = rests if isinstance(rests, Rests) else rests(values)
-        rows = jacobian_of(part.mean, values)
-        weight = 1 / (magnitude_variance(part, values).mean() + TRIAL ** 2)
+        rows = magnitude_jacobian(part.mean, values)
+        weight = 1 / (magnitude_variance(part, values).mean() + TRIAL_STD_G ** 2)
         gradient = (weight * rows.T @ (magnitude(part.mean, values) - part.gravity)
                     + values / PRIOR ** 2)
         information = weight * rows.T @ rows + np.eye(len(NAMES)) / PRIOR ** 2
@@ -165,17 +165,17 @@ def iterated(rests: Rests | Callable[[np.ndarray], Rests], start: np.ndarray, st
         steps + 1).last.values
 
 
-def information_of(rests: Rests, found: np.ndarray, excess: float) -> np.ndarray:
+def fisher_information(rests: Rests, found: np.ndarray, excess: float) -> np.ndarray:
     """Information of the rests about the nine parameters, with that of the prior, (9, 9)."""
     information = np.eye(len(NAMES)) / PRIOR ** 2
     if len(rests.mean):
-        rows = jacobian_of(rests.mean, found)
+        rows = magnitude_jacobian(rests.mean, found)
         variance = magnitude_variance(rests, found) + excess
         information += rows.T @ (rows / variance[:, None])
     return information
 
 
-def open_names(information: np.ndarray) -> list[Coefficient]:
+def undetermined(information: np.ndarray) -> list[Coefficient]:
     """Name the coefficients that the information does not determine."""
     sigma = np.sqrt(np.diag(np.linalg.inv(information)))
     return [name for name, s in zip(NAMES, sigma) if s > DETERMINED]

@@ -206,7 +206,7 @@ def linearised(unit: Sensor, poses: Poses, names: Sequence[Coefficient], precisi
         Poses that count, (k,) bool; None for all.
 
     """
-    return Linearised(poses, pose_response.by_angles(unit, poses),
-                      pose_response.by_coefficients(unit, poses, names),
-                      poses.volts - pose_response.response(unit, poses), get(unit, names),
+    return Linearised(poses, pose_response.angle_jacobian(unit, poses),
+                      pose_response.coefficient_jacobian(unit, poses, names),
+                      poses.volts - pose_response.predicted_volts(unit, poses), get(unit, names),
                       precision, np.ones(len(poses), bool) if kept is None else kept)

@@ -18,7 +18,12 @@ from __future__ import annotations
 
 from itertools import product
 
-from adxl_ros.calibrate.fits.gravity_model import jacobian_of, NAMES, open_names, sensing_axes
+from adxl_ros.calibrate.fits.gravity_model import (
+    magnitude_jacobian,
+    NAMES,
+    sensing_axes,
+    undetermined,
+)
 from adxl_ros.model.constants import AXES
 import numpy as np
 
@@ -31,7 +36,7 @@ _NEARLY = 0.5
 """Directions that tell as much as this of the best one's: the nearest of them is asked for."""
 
 
-def gain(information: np.ndarray, found: np.ndarray, gravity: float
+def information_gain(information: np.ndarray, found: np.ndarray, gravity: float
          ) -> tuple[np.ndarray, np.ndarray]:
     """
     Return what a rest in each candidate tells, (26,), and its derivatives, (26, 9).
@@ -47,7 +52,7 @@ def gain(information: np.ndarray, found: np.ndarray, gravity: float
 
     """
     outputs = found[:3] + (1 + found[3:6]) * (gravity * UP @ sensing_axes(found).T)
-    rows = jacobian_of(outputs, found)
+    rows = magnitude_jacobian(outputs, found)
     told = np.einsum('ki,ij,kj->k', rows, np.linalg.inv(information), rows)
     # With one or two axes along gravity a pose is easier to hold.
     return told / np.count_nonzero(CANDIDATES, axis=1), rows
@@ -58,8 +63,8 @@ def poses_to_add(fewest: int, information: np.ndarray, found: np.ndarray, gravit
     """Name the poses that tell most, one after the other, until all coefficients are told."""
     poses: list[str] = []
     left = np.ones(len(UP), bool)
-    while (len(poses) < fewest or open_names(information)) and len(poses) <= len(NAMES):
-        told, rows = gain(information, found, gravity)
+    while (len(poses) < fewest or undetermined(information)) and len(poses) <= len(NAMES):
+        told, rows = information_gain(information, found, gravity)
         best = int(np.argmax(np.where(left, told, -np.inf)))
         information = information + np.outer(rows[best], rows[best]) / variance
         left[best] = False

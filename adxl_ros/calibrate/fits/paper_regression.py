@@ -47,7 +47,7 @@ _REPLICAS = 200
 
 
 @dataclass(frozen=True)
-class Stages:
+class AxisRegression:
     """
     What the stages of one axis found, for figures 4 to 8 of the paper.
 
@@ -75,11 +75,11 @@ def fit(sensor: Sensor, poses: Poses) -> Sensor:
         The planes do not determine the model; says which are missing.
 
     """
-    fitted = _assemble(sensor, poses, stages(sensor, poses))
+    fitted = _assemble(sensor, poses, regress_axes(sensor, poses))
     return replace(fitted, covariance=_covariance(sensor, fitted, poses))
 
 
-def stages(sensor: Sensor, poses: Poses) -> list[Stages]:
+def regress_axes(sensor: Sensor, poses: Poses) -> list[AxisRegression]:
     """Run the stages for the x and y axes (equations 8 to 17); see `fit`."""
     if not sensor.axes.startswith('xy'):
         raise UserError(f'the physical model needs the axes x and y, not {sensor.axes}; '
@@ -95,7 +95,7 @@ def planes(alpha_rad: np.ndarray) -> list[np.ndarray]:
     return np.split(order, cuts)
 
 
-def _one_axis(d: int, start: Sensor, poses: Poses) -> Stages:
+def _one_axis(d: int, start: Sensor, poses: Poses) -> AxisRegression:
     force = np.column_stack(reference_force(poses, start.local_gravity_mps2)) / G0_MPS2
     zero, scale = start.zero_g_v, start.scale_v_per_g
     own, az, volts = force[:, d], force[:, 2], poses.volts[:, d]
@@ -122,7 +122,7 @@ def _one_axis(d: int, start: Sensor, poses: Poses) -> Stages:
     # q1 is the misalignment's A_z, which the scale factor multiplies like any other force.
     growth = _polynomial(r / r[0], plane_az)
     q = _quadratic(plane_az, plane_bias, 'the planes', wanted, growth)       # (13)
-    return Stages(zero[d], scale[d], p, q, r, plane_az, plane_bias, plane_scale)
+    return AxisRegression(zero[d], scale[d], p, q, r, plane_az, plane_bias, plane_scale)
 
 
 def _quadratic(a: np.ndarray, values: np.ndarray, where: str, add: str,
@@ -140,7 +140,7 @@ def _polynomial(coefficients: np.ndarray, a: np.ndarray) -> np.ndarray:
     return np.polynomial.polynomial.polyval(a, coefficients)
 
 
-def _assemble(sensor: Sensor, poses: Poses, of: list[Stages]) -> Sensor:
+def _assemble(sensor: Sensor, poses: Poses, of: list[AxisRegression]) -> Sensor:
     """Fix the gauge and state the result in the effects' parameters."""
     count = len(sensor.axes)
     values: dict[str, dict[str, np.ndarray]] = {name: {} for name in EFFECTS}
@@ -208,6 +208,6 @@ def _covariance(sensor: Sensor, fitted: Sensor, poses: Poses) -> np.ndarray:
             poses.alpha_rad + slack[0], poses.beta_rad + slack[1], fitted.local_gravity_mps2)))
         volts += widen * poses.std_v * rng.standard_normal(volts.shape)
         again = replace(poses, volts=volts)
-        drawn.append(get(_assemble(sensor, again, stages(sensor, again)),
+        drawn.append(get(_assemble(sensor, again, regress_axes(sensor, again)),
                          fitted.covariance_names))
     return np.cov(np.array(drawn).T)

@@ -82,11 +82,11 @@ def candidates(poses: Poses) -> tuple[str, ...]:
 
 
 def fit(sensor: Sensor, poses: Poses) -> Sensor:
-    """Return the unit alone of `fit_judged`."""
-    return fit_judged(sensor, poses)[0].fitted
+    """Return the unit alone of `fit_selected`."""
+    return fit_selected(sensor, poses)[0].fitted
 
 
-def fit_judged(sensor: Sensor, poses: Poses, effects: Sequence[str] = ()
+def fit_selected(sensor: Sensor, poses: Poses, effects: Sequence[str] = ()
                ) -> tuple[full_model.FullFit, list[Term]]:
     """
     Fit the full model with the further terms that the poses speak for.
@@ -109,12 +109,12 @@ def fit_judged(sensor: Sensor, poses: Poses, effects: Sequence[str] = ()
         See `full_model.fit_full`.
 
     """
-    terms = tuple(dict.fromkeys((*full_model.terms_of(sensor.axes), *effects)))
+    terms = tuple(dict.fromkeys((*full_model.default_terms(sensor.axes), *effects)))
     found = full_model.fit_full(sensor, poses, terms)
-    if gauge_shows(found):
+    if gauge_is_identifiable(found):
         terms = (*terms, *full_model.GAUGE)
         found = full_model.fit_full(sensor, poses, terms)
-    judged = judge(found)
+    judged = compare_terms(found)
     for _ in range(_ROUNDS):
         asked = [term for term in judged if not term.inside and term.earns]
         if not asked:
@@ -122,11 +122,11 @@ def fit_judged(sensor: Sensor, poses: Poses, effects: Sequence[str] = ()
         # One after the other: what one term explains, another need not.
         terms = (*terms, max(asked, key=lambda term: term.log_bayes_factor).name)
         found = full_model.fit_full(sensor, poses, terms)
-        judged = judge(found)
+        judged = compare_terms(found)
     return found, judged
 
 
-def judge(found: full_model.FullFit) -> list[Term]:
+def compare_terms(found: full_model.FullFit) -> list[Term]:
     """
     Compare the fit with those without a term, and with one more.
 
@@ -147,12 +147,12 @@ def judge(found: full_model.FullFit) -> list[Term]:
     for name in candidates(found.at):
         if name not in term:
             richer, _ = _linearised(found, [name])
-            stage = richer.stage_error(found.stated_sigma_rad, found.stage)
+            stage = richer.stage_error(found.stated_std_rad, found.stage)
             judged.append(Term(name, False, -richer.deviance(stage) / 2 - inside))
     return judged
 
 
-def gauge_shows(found: full_model.FullFit) -> bool:
+def gauge_is_identifiable(found: full_model.FullFit) -> bool:
     """
     Tell whether the poses show the linear cross-axis terms apart from the misalignment.
 
@@ -169,7 +169,7 @@ def _linearised(found: full_model.FullFit, more: Sequence[str]) -> tuple[Lineari
     """Linearise the fit with further terms; returns the term of each coefficient, too."""
     unit = with_neutral(found.unit, map(full_model.effect_of, more))
     names = (*found.names, *(n for name in more
-                             for n in full_model.coefficients(unit.axes, (name,))
+                             for n in full_model.fitted_coefficients(unit.axes, (name,))
                              if n not in found.names))
-    return (linearised(unit, found.at, names, full_model.priors(names), found.kept),
+    return (linearised(unit, found.at, names, full_model.prior_precision(names), found.kept),
             np.array([full_model.term_of(name) for name in names]))

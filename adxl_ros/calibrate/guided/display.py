@@ -99,7 +99,7 @@ def live(newest: Newest, unit: Sensor, still: Stillness | None) -> dict[str, Any
     rest = None
     if still is not None:
         scale = G0_MPS2 / float(unit.nominal_scale_v_per_g[still.axis])
-        rest = {'still': still.still, 'axis': unit.axes[still.axis], 'figure': still.figure,
+        rest = {'still': still.still, 'axis': unit.axes[still.axis], 'figure': still.statistic,
                 'value': still.value * scale, 'limit': still.limit * scale}
     return {'live': [[axis, mean, rms] for axis, mean, rms in zip(
         unit.axes, newest.mean_mps2(), newest.rms_mps2())], 'rate_hz': newest.rate_hz(),

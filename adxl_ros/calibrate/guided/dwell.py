@@ -19,7 +19,7 @@ from __future__ import annotations
 from typing import Any
 
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.signals.noise_limits import known_noise
+from adxl_ros.signals.noise_limits import datasheet_noise
 from adxl_ros.signals.rest_detection import Rest, rest_means, RestFinder, Stillness
 import numpy as np
 
@@ -40,7 +40,7 @@ class Dwell:
     def __init__(self, sensor: Sensor, arrived_ns: int) -> None:
         self.arrived_ns = arrived_ns
         self._sensor = sensor
-        self._finder = RestFinder(sensor.rate_hz, len(sensor.axes), known_noise(sensor),
+        self._finder = RestFinder(sensor.rate_hz, len(sensor.axes), datasheet_noise(sensor),
                                   learn=False)
         self._stamps: list[np.ndarray] = []
         self._volts: list[np.ndarray] = []
@@ -85,6 +85,6 @@ class Dwell:
         times = (stamps - self.arrived_ns) * 1e-9
         mean, std = rest_means(times, np.concatenate(self._volts),
                                [Rest(start, stop, times[start], times[stop - 1])],
-                               self._sensor.rate_hz, known_noise(self._sensor))
+                               self._sensor.rate_hz, datasheet_noise(self._sensor))
         return {'start_ns': int(stamps[start]), 'stop_ns': int(stamps[stop - 1]),
                 'samples': samples, 'mean_v': mean[0].tolist(), 'std_v': std[0].tolist()}

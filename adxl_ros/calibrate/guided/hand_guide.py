@@ -24,20 +24,20 @@ from typing import Any
 from adxl_ros.calibrate.fits import orientations
 from adxl_ros.calibrate.fits.gravity_fit import MIN_RESTS
 from adxl_ros.calibrate.fits.gravity_model import (
-    force_of,
-    in_units,
-    information_of,
+    effect_values,
+    fisher_information,
+    force_g,
     iterated,
     NAMES,
+    nominal_rests,
     PRIOR,
-    rests_of,
-    TRIAL,
+    TRIAL_STD_G,
 )
 from adxl_ros.calibrate.guided import pose_checks, running_estimate
 from adxl_ros.calibrate.guided.capture_settings import State
 from adxl_ros.calibrate.guided.live_window import Newest, Surroundings, went_back
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.signals.noise_limits import known_noise
+from adxl_ros.signals.noise_limits import datasheet_noise
 from adxl_ros.signals.rest_detection import Rest, RestFinder, Stillness
 import numpy as np
 
@@ -91,7 +91,7 @@ class Tumble:
         self._dropped: list[tuple[int, int]] = []
         self._saturated: list[int] = []
         self._finder = RestFinder(self.sensor.rate_hz, len(self.sensor.axes),
-                                  known_noise(self.sensor), learn=True)
+                                  datasheet_noise(self.sensor), learn=True)
 
     def feed(self, stamps_ns: np.ndarray, volts: np.ndarray) -> None:
         """Take samples: stamps, ns, (n,), and volts, (n, m)."""
@@ -195,7 +195,7 @@ class Tumble:
         if not len(self._newest.volts):
             return None
         mean = self._newest.volts[-_NOW:].mean(axis=0, keepdims=True)
-        force = force_of(rests_of(mean, 0 * mean, self.sensor).mean, self._found)[0]
+        force = force_g(nominal_rests(mean, 0 * mean, self.sensor).mean, self._found)[0]
         return force / max(float(np.linalg.norm(force)), 1e-9)
 
     def where(self) -> str:
@@ -215,33 +215,34 @@ class Tumble:
         if still is None:
             return State('rest', f'{said}; waiting for samples', False)
         if still.still:
-            return State('dwell', f'{said}; {still.in_mps2(self.sensor)}; {self.where()}', False)
-        return State('rest', f'{said}; {still.in_mps2(self.sensor)}; {self.where()}', False)
+            return State('dwell', f'{said}; {still.describe_mps2(self.sensor)}; {self.where()}',
+                         False)
+        return State('rest', f'{said}; {still.describe_mps2(self.sensor)}; {self.where()}', False)
 
     def _learn(self) -> None:
         entries = [self.accepted[number] for number in sorted(self.accepted)]
         mean = np.array([e['mean_v'] for e in entries]).reshape(-1, 3)
-        rests = rests_of(mean, np.array([e['std_v'] for e in entries]).reshape(-1, 3),
+        rests = nominal_rests(mean, np.array([e['std_v'] for e in entries]).reshape(-1, 3),
                          self.sensor)
         self._found = np.zeros(len(NAMES))
         if len(mean):
             self._found = iterated(rests, self._found, _STEPS)
-        information = information_of(rests, self._found, TRIAL ** 2)
-        values, to_units = in_units(self._found, self.sensor)
+        information = fisher_information(rests, self._found, TRIAL_STD_G ** 2)
+        values, to_units = effect_values(self._found, self.sensor)
         self.names, self.values, self.prior = NAMES, self._found * to_units, PRIOR * to_units
         covariance = np.linalg.inv(information) * np.outer(to_units, to_units)
         self.std = np.sqrt(np.diag(covariance))
         self._fitted = replace(self.sensor, effects=tuple(values), values=values,
                                covariance=covariance, covariance_names=NAMES)
-        force = force_of(rests.mean, self._found)
+        force = force_g(rests.mean, self._found)
         self.covered = orientations.covered(force / np.linalg.norm(force, axis=1, keepdims=True))
-        self._told = orientations.gain(information, self._found, rests.gravity)[0]
+        self._told = orientations.information_gain(information, self._found, rests.gravity)[0]
         self._choose()
 
     def tilt_error_rad(self) -> float:
         """Return the rms error of alpha and beta to expect after the rests so far, rad."""
         std_v = np.mean([e['std_v'] for e in self.accepted.values()] or
-                        [known_noise(self.sensor).sigma], axis=0)
+                        [datasheet_noise(self.sensor).sigma], axis=0)
         return running_estimate.tilt_error_rad(self._fitted, std_v)
 
     def _choose(self) -> None:

@@ -20,7 +20,7 @@ from bisect import bisect_left, bisect_right
 from collections import deque
 
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
-from adxl_ros.signals.noise_limits import known_noise
+from adxl_ros.signals.noise_limits import datasheet_noise
 from adxl_ros.signals.rest_detection import RestFinder, Stillness
 import numpy as np
 
@@ -62,7 +62,7 @@ class Newest:
     def stillness(self) -> Stillness | None:
         """Judge by the noise of the figures whether they are at rest; None if too few."""
         finder = RestFinder(self._sensor.rate_hz, len(self._sensor.axes),
-                            known_noise(self._sensor), learn=False)
+                            datasheet_noise(self._sensor), learn=False)
         if len(self.stamps_ns):
             finder.feed((self.stamps_ns - self.stamps_ns[0]) * 1e-9, self.volts)
         return finder.stillness()

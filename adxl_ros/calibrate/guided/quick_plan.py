@@ -62,10 +62,10 @@ def quick(sensor: Sensor, dwell_s: float, tilt_error_rad: float, check_poses: in
     """
     start = nothing_known(sensor, dwell_s)
     fewest = -(-(len(start.names) + _SPARE) // len(sensor.axes))
-    grid = d_optimal.grid(start.pose_std_v, _GRID_RAD)
-    rows = d_optimal.rows_of(start.unit, grid, start.names, start.stage)
+    grid = d_optimal.candidate_poses(start.pose_std_v, _GRID_RAD)
+    rows = d_optimal.whitened_jacobian(start.unit, grid, start.names, start.stage)
     chosen = [Target(float(grid.alpha_rad[i]), float(grid.beta_rad[i])) for i in
-              d_optimal.choose(rows, np.diag(1 / start.prior ** 2), max(_MOST, fewest))]
+              d_optimal.choose_poses(rows, np.diag(1 / start.prior ** 2), max(_MOST, fewest))]
     for count in range(fewest, len(chosen) + 1):
         targets = _short_way(chosen[:count])
         if start.after(targets).tilt_error_rad() <= tilt_error_rad:

@@ -81,10 +81,10 @@ class Known:
     def reading(self, alpha_rad: float, beta_rad: float) -> tuple[np.ndarray, np.ndarray]:
         """Predict the volts of a pose and their standard deviations, (m,) each."""
         pose = _at(np.array([alpha_rad]), np.array([beta_rad]), self.pose_std_v)
-        slope = pose_response.by_coefficients(self.unit, pose, self.names)[0]
-        covariance = slope @ self.covariance @ slope.T + pose_response.covariance(
+        slope = pose_response.coefficient_jacobian(self.unit, pose, self.names)[0]
+        covariance = slope @ self.covariance @ slope.T + pose_response.volts_covariance(
             self.unit, pose, self.stage).blocks[0]
-        return pose_response.response(self.unit, pose)[0], np.sqrt(np.diag(covariance))
+        return pose_response.predicted_volts(self.unit, pose)[0], np.sqrt(np.diag(covariance))
 
     def seen_at(self, alpha_rad: float, beta_rad: float, volts: np.ndarray, slack_v: np.ndarray
                 ) -> tuple[float, float] | None:
@@ -98,8 +98,8 @@ class Known:
         for _ in range(_TURNS):
             pose = _at(np.array([alpha_rad + step[0]]), np.array([beta_rad + step[1]]),
                        self.pose_std_v)
-            off = (volts - pose_response.response(self.unit, pose)[0]) / slack_v
-            slope = pose_response.by_angles(self.unit, pose)[0] / slack_v[:, None]
+            off = (volts - pose_response.predicted_volts(self.unit, pose)[0]) / slack_v
+            slope = pose_response.angle_jacobian(self.unit, pose)[0] / slack_v[:, None]
             more = np.linalg.solve(slope.T @ slope + by * np.eye(2), slope.T @ off - by * step)
             step = step + np.clip(more, -_LONGEST_RAD, _LONGEST_RAD)
         if np.abs(off).max() > _EXPLAINED:
@@ -119,7 +119,7 @@ class Known:
 
     def sensor(self) -> Sensor:
         """Return the unit with the covariance of its own coefficients."""
-        own = [i for i, name in enumerate(self.names) if not full_model.of_stage(name)]
+        own = [i for i, name in enumerate(self.names) if not full_model.belongs_to_stage(name)]
         return replace(self.unit, covariance=self.covariance[np.ix_(own, own)],
                        covariance_names=tuple(self.names[i] for i in own))
 
@@ -147,10 +147,10 @@ def from_poses(sensor: Sensor, poses: Poses, dwell_s: float, stage_rad: float,
         What was known before the last of them: the fit begins there.
 
     """
-    terms = full_model.terms_of(sensor.axes)
-    names = full_model.coefficients(sensor.axes, terms)
+    terms = full_model.default_terms(sensor.axes)
+    names = full_model.fitted_coefficients(sensor.axes, terms)
     unit = before.unit if before else with_neutral(sensor, (*terms, 'base_tilt'))
-    prior = np.array([full_model.LEVEL_RAD if full_model.of_stage(name)
+    prior = np.array([full_model.LEVEL_STD_RAD if full_model.belongs_to_stage(name)
                       else parameter_of(name).scale for name in names])
     information, stage = np.diag(1 / prior ** 2), before.stage if before else StageError(stage_rad)
     poses = replace(poses, std_v=np.maximum(poses.std_v, _LEAST_STD_V))
@@ -213,7 +213,7 @@ def by_term(names: Sequence[Coefficient], values: np.ndarray, std: np.ndarray, p
         rows.setdefault(name.without_axis, []).append(i)
     table = []
     for term, at in rows.items():
-        if full_model.of_stage(names[at[0]]):
+        if full_model.belongs_to_stage(names[at[0]]):
             continue
         unit = parameter_of(names[at[0]]).unit
         shown = [f'{names[i].axis or names[i].parameter} {values[i]:+.2g} ± '

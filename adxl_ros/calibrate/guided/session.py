@@ -262,7 +262,7 @@ class Session:
             self.journal.append({'drop': number})
         return self.walk.redo()
 
-    def finish(self) -> calibration.Result:
+    def finish(self) -> calibration.CalibrationResult:
         """
         Fit what there is, and write the parameter file; `end` is due when all is written.
 

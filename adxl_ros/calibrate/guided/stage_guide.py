@@ -312,9 +312,9 @@ class Sweep:
         if still.still:
             return State('dwell', f'at {self.where()}: averaging', late)
         steady = '; if nothing touches it, sensor.noise_density_g_per_rthz is too low for this ' \
-            'unit' if late and still.figure == 'rms' else ''
-        return State('rest', f'at {self.where()}: {still.in_mps2(self.sensor)}{since}{steady}',
-                     late)
+            'unit' if late and still.statistic == 'rms' else ''
+        return State(
+            'rest', f'at {self.where()}: {still.describe_mps2(self.sensor)}{since}{steady}', late)
 
     def _next(self) -> int:
         return next((i for i in range(len(self.targets))

@@ -124,7 +124,7 @@ def compare(fitted: Sensor, truth: Sensor) -> list[Comparison]:
 
 def added_effects(fitted: Sensor, truth: Sensor) -> list[str]:
     """Name the effects that the fit has beyond the full model and that the unit does not have."""
-    expected = {*full_model.terms_of(fitted.axes), *truth.effects}
+    expected = {*full_model.default_terms(fitted.axes), *truth.effects}
     return [effect for effect in fitted.effects if effect not in expected]
 
 

@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
-from adxl_ros.calibrate.pose_response import force_on
+from adxl_ros.calibrate.pose_response import stage_force
 from adxl_ros.calibrate.poses import Poses, reference_force
 from adxl_ros.errors import UserError
 from adxl_ros.model import signal_chain
@@ -117,7 +117,7 @@ def errors(sensor: Sensor, poses: Poses, stage: Sensor | None = None) -> Errors:
 
     """
     reference = reference_force(poses, sensor.local_gravity_mps2) if stage is None else \
-        force_on(stage, poses.alpha_rad, poses.beta_rad)
+        stage_force(stage, poses.alpha_rad, poses.beta_rad)
     up = np.where(reference[2] < 0, -1, 1)
     force = signal_chain.inverse(sensor, up)(list(poses.volts.T), poses.environment)
     covariance = force_covariance(sensor, force, np.mean(poses.std_v, axis=0) ** 2,

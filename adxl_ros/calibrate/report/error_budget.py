@@ -39,7 +39,7 @@ from dataclasses import dataclass, replace
 from math import sqrt
 
 from adxl_ros.calibrate.fits.gravity_fit import GravityFit
-from adxl_ros.calibrate.pose_response import force_on
+from adxl_ros.calibrate.pose_response import stage_force
 from adxl_ros.calibrate.poses import Poses, reference_force
 from adxl_ros.calibrate.report.cross_validation import between, errors, freedom, Score
 from adxl_ros.model import noise
@@ -126,7 +126,7 @@ def parts(score: Score, poses: Poses, stage: Sensor | None = None) -> tuple[Part
     gravity = sensor.local_gravity_mps2
     promised = np.column_stack(reference_force(held, gravity))
     stood = promised if stage is None else np.column_stack(
-        force_on(stage, held.alpha_rad, held.beta_rad))
+        stage_force(stage, held.alpha_rad, held.beta_rad))
     shown = np.isfinite(score.errors.tilt_rad)
     axes = [AXES.index(a) for a in sensor.axes]
     # Where equation 5 has two roots, the wrong z shifts x and y: that is none of the parts.

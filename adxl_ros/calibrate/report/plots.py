@@ -55,7 +55,7 @@ def sweep(sensor: Sensor, fitted: Sensor, poses: Poses, panels: Sequence[int] = 
 
     """
     swept = poses.subset(~poses.check)
-    start, of = linear.fit(sensor, swept), paper_regression.stages(sensor, swept)
+    start, of = linear.fit(sensor, swept), paper_regression.regress_axes(sensor, swept)
     force = np.column_stack(reference_force(swept, sensor.local_gravity_mps2)) / G0_MPS2
     predicted = np.column_stack(signal_chain.static_response(fitted)(
         reference_force(swept, sensor.local_gravity_mps2)))
@@ -74,7 +74,7 @@ def sweep(sensor: Sensor, fitted: Sensor, poses: Poses, panels: Sequence[int] = 
 
 
 def _panels(d: int, force: np.ndarray, swept: Poses, deviation: np.ndarray, after: np.ndarray,
-            of: paper_regression.Stages) -> list[Callable[[Any], None]]:
+            of: paper_regression.AxisRegression) -> list[Callable[[Any], None]]:
     vertical = np.abs(np.sin(swept.alpha_rad)) > np.sin(np.radians(89))
     return [
         lambda axis: _paths(axis, d, force, swept, deviation, vertical),
@@ -195,7 +195,7 @@ def _paths(axis: Any, d: int, force: np.ndarray, poses: Poses, deviation: np.nda
 
 
 def _across(axis: Any, d: int, force: np.ndarray, deviation: np.ndarray,
-            of: paper_regression.Stages, vertical: np.ndarray) -> None:
+            of: paper_regression.AxisRegression, vertical: np.ndarray) -> None:
     axis.plot(force[vertical, 1 - d], deviation[vertical], 'o', ms=4, label='measured (10)')
     axis.plot(_FINE_G, 1e3 * np.polynomial.polynomial.polyval(_FINE_G, of.p),
               label='quadratic (11)')

@@ -37,13 +37,14 @@ from adxl_ros.model.sensor import Sensor
 import numpy as np
 
 if TYPE_CHECKING:
-    from adxl_ros.calibrate.calibration import Result
+    from adxl_ros.calibrate.calibration import CalibrationResult
 
 _PANELS = ((0, 1), (2, 3), (4, 5))
 """Figures of the paper that stand beside each other on a page."""
 
 
-def write(path: str | os.PathLike, result: Result, past: Sequence[tuple[Path, Sensor]]) -> None:
+def write(path: str | os.PathLike, result: CalibrationResult,
+          past: Sequence[tuple[Path, Sensor]]) -> None:
     """
     Write the page, whole or not at all.
 
@@ -70,7 +71,7 @@ def write(path: str | os.PathLike, result: Result, past: Sequence[tuple[Path, Se
              '<h2>Coefficients</h2>', _coefficients(fitted),
              '<h2>History of this unit</h2>', _history(earlier, fitted),
              '<h2>Figures</h2>', *_figures(result),
-             '<h2>In words</h2>', f'<pre>{escape(chr(10).join(result.verdict))}</pre>',
+             '<h2>In words</h2>', f'<pre>{escape(chr(10).join(result.report_lines))}</pre>',
              '<h2>Provenance</h2>', _provenance(fitted),
              html_page.script(
                  (files('adxl_ros.calibrate.report') / 'sphere.js').read_text('utf-8'))]
@@ -78,10 +79,10 @@ def write(path: str | os.PathLike, result: Result, past: Sequence[tuple[Path, Se
         fresh.write_text(html_page.document(title, parts), encoding='utf-8')
 
 
-def _said(result: Result) -> str:
+def _said(result: CalibrationResult) -> str:
     """Say in a few lines whether it is good, and what limits it."""
     fitted = result.fitted
-    own = next((one for one in result.judged if one.model == fitted.model), None)
+    own = next((one for one in result.assessments if one.model == fitted.model), None)
     if own is None:
         return ('<p class="said open">Too few poses were held out to judge this calibration. Take '
                 'more.</p>')
@@ -94,7 +95,7 @@ def _said(result: Result) -> str:
                 if fitted.datasheet else ''}
     said = ' '.join(outcomes.values())
     kind = 'bad' if FAIL in said else 'open' if NOT_SHOWN in said else 'good'
-    score = next((s for s in result.scores if s.model == fitted.model), None)
+    score = next((s for s in result.held_out if s.model == fitted.model), None)
     lines = ['; '.join(f'{name}: {text}' for name, text in outcomes.items() if text) + '.']
     lines[0] = lines[0][0].upper() + lines[0][1:]
     if score is not None:
@@ -114,10 +115,10 @@ def _with(rms: float, ends: tuple[float, float]) -> str:
     return f'{rms:.3g} ({ends[0]:.2g} to {ends[1]:.2g})'
 
 
-def _verdict(result: Result) -> str:
-    of: dict[str, Judged] = {one.model: one for one in result.judged}
+def _verdict(result: CalibrationResult) -> str:
+    of: dict[str, Judged] = {one.model: one for one in result.assessments}
     rows = []
-    for score in result.scores:
+    for score in result.held_out:
         own = of.get(score.model)
         rows.append([score.model, str(score.poses), *(
             '-' if np.isnan(rms) else f'{_with(rms, score.intervals[name])}, max {most:.3g}'
@@ -128,7 +129,7 @@ def _verdict(result: Result) -> str:
                 ('accel', score.accel_rms_mg, score.accel_max_mg))),
             *(_judged(own) if own else ['-'] * 4)])
     if not rows:
-        return f'<pre>{escape(chr(10).join(result.verdict))}</pre>'
+        return f'<pre>{escape(chr(10).join(result.report_lines))}</pre>'
     return html_page.table(['model', 'poses', 'tilt, deg', 'alpha, deg', 'beta, deg',
                             'acceleration, mg', 'own, mg', 'datasheet', 'noise', 'limited by'],
                            rows) + (
@@ -142,7 +143,7 @@ def _judged(own: Judged) -> list[str]:
         (own.datasheet, own.tilt_datasheet), (own.noise, own.tilt_noise))), own.limit]
 
 
-def _sphere(result: Result) -> str:
+def _sphere(result: CalibrationResult) -> str:
     poses, fitted = result.poses, result.fitted
     if result.gravity_fit is not None:
         force = np.column_stack(
@@ -153,7 +154,7 @@ def _sphere(result: Result) -> str:
         says = [f'rest {i + 1}' for i in range(len(poses))]
     else:
         force = np.column_stack(reference_force(poses, fitted.local_gravity_mps2))
-        units = {s.model: s.fitted[0] for s in result.scores} | {fitted.model: fitted}
+        units = {s.model: s.fitted[0] for s in result.held_out} | {fitted.model: fitted}
         models = list(units)
         quantities = [['error of tilt', 'deg'], *([f'error of {a}', 'mg'] for a in fitted.axes)]
         values = []
@@ -214,19 +215,20 @@ def _history(earlier: drift_history.Past, fitted: Sensor) -> str:
     return ''.join(parts)
 
 
-def _figures(result: Result) -> list[str]:
+def _figures(result: CalibrationResult) -> list[str]:
     if result.gravity_fit is not None:
         return [_picture(plots.gravity_rests(result.name, result.gravity_fit),
                          'magnitude of gravity over the rests')]
-    sound = result.poses.subset(result.sound)
+    sound = result.poses.subset(result.inliers)
     found = ['<p>Errors of tilt on poses held out, as in figure 10 of Ang, Khosla and Riviere '
              '(2007); figures 2 to 8 for this unit: deviation from the linear model, and what '
              'the physical model makes of it.</p>']
-    if result.scores:
-        found.append(_picture(plots.held_out(result.scores, sound), 'errors on poses held out'))
+    if result.held_out:
+        found.append(_picture(plots.held_out(result.held_out, sound), 'errors on poses held out'))
     try:
-        return found + [_picture(plots.sweep(result.nominal, result.modelled, result.poses, two),
-                                 'figures 2 to 8 of the paper') for two in _PANELS]
+        return found + [_picture(
+            plots.sweep(result.nominal, result.paper_sensor, result.poses, two),
+            'figures 2 to 8 of the paper') for two in _PANELS]
     except UserError as error:
         return [*found, f'<p>Figures 2 to 8 of the paper cannot be drawn: {escape(str(error))}'
                 '</p>']

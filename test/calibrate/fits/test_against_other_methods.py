@@ -32,7 +32,7 @@ def rests(request, shared_dir):
     """Give the gravity fit of a recording, mean accelerations of its rests, m/s², and gravity."""
     stream = recording.read(shared_dir / 'real' / f'{request.param}.csv')
     unit = recorded_unit(parameter_file.load(NOMINAL), stream)
-    poses = pose_extraction.poses_of(stream, unit)
+    poses = pose_extraction.extract_poses(stream, unit)
     fit = gravity_fit.fit_gravity(poses.volts, poses.std_v, unit)
     kept = np.setdiff1d(np.arange(len(poses)), fit.outliers)
     accel = (poses.volts - unit.nominal_zero_g_v) / unit.nominal_scale_v_per_g * G0_MPS2

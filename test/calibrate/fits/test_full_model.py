@@ -37,7 +37,7 @@ def swept_unit(seed, axes='xy', stage_deg=5 / 60, **options):
     """Draw a unit of all terms and sweep it; return nominal figures, the unit, its poses."""
     rng = np.random.default_rng(seed)
     sensor = nominal(axes)
-    truth = drawn(rng, sensor, full_model.terms_of(axes))
+    truth = drawn(rng, sensor, full_model.default_terms(axes))
     poses = swept(rng, replace(truth, stage_resolution_rad=np.radians(stage_deg)), **options)
     return sensor, truth, poses
 
@@ -81,9 +81,9 @@ def test_an_eccentric_stage_is_found_and_a_sound_one_is_not_blamed(eccentric):
     for seed in range(8):
         rng = np.random.default_rng(seed)
         truth = drawn(rng, nominal(), (*TERMS, 'stage_eccentricity'))
-        names = full_model.coefficients('xy', ('stage_eccentricity',))[2:]
+        names = full_model.fitted_coefficients('xy', ('stage_eccentricity',))[2:]
         truth = put(truth, names, eccentric * 1e-3 * rng.choice([-1, 1], len(names)))
-        found, _ = term_selection.fit_judged(nominal(), swept(rng, truth, per_setting=True))
+        found, _ = term_selection.fit_selected(nominal(), swept(rng, truth, per_setting=True))
         assert any('eccentricity' in name.effect for name in found.names) == eccentric
         off, std = errors(found, truth)
         assert np.sqrt(np.mean((off / std) ** 2)) < 2
@@ -93,11 +93,11 @@ def test_each_axis_of_a_three_axis_unit_bends():
     """A z that bends like x and y is fitted to the noise, and the stage is not blamed for it."""
     sensor, truth, poses = swept_unit(4, 'xyz', 0.0, check_poses=0,
                                       planes_rad=np.radians(np.arange(0, 181, 30)))
-    found, _ = term_selection.fit_judged(sensor, poses)
+    found, _ = term_selection.fit_selected(sensor, poses)
     bent = truth.values['cross_axis']['quadratic_per_g'][2]
     assert abs(bent) > 1e-3
     assert found.fitted.values['cross_axis']['quadratic_per_g'][2] == pytest.approx(bent, abs=2e-4)
-    assert np.degrees(found.stage_sigma_rad) < 2e-3
+    assert np.degrees(found.stage_std_rad) < 2e-3
     off, std = errors(found, truth)
     assert np.sqrt(np.mean((off / std) ** 2)) < 1.4
 
@@ -105,11 +105,11 @@ def test_each_axis_of_a_three_axis_unit_bends():
 def test_a_fit_that_does_not_converge_says_so(monkeypatch):
     """It says so in its words; one that converges does not."""
     sensor, _, poses = swept_unit(2)
-    found, judged = term_selection.fit_judged(sensor, poses)
+    found, judged = term_selection.fit_selected(sensor, poses)
     assert found.converged
     assert full_fit_text.NOT_CONVERGED not in full_fit_text.words(found, poses, judged)
     monkeypatch.setattr(full_model, '_ROUNDS', 1)
-    found, judged = term_selection.fit_judged(sensor, poses)
+    found, judged = term_selection.fit_selected(sensor, poses)
     assert not found.converged
     assert full_fit_text.NOT_CONVERGED in full_fit_text.words(found, poses, judged)
 
@@ -141,7 +141,7 @@ def test_the_gauge_is_fixed_where_only_the_sum_shows():
     truth = put(truth, [Coefficient('cross_axis', 'linear', 'x'),
                         Coefficient('cross_axis_z', 'linear', 'y')], [0.012, -0.02])
     poses = swept(rng, truth)
-    found, _ = term_selection.fit_judged(nominal(), poses)
+    found, _ = term_selection.fit_selected(nominal(), poses)
     assert not set(full_model.GAUGE) & {full_model.term_of(name)
                                         for name in found.fitted.covariance_names}
     assert found.fitted.values['cross_axis']['linear'].tolist() == [0, 0]
@@ -165,7 +165,7 @@ def test_the_gauge_is_freed_where_products_show_the_parts():
     volts = signal_chain.static_response(truth)(force)
     worst = {}
     for name, found in (('fixed', full_model.fit_full(nominal(), poses)),
-                        ('judged', term_selection.fit_judged(nominal(), poses)[0])):
+                        ('judged', term_selection.fit_selected(nominal(), poses)[0])):
         up = np.where(np.cos(held[:, 0]) < 0, -1, 1)
         off = np.subtract(signal_chain.inverse(found.fitted, up)(volts), force)[:2]
         worst[name] = np.abs(off).max()
@@ -178,8 +178,8 @@ def test_knocked_poses_are_named_and_left_out():
     bad = [7, 40, 90]
     volts = poses.volts.copy()
     volts[bad] += [[0.01, 0.0], [0.0, -0.02], [0.03, 0.01]]
-    found, judged = term_selection.fit_judged(sensor, replace(poses, volts=volts))
-    assert found.knocked == tuple(bad)
+    found, judged = term_selection.fit_selected(sensor, replace(poses, volts=volts))
+    assert found.outliers == tuple(bad)
     off, std = errors(found, truth)
     assert np.sqrt(np.mean((off / std) ** 2)) < 1.6
     assert any('left out, disturbed: pose 8 (alpha' in line
@@ -190,8 +190,8 @@ def test_knocked_poses_are_named_and_left_out():
 def test_a_bad_stage_is_found_and_the_sensor_is_not_blamed(stage_deg):
     """The stage's error is estimated, and zero-g is as good as the magnitude of gravity tells."""
     sensor, truth, poses = swept_unit(6, 'xyz', stage_deg * np.sqrt(12))
-    found, judged = term_selection.fit_judged(sensor, poses)
-    assert np.degrees(found.stage_sigma_rad) == pytest.approx(stage_deg, rel=0.15)
+    found, judged = term_selection.fit_selected(sensor, poses)
+    assert np.degrees(found.stage_std_rad) == pytest.approx(stage_deg, rel=0.15)
     off, std = errors(found, truth)
     assert np.sqrt(np.mean((off / std) ** 2)) < 1.6
     zero_g = [name.effect == 'bias' for name in found.fitted.covariance_names]
@@ -204,7 +204,7 @@ def test_terms_that_are_not_there_do_not_earn_their_place():
     """A unit of zero-g, scale and misalignment alone: nothing else gains on poses held out."""
     rng = np.random.default_rng(8)
     truth = drawn(rng, nominal(), ('bias', 'scale_factor', 'misalignment'))
-    judged = term_selection.fit_judged(nominal(), swept(rng, truth))[1]
+    judged = term_selection.fit_selected(nominal(), swept(rng, truth))[1]
     assert [term.name for term in judged if term.earns] == ['misalignment']
 
 
@@ -218,8 +218,9 @@ def test_the_next_poses_help_more_than_others():
         more, alone = poses.subset(np.arange(len(angles_rad))), np.arange(len(angles_rad))
         more = replace(more, alpha_rad=angles_rad[:, 0], beta_rad=angles_rad[:, 1],
                        alpha_setting=alone, beta_setting=alone)
-        known = found.information + full_model.information(
-            found.unit, more, found.names, found.stage) - np.diag(full_model.priors(found.names))
+        known = found.information + full_model.fisher_information(
+            found.unit, more, found.names, found.stage) - np.diag(
+            full_model.prior_precision(found.names))
         return -np.linalg.slogdet(known)[1]
 
     others = np.column_stack([poses.alpha_rad, poses.beta_rad])[[5, 30, 60, 100]]
@@ -230,11 +231,11 @@ def test_temperature_that_moved_is_said_and_fitted():
     """15 degC of warming during the sweep: the verdict says so, or the term takes it."""
     sensor, truth, poses = swept_unit(10, check_poses=0)
     warm = replace(poses, temperature_c=np.linspace(20, 35, len(poses)))
-    found, judged = term_selection.fit_judged(sensor, warm)
+    found, judged = term_selection.fit_selected(sensor, warm)
     words = full_fit_text.words(found, warm, judged)
     assert any('temperature moved by 15.0 degC' in line for line in words)
     drift = 1e-3 * truth.scale_v_per_g * (warm.temperature_c[:, None] - 25)
-    found, judged = term_selection.fit_judged(sensor, replace(warm, volts=warm.volts + drift))
+    found, judged = term_selection.fit_selected(sensor, replace(warm, volts=warm.volts + drift))
     assert found.fitted.values['temperature_bias']['per_k'] == pytest.approx([1e-3] * 2, rel=0.1)
     assert not any('temperature moved' in line
                    for line in full_fit_text.words(found, warm, judged))
@@ -254,8 +255,8 @@ def test_what_is_not_determined_falls_back_and_says_so():
     sensor, _, poses = swept_unit(1, planes_rad=PLANES_RAD[2:3], check_poses=0)
     found = calibration.calibrate(sensor, [poses], None, ['made'])
     assert found.fitted.model == 'linear'
-    assert found.verdict[0].startswith('not full: the full model is not determined')
-    assert found.verdict[1].startswith('not physical: ')
+    assert found.report_lines[0].startswith('not full: the full model is not determined')
+    assert found.report_lines[1].startswith('not physical: ')
 
 
 def test_several_recordings_of_one_unit():
@@ -288,7 +289,7 @@ def test_six_hundred_poses_of_three_axes_take_two_seconds():
     sensor, _, poses = swept_unit(2, 'xyz', planes_rad=np.radians(np.linspace(0, 180, 23)))
     assert len(poses) > 600
     with within(2.0):
-        found, _ = term_selection.fit_judged(sensor, poses)
+        found, _ = term_selection.fit_selected(sensor, poses)
     assert len(found.names) >= 20
 
 

@@ -97,7 +97,7 @@ def test_jacobian_against_differences():
     rng = np.random.default_rng(1)
     mean, found = directions(rng, 20) * 1.05, rng.normal(0, 0.05, 9)
     step = 1e-6
-    for k, column in enumerate(gravity_model.jacobian_of(mean, found).T):
+    for k, column in enumerate(gravity_model.magnitude_jacobian(mean, found).T):
         up, down = found.copy(), found.copy()
         up[k] += step
         down[k] -= step

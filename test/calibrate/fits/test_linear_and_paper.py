@@ -164,5 +164,5 @@ def test_verdict_without_check_poses_holds_out_folds():
     poses = swept(rng, drawn(rng, nominal()), check_poses=0)
     found = calibration.calibrate(nominal(), [poses], None, ['made'])
     assert found.fitted.model == 'full'
-    first_words = [line.split()[0] for line in found.verdict[:5]]
+    first_words = [line.split()[0] for line in found.report_lines[:5]]
     assert first_words == ['held', 'nominal', 'linear', 'physical', 'full']

@@ -66,7 +66,7 @@ def test_fits_reach_the_intervals_that_a_plan_promises(axes, kind):
     ratios = []
     for seed in range(6):
         rng = np.random.default_rng(seed)
-        truth = drawn(rng, sensor, full_model.terms_of(axes))
+        truth = drawn(rng, sensor, full_model.default_terms(axes))
         poses = swept(rng, truth, per_setting=True, targets=targets)
         found = full_model.fit_full(sensor, poses)
         spread = np.sqrt(np.diag(found.fitted.covariance))

@@ -41,8 +41,8 @@ def calibrated(seed, model=None, axes='xy', check=16, stage_rad=None, effects=TE
 
 def true_errors(truth, found):
     """Return what the units that were scored err by without noise and stage: mg and deg rms."""
-    score = found.scores[-1]
-    poses = found.poses.subset(found.sound).subset(score.index)
+    score = found.held_out[-1]
+    poses = found.poses.subset(found.inliers).subset(score.index)
     force = np.column_stack(specific_force(poses.alpha_rad, poses.beta_rad,
                                            truth.local_gravity_mps2))
     volts = np.column_stack(signal_chain.static_response(truth)(list(force.T)))
@@ -64,10 +64,10 @@ def test_the_error_that_is_stated_is_true(check, units, within):
     own, true, seen = [], [], []
     for seed in range(units):
         truth, found = calibrated(seed, 'full', check=check)
-        judged = found.judged[-1]
+        judged = found.assessments[-1]
         own.append((judged.own_mg, judged.own_deg))
         true.append(true_errors(truth, found))
-        seen.append(found.scores[-1].accel_rms_mg)
+        seen.append(found.held_out[-1].accel_rms_mg)
         assert judged.limit == 'stage'
         assert (judged.datasheet, judged.noise) == ('PASS', 'PASS')
         said = found.fitted.provenance
@@ -93,14 +93,14 @@ CASES = {
 def test_what_limits_it_is_named(name):
     """By one of two units at least: chance moves a verdict once in a hundred."""
     limit, settings = CASES[name]
-    named = [calibrated(seed, **settings)[1].judged[-1].limit for seed in range(2)]
+    named = [calibrated(seed, **settings)[1].assessments[-1].limit for seed in range(2)]
     assert limit in named, named
 
 
 def test_a_linear_model_fails_and_says_why():
     """Where the unit has the paper's terms; the full model of the same poses passes."""
     _, found = calibrated(1)
-    outcomes = {one.model: (one.datasheet, one.noise, one.limit) for one in found.judged}
+    outcomes = {one.model: (one.datasheet, one.noise, one.limit) for one in found.assessments}
     assert outcomes['linear'] == ('FAIL', 'FAIL', 'model')
     assert outcomes['full'][:2] == ('PASS', 'PASS')
     limit = outcomes['full'][2]
@@ -108,11 +108,11 @@ def test_a_linear_model_fails_and_says_why():
     assert 'at most 3.4 mg by the datasheet' in lines
     assert 'unit within ADXL203' in lines
     # What a screen shows first, in its 80 columns: the verdict, and a line a model.
-    assert found.brief[0] == f'full: datasheet PASS, noise PASS; limited by the {limit}'
-    assert found.brief[1].startswith('held out: tilt 0.')
-    models = [line for line in found.brief if line.split()[0] in outcomes]
+    assert found.summary_lines[0] == f'full: datasheet PASS, noise PASS; limited by the {limit}'
+    assert found.summary_lines[1].startswith('held out: tilt 0.')
+    models = [line for line in found.summary_lines if line.split()[0] in outcomes]
     assert [line.split()[2] for line in models] == ['FAIL', 'PASS', 'PASS']
-    assert max(map(len, [*found.brief[:2], *models])) < 80
+    assert max(map(len, [*found.summary_lines[:2], *models])) < 80
 
 
 def test_a_unit_beyond_the_datasheet_is_named():
@@ -128,8 +128,8 @@ def test_a_unit_beyond_the_datasheet_is_named():
 def test_without_a_datasheet_there_is_no_bar():
     """Figures of another sensor are not judged by those of the ADXL203."""
     _, found = calibrated(3, datasheet={}, datasheet_name='')
-    assert {one.datasheet for one in found.judged} == {''}
-    assert 'no bar by a datasheet' in '\n'.join(found.verdict)
+    assert {one.datasheet for one in found.assessments} == {''}
+    assert 'no bar by a datasheet' in '\n'.join(found.report_lines)
 
 
 @pytest.mark.parametrize(('parts', 'outcome'), [
