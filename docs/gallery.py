@@ -21,7 +21,7 @@ import sys
 from adxl_ros.files import parameter_file
 from adxl_ros.model.coefficients import put, typical
 from adxl_ros.model.effects import library
-from adxl_ros.model.effects.base import Coefficient, Effect, Place
+from adxl_ros.model.effects.base import Coefficient, Effect, Need, Place
 from adxl_ros.model.sensor import Sensor, with_axes
 from adxl_ros.simulate.motion import Held, Knots, Motion
 from adxl_ros.simulate.simulator import Columns, simulate
@@ -122,10 +122,10 @@ TITLES = {Place.STAGE: 'Stage', Place.FORCE: 'Specific force', Place.MOUNTING: '
 
 def page(effect: Effect, caption: str) -> list[str]:
     """Say about an effect what the library knows."""
-    said = [f'Acts on the {effect.acts_on}',
+    said = [f'Acts on the {effect.acts_on.value}',
             'smooth in its parameters' if effect.smooth else 'not smooth in its parameters',
             'undone by the inverse' if effect.invertible else 'not undone by the inverse']
-    said += [f'needs a {need}' for need in effect.needs]
+    said += [f'needs a {need.value}' for need in effect.needs]
     said += [f'follows `{name}`' for name in effect.follows]
     rows = [f'| `{p.name}` | {p.unit} | {p.neutral:g} | {p.lower:g} to {p.upper:g} | {p.scale:g} '
             f'| {", ".join(p.axes) or "-"} | {p.doc} | {p.source} |' for p in effect.parameters]
@@ -140,7 +140,7 @@ def draw(nominal: Sensor, effect: Effect, path: Path) -> str:
     scene = SCENES.get(effect.name, plane(90))
     sensor = nominal if scene.noisy else replace(
         nominal, noise_density_g_per_rthz=np.zeros(3), adc_bits=nominal.adc_bits * (
-            'adc' in effect.needs))
+            Need.ADC in effect.needs))
     with_it = replace(sensor, effects=(effect.name,),
                       values={effect.name: typical(effect, 'xyz')})
     louder = {name: value for name, value in LOUDER.items() if name.effect == effect.name}

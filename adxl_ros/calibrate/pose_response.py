@@ -22,7 +22,14 @@ from adxl_ros.calibrate.poses import Poses
 from adxl_ros.calibrate.stage_error import PoseCovariance, shared_settings, StageError
 from adxl_ros.model import signal_chain
 from adxl_ros.model.coefficients import get, parameter_of, put
-from adxl_ros.model.effects.base import Coefficient, Components, Joint, Place, Signals
+from adxl_ros.model.effects.base import (
+    Coefficient,
+    Components,
+    Joint,
+    NOMINAL_ENVIRONMENT,
+    Place,
+    Signals,
+)
 from adxl_ros.model.kinematics import specific_force, UPRIGHT
 from adxl_ros.model.sensor import Sensor
 import numpy as np
@@ -39,7 +46,7 @@ def predicted_volts(unit: Sensor, poses: Poses, off_rad: tuple[float, float] = (
 
 def stage_force(unit: Sensor, alpha_rad: np.ndarray, beta_rad: np.ndarray) -> Components:
     """Return the specific force at rest on the unit's stage with its errors, m/s², three (k,)."""
-    signals = Signals(signal_chain.NOMINAL, alpha=Joint(alpha_rad), beta=Joint(beta_rad),
+    signals = Signals(NOMINAL_ENVIRONMENT, alpha=Joint(alpha_rad), beta=Joint(beta_rad),
                       up=list(UPRIGHT), gravity_mps2=unit.local_gravity_mps2)
     for apply, values in signal_chain.applied(unit, Place.STAGE):
         apply(signals, values)

@@ -23,7 +23,7 @@ from typing import Any
 from adxl_ros.errors import UserError
 from adxl_ros.model import signal_chain
 from adxl_ros.model.constants import AXES
-from adxl_ros.model.effects.base import Components, Environment, Value
+from adxl_ros.model.effects.base import Components, Environment, NOMINAL_ENVIRONMENT, Value
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.sensor import Sensor
 import numpy as np
@@ -102,9 +102,9 @@ class Poses:
     @property
     def environment(self) -> Environment:
         """Temperature and supply of each rest; the nominal ones where they were not measured."""
-        return signal_chain.NOMINAL._replace(
-            temperature_c=_known(self.temperature_c, signal_chain.NOMINAL.temperature_c),
-            supply_v=_known(self.supply_v, signal_chain.NOMINAL.supply_v))
+        return NOMINAL_ENVIRONMENT._replace(
+            temperature_c=_known(self.temperature_c, NOMINAL_ENVIRONMENT.temperature_c),
+            supply_v=_known(self.supply_v, NOMINAL_ENVIRONMENT.supply_v))
 
 
 def join_poses(parts: list[Poses]) -> Poses:

@@ -25,7 +25,14 @@ from collections.abc import Callable
 
 from adxl_ros.model import signal_chain
 from adxl_ros.model.constants import AXES, G0_MPS2
-from adxl_ros.model.effects.base import Components, Environment, Place, Signals, Value
+from adxl_ros.model.effects.base import (
+    Components,
+    Environment,
+    NOMINAL_ENVIRONMENT,
+    Place,
+    Signals,
+    Value,
+)
 from adxl_ros.model.scalar_or_array import ARRAYS, Maths
 from adxl_ros.model.sensor import Sensor
 import numpy as np
@@ -69,7 +76,7 @@ def inverse(sensor: Sensor, z_sign: np.ndarray | None = None, maths: Maths = ARR
     scale_v_per_g = sensor.nominal_scale_v_per_g.tolist()
 
     def respond(inputs: Components) -> Components:
-        signals = Signals(signal_chain.NOMINAL, sensed=inputs, output=list(inputs))
+        signals = Signals(NOMINAL_ENVIRONMENT, sensed=inputs, output=list(inputs))
         for apply, values in element:
             apply(signals, values)
         return signals.output
@@ -81,7 +88,7 @@ def inverse(sensor: Sensor, z_sign: np.ndarray | None = None, maths: Maths = ARR
             apply(signals, values)
         return signal_chain.converted(signals)
 
-    def invert(volts: Components, environment: Environment = signal_chain.NOMINAL) -> Components:
+    def invert(volts: Components, environment: Environment = NOMINAL_ENVIRONMENT) -> Components:
         zero = converted([0.0 * volts[0]] * 3, environment)
         one = converted([0.0 * volts[0] + 1.0] * 3, environment)
         linear = [0.0 * volts[0]] * 3
@@ -114,7 +121,7 @@ def _away_from_zero(value: Value) -> Value:
 
 def _directions(sensor: Sensor) -> list[list[float]]:
     """Rows Θ of the measured axes, (18) and (19), as the mounting effects have them."""
-    signals = Signals(signal_chain.NOMINAL, sensed=[np.array(row) for row in np.eye(3)])
+    signals = Signals(NOMINAL_ENVIRONMENT, sensed=[np.array(row) for row in np.eye(3)])
     for apply, values in signal_chain.applied(sensor, Place.MOUNTING, True):
         apply(signals, values)
     return [np.asarray(row).tolist() for row in signals.sensed]

@@ -28,7 +28,7 @@ from adxl_ros.model.covariance import (
     measured_covariance,
     UNMEASURED_VARIANCE,
 )
-from adxl_ros.model.effects.base import Components, Environment
+from adxl_ros.model.effects.base import Components, Environment, NOMINAL_ENVIRONMENT
 from adxl_ros.model.scalar_or_array import FLOATS
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.model.tilt import angles, roll_pitch_covariance
@@ -137,7 +137,7 @@ class Live:
         self._derives_z = sensor.axes == 'xy'
         # A force, and the volts at the ADC's input that respond to it.
         self._force: Components = [0.0, 0.0, 0.0]
-        self._around = self._cells_around = signal_chain.NOMINAL
+        self._around = self._cells_around = NOMINAL_ENVIRONMENT
         self._last_volts = self._respond(self._force)
         self._time_s = float('-inf')
 

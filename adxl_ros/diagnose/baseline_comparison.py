@@ -22,6 +22,7 @@ from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model import signal_chain
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects import effect_named
+from adxl_ros.model.effects.base import ActsOn
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals.rest_detection import find_rests
 from adxl_ros.simulate.from_recording import followed, surroundings
@@ -132,7 +133,7 @@ def _remembering(motion: Motion, reference: str) -> Motion:
 
 def noiseless(sensor: Sensor) -> Sensor:
     """Return the sensor without noise and without the steps of its ADC."""
-    mean = tuple(e for e in sensor.effects if effect_named(e).acts_on == 'mean')
+    mean = tuple(e for e in sensor.effects if effect_named(e).acts_on is ActsOn.MEAN)
     return replace(sensor, noise_density_g_per_rthz=np.zeros(len(sensor.axes)), adc_bits=48,
                    effects=mean, values={e: sensor.values[e] for e in mean})
 

@@ -188,7 +188,7 @@ def _each_counts(of: Study, one: Hypothesis, squares: dict[frozenset[str], float
 
 def _least_mps2(of: Study, effect: str, noise_mps2: float) -> float:
     """Return what an effect must make to be seen: no angle is known better than the stage's."""
-    if not any(p.unit == 'rad' for p in effect_named(effect).parameters if p.sized):
+    if not any(p.unit == 'rad' for p in effect_named(effect).parameters if p.is_size):
         return VISIBLE * noise_mps2
     return max(VISIBLE * noise_mps2, of.least_angle_rad() * G0_MPS2)
 

@@ -42,6 +42,7 @@ from adxl_ros.diagnose.single_effect_scores import Score, scores
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.stream_unit import check_unit
 from adxl_ros.model.effects import effect_named
+from adxl_ros.model.effects.base import ActsOn
 from adxl_ros.model.sensor import Sensor, with_axes
 from adxl_ros.simulate.motion import Motion
 import numpy as np
@@ -225,7 +226,7 @@ def _with_signs(best: Hypothesis, signs: Sequence[Sign], baseline: Sensor) -> Se
     found = best.sensor
     # Filter and latency within their tolerance are not worth an effect. Where no effect of the
     # mean is named, nothing is; and where zero-g wandered here says nothing of the next recording.
-    by_mean = any(effect_named(effect).acts_on == 'mean' for effect in best.effects)
+    by_mean = any(effect_named(effect).acts_on is ActsOn.MEAN for effect in best.effects)
     wandered = {'bias'} if drifts_among(best.effects) else set()
     as_filed = (wandered if by_mean else set(TOLERANCE)) - set(best.effects)
     effects = [e for e in found.effects if e in (*baseline.effects, *best.effects)

@@ -32,7 +32,7 @@ from adxl_ros.diagnose.linear_model import Study
 from adxl_ros.diagnose.noise_floor import Floor
 from adxl_ros.diagnose.noise_whitening import USUAL
 from adxl_ros.model.effects import effect_named
-from adxl_ros.model.effects.base import Coefficient
+from adxl_ros.model.effects.base import ActsOn, Coefficient
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
@@ -141,7 +141,7 @@ def shrunk(of: Study, full: Sequence[Series], counted: Sequence[np.ndarray], bes
     found = held_out(of, full, counted, best.effects, best.sensor) if best.effects else without
     before, after = without.squares, found.squares
     # What only makes noise leaves the mean, and the gap, as they are.
-    if all(effect_named(effect).acts_on != 'mean' for effect in best.effects):
+    if all(effect_named(effect).acts_on is not ActsOn.MEAN for effect in best.effects):
         after = before
     counts = np.zeros(BLOCKS)
     for mask in counted:

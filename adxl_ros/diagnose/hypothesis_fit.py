@@ -27,7 +27,7 @@ from adxl_ros.diagnose.noise_whitening import drifts_among, flicker_g_per_rthz, 
 from adxl_ros.diagnose.sensitivities import limits, WIDE
 from adxl_ros.model.coefficients import fitted_of, get, parameter_of, put, with_neutral
 from adxl_ros.model.effects import effect_named
-from adxl_ros.model.effects.base import Coefficient
+from adxl_ros.model.effects.base import Coefficient, Role
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
@@ -148,8 +148,8 @@ class Local:
         if whole is not None:
             lost |= spread > _ELSEWHERE * np.sqrt(np.diag(whole.covariance)[own])
         there = self.middle[own] + found.values[own]
-        there = np.where(lost & ~np.array([p.sized for p in of], bool), self.values, there)
-        near = np.where([p.shape for p in of], np.clip(
+        there = np.where(lost & ~np.array([p.is_size for p in of], bool), self.values, there)
+        near = np.where([p.role is Role.SHAPE for p in of], np.clip(
             there, *np.sort([self.values / 2, self.values * 2], axis=0)), there)
         held = np.flatnonzero(near != self.middle[own] + found.values[own])
         return evidence.given(found, held, near[held] - self.middle[held])
@@ -182,16 +182,16 @@ def local(of: Study, effects: Sequence[str], sensor: Sensor,
     """
     held = with_neutral(of.series[0].sensor, effects)
     own = [name for effect in effects for name in fitted_of(effect_named(effect), held.axes)
-           if not parameter_of(name).sized or name in of.names or limits(effect_named(effect))]
+           if not parameter_of(name).is_size or name in of.names or limits(effect_named(effect))]
     free = [n for n in dict.fromkeys(n for names in of.free for n in names)
             if n.effect not in effects]
     held = with_neutral(held, dict.fromkeys(n.effect for n in free))
     parameters = [parameter_of(name) for name in own]
-    middle = np.array([float(get(held, [name])[0]) if p.sized else p.scale
+    middle = np.array([float(get(held, [name])[0]) if p.is_size else p.scale
                        for name, p in zip(own, parameters)])
     values = get(sensor, own)
     sensor = put(held, own, values)
-    prior = [p.scale * (WIDE if p.sized else 1) for p in parameters]
+    prior = [p.scale * (WIDE if p.is_size else 1) for p in parameters]
     names = [*own, *free]
     channels: list[Channel] = []
     lines: list[dict[int, np.ndarray]] = []
@@ -264,9 +264,9 @@ def refined(of: Study, effects: Sequence[str], start: dict[Coefficient, float],
     begin = []
     for name in names:
         p = parameter_of(name)
-        middle = float(get(sensor, [name])[0]) if p.sized else p.scale
+        middle = float(get(sensor, [name])[0]) if p.is_size else p.scale
         short = name.without_axis
-        begin.append(shapes[short] if not p.sized and short in shapes
+        begin.append(shapes[short] if not p.is_size and short in shapes
                      else middle + start.get(name, 0.0))
     sensor = put(sensor, names, _within(names, np.array(begin)))
     best: tuple[float, Local, Fit] | None = None
@@ -320,7 +320,7 @@ def _of_stage(of: Study, names: Sequence[Coefficient]) -> np.ndarray:
 def _of_form(here: Local, found: Fit) -> np.ndarray:
     """Return standard deviations of coefficients by a form that is not quite true, (k,)."""
     names = here.names[:len(here.values)]
-    whole = np.where([parameter_of(n).sized for n in names], found.values[:len(names)],
+    whole = np.where([parameter_of(n).is_size for n in names], found.values[:len(names)],
                      here.values)
     return np.where([effect_named(n.effect).exact for n in names], 0.0, _FORM * whole)
 
@@ -338,7 +338,7 @@ def _of_those_that_show(here: Local, found: Fit) -> float:
     gain = 0.0
     for effect in here.effects:
         own = [i for i, name in enumerate(here.names[:len(here.values)])
-               if name.effect == effect and parameter_of(name).sized]
+               if name.effect == effect and parameter_of(name).is_size]
         if own:
             gain -= float(np.log(2.0 ** len(own) - 1))
         while len(own) > 1:
@@ -372,7 +372,7 @@ def columns_at(series: Series, sensor: Sensor, names: Sequence[Coefficient], val
         groups.setdefault(name.without_axis, []).append(i)
     for of in groups.values():
         p = parameter_of(names[of[0]])
-        by = p.scale * (0.3 if not p.limit and not effect_named(
+        by = p.scale * (0.3 if p.role is not Role.LIMIT and not effect_named(
             names[of[0]].effect).smooth else 0.02)
         if values[of[0]] + by > p.upper:
             by = -by

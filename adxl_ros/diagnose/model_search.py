@@ -217,7 +217,7 @@ def _refine(of: Study, ranked: Iterable[tuple[float, tuple[int, ...], Fit]], non
 
 def _begin(variant: Variant) -> dict[Coefficient, float]:
     """Return where a limit begins, as departures from what they are held against."""
-    return {name: value - (0.0 if parameter_of(name).sized else parameter_of(name).scale)
+    return {name: value - (0.0 if parameter_of(name).is_size else parameter_of(name).scale)
             for name, value in variant.begin.items()}
 
 

@@ -23,7 +23,7 @@ from adxl_ros.diagnose.baseline_comparison import Series
 from adxl_ros.errors import UserError
 from adxl_ros.model.coefficients import names_of, parameter_of, put, with_neutral
 from adxl_ros.model.effects import library
-from adxl_ros.model.effects.base import Coefficient, Effect, Parameter
+from adxl_ros.model.effects.base import ActsOn, Coefficient, Effect, Parameter, Role
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
@@ -72,12 +72,12 @@ class Variant:
 
 def candidates() -> list[Effect]:
     """Return the effects of the library that act on the mean and have tangents."""
-    return [effect for effect in library().values() if effect.acts_on == 'mean']
+    return [effect for effect in library().values() if effect.acts_on is ActsOn.MEAN]
 
 
 def limits(effect: Effect) -> list[Parameter]:
     """Return the parameters that do nothing until the signal reaches them."""
-    return [p for p in effect.parameters if p.limit and not p.shape]
+    return [p for p in effect.parameters if p.role is Role.LIMIT]
 
 
 def variants(series: Series, effect: Effect, base: np.ndarray) -> Iterator[Variant]:
@@ -91,7 +91,7 @@ def variants(series: Series, effect: Effect, base: np.ndarray) -> Iterator[Varia
             yield from _limited(series, effect, limits(effect)[0], base)
         return
     # An effect that the sensor has keeps its shape; one with a shape is linear beside it.
-    bends = not effect.smooth and not any(p.shape for p in effect.parameters)
+    bends = not effect.smooth and not any(p.role is Role.SHAPE for p in effect.parameters)
     for shape in [{}] if effect.name in series.sensor.effects else shapes(effect):
         for size in _LARGE if bends else (_SMALL,):
             try:
@@ -109,7 +109,7 @@ def _limited(series: Series, effect: Effect, limit: Parameter, base: np.ndarray
     held = with_neutral(series.sensor, [effect.name])
     names = names_of(replace(effect, parameters=(limit,)), axes)
     # What else it has is no size until it clips.
-    beside = {name: p.scale for p in effect.parameters if p.sized
+    beside = {name: p.scale for p in effect.parameters if p.is_size
               for name in names_of(replace(effect, parameters=(p,)), axes)}
     g = np.abs(base - series.sensor.zero_g_v) / series.sensor.scale_v_per_g
     levels = [level for part in _CLIPPED for level in (
@@ -128,7 +128,7 @@ def _limited(series: Series, effect: Effect, limit: Parameter, base: np.ndarray
 
 def shapes(effect: Effect) -> list[dict[str, float]]:
     """Return the shapes of an effect that are tried: each parameter of shape by a few factors."""
-    of_shape = [p for p in effect.parameters if p.shape and not p.held]
+    of_shape = [p for p in effect.parameters if p.role is Role.SHAPE and not p.held]
     if not of_shape:
         return [{}]
     first, rest = of_shape[0], {p.name: p.scale for p in of_shape[1:]}
@@ -146,7 +146,7 @@ def variant(series: Series, effect: Effect, shape: dict[str, float], size: float
     columns: list[list[tuple[int, np.ndarray]]] = [[] for _ in axes]
     start = base if not shape else series.simulated(held)
     for p in effect.parameters:
-        if p.shape:
+        if p.role is Role.SHAPE:
             continue
         step = p.scale * size
         if not p.lower <= np.max(values := np.asarray(held.values[effect.name][p.name])) + step \

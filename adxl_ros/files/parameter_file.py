@@ -26,7 +26,7 @@ from adxl_ros.errors import UserError
 from adxl_ros.files.atomic_write import atomic_path
 from adxl_ros.model.coefficients import names_of, neutral
 from adxl_ros.model.effects import effect_named
-from adxl_ros.model.effects.base import Coefficient
+from adxl_ros.model.effects.base import Coefficient, Role
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.model.validity import Envelope
 import numpy as np
@@ -302,7 +302,7 @@ def _effect_values(name: str, axes: str, flat: dict, fail: Any) -> dict[str, np.
     values = {}
     for parameter in effect.parameters:
         key = str(Coefficient(name, parameter.name))
-        if key not in flat and parameter.optional:
+        if key not in flat and parameter.role is Role.OPTIONAL:
             values[parameter.name] = neutral(effect, axes)[parameter.name]
             continue
         if key not in flat:

@@ -96,9 +96,8 @@ def uncalibrated(sensor: Sensor, info: StreamInfo, axes: str, rate_hz: float) ->
         A nominal value cannot be read, or those of further axes are unknown.
 
     """
-    bare = with_axes(replace(sensor, model='nominal', effects=(), values={},
-                             covariance=np.zeros((0, 0)), covariance_names=(), provenance={}),
-                     axes)
+    bare = with_axes(replace(sensor.without_covariance(), model='nominal', effects=(), values={},
+                             provenance={}), axes)
     stated: dict[str, Any] = dict(info.nominal_values(axes))
     return replace(bare, serial=info.texts.get('serial', sensor.serial), rate_hz=rate_hz, **stated)
 

@@ -22,3 +22,9 @@ AXES = 'xyz'
 
 Z_90 = 1.6449
 """Half of a 90 % interval in standard deviations: the 95 % quantile of the normal distribution."""
+
+NOMINAL_TEMPERATURE_C = 25.0
+"""Temperature of the datasheet values, °C (ADXL203 datasheet, specifications)."""
+
+NOMINAL_SUPPLY_V = 5.0
+"""Supply voltage of the datasheet values, V (ADXL203 datasheet, specifications)."""

@@ -24,7 +24,7 @@ from collections.abc import Callable
 
 from adxl_ros.model import coefficients, noise, signal_chain
 from adxl_ros.model.constants import AXES, G0_MPS2
-from adxl_ros.model.effects.base import Components, Environment, Value
+from adxl_ros.model.effects.base import Components, Environment, NOMINAL_ENVIRONMENT, Value
 from adxl_ros.model.scalar_or_array import ARRAYS, Maths
 from adxl_ros.model.sensor import Sensor
 import numpy as np
@@ -41,7 +41,7 @@ _OVERHANG_MPS2 = -0.5
 
 def force_covariance(sensor: Sensor, force: Components,
                      sample_variance_v2: np.ndarray | None = None,
-                     environment: Environment = signal_chain.NOMINAL) -> np.ndarray:
+                     environment: Environment = NOMINAL_ENVIRONMENT) -> np.ndarray:
     """
     Covariance of the specific force that `signal_chain.inverse` gives, (m/s²)², (3, 3, n).
 
@@ -97,7 +97,7 @@ def measured_covariance(sensor: Sensor, sample_variance_v2: np.ndarray | None = 
     respond, by_parameter = signal_chain.analog_response(sensor), _parameter_tangent(sensor)
     at_leverage = leverage(sensor)
 
-    def covariance(force: Components, environment: Environment = signal_chain.NOMINAL
+    def covariance(force: Components, environment: Environment = NOMINAL_ENVIRONMENT
                    ) -> tuple[np.ndarray, signal_chain.Tangent]:
         at = signal_chain.tangent(respond, sensor.axes, force, environment)
         volts = np.diag(sample_variance_v2)
@@ -206,7 +206,7 @@ def _parameter_tangent(sensor: Sensor) -> Callable[..., np.ndarray]:
         differences.append((above, below, 2 * step))
 
     def by_parameter(force: Components,
-                     environment: Environment = signal_chain.NOMINAL) -> np.ndarray:
+                     environment: Environment = NOMINAL_ENVIRONMENT) -> np.ndarray:
         columns = [[(a - b) / apart for a, b in zip(above(force, environment),
                                                     below(force, environment))]
                    for above, below, apart in differences]

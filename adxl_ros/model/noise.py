@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from adxl_ros.model import signal_chain
 from adxl_ros.model.effects import effect_named
-from adxl_ros.model.effects.base import Place, Signals
+from adxl_ros.model.effects.base import Need, NOMINAL_ENVIRONMENT, Place, Signals
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
@@ -34,12 +34,12 @@ def electronics(sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:
 
     """
     count = len(sensor.axes)
-    signals = Signals(signal_chain.NOMINAL, zero_g_v=sensor.nominal_zero_g_v.tolist(),
+    signals = Signals(NOMINAL_ENVIRONMENT, zero_g_v=sensor.nominal_zero_g_v.tolist(),
                       scale_v_per_g=sensor.nominal_scale_v_per_g.tolist(),
                       output=[0.0] * count, rc_s=[sensor.rc_s] * count,
                       noise_ratio=[1.0] * count)
     for effect in map(effect_named, sensor.effects):
-        if effect.needs in (('filter',), ('noise',)) and effect.place is Place.ELECTRONICS:
+        if effect.needs in ((Need.FILTER,), (Need.NOISE,)) and effect.place is Place.ELECTRONICS:
             effect.apply(signals, signal_chain.parameters(sensor, effect.name))
     return np.array(signals.rc_s), np.array(signals.noise_ratio)
 

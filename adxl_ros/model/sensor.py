@@ -114,6 +114,10 @@ class Sensor:
             beyond |= (volts <= 0) | (volts >= self.adc_vref_v - self.lsb_v)
         return beyond
 
+    def without_covariance(self) -> Sensor:
+        """Return the sensor with coefficients that count as exact."""
+        return replace(self, covariance=np.zeros((0, 0)), covariance_names=())
+
     def _value(self, effect: str, parameter: str) -> np.ndarray:
         known = self.values.get(effect, {})
         return known.get(parameter, np.zeros(len(self.axes)))

@@ -22,13 +22,18 @@ from typing import Any
 
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.effects import effect_named
-from adxl_ros.model.effects.base import Components, Environment, Parameters, Place, Signals, Value
+from adxl_ros.model.effects.base import (
+    Components,
+    Environment,
+    NOMINAL_ENVIRONMENT,
+    Parameters,
+    Place,
+    Signals,
+    Value,
+)
 from adxl_ros.model.scalar_or_array import ARRAYS, Maths
 from adxl_ros.model.sensor import Sensor
 import numpy as np
-
-NOMINAL = Environment(time_s=float('inf'))
-"""Nominal temperature and supply, long after power on: where drifts are 0."""
 
 _TOLERANCE_MPS2 = 1e-10
 _LOST_MPS2 = 1e-6
@@ -55,7 +60,7 @@ def static_response(sensor: Sensor) -> Callable[..., Components]:
     respond, convert = analog_response(sensor), _adc(sensor)
     if convert is None:
         return respond
-    return lambda force, environment=NOMINAL: convert(respond(force, environment))
+    return lambda force, environment=NOMINAL_ENVIRONMENT: convert(respond(force, environment))
 
 
 def analog_response(sensor: Sensor) -> Callable[..., Components]:
@@ -64,7 +69,7 @@ def analog_response(sensor: Sensor) -> Callable[..., Components]:
     zero_g_v = sensor.nominal_zero_g_v.tolist()
     scale_v_per_g = sensor.nominal_scale_v_per_g.tolist()
 
-    def respond(force: Components, environment: Environment = NOMINAL) -> Components:
+    def respond(force: Components, environment: Environment = NOMINAL_ENVIRONMENT) -> Components:
         signals = Signals(environment, sensed=[f / G0_MPS2 for f in force],
                           nominal_scale_v_per_g=scale_v_per_g)
         for apply, values in run[Place.MOUNTING]:
@@ -87,7 +92,8 @@ def _adc(sensor: Sensor) -> Callable[[Components], Components] | None:
         return None
 
     def convert(volts: Components) -> Components:
-        signals = Signals(NOMINAL, input_v=volts, volts=list(volts), vref_v=sensor.adc_vref_v)
+        signals = Signals(NOMINAL_ENVIRONMENT, input_v=volts, volts=list(volts),
+                          vref_v=sensor.adc_vref_v)
         for apply, values in effects:
             apply(signals, values)
         return signals.volts
@@ -157,14 +163,14 @@ def parameters(sensor: Sensor, effect: str) -> Parameters:
 
 def gravity_mps2(sensor: Sensor) -> float:
     """Return the local gravity with what effects add to it."""
-    signals = Signals(NOMINAL, gravity_mps2=sensor.local_gravity_mps2)
+    signals = Signals(NOMINAL_ENVIRONMENT, gravity_mps2=sensor.local_gravity_mps2)
     for apply, values in applied(sensor, Place.STAGE, True):
         apply(signals, values)
     return signals.gravity_mps2
 
 
 def jacobian(respond: Callable[..., Components], force: Components,
-             environment: Environment = NOMINAL) -> np.ndarray:
+             environment: Environment = NOMINAL_ENVIRONMENT) -> np.ndarray:
     """
     Differentiate volts by specific force at one or many points, V/(m/s²).
 
@@ -200,7 +206,7 @@ class Tangent:
 
 
 def tangent(respond: Callable[..., Components], axes: str, force: Components,
-            environment: Environment = NOMINAL) -> Tangent:
+            environment: Environment = NOMINAL_ENVIRONMENT) -> Tangent:
     """
     Linearise the inverse of `static_response` around a force, m/s², arrays or floats.
 
@@ -314,7 +320,7 @@ def inverse(sensor: Sensor, z_sign: np.ndarray | None = None) -> Callable[..., C
     undo_adc = before_adc(sensor)
     up = np.asarray(sensor.z_sign if z_sign is None else z_sign)
 
-    def invert(volts: Components, environment: Environment = NOMINAL) -> Components:
+    def invert(volts: Components, environment: Environment = NOMINAL_ENVIRONMENT) -> Components:
         data = np.array(undo_adc(list(np.array(volts, float).reshape(len(volts), -1))))
         signs = np.broadcast_to(up, data.shape[1])
         force = np.zeros((3, data.shape[1]))

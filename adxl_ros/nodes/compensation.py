@@ -29,8 +29,9 @@ from adxl_ros.files import calibration_store, imu_message
 from adxl_ros.files.cdr import CdrError
 from adxl_ros.files.stream_info import NO_UNIT, StreamInfo
 from adxl_ros.files.stream_unit import check_unit
-from adxl_ros.model import noise, signal_chain
+from adxl_ros.model import noise
 from adxl_ros.model.effects import effect_named
+from adxl_ros.model.effects.base import NOMINAL_ENVIRONMENT
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.model.tilt import UNOBSERVABLE_RAD2
 from adxl_ros.nodes.support.diagnostics import DiagnosticsReporter, Level, Status
@@ -354,7 +355,7 @@ class Compensation(Node):
                     continue
                 topic = self.resolve_topic_name(topics[name])
                 if name not in self._known:
-                    return (f'{effect.name} is taken at {getattr(signal_chain.NOMINAL, name):g}: '
+                    return (f'{effect.name} is taken at {getattr(NOMINAL_ENVIRONMENT, name):g}: '
                             f'nothing on {topic}')
                 if self._age_s(name) > _OLD_S:
                     return (f'{effect.name} is taken at {self._known[name]:g}: nothing on '

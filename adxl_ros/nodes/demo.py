@@ -311,8 +311,7 @@ def _real(folder: Path, path: Path, length_s: float) -> None:
             step.show(f'{len(poses)} rests, magnitude of gravity')
             graph.close()
     fitted = parameter_file.load(output)
-    nominal = replace(fitted, effects=(), values={}, covariance=np.zeros((0, 0)),
-                      covariance_names=())
+    nominal = replace(fitted.without_covariance(), effects=(), values={})
     _print('', *gravity_lines(gravity_fit.fit_gravity(poses.volts, poses.std_v, nominal)), '',
            *file_lines({'Page': report / 'report.html', 'Calibration': output}))
 

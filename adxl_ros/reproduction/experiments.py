@@ -106,8 +106,7 @@ def draw(nominal: Sensor, stage: Stage, rng: np.random.Generator) -> Sensor:
 
 def bare(truth: Sensor) -> Sensor:
     """Return what is known of a unit before its calibration."""
-    return replace(truth, effects=(), values={}, model='nominal',
-                   covariance=np.zeros((0, 0)), covariance_names=())
+    return replace(truth.without_covariance(), effects=(), values={}, model='nominal')
 
 
 def poses_at(truth: Sensor, read_rad: np.ndarray, seed: int

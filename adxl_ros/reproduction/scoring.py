@@ -132,8 +132,7 @@ def angles(fitted: Sensor, bound: Sensor, poses: Poses, true_rad: np.ndarray) ->
     up = np.where(np.asarray(force[2]) < 0, -1, 1)
     variance_v2 = np.mean(poses.std_v, axis=0) ** 2
     true = _angles(bound, force, up, variance_v2)
-    alone = _angles(replace(bound, covariance=np.zeros((0, 0)), covariance_names=()), force, up,
-                    variance_v2)
+    alone = _angles(bound.without_covariance(), force, up, variance_v2)
     found = _angles(fitted, signal_chain.inverse(fitted, up)(list(poses.volts.T)), up, variance_v2)
     again = signal_chain.inverse(bound, up)(list(signal_chain.static_response(bound)(force)))
     twofold = np.abs(np.subtract(again, force)).max(axis=0) > _SAME_MPS2

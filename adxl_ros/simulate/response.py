@@ -25,7 +25,15 @@ from adxl_ros.errors import UserError
 from adxl_ros.model import noise, signal_chain
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects import effect_named
-from adxl_ros.model.effects.base import Environment, Joint, Parameters, Place, Signals
+from adxl_ros.model.effects.base import (
+    Environment,
+    Joint,
+    Need,
+    NOMINAL_ENVIRONMENT,
+    Parameters,
+    Place,
+    Signals,
+)
 from adxl_ros.model.filters import low_pass
 from adxl_ros.model.kinematics import felt, UPRIGHT
 from adxl_ros.model.sensor import Sensor
@@ -124,12 +132,12 @@ class Response:
         return np.column_stack(signals.volts)
 
     def _instants(self, stamps_s: np.ndarray) -> np.ndarray:
-        signals = Signals(signal_chain.NOMINAL, time_s=stamps_s)
+        signals = Signals(NOMINAL_ENVIRONMENT, time_s=stamps_s)
         self._apply(Place.CLOCK, signals)
         return signals.time_s
 
     def _environment(self, at_s: np.ndarray) -> Environment:
-        nominal = signal_chain.NOMINAL
+        nominal = NOMINAL_ENVIRONMENT
         motion = self._motion
         return Environment(at_s,
                            motion.temperature_c(at_s) if motion.temperature_c
@@ -243,14 +251,19 @@ def _lagrange(at: np.ndarray) -> np.ndarray:
 
 
 def _check(sensor: Sensor, motion: Motion) -> None:
-    there = {'stage': motion.force is None, 'filter': sensor.rc_s > 0,
-             'adc': sensor.adc_bits > 0, 'noise': bool(np.any(sensor.noise_density_g_per_rthz))}
-    lacks = {'stage': 'this manoeuvre has none, only specific force',
-             'filter': 'the sensor has none: sensor.rc_capacitance_f or rc_resistance_ohm is 0',
-             'adc': 'the sensor has none: sensor.adc_bits is 0',
-             'noise': 'the sensor has none: sensor.noise_density_g_per_rthz is 0'}
+    """Refuse an effect that has nothing to act on."""
+    missing = {}
+    if motion.force is not None:
+        missing[Need.STAGE] = 'this manoeuvre has none, only specific force'
+    if not sensor.rc_s > 0:
+        missing[Need.FILTER] = \
+            'the sensor has none: sensor.rc_capacitance_f or rc_resistance_ohm is 0'
+    if not sensor.adc_bits > 0:
+        missing[Need.ADC] = 'the sensor has none: sensor.adc_bits is 0'
+    if not np.any(sensor.noise_density_g_per_rthz):
+        missing[Need.NOISE] = 'the sensor has none: sensor.noise_density_g_per_rthz is 0'
     for name in sensor.effects:
         for need in effect_named(name).needs:
-            if not there[need]:
-                raise UserError(f'{name} acts on the {need}, but {lacks[need]}; leave the effect '
-                                'out')
+            if need in missing:
+                raise UserError(f'{name} acts on the {need.value}, but {missing[need]}; leave the '
+                                'effect out')

@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
+from adxl_ros.model.constants import NOMINAL_SUPPLY_V, NOMINAL_TEMPERATURE_C
 from adxl_ros.simulate.motion import Held, Knots, Motion, Path
 import numpy as np
 
@@ -221,10 +222,12 @@ def shaker(_: np.random.Generator) -> Motion:
 
 def soak(_: np.random.Generator) -> Motion:
     """Rest for 30 min while temperature (25, 40, 10, 25 °C) and supply step."""
+    temperature_c = Steps(NOMINAL_TEMPERATURE_C,
+                          ((300, 40), (750, 10), (1200, NOMINAL_TEMPERATURE_C)), 60.0)
+    supply_v = Steps(NOMINAL_SUPPLY_V, ((150, 4.8), (225, NOMINAL_SUPPLY_V), (1575, 5.2),
+                                        (1690, NOMINAL_SUPPLY_V)), 0.5)
     return Motion(1800.0, Held(np.radians(60)), Held(np.radians(30)),
-                  temperature_c=Steps(25.0, ((300, 40), (750, 10), (1200, 25)), 60.0),
-                  supply_v=Steps(5.0, ((150, 4.8), (225, 5.0), (1575, 5.2), (1690, 5.0)), 0.5),
-                  internal_rate_hz=10.0)
+                  temperature_c=temperature_c, supply_v=supply_v, internal_rate_hz=10.0)
 
 
 def tumble(rng: np.random.Generator) -> Motion:
@@ -260,10 +263,11 @@ def rich(_: np.random.Generator) -> Motion:
         script.go(alpha, beta)
         script.rest(DWELL_S)
     end = script.now
-    joints = script.joints()
-    return Motion(end, *joints, Sum(tuple(shakes)),
-                  temperature_c=Steps(25.0, ((0.25 * end, 35.0), (0.6 * end, 25.0)), 30.0),
-                  supply_v=Steps(5.0, ((0.4 * end, 4.85), (0.8 * end, 5.0)), 0.5))
+    temperature_c = Steps(NOMINAL_TEMPERATURE_C,
+                          ((0.25 * end, 35.0), (0.6 * end, NOMINAL_TEMPERATURE_C)), 30.0)
+    supply_v = Steps(NOMINAL_SUPPLY_V, ((0.4 * end, 4.85), (0.8 * end, NOMINAL_SUPPLY_V)), 0.5)
+    return Motion(end, *script.joints(), Sum(tuple(shakes)), temperature_c=temperature_c,
+                  supply_v=supply_v)
 
 
 def _shake(script: Script) -> SweptSine:

@@ -33,7 +33,7 @@ from adxl_ros.model import noise, signal_chain
 from adxl_ros.model.constants import AXES
 from adxl_ros.model.covariance import force_covariance, leverage
 from adxl_ros.model.effects import effect_named
-from adxl_ros.model.effects.base import Place
+from adxl_ros.model.effects.base import ActsOn, Need, NOMINAL_ENVIRONMENT, Place
 from adxl_ros.model.sensor import Sensor, with_axes
 from adxl_ros.model.tilt import Tilt, tilt
 from adxl_ros.tools.common import default_params, progress, run, say_notes
@@ -122,23 +122,23 @@ def _around(block: Recording, began_s: float) -> signal_chain.Environment:
     measured = {name: values for name in ('temperature_c', 'supply_v')
                 if (values := block.columns.get(name)) is not None}
     return signal_chain.Environment(block.time_s - began_s, **{
-        name: np.where(np.isfinite(values), values, getattr(signal_chain.NOMINAL, name))
+        name: np.where(np.isfinite(values), values, getattr(NOMINAL_ENVIRONMENT, name))
         for name, values in measured.items()})
 
 
 def _say_unknown(block: Recording, sensor: Sensor, undo_filter: bool) -> None:
     """Say which effects are not undone, or undone for nominal surroundings."""
     for effect in map(effect_named, sensor.effects):
-        if undo_filter and 'filter' in effect.needs:
+        if undo_filter and Need.FILTER in effect.needs:
             continue
-        if not effect.invertible and effect.acts_on == 'mean' and effect.place < Place.CLOCK \
-                and 'stage' not in effect.needs:
+        if not effect.invertible and effect.acts_on is ActsOn.MEAN and effect.place < Place.CLOCK \
+                and Need.STAGE not in effect.needs:
             print(f'apply: {effect.name} is not undone: no single sample tells it',
                   file=sys.stderr)
         for name in effect.follows:
             if name != 'time_s' and not np.isfinite(block.columns.get(name, np.nan)).all():
                 print(f'apply: {block.path}: {name} is not there or has gaps: {effect.name} is '
-                      f'taken at {getattr(signal_chain.NOMINAL, name):g} there', file=sys.stderr)
+                      f'taken at {getattr(NOMINAL_ENVIRONMENT, name):g} there', file=sys.stderr)
 
 
 class Estimates:
@@ -173,7 +173,7 @@ class Estimates:
         self._variance_v2 = filter_inversion.variance_v2(sensor) if undo_filter else None
 
     def __call__(self, volts: np.ndarray, at_rail: np.ndarray,
-                 around: signal_chain.Environment = signal_chain.NOMINAL) -> dict[str, np.ndarray]:
+                 around: signal_chain.Environment = NOMINAL_ENVIRONMENT) -> dict[str, np.ndarray]:
         """
         Estimate, (n,) each; NaN with standard deviation inf is what a sample does not show.
 

@@ -28,7 +28,7 @@ from adxl_ros.model.coefficients import (
     with_neutral,
 )
 from adxl_ros.model.effects import library
-from adxl_ros.model.effects.base import Coefficient
+from adxl_ros.model.effects.base import ActsOn, Coefficient, Need, NOMINAL_ENVIRONMENT
 from adxl_ros.model.filters import low_pass, resonator
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.play_operator import play
@@ -103,7 +103,7 @@ def test_typical_values_show_and_join(name, plain):
 
 
 @pytest.mark.parametrize('name', [n for n in NAMES if library()[n].smooth
-                                  and library()[n].acts_on == 'mean'])
+                                  and library()[n].acts_on is ActsOn.MEAN])
 def test_tangents_do_not_depend_on_the_step(name):
     """Smooth effects: differences by two steps agree, so that fits can use them."""
     sensor = having(name)
@@ -120,7 +120,7 @@ def test_tangents_do_not_depend_on_the_step(name):
 def test_says_what_it_is(name):
     """Bounds hold the neutral and the typical value; unit, source and cause are stated."""
     effect = library()[name]
-    assert effect.cause.endswith('.') and effect.acts_on in ('mean', 'noise')
+    assert effect.cause.endswith('.')
     for p in effect.parameters:
         assert p.unit and p.source and p.doc and p.scale > 0
         for value in (p.neutral, p.scale if p.typical is None else p.typical):
@@ -203,7 +203,7 @@ def test_lever_arm_is_centripetal_and_tangential():
 def test_supply_is_not_quite_ratiometric():
     """The ADXL203 gives 560 mV/g and 1.5 V at 3 V."""
     respond = signal_chain.static_response(having('supply'))
-    around = signal_chain.NOMINAL._replace(supply_v=3.0)
+    around = NOMINAL_ENVIRONMENT._replace(supply_v=3.0)
     zero, one = (respond([f, 0.0, 0.0], around)[0] for f in (0.0, G))
     assert zero == pytest.approx(1.5, abs=1e-12)
     assert one - zero == pytest.approx(0.560, abs=2e-4)
@@ -211,7 +211,7 @@ def test_supply_is_not_quite_ratiometric():
 
 def test_temperature_moves_zero_g_and_scale():
     """0.1 mg/K from 25 °C on, and the scale factor by its part."""
-    around = signal_chain.NOMINAL._replace(temperature_c=35.0)
+    around = NOMINAL_ENVIRONMENT._replace(temperature_c=35.0)
     bias, scale = (signal_chain.static_response(having(name))
                    for name in ('temperature_bias', 'temperature_scale'))
     assert bias([0.0, 0.0, 0.0], around)[0] == pytest.approx(2.501, abs=1e-12)
@@ -282,7 +282,7 @@ def test_stamps_of_late_data():
 
 def test_inverse_by_surroundings():
     """With temperature, supply and time since power on known, the inverse is exact."""
-    names = [n for n in NAMES if library()[n].invertible and 'stage' not in library()[n].needs]
+    names = [n for n in NAMES if library()[n].invertible and Need.STAGE not in library()[n].needs]
     sensor = with_neutral(nominal('xyz'), names)
     sensor = replace(sensor, values={n: typical(library()[n], 'xyz') for n in names})
     rng = np.random.default_rng(0)

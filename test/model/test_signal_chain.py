@@ -21,7 +21,7 @@ from adxl_ros.model import noise, signal_chain
 from adxl_ros.model.coefficients import get, names_of, parameter_of, put, with_neutral
 from adxl_ros.model.covariance import force_covariance, parameter_tangent
 from adxl_ros.model.effects import library
-from adxl_ros.model.effects.base import Coefficient
+from adxl_ros.model.effects.base import Coefficient, Need, Role
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.scalar_or_array import ARRAYS, FLOATS
 from adxl_ros.model.sensor import Sensor, with_axes
@@ -36,7 +36,7 @@ AXES = ('x', 'xy', 'xyz')
 
 
 INVERTIBLE = tuple(name for name, effect in library().items()
-                   if effect.invertible and 'stage' not in effect.needs)
+                   if effect.invertible and Need.STAGE not in effect.needs)
 
 
 @st.composite
@@ -45,7 +45,8 @@ def sensors(draw: st.DrawFn, axes: str) -> Sensor:
     sensor = with_neutral(nominal(axes), INVERTIBLE)
     names = coefficients(sensor)
     return put(sensor, names, [
-        parameter_of(n).scale * (1 if parameter_of(n).shape else draw(st.floats(-2, 2)))
+        parameter_of(n).scale * (
+            1 if parameter_of(n).role is Role.SHAPE else draw(st.floats(-2, 2)))
         for n in names])
 
 
@@ -57,7 +58,7 @@ def one_of(axes: str, seed: int) -> Sensor:
     """Draw a unit at datasheet spread with a covariance of its coefficients."""
     rng = np.random.default_rng(seed)
     sensor = with_neutral(nominal(axes), INVERTIBLE)
-    names = tuple(n for n in coefficients(sensor) if not parameter_of(n).shape)
+    names = tuple(n for n in coefficients(sensor) if parameter_of(n).role is not Role.SHAPE)
     scale = np.array([parameter_of(n).scale for n in names])
     mixed = rng.normal(size=(len(names), len(names))) * 0.05 * scale[:, None] / len(names) ** 0.5
     return replace(put(sensor, names, rng.normal(size=len(names)) * scale),

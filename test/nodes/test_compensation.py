@@ -28,7 +28,7 @@ from adxl_ros.files.stream_info import sensor_info
 from adxl_ros.model import signal_chain
 from adxl_ros.model.coefficients import put, with_neutral
 from adxl_ros.model.covariance import force_covariance
-from adxl_ros.model.effects.base import Coefficient
+from adxl_ros.model.effects.base import Coefficient, NOMINAL_ENVIRONMENT
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.scalar_or_array import FLOATS
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
@@ -218,7 +218,7 @@ def test_supply_and_temperature_are_taken_out(robot: Robot, start: Start, tmp_pa
     clock = node.create_publisher(Clock, '/clock', 10)
     supply = node.create_publisher(BatteryState, 'supply', 1)
     temperature = node.create_publisher(Temperature, 'temperature', 1)
-    force, around = pose(0.7, 0.4), signal_chain.NOMINAL._replace(temperature_c=35.0, supply_v=4.8)
+    force, around = pose(0.7, 0.4), NOMINAL_ENVIRONMENT._replace(temperature_c=35.0, supply_v=4.8)
     volts = np.array([signal_chain.static_response(sensor)(force, around)])
     shown = [*to_nominal_mps2(volts, sensor)[0].tolist(), 0.0]
     robot.answer(shown)
@@ -554,8 +554,7 @@ def test_a_bad_file_ends_it_with_one_line(start: Start, tmp_path: Path, right: s
 def test_the_filter_is_undone_late_and_with_own_stamps(robot: Robot, start: Start,
                                                        tmp_path: Path) -> None:
     """undo_filter: what comes out is the zero-phase inverse, eight samples later."""
-    sensor = replace(unit(), rate_hz=1.0, rc_capacitance_f=3e-5, covariance=np.zeros((0, 0)),
-                     covariance_names=())
+    sensor = replace(unit().without_covariance(), rate_hz=1.0, rc_capacitance_f=3e-5)
     started(start, tmp_path, sensor, '-p', 'undo_filter:=true')
     robot.inform(sensor)
     robot.connected()

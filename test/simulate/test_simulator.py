@@ -20,7 +20,7 @@ from adxl_ros.files import parameter_file, recording
 from adxl_ros.model import noise
 from adxl_ros.model.coefficients import put, typical, with_neutral
 from adxl_ros.model.effects import library
-from adxl_ros.model.effects.base import Coefficient
+from adxl_ros.model.effects.base import ActsOn, Coefficient, Need
 from adxl_ros.simulate.motion import Knots, Motion
 from adxl_ros.simulate.response import Response
 from adxl_ros.simulate.simulator import simulate
@@ -37,7 +37,7 @@ G = 9.80665
 CLEAN = {'noise_density_g_per_rthz': np.zeros(3), 'adc_bits': 0}
 
 
-def with_all(sensor, acts_on=('mean', 'noise')):
+def with_all(sensor, acts_on=tuple(ActsOn)):
     """Give a sensor every effect of the library, typical."""
     names = [name for name, e in library().items() if e.acts_on in acts_on]
     values = {name: typical(library()[name], sensor.axes) for name in names}
@@ -49,7 +49,7 @@ def test_rich_at_250_hz_is_rich_at_16_khz(everything):
     """Noise off, the rates differ by less than 5 µg rms, with every effect in the mean, too."""
     sensor = nominal('xyz', **CLEAN)
     if everything:
-        sensor = with_all(sensor, ('mean',))
+        sensor = with_all(sensor, (ActsOn.MEAN,))
         sensor = put(sensor, [Coefficient('saturation', 'limit_g', axis) for axis in 'xyz'],
                      [1000.0] * 3)
     motion = rich(np.random.default_rng(0))
@@ -239,7 +239,7 @@ def test_neutral_effects_of_a_file_stay(tmp_path):
     sensor = nominal('xyz')
     force = [np.linspace(0, G, 500), 0.0, G]
     np.testing.assert_array_equal(Fed(sensor)(force), Fed(with_neutral(sensor, [
-        n for n, e in library().items() if 'stage' not in e.needs]))(force))
+        n for n, e in library().items() if Need.STAGE not in e.needs]))(force))
 
 
 def test_apply_takes_temperature_and_supply_out(run_tool, tmp_path):

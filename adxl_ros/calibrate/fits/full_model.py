@@ -49,7 +49,7 @@ from adxl_ros.calibrate.stage_error import AngleErrors, PoseCovariance, StageErr
 from adxl_ros.errors import UserError
 from adxl_ros.model.coefficients import get, names_of, parameter_of, put, with_neutral
 from adxl_ros.model.effects import effect_named
-from adxl_ros.model.effects.base import Coefficient, Parameter, Place
+from adxl_ros.model.effects.base import Coefficient, Parameter, Place, Role
 from adxl_ros.model.gauss_newton import gauss_newton, halve_until, Iterate, Solution
 from adxl_ros.model.sensor import Sensor
 import numpy as np
@@ -181,7 +181,7 @@ def fit_full(sensor: Sensor, poses: Poses, terms: Sequence[str] | None = None) -
     terms = default_terms(sensor.axes) if terms is None else terms
     start = linear.fit(sensor, poses)
     effects = [effect_of(term) for term in terms]
-    unit = with_neutral(replace(start, covariance=np.zeros((0, 0)), covariance_names=()), effects)
+    unit = with_neutral(start.without_covariance(), effects)
     unit = with_neutral(unit, ['base_tilt'])
     names = fitted_coefficients(unit.axes, terms)
     stated = StageError(sensor.stage_resolution_rad / np.sqrt(12))
@@ -209,7 +209,7 @@ def _starts(unit: Sensor, poses: Poses, names: Sequence[Coefficient], effects: S
     starts = [unit]
     for name in effects:
         for p in effect_named(name).parameters:
-            if not p.shape or p.held or not effect_named(name).invertible:
+            if p.role is not Role.SHAPE or p.held or not effect_named(name).invertible:
                 continue
             coarse = p.scale * _SHAPE_STEP ** np.arange(-_SHAPE_STEPS, _SHAPE_STEPS + 1)
             likely = _likeliest(unit, poses, names, (name, p), coarse, stage)[:_FEW]
@@ -287,7 +287,7 @@ def fitted_coefficients(axes: str, terms: Sequence[str]) -> tuple[Coefficient, .
     """Name what is fitted: the terms' coefficients but for the gauge, and the base's tilt."""
     named = [name for effect in dict.fromkeys(map(effect_of, terms))
              for name in names_of(effect_named(effect), axes)
-             if not parameter_of(name).shape and not parameter_of(name).optional
+             if parameter_of(name).role not in (Role.SHAPE, Role.OPTIONAL)
              and term_of(name) in terms]
     return (*(n for n in named if not belongs_to_stage(n)), *_STAGE,
             *(n for n in named if belongs_to_stage(n) and n not in _STAGE))

@@ -186,7 +186,7 @@ def tilt_error_rad(sensor: Sensor, pose_std_v: np.ndarray) -> float:
         found = tilt(force, force_covariance(of, force, pose_std_v ** 2), 'z' in of.axes)
         return np.column_stack([found.alpha_std, found.beta_std])
 
-    perfect = stds(replace(sensor, covariance=np.zeros((0, 0)), covariance_names=()))
+    perfect = stds(sensor.without_covariance())
     errors = np.minimum(stds(sensor)[perfect < _SHOWN_RAD], np.pi / 2)
     return float(np.sqrt(np.mean(errors ** 2))) if errors.size else float('nan')
 

@@ -179,7 +179,7 @@ def _covariances(score: Score, held: Poses, promised: np.ndarray) -> list[np.nda
         both = force_covariance(sensor, force, std2, around)
         quiet = force_covariance(sensor, force, 0 * std2, around)
         found[0][:, :, own], found[1][:, :, own] = both - quiet, quiet
-        known = replace(sensor, covariance=np.zeros((0, 0)), covariance_names=())
+        known = sensor.without_covariance()
         found[3][:, :, own] = force_covariance(
             known, force, (sensor.scale_v_per_g / G0_MPS2 * _SMALL_MPS2) ** 2, around)
     sensor = score.fitted[0]

@@ -15,7 +15,7 @@
 """Integral nonlinearity of the ADC: one curve over its codes for all channels."""
 
 from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre
-from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
+from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Role, Signals
 import numpy as np
 
 
@@ -46,9 +46,11 @@ EFFECT = Effect(
         Parameter('amplitude_v', 'V', -0.05, 0.05, 3e-4, 'physics: 4 LSB of 16 bit at 5 V',
                   'largest deviation from the straight line', ''),
         Parameter('cycles', '1', 0.5, 64.0, 8.0, 'physics: segments of a converter',
-                  'periods of the deviation over the full scale', '', neutral=8.0),
+                  'periods of the deviation over the full scale', '', neutral=8.0,
+                  role=Role.SHAPE),
         *(Parameter(name, 'V', -0.05, 0.05, 3e-4, 'physics: 4 LSB of 16 bit at 5 V',
-                    f'error of the weight of bit {i} from above', '', typical=0.0)
+                    f'error of the weight of bit {i} from above', '', typical=0.0,
+                    role=Role.OPTIONAL)
           for i, name in enumerate(_BITS, 1)),
     ),
     apply=apply,

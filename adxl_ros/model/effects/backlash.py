@@ -15,7 +15,7 @@
 """Backlash of the stage: the joint follows its encoder with play."""
 
 from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre
-from adxl_ros.model.effects.base import Effect, Joint, Parameter, Parameters, Place, Signals
+from adxl_ros.model.effects.base import Effect, Joint, Need, Parameter, Parameters, Place, Signals
 from adxl_ros.model.play_operator import play
 
 
@@ -42,7 +42,7 @@ EFFECT = Effect(
     ),
     apply=apply,
     smooth=False,
-    needs=('stage',),
+    needs=(Need.STAGE,),
     cause='The gears have play; approach each pose from the same side, or preload them.',
     diagnosis=DiagnosisHints(revealed_by=Manoeuvre.SPEEDS),
 )

@@ -15,7 +15,7 @@
 """Bandwidth of the output filter: the on-chip resistor is known to a quarter only."""
 
 from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre
-from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
+from adxl_ros.model.effects.base import Effect, Need, Parameter, Parameters, Place, Signals
 
 
 def apply(signals: Signals, p: Parameters) -> None:
@@ -33,7 +33,7 @@ EFFECT = Effect(
                   "filter's resistance by the stated one, minus 1"),
     ),
     apply=apply,
-    needs=('filter',),
+    needs=(Need.FILTER,),
     cause='The output filter is not the stated one; measure its resistor and capacitor.',
     # The RC product of a healthy unit is within some 2 % of the measured one (chosen: resistors
     # and capacitors of 1 %, and their temperature).

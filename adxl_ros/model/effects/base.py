@@ -18,9 +18,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from enum import IntEnum
+from enum import auto, Enum, IntEnum
 from typing import Any, NamedTuple
 
+from adxl_ros.model.constants import NOMINAL_SUPPLY_V, NOMINAL_TEMPERATURE_C
 from adxl_ros.model.diagnosis_hints import DiagnosisHints
 import numpy as np
 
@@ -54,11 +55,27 @@ class Place(IntEnum):
 
 
 class Environment(NamedTuple):
-    """What is around the sensor: time since power on, temperature, its supply."""
+    """
+    Surroundings of the sensor.
 
-    time_s: Value = 0.0
-    temperature_c: Value = 25.0
-    supply_v: Value = 5.0
+    Attributes
+    ----------
+    time_s
+        Time since power-on, s.
+    temperature_c
+        Temperature of the sensor, °C.
+    supply_v
+        Supply voltage of the sensor, V.
+
+    """
+
+    time_s: Value
+    temperature_c: Value = NOMINAL_TEMPERATURE_C
+    supply_v: Value = NOMINAL_SUPPLY_V
+
+
+NOMINAL_ENVIRONMENT = Environment(time_s=float('inf'))
+"""Temperature and supply of the datasheet values, so long after power-on that drifts are 0."""
 
 
 class Joint(NamedTuple):
@@ -174,6 +191,37 @@ class Coefficient:
         return Coefficient(self.effect, self.parameter)
 
 
+class Role(Enum):
+    """What a parameter is to its effect; fits and the diagnosis treat each role differently."""
+
+    SIZE = auto()
+    """How strong the effect is: at its neutral value the effect does nothing."""
+    OPTIONAL = auto()
+    """A size that an effect usually lacks: fits leave it out, and so may files."""
+    SHAPE = auto()
+    """A frequency, a time constant and the like: it means nothing where the sizes are neutral."""
+    LIMIT = auto()
+    """A bound of the signal: it does nothing where no sample reaches it."""
+
+
+class ActsOn(Enum):
+    """Where the effect shows in the output."""
+
+    MEAN = 'mean'
+    """In the mean of the output."""
+    NOISE = 'noise'
+    """In the statistics of the noise only."""
+
+
+class Need(Enum):
+    """A part of the simulated chain without which an effect has nothing to act on."""
+
+    STAGE = 'stage'
+    FILTER = 'filter'
+    ADC = 'adc'
+    NOISE = 'noise'
+
+
 @dataclass(frozen=True)
 class Parameter:
     """
@@ -193,6 +241,8 @@ class Parameter:
         The value that the effect takes where only its name is given; `scale` unless stated.
     held
         Whether fits leave it as it is: what it does, zero-g and scale factor do as well.
+    role
+        What it is to its effect; the size unless stated.
 
     """
 
@@ -207,26 +257,12 @@ class Parameter:
     neutral: float = 0.0
     typical: float | None = None
     held: bool = False
+    role: Role = Role.SIZE
 
     @property
-    def shape(self) -> bool:
-        """Tell whether it only shapes what another parameter gives the size of."""
-        return self.neutral == self.scale
-
-    @property
-    def limit(self) -> bool:
-        """Tell whether it does nothing until the signal reaches it: its neutral value is none."""
-        return self.neutral == self.upper
-
-    @property
-    def sized(self) -> bool:
-        """Tell whether it is the size of something, which is nothing where it is neutral."""
-        return not (self.shape or self.limit)
-
-    @property
-    def optional(self) -> bool:
-        """Tell whether the effect is itself without it: files may leave it out, fits do."""
-        return self.typical == self.neutral
+    def is_size(self) -> bool:
+        """Whether it says how strong the effect is; at its neutral value it does nothing."""
+        return self.role in (Role.SIZE, Role.OPTIONAL)
 
 
 @dataclass(frozen=True)
@@ -245,12 +281,12 @@ class Effect:
     exact
         Whether its form, geometry or a clock, is beyond doubt: what it leaves looks like no other.
     acts_on
-        'mean' where it shows in the mean of the output, 'noise' where only statistics show it.
+        Where it shows in the output. The text 'mean' or 'noise' is accepted, too.
     invertible
         Whether it is a smooth function of the sample's own force and environment, which the
         inverse undoes; an effect of the stage, of memory or of noise is not.
     needs
-        What must be there for it to act: 'stage', 'filter', 'adc', 'noise'.
+        Parts of the chain that it acts on. Their names as text are accepted, too.
     follows
         The fields of `Environment` that it follows.
     diagnosis
@@ -265,8 +301,12 @@ class Effect:
     cause: str
     smooth: bool = True
     exact: bool = False
-    acts_on: str = 'mean'
+    acts_on: ActsOn = ActsOn.MEAN
     invertible: bool = False
-    needs: tuple[str, ...] = ()
+    needs: tuple[Need, ...] = ()
     follows: tuple[str, ...] = ()
     diagnosis: DiagnosisHints = DiagnosisHints()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, 'acts_on', ActsOn(self.acts_on))
+        object.__setattr__(self, 'needs', tuple(map(Need, self.needs)))

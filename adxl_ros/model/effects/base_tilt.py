@@ -17,7 +17,7 @@
 from math import cos, sin
 
 from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre
-from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
+from adxl_ros.model.effects.base import Effect, Need, Parameter, Parameters, Place, Signals
 
 
 def apply(signals: Signals, p: Parameters) -> None:
@@ -41,7 +41,7 @@ EFFECT = Effect(
     ),
     apply=apply,
     exact=True,
-    needs=('stage',),
+    needs=(Need.STAGE,),
     cause='The base of the stage is not level; level it, or measure its tilt.',
     diagnosis=DiagnosisHints(revealed_by=Manoeuvre.PLANES),
 )

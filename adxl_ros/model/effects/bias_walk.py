@@ -15,7 +15,7 @@
 """Random walk of the zero-g: acceleration random walk, rate noise of an Allan deviation."""
 
 from adxl_ros.model.diagnosis_hints import DiagnosisHints, DriftSpectrum, Manoeuvre
-from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
+from adxl_ros.model.effects.base import ActsOn, Effect, Parameter, Parameters, Place, Signals
 import numpy as np
 
 
@@ -43,7 +43,7 @@ EFFECT = Effect(
                   'growth of the wandering zero-g with the root of time'),
     ),
     apply=apply,
-    acts_on='noise',
+    acts_on=ActsOn.NOISE,
     cause='The zero-g wanders; take the zero again more often, or choose a quieter sensor.',
     # A healthy unit drifts by 0.3 mg within 100 s at most (tuned by hand on simulated
     # recordings).

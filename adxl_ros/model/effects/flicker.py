@@ -17,7 +17,7 @@
 from functools import lru_cache
 
 from adxl_ros.model.diagnosis_hints import DiagnosisHints, DriftSpectrum, Manoeuvre
-from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
+from adxl_ros.model.effects.base import ActsOn, Effect, Parameter, Parameters, Place, Signals
 import numpy as np
 from scipy.signal import lfilter
 
@@ -79,7 +79,7 @@ EFFECT = Effect(
                   'density at 1 Hz; it grows as one over the root of the frequency'),
     ),
     apply=apply,
-    acts_on='noise',
+    acts_on=ActsOn.NOISE,
     cause='The electronics have 1/f noise; average shorter and take the zero more often.',
     # A healthy unit has 0.2 mg rms over five decades of frequency at most (tuned by hand on
     # simulated recordings).

@@ -15,7 +15,7 @@
 """Local gravity that is not the stated one."""
 
 from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre
-from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
+from adxl_ros.model.effects.base import Effect, Need, Parameter, Parameters, Place, Signals
 
 
 def apply(signals: Signals, p: Parameters) -> None:
@@ -34,7 +34,7 @@ EFFECT = Effect(
     apply=apply,
     exact=True,
     invertible=True,
-    needs=('stage',),
+    needs=(Need.STAGE,),
     cause='Local gravity is not the stated one; look it up for latitude and height.',
     diagnosis=DiagnosisHints(imitated=True, revealed_by=Manoeuvre.REMOUNT),
 )

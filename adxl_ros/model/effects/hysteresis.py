@@ -15,7 +15,7 @@
 """Hysteresis of the sensing element: a Prandtl-Ishlinskii operator of the acceleration."""
 
 from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre
-from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
+from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Role, Signals
 from adxl_ros.model.play_operator import play
 
 _THRESHOLDS = (0.25, 0.5, 0.75, 1.0)
@@ -48,7 +48,7 @@ EFFECT = Effect(
                   'largest lag behind the input, half of the width of the loop'),
         Parameter('reach_g', 'g', 1e-3, 2.0, 0.2, 'physics: part of the range',
                   'change of the input after a reversal that builds up half of the lag', '',
-                  neutral=0.2),
+                  neutral=0.2, role=Role.SHAPE),
     ),
     apply=apply,
     smooth=False,

@@ -15,7 +15,7 @@
 """Lever arm: a sensor off the axes of the stage feels the turning."""
 
 from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre
-from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
+from adxl_ros.model.effects.base import Effect, Need, Parameter, Parameters, Place, Signals
 from adxl_ros.model.kinematics import angular_motion, carried
 
 
@@ -36,7 +36,7 @@ EFFECT = Effect(
         for axis in 'xyz'),
     apply=apply,
     exact=True,
-    needs=('stage',),
+    needs=(Need.STAGE,),
     cause='The sensor is off the axis of rotation; mount it on the axis, or state the arm.',
     diagnosis=DiagnosisHints(revealed_by=Manoeuvre.SPEEDS),
 )

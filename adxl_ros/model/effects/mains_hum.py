@@ -15,7 +15,7 @@
 """Mains hum: a sine at the input of the ADC."""
 
 from adxl_ros.model.diagnosis_hints import Detector, DiagnosisHints
-from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
+from adxl_ros.model.effects.base import ActsOn, Effect, Parameter, Parameters, Place, Role, Signals
 import numpy as np
 
 
@@ -33,12 +33,12 @@ EFFECT = Effect(
         Parameter('amplitude_v', 'V', -1.0, 1.0, 1e-3, 'physics: unshielded cable',
                   'amplitude of the sine'),
         Parameter('frequency_hz', 'Hz', 1.0, 1000.0, 50.0, 'mains: 50 or 60 Hz',
-                  'frequency of the sine', '', neutral=50.0),
+                  'frequency of the sine', '', neutral=50.0, role=Role.SHAPE),
         Parameter('phase_rad', 'rad', -7.0, 7.0, 1.0, 'any', 'phase at time 0', '',
-                  typical=0.0),
+                  typical=0.0, role=Role.OPTIONAL),
     ),
     apply=apply,
-    acts_on='noise',
+    acts_on=ActsOn.NOISE,
     cause='The mains couple in; shield and twist the cable, and ground it at one end.',
     diagnosis=DiagnosisHints(detector=Detector.MAINS_LINE),
 )

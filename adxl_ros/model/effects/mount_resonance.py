@@ -15,7 +15,7 @@
 """Resonance of the mount: the sensor feels the motion through a spring and a damper."""
 
 from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre
-from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
+from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Role, Signals
 from adxl_ros.model.filters import resonator
 
 
@@ -36,9 +36,9 @@ EFFECT = Effect(
         Parameter('gain', '1', -2.0, 2.0, 1.0, 'physics: 0 is rigid, 1 all through the mount',
                   'part of the force that comes through the mount'),
         Parameter('frequency_hz', 'Hz', 2.0, 450.0, 120.0, 'physics: a board on standoffs',
-                  'natural frequency, undamped', '', neutral=120.0),
+                  'natural frequency, undamped', '', neutral=120.0, role=Role.SHAPE),
         Parameter('damping_ratio', '1', 0.001, 0.95, 0.05, 'physics: metal and FR4',
-                  'damping by the critical one', '', neutral=0.05),
+                  'damping by the critical one', '', neutral=0.05, role=Role.SHAPE),
     ),
     apply=apply,
     cause='The mount is a spring; stiffen it, or keep the motion away from its resonance.',

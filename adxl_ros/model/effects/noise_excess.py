@@ -15,7 +15,7 @@
 """White noise beyond the stated density."""
 
 from adxl_ros.model.diagnosis_hints import Detector, DiagnosisHints
-from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
+from adxl_ros.model.effects.base import ActsOn, Effect, Need, Parameter, Parameters, Place, Signals
 
 
 def apply(signals: Signals, p: Parameters) -> None:
@@ -33,8 +33,8 @@ EFFECT = Effect(
                   'noise density by the stated one, minus 1'),
     ),
     apply=apply,
-    acts_on='noise',
-    needs=('noise',),
+    acts_on=ActsOn.NOISE,
+    needs=(Need.NOISE,),
     cause='The noise is not the stated one; look at the supply, its decoupling and the cable.',
     diagnosis=DiagnosisHints(detector=Detector.NOISE_LEVEL),
 )

@@ -15,7 +15,7 @@
 """Quantisation coarser than the ADC's bits."""
 
 from adxl_ros.model.diagnosis_hints import Detector, DiagnosisHints
-from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
+from adxl_ros.model.effects.base import ActsOn, Effect, Need, Parameter, Parameters, Place, Signals
 
 
 def apply(signals: Signals, p: Parameters) -> None:
@@ -32,8 +32,8 @@ EFFECT = Effect(
     ),
     apply=apply,
     smooth=False,
-    acts_on='noise',
-    needs=('adc',),
+    acts_on=ActsOn.NOISE,
+    needs=(Need.ADC,),
     cause='The ADC resolves less than stated; look at its setting, reference and format.',
     diagnosis=DiagnosisHints(detector=Detector.COARSE_CODES),
 )

@@ -14,7 +14,7 @@
 
 """Saturation: the output stage goes no farther than its limit."""
 
-from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
+from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Role, Signals
 import numpy as np
 
 
@@ -40,9 +40,11 @@ EFFECT = Effect(
     parameters=(
         Parameter('limit_g', 'g', 0.1, 1000.0, 1.0,
                   'ADXL203 datasheet: range 1.7 g at least; lower with a low supply',
-                  'largest output of either sign; 1000 is none', neutral=1000.0),
+                  'largest output of either sign; 1000 is none', neutral=1000.0,
+                  role=Role.LIMIT),
         Parameter('knee_g', 'g', 0.0, 0.5, 0.02, 'physics: an amplifier near its rail',
-                  'how soft the clip is; 0 is hard', '', typical=0.0),
+                  'how soft the clip is; 0 is hard', '', typical=0.0,
+                  role=Role.OPTIONAL),
     ),
     apply=apply,
     smooth=False,

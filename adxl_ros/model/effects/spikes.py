@@ -15,7 +15,7 @@
 """Spikes: single samples that are far off."""
 
 from adxl_ros.model.diagnosis_hints import Detector, DiagnosisHints
-from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
+from adxl_ros.model.effects.base import ActsOn, Effect, Parameter, Parameters, Place, Signals
 import numpy as np
 
 
@@ -41,7 +41,7 @@ EFFECT = Effect(
     ),
     apply=apply,
     smooth=False,
-    acts_on='noise',
+    acts_on=ActsOn.NOISE,
     cause='Single samples are far off; look for loose contacts and loads that switch.',
     diagnosis=DiagnosisHints(detector=Detector.ISOLATED_SAMPLES),
 )

@@ -15,7 +15,7 @@
 """Eccentricity of the stage's encoder discs: an error of one period a turn."""
 
 from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre
-from adxl_ros.model.effects.base import Effect, Joint, Parameter, Parameters, Place, Signals
+from adxl_ros.model.effects.base import Effect, Joint, Need, Parameter, Parameters, Place, Signals
 import numpy as np
 
 
@@ -41,7 +41,7 @@ EFFECT = Effect(
                   f'true {joint} minus the encoder, part of the {wave}', '')
         for joint in ('alpha', 'beta') for wave in ('sine', 'cosine')),
     apply=apply,
-    needs=('stage',),
+    needs=(Need.STAGE,),
     cause='The disc of an encoder is off its axis; use two reading heads, or a table of errors.',
     diagnosis=DiagnosisHints(revealed_by=Manoeuvre.PLANES),
 )

@@ -15,7 +15,7 @@
 """Offset of the stage's encoders."""
 
 from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre
-from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
+from adxl_ros.model.effects.base import Effect, Need, Parameter, Parameters, Place, Signals
 
 
 def apply(signals: Signals, p: Parameters) -> None:
@@ -36,7 +36,7 @@ EFFECT = Effect(
     ),
     apply=apply,
     exact=True,
-    needs=('stage',),
+    needs=(Need.STAGE,),
     cause='The zero of an encoder is off; set it by a level, or remount the sensor by 180 deg.',
     diagnosis=DiagnosisHints(revealed_by=Manoeuvre.REMOUNT, half_turn='beta_rad'),
 )

@@ -15,7 +15,7 @@
 """Stuck samples: the link repeats its last sample for a while."""
 
 from adxl_ros.model.diagnosis_hints import Detector, DiagnosisHints
-from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
+from adxl_ros.model.effects.base import ActsOn, Effect, Parameter, Parameters, Place, Role, Signals
 import numpy as np
 
 
@@ -49,11 +49,11 @@ EFFECT = Effect(
         Parameter('rate_hz', 'Hz', 0.0, 1000.0, 0.1, 'physics: a bus that times out',
                   'beginnings a second', ''),
         Parameter('duration_s', 's', 1e-4, 100.0, 0.05, 'physics: a few frames',
-                  'time that the sample is held', '', neutral=0.05),
+                  'time that the sample is held', '', neutral=0.05, role=Role.SHAPE),
     ),
     apply=apply,
     smooth=False,
-    acts_on='noise',
+    acts_on=ActsOn.NOISE,
     cause='The link repeats samples; look at the bus, its load and its buffers.',
     diagnosis=DiagnosisHints(detector=Detector.REPEATED_SAMPLES),
 )

@@ -14,8 +14,9 @@
 
 """Supply: zero-g and scale factor follow it, but the ADXL203 is not exactly ratiometric."""
 
+from adxl_ros.model.constants import NOMINAL_SUPPLY_V
 from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre
-from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
+from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Role, Signals
 
 _SCALE_EXPONENT = 1.135
 """ln(560/1000)/ln(3/5): 560 mV/g at 3 V beside 1000 mV/g at 5 V."""
@@ -38,8 +39,10 @@ EFFECT = Effect(
         Parameter('scale_exponent', '1', -3.0, 3.0, _SCALE_EXPONENT,
                   'ADXL203 datasheet: 560 mV/g at 3 V, not 600',
                   'power of the supply that the scale factor follows; 0 is not at all'),
-        Parameter('nominal_v', 'V', 1.0, 30.0, 5.0, 'ADXL203 datasheet: figures at 5 V',
-                  'supply at which the figures hold', '', neutral=5.0, held=True),
+        Parameter('nominal_v', 'V', 1.0, 30.0, NOMINAL_SUPPLY_V,
+                  'ADXL203 datasheet: figures at 5 V',
+                  'supply at which the figures hold', '',
+                  neutral=NOMINAL_SUPPLY_V, held=True, role=Role.SHAPE),
     ),
     apply=apply,
     invertible=True,

@@ -14,15 +14,14 @@
 
 """Zero-g that moves with temperature."""
 
+from adxl_ros.model.constants import NOMINAL_TEMPERATURE_C
 from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre
-from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
-
-REFERENCE_C = 25.0
+from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Role, Signals
 
 
 def apply(signals: Signals, p: Parameters) -> None:
     """Add k·(T − 25 °C) + k2·(T − 25 °C)² to the output, g."""
-    off_k = signals.environment.temperature_c - REFERENCE_C
+    off_k = signals.environment.temperature_c - NOMINAL_TEMPERATURE_C
     for d, (per_k, per_k2) in enumerate(zip(p['per_k'], p['per_k2'])):
         signals.output[d] = signals.output[d] + off_k * (per_k + off_k * per_k2)
 
@@ -35,7 +34,7 @@ EFFECT = Effect(
                   'slope of the zero-g over temperature at 25 degC'),
         Parameter('per_k2', 'g/K^2', -0.01, 0.01, 1e-6,
                   'physics: a slope that changes by 1 % a degree',
-                  'curvature of the zero-g over temperature', typical=0.0),
+                  'curvature of the zero-g over temperature', typical=0.0, role=Role.OPTIONAL),
     ),
     apply=apply,
     invertible=True,

@@ -14,14 +14,14 @@
 
 """Scale factor that moves with temperature."""
 
+from adxl_ros.model.constants import NOMINAL_TEMPERATURE_C
 from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre
 from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
-from adxl_ros.model.effects.temperature_bias import REFERENCE_C
 
 
 def apply(signals: Signals, p: Parameters) -> None:
     """Multiply the scale factor by 1 + k·(T − 25 °C)."""
-    off_k = signals.environment.temperature_c - REFERENCE_C
+    off_k = signals.environment.temperature_c - NOMINAL_TEMPERATURE_C
     for d, per_k in enumerate(p['per_k']):
         signals.scale_v_per_g[d] = signals.scale_v_per_g[d] * (1 + per_k * off_k)
 

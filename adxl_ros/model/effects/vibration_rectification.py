@@ -15,7 +15,7 @@
 """Vibration rectification: vibration shifts the zero-g by its mean square."""
 
 from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre
-from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
+from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Role, Signals
 from adxl_ros.model.filters import low_pass
 
 
@@ -40,7 +40,7 @@ EFFECT = Effect(
                   'physics: asymmetry of the element, clipping of fast peaks',
                   'shift of the zero-g by the mean square of the vibration'),
         Parameter('tau_s', 's', 0.01, 60.0, 0.5, 'physics: slower than any vibration',
-                  'time over which the mean square is taken', '', neutral=0.5),
+                  'time over which the mean square is taken', '', neutral=0.5, role=Role.SHAPE),
     ),
     apply=apply,
     cause='Vibration shifts the zero-g; damp the mount, or stay away from its resonance.',

@@ -15,7 +15,7 @@
 """Warm-up: a zero-g that settles after power on."""
 
 from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre
-from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
+from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Role, Signals
 import numpy as np
 
 
@@ -33,7 +33,7 @@ EFFECT = Effect(
         Parameter('amplitude_g', 'g', -0.5, 0.5, 2e-3, 'physics: 20 K of own heat at 0.1 mg/K',
                   'zero-g at power on beside the settled one'),
         Parameter('tau_s', 's', 1.0, 1e5, 300.0, 'physics: a board in still air',
-                  'time constant of settling', '', neutral=300.0),
+                  'time constant of settling', '', neutral=300.0, role=Role.SHAPE),
     ),
     apply=apply,
     invertible=True,
