@@ -23,10 +23,14 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator
+from contextlib import redirect_stderr, redirect_stdout
+from importlib.metadata import entry_points
+from io import StringIO
 import os
 from pathlib import Path
 import signal
 import subprocess
+import sys
 
 from domain import BY_UDP, own_domain
 from hypothesis import settings
@@ -111,11 +115,28 @@ def start(ros_env: dict[str, str], tmp_path: Path) -> Iterator[Callable[..., Sta
 
 
 @pytest.fixture
-def run_tool(tmp_path: Path) -> Callable[..., subprocess.CompletedProcess]:
-    """Give a function of a name and arguments that runs a tool and captures what it prints."""
-    def run(name: str, *args: object, timeout_s: float = 120.0) -> subprocess.CompletedProcess:
-        return subprocess.run([executable(name), *map(str, args)], cwd=tmp_path, text=True,
-                              capture_output=True, timeout=timeout_s, stdin=subprocess.DEVNULL)
+def run_tool(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+             ) -> Callable[..., subprocess.CompletedProcess]:
+    """
+    Give a function of a name and arguments that runs a tool in `tmp_path` and captures its text.
+
+    The tool runs in this process, which saves the second that its imports take.
+    test_executables.py runs the installed executables.
+    """
+    def run(name: str, *args: object) -> subprocess.CompletedProcess:
+        (tool,) = entry_points(group='console_scripts', name=name)
+        main, on_sigterm = tool.load(), signal.getsignal(signal.SIGTERM)
+        with (redirect_stdout(StringIO()) as out, redirect_stderr(StringIO()) as err,
+              monkeypatch.context() as patch):
+            patch.chdir(tmp_path)
+            patch.setattr(sys, 'argv', [name, *map(str, args)])
+            try:
+                status = main()
+            except SystemExit as error:
+                status = error.code
+            finally:
+                signal.signal(signal.SIGTERM, on_sigterm)
+        return subprocess.CompletedProcess(sys.argv, status, out.getvalue(), err.getvalue())
     return run
 
 

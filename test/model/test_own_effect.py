@@ -21,13 +21,13 @@ import sys
 
 from adxl_ros.files import parameter_file, recording
 import numpy as np
-from processes import REPO
+from processes import REPO, run_executable
 from units import nominal
 
 PAGE = REPO / 'docs' / 'own_effect.md'
 
 
-def test_the_page_s_package_works(tmp_path, monkeypatch, run_tool):
+def test_the_page_s_package_works(tmp_path, monkeypatch):
     """Its module and entry point, found by simulate, by parameter files and by apply."""
     blocks = re.findall(r'`([a-z_.]+)`:\n\n```\w+\n(.*?)```', PAGE.read_text(), re.DOTALL)
     assert {name for name, _ in blocks} == {'pyproject.toml', 'crane_effects.py'}
@@ -45,9 +45,11 @@ def test_the_page_s_package_works(tmp_path, monkeypatch, run_tool):
     line = re.search(r'simulate (sweep .*) -o', PAGE.read_text())
     assert line
     effect = line[1].split()[2]
-    made = run_tool('simulate', 'tilt_alpha', '--rate', '50', '--effect', effect, '-o', 'a.csv')
+    made = run_executable('simulate', 'tilt_alpha', '--rate', '50', '--effect', effect,
+                          '-o', 'a.csv', cwd=tmp_path)
     assert made.returncode == 0, made.stderr
-    plain = run_tool('simulate', 'tilt_alpha', '--rate', '50', '-o', 'b.csv')
+    plain = run_executable('simulate', 'tilt_alpha', '--rate', '50', '-o', 'b.csv',
+                           cwd=tmp_path)
     assert plain.returncode == 0, plain.stderr
     read = [recording.read(tmp_path / name).columns['x_v'] for name in ('a.csv', 'b.csv')]
     # 2 Ohm · 0.7 mA; its growth with the output averages out over a whole turn.
@@ -58,9 +60,10 @@ def test_the_page_s_package_works(tmp_path, monkeypatch, run_tool):
                                         '      resistance_ohm: 2.0\n      current_a: 7.0e-4\n'
                                         '      growth_per_g: [0.05, 0.05]\n')
     path.write_text(text)
-    applied = run_tool('apply', 'a.csv', '--params', path, '-o', 'out.csv')
+    applied = run_executable('apply', 'a.csv', '--params', path, '-o', 'out.csv',
+                             cwd=tmp_path)
     assert applied.returncode == 0, applied.stderr
-    bare = run_tool('apply', 'b.csv', '-o', 'bare.csv')
+    bare = run_executable('apply', 'b.csv', '-o', 'bare.csv', cwd=tmp_path)
     assert bare.returncode == 0, bare.stderr
     ax = [np.genfromtxt(tmp_path / name, delimiter=',', names=True)['ax_mps2']
           for name in ('out.csv', 'bare.csv')]

@@ -84,3 +84,9 @@ class Started:
 def executable(name: str) -> Path:
     """Find an installed executable as `ros2 run` does."""
     return Path(get_package_prefix('adxl_ros')) / 'lib' / 'adxl_ros' / name
+
+
+def run_executable(name: str, *args: object, **options: object) -> subprocess.CompletedProcess:
+    """Run an installed executable to its end and capture what it prints."""
+    return subprocess.run([executable(name), *map(str, args)], text=True, capture_output=True,
+                          stdin=subprocess.DEVNULL, **{'timeout': 120, **options})
