@@ -16,13 +16,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 from adxl_ros.calibrate import joint_settings
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import COMMANDS, JOINTS, Recording
+from adxl_ros.files.sweep_journal import PoseRecord
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals import filter_time_constant
 from adxl_ros.signals.noise_limits import datasheet_noise
@@ -35,7 +35,7 @@ _FINEST_ANGLE_RAD = 1e-5
 """An encoder is never taken to be better than this, so that rounding in a file is no motion."""
 
 
-def named_rests(recording: Recording, entries: Sequence[Mapping[str, Any]]) -> list[Rest]:
+def named_rests(recording: Recording, records: Sequence[PoseRecord]) -> list[Rest]:
     """
     Find the rows of the rests that a journal names by their first and last stamp.
 
@@ -47,12 +47,12 @@ def named_rests(recording: Recording, entries: Sequence[Mapping[str, Any]]) -> l
     """
     stamps = recording.stamp_ns
     rests = []
-    for number, entry in enumerate(entries, 1):
-        start = int(np.searchsorted(stamps, entry['start_ns'], 'left'))
-        stop = int(np.searchsorted(stamps, entry['stop_ns'], 'right'))
-        if stop - start < 0.9 * entry['samples']:
+    for number, record in enumerate(records, 1):
+        start = int(np.searchsorted(stamps, record.start_ns, 'left'))
+        stop = int(np.searchsorted(stamps, record.stop_ns, 'right'))
+        if stop - start < 0.9 * record.samples:
             raise UserError(f'{recording.path}: has {stop - start} samples between the stamps of '
-                            f'pose {number} of the journal, which has {entry["samples"]}; give '
+                            f'pose {number} of the journal, which has {record.samples}; give '
                             'the recording of that very run')
         rests.append(Rest(start, stop, float(recording.time_s[start]),
                           float(recording.time_s[stop - 1])))
@@ -60,7 +60,7 @@ def named_rests(recording: Recording, entries: Sequence[Mapping[str, Any]]) -> l
 
 
 def extract_poses(recording: Recording, sensor: Sensor,
-             entries: Sequence[Mapping[str, Any]] | None = None) -> Poses:
+                  records: Sequence[PoseRecord] | None = None) -> Poses:
     """
     Find the rests of a recording, or take a journal's, and average each.
 
@@ -70,7 +70,7 @@ def extract_poses(recording: Recording, sensor: Sensor,
         Read as a whole.
     sensor
         From `stream_unit.recorded_unit`.
-    entries
+    records
         Poses of the journal of the run, which name the rests, the angles, the settings of the
         joints and the check poses.
 
@@ -82,36 +82,35 @@ def extract_poses(recording: Recording, sensor: Sensor,
     """
     volts, angles = recording.volts(sensor), recording.stage_angles
     known = datasheet_noise(sensor)
-    if entries is None:
+    if records is None:
         tolerance = max(sensor.stage_resolution_rad, _FINEST_ANGLE_RAD)
         rests = find_rests(recording.time_s, volts, sensor.rate_hz, angles, known, learn=True,
                            angle_tolerance_rad=None if angles is None else tolerance)
     else:
-        rests = named_rests(recording, entries)
+        rests = named_rests(recording, records)
     if not rests:
         raise UserError(f'{recording.path}: the sensor is nowhere at rest; hold it still for at '
                         'least 1 s in each pose')
     mean, std = rest_means(recording.time_s, volts, rests, sensor.rate_hz, known)
-    if entries is None:
+    if records is None:
         middle = rest_angles(angles, rests)
         check = np.zeros(len(rests), bool)
     else:
-        middle = np.array([[e.get('alpha_rad', np.nan), e.get('beta_rad', np.nan)]
-                           for e in entries])
-        check = np.array([bool(e.get('check', False)) for e in entries])
+        middle = np.array([[record.alpha_rad, record.beta_rad] for record in records])
+        check = np.array([record.check for record in records], bool)
     times = np.array([[r.time_start_s, r.time_stop_s] for r in rests])
-    settings = [_settings(recording, sensor, rests, joint, entries) for joint in ('alpha', 'beta')]
+    settings = [_settings(recording, sensor, rests, joint, records) for joint in ('alpha', 'beta')]
     return Poses(mean, std, middle[:, 0], middle[:, 1], times, check,
                  *(_means(recording.columns.get(name), rests)
                    for name in ('temperature_c', 'supply_v')), *settings)
 
 
 def _settings(recording: Recording, sensor: Sensor, rests: Sequence[Rest], joint: str,
-              entries: Sequence[Mapping[str, Any]] | None) -> np.ndarray | None:
+              records: Sequence[PoseRecord] | None) -> np.ndarray | None:
     """Return the settings of a joint, (k,): by the journal, else by its encoder and commands."""
     name = f'{joint}_setting'
-    if entries is not None and all(name in entry for entry in entries):
-        return np.array([entry[name] for entry in entries])
+    if records is not None and all(getattr(record, name) is not None for record in records):
+        return np.array([getattr(record, name) for record in records])
     readings, commands = (recording.columns.get(name) for name in (JOINTS[joint], COMMANDS[joint]))
     if readings is None and commands is None:
         return None

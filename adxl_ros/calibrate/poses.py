@@ -16,11 +16,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any
 
 from adxl_ros.errors import UserError
+from adxl_ros.files.sweep_journal import PoseRecord
 from adxl_ros.model import signal_chain
 from adxl_ros.model.constants import AXES
 from adxl_ros.model.effects.base import Components, Environment, NOMINAL_ENVIRONMENT, Value
@@ -82,16 +82,21 @@ class Poses:
         return len(self.volts)
 
     @staticmethod
-    def from_entries(entries: Sequence[Mapping[str, Any]]) -> Poses:
+    def from_records(records: Sequence[PoseRecord]) -> Poses:
         """Take the poses of a journal."""
-        def column(name: str, missing: Any = np.nan) -> np.ndarray:
-            return np.array([entry.get(name, missing) for entry in entries])
+        def column(name: str) -> np.ndarray:
+            return np.array([getattr(record, name) for record in records])
 
-        times = np.column_stack([column('start_ns'), column('stop_ns')]) * 1e-9
+        def settings(name: str) -> np.ndarray:
+            return np.array([-1 if getattr(record, name) is None else getattr(record, name)
+                             for record in records], int)
+
+        stamps_ns = np.array([[record.start_ns, record.stop_ns] for record in records])
+        check = np.array([record.check for record in records], bool)
         poses = Poses(column('mean_v'), column('std_v'), column('alpha_rad'), column('beta_rad'),
-                      times, column('check', False), column('temperature_c'), column('supply_v'))
+                      stamps_ns * 1e-9, check, column('temperature_c'), column('supply_v'))
         # Journals of earlier versions have no numbers of settings.
-        numbers = {name: _numbered(column(name, -1).astype(int), getattr(poses, name))
+        numbers = {name: _numbered(settings(name), getattr(poses, name))
                    for name in ('alpha_setting', 'beta_setting')}
         return replace(poses, **numbers)
 

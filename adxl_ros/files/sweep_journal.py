@@ -12,32 +12,228 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The journal of a calibration: every accepted pose on disk before it is acknowledged."""
+"""The journal of a calibration: records of its poses, on disk before they are acknowledged."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import asdict, dataclass, fields, MISSING
 from datetime import datetime, timezone
 import fcntl
 import json
+import math
 import os
 from pathlib import Path
 import shutil
-from typing import Any
+from typing import Any, NamedTuple, TypeAlias
 
 from adxl_ros.errors import UserError
 from adxl_ros.files.atomic_write import atomic_path, sync
 
 FORMAT = 1
+"""Version of the format, in the head of each journal; raised with each change of the lines."""
+_LONGEST_VALUE = 60
+"""Characters of a value in a message; chosen: two values fit on a line."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PoseRecord:
+    """
+    One accepted pose: the mean output at rest and the joint angles.
+
+    Attributes
+    ----------
+    pose
+        Number of the pose in the pose plan, or of the rest of a hand-held sensor, from 0.
+    alpha_rad, beta_rad
+        Joint angles, rad; NaN without a stage.
+    alpha_setting, beta_setting
+        Numbers of the settings of the joints; None without a stage and in earlier journals.
+    check
+        Whether the pose is kept out of the fit.
+    start_ns, stop_ns
+        Stamps of the first and the last sample, ns.
+    samples
+        Number of samples.
+    mean_v, std_v
+        Mean output of each axis and the standard deviation of that mean, V, (m,).
+    temperature_c, supply_v
+        Means over the rest, °C and V; NaN where there are no readings.
+
+    """
+
+    pose: int
+    alpha_rad: float = math.nan
+    beta_rad: float = math.nan
+    alpha_setting: int | None = None
+    beta_setting: int | None = None
+    check: bool = False
+    start_ns: int
+    stop_ns: int
+    samples: int
+    mean_v: tuple[float, ...]
+    std_v: tuple[float, ...]
+    temperature_c: float = math.nan
+    supply_v: float = math.nan
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the keys and values of the record's line; NaN and None have no key."""
+        line = {key: value for key, value in asdict(self).items()
+                if value is not None and value == value}
+        if 'alpha_rad' not in line:
+            del line['check']
+        return line
+
+    @classmethod
+    def from_json(cls, line: Mapping[str, Any]) -> PoseRecord:
+        """
+        Read the record of a line; unknown keys are left out.
+
+        Raises
+        ------
+        ValueError
+            The line lacks a key.
+
+        """
+        missing = [f.name for f in fields(cls) if f.default is MISSING and f.name not in line]
+        if missing:
+            raise ValueError(f'the pose has no {", ".join(missing)}')
+        values = {f.name: line[f.name] for f in fields(cls) if f.name in line}
+        for name in ('mean_v', 'std_v'):
+            values[name] = tuple(values[name])
+        return cls(**values)
+
+
+@dataclass(frozen=True)
+class PoseDropped:
+    """
+    A pose that counts no more, because it is to be taken again.
+
+    Attributes
+    ----------
+    pose
+        Number of the pose.
+
+    """
+
+    pose: int
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the keys and values of the line."""
+        return {'drop': self.pose}
+
+
+@dataclass(frozen=True)
+class PoseSkipped:
+    """
+    A pose that the operator leaves out.
+
+    Attributes
+    ----------
+    pose
+        Number of the pose.
+
+    """
+
+    pose: int
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the keys and values of the line."""
+        return {'skip': self.pose, 'drop': self.pose}
+
+
+@dataclass(frozen=True)
+class MountingUnchecked:
+    """A note that the operator left out the check of the mounting."""
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the keys and values of the line."""
+        return {'mounting': 'not checked'}
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """
+    A note that a fit is written.
+
+    Attributes
+    ----------
+    rests
+        Poses of the fit; None in journals of earlier versions.
+    done
+        Whether no pose was open, so that the calibration is over.
+
+    """
+
+    rests: tuple[PoseRecord, ...] | None
+    done: bool
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the keys and values of the line."""
+        rests = {} if self.rests is None else {'rests': [r.to_json() for r in self.rests]}
+        return {**rests, 'done': self.done}
+
+
+JournalEntry: TypeAlias = PoseRecord | PoseDropped | PoseSkipped | MountingUnchecked | Fitted
+
+
+class JournalContents(NamedTuple):
+    """
+    What a journal holds.
+
+    Attributes
+    ----------
+    head
+        What must be the same for poses to belong together, by key.
+    entries
+        All entries, in the order in which they were written.
+
+    """
+
+    head: dict[str, Any]
+    entries: list[JournalEntry]
+
+
+class Unfinished(NamedTuple):
+    """
+    An interrupted calibration.
+
+    Attributes
+    ----------
+    poses
+        Number of its accepted poses.
+    obstacle
+        Why it cannot be resumed: how its head differs, or which line is damaged; '' if it can.
+
+    """
+
+    poses: int
+    obstacle: str
 
 
 class NotJournalError(UserError):
-    """A line is none of a journal; `lines` are those before it."""
+    """
+    A line does not belong to a journal.
 
-    def __init__(self, path: Path, number: int, why: object, lines: list[dict[str, Any]]) -> None:
-        self.why, self.lines = f'line {number} is not of a journal ({why})', lines
-        super().__init__(f'{path}:{number}: not a journal: {why}')
+    Parameters
+    ----------
+    path
+        The file.
+    line_number
+        Number of the line, from 1.
+    reason
+        What is wrong with the line.
+    entries
+        Entries of the lines before.
+
+    """
+
+    def __init__(self, path: Path, line_number: int, reason: object,
+                 entries: list[JournalEntry]) -> None:
+        self.obstacle = f'line {line_number} is not of a journal ({reason})'
+        self.entries = entries
+        super().__init__(f'{path}:{line_number}: not a journal: {reason}')
 
 
 class Journal:
@@ -49,28 +245,28 @@ class Journal:
     Parameters
     ----------
     path
-        The file; made if it is not there.
+        The file; made if it does not exist.
     head
-        What must be the same for entries to belong together: unit, mode, plan.
-    anew
-        Begin anew beside an interrupted calibration, which is kept under its time.
+        What must be the same for entries to belong together: unit, mode, pose plan.
+    start_over
+        Begin a new journal although an interrupted one exists, which is kept under its time.
 
     Attributes
     ----------
     entries
-        What an interrupted calibration with the same head left, in order.
+        Entries of an interrupted calibration with the same head, in order.
 
     Raises
     ------
     UserError
-        Locked by another calibration, of another head (says what differs), not a journal, or not
-        writable.
+        The file is locked by another calibration, has another head, is not a journal, or cannot
+        be written.
 
     """
 
-    def __init__(self, path: str | os.PathLike, head: dict[str, Any], anew: bool = False):
+    def __init__(self, path: str | os.PathLike, head: Mapping[str, Any],
+                 start_over: bool = False) -> None:
         self.path = Path(path)
-        head = _written(head)
         try:
             self._file = open(self.path, 'a+b', buffering=0)  # noqa: SIM115 (kept open)
         except OSError as error:
@@ -83,181 +279,256 @@ class Journal:
             raise UserError(f'{path}: another calibration is writing this journal; finish or '
                             'abort it, or choose another journal') from None
         try:
-            self.entries = self._resume(head, anew)
+            self.entries = self._resume(_as_read(head), start_over)
         except UserError:
             self._file.close()
             raise
 
-    def append(self, entry: dict[str, Any]) -> None:
+    def append(self, entry: JournalEntry) -> None:
         """
         Write one entry and wait until it is on the disk.
 
         Raises
         ------
         UserError
-            The disk does not take it; the journal stays as it was.
+            The disk does not take the entry; the journal stays as it was.
 
         """
-        before = self._file.seek(0, os.SEEK_END)
-        line = json.dumps(entry).encode() + b'\n'
+        self._append_line(entry.to_json())
+
+    def close(self) -> None:
+        """Close the file, so that others can lock it."""
+        self._file.close()
+
+    def _append_line(self, line: Mapping[str, Any]) -> None:
+        size_before = self._file.seek(0, os.SEEK_END)
+        data = json.dumps(line).encode() + b'\n'
         try:
-            if self._file.write(line) != len(line):
+            if self._file.write(data) != len(data):
                 raise OSError(0, 'the disk is full')
             os.fsync(self._file.fileno())
         except OSError as error:
             with suppress(OSError):
-                self._file.truncate(before)
+                self._file.truncate(size_before)
             raise UserError(f'{self.path}: cannot write the journal: {error.strerror}; make '
                             'room and try again') from None
 
-    def close(self) -> None:
-        """Let the file go, for others to lock."""
-        self._file.close()
-
-    def _resume(self, head: dict[str, Any], anew: bool) -> list[dict[str, Any]]:
+    def _resume(self, head: dict[str, Any], start_over: bool) -> list[JournalEntry]:
         try:
-            known, whole = _parse(self.path)
+            contents, size = _parse(self.path)
         except NotJournalError as error:
-            if not anew:
+            if not start_over:
                 raise UserError(
-                    f'{error}; {len(accepted_poses(error.lines))} poses before it can be read; '
+                    f'{error}; {len(accepted_poses(error.entries))} poses before it can be read; '
                     'name another journal, or begin anew with resume:=anew (this file is kept)'
                 ) from None
-            known, whole = [{}], 0
-        if known and (anew or _ended(known, head)):
-            # A finished one is kept until the next is finished, all else for ever.
-            name = 'previous' if known[-1].get('done') else \
-                datetime.now(timezone.utc).strftime('%Y%m%dT%H%M%S.%fZ')
-            with atomic_path(self.path.with_name(f'{self.path.name}.{name}')) as kept:
-                shutil.copyfile(self.path, kept)
-            known, whole = [], 0
-        if known and (changed := differences(known[0], head)):
-            raise UserError(f'{self.path}: holds an unfinished calibration of another kind: '
-                            f'{changed}; go back, or begin anew with resume:=anew (it is kept)')
-        self._file.truncate(whole)
-        if not known:
-            self.append(head)
+            self._put_aside(None)
+            contents = None
+        if contents is not None and (start_over or _is_over(contents, head)):
+            self._put_aside(contents)
+            contents = None
+        if contents is None:
+            self._file.truncate(0)
+            self._append_line(head)
             sync(self.path.parent)
             return []
-        return known[1:]
+        if changed := differences(contents.head, head):
+            raise UserError(f'{self.path}: holds an unfinished calibration of another kind: '
+                            f'{changed}; go back, or begin anew with resume:=anew (it is kept)')
+        self._file.truncate(size)
+        return contents.entries
+
+    def _put_aside(self, contents: JournalContents | None) -> None:
+        """Copy the file: a finished journal until the next one is finished, others for ever."""
+        finished = contents is not None and bool(contents.entries) and \
+            isinstance(contents.entries[-1], Fitted) and contents.entries[-1].done
+        name = 'previous' if finished else \
+            datetime.now(timezone.utc).strftime('%Y%m%dT%H%M%S.%fZ')
+        with atomic_path(self.path.with_name(f'{self.path.name}.{name}')) as copy:
+            shutil.copyfile(self.path, copy)
 
 
-def read(path: str | os.PathLike) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+def read(path: str | os.PathLike) -> JournalContents:
     """
     Read the head and the entries of a journal.
 
     Raises
     ------
     UserError
-        Not readable or not a journal.
+        The file cannot be read or is not a journal.
 
     """
     try:
-        lines, _ = _parse(Path(path))
+        contents, _ = _parse(Path(path))
     except OSError as error:
         raise UserError(f'{path}: cannot be read: {error.strerror}') from None
-    if not lines:
+    if contents is None:
         raise UserError(f'{path}: an empty journal')
-    return lines[0], lines[1:]
+    return contents
 
 
-def unfinished(path: str | os.PathLike, head: dict[str, Any]) -> tuple[int, str] | None:
+def unfinished(path: str | os.PathLike, head: Mapping[str, Any]) -> Unfinished | None:
     """
     Look for an interrupted calibration, without a lock.
 
+    Parameters
+    ----------
+    path
+        The journal, which need not exist.
+    head
+        Head of the calibration that is to begin.
+
     Returns
     -------
-    poses, differences
-        How many poses it has, and how its head differs from this one, or which line is none of a
-        journal; None where there is none.
+    Unfinished or None
+        The interrupted calibration, if there is one.
 
     Raises
     ------
     UserError
-        Not readable.
+        The file cannot be read.
 
     """
     if not Path(path).exists():
         return None
     try:
-        lines, _ = _parse(Path(path))
+        contents, _ = _parse(Path(path))
     except NotJournalError as error:
-        return len(accepted_poses(error.lines)), error.why
+        return Unfinished(len(accepted_poses(error.entries)), error.obstacle)
     except OSError as error:
         raise UserError(f'{path}: cannot be read: {error.strerror}') from None
-    poses, head = len(accepted_poses(lines)), _written(head)
-    if not poses or _ended(lines, head):
+    if contents is None:
         return None
-    return poses, differences(lines[0], head)
+    poses, new_head = len(accepted_poses(contents.entries)), _as_read(head)
+    if not poses or _is_over(contents, new_head):
+        return None
+    return Unfinished(poses, differences(contents.head, new_head))
 
 
-def differences(was: dict[str, Any], now: dict[str, Any]) -> str:
-    """Say in which keys two heads differ, in the order of the present one: the unit first."""
-    return ', '.join(f'{key} was {_short(was.get(key))}, is {_short(now.get(key))}'
-                     for key in {**now, **was} if was.get(key) != now.get(key))
-
-
-def _ended(lines: Sequence[dict[str, Any]], head: dict[str, Any]) -> bool:
+def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> str:
     """
-    Tell whether a calibration is over, so that another may begin.
+    Return in which keys two heads differ.
 
-    One that was fitted with poses left open (`done` is false) can go on, but is in nobody's way.
+    Parameters
+    ----------
+    old, new
+        Heads by key; the keys of the new head come first.
+
+    Returns
+    -------
+    str
+        Each key with its old and new value; '' where the heads are equal.
+
     """
-    done = lines[-1].get('done')
-    return bool(done) or (done is not None and bool(differences(lines[0], head)))
+    return ', '.join(f'{key} was {_short(old.get(key))}, is {_short(new.get(key))}'
+                     for key in {**new, **old} if old.get(key) != new.get(key))
 
 
-def skipped_poses(entries: Sequence[dict[str, Any]]) -> set[int]:
-    """Return the poses that the operator left out and did not ask for again."""
-    found: set[int] = set()
+def skipped_poses(entries: Sequence[JournalEntry]) -> set[int]:
+    """Return the numbers of the poses that are left out and not asked for again."""
+    skipped: set[int] = set()
     for entry in entries:
-        found.discard(entry.get('drop', -1))
-        if 'skip' in entry:
-            found.add(entry['skip'])
-    return found
+        if isinstance(entry, PoseSkipped):
+            skipped.add(entry.pose)
+        elif isinstance(entry, PoseDropped):
+            skipped.discard(entry.pose)
+    return skipped
 
 
-def accepted_poses(entries: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the accepted poses in order; one that was taken again replaces the earlier one."""
-    poses: dict[int, dict[str, Any]] = {}
+def accepted_poses(entries: Sequence[JournalEntry]) -> list[PoseRecord]:
+    """Return the accepted poses by number; a pose that is taken again replaces the earlier."""
+    poses: dict[int, PoseRecord] = {}
     for entry in entries:
-        if 'pose' in entry:
-            poses[entry['pose']] = entry
-        poses.pop(entry.get('drop', -1), None)
+        if isinstance(entry, PoseRecord):
+            poses[entry.pose] = entry
+        elif isinstance(entry, PoseDropped | PoseSkipped):
+            poses.pop(entry.pose, None)
     return [poses[number] for number in sorted(poses)]
 
 
-def _parse(path: Path) -> tuple[list[dict[str, Any]], int]:
-    """Return the whole lines and their length in bytes; a last line cut by a crash is left."""
-    lines, whole = [], 0
+def poses_to_fit(entries: Sequence[JournalEntry]) -> list[PoseRecord]:
+    """Return the poses of the last fit, or the accepted ones if the sweep went on since."""
+    for entry in reversed(entries):
+        if isinstance(entry, Fitted) and entry.rests is not None:
+            return list(entry.rests)
+        if isinstance(entry, PoseRecord | PoseDropped | PoseSkipped):
+            break
+    return accepted_poses(entries)
+
+
+def _is_over(contents: JournalContents, head: Mapping[str, Any]) -> bool:
+    """
+    Return whether a calibration is over, so that another may begin.
+
+    A calibration that was fitted with open poses can be resumed. For another head it is over.
+    """
+    if not contents.entries or not isinstance(contents.entries[-1], Fitted):
+        return False
+    return contents.entries[-1].done or bool(differences(contents.head, head))
+
+
+def _parse(path: Path) -> tuple[JournalContents | None, int]:
+    """Return the contents, None without a head, and the size of the complete lines, bytes."""
     data = path.read_bytes()
     # A crash may have left the beginning of the head, or its length without its bytes.
     if b'\n' not in data and data.strip(b'\0') and not data.startswith(b'{'):
-        raise NotJournalError(path, 1, 'it does not begin with {', lines)
-    for number, raw in enumerate(_whole_lines(data), 1):
+        raise NotJournalError(path, 1, 'it does not begin with {', [])
+    # The text after the last newline is a line that a crash has cut.
+    lines = data.split(b'\n')[:-1]
+    if not lines:
+        return None, 0
+    head = _head(path, lines[0])
+    entries: list[JournalEntry] = []
+    for number, raw in enumerate(lines[1:], 2):
         try:
-            entry = json.loads(raw)
-            if not isinstance(entry, dict):
-                raise ValueError('not an object')
-        except ValueError as error:
-            raise NotJournalError(path, number, error, lines) from None
-        lines.append(entry)
-        whole += len(raw) + 1
-    if lines and lines[0].get('format') != FORMAT:
-        raise NotJournalError(path, 1, f'format {lines[0].get("format")!r}, but this package '
+            entry = _entry(_object(raw))
+        except (ValueError, TypeError) as error:
+            raise NotJournalError(path, number, error, entries) from None
+        if entry is not None:
+            entries.append(entry)
+    return JournalContents(head, entries), sum(len(raw) + 1 for raw in lines)
+
+
+def _head(path: Path, raw: bytes) -> dict[str, Any]:
+    try:
+        head = _object(raw)
+    except ValueError as error:
+        raise NotJournalError(path, 1, error, []) from None
+    if head.get('format') != FORMAT:
+        raise NotJournalError(path, 1, f'format {head.get("format")!r}, but this package '
                               f'reads version {FORMAT}', [])
-    return lines, whole
+    return head
 
 
-def _whole_lines(data: bytes) -> Iterator[bytes]:
-    yield from data.split(b'\n')[:-1]
+def _object(raw: bytes) -> dict[str, Any]:
+    line = json.loads(raw)
+    if not isinstance(line, dict):
+        raise ValueError('not an object')
+    return line
 
 
-def _written(head: dict[str, Any]) -> dict[str, Any]:
-    """Return a head as it is read again."""
+def _entry(line: Mapping[str, Any]) -> JournalEntry | None:
+    """Return the entry of a line; None for a line of another version without a meaning here."""
+    if 'pose' in line:
+        return PoseRecord.from_json(line)
+    if 'skip' in line:
+        return PoseSkipped(line['skip'])
+    if 'drop' in line:
+        return PoseDropped(line['drop'])
+    if 'mounting' in line:
+        return MountingUnchecked()
+    if 'done' in line:
+        rests = line.get('rests')
+        records = None if rests is None else tuple(PoseRecord.from_json(rest) for rest in rests)
+        return Fitted(records, bool(line['done']))
+    return None
+
+
+def _as_read(head: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a head as it is read from a file: with its format, and tuples as lists."""
     return json.loads(json.dumps({'format': FORMAT, **head}))
 
 
 def _short(value: Any) -> str:
     text = json.dumps(value)
-    return text if len(text) < 60 else f'{text[:57]}...'
+    return text if len(text) < _LONGEST_VALUE else f'{text[:_LONGEST_VALUE - 3]}...'

@@ -152,7 +152,7 @@ class Calibration(Node):
                     f'{"ahead of" if ahead_ns > 0 else "behind"} imu/data_raw: it counts from '
                     'when it arrives; put both on one clock')
             stamp_ns = 0
-        self.session.walk.surroundings.add(name, stamp_ns or newest_ns, value)
+        getattr(self.session.walk.surroundings, name).add(stamp_ns or newest_ns, value)
 
     @property
     def _sweep(self) -> Sweep | None:

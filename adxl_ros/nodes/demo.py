@@ -276,7 +276,7 @@ def _sweep(graph: Graph, output: Path) -> Poses:
     with steps.step('3/3 check', f'{_CHECKS} poses that the fit has not seen'):
         graph.wait(lambda: bool(_fitted_poses(path)), lambda: None, _FIT_S)
         graph.close()
-    return Poses.from_entries(_fitted_poses(path))
+    return Poses.from_records(_fitted_poses(path))
 
 
 def _real(folder: Path, path: Path, length_s: float) -> None:
@@ -307,7 +307,7 @@ def _real(folder: Path, path: Path, length_s: float) -> None:
             answer = graph.watcher.finish()
             if not output.exists():
                 raise UserError(f'{path}: {answer}')
-            poses = Poses.from_entries(_fitted_poses(_journal(output)))
+            poses = Poses.from_records(_fitted_poses(_journal(output)))
             step.show(f'{len(poses)} rests, magnitude of gravity')
             graph.close()
     fitted = parameter_file.load(output)
@@ -449,17 +449,18 @@ def _journal(output: Path) -> Path:
     return output.with_name(f'{output.name}.journal')
 
 
-def _poses(path: Path) -> list[dict]:
+def _poses(path: Path) -> list[sweep_journal.PoseRecord]:
     """Return the poses that a journal has so far."""
     return sweep_journal.accepted_poses(_entries(path))
 
 
-def _fitted_poses(path: Path) -> list[dict]:
+def _fitted_poses(path: Path) -> list[sweep_journal.PoseRecord]:
     """Return the poses that were fitted; the journal has them when everything is written."""
-    return next((entry['rests'] for entry in _entries(path) if 'rests' in entry), [])
+    fits = [entry for entry in _entries(path) if isinstance(entry, sweep_journal.Fitted)]
+    return list(fits[0].rests or ()) if fits else []
 
 
-def _entries(path: Path) -> list[dict]:
+def _entries(path: Path) -> list[sweep_journal.JournalEntry]:
     try:
         return sweep_journal.read(path)[1]
     except UserError:

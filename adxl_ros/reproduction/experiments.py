@@ -31,6 +31,7 @@ from adxl_ros.calibrate.guided.pose_plan import sweep
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.stream_info import sensor_info
+from adxl_ros.files.sweep_journal import PoseRecord
 from adxl_ros.model.coefficients import typical, with_neutral
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.sensor import Sensor
@@ -141,10 +142,13 @@ def poses_at(truth: Sensor, read_rad: np.ndarray, seed: int
     columns = simulate(truth, motion, seed)
     time_s = columns.pop('time_s')
     recording = Recording('simulated', time_s, columns, sensor_info(truth))
-    entries = [{'start_ns': round((end - trajectories.DWELL_S) * 1e9), 'stop_ns': round(end * 1e9),
-                'samples': round(trajectories.DWELL_S * truth.rate_hz), 'alpha_rad': a,
-                'beta_rad': b} for end, (a, b) in zip(ends_s, on_grid)]
-    return pose_extraction.extract_poses(recording, bare(truth), entries), true, recording
+    samples = round(trajectories.DWELL_S * truth.rate_hz)
+    records = [
+        PoseRecord(pose=number, start_ns=round((end_s - trajectories.DWELL_S) * 1e9),
+                   stop_ns=round(end_s * 1e9), samples=samples, mean_v=(), std_v=(),
+                   alpha_rad=alpha_rad, beta_rad=beta_rad)
+        for number, (end_s, (alpha_rad, beta_rad)) in enumerate(zip(ends_s, on_grid))]
+    return pose_extraction.extract_poses(recording, bare(truth), records), true, recording
 
 
 def visited(true_rad: np.ndarray) -> tuple[Motion, list[float]]:

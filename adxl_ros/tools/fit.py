@@ -59,14 +59,14 @@ def fit(options: argparse.Namespace) -> int:
         raise UserError(f'--journal {options.journal}: names the rests of one recording, but '
                         f'{len(options.recording)} are given')
     sensor = parameter_file.load(options.params or default_params())
-    entries = _entries(options.journal)
+    records = _records(options.journal)
     unit: Sensor | None = None
     parts, filters = [], []
     for path in options.recording:
         read = recording.read(path)
         say_notes('fit', read)
         unit = recorded_unit(unit or sensor, read)
-        parts.append(pose_extraction.extract_poses(read, unit, entries))
+        parts.append(pose_extraction.extract_poses(read, unit, records))
         filters.append(pose_extraction.estimate_filters(read, unit, parts[-1]))
     found = calibration.calibrate(unit, parts, options.model,
                                   [Path(path).name for path in options.recording],
@@ -81,13 +81,8 @@ def fit(options: argparse.Namespace) -> int:
     return 0
 
 
-def _entries(path: str | None) -> list[dict] | None:
-    if path is None:
-        return None
-    _, entries = sweep_journal.read(path)
-    # Rests that were fitted, unless the sweep has gone on since.
-    last = next((e for e in reversed(entries) if e.keys() & {'rests', 'pose', 'drop'}), {})
-    return last['rests'] if 'rests' in last else sweep_journal.accepted_poses(entries)
+def _records(path: str | None) -> list[sweep_journal.PoseRecord] | None:
+    return None if path is None else sweep_journal.poses_to_fit(sweep_journal.read(path).entries)
 
 
 def main() -> int:

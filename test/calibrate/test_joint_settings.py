@@ -15,7 +15,6 @@
 """Settings of a joint: the rule, and the same numbers from sweep, journal, bag and CSV."""
 
 from dataclasses import replace
-import json
 
 from adxl_ros.calibrate import joint_settings, pose_extraction
 from adxl_ros.calibrate.guided.capture_settings import Settings
@@ -32,8 +31,14 @@ from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.sensor import to_nominal_mps2
 import numpy as np
 import pytest
-from setting_checks import by_rests, check_all_agree, same_partition
-from units import Bench, Fed, nominal
+from setting_checks import (
+    as_read,
+    by_rests,
+    check_all_agree,
+    same_partition,
+    without_settings,
+)
+from units import Bench, Fed, nominal, pose_record
 
 NAN = float('nan')
 STEP = 1e-3
@@ -161,15 +166,15 @@ def take(on, alpha=None, beta=None):
     on.sweep.capture()
     entry = on.run(5, alpha, beta)
     # As it is in a journal.
-    entry = json.loads(json.dumps(entry))
+    entry = as_read(entry)
     on.sweep.take(entry)
     return entry
 
 
 def numbers(entries):
     """Return the settings of both joints, in the order of time."""
-    by_time = sorted(entries, key=lambda e: e['start_ns'])
-    return [e['alpha_setting'] for e in by_time], [e['beta_setting'] for e in by_time]
+    by_time = sorted(entries, key=lambda e: e.start_ns)
+    return [e.alpha_setting for e in by_time], [e.beta_setting for e in by_time]
 
 
 @pytest.mark.parametrize('mode', ['commanded', 'encoder', 'manual'])
@@ -230,19 +235,19 @@ def test_a_target_that_is_left_again_was_a_command(mode):
 def test_a_refused_pose_and_readings_after_the_dwell_move_nothing():
     """What is taken counts; a stage that goes on early moves for the next pose."""
     on = bench('encoder', [Target(ALPHA, 0.0)] * 3, temperature_span_c=1.0)
-    on.sweep.surroundings.add('temperature_c', on.now_ns, 20.0)
+    on.sweep.surroundings.temperature_c.add(on.now_ns, 20.0)
     entries = [take(on)]
-    on.sweep.surroundings.add('temperature_c', on.now_ns, 30.0)
+    on.sweep.surroundings.temperature_c.add(on.now_ns, 30.0)
     on.run(0.2, ALPHA, 0.0)
     assert on.sweep.capture() == ''
     assert on.run(3, ALPHA, 0.0) is None
     assert 'temperature moved' in on.sweep.refused()
-    on.sweep.surroundings.add('temperature_c', on.now_ns, 20.0)
+    on.sweep.surroundings.temperature_c.add(on.now_ns, 20.0)
     on.sweep.capture()
     entry = on.run(3, ALPHA, 0.0)
-    on.sweep.stage(entry['stop_ns'] + 10_000_000, ALPHA + 0.02, 0.0)
+    on.sweep.stage(entry.stop_ns + 10_000_000, ALPHA + 0.02, 0.0)
     again = on.sweep.accept()
-    assert again['alpha_setting'] == entry['alpha_setting'] == 0
+    assert again.alpha_setting == entry.alpha_setting == 0
     on.sweep.take(again)
     entries += [again, take(on)]
     assert numbers(entries) == ([0, 0, 1], [0, 0, 0])
@@ -260,7 +265,7 @@ def test_after_an_interruption_both_joints_have_moved():
         assert on.run(3, target.alpha_rad, target.beta_rad) is None
     after = [take(on) for _ in range(3)]
     assert numbers(after) == ([1, 1, 1], [2, 2, 2])
-    poses = Poses.from_entries([*after, *before])
+    poses = Poses.from_records([*after, *before])
     assert poses.alpha_setting.tolist() == [1, 1, 1, 0, 0, 0]
     # A driver that was started anew: the way to the check and back is by command.
     on = bench(targets=on.sweep.targets, accepted=())
@@ -292,20 +297,20 @@ def test_a_clock_that_goes_back_leaves_open_whether_the_stage_has_moved(mode, ba
 
 def test_journals_of_earlier_versions_are_numbered_by_their_angles():
     """In the order of time, whatever the order of the entries; beside new ones, too."""
-    entries = [{'mean_v': [2.5], 'std_v': [1e-5], 'alpha_rad': alpha, 'beta_rad': beta,
-                'start_ns': 10 * i, 'stop_ns': 10 * i + 5}
+    entries = [pose_record(i, mean_v=(2.5,), std_v=(1e-5,), alpha_rad=alpha, beta_rad=beta,
+                           start_ns=10 * i, stop_ns=10 * i + 5)
                for i, (alpha, beta) in enumerate([(1, 0), (1, 1), (1, 0), (2, 0)])]
-    poses = Poses.from_entries([entries[i] for i in (2, 0, 3, 1)])
+    poses = Poses.from_records([entries[i] for i in (2, 0, 3, 1)])
     assert poses.alpha_setting.tolist() == [0, 0, 1, 0]
     assert poses.beta_setting.tolist() == [2, 0, 2, 1]
-    new = [{**entries[3], 'start_ns': 100 + i, 'alpha_setting': 0, 'beta_setting': i}
+    new = [replace(entries[3], start_ns=100 + i, alpha_setting=0, beta_setting=i)
            for i in range(2)]
-    mixed = Poses.from_entries([*entries, *new])
+    mixed = Poses.from_records([*entries, *new])
     assert mixed.alpha_setting.tolist() == [0, 0, 0, 1, 2, 2]
     assert len(set(mixed.beta_setting.tolist())) == 5
-    both = join_poses([poses, Poses.from_entries(new)])
+    both = join_poses([poses, Poses.from_records(new)])
     assert both.alpha_setting.tolist() == [0, 0, 1, 0, 2, 2]
-    assert Poses.from_entries([{**entries[0], 'alpha_rad': NAN}]).alpha_setting.tolist() == [0]
+    assert Poses.from_records([replace(entries[0], alpha_rad=NAN)]).alpha_setting.tolist() == [0]
 
 
 class Run:
@@ -343,7 +348,7 @@ class Run:
         self.now_ns += 10_000_000
         entry = self.sweep.accept()
         if entry is not None:
-            self.entries.append(json.loads(json.dumps(entry)))
+            self.entries.append(as_read(entry))
             self.sweep.take(entry)
 
     def pose(self):
@@ -384,7 +389,7 @@ def test_sweep_journal_bag_and_csv_give_the_same_settings(tmp_path):
         run.pose()
     entries = [run.sweep.accepted[number] for number in sorted(run.sweep.accepted)]
     assert len(entries) == 9
-    live = Poses.from_entries(entries)
+    live = Poses.from_records(entries)
     assert live.alpha_setting.tolist() == [0, 0, 1, 2, 2, 3, 4, 4, 4]
     assert live.beta_setting.tolist() == [0, 1, 3, 4, 5, 6, 6, 6, 7]
     read = recording.read(run.bag(tmp_path / 'bag'))
@@ -403,7 +408,7 @@ def test_sweep_journal_bag_and_csv_give_the_same_settings(tmp_path):
     for name in COMMANDS.values():
         del read.columns[name]
     poses = pose_extraction.extract_poses(
-        read, unit, [{**e, 'alpha_setting': -1} for e in entries])
+        read, unit, [replace(e, alpha_setting=-1) for e in entries])
     assert (poses.alpha_setting == -1).all(), 'the numbers of a journal stand'
     _, beta = by_rests(read, unit, entries)
     assert same_partition(beta.tolist(), [0, 1, 3, 4, 5, 5, 5, 5, 7])
@@ -419,11 +424,11 @@ def test_a_sweep_with_a_journal_of_an_earlier_version_is_numbered_by_the_recordi
     run.pose()
     read = recording.read(run.bag(tmp_path / 'bag'))
     unit = recorded_unit(run.sensor, read)
-    bare = [{k: v for k, v in e.items() if not k.endswith('_setting')} for e in run.entries]
+    bare = without_settings(run.entries)
     poses = pose_extraction.extract_poses(read, unit, bare)
     assert poses.alpha_setting.tolist() == [0, 0, 0]
     assert poses.beta_setting.tolist() == [0, 1, 2]
-    assert Poses.from_entries(run.entries).beta_setting.tolist() == [0, 1, 2]
+    assert Poses.from_records(run.entries).beta_setting.tolist() == [0, 1, 2]
 
 
 def test_a_recording_without_a_stage_has_one_setting():

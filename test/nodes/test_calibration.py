@@ -112,9 +112,9 @@ def test_a_sweep_ends_with_a_file_and_fit_agrees_on_its_bag(start, run_tool, tmp
     np.testing.assert_allclose(offline.covariance[:both, :both], found.covariance, rtol=1e-5)
 
     _, entries = sweep_journal.read(tmp_path / 'unit.yaml.journal')
-    assert entries[-1]['done']
-    assert sum(entry['check'] for entry in entries[-1]['rests']) == 6
-    assert all(entry['samples'] == 1000 for entry in entries[-1]['rests'])
+    assert entries[-1].done
+    assert sum(entry.check for entry in entries[-1].rests) == 6
+    assert all(entry.samples == 1000 for entry in entries[-1].rests)
 
     # The bag and its CSV number the settings of the joints as the sweep did.
     read = recording.read(bag)
@@ -122,10 +122,10 @@ def test_a_sweep_ends_with_a_file_and_fit_agrees_on_its_bag(start, run_tool, tmp
     for path in (bag, tmp_path / 'bag.csv'):
         read = recording.read(path)
         check_all_agree(read, recorded_unit(nominal(serial='T1'), read),
-                        entries[-1]['rests'])
-    counts = [len({entry[f'{joint}_setting'] for entry in entries[-1]['rests']})
+                        entries[-1].rests)
+    counts = [len({getattr(entry, f'{joint}_setting') for entry in entries[-1].rests})
               for joint in ('alpha', 'beta')]
-    assert 5 <= min(counts) < len(entries[-1]['rests']) / 2, 'neighbours share one joint'
+    assert 5 <= min(counts) < len(entries[-1].rests) / 2, 'neighbours share one joint'
 
 
 def test_services_and_refusals(start, tmp_path):
@@ -257,7 +257,7 @@ def test_what_came_before_the_driver_said_what_it_is_counts(start, tmp_path):
         graph.spin_until(lambda: graph.value('calibration', 'accepted') == '2', 30, 'both rests')
     _, entries = sweep_journal.read(tmp_path / 'unit.yaml.journal')
     # The ends of a rest are left out.
-    assert min(entry['samples'] for entry in sweep_journal.accepted_poses(entries)) > 2500
+    assert min(entry.samples for entry in sweep_journal.accepted_poses(entries)) > 2500
 
 
 def test_an_operator_captures(start, tmp_path):
@@ -273,7 +273,7 @@ def test_an_operator_captures(start, tmp_path):
         answer = graph.call(Trigger, 'calibration/capture', Trigger.Request(), 30)
         assert answer.success and 'pose 1 is on disk' in answer.message
         _, entries = sweep_journal.read(tmp_path / 'calibration.yaml.journal')
-        assert entries[0]['alpha_rad'] == 0.785
+        assert entries[0].alpha_rad == 0.785
         # One axis shows no tilt: there is no figure, and it is not NaN.
         graph.spin_until(lambda: graph.value('calibration', 'accepted') == '1', 10, 'the pose')
         values = {p.key: p.value for p in graph.diagnostics['calibration'].values}

@@ -24,7 +24,7 @@ from graph import Graph, RELIABLE
 import numpy as np
 import pytest
 from std_srvs.srv import Trigger
-from units import drawn, nominal
+from units import drawn, nominal, pose_record
 
 FAST = ('-p', 'use_sim_time:=true')
 PLAN = ('-p', 'sweep.planes_rad:=[0.785, 1.5707963267948966, 2.356]', '-p',
@@ -82,7 +82,7 @@ def test_a_full_disk_is_said_and_waited_for(start, tmp_path):
         resource.prlimit(node.popen.pid, resource.RLIMIT_FSIZE, unlimited)
         graph.spin_until(lambda: _accepted(graph) >= full + 3, 60, 'more poses')
         assert node.popen.poll() is None and 'Traceback' not in node.output()
-    assert [entry['pose'] for entry in _on_disk(tmp_path)][:full + 3] == list(range(full + 3))
+    assert [entry.pose for entry in _on_disk(tmp_path)][:full + 3] == list(range(full + 3))
 
 
 def test_a_driver_that_is_started_anew_is_followed_and_another_unit_is_not(start, tmp_path):
@@ -111,11 +111,10 @@ def test_a_fit_that_fails_at_the_end_waits_and_another_unit_ends_the_session(sta
                  tmp_path / 'unit.yaml', tmp_path / 'unit.yaml.journal', '', '')
     interrupted = sweep_journal.Journal(asked.journal, asked.head(base))
     for i, target in enumerate(asked.targets(base)):
-        interrupted.append({
-            'pose': i, 'alpha_rad': target.alpha_rad, 'beta_rad': target.beta_rad, 'check': False,
-            'start_ns': i, 'stop_ns': i, 'samples': 500, 'std_v': [1e-4, 1e-4],
+        interrupted.append(pose_record(
+            i, alpha_rad=target.alpha_rad, beta_rad=target.beta_rad, samples=500,
             # Inverted: a unit that no fit takes.
-            'mean_v': [2.5 - np.cos(target.beta_rad), 2.5 - np.sin(target.beta_rad)]})
+            mean_v=(2.5 - np.cos(target.beta_rad), 2.5 - np.sin(target.beta_rad))))
     interrupted.close()
     with Graph() as graph:
         driver = _driver(start, tmp_path)

@@ -146,10 +146,11 @@ def test_an_operator_who_makes_mistakes_ends_with_a_good_file(start, tmp_path):
     np.testing.assert_allclose(found.zero_g_v, want.zero_g_v, atol=0.01)
     _, entries = sweep_journal.read(tmp_path / 'unit.yaml.journal')
     poses = sweep_journal.accepted_poses(entries)
-    assert all(e['samples'] == 2000 for e in poses)
+    assert all(e.samples == 2000 for e in poses)
     # Pose 2 was reached by other ways, and for pose 4 only the command tells of the second joint.
-    turned, moved = (np.abs(np.diff([[e[f'alpha_{what}'], e[f'beta_{what}']] for e in poses],
-                                    axis=0)) > 0.01 for what in ('rad', 'setting'))
+    angles = [[pose.alpha_rad, pose.beta_rad] for pose in poses]
+    settings = [[pose.alpha_setting, pose.beta_setting] for pose in poses]
+    turned, moved = (np.abs(np.diff(rows, axis=0)) > 0.01 for rows in (angles, settings))
     turned[2] = True
     assert (moved[1:] == turned[1:]).all()
 
@@ -218,7 +219,8 @@ def test_a_temperature_that_moved_is_refused_until_it_is_back(start, tmp_path):
         operator.node.create_timer(0.05, lambda: warm.publish(Temperature(
             header=stamped, temperature=now[0])))
         node = _bench(start, tmp_path, 'commanded')
-        operator.spin_until(lambda: any('temperature_c' in entry for entry in _taken(tmp_path)),
+        operator.spin_until(lambda: any(np.isfinite(pose.temperature_c)
+                                        for pose in _taken(tmp_path)),
                             60, 'a pose with its temperature')
         now[0] = 27.0
         operator.spin_until(lambda: operator.said(
@@ -228,7 +230,7 @@ def test_a_temperature_that_moved_is_refused_until_it_is_back(start, tmp_path):
             operator.value('calibration', 'accepted')) >= 4, 60, 'more poses')
     assert node.popen.poll() is None
     assert node.output().count('temperature is stamped ') == 1
-    measured = [e['temperature_c'] for e in _taken(tmp_path) if 'temperature_c' in e]
+    measured = [e.temperature_c for e in _taken(tmp_path) if np.isfinite(e.temperature_c)]
     assert measured[0] == pytest.approx(23.0) and max(measured) < 26.0
 
 

@@ -28,7 +28,7 @@ import pytest
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 from terminal import Terminal
-from units import drawn, nominal
+from units import drawn, nominal, pose_record
 from without_extras import run_without_extras
 
 FAST = ('-p', 'use_sim_time:=true')
@@ -161,7 +161,7 @@ def test_an_operator_is_led_through_a_sweep_by_the_screen(start, terminal, tmp_p
     poses = sweep_journal.accepted_poses(entries)
     assert len(poses) == 5 and sweep_journal.skipped_poses(entries) == {4}
     # The screen costs no samples: every pose is gapless.
-    assert all(e['stop_ns'] - e['start_ns'] == 1_000_000 * (e['samples'] - 1) for e in poses)
+    assert all(e.stop_ns - e.start_ns == 1_000_000 * (e.samples - 1) for e in poses)
 
 
 def _tilt(shown):
@@ -214,7 +214,7 @@ def test_a_terminal_of_another_process_has_a_screen_too(terminal):
 def test_what_changed_is_said_and_asked_about(start, terminal, tmp_path):
     """An interrupted calibration of other settings: what differs, and anew only if told."""
     old = sweep_journal.Journal(tmp_path / 'unit.yaml.journal', {'mode': 'stage', 'serial': 'T0'})
-    old.append({'pose': 0})
+    old.append(pose_record(0))
     old.close()
     bench(start, tmp_path)
     seen = terminal(*FAST, '-p', 'autostart:=true')

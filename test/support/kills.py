@@ -149,14 +149,14 @@ class Sweeps:
 
     def _look_at_poses(self, acknowledged):
         _, entries = sweep_journal.read(self.folder / 'unit.yaml.journal')
-        kept = {entry['pose']: json.dumps(entry)
+        kept = {entry.pose: json.dumps(entry.to_json())
                 for entry in sweep_journal.accepted_poses(entries)}
         gone = [n for n in {*self._known, *acknowledged} if n not in kept]
         changed = [n for n in self._known if n in kept and kept[n] != self._known[n]]
         if gone or changed:
             self.lost.append(f'kill {self.kills}: gone {gone}, changed {changed}')
         self._known = kept
-        if any(entry.get('done') for entry in entries):
+        if any(isinstance(entry, sweep_journal.Fitted) and entry.done for entry in entries):
             self.sweeps += 1
             self._known = {}
             if _data(self.folder / 'unit.yaml') not in map(_data, self._in_store()):

@@ -14,8 +14,22 @@
 
 """Recording and journal of one sweep number the settings of its joints alike."""
 
+from dataclasses import replace
+import json
+
 from adxl_ros.calibrate import pose_extraction
+from adxl_ros.files.sweep_journal import PoseRecord
 import numpy as np
+
+
+def as_read(record):
+    """Return a record as it is read from a journal."""
+    return PoseRecord.from_json(json.loads(json.dumps(record.to_json())))
+
+
+def without_settings(records):
+    """Return records of an earlier version, without the numbers of settings."""
+    return [replace(record, alpha_setting=None, beta_setting=None) for record in records]
 
 
 def same_partition(some, others):
@@ -28,18 +42,18 @@ def by_rests(read, unit, entries):
     """Find the rests without a journal; return the settings of those of a journal's poses."""
     poses = pose_extraction.extract_poses(read, unit)
     begin, end = (read.epoch_ns + np.rint(poses.time_s * 1e9).astype(np.int64)).T
-    middle = [(e['start_ns'] + e['stop_ns']) // 2 for e in entries]
+    middle = [(e.start_ns + e.stop_ns) // 2 for e in entries]
     rest = [int(np.flatnonzero((begin <= m) & (m <= end))[0]) for m in middle]
     return poses.alpha_setting[rest], poses.beta_setting[rest]
 
 
 def check_all_agree(read, unit, entries):
     """Assert that a recording numbers the settings as its journal does."""
-    alpha, beta = (np.array([e[f'{joint}_setting'] for e in entries])
+    alpha, beta = (np.array([getattr(e, f'{joint}_setting') for e in entries])
                    for joint in ('alpha', 'beta'))
     by_journal = pose_extraction.extract_poses(read, unit, entries)
     assert (by_journal.alpha_setting == alpha).all() and (by_journal.beta_setting == beta).all()
-    bare = [{k: v for k, v in e.items() if not k.endswith('_setting')} for e in entries]
+    bare = without_settings(entries)
     named = pose_extraction.extract_poses(read, unit, bare)
     for found in ((named.alpha_setting, named.beta_setting), by_rests(read, unit, entries)):
         assert same_partition(found[0].tolist(), alpha.tolist())

@@ -21,6 +21,7 @@ from adxl_ros.calibrate.fits.paper_regression import EFFECTS
 from adxl_ros.calibrate.guided.pose_plan import sweep
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.files import parameter_file
+from adxl_ros.files.sweep_journal import PoseRecord
 from adxl_ros.model import noise, signal_chain
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.kinematics import specific_force
@@ -96,6 +97,13 @@ class Fed:
         stamps_s = (self.count + np.arange(count)) / self.rate_hz
         self.count += count
         return self.respond(stamps_s)
+
+
+def pose_record(pose, **changes):
+    """Return a pose of a journal, that of a level sensor by default."""
+    return PoseRecord(**{'pose': pose, 'alpha_rad': 0.0, 'beta_rad': 0.0, 'start_ns': pose,
+                         'stop_ns': pose, 'samples': 1000, 'mean_v': (2.5, 2.5),
+                         'std_v': (1e-4, 1e-4), **changes})
 
 
 class Bench:

@@ -77,7 +77,7 @@ class View:
 
     def _pose_s(self, walk: Sweep) -> float:
         """Return the time that a pose takes, by those of this session, s."""
-        ends = [e['stop_ns'] for e in list(walk.accepted.values())[self._first:]]
+        ends = [e.stop_ns for e in list(walk.accepted.values())[self._first:]]
         if len(ends) < 3:
             return walk.settings.dwell_s + MOVE_S
         return float(np.median(np.abs(np.diff(ends)))) * 1e-9
@@ -85,7 +85,7 @@ class View:
     def _learned(self) -> dict[str, Any]:
         """Return coverage, coefficients and the tilt to expect; made anew with each pose."""
         walk = self._session.walk
-        key = len(walk.accepted), max((e['stop_ns'] for e in walk.accepted.values()), default=0)
+        key = len(walk.accepted), max((e.stop_ns for e in walk.accepted.values()), default=0)
         if key != self._key:
             self._key = key
             self._slow = _of_sweep(walk) if isinstance(walk, Sweep) else _of_tumble(walk)

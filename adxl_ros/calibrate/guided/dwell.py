@@ -16,12 +16,34 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import NamedTuple
 
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals.noise_limits import datasheet_noise
 from adxl_ros.signals.rest_detection import Rest, rest_means, RestFinder, Stillness
 import numpy as np
+
+
+class RestMean(NamedTuple):
+    """
+    The average of a rest.
+
+    Attributes
+    ----------
+    start_ns, stop_ns
+        Stamps of the first and the last sample, ns.
+    samples
+        Number of samples.
+    mean_v, std_v
+        Mean output of each axis and the standard deviation of that mean, V, (m,).
+
+    """
+
+    start_ns: int
+    stop_ns: int
+    samples: int
+    mean_v: tuple[float, ...]
+    std_v: tuple[float, ...]
 
 
 class Dwell:
@@ -79,12 +101,27 @@ class Dwell:
         """Return the samples of a rest, V, (n, m)."""
         return np.concatenate(self._volts)[rest.start:rest.stop]
 
-    def mean(self, rest: Rest, samples: int) -> dict[str, Any]:
-        """Average that many samples from the beginning of a rest: part of a journal's entry."""
+    def mean(self, rest: Rest, samples: int) -> RestMean:
+        """
+        Average the first samples of a rest.
+
+        Parameters
+        ----------
+        rest
+            The rest.
+        samples
+            Number of samples to average.
+
+        Returns
+        -------
+        RestMean
+            Their average.
+
+        """
         stamps, start, stop = np.concatenate(self._stamps), rest.start, rest.start + samples
         times = (stamps - self.arrived_ns) * 1e-9
         mean, std = rest_means(times, np.concatenate(self._volts),
                                [Rest(start, stop, times[start], times[stop - 1])],
                                self._sensor.rate_hz, datasheet_noise(self._sensor))
-        return {'start_ns': int(stamps[start]), 'stop_ns': int(stamps[stop - 1]),
-                'samples': samples, 'mean_v': mean[0].tolist(), 'std_v': std[0].tolist()}
+        return RestMean(int(stamps[start]), int(stamps[stop - 1]), samples,
+                        tuple(mean[0].tolist()), tuple(std[0].tolist()))

@@ -19,7 +19,6 @@ from __future__ import annotations
 from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 from adxl_ros.calibrate.fits import orientations
 from adxl_ros.calibrate.fits.gravity_fit import MIN_RESTS
@@ -36,6 +35,7 @@ from adxl_ros.calibrate.fits.gravity_model import (
 from adxl_ros.calibrate.guided import pose_checks, running_estimate
 from adxl_ros.calibrate.guided.capture_settings import State
 from adxl_ros.calibrate.guided.live_window import Newest, Surroundings, went_back
+from adxl_ros.files.sweep_journal import PoseRecord
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals.noise_limits import datasheet_noise
 from adxl_ros.signals.rest_detection import Rest, RestFinder, Stillness
@@ -71,9 +71,9 @@ class Tumble:
     """
 
     def __init__(self, sensor: Sensor, temperature_span_c: float,
-                 accepted: Sequence[dict[str, Any]] = ()):
+                 accepted: Sequence[PoseRecord] = ()):
         self.sensor = sensor
-        self.accepted = {entry['pose']: entry for entry in accepted}
+        self.accepted = {record.pose: record for record in accepted}
         self.surroundings = Surroundings()
         self.newest_ns: int | None = None
         self._span_c = temperature_span_c
@@ -105,7 +105,7 @@ class Tumble:
         self._saturated += stamps_ns[self.sensor.saturated(volts).any(axis=1)].tolist()
         self._finder.feed(self._time_s(stamps_ns), volts)
 
-    def accept(self) -> dict[str, Any] | None:
+    def accept(self) -> PoseRecord | None:
         """Return the next rest that has ended, for the journal, else None."""
         if not self._stamps or self._stamps[-1][-1] < self._judge_ns:
             return None
@@ -113,23 +113,23 @@ class Tumble:
         self._judge_ns = int(stamps[-1]) + _JUDGE_NS
         for rest in self._finder.rests():
             entry = self._entry(self._number(), rest, stamps)
-            ended = (stamps[-1] - entry['stop_ns']) * 1e-9 > _ENDED_S
-            if ended and entry['start_ns'] > self._said_ns:
-                self._said_ns = entry['stop_ns']
+            ended = (stamps[-1] - entry.stop_ns) * 1e-9 > _ENDED_S
+            if ended and entry.start_ns > self._said_ns:
+                self._said_ns = entry.stop_ns
                 self._judge_ns = 0
                 self._unsaid = self._wrong(entry)
                 return None if self._unsaid else entry
         return None
 
-    def take(self, entry: dict[str, Any]) -> None:
+    def take(self, entry: PoseRecord) -> None:
         """Count a rest that is on disk."""
-        self.accepted[entry['pose']] = entry
+        self.accepted[entry.pose] = entry
         self._learn()
 
     def retry(self) -> None:
         """Announce the newest rest once more."""
-        before = {e['pose'] for e in self._resumed}
-        self._said_ns = max((e['stop_ns'] for number, e in self.accepted.items()
+        before = {e.pose for e in self._resumed}
+        self._said_ns = max((e.stop_ns for number, e in self.accepted.items()
                              if number not in before), default=0)
         self._judge_ns = (self.newest_ns or 0) + 2 * _JUDGE_NS
 
@@ -159,16 +159,16 @@ class Tumble:
         self.drop(self.accepted[number])
         return f'rest {number + 1} is forgotten; hold the sensor in that direction again'
 
-    def drop(self, entry: dict[str, Any]) -> None:
+    def drop(self, entry: PoseRecord) -> None:
         """Leave a rest out."""
-        del self.accepted[entry['pose']]
-        resumed = [e for e in self._resumed if e['pose'] != entry['pose']]
+        del self.accepted[entry.pose]
+        resumed = [e for e in self._resumed if e.pose != entry.pose]
         if len(resumed) == len(self._resumed):
-            self._dropped.append((entry['start_ns'], entry['stop_ns']))
+            self._dropped.append((entry.start_ns, entry.stop_ns))
         self._resumed = resumed
         self._learn()
 
-    def results(self) -> list[dict[str, Any]]:
+    def results(self) -> list[PoseRecord]:
         """Return the rests to fit: those resumed, and all of this stream judged as a whole."""
         entries = list(self._resumed)
         if self._stamps:
@@ -176,7 +176,7 @@ class Tumble:
             for rest in self._finder.rests():
                 entry = self._entry(len(entries), rest, stamps)
                 if not self._wrong(entry) and not any(
-                        first <= entry['stop_ns'] and entry['start_ns'] <= last
+                        first <= entry.stop_ns and entry.start_ns <= last
                         for first, last in self._dropped):
                     entries.append(entry)
         return entries
@@ -221,8 +221,8 @@ class Tumble:
 
     def _learn(self) -> None:
         entries = [self.accepted[number] for number in sorted(self.accepted)]
-        mean = np.array([e['mean_v'] for e in entries]).reshape(-1, 3)
-        rests = nominal_rests(mean, np.array([e['std_v'] for e in entries]).reshape(-1, 3),
+        mean = np.array([record.mean_v for record in entries]).reshape(-1, 3)
+        rests = nominal_rests(mean, np.array([record.std_v for record in entries]).reshape(-1, 3),
                          self.sensor)
         self._found = np.zeros(len(NAMES))
         if len(mean):
@@ -241,23 +241,22 @@ class Tumble:
 
     def tilt_error_rad(self) -> float:
         """Return the rms error of alpha and beta to expect after the rests so far, rad."""
-        std_v = np.mean([e['std_v'] for e in self.accepted.values()] or
-                        [datasheet_noise(self.sensor).sigma], axis=0)
+        std_v = np.mean([e.std_v for e in self.accepted.values()] or
+                        [tuple(datasheet_noise(self.sensor).sigma)], axis=0)
         return running_estimate.tilt_error_rad(self._fitted, std_v)
 
     def _choose(self) -> None:
         self.next_up = orientations.next_up(self._told, ~self.covered & ~self._passed, self.up())
 
-    def _wrong(self, entry: dict[str, Any]) -> str:
-        first = next((e['temperature_c'] for e in self.accepted.values()
-                      if 'temperature_c' in e), np.nan)
+    def _wrong(self, entry: PoseRecord) -> str:
+        first = next((record.temperature_c for record in self.accepted.values()
+                      if np.isfinite(record.temperature_c)), np.nan)
         # A knock at the rail that leaves the rest as it was is left out of the mean.
-        at_rail = _SHARE * entry['samples'] < (bisect_right(self._saturated, entry['stop_ns'])
-                                               - bisect_left(self._saturated, entry['start_ns']))
+        at_rail = _SHARE * entry.samples < (bisect_right(self._saturated, entry.stop_ns)
+                                               - bisect_left(self._saturated, entry.start_ns))
         return ('saturated: samples of the rest are beyond the range of '
                 f'±{self.sensor.range_g:g} g or at a rail of the ADC; check supply and wiring'
-                if at_rail else pose_checks.temperature(first, entry.get('temperature_c', np.nan),
-                                                        self._span_c))
+                if at_rail else pose_checks.temperature(first, entry.temperature_c, self._span_c))
 
     def _number(self) -> int:
         return max(self.accepted, default=-1) + 1
@@ -270,9 +269,11 @@ class Tumble:
         self._stamps = [np.concatenate(self._stamps)]
         return self._stamps[0]
 
-    def _entry(self, number: int, rest: Rest, stamps: np.ndarray) -> dict[str, Any]:
+    def _entry(self, number: int, rest: Rest, stamps: np.ndarray) -> PoseRecord:
         mean, std = self._finder.means([rest])
         span = int(stamps[rest.start]), int(stamps[rest.stop - 1])
-        return {'pose': number, 'start_ns': span[0], 'stop_ns': span[1],
-                'samples': rest.stop - rest.start, 'mean_v': mean[0].tolist(),
-                'std_v': std[0].tolist(), **self.surroundings.means(*span)}
+        return PoseRecord(
+            pose=number, start_ns=span[0], stop_ns=span[1], samples=rest.stop - rest.start,
+            mean_v=tuple(mean[0].tolist()), std_v=tuple(std[0].tolist()),
+            temperature_c=self.surroundings.temperature_c.mean(*span),
+            supply_v=self.surroundings.supply_v.mean(*span))

@@ -27,6 +27,8 @@ import numpy as np
 _JUDGED_S, _SHOWN_S = 1.2, 0.5
 _SAMPLES = 20
 _BACK_NS = 1_000_000_000
+_KEPT_READINGS = 100_000
+"""Readings that stay in memory; chosen: 1000 s at 100 Hz."""
 STALE_NS = 60_000_000_000
 """A temperature or supply that is stamped so far from the samples is not theirs."""
 
@@ -78,30 +80,70 @@ class Newest:
         return to_nominal_mps2(self.volts[-self._show:], self._sensor)
 
 
-class Surroundings:
-    """Temperature and supply over time."""
+class Readings:
+    """Readings of one quantity over time."""
 
     def __init__(self) -> None:
-        self._kept: dict[str, tuple[deque[int], deque[float]]] = {}
+        self._stamps_ns: deque[int] = deque(maxlen=_KEPT_READINGS)
+        self._values: deque[float] = deque(maxlen=_KEPT_READINGS)
 
-    def add(self, name: str, stamp_ns: int, value: float) -> None:
-        """Take a reading of `temperature_c` or `supply_v`; what is not finite is left out."""
-        if np.isfinite(value):
-            stamps, values = self._kept.setdefault(name, (deque(maxlen=100_000),
-                                                          deque(maxlen=100_000)))
-            if stamps and stamp_ns < stamps[-1]:
-                stamps.clear()
-                values.clear()
-            stamps.append(stamp_ns)
-            values.append(value)
+    def add(self, stamp_ns: int, value: float) -> None:
+        """
+        Take a reading; one that is not finite is left out.
 
-    def means(self, first_ns: int, last_ns: int) -> dict[str, float]:
-        """Average what was read between two stamps, or else the last reading before, by name."""
-        found = {}
-        for name, (stamps, values) in self._kept.items():
-            begin, end = bisect_left(stamps, first_ns), bisect_right(stamps, last_ns)
-            if begin == end and end and first_ns - stamps[end - 1] < STALE_NS:
-                begin = end - 1
-            if begin < end:
-                found[name] = float(np.mean([values[i] for i in range(begin, end)]))
-        return found
+        Parameters
+        ----------
+        stamp_ns
+            Its stamp, ns. A stamp before the newest one begins a new history.
+        value
+            The reading, in its unit.
+
+        """
+        if not np.isfinite(value):
+            return
+        if self._stamps_ns and stamp_ns < self._stamps_ns[-1]:
+            self._stamps_ns.clear()
+            self._values.clear()
+        self._stamps_ns.append(stamp_ns)
+        self._values.append(value)
+
+    def mean(self, first_ns: int, last_ns: int) -> float:
+        """
+        Average the readings between two stamps, or return the last reading before.
+
+        Parameters
+        ----------
+        first_ns, last_ns
+            The stamps, ns.
+
+        Returns
+        -------
+        float
+            The average; NaN where no reading is recent enough.
+
+        """
+        begin = bisect_left(self._stamps_ns, first_ns)
+        end = bisect_right(self._stamps_ns, last_ns)
+        if begin == end and end and first_ns - self._stamps_ns[end - 1] < STALE_NS:
+            begin = end - 1
+        if begin == end:
+            return float('nan')
+        return float(np.mean([self._values[i] for i in range(begin, end)]))
+
+
+class Surroundings:
+    """
+    Temperature and supply over time.
+
+    Attributes
+    ----------
+    temperature_c
+        Readings of the temperature, °C.
+    supply_v
+        Readings of the supply, V.
+
+    """
+
+    def __init__(self) -> None:
+        self.temperature_c = Readings()
+        self.supply_v = Readings()

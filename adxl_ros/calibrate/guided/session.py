@@ -32,7 +32,17 @@ from adxl_ros.calibrate.poses import Poses
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store
 from adxl_ros.files.atomic_write import clear_left
-from adxl_ros.files.sweep_journal import accepted_poses, Journal, skipped_poses, unfinished
+from adxl_ros.files.sweep_journal import (
+    accepted_poses,
+    Fitted,
+    Journal,
+    MountingUnchecked,
+    PoseDropped,
+    PoseRecord,
+    PoseSkipped,
+    skipped_poses,
+    unfinished,
+)
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
@@ -134,11 +144,12 @@ class Plan:
         found = unfinished(self.journal, self.head(unit))
         if found is None:
             return ''
-        poses, changed = found
-        then = f', which cannot go on: {changed}. Begin anew (n; it is kept), or abort (a) and ' \
-               'put that back?' if changed else \
-            ' of this unit. Go on with them (y), or begin anew (n; they are kept)?'
-        return f'{self.journal} holds {poses} poses of an interrupted calibration{then}'
+        if found.obstacle:
+            return (f'{self.journal} holds {found.poses} poses of an interrupted calibration, '
+                    f'which cannot go on: {found.obstacle}. Begin anew (n; it is kept), or abort '
+                    '(a) and put that back?')
+        return (f'{self.journal} holds {found.poses} poses of an interrupted calibration of this '
+                'unit. Go on with them (y), or begin anew (n; they are kept)?')
 
 
 class Session:
@@ -173,8 +184,9 @@ class Session:
         self.newest = Newest(unit)
         self.journal = Journal(asked.journal, asked.head(unit), anew)
         self._clear_left()
-        self._fitted: list[dict[str, Any]] = []
-        self._unchecked = any('mounting' in entry for entry in self.journal.entries)
+        self._fitted: list[PoseRecord] = []
+        self._unchecked = any(isinstance(entry, MountingUnchecked)
+                              for entry in self.journal.entries)
         accepted = accepted_poses(self.journal.entries)
         self.resumed = len(accepted)
         self.walk = Sweep(unit, targets, asked.settings, accepted,
@@ -240,7 +252,7 @@ class Session:
                 self.walk.retry()
                 raise
             self.walk.take(entry)
-            yield f'pose {entry["pose"] + 1} is on disk'
+            yield f'pose {entry.pose + 1} is on disk'
         if unverified > self._unverified:
             yield 'the sensor is mounted as it was' if not self._unverified else \
                 'this pose reads what it did before; one more shows the mounting as a whole'
@@ -248,10 +260,10 @@ class Session:
     def skip(self) -> str:
         """Leave the pose at hand out; return what is done, or '' where none is left."""
         if self._unverified:
-            self.journal.append({'mounting': 'not checked'})
+            self.journal.append(MountingUnchecked())
             self._unchecked = True
         elif isinstance(self.walk, Sweep) and not self.over:
-            self.journal.append({'skip': self.walk.index, 'drop': self.walk.index})
+            self.journal.append(PoseSkipped(self.walk.index))
         return self.walk.skip() if not self.over else ''
 
     def redo(self) -> str:
@@ -259,7 +271,7 @@ class Session:
         number = self.walk.before
         if number is not None:
             # It is bad, and no part of a fit even if it is not taken again.
-            self.journal.append({'drop': number})
+            self.journal.append(PoseDropped(number))
         return self.walk.redo()
 
     def finish(self) -> calibration.CalibrationResult:
@@ -275,10 +287,10 @@ class Session:
         entries = self.walk.results()
         if not entries:
             raise UserError('no pose is taken yet')
-        if all(entry.get('check') for entry in entries):
+        if all(entry.check for entry in entries):
             raise UserError('only check poses are taken, which judge a fit and are no part of '
                             'it; take poses of the planes, too')
-        found = calibration.calibrate(self.unit, [Poses.from_entries(entries)], None,
+        found = calibration.calibrate(self.unit, [Poses.from_records(entries)], None,
                                       [self.journal.path.name])
         if self._unchecked:
             found = replace(found, fitted=replace(found.fitted, provenance={
@@ -300,7 +312,7 @@ class Session:
 
         """
         try:
-            self.journal.append({'rests': self._fitted, 'done': not self.left})
+            self.journal.append(Fitted(tuple(self._fitted), not self.left))
         except UserError as error:
             raise UserError(f'{self.asked.output} is written, but {error}') from None
 

@@ -23,17 +23,17 @@ dwell begins it anew.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from collections.abc import Iterable, Sequence
 
 from adxl_ros.calibrate.guided import mounting_check, pose_checks, running_estimate
 from adxl_ros.calibrate.guided.capture_settings import Settings, State
-from adxl_ros.calibrate.guided.dwell import Dwell
+from adxl_ros.calibrate.guided.dwell import Dwell, RestMean
 from adxl_ros.calibrate.guided.live_window import Surroundings, went_back
 from adxl_ros.calibrate.guided.pose_plan import Target
 from adxl_ros.calibrate.joint_settings import angle_tolerance_rad, SettingTracker
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.errors import UserError
+from adxl_ros.files.sweep_journal import PoseRecord
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals.rest_detection import Rest
 import numpy as np
@@ -66,12 +66,12 @@ class Sweep:
     """
 
     def __init__(self, sensor: Sensor, targets: Sequence[Target], settings: Settings,
-                 accepted: Sequence[Mapping[str, Any]] = (), skipped: Iterable[int] = ()):
+                 accepted: Sequence[PoseRecord] = (), skipped: Iterable[int] = ()):
         self.settings, self.targets, self.sensor = settings, targets, sensor
-        self.accepted: dict[int, dict[str, Any]] = {e['pose']: dict(e) for e in accepted}
+        self.accepted = {record.pose: record for record in accepted}
         self.skipped = set(skipped) - set(self.accepted)
         self.surroundings = Surroundings()
-        self._verify: list[dict[str, Any]] = []
+        self._verify: list[PoseRecord] = []
         self.newest_ns: int | None = None
         self._angles: deque[tuple[int, float, float]] = deque(maxlen=_KEPT_ANGLES)
         self._ahead_s: deque[float] = deque(maxlen=_OFFSETS)
@@ -90,7 +90,7 @@ class Sweep:
         """Take poses again before others, to see that the sensor is mounted as it was."""
         if self.target is not None and self.accepted:
             self._verify = mounting_check.to_take_again(list(self.accepted.values()))
-            self._go(self._verify[0]['pose'])
+            self._go(self._verify[0].pose)
 
     @property
     def target(self) -> Target | None:
@@ -207,7 +207,7 @@ class Sweep:
         if self._captured:
             self._dwell.feed(stamps_ns, volts)
 
-    def accept(self) -> dict[str, Any] | None:
+    def accept(self) -> PoseRecord | None:
         """
         Return the pose for the journal when a full dwell at rest is there, else None.
 
@@ -230,7 +230,7 @@ class Sweep:
                 self._dwell = Dwell(self.sensor, (self.newest_ns or 0) + 1)
             return None
         mean = self._dwell.mean(rest, wanted)
-        if self.settings.stage_mode != 'manual' and self._angles[-1][0] < mean['stop_ns']:
+        if self.settings.stage_mode != 'manual' and self._angles[-1][0] < mean.stop_ns:
             # What the stage did to the end of the dwell is still to come, or never will.
             if self.settings.stage_mode == 'encoder' and (silent := self._silent()):
                 self._refuse(f'{silent}; capture again when it is back')
@@ -245,12 +245,11 @@ class Sweep:
             return None
         return entry
 
-    def take(self, entry: dict[str, Any]) -> None:
+    def take(self, entry: PoseRecord) -> None:
         """Count a pose that is on disk, and go on to the next that is open."""
-        self.accepted[entry['pose']] = entry
-        self.skipped.discard(entry['pose'])
-        self._tracker.take(*(entry[name] for name in (
-            'start_ns', 'stop_ns', 'alpha_rad', 'beta_rad')))
+        self.accepted[entry.pose] = entry
+        self.skipped.discard(entry.pose)
+        self._tracker.take(entry.start_ns, entry.stop_ns, entry.alpha_rad, entry.beta_rad)
         self.known = self._learned(self.known)
         self._go(self._next())
 
@@ -258,7 +257,7 @@ class Sweep:
         """Take the same pose anew."""
         self._go(self.index)
 
-    def results(self) -> list[dict[str, Any]]:
+    def results(self) -> list[PoseRecord]:
         """Return the poses to fit: all that were accepted."""
         return [self.accepted[number] for number in sorted(self.accepted)]
 
@@ -334,7 +333,8 @@ class Sweep:
                                   self.target.beta_rad)
 
     def _highest(self, name: str) -> int:
-        return max((entry.get(name, -1) for entry in self.accepted.values()), default=-1)
+        return max((getattr(record, name) for record in self.accepted.values()
+                    if getattr(record, name) is not None), default=-1)
 
     def _begin(self) -> None:
         self._captured = False
@@ -342,50 +342,53 @@ class Sweep:
 
     def _learned(self, before: running_estimate.Known | None) -> running_estimate.Known:
         stage_rad = self.sensor.stage_resolution_rad / np.sqrt(12)
-        entries = [e for e in self.results() if not e.get('check')]
-        poses = Poses.from_entries(entries) if entries else Poses(
+        entries = [record for record in self.results() if not record.check]
+        poses = Poses.from_records(entries) if entries else Poses(
             *(np.zeros((0, len(self.sensor.axes))),) * 2, *(np.zeros(0),) * 2, np.zeros((0, 2)),
             np.zeros(0, bool))
         return running_estimate.from_poses(
             self.sensor, poses, self.settings.dwell_s, stage_rad, before)
 
-    def _entry(self, mean: dict[str, Any], target: Target) -> dict[str, Any]:
-        span = mean['start_ns'], mean['stop_ns']
+    def _entry(self, mean: RestMean, target: Target) -> PoseRecord:
+        span = mean.start_ns, mean.stop_ns
         alpha, beta = self._angle_between(*span, target)
         alpha_setting, beta_setting = self._tracker.settings(*span, alpha, beta)
-        return {'pose': self.index, 'alpha_rad': alpha, 'beta_rad': beta,
-                'alpha_setting': alpha_setting, 'beta_setting': beta_setting,
-                'check': target.check, **mean, **self.surroundings.means(*span)}
+        return PoseRecord(
+            pose=self.index, alpha_rad=alpha, beta_rad=beta, alpha_setting=alpha_setting,
+            beta_setting=beta_setting, check=target.check, **mean._asdict(),
+            temperature_c=self.surroundings.temperature_c.mean(*span),
+            supply_v=self.surroundings.supply_v.mean(*span))
 
-    def _moved_away(self, rest: Rest, entry: dict[str, Any]) -> str:
+    def _moved_away(self, rest: Rest, entry: PoseRecord) -> str:
         """Refuse a rest in another pose than the one in which the operator captured."""
         if self.settings.stage_mode == 'commanded':
             return ''
         if self.settings.stage_mode == 'encoder':
             seen = np.array([(a, b) for stamp, a, b in self._angles
-                             if entry['start_ns'] <= stamp <= entry['stop_ns']]).reshape(-1, 2)
-            alpha, beta = self.angles or (entry['alpha_rad'], entry['beta_rad'])
+                             if entry.start_ns <= stamp <= entry.stop_ns]).reshape(-1, 2)
+            alpha, beta = self.angles or (entry.alpha_rad, entry.beta_rad)
             return (pose_checks.angles(self.targets[self.index], alpha, beta,
                                        self.settings.near_rad)
                     or pose_checks.moved('alpha', seen[:, 0], self.settings.tolerance_rad)
                     or pose_checks.moved('beta', seen[:, 1], self.settings.tolerance_rad))
         before = self._dwell.volts(self._dwell.rests()[0]).mean(axis=0)
-        off_g = np.abs(np.array(entry['mean_v']) - before) / self.sensor.nominal_scale_v_per_g
+        off_g = np.abs(np.array(entry.mean_v) - before) / self.sensor.nominal_scale_v_per_g
         axis = int(off_g.argmax())
         return '' if off_g[axis] < np.sin(self.settings.near_rad) else (
             f'the pose changed after the capture: {self.sensor.axes[axis]} moved by '
             f'{off_g[axis]:.2f} g; hold the stage still until the pose is taken')
 
-    def _wrong(self, entry: dict[str, Any], volts: np.ndarray) -> str:
+    def _wrong(self, entry: PoseRecord, volts: np.ndarray) -> str:
         """Say what speaks against a pose with these samples, or ''."""
-        first = next((e['temperature_c'] for e in self.results() if 'temperature_c' in e), np.nan)
+        first = next((record.temperature_c for record in self.results()
+                      if np.isfinite(record.temperature_c)), np.nan)
         why = (pose_checks.saturated(self.sensor, volts)
-               or pose_checks.temperature(first, entry.get('temperature_c', np.nan),
+               or pose_checks.temperature(first, entry.temperature_c,
                                           self.settings.temperature_span_c))
         if why or self.verifying:
             return why
-        return pose_checks.reading(self.known, Target(entry['alpha_rad'], entry['beta_rad']),
-                                   np.array(entry['mean_v']), self.settings.tolerance_rad)
+        return pose_checks.reading(self.known, Target(entry.alpha_rad, entry.beta_rad),
+                                   np.array(entry.mean_v), self.settings.tolerance_rad)
 
     def _refuse(self, why: str) -> None:
         """Say why, once; what turns itself is looked at again, an operator captures again."""
@@ -396,13 +399,14 @@ class Sweep:
         if self.settings.stage_mode != 'commanded':
             self._captured = False
 
-    def _check_mounting(self, entry: dict[str, Any]) -> None:
+    def _check_mounting(self, entry: PoseRecord) -> None:
         before, stage_rad = self._verify[0], self.sensor.stage_resolution_rad
         if self.settings.stage_mode == 'manual':
             stage_rad = max(stage_rad, self.settings.tolerance_rad)
         else:
             # The stage is elsewhere within its tolerance: what the encoder knows is allowed for.
-            stage_rad += max(abs(entry[name] - before[name]) for name in ('alpha_rad', 'beta_rad'))
+            stage_rad += max(abs(getattr(entry, name) - getattr(before, name))
+                             for name in ('alpha_rad', 'beta_rad'))
         why = mounting_check.changed(self.sensor, before, entry, stage_rad)
         if why and self.settings.stage_mode == 'manual':
             self._refuse(f'{why}; or turn the stage to where it was, and capture again')
@@ -410,7 +414,7 @@ class Sweep:
         if why:
             raise MountingError(why)
         del self._verify[0]
-        self._go(self._verify[0]['pose'] if self._verify else self._next())
+        self._go(self._verify[0].pose if self._verify else self._next())
 
     def _clocks(self) -> str:
         if len(self._ahead_s) < _FEWEST_OFFSETS:

@@ -29,7 +29,7 @@ from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.kinematics import specific_force
 import numpy as np
 import pytest
-from units import Bench, drawn, Fed, nominal, swept
+from units import Bench, drawn, Fed, nominal, pose_record, swept
 
 UP = Target(np.pi / 2, 0.0)
 NEXT = Target(np.pi / 2, np.pi / 6)
@@ -66,7 +66,7 @@ def test_a_stage_turned_by_hand_is_captured_where_it_was_asked():
         'beta is 3.2° from the asked 30°; turn the stage there and capture again'
     by_hand.run(0.5, np.pi / 2, np.radians(31))
     assert by_hand.sweep.capture() == ''
-    assert by_hand.run(4, np.pi / 2, np.radians(31))['beta_rad'] == pytest.approx(np.radians(31))
+    assert by_hand.run(4, np.pi / 2, np.radians(31)).beta_rad == pytest.approx(np.radians(31))
 
 
 def test_a_stage_that_is_turned_during_the_dwell_is_told():
@@ -133,9 +133,9 @@ def test_a_wrong_pose_is_told_once_the_unit_is_known():
     sensor = drawn(np.random.default_rng(5), nominal())
     targets = guided([np.pi / 2], np.radians(30), 0)
     poses = swept(np.random.default_rng(1), sensor, [np.pi / 2], 0)
-    taken = [{'pose': i, 'alpha_rad': np.pi / 2, 'beta_rad': poses.beta_rad[i], 'check': False,
-              'start_ns': i, 'stop_ns': i + 1, 'mean_v': poses.volts[i].tolist(),
-              'std_v': poses.std_v[i].tolist()} for i in range(8)]
+    taken = [pose_record(i, alpha_rad=np.pi / 2, beta_rad=poses.beta_rad[i],
+                         mean_v=tuple(poses.volts[i]), std_v=tuple(poses.std_v[i]))
+             for i in range(8)]
     hand = bench('manual', targets, sensor, taken)
     hand.sweep.skip()  # the check of the mounting
     asked = hand.sweep.target
@@ -181,15 +181,15 @@ def test_saturated():
 def test_temperature():
     """4 °C more than at the first pose is refused, and taken again when it is back."""
     warm = bench()
-    warm.sweep.surroundings.add('temperature_c', warm.now_ns, 23.0)
+    warm.sweep.surroundings.temperature_c.add(warm.now_ns, 23.0)
     first = warm.run(5, np.pi / 2, 0.0)
-    assert first['temperature_c'] == 23.0
+    assert first.temperature_c == 23.0
     warm.sweep.take(first)
-    warm.sweep.surroundings.add('temperature_c', warm.now_ns, 27.0)
+    warm.sweep.surroundings.temperature_c.add(warm.now_ns, 27.0)
     assert warm.run(4, np.pi / 2, np.pi / 6) is None
     assert refusal(warm).startswith('temperature moved 4.0 °C since the first pose (23.0 to 27.0')
-    warm.sweep.surroundings.add('temperature_c', warm.now_ns, 24.0)
-    assert warm.run(5, np.pi / 2, np.pi / 6)['temperature_c'] == 24.0
+    warm.sweep.surroundings.temperature_c.add(warm.now_ns, 24.0)
+    assert warm.run(5, np.pi / 2, np.pi / 6).temperature_c == 24.0
 
 
 @pytest.mark.parametrize('ahead_s, words', [

@@ -24,7 +24,7 @@ from adxl_ros.model import signal_chain
 from adxl_ros.model.kinematics import specific_force
 import numpy as np
 import pytest
-from units import drawn, nominal
+from units import drawn, nominal, pose_record
 
 UNIT = nominal(serial='S1')
 TRUTH = drawn(np.random.default_rng(3), UNIT)
@@ -54,16 +54,17 @@ def take(session, count, off_v=0.0):
         target, walk = session.walk.target, session.walk
         volts = np.column_stack(signal_chain.static_response(TRUTH)(specific_force(
             np.array([target.alpha_rad]), np.array([target.beta_rad]), 9.80665)))[0] + off_v
-        entry = {'pose': walk.index, 'alpha_rad': target.alpha_rad, 'beta_rad': target.beta_rad,
-                 'check': target.check, 'start_ns': 2 * walk.index, 'stop_ns': 2 * walk.index + 1,
-                 'samples': 1000, 'mean_v': volts.tolist(), 'std_v': [5e-5, 5e-5]}
+        entry = pose_record(
+            walk.index, alpha_rad=target.alpha_rad, beta_rad=target.beta_rad, check=target.check,
+            start_ns=2 * walk.index, stop_ns=2 * walk.index + 1, mean_v=tuple(volts.tolist()),
+            std_v=(5e-5, 5e-5))
         session.journal.append(entry)
         walk.take(entry)
 
 
 def kept(session):
     """Return the numbers of the poses on disk."""
-    return [e['pose'] for e in sweep_journal.accepted_poses(
+    return [e.pose for e in sweep_journal.accepted_poses(
         sweep_journal.read(session.journal.path)[1])]
 
 
@@ -74,7 +75,7 @@ def test_a_pose_to_be_taken_again_is_in_no_fit_and_not_resumed(begin):
     take(session, 1, 0.3)
     assert session.redo() == 'pose 3 will be taken again'
     assert kept(session) == [0, 1]
-    assert [e['pose'] for e in session.walk.results()] == [0, 1]
+    assert [e.pose for e in session.walk.results()] == [0, 1]
     session = begin()
     assert session.resumed == 2 and kept(session) == [0, 1]
 

@@ -37,10 +37,10 @@ def test_a_pose_keeps_its_full_dwell():
     """A pose is 5000 samples at rest after arrival, with the deviation of 237 samples."""
     bench = _bench()
     entry = bench.run(10, np.pi / 2, 0.0)
-    assert entry['samples'] == 5000
-    assert entry['stop_ns'] - entry['start_ns'] == 4_999_000_000
-    assert entry['std_v'][0] == pytest.approx(0.535e-3 / np.sqrt(237), rel=0.8)
-    assert entry['mean_v'][0] == pytest.approx(3.5, abs=3e-4)
+    assert entry.samples == 5000
+    assert entry.stop_ns - entry.start_ns == 4_999_000_000
+    assert entry.std_v[0] == pytest.approx(0.535e-3 / np.sqrt(237), rel=0.8)
+    assert entry.mean_v[0] == pytest.approx(3.5, abs=3e-4)
 
 
 def test_nothing_is_accepted_before_arrival_and_the_text_says_how_far_off():
@@ -79,7 +79,7 @@ def test_motion_during_the_dwell_begins_it_anew():
     assert bench.run(0.2, np.pi / 2, 0.0, shake_mps2=1.0) is None
     knocked_ns = bench.now_ns
     entry = bench.run(10, np.pi / 2, 0.0)
-    assert entry['start_ns'] >= knocked_ns
+    assert entry.start_ns >= knocked_ns
 
 
 def test_a_stage_that_leaves_and_returns_begins_anew():
@@ -89,7 +89,7 @@ def test_a_stage_that_leaves_and_returns_begins_anew():
     bench.run(1, np.pi / 2, 0.05)
     returned_ns = bench.now_ns
     entry = bench.run(10, np.pi / 2, 0.0)
-    assert entry['start_ns'] > returned_ns
+    assert entry.start_ns > returned_ns
 
 
 @pytest.mark.parametrize('mode, beta', [('encoder', 0.02), ('manual', 0.0)])
@@ -101,8 +101,8 @@ def test_the_operator_captures(mode, beta):
     captured_ns = bench.now_ns
     bench.sweep.capture()
     entry = bench.run(7, np.pi / 2, 0.02, encoder=mode == 'encoder')
-    assert entry['start_ns'] >= captured_ns - 1_000_000
-    assert entry['beta_rad'] == pytest.approx(beta)
+    assert entry.start_ns >= captured_ns - 1_000_000
+    assert entry.beta_rad == pytest.approx(beta)
 
 
 def test_the_plan_is_the_papers_and_refuses_nonsense():
@@ -153,7 +153,7 @@ def test_rests_by_hand_are_announced_as_they_end():
     assert len(found) == 5
     results = tumble.results()
     assert len(results) == 6
-    assert all(2.0 < e['samples'] / 1000 < 3.1 for e in results)
+    assert all(2.0 < e.samples / 1000 < 3.1 for e in results)
     assert '5 rests (5 more at least)' in tumble.state().text
 
 
