@@ -16,7 +16,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import NamedTuple
 
 from adxl_ros.compensate import filter_inversion, paper_inverse
@@ -129,8 +128,7 @@ class Live:
                                        sensor.z_sign, FLOATS)
         self._invert = signal_chain.inverse(sensor)
         self._variance_v2 = variance_v2
-        # Until it is known, the temperature is neither within nor outside.
-        self._within(replace(sensor, envelope=replace(sensor.envelope, temperature_c=None)))
+        self._within(sensor.without_temperature_range())
         self._cells: dict[tuple[int, int, int], _Cell] = {}
         quiet = np.sqrt(variance_v2) / sensor.scale_v_per_g * G0_MPS2
         self._noise = (quiet[:2] ** 2).tolist()

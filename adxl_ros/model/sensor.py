@@ -118,6 +118,10 @@ class Sensor:
         """Return the sensor with coefficients that count as exact."""
         return replace(self, covariance=np.zeros((0, 0)), covariance_names=())
 
+    def without_temperature_range(self) -> Sensor:
+        """Return the sensor for samples whose temperature is not known: none is outside."""
+        return replace(self, envelope=replace(self.envelope, temperature_c=None))
+
     def _value(self, effect: str, parameter: str) -> np.ndarray:
         known = self.values.get(effect, {})
         return known.get(parameter, np.zeros(len(self.axes)))
