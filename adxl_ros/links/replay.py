@@ -12,68 +12,122 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""A recording played as if it were sensed now, in real time or faster."""
+"""A recording that is played as a live sensor, in real time or faster."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import replace
-from typing import Any
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import recording
 from adxl_ros.files.recording_columns import Recording, REFERENCES
 from adxl_ros.files.stream_unit import uncalibrated
-from adxl_ros.links.support.base import nothing, Option, Samples, State
+from adxl_ros.links.support.base import (
+    Level,
+    LinkStatus,
+    no_samples,
+    option,
+    PacedSettings,
+    Samples,
+)
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
-OPTIONS = (
-    Option('recording', '', 'the recording to play: a rosbag2 directory, .mcap or CSV'),
-    Option('loop', False, 'whether to start again at its end'),
-    Option('speed', 1.0, 'sensor time by real time; other than 1 with /clock', '', 0.01, 1000.0),
-)
-
 _ROWS = 2000
-"""Rows read at once: some milliseconds, so that samples leave in time."""
-_LAST_NS = 2 ** 31 * 10 ** 9
+"""Rows of a block. Chosen: reading a block takes some milliseconds, so samples leave in time."""
+_MAX_CLOCK_NS = 2 ** 31 * 10 ** 9
+"""Largest time of a ROS clock, ns: its seconds are an int32."""
 
 
-def open_link(sensor: Sensor, options: Mapping[str, Any]) -> Replay:
-    """Open the recording; raises `UserError` when it cannot be read."""
-    if not options['recording']:
+@dataclass(frozen=True)
+class Settings(PacedSettings):
+    """
+    Settings of the link.
+
+    Attributes
+    ----------
+    recording
+        Path of the recording.
+    loop
+        Whether the recording starts again at its end.
+
+    """
+
+    recording: str = option('', 'the recording to play: a rosbag2 directory, .mcap or CSV')
+    loop: bool = option(False, 'whether the recording starts again at its end')
+
+
+def open_link(sensor: Sensor, settings: Settings) -> Replay:
+    """
+    Open the recording.
+
+    Parameters
+    ----------
+    sensor
+        Sensor of the driver's parameters. What the recording states about its sensor has priority.
+    settings
+        Settings of the link.
+
+    Returns
+    -------
+    Replay
+        The link.
+
+    Raises
+    ------
+    UserError
+        The recording cannot be read.
+
+    """
+    if not settings.recording:
         raise UserError('link.recording: names no recording; set it to a rosbag2 directory, an '
                         '.mcap or a CSV file')
-    return Replay(sensor, options['recording'], options['loop'])
+    return Replay(sensor, settings)
 
 
 class Replay:
     """
-    The samples of a recording at the pace of a clock, with the figures that it carries.
+    The samples of a recording at the pace of a clock.
 
-    Its stamps are kept relative to each other; the first is when the replay begins.
+    The stamps keep their distances; the first one is the time at which the replay begins.
     """
 
     live = False
-    waits = True
+    waits_for_listener = True
 
-    def __init__(self, sensor: Sensor, path: str, loop: bool) -> None:
-        """Read the first rows."""
-        self._path, self._loop = path, loop
-        self._blocks: Iterator[Recording] = recording.blocks(path, _ROWS)
+    def __init__(self, sensor: Sensor, settings: Settings) -> None:
+        """
+        Read the first rows.
+
+        Parameters
+        ----------
+        sensor
+            Sensor of the driver's parameters.
+        settings
+            Settings of the link.
+
+        Raises
+        ------
+        UserError
+            The recording cannot be read.
+
+        """
+        self._path, self._loop = settings.recording, settings.loop
+        self._blocks: Iterator[Recording] = recording.blocks(self._path, _ROWS)
         first = next(self._blocks)
-        self.sensor = _unit(sensor, first)
+        self.sensor = _recorded_sensor(sensor, first)
         self.references = tuple(name for name in REFERENCES if name in first.columns)
         self._period_ns = round(1e9 / self.sensor.rate_hz)
         self._load(first)
         self._first_ns = int(self._stamps[0])
-        # A clock of ROS cannot show what a recording may hold, such as times before 0.
-        self.start_ns = self._first_ns if 0 <= self._first_ns < _LAST_NS else None
+        # A recording may hold times that a clock of ROS cannot show, such as times before 0.
+        self.start_ns = self._first_ns if 0 <= self._first_ns < _MAX_CLOCK_NS else None
         self._offset_ns = 0
         self._last_ns = self._first_ns - self._period_ns
 
     def begin(self, now_ns: int) -> int:
-        """Let the next sample be due now; none is lost by that."""
+        """Make the next sample due now; no sample is lost."""
         if self._block is not None:
             self._offset_ns = now_ns - int(self._stamps[self._row])
             self._last_ns = now_ns - self._period_ns
@@ -82,25 +136,25 @@ class Replay:
     def read(self, now_ns: int) -> Samples:
         """Return the rows that are due, at most to the end of a block."""
         if self._block is None:
-            return nothing(self.sensor, now_ns)
+            return no_samples(self.sensor, now_ns)
         end = int(np.searchsorted(self._stamps, now_ns - self._offset_ns, 'right'))
         rows = slice(self._row, max(end, self._row))
         stamps = self._stamps[rows] + self._offset_ns
-        steps = np.rint(np.diff(stamps, prepend=self._last_ns) / self._period_ns)
-        given = Samples(stamps, self._volts[rows], now_ns, int((steps - 1).clip(0).sum()),
-                        {name: self._block.columns[name][rows] for name in self.references})
+        periods = np.rint(np.diff(stamps, prepend=self._last_ns) / self._period_ns)
+        samples = Samples(stamps, self._volts[rows], now_ns, int((periods - 1).clip(0).sum()),
+                          {name: self._block.columns[name][rows] for name in self.references})
         self._row = rows.stop
         if len(stamps):
             self._last_ns = int(stamps[-1])
         if self._row == len(self._stamps):
-            self._turn()
+            self._load_next()
             if self._block is not None and self._stamps[0] + self._offset_ns <= now_ns:
-                given = replace(given, until_ns=self._last_ns)
-        return given
+                samples = replace(samples, until_ns=self._last_ns)
+        return samples
 
-    def state(self) -> State:
-        """Say whether it plays."""
-        return State('ok', 'playing' if self._block is not None else 'ended')
+    def status(self) -> LinkStatus:
+        """Return whether the recording plays."""
+        return LinkStatus(Level.OK, 'playing' if self._block is not None else 'ended')
 
     def close(self) -> None:
         """Close the file."""
@@ -111,8 +165,8 @@ class Replay:
         if block is not None:
             self._stamps, self._volts = block.stamp_ns, block.volts(self.sensor)
 
-    def _turn(self) -> None:
-        """Go to the next block, or to the first again, or to the end."""
+    def _load_next(self) -> None:
+        """Load the next block, the first block again, or none at the end."""
         self._load(next(self._blocks, None))
         if self._block is None and self._loop:
             self._blocks = recording.blocks(self._path, _ROWS)
@@ -120,9 +174,9 @@ class Replay:
             self._offset_ns = self._last_ns + self._period_ns - self._first_ns
 
 
-def _unit(sensor: Sensor, first: Recording) -> Sensor:
+def _recorded_sensor(sensor: Sensor, first: Recording) -> Sensor:
     """
-    Return the nominal sensor of a recording: what it states, the rest as the parameters.
+    Return the sensor of a recording; what the recording does not state is as in the parameters.
 
     Calibrated coefficients have no part in the nominal conversion.
     """

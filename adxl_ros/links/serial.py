@@ -17,24 +17,33 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 import time
-from typing import Any
+from typing import NamedTuple
 
 from adxl_ros.errors import UserError
 from adxl_ros.links.support import channels
-from adxl_ros.links.support.base import nothing, Option, Samples, State
+from adxl_ros.links.support.base import (
+    DeviceSettings,
+    Event,
+    Level,
+    LinkStatus,
+    no_samples,
+    option,
+    Samples,
+)
 from adxl_ros.links.support.clock_sync import ClockMap
-from adxl_ros.links.support.frame_counter import Count
-from adxl_ros.links.support.sample_stamps import Block, Timeline
-from adxl_ros.links.support.serial_port import Port, SILENT
+from adxl_ros.links.support.frame_counter import FrameCounter
+from adxl_ros.links.support.sample_stamps import clock_events, Stamper
+from adxl_ros.links.support.serial_port import SerialPort, SILENT
 from adxl_ros.links.support.wire_format import (
     AFTER_RESET,
-    Data,
+    BoardInfo,
     decode,
-    Info,
-    library,
+    import_cobs,
+    RAIL,
+    SampleFrame,
     Splitter,
     VersionError,
     WireError,
@@ -43,226 +52,370 @@ from adxl_ros.model.constants import AXES
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
-OPTIONS = (
-    Option('port', '', 'device path, such as /dev/ttyACM0, or a pyserial URL'),
-    Option('baud', 115200, 'of a UART; USB and network ports ignore it', 'Bd', 50, 100_000_000),
-    Option('channels', (), 'what the channels of a frame are, among x, y, z, supply, temperature '
-           'and - (unused); empty: x, y, z, supply, the first ones'),
-    Option('delay', 0.0, 'what the link takes at least from a sample to its arrival', 's',
-           0.0, 1.0),
-    channels.SUPPLY_SCALE,
-    Option('temperature_zero_v', 0.5, 'output of the temperature sensor at 0 degC', 'V',
-           -10.0, 10.0),
-    Option('temperature_v_per_c', 0.01, 'its slope', 'V/degC', -10.0, 10.0),
-)
-
-_USUAL = (*AXES, channels.SUPPLY)
+_DEFAULT_ROLES = (*AXES, channels.SUPPLY)
+"""Roles of the first channels where the parameters state none."""
 _SILENT_S = 0.5
-_DEAF_S = 1.0
-"""Bytes without a frame for so long are not those of a board at this rate."""
-_INFORMED_S = 1.5
-"""A board that has just been opened says what it is within this."""
-_CONNECTING = 'connecting'
-_BYTES_PER_S = 4e6
-_FASTER = 20.0
-"""Samples are taken at so many times their stated rate at most; the rest waits, or is the
-device's loss: nobody can keep this node busy, or fill its memory."""
+"""Silence after which a board counts as silent, s. Chosen: 50 frames of the firmware."""
+_NO_FRAME_S = 1.0
+"""Time without a whole frame after which the bytes are not those of a board, s. Chosen: two
+silences, so that silence is reported first."""
+_INFO_WAIT_S = 1.5
+"""Longest time without an info frame after opening, s. Derived: a board sends one each second."""
+_SILENT_FRAMES = 3
+"""A board also counts as silent only after this many times its longest frame."""
+_MAX_BYTES_PER_S = 4e6
+"""Bytes that are read per second at most. Chosen: more than USB full speed carries."""
+_MAX_RATE_RATIO = 20.0
+"""Samples are read at this many times the stated rate at most. What comes faster waits in the
+kernel or is lost there. So no device can keep the node busy or fill its memory."""
 _CREDIT_S = 0.2
+"""Reading time that a link saves up for a burst, s. Chosen: the backlog of a stall is read at
+once."""
+_MAX_PAUSE_S = 0.05
+"""Longest pause of one read, s, so that the driver reacts to its end."""
+_UNSTATED_RATE_HZ = 1000.0
+"""Sample rate before the info frame, Hz: that of the firmware."""
 
 
-def open_link(sensor: Sensor, options: Mapping[str, Any]) -> SerialLink:
-    """Check the options; the port is opened, and reopened for ever, by reading."""
-    if not options['port']:
+@dataclass(frozen=True)
+class Settings(DeviceSettings):
+    """
+    Settings of the link.
+
+    Attributes
+    ----------
+    port
+        Device path or pyserial URL.
+    baud
+        Baud rate of a UART, Bd.
+    channels
+        Roles of the channels of a frame: a list of strings, or one string with commas. Empty for
+        x, y, z, supply.
+    temperature_zero_v
+        Output of the temperature sensor at 0 degC, V.
+    temperature_v_per_c
+        Slope of the temperature sensor, V/degC.
+
+    """
+
+    port: str = option('', 'device path, such as /dev/ttyACM0, or a pyserial URL')
+    baud: int = option(115200, 'baud rate of a UART; USB and network ports ignore it', 'Bd', 50,
+                       100_000_000)
+    channels: str | Sequence[str] = option(
+        (), 'roles of the channels of a frame: x, y, z, supply, temperature, or - for unused; '
+        'empty: the first channels are x, y, z, supply')
+    temperature_zero_v: float = option(0.5, 'output of the temperature sensor at 0 degC', 'V',
+                                       -10.0, 10.0)
+    temperature_v_per_c: float = option(0.01, 'slope of the temperature sensor', 'V/degC',
+                                        -10.0, 10.0)
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """
+    Counts of the link, as diagnostics show them.
+
+    Attributes
+    ----------
+    frames
+        Whole frames.
+    bad_frames
+        Frames that are damaged or contradict the info frame.
+    bytes
+        Bytes received.
+    skipped_bytes
+        Bytes of runs that are too long for a frame.
+    held_back
+        Samples that came before the board had described itself, or do not fit the sensor.
+    repeated
+        Samples of frames that came twice or late.
+    device_overruns
+        Samples that the board itself dropped.
+    rail_frames
+        Frames with a code at a rail of the ADC.
+    resets
+        How often a new count has begun.
+    connections
+        How often the port was opened.
+
+    """
+
+    frames: int
+    bad_frames: int
+    bytes: int
+    skipped_bytes: int
+    held_back: int
+    repeated: int
+    device_overruns: int
+    rail_frames: int
+    resets: int
+    connections: int
+
+
+class _Arrival(NamedTuple):
+    """A decoded frame, and the monotonic time of its arrival, ns."""
+
+    frame: BoardInfo | SampleFrame
+    arrived_ns: int
+
+
+def open_link(sensor: Sensor, settings: Settings) -> SerialLink:
+    """
+    Check the settings; `SerialLink.read` opens the port, and opens it again after each loss.
+
+    Parameters
+    ----------
+    sensor
+        Sensor of the driver's parameters.
+    settings
+        Settings of the link.
+
+    Returns
+    -------
+    SerialLink
+        The link.
+
+    Raises
+    ------
+    UserError
+        A setting is missing or invalid, or a Python package is not installed.
+
+    """
+    if not settings.port:
         raise UserError('link.port: names no port; set it to a device path or a pyserial URL')
-    if not options['temperature_v_per_c']:
-        raise UserError('link.temperature_v_per_c: 0 tells no temperature')
-    library()
-    return SerialLink(sensor, options)
+    if not settings.temperature_v_per_c:
+        raise UserError('link.temperature_v_per_c: is 0; set the slope of the temperature sensor')
+    import_cobs()
+    return SerialLink(sensor, settings)
 
 
 class SerialLink:
     """
-    The samples of a board, each once and in order, stamped by the board's clock.
+    The samples of a board, each once and in order, stamped by the clock of the board.
 
-    Whatever comes is skipped up to the next whole frame; what is lost is counted by the board's
-    own numbers.
+    Bytes that are no whole frame are skipped. The numbers of the board show which samples are
+    lost.
     """
 
     live = True
-    waits = False
+    waits_for_listener = False
     start_ns = None
     sensor: Sensor | None = None
 
-    def __init__(self, sensor: Sensor, options: Mapping[str, Any]) -> None:
-        """Take what `OPTIONS` describe."""
-        self._unit, self._options = sensor, options
-        self._roles = channels.listed(options['channels'])
-        if self._roles:
-            channels.check_roles(self._roles, sensor.axes)
-        self.references = channels.references_of(self._roles or _USUAL)
-        self._port = Port(options['port'], options['baud'])
+    def __init__(self, sensor: Sensor, settings: Settings) -> None:
+        """
+        Prepare the link without opening the port.
+
+        Parameters
+        ----------
+        sensor
+            Sensor of the driver's parameters.
+        settings
+            Settings of the link.
+
+        Raises
+        ------
+        UserError
+            The channels do not fit the sensor, or pyserial is not installed.
+
+        """
+        self._declared, self._settings = sensor, settings
+        self._stated_roles = channels.parse_channels(settings.channels)
+        if self._stated_roles:
+            channels.check_roles(self._stated_roles, sensor.axes)
+        self.references = channels.reference_columns(self._stated_roles or _DEFAULT_ROLES)
+        self._port = SerialPort(settings.port, settings.baud)
         self._splitter = Splitter()
-        self._frames: deque[tuple[Info | Data, int]] = deque()
-        self._info: Info | None = None
-        self._refusal = self._version = ''
-        self._count = Count()
-        self._timeline = Timeline(ClockMap(options['delay']))
-        self._good = self._bad = self._held_back = self._resets = self._rail = 0
-        self._good_s = self._began_s = time.monotonic()
-        self._longest_s = 0.0
-        self._busy_s = 0.0
+        self._arrivals: deque[_Arrival] = deque()
+        self._info: BoardInfo | None = None
+        self._misfit = self._version_error = ''
+        self._counter = FrameCounter()
+        self._stamper = Stamper(ClockMap(settings.delay))
+        self._frames = self._bad_frames = self._held_back = self._resets = self._rail_frames = 0
+        self._last_frame_s = self._created_s = time.monotonic()
+        self._longest_frame_s = 0.0
+        self._busy_until_s = 0.0
 
     def begin(self, now_ns: int) -> int:
-        """Nothing is lost by a beginning: what was sent before is nobody's."""
+        """Do nothing: samples before the beginning do not count as lost."""
         return 0
 
     def read(self, now_ns: int) -> Samples:
-        """Wait for bytes, 50 ms at most, and return the samples that they complete."""
-        if not self._frames:
+        """Wait for bytes, at most 50 ms, and return the samples that they complete."""
+        if not self._arrivals:
             self._receive()
-        while self._frames:
-            frame, arrived_ns = self._frames[0]
-            if isinstance(frame, Info) and frame != self._info:
-                self._timeline.flush()
-                if self._timeline.waiting:
-                    break  # these have the figures of the board before
-            self._frames.popleft()
-            if isinstance(frame, Info):
+        while self._arrivals:
+            frame, arrived_ns = self._arrivals[0]
+            if isinstance(frame, BoardInfo) and frame != self._info:
+                self._stamper.flush()
+                if self._stamper.waiting:
+                    break  # the samples in the stamper belong to the previous board
+            self._arrivals.popleft()
+            if isinstance(frame, BoardInfo):
                 self._on_info(frame)
             else:
-                self._on_data(frame, arrived_ns)
-        samples = self._timeline.take()
-        return nothing(self._unit, time.time_ns()) if samples is None else samples
+                self._on_samples(frame, arrived_ns)
+        samples = self._stamper.take()
+        return no_samples(self._declared, time.time_ns()) if samples is None else samples
 
-    def state(self) -> State:
-        """Say how the port, the frames and the clock are."""
+    def status(self) -> LinkStatus:
+        """Return how the port, the frames and the clock work."""
         level, text = self._condition()
-        return State(level, text, {
-            'frames': self._good, 'bad_frames': self._bad,
-            'bytes': self._port.received, 'skipped_bytes': self._splitter.skipped,
-            'held_back': self._held_back, 'repeated': self._count.repeated,
-            'device_overruns': self._count.overruns, 'rail_frames': self._rail,
-            'resets': self._resets, 'connections': self._port.opened,
-            **self._timeline.values()})
+        clock = self._stamper.statistics()
+        statistics = Statistics(
+            frames=self._frames, bad_frames=self._bad_frames, bytes=self._port.received_bytes,
+            skipped_bytes=self._splitter.skipped, held_back=self._held_back,
+            repeated=self._counter.repeated, device_overruns=self._counter.overruns,
+            rail_frames=self._rail_frames, resets=self._resets,
+            connections=self._port.connections)
+        reset = Event('the device was reset or is another one: a new count begins', self._resets)
+        return LinkStatus(level, text, (statistics, clock), (reset, *clock_events(clock)))
 
     def close(self) -> None:
-        """Let go of the port."""
+        """Close the port."""
         self._port.close()
 
-    def _condition(self) -> tuple[str, str]:
+    def _condition(self) -> tuple[Level, str]:
+        if self._port.error:
+            return Level.ERROR, self._port.error
+        if self._version_error:
+            return Level.ERROR, self._version_error
         now_s = time.monotonic()
-        if self._port.trouble:
-            return 'error', self._port.trouble
-        if self._version:
-            return 'error', self._version
-        if self._info is None and now_s - max(self._port.opened_s, self._began_s) < _INFORMED_S:
-            return 'ok', _CONNECTING
-        name = self._options['port']
-        silent_s = now_s - max(self._port.heard_s, self._began_s)
-        if silent_s > max(_SILENT_S, 3 * self._longest_s):
-            return 'warn', f'{name}: {SILENT}'
-        if now_s - self._good_s > max(_DEAF_S, 3 * self._longest_s):
-            return 'warn', (f'{name}: bytes, but no frame of wire format 1: is link.baud '
-                            f'({self._options["baud"]}) that of the board?')
-        if self._refusal:
-            return 'error', self._refusal
+        port = self._settings.port
+        opened_s = max(self._port.opened_s, self._created_s)
+        if self._info is None and now_s - opened_s < _INFO_WAIT_S:
+            return Level.OK, 'connecting'
+        silent_s = now_s - max(self._port.last_byte_s, self._created_s)
+        if silent_s > max(_SILENT_S, _SILENT_FRAMES * self._longest_frame_s):
+            return Level.WARN, f'{port}: {SILENT}'
+        if now_s - self._last_frame_s > max(_NO_FRAME_S, _SILENT_FRAMES * self._longest_frame_s):
+            return Level.WARN, (f'{port}: bytes, but no frame of wire format 1: is link.baud '
+                                f'({self._settings.baud}) that of the board?')
+        if self._misfit:
+            return Level.ERROR, self._misfit
         if self._info is None:
-            return 'warn', f'{name}: waiting for the info frame of the board'
-        return 'ok', self._streaming()
+            return Level.WARN, f'{port}: waiting for the info frame of the board'
+        return Level.OK, self._streaming(self._info)
 
-    def _streaming(self) -> str:
-        assert self._info is not None
-        unused = [] if self._roles else \
-            [axis for axis in AXES[:self._info.channels] if axis not in self._unit.axes]
-        if unused:
-            return (f'streaming; the channel of {", ".join(unused)} is not used: sensor.axes is '
-                    f'{self._unit.axes} (link.channels can say that it is the supply)')
-        return 'streaming'
+    def _streaming(self, info: BoardInfo) -> str:
+        unused = [axis for axis in AXES[:info.channels] if axis not in self._declared.axes]
+        if self._stated_roles or not unused:
+            return 'streaming'
+        return (f'streaming; the channel of {", ".join(unused)} is not used: sensor.axes is '
+                f'{self._declared.axes} (link.channels can say that it is the supply)')
 
     def _receive(self) -> None:
+        """Read bytes and queue the frames that they complete."""
         chunk = self._port.read()
         if chunk is None:
-            # Another beginning: what had begun does not go on, and it may be another board.
+            # The port opens again, perhaps on another board: an incomplete frame stays incomplete.
             self._splitter.restart()
-            self._count.reopened()
+            self._counter.reopened()
             return
         arrived_ns = time.monotonic_ns()
         samples = 0
-        for raw in self._splitter(chunk):
-            try:
-                frame = decode(raw)
-            except VersionError as error:
-                self._version = (f'{self._options["port"]}: the board speaks {error}, this '
-                                 'driver reads 1; use the firmware of this version')
-                continue
-            except WireError:
-                self._bad += 1
-                continue
-            self._version = ''
-            self._good += 1
-            self._good_s = time.monotonic()
-            self._port.worked()
-            samples += len(frame.codes) if isinstance(frame, Data) else 1
-            self._frames.append((frame, arrived_ns))
-        self._brake(len(chunk), samples)
+        for raw in self._splitter.split(chunk):
+            frame = self._decoded(raw)
+            if frame is not None:
+                samples += len(frame.codes) if isinstance(frame, SampleFrame) else 1
+                self._arrivals.append(_Arrival(frame, arrived_ns))
+        self._throttle(len(chunk), samples)
 
-    def _brake(self, size: int, samples: int) -> None:
-        """Take no more than what a board can mean; the rest stays where it is."""
-        rate_hz = self._info.rate_hz if self._info else 1000.0
-        now_s = time.monotonic()
-        cost_s = size / _BYTES_PER_S + samples / (_FASTER * rate_hz)
-        self._busy_s = max(self._busy_s, now_s - _CREDIT_S) + cost_s
-        if self._busy_s > now_s:
-            time.sleep(min(self._busy_s - now_s, 0.05))
-
-    def _on_info(self, info: Info) -> None:
-        reset = bool(info.flags & AFTER_RESET)
-        if info == self._info and not reset:
-            return
-        changed = info != self._info
-        self._info = info
-        self._count.restart(info.rate_hz)
-        self._refusal = ''
+    def _decoded(self, raw: bytes) -> BoardInfo | SampleFrame | None:
+        """Decode and count a frame; None for one that cannot be read."""
         try:
-            roles = self._roles or list(_USUAL[:info.channels])
-            if len(roles) > info.channels:
-                raise UserError(f'link.channels: {len(roles)} are named, the board has '
-                                f'{info.channels}')
-            channels.check_roles([role for role in roles if self._roles or role not in AXES
-                                  or role in self._unit.axes], self._unit.axes)
+            frame = decode(raw)
+        except VersionError as error:
+            self._version_error = (f'{self._settings.port}: the board speaks {error}, this '
+                                   'driver reads 1; use the firmware of this version')
+            return None
+        except WireError:
+            self._bad_frames += 1
+            return None
+        self._version_error = ''
+        self._frames += 1
+        self._last_frame_s = time.monotonic()
+        self._port.confirm()
+        return frame
+
+    def _throttle(self, size: int, samples: int) -> None:
+        """
+        Pause so that bytes and samples stay below their largest rates (a leaky bucket).
+
+        Parameters
+        ----------
+        size
+            Bytes that were read.
+        samples
+            Samples in them.
+
+        """
+        rate_hz = self._info.rate_hz if self._info else _UNSTATED_RATE_HZ
+        now_s = time.monotonic()
+        cost_s = size / _MAX_BYTES_PER_S + samples / (_MAX_RATE_RATIO * rate_hz)
+        self._busy_until_s = max(self._busy_until_s, now_s - _CREDIT_S) + cost_s
+        if self._busy_until_s > now_s:
+            time.sleep(min(self._busy_until_s - now_s, _MAX_PAUSE_S))
+
+    def _on_info(self, info: BoardInfo) -> None:
+        changed = info != self._info
+        if not changed and not info.flags & AFTER_RESET:
+            return
+        self._info = info
+        self._counter.restart(info.rate_hz)
+        self._misfit = self._why_unfit(info)
+        if changed and not self._misfit:
+            self.sensor = replace(self._declared, rate_hz=info.rate_hz, adc_bits=info.bits,
+                                  adc_vref_v=info.vref_v,
+                                  serial=info.serial or self._declared.serial)
+
+    def _roles(self, info: BoardInfo) -> Sequence[str]:
+        """Return the roles of a board's channels, in their order."""
+        return self._stated_roles or _DEFAULT_ROLES[:info.channels]
+
+    def _why_unfit(self, info: BoardInfo) -> str:
+        """Return why the channels of a board do not fit the sensor; '' where they do."""
+        axes = self._declared.axes
+        roles = self._roles(info)
+        if len(roles) > info.channels:
+            return f'link.channels: {len(roles)} are named, the board has {info.channels}'
+        if not self._stated_roles:
+            roles = [role for role in roles if role not in AXES or role in axes]
+        try:
+            channels.check_roles(roles, axes)
         except UserError as error:
-            self._refusal = str(error)
-        if changed and not self._refusal:
-            self.sensor = replace(self._unit, rate_hz=info.rate_hz, adc_bits=info.bits,
-                                  adc_vref_v=info.vref_v, serial=info.serial or self._unit.serial)
+            return str(error)
+        return ''
 
-    def _on_data(self, data: Data, arrived_ns: int) -> None:
+    def _on_samples(self, frame: SampleFrame, arrived_ns: int) -> None:
         info = self._info
-        self._longest_s = len(data.codes) / (info.rate_hz if info else 1000.0)
-        if info is None or self._refusal:
-            self._held_back += len(data.codes)
+        rate_hz = info.rate_hz if info else _UNSTATED_RATE_HZ
+        self._longest_frame_s = len(frame.codes) / rate_hz
+        if info is None or self._misfit:
+            self._held_back += len(frame.codes)
             return
-        if data.codes.shape[1] != info.channels or data.codes.max() >= 2 ** info.bits:
-            self._bad += 1  # whole, but not what the info frame says
+        if frame.codes.shape[1] != info.channels or frame.codes.max() >= 2 ** info.bits:
+            self._bad_frames += 1  # whole, but it contradicts the info frame
             return
-        for found in self._count(data, arrived_ns):
-            if found.lost is None:
-                self._resets += self._timeline.period_ns > 0
-                self._timeline.restart(1e9 / info.rate_hz)
-            elif found.stepped:
-                self._timeline.step()
-            self._timeline.put(self._block(found.data, info), arrived_ns, found.lost or 0)
+        for accepted in self._counter.accept(frame, arrived_ns):
+            if accepted.lost is None:
+                self._resets += self._stamper.period_ns > 0
+                self._stamper.restart(1e9 / info.rate_hz)
+            elif accepted.stepped:
+                self._stamper.step()
+            self._stamper.add(self._block(accepted.frame, info), arrived_ns, accepted.lost or 0)
 
-    def _block(self, data: Data, info: Info) -> Block:
-        self._rail += data.flags & 1
-        roles = self._roles or _USUAL[:info.channels]
-        volts = data.codes * (info.vref_v / 2 ** info.bits)
-        values = {role: volts[:, i] for i, role in enumerate(roles)}
+    def _block(self, frame: SampleFrame, info: BoardInfo) -> channels.Block:
+        """Convert the codes of a frame to volts by role, and number its samples by time."""
+        self._rail_frames += frame.flags & RAIL
+        volts = frame.codes * (info.vref_v / 2 ** info.bits)
+        values = {role: volts[:, i] for i, role in enumerate(self._roles(info))}
         if channels.TEMPERATURE in values:
             values[channels.TEMPERATURE] = (
-                values[channels.TEMPERATURE] - self._options['temperature_zero_v']
-            ) / self._options['temperature_v_per_c']
-        steps = np.arange(len(volts)) * (1e9 / info.rate_hz)
-        device_ns = data.time_us * 1000 + np.rint(steps).astype(np.int64)
-        return Block(device_ns, *channels.split(values, self._unit, self.references,
-                                                self._options['supply_scale']))
+                values[channels.TEMPERATURE] - self._settings.temperature_zero_v
+            ) / self._settings.temperature_v_per_c
+        steps_ns = np.arange(len(volts)) * (1e9 / info.rate_hz)
+        device_ns = frame.time_us * 1000 + np.rint(steps_ns).astype(np.int64)
+        layout = channels.Layout(self._declared.axes, self.references,
+                                 self._settings.supply_scale)
+        return layout.block(device_ns, values)

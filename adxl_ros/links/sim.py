@@ -12,135 +12,202 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""A simulated sensor on a stage that moves, or at rest in a pose."""
+"""A simulated sensor, on a stage that moves or at rest in a pose."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import partial
 from math import inf
 import time
-from typing import Any
+from typing import NamedTuple
 
-from adxl_ros.links.support.base import Option, Samples, State
+from adxl_ros.links.support.base import Level, LinkStatus, option, PacedSettings, Samples
 from adxl_ros.links.support.simulated_stage import JOINTS
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.simulate.motion import Motion
 from adxl_ros.simulate.response import Response
 import numpy as np
 
-OPTIONS = (
-    Option('speed', 1.0, 'sensor time by real time; other than 1 with /clock', '', 0.01, 1000.0),
-    Option('seed', 0, 'of the noise', '', 0, 2 ** 31 - 1),
-    Option('alpha_rad', 0.0, 'pose while no stage is heard', 'rad', -100.0, 100.0),
-    Option('beta_rad', 0.0, 'pose while no stage is heard', 'rad', -100.0, 100.0),
-)
-
 _AHEAD_NS = 50_000_000
-"""Samples are made in blocks of this length, which costs less than one by one."""
-_BLOCK = 4096
+"""Length of a block of samples, ns. Chosen: a block costs less than its samples one by one."""
+_MAX_BLOCK = 4096
+"""Most samples of a block. Chosen: it bounds the memory at high sample rates."""
 _LOST_S = 1.0
-"""A stage that says nothing for so long of steady time is lost."""
+"""Silence after which a stage counts as lost, s of steady time. Chosen: a stage sends 100 poses a
+second."""
 _FOREIGN_NS = 2_000_000_000
-"""A stage whose stamps are farther from the samples' than this lives by another clock."""
+"""Largest distance between the stamps of stage and samples, ns. A larger one is another clock."""
 _GAP_NS = 50_000_000
-"""Over a longer gap in what the stage says the pose is held, not interpolated."""
+"""Longest gap in the stage's motion that is interpolated, ns. Over a longer one the pose is held.
+Chosen: five of the stage's steps."""
 _BEAT_NS = 10_000_000
-"""The first sample is on a multiple of this, as the stage's stamps are: no reference lies between
-samples."""
-_FOR_EVER_NS = 2 ** 63 - 1
+"""The first sample lies on a multiple of this, ns, as the stage's stamps do. So every reference
+has a sample of its own."""
+_FOREVER_NS = 2 ** 63 - 1
+"""Largest stamp, ns: no motion bounds the time."""
 
 
-def open_link(sensor: Sensor, options: Mapping[str, Any]) -> SimulatedSensor:
-    """Make the sensor in the pose that the options name."""
-    return SimulatedSensor(sensor, [options['alpha_rad'], options['beta_rad'], 0.0],
-                           options['seed'])
+@dataclass(frozen=True)
+class Settings(PacedSettings):
+    """
+    Settings of the link.
+
+    Attributes
+    ----------
+    seed
+        Seed of the noise.
+    alpha_rad, beta_rad
+        Pose without a stage, rad.
+
+    """
+
+    seed: int = option(0, 'seed of the noise', '', 0, 2 ** 31 - 1)
+    alpha_rad: float = option(0.0, 'pose without a stage', 'rad', -100.0, 100.0)
+    beta_rad: float = option(0.0, 'pose without a stage', 'rad', -100.0, 100.0)
+
+
+class _Knot(NamedTuple):
+    """
+    Motion of the joints at one stamp.
+
+    Attributes
+    ----------
+    stamp_ns
+        ROS time, ns.
+    position
+        alpha, rad; beta, rad; shift, m.
+    velocity
+        Their rates, rad/s and m/s.
+
+    """
+
+    stamp_ns: int
+    position: tuple[float, ...]
+    velocity: tuple[float, ...]
+
+
+def open_link(sensor: Sensor, settings: Settings) -> SimulatedSensor:
+    """
+    Open the link with the sensor at rest.
+
+    Parameters
+    ----------
+    sensor
+        Sensor that is simulated.
+    settings
+        Settings of the link.
+
+    Returns
+    -------
+    SimulatedSensor
+        The link.
+
+    """
+    return SimulatedSensor(sensor, settings)
 
 
 class SimulatedSensor:
     """
-    The chain of effects run forward, behind the stage's true motion where one is heard.
+    The signal chain forward in time, driven by the true motion of the stage.
 
-    The stage says where it will be some time ahead; samples are made up to the newest of that,
-    so that sensor time waits for the stage, and the sensor feels the motion exactly at its
-    samples. A stage that falls silent is waited for for a second; then its last pose is held.
+    The stage publishes its motion some time ahead. Samples are made up to the newest stamp of that
+    motion, so sensor time waits for the stage and each sample has the exact motion. The link waits
+    for a silent stage for one second; then it holds the last pose.
     """
 
     live = False
     references = ()
-    waits = False
+    waits_for_listener = False
     start_ns = None
+    joint_state_topic = 'stage/true_joint_states'
 
-    def __init__(self, sensor: Sensor, pose: list[float], seed: int) -> None:
-        """Rest in a pose: alpha, beta, rad, and shift, m."""
-        self.sensor = sensor
-        self._seed = seed
-        # Motion of the joints: stamp, position, velocity of each, (k, 1 + 3 + 3).
-        self._motion = [(0, *pose, 0.0, 0.0, 0.0)]
-        self._respond = self._settled()
-        self._heard_s = -inf
-        self._state = State('ok', 'at rest, no stage')
-        self._origin_ns = self._made = self._until_ns = 0
-        self._stamps, self._volts = np.zeros(0, np.int64), np.zeros((0, len(sensor.axes)))
-
-    def feel(self, stamp_ns: int, position: Mapping[str, float],
-             velocity: Mapping[str, float]) -> None:
+    def __init__(self, sensor: Sensor, settings: Settings) -> None:
         """
-        Take where the stage truly is, or will be, at a stamp.
+        Rest in the pose of the settings.
+
+        Parameters
+        ----------
+        sensor
+            Sensor that is simulated.
+        settings
+            Settings of the link.
+
+        """
+        self.sensor = sensor
+        self._seed = settings.seed
+        self._knots = [_resting((settings.alpha_rad, settings.beta_rad, 0.0))]
+        self._respond = self._settled_response()
+        self._last_motion_s = -inf
+        self._status = LinkStatus(Level.OK, 'at rest, no stage')
+        self._origin_ns = self._made = self._until_ns = 0
+        self._stamps = np.zeros(0, np.int64)
+        self._volts = np.zeros((0, len(sensor.axes)))
+
+    def sense_stage(self, stamp_ns: int, position: Mapping[str, float],
+                    velocity: Mapping[str, float]) -> None:
+        """
+        Take the true motion of the stage at a stamp, which may lie ahead.
 
         Parameters
         ----------
         stamp_ns
             ROS time, ns.
-        position, velocity
-            By joint, rad or m and their rates; a joint that is not named stays.
+        position
+            Position by joint, rad or m. A joint that is not named stays.
+        velocity
+            Velocity by joint, rad/s or m/s.
 
         """
         if not np.isfinite([*position.values(), *velocity.values()]).all():
-            self._state = State('warn', f'stage/true_joint_states: not finite: {position}')
+            self._status = LinkStatus(
+                Level.WARN, f'{self.joint_state_topic}: not finite: {position}')
             return
         if abs(stamp_ns - self._until_ns) > _FOREIGN_NS:
-            self._state = State('warn', 'the stage lives by another clock, '
-                                f'{(stamp_ns - self._until_ns) * 1e-9:+.1f} s from the sensor; '
-                                'set use_sim_time for both or for none')
+            self._status = LinkStatus(
+                Level.WARN, 'the stage lives by another clock, '
+                f'{(stamp_ns - self._until_ns) * 1e-9:+.1f} s from the sensor; set use_sim_time '
+                'for both or for none')
             return
-        # A stage that was started anew says it again, from where it is now.
-        while len(self._motion) > 1 and self._motion[-1][0] >= stamp_ns:
-            self._motion.pop()
-        last = self._motion[-1]
-        self._motion.append((stamp_ns, *(position.get(j, last[1 + i])
-                                         for i, j in enumerate(JOINTS)),
-                             *(velocity.get(j, 0.0) for j in JOINTS)))
-        self._heard_s = time.monotonic()
-        self._state = State('ok', 'on the stage')
+        # A stage that has started again publishes these stamps a second time, from its new pose.
+        while len(self._knots) > 1 and self._knots[-1].stamp_ns >= stamp_ns:
+            self._knots.pop()
+        previous = self._knots[-1].position
+        self._knots.append(_Knot(
+            stamp_ns,
+            tuple(position.get(joint, previous[i]) for i, joint in enumerate(JOINTS)),
+            tuple(velocity.get(joint, 0.0) for joint in JOINTS)))
+        self._last_motion_s = time.monotonic()
+        self._status = LinkStatus(Level.OK, 'on the stage')
 
     def begin(self, now_ns: int) -> int:
-        """Let the next sample be due now; return the samples that are left out."""
+        """Make the next sample due now; return the number of samples that are skipped."""
         skipped = self._skipped(now_ns)
         self._origin_ns = -(-now_ns // _BEAT_NS) * _BEAT_NS
         self._made, self._until_ns = 0, now_ns
         self._stamps, self._volts = self._stamps[:0], self._volts[:0]
-        self._motion = [(0, *self._motion[-1][1:4], 0.0, 0.0, 0.0)]
-        self._respond = self._settled()
+        self._knots = [_resting(self._knots[-1].position)]
+        self._respond = self._settled_response()
         return skipped
 
     def read(self, now_ns: int) -> Samples:
-        """Return the samples up to now, or up to where the stage's motion is known."""
-        until = max(self._until_ns, min(now_ns, self._known_ns()))
-        while until >= self._stamp(self._made):
-            self._make(until)
-        due = int(np.searchsorted(self._stamps, until, 'right'))
-        samples = Samples(self._stamps[:due], self._volts[:due], until)
+        """Return the samples up to now, or up to the newest stamp of the stage's motion."""
+        until_ns = max(self._until_ns, min(now_ns, self._motion_until_ns()))
+        while until_ns >= self._stamp(self._made):
+            self._make(until_ns)
+        due = int(np.searchsorted(self._stamps, until_ns, 'right'))
+        samples = Samples(self._stamps[:due], self._volts[:due], until_ns)
         self._stamps, self._volts = self._stamps[due:], self._volts[due:]
-        self._until_ns = until
+        self._until_ns = until_ns
         return samples
 
-    def state(self) -> State:
-        """Say whether there is a stage."""
-        return self._state
+    def status(self) -> LinkStatus:
+        """Return whether a stage moves the sensor."""
+        return self._status
 
     def close(self) -> None:
-        """Nothing is open."""
+        """Do nothing: the link holds nothing open."""
 
     def _skipped(self, now_ns: int) -> int:
         gap_s = (now_ns - self._until_ns) * 1e-9
@@ -150,52 +217,79 @@ class SimulatedSensor:
         """Return the times of samples by their numbers, ns."""
         return self._origin_ns + np.rint(index * (1e9 / self.sensor.rate_hz)).astype(np.int64)
 
-    def _known_ns(self) -> int:
-        """Time up to which the motion is known: for ever while there is no stage."""
-        if self._heard_s == -inf:
-            return _FOR_EVER_NS
-        if time.monotonic() - self._heard_s < _LOST_S:
-            return self._motion[-1][0]
-        self._heard_s = -inf
-        self._state = State('warn', 'stage lost: nothing on stage/true_joint_states for '
-                            f'{_LOST_S:g} s, its last pose is held')
-        return _FOR_EVER_NS
+    def _motion_until_ns(self) -> int:
+        """Return the time up to which the motion is known; it is unbounded without a stage."""
+        if self._last_motion_s == -inf:
+            return _FOREVER_NS
+        if time.monotonic() - self._last_motion_s < _LOST_S:
+            return self._knots[-1].stamp_ns
+        self._last_motion_s = -inf
+        self._status = LinkStatus(
+            Level.WARN, f'stage lost: nothing on {self.joint_state_topic} for {_LOST_S:g} s, its '
+            'last pose is held')
+        return _FOREVER_NS
 
-    def _make(self, until: int) -> None:
-        """Make samples up to a time, and ahead of it as far as the motion is known."""
-        ahead = min(until + _AHEAD_NS, self._known_ns())
-        stamps = self._stamp(self._made + np.arange(_BLOCK, dtype=float))
-        stamps = stamps[:np.searchsorted(stamps, ahead, 'right')]
+    def _make(self, until_ns: int) -> None:
+        """Make a block of samples, beyond a time as far as the motion is known."""
+        ahead_ns = min(until_ns + _AHEAD_NS, self._motion_until_ns())
+        stamps = self._stamp(self._made + np.arange(_MAX_BLOCK, dtype=float))
+        stamps = stamps[:np.searchsorted(stamps, ahead_ns, 'right')]
         self._made += len(stamps)
         volts = self._respond((stamps - self._origin_ns) * 1e-9)
         self._stamps = np.concatenate([self._stamps, stamps])
         self._volts = np.concatenate([self._volts, volts])
-        while len(self._motion) > 1 and self._motion[1][0] <= stamps[-1]:
-            del self._motion[0]
+        while len(self._knots) > 1 and self._knots[1].stamp_ns <= stamps[-1]:
+            del self._knots[0]
 
-    def _settled(self) -> Response:
-        """Let the sensor be at rest where the stage is; its noise is new each time."""
-        joints = [partial(self._joint, j) for j in range(len(JOINTS))]
+    def _settled_response(self) -> Response:
+        """Return the response of a sensor at rest in the stage's pose, with new noise."""
+        joints = [partial(self._joint, joint) for joint in range(len(JOINTS))]
         self._seed += 1
         return Response(self.sensor, Motion(inf, *joints), self._seed - 1)
 
     def _joint(self, joint: int, time_s: np.ndarray, order: int = 0) -> np.ndarray:
-        """Interpolate a joint at times since the origin, s, (n,); see `motion.Path`."""
+        """
+        Interpolate one joint by cubic Hermite splines, as a `simulate.motion.Path`.
+
+        The interpolation is exact in position and velocity at the stage's stamps.
+
+        Parameters
+        ----------
+        joint
+            Number of the joint in `JOINTS`.
+        time_s
+            Times since the origin, s, (n,).
+        order
+            Order of the derivative: 0, 1 or 2.
+
+        Returns
+        -------
+        ndarray
+            Position, rad or m, or its derivative, (n,).
+
+        """
         stamps = self._origin_ns + np.rint(time_s * 1e9).astype(np.int64)
-        knots = np.array([m[0] for m in self._motion], np.int64)
-        at = np.array([(m[1 + joint], m[4 + joint]) for m in self._motion])
-        left = (np.searchsorted(knots, stamps) - 1).clip(0)
-        right = (left + 1).clip(max=len(knots) - 1)
-        step_ns = knots[right] - knots[left]
+        knots = np.array([knot.stamp_ns for knot in self._knots], np.int64)
+        position = np.array([knot.position[joint] for knot in self._knots])
+        velocity = np.array([knot.velocity[joint] for knot in self._knots])
+        before = (np.searchsorted(knots, stamps) - 1).clip(0)
+        after = (before + 1).clip(max=len(knots) - 1)
+        step_ns = knots[after] - knots[before]
         held = (step_ns <= 0) | (step_ns > _GAP_NS)
         h = np.where(held, 1, step_ns) * 1e-9
-        u = np.where(held, 0.0, (stamps - knots[left]) * 1e-9 / h)
-        (p0, v0), (p1, v1) = at[left].T, at[right].T
-        v0, v1 = np.where(held, 0.0, v0 * h), v1 * h
-        # Cubic Hermite: exact in position and velocity at the stage's stamps.
-        square, cube = 3 * (p1 - p0) - 2 * v0 - v1, 2 * (p0 - p1) + v0 + v1
+        u = np.where(held, 0.0, (stamps - knots[before]) * 1e-9 / h)
+        p0, p1 = position[before], position[after]
+        v0 = np.where(held, 0.0, velocity[before] * h)
+        v1 = velocity[after] * h
+        # p(u) = p0 + v0 u + a u² + b u³ with p(1) = p1 and p'(1) = v1, u in steps.
+        a, b = 3 * (p1 - p0) - 2 * v0 - v1, 2 * (p0 - p1) + v0 + v1
         if order == 0:
-            return p0 + u * (v0 + u * (square + u * cube))
-        moving = np.where(held, 0.0, v0 + u * (2 * square + 3 * u * cube) if order == 1
-                          else (2 * square + 6 * u * cube) / h)
-        return moving / h
+            return p0 + u * (v0 + u * (a + u * b))
+        if order == 1:
+            return np.where(held, 0.0, v0 + u * (2 * a + 3 * u * b)) / h
+        return np.where(held, 0.0, (2 * a + 6 * u * b) / h) / h
+
+
+def _resting(position: tuple[float, ...]) -> _Knot:
+    """Return a knot at rest before all stamps."""
+    return _Knot(0, position, (0.0,) * len(JOINTS))

@@ -187,13 +187,14 @@ def _until(condition: Callable[[], bool], what: str) -> None:
 
 def _decoding() -> None:
     """Print how many frames of the serial link are decoded in a second."""
-    encoder = wire_format.Encoder(wire_format.Info(_RATE_HZ, 16, 3, 5.0, 'bench'))
+    encoder = wire_format.Encoder(wire_format.BoardInfo(_RATE_HZ, 16, 3, 5.0, 'bench'))
     codes = np.random.default_rng(0).integers(1, 65535, (10, 3))
-    stream = b''.join(encoder.data_frame(10_000 * k, 10 * k, codes) for k in range(20_000))
-    cut = wire_format.Splitter()
+    stream = b''.join(encoder.sample_frame(10_000 * k, 10 * k, codes) for k in range(20_000))
+    splitter = wire_format.Splitter()
     began = time.perf_counter()
-    count = sum(isinstance(wire_format.decode(raw), wire_format.Data)
-                for i in range(0, len(stream), 4096) for raw in cut(stream[i:i + 4096]))
+    count = sum(isinstance(wire_format.decode(raw), wire_format.SampleFrame)
+                for i in range(0, len(stream), 4096)
+                for raw in splitter.split(stream[i:i + 4096]))
     print(f'\n{"frames decoded a second":36} {count / (time.perf_counter() - began):8.0f}')
 
 

@@ -52,7 +52,6 @@ _JUMP_NS = 2_000_000_000
 _QUEUE = 5000
 _DEAF_NS = 300_000_000
 """A listener that has just appeared may not hear yet for so long."""
-_LEVELS = {'ok': Level.OK, 'warn': Level.WARN, 'error': Level.ERROR}
 
 
 class Driver(LifecycleNode):
@@ -70,20 +69,21 @@ class Driver(LifecycleNode):
         self._offset_ns = round(1e9 * declare(
             self, 'stamp_offset', 0.0, 'delay of the sensor, such as that of its RC filter, that '
             'is taken out of the stamps: they are earlier by this', 's', -10.0, 10.0))
-        self._type = declare(self, 'link.type', 'sim', 'where the samples come from',
-                                          choices=base.names())
-        self._module = base.module_of(self._type)
-        self._options = {
-            one.name: declare(self, f'link.{one.name}', one.default, one.doc,
-                                           one.unit, one.lower, one.upper)
-            for one in self._module.OPTIONS}
+        self._type = declare(self, 'link.type', base.DEFAULT_LINK, 'where the samples come from',
+                             choices=base.link_names())
+        self._module = base.link_module(self._type)
+        self._settings = self._module.Settings(**{
+            option.name: declare(self, f'link.{option.name}', option.default, option.doc,
+                                 option.unit, option.lower, option.upper)
+            for option in base.options(self._module.Settings)})
         autostart = declare(
             self, 'autostart', True, 'configure and activate at the start; else a system manager '
             'does')
-        self._speed = self._options.get('speed', 1.0)
+        paced = isinstance(self._settings, base.PacedSettings)
+        self._speed = self._settings.speed if paced else 1.0
         # Sensor time that is not real time must be everybody's: then this node is the clock.
-        self._is_clock = self._speed != 1 or ('speed' in self._options
-                                              and self.get_parameter('use_sim_time').value)
+        self._is_clock = self._speed != 1 or (
+            paced and self.get_parameter('use_sim_time').value)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._wall = Clock(clock_type=ClockType.SYSTEM_TIME)
         self._tally = Tally(self._steady.now().nanoseconds)
@@ -166,18 +166,18 @@ class Driver(LifecycleNode):
         self._now_ns = None
         self._waited_ns = 0
         self._ticked_ns = self._steady.now().nanoseconds
-        self._link = self._module.open_link(self._given, self._options)
+        self._link = self._module.open_link(self._given, self._settings)
         if self._link.live and self.get_parameter('use_sim_time').value:
             self.get_logger().warning('use_sim_time: a real device lives in real time; its '
                                       'samples are stamped by the system clock')
         self._references = References(self, self._frame, self._link.references)
-        self._say = StateLog(self.get_logger(), self._link.state().text)
+        self._say = StatusLog(self.get_logger(), self._link.status().text)
         if self._link.sensor is not None:
             self._adopt(self._link.sensor)
-        if hasattr(self._link, 'feel'):
+        if isinstance(self._link, base.StageLink):
             self._stage = self.create_subscription(
-                JointState, 'stage/true_joint_states', self._feel, QoSProfile(depth=_QUEUE),
-                callback_group=NotForExecutors())
+                JointState, self._link.joint_state_topic, self._sense_stage,
+                QoSProfile(depth=_QUEUE), callback_group=NotForExecutors())
         turn = self._live_turn if self._link.live else PeriodicTurn(self._tick, _TICK_S)
         self._loop = RepeatingThread(self, turn, 'link')
 
@@ -191,13 +191,13 @@ class Driver(LifecycleNode):
 
     def _take_from_stage(self) -> None:
         for message in take_messages(self._stage, JointState, False, _QUEUE):
-            self._feel(message)
+            self._sense_stage(message)
 
-    def _feel(self, message: JointState) -> None:
-        at = message.header.stamp
-        self._link.feel(at.sec * 10 ** 9 + at.nanosec,
-                        dict(zip(message.name, message.position)),
-                        dict(zip(message.name, message.velocity)))
+    def _sense_stage(self, message: JointState) -> None:
+        ros_time = message.header.stamp
+        self._link.sense_stage(ros_time.sec * 10 ** 9 + ros_time.nanosec,
+                               dict(zip(message.name, message.position)),
+                               dict(zip(message.name, message.velocity)))
 
     def _live_turn(self) -> None:
         """Publish what a device sends; the link waits for it."""
@@ -217,7 +217,7 @@ class Driver(LifecycleNode):
             self._tally.begin(samples.until_ns)
         self._now_ns = samples.until_ns
         self._publish(samples)
-        self._say(self._link.state())
+        self._say(self._link.status())
 
     def _tick(self) -> None:
         """Publish what is due."""
@@ -243,7 +243,7 @@ class Driver(LifecycleNode):
         """Begin, as soon as there is somebody to hear a recording's first sample."""
         heard = self._data.get_subscription_count() > 0
         self._waited_ns = self._waited_ns + passed_ns if heard else 0
-        if self._link.waits and self._waited_ns < _DEAF_NS:
+        if self._link.waits_for_listener and self._waited_ns < _DEAF_NS:
             return False
         own_ns = self._link.start_ns if self._is_clock else None
         self._now_ns = self._wall.now().nanoseconds if own_ns is None else own_ns
@@ -279,66 +279,79 @@ class Driver(LifecycleNode):
         self.get_logger().error(self._fault)
 
     def _status(self) -> Status:
-        state = self._state()
+        link = self._link_status()
         now_ns = self._now_ns
         if now_ns is not None and not self._is_clock:
             now_ns = self._wall.now().nanoseconds
         values, warning = self._tally.report(self._steady.now().nanoseconds, now_ns or 0)
-        level = Level.WARN if warning and state.level == 'ok' else _LEVELS[state.level]
-        text = ', '.join(filter(None, (f'{self._type}: {state.text}', warning)))
+        level = Level[link.level.name]
+        if warning and level == Level.OK:
+            level = Level.WARN
+        text = ', '.join(filter(None, (f'{self._type}: {link.text}', warning)))
         return Status(level, text, self._imu.serial, {
-            **values, 'link_type': self._type, 'link_state': state.text, **state.values})
+            **values, 'link_type': self._type, 'link_state': link.text, **link.values()})
 
-    def _state(self) -> base.State:
+    def _link_status(self) -> base.LinkStatus:
         """Say how the link is, or why there is none."""
         link = self._link
         if self._fault:
-            return base.State('error', self._fault)
+            return base.LinkStatus(base.Level.ERROR, self._fault)
         if link is None:
-            return base.State('ok', 'inactive')
+            return base.LinkStatus(base.Level.OK, 'inactive')
         if not link.live and self._now_ns is None:
-            return base.State('ok', 'waiting for a subscriber of imu/data_raw')
-        state = link.state()
+            return base.LinkStatus(base.Level.OK, 'waiting for a subscriber of imu/data_raw')
+        status = link.status()
         if link.live:
             # A read may be held up for a while; what holds it up is said all the same.
-            self._say(state)
-        return state
+            self._say(status)
+        return status
 
 
-class StateLog:
-    """Logs the state of a link and its events when they are news, once a second at most."""
+class StatusLog:
+    """Logs the status of a link when its text or an event is new, once a second at most."""
 
-    _SHORTEST_S = 1.0
-    _EVENTS = (('resets', 'the device was reset or is another one: a new count begins'),
-               ('clock_steps', 'the clock of the device has stepped: it is followed anew'),
-               ('system_clock_steps', 'the system clock was set: the stamps follow it'))
+    _MIN_PERIOD_S = 1.0
+    """Shortest time between two messages, s."""
 
     def __init__(self, logger: RcutilsLogger, text: str) -> None:
-        """Take the first state as known."""
-        self._logger, self._said = logger, text
-        self._said_s = -self._SHORTEST_S
-        self._counts = {name: 0 for name, _ in self._EVENTS}
+        """
+        Begin with a text that is not logged.
 
-    def __call__(self, state: base.State) -> None:
-        """Log it, if it is news."""
+        Parameters
+        ----------
+        logger
+            Logger of the node.
+        text
+            Text of the present status.
+
+        """
+        self._logger, self._text = logger, text
+        self._logged_s = -self._MIN_PERIOD_S
+        self._counts: dict[str, int] = {}
+
+    def __call__(self, status: base.LinkStatus) -> None:
+        """Log a status where it is new."""
         now_s = time.monotonic()
-        events = {name: state.values.get(name, 0) for name, _ in self._EVENTS}
-        if (state.text == self._said and events == self._counts) \
-                or now_s - self._said_s < self._SHORTEST_S:
+        if now_s - self._logged_s < self._MIN_PERIOD_S:
             return
-        for name, what in self._EVENTS:
-            if events[name] > self._counts[name]:
-                self._logger.warning(what)
-        before, self._said, self._said_s, self._counts = self._said, state.text, now_s, events
-        if state.text == before:
+        new_events = [event for event in status.events
+                      if event.count > self._counts.get(event.message, 0)]
+        new_text = status.text != self._text
+        if not new_events and not new_text:
             return
-        # rclpy wants one severity a line of code.
-        if state.level == 'ok':
-            self._logger.info(state.text)
-        elif state.level == 'warn':
-            self._logger.warning(state.text)
+        for event in new_events:
+            self._logger.warning(event.message)
+            self._counts[event.message] = event.count
+        self._text, self._logged_s = status.text, now_s
+        if not new_text:
+            return
+        # rclpy permits one severity for each line of code.
+        if status.level == base.Level.OK:
+            self._logger.info(status.text)
+        elif status.level == base.Level.WARN:
+            self._logger.warning(status.text)
         else:
-            self._logger.error(state.text)
+            self._logger.error(status.text)
 
 
 def main() -> int:

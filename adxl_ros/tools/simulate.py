@@ -117,15 +117,16 @@ def _writer(stack: ExitStack, sensor: Sensor, path: str) -> Taker:
 
 
 def _sender(stack: ExitStack, sensor: Sensor, port: str) -> Taker:
-    emulated_board.check(sensor)
-    fd = stack.enter_context(emulated_board.opened(port))
+    emulated_board.check_sensor(sensor)
+    fd = stack.enter_context(emulated_board.open_terminal(port))
     sending: list[emulated_board.Board] = []
 
     def take(columns: simulator.Columns) -> None:
         if not sending:
             roles = emulated_board.roles_of(sensor, columns)
             sending.append(emulated_board.Board(sensor, roles, fd))
-            print(f'simulate: sending: {emulated_board.reading(port, roles)}', file=sys.stderr)
+            command = emulated_board.driver_command(port, roles)
+            print(f'simulate: sending: {command}', file=sys.stderr)
         sending[0].send(columns)
 
     return take

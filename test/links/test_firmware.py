@@ -18,7 +18,7 @@ import ctypes
 import shutil
 import subprocess
 
-from adxl_ros.links.support.wire_format import AFTER_RESET, decode, Encoder, Info, RAIL
+from adxl_ros.links.support.wire_format import AFTER_RESET, BoardInfo, decode, Encoder, RAIL
 import numpy as np
 from processes import REPO
 import pytest
@@ -71,7 +71,7 @@ def test_the_vector_of_the_interfaces(library):
 
 def test_every_frame_is_that_of_the_reference(library):
     rng = np.random.default_rng(1)
-    info = Info(1000.0, 16, 3, 5.0, 'adxl-0001')
+    info = BoardInfo(1000.0, 16, 3, 5.0, 'adxl-0001')
     reference, counts = Encoder(info), Counts(0, AFTER_RESET)
     out = (ctypes.c_uint8 * 64)()
     length = library.frame_info(ctypes.byref(counts), ctypes.c_float(1000.0), ctypes.c_uint8(16),
@@ -83,7 +83,7 @@ def test_every_frame_is_that_of_the_reference(library):
         codes = rng.integers(1, 2 ** 16, (count, channels)) | (0x0101 * int(rng.integers(2)))
         time_us, index = int(rng.integers(2 ** 53)), int(rng.integers(2 ** 32))
         mine = data(library, counts, time_us, index, count, codes)
-        theirs = reference.data_frame(time_us, index, codes, count)
+        theirs = reference.sample_frame(time_us, index, codes, count)
         assert mine.count(b'\0') == 1
         found, wanted = decode(mine[:-1]), decode(theirs[:-1])
         assert found.check == wanted.check

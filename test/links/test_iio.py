@@ -19,20 +19,18 @@ import time
 
 from adxl_ros.errors import UserError
 from adxl_ros.links import iio
-from adxl_ros.links.support import iio_device
+from adxl_ros.links.support.base import Level
 import iiod
 import numpy as np
 import pytest
 from rig import Helper
 from units import nominal
 
-DEFAULTS = {option.name: option.default for option in iio.OPTIONS}
-
 
 @pytest.fixture(scope='module', autouse=True)
 def library():
     try:
-        iio_device.library()
+        iio.import_libiio()
     except UserError as error:
         pytest.skip(str(error))
 
@@ -44,8 +42,8 @@ def served():
 
     def serve(sensor=None, setting=None, **options):
         server = Helper('iiod.py', json.dumps(setting or {}))
-        link = iio.open_link(sensor or nominal(), {
-            **DEFAULTS, 'uri': f'ip:127.0.0.1:{server.first}', **options})
+        link = iio.open_link(sensor or nominal(), iio.Settings(
+            uri=f'ip:127.0.0.1:{server.first}', **options))
         link.begin(0)
         opened.append((server, link))
         return server, link
@@ -123,11 +121,11 @@ def test_the_rate_is_set_and_read_back(served):
     _, link = served(nominal(rate_hz=500.0))
     taken(link, 100)
     assert link.sensor.rate_hz == 500
-    assert link.state().text == 'streaming at 500 Hz'
+    assert link.status().text == 'streaming at 500 Hz'
     _, link = served(nominal(rate_hz=900.0), {'rates': [475, 860], 'rate': 860})
     taken(link, 100)
     assert link.sensor.rate_hz == 860
-    assert link.state().text == 'streaming at 860 Hz (900 Hz were asked for)'
+    assert link.status().text == 'streaming at 860 Hz (900 Hz were asked for)'
 
 
 def test_a_thermometer_beside_the_buffer_is_read_once_a_second(served):
@@ -163,8 +161,8 @@ def test_a_digital_sensor_gives_pseudo_volts(served):
 def test_what_does_not_fit_is_said_and_nothing_made_up(served, setting, options, why):
     _, link = served(setting=setting, **options)
     assert not sum(len(s.stamp_ns) for s in taken(link, 1, 0.4))
-    state = link.state()
-    assert state.level == 'error'
+    state = link.status()
+    assert state.level == Level.ERROR
     assert why in state.text, state.text
 
 
@@ -182,12 +180,12 @@ def test_stamps_are_those_of_the_devices_clock(served):
 
 
 def test_a_server_that_is_not_there_is_waited_for(served):
-    link = iio.open_link(nominal(), {**DEFAULTS, 'uri': 'ip:127.0.0.1:1'})
+    link = iio.open_link(nominal(), iio.Settings(uri='ip:127.0.0.1:1'))
     taken(link, 1, 0.3)
-    assert link.state().text == 'ip:127.0.0.1:1: Connection refused'
+    assert link.status().text == 'ip:127.0.0.1:1: Connection refused'
 
 
 @pytest.mark.parametrize('uri', ['', 'ip:', 'xml:/etc/passwd', 'adc', 'ip:\u00e4'])
 def test_a_uri_that_names_no_device_is_refused(uri):
     with pytest.raises(UserError, match=r'link\.uri'):
-        iio.open_link(nominal(), {**DEFAULTS, 'uri': uri})
+        iio.open_link(nominal(), iio.Settings(uri=uri))

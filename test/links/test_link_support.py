@@ -18,9 +18,9 @@ from dataclasses import replace
 
 from adxl_ros.errors import UserError
 from adxl_ros.links.support import channels, clock_sync, emulated_board
-from adxl_ros.links.support.clock_sync import ClockMap, RosClock
-from adxl_ros.links.support.frame_counter import Count
-from adxl_ros.links.support.wire_format import AFTER_RESET, Data
+from adxl_ros.links.support.clock_sync import ClockMap, SystemClockMap
+from adxl_ros.links.support.frame_counter import FrameCounter
+from adxl_ros.links.support.wire_format import AFTER_RESET, SampleFrame
 from hypothesis import given, settings, strategies as st
 import numpy as np
 import pytest
@@ -59,7 +59,7 @@ class Link:
     def take(self):
         if self.map.ready(self.arrived):
             for device, true in self.held:
-                self.stamps.append(self.map(device))
+                self.stamps.append(self.map.host_ns(device))
                 self.truth.append(true)
             self.held = []
 
@@ -127,31 +127,31 @@ def test_ros_time_follows_the_system_clock_when_it_is_set(monkeypatch):
     now = {'monotonic': 10 * S, 'time': 1000 * S}
     monkeypatch.setattr(clock_sync.time, 'monotonic_ns', lambda: now['monotonic'])
     monkeypatch.setattr(clock_sync.time, 'time_ns', lambda: now['time'])
-    clock = RosClock()
-    assert clock(np.array([11 * S])) == [1001 * S]
+    clock = SystemClockMap()
+    assert clock.ros_ns(np.array([11 * S])) == [1001 * S]
     for name in now:
         now[name] += 5 * S
-    assert clock.watch() == 0
+    assert clock.update() == 0
     now['time'] -= 3600 * S
-    assert clock.watch() == -3600 * S
+    assert clock.update() == -3600 * S
     assert clock.steps == 1
-    assert clock(np.array([11 * S])) == [1001 * S - 3600 * S]
+    assert clock.ros_ns(np.array([11 * S])) == [1001 * S - 3600 * S]
 
 
 def data(index, time_us=None, flags=0, overruns=0, seed=0, count=10):
     """Return a frame at its time by 1 kHz, unless another is given."""
     time_us = index * 1000 if time_us is None else time_us
     check = hash((index, time_us, flags, seed))
-    return Data(flags, 0, time_us, index % 2 ** 32, overruns, np.zeros((count, 2)), check)
+    return SampleFrame(flags, 0, time_us, index % 2 ** 32, overruns, np.zeros((count, 2)), check)
 
 
 def judged(*frames, arrived_us=None):
-    count = Count()
+    count = FrameCounter()
     count.restart(1000.0)
     found = []
     for frame in frames:
-        found += count(frame, (arrived_us or (lambda f: f.time_us))(frame) * 1000)
-    return count, [(f.data.index, f.lost, f.stepped) for f in found]
+        found += count.accept(frame, (arrived_us or (lambda f: f.time_us))(frame) * 1000)
+    return count, [(f.frame.index, f.lost, f.stepped) for f in found]
 
 
 def test_every_sample_that_lacks_is_counted_over_the_wrap_too():
@@ -193,12 +193,12 @@ def test_a_step_of_the_clock_without_a_loss_is_told():
 @pytest.mark.parametrize('index, away_s, lost', [
     (1010, 1.0, 1000), (10, 0.05, 0), (10, 9.0, 0), (1010, 3.0, None), (0, 1.0, None)])
 def test_a_count_goes_on_over_a_closed_port_if_the_clocks_agree(index, away_s, lost):
-    count = Count()
+    count = FrameCounter()
     count.restart(1000.0)
-    count(data(0), 0)
+    count.accept(data(0), 0)
     count.reopened()
     count.reopened()
-    found = count(data(index, seed=1), round(away_s * 1e9) + 10 * MS)
+    found = count.accept(data(index, seed=1), round(away_s * 1e9) + 10 * MS)
     assert [f.lost for f in found] == [lost]
 
 
@@ -221,23 +221,23 @@ def test_no_frame_is_taken_twice_and_none_backwards(order):
 
 
 def test_channels_are_listed_both_ways():
-    assert channels.listed('x, y,supply') == channels.listed(['x', 'y', 'supply']) == \
-        ['x', 'y', 'supply']
-    assert channels.listed('') == channels.listed(()) == []
+    roles = ['x', 'y', 'supply']
+    assert channels.parse_channels('x, y,supply') == channels.parse_channels(roles) == roles
+    assert channels.parse_channels('') == channels.parse_channels(()) == []
 
 
 @pytest.mark.parametrize('roles, why', [
     ('x', 'no channel for y'), ('x,y,x', 'twice'), ('x,y,z', 'no axis z'), ('x,y,w', "'w' is")])
 def test_channels_that_do_not_fit_the_sensor_are_refused(roles, why):
     with pytest.raises(UserError, match=why):
-        channels.check_roles(channels.listed(roles), 'xy')
+        channels.check_roles(channels.parse_channels(roles), 'xy')
 
 
 def test_slow_values_are_means_of_a_tenth_of_a_second():
-    thin = channels.Seldom()
+    thin = channels.PeriodMeans()
     stamps = np.arange(1000) * MS
     values = np.arange(1000.0)
-    out = np.concatenate([thin(stamps[k:k + 10], {'supply_v': values[k:k + 10]})['supply_v']
+    out = np.concatenate([thin.thin(stamps[k:k + 10], {'supply_v': values[k:k + 10]})['supply_v']
                           for k in range(0, 1000, 10)])
     rows = np.flatnonzero(np.isfinite(out))
     assert rows.tolist() == list(range(100, 1000, 100))
@@ -248,4 +248,4 @@ def test_slow_values_are_means_of_a_tenth_of_a_second():
                                          ({'serial': 'x' * 17}, 'serial')])
 def test_a_sensor_that_no_board_can_be_is_refused(change, why):
     with pytest.raises(UserError, match=why):
-        emulated_board.check(replace(nominal(), **change))
+        emulated_board.check_sensor(replace(nominal(), **change))

@@ -25,25 +25,24 @@ import tty
 from adxl_ros.errors import UserError
 from adxl_ros.links import serial
 from adxl_ros.links.support import base, emulated_board
-from adxl_ros.links.support.wire_format import Encoder, frame, Info
+from adxl_ros.links.support.wire_format import BoardInfo, encode_payload, Encoder
 import numpy as np
 import pytest
 from units import nominal
 
-INFO = Info(1000.0, 16, 2, 5.0, 'A7')
-DEFAULTS = {option.name: option.default for option in serial.OPTIONS}
+INFO = BoardInfo(1000.0, 16, 2, 5.0, 'A7')
 
 
 class Line:
     """A terminal pair, the board's end written by hand, and a link that reads the other."""
 
-    def __init__(self, tmp_path, info=INFO, sensor=None, **options):
+    def __init__(self, tmp_path, info=INFO, sensor=None, **settings):
         self.path = tmp_path / 'port'
         self.info, self.codes = info, np.arange(info.channels * 10).reshape(10, -1) + 30000
         self.index = 0
         self.plug()
         self.link = serial.open_link(sensor or nominal(),
-                                     {**DEFAULTS, 'port': str(self.path), **options})
+                                     serial.Settings(port=str(self.path), **settings))
         self.link.begin(0)
         self.encoder = Encoder(info)
         self.samples = []
@@ -69,7 +68,7 @@ class Line:
 
     def frames(self, count=1, pace_s=0.0):
         for _ in range(count):
-            self.send(self.encoder.data_frame(self.index * 1000, self.index, self.codes))
+            self.send(self.encoder.sample_frame(self.index * 1000, self.index, self.codes))
             self.index += len(self.codes)
             time.sleep(pace_s)
 
@@ -88,7 +87,7 @@ class Line:
         return sum(len(samples.stamp_ns) for samples in got)
 
     def value(self, name):
-        return self.link.state().values[name]
+        return self.link.status().values()[name]
 
     def close(self):
         self.link.close()
@@ -108,7 +107,7 @@ def line(tmp_path):
 
 
 def test_samples_are_volts_of_the_codes_at_the_rate_of_the_board(line):
-    one = line(info=Info(500.0, 12, 2, 3.3, 'B9'))
+    one = line(info=BoardInfo(500.0, 12, 2, 3.3, 'B9'))
     one.codes %= 4096
     one.inform()
     one.frames(5)
@@ -118,7 +117,8 @@ def test_samples_are_volts_of_the_codes_at_the_rate_of_the_board(line):
     assert (one.link.sensor.serial, one.link.sensor.rate_hz, one.link.sensor.adc_bits) == (
         'B9', 500.0, 12)
     assert one.link.sensor.adc_vref_v == pytest.approx(3.3)
-    assert one.link.state() == base.State('ok', 'streaming', one.link.state().values)
+    assert one.link.status().level == base.Level.OK
+    assert one.link.status().text == 'streaming'
     assert sum(s.missing for s in got) == 0
 
 
@@ -152,7 +152,7 @@ def test_a_frame_that_was_lost_is_missing_exactly(line):
 def test_a_repeated_frame_is_not_published_again(line):
     one = line()
     one.inform()
-    raw = one.encoder.data_frame(0, 0, one.codes)
+    raw = one.encoder.sample_frame(0, 0, one.codes)
     one.send(raw + raw)
     one.index = 10
     one.frames(2)
@@ -186,7 +186,7 @@ def test_another_board_on_the_port_is_another_sensor(line):
     one.inform()
     one.frames(3)
     one.read(lambda g: one.number(g) >= 30)
-    one.encoder, one.index = Encoder(Info(1000.0, 12, 2, 2.5, 'Z1')), 0
+    one.encoder, one.index = Encoder(BoardInfo(1000.0, 12, 2, 2.5, 'Z1')), 0
     one.codes = np.full((10, 2), 2048)
     one.inform()
     one.frames(3)
@@ -197,7 +197,7 @@ def test_another_board_on_the_port_is_another_sensor(line):
 
 @pytest.mark.parametrize('listed', ['x,y,supply,temperature', ['y', '-', 'x', 'supply']])
 def test_channels_are_what_the_parameter_says(line, listed):
-    one = line(info=Info(1000.0, 16, 4, 5.0, ''), channels=listed, supply_scale=2.0)
+    one = line(info=BoardInfo(1000.0, 16, 4, 5.0, ''), channels=listed, supply_scale=2.0)
     one.codes = np.tile(np.array([20000, 30000, 32000, 40000]), (10, 1))
     one.inform()
     one.frames(40, 0.005)
@@ -215,7 +215,7 @@ def test_channels_are_what_the_parameter_says(line, listed):
 
 
 def test_by_default_the_channels_are_x_y_z_supply(line):
-    one = line(info=Info(1000.0, 16, 4, 5.0, ''), sensor=nominal('xyz'))
+    one = line(info=BoardInfo(1000.0, 16, 4, 5.0, ''), sensor=nominal('xyz'))
     one.inform()
     one.frames(30, 0.005)
     got = one.read(lambda g: one.number(g) >= 300)
@@ -226,30 +226,30 @@ def test_by_default_the_channels_are_x_y_z_supply(line):
 
 
 @pytest.mark.parametrize('info, options, why', [
-    (Info(1000.0, 16, 1, 5.0, ''), {}, 'no channel for y'),
+    (BoardInfo(1000.0, 16, 1, 5.0, ''), {}, 'no channel for y'),
     (INFO, {'channels': 'x,y,supply'}, '3 are named, the board has 2')])
 def test_a_board_that_does_not_fit_publishes_nothing_and_says_why(line, info, options, why):
     one = line(info=info, **options)
     one.inform()
     one.frames(5)
     assert not one.read()
-    state = one.link.state()
-    assert state.level == 'error'
+    state = one.link.status()
+    assert state.level == base.Level.ERROR
     assert why in state.text
     assert one.value('held_back') == 50
 
 
 def test_a_channel_that_the_sensor_does_not_have_is_not_published(line):
-    one = line(info=Info(1000.0, 16, 3, 5.0, ''))
+    one = line(info=BoardInfo(1000.0, 16, 3, 5.0, ''))
     one.inform()
     one.frames(5)
     got = one.read(lambda g: one.number(g) >= 50)
     assert got[0].volts.shape[1] == 2
-    assert 'the channel of z is not used' in one.link.state().text
+    assert 'the channel of z is not used' in one.link.status().text
 
 
 def test_frames_that_the_info_frame_rules_out_are_not_published(line):
-    one = line(info=Info(1000.0, 12, 2, 5.0, ''))
+    one = line(info=BoardInfo(1000.0, 12, 2, 5.0, ''))
     one.codes %= 4096
     one.inform()
     one.frames(2)
@@ -267,13 +267,13 @@ def test_frames_that_the_info_frame_rules_out_are_not_published(line):
 
 def test_another_version_of_the_format_is_said(line):
     one = line()
-    one.send(frame(b'\1\2' + bytes(30)))
+    one.send(encode_payload(b'\1\2' + bytes(30)))
     assert not one.read()
-    assert 'speaks wire format 2' in one.link.state().text
+    assert 'speaks wire format 2' in one.link.status().text
     one.inform()
     one.frames(3)
     one.read(lambda g: one.number(g) >= 30)
-    assert one.link.state().text == 'streaming'
+    assert one.link.status().text == 'streaming'
 
 
 def test_nothing_and_nonsense_are_told_apart(line):
@@ -283,15 +283,15 @@ def test_nothing_and_nonsense_are_told_apart(line):
     one.read()
     time.sleep(0.6)
     one.read()
-    assert 'silent' in one.link.state().text
+    assert 'silent' in one.link.status().text
     end = time.monotonic() + 1.5
     while time.monotonic() < end:
         one.send(os.urandom(50).replace(b'\0', b'\1') + b'\0')
         one.link.read(0)
-    assert 'is link.baud (115200) that of the board?' in one.link.state().text
+    assert 'is link.baud (115200) that of the board?' in one.link.status().text
     one.frames(3)
     one.read(lambda g: one.number(g) >= 30)
-    assert one.link.state().text == 'streaming'
+    assert one.link.status().text == 'streaming'
 
 
 def test_frames_faster_than_a_board_can_mean_wait(line):
@@ -320,8 +320,8 @@ def test_a_port_comes_back_and_the_count_goes_on(line):
     one.read(lambda g: one.number(g) >= 200)
     one.unplug()
     went = time.monotonic()
-    one.read(lambda g: one.link.state().level == 'error')
-    assert one.link.state().level == 'error'
+    one.read(lambda g: one.link.status().level == base.Level.ERROR)
+    assert one.link.status().level == base.Level.ERROR
     time.sleep(0.3)
     one.plug()
     back = time.monotonic()
@@ -342,8 +342,8 @@ def test_a_port_comes_back_and_the_count_goes_on(line):
 
 def test_a_socket_is_a_port_too():
     with socket.create_server(('127.0.0.1', 0)) as server:
-        link = serial.open_link(nominal(), {
-            **DEFAULTS, 'port': f'socket://127.0.0.1:{server.getsockname()[1]}'})
+        link = serial.open_link(nominal(), serial.Settings(
+            port=f'socket://127.0.0.1:{server.getsockname()[1]}'))
         accepted = []
         thread = threading.Thread(target=lambda: accepted.append(server.accept()[0]))
         thread.start()
@@ -353,13 +353,13 @@ def test_a_socket_is_a_port_too():
         accepted[0].sendall(encoder.info_frame())
         began = time.monotonic()
         for k in range(300):
-            accepted[0].sendall(encoder.data_frame(10_000 * k, 10 * k, codes))
+            accepted[0].sendall(encoder.sample_frame(10_000 * k, 10 * k, codes))
         while count < 3000 and time.monotonic() < began + 5:
             count += len(link.read(0).stamp_ns)
         assert count == 3000
         accepted[0].close()
         link.read(0)
-        assert 'unplugged' in link.state().text
+        assert 'unplugged' in link.status().text
         link.close()
 
 
@@ -368,17 +368,17 @@ def test_a_socket_is_a_port_too():
     ({'channels': 'x'}, 'no channel for y'), ({'temperature_v_per_c': 0.0}, 'temperature_v_per')])
 def test_options_that_cannot_be_are_refused(options, why):
     with pytest.raises(UserError, match=why):
-        serial.open_link(nominal(), {**DEFAULTS, 'port': '/dev/null', **options})
+        serial.open_link(nominal(), serial.Settings(**{'port': '/dev/null', **options}))
 
 
 @pytest.mark.parametrize('port, why', [
     ('/no/such/port', 'No such file'), ('gopher://x', 'gopher|URL|protocol'),
     ('socket://127.0.0.1:1', 'refused'), ('/etc/hostname', 'configure|ioctl|Inappropriate')])
 def test_a_port_that_does_not_open_says_why(port, why):
-    link = serial.open_link(nominal(), {**DEFAULTS, 'port': port})
+    link = serial.open_link(nominal(), serial.Settings(port=port))
     link.read(0)
-    state = link.state()
-    assert state.level == 'error'
+    state = link.status()
+    assert state.level == base.Level.ERROR
     assert port in state.text
     assert '\n' not in state.text
     assert re.search(why, state.text), state.text
@@ -390,10 +390,10 @@ def test_a_board_on_a_terminal_is_read_to_the_last_sample(tmp_path):
     rng = np.random.default_rng(0)
     columns = {'x_v': rng.uniform(1, 4, 1000), 'y_v': rng.uniform(1, 4, 1000),
                'supply_v': np.full(1000, 4.9)}
-    with emulated_board.opened(path) as fd:
+    with emulated_board.open_terminal(path) as fd:
         sender = emulated_board.Board(sensor, emulated_board.roles_of(sensor, columns), fd)
-        link = serial.open_link(sensor, {**DEFAULTS, 'port': path, 'supply_scale': 2.0,
-                                         'channels': 'x,y,supply'})
+        link = serial.open_link(sensor, serial.Settings(port=path, supply_scale=2.0,
+                                                        channels='x,y,supply'))
         link.read(0)
         thread = threading.Thread(target=sender.send, args=(columns,))
         thread.start()

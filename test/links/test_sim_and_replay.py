@@ -35,7 +35,7 @@ START = 1_700_000_000 * 10 ** 9
 
 def simulated(sensor=None, alpha=np.pi / 2, beta=0.0, seed=0):
     link = sim.open_link(sensor or nominal(),
-                         {'alpha_rad': alpha, 'beta_rad': beta, 'seed': seed})
+                         sim.Settings(alpha_rad=alpha, beta_rad=beta, seed=seed))
     link.begin(START)
     return link
 
@@ -51,12 +51,12 @@ def taken(link, until_ns, step_ns):
 
 
 def test_every_link_can_be_opened_by_its_name():
-    assert base.names()[0] == 'sim'
-    assert 'replay' in base.names()
-    for name in base.names():
-        module = base.module_of(name)
+    assert base.link_names()[0] == 'sim'
+    assert 'replay' in base.link_names()
+    for name in base.link_names():
+        module = base.link_module(name)
         assert callable(module.open_link)
-        assert all(isinstance(option, base.Option) for option in module.OPTIONS)
+        assert all(isinstance(option, base.Option) for option in base.options(module.Settings))
 
 
 def test_sim_samples_a_pose_with_the_noise_that_the_figures_promise():
@@ -86,7 +86,7 @@ def turning(t):
 def test_sim_feels_the_true_motion_at_its_samples():
     link = simulated(ideal())
     for k in range(101):
-        link.feel(START + k * 10 * MS, *turning(k * 0.01))
+        link.sense_stage(START + k * 10 * MS, *turning(k * 0.01))
     samples = link.read(START + 5000 * MS)
     assert samples.until_ns == START + 1000 * MS, 'sensor time waits for the stage'
     t = (samples.stamp_ns - START) * 1e-9
@@ -104,28 +104,28 @@ def test_sim_waits_for_a_stage_and_holds_the_pose_of_a_lost_one(monkeypatch):
     monkeypatch.setattr(time, 'monotonic', lambda: clock[0])
     link = simulated(ideal())
     assert link.read(START + 100 * MS).until_ns == START + 100 * MS
-    link.feel(START + 200 * MS, {'alpha': 0.3, 'beta': 0.0}, {})
+    link.sense_stage(START + 200 * MS, {'alpha': 0.3, 'beta': 0.0}, {})
     assert link.read(START + 900 * MS).until_ns == START + 200 * MS
     clock[0] += 0.9
     assert not len(link.read(START + 1100 * MS).stamp_ns)
     clock[0] += 0.2
     after = link.read(START + 1300 * MS)
     assert after.until_ns == START + 1300 * MS
-    assert link.state().level == 'warn'
-    assert 'stage lost' in link.state().text
+    assert link.status().level == base.Level.WARN
+    assert 'stage lost' in link.status().text
     held = np.column_stack(specific_force(np.array([0.3]), 0.0, 9.80665))
     assert np.abs(to_nominal_mps2(after.volts, ideal()) - held).max() < 1e-9
-    link.feel(START + 1310 * MS, {'alpha': 0.3, 'beta': 0.0}, {})
-    assert link.state() == base.State('ok', 'on the stage')
+    link.sense_stage(START + 1310 * MS, {'alpha': 0.3, 'beta': 0.0}, {})
+    assert link.status() == base.LinkStatus(base.Level.OK, 'on the stage')
     assert link.read(START + 9000 * MS).until_ns == START + 1310 * MS
 
 
 def test_sim_takes_the_word_of_a_stage_that_was_started_anew():
     link = simulated(ideal())
     for k in range(11):
-        link.feel(START + k * 10 * MS, {'alpha': 0.3, 'beta': 0.0}, {})
+        link.sense_stage(START + k * 10 * MS, {'alpha': 0.3, 'beta': 0.0}, {})
     for k in range(5, 9):
-        link.feel(START + k * 10 * MS, {'alpha': 0.7, 'beta': 0.0}, {})
+        link.sense_stage(START + k * 10 * MS, {'alpha': 0.7, 'beta': 0.0}, {})
     samples = link.read(START + 200 * MS)
     assert samples.until_ns == START + 80 * MS
     assert to_nominal_mps2(samples.volts, ideal())[-1, 2] == pytest.approx(9.80665 * np.cos(0.7))
@@ -136,9 +136,9 @@ def test_sim_takes_the_word_of_a_stage_that_was_started_anew():
     (START + 10 * MS, np.nan, 'not finite')])
 def test_sim_does_not_feel_nonsense(stamp, alpha, why):
     link = simulated(ideal(), alpha=0.2)
-    link.feel(stamp, {'alpha': alpha, 'beta': 0.0}, {'alpha': 0.0, 'beta': 0.0})
-    assert link.state().level == 'warn'
-    assert why in link.state().text
+    link.sense_stage(stamp, {'alpha': alpha, 'beta': 0.0}, {'alpha': 0.0, 'beta': 0.0})
+    assert link.status().level == base.Level.WARN
+    assert why in link.status().text
     samples = link.read(START + 100 * MS)
     assert len(samples.stamp_ns) == 101
     assert to_nominal_mps2(samples.volts, ideal())[-1, 2] == pytest.approx(9.80665 * np.cos(0.2))
@@ -210,7 +210,7 @@ def written(path, rows, head='time_s,ax_mps2,ay_mps2,az_mps2'):
 
 
 def opened(path, loop=False, sensor=None):
-    link = replay.open_link(sensor or nominal(), {'recording': str(path), 'loop': loop})
+    link = replay.open_link(sensor or nominal(), replay.Settings(recording=str(path), loop=loop))
     link.begin(START)
     return link
 
@@ -230,7 +230,7 @@ def test_replay_gives_every_row_at_its_time(tmp_path):
     rest = link.read(START + 10_000 * MS)
     assert len(rest.stamp_ns) == 40
     assert first.missing == rest.missing == 0
-    assert link.state().text == 'ended'
+    assert link.status().text == 'ended'
     assert not len(link.read(START + 20_000 * MS).stamp_ns)
 
 
@@ -242,7 +242,7 @@ def test_replay_loops_without_a_gap(tmp_path):
         stamps += samples.stamp_ns.tolist()
         assert not samples.missing
     assert np.allclose(np.diff(stamps), 10 * MS, atol=2, rtol=0)
-    assert link.state().text == 'playing'
+    assert link.status().text == 'playing'
 
 
 def test_replay_counts_the_rows_that_a_recording_lacks(tmp_path):
@@ -283,4 +283,4 @@ def test_replay_says_in_one_line_what_is_wrong(tmp_path, text, why):
 @pytest.mark.parametrize('recording, why', [('', 'link.recording'), ('/no/such.csv', 'No such')])
 def test_replay_without_a_recording_is_refused(recording, why):
     with pytest.raises(UserError, match=why):
-        replay.open_link(nominal(), {'recording': recording, 'loop': False})
+        replay.open_link(nominal(), replay.Settings(recording=recording))

@@ -19,13 +19,13 @@ import zlib
 
 from adxl_ros.links.support.wire_format import (
     AFTER_RESET,
-    Data,
+    BoardInfo,
     decode,
+    encode_payload,
     Encoder,
-    frame,
-    Info,
-    MOST_BYTES,
+    MAX_FRAME_BYTES,
     RAIL,
+    SampleFrame,
     Splitter,
     VersionError,
     WireError,
@@ -38,12 +38,12 @@ PAYLOAD = bytes.fromhex(
     '010100000700000040420f00000000004600000000000202008000003412ffff')
 FRAME = bytes.fromhex(
     '03010101020701010440420f01010101024601010101030202028001093412ffffe9e413f100')
-INFO = Info(1000.0, 16, 2, 5.0, 'A7')
+INFO = BoardInfo(1000.0, 16, 2, 5.0, 'A7')
 
 
 def test_the_vector_of_the_interfaces():
     assert zlib.crc32(PAYLOAD).to_bytes(4, 'little') == bytes.fromhex('e9e413f1')
-    assert frame(PAYLOAD) == FRAME
+    assert encode_payload(PAYLOAD) == FRAME
     data = decode(FRAME[:-1])
     assert (data.flags, data.sequence, data.time_us, data.index, data.overruns) == \
         (0, 7, 1_000_000, 70, 0)
@@ -54,7 +54,7 @@ def test_the_encoder_makes_the_vector_but_for_the_flags_that_it_sets():
     encoder = Encoder(INFO)
     for _ in range(7):
         encoder.info_frame()
-    made = decode(encoder.data_frame(1_000_000, 70, np.array([[0x8000, 0], [0x1234, 0xffff]]))
+    made = decode(encoder.sample_frame(1_000_000, 70, np.array([[0x8000, 0], [0x1234, 0xffff]]))
                   [:-1])
     assert made.flags == RAIL | AFTER_RESET
     assert replace(made, flags=0, check=0, codes=None) == \
@@ -62,12 +62,12 @@ def test_the_encoder_makes_the_vector_but_for_the_flags_that_it_sets():
 
 
 def test_info_comes_back_as_it_was_and_the_reset_is_told_until_the_first_samples():
-    encoder = Encoder(Info(333.25, 12, 3, 3.3, 'board 17'))
+    encoder = Encoder(BoardInfo(333.25, 12, 3, 3.3, 'board 17'))
     info = decode(encoder.info_frame()[:-1])
-    assert info == Info(333.25, 12, 3, pytest.approx(3.3, rel=1e-7), 'board 17')
+    assert info == BoardInfo(333.25, 12, 3, pytest.approx(3.3, rel=1e-7), 'board 17')
     assert info.flags == AFTER_RESET
-    assert decode(encoder.data_frame(0, 0, np.full((2, 3), 7))[:-1]).flags == AFTER_RESET
-    assert decode(encoder.data_frame(0, 2, np.full((2, 3), 7))[:-1]).flags == 0
+    assert decode(encoder.sample_frame(0, 0, np.full((2, 3), 7))[:-1]).flags == AFTER_RESET
+    assert decode(encoder.sample_frame(0, 2, np.full((2, 3), 7))[:-1]).flags == 0
     assert decode(encoder.info_frame()[:-1]).flags == 0
 
 
@@ -79,7 +79,7 @@ def test_info_comes_back_as_it_was_and_the_reset_is_told_until_the_first_samples
 def test_what_cannot_be_is_refused(change, why):
     kind = VersionError if 'format' in why else WireError
     with pytest.raises(kind, match=why):
-        decode(frame(change(PAYLOAD))[:-1])
+        decode(encode_payload(change(PAYLOAD))[:-1])
 
 
 @pytest.mark.parametrize('info', [
@@ -107,13 +107,13 @@ def test_a_single_changed_lost_or_added_byte_is_never_taken_for_a_frame():
 
 def test_a_stream_without_an_end_is_skipped_and_not_kept():
     cut = Splitter()
-    assert cut(b'noise\0') == [b'noise']
+    assert cut.split(b'noise\0') == [b'noise']
     for _ in range(100):
-        assert cut(b'\x55' * 1000) == []
-        assert len(cut._rest) <= MOST_BYTES
-    assert cut(b'tail\0' + FRAME + FRAME[:5]) == [FRAME[:-1]]
+        assert cut.split(b'\x55' * 1000) == []
+        assert len(cut._incomplete) <= MAX_FRAME_BYTES
+    assert cut.split(b'tail\0' + FRAME + FRAME[:5]) == [FRAME[:-1]]
     assert cut.skipped == 100_004
-    assert cut(FRAME[5:]) == [FRAME[:-1]]
+    assert cut.split(FRAME[5:]) == [FRAME[:-1]]
 
 
 @settings(max_examples=300)
@@ -123,7 +123,7 @@ def test_any_bytes_are_a_frame_or_an_error(raw):
         found = decode(raw)
     except WireError:
         return
-    assert isinstance(found, Info | Data)
+    assert isinstance(found, BoardInfo | SampleFrame)
 
 
 @settings(max_examples=200)
@@ -131,9 +131,9 @@ def test_any_bytes_are_a_frame_or_an_error(raw):
        st.integers(1, 30))
 def test_how_a_stream_is_cut_into_chunks_changes_nothing(parts, size):
     stream = b''.join(parts) + b'\0'
-    whole = Splitter()(stream)
+    whole = Splitter().split(stream)
     cut = Splitter()
-    pieces = [raw for i in range(0, len(stream), size) for raw in cut(stream[i:i + size])]
+    pieces = [raw for i in range(0, len(stream), size) for raw in cut.split(stream[i:i + size])]
     assert pieces == whole
 
 
@@ -143,7 +143,7 @@ def test_how_a_stream_is_cut_into_chunks_changes_nothing(parts, size):
 def test_every_frame_comes_back_as_it_was(count, channels, time_us, index, random):
     codes = np.array([[random.randrange(2 ** 16) for _ in range(channels)]
                       for _ in range(count)], np.uint16)
-    raw = Encoder(replace(INFO, channels=channels)).data_frame(time_us, index, codes)
+    raw = Encoder(replace(INFO, channels=channels)).sample_frame(time_us, index, codes)
     assert raw.count(b'\0') == 1
     assert raw.endswith(b'\0')
     data = decode(raw[:-1])

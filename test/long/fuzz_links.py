@@ -45,7 +45,7 @@ else:
 import numpy as np
 from units import nominal
 
-OPTIONS = {**{o.name: o.default for o in serial.OPTIONS}, 'port': '/dev/null'}
+SETTINGS = serial.Settings(port='/dev/null')
 SENSOR = nominal()
 counts = Counter()
 
@@ -53,9 +53,9 @@ counts = Counter()
 class Script:
     """A port that gives chunks, and nothing when they are over; None is a port that was closed."""
 
-    trouble = ''
-    received = opened = 0
-    heard_s = opened_s = 0.0
+    error = ''
+    received_bytes = connections = 0
+    last_byte_s = opened_s = 0.0
 
     def __init__(self, chunks):
         self.chunks = chunks
@@ -63,7 +63,7 @@ class Script:
     def read(self):
         return self.chunks.pop(0) if self.chunks else b''
 
-    def worked(self):
+    def confirm(self):
         pass
 
     def close(self):
@@ -80,13 +80,13 @@ def frames_of(data):
         if kind == 0:
             chunks.append(part)
         elif kind == 1:
-            chunks.append(wire_format.frame(part))
+            chunks.append(wire_format.encode_payload(part))
         elif kind == 2:
             chunks.append(None)
         elif kind == 3:
             fields = part[:12].ljust(12, b'\1')
             rate, bits, channels = struct.unpack('<fBB', fields[:6])
-            chunks.append(wire_format.frame(struct.pack(
+            chunks.append(wire_format.encode_payload(struct.pack(
                 '<BBHIfBBf16s', 2, 1, fields[6], 0, rate, bits % 18, channels % 9, 5.0, b'fuzz')))
         else:
             fields = part[:16].ljust(16, b'\2')
@@ -95,22 +95,22 @@ def frames_of(data):
                 index, time_us = index % 1000, time_us % 10 ** 6
             count, channels = shape % 16 + 1, shape // 16 % 4 + 1
             codes = (part * 130)[:2 * count * channels].ljust(2 * count * channels, b'\3')
-            chunks.append(wire_format.frame(struct.pack(
+            chunks.append(wire_format.encode_payload(struct.pack(
                 '<BBHIQIHBB', 1, 1, flags, 0, time_us, index, overruns, count, channels) + codes))
     return chunks
 
 
 def one(data):
     """Run the link on an input; whatever it is, samples are sound and in order."""
-    link = serial.open_link(SENSOR, OPTIONS)
+    link = serial.open_link(SENSOR, SETTINGS)
     chunks = frames_of(data)
     link._port = Script(chunks)
-    link._brake = lambda size, samples: None
+    link._throttle = lambda size, samples: None
     last = -1
     while True:
-        done = not chunks and not link._frames
+        done = not chunks and not link._arrivals
         if done:
-            link._timeline.flush()
+            link._stamper.flush()
         samples = link.read(0)
         assert np.isfinite(samples.volts).all()
         assert samples.missing >= samples.estimated >= 0
@@ -121,8 +121,8 @@ def one(data):
         counts['samples'] += len(samples.stamp_ns)
         if done:
             break
-    assert len(link._splitter._rest) <= wire_format.MOST_BYTES
-    link.state()
+    assert len(link._splitter._incomplete) <= wire_format.MAX_FRAME_BYTES
+    link.status()
     counts['inputs'] += 1
 
 

@@ -26,7 +26,8 @@ import time
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
-from adxl_ros.links.support import emulated_board, iio_device
+from adxl_ros.links import iio
+from adxl_ros.links.support import emulated_board
 from adxl_ros.model.effects import effect_named
 from diagnostic_msgs.msg import DiagnosticStatus
 from faults import bytes_hurt, IIO, Row, run, SERIAL
@@ -100,7 +101,7 @@ def test_every_fault_of_a_board_is_counted_exactly(start, tmp_path):
 
 def test_every_fault_of_an_iiod_is_survived(start, tmp_path):
     try:
-        iio_device.library()
+        iio.import_libiio()
     except UserError as error:
         pytest.skip(str(error))
     with Graph() as graph:
@@ -256,7 +257,7 @@ def feeding(tmp_path, sensor, columns):
     ready = threading.Event()
 
     def feed():
-        with emulated_board.opened(path) as fd:
+        with emulated_board.open_terminal(path) as fd:
             sender = emulated_board.Board(sensor, emulated_board.roles_of(sensor, columns), fd)
             ready.set()
             while not stop.is_set():

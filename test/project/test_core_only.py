@@ -60,11 +60,10 @@ def test_a_real_link_says_what_to_install() -> None:
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
 from adxl_ros.links.support import base
-for name, given in (('serial', {'port': '/dev/null'}), ('iio', {})):
-    module = base.module_of(name)
-    options = {option.name: option.default for option in module.OPTIONS}
+for name, settings in (('serial', {'port': '/dev/null'}), ('iio', {})):
+    module = base.link_module(name)
     try:
-        module.open_link(parameter_file.load(sys.argv[1]), options | given)
+        module.open_link(parameter_file.load(sys.argv[1]), module.Settings(**settings))
     except UserError as error:
         print(error)
 """

@@ -42,7 +42,7 @@ import sys
 import time
 import tty
 
-from adxl_ros.links.support.wire_format import Encoder, Info
+from adxl_ros.links.support.wire_format import BoardInfo, Encoder
 import numpy as np
 
 BLOCK = 10
@@ -64,7 +64,7 @@ class FaultyBoard:
         self.random = random.Random(setting.get('seed', 1))
         self.fault, self.chance = '', 0.0
         self.ours = self.theirs = None
-        self.info = Info(self.rate, 16, self.channels, 5.0, setting.get('serial', 'T1'))
+        self.info = BoardInfo(self.rate, 16, self.channels, 5.0, setting.get('serial', 'T1'))
         self.halted_ns = 0
         self.start_ns = time.monotonic_ns()
         self.k = self.first_k = self.overruns = 0
@@ -109,7 +109,7 @@ class FaultyBoard:
         codes = np.full((BLOCK, self.channels), 32768)
         codes[:, 0], codes[:, 1] = k % 65534 + 1, mark(k)
         index = self.k - self.first_k
-        raw = self.encoder.data_frame(round(index * 1e6 / self.rate), index,
+        raw = self.encoder.sample_frame(round(index * 1e6 / self.rate), index,
                                       codes.astype(np.uint16), self.overruns)
         if not self.write(raw):
             self.overruns += BLOCK

@@ -12,39 +12,42 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""When to try again what has failed: for ever, soon at first, then less often."""
+"""Back-off: when a failed attempt is made again, soon at first, then less often, without end."""
 
 from __future__ import annotations
 
 import time
 
 _FIRST_S = 0.01
+"""First waiting time, s; each failure doubles it."""
 _LONGEST_S = 0.08
-"""A device that is back is noticed within this."""
+"""Longest waiting time, s: a device that is back is noticed within it."""
 _SLOW_S = 1.0
-"""A device that is there, but not what the parameters say, is not asked more often."""
+"""Waiting time for a device that is there but does not fit the parameters, s."""
+_MAX_WAIT_S = 0.05
+"""Longest wait of one call, s, so that the driver reacts to its end."""
 
 
-class Retry:
-    """A back-off that ends when something works again."""
+class Backoff:
+    """An exponential back-off that a success resets."""
 
     def __init__(self) -> None:
-        """Try at once."""
+        """Make the first attempt due at once."""
         self._wait_s = _FIRST_S
-        self._next_s = 0.0
+        self._due_s = 0.0
 
     def wait(self) -> bool:
-        """Wait for the next try, 50 ms at most; tell whether it is time for it."""
-        left_s = self._next_s - time.monotonic()
-        if left_s > 0:
-            time.sleep(min(left_s, 0.05))
-        return left_s <= 0.05
+        """Wait for the next attempt, at most 50 ms; return whether it is due."""
+        remaining_s = self._due_s - time.monotonic()
+        if remaining_s > 0:
+            time.sleep(min(remaining_s, _MAX_WAIT_S))
+        return remaining_s <= _MAX_WAIT_S
 
-    def failed(self, slow: bool = False) -> None:
-        """Take the time until the next try; `slow` where trying soon is not likely to help."""
-        self._next_s = time.monotonic() + (_SLOW_S if slow else self._wait_s)
+    def fail(self, slow: bool = False) -> None:
+        """Schedule the next attempt; `slow` where an early one is not likely to help."""
+        self._due_s = time.monotonic() + (_SLOW_S if slow else self._wait_s)
         self._wait_s = min(2 * self._wait_s, _LONGEST_S)
 
-    def worked(self) -> None:
-        """Be quick again after the next failure."""
+    def reset(self) -> None:
+        """Retry soon after the next failure."""
         self._wait_s = _FIRST_S

@@ -12,29 +12,51 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What a link is: where the samples come from. One file a link, found by being in `links`."""
+"""
+What a link is: a source of samples.
+
+Each module of the package `links` is one link, found by its file name. It holds the dataclass
+`Settings` and the function `open_link`.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, fields
+from enum import Enum
 from importlib import import_module
 import pkgutil
-from typing import Any, Protocol
+from typing import Any, cast, Protocol, runtime_checkable
 
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
+DEFAULT_LINK = 'sim'
+"""Link of a driver whose parameters name none: it needs no device."""
+
 _LINKS = 'adxl_ros.links'
-"""Package whose modules are the links; its folder `support` is none."""
+"""Package whose modules are the links; its folder `support` holds no link."""
 
 
 @dataclass(frozen=True)
 class Option:
     """
-    One parameter `link.<name>` of the driver; the type of the default is its type.
+    One setting of a link, which is the parameter `link.<name>` of the driver.
 
-    An empty tuple stands for a list of strings, or one string with commas.
+    Attributes
+    ----------
+    name
+        Name of the field in `Settings`.
+    default
+        Default value; its type is the type of the parameter. An empty tuple stands for a list of
+        strings, or one string with commas.
+    doc
+        Meaning, for the parameter's descriptor.
+    unit
+        Unit of the value; '' without one.
+    lower, upper
+        Permitted range, in `unit`; None without limits.
+
     """
 
     name: str
@@ -45,31 +67,128 @@ class Option:
     upper: float | None = None
 
 
-@dataclass(frozen=True)
-class State:
+def option(default: bool | int | float | str | tuple[()], doc: str, unit: str = '',
+           lower: float | None = None, upper: float | None = None) -> Any:
     """
-    How a link is.
+    Declare one field of a link's `Settings`.
+
+    Parameters
+    ----------
+    default, doc, unit, lower, upper
+        As the attributes of `Option`.
+
+    Returns
+    -------
+    dataclasses.Field
+        The field, with the description in its metadata.
+
+    """
+    return field(default=default,
+                 metadata={'doc': doc, 'unit': unit, 'lower': lower, 'upper': upper})
+
+
+def options(settings: type) -> tuple[Option, ...]:
+    """Describe the fields of a link's `Settings`."""
+    return tuple(Option(f.name, f.default, **f.metadata) for f in fields(settings))
+
+
+@dataclass(frozen=True)
+class PacedSettings:
+    """
+    Settings of a link that makes its own time.
+
+    Attributes
+    ----------
+    speed
+        Sensor time by real time.
+
+    """
+
+    speed: float = option(1.0, 'sensor time by real time; other than 1 the driver publishes '
+                          '/clock', '', 0.01, 1000.0)
+
+
+@dataclass(frozen=True)
+class DeviceSettings:
+    """
+    Settings of a link that reads a device.
+
+    Attributes
+    ----------
+    delay
+        Shortest time from a sample to its arrival, s.
+    supply_scale
+        Supply voltage by the voltage of its channel, V/V: the ratio of its divider.
+
+    """
+
+    delay: float = option(0.0, 'shortest time from a sample to its arrival', 's', 0.0, 1.0)
+    supply_scale: float = option(1.0, 'supply voltage by the voltage of its channel: the ratio '
+                                 'of its divider', 'V/V', 1e-3, 1e3)
+
+
+class Level(Enum):
+    """How well a link works."""
+
+    OK = 'ok'
+    WARN = 'warn'
+    ERROR = 'error'
+
+
+@dataclass(frozen=True)
+class Event:
+    """
+    Something that happens to a device now and then.
+
+    Attributes
+    ----------
+    message
+        What a user is told.
+    count
+        How often it has happened.
+
+    """
+
+    message: str
+    count: int
+
+
+@dataclass(frozen=True)
+class LinkStatus:
+    """
+    How a link works.
 
     Attributes
     ----------
     level
-        `ok`, `warn` or `error`.
+        How well.
     text
-        One or two words, or a line of reasons; it changes when the state does, and only then.
-    values : mapping
-        Figures for diagnostics.
+        One or two words, or one line with the reason. It changes only when the condition of the
+        link changes.
+    statistics
+        Dataclasses with the counts of the link and of its clock.
+    events
+        Events that are logged when their count rises.
 
     """
 
-    level: str
+    level: Level
     text: str
-    values: Mapping[str, Any] = field(default_factory=dict)
+    statistics: tuple[Any, ...] = ()
+    events: tuple[Event, ...] = ()
+
+    def values(self) -> dict[str, Any]:
+        """Return the statistics by name, as diagnostics show them."""
+        values: dict[str, Any] = {}
+        for part in self.statistics:
+            values |= asdict(part)
+        return values
 
 
 @dataclass(frozen=True)
 class Samples:
     """
-    What a link gives at once.
+    What one read of a link returns.
 
     Attributes
     ----------
@@ -78,14 +197,14 @@ class Samples:
     volts
         Output of the sensor by axis, V, (n, m), finite.
     until_ns
-        Time up to which the link has nothing more to give.
+        Time up to which the link has no further samples, ns.
     missing
         Samples lost since the last call.
-    references : mapping or tuple
-        What was recorded beside the sensor, by the column names of a recording, (n,); NaN where
-        it was not sampled.
+    references : mapping
+        References by the column names of a recording, (n,) each; NaN where a reference was not
+        sampled.
     estimated
-        How many of `missing` are estimated by time, not counted.
+        Part of `missing` that is estimated from time, not counted.
 
     """
 
@@ -97,65 +216,144 @@ class Samples:
     estimated: int = 0
 
 
-def nothing(sensor: Sensor, until_ns: int) -> Samples:
-    """Return no samples of a sensor."""
+def no_samples(sensor: Sensor, until_ns: int) -> Samples:
+    """
+    Return an empty set of samples.
+
+    Parameters
+    ----------
+    sensor
+        Sensor whose axes give the number of columns.
+    until_ns
+        Time up to which the link has no samples, ns.
+
+    Returns
+    -------
+    Samples
+        No rows.
+
+    """
     return Samples(np.zeros(0, np.int64), np.zeros((0, len(sensor.axes))), until_ns)
 
 
 class Link(Protocol):
     """
-    A source of samples.
-
-    A module of `links` that is a link has `OPTIONS`, a tuple of `Option`, and
-    `open_link(sensor, options)`, which returns one of these and raises `UserError` for options
-    that it cannot work with. A link that simulates has a method `feel`, too; see `links.sim`.
+    A source of samples, as `open_link` returns it.
 
     Attributes
     ----------
     sensor
-        Whose figures make the samples readable; None until the device has said.
+        Sensor that makes the samples readable; None until the device has described itself.
     live
-        Whether samples come when a device sends them. Then `read` waits for them, 50 ms or so,
-        and their stamps are the link's; else it gives at once what is due.
-    references : mapping or tuple
-        Names of the references that its samples come with.
-    waits
-        Whether it has a beginning that nobody should miss: it starts with its first listener.
+        Whether a device sends the samples. Then `read` waits for them for about 50 ms and their
+        stamps are final. Otherwise `read` returns at once what is due.
+    references : tuple
+        Names of the references that come with the samples.
+    waits_for_listener
+        Whether the first sample waits for the first subscriber.
     start_ns
-        Time of its first sample, ns, where it has one of its own; else None.
+        Time of the first sample, ns, where the link has a time of its own; else None.
 
     """
 
     sensor: Sensor | None
     live: bool
     references: tuple[str, ...]
-    waits: bool
+    waits_for_listener: bool
     start_ns: int | None
 
     def begin(self, now_ns: int) -> int:
         """
-        Let the next sample be due now; return how many samples are lost by that.
+        Make the next sample due now; return how many samples this loses.
 
-        Called once before the first `read`, and again when the clock has jumped.
+        It is called once before the first `read`, and again when the clock has jumped.
         """
 
     def read(self, now_ns: int) -> Samples:
         """Return the samples that are due; raises `UserError` when there will be no more."""
 
-    def state(self) -> State:
-        """Say how the link is."""
+    def status(self) -> LinkStatus:
+        """Return how the link works."""
 
     def close(self) -> None:
-        """Let go of what the link holds open."""
+        """Close what the link holds open."""
 
 
-def names() -> tuple[str, ...]:
-    """Name the links, `sim` first."""
-    found = [module.name for module in pkgutil.iter_modules(import_module(_LINKS).__path__)
-             if not module.ispkg]
-    return tuple(sorted(found, key=lambda name: (name != 'sim', name)))
+@runtime_checkable
+class StageLink(Protocol):
+    """
+    A link whose sensor senses the motion of the stage.
+
+    Attributes
+    ----------
+    joint_state_topic
+        Topic with the true motion of the stage.
+
+    """
+
+    joint_state_topic: str
+
+    def sense_stage(self, stamp_ns: int, position: Mapping[str, float],
+                    velocity: Mapping[str, float]) -> None:
+        """
+        Take the true motion of the stage at a stamp, which may lie ahead.
+
+        Parameters
+        ----------
+        stamp_ns
+            ROS time, ns.
+        position
+            Position by joint, rad or m. A joint that is not named stays.
+        velocity
+            Velocity by joint, rad/s or m/s.
+
+        """
 
 
-def module_of(name: str) -> Any:
-    """Import a link by its name."""
-    return import_module(f'{_LINKS}.{name}')
+class LinkModule(Protocol):
+    """
+    What a module of `links` contains.
+
+    Attributes
+    ----------
+    Settings
+        Frozen dataclass whose fields are declared by `option`.
+
+    """
+
+    Settings: type
+
+    def open_link(self, sensor: Sensor, settings: Any) -> Link:
+        """
+        Open the link.
+
+        Parameters
+        ----------
+        sensor
+            Sensor of the driver's parameters.
+        settings
+            Instance of `Settings`.
+
+        Returns
+        -------
+        Link
+            The link; a device that is not there yet is opened later, by reading.
+
+        Raises
+        ------
+        UserError
+            The link cannot work with these settings.
+
+        """
+
+
+def link_names() -> tuple[str, ...]:
+    """Return the names of all links, the default one first."""
+    modules = pkgutil.iter_modules(import_module(_LINKS).__path__)
+    names = [module.name for module in modules if not module.ispkg]
+    return tuple(sorted(names, key=lambda name: (name != DEFAULT_LINK, name)))
+
+
+def link_module(name: str) -> LinkModule:
+    """Import the module of a link."""
+    return cast(LinkModule, import_module(f'{_LINKS}.{name}'))

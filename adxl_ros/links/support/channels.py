@@ -12,34 +12,37 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What the channels of an ADC are: axes of the sensor, its supply, a temperature."""
+"""What the channels of an ADC carry: axes of the sensor, its supply, a temperature."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 from adxl_ros.errors import UserError
-from adxl_ros.links.support.base import Option
 from adxl_ros.model.constants import AXES
-from adxl_ros.model.sensor import Sensor
 import numpy as np
 
-SUPPLY, TEMPERATURE, UNUSED = 'supply', 'temperature', '-'
+SUPPLY = 'supply'
+"""Role of the channel with the supply voltage."""
+TEMPERATURE = 'temperature'
+"""Role of the channel with the temperature."""
+UNUSED = '-'
+"""Role of a channel that is not read."""
 ROLES = (*AXES, SUPPLY, TEMPERATURE)
-
-SUPPLY_SCALE = Option('supply_scale', 1.0, "supply by the volts of its channel: its divider's",
-                      'V/V', 1e-3, 1e3)
+"""All roles of channels that are read."""
+COLUMNS = {SUPPLY: 'supply_v', TEMPERATURE: 'temperature_c'}
+"""Column of a recording by the role of a reference channel."""
 
 _PERIOD_NS = 100_000_000
-"""Supply and temperature change slowly: the mean of so long is published once."""
-_COLUMNS = {SUPPLY: 'supply_v', TEMPERATURE: 'temperature_c'}
+"""Period of the means of supply and temperature, ns. Chosen: both change slowly."""
 
 
-def listed(value: str | Sequence[str]) -> list[str]:
+def parse_channels(value: str | Sequence[str]) -> list[str]:
     """
-    Read `link.channels`: a list of strings, or one string with commas.
+    Parse `link.channels`: a list of strings, or one string with commas.
 
-    The string is for the command line, where YAML would take a bare y in a list for a boolean.
+    The string is for the command line, where YAML reads a bare y in a list as a boolean.
     """
     parts = value.split(',') if isinstance(value, str) else value
     if not isinstance(parts, Sequence) or not all(isinstance(part, str) for part in parts):
@@ -49,12 +52,19 @@ def listed(value: str | Sequence[str]) -> list[str]:
 
 def check_roles(roles: Sequence[str], axes: str) -> None:
     """
-    Refuse channels that a sensor with these axes cannot be read from.
+    Check that the channels make a sensor readable.
+
+    Parameters
+    ----------
+    roles
+        Roles of the channels.
+    axes
+        Axes of the sensor.
 
     Raises
     ------
     UserError
-        A role is unknown, there twice, or no axis of the sensor; or an axis has no channel.
+        A role is unknown, is there twice, or is no axis of the sensor; or an axis has no channel.
 
     """
     for role in roles:
@@ -71,58 +81,133 @@ def check_roles(roles: Sequence[str], axes: str) -> None:
                         f'{", ".join(roles) or "none"}, sensor.axes is {axes}')
 
 
-def references_of(roles: Sequence[str]) -> tuple[str, ...]:
-    """Name the columns that the channels give beside the axes."""
-    return tuple(column for role, column in _COLUMNS.items() if role in roles)
+def reference_columns(roles: Sequence[str]) -> tuple[str, ...]:
+    """Return the columns of the references among the roles."""
+    return tuple(column for role, column in COLUMNS.items() if role in roles)
 
 
-def split(values: Mapping[str, np.ndarray], sensor: Sensor, columns: Sequence[str],
-          supply_scale: float) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+@dataclass(frozen=True)
+class Block:
     """
-    Return the volts by axis, (n, m), and the references by column, (n,) each.
+    Samples as a device sends them.
 
-    Parameters
+    Attributes
     ----------
-    values
-        By role, (n,) each.
-    sensor
-        Whose axes.
-    columns
-        References that are asked for; NaN where no channel gives them.
-    supply_scale
-        Supply by the volts of its channel.
+    device_ns
+        Device time, ns, (n,) int64, ascending.
+    volts
+        Output of the sensor by axis, V, (n, m).
+    references
+        References by column, (n,) each.
 
     """
-    volts = np.column_stack([values[axis] for axis in sensor.axes])
-    beside = {column: np.full(len(volts), np.nan) for column in columns}
-    beside |= {column: values[role] * (supply_scale if role == SUPPLY else 1.0)
-               for role, column in _COLUMNS.items() if role in values}
-    return volts, beside
+
+    device_ns: np.ndarray
+    volts: np.ndarray
+    references: Mapping[str, np.ndarray]
 
 
-class Seldom:
-    """Thins out what changes slowly: means of 0.1 s, each at the next sample; NaN between."""
+@dataclass(frozen=True)
+class Layout:
+    """
+    How the channels of a device become samples.
+
+    Attributes
+    ----------
+    axes
+        Axes of the sensor.
+    columns
+        Columns of the references; NaN where no channel has them.
+    supply_scale
+        Supply voltage by the voltage of its channel, V/V.
+
+    """
+
+    axes: str
+    columns: tuple[str, ...]
+    supply_scale: float
+
+    def block(self, device_ns: np.ndarray, values: Mapping[str, np.ndarray]) -> Block:
+        """
+        Arrange the values of channels as samples.
+
+        Parameters
+        ----------
+        device_ns
+            Device time, ns, (n,) int64, ascending.
+        values
+            Volts, or degC for the temperature, by role, (n,) each.
+
+        Returns
+        -------
+        Block
+            The samples.
+
+        """
+        volts = np.column_stack([values[axis] for axis in self.axes])
+        references = {column: np.full(len(volts), np.nan) for column in self.columns}
+        if SUPPLY in values:
+            references[COLUMNS[SUPPLY]] = values[SUPPLY] * self.supply_scale
+        if TEMPERATURE in values:
+            references[COLUMNS[TEMPERATURE]] = values[TEMPERATURE]
+        return Block(device_ns, volts, references)
+
+
+@dataclass
+class _RunningMean:
+    """Mean of the finite values since the last one that was taken."""
+
+    total: float = 0.0
+    count: int = 0
+
+    def add(self, values: np.ndarray) -> None:
+        finite = values[np.isfinite(values)]
+        self.total += float(finite.sum())
+        self.count += len(finite)
+
+    def take(self) -> float:
+        """Return the mean, NaN without a value, and begin again."""
+        mean = self.total / self.count if self.count else np.nan
+        self.total, self.count = 0.0, 0
+        return mean
+
+
+class PeriodMeans:
+    """Replaces slow references by their means over 0.1 s, each at the first sample after it."""
 
     def __init__(self) -> None:
-        """Begin without a mean."""
-        self._sums: dict[str, tuple[float, int]] = {}
+        """Begin without values."""
+        self._running: dict[str, _RunningMean] = {}
         self._period = 0
 
-    def __call__(self, host_ns: np.ndarray, columns: Mapping[str, np.ndarray]
-                 ) -> dict[str, np.ndarray]:
-        """Return the columns, (n,), with means in a few rows and NaN in the others."""
-        thin = {name: np.full(len(host_ns), np.nan) for name in columns}
+    def thin(self, host_ns: np.ndarray, references: Mapping[str, np.ndarray]
+             ) -> dict[str, np.ndarray]:
+        """
+        Return the means in a few rows, and NaN in the others.
+
+        Parameters
+        ----------
+        host_ns
+            Times of the samples, ns, (n,), ascending from call to call.
+        references
+            References by column, (n,) each.
+
+        Returns
+        -------
+        dict
+            Means by column, (n,) each.
+
+        """
         periods = host_ns // _PERIOD_NS
         begins = np.flatnonzero(np.diff(periods, prepend=self._period))
         self._period = int(periods[-1])
-        for name, values in columns.items():
-            total, count = self._sums.get(name, (0.0, 0))
-            for begin, part in zip([0, *begins], np.split(values, begins)):
-                if begin in begins:
-                    if count:
-                        thin[name][begin] = total / count
-                    total, count = 0.0, 0
-                known = part[np.isfinite(part)]
-                total, count = total + float(known.sum()), count + len(known)
-            self._sums[name] = total, count
-        return thin
+        means = {}
+        for column, values in references.items():
+            running = self._running.setdefault(column, _RunningMean())
+            means[column] = np.full(len(host_ns), np.nan)
+            parts = np.split(values, begins)
+            running.add(parts[0])
+            for begin, part in zip(begins, parts[1:]):
+                means[column][begin] = running.take()
+                running.add(part)
+        return means

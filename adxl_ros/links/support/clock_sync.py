@@ -13,11 +13,11 @@
 # limitations under the License.
 
 """
-From the clock of a device to that of the host, and from there to ROS time.
+Maps from the clock of a device to the host's monotonic clock, and from there to ROS time.
 
-A sample arrives later than it was taken, never earlier. So the line that goes below the arrivals,
-close to the earliest of them, is the clock of the device seen on the host's: its offset and its
-drift. Stamps follow that line smoothly, and never go backwards.
+A sample arrives later than it was taken, never earlier. So the clock of the device, seen on the
+host's clock, is the line just below the arrivals: it has an offset and a drift. The stamps follow
+this line smoothly and never go backwards.
 """
 
 from __future__ import annotations
@@ -25,307 +25,432 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass
 import time
+from typing import NamedTuple
 
 import numpy as np
 
+# Limits and time constants without a source are chosen for links of 0.1 to 5 ms of jitter at
+# 1 kHz; test_link_parts states what they achieve.
 _WINDOW_S = 0.5
-_ENOUGH = 25
-"""Arrivals that a window should have, for its earliest to be early ..."""
-_LONGEST_WINDOW_S = 5.0
-"""... unless that takes longer than this."""
+"""Length of a window, s, of which only the earliest arrival counts."""
+_MIN_ARRIVALS = 25
+"""Arrivals that a window needs, so that its earliest one is early."""
+_MAX_WINDOW_S = 5.0
+"""Length at which a window ends without these arrivals, s."""
 _SPAN_S = 25.0
-_FEW = 20
-"""So many windows are kept however old they are."""
-_FIRST_S = 0.15
-_SETTLE_S = 0.06
-"""Samples of the first clock, and of a later one, which must not keep a robot waiting, wait so
-long for their stamps: of some arrivals one is early."""
-_QUICK_S = 0.3
-"""Within this the stamps of a new clock follow an arrival that is earlier than those before."""
+"""Age at which a window is forgotten, s. A crystal's drift is constant over this time."""
+_MIN_WINDOWS = 20
+"""Number of windows that are kept whatever their age."""
+_FIRST_WAIT_S = 0.15
+"""Time for which the samples of the first clock wait for their stamps, s. Of some arrivals one is
+early."""
+_LATER_WAIT_S = 0.06
+"""The same for a later clock, s: it is short because a robot is in motion."""
+_FIRST_HORIZON_S = 0.3
+"""Shortest time in which the stamps of a new clock follow an earlier arrival, s."""
 _HORIZON_S = 2.0
-"""Stamps approach a better line within this, so that its corrections are no jitter."""
+"""Shortest time in which stamps approach a better line, s. So a correction is no jitter."""
 _PRIOR_S2 = 1.0
-"""That there is no drift counts like windows whose times have this sum of squares: a lateness of
-0.2 ms is as likely as the 200 ppm of a crystal."""
-_LATE = 0.1
-"""Weight of an arrival above the line, one below it having 1: lateness says little."""
+"""Weight of a drift of 0, as the sum of squared window times, s². A lateness of 0.2 ms is as
+likely as the 200 ppm of a crystal."""
+_LATE_WEIGHT = 0.1
+"""Weight of a window above the line, relative to one below it: lateness carries little
+information."""
+_FIT_ITERATIONS = 8
+"""Iterations of the reweighted least squares. Chosen: the weights settle in fewer."""
 _EARLY_NS = 20e6
-"""An arrival that is early by this shows that the device's clock has stepped forward."""
+"""Earliness of an arrival that shows a forward step of the device's clock, ns."""
 _SHIFT_NS = 20e6
-"""A clock that has stepped back shows in two windows whose earliest are late alike."""
-_STOOD_NS = 250e6
-"""After an arrival that is late by this, the next ones tell whether the clock stood still."""
+"""Common lateness of two windows that shows a backward step of the device's clock, ns."""
+_STOPPED_NS = 250e6
+"""Lateness of an arrival after which the next arrivals decide whether the clock stopped, ns."""
+_CATCH_UP_RATIO = 1.5
+"""Late samples that come this many times faster than they were taken were delayed on the way."""
 _SMOOTH_NS = 50e6
-"""Differences up to this are taken up smoothly; a larger one forward is a step of the stamps."""
-_BEND = 0.05
-_HARD_BEND = 0.5
-_LEAST_SLOPE = 1e-3
-"""Stamps go forward, however fast a device that is none may send."""
+"""Largest difference that the stamps take up smoothly, ns. A larger one forward is a step."""
+_MAX_BEND = 0.05
+"""Largest change of slope for a small difference, relative to the drift."""
+_MAX_STEEP_BEND = 0.5
+"""Largest change of slope for a difference beyond `_SMOOTH_NS`."""
+_MIN_SLOPE = 1e-3
+"""Smallest slope of the stamps: they go forward whatever a faulty device sends."""
 
 
-@dataclass(frozen=True)
-class _Window:
-    """The earliest arrival of a window: device time, and its distance to host time, ns."""
+class _Window(NamedTuple):
+    """The earliest arrival of a window: device time, and its lag behind host time, ns."""
 
     device_ns: int
     lag_ns: int
 
 
 @dataclass
-class _Doubt:
-    """Arrivals that are far too late: the samples were on their way, or the clock stood still."""
+class _LateArrivals:
+    """
+    Arrivals that are far too late: their samples were delayed, or the device's clock stopped.
+
+    Attributes
+    ----------
+    first_ns, last_ns
+        Host times of the first and the last one, ns.
+    first_device_ns, last_device_ns
+        Their device times, ns.
+    min_lag_ns
+        Smallest lag of device time behind host time, ns.
+    count
+        Number of arrivals.
+
+    """
 
     first_ns: int
     first_device_ns: int
     last_device_ns: int
     last_ns: int
-    least_ns: int
+    min_lag_ns: int
     count: int = 1
 
 
 class ClockMap:
     """
-    Follows the clock of a device by the arrivals of its samples.
+    Map of a device's clock by the arrivals of its samples.
 
     Attributes
     ----------
     steps
-        How often the device's clock has stepped, by what the arrivals show.
+        How often the device's clock has stepped, by its arrivals.
     drift_ppm
-        How much slower the device's clock goes than the host's.
+        Drift of the device's clock, ppm; positive where it is slower than the host's.
     jitter_ns
-        Half of the windows' earliest arrivals are farther from the line than this.
+        Median distance of the windows' earliest arrivals from the line, ns.
     settled
-        Whether samples get stamps: not in the first instants of a new clock.
+        Whether samples get stamps. They wait in the first instants of a new clock.
 
     """
 
     def __init__(self, delay_s: float) -> None:
-        """Begin; `delay_s` is what the link takes at least, from sample to arrival."""
+        """Begin without arrivals; `delay_s` is the shortest time from sample to arrival, s."""
         self.steps = 0
         self._delay_ns = round(delay_s * 1e9)
-        self._out_ns: int | None = None
-        self._settle_s = _FIRST_S
+        self._newest_stamp_ns: int | None = None
+        self._wait_s = _FIRST_WAIT_S
         self.restart()
 
     def restart(self) -> None:
-        """Begin a new clock; stamps do not go back behind those that were given."""
+        """Begin a new clock; its stamps follow the earlier ones."""
         self.drift_ppm = self.jitter_ns = 0.0
         self.settled = False
         self._windows: deque[_Window] = deque()
         self._open: _Window | None = None
         self._opened_ns = self._seen_ns = self._count = 0
         self._first_arrived_ns: int | None = None
-        self._doubt: _Doubt | None = None
-        # The stamps' line: passes through a point, ns, with a slope.
-        self._at_ns = self._to_ns = 0
+        self._late: _LateArrivals | None = None
+        # The stamps lie on a line through this point, device time and host time, ns.
+        self._line_device_ns = self._line_host_ns = 0
         self._slope = 1.0
 
     def observe(self, device_ns: int, arrived_ns: int) -> bool:
         """
-        Take an arrival; return whether the clock has stepped, and a new one has begun with it.
+        Take an arrival.
 
         Parameters
         ----------
         device_ns
-            Device time of the newest sample that arrived.
+            Device time of the newest sample that arrived, ns.
         arrived_ns
-            When that was, host time.
+            Host time of its arrival, ns.
+
+        Returns
+        -------
+        bool
+            Whether the device's clock has stepped, so that a new map has begun.
 
         """
         lag_ns = arrived_ns - self._delay_ns - device_ns
-        if (self.settled and arrived_ns - self._delay_ns - self._line(device_ns) < -_EARLY_NS) \
-                or self._shifted(lag_ns):
+        if self._is_early(device_ns, arrived_ns) or self._is_shifted(lag_ns):
             self.steps += 1
             self.restart()
             self.observe(device_ns, arrived_ns)
             return True
-        if self.settled and self._is_doubtful(device_ns, arrived_ns, lag_ns):
+        if self.settled and self._is_late(device_ns, arrived_ns, lag_ns):
             return False
         if self._first_arrived_ns is None:
             self._first_arrived_ns = arrived_ns
-        if self._open is None or lag_ns < self._open.lag_ns:
-            if self._open is None:
-                self._opened_ns, self._count = device_ns, 0
-            self._open = _Window(device_ns, lag_ns)
-            if self.settled and not self._windows:
-                self._steer(device_ns, max(_QUICK_S, 2e-9 * (device_ns - self._seen_ns)))
-        self._count += 1
-        self._seen_ns = device_ns
-        open_s = (device_ns - self._opened_ns) * 1e-9
-        if (open_s >= _WINDOW_S and self._count >= _ENOUGH) or open_s >= _LONGEST_WINDOW_S:
-            self._windows.append(self._open)
-            self._open = None
-            while len(self._windows) > _FEW \
-                    and device_ns - self._windows[0].device_ns > _SPAN_S * 1e9:
-                self._windows.popleft()
-            self._steer(device_ns, max(_HORIZON_S, 2 * open_s))
+        self._update_window(device_ns, lag_ns)
         return False
 
     def ready(self, now_ns: int) -> bool:
-        """Tell whether stamps can be given now."""
-        if self._doubt is not None and self._doubt.count > 1 \
-                and now_ns - self._doubt.first_ns >= _SETTLE_S * 1e9:
-            self._resolve(self._doubt)
+        """Return whether samples can be stamped at a host time, ns."""
+        late = self._late
+        if late is not None and late.count > 1 and now_ns - late.first_ns >= _LATER_WAIT_S * 1e9:
+            self._resolve(late)
         if not self.settled and self._open is not None \
-                and now_ns - self._first_arrived_ns >= self._settle_s * 1e9:
+                and now_ns - self._first_arrived_ns >= self._wait_s * 1e9:
             self.settled = True
-            self._settle_s = _SETTLE_S
-            self._at_ns = self._open.device_ns
-            self._to_ns = self._at_ns + self._fit(self._at_ns)
-        return self.settled and self._doubt is None
+            self._wait_s = _LATER_WAIT_S
+            self._line_device_ns = self._open.device_ns
+            self._line_host_ns = self._line_device_ns + self._fit(self._line_device_ns)
+        return self.settled and self._late is None
 
-    def __call__(self, device_ns: np.ndarray) -> np.ndarray:
-        """Return host times, ns, (n,) int64, ascending with the device's and from call to call."""
+    def host_ns(self, device_ns: np.ndarray) -> np.ndarray:
+        """
+        Map device times to host times.
+
+        Parameters
+        ----------
+        device_ns
+            Device times, ns, (n,) int64, ascending.
+
+        Returns
+        -------
+        ndarray
+            Host times, ns, (n,) int64, ascending within the call and from call to call.
+
+        """
         stamps = np.rint(self._line(device_ns)).astype(np.int64)
-        if self._out_ns is not None and stamps[0] <= self._out_ns:
-            # A new clock that begins behind the stamps of the old: go on from those.
-            self._to_ns += self._out_ns + 1 - int(stamps[0])
+        newest_ns = self._newest_stamp_ns
+        if newest_ns is not None and stamps[0] <= newest_ns:
+            # The new clock begins behind the stamps of the previous one: continue from those.
+            self._line_host_ns += newest_ns + 1 - int(stamps[0])
             self._steer(int(device_ns[0]), _HORIZON_S)
             stamps = np.maximum(np.rint(self._line(device_ns)).astype(np.int64),
-                                self._out_ns + 1 + np.arange(len(stamps)))
-        self._out_ns = int(stamps[-1])
+                                newest_ns + 1 + np.arange(len(stamps)))
+        self._newest_stamp_ns = int(stamps[-1])
         return stamps
 
     def _line(self, device_ns: np.ndarray | int) -> np.ndarray | float:
-        return self._to_ns + (device_ns - self._at_ns) * self._slope
+        return self._line_host_ns + (device_ns - self._line_device_ns) * self._slope
+
+    def _lateness_ns(self, device_ns: int, arrived_ns: int) -> float:
+        """Return how far an arrival lies above the line, ns."""
+        return arrived_ns - self._delay_ns - self._line(device_ns)
+
+    def _update_window(self, device_ns: int, lag_ns: int) -> None:
+        """Add an arrival to the open window; a window that ends corrects the line."""
+        if self._open is None:
+            self._opened_ns, self._count = device_ns, 0
+        if self._open is None or lag_ns < self._open.lag_ns:
+            self._open = _Window(device_ns, lag_ns)
+            if self.settled and not self._windows:
+                self._steer(device_ns, max(_FIRST_HORIZON_S, 2e-9 * (device_ns - self._seen_ns)))
+        self._count += 1
+        self._seen_ns = device_ns
+        open_s = (device_ns - self._opened_ns) * 1e-9
+        complete = open_s >= _WINDOW_S and self._count >= _MIN_ARRIVALS
+        if complete or open_s >= _MAX_WINDOW_S:
+            self._windows.append(self._open)
+            self._open = None
+            while len(self._windows) > _MIN_WINDOWS \
+                    and device_ns - self._windows[0].device_ns > _SPAN_S * 1e9:
+                self._windows.popleft()
+            self._steer(device_ns, max(_HORIZON_S, 2 * open_s))
 
     def _steer(self, device_ns: int, horizon_s: float) -> None:
-        """Let the stamps go on from where they are, to meet the best line at the horizon."""
-        here_ns = round(self._line(device_ns))
-        ahead_ns = round(horizon_s * 1e9)
-        off_ns = device_ns + self._fit(device_ns) - here_ns
-        if off_ns > _SMOOTH_NS:
-            here_ns, off_ns = here_ns + off_ns, 0
-        bend = _BEND if abs(off_ns) < _SMOOTH_NS else _HARD_BEND
-        slope = (device_ns + ahead_ns + self._fit(device_ns + ahead_ns) - here_ns) / ahead_ns
+        """
+        Turn the line so that it meets the best line at the horizon.
+
+        Parameters
+        ----------
+        device_ns
+            Device time from which the new line holds, ns.
+        horizon_s
+            Time until the lines meet, s.
+
+        """
+        host_ns = round(self._line(device_ns))
+        horizon_ns = round(horizon_s * 1e9)
+        difference_ns = device_ns + self._fit(device_ns) - host_ns
+        if difference_ns > _SMOOTH_NS:
+            host_ns, difference_ns = host_ns + difference_ns, 0
+        bend = _MAX_BEND if abs(difference_ns) < _SMOOTH_NS else _MAX_STEEP_BEND
+        target_ns = device_ns + horizon_ns
+        slope = (target_ns + self._fit(target_ns) - host_ns) / horizon_ns
         drift = 1 + self.drift_ppm * 1e-6
-        self._slope = max(min(max(slope, drift - bend), drift + bend), _LEAST_SLOPE)
-        self._at_ns, self._to_ns = device_ns, here_ns
+        self._slope = max(min(max(slope, drift - bend), drift + bend), _MIN_SLOPE)
+        self._line_device_ns, self._line_host_ns = device_ns, host_ns
 
     def _fit(self, device_ns: int) -> int:
-        """Return how far host time is ahead of a device time by the windows, ns."""
+        """
+        Fit the best line to the windows; return the lag of a device time on it, ns.
+
+        The fit is a least-squares line, reweighted so that a window above it counts less, with a
+        prior for a drift of 0.
+        """
         windows = [*self._windows] or [self._open]
         origin = windows[-1]
-        at_s = np.array([w.device_ns - origin.device_ns for w in windows]) * 1e-9
+        time_s = np.array([w.device_ns - origin.device_ns for w in windows]) * 1e-9
         lag_ns = np.array([w.lag_ns - origin.lag_ns for w in windows], float)
         weight = np.ones(len(windows))
         offset_ns = slope = 0.0
-        for _ in range(8):
-            mean_s = np.average(at_s, weights=weight)
+        for _ in range(_FIT_ITERATIONS):
+            mean_s = np.average(time_s, weights=weight)
             mean_ns = np.average(lag_ns, weights=weight)
-            spread = weight @ (at_s - mean_s) ** 2
-            slope = weight @ ((at_s - mean_s) * (lag_ns - mean_ns)) / (spread + _PRIOR_S2)
+            spread_s2 = weight @ (time_s - mean_s) ** 2
+            slope = weight @ ((time_s - mean_s) * (lag_ns - mean_ns)) / (spread_s2 + _PRIOR_S2)
             offset_ns = mean_ns - slope * mean_s
-            off = lag_ns - offset_ns - slope * at_s
-            weight = np.where(off > 0, _LATE, 1.0)
-            self.jitter_ns = float(np.median(np.abs(off)))
+            residual_ns = lag_ns - offset_ns - slope * time_s
+            weight = np.where(residual_ns > 0, _LATE_WEIGHT, 1.0)
+            self.jitter_ns = float(np.median(np.abs(residual_ns)))
         self.drift_ppm = float(slope) * 1e-3
         ahead_s = (device_ns - origin.device_ns) * 1e-9
         return origin.lag_ns + round(offset_ns + slope * ahead_s)
 
-    def _is_doubtful(self, device_ns: int, arrived_ns: int, lag_ns: int) -> bool:
-        """Keep an arrival that is far too late out of the windows, until the next ones tell."""
-        late_ns = arrived_ns - self._delay_ns - self._line(device_ns)
-        doubt = self._doubt
-        if doubt is None:
-            if late_ns < _STOOD_NS:
+    def _is_early(self, device_ns: int, arrived_ns: int) -> bool:
+        """Return whether an arrival is so early that the device's clock has stepped forward."""
+        return self.settled and self._lateness_ns(device_ns, arrived_ns) < -_EARLY_NS
+
+    def _is_late(self, device_ns: int, arrived_ns: int, lag_ns: int) -> bool:
+        """
+        Keep an arrival that is far too late out of the windows, until later ones explain it.
+
+        Parameters
+        ----------
+        device_ns
+            Device time of the newest sample, ns.
+        arrived_ns
+            Host time of its arrival, ns.
+        lag_ns
+            Lag of device time behind host time, ns.
+
+        Returns
+        -------
+        bool
+            Whether the arrival is kept out.
+
+        """
+        lateness_ns = self._lateness_ns(device_ns, arrived_ns)
+        late = self._late
+        if late is None:
+            if lateness_ns < _STOPPED_NS:
                 return False
-            self._doubt = _Doubt(arrived_ns, device_ns, device_ns, arrived_ns, lag_ns)
-        elif late_ns < _SHIFT_NS:
-            # What was stuck on its way has been delivered: the clock is what it was.
-            self._doubt = None
+            self._late = _LateArrivals(arrived_ns, device_ns, device_ns, arrived_ns, lag_ns)
+            return True
+        if lateness_ns < _SHIFT_NS:
+            # The delayed samples have been delivered: the clock did not stop.
+            self._late = None
             return False
-        else:
-            doubt.last_device_ns, doubt.last_ns = device_ns, arrived_ns
-            doubt.least_ns = min(doubt.least_ns, lag_ns)
-            doubt.count += 1
+        late.last_device_ns, late.last_ns = device_ns, arrived_ns
+        late.min_lag_ns = min(late.min_lag_ns, lag_ns)
+        late.count += 1
         return True
 
-    def _resolve(self, doubt: _Doubt) -> None:
-        """Begin a new clock, unless samples come faster than they were taken: late ones do."""
-        self._doubt = None
-        paced_ns = doubt.last_device_ns - doubt.first_device_ns
-        if paced_ns > 1.5 * (doubt.last_ns - doubt.first_ns):
+    def _resolve(self, late: _LateArrivals) -> None:
+        """Begin a new clock, unless the samples come faster than they were taken."""
+        self._late = None
+        taken_ns = late.last_device_ns - late.first_device_ns
+        if taken_ns > _CATCH_UP_RATIO * (late.last_ns - late.first_ns):
             return
         self.steps += 1
         self.restart()
-        self._first_arrived_ns = doubt.first_ns
-        self._open = _Window(doubt.last_device_ns, doubt.least_ns)
-        self._opened_ns, self._count = doubt.last_device_ns, 1
+        self._first_arrived_ns = late.first_ns
+        self._open = _Window(late.last_device_ns, late.min_lag_ns)
+        self._opened_ns, self._count = late.last_device_ns, 1
 
-    def _shifted(self, lag_ns: int) -> bool:
-        """Tell whether the last windows are late alike, far behind what was before them."""
+    def _is_shifted(self, lag_ns: int) -> bool:
+        """Return whether the last two windows are late by the same amount: a backward step."""
         if len(self._windows) < 3 or lag_ns - self._windows[-1].lag_ns < -_SHIFT_NS / 4:
             return False
         before, first, second = (self._windows[i].lag_ns for i in (-3, -2, -1))
         return first - before > _SHIFT_NS and abs(second - first) < _SHIFT_NS / 4
 
 
-class HostStamps:
-    """Stands in for the map where a device stamps by the host's own monotonic clock."""
+class IdentityMap:
+    """
+    Map for a device that stamps by the host's own monotonic clock.
+
+    Attributes
+    ----------
+    steps, settled, drift_ppm, jitter_ns
+        As those of `ClockMap`, and constant.
+
+    """
 
     steps = 0
     settled = True
     drift_ppm = jitter_ns = 0.0
 
     def restart(self) -> None:
-        """Nothing is learnt, nothing is forgotten."""
+        """Do nothing: this map learns nothing."""
 
     def observe(self, device_ns: int, arrived_ns: int) -> bool:
-        """See `ClockMap.observe`: this clock does not step."""
+        """
+        Do nothing: this clock does not step.
+
+        Parameters
+        ----------
+        device_ns, arrived_ns
+            As those of `ClockMap.observe`.
+
+        Returns
+        -------
+        bool
+            False.
+
+        """
         return False
 
     def ready(self, now_ns: int) -> bool:
-        """Say yes."""
+        """Return True: samples can be stamped at any time."""
         return True
 
-    def __call__(self, device_ns: np.ndarray) -> np.ndarray:
-        """Return the same times."""
+    def host_ns(self, device_ns: np.ndarray) -> np.ndarray:
+        """Return the same times, ns."""
         return device_ns
 
 
-class RosClock:
+class SystemClockMap:
     """
-    From the host's monotonic clock, which nobody sets, to ROS time, which is the system's.
+    Map from the host's monotonic clock, which is never set, to ROS time, the system clock.
 
     Attributes
     ----------
     steps
-        How often the system's clock was set while it was watched.
+        How often the system clock was set since the map began.
 
     """
 
     _STEP_NS = 1_000_000
+    """Change of the offset that counts as a step, ns. Chosen: slewing by NTP is slower."""
     _TRIES = 3
-    _SHARP_NS = 20_000
+    """Readings of which the least interrupted one counts."""
+    _MAX_UNCERTAINTY_NS = 20_000
+    """Uncertainty above which a reading is ignored, ns: the process was interrupted."""
+    _GAIN = 0.05
+    """Share of a small difference that an update takes up."""
 
     def __init__(self) -> None:
-        """Look at both clocks."""
+        """Read both clocks."""
         self.steps = 0
-        self._offset_ns = float(self._look()[1])
+        self._offset_ns = float(self._read().offset_ns)
 
-    def watch(self) -> int:
-        """Follow the system's clock; return by how much it was set since the last call, or 0."""
-        uncertain_ns, seen_ns = self._look()
-        if uncertain_ns > self._SHARP_NS:
+    def update(self) -> int:
+        """Follow the system clock; return by how much it was set since the last call, ns, or 0."""
+        reading = self._read()
+        if reading.uncertainty_ns > self._MAX_UNCERTAINTY_NS:
             return 0
-        off_ns = seen_ns - self._offset_ns
-        if abs(off_ns) < self._STEP_NS:
-            self._offset_ns += 0.05 * off_ns
+        difference_ns = reading.offset_ns - self._offset_ns
+        if abs(difference_ns) < self._STEP_NS:
+            self._offset_ns += self._GAIN * difference_ns
             return 0
-        self._offset_ns += off_ns
+        self._offset_ns += difference_ns
         self.steps += 1
-        return round(off_ns)
+        return round(difference_ns)
 
-    def __call__(self, host_ns: np.ndarray) -> np.ndarray:
-        """Return ROS times, ns, of monotonic ones."""
+    def ros_ns(self, host_ns: np.ndarray) -> np.ndarray:
+        """Return the ROS times of monotonic times, ns."""
         return host_ns + round(self._offset_ns)
 
-    def _look(self) -> tuple[int, int]:
-        """Return how sure it is and the offset, ns: of some looks the least interrupted one."""
-        looks = []
+    def _read(self) -> _OffsetReading:
+        """Read the offset of the system clock, the least interrupted of some tries."""
+        readings = []
         for _ in range(self._TRIES):
-            before, system, after = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
-            looks.append((after - before, system - (before + after) // 2))
-        return min(looks)
+            before_ns, system_ns, after_ns = (
+                time.monotonic_ns(), time.time_ns(), time.monotonic_ns())
+            readings.append(_OffsetReading(after_ns - before_ns,
+                                           system_ns - (before_ns + after_ns) // 2))
+        return min(readings)
+
+
+class _OffsetReading(NamedTuple):
+    """Offset of the system clock from the monotonic clock, and its uncertainty, ns."""
+
+    uncertainty_ns: int
+    offset_ns: int

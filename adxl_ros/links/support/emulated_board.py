@@ -12,13 +12,12 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""A board of the bench: samples in wire format 1 on a pseudo-terminal, at the pace of time."""
+"""An emulated board: samples in wire format 1 on a terminal, in real time."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 import os
 from pathlib import Path
 import pty
@@ -28,128 +27,190 @@ import tty
 
 from adxl_ros.errors import UserError
 from adxl_ros.links.support import channels
-from adxl_ros.links.support.wire_format import Encoder, Info
+from adxl_ros.links.support.wire_format import BoardInfo, Encoder
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
-_BLOCK = 10
+_FRAME_SAMPLES = 10
 """Samples of a frame, as the firmware sends them."""
 _INFO_S = 1.0
+"""Period of the info frames, s, as the firmware sends them."""
 _SUPPLY_SCALE = 2.0
-"""As a divider would: the ADC cannot measure what is its own reference."""
-_TEMPERATURE_ZERO_V, _TEMPERATURE_V_PER_C = 0.5, 0.01
+"""Ratio of the supply's divider, V/V, as in the firmware: the ADC cannot measure its own
+reference."""
+_TEMPERATURE_ZERO_V = 0.5
+"""Output of the temperature sensor at 0 degC, V, as a TMP36 has it."""
+_TEMPERATURE_V_PER_C = 0.01
+"""Slope of the temperature sensor, V/degC, as a TMP36 has it."""
+_MAX_BITS = 16
+"""Largest resolution of the codes of wire format 1, bit."""
+_MAX_SERIAL = 16
+"""Most characters of a serial number in wire format 1."""
 
 
-@dataclass
 class Board:
     """
-    Sends what a sensor gives.
+    Sends the samples of a sensor.
 
-    Frames that nobody takes are dropped and counted, as a board does whose host is not reading.
-
-    Attributes
-    ----------
-    roles
-        What its channels are.
-
+    Frames that nobody reads are dropped and counted, as on a board without a host.
     """
 
-    sensor: Sensor
-    roles: list[str]
-    fd: int
+    def __init__(self, sensor: Sensor, roles: list[str], fd: int) -> None:
+        """
+        Begin as after a reset.
 
-    def __post_init__(self) -> None:
-        """Begin as after a reset."""
-        s = self.sensor
-        self._encoder = Encoder(Info(s.rate_hz, s.adc_bits, len(self.roles), s.adc_vref_v,
-                                     s.serial))
+        Parameters
+        ----------
+        sensor
+            Sensor of the board, with the ADC and the sample rate.
+        roles
+            Roles of the channels.
+        fd
+            File descriptor of the terminal, which does not block.
+
+        """
+        self._sensor, self._roles, self._fd = sensor, roles, fd
+        self._encoder = Encoder(BoardInfo(sensor.rate_hz, sensor.adc_bits, len(roles),
+                                          sensor.adc_vref_v, sensor.serial))
         self._began_s: float | None = None
         self._index = self._overruns = 0
         self._informed_s = -_INFO_S
-        self._rest = b''
+        self._unsent = b''
 
     def send(self, columns: Mapping[str, np.ndarray]) -> None:
-        """Send samples as their time comes: volts by axis, `supply_v`, `temperature_c`, (n,)."""
+        """
+        Send samples, each frame at the time of its last sample.
+
+        Parameters
+        ----------
+        columns
+            Volts by axis, such as `x_v`, and `supply_v` and `temperature_c`, (n,) each.
+
+        Raises
+        ------
+        UserError
+            The terminal is gone.
+
+        """
         codes = self._codes(columns)
         if self._began_s is None:
             self._began_s = time.monotonic()
-        for begin in range(0, len(codes), _BLOCK):
-            block = codes[begin:begin + _BLOCK]
-            at_s = self._index / self.sensor.rate_hz
-            if at_s - self._informed_s >= _INFO_S and self._write(self._encoder.info_frame()):
-                self._informed_s = at_s
-            # A board sends a block when it has the last sample of it.
-            due_s = self._began_s + (self._index + len(block) - 1) / self.sensor.rate_hz
+        for begin in range(0, len(codes), _FRAME_SAMPLES):
+            block = codes[begin:begin + _FRAME_SAMPLES]
+            first_s = self._index / self._sensor.rate_hz
+            if first_s - self._informed_s >= _INFO_S and self._write(self._encoder.info_frame()):
+                self._informed_s = first_s
+            due_s = self._began_s + (self._index + len(block) - 1) / self._sensor.rate_hz
             time.sleep(max(due_s - time.monotonic(), 0))
-            frame = self._encoder.data_frame(round(at_s * 1e6), self._index, block,
-                                             self._overruns)
+            frame = self._encoder.sample_frame(round(first_s * 1e6), self._index, block,
+                                               self._overruns)
             if not self._write(frame):
                 self._overruns += len(block)
             self._index += len(block)
 
     def _codes(self, columns: Mapping[str, np.ndarray]) -> np.ndarray:
-        volts = []
-        for role in self.roles:
-            if role == channels.SUPPLY:
-                volts.append(columns['supply_v'] / _SUPPLY_SCALE)
-            elif role == channels.TEMPERATURE:
-                volts.append(_TEMPERATURE_ZERO_V
-                             + _TEMPERATURE_V_PER_C * columns['temperature_c'])
-            else:
-                volts.append(columns[f'{role}_v'])
-        codes = np.rint(np.column_stack(volts) / self.sensor.lsb_v)
-        return codes.clip(0, 2 ** self.sensor.adc_bits - 1).astype(np.uint16)
+        volts = np.column_stack([_volts(role, columns) for role in self._roles])
+        codes = np.rint(volts / self._sensor.lsb_v)
+        return codes.clip(0, 2 ** self._sensor.adc_bits - 1).astype(np.uint16)
 
     def _write(self, frame: bytes) -> bool:
-        """Write a frame whole, what is cut with the next one; tell whether it was taken."""
+        """Write a frame, after the rest of a previous one; return whether it was taken."""
         try:
-            if self._rest:
-                self._rest = self._rest[os.write(self.fd, self._rest):]
-            if self._rest:
+            if self._unsent:
+                self._unsent = self._unsent[os.write(self._fd, self._unsent):]
+            if self._unsent:
                 return False
-            self._rest = frame[os.write(self.fd, frame):]
+            self._unsent = frame[os.write(self._fd, frame):]
         except BlockingIOError:
             return False
         except OSError as error:
-            raise UserError(f'--port: nobody can be written to any more: {error.strerror}'
-                            ) from None
+            raise UserError(f'--port: the terminal is gone: {error.strerror}') from None
         return True
 
 
+def _volts(role: str, columns: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Return the voltage of a channel, V, (n,)."""
+    if role == channels.SUPPLY:
+        return columns[channels.COLUMNS[role]] / _SUPPLY_SCALE
+    if role == channels.TEMPERATURE:
+        return _TEMPERATURE_ZERO_V + _TEMPERATURE_V_PER_C * columns[channels.COLUMNS[role]]
+    return columns[f'{role}_v']
+
+
 def roles_of(sensor: Sensor, columns: Mapping[str, np.ndarray]) -> list[str]:
-    """Name the channels for columns of samples."""
-    return [*sensor.axes, *(role for role, name in (
-        (channels.SUPPLY, 'supply_v'), (channels.TEMPERATURE, 'temperature_c'))
-        if name in columns)]
+    """
+    Return the roles of the channels for columns of samples.
+
+    Parameters
+    ----------
+    sensor
+        Sensor whose axes are sent.
+    columns
+        Samples by column.
+
+    Returns
+    -------
+    list
+        Roles of the axes, and of the references among the columns.
+
+    """
+    references = [role for role, column in channels.COLUMNS.items() if column in columns]
+    return [*sensor.axes, *references]
 
 
-def reading(port: str, roles: list[str]) -> str:
-    """Say how the driver reads this board."""
+def driver_command(port: str, roles: list[str]) -> str:
+    """
+    Return the command of a driver that reads this board.
+
+    Parameters
+    ----------
+    port
+        Path of the terminal.
+    roles
+        Roles of the channels.
+
+    Returns
+    -------
+    str
+        One line for a shell.
+
+    """
     options = [f'-p link.type:=serial -p link.port:={port} -p link.channels:={",".join(roles)}']
     if channels.SUPPLY in roles:
         options.append(f'-p link.supply_scale:={_SUPPLY_SCALE}')
     return f'ros2 run adxl_ros driver --ros-args {" ".join(options)}'
 
 
-def check(sensor: Sensor) -> None:
-    """Refuse a sensor that no board can send in this format; raises `UserError`."""
-    if not 1 <= sensor.adc_bits <= 16:
-        raise UserError(f'sensor.adc_bits: {sensor.adc_bits}: a board sends codes of 1 to 16 bits')
-    if len(sensor.serial) > 16 or not sensor.serial.isascii():
-        raise UserError(f'sensor.serial: {sensor.serial!r}: a board has room for 16 ASCII '
-                        'characters')
+def check_sensor(sensor: Sensor) -> None:
+    """Raise `UserError` for a sensor that wire format 1 cannot describe."""
+    if not 1 <= sensor.adc_bits <= _MAX_BITS:
+        raise UserError(f'sensor.adc_bits: {sensor.adc_bits}: a board sends codes of 1 to '
+                        f'{_MAX_BITS} bits')
+    if len(sensor.serial) > _MAX_SERIAL or not sensor.serial.isascii():
+        raise UserError(f'sensor.serial: {sensor.serial!r}: a board has room for {_MAX_SERIAL} '
+                        'ASCII characters')
 
 
 @contextmanager
-def opened(port: str) -> Iterator[int]:
+def open_terminal(port: str) -> Iterator[int]:
     """
-    Give the end that a board writes to.
+    Open the end of a terminal that a board writes to.
 
     Parameters
     ----------
     port
-        An existing terminal device, or the name for a new pseudo-terminal, which is there as
-        long as the board.
+        An existing terminal device, or the name of a new pseudo-terminal, which exists as long as
+        the board.
+
+    Yields
+    ------
+    int
+        File descriptor, which does not block.
+
+    Raises
+    ------
+    UserError
+        The terminal cannot be opened.
 
     """
     path = Path(port)
@@ -157,29 +218,29 @@ def opened(port: str) -> Iterator[int]:
         if not stat.S_ISCHR(path.stat().st_mode):
             raise UserError(f'--port {port}: is no terminal device; name one, or a path that '
                             'does not exist for a new pseudo-terminal')
-        fd = _existing(path)
+        fd = _open_existing(path)
         try:
             yield fd
         finally:
             os.close(fd)
         return
-    ours, theirs = pty.openpty()
+    board_fd, driver_fd = pty.openpty()
     try:
-        tty.setraw(theirs)
-        os.set_blocking(ours, False)
-        path.unlink(missing_ok=True)  # a name that was left behind
-        path.symlink_to(os.ttyname(theirs))
-        yield ours
+        tty.setraw(driver_fd)
+        os.set_blocking(board_fd, False)
+        path.unlink(missing_ok=True)  # the name of an earlier board
+        path.symlink_to(os.ttyname(driver_fd))
+        yield board_fd
     except OSError as error:
         raise UserError(f'--port {port}: {error.strerror}') from None
     finally:
-        if path.is_symlink() and os.readlink(path) == os.ttyname(theirs):
+        if path.is_symlink() and os.readlink(path) == os.ttyname(driver_fd):
             path.unlink()
-        os.close(ours)
-        os.close(theirs)
+        os.close(board_fd)
+        os.close(driver_fd)
 
 
-def _existing(path: Path) -> int:
+def _open_existing(path: Path) -> int:
     try:
         fd = os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
         tty.setraw(fd)

@@ -12,165 +12,199 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""How frames follow each other by the device's own count of samples and its clock."""
+"""Order of frames by the device's own count of samples and by its clock."""
 
 from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
+from typing import NamedTuple
 
-from adxl_ros.links.support.wire_format import AFTER_RESET, Data
+from adxl_ros.links.support.wire_format import AFTER_RESET, SampleFrame
 
 _REMEMBERED = 4096
-"""Frames that are known again when they come twice."""
-_SLACK_US = 1000.0
-_SLACK = 0.002
-"""Device clock and count may differ by this part, as a stated rate and the real one do."""
-_REPLAY_US = 500e3
-"""Known frames that come at the pace of time for so long are a board that begins again."""
-_AWAY_US = 250e3
-"""How far the clocks of device and host may differ over the time that a link was closed."""
+"""Frames that are recognised when they come twice. Chosen: 40 s of the firmware at 1 kHz."""
+_TOLERANCE_US = 1000.0
+"""Absolute tolerance between the device's clock and its count, µs."""
+_TOLERANCE = 0.002
+"""Relative tolerance between the device's clock and its count. Chosen: a real rate differs from
+the stated one by less."""
+_RESTART_US = 500e3
+"""Duration of known frames at the pace of time that shows a board which begins again, µs."""
+_RESTART_TOLERANCE = 0.1
+"""Relative tolerance of that pace."""
+_AWAY_TOLERANCE_US = 250e3
+"""Tolerance between the clocks of device and host while a port was closed, µs."""
 
 
 @dataclass(frozen=True)
-class Next:
+class AcceptedFrame:
     """
-    A frame whose samples go on.
+    A frame whose samples are published.
 
     Attributes
     ----------
-    data
+    frame
         The frame.
     lost
-        Samples that lack before it, exactly; None where a new count begins.
+        Number of samples that are missing before it, exactly; None where a new count begins.
     stepped
-        Whether the device's clock has stepped since the frame before.
+        Whether the device's clock has stepped since the previous frame.
 
     """
 
-    data: Data
+    frame: SampleFrame
     lost: int | None
     stepped: bool = False
 
 
-class Count:
+class _Repetition(NamedTuple):
+    """First of a run of repeated frames: its lag behind host time and its arrival, µs."""
+
+    lag_us: float
+    arrived_us: float
+
+
+class FrameCounter:
     """
-    Judges frame by frame: the next one, one after a gap, a repeated one, or a new count.
+    Decides for each frame: the next one, one after a gap, a repeated one, or a new count.
 
     Attributes
     ----------
     repeated
         Samples of frames that came twice or late.
     overruns
-        Samples that the device says it dropped itself.
+        Samples that the device itself dropped.
 
     """
 
     def __init__(self) -> None:
-        """Begin with no count."""
+        """Begin without a count."""
         self.repeated = self.overruns = 0
         self._period_us = 0.0
-        self._index = self._time_us = self._dropped = 0
+        self._next_index = self._next_time_us = self._device_overruns = 0
         self._begun = False
         self._closed_us: float | None = None
         self._arrived_us = 0.0
-        self._doubtful: Data | None = None
-        self._again_us: tuple[float, float] | None = None
-        self._known: set[int] = set()
-        self._order: deque[int] = deque()
+        self._pending: SampleFrame | None = None
+        self._repetition: _Repetition | None = None
+        self._checks: set[int] = set()
+        self._check_order: deque[int] = deque()
 
     def restart(self, rate_hz: float) -> None:
-        """Let the next frame begin a new count, at a sample rate."""
+        """Let the next frame begin a new count, at a sample rate, Hz."""
         self._period_us = 1e6 / rate_hz
         self._begun = False
-        self._doubtful = None
+        self._pending = None
         self._forget()
 
     def reopened(self) -> None:
-        """Take that frames which come now may be those of another device."""
+        """Take note that the next frames may come from another device."""
         if self._closed_us is None:
             self._closed_us = self._arrived_us
-        self._doubtful = None
+        self._pending = None
         self._forget()
 
-    def _forget(self) -> None:
-        self._known.clear()
-        self._order.clear()
+    def accept(self, frame: SampleFrame, arrived_ns: int) -> list[AcceptedFrame]:
+        """
+        Take the next frame of the stream.
 
-    def __call__(self, data: Data, arrived_ns: int) -> list[Next]:
-        """Return what can be taken, in order: nothing, this frame, or one held back and this."""
+        Parameters
+        ----------
+        frame
+            The frame.
+        arrived_ns
+            Host time of its arrival, ns.
+
+        Returns
+        -------
+        list
+            No frame, this frame, or a frame that was held back and this one.
+
+        """
         arrived_us = arrived_ns * 1e-3
-        doubtful, self._doubtful = self._doubtful, None
-        found = self._again(data, arrived_us) if data.check in self._known else \
-            self._follow(data, arrived_us)
-        if found is None and doubtful is not None and self._is_next(doubtful, data):
-            # Two frames in a row of another count: the device was reset, and nobody heard it.
-            self._accept(doubtful, arrived_us, True)
-            after = self._follow(data, arrived_us)
-            self._accept(data, arrived_us)
-            return [Next(doubtful, None), *filter(None, [after])]
-        if doubtful is not None:
-            self.repeated += len(doubtful.codes)
-        if found is not None:
-            self._accept(data, arrived_us, found.lost is None)
-            return [found]
-        if data.check not in self._known or data.flags & AFTER_RESET:
-            self._doubtful = data
+        is_repeated = frame.check in self._checks
+        pending, self._pending = self._pending, None
+        accepted = self._after_restart(frame, arrived_us) if is_repeated \
+            else self._after_previous(frame, arrived_us)
+        if accepted is None and pending is not None and self._are_consecutive(pending, frame):
+            # Two frames in a row have another count: the device was reset without a message.
+            self._register(pending, arrived_us, True)
+            following = self._after_previous(frame, arrived_us)
+            self._register(frame, arrived_us)
+            first = AcceptedFrame(pending, None)
+            return [first] if following is None else [first, following]
+        if pending is not None:
+            self.repeated += len(pending.codes)
+        if accepted is not None:
+            self._register(frame, arrived_us, accepted.lost is None)
+            return [accepted]
+        if is_repeated and not frame.flags & AFTER_RESET:
+            self.repeated += len(frame.codes)
         else:
-            self.repeated += len(data.codes)
+            self._pending = frame
         return []
 
-    def _again(self, data: Data, arrived_us: float) -> Next | None:
-        """Judge a frame that is known: repeated, unless such ones come at the pace of time."""
-        if self._again_us is None:
-            self._again_us = arrived_us - data.time_us, arrived_us
-        off_us, since_us = self._again_us
-        ran_us = arrived_us - since_us
-        if ran_us < _REPLAY_US or abs(arrived_us - data.time_us - off_us) > 0.1 * ran_us:
+    def _after_restart(self, frame: SampleFrame, arrived_us: float) -> AcceptedFrame | None:
+        """Accept a repeated frame only where such frames come at the pace of time."""
+        lag_us = arrived_us - frame.time_us
+        if self._repetition is None:
+            self._repetition = _Repetition(lag_us, arrived_us)
+        duration_us = arrived_us - self._repetition.arrived_us
+        if duration_us < _RESTART_US \
+                or abs(lag_us - self._repetition.lag_us) > _RESTART_TOLERANCE * duration_us:
             return None
-        # A board of the bench that does after its reset what it did before.
-        return Next(data, None)
+        # An emulated board does after its reset exactly what it did before.
+        return AcceptedFrame(frame, None)
 
-    def _follow(self, data: Data, arrived_us: float) -> Next | None:
-        """Judge a frame by the one before; None where another must tell."""
-        if not self._begun or data.flags & AFTER_RESET:
-            return Next(data, None)
-        ahead = _signed(data.index - self._index)
-        passed_us = data.time_us - self._time_us
-        off_us = abs(passed_us - ahead * self._period_us)
-        in_step = off_us < _SLACK_US + 0.5 * self._period_us + _SLACK * abs(passed_us)
+    def _after_previous(self, frame: SampleFrame, arrived_us: float) -> AcceptedFrame | None:
+        """Compare a frame with the previous one; None where the next one must decide."""
+        if not self._begun or frame.flags & AFTER_RESET:
+            return AcceptedFrame(frame, None)
+        ahead = _signed(frame.index - self._next_index)
+        passed_us = frame.time_us - self._next_time_us
+        in_step = self._agree(ahead, passed_us)
         if ahead == 0:
-            return Next(data, 0, not in_step)
+            return AcceptedFrame(frame, 0, not in_step)
         if self._closed_us is not None:
             away_us = arrived_us - self._closed_us
-            in_step &= abs(away_us - passed_us) < _AWAY_US + _SLACK * away_us
+            in_step &= abs(away_us - passed_us) < _AWAY_TOLERANCE_US + _TOLERANCE * away_us
         elif ahead < 0:
             return None
-        return Next(data, ahead) if ahead > 0 and in_step else Next(data, None)
+        return AcceptedFrame(frame, ahead if ahead > 0 and in_step else None)
 
-    def _is_next(self, first: Data, second: Data) -> bool:
-        """Tell whether two frames follow each other, with what may lack between."""
+    def _are_consecutive(self, first: SampleFrame, second: SampleFrame) -> bool:
+        """Return whether count and clock lead from the first frame to the second."""
         count = len(first.codes)
         ahead = _signed(second.index - first.index - count)
         passed_us = second.time_us - first.time_us - count * self._period_us
-        return ahead >= 0 and abs(passed_us - ahead * self._period_us) < \
-            _SLACK_US + 0.5 * self._period_us + _SLACK * abs(passed_us)
+        return ahead >= 0 and self._agree(ahead, passed_us)
 
-    def _accept(self, data: Data, arrived_us: float, is_new: bool = False) -> None:
+    def _agree(self, samples: int, passed_us: float) -> bool:
+        """Return whether a number of samples fits a time by the device's clock, µs."""
+        tolerance_us = _TOLERANCE_US + 0.5 * self._period_us + _TOLERANCE * abs(passed_us)
+        return abs(passed_us - samples * self._period_us) < tolerance_us
+
+    def _register(self, frame: SampleFrame, arrived_us: float, is_new: bool = False) -> None:
+        """Make a frame the previous one; `is_new` begins a new count with it."""
         if is_new:
             self._forget()
-        self._again_us = None
-        count = len(data.codes)
-        resumed = self._begun and not data.flags & AFTER_RESET
-        self.overruns += (data.overruns - self._dropped) % 2 ** 16 if resumed else 0
-        self._dropped = data.overruns
-        self._index = (data.index + count) % 2 ** 32
-        self._time_us = data.time_us + round(count * self._period_us)
+        self._repetition = None
+        count = len(frame.codes)
+        resumed = self._begun and not frame.flags & AFTER_RESET
+        self.overruns += (frame.overruns - self._device_overruns) % 2 ** 16 if resumed else 0
+        self._device_overruns = frame.overruns
+        self._next_index = (frame.index + count) % 2 ** 32
+        self._next_time_us = frame.time_us + round(count * self._period_us)
         self._begun, self._closed_us, self._arrived_us = True, None, arrived_us
-        self._known.add(data.check)
-        self._order.append(data.check)
-        if len(self._order) > _REMEMBERED:
-            self._known.discard(self._order.popleft())
+        self._checks.add(frame.check)
+        self._check_order.append(frame.check)
+        if len(self._check_order) > _REMEMBERED:
+            self._checks.discard(self._check_order.popleft())
+
+    def _forget(self) -> None:
+        self._checks.clear()
+        self._check_order.clear()
 
 
 def _signed(difference: int) -> int:

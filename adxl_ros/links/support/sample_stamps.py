@@ -12,94 +12,108 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Samples by device time, given stamps in ROS time; what lacks between them is counted."""
+"""Stamps in ROS time for samples with device time, and the number of samples that are missing."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 import time
-from typing import Any
 
-from adxl_ros.links.support.base import Samples
-from adxl_ros.links.support.channels import Seldom
-from adxl_ros.links.support.clock_sync import ClockMap, HostStamps, RosClock
+from adxl_ros.links.support.base import Event, Samples
+from adxl_ros.links.support.channels import Block, PeriodMeans
+from adxl_ros.links.support.clock_sync import ClockMap, IdentityMap, SystemClockMap
 import numpy as np
 
-_FOR_EVER_NS = 2 ** 63 - 1
+_FOREVER_NS = 2 ** 63 - 1
+"""Largest time, ns: any waiting time is over by then."""
 
 
 @dataclass(frozen=True)
-class Block:
+class ClockStatistics:
     """
-    Samples as they come from a device.
-
-    Attributes
-    ----------
-    device_ns
-        Device time, ns, (n,) int64, ascending.
-    volts
-        By axis, V, (n, m).
-    references : mapping
-        What was sampled beside the axes, (n,) by column.
-
-    """
-
-    device_ns: np.ndarray
-    volts: np.ndarray
-    references: Mapping[str, np.ndarray]
-
-
-class Timeline:
-    """
-    Holds samples until the device's clock is known, and counts what is lost.
+    How the clocks work, as diagnostics show it.
 
     Attributes
     ----------
     clock
-        The map of the device's clock, or what stands in for it.
+        `settled` or `settling`.
+    clock_drift_ppm
+        Drift of the device's clock against the host's, ppm.
+    clock_jitter_us
+        Median distance of the earliest arrivals from the line of the map, µs.
+    clock_steps
+        How often the device's clock has stepped.
+    system_clock_steps
+        How often the system clock was set.
 
     """
 
-    def __init__(self, clock: ClockMap | HostStamps) -> None:
+    clock: str
+    clock_drift_ppm: float
+    clock_jitter_us: float
+    clock_steps: int
+    system_clock_steps: int
+
+
+def clock_events(clock: ClockStatistics) -> tuple[Event, Event]:
+    """Return the events of the clocks, for the status of a link."""
+    return (Event('the clock of the device has stepped: a new map of it begins',
+                  clock.clock_steps),
+            Event('the system clock was set: the stamps follow it', clock.system_clock_steps))
+
+
+class Stamper:
+    """
+    Holds samples until the clock of the device is known, stamps them and counts the lost ones.
+
+    Attributes
+    ----------
+    clock
+        Map of the device's clock.
+    period_ns
+        Sample period, ns; 0 before the first `restart`.
+
+    """
+
+    def __init__(self, clock: ClockMap | IdentityMap) -> None:
         """Begin without samples."""
         self.clock = clock
         self.period_ns = 0.0
-        self._ros = RosClock()
-        self._seldom = Seldom()
-        self._held: list[Block] = []
-        self._given: list[Samples] = []
+        self._system_clock = SystemClockMap()
+        self._means = PeriodMeans()
+        self._unstamped: list[Block] = []
+        self._stamped: list[Samples] = []
         self._last_ns: int | None = None
         self._last_device_ns: int | None = None
-        self._new = True
+        self._new_clock = True
         self._counted = self._estimated = 0
 
     @property
     def waiting(self) -> bool:
-        """Whether there are samples that `take` would return."""
-        return bool(self._given)
+        """Whether `take` would return samples."""
+        return bool(self._stamped)
 
     def restart(self, period_ns: float) -> None:
         """
-        Begin a new clock, or a new device; what was lost up to then is estimated by time.
+        Begin a new clock or a new device; time gives an estimate of the samples lost before it.
 
         Parameters
         ----------
         period_ns
-            Between two samples, ns.
+            Sample period, ns.
 
         """
         self.flush()
         self.clock.restart()
         self.period_ns = period_ns
-        self._new = True
+        self._new_clock = True
 
     def step(self) -> None:
-        """Begin a new clock for samples that follow on those before without a loss."""
+        """Begin a new clock for samples that follow the previous ones without a loss."""
         self.flush()
         self.clock.restart()
 
-    def put(self, block: Block, arrived_ns: int, lost: int | None) -> None:
+    def add(self, block: Block, arrived_ns: int, lost: int | None) -> None:
         """
         Take samples.
 
@@ -108,67 +122,68 @@ class Timeline:
         block
             The samples.
         arrived_ns
-            When the newest was here, by the host's monotonic clock.
+            Arrival of the newest sample by the host's monotonic clock, ns.
         lost
-            How many lack before them; None where the device does not count.
+            Samples that are missing before the block; None where the device does not count.
 
         """
         stepped = self.clock.observe(int(block.device_ns[-1]), arrived_ns)
         if lost is None:
-            self._new |= stepped
-            if not self._new:
+            self._new_clock |= stepped
+            if not self._new_clock:
                 self._estimated += self._gaps(block.device_ns)
             self._last_device_ns = int(block.device_ns[-1])
         else:
             self._counted += lost
-        self._held.append(block)
+        self._unstamped.append(block)
         if self.clock.ready(arrived_ns):
             self._stamp()
 
     def flush(self) -> None:
-        """Give what is held its stamps now, however little is known of the clock."""
-        if self._held:
-            self.clock.ready(_FOR_EVER_NS)
+        """Stamp all samples now, by what is known of the clock."""
+        if self._unstamped:
+            self.clock.ready(_FOREVER_NS)
             self._stamp()
 
     def take(self) -> Samples | None:
-        """Return what has got its stamps since the last call, if there is any."""
-        if self._held and self.clock.ready(time.monotonic_ns()):
+        """Return the samples stamped since the last call; None without any."""
+        if self._unstamped and self.clock.ready(time.monotonic_ns()):
             self._stamp()
-        if not self._given:
+        if not self._stamped:
             return None
-        given, self._given = self._given, []
-        names = given[0].references
+        parts, self._stamped = self._stamped, []
         return Samples(
-            np.concatenate([s.stamp_ns for s in given]), np.concatenate([s.volts for s in given]),
-            time.time_ns(), sum(s.missing for s in given),
-            {name: np.concatenate([s.references[name] for s in given]) for name in names},
-            sum(s.estimated for s in given))
+            np.concatenate([part.stamp_ns for part in parts]),
+            np.concatenate([part.volts for part in parts]),
+            time.time_ns(), sum(part.missing for part in parts),
+            {name: np.concatenate([part.references[name] for part in parts])
+             for name in parts[0].references},
+            sum(part.estimated for part in parts))
 
-    def values(self) -> dict[str, Any]:
-        """Say for diagnostics how the clocks are."""
+    def statistics(self) -> ClockStatistics:
+        """Return how the clocks work."""
         clock = self.clock
-        return {'clock': 'settled' if clock.settled else 'settling',
-                'clock_drift_ppm': round(clock.drift_ppm, 2),
-                'clock_jitter_us': round(clock.jitter_ns * 1e-3, 1),
-                'clock_steps': clock.steps, 'system_clock_steps': self._ros.steps}
+        return ClockStatistics(
+            'settled' if clock.settled else 'settling', round(clock.drift_ppm, 2),
+            round(clock.jitter_ns * 1e-3, 1), clock.steps, self._system_clock.steps)
 
     def _stamp(self) -> None:
-        self._ros.watch()
-        for block in self._held:
-            host_ns = self.clock(block.device_ns)
-            if self._new and self._last_ns is not None:
+        self._system_clock.update()
+        for block in self._unstamped:
+            host_ns = self.clock.host_ns(block.device_ns)
+            if self._new_clock and self._last_ns is not None:
                 periods = (int(host_ns[0]) - self._last_ns) / self.period_ns
                 self._estimated += max(round(periods) - 1, 0)
-            self._new = False
+            self._new_clock = False
             self._last_ns = int(host_ns[-1])
-            self._given.append(Samples(
-                self._ros(host_ns), block.volts, 0, self._counted + self._estimated,
-                self._seldom(host_ns, block.references), self._estimated))
+            self._stamped.append(Samples(
+                self._system_clock.ros_ns(host_ns), block.volts, 0,
+                self._counted + self._estimated, self._means.thin(host_ns, block.references),
+                self._estimated))
             self._counted = self._estimated = 0
-        self._held.clear()
+        self._unstamped.clear()
 
     def _gaps(self, device_ns: np.ndarray) -> int:
-        """Count the samples that lack by the device's stamps."""
-        steps = np.rint(np.diff(device_ns, prepend=self._last_device_ns) / self.period_ns)
-        return int((steps - 1).clip(0).sum())
+        """Count the samples that are missing by the device's stamps."""
+        periods = np.rint(np.diff(device_ns, prepend=self._last_device_ns) / self.period_ns)
+        return int((periods - 1).clip(0).sum())

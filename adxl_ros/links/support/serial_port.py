@@ -12,11 +12,12 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""A serial port that may go and come back: opened for ever, read without waiting long."""
+"""A serial port that may disappear and come back, read without a long wait."""
 
 from __future__ import annotations
 
 from contextlib import suppress
+import errno
 import os
 import select
 import stat
@@ -25,53 +26,72 @@ import time
 from typing import Any
 
 from adxl_ros.errors import UserError
-from adxl_ros.links.support.backoff import Retry
+from adxl_ros.links.support.backoff import Backoff
+
+SILENT = 'silent, the board sends nothing'
+"""Error of a port that is open but delivers nothing."""
 
 _WAIT_MS = 50
-_MOST = 65536
-_LOOK_S = 0.1
-"""A silent port is looked after this often: the device may be another one by now."""
-SILENT = 'silent, the board sends nothing'
-_DEAD_S = 3.0
-"""A network connection that is silent for so long is made anew."""
+"""Longest wait for bytes, ms, so that the driver reacts to its end."""
+_MAX_READ = 65536
+"""Most bytes of one read: more than a terminal or a socket usually holds."""
+_CHECK_S = 0.1
+"""Period of the check of a silent port, s: its name may stand for another device by now."""
+_RECONNECT_S = 3.0
+"""Silence after which a network connection is made again, s: a lost peer sends no error."""
 
 
-class Port:
+class SerialPort:
     """
     Bytes from a device path or a pyserial URL.
 
     Attributes
     ----------
-    trouble
-        Why there is none, in one line; '' while it is open, and before the first try.
-    opened
-        How often it was.
+    error
+        Why the port is not open, in one line; '' while it is open and before the first attempt.
+    connections
+        How often the port was opened.
     opened_s
-        When it was the last time, by the monotonic clock.
-    received
+        Monotonic time of the last opening, s.
+    received_bytes
         Bytes so far.
-    heard_s
-        When the last ones came, by the monotonic clock.
+    last_byte_s
+        Monotonic time of the last bytes, s.
 
     """
 
     def __init__(self, name: str, baud: int) -> None:
-        """Name the port; the first `read` opens it."""
-        self.opened = self.received = 0
-        self.heard_s = self.opened_s = 0.0
+        """
+        Prepare the port; the first `read` opens it.
+
+        Parameters
+        ----------
+        name
+            Device path or pyserial URL.
+        baud
+            Baud rate, Bd.
+
+        Raises
+        ------
+        UserError
+            pyserial is not installed.
+
+        """
+        self.connections = self.received_bytes = 0
+        self.last_byte_s = self.opened_s = 0.0
         self._name, self._baud = name, baud
-        self._serial = _pyserial()
-        self._open: Any = None
+        self._pyserial = _import_pyserial()
+        self._port: Any = None
         self._poll: Any = None
-        self._retry = Retry()
-        self._looked_s = 0.0
-        self.trouble = ''
+        self._backoff = Backoff()
+        self._checked_s = 0.0
+        self.error = ''
 
     def read(self) -> bytes | None:
-        """Return what has come, b'' after 50 ms without; None where the port was not open."""
-        if self._open is None:
-            if self._retry.wait():
-                self._reopen()
+        """Return the bytes that have come, b'' after 50 ms; None where the port was not open."""
+        if self._port is None:
+            if self._backoff.wait():
+                self._open()
             return None
         try:
             chunk = self._read()
@@ -80,93 +100,96 @@ class Port:
             return None
         now_s = time.monotonic()
         if chunk:
-            self.received += len(chunk)
-            self.heard_s = now_s
-        elif now_s - max(self.heard_s, self._looked_s) > _LOOK_S:
-            self._looked_s = now_s
-            self._look_after(now_s)
+            self.received_bytes += len(chunk)
+            self.last_byte_s = now_s
+        elif now_s - max(self.last_byte_s, self._checked_s) > _CHECK_S:
+            self._checked_s = now_s
+            self._check_device(now_s)
         return chunk
 
-    def worked(self) -> None:
-        """Take note that what has come made sense: be quick again after the next failure."""
-        self._retry.worked()
+    def confirm(self) -> None:
+        """Take note that the bytes made sense: the next failure is retried soon."""
+        self._backoff.reset()
 
     def close(self) -> None:
-        """Let go of it."""
-        if self._open is not None:
-            with suppress(OSError):  # what was unplugged may not close
-                self._open.close()
-            self._open = None
+        """Close the port."""
+        if self._port is not None:
+            with suppress(OSError):  # an unplugged port may not close
+                self._port.close()
+            self._port = None
 
-    def _reopen(self) -> None:
-        serial = self._serial
+    def _open(self) -> None:
         try:
-            self._open = serial.serial_for_url(self._name, self._baud, timeout=0, exclusive=True)
+            self._port = self._pyserial.serial_for_url(self._name, self._baud, timeout=0,
+                                                       exclusive=True)
         except (OSError, ValueError, termios.error) as error:
-            self._open = None
-            self._retry.failed()
-            self.trouble = f'{self._name}: {_reason(error)}'
+            self._port = None
+            self._backoff.fail()
+            self.error = f'{self._name}: {_reason(error)}'
             return
-        self.opened += 1
+        self.connections += 1
         self.opened_s = time.monotonic()
-        self.trouble = ''
+        self.error = ''
         try:
             self._poll = select.poll()
-            self._poll.register(self._open.fileno(), select.POLLIN)
+            self._poll.register(self._port.fileno(), select.POLLIN)
         except (OSError, AttributeError):
-            self._poll = None  # a URL without a file: its own time-out serves
-            self._open.timeout = _WAIT_MS * 1e-3
+            self._poll = None  # a URL without a file: pyserial's own time-out applies
+            self._port.timeout = _WAIT_MS * 1e-3
 
     def _read(self) -> bytes:
         if self._poll is None:
-            first = self._open.read(1)
-            return first + self._open.read(min(self._open.in_waiting, _MOST)) if first else b''
+            first = self._port.read(1)
+            if not first:
+                return b''
+            return first + self._port.read(min(self._port.in_waiting, _MAX_READ))
         if not self._poll.poll(_WAIT_MS):
             return b''
-        # pyserial's own read takes a byte at a time from a socket.
+        # pyserial's own read takes one byte at a time from a socket.
         try:
-            chunk = os.read(self._open.fileno(), _MOST)
+            chunk = os.read(self._port.fileno(), _MAX_READ)
         except (BlockingIOError, InterruptedError):
             return b''
         if not chunk:
             raise OSError('the other side has closed')
         return chunk
 
-    def _lose(self, why: str) -> None:
-        self.trouble = f'{self._name}: {why}'
+    def _lose(self, reason: str) -> None:
+        self.error = f'{self._name}: {reason}'
         self.close()
-        self._retry.failed()
+        self._backoff.fail()
 
-    def _look_after(self, now_s: float) -> None:
-        """Let go of a silent port whose name stands for another device, or for none."""
+    def _check_device(self, now_s: float) -> None:
+        """Close a silent port whose name stands for another device, or for none."""
         try:
-            held = os.fstat(self._open.fileno())
+            opened = os.fstat(self._port.fileno())
         except (OSError, AttributeError):
             return
-        if stat.S_ISSOCK(held.st_mode):
-            if now_s - max(self.heard_s, self.opened_s) > _DEAD_S:
+        if stat.S_ISSOCK(opened.st_mode):
+            if now_s - max(self.last_byte_s, self.opened_s) > _RECONNECT_S:
                 self._lose(SILENT)
             return
         try:
-            there = os.stat(self._name)
+            named = os.stat(self._name)
         except OSError:
             self._lose('unplugged: its name is gone')
             return
-        if there.st_rdev != held.st_rdev:
+        if named.st_rdev != opened.st_rdev:
             self._lose('its name stands for another device now')
 
 
 def _reason(error: Exception) -> str:
-    """Say in stable words why a port does not open."""
+    """Return in stable words why a port does not open."""
     code = getattr(error, 'errno', None)
-    if code in (11, 16):  # EAGAIN of the lock, EBUSY
+    if code in (errno.EAGAIN, errno.EBUSY):  # EAGAIN is the answer of the lock
         return 'in use: another process has locked it'
     if code:
         return os.strerror(code)
     return ' '.join(str(error).split())
 
 
-def _pyserial() -> Any:
+def _import_pyserial() -> Any:
+    """Return the module serial; raises `UserError` where it is not installed."""
     try:
         import serial
     except ImportError:

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""A two-axis rotary stage with a linear third joint: what its motors do with a command."""
+"""A rotary stage of two axes with a linear third joint: how its motors follow a command."""
 
 from __future__ import annotations
 
@@ -24,19 +24,32 @@ from adxl_ros.simulate.simulator import encoder
 import numpy as np
 
 JOINTS = ('alpha', 'beta', 'shift')
-_FARTHEST = {'alpha': 100.0, 'beta': 100.0, 'shift': 10.0}
+"""Names of the joints, in the order of all arrays."""
+
+_REACH = {'alpha': 100.0, 'beta': 100.0, 'shift': 10.0}
+"""Largest position of each joint, rad or m. Chosen: 16 turns, and more than a laboratory."""
 _SETTLED = 6.638
-"""Where the step response (1 + x)·exp(−x) of a critically damped system has 1 % to go."""
+"""Solution of (1 + x)·exp(−x) = 0.01: a critically damped step response is within 1 % there."""
+_MIN_MOVE = 1e-9
+"""Distance from the goal, rad or m, below which a joint without an encoder step is at rest."""
 
 
 class SimulatedStage:
     """
-    True motion and encoder of the stage, joint by joint, (3,) each: rad, rad, m.
+    True motion and encoders of the stage.
 
-    A reference runs to the goal at the slew rate; the joint follows it as a critically damped
-    system of second order. A step of time is exact for a reference that is linear within it.
-    The encoder brings a joint to the commanded one of its steps; where in that step it comes to
-    rest is drawn anew with each command.
+    All arrays are (3,): alpha, rad; beta, rad; shift, m. A reference moves to the goal at the slew
+    rate, and the joint follows it as a critically damped system of second order. A time step is
+    exact for a reference that is linear within it. A joint comes to rest within the encoder step
+    of the command; its place in that step is random for each command.
+
+    Attributes
+    ----------
+    position
+        True position, (3,).
+    velocity
+        True velocity, (3,).
+
     """
 
     def __init__(self, pose: np.ndarray, slew: np.ndarray, settling_s: float,
@@ -47,54 +60,59 @@ class SimulatedStage:
         Parameters
         ----------
         pose
-            Where it rests, rad, rad, m, (3,).
+            Initial position, rad, rad, m, (3,).
         slew
-            Fastest motion, rad/s, rad/s, m/s, (3,).
+            Largest velocity, rad/s, rad/s, m/s, (3,).
         settling_s
-            Time that the step response takes to 1 %, s.
+            Time of the step response to 1 %, s.
         resolution
-            Steps of the encoders, (3,); 0 for none.
+            Steps of the encoders, rad, rad, m, (3,); 0 for none.
         seed
-            Of where in the encoder's step a joint comes to rest.
+            Seed of the places of rest within the encoder steps.
 
         """
         self._slew = slew
         self._omega = _SETTLED / settling_s
         self._resolution = resolution
         self._rng = np.random.default_rng(seed)
-        self._wanted = np.array(pose, float)
-        self._goal = self._reachable(self._wanted)
+        self._commanded = np.array(pose, float)
+        self._goal = self._reachable(self._commanded)
         self._reference = self._goal.copy()
         self.position = self._goal.copy()
         self.velocity = np.zeros(3)
 
-    def command(self, wanted: Mapping[str, float]) -> None:
+    def command(self, positions: Mapping[str, float]) -> None:
         """
-        Set where joints shall go; a joint that is told what it knows goes on.
+        Command joints to positions; a joint whose command does not change goes on.
+
+        Parameters
+        ----------
+        positions
+            Position by joint, rad or m.
 
         Raises
         ------
         UserError
-            An unknown joint, or a position that is no number or out of reach; no joint moves.
+            A joint is unknown, or a position is not finite or out of reach; no joint moves.
 
         """
-        target = self._wanted.copy()
-        for name, position in wanted.items():
+        target = self._commanded.copy()
+        for name, position in positions.items():
             if name not in JOINTS:
                 raise UserError(f'no joint {name!r}; the joints are {", ".join(JOINTS)}')
-            if not abs(position) <= _FARTHEST[name]:
+            if not abs(position) <= _REACH[name]:
                 raise UserError(f'{name} = {position:g} is out of reach; the stage goes to '
-                                f'+-{_FARTHEST[name]:g}')
+                                f'+-{_REACH[name]:g}')
             target[JOINTS.index(name)] = position
-        self._goal = np.where(target == self._wanted, self._goal, self._reachable(target))
-        self._wanted = target
+        self._goal = np.where(target == self._commanded, self._goal, self._reachable(target))
+        self._commanded = target
 
     def step(self, dt_s: float) -> None:
         """Advance by a time step, s."""
-        most = self._slew * dt_s
-        reference = self._reference + np.clip(self._goal - self._reference, -most, most)
+        max_move = self._slew * dt_s
+        reference = self._reference + np.clip(self._goal - self._reference, -max_move, max_move)
         rate = (reference - self._reference) / dt_s
-        # x'' = w^2 (r - x) - 2 w x' behind a ramp: x = r - 2 r'/w + (c + d t) exp(-w t).
+        # x'' = w² (r - x) - 2 w x' behind a ramp r: x = r - 2 r'/w + (c + d t) exp(-w t).
         w, decay = self._omega, exp(-self._omega * dt_s)
         lag = self.position - (self._reference - 2 * rate / w)
         slope = self.velocity - rate + w * lag
@@ -103,15 +121,16 @@ class SimulatedStage:
         self._reference = reference
 
     def encoder(self) -> np.ndarray:
-        """Read the encoders, rad, rad, m, (3,)."""
+        """Return the readings of the encoders, rad, rad, m, (3,)."""
         # + 0.0 turns -0.0 into 0.0.
         return np.array([encoder(p, r) for p, r in zip(self.position, self._resolution)]) + 0.0
 
     def moving(self) -> bool:
-        """Tell whether a joint is more than an encoder's step from its goal."""
-        off = np.abs(self.position - self._goal)
-        return bool((off > np.maximum(self._resolution, 1e-9)).any())
+        """Return whether a joint is more than an encoder step from its goal."""
+        distance = np.abs(self.position - self._goal)
+        return bool((distance > np.maximum(self._resolution, _MIN_MOVE)).any())
 
     def _reachable(self, target: np.ndarray) -> np.ndarray:
+        """Return where the joints come to rest for a target, (3,)."""
         on_step = np.array([encoder(p, r) for p, r in zip(target, self._resolution)])
         return on_step + self._resolution * self._rng.uniform(-0.5, 0.5, 3)

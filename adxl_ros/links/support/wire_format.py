@@ -15,7 +15,7 @@
 """
 The serial wire format, version 1: frames of samples, encoded and decoded.
 
-A frame is COBS(payload, CRC-32 of the payload) and one 0x00; everything is little-endian. The
+A frame is COBS(payload, CRC-32 of the payload) and one 0x00; all numbers are little-endian. The
 format is the contract with the board: docs/links.md has its table, firmware/ its encoder in C.
 """
 
@@ -31,21 +31,44 @@ from adxl_ros.errors import UserError
 import numpy as np
 
 VERSION = 1
-DATA, INFO = 1, 2
-RAIL, AFTER_RESET = 1, 2
-"""Flags of a data frame."""
-MOST_CHANNELS = 8
-"""A board has at most so many: what says more is no frame of ours."""
+"""Version of the format."""
+SAMPLES_TYPE = 1
+"""Type of a frame with samples."""
+INFO_TYPE = 2
+"""Type of a frame that describes the board."""
+RAIL = 1
+"""Flag of a frame with samples: a code is at a rail of the ADC."""
+AFTER_RESET = 2
+"""Flag of all frames from a reset to the first one with samples."""
+MAX_CHANNELS = 8
+"""Most channels of a board; a frame with more of them is invalid."""
 
 _COMMON = struct.Struct('<BBHI')
-_DATA = struct.Struct('<BBHIQIHBB')
+"""type, version, flags, block_seq: the first fields of every payload."""
+_SAMPLES = struct.Struct('<BBHIQIHBB')
+"""Fields of a payload with samples: the common ones, time, index, overruns, samples, channels."""
 _INFO = struct.Struct('<BBHIfBBf16s')
+"""Fields of an info payload: the common ones, sample rate, bits, channels, vref, serial number."""
 _CRC = struct.Struct('<I')
-_LONGEST_PAYLOAD = _DATA.size + 255 * MOST_CHANNELS * 2
-MOST_BYTES = _LONGEST_PAYLOAD + _CRC.size + 2 + _LONGEST_PAYLOAD // 254
-"""Of a frame, its 0x00 left out; a longer run without 0x00 is skipped."""
-_LAST_US = 2 ** 53
-"""A device clock beyond 285 years is none."""
+"""CRC-32 behind the payload, as zlib computes it."""
+_MAX_COUNT = 255
+"""Most samples of a frame: their number is a u8."""
+_MAX_PAYLOAD = _SAMPLES.size + _MAX_COUNT * MAX_CHANNELS * 2
+"""Most bytes of a payload."""
+MAX_FRAME_BYTES = _MAX_PAYLOAD + _CRC.size + 2 + _MAX_PAYLOAD // 254
+"""Most bytes of a frame without its 0x00: COBS adds one byte for each 254."""
+_MAX_TIME_US = 2 ** 53
+"""Largest time of a device clock, µs: 285 years."""
+_MIN_RATE_HZ = 0.01
+"""Smallest sample rate, Hz, as `sensor.rate_hz` permits."""
+_MAX_RATE_HZ = 1e5
+"""Largest sample rate, Hz, as `sensor.rate_hz` permits."""
+_MIN_VREF_V = 0.1
+"""Smallest reference voltage, V, as `sensor.adc_vref_v` permits."""
+_MAX_VREF_V = 100.0
+"""Largest reference voltage, V, as `sensor.adc_vref_v` permits."""
+_MAX_BITS = 16
+"""Largest resolution of the ADC, bit: codes are u16."""
 
 
 class WireError(Exception):
@@ -57,11 +80,25 @@ class VersionError(WireError):
 
 
 @dataclass(frozen=True)
-class Info:
+class BoardInfo:
     """
-    What a board says of itself: the sample rate, Hz, its ADC, V, and its serial number.
+    How a board describes itself.
 
-    The flags do not count when two are compared.
+    Attributes
+    ----------
+    rate_hz
+        Sample rate, Hz.
+    bits
+        Resolution of the ADC, bit.
+    channels
+        Number of channels.
+    vref_v
+        Reference voltage of the ADC, V.
+    serial
+        Serial number of the sensor; '' without one.
+    flags
+        `AFTER_RESET`; two descriptions are equal whatever their flags.
+
     """
 
     rate_hz: float
@@ -73,7 +110,7 @@ class Info:
 
 
 @dataclass(frozen=True)
-class Data:
+class SampleFrame:
     """
     Samples at equal steps of the device clock.
 
@@ -84,15 +121,15 @@ class Data:
     sequence
         Number of the frame, wraps at 2^32.
     time_us
-        Device clock of the first sample, µs.
+        Device clock at the first sample, µs.
     index
-        Number of the first sample among all that the device should have taken, wraps at 2^32.
+        Number of the first sample, dropped samples included, wraps at 2^32.
     overruns
-        Samples that the device itself dropped since its reset, wraps at 2^16.
+        Samples that the device itself has dropped since its reset, wraps at 2^16.
     codes
         ADC codes, (n, m) uint16.
     check
-        CRC-32 of the payload, which tells frames from each other.
+        CRC-32 of the payload, which identifies the frame.
 
     """
 
@@ -107,159 +144,176 @@ class Data:
 
 class Encoder:
     """
-    The board's side: makes frames and counts them.
+    Encodes and numbers frames, as the firmware does.
 
-    Tests and `simulate --port` are boards by it.
+    Attributes
+    ----------
+    info
+        Description of the board.
+
     """
 
-    def __init__(self, info: Info) -> None:
+    def __init__(self, info: BoardInfo) -> None:
         """Begin as after a reset."""
         self.info = info
         self._sequence = 0
         self._flags = AFTER_RESET
 
     def info_frame(self) -> bytes:
-        """Make the frame that comes first and then every second."""
+        """Encode the frame that comes first and then every second."""
         i = self.info
-        return frame(_INFO.pack(INFO, VERSION, self._flags, self._next(), i.rate_hz, i.bits,
-                                i.channels, i.vref_v, i.serial.encode('ascii')))
+        return encode_payload(_INFO.pack(
+            INFO_TYPE, VERSION, self._flags, self._next_sequence(), i.rate_hz, i.bits, i.channels,
+            i.vref_v, i.serial.encode('ascii')))
 
-    def data_frame(self, time_us: int, index: int, codes: np.ndarray, overruns: int = 0,
-                   flags: int = 0) -> bytes:
+    def sample_frame(self, time_us: int, index: int, codes: np.ndarray, overruns: int = 0,
+                     flags: int = 0) -> bytes:
         """
-        Make a frame of samples.
+        Encode a frame of samples.
 
         Parameters
         ----------
-        time_us, index
-            Of the first sample.
+        time_us
+            Device clock at the first sample, µs.
+        index
+            Number of the first sample.
         codes
-            ADC codes, (n, m), n and m at most 255.
+            ADC codes, (n, m); n and m are at most 255.
         overruns
             Samples dropped so far.
         flags
-            Beside those that are set here: that of the first frames after a reset, up to the
-            first with samples, and that of a sample at its rail.
+            Further flags: `RAIL` and `AFTER_RESET` are set here.
+
+        Returns
+        -------
+        bytes
+            The frame with its 0x00.
 
         """
         rail = RAIL if (codes == 0).any() or (codes >= 2 ** self.info.bits - 1).any() else 0
         flags |= self._flags | rail
         self._flags = 0
-        head = _DATA.pack(DATA, VERSION, flags, self._next(), time_us, index % 2 ** 32,
-                          overruns % 2 ** 16, *codes.shape)
-        return frame(head + codes.astype('<u2').tobytes())
+        head = _SAMPLES.pack(SAMPLES_TYPE, VERSION, flags, self._next_sequence(), time_us,
+                             index % 2 ** 32, overruns % 2 ** 16, *codes.shape)
+        return encode_payload(head + codes.astype('<u2').tobytes())
 
-    def _next(self) -> int:
+    def _next_sequence(self) -> int:
         self._sequence += 1
         return (self._sequence - 1) % 2 ** 32
 
 
-def frame(payload: bytes) -> bytes:
-    """Put the CRC behind a payload, and both into COBS with its 0x00."""
-    return library().encode(payload + _CRC.pack(zlib.crc32(payload))) + b'\0'
+def encode_payload(payload: bytes) -> bytes:
+    """Append the CRC to a payload, encode both by COBS and append 0x00."""
+    return import_cobs().encode(payload + _CRC.pack(zlib.crc32(payload))) + b'\0'
 
 
-def decode(raw: bytes) -> Info | Data:
+def decode(raw: bytes) -> BoardInfo | SampleFrame:
     """
-    Read one frame.
+    Decode one frame.
 
     Parameters
     ----------
     raw
         The bytes between two 0x00.
 
+    Returns
+    -------
+    BoardInfo or SampleFrame
+        What the frame contains.
+
     Raises
     ------
     VersionError
-        It is whole, but of another version.
+        The frame is whole, but of another version.
     WireError
-        It is damaged, or says what cannot be.
+        The frame is damaged, or a field is out of range.
 
     """
-    cobs = library()
+    cobs = import_cobs()
     try:
-        whole = cobs.decode(raw)
+        decoded = cobs.decode(raw)
     except cobs.DecodeError as error:
         raise WireError(str(error)) from None
-    payload, check = whole[:-_CRC.size], whole[-_CRC.size:]
+    payload, check = decoded[:-_CRC.size], decoded[-_CRC.size:]
     if len(payload) < _COMMON.size or check != _CRC.pack(zlib.crc32(payload)):
         raise WireError('the CRC does not match')
     kind, version = payload[:2]
     if version != VERSION:
         raise VersionError(f'wire format {version}')
-    if kind == INFO:
-        return _info(payload)
-    if kind == DATA:
-        return _data(payload, *_CRC.unpack(check))
+    if kind == INFO_TYPE:
+        return _decode_info(payload)
+    if kind == SAMPLES_TYPE:
+        return _decode_samples(payload, *_CRC.unpack(check))
     raise WireError(f'unknown type {kind}')
 
 
-def _info(payload: bytes) -> Info:
+def _decode_info(payload: bytes) -> BoardInfo:
     if len(payload) != _INFO.size:
         raise WireError(f'an info frame of {len(payload)} bytes')
     _, _, flags, _, rate_hz, bits, channels, vref_v, serial = _INFO.unpack(payload)
     name = serial.rstrip(b'\0')
-    if not (isfinite(rate_hz) and 0.01 <= rate_hz <= 1e5 and 1 <= bits <= 16
-            and 1 <= channels <= MOST_CHANNELS and isfinite(vref_v) and 0.1 <= vref_v <= 100
+    if not (isfinite(rate_hz) and _MIN_RATE_HZ <= rate_hz <= _MAX_RATE_HZ
+            and 1 <= bits <= _MAX_BITS and 1 <= channels <= MAX_CHANNELS
+            and isfinite(vref_v) and _MIN_VREF_V <= vref_v <= _MAX_VREF_V
             and all(32 <= byte < 127 for byte in name)):
         raise WireError(f'an info frame with {rate_hz:g} Hz, {bits} bits, {channels} channels, '
                         f'{vref_v:g} V, {name!r}')
-    return Info(rate_hz, bits, channels, vref_v, name.decode('ascii').strip(),
-                flags)
+    return BoardInfo(rate_hz, bits, channels, vref_v, name.decode('ascii').strip(), flags)
 
 
-def _data(payload: bytes, check: int) -> Data:
-    if len(payload) < _DATA.size:
+def _decode_samples(payload: bytes, check: int) -> SampleFrame:
+    if len(payload) < _SAMPLES.size:
         raise WireError(f'a data frame of {len(payload)} bytes')
-    _, _, flags, sequence, time_us, index, overruns, count, channels = _DATA.unpack_from(payload)
-    if (len(payload) != _DATA.size + 2 * count * channels or not count
-            or not 0 < channels <= MOST_CHANNELS or time_us > _LAST_US):
+    (_, _, flags, sequence, time_us, index, overruns, count,
+     channels) = _SAMPLES.unpack_from(payload)
+    if (len(payload) != _SAMPLES.size + 2 * count * channels or not count
+            or not 0 < channels <= MAX_CHANNELS or time_us > _MAX_TIME_US):
         raise WireError(f'a data frame of {count} samples of {channels} channels in '
                         f'{len(payload)} bytes at {time_us} us')
-    codes = np.frombuffer(payload, '<u2', offset=_DATA.size).reshape(count, channels)
-    return Data(flags, sequence, time_us, index, overruns, codes, check)
+    codes = np.frombuffer(payload, '<u2', offset=_SAMPLES.size).reshape(count, channels)
+    return SampleFrame(flags, sequence, time_us, index, overruns, codes, check)
 
 
 class Splitter:
     """
-    Cuts a stream of bytes at each 0x00; holds no more than one frame, whatever comes.
+    Splits a stream of bytes at each 0x00 and holds at most one frame.
 
     Attributes
     ----------
     skipped
-        Bytes of runs too long to be a frame.
+        Bytes of runs that are too long for a frame.
 
     """
 
     def __init__(self) -> None:
         """Begin anywhere in the stream."""
         self.skipped = 0
-        self._rest = b''
+        self._incomplete = b''
         self._skipping = False
 
-    def __call__(self, chunk: bytes) -> list[bytes]:
-        """Return what has ended with this chunk, empty runs left out."""
-        *whole, rest = chunk.split(b'\0')
-        ended = []
-        for part in whole:
-            raw, self._rest = self._rest + part, b''
-            if self._skipping or len(raw) > MOST_BYTES:
+    def split(self, chunk: bytes) -> list[bytes]:
+        """Return the runs that end within this chunk, without the empty ones."""
+        *ended, rest = chunk.split(b'\0')
+        frames = []
+        for part in ended:
+            raw, self._incomplete = self._incomplete + part, b''
+            if self._skipping or len(raw) > MAX_FRAME_BYTES:
                 self.skipped += len(raw)
                 self._skipping = False
             elif raw:
-                ended.append(raw)
-        self._rest += rest
-        if self._skipping or len(self._rest) > MOST_BYTES:
-            self.skipped += len(self._rest)
-            self._rest, self._skipping = b'', True
-        return ended
+                frames.append(raw)
+        self._incomplete += rest
+        if self._skipping or len(self._incomplete) > MAX_FRAME_BYTES:
+            self.skipped += len(self._incomplete)
+            self._incomplete, self._skipping = b'', True
+        return frames
 
     def restart(self) -> None:
-        """Forget what has begun: the next byte does not belong to it."""
-        self._rest, self._skipping = b'', False
+        """Drop the incomplete frame: the next byte does not belong to it."""
+        self._incomplete, self._skipping = b'', False
 
 
-def library() -> Any:
+def import_cobs() -> Any:
     """Return the module cobs.cobs; raises `UserError` where it is not installed."""
     try:
         from cobs import cobs
