@@ -45,7 +45,7 @@ from adxl_ros.calibrate.report.cross_validation import Score
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store, parameter_file
 from adxl_ros.files.atomic_write import keep_previous
-from adxl_ros.files.figure_file import write
+from adxl_ros.files.plot_file import write_plot
 from adxl_ros.files.stream_info import NO_UNIT
 from adxl_ros.model import signal_chain
 from adxl_ros.model.coefficients import get
@@ -177,7 +177,7 @@ class CalibrationResult:
     def draw(self, path: str | os.PathLike) -> None:
         """Write the figures of this unit as PNG."""
         if self.gravity_fit is not None:
-            write(plots.gravity_rests(self.name, self.gravity_fit), path)
+            write_plot(plots.gravity_rests(self.name, self.gravity_fit), path)
         else:
             plots.draw_sweep(path, self.nominal, self.paper_sensor, self.poses)
 

@@ -25,7 +25,7 @@ from typing import Any
 from adxl_ros.diagnose.diagnosis import Diagnosis
 from adxl_ros.diagnose.report_json import as_json, sentence, shares
 from adxl_ros.diagnose.residual_map import SHOWS_P
-from adxl_ros.files.figure_file import pyplot
+from adxl_ros.files.plot_file import pyplot
 from adxl_ros.model.constants import G0_MPS2
 import numpy as np
 from scipy.signal import welch

@@ -12,12 +12,16 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The parameter file: what ROS nodes load, what `fit` writes, with one check for all."""
+"""
+The parameter file of a sensor: read with one check for nodes and tools, and written.
+
+It is a YAML file that ROS nodes can load: flat keys below `/**: ros__parameters:`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import fields
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, Field, fields
 import os
 from pathlib import Path
 from typing import Any
@@ -26,39 +30,63 @@ from adxl_ros.errors import UserError
 from adxl_ros.files.atomic_write import atomic_path
 from adxl_ros.model.coefficients import names_of, neutral
 from adxl_ros.model.effects import effect_named
-from adxl_ros.model.effects.base import Coefficient, Role
+from adxl_ros.model.effects.base import Coefficient, Effect, Parameter, Role
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.model.validity import Envelope
 import numpy as np
 import yaml
 
 FORMAT = 1
-"""Version of the parameter file's format; another one is refused."""
+"""Version of the format. A file of another version is refused."""
 
 UNITS = 'V, V/g, 1/g, rad'
-"""Units of the coefficients, written into every file and checked."""
+"""Units of the coefficients: written into every file, and checked."""
 
-FIGURES = {f.metadata['key']: f for f in fields(Sensor) if f.metadata}
+SENSOR_FIELDS: dict[str, Field[Any]] = {
+    field.metadata['key']: field for field in fields(Sensor) if field.metadata}
+"""Fields of `Sensor` by their keys; the metadata hold unit, bounds and meaning."""
 
 ENVELOPE = {
     'temperature_c': 'lowest and highest temperature of the poses, degC',
     'zero_g_per_k': 'drift of the zero-g beyond them, g/K',
     'scale_per_k': 'drift of the scale factor beyond them, 1/K',
     'leverage': 'largest leverage of the poses, (m/s^2)^2',
-    'misfit_mps2': 'what poses held out showed beyond noise and stage, m/s^2',
-    'force_low_mps2': 'least specific force of the poses by component, m/s^2',
-    'force_high_mps2': 'greatest specific force of the poses by component, m/s^2',
+    'misfit_mps2': 'error of held-out poses beyond noise and stage, m/s^2',
+    'force_low_mps2': 'lowest specific force of the poses by component, m/s^2',
+    'force_high_mps2': 'highest specific force of the poses by component, m/s^2',
 }
-"""Keys of `envelope.*`, those of `model.validity.Envelope`; each may be missing."""
+"""Meaning of the keys `envelope.*`, those of `model.validity.Envelope`; each may be missing."""
+
 ENVELOPE_LISTS = {'temperature_c': 2, 'force_low_mps2': 3, 'force_high_mps2': 3}
+"""Number of values of the keys `envelope.*` that have more than one."""
 
 DATASHEET = {
-    'name': 'what the figures are of',
+    'name': 'datasheet that the values are from',
     'figures': 'effect.parameter that the datasheet bounds',
     'typical': 'typical departures, 0.0 where not stated',
     'maximum': 'greatest departures, 0.0 where not stated',
 }
-"""Keys of `datasheet.*`; all of them or none."""
+"""Meaning of the keys `datasheet.*`; a file has all of them or none."""
+
+_SMALLEST_VARIANCE = 1e-300
+"""Smaller variances count as this in the check of a covariance (chosen: near the smallest
+float64, so that a variance of 0 divides nothing by 0)."""
+
+_ASYMMETRY = 1e-6
+"""Permitted asymmetry of a correlation (chosen: far above the digits that a file holds)."""
+
+_LOWEST_EIGENVALUE = -1e-9
+"""Permitted rounding below 0 of a correlation matrix's eigenvalues (chosen: as above)."""
+
+MakeError = Callable[[str, str], Exception]
+"""Makes the exception to raise from a key and a reason."""
+
+
+def nominal_path() -> Path:
+    """Return the installed parameter file of the nominal sensor, the default everywhere."""
+    # Where there is no ROS, only this function fails.
+    from ament_index_python.packages import get_package_share_directory
+    return Path(get_package_share_directory('adxl_ros')) / 'params' / 'adxl203.yaml'
 
 
 def load(path: str | os.PathLike) -> Sensor:
@@ -68,64 +96,53 @@ def load(path: str | os.PathLike) -> Sensor:
     Raises
     ------
     UserError
-        Not readable, not YAML, a key missing or unknown, a value of the wrong type, unit, length
-        or range, a covariance that is not positive: naming file, line and column.
+        The file cannot be read, is not YAML, or has a missing, unknown or wrong value. The
+        message names file, line and column.
 
     """
     flat, marks = _read(Path(path))
 
-    def fail(key: str, why: str) -> UserError:
-        # What is missing has no place of its own: name that of what it belongs to.
+    def make_error(key: str, reason: str) -> UserError:
+        # A missing key has no place of its own: name that of its parent.
         place = key
         while place not in marks:
             place = place.rpartition('.')[0]
-        return UserError(f'{_where(path, marks[place])}: {key}: {why}')
+        return UserError(f'{_where(path, marks[place])}: {key}: {reason}')
 
-    return from_flat(flat, fail)
+    return from_flat(flat, make_error)
 
 
-def from_flat(flat: dict[str, Any], fail: Any) -> Sensor:
+def from_flat(flat: Mapping[str, Any], make_error: MakeError) -> Sensor:
     """
-    Make a `Sensor` of flat parameters ('sensor.serial', 'bias.offset_v', ...), all checked.
+    Make a `Sensor` of flat parameters, and check all of them.
 
     Parameters
     ----------
     flat
-        As in the file, nested keys joined by dots; other nodes' keys may be among them.
-    fail
-        Callable (key, reason) that returns the exception to raise.
+        Values by dotted key (`sensor.serial`, `bias.offset_v`, ...). Keys of other nodes may be
+        among them.
+    make_error
+        Makes the exception to raise from a key and a reason.
+
+    Returns
+    -------
+    Sensor
+        The sensor.
 
     """
     if flat.get('format') != FORMAT:
-        raise fail('format', f'version {flat.get("format")!r}, but this package reads version '
-                             f'{FORMAT}; fit the calibration again, or update the package')
+        raise make_error('format', f'version {flat.get("format")!r}, but this package reads '
+                         f'version {FORMAT}; fit the calibration again, or update the package')
     if flat.get('units', UNITS) != UNITS:
-        raise fail('units', f'{flat["units"]!r}, but coefficients are in {UNITS!r}')
-    figures = {f.name: _figure(f, flat, fail) for f in FIGURES.values()}
-    count = len(figures['axes'])
-    for f in FIGURES.values():
-        value = figures[f.name]
-        if isinstance(value, np.ndarray) and len(value) != count:
-            raise fail(f.metadata['key'], f'{len(value)} values for {count} axes '
-                                          f'({figures["axes"]})')
-    if figures['z_sign'] == 0:
-        raise fail('sensor.z_sign', '0, but must be 1 (upright) or -1')
-    names = _strings('effects', flat, fail)
-    values = {name: _effect_values(name, figures['axes'], flat, fail) for name in names}
-    covariance, covariance_names = _covariance(flat, values, figures['axes'], fail)
-    provenance = {key.removeprefix('provenance.'): str(value) for key, value in flat.items()
-                  if key.startswith('provenance.')}
-    name, datasheet = _datasheet(flat, fail)
-    return Sensor(**figures, effects=names, values=values, covariance=covariance,
-                  covariance_names=covariance_names, provenance=provenance,
-                  envelope=_envelope(flat, fail), datasheet_name=name, datasheet=datasheet)
+        raise make_error('units', f'{flat["units"]!r}, but coefficients are in {UNITS!r}')
+    return _FlatReader(flat, make_error).sensor()
 
 
 def to_flat(sensor: Sensor) -> dict[str, Any]:
-    """Flatten a sensor to the parameters of its file, plain Python values, in file order."""
+    """Return the parameters of a sensor's file by dotted key, plain Python values, in order."""
     flat: dict[str, Any] = {'format': FORMAT, 'units': UNITS, 'model': sensor.model}
-    for key, f in FIGURES.items():
-        value = getattr(sensor, f.name)
+    for key, field in SENSOR_FIELDS.items():
+        value = getattr(sensor, field.name)
         flat[key] = value.tolist() if isinstance(value, np.ndarray) else value
     if sensor.effects:
         flat['effects'] = list(sensor.effects)
@@ -134,11 +151,11 @@ def to_flat(sensor: Sensor) -> dict[str, Any]:
             flat[str(Coefficient(name, parameter))] = np.asarray(value, float).tolist()
     if sensor.covariance_names:
         flat['covariance_names'] = [str(name) for name in sensor.covariance_names]
-        flat['covariance'] = [float(v) for v in sensor.covariance.ravel()]
+        flat['covariance'] = [float(value) for value in sensor.covariance.ravel()]
     for key in ENVELOPE:
-        figure = getattr(sensor.envelope, key)
-        if figure:
-            flat[f'envelope.{key}'] = list(figure) if key in ENVELOPE_LISTS else figure
+        value = getattr(sensor.envelope, key)
+        if value:
+            flat[f'envelope.{key}'] = list(value) if key in ENVELOPE_LISTS else value
     for key, text in sensor.provenance.items():
         flat[f'provenance.{key}'] = text
     if sensor.datasheet:
@@ -151,25 +168,30 @@ def to_flat(sensor: Sensor) -> dict[str, Any]:
 
 def save(path: str | os.PathLike, sensor: Sensor, comments: Iterable[str] = ()) -> None:
     """
-    Write a parameter file, whole or not at all; floats round-trip.
+    Write a parameter file, whole or not at all. Reading it gives the same floats.
 
     Parameters
     ----------
     path
-        The file to write.
+        The file.
     sensor
-        What it shall hold.
+        The sensor to write.
     comments
-        Lines for people, put before the parameters.
+        Lines for people, before the parameters.
+
+    Raises
+    ------
+    UserError
+        The file cannot be written.
 
     """
     tree: dict[str, Any] = {}
     for key, value in to_flat(sensor).items():
         *parents, leaf = key.split('.')
-        below = tree
+        branch = tree
         for parent in parents:
-            below = below.setdefault(parent, {})
-        below[leaf] = value
+            branch = branch.setdefault(parent, {})
+        branch[leaf] = value
     text = yaml.dump({'/**': {'ros__parameters': tree}}, Dumper=_Dumper, sort_keys=False,
                      default_flow_style=None, width=99, allow_unicode=True)
     with atomic_path(path) as fresh:
@@ -193,7 +215,7 @@ _Dumper.add_representer(float, _represent_float)
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Flatten /**: ros__parameters: to dotted keys; return values, and the places of keys."""
+    """Return values and places by dotted key, from below `/**: ros__parameters:`."""
     try:
         text = path.read_text(encoding='utf-8')
     except (OSError, UnicodeDecodeError) as error:
@@ -201,11 +223,11 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
         raise UserError(f'{path}: cannot be read: {reason}') from None
     flat: dict[str, Any] = {}
     try:
-        root = yaml.compose(text, Loader=yaml.SafeLoader)
+        parameters: Any = yaml.compose(text, Loader=yaml.SafeLoader)
         for key in ('/**', 'ros__parameters'):
-            root = _child(root, key, path)
-        marks = {'': root.start_mark}
-        _flatten(root, '', flat, marks, path)
+            parameters = _child(parameters, key, path)
+        marks = {'': parameters.start_mark}
+        _flatten(parameters, '', flat, marks, path)
     except yaml.YAMLError as error:
         problem = ' '.join(str(getattr(error, 'problem', error)).split())
         raise UserError(f'{_where(path, getattr(error, "problem_mark", None))}: not YAML: '
@@ -228,7 +250,8 @@ def _child(node: Any, key: str, path: Path) -> Any:
                     "it; a parameter file begins with '/**:' and 'ros__parameters:'")
 
 
-def _flatten(node: yaml.MappingNode, prefix: str, flat: dict, marks: dict, path: Path) -> None:
+def _flatten(node: yaml.MappingNode, prefix: str, flat: dict[str, Any], marks: dict[str, Any],
+             path: Path) -> None:
     for name, value in node.value:
         key = f'{prefix}{name.value}'
         if key in marks:
@@ -241,40 +264,194 @@ def _flatten(node: yaml.MappingNode, prefix: str, flat: dict, marks: dict, path:
             flat[key] = yaml.constructor.SafeConstructor().construct_object(value, deep=True)
 
 
-def _figure(f: Any, flat: dict, fail: Any) -> Any:
-    key, kind = f.metadata['key'], f.type
-    if key not in flat:
-        raise fail(key, f'missing; it is the {f.metadata["doc"]}')
-    value = flat[key]
-    if kind == 'np.ndarray':
-        value = _floats(key, value, fail)
-    elif kind == 'float':
-        value = _floats(key, [value], fail)[0].item()
-    elif not isinstance(value, {'int': int, 'str': str}[kind]) or isinstance(value, bool):
-        raise fail(key, f'{value!r} is not {"a whole number" if kind == "int" else "text"}')
-    _bounded(key, value, f.metadata, fail)
-    return value
+@dataclass(frozen=True)
+class _FlatReader:
+    """Reads and checks flat parameters."""
 
+    flat: Mapping[str, Any]
+    make_error: MakeError
 
-def _bounded(key: str, value: Any, limits: Any, fail: Any) -> None:
-    if limits['choices'] and value not in limits['choices']:
-        raise fail(key, f'{value!r} is not one of {", ".join(limits["choices"])}')
-    if limits['lower'] is None:
-        return
-    for one in np.ravel(value):
-        if not limits['lower'] <= one <= limits['upper']:
-            raise fail(key, f'{one:g} {limits["unit"]} is outside {limits["lower"]:g} to '
-                            f'{limits["upper"]:g}')
+    def sensor(self) -> Sensor:
+        values = {field.name: self._field(field) for field in SENSOR_FIELDS.values()}
+        axes = values['axes']
+        for key, field in SENSOR_FIELDS.items():
+            value = values[field.name]
+            if isinstance(value, np.ndarray) and len(value) != len(axes):
+                raise self.make_error(key, f'{len(value)} values for {len(axes)} axes ({axes})')
+        if values['z_sign'] == 0:
+            raise self.make_error('sensor.z_sign', '0, but must be 1 (upright) or -1')
+        effects = self._names('effects')
+        coefficients = {name: self._coefficients(name, axes) for name in effects}
+        covariance, covariance_names = self._covariance(effects, axes)
+        provenance = {key.removeprefix('provenance.'): str(value)
+                      for key, value in self.flat.items() if key.startswith('provenance.')}
+        datasheet_name = str(self.flat.get('datasheet.name', '')) \
+            if 'datasheet.figures' in self.flat else ''
+        return Sensor(**values, effects=effects, values=coefficients, covariance=covariance,
+                      covariance_names=covariance_names, provenance=provenance,
+                      envelope=self._envelope(), datasheet_name=datasheet_name,
+                      datasheet=self._datasheet())
 
+    def _field(self, field: Field[Any]) -> Any:
+        """Return the value of a field of `Sensor`."""
+        key, kind = field.metadata['key'], field.type
+        if key not in self.flat:
+            raise self.make_error(key, f'missing; it is the {field.metadata["doc"]}')
+        value = self.flat[key]
+        if kind == 'np.ndarray':
+            value = self._numbers(key, value)
+        elif kind == 'float':
+            value = self._numbers(key, [value])[0].item()
+        elif not isinstance(value, {'int': int, 'str': str}[str(kind)]) or isinstance(value, bool):
+            raise self.make_error(
+                key, f'{value!r} is not {"a whole number" if kind == "int" else "text"}')
+        choices = field.metadata['choices']
+        if choices and value not in choices:
+            raise self.make_error(key, f'{value!r} is not one of {", ".join(choices)}')
+        if field.metadata['lower'] is not None:
+            self._check_bounds(key, value, field.metadata['lower'], field.metadata['upper'],
+                               field.metadata['unit'])
+        return value
 
-def _floats(key: str, value: Any, fail: Any) -> np.ndarray:
-    many = value if isinstance(value, (list, tuple, np.ndarray)) else [value]
-    for one in many:
-        if isinstance(one, bool) or not isinstance(one, float):
-            raise fail(key, f'{one!r} is not a floating-point number{_as_float(one)}')
-        if not np.isfinite(one):
-            raise fail(key, f'{one} is not a finite number')
-    return np.array(many, float)
+    def _check_bounds(self, key: str, values: Any, lower: float, upper: float, unit: str) -> None:
+        for value in np.ravel(values):
+            if not lower <= value <= upper:
+                raise self.make_error(
+                    key, f'{value:g} {unit} is outside {lower:g} to {upper:g}')
+
+    def _numbers(self, key: str, value: Any) -> np.ndarray:
+        """Return a number or a list of numbers as an array."""
+        numbers = value if isinstance(value, (list, tuple, np.ndarray)) else [value]
+        for number in numbers:
+            if not isinstance(number, float):
+                raise self.make_error(
+                    key, f'{number!r} is not a floating-point number{_as_float(number)}')
+            if not np.isfinite(number):
+                raise self.make_error(key, f'{number} is not a finite number')
+        return np.array(numbers, float)
+
+    def _names(self, key: str) -> tuple[str, ...]:
+        """Return a list of different names; none where the key is missing."""
+        names = self.flat.get(key) or []
+        if not isinstance(names, (list, tuple)) or not all(isinstance(n, str) for n in names):
+            raise self.make_error(key, f'{names!r} is not a list of names')
+        if len(set(names)) != len(names):
+            raise self.make_error(key, 'a name stands twice')
+        return tuple(names)
+
+    def _effect(self, key: str, name: str) -> Effect:
+        try:
+            return effect_named(name)
+        except UserError as error:
+            raise self.make_error(key, str(error)) from None
+
+    def _coefficients(self, name: str, axes: str) -> dict[str, np.ndarray]:
+        """Return the values of an effect by parameter, (m,) or ()."""
+        effect = self._effect('effects', name)
+        values = {parameter.name: self._values(effect, parameter, axes)
+                  for parameter in effect.parameters}
+        for key in self.flat:
+            if key.startswith(f'{name}.') and key.removeprefix(f'{name}.') not in values:
+                raise self.make_error(
+                    key, f'unknown parameter; {name} has {", ".join(sorted(values))}')
+        return values
+
+    def _values(self, effect: Effect, parameter: Parameter, axes: str) -> np.ndarray:
+        key = str(Coefficient(effect.name, parameter.name))
+        if key not in self.flat and parameter.role is Role.OPTIONAL:
+            return neutral(effect, axes)[parameter.name]
+        if key not in self.flat:
+            raise self.make_error(key, f'missing; it is the {parameter.doc}, {parameter.unit}'
+                                  f'{", by axis" if parameter.axes else ""}')
+        values = self._numbers(key, self.flat[key])
+        if parameter.axes and len(values) != len(axes):
+            raise self.make_error(key, f'{len(values)} values for {len(axes)} axes ({axes})')
+        if not parameter.axes and isinstance(self.flat[key], (list, tuple)):
+            raise self.make_error(
+                key, f'{self.flat[key]} is a list; it is one number without axes')
+        self._check_bounds(key, values, parameter.lower, parameter.upper, parameter.unit)
+        if not parameter.axes:
+            return values[0]
+        for axis, value in zip(axes, values):
+            if axis not in parameter.axes and value != parameter.neutral:
+                raise self.make_error(key, f'{value:g} for {axis}, which it does not act on; '
+                                      f'write {parameter.neutral!r}')
+        return values
+
+    def _covariance(self, effects: Sequence[str], axes: str
+                    ) -> tuple[np.ndarray, tuple[Coefficient, ...]]:
+        """Return the covariance, (k, k), and the names of its k coefficients."""
+        names = self._names('covariance_names')
+        coefficients = {str(name): name for effect in effects
+                        for name in names_of(effect_named(effect), axes)}
+        for name in names:
+            if name not in coefficients:
+                raise self.make_error('covariance_names',
+                                      f'{name!r} is no parameter of the listed effects')
+        if not names:
+            return np.zeros((0, 0)), ()
+        if 'covariance' not in self.flat:
+            raise self.make_error('covariance',
+                                  f'missing; {len(names)} names stand in covariance_names')
+        matrix = self._numbers('covariance', self.flat['covariance'])
+        if matrix.size != len(names) ** 2:
+            raise self.make_error('covariance', f'{matrix.size} values, but {len(names)} names '
+                                  f'need {len(names) ** 2}')
+        matrix = matrix.reshape(len(names), -1)
+        self._check_covariance(matrix, names)
+        return matrix, tuple(coefficients[name] for name in names)
+
+    def _check_covariance(self, matrix: np.ndarray, names: Sequence[str]) -> None:
+        for name, variance in zip(names, np.diag(matrix)):
+            if variance < 0:
+                raise self.make_error(
+                    'covariance', f'the variance of {name} is {variance:g}, not positive')
+        std = np.sqrt(np.maximum(np.diag(matrix), _SMALLEST_VARIANCE))
+        correlation = matrix / np.outer(std, std)
+        if np.abs(correlation - correlation.T).max() > _ASYMMETRY:
+            raise self.make_error('covariance', 'not symmetric')
+        smallest = np.linalg.eigvalsh(correlation).min()
+        if smallest < _LOWEST_EIGENVALUE:
+            raise self.make_error('covariance', 'not positive: its smallest eigenvalue is '
+                                  f'{smallest:.3g} in units of the variances')
+
+    def _envelope(self) -> Envelope:
+        values_by_name: dict[str, Any] = {}
+        for name, meaning in ENVELOPE.items():
+            key = f'envelope.{name}'
+            if key not in self.flat:
+                continue
+            values = self._numbers(key, self.flat[key])
+            count = ENVELOPE_LISTS.get(name, 1)
+            if len(values) != count or (count == 1 and values[0] < 0) or \
+                    (name == 'temperature_c' and values[0] > values[1]):
+                raise self.make_error(key, f'{self.flat[key]} is not the {meaning}')
+            values_by_name[name] = float(values[0]) if count == 1 else tuple(values.tolist())
+        return Envelope(**values_by_name)
+
+    def _datasheet(self) -> dict[Coefficient, tuple[float, float]]:
+        """Return the typical and the greatest departure by `effect.parameter`."""
+        if 'datasheet.figures' not in self.flat:
+            return {}
+        names = self._names('datasheet.figures')
+        typical = self._departures('typical', len(names))
+        maximum = self._departures('maximum', len(names))
+        for name in names:
+            effect, _, parameter = name.partition('.')
+            if all(p.name != parameter
+                   for p in self._effect('datasheet.figures', effect).parameters):
+                raise self.make_error('datasheet.figures', f'{name!r} is no parameter of {effect}')
+        return dict(zip(map(Coefficient.parse, names), zip(typical, maximum)))
+
+    def _departures(self, name: str, count: int) -> list[float]:
+        key = f'datasheet.{name}'
+        if key not in self.flat:
+            raise self.make_error(key, f'missing; {count} names stand in datasheet.figures')
+        values = self._numbers(key, self.flat[key])
+        if len(values) != count or (values < 0).any():
+            raise self.make_error(key, f'{len(values)} values, but {count} names need as many, '
+                                  'of 0 or more')
+        return values.tolist()
 
 
 def _as_float(value: Any) -> str:
@@ -283,116 +460,3 @@ def _as_float(value: Any) -> str:
         return f'; write {_float_text(float(value))}'
     except (TypeError, ValueError):
         return ''
-
-
-def _strings(key: str, flat: dict, fail: Any) -> tuple[str, ...]:
-    value = flat.get(key) or []
-    if not isinstance(value, (list, tuple)) or not all(isinstance(one, str) for one in value):
-        raise fail(key, f'{value!r} is not a list of names')
-    if len(set(value)) != len(value):
-        raise fail(key, 'names one twice')
-    return tuple(value)
-
-
-def _effect_values(name: str, axes: str, flat: dict, fail: Any) -> dict[str, np.ndarray]:
-    try:
-        effect = effect_named(name)
-    except UserError as error:
-        raise fail('effects', str(error)) from None
-    values = {}
-    for parameter in effect.parameters:
-        key = str(Coefficient(name, parameter.name))
-        if key not in flat and parameter.role is Role.OPTIONAL:
-            values[parameter.name] = neutral(effect, axes)[parameter.name]
-            continue
-        if key not in flat:
-            raise fail(key, f'missing; it is the {parameter.doc}, {parameter.unit}'
-                            f'{", by axis" if parameter.axes else ""}')
-        array = _floats(key, flat[key], fail)
-        if parameter.axes and len(array) != len(axes):
-            raise fail(key, f'{len(array)} values for {len(axes)} axes ({axes})')
-        if not parameter.axes and isinstance(flat[key], (list, tuple)):
-            raise fail(key, f'{flat[key]} is a list; it is one number without axes')
-        _bounded(key, array, {'choices': (), 'lower': parameter.lower,
-                              'upper': parameter.upper, 'unit': parameter.unit}, fail)
-        for axis, value in zip(axes if parameter.axes else '', array):
-            if axis not in parameter.axes and value != parameter.neutral:
-                raise fail(key, f'{value:g} for {axis}, which it does not act on; write '
-                                f'{parameter.neutral!r}')
-        values[parameter.name] = array if parameter.axes else array[0]
-    known = {p.name for p in effect.parameters}
-    for key in flat:
-        if key.startswith(f'{name}.') and key.removeprefix(f'{name}.') not in known:
-            raise fail(key, f'unknown parameter; {name} has {", ".join(sorted(known))}')
-    return values
-
-
-def _covariance(flat: dict, values: dict, axes: str, fail: Any) -> tuple:
-    names = _strings('covariance_names', flat, fail)
-    known = {str(name): name for effect in values
-             for name in names_of(effect_named(effect), axes)}
-    for name in names:
-        if name not in known:
-            raise fail('covariance_names', f'{name!r} is no parameter of the listed effects')
-    if not names:
-        return np.zeros((0, 0)), ()
-    if 'covariance' not in flat:
-        raise fail('covariance', f'missing; {len(names)} names stand in covariance_names')
-    matrix = _floats('covariance', flat['covariance'], fail)
-    if matrix.size != len(names) ** 2:
-        raise fail('covariance', f'{matrix.size} values, but {len(names)} names need '
-                                 f'{len(names) ** 2}')
-    matrix = matrix.reshape(len(names), -1)
-    for name, variance in zip(names, np.diag(matrix)):
-        if variance < 0:
-            raise fail('covariance', f'the variance of {name} is {variance:g}, not positive')
-    scale = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-    relative = matrix / np.outer(scale, scale)
-    if np.abs(relative - relative.T).max() > 1e-6:
-        raise fail('covariance', 'not symmetric')
-    smallest = np.linalg.eigvalsh(relative).min()
-    if smallest < -1e-9:
-        raise fail('covariance', f'not positive: its smallest eigenvalue is {smallest:.3g} in '
-                                 'units of the variances')
-    return matrix, tuple(known[name] for name in names)
-
-
-def _envelope(flat: dict, fail: Any) -> Envelope:
-    found: dict[str, Any] = {}
-    for key in ENVELOPE:
-        name = f'envelope.{key}'
-        if name not in flat:
-            continue
-        values = _floats(name, flat[name], fail)
-        count = ENVELOPE_LISTS.get(key, 1)
-        if len(values) != count or (count == 1 and values[0] < 0) or \
-                (key == 'temperature_c' and values[0] > values[1]):
-            raise fail(name, f'{flat[name]} is not the {ENVELOPE[key]}')
-        found[key] = float(values[0]) if count == 1 else tuple(values.tolist())
-    return Envelope(**found)
-
-
-def _datasheet(flat: dict, fail: Any) -> tuple[str, dict[Coefficient, tuple[float, float]]]:
-    if 'datasheet.figures' not in flat:
-        return '', {}
-    names = _strings('datasheet.figures', flat, fail)
-    columns = []
-    for key in ('typical', 'maximum'):
-        of = f'datasheet.{key}'
-        if of not in flat:
-            raise fail(of, f'missing; {len(names)} names stand in datasheet.figures')
-        values = _floats(of, flat[of], fail)
-        if len(values) != len(names) or (values < 0).any():
-            raise fail(of, f'{len(values)} values, but {len(names)} names need as many, of 0 or '
-                           'more')
-        columns.append(values.tolist())
-    for name in names:
-        effect, _, parameter = name.partition('.')
-        try:
-            known = {p.name for p in effect_named(effect).parameters}
-        except UserError as error:
-            raise fail('datasheet.figures', str(error)) from None
-        if parameter not in known:
-            raise fail('datasheet.figures', f'{name!r} is no parameter of {effect}')
-    figures = dict(zip(map(Coefficient.parse, names), zip(*columns)))
-    return str(flat.get('datasheet.name', '')), figures

@@ -35,7 +35,6 @@ from adxl_ros.files.stream_info import sensor_info
 from adxl_ros.files.stream_unit import recorded_unit
 from adxl_ros.links.support import wire_format
 from adxl_ros.nodes.demo import end
-from adxl_ros.nodes.support.sensor_parameters import nominal_path
 from adxl_ros.simulate.simulator import simulate
 from adxl_ros.simulate.trajectories import sweep
 import numpy as np
@@ -254,7 +253,7 @@ def _cpu_s(pid: int) -> float:
 
 def _reading() -> None:
     """Print how long 3 million rows take to read, and the physical fit of a sweep."""
-    sensor = parameter_file.load(nominal_path())
+    sensor = parameter_file.load(parameter_file.nominal_path())
     columns = simulate(sensor, sweep(np.random.default_rng(0)), 0)
     count = len(columns['time_s'])
     whole = {name: np.resize(values, _ROWS) for name, values in columns.items()}

@@ -38,7 +38,6 @@ from adxl_ros.files import parameter_file, recording, sweep_journal
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.nodes.support.sensor_parameters import nominal_path
 from adxl_ros.nodes.terminal import steps
 from diagnostic_msgs.msg import DiagnosticArray
 import numpy as np
@@ -231,7 +230,7 @@ def main() -> int:
 def _simulated(folder: Path, speed: float) -> None:
     """Sweep a simulated ADXL203 whose coefficients are drawn at datasheet spread."""
     unit, nominal = folder / 'simulated_unit.yaml', folder / 'nominal.yaml'
-    sensor = replace(parameter_file.load(nominal_path()), serial='demo')
+    sensor = replace(parameter_file.load(parameter_file.nominal_path()), serial='demo')
     truth = _drawn(sensor)
     parameter_file.save(nominal, sensor)
     parameter_file.save(unit, truth, ['The truth of the simulated unit.'])
@@ -287,10 +286,10 @@ def _real(folder: Path, path: Path, length_s: float) -> None:
     clock = ('-p', 'use_sim_time:=true')
     _fresh(output)
     with _graph(folder / f'{path.stem}.log') as graph:
-        graph.start('calibration', nominal_path(), *clock, *_LOSSLESS, *_UNATTENDED,
+        graph.start('calibration', parameter_file.nominal_path(), *clock, *_LOSSLESS, *_UNATTENDED,
                     '-p', 'mode:=gravity', '-p', f'output:={output}', '-p', f'report:={report}',
                     '-p', f'store:={folder / "calibrations"}')
-        graph.start('driver', nominal_path(), '-p', 'link.type:=replay',
+        graph.start('driver', parameter_file.nominal_path(), '-p', 'link.type:=replay',
                     '-p', f'link.recording:={path}', '-p', f'link.speed:={_REPLAY_SPEED}', *clock)
         with steps.step('1/2 replay', 'starting') as step:
             def rests() -> int:

@@ -20,7 +20,7 @@ from dataclasses import replace
 import os
 from typing import Any
 
-from adxl_ros.files.figure_file import pyplot, write
+from adxl_ros.files.plot_file import pyplot, write_plot
 from adxl_ros.model import signal_chain
 from adxl_ros.model.constants import G0_MPS2, Z_90
 from adxl_ros.model.sensor import Sensor
@@ -48,7 +48,7 @@ def draw_misalignment(path: str | os.PathLike, found: Found) -> None:
     axis.set(xlabel='beta of the stage, °', ylabel='x output less its greatest, mg',
              title='Direction of the x axis (18): the maximum is flat')
     axis.legend(fontsize=8)
-    write(figure, path)
+    write_plot(figure, path)
 
 
 def draw_tilt(path: str | os.PathLike, unit: Unit) -> None:
@@ -73,7 +73,7 @@ def draw_tilt(path: str | os.PathLike, unit: Unit) -> None:
     grid[0, 0].legend(fontsize=8)
     figure.suptitle('Tilt; gaps are poses whose bound exceeds 1° '
                     '(linear scale within ±0.1°, logarithmic beyond)')
-    write(figure, path)
+    write_plot(figure, path)
 
 
 def draw_motion(path: str | os.PathLike, fitted: dict[str, Sensor],
@@ -91,7 +91,7 @@ def draw_motion(path: str | os.PathLike, fitted: dict[str, Sensor],
                                          f'about an offset of {figures.offset_mmps2:.1f}')
         axis.legend(fontsize=8, loc='upper right')
     row[0].set(ylabel='acceleration along x, mm/s²')
-    write(figure, path)
+    write_plot(figure, path)
 
 
 def draw_components(path: str | os.PathLike, truth: Sensor, fitted: Sensor,
@@ -119,7 +119,7 @@ def draw_components(path: str | os.PathLike, truth: Sensor, fitted: Sensor,
     apart.set(xlabel='acceleration along x, g', ylabel='less the actual response, mV',
               title='the same, less the actual response')
     whole.legend(fontsize=8)
-    write(figure, path)
+    write_plot(figure, path)
 
 
 def _volts(unit: Sensor, effects: tuple[str, ...] | None, pose: list[np.ndarray]) -> np.ndarray:

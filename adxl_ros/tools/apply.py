@@ -33,7 +33,7 @@ from adxl_ros.model.constants import AXES
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import NOMINAL_ENVIRONMENT
 from adxl_ros.model.sensor import Sensor, with_axes
-from adxl_ros.tools.common import default_params, progress, run, say_notes
+from adxl_ros.tools.common import progress, run, say_notes
 import numpy as np
 
 _BLOCK_ROWS = 16384
@@ -59,7 +59,7 @@ def apply(options: argparse.Namespace) -> int:
     """Run the tool; see `parser`."""
     if Path(options.output).resolve() == Path(options.recording).resolve():
         raise UserError(f'{options.output}: is the recording itself; choose another output')
-    sensor = parameter_file.load(options.params or default_params())
+    sensor = parameter_file.load(options.params or parameter_file.nominal_path())
     rows = unsolved = outside = at_rail = 0
     block = None
     with CsvWriter(options.output, _DIGITS) as out, progress('apply') as show:

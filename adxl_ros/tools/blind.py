@@ -24,7 +24,7 @@ import sys
 from adxl_ros.blind import blind_check, diagnosis_runs as running, real_recordings, report_html
 from adxl_ros.errors import UserError
 from adxl_ros.files.atomic_write import atomic_path
-from adxl_ros.files.figure_file import pyplot
+from adxl_ros.files.plot_file import pyplot
 from adxl_ros.tools.common import make_folder, progress, run
 
 PROG = 'blind'

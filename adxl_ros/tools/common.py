@@ -27,7 +27,6 @@ from types import FrameType
 
 from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import Recording
-from ament_index_python.packages import get_package_share_directory
 
 
 def run(parser: argparse.ArgumentParser, command: Callable[[argparse.Namespace], int]) -> int:
@@ -68,11 +67,6 @@ def run(parser: argparse.ArgumentParser, command: Callable[[argparse.Namespace],
 def _terminated(number: int, frame: FrameType | None) -> None:
     """End by an exception, so that files begun are removed on the way out."""
     sys.exit(128 + number)
-
-
-def default_params() -> Path:
-    """Where the nominal sensor is installed, the default of every `--params`."""
-    return Path(get_package_share_directory('adxl_ros')) / 'params' / 'adxl203.yaml'
 
 
 def make_folder(folder: Path) -> None:

@@ -26,7 +26,7 @@ from adxl_ros.files import calibration_store, parameter_file, recording, sweep_j
 from adxl_ros.files.checksum import sha256
 from adxl_ros.files.stream_unit import recorded_unit
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.tools.common import default_params, make_folder, run, say_notes
+from adxl_ros.tools.common import make_folder, run, say_notes
 
 
 def parser() -> argparse.ArgumentParser:
@@ -58,7 +58,7 @@ def fit(options: argparse.Namespace) -> int:
     if options.journal and len(options.recording) != 1:
         raise UserError(f'--journal {options.journal}: names the rests of one recording, but '
                         f'{len(options.recording)} are given')
-    sensor = parameter_file.load(options.params or default_params())
+    sensor = parameter_file.load(options.params or parameter_file.nominal_path())
     records = _records(options.journal)
     unit: Sensor | None = None
     parts, filters = [], []

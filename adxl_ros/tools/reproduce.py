@@ -31,7 +31,7 @@ from adxl_ros.files.stream_unit import recorded_unit
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.reproduction import coverage, experiments, plots, report_page, scoring, units
 from adxl_ros.reproduction.report_page import FIGURES
-from adxl_ros.tools.common import default_params, make_folder, progress, run, say_notes
+from adxl_ros.tools.common import make_folder, progress, run, say_notes
 import numpy as np
 
 
@@ -60,7 +60,7 @@ def reproduce(options: argparse.Namespace) -> int:
         raise UserError(f'--units {options.units}: at least 1 is needed')
     if options.seed < 0:
         raise UserError(f'--seed {options.seed}: must not be negative')
-    sensor = parameter_file.load(options.params or default_params())
+    sensor = parameter_file.load(options.params or parameter_file.nominal_path())
     folder = Path(options.output)
     make_folder(folder / FIGURES)
     text = _of_recordings(sensor, options.recording, folder) if options.recording \

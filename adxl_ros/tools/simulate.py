@@ -35,7 +35,7 @@ from adxl_ros.simulate.from_recording import felt, followed
 from adxl_ros.simulate.motion import Motion
 from adxl_ros.simulate.response import Response
 from adxl_ros.simulate.trajectories import TRAJECTORIES
-from adxl_ros.tools.common import default_params, progress, run, say_notes
+from adxl_ros.tools.common import progress, run, say_notes
 from adxl_ros.tools.effect_option import SYNTAX, with_effects
 import numpy as np
 
@@ -80,7 +80,7 @@ def simulate(options: argparse.Namespace) -> int:
                        f'{", ".join(TRAJECTORIES)}, imu')
     if not options.output and not options.port:
         parser().error('the following arguments are required: -o, or --port')
-    sensor = parameter_file.load(options.params or default_params())
+    sensor = parameter_file.load(options.params or parameter_file.nominal_path())
     if options.rate is not None:
         if not 0.01 <= options.rate <= 1e5:
             raise UserError(f'--rate {options.rate:g}: outside 0.01 to 100000 Hz')

@@ -36,7 +36,7 @@ from adxl_ros.blind import (
 from adxl_ros.blind.trials import Label
 from adxl_ros.blind.world import chain, fault_table, ideal_observer, motion, unit
 from adxl_ros.errors import UserError
-from adxl_ros.files.figure_file import pyplot
+from adxl_ros.files.plot_file import pyplot
 import numpy as np
 import pytest
 import yaml

@@ -101,7 +101,7 @@ BAD = {
     'unknown effect': ('effects: [bias, scale_factor]', 'effects: [bais, scale_factor]',
                        r":22:14: effects: unknown effect 'bais'; did you mean bias\?"),
     'an effect twice': ('effects: [bias, scale_factor]', 'effects: [bias, bias]',
-                        r':22:14: effects: names one twice'),
+                        r':22:14: effects: a name stands twice'),
     'no list of effects': ('effects: [bias, scale_factor]', 'effects: bias',
                            r":22:14: effects: 'bias' is not a list of names"),
     'a key twice': ('    model: linear\n', '    model: linear\n    model: physical\n',

@@ -24,7 +24,7 @@ from adxl_ros.calibrate.fits import linear, paper_regression
 from adxl_ros.calibrate.fits.gravity_fit import GravityFit
 from adxl_ros.calibrate.poses import Poses, reference_force
 from adxl_ros.calibrate.report.cross_validation import Score
-from adxl_ros.files.figure_file import pyplot, write
+from adxl_ros.files.plot_file import pyplot, write_plot
 from adxl_ros.model import signal_chain
 from adxl_ros.model.constants import G0_MPS2, Z_90
 from adxl_ros.model.sensor import Sensor
@@ -35,7 +35,7 @@ _FINE_G = np.linspace(-1, 1, 201)
 
 def draw_sweep(path: str | os.PathLike, sensor: Sensor, fitted: Sensor, poses: Poses) -> None:
     """Draw `sweep` as PNG."""
-    write(sweep(sensor, fitted, poses), path)
+    write_plot(sweep(sensor, fitted, poses), path)
 
 
 def sweep(sensor: Sensor, fitted: Sensor, poses: Poses, panels: Sequence[int] = range(6)) -> Any:

@@ -29,7 +29,7 @@ from adxl_ros.calibrate.report.acceptance import beyond_datasheet, FAIL, Judged,
 from adxl_ros.errors import UserError
 from adxl_ros.files import html_page
 from adxl_ros.files.atomic_write import atomic_path
-from adxl_ros.files.figure_file import pyplot
+from adxl_ros.files.plot_file import pyplot
 from adxl_ros.model import signal_chain
 from adxl_ros.model.coefficients import get, parameter_of
 from adxl_ros.model.constants import G0_MPS2, Z_90

@@ -27,12 +27,12 @@ from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.nodes.support.parameters import declare
 from adxl_ros.nodes.support.rclpy_internals import given_parameters
-from adxl_ros.nodes.support.sensor_parameters import declare_sensor, make_sensor, nominal_path
+from adxl_ros.nodes.support.sensor_parameters import declare_sensor, make_sensor
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-_FILE_KEYS = {'format', 'units', *parameter_file.FIGURES,
+_FILE_KEYS = {'format', 'units', *parameter_file.SENSOR_FIELDS,
               *(f'envelope.{key}' for key in parameter_file.ENVELOPE),
               *(f'datasheet.{key}' for key in parameter_file.DATASHEET)}
 """Parameters that belong to a file and change with it alone."""
@@ -76,7 +76,8 @@ class ExchangeableSensor:
         self._flat = declare_sensor(node, live=True)
         make_sensor(self._flat)
         from_file = node.get_parameter_or('format').value is not None
-        self._source = 'the parameters given' if from_file else f'the nominal {nominal_path()}'
+        self._source = 'the parameters given' if from_file else \
+            f'the nominal {parameter_file.nominal_path()}'
         self._declare_provenance(given_parameters(node))
         path = declare(
             node, 'calibration', '', 'parameter file to use; setting it loads the whole file or '

@@ -17,7 +17,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from pathlib import Path
 from typing import Any, NamedTuple
 
 from adxl_ros.errors import UserError
@@ -26,7 +25,6 @@ from adxl_ros.model.effects import library
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.nodes.support.parameters import declare, parameter_error
-from ament_index_python.packages import get_package_share_directory
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
@@ -73,7 +71,7 @@ def declare_sensor(node: Node, live: bool = False) -> dict[str, Any]:
     """
     version = declare(node, 'format', Kind.INTEGER, 'version of the parameter file', live=live)
     nominal = {} if version is not None else parameter_file.to_flat(
-        parameter_file.load(nominal_path()))
+        parameter_file.load(parameter_file.nominal_path()))
     flat = {'format': nominal.get('format', version),
             'units': declare(node, 'units', parameter_file.UNITS, 'units of the coefficients',
                              live=live)}
@@ -84,7 +82,7 @@ def declare_sensor(node: Node, live: bool = False) -> dict[str, Any]:
 
 def _keys() -> Iterator[_Key]:
     """Yield the keys of a parameter file behind `format` and `units`."""
-    for name, field in parameter_file.FIGURES.items():
+    for name, field in parameter_file.SENSOR_FIELDS.items():
         about = field.metadata
         yield _Key(name, _FIELD_KINDS[str(field.type)], about['doc'], about['unit'],
                    about['lower'], about['upper'], about['choices'])
@@ -131,8 +129,3 @@ def make_sensor(flat: Mapping[str, Any],
               if effect.name not in listed for p in effect.parameters}
     return parameter_file.from_flat(
         {key: value for key, value in flat.items() if key not in unused}, make_error)
-
-
-def nominal_path() -> Path:
-    """Return the path of the installed parameter file of the nominal sensor."""
-    return Path(get_package_share_directory('adxl_ros')) / 'params' / 'adxl203.yaml'

@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections import deque
 
 from adxl_ros.errors import UserError
-from adxl_ros.files.parameter_file import FIGURES
+from adxl_ros.files.parameter_file import SENSOR_FIELDS
 from adxl_ros.links.support.simulated_stage import JOINTS, SimulatedStage
 from adxl_ros.nodes.support.diagnostics import DiagnosticsReporter, Level, Status
 from adxl_ros.nodes.support.parameters import declare
@@ -123,7 +123,7 @@ class SimulatedStageNode:
 
 def _declare_stage(node: Node) -> SimulatedStage:
     """Declare the parameters of the stage and make it."""
-    about = FIGURES['stage.resolution_rad'].metadata
+    about = SENSOR_FIELDS['stage.resolution_rad'].metadata
     resolution_rad = declare(node, 'stage.resolution_rad', _RESOLUTION_RAD, about['doc'],
                              about['unit'], about['lower'], about['upper'])
     turn_rad_s = declare(node, 'slew_rate_rad_s', 0.5, 'fastest turn', 'rad/s', 1e-6, 100.0)

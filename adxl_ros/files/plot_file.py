@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Figures as PNG files, drawn without a display."""
+"""Plots as PNG files, drawn without a display."""
 
 from __future__ import annotations
 
@@ -22,9 +22,20 @@ from typing import Any
 from adxl_ros.errors import UserError
 from adxl_ros.files.atomic_write import atomic_path
 
+_DPI = 80
+"""Resolution of the PNG files, dots per inch (chosen: a plot of 12 inches fits a screen)."""
+
 
 def pyplot() -> Any:
-    """Return matplotlib's drawing functions, without a display."""
+    """
+    Return matplotlib's drawing functions, without a display.
+
+    Raises
+    ------
+    UserError
+        Matplotlib is not installed.
+
+    """
     try:
         import matplotlib
     except ImportError:
@@ -34,8 +45,23 @@ def pyplot() -> Any:
     return matplotlib.pyplot
 
 
-def write(figure: Any, path: str | os.PathLike) -> None:
-    """Write a figure as PNG, whole or not at all."""
+def write_plot(figure: Any, path: str | os.PathLike) -> None:
+    """
+    Write a matplotlib figure as a PNG file, whole or not at all, and close it.
+
+    Parameters
+    ----------
+    figure
+        The figure.
+    path
+        The file, replaced if it exists.
+
+    Raises
+    ------
+    UserError
+        The file cannot be written.
+
+    """
     with atomic_path(path) as fresh:
-        figure.savefig(fresh, dpi=80, format='png')
+        figure.savefig(fresh, dpi=_DPI, format='png')
     pyplot().close(figure)
