@@ -22,17 +22,17 @@ The calibration starts by itself and stays up to show its verdict; in mode `grav
 stage, and `ros2 service call /calibration/finish std_srvs/srv/Trigger` fits what is there.
 """
 
+from adxl_ros.files import parameter_file
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, Shutdown
 from launch.conditions import IfCondition
-from launch.substitutions import EqualsSubstitution, LaunchConfiguration, PathJoinSubstitution
+from launch.substitutions import EqualsSubstitution, LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
-from launch_ros.substitutions import FindPackageShare
 
 
 def generate_launch_description() -> LaunchDescription:
-    params = PathJoinSubstitution([FindPackageShare('adxl_ros'), 'params', 'adxl203.yaml'])
+    params = str(parameter_file.nominal_path())
     mode = LaunchConfiguration('mode')
     common = {
         'package': 'adxl_ros',

@@ -18,16 +18,16 @@ Run a calibrated sensor on a robot: the driver and the compensation.
     ros2 launch adxl_ros robot.launch.py params_file:=unit_17.yaml namespace:=arm frame_id:=arm_imu
 """
 
+from adxl_ros.files import parameter_file
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument
-from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
+from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
-from launch_ros.substitutions import FindPackageShare
 
 
 def generate_launch_description() -> LaunchDescription:
-    params = PathJoinSubstitution([FindPackageShare('adxl_ros'), 'params', 'adxl203.yaml'])
+    params = str(parameter_file.nominal_path())
     frame_id = ParameterValue(LaunchConfiguration('frame_id'), value_type=str)
     nodes = [
         Node(package='adxl_ros', executable=executable, output='screen', respawn=True,

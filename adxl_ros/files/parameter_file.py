@@ -82,11 +82,15 @@ MakeError = Callable[[str, str], Exception]
 """Makes the exception to raise from a key and a reason."""
 
 
+_NOMINAL_FILE = 'adxl203.yaml'
+"""Parameter file in `params/` of the default sensor; no other place in the code names a sensor."""
+
+
 def nominal_path() -> Path:
     """Return the installed parameter file of the nominal sensor, the default everywhere."""
     # Where there is no ROS, only this function fails.
     from ament_index_python.packages import get_package_share_directory
-    return Path(get_package_share_directory('adxl_ros')) / 'params' / 'adxl203.yaml'
+    return Path(get_package_share_directory('adxl_ros')) / 'params' / _NOMINAL_FILE
 
 
 def load(path: str | os.PathLike) -> Sensor:

@@ -228,14 +228,16 @@ def main() -> int:
 
 
 def _simulated(folder: Path, speed: float) -> None:
-    """Sweep a simulated ADXL203 whose coefficients are drawn at datasheet spread."""
+    """Sweep a simulated sensor whose coefficients are drawn at datasheet spread."""
     unit, nominal = folder / 'simulated_unit.yaml', folder / 'nominal.yaml'
     sensor = replace(parameter_file.load(parameter_file.nominal_path()), serial='demo')
     truth = _drawn(sensor)
     parameter_file.save(nominal, sensor)
     parameter_file.save(unit, truth, ['The truth of the simulated unit.'])
-    output, report = folder / 'adxl203_demo.yaml', folder / 'sweep'
-    _print(title('Demo: calibrate a simulated ADXL203 whose true coefficients are known',
+    sensor_name = parameter_file.nominal_path().stem
+    output, report = folder / f'{sensor_name}_demo.yaml', folder / 'sweep'
+    _print(title(f'Demo: calibrate a simulated {sensor_name.upper()} whose true coefficients '
+                 'are known',
                  _SWEEP_S / speed + _OVERHEAD_S), '')
     _fresh(output)
     clock = ('-p', 'use_sim_time:=true')

@@ -46,7 +46,7 @@ def parser() -> argparse.ArgumentParser:
     parse = argparse.ArgumentParser(prog='apply', description=__doc__)
     parse.add_argument('recording', metavar='RECORDING', help='rosbag2 directory, .mcap or CSV')
     parse.add_argument('--params', metavar='FILE', default=None,
-                       help='the calibrated sensor (default: the nominal ADXL203)')
+                       help='the calibrated sensor (default: the nominal sensor)')
     parse.add_argument('--inverse', choices=('exact', 'paper'), default='exact',
                        help="of the model: exact, or the paper's approximation (14) to (21)")
     parse.add_argument('--undo-filter', action='store_true',

@@ -34,7 +34,7 @@ def parser() -> argparse.ArgumentParser:
     parse.add_argument('recording', nargs='+',
                        help='rosbag2 directory, .mcap or CSV, all of one unit')
     parse.add_argument('--params', metavar='FILE', default=None,
-                       help='what the simulator models (default: the nominal ADXL203)')
+                       help='what the simulator models (default: the nominal sensor)')
     parse.add_argument('--sim', metavar='RECORDING',
                        help='ideal specific force of the same manoeuvre by another simulator')
     parse.add_argument('--seed', type=int, default=0, help='of bootstraps (default 0)')

@@ -35,7 +35,7 @@ def parser() -> argparse.ArgumentParser:
     parse.add_argument('recording', nargs='+',
                        help='rosbag2 directory, .mcap or CSV, all of one unit')
     parse.add_argument('--params', metavar='FILE', default=None,
-                       help='figures that are not fitted (default: the nominal ADXL203)')
+                       help='figures that are not fitted (default: the nominal sensor)')
     parse.add_argument('--model', choices=list(calibration.STAGE_FITS),
                        help='against stage angles (default: the richest that the poses '
                             'determine); a three-axis recording without them is '

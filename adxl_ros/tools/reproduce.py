@@ -42,7 +42,7 @@ def parser() -> argparse.ArgumentParser:
                        help='sweeps of one unit; without any, units are simulated')
     parse.add_argument('--params', metavar='FILE', default=None,
                        help='figures that units are drawn about, or one unit with its effects '
-                            '(default: the nominal ADXL203)')
+                            '(default: the nominal sensor)')
     parse.add_argument('--seed', type=int, default=0)
     parse.add_argument('--units', type=int, default=20, help='how many are drawn')
     parse.add_argument('--draws', type=int, default=0,

@@ -56,7 +56,7 @@ def parser() -> argparse.ArgumentParser:
     parse.add_argument('trajectory', metavar='TRAJECTORY',
                        help=f'{", ".join(TRAJECTORIES)}, imu, or a recording')
     parse.add_argument('--params', metavar='FILE', default=None,
-                       help='the sensor (default: the nominal ADXL203)')
+                       help='the sensor (default: the nominal sensor)')
     parse.add_argument('--effect', action='append', default=[], metavar='NAME[:key=value,...]',
                        help=f'add an effect: {SYNTAX}')
     parse.add_argument('--force', metavar='RECORDING',
