@@ -17,10 +17,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 import os
-from pathlib import Path
 
 from adxl_ros.calibrate.fits import (
     full_fit_text,
@@ -37,15 +35,12 @@ from adxl_ros.calibrate.report import (
     acceptance,
     cross_validation,
     error_budget,
-    plots,
-    report_html,
 )
-from adxl_ros.calibrate.report.acceptance import Judged
-from adxl_ros.calibrate.report.cross_validation import Score
+from adxl_ros.calibrate.report.acceptance import Assessment
+from adxl_ros.calibrate.report.cross_validation import HeldOutErrors
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store, parameter_file
 from adxl_ros.files.atomic_write import keep_previous
-from adxl_ros.files.plot_file import write_plot
 from adxl_ros.files.stream_info import NO_UNIT
 from adxl_ros.model import signal_chain
 from adxl_ros.model.coefficients import get
@@ -76,9 +71,9 @@ class CalibrationResult:
     poses
         What it was made of and judged by.
     assessments
-        Each model beside the datasheet and the noise, the one that was taken last.
+        Acceptance of each model, the one that was taken last.
     held_out
-        Their errors on poses held out.
+        Errors of the models on held-out poses, the nominal sensor first.
     gravity_fit
         Of a calibration against gravity.
     outliers
@@ -91,8 +86,8 @@ class CalibrationResult:
     report_lines: list[str]
     summary_lines: list[str]
     poses: Poses
-    assessments: tuple[Judged, ...] = ()
-    held_out: tuple[Score, ...] = ()
+    assessments: tuple[Assessment, ...] = ()
+    held_out: tuple[HeldOutErrors, ...] = ()
     gravity_fit: gravity.GravityFit | None = None
     outliers: tuple[int, ...] = ()
 
@@ -155,31 +150,6 @@ class CalibrationResult:
             own.model, own.effects, names) and \
             there.provenance.get('data_sha256') == own.provenance['data_sha256'] and \
             bool(np.allclose(get(there, names), get(own, names), rtol=1e-6))
-
-    def report(self, folder: str | os.PathLike, kept: str | os.PathLike = '') -> None:
-        """
-        Leave the page `report.html`, and the figures of the unit as `calibration.png`.
-
-        Parameters
-        ----------
-        folder
-            Which is there.
-        kept
-            The store with the history of the unit; empty for none.
-
-        """
-        past = calibration_store.history(kept, self.fitted.serial)[0] if str(kept) else []
-        report_html.write(Path(folder) / 'report.html', self, past)
-        # Poses that do not show the paper's figures have a page, which says why.
-        with suppress(UserError):
-            self.draw(Path(folder) / 'calibration.png')
-
-    def draw(self, path: str | os.PathLike) -> None:
-        """Write the figures of this unit as PNG."""
-        if self.gravity_fit is not None:
-            write_plot(plots.gravity_rests(self.name, self.gravity_fit), path)
-        else:
-            plots.draw_sweep(path, self.nominal, self.paper_sensor, self.poses)
 
     @property
     def name(self) -> str:
@@ -266,12 +236,12 @@ def _against_stage(sensor: Sensor, parts: Sequence[Poses], model: str | None,
     sound = poses.subset(~np.isin(np.arange(len(poses)), knocked))
     # What the full model found of the stage is no error of the sensor, by any model.
     stage = found.full.unit if found.full else None
-    scores = cross_validation.held_out({'nominal': lambda sensor, _: sensor,
-                                        **{name: STAGE_FITS[name] for name in simpler},
-                                        fitted.model: found.fit}, sensor, sound, stage)
-    judgements = tuple(
-        acceptance.judge(score.model, *error_budget.parts(score, sound, stage), sensor)
-        for score in scores if score.model != 'nominal')
+    held_out = cross_validation.cross_validate({'nominal': lambda sensor, _: sensor,
+                                                **{name: STAGE_FITS[name] for name in simpler},
+                                                fitted.model: found.fit}, sensor, sound, stage)
+    assessments = tuple(
+        acceptance.assess(errors.model, error_budget.error_budgets(errors, sound, stage), sensor)
+        for errors in held_out if errors.model != 'nominal')
     predicted = np.column_stack(signal_chain.static_response(fitted)(
         reference_force(fitting, fitted.local_gravity_mps2), fitting.environment))
     residual = (fitting.volts - predicted) / fitted.scale_v_per_g * 1e3
@@ -279,21 +249,23 @@ def _against_stage(sensor: Sensor, parts: Sequence[Poses], model: str | None,
     if fitted.model == 'full':
         fitted, more = with_filter(fitted, filters)
         said = [*said, *more]
-    own = [one for one in judgements if one.model == fitted.model]
+    own = [row for row in assessments if row.model == fitted.model]
     force = np.column_stack(reference_force(poses, fitted.local_gravity_mps2))
-    fitted = replace(fitted, envelope=envelope(
-        fitted, force, poses, np.nan_to_num(np.sqrt(own[0].accel.own)).item() if own else 0.0))
+    error_mps2 = np.nan_to_num(np.sqrt(own[0].accel.calibration)).item() if own else 0.0
+    fitted = replace(fitted, envelope=envelope(fitted, force, poses, error_mps2))
     fitted = with_provenance(fitted, ', '.join(sources), poses, data_sha256, {
         'reference': 'stage', 'residual_mg': f'{np.sqrt(np.mean(residual ** 2)):.4f}',
         **({'converged': _yes(found.full.converged)} if found.full else {}),
-        **acceptance.figures(own[0] if own else None, scores)})
-    words, unit = acceptance.words(own[0], fitted) if own else [], acceptance.unit_line(fitted)
-    lines = [*refusals, *cross_validation.table(scores), *acceptance.table(judgements, scores),
+        **acceptance.provenance_entries(own[0] if own else None, held_out)})
+    words, unit = acceptance.explanation(own[0], fitted) if own else [], \
+        acceptance.unit_line(fitted)
+    lines = [*refusals, *cross_validation.table(held_out),
+             *acceptance.table(assessments, held_out),
              *words, *unit, *said]
-    brief = [*acceptance.headline(own[0] if own else None, scores), *unit,
-             *acceptance.narrow_table(judgements, scores), *words, *said, *refusals]
-    return CalibrationResult(sensor, fitted, lines, brief, poses, judgements, tuple(scores), None,
-                             knocked)
+    brief = [*acceptance.headline(own[0] if own else None, held_out), *unit,
+             *acceptance.narrow_table(assessments, held_out), *words, *said, *refusals]
+    return CalibrationResult(sensor, fitted, lines, brief, poses, assessments, tuple(held_out),
+                             None, knocked)
 
 
 def _fit(model: str, sensor: Sensor, fitting: Poses, parts: Sequence[Poses],
@@ -333,16 +305,16 @@ def _against_gravity(sensor: Sensor, poses: Poses, source: str, data_sha256: str
         sensor, model='gravity', effects=('bias', 'scale_factor', 'misalignment'),
         values=found.values, covariance=found.covariance, covariance_names=gravity.NAMES)
     force = np.column_stack(signal_chain.inverse(fitted)(list(poses.volts.T), poses.environment))
-    accel, tilt = error_budget.gravity_parts(found, fitted, force, kept)
-    own = acceptance.judge('gravity', accel, tilt, fitted)
+    budgets = error_budget.gravity_error_budgets(found, fitted, force, kept)
+    own = acceptance.assess('gravity', budgets, fitted)
     fitted = replace(fitted, envelope=envelope(fitted, force[kept], poses,
-                                               float(np.sqrt(accel.model))))
+                                               float(np.sqrt(budgets.accel.model))))
     fitted = with_provenance(fitted, source, poses, data_sha256, {
         'reference': 'gravity', 'residual_mg': f'{after:.4f}', 'leave_one_out_mg': f'{out:.4f}',
         'converged': _yes(found.converged),
-        **acceptance.figures(own, ())})
+        **acceptance.provenance_entries(own, ())})
     lines += [acceptance.gravity_line(own, found.leave_one_out_mps2[kept]),
-              *acceptance.words(own, fitted), *acceptance.unit_line(fitted)]
+              *acceptance.explanation(own, fitted), *acceptance.unit_line(fitted)]
     return CalibrationResult(sensor, fitted, lines, [*acceptance.headline(own, ()), *lines], poses,
                              (own,), (), found)
 

@@ -24,6 +24,7 @@ from adxl_ros.calibrate.calibration import CalibrationResult
 from adxl_ros.calibrate.guided.live_window import Newest, STALE_NS
 from adxl_ros.calibrate.guided.session import Session
 from adxl_ros.calibrate.guided.stage_guide import MountingError, Sweep
+from adxl_ros.calibrate.report import report_html
 from adxl_ros.errors import UserError
 from adxl_ros.files.stream_info import StreamInfo
 from adxl_ros.files.stream_unit import unit_of
@@ -361,7 +362,7 @@ class Calibration(Node):
             return
         try:
             Path(self.asked.report).mkdir(parents=True, exist_ok=True)
-            found.report(self.asked.report, self.asked.store)
+            report_html.write(self.asked.report, found, self.asked.store)
         except (UserError, OSError) as error:
             self.fail(f'no report: {error}')
 

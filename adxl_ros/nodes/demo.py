@@ -251,9 +251,10 @@ def _simulated(folder: Path, speed: float) -> None:
     fitted, held_out = parameter_file.load(output), poses.subset(poses.check)
     models = {'nominal': sensor, 'linear': linear.fit(sensor, poses.subset(~poses.check)),
               fitted.model: fitted}
-    scores = [cross_validation.score(model, cross_validation.errors(calibrated, held_out))
+    errors = [cross_validation.summarise(model,
+                                         cross_validation.pose_errors(calibrated, held_out))
               for model, calibrated in models.items()]
-    _print('', *scores_table(scores), '', *truth_table(against_truth.compare(fitted, truth)), '',
+    _print('', *error_table(errors), '', *truth_table(against_truth.compare(fitted, truth)), '',
            *verdict_lines(fitted), *added_lines(against_truth.added_effects(fitted, truth)), '',
            *file_lines({'Page': report / 'report.html', 'Calibration': output}))
 
@@ -333,11 +334,11 @@ def title(text: str, seconds: float) -> str:
     return f'{text}   ({takes})'
 
 
-def scores_table(scores: Sequence[cross_validation.Score]) -> list[str]:
+def error_table(models: Sequence[cross_validation.HeldOutErrors]) -> list[str]:
     """Lay out the errors of the models on held-out poses; the file holds the last model."""
     lines = [f' {"":24}tilt error     acceleration error     (rms)']
-    lines += [f' {_MODELS[score.model]:22} {_three_digits(score.tilt_rms_deg):>9} ° '
-              f'{_three_digits(score.accel_rms_mg):>18} mg' for score in scores]
+    lines += [f' {_MODELS[errors.model]:22} {_three_digits(errors.tilt_deg.rms):>9} ° '
+              f'{_three_digits(errors.accel_mg.rms):>18} mg' for errors in models]
     lines[-1] += '           <- saved'
     return lines
 
@@ -381,7 +382,7 @@ def verdict_lines(fitted: Sensor) -> list[str]:
     if 'own_accel_mg' not in figures:
         return [f' {acceptance.NOT_SHOWN}  no pose was kept out of the fit to judge it']
     error_mg = float(figures['own_accel_mg'])
-    limit = f'{1e3 * acceptance.linearity_mps2(fitted) / G0_MPS2:.2g} mg'
+    limit = f'{1e3 * acceptance.nonlinearity_mps2(fitted) / G0_MPS2:.2g} mg'
     accel, tilt = (figures.get(f'verdict_{name}', '') for name in ('datasheet', 'tilt_datasheet'))
     shown = f'calibration error {error_mg:#.2g} mg; the datasheet allows {limit}'
     if acceptance.FAIL in (accel, tilt):

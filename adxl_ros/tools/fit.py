@@ -21,6 +21,7 @@ from pathlib import Path
 import sys
 
 from adxl_ros.calibrate import calibration, pose_extraction
+from adxl_ros.calibrate.report import report_html
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store, parameter_file, recording, sweep_journal
 from adxl_ros.files.checksum import sha256
@@ -73,7 +74,7 @@ def fit(options: argparse.Namespace) -> int:
                                   options.effect, filters, sha256(options.recording))
     if options.report:
         make_folder(Path(options.report))
-        found.report(options.report, options.store)
+        report_html.write(options.report, found, options.store)
     found.save(options.output)
     kept = found.keep(options.store)
     print('\n'.join(found.comments()))

@@ -23,7 +23,7 @@ from datetime import date
 from pathlib import Path
 
 from adxl_ros.calibrate import calibration, pose_extraction, provenance
-from adxl_ros.calibrate.report import plots as sweep_figures
+from adxl_ros.calibrate.report import plots as sweep_figures, report_html
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.atomic_write import atomic_path
@@ -80,7 +80,7 @@ def _of_recordings(sensor: Sensor, paths: Sequence[str], folder: Path) -> str:
         unit = recorded_unit(unit, read)
         parts.append(pose_extraction.extract_poses(read, unit))
     found = calibration.calibrate(unit, parts, 'full', [Path(path).name for path in paths])
-    found.draw(folder / FIGURES / 'sweep.png')
+    report_html.draw(folder / FIGURES / 'sweep.png', found)
     lines = '\n'.join(found.comments())
     return (f"# The paper's calibration of {', '.join(paths)}\n\n```\n{lines}\n```\n\n"
             f'The paper: alpha {report_page.in_words("alpha")}; '

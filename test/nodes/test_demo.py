@@ -91,7 +91,7 @@ def test_an_interval_is_90_percent(off: float, inside: bool) -> None:
 
 
 def test_other_axes_are_refused() -> None:
-    with pytest.raises(UserError, match='axes xy, the true one xyz'):
+    with pytest.raises(UserError, match='axes xy, the true unit has xyz'):
         compare(made()[0], made(axes='xyz')[1])
 
 
@@ -166,11 +166,12 @@ def test_table_of_the_truth_has_room() -> None:
 
 
 def test_table_of_scores() -> None:
-    errors = cross_validation.Errors(*np.zeros((2, 3)), np.full((3, 2), 0.45),
+    errors = cross_validation.PoseErrors(*np.zeros((2, 3)), np.full((3, 2), 0.45),
                                      np.radians(np.full(3, 7.2)), np.zeros((3, 3)))
-    scores = [cross_validation.score('nominal', errors), cross_validation.score('full', replace(
-        errors, accel_mps2=errors.accel_mps2 / 100, tilt_rad=np.full(3, np.nan)))]
-    lines = demo.scores_table(scores)
+    fitted = replace(errors, accel_mps2=errors.accel_mps2 / 100, tilt_rad=np.full(3, np.nan))
+    models = [cross_validation.summarise('nominal', errors),
+              cross_validation.summarise('full', fitted)]
+    lines = demo.error_table(models)
     assert lines[1].split() == ['datasheet', 'values', '7.20', '°', '45.9', 'mg']
     assert lines[2].split() == ['full', 'calibration', '-', '°', '0.459', 'mg', '<-', 'saved']
     assert lines[1].index('45.9') + 1 == lines[2].index('0.459')

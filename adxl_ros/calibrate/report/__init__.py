@@ -12,4 +12,4 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""How good a calibration is, and its pages and plots."""
+"""Quality of a calibration: held-out errors, error budget, acceptance, drift, plots, page."""

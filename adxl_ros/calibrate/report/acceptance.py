@@ -12,172 +12,243 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Whether a calibration passes: against the datasheet, against the noise, and what limits it."""
+"""Acceptance of a calibration: PASS or FAIL against the datasheet and against the noise."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from adxl_ros.calibrate.report.cross_validation import rms_interval, Score
-from adxl_ros.calibrate.report.error_budget import milli_g, own_noise_mps2, Parts
+from adxl_ros.calibrate.report.cross_validation import (
+    ErrorStatistic,
+    HeldOutErrors,
+    rms_interval,
+)
+from adxl_ros.calibrate.report.error_budget import (
+    ErrorBudget,
+    ErrorBudgets,
+    rms_mg,
+    sample_noise_mps2,
+)
 from adxl_ros.model.coefficients import get, parameter_of
 from adxl_ros.model.constants import G0_MPS2, Z_90
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
-PASS, FAIL, NOT_SHOWN = 'PASS', 'FAIL', 'NOT SHOWN'
-_CLOSE = 0.2
-_LINEARITY = Coefficient('nonlinearity', 'cubic_per_g2')
+PASS = 'PASS'
+"""The whole 90 % interval of the error keeps the limit."""
+FAIL = 'FAIL'
+"""The error exceeds the limit."""
+NOT_SHOWN = 'NOT SHOWN'
+"""The error keeps the limit, but its 90 % interval does not."""
+_CHANCE_SHARE = 0.2
+"""Largest difference of measured and expected mean square that needs no comment; chosen."""
+_NONLINEARITY = Coefficient('nonlinearity', 'cubic_per_g2')
+"""Parameter whose typical datasheet value is the limit of acceleration."""
 
 
 @dataclass(frozen=True)
-class Judged:
+class Assessment:
     """
-    One model beside what it could be.
+    One model against its limits. Outcomes are PASS, FAIL, NOT SHOWN, or '' without a limit.
 
     Attributes
     ----------
     model
-        Its name.
+        Name of the model.
     accel, tilt
-        What its errors are made of, (m/s²)² an axis and rad².
-    datasheet, noise
-        Of acceleration: PASS, FAIL or NOT SHOWN; empty where there is no such bar.
-    tilt_datasheet, tilt_noise
-        Of tilt.
-    limit
-        'noise', 'stage', 'model' or 'stage or model'.
+        Error budgets of acceleration, (m/s²)² per axis, and of tilt, rad².
+    accel_datasheet, tilt_datasheet
+        Outcomes against the typical nonlinearity of the datasheet.
+    accel_noise, tilt_noise
+        Outcomes against the noise of one sample.
 
     """
 
     model: str
-    accel: Parts
-    tilt: Parts
-    datasheet: str
-    noise: str
-    limit: str
+    accel: ErrorBudget
+    tilt: ErrorBudget
+    accel_datasheet: str
+    accel_noise: str
     tilt_datasheet: str = ''
     tilt_noise: str = ''
 
-    def worst(self, bar: str) -> str:
-        """Return the worse of acceleration's and tilt's verdict against `datasheet` or `noise`."""
-        both = getattr(self, bar), getattr(self, f'tilt_{bar}')
-        return next((one for one in (FAIL, NOT_SHOWN, PASS) if one in both), '')
+    @property
+    def datasheet(self) -> str:
+        """Return the worse outcome of acceleration and tilt against the datasheet."""
+        return _worse(self.accel_datasheet, self.tilt_datasheet)
 
     @property
-    def own_mg(self) -> float:
-        """Return what the calibration itself errs by, mg rms over the axes."""
-        return milli_g(self.accel.own)
+    def noise(self) -> str:
+        """Return the worse outcome of acceleration and tilt against the noise."""
+        return _worse(self.accel_noise, self.tilt_noise)
 
     @property
-    def own_deg(self) -> float:
-        """Return what it errs by in tilt, deg rms; NaN where no pose shows it."""
-        return float(np.degrees(np.sqrt(self.tilt.own)))
+    def limited_by(self) -> str:
+        """Return 'noise', 'stage', 'model' or 'stage or model'."""
+        return self.accel.limited_by
+
+    @property
+    def error_mg(self) -> float:
+        """Return the error of the calibration itself, mg rms over the axes."""
+        return rms_mg(self.accel.calibration)
+
+    @property
+    def error_deg(self) -> float:
+        """Return the tilt error of the calibration itself, deg rms; NaN where no pose shows it."""
+        return float(np.degrees(np.sqrt(self.tilt.calibration)))
 
 
-def judge(model: str, accel: Parts, tilt: Parts, sensor: Sensor) -> Judged:
+def _worse(*outcomes: str) -> str:
+    return next((outcome for outcome in (FAIL, NOT_SHOWN, PASS) if outcome in outcomes), '')
+
+
+def assess(model: str, budgets: ErrorBudgets, sensor: Sensor) -> Assessment:
     """
-    Judge one model by what it errs by itself, noise and stage of the check taken out.
+    Assess the error of one model itself, without noise and stage error of the check.
 
-    Against the datasheet: no more than the nonlinearity at full scale that the maker calls
-    typical, the only error that his own calibration leaves. Against the noise: no more than that
-    of one sample, rms over the axes. Tilt: no more than such errors on each axis make of it. An
-    error whose 90 % interval reaches beyond the bar is not shown to keep it.
+    The limit by the datasheet is the typical nonlinearity at full scale, the only error that the
+    manufacturer's own calibration leaves. The limit by the noise is that of one sample, rms over
+    the axes. The limits of tilt follow from such errors on each axis. NOT SHOWN is an error whose
+    90 % interval exceeds the limit.
+
+    Parameters
+    ----------
+    model
+        Name of the model.
+    budgets
+        From `error_budget`.
+    sensor
+        The unit with its datasheet values and noise.
+
+    Returns
+    -------
+    Assessment
+        The outcomes against all limits.
+
     """
-    bars = [bar ** 2 for bar in (linearity_mps2(sensor), own_noise_mps2(sensor))]
-    limit = accel.limit
-    if not accel.apart and max(accel.model, accel.fit) > max(accel.noise, accel.stage):
-        limit = 'stage or model'
-    datasheet, noise = (_against(accel, bar) for bar in bars)
-    tilted = [_against(tilt, bar * tilt.per_axis) for bar in bars]
-    return Judged(model, accel, tilt, datasheet, noise, limit, *tilted)
+    datasheet, noise = nonlinearity_mps2(sensor) ** 2, sample_noise_mps2(sensor) ** 2
+    accel, tilt = budgets
+    return Assessment(model, accel, tilt, _outcome(accel, datasheet), _outcome(accel, noise),
+                      _outcome(tilt, datasheet * tilt.tilt_per_axis),
+                      _outcome(tilt, noise * tilt.tilt_per_axis))
 
 
-def _against(parts: Parts, bar: float) -> str:
-    if not bar > 0:
+def _outcome(budget: ErrorBudget, limit: float) -> str:
+    """Compare the error of a calibration with a limit, both mean squares."""
+    if not limit > 0:
         return ''
-    sure = parts.own if parts.apart else parts.fit
-    if sure > bar:
+    shown = budget.calibration if budget.separable else budget.coefficients
+    if shown > limit:
         return FAIL
-    return PASS if parts.own_most <= bar else NOT_SHOWN
+    return PASS if budget.calibration_high <= limit else NOT_SHOWN
 
 
-def linearity_mps2(sensor: Sensor) -> float:
+def nonlinearity_mps2(sensor: Sensor) -> float:
     """Return the typical nonlinearity at full scale by the datasheet, m/s²; 0 if not stated."""
-    typical, _ = sensor.datasheet.get(_LINEARITY, (0.0, 0.0))
+    typical, _ = sensor.datasheet.get(_NONLINEARITY, (0.0, 0.0))
     return typical * sensor.range_g ** 3 * G0_MPS2
 
 
 def beyond_datasheet(sensor: Sensor) -> list[str]:
-    """Name the coefficients whose whole 90 % interval is beyond the datasheet's greatest."""
-    found = []
-    std = np.sqrt(np.diag(sensor.covariance))
-    for name, value, s in zip(sensor.covariance_names, get(sensor, sensor.covariance_names), std):
-        _, most = sensor.datasheet.get(name.without_axis, (0.0, 0.0))
-        if most and abs(value) - Z_90 * s > most:
-            found.append(f'{name} is {value:.4g} +- {Z_90 * s:.2g} {parameter_of(name).unit}, '
-                         f'beyond {most:g}')
-    return found
+    """Name the coefficients whose whole 90 % interval exceeds the datasheet's maximum."""
+    lines = []
+    stds = np.sqrt(np.diag(sensor.covariance))
+    values = get(sensor, sensor.covariance_names)
+    for name, value, std in zip(sensor.covariance_names, values, stds):
+        _, maximum = sensor.datasheet.get(name.without_axis, (0.0, 0.0))
+        half_width = Z_90 * std
+        if maximum and abs(value) - half_width > maximum:
+            lines.append(f'{name} is {value:.4g} +- {half_width:.2g} {parameter_of(name).unit}, '
+                         f'beyond {maximum:g}')
+    return lines
 
 
-def table(judged: Sequence[Judged], scores: Sequence[Score]) -> list[str]:
-    """Lay the verdicts out for a terminal; models are those of `scores`."""
-    lines = [f'{"verdict":9} {"tilt rms (90 %) deg":>23} {"accel rms (90 %) mg":>23}  '
-             f'{"own mg":>7}  {"datasheet":9} {"noise":9} limited by']
-    of = {score.model: score for score in scores}
-    for one in judged:
-        score = of[one.model]
+def table(assessments: Sequence[Assessment], models: Sequence[HeldOutErrors]) -> list[str]:
+    """
+    Return errors and outcomes of all models as lines for a terminal.
+
+    Parameters
+    ----------
+    assessments
+        One for each row.
+    models
+        Held-out errors of the same models, and of others.
+
+    Returns
+    -------
+    list of str
+        The head, and a line for each assessment.
+
+    """
+    lines = [f'{"model":9} {"tilt rms (90 %) deg":>23} {"accel rms (90 %) mg":>23}  '
+             f'{"error mg":>8}  {"datasheet":9} {"noise":9} limited by']
+    errors_of = {errors.model: errors for errors in models}
+    for row in assessments:
+        errors = errors_of[row.model]
         lines.append(
-            f'{one.model:9} {_interval(score.tilt_rms_deg, score.intervals["tilt"])} '
-            f'{_interval(score.accel_rms_mg, score.intervals["accel"])}  '
-            f'{one.own_mg:7.3f}  {one.datasheet or "-":9} {one.noise:9} '
-            f'{one.limit}')
+            f'{row.model:9} {_with_interval(errors.tilt_deg)} {_with_interval(errors.accel_mg)}  '
+            f'{row.error_mg:8.3f}  {row.accel_datasheet or "-":9} {row.accel_noise:9} '
+            f'{row.limited_by}')
     return lines
 
 
-def words(judged: Judged, sensor: Sensor) -> list[str]:
-    """Say what the bars are, and what the errors of the model that was taken are made of."""
-    accel = judged.accel
-    bar = linearity_mps2(sensor)
-    lines = ['own: what the calibration itself errs by, noise and stage of the check taken out; '
-             + (f'at most {1e3 * bar / G0_MPS2:.2g} mg by the datasheet (typical nonlinearity at '
-                'full scale), ' if bar else 'no bar by a datasheet, ')
-             + f'{1e3 * own_noise_mps2(sensor) / G0_MPS2:.2g} mg by the noise of one sample']
-    made = ', '.join(f'{name} {milli_g(getattr(accel, name)):.3f}'
-                     for name in ('noise', 'stage', 'fit', 'model'))
-    turned = '' if np.isnan(judged.own_deg) else \
-        f'; its own tilt error is {judged.own_deg:.3f} deg rms'
-    if judged.model == 'gravity':
-        # The fit's part is of all directions, and what was seen a magnitude.
-        lines.append(f'gravity: noise of the means {milli_g(accel.noise):.3f} mg, what nine '
-                     f'parameters leave {milli_g(accel.model):.3f} mg, the fit, each direction, '
-                     f'{milli_g(accel.fit):.3f} mg{turned}')
+def explanation(assessment: Assessment, sensor: Sensor) -> list[str]:
+    """
+    State the limits, and the parts of the error of the model that was taken.
+
+    Parameters
+    ----------
+    assessment
+        Of that model.
+    sensor
+        The unit with its datasheet values and noise.
+
+    Returns
+    -------
+    list of str
+        Lines of text.
+
+    """
+    accel = assessment.accel
+    limit_mps2, noise_mps2 = nonlinearity_mps2(sensor), sample_noise_mps2(sensor)
+    tilt = '' if np.isnan(assessment.error_deg) else f' and {assessment.error_deg:.3f} deg'
+    datasheet = f'limit by the datasheet {1e3 * limit_mps2 / G0_MPS2:.2g} mg (typical ' \
+        'nonlinearity at full scale)' if limit_mps2 else 'no limit by a datasheet'
+    lines = [f'calibration error {assessment.error_mg:.3f} mg{tilt} rms, without noise and stage '
+             'error of the check',
+             f'{datasheet}; limit by the noise of one sample {1e3 * noise_mps2 / G0_MPS2:.2g} mg']
+    part = {name: f'{name} {rms_mg(getattr(accel, name)):.3f}'
+            for name in ('noise', 'stage', 'coefficients', 'model')}
+    if assessment.model == 'gravity':
+        # The part of the coefficients is of all directions; the measured error is of a magnitude.
+        lines.append(f'gravity: {part["noise"]} mg, {part["model"]} mg; {part["coefficients"]} mg '
+                     'in each direction')
     else:
-        known = accel.noise + accel.stage + accel.fit + accel.model
-        # The fit's covariance may promise more than these poses happened to show, or less.
-        chance = '' if abs(known - accel.seen) < _CLOSE * accel.seen else \
-            ' (by their covariances: what is seen departs from that by chance)'
-        lines.append(f'{judged.model}: {milli_g(accel.seen):.3f} mg seen, of {made} in '
-                     f'squares{chance}{turned}')
-    if judged.tilt_noise:
-        lines.append('tilt, by what such errors of the axes make of it: ' + ', '.join(
-            f'at most {_turned_deg(judged, bar):.2g} deg by the {name}: {said}'
-            for name, bar, said in (
-                ('datasheet', bar, judged.tilt_datasheet),
-                ('noise', own_noise_mps2(sensor), judged.tilt_noise)) if said))
-    if not accel.apart:
-        lines.append('no pose was visited twice: stage and model are not told apart')
+        # The covariance of the coefficients may predict more, or less, than these poses show.
+        by_chance = abs(accel.expected - accel.measured) >= _CHANCE_SHARE * accel.measured
+        lines.append(f'expected {rms_mg(accel.expected):.3f} mg = {", ".join(part.values())} '
+                     f'(squares add); measured {rms_mg(accel.measured):.3f} mg'
+                     + (', which differs by chance' if by_chance else ''))
+    limits = [
+        f'{_tilt_deg(assessment, limit):.2g} deg by the {name}: {outcome}'
+        for name, limit, outcome in (('datasheet', limit_mps2, assessment.tilt_datasheet),
+                                     ('noise', noise_mps2, assessment.tilt_noise)) if outcome]
+    if assessment.tilt_noise:
+        lines.append(f'limits of tilt: {", ".join(limits)}')
+    if not accel.separable:
+        lines.append('no pose was visited twice: stage and model are inseparable')
     return lines
 
 
-def _turned_deg(judged: Judged, bar_mps2: float) -> float:
-    return float(np.degrees(bar_mps2 * np.sqrt(judged.tilt.per_axis)))
+def _tilt_deg(assessment: Assessment, accel_mps2: float) -> float:
+    """Return the tilt that an acceleration error of each axis causes, deg rms."""
+    return float(np.degrees(accel_mps2 * np.sqrt(assessment.tilt.tilt_per_axis)))
 
 
 def unit_line(sensor: Sensor) -> list[str]:
-    """Say whether the unit itself is what its datasheet promises; nothing without one."""
+    """Return a line that compares the unit with its datasheet; none without a datasheet."""
     if not sensor.datasheet:
         return []
     beyond = beyond_datasheet(sensor)
@@ -185,71 +256,141 @@ def unit_line(sensor: Sensor) -> list[str]:
             + (f'{FAIL}: {"; ".join(beyond)}' if beyond else PASS)]
 
 
-def headline(judged: Judged | None, scores: Sequence[Score]) -> list[str]:
-    """Say in one line how the model that was taken does, and in one what it errs by."""
-    if judged is None:
-        return ['not judged: too few poses to hold some of them out']
-    against = ', '.join(f'{bar} {worst}' for bar in ('datasheet', 'noise')
-                        if (worst := judged.worst(bar)))
-    limit = 'stage or model' if judged.limit == 'stage or model' else f'the {judged.limit}'
-    lines = [f'{judged.model}: {against}; limited by {limit}']
-    for score in scores:
-        if score.model == judged.model:
-            tilt = '' if np.isnan(score.tilt_rms_deg) else \
-                f'tilt {score.tilt_rms_deg:.2g}° rms, {score.tilt_max_deg:.2g}° max; '
-            lines.append(f'held out: {tilt}accel {score.accel_rms_mg:.2g} mg rms, '
-                         f'{score.accel_max_mg:.2g} mg max')
+def headline(assessment: Assessment | None, models: Sequence[HeldOutErrors]) -> list[str]:
+    """
+    State outcomes and held-out errors of the model that was taken, in a line each.
+
+    Parameters
+    ----------
+    assessment
+        Of that model; None where no pose was held out.
+    models
+        Held-out errors of all models.
+
+    Returns
+    -------
+    list of str
+        One or two lines.
+
+    """
+    if assessment is None:
+        return ['not assessed: too few poses to hold some of them out']
+    outcomes = {'datasheet': assessment.datasheet, 'noise': assessment.noise}
+    against = ', '.join(f'{name} {outcome}' for name, outcome in outcomes.items() if outcome)
+    cause = assessment.limited_by
+    lines = [f'{assessment.model}: {against}; limited by '
+             + (cause if cause == 'stage or model' else f'the {cause}')]
+    for errors in models:
+        if errors.model == assessment.model:
+            tilt, accel = errors.tilt_deg, errors.accel_mg
+            shown = '' if np.isnan(tilt.rms) else \
+                f'tilt {tilt.rms:.2g}° rms, {tilt.largest:.2g}° max; '
+            lines.append(f'held out: {shown}accel {accel.rms:.2g} mg rms, {accel.largest:.2g} mg '
+                         'max')
     return lines
 
 
-def narrow_table(judged: Sequence[Judged], scores: Sequence[Score]) -> list[str]:
-    """Lay the models out in 79 columns, the simplest first; none without scores."""
-    of, bars = {one.model: one for one in judged}, f'{"datasheet":9} {"noise":9}'
-    lines = [f'{"held out":8} {"tilt rms/max°":>14} {bars} {"mg rms/max":>14} {bars}'.rstrip()]
-    for score in scores:
-        own = of.get(score.model)
-        tilted, accel = [(own.tilt_datasheet, own.tilt_noise), (own.datasheet, own.noise)] \
-            if own else [('', '')] * 2
-        lines.append(f'{score.model:8} {_pair(score.tilt_rms_deg, score.tilt_max_deg, *tilted)} '
-                     f'{_pair(score.accel_rms_mg, score.accel_max_mg, *accel)}'.rstrip())
-    return lines if scores else []
+def narrow_table(assessments: Sequence[Assessment], models: Sequence[HeldOutErrors]
+                 ) -> list[str]:
+    """
+    Return errors and outcomes of all models in at most 79 columns, the simplest model first.
+
+    Parameters
+    ----------
+    assessments
+        Of some of the models.
+    models
+        Held-out errors, one row each.
+
+    Returns
+    -------
+    list of str
+        The head, and a line for each model; nothing without models.
+
+    """
+    if not models:
+        return []
+    row_of, limits = {row.model: row for row in assessments}, f'{"datasheet":9} {"noise":9}'
+    lines = [
+        f'{"held out":8} {"tilt rms/max°":>14} {limits} {"mg rms/max":>14} {limits}'.rstrip()]
+    for errors in models:
+        row = row_of.get(errors.model)
+        tilt = (row.tilt_datasheet, row.tilt_noise) if row else ('', '')
+        accel = (row.accel_datasheet, row.accel_noise) if row else ('', '')
+        lines.append(f'{errors.model:8} {_cell(errors.tilt_deg, *tilt)} '
+                     f'{_cell(errors.accel_mg, *accel)}'.rstrip())
+    return lines
 
 
-def _pair(rms: float, most: float, datasheet: str, noise: str) -> str:
-    shown = '-' if np.isnan(rms) else f'{rms:.3f}/{most:.3f}'
+def _cell(statistic: ErrorStatistic, datasheet: str, noise: str) -> str:
+    shown = '-' if np.isnan(statistic.rms) else f'{statistic.rms:.3f}/{statistic.largest:.3f}'
     return f'{shown:>14} {datasheet:9} {noise:9}'
 
 
-def gravity_line(judged: Judged, left_out_mps2: np.ndarray) -> str:
-    """Lay out the verdict of a calibration against gravity, whose only figure is a magnitude."""
-    mg = left_out_mps2 / G0_MPS2 * 1e3
+def gravity_line(assessment: Assessment, leave_one_out_mps2: np.ndarray) -> str:
+    """
+    State errors and outcomes of a calibration against gravity in one line.
+
+    Parameters
+    ----------
+    assessment
+        Of that calibration.
+    leave_one_out_mps2
+        Error of the magnitude of gravity at each rest by the fit to all others, m/s², (k,).
+
+    Returns
+    -------
+    str
+        The line.
+
+    """
+    mg = leave_one_out_mps2 / G0_MPS2 * 1e3
     low, high = rms_interval(mg)
-    return (f'verdict: rests left out {np.sqrt(np.mean(mg ** 2)):.3f} ({low:.3f} to {high:.3f}) '
-            f'mg rms, {np.abs(mg).max():.3f} max; datasheet {judged.datasheet or "-"}, noise '
-            f'{judged.noise}; limited by the {judged.limit}')
+    return (f'held-out rests: {np.sqrt(np.mean(mg ** 2)):.3f} ({low:.3f} to {high:.3f}) mg rms, '
+            f'{np.abs(mg).max():.3f} max; datasheet {assessment.accel_datasheet or "-"}, noise '
+            f'{assessment.accel_noise}; limited by the {assessment.limited_by}')
 
 
-def figures(judged: Judged | None, scores: Sequence[Score]) -> dict[str, str]:
-    """Return the figures of the model that was taken for the provenance; NaN are left out."""
-    if judged is None:
+def provenance_entries(assessment: Assessment | None, models: Sequence[HeldOutErrors]
+                       ) -> dict[str, str]:
+    """
+    Return the entries of the provenance about the model that was taken, without NaN.
+
+    Parameters
+    ----------
+    assessment
+        Of that model; None gives no entries.
+    models
+        Held-out errors of all models.
+
+    Returns
+    -------
+    dict
+        Text by key.
+
+    """
+    if assessment is None:
         return {}
-    found = {'own_accel_mg': judged.own_mg,
-             'own_tilt_deg': judged.own_deg}
-    for score in scores:
-        if score.model == judged.model:
-            found |= {'held_out_poses': score.poses, 'held_out_tilt_rms_deg': score.tilt_rms_deg,
-                      'held_out_tilt_max_deg': score.tilt_max_deg,
-                      'held_out_accel_rms_mg': score.accel_rms_mg,
-                      'held_out_accel_max_mg': score.accel_max_mg}
-    return {**{key: f'{value:.4g}' for key, value in found.items() if np.isfinite(value)},
-            **({'verdict_datasheet': judged.datasheet} if judged.datasheet else {}),
-            'verdict_noise': judged.noise,
-            **{f'verdict_tilt_{name}': said for name, said in (
-                ('datasheet', judged.tilt_datasheet), ('noise', judged.tilt_noise)) if said},
-            'limited_by': judged.limit}
+    numbers: dict[str, float] = {'own_accel_mg': assessment.error_mg,
+                                 'own_tilt_deg': assessment.error_deg}
+    for errors in models:
+        if errors.model == assessment.model:
+            numbers |= {'held_out_poses': errors.pose_count,
+                        'held_out_tilt_rms_deg': errors.tilt_deg.rms,
+                        'held_out_tilt_max_deg': errors.tilt_deg.largest,
+                        'held_out_accel_rms_mg': errors.accel_mg.rms,
+                        'held_out_accel_max_mg': errors.accel_mg.largest}
+    outcomes = {'verdict_datasheet': assessment.accel_datasheet,
+                'verdict_noise': assessment.accel_noise,
+                'verdict_tilt_datasheet': assessment.tilt_datasheet,
+                'verdict_tilt_noise': assessment.tilt_noise}
+    return {**{key: f'{value:.4g}' for key, value in numbers.items() if np.isfinite(value)},
+            **{key: outcome for key, outcome in outcomes.items() if outcome},
+            'limited_by': assessment.limited_by}
 
 
-def _interval(rms: float, ends: tuple[float, float]) -> str:
-    if np.isnan(rms):
+def _with_interval(statistic: ErrorStatistic) -> str:
+    if np.isnan(statistic.rms):
         return f'{"-":>23}'
-    return f'{f"{rms:.3f} ({ends[0]:.3f} to {ends[1]:.3f})":>23}'
+    low, high = statistic.interval
+    return f'{f"{statistic.rms:.3f} ({low:.3f} to {high:.3f})":>23}'

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""A fitted unit beside its true coefficients, which are known of a simulated unit alone."""
+"""Comparison of fitted coefficients with the true ones of a simulated unit."""
 
 from __future__ import annotations
 
@@ -30,9 +30,10 @@ from adxl_ros.model.sensor import Sensor
 import numpy as np
 
 _SCALE = Coefficient('scale_factor', 'offset_v_per_g')
+"""Parameter that takes the length of a direction."""
 _ABSOLUTE = {Coefficient('bias', 'offset_v'): 'nominal_zero_g_v',
              _SCALE: 'nominal_scale_v_per_g'}
-"""Coefficients that are departures from a nominal figure, and that figure."""
+"""Parameters that are departures from a nominal value, and the field of that value."""
 _LABELS = {
     'bias.offset_v': 'zero-g',
     'scale_factor.offset_v_per_g': 'scale factor',
@@ -47,34 +48,37 @@ _LABELS = {
     'scale_factor_z.quadratic_per_g2': 'scale, {other}²',
     'nonlinearity.cubic_per_g2': 'cubic',
 }
-"""Coefficients in words; {other} is the axis that acts on the own axis."""
+"""Parameters in words; {other} is the axis that acts on the measured axis."""
 _OTHER = {effect.EFFECT.name: effect.OTHER
           for effect in (cross_axis, cross_axis_z, scale_factor_cross, scale_factor_z)}
+"""By effect: index of the axis that acts on x, y and z."""
 _ANGLES = (Coefficient('misalignment', 'alpha_rad'), Coefficient('misalignment', 'beta_rad'))
+"""Parameters of the direction of an axis."""
 _LINEAR = (Coefficient('cross_axis', 'linear'), Coefficient('cross_axis_z', 'linear'))
+"""Parameters that a misalignment equals to first order."""
 
 
 @dataclass(frozen=True)
 class Comparison:
     """
-    One fitted coefficient beside the true one.
+    A fitted coefficient and its true value.
 
     Attributes
     ----------
     name
         'effect.parameter', as in the parameter file.
     axis
-        'x', 'y' or 'z'; empty for a coefficient of the whole unit.
+        'x', 'y' or 'z'; empty for a coefficient of all axes.
     label
         The coefficient in words.
     unit
-        Unit of the values: that of the parameter, but degrees for an angle.
+        Unit of the values: degrees for an angle, else the unit of the parameter.
     fitted
         The fitted value. Zero-g and scale factor are absolute, in V and V/g.
     half_width
         Half of the 90 % interval.
     truth
-        The true value; 0 for what the unit does not have.
+        The true value; 0 for an effect that the unit does not have.
 
     """
 
@@ -88,7 +92,7 @@ class Comparison:
 
     @property
     def inside(self) -> bool:
-        """Tell whether the 90 % interval holds the true value."""
+        """Return whether the 90 % interval contains the true value."""
         return abs(self.fitted - self.truth) <= self.half_width
 
 
@@ -102,19 +106,24 @@ def compare(fitted: Sensor, truth: Sensor) -> list[Comparison]:
     Parameters
     ----------
     fitted
-        With the covariance of its coefficients.
+        The fitted unit with the covariance of its coefficients.
     truth
         The same unit with its true coefficients.
+
+    Returns
+    -------
+    list of Comparison
+        One for each fitted coefficient.
 
     Raises
     ------
     UserError
-        The two have other axes.
+        The units have different axes.
 
     """
     if fitted.axes != truth.axes:
-        raise UserError(f'the fitted unit has the axes {fitted.axes}, the true one {truth.axes}; '
-                        'compare parameter files of one unit')
+        raise UserError(f'the fitted unit has the axes {fitted.axes}, the true unit has '
+                        f'{truth.axes}; compare parameter files of one unit')
     names = fitted.covariance_names
     truth = _in_gauge_of_fit(truth, names)
     half_widths = Z_90 * np.sqrt(np.diag(fitted.covariance))
@@ -123,7 +132,20 @@ def compare(fitted: Sensor, truth: Sensor) -> list[Comparison]:
 
 
 def added_effects(fitted: Sensor, truth: Sensor) -> list[str]:
-    """Name the effects that the fit has beyond the full model and that the unit does not have."""
+    """
+    Return the effects of the fit that neither the full model nor the unit has.
+
+    Parameters
+    ----------
+    fitted, truth
+        The fitted unit, and the same unit with its true coefficients.
+
+    Returns
+    -------
+    list of str
+        Names of effects.
+
+    """
     expected = {*full_model.default_terms(fitted.axes), *truth.effects}
     return [effect for effect in fitted.effects if effect not in expected]
 
@@ -141,7 +163,7 @@ def _compared(name: Coefficient, fitted: float, half_width: float, truth: float)
 
 
 def _absolute(sensor: Sensor, names: tuple[Coefficient, ...]) -> np.ndarray:
-    """Return coefficients, zero-g and scale factor with their nominal figures, (p,)."""
+    """Return coefficients; zero-g and scale factor include their nominal values, (p,)."""
     values = get(sensor, names)
     for i, name in enumerate(names):
         nominal = _ABSOLUTE.get(name.without_axis)
@@ -151,14 +173,14 @@ def _absolute(sensor: Sensor, names: tuple[Coefficient, ...]) -> np.ndarray:
 
 
 def _in_gauge_of_fit(truth: Sensor, names: tuple[Coefficient, ...]) -> Sensor:
-    """Return the true unit with every effect of the fit, and no linear term that it lacks."""
+    """Return the true unit with all effects of the fit, and without linear terms it lacks."""
     effects = [name.effect for name in (*names, *_LINEAR, *_ANGLES, _SCALE)]
-    same = truth = with_neutral(truth, effects)
+    equivalent = truth = with_neutral(truth, effects)
     for axis in truth.axes:
         moved = [name for name in _on(axis, _LINEAR) if name not in names]
         if moved and all(name in names for name in _on(axis, _ANGLES)):
-            same = put(same, *_as_misalignment(truth, axis, moved))
-    return same
+            equivalent = put(equivalent, *_as_misalignment(truth, axis, moved))
+    return equivalent
 
 
 def _on(axis: str, parameters: Sequence[Coefficient]) -> list[Coefficient]:
@@ -172,7 +194,16 @@ def _as_misalignment(truth: Sensor, axis: str, moved: list[Coefficient]
     Move linear cross-axis terms of one axis into its misalignment and its scale factor.
 
     A_d + p·A_c = (Θ_d + p·Θ_c)·f is again a projection of the specific force, along another
-    direction and by its length. Products of p with the other terms are left out.
+    direction and scaled by its length. Products of p with the other terms are neglected.
+
+    Parameters
+    ----------
+    truth
+        The unit with the linear terms.
+    axis
+        The axis 'x', 'y' or 'z'.
+    moved
+        The linear coefficients to move.
 
     Returns
     -------
@@ -180,20 +211,20 @@ def _as_misalignment(truth: Sensor, axis: str, moved: list[Coefficient]
         Names of the coefficients that change, and their new values.
 
     """
-    own = AXES.index(axis)
-    along = _direction(truth, own)
+    case_axis = AXES.index(axis)
+    along = _direction(truth, case_axis)
     for name in moved:
         linear, = get(truth, [name])
-        along = along + linear * _direction(truth, _OTHER[name.effect][own])
+        along = along + linear * _direction(truth, _OTHER[name.effect][case_axis])
     length = float(np.linalg.norm(along))
     d = truth.axes.index(axis)
     scale = truth.scale_v_per_g[d] * length - truth.nominal_scale_v_per_g[d]
     changed = [*_on(axis, (*_ANGLES, _SCALE)), *moved]
-    return changed, [*_alpha_beta(own, along / length), float(scale), *[0.0] * len(moved)]
+    return changed, [*_alpha_beta(case_axis, along / length), float(scale), *[0.0] * len(moved)]
 
 
 def _direction(sensor: Sensor, axis: int) -> np.ndarray:
-    """Return the direction of an axis in the case; one that is not measured is aligned."""
+    """Return the direction of an axis in the case; an unmeasured axis is aligned."""
     if AXES[axis] not in sensor.axes:
         return np.eye(3)[axis]
     return np.array(direction(axis, *get(sensor, _on(AXES[axis], _ANGLES))))

@@ -12,12 +12,12 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""How good a calibration is, on poses that it has not seen."""
+"""Cross-validation of calibration models: errors on poses that a fit has not seen."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, fields
 
 from adxl_ros.calibrate.pose_response import stage_force
 from adxl_ros.calibrate.poses import Poses, reference_force
@@ -31,27 +31,31 @@ import numpy as np
 from scipy.stats import chi2
 
 Fit = Callable[[Sensor, Poses], Sensor]
-"""Fits a nominal sensor to poses."""
+"""A function that fits a nominal sensor to poses."""
 
 _FOLDS = 5
-_BLIND_RAD = np.radians(1.0)
-"""Poses that show an angle worse than this are not scored for it (alpha near ±90° without z)."""
+"""Number of folds where no pose is marked as a check pose; chosen: the usual number."""
+_MAX_ANGLE_STD_RAD = np.radians(1.0)
+"""Largest standard deviation of an angle, rad, at which its error counts; chosen.
+
+Without z, alpha is poorly determined near ±90°.
+"""
 
 
 @dataclass(frozen=True)
-class Errors:
+class PoseErrors:
     """
-    Errors pose by pose.
+    Errors of a calibrated sensor, pose by pose.
 
     Attributes
     ----------
     alpha_rad, beta_rad
-        rad, (k,), NaN where the pose does not show one.
+        Measured minus reference, rad, (k,). NaN where the pose does not determine the angle.
     accel_mps2
         Along the measured axes, m/s², (k, m).
     tilt_rad
-        Angle between the measured and the promised vertical, rad, (k,); NaN where the pose does
-        not show alpha.
+        Angle between the measured and the reference vertical, rad, (k,). NaN where the pose does
+        not determine alpha.
     force_mps2
         The measured specific force, m/s², (k, 3).
 
@@ -65,55 +69,92 @@ class Errors:
 
 
 @dataclass(frozen=True)
-class Score:
+class ErrorStatistic:
     """
-    Errors of one model over held-out poses; angles in degrees, acceleration in mg.
+    Size of one kind of error over all poses; NaN where no pose shows it.
 
     Attributes
     ----------
-    intervals
-        90 % interval of each rms, by 'tilt', 'alpha', 'beta' and 'accel'.
-    errors, index
-        The errors behind them, and the numbers of their poses, (k,).
-    fitted, fold
-        The units that were scored, and the number of that of each pose, (k,).
+    rms
+        Root mean square.
+    largest
+        Largest magnitude.
+    interval
+        90 % interval of the rms.
+
+    """
+
+    rms: float
+    largest: float
+    interval: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class HeldOutErrors:
+    """
+    Errors of one model over held-out poses.
+
+    Attributes
+    ----------
+    model
+        Name of the model.
+    tilt_deg, alpha_deg, beta_deg
+        Errors of the angles, degrees.
+    accel_mg
+        Error of acceleration over the measured axes, mg.
+    errors
+        The errors of all held-out poses.
+    pose_index
+        Index of each held-out pose among all poses, (k,).
+    fitted
+        The fitted sensor of each fold.
+    fold
+        Index in `fitted` of the sensor that measured each pose, (k,).
 
     """
 
     model: str
-    poses: int
-    tilt_rms_deg: float
-    tilt_max_deg: float
-    alpha_rms_deg: float
-    alpha_max_deg: float
-    beta_rms_deg: float
-    beta_max_deg: float
-    accel_rms_mg: float
-    accel_max_mg: float
-    unscored: int
-    intervals: dict[str, tuple[float, float]] = field(default_factory=dict)
-    errors: Errors | None = None
-    index: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
-    fitted: tuple[Sensor, ...] = ()
-    fold: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
+    tilt_deg: ErrorStatistic
+    alpha_deg: ErrorStatistic
+    beta_deg: ErrorStatistic
+    accel_mg: ErrorStatistic
+    errors: PoseErrors
+    pose_index: np.ndarray
+    fitted: tuple[Sensor, ...]
+    fold: np.ndarray
+
+    @property
+    def pose_count(self) -> int:
+        """Return the number of held-out poses."""
+        return len(self.errors.accel_mps2)
+
+    @property
+    def poses_without_alpha(self) -> int:
+        """Return the number of held-out poses that do not determine alpha."""
+        return int(np.isnan(self.errors.alpha_rad).sum())
 
 
-def errors(sensor: Sensor, poses: Poses, stage: Sensor | None = None) -> Errors:
+def pose_errors(sensor: Sensor, poses: Poses, stage: Sensor | None = None) -> PoseErrors:
     """
     Compare a calibrated sensor with the stage, pose by pose.
 
-    Angles are taken to the equivalent pose nearest the reference: f(−α, β + π) = f(α, β), and a
-    sensor without z cannot tell α from π − α. The sign of its z comes from the stage.
+    f(−α, β + π) = f(α, β): angle errors refer to the equivalent pose nearest the reference. A
+    sensor without z cannot distinguish α from π − α. The stage gives the sign of its z.
 
     Parameters
     ----------
     sensor
-        The unit as it is calibrated.
+        The calibrated unit.
     poses
-        Not fitted.
+        The poses, k of them.
     stage
-        The unit with what was found of the stage (its level), which no sensor is blamed for;
-        None takes the stage to be as it says.
+        The unit with the fitted errors of the stage, which are part of the reference. None takes
+        the angles of the stage as they are.
+
+    Returns
+    -------
+    PoseErrors
+        Errors of the k poses.
 
     """
     reference = reference_force(poses, sensor.local_gravity_mps2) if stage is None else \
@@ -128,49 +169,89 @@ def errors(sensor: Sensor, poses: Poses, stage: Sensor | None = None) -> Errors:
     if not measures_z:
         alpha = np.minimum(alpha, np.pi - alpha)
     beta = np.arctan2(-reference[1], reference[0])
-    measured = [AXES.index(a) for a in sensor.axes]
-    shown = angles.alpha_std < _BLIND_RAD
-    return Errors(
-        np.where(shown, angles.alpha - alpha, np.nan),
-        np.where(angles.beta_std < _BLIND_RAD,
-                 (angles.beta - beta + np.pi) % (2 * np.pi) - np.pi, np.nan),
+    measured = [AXES.index(axis) for axis in sensor.axes]
+    alpha_determined = angles.alpha_std < _MAX_ANGLE_STD_RAD
+    beta_determined = angles.beta_std < _MAX_ANGLE_STD_RAD
+    beta_error = (angles.beta - beta + np.pi) % (2 * np.pi) - np.pi
+    tilt_error = angle_between(np.column_stack(force), np.column_stack(reference))
+    return PoseErrors(
+        np.where(alpha_determined, angles.alpha - alpha, np.nan),
+        np.where(beta_determined, beta_error, np.nan),
         np.column_stack([force[d] - reference[d] for d in measured]),
-        np.where(shown, between(np.column_stack(force), np.column_stack(reference)), np.nan),
+        np.where(alpha_determined, tilt_error, np.nan),
         np.column_stack(force))
 
 
-def between(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Return the angle between vectors (k, 3), rad, (k,)."""
-    across = np.linalg.norm(np.cross(one, other), axis=1)
-    return np.arctan2(across, np.sum(one * other, axis=1))
-
-
-def score(model: str, of: Errors, index: np.ndarray | None = None,
-          fitted: Sequence[Sensor] = (), fold: np.ndarray | None = None) -> Score:
-    """Sum up errors over poses, in the order of their visit; see `Score`."""
-    values = {'tilt': np.degrees(of.tilt_rad), 'alpha': np.degrees(of.alpha_rad),
-              'beta': np.degrees(of.beta_rad), 'accel': of.accel_mps2 / G0_MPS2 * 1e3}
-    count = len(of.accel_mps2)
-    tilt, alpha, beta, accel = ((_rms(one), _largest(one)) for one in values.values())
-    return Score(model, count, *tilt, *alpha, *beta, *accel, int(np.isnan(values['alpha']).sum()),
-                 {name: rms_interval(one) for name, one in values.items()}, of,
-                 np.arange(count) if index is None else index, tuple(fitted),
-                 np.zeros(count, int) if fold is None else fold)
-
-
-def freedom(values: np.ndarray) -> float:
+def angle_between(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """
-    Return how many independent squares the mean square of errors is as good as, ν.
+    Return the angles between pairs of vectors.
 
-    Errors of neighbouring poses go together: they share a plane, a temperature, a fit. With the
-    mean of each pose's squares, s, of variance γ₀ and correlation ρ_k over k poses of the visit,
-    var(s̄) = γ₀/n·(1 + 2·Σ(1 − k/n)·ρ_k), summed up to the first ρ_k that is not positive (Geyer
-    1992), and ν = 2·s̄²/var(s̄) (Satterthwaite 1946), at most the number of errors.
+    Parameters
+    ----------
+    first, second
+        The vectors, of any length, (k, 3).
+
+    Returns
+    -------
+    numpy.ndarray
+        Angles from 0 to π, rad, (k,).
+
+    """
+    across = np.linalg.norm(np.cross(first, second), axis=1)
+    return np.arctan2(across, np.sum(first * second, axis=1))
+
+
+def summarise(model: str, errors: PoseErrors, pose_index: np.ndarray | None = None,
+              fitted: Sequence[Sensor] = (), fold: np.ndarray | None = None) -> HeldOutErrors:
+    """
+    Summarise the errors of one model over held-out poses.
+
+    Parameters
+    ----------
+    model
+        Name of the model.
+    errors
+        Errors of k poses in the order of their visit.
+    pose_index
+        Index of each pose among all poses, (k,); None is 0 to k − 1.
+    fitted
+        The fitted sensor of each fold.
+    fold
+        Index in `fitted` of the sensor of each pose, (k,); None is 0 for all.
+
+    Returns
+    -------
+    HeldOutErrors
+        The errors with their statistics.
+
+    """
+    count = len(errors.accel_mps2)
+    return HeldOutErrors(
+        model, _statistic(np.degrees(errors.tilt_rad)), _statistic(np.degrees(errors.alpha_rad)),
+        _statistic(np.degrees(errors.beta_rad)), _statistic(errors.accel_mps2 / G0_MPS2 * 1e3),
+        errors, np.arange(count) if pose_index is None else pose_index, tuple(fitted),
+        np.zeros(count, int) if fold is None else fold)
+
+
+def _statistic(values: np.ndarray) -> ErrorStatistic:
+    finite = values[np.isfinite(values)]
+    largest = float(np.abs(finite).max()) if finite.size else float('nan')
+    return ErrorStatistic(_rms(values), largest, rms_interval(values))
+
+
+def degrees_of_freedom(values: np.ndarray) -> float:
+    """
+    Return the effective degrees of freedom ν of a mean square of correlated errors.
+
+    Errors of neighbouring poses are correlated: the poses share a plane, a temperature, a fit.
+    Let s be the mean of each pose's squares, γ₀ its variance and ρ_k its correlation over k poses.
+    Then var(s̄) = γ₀/n·(1 + 2·Σ(1 − k/n)·ρ_k), summed up to the first ρ_k that is not positive
+    (Geyer 1992), and ν = 2·s̄²/var(s̄) (Satterthwaite 1946), at most the number of errors.
 
     Parameters
     ----------
     values
-        Errors in the order of the visit, (k,) or (k, m); NaN are left out.
+        Errors in the order of the visit, (k,) or (k, m). Rows with NaN do not count.
 
     """
     table = values.reshape(len(values), -1)
@@ -179,73 +260,78 @@ def freedom(values: np.ndarray) -> float:
     count, mean = len(squares), float(np.sum(squares)) / max(len(squares), 1)
     if count < 3 or mean <= 0:
         return float(max(count, 1))
-    off = squares - mean
-    spread = float(np.mean(off ** 2))
-    if spread <= 0:
+    deviation = squares - mean
+    variance = float(np.mean(deviation ** 2))
+    if variance <= 0:
         return float(count)
-    inflated = 1.0
+    inflation = 1.0
     for k in range(1, count // 2):
-        together = float(np.sum(off[k:] * off[:-k])) / count / spread
-        if together <= 0:
+        correlation = float(np.sum(deviation[k:] * deviation[:-k])) / count / variance
+        if correlation <= 0:
             break
-        inflated += 2 * (1 - k / count) * together
-    found = 2 * mean ** 2 / (spread / (count - 1) * inflated)
-    return float(np.clip(found, 1.0, table.size))
+        inflation += 2 * (1 - k / count) * correlation
+    freedom = 2 * mean ** 2 / (variance / (count - 1) * inflation)
+    return float(np.clip(freedom, 1.0, table.size))
 
 
 def rms_interval(values: np.ndarray) -> tuple[float, float]:
-    """Return the 90 % interval of the rms that errors are drawn with; see `freedom`."""
+    """Return the 90 % interval of the rms of correlated errors; see `degrees_of_freedom`."""
     with np.errstate(invalid='ignore'):
-        rms, nu = _rms(values), freedom(values)
+        rms, nu = _rms(values), degrees_of_freedom(values)
     return rms * float(np.sqrt(nu / chi2.isf(0.05, nu))), \
         rms * float(np.sqrt(nu / chi2.isf(0.95, nu)))
 
 
-def held_out(fits: dict[str, Fit], sensor: Sensor, poses: Poses,
-             stage: Sensor | None = None) -> list[Score]:
+def cross_validate(fits: dict[str, Fit], sensor: Sensor, poses: Poses,
+                   stage: Sensor | None = None) -> list[HeldOutErrors]:
     """
-    Score models on poses kept out of their fit.
+    Return the errors of models on poses that are held out of their fit.
 
-    Poses marked `check` are scored by fits to the others. Without any, each fifth of the poses
-    is scored by fits to the rest; a fold whose rest does not determine a model is left out of
-    that model's score.
+    Poses marked `check` are held out of a fit to all others. Without check poses, each fold of
+    every fifth pose is held out of a fit to the rest. A fold whose rest does not determine a model
+    does not count for that model.
 
     Parameters
     ----------
     fits
         Fit functions by the name of their model.
     sensor
-        The nominal sensor that they start from.
+        The nominal sensor, from which the fits start.
     poses
-        All of them, check poses too.
+        All poses, with the check poses.
     stage
-        As for `errors`.
+        As for `pose_errors`.
+
+    Returns
+    -------
+    list of HeldOutErrors
+        One entry for each model with at least one fold.
 
     """
-    scores = []
+    models = []
     for model, fit in fits.items():
-        parts, index, units = [], [], []
-        for out in _folds(poses):
+        errors, pose_index, units = [], [], []
+        for held_out in _folds(poses):
             try:
-                units.append(fit(sensor, poses.subset(~out)))
+                units.append(fit(sensor, poses.subset(~held_out)))
             except UserError:
                 continue
-            parts.append(errors(units[-1], poses.subset(out), stage))
-            index.append(np.flatnonzero(out))
-        if parts:
-            scores.append(_joined(model, parts, index, units))
-    return scores
+            errors.append(pose_errors(units[-1], poses.subset(held_out), stage))
+            pose_index.append(np.flatnonzero(held_out))
+        if errors:
+            models.append(_joined(model, errors, pose_index, units))
+    return models
 
 
-def _joined(model: str, parts: list[Errors], index: list[np.ndarray], units: list[Sensor]
-            ) -> Score:
-    """Put the folds together in the order of the visit."""
-    number = np.concatenate(index)
-    order = np.argsort(number)
-    fold = np.repeat(np.arange(len(index)), [len(one) for one in index])
-    return score(model, Errors(*(np.concatenate([getattr(part, name) for part in parts])[order]
-                                 for name in Errors.__dataclass_fields__)),
-                 number[order], units, fold[order])
+def _joined(model: str, parts: list[PoseErrors], pose_index: list[np.ndarray],
+            units: list[Sensor]) -> HeldOutErrors:
+    """Join the folds in the order of the visit."""
+    index = np.concatenate(pose_index)
+    order = np.argsort(index)
+    fold = np.repeat(np.arange(len(pose_index)), [len(part) for part in pose_index])
+    joined = [np.concatenate([getattr(part, field.name) for part in parts])[order]
+              for field in fields(PoseErrors)]
+    return summarise(model, PoseErrors(*joined), index[order], units, fold[order])
 
 
 def _folds(poses: Poses) -> list[np.ndarray]:
@@ -254,30 +340,26 @@ def _folds(poses: Poses) -> list[np.ndarray]:
     return [np.arange(len(poses)) % _FOLDS == fold for fold in range(min(_FOLDS, len(poses)))]
 
 
-def table(scores: list[Score]) -> list[str]:
-    """Lay scores out for a terminal."""
+def table(models: Sequence[HeldOutErrors]) -> list[str]:
+    """Return the errors of all models as lines for a terminal."""
     lines = [f'{"held out":9} {"poses":>5}  {"tilt rms/max deg":>16}  {"alpha rms/max deg":>17}  '
              f'{"beta rms/max deg":>16}  {"accel rms/max mg":>16}']
-    for s in scores:
-        lines.append(f'{s.model:9} {s.poses:5d}  {_pair(s.tilt_rms_deg, s.tilt_max_deg)}  '
-                     f' {_pair(s.alpha_rms_deg, s.alpha_max_deg)}  '
-                     f'{_pair(s.beta_rms_deg, s.beta_max_deg)}  '
-                     f'{_pair(s.accel_rms_mg, s.accel_max_mg)}')
-    if scores and scores[-1].unscored:
-        lines.append(f'alpha not scored in {scores[-1].unscored} poses that show it worse than '
-                     '1 deg (near +-90 deg without a z axis)')
+    for errors in models:
+        lines.append(f'{errors.model:9} {errors.pose_count:5d}  {_cell(errors.tilt_deg)}  '
+                     f' {_cell(errors.alpha_deg)}  {_cell(errors.beta_deg)}  '
+                     f'{_cell(errors.accel_mg)}')
+    if models and models[-1].poses_without_alpha:
+        lines.append(f'alpha does not count in {models[-1].poses_without_alpha} poses: its '
+                     'standard deviation is over 1 deg there (near +-90 deg without a z axis)')
     return lines
 
 
-def _pair(rms: float, largest: float) -> str:
-    return f'{"-":>16}' if np.isnan(rms) else f'{rms:7.3f} /{largest:7.3f}'
+def _cell(statistic: ErrorStatistic) -> str:
+    if np.isnan(statistic.rms):
+        return f'{"-":>16}'
+    return f'{statistic.rms:7.3f} /{statistic.largest:7.3f}'
 
 
 def _rms(values: np.ndarray) -> float:
-    known = values[np.isfinite(values)]
-    return float(np.sqrt(np.mean(known ** 2))) if known.size else float('nan')
-
-
-def _largest(values: np.ndarray) -> float:
-    known = values[np.isfinite(values)]
-    return float(np.abs(known).max()) if known.size else float('nan')
+    finite = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(finite ** 2))) if finite.size else float('nan')

@@ -12,13 +12,13 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""How a unit has drifted from one calibration to the next."""
+"""Drift of a unit from one calibration to the next."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import NamedTuple
 
 from adxl_ros.files import calibration_store
 from adxl_ros.model.constants import Z_90
@@ -26,107 +26,184 @@ from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
-_FIGURES = (('zero-g', Coefficient('bias', 'offset_v'), 'mg'),
-            ('scale factor', Coefficient('scale_factor', 'offset_v_per_g'), 'permille'))
-_TEMPERATURE = Coefficient('temperature_bias', 'per_k')
+_TEMPERATURE_SLOPE = Coefficient('temperature_bias', 'per_k')
+"""Parameter whose typical datasheet value predicts the drift by temperature."""
+_MIN_WARMING_C = 1.0
+"""Smallest difference of temperature that is reported, °C; chosen."""
+_TYPICAL_SLOPE_PER_K = 1e-4
+"""Typical slope of zero-g where the datasheet states none, g/K; ADXL203 datasheet: 0.1 mg/K."""
+
+
+class _Quantity(NamedTuple):
+    """
+    A quantity that is compared between calibrations.
+
+    Attributes
+    ----------
+    label
+        Its name for people.
+    parameter
+        The fitted parameter.
+    unit
+        Unit of a change.
+
+    """
+
+    label: str
+    parameter: Coefficient
+    unit: str
+
+
+_ZERO_G = _Quantity('zero-g', Coefficient('bias', 'offset_v'), 'mg')
+_SCALE_FACTOR = _Quantity('scale factor', Coefficient('scale_factor', 'offset_v_per_g'),
+                          'permille')
+_QUANTITIES = (_ZERO_G, _SCALE_FACTOR)
 
 
 @dataclass(frozen=True)
-class Past:
+class DriftSeries:
     """
-    Calibrations of one unit, oldest first, the newest last.
+    Zero-g and scale factor of k calibrations minus those of the newest.
+
+    Attributes
+    ----------
+    dates
+        Dates of the calibrations, as text, (k,).
+    axes
+        Measured axes, m of them.
+    zero_g_mg, scale_permille
+        Differences, (k, m).
+    zero_g_std_mg, scale_std_permille
+        Standard deviations of the values, (k, m).
+
+    """
+
+    dates: list[str]
+    axes: str
+    zero_g_mg: np.ndarray
+    scale_permille: np.ndarray
+    zero_g_std_mg: np.ndarray
+    scale_std_permille: np.ndarray
+
+
+@dataclass(frozen=True)
+class DriftHistory:
+    """
+    Calibrations of one unit, oldest first.
 
     Attributes
     ----------
     sensors
-        All of them but for those of the newest's own data; empty where it is the only one.
+        The stored calibrations, then the newest. Empty where the newest is the only one.
 
     """
 
     sensors: tuple[Sensor, ...]
 
     @staticmethod
-    def of(newest: Sensor, stored: Sequence[Sensor]) -> Past:
-        """Put the newest after those of the store that are of other data and of its axes."""
-        own = newest.provenance.get('data_sha256')
-        seen: dict[str, Sensor] = {}
+    def of(newest: Sensor, stored: Sequence[Sensor]) -> DriftHistory:
+        """
+        Append the newest calibration to the stored ones of other data and the same axes.
+
+        Parameters
+        ----------
+        newest
+            The new calibration.
+        stored
+            Calibrations of the unit, oldest first.
+
+        Returns
+        -------
+        DriftHistory
+            The history of the unit.
+
+        """
+        data = newest.provenance.get('data_sha256')
+        by_data: dict[str, Sensor] = {}
         for sensor in stored:
-            # A fit anew to the same data is no drift: the last one stands for all.
+            # Two fits of the same data show no drift: the last one represents them.
             if sensor.axes == newest.axes and (
-                    own is None or sensor.provenance.get('data_sha256') != own):
-                seen[sensor.provenance.get('data_sha256')
-                     or calibration_store.calibration_id(sensor)] = sensor
-        return Past((*seen.values(), newest) if seen else ())
+                    data is None or sensor.provenance.get('data_sha256') != data):
+                by_data[sensor.provenance.get('data_sha256')
+                        or calibration_store.calibration_id(sensor)] = sensor
+        return DriftHistory((*by_data.values(), newest) if by_data else ())
 
     def table(self) -> tuple[list[str], list[list[str]]]:
-        """Return head and rows: figures of each calibration and their change to the next."""
+        """Return head and rows: each calibration, and its change from the one before."""
         axes = self.sensors[-1].axes
         head = ['date', 'id', 'model', 'temperature, °C', *(
-            f'{name} {axis}' for name, _, _ in _FIGURES for axis in axes)]
-        rows = []
-        for before, now in zip((None, *self.sensors), self.sensors):
-            cells = []
-            for _, key, unit in _FIGURES:
-                for d in range(len(axes)):
-                    value = _absolute(now, key)[d]
-                    change = '' if before is None else \
-                        f' ({_change(before, now, key)[0][d]:+.2f} {unit})'
-                    cells.append(f'{value:.5f}{change}')
-            rows.append([now.provenance.get('date', '')[:16].replace('T', ' '),
-                         calibration_store.calibration_id(now), now.model,
-                         now.provenance.get('temperature_c', '-'), *cells])
-        return head, rows
+            f'{quantity.label} {axis}' for quantity in _QUANTITIES for axis in axes)]
+        return head, [_row(*pair) for pair in zip((None, *self.sensors), self.sensors)]
 
-    def words(self) -> list[str]:
-        """Say what has changed since the last calibration beyond both intervals."""
+    def changes(self) -> list[str]:
+        """Return lines that state what has changed beyond the 90 % interval of the change."""
         before, now = self.sensors[-2:]
-        found = []
-        for name, key, unit in _FIGURES:
-            change, std = _change(before, now, key)
-            for axis, by, s in zip(now.axes, change, std):
-                if abs(by) > Z_90 * s:
-                    found.append(f'{name} of {axis} by {by:+.2f} +- {Z_90 * s:.2f} {unit}')
+        changes = []
+        for quantity in _QUANTITIES:
+            change, std = _change(before, now, quantity)
+            for axis, by, half_width in zip(now.axes, change, Z_90 * std):
+                if abs(by) > half_width:
+                    changes.append(f'{quantity.label} of {axis} by {by:+.2f} +- {half_width:.2f} '
+                                   f'{quantity.unit}')
         days = _days(before, now)
         identity = calibration_store.calibration_id(before)
         since = f'In {days:.1f} days since {identity}' if days is not None else \
             f'Since {identity}'
-        lines = [f'{since}: {"; ".join(found)}.' if found else
+        lines = [f'{since}: {"; ".join(changes)}.' if changes else
                  f'{since} nothing has changed beyond the 90 % intervals.']
-        warmed = _temperature(now) - _temperature(before)
-        if abs(warmed) > 1 and found:
-            slope, _ = now.datasheet.get(_TEMPERATURE, (1e-4, 0.0))
-            lines.append(f"It was {warmed:+.1f} °C warmer: by the datasheet's typical slope "
-                         f'{1e3 * slope * abs(warmed):.2f} mg of zero-g come of that.')
+        warming = _temperature_c(now) - _temperature_c(before)
+        if abs(warming) > _MIN_WARMING_C and changes:
+            slope, _ = now.datasheet.get(_TEMPERATURE_SLOPE, (_TYPICAL_SLOPE_PER_K, 0.0))
+            lines.append(f"The temperature differs by {warming:+.1f} °C. The datasheet's typical "
+                         f'slope makes {1e3 * slope * abs(warming):.2f} mg of zero-g from it.')
         return lines
 
-    def series(self) -> tuple[Any, ...]:
-        """Return what `plots.drift` takes."""
+    def series(self) -> DriftSeries:
+        """Return the drift relative to the newest calibration."""
         newest = self.sensors[-1]
-        dates = [s.provenance.get('date', f'no. {i}')[:16].replace('T', ' ')
-                 for i, s in enumerate(self.sensors, 1)]
-        columns = [np.array([_change(newest, s, key)[0] for s in self.sensors])
-                   for _, key, _ in _FIGURES]
-        spreads = [np.array([_std(s, key) for s in self.sensors]) for _, key, _ in _FIGURES]
-        return (dates, newest.axes, *columns, *spreads)
+        dates = [_date(sensor, f'no. {i}') for i, sensor in enumerate(self.sensors, 1)]
+        change = {quantity: np.array([_change(newest, sensor, quantity)[0]
+                                      for sensor in self.sensors]) for quantity in _QUANTITIES}
+        std = {quantity: np.array([_std(sensor, quantity) for sensor in self.sensors])
+               for quantity in _QUANTITIES}
+        return DriftSeries(dates, newest.axes, change[_ZERO_G], change[_SCALE_FACTOR],
+                           std[_ZERO_G], std[_SCALE_FACTOR])
 
 
-def _absolute(sensor: Sensor, key: Coefficient) -> np.ndarray:
-    return sensor.zero_g_v if key.effect == 'bias' else sensor.scale_v_per_g
+def _row(before: Sensor | None, now: Sensor) -> list[str]:
+    cells = []
+    for quantity in _QUANTITIES:
+        for d in range(len(now.axes)):
+            change = '' if before is None else \
+                f' ({_change(before, now, quantity)[0][d]:+.2f} {quantity.unit})'
+            cells.append(f'{_values(now, quantity)[d]:.5f}{change}')
+    return [_date(now), calibration_store.calibration_id(now), now.model,
+            now.provenance.get('temperature_c', '-'), *cells]
 
 
-def _change(before: Sensor, now: Sensor, key: Coefficient) -> tuple[np.ndarray, np.ndarray]:
-    """Return the change of a figure and its standard deviation, mg or permille, (m,)."""
-    by = (_absolute(now, key) - _absolute(before, key)) / now.scale_v_per_g * 1e3
-    return by, np.hypot(_std(before, key), _std(now, key))
+def _values(sensor: Sensor, quantity: _Quantity) -> np.ndarray:
+    return sensor.zero_g_v if quantity is _ZERO_G else sensor.scale_v_per_g
 
 
-def _std(sensor: Sensor, key: Coefficient) -> np.ndarray:
+def _change(before: Sensor, now: Sensor, quantity: _Quantity) -> tuple[np.ndarray, np.ndarray]:
+    """Return the change of a quantity and its standard deviation, mg or permille, (m,)."""
+    by = (_values(now, quantity) - _values(before, quantity)) / now.scale_v_per_g * 1e3
+    return by, np.hypot(_std(before, quantity), _std(now, quantity))
+
+
+def _std(sensor: Sensor, quantity: _Quantity) -> np.ndarray:
+    """Return the standard deviation of a quantity, mg or permille, (m,)."""
     std = dict(zip(sensor.covariance_names, np.sqrt(np.diag(sensor.covariance))))
-    return np.array([std.get(replace(key, axis=axis), 0.0) for axis in sensor.axes]) \
+    return np.array([std.get(replace(quantity.parameter, axis=axis), 0.0)
+                     for axis in sensor.axes]) \
         / sensor.scale_v_per_g * 1e3
 
 
-def _temperature(sensor: Sensor) -> float:
+def _date(sensor: Sensor, unknown: str = '') -> str:
+    return sensor.provenance.get('date', unknown)[:16].replace('T', ' ')
+
+
+def _temperature_c(sensor: Sensor) -> float:
     try:
         return float(sensor.provenance.get('temperature_c', 'nan'))
     except ValueError:
@@ -134,5 +211,5 @@ def _temperature(sensor: Sensor) -> float:
 
 
 def _days(before: Sensor, now: Sensor) -> float | None:
-    then, when = calibration_store.date_of(before), calibration_store.date_of(now)
-    return None if then is None or when is None else (when - then).total_seconds() / 86400
+    earlier, later = calibration_store.date_of(before), calibration_store.date_of(now)
+    return None if earlier is None or later is None else (later - earlier).total_seconds() / 86400

@@ -13,35 +13,39 @@
 # limitations under the License.
 
 """
-What limits a calibration, and whether it passes: the mean square of held-out errors in its parts.
+Error budget of a calibration: the mean square of held-out errors, split by cause.
 
-Means over the poses that show alpha, and axes, in squares, of the errors of the model against the
-stage:
+The mean runs over axes and over the poses that determine alpha. Squares add:
 
-    seen = noise of the means + stage + fit + model
+    measured = noise + stage + coefficients + model
 
-- noise: of the pose's mean, by the inverse's tangent.
-- stage: a random error of each joint, up to the stated σ = step/√12; and what poses of the same
-  angles differ by beyond that. Its level and its form, as the full model found them, are taken out
-  of the reference.
-- fit: the covariance of the calibration, which noise and stage have brought about.
-- model: what is left, as far as it is more than chance makes once in a hundred (with the freedom
-  of correlated poses) and no scatter between visits of the same pose. Where no pose was visited
-  twice, a sensor with z tells the two by |f|, which no stage can change.
+- noise: noise of the pose's mean, by the tangent of the inverse.
+- stage: a random error of each joint, up to the stated σ = step/√12, and what visits of the same
+  pose scatter by beyond that. The level and the form of the stage that the full model fitted are
+  part of the reference.
+- coefficients: the covariance of the calibration, which noise and stage error cause.
+- model: the rest. It counts where it exceeds what chance makes once in a hundred (with the degrees
+  of freedom of correlated poses) and the scatter between visits of the same pose. Where no pose
+  was visited twice, a sensor with z separates stage and model by |f|, which no stage can change.
 
-What calibration itself errs by, noise and stage of the check taken out, is √(fit + model).
+The error of the calibration itself is √(coefficients + model).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import sqrt
+from typing import NamedTuple
 
 from adxl_ros.calibrate.fits.gravity_fit import GravityFit
 from adxl_ros.calibrate.pose_response import stage_force
 from adxl_ros.calibrate.poses import Poses, reference_force
-from adxl_ros.calibrate.report.cross_validation import between, errors, freedom, Score
+from adxl_ros.calibrate.report.cross_validation import (
+    angle_between,
+    degrees_of_freedom,
+    HeldOutErrors,
+    pose_errors,
+)
 from adxl_ros.model import noise
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.covariance import force_covariance
@@ -50,231 +54,352 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.stats import chi2
 
-_SAME_RAD = np.radians(0.5)
-"""Poses whose joints agree so well are visits of the same."""
-_FEWEST_PAIRS = 6
-_SMALL_MPS2 = 1e-3 * G0_MPS2
+_SAME_POSE_RAD = np.radians(0.5)
+"""Largest distance of the joint angles of two visits of the same pose, rad; chosen."""
+_MIN_PAIRS = 6
+"""Smallest number of pairs of visits that show the scatter between visits; chosen."""
+_PROBE_MPS2 = 1e-3 * G0_MPS2
+"""Error of each axis, m/s², by which the tilt error that it causes is computed: 1 mg."""
 _CHANCE = 0.01
-KINDS = ('noise', 'stage', 'model')
+"""Chance that errors without a model part are said to have one; chosen."""
+_UPPER_QUANTILE = 0.95
+"""Probability of the upper end of a 90 % interval."""
 
 
 @dataclass(frozen=True)
-class Parts:
+class ErrorBudget:
     """
-    Parts of the mean square of held-out errors: (m/s²)² an axis, or rad² of tilt.
+    Parts of a mean square of errors: (m/s²)² per axis for acceleration, rad² for tilt.
 
     Attributes
     ----------
-    seen
-        All of it.
-    noise, stage, fit, model
-        See the module; they need not sum to `seen`, which chance moves.
-    own_most
-        Upper end of the 90 % interval of `fit + model`.
-    apart
-        Whether stage and model could be told apart.
-    per_axis
-        Mean square of tilt that one of 1 (m/s²)² on each measured axis makes; of tilt alone.
+    measured
+        Mean square of the held-out errors. By chance it differs from the sum of the parts.
+    noise, stage, coefficients, model
+        The parts, as the module describes them.
+    calibration_high
+        Upper end of the 90 % interval of `coefficients + model`.
+    separable
+        Whether the poses separate stage and model.
+    tilt_per_axis
+        Mean square of tilt that a mean square of 1 (m/s²)² on each measured axis causes; NaN for
+        acceleration.
 
     """
 
-    seen: float
+    measured: float
     noise: float
     stage: float
-    fit: float
+    coefficients: float
     model: float
-    own_most: float
-    apart: bool = True
-    per_axis: float = float('nan')
+    calibration_high: float
+    separable: bool = True
+    tilt_per_axis: float = float('nan')
 
     @property
-    def own(self) -> float:
-        """Return the mean square of what the calibration itself errs by."""
-        return self.fit + self.model
+    def calibration(self) -> float:
+        """Return the mean square of the error of the calibration itself."""
+        return self.coefficients + self.model
 
     @property
-    def limit(self) -> str:
-        """Name the largest of `KINDS`; the fit's part has come of them and grows with them."""
-        return KINDS[int(np.argmax([getattr(self, kind) for kind in KINDS]))]
+    def expected(self) -> float:
+        """Return the sum of all parts."""
+        return self.noise + self.stage + self.coefficients + self.model
+
+    @property
+    def limited_by(self) -> str:
+        """Return 'noise', 'stage', 'model' or 'stage or model': the cause of the largest part."""
+        if not self.separable and \
+                max(self.model, self.coefficients) > max(self.noise, self.stage):
+            return 'stage or model'
+        # Noise and stage cause the error of the coefficients, which is no limit of its own.
+        causes = {'noise': self.noise, 'stage': self.stage, 'model': self.model}
+        return list(causes)[int(np.argmax(list(causes.values())))]
 
 
-_NOTHING = Parts(*(float('nan'),) * 6)  # type: ignore[arg-type]
+_NO_BUDGET = ErrorBudget(measured=float('nan'), noise=float('nan'), stage=float('nan'),
+                         coefficients=float('nan'), model=float('nan'),
+                         calibration_high=float('nan'))
+"""Budget of a quantity that no pose shows."""
 
 
-def parts(score: Score, poses: Poses, stage: Sensor | None = None) -> tuple[Parts, Parts]:
+class ErrorBudgets(NamedTuple):
     """
-    Take the held-out errors of one model apart.
+    The error budgets of one model.
+
+    Attributes
+    ----------
+    accel
+        Of acceleration, (m/s²)² per axis.
+    tilt
+        Of tilt, rad².
+
+    """
+
+    accel: ErrorBudget
+    tilt: ErrorBudget
+
+
+class _Covariances(NamedTuple):
+    """
+    Covariances of the specific force by cause, (m/s²)², each (3, 3, k).
+
+    Attributes
+    ----------
+    noise, coefficients, stage
+        Of the mean's noise, of the calibration, and of the stated stage error.
+    probe
+        Of an independent error `_PROBE_MPS2` on each measured axis.
+
+    """
+
+    noise: np.ndarray
+    coefficients: np.ndarray
+    stage: np.ndarray
+    probe: np.ndarray
+
+
+class _KnownParts(NamedTuple):
+    """
+    Parts of a mean square that covariances predict.
+
+    Attributes
+    ----------
+    noise, coefficients
+        As in `ErrorBudget`.
+    stated_stage
+        Of the stage error that the parameter file states.
+
+    """
+
+    noise: float
+    coefficients: float
+    stated_stage: float
+
+
+class _Scatter(NamedTuple):
+    """
+    Mean square of errors that no model can explain.
+
+    Attributes
+    ----------
+    accel, tilt
+        Of acceleration, (m/s²)² per axis, and of tilt, rad².
+    has_noise
+        Whether the noise of the means is in it.
+
+    """
+
+    accel: float
+    tilt: float
+    has_noise: bool
+
+
+def error_budgets(errors: HeldOutErrors, poses: Poses, stage: Sensor | None = None
+                  ) -> ErrorBudgets:
+    """
+    Split the held-out errors of one model by cause.
 
     Parameters
     ----------
-    score
-        From `cross_validation.held_out`.
+    errors
+        From `cross_validation.cross_validate`.
     poses
-        All of them, as they were given to it.
+        All poses that were given to it.
     stage
-        The unit with what was fitted of the stage; None where nothing was.
+        The unit with the fitted errors of the stage; None where none were fitted.
 
     Returns
     -------
-    tuple
-        Of acceleration, (m/s²)² an axis, and of tilt, rad².
+    ErrorBudgets
+        Of acceleration and of tilt.
 
     """
-    assert score.errors is not None
-    held = poses.subset(score.index)
-    sensor = score.fitted[0]
+    held = poses.subset(errors.pose_index)
+    sensor = errors.fitted[0]
     gravity = sensor.local_gravity_mps2
-    promised = np.column_stack(reference_force(held, gravity))
-    stood = promised if stage is None else np.column_stack(
+    measured = errors.errors
+    reference = np.column_stack(reference_force(held, gravity))
+    corrected = reference if stage is None else np.column_stack(
         stage_force(stage, held.alpha_rad, held.beta_rad))
-    shown = np.isfinite(score.errors.tilt_rad)
-    axes = [AXES.index(a) for a in sensor.axes]
-    # Where equation 5 has two roots, the wrong z shifts x and y: that is none of the parts.
-    plain = shown if shown.any() else np.isfinite(score.errors.force_mps2).all(axis=1)
-    off = (score.errors.force_mps2 - stood)[plain][:, axes]
-    of_noise, of_fit, of_stage, of_one = _covariances(score, held, promised)
-    found = []
-    scattered = _between_visits(sensor, poses.subset(~poses.check))
-    for i, (after, before, weigh) in enumerate((
-            (off, score.errors.accel_mps2[plain], _along(axes, plain)),
-            (between(score.errors.force_mps2, stood)[shown], score.errors.tilt_rad[shown],
-             _across(promised, gravity, shown)))):
-        if not after.size:
-            # No pose shows it, or a sensor of one axis has no tilt.
-            found.append(_NOTHING)
-            continue
-        known = [weigh(covariance) for covariance in (of_noise, of_fit, of_stage)]
-        found.append(_apart(after, float(np.mean(before ** 2)), known,
-                            None if scattered is None else scattered[i](known[0])))
-    if shown.any() and found[1] is not _NOTHING:
-        per_axis = _across(promised, gravity, shown)(of_one) / _SMALL_MPS2 ** 2
-        found[1] = replace(found[1], per_axis=per_axis)
-    return found[0], found[1]
+    has_tilt = np.isfinite(measured.tilt_rad)
+    axes = [AXES.index(axis) for axis in sensor.axes]
+    # Where equation 5 has two roots, the wrong z shifts x and y, which is none of the parts.
+    used = has_tilt if has_tilt.any() else np.isfinite(measured.force_mps2).all(axis=1)
+    covariances = _covariances(errors, held, reference)
+    scatter = _scatter(sensor, poses.subset(~poses.check))
+    accel = tilt = _NO_BUDGET
+    if used.any():
+        known = _KnownParts(*(_axis_variance(covariance, axes, used)
+                              for covariance in covariances[:3]))
+        accel = _budget((measured.force_mps2 - corrected)[used][:, axes],
+                        float(np.mean(measured.accel_mps2[used] ** 2)), known,
+                        _unexplainable(scatter, 'accel', known))
+    if has_tilt.any():
+        known = _KnownParts(*(_tilt_variance(covariance, reference, gravity, has_tilt)
+                              for covariance in covariances[:3]))
+        tilt = _budget(angle_between(measured.force_mps2, corrected)[has_tilt],
+                       float(np.mean(measured.tilt_rad[has_tilt] ** 2)), known,
+                       _unexplainable(scatter, 'tilt', known))
+        tilt_per_axis = _tilt_variance(covariances.probe, reference, gravity, has_tilt) \
+            / _PROBE_MPS2 ** 2
+        tilt = replace(tilt, tilt_per_axis=tilt_per_axis)
+    return ErrorBudgets(accel, tilt)
 
 
-def _apart(off: np.ndarray, seen: float, known: list[float], random: float | None) -> Parts:
+def _unexplainable(scatter: _Scatter | None, quantity: str, known: _KnownParts) -> float | None:
+    """Return the mean square that no model explains, without noise; None where unknown."""
+    if scatter is None:
+        return None
+    return getattr(scatter, quantity) - (known.noise if scatter.has_noise else 0.0)
+
+
+def _budget(errors: np.ndarray, measured: float, known: _KnownParts,
+            unexplainable: float | None) -> ErrorBudget:
     """
-    Split a mean square whose parts by noise, fit and the stated stage are known.
+    Split a mean square of errors against the corrected reference.
 
-    `random` is what no model could explain, noise apart; None where nothing tells it.
+    Parameters
+    ----------
+    errors
+        Errors against the corrected reference, (k,) or (k, m), in the order of the visit.
+    measured
+        Mean square of the errors against the angles of the stage.
+    known
+        The parts that covariances predict.
+    unexplainable
+        Mean square that no model could explain, without noise; None where it is unknown.
+
+    Returns
+    -------
+    ErrorBudget
+        The parts.
+
     """
-    by_noise, by_fit, stated = known
-    after, nu = float(np.mean(off ** 2)), freedom(off)
-    sure, high = (after * nu / float(chi2.isf(chance, nu)) for chance in (_CHANCE, 0.95))
-    at_most = stated if random is None else max(stated, random)
-    explained = by_noise + by_fit + at_most
-    model = after - explained if sure > explained else 0.0
-    stage = min(max(after - by_noise - by_fit, 0.0), at_most)
-    return Parts(seen, by_noise, max(seen - after, 0.0) + stage, by_fit, model,
-                 by_fit + max(high - explained, 0.0), random is not None)
+    mean_square, nu = float(np.mean(errors ** 2)), degrees_of_freedom(errors)
+    lower = mean_square * nu / float(chi2.isf(_CHANCE, nu))
+    upper = mean_square * nu / float(chi2.isf(_UPPER_QUANTILE, nu))
+    largest_stage = known.stated_stage if unexplainable is None else \
+        max(known.stated_stage, unexplainable)
+    explained = known.noise + known.coefficients + largest_stage
+    model = mean_square - explained if lower > explained else 0.0
+    stage = min(max(mean_square - known.noise - known.coefficients, 0.0), largest_stage)
+    return ErrorBudget(
+        measured, known.noise, max(measured - mean_square, 0.0) + stage, known.coefficients,
+        model, known.coefficients + max(upper - explained, 0.0), unexplainable is not None)
 
 
-def _covariances(score: Score, held: Poses, promised: np.ndarray) -> list[np.ndarray]:
-    """Return those of the force by the mean's noise, fit, stated stage and 1 mg, (3, 3, k)."""
-    found = [np.zeros((3, 3, len(held))) for _ in range(4)]
-    for number, sensor in enumerate(score.fitted):
-        own = score.fold == number
-        force, around = list(promised[own].T), held.subset(own).environment
-        std2 = np.mean(held.std_v[own], axis=0) ** 2
-        both = force_covariance(sensor, force, std2, around)
-        quiet = force_covariance(sensor, force, 0 * std2, around)
-        found[0][:, :, own], found[1][:, :, own] = both - quiet, quiet
-        known = sensor.without_covariance()
-        found[3][:, :, own] = force_covariance(
-            known, force, (sensor.scale_v_per_g / G0_MPS2 * _SMALL_MPS2) ** 2, around)
-    sensor = score.fitted[0]
-    sigma2 = sensor.stage_resolution_rad ** 2 / 12 * sensor.local_gravity_mps2 ** 2
-    a, b, nothing = held.alpha_rad, held.beta_rad, np.zeros(len(held))
+def _covariances(errors: HeldOutErrors, held: Poses, reference: np.ndarray) -> _Covariances:
+    """Return the covariances of the specific force in the held-out poses."""
+    shape = (3, 3, len(held))
+    by_noise, by_coefficients, by_probe = np.zeros(shape), np.zeros(shape), np.zeros(shape)
+    for number, sensor in enumerate(errors.fitted):
+        fold = errors.fold == number
+        force, environment = list(reference[fold].T), held.subset(fold).environment
+        variance_v2 = np.mean(held.std_v[fold], axis=0) ** 2
+        total = force_covariance(sensor, force, variance_v2, environment)
+        without_noise = force_covariance(sensor, force, 0 * variance_v2, environment)
+        by_noise[:, :, fold] = total - without_noise
+        by_coefficients[:, :, fold] = without_noise
+        exact = sensor.without_covariance()
+        by_probe[:, :, fold] = force_covariance(
+            exact, force, (sensor.scale_v_per_g / G0_MPS2 * _PROBE_MPS2) ** 2, environment)
+    return _Covariances(by_noise, by_coefficients, _stage_covariance(errors.fitted[0], held),
+                        by_probe)
+
+
+def _stage_covariance(sensor: Sensor, held: Poses) -> np.ndarray:
+    """Return the covariance of the reference by the stated stage error, (m/s²)², (3, 3, k)."""
+    variance = sensor.stage_resolution_rad ** 2 / 12 * sensor.local_gravity_mps2 ** 2
+    a, b, zero = held.alpha_rad, held.beta_rad, np.zeros(len(held))
     by_alpha = np.array([np.cos(a) * np.cos(b), -np.cos(a) * np.sin(b), -np.sin(a)])
-    by_beta = np.array([-np.sin(a) * np.sin(b), -np.sin(a) * np.cos(b), nothing])
-    found[2] = sigma2 * sum(np.einsum('ik,jk->ijk', one, one) for one in (by_alpha, by_beta))
-    return found
+    by_beta = np.array([-np.sin(a) * np.sin(b), -np.sin(a) * np.cos(b), zero])
+    return variance * (np.einsum('ik,jk->ijk', by_alpha, by_alpha)
+                       + np.einsum('ik,jk->ijk', by_beta, by_beta))
 
 
-def _along(axes: list[int], used: np.ndarray) -> Callable[[np.ndarray], float]:
-    return lambda covariance: float(np.mean([covariance[d, d][used] for d in axes]))
+def _axis_variance(covariance: np.ndarray, axes: list[int], used: np.ndarray) -> float:
+    """Return the mean variance of the measured axes over the poses used, (m/s²)²."""
+    return float(np.mean([covariance[d, d][used] for d in axes]))
 
 
-def _across(force: np.ndarray, gravity: float, shown: np.ndarray
-            ) -> Callable[[np.ndarray], float]:
-    """Weigh a covariance by what it turns the vertical by, mean over the poses that show it."""
+def _tilt_variance(covariance: np.ndarray, force: np.ndarray, gravity: float, used: np.ndarray
+                   ) -> float:
+    """Return the mean square of tilt over the poses used, rad², by the part across the force."""
     up = force / np.linalg.norm(force, axis=1, keepdims=True)
-
-    def weigh(covariance: np.ndarray) -> float:
-        whole = np.einsum('iik->k', covariance)
-        radial = np.einsum('ki,ijk,kj->k', up, covariance, up)
-        return float(np.mean((whole - radial)[shown])) / gravity ** 2
-    return weigh
+    trace = np.einsum('iik->k', covariance)
+    radial = np.einsum('ki,ijk,kj->k', up, covariance, up)
+    return float(np.mean((trace - radial)[used])) / gravity ** 2
 
 
-def _between_visits(sensor: Sensor, poses: Poses) -> list[Callable[[float], float]] | None:
-    """
-    Return what scatters and is no model's, of acceleration, (m/s²)² an axis, and of tilt, rad².
-
-    Functions of the part that is the noise of the means; None where nothing tells it.
-    """
-    place = np.column_stack([np.cos(poses.alpha_rad), np.sin(poses.alpha_rad),
-                             np.cos(poses.beta_rad), np.sin(poses.beta_rad)])
-    pairs = np.array(sorted(cKDTree(place).query_pairs(_SAME_RAD)), int).reshape(-1, 2)
+def _scatter(sensor: Sensor, poses: Poses) -> _Scatter | None:
+    """Return the scatter that no model can explain; None where the poses do not show it."""
+    joints = np.column_stack([np.cos(poses.alpha_rad), np.sin(poses.alpha_rad),
+                              np.cos(poses.beta_rad), np.sin(poses.beta_rad)])
+    pairs = np.array(sorted(cKDTree(joints).query_pairs(_SAME_POSE_RAD)), int).reshape(-1, 2)
     gravity = sensor.local_gravity_mps2
-    of, promised = errors(sensor, poses), np.column_stack(reference_force(poses, gravity))
-    if len(pairs) >= _FEWEST_PAIRS:
-        off = np.diff(of.accel_mps2[pairs], axis=1)[:, 0]
-        whole = np.diff((of.force_mps2 - promised)[pairs], axis=1)[:, 0]
-        shown = np.isfinite(of.tilt_rad[pairs]).all(axis=1)
-        across = np.cross(whole, promised[pairs[:, 0]])[shown] / gravity ** 2
-        scatter = np.mean(off ** 2) / 2, np.sum(across ** 2) / max(len(across), 1) / 2
-        return [lambda noise, one=one: float(one) - noise for one in scatter]  # type: ignore
+    errors = pose_errors(sensor, poses)
+    reference = np.column_stack(reference_force(poses, gravity))
+    if len(pairs) >= _MIN_PAIRS:
+        accel = np.diff(errors.accel_mps2[pairs], axis=1)[:, 0]
+        force = np.diff((errors.force_mps2 - reference)[pairs], axis=1)[:, 0]
+        has_tilt = np.isfinite(errors.tilt_rad[pairs]).all(axis=1)
+        across = np.cross(force, reference[pairs[:, 0]])[has_tilt] / gravity ** 2
+        tilt = np.sum(across ** 2) / max(len(across), 1) / 2
+        return _Scatter(float(np.mean(accel ** 2) / 2), float(tilt), has_noise=True)
     if sensor.axes != 'xyz':
         return None
-    # No stage changes |f|: what that scatters by, a model's error has in each direction.
-    along = np.linalg.norm(of.force_mps2, axis=1) - gravity
-    more = max(float(np.mean(of.accel_mps2 ** 2) - np.mean(along ** 2)), 0.0)
-    return [lambda _: more, lambda _: 3 * more / gravity ** 2]
+    # No stage error changes |f|. A model error is as large in |f| as in any other direction.
+    magnitude = np.linalg.norm(errors.force_mps2, axis=1) - gravity
+    excess = max(float(np.mean(errors.accel_mps2 ** 2) - np.mean(magnitude ** 2)), 0.0)
+    return _Scatter(excess, 3 * excess / gravity ** 2, has_noise=False)
 
 
-def gravity_parts(found: GravityFit, fitted: Sensor, force: np.ndarray, kept: np.ndarray
-                  ) -> tuple[Parts, Parts]:
+def gravity_error_budgets(fit: GravityFit, fitted: Sensor, force: np.ndarray, kept: np.ndarray
+                          ) -> ErrorBudgets:
     """
-    Take the errors of magnitudes, each by the fit to the other rests, apart; no stage is there.
+    Split the leave-one-out errors of the magnitude of gravity; there is no stage part.
 
-    The fit's part is that of the force, which the covariance tells, not that of the magnitude:
-    it has the directions that a magnitude does not show.
+    The part of the coefficients is that of the force by their covariance. It includes directions
+    that a magnitude does not show.
 
     Parameters
     ----------
-    found, fitted
-        The fit, and the unit that it gives.
+    fit, fitted
+        The fit, and the unit with its coefficients.
     force
-        Of all rests by the fit, m/s², (k, 3).
+        Specific force in all rests by the fit, m/s², (k, 3).
     kept
-        Numbers of those that were no knocks.
+        Indices of the rests that are no outliers.
 
     Returns
     -------
-    tuple
-        Of acceleration, (m/s²)² an axis, and of tilt, rad².
+    ErrorBudgets
+        Of acceleration and of tilt.
 
     """
-    off = found.leave_one_out_mps2[kept]
-    excess = found.excess_mps2 ** 2
-    by_noise = float(np.mean(found.expected_mps2[kept] ** 2)) - excess
+    errors = fit.leave_one_out_mps2[kept]
+    excess = fit.excess_mps2 ** 2
+    by_noise = float(np.mean(fit.expected_mps2[kept] ** 2)) - excess
     covariance = force_covariance(fitted, list(force[kept].T), np.zeros(len(fitted.axes)))
-    gravity, shown = fitted.local_gravity_mps2, np.ones(len(kept), bool)
-    seen, nu = float(np.mean(off ** 2)), freedom(off)
-    most = max(seen * nu / float(chi2.isf(0.95, nu)) - by_noise, excess)
-    by_fit = _along([0, 1, 2], shown)(covariance), _across(force[kept], gravity, shown)(covariance)
-    return (Parts(seen, by_noise, 0.0, by_fit[0], excess, by_fit[0] + most),
-            Parts(3 * seen / gravity ** 2, 2 * by_noise / gravity ** 2, 0.0, by_fit[1],
-                  2 * excess / gravity ** 2, by_fit[1] + 2 * most / gravity ** 2,
-                  per_axis=2 / gravity ** 2))
+    gravity, used = fitted.local_gravity_mps2, np.ones(len(kept), bool)
+    measured, nu = float(np.mean(errors ** 2)), degrees_of_freedom(errors)
+    upper = max(measured * nu / float(chi2.isf(_UPPER_QUANTILE, nu)) - by_noise, excess)
+    accel = _axis_variance(covariance, [0, 1, 2], used)
+    tilt = _tilt_variance(covariance, force[kept], gravity, used)
+    # Three axes have a magnitude's error each; two of the three turn the vertical.
+    return ErrorBudgets(
+        ErrorBudget(measured, by_noise, 0.0, accel, excess, accel + upper),
+        ErrorBudget(3 * measured / gravity ** 2, 2 * by_noise / gravity ** 2, 0.0, tilt,
+                    2 * excess / gravity ** 2, tilt + 2 * upper / gravity ** 2,
+                    tilt_per_axis=2 / gravity ** 2))
 
 
-def own_noise_mps2(sensor: Sensor) -> float:
+def sample_noise_mps2(sensor: Sensor) -> float:
     """Return the noise of one sample, rms over the axes, m/s²."""
     return float(np.sqrt(np.mean((noise.sigma_v(sensor) / sensor.scale_v_per_g) ** 2))) * G0_MPS2
 
 
-def milli_g(square: float) -> float:
-    """Turn a mean square, (m/s²)², into mg rms."""
-    return sqrt(max(square, 0.0)) / G0_MPS2 * 1e3
+def rms_mg(mean_square: float) -> float:
+    """Return the rms in mg of a mean square in (m/s²)²; 0 for a negative one."""
+    return sqrt(max(mean_square, 0.0)) / G0_MPS2 * 1e3

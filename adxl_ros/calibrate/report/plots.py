@@ -12,18 +12,20 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Figures 2 to 8 of the paper for one unit, and the magnitudes of a gravity calibration."""
+"""Plots of a calibration: figures 2 to 8 of the paper for one unit, and errors of fits."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 import os
 from typing import Any
 
 from adxl_ros.calibrate.fits import linear, paper_regression
 from adxl_ros.calibrate.fits.gravity_fit import GravityFit
 from adxl_ros.calibrate.poses import Poses, reference_force
-from adxl_ros.calibrate.report.cross_validation import Score
+from adxl_ros.calibrate.report.cross_validation import HeldOutErrors
+from adxl_ros.calibrate.report.drift_history import DriftSeries
 from adxl_ros.files.plot_file import pyplot, write_plot
 from adxl_ros.model import signal_chain
 from adxl_ros.model.constants import G0_MPS2, Z_90
@@ -31,72 +33,125 @@ from adxl_ros.model.sensor import Sensor
 import numpy as np
 
 _FINE_G = np.linspace(-1, 1, 201)
+"""Specific force at which curves are drawn, g."""
+_VERTICAL = np.sin(np.radians(89))
+"""Smallest sine of alpha in the plane alpha = 90°; chosen: encoders are better than 1°."""
+_MARKERS = 'os^D'
+"""Markers of models and axes, in order."""
+
+
+@dataclass(frozen=True)
+class _AxisData:
+    """
+    What the panels of one axis show; k poses.
+
+    Attributes
+    ----------
+    d
+        Index of the axis, 0 for x or 1 for y.
+    force_g
+        Reference along the measured axes, g, (k, m).
+    poses
+        The poses of the sweep.
+    deviation_mv, model_mv
+        Measured and modelled output minus the linear model, mV, (k,).
+    regression
+        Coefficients of the staged regression.
+    vertical
+        Whether the pose is in the plane alpha = 90°, (k,).
+
+    """
+
+    d: int
+    force_g: np.ndarray
+    poses: Poses
+    deviation_mv: np.ndarray
+    model_mv: np.ndarray
+    regression: paper_regression.AxisRegression
+    vertical: np.ndarray
+
+    @property
+    def name(self) -> str:
+        """Return the name of the axis."""
+        return 'xy'[self.d]
+
+    @property
+    def other(self) -> str:
+        """Return the name of the other axis."""
+        return 'yx'[self.d]
 
 
 def draw_sweep(path: str | os.PathLike, sensor: Sensor, fitted: Sensor, poses: Poses) -> None:
-    """Draw `sweep` as PNG."""
+    """
+    Write the plot of `sweep` as PNG.
+
+    Parameters
+    ----------
+    path
+        The file.
+    sensor, fitted, poses
+        As for `sweep`.
+
+    """
     write_plot(sweep(sensor, fitted, poses), path)
 
 
 def sweep(sensor: Sensor, fitted: Sensor, poses: Poses, panels: Sequence[int] = range(6)) -> Any:
     """
-    Draw figures 2 to 8 of the paper for the x and y axes, one row an axis.
+    Draw figures 2 to 8 of the paper for the x and y axes, one row per axis.
 
     Parameters
     ----------
     sensor
-        The nominal figures that the fit started from.
+        The nominal unit from which the fit started.
     fitted
-        The physical model of the unit.
+        The unit by a physical or full model.
     poses
-        The sweep, check poses among them.
+        The sweep with its check poses.
     panels
-        Which: figures 2, 3, 4, 5 with 7, 6 and 8, counted from 0.
+        Indices of the panels: figures 2, 3, 4, 5 with 7, 6 and 8.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        The plot.
 
     """
     swept = poses.subset(~poses.check)
-    start, of = linear.fit(sensor, swept), paper_regression.regress_axes(sensor, swept)
-    force = np.column_stack(reference_force(swept, sensor.local_gravity_mps2)) / G0_MPS2
-    predicted = np.column_stack(signal_chain.static_response(fitted)(
-        reference_force(swept, sensor.local_gravity_mps2)))
+    line, regressions = linear.fit(sensor, swept), paper_regression.regress_axes(sensor, swept)
+    reference = reference_force(swept, sensor.local_gravity_mps2)
+    force_g = np.column_stack(reference) / G0_MPS2
+    predicted = np.column_stack(signal_chain.static_response(fitted)(reference))
+    vertical = np.abs(np.sin(swept.alpha_rad)) > _VERTICAL
     figure, grid = pyplot().subplots(2, len(panels), figsize=(4.4 * len(panels), 9),
                                      layout='constrained', squeeze=False)
     for d, row in enumerate(grid):
-        straight = start.zero_g_v[d] + start.scale_v_per_g[d] * force[:, d]
-        draw = _panels(d, force, swept, 1e3 * (swept.volts[:, d] - straight),
-                       1e3 * (predicted[:, d] - straight), of[d])
+        linear_v = line.zero_g_v[d] + line.scale_v_per_g[d] * force_g[:, d]
+        data = _AxisData(d, force_g, swept, 1e3 * (swept.volts[:, d] - linear_v),
+                         1e3 * (predicted[:, d] - linear_v), regressions[d], vertical)
         for axis, panel in zip(row, panels):
-            draw[panel](axis)
+            _PANELS[panel](axis, data)
     if len(panels) > 4:
-        figure.suptitle(f'{fitted.serial}: deviation from the linear model, and what the physical '
-                        'model makes of it (Ang et al. 2007, figures 2 to 8)')
+        figure.suptitle(f'{fitted.serial}: deviation from the linear model, measured and by the '
+                        'physical model (Ang et al. 2007, figures 2 to 8)')
     return figure
-
-
-def _panels(d: int, force: np.ndarray, swept: Poses, deviation: np.ndarray, after: np.ndarray,
-            of: paper_regression.AxisRegression) -> list[Callable[[Any], None]]:
-    vertical = np.abs(np.sin(swept.alpha_rad)) > np.sin(np.radians(89))
-    return [
-        lambda axis: _paths(axis, d, force, swept, deviation, vertical),
-        lambda axis: _paths(axis, d, force, swept, deviation, np.ones(len(swept), bool)),
-        lambda axis: _across(axis, d, force, deviation, of, vertical),
-        lambda axis: _modelled(axis, d, force, swept, deviation, after),
-        lambda axis: _along_z(axis, d, of.plane_az_g, 1e3 * of.plane_bias_v, 1e3 * of.q,
-                              'bias minus bias at 90°, mV', 'fig. 6: bias against z (12, 13)'),
-        lambda axis: _along_z(axis, d, of.plane_az_g, of.plane_scale_v_per_g, of.r,
-                              'scale factor, V/g', 'fig. 8: scale factor against z (15, 17)')]
 
 
 def gravity_rests(name: str, fit: GravityFit) -> Any:
     """
-    Draw the error of the magnitude of gravity over the rests, before and after.
+    Draw the error of the magnitude of gravity over the rests, before and after the fit.
 
     Parameters
     ----------
     name
-        Of the unit.
+        Name of the unit.
     fit
-        Of its rests.
+        Fit of its rests.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        The plot.
 
     """
     figure, axes = pyplot().subplots(1, 2, figsize=(12, 4.5), layout='constrained')
@@ -113,112 +168,126 @@ def gravity_rests(name: str, fit: GravityFit) -> Any:
     return figure
 
 
-def held_out(scores: Sequence[Score], poses: Poses) -> Any:
+def held_out(models: Sequence[HeldOutErrors], poses: Poses) -> Any:
     """
-    Draw the errors of tilt on poses held out, model by model, as figure 10 of the paper does.
+    Draw the errors on held-out poses, model by model, as in figure 10 of the paper.
 
     Parameters
     ----------
-    scores
-        With their errors.
+    models
+        Errors of the models.
     poses
-        All of them, as they were scored.
+        All poses that the models were fitted to or tested on.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        The plot.
 
     """
     figure, axes = pyplot().subplots(1, 3, figsize=(13, 4), layout='constrained')
-    for i, score in enumerate(scores):
-        if score.errors is None:
-            continue
-        alpha = np.degrees(poses.alpha_rad[score.index])
-        mg = np.sqrt(np.mean(score.errors.accel_mps2 ** 2, axis=1)) / G0_MPS2 * 1e3
-        for axis, values in zip(axes, (np.degrees(score.errors.alpha_rad),
-                                       np.degrees(score.errors.beta_rad), mg)):
-            axis.plot(alpha, np.abs(values), 'os^D'[i % 4], ms=4, mfc='none', color=f'C{i}',
-                      label=score.model)
+    for i, model in enumerate(models):
+        errors = model.errors
+        alpha_deg = np.degrees(poses.alpha_rad[model.pose_index])
+        accel_mg = np.sqrt(np.mean(errors.accel_mps2 ** 2, axis=1)) / G0_MPS2 * 1e3
+        for axis, values in zip(axes, (np.degrees(errors.alpha_rad), np.degrees(errors.beta_rad),
+                                       accel_mg)):
+            axis.plot(alpha_deg, np.abs(values), _MARKERS[i % 4], ms=4, mfc='none', color=f'C{i}',
+                      label=model.model)
     for axis, label in zip(axes, ('|error of alpha|, deg', '|error of beta|, deg',
                                   'error of acceleration, mg')):
         axis.set(xlabel='alpha of the pose, deg', ylabel=label, yscale='log')
-        # A pose that is right by chance must not squeeze the others.
+        # A tiny error by chance must not compress the scale.
         axis.set_ylim(bottom=1e-6 * axis.get_ylim()[1])
         axis.grid(alpha=0.3)
     axes[0].legend(fontsize=8)
     return figure
 
 
-def drift(dates: Sequence[Any], axes: str, zero_mg: np.ndarray, scale_permille: np.ndarray,
-          zero_std_mg: np.ndarray, scale_std_permille: np.ndarray) -> Any:
-    """
-    Draw zero-g and scale factor of a unit over its calibrations, relative to the newest.
-
-    Parameters
-    ----------
-    dates
-        Of the calibrations, (k,).
-    axes
-        Measured axes.
-    zero_mg, scale_permille
-        Less those of the newest, (k, m).
-    zero_std_mg, scale_std_permille
-        Their standard deviations, (k, m).
-
-    """
+def drift(series: DriftSeries) -> Any:
+    """Draw zero-g and scale factor of a unit over its calibrations, relative to the newest."""
     figure, row = pyplot().subplots(1, 2, figsize=(12, 3.6), layout='constrained')
-    for axis, values, std, label in ((row[0], zero_mg, zero_std_mg, 'zero-g, mg'),
-                                     (row[1], scale_permille, scale_std_permille,
-                                      'scale factor, ‰')):
-        for d, name in enumerate(axes):
-            axis.errorbar(dates, values[:, d], yerr=Z_90 * std[:, d], fmt='-' + 'os^'[d], ms=5,
-                          lw=1, capsize=3, label=name)
+    for axis, values, std, label in (
+            (row[0], series.zero_g_mg, series.zero_g_std_mg, 'zero-g, mg'),
+            (row[1], series.scale_permille, series.scale_std_permille, 'scale factor, ‰')):
+        for d, name in enumerate(series.axes):
+            axis.errorbar(series.dates, values[:, d], yerr=Z_90 * std[:, d],
+                          fmt='-' + _MARKERS[d], ms=5, lw=1, capsize=3, label=name)
         axis.axhline(0, color='0.7', lw=0.8)
-        axis.set(ylabel=f'{label}, less the newest')
+        axis.set(ylabel=f'{label}, minus the newest')
         axis.tick_params(axis='x', rotation=20)
         axis.legend(fontsize=8)
     return figure
 
 
-def _paths(axis: Any, d: int, force: np.ndarray, poses: Poses, deviation: np.ndarray,
-           chosen: np.ndarray) -> None:
-    alpha = np.degrees(poses.alpha_rad)
-    turn = np.gradient(poses.beta_rad) < 0
-    for plane in paper_regression.planes(poses.alpha_rad[chosen]):
+def _vertical_paths(axis: Any, data: _AxisData) -> None:
+    _paths(axis, data, data.vertical, 2)
+
+
+def _all_paths(axis: Any, data: _AxisData) -> None:
+    _paths(axis, data, np.ones(len(data.poses), bool), 3)
+
+
+def _paths(axis: Any, data: _AxisData, chosen: np.ndarray, number: int) -> None:
+    """Draw the deviation over the reference, plane by plane, up and down in beta."""
+    alpha_deg = np.degrees(data.poses.alpha_rad)
+    backward = np.gradient(data.poses.beta_rad) < 0
+    force_g, deviation_mv = data.force_g[:, data.d], data.deviation_mv
+    for plane in paper_regression.planes(data.poses.alpha_rad[chosen]):
         index = np.flatnonzero(chosen)[np.sort(plane)]
-        line, = axis.plot(force[index, d], deviation[index], lw=1,
-                          label=f'{alpha[index].mean():.0f}°')
-        for back, marker in ((False, 'o'), (True, '<')):
-            part = index[turn[index] == back]
-            axis.plot(force[part, d], deviation[part], marker, ms=4, color=line.get_color(),
-                      mfc='none' if back else None)
-    number = 3 if chosen.all() else 2
+        line, = axis.plot(force_g[index], deviation_mv[index], lw=1,
+                          label=f'{alpha_deg[index].mean():.0f}°')
+        forth, back = index[~backward[index]], index[backward[index]]
+        axis.plot(force_g[forth], deviation_mv[forth], 'o', ms=4, color=line.get_color())
+        axis.plot(force_g[back], deviation_mv[back], '<', ms=4, color=line.get_color(),
+                  mfc='none')
     axis.legend(title='alpha', fontsize=7)
-    axis.set(xlabel=f'{"xy"[d]} reference, g', ylabel=f'{"xy"[d]} output minus linear, mV',
+    axis.set(xlabel=f'{data.name} reference, g', ylabel=f'{data.name} output minus linear, mV',
              title=f'fig. {number}: paths, forth ● and back ◁')
 
 
-def _across(axis: Any, d: int, force: np.ndarray, deviation: np.ndarray,
-            of: paper_regression.AxisRegression, vertical: np.ndarray) -> None:
-    axis.plot(force[vertical, 1 - d], deviation[vertical], 'o', ms=4, label='measured (10)')
-    axis.plot(_FINE_G, 1e3 * np.polynomial.polynomial.polyval(_FINE_G, of.p),
+def _across(axis: Any, data: _AxisData) -> None:
+    vertical = data.vertical
+    axis.plot(data.force_g[vertical, 1 - data.d], data.deviation_mv[vertical], 'o', ms=4,
+              label='measured (10)')
+    axis.plot(_FINE_G, 1e3 * np.polynomial.polynomial.polyval(_FINE_G, data.regression.p),
               label='quadratic (11)')
     axis.legend(fontsize=7)
-    axis.set(xlabel=f'{"yx"[d]} reference, g', ylabel=f'{"xy"[d]} residual, mV',
-             title=f'fig. 4: residual against {"yx"[d]}, alpha = 90°')
+    axis.set(xlabel=f'{data.other} reference, g', ylabel=f'{data.name} residual, mV',
+             title=f'fig. 4: residual against {data.other}, alpha = 90°')
 
 
-def _modelled(axis: Any, d: int, force: np.ndarray, poses: Poses, deviation: np.ndarray,
-              after: np.ndarray) -> None:
-    for plane in paper_regression.planes(poses.alpha_rad):
+def _modelled(axis: Any, data: _AxisData) -> None:
+    alpha_rad, force_g = data.poses.alpha_rad, data.force_g[:, data.d]
+    for plane in paper_regression.planes(alpha_rad):
         index = np.sort(plane)
-        line, = axis.plot(force[index, d], deviation[index], 'o', ms=3,
-                          label=f'{np.degrees(poses.alpha_rad[index]).mean():.0f}°')
-        axis.plot(force[index, d], after[index], lw=1, color=line.get_color())
+        line, = axis.plot(force_g[index], data.deviation_mv[index], 'o', ms=3,
+                          label=f'{np.degrees(alpha_rad[index]).mean():.0f}°')
+        axis.plot(force_g[index], data.model_mv[index], lw=1, color=line.get_color())
     axis.legend(title='alpha', fontsize=7)
-    axis.set(xlabel=f'{"xy"[d]} reference, g', ylabel=f'{"xy"[d]} output minus linear, mV',
+    axis.set(xlabel=f'{data.name} reference, g', ylabel=f'{data.name} output minus linear, mV',
              title='figs. 5, 7: measured ● and physical model ─')
 
 
-def _along_z(axis: Any, d: int, az_g: np.ndarray, values: np.ndarray, curve: np.ndarray,
-             label: str, title: str) -> None:
-    fine = np.linspace(az_g.min(), az_g.max(), 101)
+def _bias_along_z(axis: Any, data: _AxisData) -> None:
+    regression = data.regression
+    _along_z(axis, regression.plane_az_g, 1e3 * regression.plane_bias_v, 1e3 * regression.q)
+    axis.set(xlabel='z reference, g', ylabel=f'{data.name} bias minus bias at 90°, mV',
+             title='fig. 6: bias against z (12, 13)')
+
+
+def _scale_along_z(axis: Any, data: _AxisData) -> None:
+    regression = data.regression
+    _along_z(axis, regression.plane_az_g, regression.plane_scale_v_per_g, regression.r)
+    axis.set(xlabel='z reference, g', ylabel=f'{data.name} scale factor, V/g',
+             title='fig. 8: scale factor against z (15, 17)')
+
+
+def _along_z(axis: Any, az_g: np.ndarray, values: np.ndarray, polynomial: np.ndarray) -> None:
+    fine_g = np.linspace(az_g.min(), az_g.max(), 101)
     axis.plot(az_g, values, 'o', ms=4)
-    axis.plot(fine, np.polynomial.polynomial.polyval(fine, curve))
-    axis.set(xlabel='z reference, g', ylabel=f'{"xy"[d]} {label}', title=title)
+    axis.plot(fine_g, np.polynomial.polynomial.polyval(fine_g, polynomial))
+
+
+_PANELS = (_vertical_paths, _all_paths, _across, _modelled, _bias_along_z, _scale_along_z)
+"""The panels of `sweep`, in order."""

@@ -1,6 +1,6 @@
-// Residuals over the sphere of poses: drag or arrow keys turn it, the wheel zooms, a pose under the
-// pointer says what it is. Data: {models: [name], quantities: [[label, unit]], poses:
-// [{u: [x, y, z], says, held, values: by model, by quantity, null where not shown}]}.
+// Residuals over the sphere of poses. Dragging or arrow keys turn it, the wheel zooms, and the pose
+// under the pointer is named. Data: {models: [name], quantities: [[label, unit]], poses:
+// [{u: [x, y, z], label, held_out, values: by model, by quantity, null where not shown}]}.
 'use strict';
 (function () {
   const data = JSON.parse(document.getElementById('sphere-data').textContent);
@@ -21,7 +21,7 @@
   function turned(u) {
     const a = Math.cos(yaw) * u[0] - Math.sin(yaw) * u[1];
     const b = Math.sin(yaw) * u[0] + Math.cos(yaw) * u[1];
-    // Seen from the side: z is up, the third is towards the eye.
+    // Seen from the side: the second component is up, the third points to the viewer.
     return [a, Math.cos(pitch) * u[2] + Math.sin(pitch) * b,
             -Math.cos(pitch) * b + Math.sin(pitch) * u[2]];
   }
@@ -29,7 +29,7 @@
     return [CENTRE[0] + RADIUS * zoom * v[0], CENTRE[1] - RADIUS * zoom * v[1]];
   }
   function colour(share) {
-    // Blue, white, red: told apart by colour-blind eyes, too.
+    // Blue, white, red: colour-blind people can distinguish them.
     const s = Math.max(-1, Math.min(1, share)), f = 1 - Math.abs(s);
     const end = s < 0 ? [33, 102, 172] : [178, 24, 43];
     const mixed = end.map(function (c) { return Math.round(c + (247 - c) * f); });
@@ -55,42 +55,42 @@
   function values() {
     return data.poses.map(function (p) { return p.values[model.value][quantity.value]; });
   }
-  function limit(all) {
+  function colourLimit(all) {
     const sizes = all.filter(function (v) { return v !== null; }).map(Math.abs);
     sizes.sort(function (a, b) { return a - b; });
-    // One wild pose must not pale all others.
+    // One outlier must not make all other colours pale.
     return sizes.length ? sizes[Math.floor(0.95 * (sizes.length - 1))] || 1e-12 : 1;
   }
-  function legend(most, least, unit) {
+  function legend(largest, lowest, unit) {
     for (let i = 0; i < 200; i++) {
-      pen.fillStyle = colour(1 - (1 - least) * i / 199);
+      pen.fillStyle = colour(1 - (1 - lowest) * i / 199);
       pen.fillRect(690, 160 + i, 22, 1.5);
     }
     pen.fillStyle = '#222';
-    [[1, 165], [0, least < 0 ? 264 : 363], [-1, 363]].forEach(function (at) {
-      if (at[0] < least) { return; }
-      pen.fillText((at[0] * most).toPrecision(2) + ' ' + unit + (at[0] ? ' and beyond' : ''), 720,
-                   at[1]);
+    [[1, 165], [0, lowest < 0 ? 264 : 363], [-1, 363]].forEach(function (tick) {
+      if (tick[0] < lowest) { return; }
+      pen.fillText((tick[0] * largest).toPrecision(2) + ' ' + unit + (tick[0] ? ' and beyond' : ''), 720,
+                   tick[1]);
     });
-    pen.fillText('● in the fit   ■ only judges it', 690, 395);
-    pen.fillText('× does not show it', 690, 415);
+    pen.fillText('● in the fit   ■ held out', 690, 395);
+    pen.fillText('× not determined', 690, 415);
   }
-  function mark(one, size, most) {
-    const x = one.at[0], y = one.at[1];
+  function mark(point, size, largest) {
+    const x = point.at[0], y = point.at[1];
     pen.strokeStyle = '#444';
     pen.beginPath();
-    if (one.value === null) {
+    if (point.value === null) {
       pen.moveTo(x - size, y - size);
       pen.lineTo(x + size, y + size);
       pen.moveTo(x - size, y + size);
       pen.lineTo(x + size, y - size);
-    } else if (one.pose.held) {
+    } else if (point.pose.held_out) {
       pen.rect(x - size, y - size, 2 * size, 2 * size);
     } else {
       pen.arc(x, y, size, 0, 7);
     }
-    if (one.value !== null) {
-      pen.fillStyle = colour(one.value / most);
+    if (point.value !== null) {
+      pen.fillStyle = colour(point.value / largest);
       pen.fill();
     }
     pen.stroke();
@@ -125,28 +125,28 @@
       pen.stroke();
       pen.fillText(name + ' up', at[0] + 4, at[1] - 4);
     });
-    const all = values(), most = limit(all), unit = data.quantities[quantity.value][1];
+    const all = values(), largest = colourLimit(all), unit = data.quantities[quantity.value][1];
     shown = data.poses.map(function (pose, i) {
       const v = turned(pose.u);
       return {pose: pose, value: all[i], depth: v[2], at: placed(v)};
     });
     shown.sort(function (a, b) { return a.depth - b.depth; });
-    shown.forEach(function (one) {
-      pen.globalAlpha = one.depth > 0 ? 1 : 0.45;
-      mark(one, one.depth > 0 ? 6 : 3.5, most);
+    shown.forEach(function (point) {
+      pen.globalAlpha = point.depth > 0 ? 1 : 0.45;
+      mark(point, point.depth > 0 ? 6 : 3.5, largest);
       pen.globalAlpha = 1;
     });
-    legend(most, all.some(function (v) { return v < 0; }) ? -1 : 0, unit);
+    legend(largest, all.some(function (v) { return v < 0; }) ? -1 : 0, unit);
     canvas.dataset.turn = yaw.toFixed(3) + ' ' + pitch.toFixed(3) + ' ' + zoom.toFixed(2);
   }
-  function say(event) {
+  function describe(event) {
     const box = canvas.getBoundingClientRect(), scale = SIZE[0] / box.width;
     const x = (event.clientX - box.left) * scale, y = (event.clientY - box.top) * scale;
-    const near = shown.filter(function (one) {
-      return one.depth > 0 && Math.hypot(one.at[0] - x, one.at[1] - y) < 10;
+    const near = shown.filter(function (point) {
+      return point.depth > 0 && Math.hypot(point.at[0] - x, point.at[1] - y) < 10;
     }).pop();
     about.textContent = !near ? 'Drag to turn, wheel to zoom, point at a pose.' :
-        near.pose.says + ': ' + (near.value === null ? 'does not show it' :
+        near.pose.label + ': ' + (near.value === null ? 'not determined' :
             near.value.toPrecision(3) + ' ' + data.quantities[quantity.value][1]);
   }
   function turn(right, up) {
@@ -163,7 +163,7 @@
       turn((event.clientX - drag[0]) * 0.008, (event.clientY - drag[1]) * 0.008);
       drag = [event.clientX, event.clientY];
     }
-    say(event);
+    describe(event);
   });
   canvas.addEventListener('pointerup', function () { drag = null; });
   canvas.addEventListener('wheel', function (event) {

@@ -86,10 +86,10 @@ def test_physical_finds_the_unit(axes):
             error = (fitted.values[name.effect][name.parameter][index]
                      - truth.values[name.effect][name.parameter][index])
             inside.append(abs(error) < 1.645 * sigma)
-        of = cross_validation.score(
-            'physical', cross_validation.errors(fitted, poses.subset(poses.check)))
-        alpha_deg.append(of.alpha_rms_deg)
-        assert of.accel_rms_mg < 0.6
+        errors = cross_validation.summarise(
+            'physical', cross_validation.pose_errors(fitted, poses.subset(poses.check)))
+        alpha_deg.append(errors.alpha_deg.rms)
+        assert errors.accel_mg.rms < 0.6
     assert np.mean(alpha_deg) < 0.1
     assert 0.85 < np.mean(inside) < 0.99
 
@@ -101,9 +101,9 @@ def test_physical_reduces_the_tilt_error_as_the_paper_does():
     ratios = []
     for _ in range(10):
         poses = swept(rng, drawn(rng, sensor))
-        linear_score, physical_score = cross_validation.held_out(
+        linear_errors, physical_errors = cross_validation.cross_validate(
             {'linear': linear.fit, 'physical': paper_regression.fit}, sensor, poses)
-        ratios.append(physical_score.alpha_rms_deg / linear_score.alpha_rms_deg)
+        ratios.append(physical_errors.alpha_deg.rms / linear_errors.alpha_deg.rms)
     assert np.mean(ratios) < 1 - 0.889
 
 
@@ -113,7 +113,7 @@ def test_physical_is_exact_without_noise():
     truth = drawn(rng, nominal())
     poses = swept(rng, truth, noisy=False)
     fitted = paper_regression.fit(nominal(), poses.subset(~poses.check))
-    errors = cross_validation.errors(fitted, poses.subset(poses.check))
+    errors = cross_validation.pose_errors(fitted, poses.subset(poses.check))
     assert np.abs(errors.accel_mps2).max() < 0.3e-3 * 9.8
 
 

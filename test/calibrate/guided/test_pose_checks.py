@@ -389,7 +389,7 @@ def test_the_tilt_to_expect_is_that_of_poses_not_seen():
         std_v = np.tile(told.pose_std_v, (48, 1))
         unseen = Poses(volts + std_v * rng.normal(size=volts.shape), std_v, alpha, beta,
                        np.zeros((48, 2)), np.zeros(48, bool))
-        off = cross_validation.errors(told.sensor(), unseen)
+        off = cross_validation.pose_errors(told.sensor(), unseen)
         found.append(np.nanmean(np.concatenate([off.alpha_rad, off.beta_rad]) ** 2))
     assert np.sqrt(np.mean(found)) == pytest.approx(np.mean(promised), rel=0.4)
 

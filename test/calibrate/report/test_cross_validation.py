@@ -12,14 +12,14 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The verdict on simulated units, whose truth is known: its figures are true, and its blame."""
+"""Held-out errors, error budget and acceptance of simulated units, whose truth is known."""
 
 from dataclasses import replace
 
 from adxl_ros.calibrate import calibration
 from adxl_ros.calibrate.fits.full_model import TERMS
 from adxl_ros.calibrate.report import acceptance, cross_validation
-from adxl_ros.calibrate.report.error_budget import Parts
+from adxl_ros.calibrate.report.error_budget import ErrorBudget, ErrorBudgets
 from adxl_ros.model import signal_chain
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects.base import Coefficient
@@ -30,7 +30,7 @@ from units import drawn, nominal, swept
 
 
 def calibrated(seed, model=None, axes='xy', check=16, stage_rad=None, effects=TERMS, **figures):
-    """Calibrate a drawn unit on a stage that may err by another step than it states."""
+    """Calibrate a drawn unit on a stage whose true step may differ from the stated one."""
     rng = np.random.default_rng([seed, 81])
     sensor = nominal(axes, serial='S', **figures)
     truth = drawn(rng, sensor, effects)
@@ -40,42 +40,43 @@ def calibrated(seed, model=None, axes='xy', check=16, stage_rad=None, effects=TE
 
 
 def true_errors(truth, found):
-    """Return what the units that were scored err by without noise and stage: mg and deg rms."""
-    score = found.held_out[-1]
-    poses = found.poses.subset(found.inliers).subset(score.index)
+    """Return the errors of the fitted units without noise and stage error, mg and deg rms."""
+    held_out = found.held_out[-1]
+    poses = found.poses.subset(found.inliers).subset(held_out.pose_index)
     force = np.column_stack(specific_force(poses.alpha_rad, poses.beta_rad,
                                            truth.local_gravity_mps2))
     volts = np.column_stack(signal_chain.static_response(truth)(list(force.T)))
     got = np.empty_like(force)
-    for number, unit in enumerate(score.fitted):
-        own = score.fold == number
+    for number, unit in enumerate(held_out.fitted):
+        own = held_out.fold == number
         up = np.where(force[own, 2] < 0, -1, 1)
         got[own] = np.column_stack(signal_chain.inverse(unit, up)(list(volts[own].T)))
-    shown = np.isfinite(score.errors.tilt_rad)
+    shown = np.isfinite(held_out.errors.tilt_rad)
     mg = (got - force)[shown, :len(truth.axes)] / G0_MPS2 * 1e3
     return (np.sqrt(np.mean(mg ** 2)),
-            np.degrees(np.sqrt(np.mean(cross_validation.between(got, force)[shown] ** 2))))
+            np.degrees(np.sqrt(np.mean(cross_validation.angle_between(got, force)[shown] ** 2))))
 
 
 @pytest.mark.parametrize(('check', 'units', 'within'), [(16, 4, 0.35), (0, 2, 0.5)],
                          ids=['check poses', 'folds'])
 def test_the_error_that_is_stated_is_true(check, units, within):
-    """Noise and stage taken out, rms over units; what is seen is more."""
-    own, true, seen = [], [], []
+    """Without noise and stage error, rms over units; the measured errors are larger."""
+    estimated, true, measured = [], [], []
     for seed in range(units):
         truth, found = calibrated(seed, 'full', check=check)
-        judged = found.assessments[-1]
-        own.append((judged.own_mg, judged.own_deg))
+        assessment = found.assessments[-1]
+        estimated.append((assessment.error_mg, assessment.error_deg))
         true.append(true_errors(truth, found))
-        seen.append(found.held_out[-1].accel_rms_mg)
-        assert judged.limit == 'stage'
-        assert (judged.datasheet, judged.noise) == ('PASS', 'PASS')
-        said = found.fitted.provenance
-        assert float(said['own_accel_mg']) == pytest.approx(judged.own_mg, rel=1e-3)
-        assert float(said['held_out_accel_rms_mg']) == pytest.approx(seen[-1], rel=1e-3)
-    own, true = (np.sqrt(np.mean(np.square(one), axis=0)) for one in (own, true))
-    np.testing.assert_allclose(true, own, rtol=within)
-    assert np.sqrt(np.mean(np.square(seen))) > 2 * own[0]
+        measured.append(found.held_out[-1].accel_mg.rms)
+        assert assessment.limited_by == 'stage'
+        assert (assessment.accel_datasheet, assessment.accel_noise) == ('PASS', 'PASS')
+        entries = found.fitted.provenance
+        assert float(entries['own_accel_mg']) == pytest.approx(assessment.error_mg, rel=1e-3)
+        assert float(entries['held_out_accel_rms_mg']) == pytest.approx(measured[-1], rel=1e-3)
+    estimated, true = (np.sqrt(np.mean(np.square(errors), axis=0))
+                       for errors in (estimated, true))
+    np.testing.assert_allclose(true, estimated, rtol=within)
+    assert np.sqrt(np.mean(np.square(measured))) > 2 * estimated[0]
 
 
 CASES = {
@@ -91,23 +92,24 @@ CASES = {
 
 @pytest.mark.parametrize('name', CASES)
 def test_what_limits_it_is_named(name):
-    """By one of two units at least: chance moves a verdict once in a hundred."""
+    """For one of two units at least: chance changes an outcome once in a hundred."""
     limit, settings = CASES[name]
-    named = [calibrated(seed, **settings)[1].assessments[-1].limit for seed in range(2)]
+    named = [calibrated(seed, **settings)[1].assessments[-1].limited_by for seed in range(2)]
     assert limit in named, named
 
 
 def test_a_linear_model_fails_and_says_why():
     """Where the unit has the paper's terms; the full model of the same poses passes."""
     _, found = calibrated(1)
-    outcomes = {one.model: (one.datasheet, one.noise, one.limit) for one in found.assessments}
+    outcomes = {row.model: (row.accel_datasheet, row.accel_noise, row.limited_by)
+                for row in found.assessments}
     assert outcomes['linear'] == ('FAIL', 'FAIL', 'model')
     assert outcomes['full'][:2] == ('PASS', 'PASS')
     limit = outcomes['full'][2]
     lines = '\n'.join(found.comments())
-    assert 'at most 3.4 mg by the datasheet' in lines
+    assert 'limit by the datasheet 3.4 mg' in lines
     assert 'unit within ADXL203' in lines
-    # What a screen shows first, in its 80 columns: the verdict, and a line a model.
+    # A screen shows the acceptance first, and a line per model, within 80 columns.
     assert found.summary_lines[0] == f'full: datasheet PASS, noise PASS; limited by the {limit}'
     assert found.summary_lines[1].startswith('held out: tilt 0.')
     models = [line for line in found.summary_lines if line.split()[0] in outcomes]
@@ -125,11 +127,11 @@ def test_a_unit_beyond_the_datasheet_is_named():
     assert said.startswith('bias.offset_v.y is -0.11')
 
 
-def test_without_a_datasheet_there_is_no_bar():
-    """Figures of another sensor are not judged by those of the ADXL203."""
+def test_without_a_datasheet_there_is_no_limit():
+    """The datasheet values of the ADXL203 are no limits of another sensor."""
     _, found = calibrated(3, datasheet={}, datasheet_name='')
-    assert {one.datasheet for one in found.assessments} == {''}
-    assert 'no bar by a datasheet' in '\n'.join(found.report_lines)
+    assert {row.accel_datasheet for row in found.assessments} == {''}
+    assert 'no limit by a datasheet' in '\n'.join(found.report_lines)
 
 
 @pytest.mark.parametrize(('parts', 'outcome'), [
@@ -137,17 +139,20 @@ def test_without_a_datasheet_there_is_no_bar():
     ((9.0, 0.0, 0.1, 0.1, 8.8, 12.0), 'FAIL'), ((9.0, 0.0, 0.1, 0.1, 8.8, 12.0, False),
                                                 'NOT SHOWN')])
 def test_pass_fail_and_not_shown(parts, outcome):
-    """The bar is 1: an error that is below, that may be below, and that is beyond."""
-    bar = replace(nominal(), datasheet={Coefficient('nonlinearity', 'cubic_per_g2'): (
+    """The limit is 1: an error below it, one that may be below it, and one beyond it."""
+    sensor = replace(nominal(), datasheet={Coefficient('nonlinearity', 'cubic_per_g2'): (
         1 / G0_MPS2 / nominal().range_g ** 3, 0.0)})
-    judged = acceptance.judge('full', Parts(*parts), Parts(*parts), bar)
-    assert judged.datasheet == judged.worst('datasheet') == outcome
-    tilted = acceptance.judge('full', Parts(1.0, 0.0, 0.9, 0.1, 0.0, 0.2), replace(
-        Parts(*parts), per_axis=1.0), bar)
-    assert (tilted.datasheet, tilted.tilt_datasheet) == ('PASS', outcome)
-    assert tilted.worst('datasheet') == outcome
-    assert judged.limit == ('stage' if outcome in ('PASS', 'NOT SHOWN') and len(parts) == 6
-                            else 'model' if len(parts) == 6 else 'stage or model')
+    budget = ErrorBudget(*parts)
+    assessment = acceptance.assess('full', ErrorBudgets(budget, budget), sensor)
+    assert assessment.accel_datasheet == assessment.datasheet == outcome
+    tilted = acceptance.assess('full', ErrorBudgets(
+        ErrorBudget(1.0, 0.0, 0.9, 0.1, 0.0, 0.2), replace(budget, tilt_per_axis=1.0)), sensor)
+    assert (tilted.accel_datasheet, tilted.tilt_datasheet) == ('PASS', outcome)
+    assert tilted.datasheet == outcome
+    if len(parts) == 7:
+        assert assessment.limited_by == 'stage or model'
+    else:
+        assert assessment.limited_by == ('model' if outcome == 'FAIL' else 'stage')
 
 
 @pytest.mark.parametrize(('together', 'least'), [(0.0, 0.82), (0.9, 0.7)])

@@ -191,5 +191,5 @@ def test_a_first_calibration_and_one_by_hand(opened, reported, run_tool, shared_
     assert done.returncode == 0, done.stderr
     by_hand, said_by_hand = opened(tmp_path / 'by_hand' / 'report.html')
     text = by_hand.locator('body').inner_text()
-    assert 'magnitude less gravity, mg' in text and 'magnitude of gravity over 23 rests' in text
+    assert 'magnitude minus gravity, mg' in text and 'magnitude of gravity over 23 rests' in text
     assert said == said_by_hand == []
