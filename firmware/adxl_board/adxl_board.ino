@@ -14,30 +14,34 @@
  */
 
 
-/* An ADXL203 (or its kind) on a 16 bit SPI ADC, sent to adxl_ros's driver, link.type serial.
+/* Samples an analog accelerometer by a 16 bit SPI ADC and sends it to the driver of adxl_ros,
+ * link.type serial.
  *
- * Teensy (any) or an Arduino with an ATmega328P, 32U4 or 2560; ADC ADS8344, 5 V, its CS on pin 10.
- * CH0 x, CH1 y, CH2 the sensor's supply through a 2:1 divider (link.channels:=x,y,supply
- * link.supply_scale:=2.0). For another ADC change read_adc() and the figures below it.
+ * Board: any Teensy, or an Arduino with an ATmega328P, 32U4 or 2560. ADC: ADS8344 at 5 V, CS on
+ * pin 10. CH0 is x, CH1 is y, CH2 is the sensor's supply through a 2:1 divider. The driver needs
+ * link.channels:=x,y,supply link.supply_scale:=2.0. For another ADC change read_adc() and the
+ * constants of the ADC.
  *
- * A timer takes the samples, ten make a block, the loop sends whole blocks. When the host does
- * not read, blocks are dropped and their samples counted: the driver knows exactly what lacks. */
+ * A timer takes the samples, ten samples make a block, and the loop sends complete blocks. When
+ * the host does not read, blocks are dropped and their samples are counted. So the driver knows
+ * exactly how many samples are missing. */
 
 #include <SPI.h>
 
 #include "frame.h"
 
-const float RATE_HZ = 1000.0f;
-const uint8_t CHANNELS = 3;
-const uint8_t BITS = 16;
-const float VREF_V = 5.0f;
-const char SERIAL_NUMBER[] = "adxl-0001"; /* of the sensor on this board, 16 characters at most */
-const long BAUD = 500000;                 /* USB boards ignore it */
+const char SERIAL_NUMBER[] = "adxl-0001"; /* of the sensor on this board, at most 16 characters */
+const float RATE_HZ = 1000.0f;            /* sample rate, Hz */
+const long BAUD = 500000;                 /* baud rate; USB boards ignore it */
 
-const uint8_t CS_PIN = 10;
-const uint8_t BLOCK = 10;
-const uint8_t BLOCKS = 8;
-const SPISettings ADC_BUS(2000000, MSBFIRST, SPI_MODE0);
+const uint8_t CHANNELS = 3; /* channels of the ADC that are read */
+const uint8_t BITS = 16;    /* resolution of the ADC, bit */
+const float VREF_V = 5.0f;  /* reference voltage of the ADC, V */
+const uint8_t CS_PIN = 10;  /* chip select of the ADC */
+const SPISettings ADC_BUS(2000000, MSBFIRST, SPI_MODE0); /* the ADS8344 permits 2.4 MHz */
+
+const uint8_t BLOCK = 10; /* samples of a block */
+const uint8_t BLOCKS = 8; /* blocks that wait for the host; 80 ms of samples */
 
 struct block {
     uint64_t t_us;
@@ -53,7 +57,7 @@ static struct frame_counts counts = {0, FRAME_AFTER_RESET};
 static uint8_t frame[FRAME_ROOM(BLOCK, CHANNELS)];
 
 static uint16_t read_adc(uint8_t channel) {
-    /* Start, channel, single ended, always on; a busy clock, then 16 bits. */
+    /* Control byte: start, channel, single ended, always on. After one busy clock come 16 bits. */
     const uint8_t select = (uint8_t)(((channel & 1) << 2) | (channel >> 1));
     uint32_t raw;
     digitalWrite(CS_PIN, LOW);
@@ -80,7 +84,7 @@ static void take_sample() {
     static uint8_t filled = 0;
     const uint64_t t_us = now_us();
     struct block *b = &blocks[made % BLOCKS];
-    if (!filled && (uint8_t)(made - sent) == BLOCKS) { /* nowhere to put it */
+    if (!filled && (uint8_t)(made - sent) == BLOCKS) { /* all blocks wait for the host */
         index++;
         overruns++;
         return;
@@ -117,7 +121,7 @@ static void start_timer() {
     interrupts();
 }
 #else
-#error "Only Teensy and AVR have their timer here: let it call take_sample() RATE_HZ times a second"
+#error "No timer for this board: add one that calls take_sample() RATE_HZ times a second"
 #endif
 
 void setup() {
@@ -129,14 +133,14 @@ void setup() {
 }
 
 static void send(size_t length) {
-    /* Waits for room where the port has less than a frame; the timer goes on meanwhile. */
+    /* Waits for room in the port; the timer goes on meanwhile. */
     Serial.write(frame, length);
 }
 
 void loop() {
     static uint32_t informed_ms = 0;
     static bool informed = false;
-    if (!Serial) { /* no host has opened the port: what it misses is counted */
+    if (!Serial) { /* no host has opened the port: dropped samples are counted */
         return;
     }
     if (!informed || millis() - informed_ms >= 1000) {

@@ -17,12 +17,12 @@
 
 #include <string.h>
 
-/* Bytes go through these two steps as they are written: no second buffer is needed. */
+/* Computes the CRC and COBS byte by byte, so no second buffer is needed. */
 struct writer {
-    uint8_t *out;  /* where the frame begins */
-    size_t code;   /* where the length of the present COBS run goes */
-    size_t next;   /* where the next byte goes */
-    uint32_t crc;
+    uint8_t *out;  /* begin of the frame */
+    size_t code;   /* index of the length of the present COBS run */
+    size_t next;   /* index of the next byte */
+    uint32_t crc;  /* CRC-32 so far, as zlib computes it, before the final inversion */
 };
 
 static void stuff(struct writer *w, uint8_t byte) {

@@ -13,10 +13,10 @@
  * limitations under the License.
  */
 
-/* Frames of the serial wire format, version 1, of adxl_ros: plain C99, no heap, no globals.
+/* Frames of the serial wire format of adxl_ros, version 1: plain C99, no heap, no globals.
  *
- * A frame is COBS(payload, CRC-32) and one 0x00; everything is little-endian, whatever the
- * processor is. docs/links.md has the fields. */
+ * A frame is COBS(payload, CRC-32) and one 0x00. All numbers are little-endian on every processor.
+ * docs/links.md has the fields. */
 
 #ifndef ADXL_FRAME_H
 #define ADXL_FRAME_H
@@ -30,22 +30,27 @@ extern "C" {
 
 enum { FRAME_RAIL = 1, FRAME_AFTER_RESET = 2 };
 
-/* What the board counts; all zero, but for flags = FRAME_AFTER_RESET, after a reset. */
+/* Counts of the board. After a reset: block_seq = 0, flags = FRAME_AFTER_RESET. */
 struct frame_counts {
-    uint32_t block_seq;
-    uint16_t flags;
+    uint32_t block_seq; /* number of the next frame */
+    uint16_t flags;     /* flags of the next frame */
 };
 
-/* Room that a frame of n samples of m channels takes at most, its 0x00 included. */
+/* Largest size of a frame of n samples of m channels in bytes, its 0x00 included. */
 #define FRAME_ROOM(n, m) (24 + 2 * (n) * (m) + 4 + (28 + 2 * (n) * (m)) / 254 + 2)
 
-/* Write a data frame; returns its length in bytes.
- * codes: nsamp * nch ADC codes, right-aligned, sample after sample; bits: of the ADC. */
+/* Write a data frame; return its length in bytes.
+ * t_dev_us: device clock at the first sample. first_index: its number, dropped samples included.
+ * overruns: samples dropped since the reset. nsamp, nch: numbers of samples and channels.
+ * codes: nsamp * nch ADC codes, right-aligned, sample after sample. bits: resolution of the ADC.
+ * out: FRAME_ROOM(nsamp, nch) bytes. */
 size_t frame_data(struct frame_counts *counts, uint64_t t_dev_us, uint32_t first_index,
                   uint16_t overruns, uint8_t nsamp, uint8_t nch, const uint16_t *codes,
                   uint8_t bits, uint8_t *out);
 
-/* Write an info frame; returns its length in bytes. serial: up to 16 ASCII characters. */
+/* Write an info frame; return its length in bytes.
+ * rate_hz: sample rate. bits, vref_v: resolution and reference voltage of the ADC. nch: number of
+ * channels. serial: up to 16 ASCII characters. out: 48 bytes. */
 size_t frame_info(struct frame_counts *counts, float rate_hz, uint8_t bits, uint8_t nch,
                   float vref_v, const char *serial, uint8_t *out);
 
