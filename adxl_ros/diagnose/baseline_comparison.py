@@ -12,11 +12,12 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""A recording beside the simulator's baseline on its own reference motion."""
+"""A recording beside the simulation of its baseline, on the recording's own reference motion."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from enum import Enum
 
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model import signal_chain
@@ -30,40 +31,70 @@ from adxl_ros.simulate.motion import Motion, Path
 from adxl_ros.simulate.response import Response
 import numpy as np
 
-SEARCH_RATE_HZ, SEARCH_SAMPLES = 125.0, 80_000
-"""The search looks at samples about this often, more seldom where a recording is long; samples
-are left out, never averaged, so that what is fast still shows in them. What is found is confirmed
-at the full rate."""
+SEARCH_RATE_HZ = 125.0
+"""The search uses samples at about this rate, Hz. Chosen: it shows motion up to 60 Hz. Samples
+are left out, never averaged, so that aliases of faster signals remain."""
+SEARCH_SAMPLES = 80_000
+"""Largest number of samples of a recording in the search. Chosen: some ten minutes at 125 Hz, and
+less than 1 GB of memory."""
 _INTERNAL_RATE_HZ = 250.0
-_REMEMBERED = 3_000_000
-"""So many values of a path are held in memory."""
-_NEVER_MOVES_RAD, _NEVER_SHIFTS_M = 2e-3, 1e-6
-_STILL_RAD_S = 1e-3
-_AROUND_STILL_S = 0.3
-"""A sample is still if no joint moves within this before it: the filter has settled."""
+"""Lowest internal rate of the simulator, Hz. Chosen: twice the rate of the search."""
+_HIGHEST_INTERNAL_RATE_HZ = 1000.0
+"""Highest internal rate of the simulator, Hz, its default elsewhere."""
+_REST_INTERNAL_RATE_HZ = 1e-3
+"""Internal rate where nothing moves, Hz, so that the rate of the samples is enough."""
+_CACHED_VALUES = 3_000_000
+"""Number of values of one path that are kept in memory. Chosen: 24 MB."""
+_SMALLEST_TURN_RAD = 2e-3
+"""A joint that turns by less, rad, does not move. Chosen: above the step of an encoder."""
+_SMALLEST_SHIFT_M = 1e-6
+"""A stage that shifts by less, m, does not move. Chosen: above the step of an encoder."""
+_REST_RATE = 1e-3
+"""A joint rests below this rate, rad/s, and the shift below this acceleration, m/s². Chosen: the
+specific force then changes by less than the noise within a second."""
+_SETTLING_S = 0.3
+"""A sample rests if no joint moves within this time before it, s. Chosen: an RC filter of 15 Hz
+has settled."""
+
+
+class Reference(Enum):
+    """
+    What determines the motion of a recording.
+
+    STAGE: the angles of the stage. SIMULATOR: specific force by another simulator. NONE: the
+    sensor never moves, and its pose is unknown.
+    """
+
+    STAGE = 'stage'
+    SIMULATOR = 'sim'
+    NONE = 'rest'
 
 
 @dataclass(frozen=True)
-class Series:
+class BaselineComparison:
     """
-    Samples of one recording, (n,) of them, and what the simulator needs to follow it.
+    Samples of one recording, n of m axes, and what the simulator needs to follow the recording.
 
     Attributes
     ----------
     name
-        Of the recording, for people.
-    time_s, volts
-        Stamps, s, (n,), and output, V, (n, m).
+        Path of the recording, for people.
+    time_s
+        Stamps, s, (n,).
+    volts
+        Output of the sensor, V, (n, m).
     motion
-        Of the reference.
+        Motion of the reference.
     sensor
-        The baseline: stated figures and the effects of the parameter file, at this rate.
+        The baseline: datasheet values and effects of the parameter file, at this sample rate.
     reference
-        'stage', 'sim' (another simulator's specific force) or 'rest' (it never moves).
-    columns
-        References by name, (n,) each.
-    still
-        Samples at which nothing moves, (n,).
+        What determines the motion.
+    has_stage_angles
+        Whether the recording holds stage angles, even if they never change.
+    at_rest
+        Samples at which nothing moves, (n,) bool.
+    used
+        Samples that count, (n,) bool; the others are missing, repeated or outliers.
 
     """
 
@@ -72,63 +103,112 @@ class Series:
     volts: np.ndarray
     motion: Motion
     sensor: Sensor
-    reference: str
-    columns: dict[str, np.ndarray]
-    still: np.ndarray
+    reference: Reference
+    has_stage_angles: bool
+    at_rest: np.ndarray
+    used: np.ndarray
 
     def __len__(self) -> int:
-        """Count the samples."""
+        """Return the number of samples."""
         return len(self.time_s)
 
-    def simulated(self, sensor: Sensor) -> np.ndarray:
-        """Return what the mean of a sensor's output would be in this recording, V, (n, m)."""
-        return Response(noiseless(sensor), self.motion, 0, float(self.time_s[0]))(self.time_s)
+    @property
+    def dt_s(self) -> float:
+        """Median time between samples, s."""
+        return float(np.median(np.diff(self.time_s)))
 
-    def residual(self, sensor: Sensor) -> np.ndarray:
-        """
-        Return the recording less the mean of a sensor's output, V, (n, m).
-
-        At rest, where the pose is not known, less its own mean, too.
-        """
-        off = self.volts - self.simulated(replace(sensor, rate_hz=self.sensor.rate_hz))
-        return off - np.nanmean(off, axis=0) if self.reference == 'rest' else off
+    @property
+    def span_s(self) -> float:
+        """Time from the first sample to the last, s."""
+        return float(self.time_s[-1] - self.time_s[0])
 
     @property
     def scale_v_per_mps2(self) -> np.ndarray:
-        """Volts a m/s², by axis, (m,)."""
+        """Scale factor of the baseline by axis, V/(m/s²), (m,)."""
         return self.sensor.scale_v_per_g / G0_MPS2
 
+    def simulated_v(self, sensor: Sensor) -> np.ndarray:
+        """Return the mean output of a sensor in this recording, V, (n, m)."""
+        return Response(noiseless(sensor), self.motion, 0, float(self.time_s[0]))(self.time_s)
 
-class Remembered:
-    """A path that is asked for the same instants again and again."""
+    def residual_v(self, sensor: Sensor) -> np.ndarray:
+        """
+        Return the recording minus the mean output of a sensor, V, (n, m).
+
+        Without a reference the pose is unknown, and the mean of the residual is subtracted.
+        """
+        residual_v = self.volts - self.simulated_v(replace(sensor, rate_hz=self.sensor.rate_hz))
+        if self.reference is Reference.NONE:
+            return residual_v - np.nanmean(residual_v, axis=0)
+        return residual_v
+
+    def simulated_noise_v(self, sensor: Sensor, seed: int) -> np.ndarray:
+        """
+        Draw a sensor's output about its own mean, V, (n, m).
+
+        Parameters
+        ----------
+        sensor
+            The sensor with its noise and its effects.
+        seed
+            Seed of the noise.
+
+        Returns
+        -------
+        numpy.ndarray
+            Noise, V, (n, m).
+
+        """
+        at_rate = replace(sensor, rate_hz=self.sensor.rate_hz)
+        noisy = Response(at_rate, self.motion, seed, float(self.time_s[0]))(self.time_s)
+        return noisy - self.simulated_v(at_rate)
+
+
+class CachedPath:
+    """A path that keeps its newest values, because it is evaluated at the same times often."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._known: dict[tuple, np.ndarray] = {}
+        self._values: dict[tuple, np.ndarray] = {}
 
     def __call__(self, time_s: np.ndarray, order: int = 0) -> np.ndarray:
-        """See `Path`."""
+        """
+        Return the derivative of an order at times.
+
+        Parameters
+        ----------
+        time_s
+            Times, s, (n,).
+        order
+            0, 1 or 2.
+
+        Returns
+        -------
+        numpy.ndarray
+            Values of the path's derivative, (n,).
+
+        """
         if not len(time_s):
             return self._path(time_s, order)
         key = (order, len(time_s), float(time_s[0]), float(time_s[-1]),
                float(time_s[len(time_s) // 2]))
-        if key not in self._known:
-            self._known[key] = self._path(time_s, order)
-            while sum(map(len, self._known.values())) > _REMEMBERED and len(self._known) > 1:
-                del self._known[next(iter(self._known))]
-        # The newest is last: what was not asked for the longest goes first.
-        self._known[key] = self._known.pop(key)
-        return self._known[key]
+        if key not in self._values:
+            self._values[key] = self._path(time_s, order)
+            while sum(map(len, self._values.values())) > _CACHED_VALUES \
+                    and len(self._values) > 1:
+                del self._values[next(iter(self._values))]
+        # The dictionary is in the order of use: the oldest use goes first.
+        self._values[key] = self._values.pop(key)
+        return self._values[key]
 
 
-def _remembering(motion: Motion, reference: str) -> Motion:
+def _cached(motion: Motion, reference: Reference) -> Motion:
     """Return the motion with paths that are evaluated once."""
-    if reference == 'stage':
-        motion = replace(motion, alpha=Remembered(motion.alpha), beta=Remembered(motion.beta),
-                         shift=Remembered(motion.shift))
-    temperature_c, supply_v = (path and Remembered(path)
-                               for path in (motion.temperature_c, motion.supply_v))
-    return replace(motion, temperature_c=temperature_c, supply_v=supply_v)
+    if reference is Reference.STAGE:
+        motion = replace(motion, alpha=CachedPath(motion.alpha), beta=CachedPath(motion.beta),
+                         shift=CachedPath(motion.shift))
+    return replace(motion, temperature_c=motion.temperature_c and CachedPath(motion.temperature_c),
+                   supply_v=motion.supply_v and CachedPath(motion.supply_v))
 
 
 def noiseless(sensor: Sensor) -> Sensor:
@@ -138,84 +218,105 @@ def noiseless(sensor: Sensor) -> Sensor:
                    effects=mean, values={e: sensor.values[e] for e in mean})
 
 
-def series_of(read: Recording, sensor: Sensor, sim: Motion | None = None) -> Series:
+def compare(recording: Recording, sensor: Sensor, sim: Motion | None = None
+            ) -> BaselineComparison:
     """
-    Put a recording beside the simulator, at its full rate.
+    Put a recording beside the simulator, at the full rate of the recording.
 
     Parameters
     ----------
-    read
-        The recording, of `sensor`.
+    recording
+        A recording of `sensor`.
     sensor
-        The baseline, at the rate of the samples.
+        The baseline.
     sim
-        The motion by another simulator, in place of the stage.
+        Specific force by another simulator, in place of the stage.
+
+    Returns
+    -------
+    BaselineComparison
+        The comparison; all samples count.
 
     Raises
     ------
     UserError
-        See `from_recording.followed`.
+        The stage angles jump as no stage does.
 
     """
-    volts = read.volts(sensor)
-    motion, reference = _motion(read, sensor, volts, sim)
-    if reference != 'rest':
-        motion = replace(motion, internal_rate_hz=min(max(_INTERNAL_RATE_HZ, sensor.rate_hz),
-                                                      1000.0))
-    motion = _remembering(motion, reference)
-    return Series(read.path, read.time_s, volts, motion, sensor, reference, dict(read.columns),
-                  _still(motion, read.time_s, reference, volts))
+    sensor = replace(sensor, rate_hz=recording.rate_hz)
+    volts = recording.volts(sensor)
+    motion, reference = _motion(recording, sensor, volts, sim)
+    if reference is not Reference.NONE:
+        motion = replace(motion, internal_rate_hz=min(
+            max(_INTERNAL_RATE_HZ, sensor.rate_hz), _HIGHEST_INTERNAL_RATE_HZ))
+    motion = _cached(motion, reference)
+    return BaselineComparison(
+        recording.path, recording.time_s, volts, motion, sensor, reference,
+        'alpha_rad' in recording.columns, _at_rest(motion, recording.time_s, reference, volts),
+        np.ones(len(recording), bool))
 
 
-def thinned(full: Series) -> Series:
+def at_search_rate(comparison: BaselineComparison) -> BaselineComparison:
     """Return every k-th sample of a recording, for the search."""
-    span_s = float(full.time_s[-1] - full.time_s[0])
-    wanted_hz = min(SEARCH_RATE_HZ, SEARCH_SAMPLES / max(span_s, 1.0))
-    every = max(1, round(full.sensor.rate_hz / wanted_hz))
-    part, motion = slice(None, None, every), full.motion
-    if full.reference != 'rest':
+    rate_wanted_hz = min(SEARCH_RATE_HZ, SEARCH_SAMPLES / max(comparison.span_s, 1.0))
+    every = max(1, round(comparison.sensor.rate_hz / rate_wanted_hz))
+    part, motion = slice(None, None, every), comparison.motion
+    if comparison.reference is not Reference.NONE:
         motion = replace(motion, internal_rate_hz=_INTERNAL_RATE_HZ)
-    return Series(full.name, full.time_s[part], full.volts[part],
-                  _remembering(motion, full.reference),
-                  replace(full.sensor, rate_hz=full.sensor.rate_hz / every), full.reference,
-                  {name: values[part] for name, values in full.columns.items()},
-                  full.still[part])
+    return replace(
+        comparison, time_s=comparison.time_s[part], volts=comparison.volts[part],
+        motion=_cached(motion, comparison.reference),
+        sensor=replace(comparison.sensor, rate_hz=comparison.sensor.rate_hz / every),
+        at_rest=comparison.at_rest[part], used=comparison.used[part])
 
 
-def _motion(read: Recording, sensor: Sensor, volts: np.ndarray, sim: Motion | None
-            ) -> tuple[Motion, str]:
-    around = surroundings(read)
-    temperature_c, supply_v = around.get('temperature_c'), around.get('supply_v')
+def _motion(recording: Recording, sensor: Sensor, volts: np.ndarray, sim: Motion | None
+            ) -> tuple[Motion, Reference]:
+    """Return the motion of a recording and what determines it."""
+    paths = surroundings(recording)
+    temperature_c, supply_v = paths.get('temperature_c'), paths.get('supply_v')
     if sim is not None:
-        return replace(sim, temperature_c=temperature_c, supply_v=supply_v), 'sim'
-    angles = [read.columns.get(name, np.array([np.nan])) for name in ('alpha_rad', 'beta_rad')]
-    shift_m = read.columns.get('shift_m', np.zeros(1))
-    moves = any(np.nanmax(q) - np.nanmin(q) > least for q, least in (
-        (angles[0], _NEVER_MOVES_RAD), (angles[1], _NEVER_MOVES_RAD), (shift_m, _NEVER_SHIFTS_M))
-        if np.isfinite(q).any())
-    if moves and all(np.isfinite(q).any() for q in angles):
-        return followed(read, sensor), 'stage'
-    middle = np.nanmedian(volts, axis=0)
-    force = signal_chain.inverse(sensor)([float(v) for v in middle])
-    return Motion(float(read.time_s[-1] - read.time_s[0]), internal_rate_hz=1e-3,
+        return replace(sim, temperature_c=temperature_c,
+                       supply_v=supply_v), Reference.SIMULATOR
+    if _stage_moves(recording):
+        return followed(recording, sensor), Reference.STAGE
+    # The median output stands for the unknown pose.
+    force = signal_chain.inverse(sensor)([float(v) for v in np.nanmedian(volts, axis=0)])
+    return Motion(float(recording.time_s[-1] - recording.time_s[0]),
+                  internal_rate_hz=_REST_INTERNAL_RATE_HZ,
                   temperature_c=temperature_c, supply_v=supply_v,
-                  force=lambda at_s: [np.full(len(at_s), f) for f in force]), 'rest'
+                  force=lambda time_s: [np.full(len(time_s), f) for f in force]), Reference.NONE
 
 
-def _still(motion: Motion, time_s: np.ndarray, reference: str, volts: np.ndarray) -> np.ndarray:
-    if reference == 'rest':
+def _stage_moves(recording: Recording) -> bool:
+    """Determine whether both angles were sampled and a joint moves."""
+    def span(name: str) -> float:
+        values = recording.columns.get(name, np.array([np.nan]))
+        return float(np.nanmax(values) - np.nanmin(values)) if np.isfinite(values).any() \
+            else np.nan
+
+    alpha_rad, beta_rad, shift_m = span('alpha_rad'), span('beta_rad'), span('shift_m')
+    moves = (alpha_rad > _SMALLEST_TURN_RAD or beta_rad > _SMALLEST_TURN_RAD
+             or shift_m > _SMALLEST_SHIFT_M)
+    return bool(moves and np.isfinite([alpha_rad, beta_rad]).all())
+
+
+def _at_rest(motion: Motion, time_s: np.ndarray, reference: Reference, volts: np.ndarray
+             ) -> np.ndarray:
+    """Return which samples rest, (n,) bool."""
+    if reference is Reference.NONE:
         return np.ones(len(time_s), bool)
-    if reference == 'sim':
-        # Another simulator's force may be measured, and noisy: the sensor tells.
-        known = np.isfinite(volts).all(axis=1)
-        rests = find_rests(time_s[known], volts[known], 1 / float(np.median(np.diff(time_s))))
-        still = np.zeros(len(time_s), bool)
+    if reference is Reference.SIMULATOR:
+        # The force of another simulator may be noisy, so that the sensor itself shows its rests.
+        finite = np.isfinite(volts).all(axis=1)
+        rests = find_rests(time_s[finite], volts[finite], 1 / float(np.median(np.diff(time_s))))
+        at_rest = np.zeros(len(time_s), bool)
         for rest in rests:
-            still |= (time_s >= rest.time_start_s) & (time_s <= rest.time_stop_s)
-        return still
+            at_rest |= (time_s >= rest.time_start_s) & (time_s <= rest.time_stop_s)
+        return at_rest
     moving = np.zeros(len(time_s), bool)
     for joint in (motion.alpha, motion.beta):
-        moving |= np.abs(joint(time_s, 1)) > _STILL_RAD_S
-    moving |= np.abs(motion.shift(time_s, 2)) > _STILL_RAD_S
-    last = np.maximum.accumulate(np.where(moving, time_s, -np.inf))
-    return time_s - last > _AROUND_STILL_S
+        moving |= np.abs(joint(time_s, 1)) > _REST_RATE
+    moving |= np.abs(motion.shift(time_s, 2)) > _REST_RATE
+    last_move_s = np.maximum.accumulate(np.where(moving, time_s, -np.inf))
+    return time_s - last_move_s > _SETTLING_S

@@ -13,171 +13,309 @@
 # limitations under the License.
 
 """
-Faults of the recording itself, before anything else: axes, units, clocks, what is missing.
+Faults of the recording itself, which would make a diagnosis of effects meaningless.
 
-A swapped or inverted axis is the commonest gap of all; it must be called what it is.
+They are axes, units, clocks, the range, the reference, and missing samples.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from adxl_ros.diagnose.baseline_comparison import Series
+from adxl_ros.diagnose.baseline_comparison import at_search_rate, BaselineComparison, Reference
+from adxl_ros.diagnose.noise_detectors import (
+    coarse_codes,
+    Detection,
+    isolated_samples,
+    repeated_samples,
+)
 import numpy as np
 
 SHORTEST_S = 30.0
-_LEAST_MOTION_G = 0.05
-_LEAST_MOVED_G = 0.3
-_ALIKE = 0.9
-_WORST_MISSING = 0.3
-_LEAST_GAIN = 0.5
-_SEARCH_S = 1.0
-_GAP = 20.0
-_RATIOS = {9.80665: 'g instead of m/s²', 1e3: 'mV instead of V', 1e-3: 'kV instead of V',
-           1 / 9.80665: 'm/s² instead of g'}
+"""Shortest recording of a moving sensor, s. Chosen: a few turns of the stage."""
+_FEWEST_SAMPLES = 50
+"""Fewest samples of any recording. Chosen: one for each of 48 blocks."""
+_SMALLEST_MOTION_G = 0.05
+"""Standard deviation of the simulated force, g, from which an axis is compared. Chosen: ten times
+the noise of an ADXL203."""
+_LARGEST_UNEXPLAINED_MOTION_G = 0.3
+"""Range of the output, g, that drift and noise cannot explain without a reference. Chosen: 17°
+of tilt."""
+_CORRELATED = 0.9
+"""Correlation from which two signals are the same one. Chosen: noise of 0.4 times the signal."""
+_UNCORRELATED = 0.5
+"""Correlation below which the output does not follow the reference. Chosen."""
+_LARGEST_MISSING_SHARE = 0.3
+"""Share of samples that may be missing, or at the end of the range. Chosen."""
+_SEARCHED_DELAY_S = 1.0
+"""Largest delay that the effect of a time offset models, s: its upper bound."""
+_LARGEST_DELAY_S = 30.0
+"""Largest delay that is looked for, s. Chosen: a recording started by hand."""
+_CORRELATION_GAIN = 0.05
+"""Correlation that a delay must gain to be a fault. Chosen."""
+_JUMP_STEPS = 20.0
+"""A step of the stamps of this many usual steps is a jump. Chosen."""
+_LARGEST_JUMP_SHARE = 0.2
+"""Share of the recording that jumps of the stamps may have. Chosen."""
+_RAIL_SHARE = 0.05
+"""Share of the samples at one extreme value from which it is the end of the range. Chosen."""
+_SMALLEST_RANGE_V = 0.05
+"""Range of the output, V, below which an extreme value is not the end of the range. Chosen."""
+_UNIT_TOLERANCE = 0.1
+"""Relative deviation of a gain from the ratio of two units. Chosen: above any scale error."""
+_UNIT_RATIOS = {
+    9.80665: 'g instead of m/s²',
+    1e3: 'mV instead of V',
+    1e-3: 'kV instead of V',
+    1 / 9.80665: 'm/s² instead of g',
+}
+"""Gains of an output in the wrong unit, and what was taken for what."""
 
 
 @dataclass(frozen=True)
-class Fault:
-    """What is wrong: its name in the report, the status that follows, and words."""
+class DataFault:
+    """
+    A fault of the recording.
+
+    Attributes
+    ----------
+    name
+        Name in the report: `verdict.data_fault`.
+    status
+        Status of the verdict: 'bad_data' or 'insufficient'.
+    message
+        What is wrong and what to do, one line.
+
+    """
 
     name: str
     status: str
-    words: str
+    message: str
 
 
-def look(series: Series, thin: Series) -> Fault | None:
+@dataclass(frozen=True)
+class CheckedRecording:
+    """
+    A recording that can be diagnosed.
+
+    Attributes
+    ----------
+    comparison
+        The recording beside the baseline at its full rate.
+    search_comparison
+        The same at the rate of the search.
+    detections
+        Noise-like effects that the samples themselves show.
+    possible_spikes
+        Isolated samples; the residual of the best hypothesis must show them, too.
+
+    """
+
+    comparison: BaselineComparison
+    search_comparison: BaselineComparison
+    detections: tuple[Detection, ...]
+    possible_spikes: Detection | None
+
+
+def check_recording(comparison: BaselineComparison) -> CheckedRecording | DataFault:
+    """
+    Check a recording, and mark the samples that do not count.
+
+    Where the codes of the ADC are coarser than stated, the baseline gets their true number of
+    bits.
+    """
+    search_comparison = at_search_rate(comparison)
+    fault = find_data_fault(comparison, search_comparison)
+    if fault is not None:
+        return fault
+    detections: list[Detection] = []
+    coarse = coarse_codes(comparison.volts, comparison.sensor)
+    if coarse is not None:
+        detections.append(coarse)
+        bits = round(comparison.sensor.adc_bits - float(coarse.values['lost_bits']))
+        comparison, search_comparison = (
+            replace(c, sensor=replace(c.sensor, adc_bits=bits))
+            for c in (comparison, search_comparison))
+    used = np.isfinite(comparison.volts).all(axis=1)
+    # Coarse codes repeat by themselves.
+    if coarse is None:
+        used, repeated = repeated_samples(comparison.volts, comparison.time_s, used,
+                                          comparison.sensor)
+        detections += repeated
+    used, spikes = isolated_samples(comparison.volts, comparison.time_s, used, comparison.sensor)
+    every = round(comparison.sensor.rate_hz / search_comparison.sensor.rate_hz)
+    return CheckedRecording(replace(comparison, used=used),
+                            replace(search_comparison, used=used[::every]),
+                            tuple(detections), spikes)
+
+
+def find_data_fault(comparison: BaselineComparison, search_comparison: BaselineComparison
+                    ) -> DataFault | None:
     """
     Find what makes a diagnosis of effects meaningless.
 
     Parameters
     ----------
-    series, thin
-        The recording at its full rate, and at the search's.
+    comparison
+        The recording at its full rate.
+    search_comparison
+        The recording at the rate of the search.
+
+    Returns
+    -------
+    DataFault or None
+        The first fault that was found.
 
     """
-    span_s = float(series.time_s[-1] - series.time_s[0])
-    if (span_s < SHORTEST_S and series.reference != 'rest') or len(series) < 50:
-        return Fault('too_short', 'insufficient',
-                     f'{span_s:.3g} s are too short for a verdict; record a minute at least')
-    finite = np.isfinite(series.volts).all(axis=1)
-    if finite.mean() < 1 - _WORST_MISSING:
-        return Fault('missing', 'bad_data', f'{100 * (1 - finite.mean()):.0f} % of the samples '
-                     'are not numbers; record again')
-    clock = _clock(series)
+    span_s = comparison.span_s
+    if (span_s < SHORTEST_S and comparison.reference is not Reference.NONE) \
+            or len(comparison) < _FEWEST_SAMPLES:
+        return DataFault('too_short', 'insufficient', f'{span_s:.3g} s are too short for a '
+                         'verdict; record at least one minute')
+    finite = np.isfinite(comparison.volts).all(axis=1)
+    if finite.mean() < 1 - _LARGEST_MISSING_SHARE:
+        return DataFault('missing', 'bad_data', f'{100 * (1 - finite.mean()):.0f} % of the '
+                         'samples are not numbers; record again')
+    clock = _clock_fault(comparison.time_s)
     if clock is not None:
         return clock
-    railed = _railed(series, finite)
-    if railed > _WORST_MISSING:
-        return Fault('saturated', 'bad_data', f'{100 * railed:.0f} % of the '
-                     'samples are at the end of the range; check supply, range and wiring')
-    if series.reference == 'rest':
-        return _moved(series, finite)
-    return _axes(thin, np.isfinite(thin.volts).all(axis=1))
+    railed = _share_at_rail(comparison.volts[finite], comparison.sensor.lsb_v)
+    if railed > _LARGEST_MISSING_SHARE:
+        return DataFault('saturated', 'bad_data', f'{100 * railed:.0f} % of the samples are at '
+                         'the end of the range; check supply, range and wiring')
+    if comparison.reference is Reference.NONE:
+        return _unexplained_motion(comparison, finite)
+    return _axis_fault(search_comparison)
 
 
-def _moved(series: Series, finite: np.ndarray) -> Fault | None:
-    """Tell a sensor that moves while no reference says how."""
-    g = series.volts[finite] / series.sensor.scale_v_per_g
-    step = np.std(np.diff(g, axis=0), axis=0)
-    spread = np.quantile(g, 0.98, axis=0) - np.quantile(g, 0.02, axis=0)
-    worst = int(np.argmax(spread))
-    if spread[worst] < _LEAST_MOVED_G or step[worst] > spread[worst]:
+def _unexplained_motion(comparison: BaselineComparison, finite: np.ndarray) -> DataFault | None:
+    """Find a sensor that moves although no reference describes the motion."""
+    force_g = comparison.volts[finite] / comparison.sensor.scale_v_per_g
+    step_g = np.std(np.diff(force_g, axis=0), axis=0)
+    range_g = np.quantile(force_g, 0.98, axis=0) - np.quantile(force_g, 0.02, axis=0)
+    worst = int(np.argmax(range_g))
+    if range_g[worst] < _LARGEST_UNEXPLAINED_MOTION_G or step_g[worst] > range_g[worst]:
         return None
-    angles = 'its stage angles do not change' if 'alpha_rad' in series.columns else \
+    angles = 'its stage angles do not change' if comparison.has_stage_angles else \
         'it has no stage angles'
-    return Fault('reference', 'bad_data', f'{series.sensor.axes[worst]} moves by '
-                 f'{spread[worst]:.2f} g, but {angles}; give the angles, or --sim with the '
-                 'specific force of the same manoeuvre')
+    return DataFault('reference', 'bad_data', f'{comparison.sensor.axes[worst]} moves by '
+                     f'{range_g[worst]:.2f} g, but {angles}; give the angles, or --sim with the '
+                     'specific force of the same manoeuvre')
 
 
-def _clock(series: Series) -> Fault | None:
-    step = np.diff(series.time_s)
-    usual = float(np.median(step))
-    back = np.flatnonzero(step <= 0)
-    if len(back):
-        return Fault('clock_jump', 'bad_data', f'the stamps run backwards at '
-                     f'{series.time_s[back[0]]:.6g} s; record again with a steady clock')
-    wide = np.flatnonzero(step > _GAP * usual)
-    if len(wide) and float(step[wide].sum()) > 0.2 * float(step.sum()):
-        return Fault('clock_jump', 'bad_data', f'the stamps jump by {step[wide].max():.3g} s at '
-                     f'{series.time_s[wide[0]]:.6g} s; cut the recording there')
+def _clock_fault(time_s: np.ndarray) -> DataFault | None:
+    """Find stamps that run backwards or jump."""
+    steps_s = np.diff(time_s)
+    backward = np.flatnonzero(steps_s <= 0)
+    if len(backward):
+        return DataFault('clock_jump', 'bad_data', 'the stamps run backwards at '
+                         f'{time_s[backward[0]]:.6g} s; record again with a steady clock')
+    wide = np.flatnonzero(steps_s > _JUMP_STEPS * float(np.median(steps_s)))
+    if len(wide) and float(steps_s[wide].sum()) > _LARGEST_JUMP_SHARE * float(steps_s.sum()):
+        return DataFault('clock_jump', 'bad_data', f'the stamps jump by '
+                         f'{steps_s[wide].max():.3g} s at {time_s[wide[0]]:.6g} s; cut the '
+                         'recording there')
     return None
 
 
-def _railed(series: Series, finite: np.ndarray) -> float:
-    """Return the share of samples at an extreme value of their axis that many samples share."""
-    worst = 0.0
-    for v in series.volts[finite].T:
-        for end in (v.max(), v.min()):
-            share = float(np.mean(np.abs(v - end) < max(series.sensor.lsb_v, 1e-9) / 2))
-            worst = max(worst, share if share > 0.05 and np.ptp(v) > 0.05 else 0.0)
-    return worst
+def _share_at_rail(volts: np.ndarray, lsb_v: float) -> float:
+    """Return the share of samples at an extreme value of their axis that many samples have."""
+    largest = 0.0
+    for axis_v in volts.T:
+        for rail_v in (axis_v.max(), axis_v.min()):
+            share = float(np.mean(np.abs(axis_v - rail_v) < max(lsb_v, 1e-9) / 2))
+            if share > _RAIL_SHARE and np.ptp(axis_v) > _SMALLEST_RANGE_V:
+                largest = max(largest, share)
+    return largest
 
 
-def _axes(series: Series, finite: np.ndarray) -> Fault | None:
-    """Compare the axes with the force that the reference promises: order, sign, unit, time."""
-    sensor = series.sensor
-    base = series.simulated(sensor)
-    promised = (base - base.mean(axis=0)) / sensor.scale_v_per_g
-    seen = (series.volts - series.volts[finite].mean(axis=0)) / sensor.scale_v_per_g
-    moving = promised.std(axis=0) > _LEAST_MOTION_G
-    if not moving.any():
+def _axis_fault(comparison: BaselineComparison) -> DataFault | None:
+    """Compare order, sign, unit and time of the axes with the simulated output."""
+    sensor = comparison.sensor
+    finite = np.isfinite(comparison.volts).all(axis=1)
+    simulated_v = comparison.simulated_v(sensor)
+    simulated_g = (simulated_v - simulated_v.mean(axis=0)) / sensor.scale_v_per_g
+    measured_g = (comparison.volts - comparison.volts[finite].mean(axis=0)) \
+        / sensor.scale_v_per_g
+    moving = np.flatnonzero(simulated_g.std(axis=0) > _SMALLEST_MOTION_G)
+    if not len(moving):
         return None
-    late = _late(series, promised, seen, finite)
-    if late is not None:
-        return late
-    axes = np.flatnonzero(moving)
-    alike = np.array([[_correlation(seen[finite, d], promised[finite, c]) for c in axes]
-                      for d in axes])
-    for i, d in enumerate(axes):
-        if alike[i, i] < -_ALIKE:
-            return Fault('axis_inverted', 'bad_data', f'{sensor.axes[d]} reads against the '
-                         f'reference (correlation {alike[i, i]:.2f}): the axis is inverted; '
-                         'correct its sign or the mounting')
-        best = int(np.argmax(np.abs(alike[i])))
-        if best != i and abs(alike[i, best]) > _ALIKE > 2 * abs(alike[i, i]) - 0.5:
-            sign = 'against' if alike[i, best] < 0 else 'with'
-            return Fault('axis_swapped', 'bad_data', f'{sensor.axes[d]} moves {sign} the '
-                         f'reference of {sensor.axes[axes[best]]} (correlation '
-                         f'{alike[i, best]:.2f}): axes are swapped; correct the wiring or '
-                         'the mounting')
-    gains = [float(np.polyfit(promised[finite, d], seen[finite, d], 1)[0])
-             for i, d in enumerate(axes) if alike[i, i] > _ALIKE]
-    for ratio, words in _RATIOS.items():
-        if gains and abs(np.log(np.median(gains) / ratio)) < 0.1:
-            return Fault('unit', 'bad_data', f'the output is {np.median(gains):.4g} times what '
-                         f'the reference promises: {words}; correct the unit of the columns')
-    if len(axes) and np.max(np.abs(alike)) < _LEAST_GAIN:
-        return Fault('reference', 'bad_data', 'the output does not follow the reference at all '
-                     f'(correlation {np.max(np.abs(alike)):.2f}): they belong to different '
-                     'recordings, or are further apart in time than 30 s')
+    delay = _delay_fault(simulated_g, np.where(finite[:, None], measured_g, 0.0), sensor.rate_hz)
+    if delay is not None:
+        return delay
+    simulated_g, measured_g = simulated_g[finite][:, moving], measured_g[finite][:, moving]
+    correlation = np.array([[_correlation(measured, simulated) for simulated in simulated_g.T]
+                            for measured in measured_g.T])
+    axes = [sensor.axes[d] for d in moving]
+    return (_order_fault(axes, correlation)
+            or _unit_fault(simulated_g, measured_g, np.diag(correlation))
+            or _reference_fault(float(np.max(np.abs(correlation)))))
+
+
+def _order_fault(axes: list[str], correlation: np.ndarray) -> DataFault | None:
+    """Find an inverted or swapped axis; rows of the correlation are measured axes."""
+    for i, axis in enumerate(axes):
+        if correlation[i, i] < -_CORRELATED:
+            return DataFault('axis_inverted', 'bad_data', f'{axis} reads against the reference '
+                             f'(correlation {correlation[i, i]:.2f}): the axis is inverted; '
+                             'correct its sign or the mounting')
+        best = int(np.argmax(np.abs(correlation[i])))
+        uncorrelated = 2 * abs(correlation[i, i]) - 0.5 < _CORRELATED
+        if best != i and uncorrelated and abs(correlation[i, best]) > _CORRELATED:
+            sign = 'against' if correlation[i, best] < 0 else 'with'
+            return DataFault('axis_swapped', 'bad_data', f'{axis} moves {sign} the reference of '
+                             f'{axes[best]} (correlation {correlation[i, best]:.2f}): axes are '
+                             'swapped; correct the wiring or the mounting')
     return None
 
 
-def _late(series: Series, promised: np.ndarray, seen: np.ndarray, finite: np.ndarray
-          ) -> Fault | None:
-    """Tell a sensor that is later than the search's range, by cross-correlation."""
-    rate = series.sensor.rate_hz
-    most = min(round(30 * rate), len(promised) // 3)
-    best, at = 0.0, 0
-    here = 0.0
-    for d in range(promised.shape[1]):
-        a = promised[:, d]
-        b = np.where(finite, seen[:, d], 0.0)
-        size = 2 ** int(np.ceil(np.log2(2 * len(a))))
-        across = np.fft.irfft(np.fft.rfft(b, size) * np.conj(np.fft.rfft(a, size)), size)
-        norm = np.sqrt(np.sum(a * a) * np.sum(b * b)) + 1e-12
-        lags = np.concatenate([across[-most:], across[:most + 1]]) / norm
+def _unit_fault(simulated_g: np.ndarray, measured_g: np.ndarray, correlation: np.ndarray
+                ) -> DataFault | None:
+    """Find an output in the wrong unit, by its gain; the arguments are of the moving axes."""
+    gains = [float(np.polyfit(simulated_g[:, d], measured_g[:, d], 1)[0])
+             for d in np.flatnonzero(correlation > _CORRELATED)]
+    if not gains:
+        return None
+    gain = np.median(gains)
+    for ratio, units in _UNIT_RATIOS.items():
+        if abs(np.log(gain / ratio)) < _UNIT_TOLERANCE:
+            return DataFault('unit', 'bad_data', f'the output is {gain:.4g} times the simulated '
+                             f'output: {units}; correct the unit of the columns')
+    return None
+
+
+def _reference_fault(correlation: float) -> DataFault | None:
+    """Find an output that does not follow the reference, by its largest correlation."""
+    if correlation >= _UNCORRELATED:
+        return None
+    return DataFault('reference', 'bad_data', 'the output does not follow the reference '
+                     f'(correlation {correlation:.2f}): they belong to different recordings, or '
+                     'they are more than 30 s apart in time')
+
+
+def _delay_fault(simulated_g: np.ndarray, measured_g: np.ndarray, rate_hz: float
+                 ) -> DataFault | None:
+    """Find a delay beyond the range of the search, by the cross-correlation of each axis."""
+    largest_lag = min(round(_LARGEST_DELAY_S * rate_hz), len(simulated_g) // 3)
+    best, best_lag, undelayed = 0.0, 0, 0.0
+    for simulated, measured in zip(simulated_g.T, measured_g.T):
+        size = 2 ** int(np.ceil(np.log2(2 * len(simulated))))
+        products = np.fft.irfft(np.fft.rfft(measured, size)
+                                * np.conj(np.fft.rfft(simulated, size)), size)
+        norm = np.sqrt(np.sum(simulated * simulated) * np.sum(measured * measured)) + 1e-12
+        lags = np.concatenate([products[-largest_lag:], products[:largest_lag + 1]]) / norm
         if lags.max() > best:
-            best, at = float(lags.max()), int(np.argmax(lags)) - most
-            here = float(across[0] / norm)
-    if best > _ALIKE and best - here > 0.05 and abs(at) / rate > _SEARCH_S:
-        return Fault('time_misaligned', 'bad_data', f'the sensor is {at / rate:+.2f} s late of '
-                     'the reference, beyond the 1 s that are searched; shift its stamps')
+            best, best_lag = float(lags.max()), int(np.argmax(lags)) - largest_lag
+            undelayed = float(products[0] / norm)
+    delay_s = best_lag / rate_hz
+    if best > _CORRELATED and best - undelayed > _CORRELATION_GAIN \
+            and abs(delay_s) > _SEARCHED_DELAY_S:
+        return DataFault('time_misaligned', 'bad_data', f'the sensor is {delay_s:+.2f} s late of '
+                         'the reference, but the search covers 1 s; shift its stamps')
     return None
 
 
 def _correlation(a: np.ndarray, b: np.ndarray) -> float:
+    """Return the correlation of two signals, 0 where one is constant."""
     with np.errstate(all='ignore'):
         return float(np.nan_to_num(np.corrcoef(a, b)[0, 1]))

@@ -12,100 +12,129 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The diagnosis as a whole, as a library call."""
+"""
+The diagnosis as one library call, in stages.
+
+The stages are checks, comparison, linear model, search and decision; then what the report adds.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
-from adxl_ros.diagnose import (
-    data_checks,
-    decision,
-    model_discrepancy,
-    model_search,
-    noise_detectors,
-)
-from adxl_ros.diagnose.baseline_comparison import Series, series_of, thinned
-from adxl_ros.diagnose.data_checks import Fault
-from adxl_ros.diagnose.decision import Verdict
-from adxl_ros.diagnose.gap_closure import held_out, Shrunk, shrunk
-from adxl_ros.diagnose.hypothesis_fit import Hypothesis
-from adxl_ros.diagnose.linear_model import FOLLOWED, STRAIGHT, study, TOLERANCE
-from adxl_ros.diagnose.next_experiment import Next, proposed
-from adxl_ros.diagnose.noise_comparison import Likeness, likeness
-from adxl_ros.diagnose.noise_detectors import Sign
-from adxl_ros.diagnose.noise_floor import Floor, floor
-from adxl_ros.diagnose.noise_whitening import DRIFTS, drifts_among
-from adxl_ros.diagnose.residual_map import Cell, covered, map_of
-from adxl_ros.diagnose.single_effect_scores import Score, scores
+from adxl_ros.diagnose import data_checks, decision, gap_closure, noise_detectors
+from adxl_ros.diagnose.baseline_comparison import BaselineComparison, compare, Reference
+from adxl_ros.diagnose.data_checks import CheckedRecording, DataFault
+from adxl_ros.diagnose.decision import Findings, Verdict
+from adxl_ros.diagnose.drift_checks import walk_log_bayes_factor
+from adxl_ros.diagnose.evidence import bridged
+from adxl_ros.diagnose.gap_closure import GapClosure, HeldOutResidual
+from adxl_ros.diagnose.hypothesis_fit import Hypothesis, residual_channels
+from adxl_ros.diagnose.linear_model import build_linear_model, LinearModel
+from adxl_ros.diagnose.model_discrepancy import discrepancy, discrepancy_instead_of_drift
+from adxl_ros.diagnose.model_search import search, WORTH_LOG_BAYES_FACTOR
+from adxl_ros.diagnose.next_experiment import NextExperiment, propose_next_experiment
+from adxl_ros.diagnose.noise_comparison import compare_noise, NoiseComparison
+from adxl_ros.diagnose.noise_detectors import Detection, NoiseSamples, UNKNOWN
+from adxl_ros.diagnose.noise_floor import NoiseFloor
+from adxl_ros.diagnose.noise_whitening import drifts_among
+from adxl_ros.diagnose.residual_map import not_covered, residual_map, ResidualCell
+from adxl_ros.diagnose.single_effect_tests import single_effect_tests, SingleEffectTest
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.stream_unit import check_unit
+from adxl_ros.model.diagnosis_hints import StraightLine
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import ActsOn
 from adxl_ros.model.sensor import Sensor, with_axes
 from adxl_ros.simulate.motion import Motion
 import numpy as np
 
+_SMALLEST_WARMING_C = 1.0
+"""Range of the temperature, °C, below which nothing warms. Chosen."""
+_SMALLEST_SUPPLY_CHANGE_V = 0.02
+"""Range of the supply, V, below which it does not change. Chosen."""
+
 
 @dataclass(frozen=True)
 class Diagnosis:
     """
-    All that was found.
+    Everything that a diagnosis found.
 
     Attributes
     ----------
-    fault
-        Of the recording; then there is nothing else.
-    series, used
-        The recordings at the rate of the search, and the samples that count.
-    verdict, hypotheses
-        The answer, and what was weighed.
-    contributions
-        What each effect of the verdict's hypothesis makes, rms m/s².
-    scores
-        Of each effect alone, on tangents.
-    alike
-        Recorded noise by simulated noise, recording by recording, before and after.
+    data_fault
+        Fault of a recording; then everything else is empty.
+    comparisons
+        The recordings at the rate of the search, beside the baseline.
+    noise_floor
+        The noise floor.
+    verdict
+        The verdict.
+    hypotheses
+        Material hypotheses, the most probable first.
+    detections
+        Noise-like effects that show.
+    gap_closure
+        How far the best hypothesis closes the gap.
+    residual_cells
+        Map of the residual of the first recording.
+    not_covered
+        What the recordings do not cover, for people.
+    next_experiment
+        What to record next.
+    contributions_mps2
+        Rms that each effect of the best hypothesis contributes, m/s².
+    single_effect_tests
+        Tests of each effect alone.
+    noise_before, noise_after
+        Recorded by simulated noise of each recording, for the baseline and for the baseline with
+        the effects that were found.
     sensor
-        The baseline with what was found, ready for `simulate`.
+        The baseline with the effects of the verdict, ready for `simulate`.
 
     """
 
-    fault: Fault | None
-    series: list[Series]
-    used: list[np.ndarray]
-    floor: Floor | None = None
+    data_fault: DataFault | None
+    comparisons: list[BaselineComparison]
+    noise_floor: NoiseFloor | None = None
     verdict: Verdict | None = None
     hypotheses: tuple[Hypothesis, ...] = ()
-    signs: tuple[Sign, ...] = ()
-    shrunk: Shrunk | None = None
-    cells: tuple[Cell, ...] = ()
-    missing: tuple[str, ...] = ()
-    proposal: Next | None = None
-    contributions: dict[str, float] = field(default_factory=dict)
-    scores: dict[str, Score] = field(default_factory=dict)
-    alike: tuple[tuple[Likeness, ...], tuple[Likeness, ...]] = ((), ())
+    detections: tuple[Detection, ...] = ()
+    gap_closure: GapClosure | None = None
+    residual_cells: tuple[ResidualCell, ...] = ()
+    not_covered: tuple[str, ...] = ()
+    next_experiment: NextExperiment | None = None
+    contributions_mps2: dict[str, float] = field(default_factory=dict)
+    single_effect_tests: dict[str, SingleEffectTest] = field(default_factory=dict)
+    noise_before: tuple[NoiseComparison, ...] = ()
+    noise_after: tuple[NoiseComparison, ...] = ()
     sensor: Sensor | None = None
 
 
 def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None = None,
-             seed: int = 0, show: Callable[[float], None] = lambda done: None) -> Diagnosis:
+             seed: int = 0, show_progress: Callable[[float], None] = lambda fraction: None
+             ) -> Diagnosis:
     """
-    Compare recordings of one unit with the simulator, and find what the simulator lacks.
+    Compare recordings of one unit with the simulator, and find which effects it lacks.
 
     Parameters
     ----------
     recordings
-        Read as a whole.
+        Whole recordings of one unit.
     sensor
-        The baseline: stated figures and modelled effects.
+        The baseline: datasheet values and modelled effects.
     sim
         Specific force by another simulator, in place of the stage.
     seed
-        Of bootstraps.
-    show
+        Seed of bootstraps and of simulated noise.
+    show_progress
         Takes the fraction that is done.
+
+    Returns
+    -------
+    Diagnosis
+        The verdict and what it rests on, or a fault of a recording.
 
     Raises
     ------
@@ -115,131 +144,184 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
     """
     if not sensor.effects:
         sensor = with_axes(sensor, recordings[0].axes)
-    full, series, counted, used = [], [], [], []
-    signs: list[Sign] = []
-    alone: list[Sign | None] = []
-    for read in recordings:
-        check_unit(read.stream_info, read.axes, sensor)
-        one = series_of(read, replace(sensor, rate_hz=read.rate_hz), sim)
-        thin = thinned(one)
-        fault = data_checks.look(one, thin)
-        if fault is not None:
-            return Diagnosis(fault, [one], [np.ones(len(one), bool)])
-        coarse = noise_detectors.coarse_steps(one.volts, sensor)
-        if coarse is not None:
-            signs.append(coarse)
-            bits = round(sensor.adc_bits - float(coarse.values['lost_bits']))
-            one, thin = (replace(s, sensor=replace(s.sensor, adc_bits=bits)) for s in (one, thin))
-        good, of_samples = noise_detectors.bad_samples(one.volts, one.time_s, one.sensor,
-                                                       coarse is not None)
-        full.append(one)
-        series.append(thin)
-        counted.append(good)
-        used.append(good[::round(one.sensor.rate_hz / thin.sensor.rate_hz)])
-        signs += [sign for sign in of_samples if sign.effect != 'spikes']
-        alone.append(next((sign for sign in of_samples if sign.effect == 'spikes'), None))
-    show(0.05)
-    weighed = study(series, used, lambda done: show(0.05 + 0.25 * done))
-    base = floor(full, counted)
-    noise_mps2 = float(np.sqrt(np.mean((base.noise_v / series[0].scale_v_per_mps2) ** 2)))
-    found = decision.worthy(weighed, model_search.search(
-        weighed, lambda done: show(0.3 + 0.4 * done)), noise_mps2)
-    without = held_out(weighed, full, counted, (), series[0].sensor)
-    found, far = _holding(found, lambda one: shrunk(weighed, full, counted, one, without, base,
-                                                    seed))
-    best = found[0]
-    show(0.8)
-    beside = model_discrepancy.discrepancy(weighed, best)
-    instead = model_discrepancy.instead_of_drift(weighed, found)
-    left = [one.residual(best.sensor) for one in full]
-    for one, mask, off, spikes in zip(full, counted, left, alone):
-        there = replace(best.sensor, rate_hz=one.sensor.rate_hz)
-        if spikes is not None and noise_detectors.still_alone(spikes, off, mask, there):
-            signs.append(spikes)
-        signs += noise_detectors.of_residual(off, mask, replace(one, sensor=there))
-    signs = list({sign.effect: sign for sign in sorted(signs, key=lambda s: s.nats)}.values())
-    loud = _with_signs(best, signs, sensor)
-    before = [one.residual(sensor) for one in full]
-    alike = [tuple(likeness(one, off, mask, whole, seed)
-                   for one, off, mask in zip(full, offs, counted))
-             for offs, whole in ((before, sensor), (left, loud))]
-    explained = float(np.sqrt(max(far.before_mps2 ** 2 - far.within_mps2 ** 2, 0.0)))
-    as_noise = float(np.sqrt(np.mean([one.sigma_mps2 ** 2 for one in alike[1]])))
-    answer = decision.judge(weighed, found, beside, instead, signs, noise_mps2, explained,
-                            decision.left(weighed, best, far, as_noise))
-    answer = _insufficient(answer, series)
-    show(0.9)
-    cells = map_of(series[0], series[0].residual(series[0].sensor), used[0], base.rms_mps2, seed)
-    missing = covered(series)
-    by_effect = scores(weighed, seed)
-    show(1.0)
-    return Diagnosis(None, series, used, base, answer, tuple(found), tuple(signs), far,
-                     tuple(cells), tuple(missing), proposed(answer, missing, seed),
-                     {effect: decision.contribution_mps2(weighed, answer.best, effect)
-                      for effect in answer.best.effects}, by_effect, (alike[0], alike[1]),
-                     sensor if answer.status in ('no_gap', 'unknown', 'insufficient') else loud)
+    checked: list[CheckedRecording] = []
+    for recording in recordings:
+        check_unit(recording.stream_info, recording.axes, sensor)
+        comparison = compare(recording, sensor, sim)
+        result = data_checks.check_recording(comparison)
+        if isinstance(result, DataFault):
+            return Diagnosis(result, [comparison])
+        checked.append(result)
+    show_progress(0.05)
+    linear_model = build_linear_model([c.search_comparison for c in checked],
+                                      lambda done: show_progress(0.05 + 0.25 * done))
+    floor = gap_closure.estimate_noise_floor([c.comparison for c in checked])
+    hypotheses = search(linear_model, lambda done: show_progress(0.3 + 0.4 * done))
+    return _decided(checked, linear_model, floor, hypotheses, sensor, seed, show_progress)
 
 
-def _holding(found: list[Hypothesis], compared: Callable[[Hypothesis], Shrunk]
-             ) -> tuple[list[Hypothesis], Shrunk]:
+def _decided(checked: Sequence[CheckedRecording], linear_model: LinearModel, floor: NoiseFloor,
+             hypotheses: Sequence[Hypothesis], sensor: Sensor, seed: int,
+             show_progress: Callable[[float], None]) -> Diagnosis:
+    """Decide between the hypotheses of the search, and add what the report needs."""
+    comparisons = [c.comparison for c in checked]
+    search_comparisons = linear_model.comparisons
+    scale_v_per_mps2 = search_comparisons[0].scale_v_per_mps2
+    noise_mps2 = float(np.sqrt(np.mean((floor.noise_v / scale_v_per_mps2) ** 2)))
+    library_size = len({v.effect for v in linear_model.variants})
+    material = decision.material_hypotheses(
+        [gap_closure.size_of(linear_model, h) for h in hypotheses], library_size, noise_mps2,
+        linear_model.smallest_angle_rad())
+    baseline_residual = gap_closure.held_out_residual(linear_model, comparisons, (),
+                                                      linear_model.baseline)
+    confirmed, closure = _confirmed(linear_model, comparisons, material, baseline_residual,
+                                    floor.rms_mps2, seed)
+    best = confirmed[0]
+    show_progress(0.8)
+    beside = discrepancy(linear_model, best)
+    instead = discrepancy_instead_of_drift(linear_model, confirmed)
+    detections = _detections(checked, best)
+    named_sensor = _with_detections(best, detections, sensor)
+    noise_before = _noise_comparisons(comparisons, sensor, sensor, seed)
+    noise_after = _noise_comparisons(comparisons, best.sensor, named_sensor, seed)
+    simulated_noise_mps2 = float(np.sqrt(np.mean(
+        [n.simulated_std_mps2 ** 2 for n in noise_after])))
+    walk = walk_log_bayes_factor(list(residual_channels(linear_model, best))) \
+        if drifts_among(best.effects) else 0.0
+    verdict = decision.decide(Findings(
+        confirmed, library_size, beside, instead, walk, detections, noise_mps2,
+        float(np.sqrt(max(closure.before_mps2 ** 2 - closure.fitted_rms_mps2 ** 2, 0.0))),
+        gap_closure.unexplained_mps2(linear_model, best, closure, simulated_noise_mps2),
+        max(float(c.sensor.lsb_v / np.min(c.scale_v_per_mps2)) / 12 ** 0.5
+            for c in search_comparisons)))
+    if verdict.status == 'no_gap' and not any(map(_could_show, search_comparisons)):
+        verdict = replace(verdict, status='insufficient')
+    show_progress(0.9)
+    lacking = not_covered(search_comparisons)
+    diagnosis = Diagnosis(
+        None, search_comparisons, floor, verdict, tuple(confirmed), tuple(detections), closure,
+        tuple(residual_map(search_comparisons[0], floor.rms_mps2, seed)), tuple(lacking),
+        propose_next_experiment(verdict, lacking, seed),
+        {effect: gap_closure.contribution_mps2(linear_model, best, effect)
+         for effect in best.effects},
+        single_effect_tests(linear_model, seed), noise_before, noise_after,
+        sensor if verdict.status in ('no_gap', 'unknown', 'insufficient') else named_sensor)
+    show_progress(1.0)
+    return diagnosis
+
+
+def _confirmed(linear_model: LinearModel, comparisons: Sequence[BaselineComparison],
+               hypotheses: Sequence[Hypothesis], baseline_residual: HeldOutResidual,
+               floor_mps2: float, seed: int) -> tuple[list[Hypothesis], GapClosure]:
     """
-    Leave out what does not hold on stretches held out: it is not the cause.
+    Remove the first hypotheses until the best one holds on held-out blocks.
 
-    Zero-g, scale, filter and latency follow the recording within limits in any case, scale what
-    gravity does. A drift may only take up what the form of the effects beside it lacks: it must
-    predict more than they do.
+    It must make the held-out samples more probable and their residual not larger. Nuisance
+    parameters follow the recording in any case, and the scale factor imitates gravity, so that
+    these effects need not. A drift may only take up what the form of the effects beside it lacks,
+    so that it must predict more than they do.
     """
-    known: dict[frozenset[str], Shrunk] = {}
+    closures: dict[frozenset[str], GapClosure] = {}
 
-    def of(one: Hypothesis) -> Shrunk:
-        if (effects := frozenset(one.effects)) not in known:
-            known[effects] = compared(one)
-        return known[effects]
+    def closure_of(hypothesis: Hypothesis) -> GapClosure:
+        effects = frozenset(hypothesis.effects)
+        if effects not in closures:
+            closures[effects] = gap_closure.gap_closure(
+                linear_model, comparisons, hypothesis, baseline_residual, floor_mps2, seed)
+        return closures[effects]
 
-    while (effects := frozenset(found[0].effects)):
-        far = of(found[0])
-        steady = [one for one in found[1:] if 0 < len(one.effects) < len(effects)
-                  and frozenset(one.effects) == effects - frozenset(DRIFTS)]
-        if not far.harm and (far.predicted > 0 or effects <= set(FOLLOWED)) and not any(
-                far.predicted - of(one).predicted < model_search.WORTH for one in steady):
+    remaining = list(hypotheses)
+    while remaining[0].effects:
+        best, closure = remaining[0], closure_of(remaining[0])
+        without_drift = frozenset(best.effects) - frozenset(drifts_among(best.effects))
+        steady = [h for h in remaining[1:] if 0 < len(h.effects) < len(best.effects)
+                  and frozenset(h.effects) == without_drift]
+        absorbed = all(effect_named(e).diagnosis.absorbed for e in best.effects)
+        predicts = closure.log_likelihood_gain > 0 or absorbed
+        if not closure.harm and predicts and all(
+                closure.log_likelihood_gain - closure_of(h).log_likelihood_gain
+                >= WORTH_LOG_BAYES_FACTOR for h in steady):
             break
-        found = found[1:]
-    return found, of(found[0])
+        remaining = remaining[1:]
+    return remaining, closure_of(remaining[0])
 
 
-def _insufficient(answer: Verdict, series: Sequence[Series]) -> Verdict:
-    """Take back "no gap" where nothing moves or warms: such a recording cannot say it."""
-    if answer.status != 'no_gap':
-        return answer
-    for one in series:
-        moved = one.reference == 'sim' or (one.reference == 'stage' and not one.still.all())
-        around = [getattr(one.motion, name) for name in ('temperature_c', 'supply_v')]
-        changed = any(path is not None and np.ptp(path(one.time_s)) > least
-                      for path, least in zip(around, (1.0, 0.02)))
-        if moved or changed:
-            return answer
-    return replace(answer, status='insufficient')
+def _detections(checked: Sequence[CheckedRecording], best: Hypothesis) -> list[Detection]:
+    """
+    Return the noise-like effects of the recordings and of the residual, the strongest of each.
+
+    Spikes count only where the residual of the best hypothesis shows them, too.
+    """
+    detections = [d for c in checked for d in c.detections]
+    for c in checked:
+        comparison, used = c.comparison, c.comparison.used
+        sensor = replace(best.sensor, rate_hz=comparison.sensor.rate_hz)
+        residual_v = comparison.residual_v(best.sensor)
+        spikes = c.possible_spikes
+        if spikes is not None and noise_detectors.residual_shows_spikes(spikes, residual_v, used,
+                                                                        sensor):
+            detections.append(spikes)
+        detections += noise_detectors.residual_detections(NoiseSamples(
+            comparison.time_s, bridged(residual_v, used), residual_v,
+            comparison.simulated_noise_v(sensor, 0), comparison.at_rest & used, used), sensor)
+    ranked = sorted(detections, key=lambda d: d.log_bayes_factor)
+    return list({d.effect: d for d in ranked}.values())
 
 
-def _with_signs(best: Hypothesis, signs: Sequence[Sign], baseline: Sensor) -> Sensor:
-    """Put the noise-like effects beside those of the mean, at the baseline's rate."""
-    found = best.sensor
-    # Filter and latency within their tolerance are not worth an effect. Where no effect of the
-    # mean is named, nothing is; and where zero-g wandered here says nothing of the next recording.
+def _noise_comparisons(comparisons: Sequence[BaselineComparison], mean_sensor: Sensor,
+                       noise_sensor: Sensor, seed: int) -> tuple[NoiseComparison, ...]:
+    """Compare the residual about the mean of one sensor with the noise of another."""
+    return tuple(compare_noise(bridged(c.residual_v(mean_sensor), c.used),
+                               c.simulated_noise_v(noise_sensor, seed), c.sensor.rate_hz,
+                               c.scale_v_per_mps2) for c in comparisons)
+
+
+def _could_show(comparison: BaselineComparison) -> bool:
+    """Determine whether the sensor moves, or its temperature or supply changes."""
+    if comparison.reference is Reference.SIMULATOR:
+        return True
+    if comparison.reference is Reference.STAGE and not comparison.at_rest.all():
+        return True
+    motion, time_s = comparison.motion, comparison.time_s
+    warms = motion.temperature_c is not None \
+        and np.ptp(motion.temperature_c(time_s)) > _SMALLEST_WARMING_C
+    supply_changes = motion.supply_v is not None \
+        and np.ptp(motion.supply_v(time_s)) > _SMALLEST_SUPPLY_CHANGE_V
+    return bool(warms or supply_changes)
+
+
+def _with_detections(best: Hypothesis, detections: Sequence[Detection], baseline: Sensor
+                     ) -> Sensor:
+    """
+    Return the sensor of a hypothesis with the noise-like effects, at the baseline's rate.
+
+    Filter and latency within their tolerance are not worth an effect. Where no effect of the mean
+    is named, zero-g and scale factor stay those of the file, too. A zero-g that drifted says
+    nothing about the next recording.
+    """
     by_mean = any(effect_named(effect).acts_on is ActsOn.MEAN for effect in best.effects)
-    wandered = {'bias'} if drifts_among(best.effects) else set()
-    as_filed = (wandered if by_mean else set(TOLERANCE)) - set(best.effects)
-    effects = [e for e in found.effects if e in (*baseline.effects, *best.effects)
-               or e in set(STRAIGHT) - as_filed]
-    values = {name: (baseline if name in as_filed else found).values[name] for name in effects}
-    for sign in signs:
-        if sign.effect != 'unknown':
-            if sign.effect not in effects:
-                effects.append(sign.effect)
-            values[sign.effect] = sign.values
-    known = [i for i, name in enumerate(baseline.covariance_names)
-             if name.effect in effects]
-    return replace(found, effects=tuple(effects), values=values, rate_hz=baseline.rate_hz,
+    drifts = bool(drifts_among(best.effects))
+
+    def stays_as_filed(effect: str) -> bool:
+        hints = effect_named(effect).diagnosis
+        if effect in best.effects:
+            return False
+        return (hints.straight_line is StraightLine.ZERO_G and drifts) if by_mean \
+            else hints.nuisance
+
+    effects = [e for e in best.sensor.effects
+               if e in (*baseline.effects, *best.effects)
+               or (effect_named(e).diagnosis.straight_line and not stays_as_filed(e))]
+    values = {name: (baseline if stays_as_filed(name) else best.sensor).values[name]
+              for name in effects}
+    for detection in detections:
+        if detection.effect != UNKNOWN:
+            if detection.effect not in effects:
+                effects.append(detection.effect)
+            values[detection.effect] = detection.values
+    kept = [i for i, name in enumerate(baseline.covariance_names)
+            if name.effect in effects]
+    return replace(best.sensor, effects=tuple(effects), values=values, rate_hz=baseline.rate_hz,
                    adc_bits=baseline.adc_bits,
-                   covariance=baseline.covariance[np.ix_(known, known)],
-                   covariance_names=tuple(baseline.covariance_names[i] for i in known))
+                   covariance=baseline.covariance[np.ix_(kept, kept)],
+                   covariance_names=tuple(baseline.covariance_names[i] for i in kept))

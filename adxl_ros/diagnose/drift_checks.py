@@ -13,116 +13,154 @@
 # limitations under the License.
 
 """
-Whether what passes for a zero-g that wanders is one.
+Checks of a drift: whether the noise is the same all the time, and has the spectrum of the drift.
 
-The evidence takes whatever comes and goes slowly for a drift. A drift is the same all the time,
-and a random walk has its share in every octave; a warm draught or a floor that sways crowds a few
-of them.
+The evidence takes any slow change for a drift. A drift has the same power in all blocks, and a
+random walk has its expected power in every octave. A warm draught or a floor that sways has most
+of its power in a few octaves.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import combinations, pairwise
 
-from adxl_ros.diagnose.baseline_comparison import Series
-from adxl_ros.diagnose.evidence import block_edges, bridged
-from adxl_ros.diagnose.hypothesis_fit import Hypothesis
-from adxl_ros.diagnose.linear_model import Study
-from adxl_ros.diagnose.noise_whitening import WALKS_G_PER_RTS, Whitener
+from adxl_ros.diagnose.evidence import block_edges
+from adxl_ros.diagnose.noise_whitening import RANDOM_WALKS_G_PER_RTS, Whitener
+from adxl_ros.model.diagnosis_hints import DriftSpectrum
 import numpy as np
 from scipy.optimize import minimize_scalar
 from scipy.signal import sosfreqz
 
-_FEW = 4.0
-"""Octaves with more than so many times the walk's power, or so many times less, are not of it."""
-_TAPERED = 0.6
-"""Of neighbouring frequencies under a Hann window so many are independent (Harris 1978)."""
-_COLOUR_S = 0.1
-"""Strong noise of another colour than the filter's stays correlated so long."""
+_OCTAVE_RATIO = 4.0
+"""Ratio of the power in octaves to the walk's, above or below which they are not part of it.
+Tuned by hand on simulated recordings of the working seeds of the blind check."""
+_INDEPENDENT_SHARE = 0.6
+"""Share of neighbouring frequencies under a Hann window that are independent (Harris 1978)."""
+_CORRELATION_S = 0.1
+"""Time over which strong noise of another colour than the filter's stays correlated, s. Tuned by
+hand on simulated flicker noise of another form than the library's."""
+_LOG_LEVEL_RANGE = 3.0
+"""Range of the logarithm of a walk's power by that of its filter. Chosen: wider than the grid."""
+_BAND_OCTAVES = 4
+"""Highest frequency of that fit, by the highest at which the walk dominates. Chosen: 2 octaves."""
 
 
-def unevenness(of: Study, found: Hypothesis) -> float:
+@dataclass(frozen=True)
+class ResidualChannel:
     """
-    Return how unlike each other the stretches are: 1 where the noise is the same in all of them.
+    The residual of a hypothesis on one axis of one recording.
 
-    The rms, over stretches, of what each one's squares depart from the mean by, in standard
-    deviations of such a sum (of correlated samples Bartlett 1946); of the axis where it is
-    largest.
+    Attributes
+    ----------
+    residual_v
+        Residual, bridged over samples that do not count, V, (n,).
+    used
+        Samples that count, (n,) bool.
+    rate_hz
+        Sample rate, Hz.
+    whitener
+        The filter of the hypothesis.
+    weakest_walk
+        The filter of the weakest random walk, which stands for no drift.
+    innovation_variance_v2
+        Variance of the whitened residual, V².
+
     """
-    most = 0.0
-    for one, mask, column, walk in _channels(of, found):
-        white = walk(column[None])[0] * mask
+
+    residual_v: np.ndarray
+    used: np.ndarray
+    rate_hz: float
+    whitener: Whitener
+    weakest_walk: Whitener
+    innovation_variance_v2: float
+
+    def whitened_v(self) -> np.ndarray:
+        """Return the whitened residual, V, (n,), zero where samples do not count."""
+        white = self.whitener(self.residual_v[None])[0] * self.used
+        # The first sample is a step from zero.
         white[0] = 0.0
+        return white
+
+
+def weakest_walk(filters: Sequence[Whitener]) -> Whitener:
+    """Return the filter of the weakest random walk."""
+    return next(f for f in filters if f.density == RANDOM_WALKS_G_PER_RTS[0])
+
+
+def unevenness(channels: Sequence[ResidualChannel]) -> float:
+    """
+    Return how much the power of the noise differs between blocks.
+
+    It is the rms, over blocks, of the deviation of each block's squares from the mean, in standard
+    deviations of such a sum (of correlated samples by Bartlett 1946), on the axis where it is
+    largest. Noise that is the same all the time has about 1.
+    """
+    largest = 0.0
+    for channel in channels:
+        white, used = channel.whitened_v(), channel.used
         if not white.any():
             continue
         spectrum = np.abs(np.fft.rfft(white, 2 * len(white))) ** 2
-        alike = np.fft.irfft(spectrum)[:1 + int(_COLOUR_S * one.sensor.rate_hz)]
-        times = 1 + 2 * float(np.sum((alike[1:] / alike[0]) ** 2))
+        autocovariance = np.fft.irfft(spectrum)[:1 + int(_CORRELATION_S * channel.rate_hz)]
+        variance_factor = 1 + 2 * float(np.sum((autocovariance[1:] / autocovariance[0]) ** 2))
         edges = block_edges(len(white))[:-1]
-        counts = np.add.reduceat(mask, edges).astype(float)
+        counts = np.add.reduceat(used, edges).astype(float)
         squares = np.add.reduceat(white ** 2, edges)[counts > 0]
         counts = counts[counts > 0]
-        depart = (squares / counts * mask.sum() / squares.sum() - 1) * np.sqrt(counts / 2 / times)
-        most = max(most, float(np.sqrt(np.mean(depart ** 2))))
-    return most
+        deviation = (squares / counts * used.sum() / squares.sum() - 1) \
+            * np.sqrt(counts / 2 / variance_factor)
+        largest = max(largest, float(np.sqrt(np.mean(deviation ** 2))))
+    return largest
 
 
-def crowding(of: Study, found: Hypothesis) -> float:
+def walk_log_bayes_factor(channels: Sequence[ResidualChannel]) -> float:
     """
-    Return by how many nats octaves of a random walk are fuller or emptier than it has them.
+    Return the log Bayes factor against random walks by the power in their octaves.
 
-    Whittle's likelihood of the whitened residual, summed over the axes that walk more than a
-    healthy unit's: a periodogram of the walk's own mean against one of the mean that is seen,
-    over the run of octaves that tells most. 0 where nothing walks.
+    It is Whittle's likelihood ratio of the whitened residual, summed over the axes that walk more
+    than a healthy unit's. The alternative has another power in one run of octaves. Without a
+    random walk it is 0.
     """
-    return sum(_nats(*_beside_walk(column, mask, walk, of.filters[number],
-                                   float(found.fit.variance[number])))
-               for number, (_, mask, column, walk) in enumerate(_channels(of, found))
-               if walk.drift == 'bias_walk' and not walk.healthy)
+    return sum(_octaves_log_bayes_factor(*_octaves(channel)) for channel in channels
+               if channel.whitener.spectrum is DriftSpectrum.RANDOM_WALK
+               and not channel.whitener.healthy)
 
 
-def _channels(of: Study, found: Hypothesis
-              ) -> Iterator[tuple[Series, np.ndarray, np.ndarray, Whitener]]:
-    """Give by axis of each recording it, samples that count, what is left, V, and its filter."""
-    number = 0
-    for one, mask in zip(of.series, of.used):
-        for column in bridged(one.residual(found.sensor), mask).T:
-            yield one, mask, column, of.filters[number][found.fit.walks[number]]
-            number += 1
-
-
-def _beside_walk(residual: np.ndarray, used: np.ndarray, walk: Whitener,
-                 tried: list[Whitener], variance_v2: float) -> tuple[np.ndarray, np.ndarray]:
-    """Give by octave, as far as it walks, how many frequencies, and power by what is expected."""
-    white = walk(residual[None])[0] * used
-    white[0] = 0.0
+def _octaves(channel: ResidualChannel) -> tuple[np.ndarray, np.ndarray]:
+    """Return by octave of the walk the number of frequencies, and power by expected power."""
+    white = channel.whitened_v()
     taper = np.sqrt(8 / 3) * np.hanning(len(white))
-    power = np.abs(np.fft.rfft(white * taper)) ** 2 / (used.sum() * variance_v2)
+    power = np.abs(np.fft.rfft(white * taper)) ** 2 \
+        / (channel.used.sum() * channel.innovation_variance_v2)
     angle = 2 * np.pi * np.arange(len(power)) / len(white)
-    still = next(f for f in tried if f.density == WALKS_G_PER_RTS[0])
-    gain, at_rest = (np.abs(sosfreqz(f.sections, angle)[1]) ** 2 for f in (walk, still))
-    # What does not walk has this share of the whitened power.
+    gain, healthy_gain = (np.abs(sosfreqz(f.sections, angle)[1]) ** 2
+                          for f in (channel.whitener, channel.weakest_walk))
+    # Share of the whitened power that does not walk.
     share = np.zeros(len(power))
-    share[1:] = np.minimum(gain[1:] / at_rest[1:] * (at_rest[-1] / gain[-1]), 1.0)
+    share[1:] = np.minimum(gain[1:] / healthy_gain[1:] * (healthy_gain[-1] / gain[-1]), 1.0)
     top = int(np.argmax(share > 0.5))
-    band = slice(1, 4 * top)
+    band = slice(1, _BAND_OCTAVES * top)
 
-    def lacks(log_more: float) -> float:
-        mean = share[band] + np.exp(log_more) * (1 - share[band])
+    def negative_log_likelihood(log_level: float) -> float:
+        mean = share[band] + np.exp(log_level) * (1 - share[band])
         return float(np.sum(np.log(mean) + power[band] / mean))
-    # The grid of filters is wide: how much of the walk there is, is fitted.
-    more = np.exp(minimize_scalar(lacks, bounds=(-3.0, 3.0), method='bounded').x)
-    power = power / (share + more * (1 - share))
+
+    # The grid of filters is coarse, so that the level of the walk is fitted.
+    level = np.exp(minimize_scalar(negative_log_likelihood, method='bounded',
+                                   bounds=(-_LOG_LEVEL_RANGE, _LOG_LEVEL_RANGE)).x)
+    power = power / (share + level * (1 - share))
     edges = np.unique(np.minimum(2 ** np.arange(int(np.log2(max(top, 1))) + 2), top))
     return np.diff(edges), np.array([power[i:j].mean() for i, j in pairwise(edges)])
 
 
-def _nats(counts: np.ndarray, means: np.ndarray) -> float:
-    most = 0.0
+def _octaves_log_bayes_factor(counts: np.ndarray, means: np.ndarray) -> float:
+    """Return the largest log likelihood ratio of another power in a run of octaves."""
+    largest = 0.0
     for begin, end in combinations(range(len(counts) + 1), 2):
         count = counts[begin:end].sum()
         mean = max(float(np.average(means[begin:end], weights=counts[begin:end])), 1e-9)
-        if not 1 / _FEW < mean < _FEW:
-            most = max(most, _TAPERED * count * (mean - 1 - np.log(mean)))
-    return most
+        if not 1 / _OCTAVE_RATIO < mean < _OCTAVE_RATIO:
+            largest = max(largest, _INDEPENDENT_SHARE * count * (mean - 1 - np.log(mean)))
+    return largest

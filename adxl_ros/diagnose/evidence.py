@@ -13,13 +13,12 @@
 # limitations under the License.
 
 """
-The evidence for hypotheses: Bayesian model comparison on whitened tangents.
+Log evidence of hypotheses: Bayesian comparison of linear models on whitened columns.
 
-Columns are tangents of the simulated output by coefficients; a hypothesis is a set of them.
-Coefficients have normal priors of their typical size, zero-g and scale what the calibration and
-their stability leave. The evidence integrates the coefficients out (Bishop 2006, section 3.5), so
-that an effect that the recording hardly shows gains nothing and costs nothing. The noise is that
-of `noise_whitening`, fitted anew to each hypothesis.
+Columns are sensitivities of the simulated output, and a hypothesis is a set of columns. The
+coefficients have normal priors. The evidence integrates the coefficients out (Bishop 2006,
+section 3.5), so that an effect that the recording hardly shows gains nothing and costs nothing.
+The noise is that of `noise_whitening`; its filter and level are fitted to each hypothesis.
 """
 
 from __future__ import annotations
@@ -33,82 +32,113 @@ import numpy as np
 from scipy.linalg import cho_solve
 
 BLOCKS = 48
-"""Stretches that a recording is cut into, to hold some out."""
-_ROUNDS = 3
-SIZES = 10.0 ** np.arange(0, -2.5, -0.5)
-"""Of typical sizes, alike beforehand: an effect may be as strong as usual or hardly show."""
-_TINY = 1e-300
-_ALIKE = 1e-12
+"""Number of blocks of a recording, of which some are held out. Chosen: a multiple of the folds,
+and blocks of a few seconds in a short recording."""
+AMPLITUDES = 10.0 ** np.arange(0, -2.5, -0.5)
+"""Amplitudes of an effect by its typical one, equally probable: a log-uniform prior over two
+decades, in five steps."""
+_ITERATIONS = 3
+"""Iterations over coefficients and noise. Chosen: the filters no longer change then."""
+_SMALLEST_SQUARES_V2 = 1e-300
+"""Smallest sum of squares, V², whose logarithm is taken: above zero."""
+_RIDGE = 1e-12
+"""Ridge on the scaled precision. Chosen: columns that differ by a millionth are separable."""
+_BOUND_TOLERANCE = 1e-9
+"""Relative excess over a bound that is a rounding error."""
 
 
 @dataclass(frozen=True)
-class Channel:
+class WhitenedChannel:
     """
-    One axis of one recording.
+    One axis of one recording: products of whitened columns, by filter and block.
 
     Attributes
     ----------
-    ids
-        Numbers of the columns that it follows, (k,).
-    grams
-        Products of the whitened residual (first) and columns, by walk and block, (w, b, k+1, k+1).
-    whole
-        Their sums over all blocks, (w, k+1, k+1).
+    column_ids
+        Numbers of the k columns that the axis follows, (k,).
+    block_grams
+        Products of the residual (first) and the columns, V², (filters, blocks, k + 1, k + 1).
+    total_grams
+        Their sums over all blocks, V², (filters, k + 1, k + 1).
     counts
-        Samples by block, (b,).
-    log_priors, needs
-        Of the filters, and the effect that the noise of each takes, '' for none, (w,).
+        Samples by block, (blocks,).
+    log_priors
+        Log prior probability of each filter, (filters,).
+    drift_effects
+        Effect that the noise of each filter needs, '' for a healthy unit, (filters,).
 
     """
 
-    ids: np.ndarray
-    grams: np.ndarray
-    whole: np.ndarray
+    column_ids: np.ndarray
+    block_grams: np.ndarray
+    total_grams: np.ndarray
     counts: np.ndarray
     log_priors: np.ndarray
-    needs: np.ndarray
+    drift_effects: np.ndarray
 
 
-def channel(residual: np.ndarray, columns: np.ndarray, ids: np.ndarray, used: np.ndarray,
-            filters: Sequence[Whitener]) -> Channel:
+def whiten_channel(residual_v: np.ndarray, columns: np.ndarray, column_ids: np.ndarray,
+                   used: np.ndarray, filters: Sequence[Whitener]) -> WhitenedChannel:
     """
     Whiten one axis of one recording.
 
     Parameters
     ----------
-    residual, columns
-        (n,) and (n, k), V.
-    ids
+    residual_v
+        Residual, V, (n,).
+    columns
+        Columns, V per unit of their coefficients, (n, k).
+    column_ids
         Numbers of the columns, (k,).
     used
-        Samples that count, (n,); the others are bridged by straight lines, all alike.
+        Samples that count, (n,) bool; the others are bridged by straight lines.
     filters
-        From `noise_whitening.whiteners`.
+        Whitening filters to choose from.
+
+    Returns
+    -------
+    WhitenedChannel
+        Products of the whitened columns.
 
     """
-    data = np.ascontiguousarray(bridged(np.column_stack([residual, columns]), used).T)
+    data = np.ascontiguousarray(bridged(np.column_stack([residual_v, columns]), used).T)
     edges = block_edges(len(used))
     grams = np.empty((len(filters), BLOCKS, len(data), len(data)))
-    for i, whiten in enumerate(filters):
-        white = whiten(data)
+    for i, whitener in enumerate(filters):
+        white = whitener(data)
         white[:, ~used] = 0.0
-        # The first sample is a step from nothing.
+        # The first sample is a step from zero.
         white[:, 0] = 0.0
         for b, (begin, end) in enumerate(pairwise(edges)):
             grams[i, b] = white[:, begin:end] @ white[:, begin:end].T
     counts = np.add.reduceat(used, edges[:-1]).astype(float)
-    return Channel(ids, grams, grams.sum(axis=1), counts,
-                   np.array([f.log_prior for f in filters]),
-                   np.array(['' if f.healthy else f.drift for f in filters]))
+    return WhitenedChannel(column_ids, grams, grams.sum(axis=1), counts,
+                           np.array([f.log_prior for f in filters]),
+                           np.array(['' if f.healthy else f.effect for f in filters]))
 
 
 def block_edges(count: int) -> np.ndarray:
-    """Return where the stretches of so many samples begin and end, (b + 1,)."""
+    """Return where the blocks of so many samples begin and end, (blocks + 1,)."""
     return np.linspace(0, count, BLOCKS + 1).astype(int)
 
 
 def bridged(data: np.ndarray, used: np.ndarray) -> np.ndarray:
-    """Replace rows that do not count by straight lines between those that do."""
+    """
+    Replace rows that do not count by straight lines between those that do.
+
+    Parameters
+    ----------
+    data
+        Series, (n, k).
+    used
+        Rows that count, (n,) bool.
+
+    Returns
+    -------
+    numpy.ndarray
+        Series without gaps, (n, k).
+
+    """
     if used.all() or not used.any():
         return data
     rows = np.arange(len(data))
@@ -116,237 +146,347 @@ def bridged(data: np.ndarray, used: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class Fit:
+class LinearFit:
     """
-    A hypothesis after the fit.
+    A linear model after the fit of k coefficients.
 
     Attributes
     ----------
-    ids, values, covariance
-        Coefficients, (k,), (k,), (k, k).
-    held
-        Those that are as large as they may be, (k,); their covariance is none.
+    column_ids
+        Numbers of the columns, (k,).
+    values
+        Posterior mean of the coefficients, within their bounds, (k,).
+    covariance
+        Posterior covariance, (k, k); zero for coefficients at a bound.
+    at_bound
+        Coefficients that are at a bound, (k,) bool.
     log_evidence
-        Of the samples, nats.
-    walks, variance
-        By channel: number of the walk, and variance of the innovations, V².
+        Log evidence of the samples.
+    filter_indices
+        Number of the whitening filter of each channel.
+    innovation_variance_v2
+        Variance of the whitened residual of each channel, V².
 
     """
 
-    ids: np.ndarray
+    column_ids: np.ndarray
     values: np.ndarray
     covariance: np.ndarray
-    held: np.ndarray
+    at_bound: np.ndarray
     log_evidence: float
-    walks: tuple[int, ...]
-    variance: np.ndarray
+    filter_indices: tuple[int, ...]
+    innovation_variance_v2: np.ndarray
 
 
-def fit(channels: Sequence[Channel], ids: Sequence[int], prior: np.ndarray, most: np.ndarray,
-        blocks: np.ndarray | None = None, start: Fit | None = None,
-        wanders: Sequence[str] = ()) -> Fit:
+def fit_columns(channels: Sequence[WhitenedChannel], column_ids: Sequence[int],
+                prior_std: np.ndarray, bounds: np.ndarray, blocks: np.ndarray | None = None,
+                start: LinearFit | None = None, drifts: Sequence[str] = ()) -> LinearFit:
     """
-    Fit a hypothesis.
+    Fit the coefficients of some columns, and the noise.
 
     Parameters
     ----------
     channels
-        Axes of recordings.
-    ids
-        Columns of the hypothesis, nuisances among them.
-    prior, most
-        Standard deviation of each column's coefficient, and how large it may be, by number,
-        (all,) each.
+        All axes of all recordings.
+    column_ids
+        Numbers of the columns of the hypothesis, nuisance parameters included.
+    prior_std
+        Prior standard deviation of every column's coefficient, by number.
+    bounds
+        Largest magnitude of every column's coefficient, by number.
     blocks
-        Which blocks count, (b,); all of them unless given.
+        Blocks that count, (blocks,) bool; None for all.
     start
-        A fit with walks and variances near those of this one.
-    wanders
-        Effects by which the zero-g may wander more than that of a healthy unit.
+        A fit whose noise is close to that of this fit.
+    drifts
+        Effects by which the zero-g may drift more than that of a healthy unit.
+
+    Returns
+    -------
+    LinearFit
+        Coefficients, noise and log evidence.
 
     """
-    own = np.array(sorted(ids), int)
+    ids = np.array(sorted(column_ids), int)
+    selected = [_selected(channel, ids, blocks) for channel in channels]
+    counts = [s.count for s in selected]
+    log_priors = [_filter_log_priors(channel, drifts) for channel in channels]
+    filters = list(start.filter_indices) if start else [int(np.argmax(p)) for p in log_priors]
+    variance = np.array([s.grams[f, 0, 0] / s.count for s, f in zip(selected, filters)])
+    prior_precision, bound = prior_std[ids] ** -2.0, bounds[ids]
+    for _ in range(_ITERATIONS):
+        precision, information = np.diag(prior_precision), np.zeros(len(ids))
+        for s, f, v in zip(selected, filters, variance):
+            precision[np.ix_(s.places, s.places)] += s.grams[f, 1:, 1:] / v
+            information[s.places] += s.grams[f, 1:, 0] / v
+        values, at_bound, covariance, half_log_det = _bounded_solution(precision, information,
+                                                                       bound)
+        squares = [_residual_squares(s.grams, values[s.places]) for s in selected]
+        filters = [int(np.argmax(-n / 2 * np.log(np.maximum(r, _SMALLEST_SQUARES_V2)) + p))
+                   for r, n, p in zip(squares, counts, log_priors)]
+        variance = np.array([max(r[f], _SMALLEST_SQUARES_V2) / n
+                             for r, f, n in zip(squares, filters, counts)])
+    log_evidence = -0.5 * float(np.sum(prior_precision * values ** 2)) \
+        - half_log_det + 0.5 * float(np.log(prior_precision[~at_bound]).sum())
+    for n, v, f, channel in zip(counts, variance, filters, channels):
+        log_evidence += float(-n / 2 * (np.log(v) + 1) + channel.log_priors[f])
+    return LinearFit(ids, values, covariance, at_bound, log_evidence, tuple(filters), variance)
+
+
+@dataclass(frozen=True)
+class _SelectedColumns:
+    """Some columns of a channel: places among all that are fitted, grams, count of samples."""
+
+    places: np.ndarray
+    grams: np.ndarray
+    count: float
+
+
+def _selected(channel: WhitenedChannel, ids: np.ndarray, blocks: np.ndarray | None
+              ) -> _SelectedColumns:
+    """Select columns and blocks of a channel."""
+    columns = np.flatnonzero(np.isin(channel.column_ids, ids))
+    rows = np.concatenate([[0], 1 + columns])
+    grams = channel.total_grams if blocks is None \
+        else channel.block_grams[:, blocks].sum(axis=1)
     chosen = np.ones(BLOCKS, bool) if blocks is None else blocks
-    grams, counts = [], []
-    for c in channels:
-        at = np.flatnonzero(np.isin(c.ids, own))
-        rows = np.concatenate([[0], 1 + at])
-        together = c.whole if blocks is None else c.grams[:, chosen].sum(axis=1)
-        grams.append((np.searchsorted(own, c.ids[at]), together[:, rows[:, None], rows]))
-        counts.append(max(float(c.counts[chosen].sum()), 1.0))
-    allowed = [np.isin(c.needs, ('', *wanders)) for c in channels]
-    priors = [np.where(may | ~may.any(), c.log_priors, -np.inf)
-              for c, may in zip(channels, allowed)]
-    walks = list(start.walks) if start else [int(np.argmax(p)) for p in priors]
-    variance = np.array([g[w, 0, 0] / n for (_, g), w, n in zip(grams, walks, counts)])
-    known, bound = prior[own] ** -2.0, most[own]
-    for _ in range(_ROUNDS):
-        precision, pull = np.diag(known), np.zeros(len(own))
-        for (at, g), w, s2 in zip(grams, walks, variance):
-            precision[np.ix_(at, at)] += g[w, 1:, 1:] / s2
-            pull[at] += g[w, 1:, 0] / s2
-        values, held, covariance, half_log_det = _bounded(precision, pull, bound)
-        left = [_left(g, values[at]) for at, g in grams]
-        walks = [int(np.argmax(-n / 2 * np.log(np.maximum(r, _TINY)) + p))
-                 for r, n, p in zip(left, counts, priors)]
-        variance = np.array([max(r[w], _TINY) / n for r, w, n in zip(left, walks, counts)])
-    log_evidence = -0.5 * float(np.sum(known * values ** 2)) \
-        - half_log_det + 0.5 * float(np.log(known[~held]).sum())
-    for n, s2, w, c in zip(counts, variance, walks, channels):
-        log_evidence += float(-n / 2 * (np.log(s2) + 1) + c.log_priors[w])
-    return Fit(own, values, covariance, held, log_evidence, tuple(walks), variance)
+    return _SelectedColumns(np.searchsorted(ids, channel.column_ids[columns]),
+                            grams[:, rows[:, None], rows],
+                            max(float(channel.counts[chosen].sum()), 1.0))
 
 
-def of_any_size(mean: np.ndarray, covariance: np.ndarray, prior: np.ndarray) -> float:
-    """Return what the log-evidence gains where an effect may be of any of `SIZES`, nats."""
-    gains = by_size(mean, covariance, prior)
-    return float(np.logaddexp.reduce(gains) - np.log(len(gains)))
+def _filter_log_priors(channel: WhitenedChannel, drifts: Sequence[str]) -> np.ndarray:
+    """Return log priors of the filters, −inf where they need another drift, (filters,)."""
+    allowed = np.isin(channel.drift_effects, ('', *drifts))
+    return np.where(allowed | ~allowed.any(), channel.log_priors, -np.inf)
 
 
-def by_size(mean: np.ndarray, covariance: np.ndarray, prior: np.ndarray) -> np.ndarray:
+def amplitude_log_bayes_factor(mean: np.ndarray, covariance: np.ndarray, prior_std: np.ndarray
+                               ) -> float:
     """
-    Return what the log-evidence gains where the prior is narrower, by `SIZES`, nats.
-
-    The posterior's mean of the ratio of the narrower and the given prior, in closed form.
+    Return what the log evidence gains by the log-uniform prior over `AMPLITUDES`.
 
     Parameters
     ----------
-    mean, covariance
-        Of coefficients, (k,), (k, k), with the given prior.
-    prior
-        Its standard deviations, (k,).
+    mean
+        Posterior mean of the effect's k coefficients with the given prior, (k,).
+    covariance
+        Posterior covariance, (k, k).
+    prior_std
+        Standard deviations of the given prior, (k,).
+
+    Returns
+    -------
+    float
+        Log Bayes factor of the log-uniform prior over the given prior.
 
     """
-    # In units of the prior, so that volts and radians are alike.
-    inverse = np.linalg.inv(covariance / prior[:, None] / prior)
-    pull = inverse @ (mean / prior)
-    here, whole = float(pull @ (mean / prior)), np.linalg.slogdet(inverse)[1]
+    gains = log_bayes_factor_by_amplitude(mean, covariance, prior_std)
+    return float(np.logaddexp.reduce(gains) - np.log(len(gains)))
+
+
+def log_bayes_factor_by_amplitude(mean: np.ndarray, covariance: np.ndarray,
+                                  prior_std: np.ndarray) -> np.ndarray:
+    """
+    Return what the log evidence gains by a narrower prior, for each of `AMPLITUDES`.
+
+    It is the logarithm of the posterior mean of the ratio of both priors, in closed form.
+
+    Parameters
+    ----------
+    mean
+        Posterior mean of k coefficients with the given prior, (k,).
+    covariance
+        Posterior covariance, (k, k).
+    prior_std
+        Standard deviations of the given prior, (k,).
+
+    Returns
+    -------
+    numpy.ndarray
+        Log Bayes factors, (amplitudes,).
+
+    """
+    # In units of the prior volts and radians have similar sizes.
+    precision = np.linalg.inv(covariance / prior_std[:, None] / prior_std)
+    information = precision @ (mean / prior_std)
+    quadratic = float(information @ (mean / prior_std))
+    log_det = np.linalg.slogdet(precision)[1]
     gains = []
-    for size in SIZES:
-        there = inverse + (size ** -2 - 1) * np.eye(len(prior))
-        gains.append(-len(prior) * np.log(size) + 0.5 * (
-            whole - np.linalg.slogdet(there)[1]
-            + float(pull @ np.linalg.solve(there, pull)) - here))
+    for amplitude in AMPLITUDES:
+        narrower = precision + (amplitude ** -2 - 1) * np.eye(len(prior_std))
+        gains.append(-len(prior_std) * np.log(amplitude) + 0.5 * (
+            log_det - np.linalg.slogdet(narrower)[1]
+            + float(information @ np.linalg.solve(narrower, information)) - quadratic))
     return np.array(gains)
 
 
-def _bounded(precision: np.ndarray, pull: np.ndarray, bound: np.ndarray
-             ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+def _bounded_solution(precision: np.ndarray, information: np.ndarray, bound: np.ndarray
+                      ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     """
-    Solve for values within bounds.
+    Solve precision · values = information within bounds.
 
-    Gives the values, which are held, the others' covariance, and half the logarithm of the
-    determinant of their precision. Columns of all sizes that are nearly alike are no obstacle:
-    they are scaled, and told apart to a millionth.
+    Returns the values, which are at a bound, the covariance of the others, and half the logarithm
+    of the determinant of their precision. The columns are scaled, so that those of different
+    sizes and those that are nearly equal are no obstacle.
     """
     size = 1 / np.sqrt(np.diag(precision))
-    scaled = precision * size[:, None] * size + _ALIKE * np.eye(len(size))
-    values, held = np.zeros(len(bound)), np.zeros(len(bound), bool)
+    scaled = precision * size[:, None] * size + _RIDGE * np.eye(len(size))
+    values, at_bound = np.zeros(len(bound)), np.zeros(len(bound), bool)
     while True:
-        free = ~held
+        free = ~at_bound
         factor = np.linalg.cholesky(scaled[np.ix_(free, free)])
-        rest = pull - precision @ np.where(held, values, 0.0)
-        values[free] = size[free] * cho_solve((factor, True), (size * rest)[free])
-        beyond = np.abs(values) > bound * (1 + 1e-9)
-        if not beyond.any():
+        remaining = information - precision @ np.where(at_bound, values, 0.0)
+        values[free] = size[free] * cho_solve((factor, True), (size * remaining)[free])
+        outside = np.abs(values) > bound * (1 + _BOUND_TOLERANCE)
+        if not outside.any():
             break
-        values[beyond] = np.sign(values[beyond]) * bound[beyond]
-        held |= beyond
+        values[outside] = np.sign(values[outside]) * bound[outside]
+        at_bound |= outside
     covariance = np.zeros_like(precision)
     covariance[np.ix_(free, free)] = (cho_solve((factor, True), np.eye(int(free.sum())))
                                       * size[free][:, None] * size[free])
-    return values, held, covariance, float(np.log(np.diag(factor) / size[free]).sum())
+    return values, at_bound, covariance, float(np.log(np.diag(factor) / size[free]).sum())
 
 
-def _left(grams: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return the squares that coefficients leave, by walk."""
+def _residual_squares(grams: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return the sum of squares of the residual after a fit, by filter, V², (filters,)."""
     v = np.concatenate([[1.0], -values])
     return np.einsum('i,wij,j->w', v, grams, v)
 
 
-def robust_std(channels: Sequence[Channel], found: Fit, prior: np.ndarray) -> np.ndarray:
+def robust_std(channels: Sequence[WhitenedChannel], fit: LinearFit, prior_std: np.ndarray
+               ) -> np.ndarray:
     """
-    Return standard deviations that hold where the model is not quite right, too, (k,).
+    Return standard deviations that also hold where the model is not exact.
 
-    The larger of the model's and of what the scores of blocks say (sandwich; White 1982,
-    Econometrica 50, blocks for what is correlated).
+    They are the larger of the model's and of the sandwich estimate from the scores of blocks
+    (White 1982, Econometrica 50), whose samples may be correlated.
+
+    Parameters
+    ----------
+    channels
+        All axes of all recordings.
+    fit
+        The fit of k coefficients.
+    prior_std
+        Prior standard deviation of every column's coefficient, by number.
+
+    Returns
+    -------
+    numpy.ndarray
+        Standard deviations of the coefficients, (k,).
+
     """
-    own = len(found.ids)
-    scores = np.zeros((BLOCKS, own))
-    for c, w, s2 in zip(channels, found.walks, found.variance):
-        at = np.flatnonzero(np.isin(c.ids, found.ids))
-        to = np.searchsorted(found.ids, c.ids[at])
-        rows = c.grams[w][:, 1 + at]
-        scores[:, to] += (rows[:, :, 0] - rows[:, :, 1 + at] @ found.values[to]) / s2
+    scores = np.zeros((BLOCKS, len(fit.column_ids)))
+    for c, f, v in zip(channels, fit.filter_indices, fit.innovation_variance_v2):
+        columns = np.flatnonzero(np.isin(c.column_ids, fit.column_ids))
+        places = np.searchsorted(fit.column_ids, c.column_ids[columns])
+        rows = c.block_grams[f][:, 1 + columns]
+        scores[:, places] += (rows[:, :, 0] - rows[:, :, 1 + columns] @ fit.values[places]) / v
     scores = scores - scores.mean(axis=0)
-    sandwich = found.covariance @ (scores.T @ scores) @ found.covariance * BLOCKS / (BLOCKS - 1)
-    return np.sqrt(np.maximum(np.diag(found.covariance),
-                              np.minimum(np.diag(sandwich), prior[found.ids] ** 2)))
+    sandwich = fit.covariance @ (scores.T @ scores) @ fit.covariance * BLOCKS / (BLOCKS - 1)
+    return np.sqrt(np.maximum(np.diag(fit.covariance),
+                              np.minimum(np.diag(sandwich), prior_std[fit.column_ids] ** 2)))
 
 
-def given(found: Fit, held: np.ndarray, values: np.ndarray) -> np.ndarray:
+def conditional_mean(fit: LinearFit, places: np.ndarray, values: np.ndarray) -> np.ndarray:
     """
     Return the posterior mean of all coefficients where some have given values.
 
     Parameters
     ----------
-    found
-        The fit, (k,).
-    held, values
-        Places of those that are given in it, and their values, (j,) each.
+    fit
+        The fit of k coefficients.
+    places
+        Places of the j coefficients with given values, (j,).
+    values
+        Their values, (j,).
+
+    Returns
+    -------
+    numpy.ndarray
+        Mean of the coefficients, (k,).
 
     """
-    out = found.values.copy()
-    others = np.setdiff1d(np.arange(len(out)), held)
-    out[others] += found.covariance[np.ix_(others, held)] @ np.linalg.lstsq(
-        found.covariance[np.ix_(held, held)], values - out[held])[0]
-    out[held] = values
-    return out
+    mean = fit.values.copy()
+    others = np.setdiff1d(np.arange(len(mean)), places)
+    mean[others] += fit.covariance[np.ix_(others, places)] @ np.linalg.lstsq(
+        fit.covariance[np.ix_(places, places)], values - mean[places])[0]
+    mean[places] = values
+    return mean
 
 
-def predicted(channels: Sequence[Channel], found: Fit, blocks: np.ndarray) -> np.ndarray:
-    """Return the log-likelihood of blocks that were not fitted, nats, by block, (b,)."""
-    out = np.zeros(len(blocks))
-    for c, w, s2 in zip(channels, found.walks, found.variance):
-        left = _by_block(c, found, w)[blocks]
-        out += -0.5 * (left / s2 + c.counts[blocks] * np.log(s2))
-    return out
-
-
-def _by_block(c: Channel, found: Fit, walk: int) -> np.ndarray:
-    """Return the squares that a fit leaves, by block, (b,)."""
-    at = np.flatnonzero(np.isin(c.ids, found.ids))
-    v = np.zeros(len(c.ids) + 1)
-    v[0] = 1.0
-    v[1 + at] = -found.values[np.searchsorted(found.ids, c.ids[at])]
-    return np.einsum('i,bij,j->b', v, c.grams[walk], v)
-
-
-def lost(channels: Sequence[Channel], found: Fit, values: np.ndarray, prior: np.ndarray
-         ) -> float:
+def held_out_log_likelihood(channels: Sequence[WhitenedChannel], fit: LinearFit,
+                            blocks: np.ndarray) -> np.ndarray:
     """
-    Return what the log-posterior at other values of coefficients lacks of its maximum, nats.
-
-    The other coefficients are at their best beside them.
+    Return the log likelihood of blocks that the fit has not seen.
 
     Parameters
     ----------
-    channels, prior
-        As for `fit`, of all blocks.
-    found
-        The fit.
+    channels
+        All axes of all recordings.
+    fit
+        The fit to other blocks.
+    blocks
+        Numbers of the j held-out blocks, (j,).
+
+    Returns
+    -------
+    numpy.ndarray
+        Log likelihood by block, (j,).
+
+    """
+    total = np.zeros(len(blocks))
+    for c, f, v in zip(channels, fit.filter_indices, fit.innovation_variance_v2):
+        squares = _squares_by_block(c, fit, f)[blocks]
+        total += -0.5 * (squares / v + c.counts[blocks] * np.log(v))
+    return total
+
+
+def _squares_by_block(channel: WhitenedChannel, fit: LinearFit, filter_index: int) -> np.ndarray:
+    """Return the sum of squares of the residual after a fit, by block, V², (blocks,)."""
+    columns = np.flatnonzero(np.isin(channel.column_ids, fit.column_ids))
+    v = np.zeros(len(channel.column_ids) + 1)
+    v[0] = 1.0
+    v[1 + columns] = -fit.values[np.searchsorted(fit.column_ids, channel.column_ids[columns])]
+    return np.einsum('i,bij,j->b', v, channel.block_grams[filter_index], v)
+
+
+def log_posterior_loss(channels: Sequence[WhitenedChannel], fit: LinearFit, values: np.ndarray,
+                       prior_std: np.ndarray) -> float:
+    """
+    Return how far the log posterior at some values is below its maximum.
+
+    The other coefficients are at their conditional maximum.
+
+    Parameters
+    ----------
+    channels
+        All axes of all recordings.
+    fit
+        The fit of all columns to all blocks.
     values
-        Of the first coefficients, (j,).
+        Values of the first j coefficients, (j,).
+    prior_std
+        Prior standard deviation of every column's coefficient, by number.
+
+    Returns
+    -------
+    float
+        Difference of log posteriors, not negative.
 
     """
     count = len(values)
-    off = values - found.values[:count]
-    precision = np.diag(prior[found.ids] ** -2.0)
-    for c, w, s2 in zip(channels, found.walks, found.variance):
-        at = np.searchsorted(found.ids, c.ids)
-        precision[np.ix_(at, at)] += c.whole[w, 1:, 1:] / s2
-    free = np.flatnonzero(~found.held)
+    deviation = values - fit.values[:count]
+    precision = np.diag(prior_std[fit.column_ids] ** -2.0)
+    for c, f, v in zip(channels, fit.filter_indices, fit.innovation_variance_v2):
+        places = np.searchsorted(fit.column_ids, c.column_ids)
+        precision[np.ix_(places, places)] += c.total_grams[f, 1:, 1:] / v
+    free = np.flatnonzero(~fit.at_bound)
     free = free[free >= count]
-    own, across, rest = precision[:count, :count], precision[:count, free], \
-        precision[np.ix_(free, free)]
-    return 0.5 * float(off @ (own - across @ np.linalg.solve(rest, across.T)) @ off)
+    # Schur complement of the free coefficients.
+    cross = precision[:count, free]
+    marginal = precision[:count, :count] - cross @ np.linalg.solve(
+        precision[np.ix_(free, free)], cross.T)
+    return 0.5 * float(deviation @ marginal @ deviation)

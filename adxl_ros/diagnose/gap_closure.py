@@ -13,49 +13,71 @@
 # limitations under the License.
 
 """
-How far the gap shrinks: the effect is fitted on one part and simulated on another.
+How large the gap is, what each effect contributes, and how far a hypothesis closes the gap.
 
-Stretches are held out in turn, with a stretch between them and what is fitted left out. The gap is
-the rms over held-out samples and axes, zero-g and scale at their posterior from the other part.
+Blocks are held out in turn, and the blocks next to them are not fitted. The gap is the rms over
+held-out samples and axes, with zero-g and scale factor at their posterior from the other blocks.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from adxl_ros.diagnose import evidence
-from adxl_ros.diagnose.baseline_comparison import Series
+from adxl_ros.diagnose import evidence, noise_floor
+from adxl_ros.diagnose.baseline_comparison import BaselineComparison, Reference
 from adxl_ros.diagnose.evidence import BLOCKS
-from adxl_ros.diagnose.hypothesis_fit import Hypothesis, local
-from adxl_ros.diagnose.linear_model import Study
-from adxl_ros.diagnose.noise_floor import Floor
-from adxl_ros.diagnose.noise_whitening import USUAL
+from adxl_ros.diagnose.hypothesis_fit import Hypothesis, linearise
+from adxl_ros.diagnose.linear_model import LinearModel
+from adxl_ros.diagnose.noise_floor import FEWEST_SAMPLES, NoiseFloor, SquareSum
+from adxl_ros.diagnose.noise_whitening import expected_drift_g, USUAL_DENSITY
+from adxl_ros.model import noise
+from adxl_ros.model.coefficients import neutral
+from adxl_ros.model.constants import G0_MPS2
+from adxl_ros.model.diagnosis_hints import StraightLine
 from adxl_ros.model.effects import effect_named
-from adxl_ros.model.effects.base import ActsOn, Coefficient
+from adxl_ros.model.effects.base import ActsOn
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
-_FOLDS, _RUN = 4, 2
-_HARM = 1.005
-_DRAWS = 400
+_FOLDS = 4
+"""Number of parts of a recording, each of which is held out once. Chosen: run time."""
+_RUN_BLOCKS = 2
+"""Number of neighbouring blocks that are held out together. Chosen: most slow effects change
+within two blocks."""
+_HARM_RATIO = 1.005
+"""Mean square after the hypothesis, by that before, from which the hypothesis does harm. Chosen:
+above the change by refitting."""
+_BOOTSTRAP_DRAWS = 400
+"""Number of draws of the interval. Chosen: the 5 % quantile has 20 draws below it."""
+_DRIFT_QUANTILE = 2.0
+"""Mean square of a random walk by its expected value, which nine of ten recordings do not
+reach: derived for a random walk about its mean."""
 
 
 @dataclass(frozen=True)
-class Shrunk:
+class GapClosure:
     """
-    The gap before, after and at the floor, rms m/s², and the closed share with its interval.
+    The gap before, after and at the noise floor, and the closed share.
 
     Attributes
     ----------
+    before_mps2
+        Held-out rms of the baseline, m/s².
+    after_mps2
+        Held-out rms with the effects of the hypothesis, m/s².
+    floor_mps2
+        Noise floor, m/s².
     closed
-        (before² − after²)/(before² − floor²), held out; nan where there is no gap to close.
+        (before² − after²)/(before² − floor²); NaN where there is no gap to close.
+    closed_ci
+        90 % interval of the closed share.
     harm
-        Whether after is more than before.
-    within_mps2
-        Rms about the fit to all stretches, none held out.
-    predicted
-        Nats by which stretches held out are more likely with the effects than without.
+        Whether the hypothesis makes the held-out residual larger.
+    fitted_rms_mps2
+        Rms about the fit to all blocks, none held out, m/s².
+    log_likelihood_gain
+        Held-out log likelihood with the effects minus that without.
 
     """
 
@@ -65,21 +87,42 @@ class Shrunk:
     closed: float
     closed_ci: tuple[float, float]
     harm: bool
-    within_mps2: float
-    predicted: float
+    fitted_rms_mps2: float
+    log_likelihood_gain: float
 
 
 @dataclass(frozen=True)
-class HeldOut:
+class SizedHypothesis:
     """
-    What a hypothesis leaves on stretches that it was not fitted to.
+    A hypothesis with the sizes of its effects and of its residual, on the samples of the search.
+
+    Attributes
+    ----------
+    hypothesis
+        The fitted hypothesis.
+    contributions_mps2
+        Rms that each effect contributes to the output, m/s².
+    residual_mean_square
+        Mean square of the residual about its mean, (m/s²)².
+
+    """
+
+    hypothesis: Hypothesis
+    contributions_mps2: dict[str, float]
+    residual_mean_square: float
+
+
+@dataclass(frozen=True)
+class HeldOutResidual:
+    """
+    The residual of a hypothesis on blocks that it was not fitted to.
 
     Attributes
     ----------
     squares
-        Sums over samples of the mean square over axes, (m/s²)², by block, (b,).
+        Sum over samples of the mean square over axes, by block, (m/s²)², (blocks,).
     log_likelihood
-        Of all stretches, nats.
+        Log likelihood of all blocks.
 
     """
 
@@ -87,100 +130,304 @@ class HeldOut:
     log_likelihood: float
 
 
-def held_out(of: Study, full: Sequence[Series], counted: Sequence[np.ndarray],
-             effects: Sequence[str], sensor: Sensor) -> HeldOut:
+def estimate_noise_floor(comparisons: Sequence[BaselineComparison]) -> NoiseFloor:
     """
-    Fit on three quarters of the stretches and simulate the others at the full rate, in turn.
+    Estimate the noise floor from rests, else from repeats, else from the parameter file.
+
+    The noise at rest is that about the mean of each second. To the noise the steps of the stage's
+    encoder are added.
+    """
+    baseline = comparisons[0].sensor
+    nothing = SquareSum(np.zeros(len(baseline.axes)), 0)
+    total = sum((noise_floor.squares_at_rest(c.volts, c.at_rest & c.used, c.sensor)
+                 for c in comparisons), nothing)
+    source = 'still'
+    if total.count < FEWEST_SAMPLES:
+        total, source = sum(_repeat_squares(comparisons), nothing), 'repeats'
+    if total.count < FEWEST_SAMPLES:
+        noise_v, source = noise.sigma_v(baseline), 'assumed'
+    else:
+        noise_v = np.sqrt(total.squares_v2 / total.count)
+    encoder = np.mean([_encoder_mean_square(c) for c in comparisons])
+    noise_mps2 = noise_v / comparisons[0].scale_v_per_mps2
+    return NoiseFloor(noise_v, float(np.sqrt(np.mean(noise_mps2 ** 2) + encoder)), source)
+
+
+def _repeat_squares(comparisons: Sequence[BaselineComparison]) -> list[SquareSum]:
+    """Return the squares of the differences between repeats of a trajectory on the stage."""
+    staged = [c for c in comparisons if c.reference is Reference.STAGE]
+    directions = [noise_floor.directions(c.motion.alpha(c.time_s), c.motion.beta(c.time_s))
+                  for c in staged]
+    out = []
+    for i, first in enumerate(staged):
+        for j, second in enumerate(staged[i:], i):
+            rate_hz = first.sensor.rate_hz
+            if abs(rate_hz / second.sensor.rate_hz - 1) > 1e-3:
+                continue
+            repeat = noise_floor.find_repeat(directions[i], directions[j], rate_hz,
+                                             first.sensor.stage_resolution_rad, i == j)
+            if repeat is not None:
+                used = first.used[repeat[0]] & second.used[repeat[1]]
+                out.append(noise_floor.squares_of_difference(
+                    first.residual_v(first.sensor)[repeat[0]][used],
+                    second.residual_v(second.sensor)[repeat[1]][used]))
+    return out
+
+
+def _encoder_mean_square(comparison: BaselineComparison) -> float:
+    """Return the mean square that the steps of the encoder make in a recording, (m/s²)²."""
+    if comparison.reference is not Reference.STAGE or not comparison.sensor.stage_resolution_rad:
+        return 0.0
+    motion, time_s, used = comparison.motion, comparison.time_s, comparison.used
+    return noise_floor.encoder_mean_square(motion.alpha(time_s)[used], motion.beta(time_s)[used],
+                                           comparison.sensor)
+
+
+def size_of(linear_model: LinearModel, hypothesis: Hypothesis) -> SizedHypothesis:
+    """
+    Simulate how large the effects and the residual of a hypothesis are.
 
     Parameters
     ----------
-    of
-        The recordings as searched.
-    full, counted
-        The same at their full rate, and the samples that count.
-    effects, sensor
-        Whose parameters are fitted anew, and which has them as fitted to all stretches.
+    linear_model
+        The recordings.
+    hypothesis
+        A fitted hypothesis.
+
+    Returns
+    -------
+    SizedHypothesis
+        The hypothesis with its sizes.
+
+    """
+    return SizedHypothesis(
+        hypothesis, {effect: contribution_mps2(linear_model, hypothesis, effect)
+                     for effect in hypothesis.effects},
+        residual_mean_square(linear_model, hypothesis))
+
+
+def contribution_mps2(linear_model: LinearModel, hypothesis: Hypothesis, effect: str) -> float:
+    """
+    Simulate what one effect of a hypothesis contributes to the output.
+
+    Parameters
+    ----------
+    linear_model
+        The recordings.
+    hypothesis
+        A fitted hypothesis.
+    effect
+        Name of one of its effects.
+
+    Returns
+    -------
+    float
+        Rms over samples and axes about the mean, of zero-g and scale factor about zero, m/s².
+
+    """
+    library_effect = effect_named(effect)
+    if library_effect.diagnosis.drift:
+        density = np.sqrt(np.mean(next(iter(hypothesis.sensor.values[effect].values())) ** 2))
+        return float(np.sqrt(np.mean([
+            (G0_MPS2 * expected_drift_g(library_effect.diagnosis.drift, density, c.span_s,
+                                        c.sensor.rate_hz)) ** 2
+            for c in linear_model.comparisons])))
+    baseline = linear_model.baseline
+    absent = baseline.values[effect] if effect in baseline.effects \
+        else neutral(library_effect, baseline.axes)
+    squares, count = 0.0, 0
+    for c in linear_model.comparisons:
+        sensor = replace(hypothesis.sensor, rate_hz=c.sensor.rate_hz)
+        without = replace(sensor, values={**sensor.values, effect: absent})
+        change_v = (c.simulated_v(sensor) - c.simulated_v(without))[c.used]
+        if not library_effect.diagnosis.straight_line:
+            change_v = change_v - change_v.mean(axis=0)
+        squares += float(np.sum((change_v / c.scale_v_per_mps2) ** 2))
+        count += change_v.size
+    return float(np.sqrt(squares / max(count, 1)))
+
+
+def residual_mean_square(linear_model: LinearModel, hypothesis: Hypothesis) -> float:
+    """
+    Return the mean square of a hypothesis's residual about its mean.
+
+    Parameters
+    ----------
+    linear_model
+        The recordings.
+    hypothesis
+        A fitted hypothesis.
+
+    Returns
+    -------
+    float
+        Mean square over samples and axes, (m/s²)².
+
+    """
+    squares, count = 0.0, 0
+    for c in linear_model.comparisons:
+        residual = (c.residual_v(hypothesis.sensor) / c.scale_v_per_mps2)[c.used]
+        squares += float(np.sum((residual - residual.mean(axis=0)) ** 2))
+        count += residual.size
+    return squares / max(count, 1)
+
+
+def unexplained_mps2(linear_model: LinearModel, hypothesis: Hypothesis, closure: GapClosure,
+                     noise_mps2: float) -> float:
+    """
+    Return the rms that neither the hypothesis nor noise nor a healthy drift explains.
+
+    Parameters
+    ----------
+    linear_model
+        The recordings.
+    hypothesis
+        The best hypothesis, whose noise may drift.
+    closure
+        Its gap closure.
+    noise_mps2
+        Rms of the simulated noise, with lines, spikes and steps that were detected, m/s².
+
+    Returns
+    -------
+    float
+        Rms, m/s².
+
+    """
+    channels = [c for c in linear_model.comparisons for _ in c.sensor.axes]
+    drift_squares = []
+    for c, filters, i in zip(channels, linear_model.filters, hypothesis.fit.filter_indices):
+        drift_g = expected_drift_g(filters[i].spectrum, filters[i].density, c.span_s,
+                                   c.sensor.rate_hz)
+        drift_squares.append((G0_MPS2 * drift_g) ** 2)
+    floor = max(closure.floor_mps2, noise_mps2) ** 2 \
+        + _DRIFT_QUANTILE * float(np.mean(drift_squares))
+    return float(np.sqrt(max(closure.fitted_rms_mps2 ** 2 - floor, 0.0)))
+
+
+def held_out_residual(linear_model: LinearModel, comparisons: Sequence[BaselineComparison],
+                      effects: Sequence[str], sensor: Sensor) -> HeldOutResidual:
+    """
+    Fit on three quarters of the blocks and simulate the others at the full rate, in turn.
+
+    Parameters
+    ----------
+    linear_model
+        The recordings at the rate of the search.
+    comparisons
+        The same recordings at their full rate.
+    effects
+        Effects whose parameters are fitted.
+    sensor
+        The sensor with these effects as fitted to all blocks.
+
+    Returns
+    -------
+    HeldOutResidual
+        Squares by block, and the log likelihood.
 
     """
     number = np.arange(BLOCKS)
-    here, free = local(of, effects, sensor), 'bias' in effects
-    whole = here.fit()
+    linearised = linearise(linear_model, effects, sensor)
+    full_fit = linearised.fit()
     squares, log_likelihood = np.zeros(BLOCKS), 0.0
     for fold in range(_FOLDS):
-        out = (number // _RUN) % _FOLDS == fold
-        near = np.convolve(out, np.ones(3), 'same') > 0
-        fit = here.fit(~near)
-        log_likelihood += float(evidence.predicted(here.channels, fit, np.flatnonzero(out)).sum())
-        refitted = here.fitted(fit, whole=whole)
-        for one, mask in zip(full, counted):
-            squares[out] += _by_block(one, mask, one.residual(refitted), ~near, of, free)[out]
-    return HeldOut(squares, log_likelihood)
+        held_out = (number // _RUN_BLOCKS) % _FOLDS == fold
+        fitted = np.convolve(held_out, np.ones(3), 'same') == 0
+        fit = linearised.fit(fitted)
+        log_likelihood += float(evidence.held_out_log_likelihood(
+            linearised.channels, fit, np.flatnonzero(held_out)).sum())
+        refitted = linearised.refitted_sensor(fit, full_fit)
+        for comparison in comparisons:
+            squares[held_out] += _squares_by_block(comparison, refitted, fitted, linear_model,
+                                                   effects)[held_out]
+    return HeldOutResidual(squares, log_likelihood)
 
 
-def shrunk(of: Study, full: Sequence[Series], counted: Sequence[np.ndarray], best: Hypothesis,
-           without: HeldOut, floor: Floor, seed: int) -> Shrunk:
+def gap_closure(linear_model: LinearModel, comparisons: Sequence[BaselineComparison],
+                hypothesis: Hypothesis, baseline_residual: HeldOutResidual, floor_mps2: float,
+                seed: int) -> GapClosure:
     """
-    Compare a hypothesis with none, on stretches held out.
+    Compare a hypothesis with the baseline on held-out blocks.
 
     Parameters
     ----------
-    of
-        The recordings as searched.
-    full, counted
-        The same at their full rate, and the samples that count.
-    best
-        Effects whose parameters are fitted anew.
-    without
-        What is left without effects.
-    floor
-        From `floor`.
+    linear_model
+        The recordings at the rate of the search.
+    comparisons
+        The same recordings at their full rate.
+    hypothesis
+        A fitted hypothesis, whose parameters are fitted again.
+    baseline_residual
+        Held-out residual without effects.
+    floor_mps2
+        Noise floor, m/s².
     seed
-        Of the bootstrap.
+        Seed of the bootstrap.
+
+    Returns
+    -------
+    GapClosure
+        The gap and its closed share.
 
     """
-    found = held_out(of, full, counted, best.effects, best.sensor) if best.effects else without
-    before, after = without.squares, found.squares
-    # What only makes noise leaves the mean, and the gap, as they are.
-    if all(effect_named(effect).acts_on is not ActsOn.MEAN for effect in best.effects):
+    residual = baseline_residual if not hypothesis.effects else held_out_residual(
+        linear_model, comparisons, hypothesis.effects, hypothesis.sensor)
+    before, after = baseline_residual.squares, residual.squares
+    # Effects on the noise leave the mean and the gap as they are.
+    if all(effect_named(effect).acts_on is not ActsOn.MEAN for effect in hypothesis.effects):
         after = before
     counts = np.zeros(BLOCKS)
-    for mask in counted:
-        counts += np.add.reduceat(mask, evidence.block_edges(len(mask))[:-1])
-    everywhere = np.ones(BLOCKS, bool)
-    within = sum(_by_block(one, mask, one.residual(best.sensor), everywhere, of,
-                           'bias' in best.effects).sum() for one, mask in zip(full, counted))
-    f2 = floor.rms_mps2 ** 2
-    b2, a2 = before.sum() / counts.sum(), after.sum() / counts.sum()
-    rng = np.random.default_rng(seed)
-    drawn = rng.integers(0, BLOCKS, (_DRAWS, BLOCKS))
-    b_drawn = before[drawn].sum(axis=1) / counts[drawn].sum(axis=1)
-    a_drawn = after[drawn].sum(axis=1) / counts[drawn].sum(axis=1)
-    # The floor in the sense of the same samples: after can be below it by chance.
+    for c in comparisons:
+        counts += np.add.reduceat(c.used, evidence.block_edges(len(c))[:-1])
+    every_block = np.ones(BLOCKS, bool)
+    fitted_squares = sum(_squares_by_block(c, hypothesis.sensor, every_block, linear_model,
+                                           hypothesis.effects).sum() for c in comparisons)
+    floor = floor_mps2 ** 2
+    before_square, after_square = before.sum() / counts.sum(), after.sum() / counts.sum()
+    # The rms after can be below the floor by chance.
+    closed = (before_square - after_square) / (before_square - min(floor, after_square)) \
+        if before_square > floor else float('nan')
+    return GapClosure(
+        float(np.sqrt(before_square)), float(np.sqrt(after_square)), floor_mps2,
+        float(min(closed, 1.0)), _closed_interval(before, after, counts,
+                                                  min(floor, after_square), seed),
+        bool(after_square > before_square * _HARM_RATIO),
+        float(np.sqrt(fitted_squares / counts.sum())),
+        residual.log_likelihood - baseline_residual.log_likelihood)
+
+
+def _closed_interval(before: np.ndarray, after: np.ndarray, counts: np.ndarray, floor: float,
+                     seed: int) -> tuple[float, float]:
+    """Return the 90 % interval of the closed share by a bootstrap of blocks."""
+    drawn = np.random.default_rng(seed).integers(0, BLOCKS, (_BOOTSTRAP_DRAWS, BLOCKS))
+    before_drawn = before[drawn].sum(axis=1) / counts[drawn].sum(axis=1)
+    after_drawn = after[drawn].sum(axis=1) / counts[drawn].sum(axis=1)
     with np.errstate(all='ignore'):
-        shares = (b_drawn - a_drawn) / (b_drawn - np.minimum(f2, a2))
-    closed = (b2 - a2) / (b2 - min(f2, a2)) if b2 > f2 else float('nan')
+        shares = (before_drawn - after_drawn) / (before_drawn - floor)
     low, high = np.quantile(np.clip(np.nan_to_num(shares), -1, 1), [0.05, 0.95])
-    return Shrunk(float(np.sqrt(b2)), float(np.sqrt(a2)), floor.rms_mps2, float(min(closed, 1.0)),
-                  (float(low), float(high)), bool(a2 > b2 * _HARM),
-                  float(np.sqrt(within / counts.sum())),
-                  found.log_likelihood - without.log_likelihood)
+    return float(low), float(high)
 
 
-def _by_block(series: Series, used: np.ndarray, off: np.ndarray, blocks: np.ndarray, of: Study,
-              free: bool) -> np.ndarray:
+def _squares_by_block(comparison: BaselineComparison, sensor: Sensor, fitted: np.ndarray,
+                      linear_model: LinearModel, effects: Sequence[str]) -> np.ndarray:
     """
-    Return the sum over samples of the mean square over axes of what is left, (m/s²)², (b,).
+    Return the sum over samples of the mean square over axes, by block, (m/s²)², (blocks,).
 
-    The level of a zero-g that wanders is that of the stretches that are not held out, within its
-    tolerance; where it is an effect, wherever they say.
+    The zero-g drifts, so that its level comes from the fitted blocks, within its tolerance. Where
+    the zero-g is an effect, its level has no bound.
     """
-    edges = evidence.block_edges(len(series))
-    fitted = used & np.repeat(blocks, np.diff(edges))
-    if fitted.any():
-        span_s = float(series.time_s[-1] - series.time_s[0])
-        drift = USUAL ** 2 * span_s / 6 * series.sensor.scale_v_per_g ** 2
-        known = np.array([np.inf if free else of.tolerance(Coefficient('bias', 'offset_v', axis))
-                          for axis in series.sensor.axes]) ** 2
-        off = off - off[fitted].mean(axis=0) / (1 + drift / known)
-    squares = ((off / series.scale_v_per_mps2) ** 2).mean(axis=1)
-    return np.add.reduceat(np.where(used, squares, 0.0), edges[:-1])
+    residual_v = comparison.residual_v(sensor)
+    edges = evidence.block_edges(len(comparison))
+    level_samples = comparison.used & np.repeat(fitted, np.diff(edges))
+    if level_samples.any():
+        drift_v2 = USUAL_DENSITY ** 2 * comparison.span_s / 6 \
+            * comparison.sensor.scale_v_per_g ** 2
+        zero_g_free = any(effect_named(e).diagnosis.straight_line is StraightLine.ZERO_G
+                          for e in effects)
+        tolerance_v = np.array([np.inf if zero_g_free else linear_model.zero_g_tolerance_v(axis)
+                                for axis in comparison.sensor.axes])
+        residual_v = residual_v - residual_v[level_samples].mean(axis=0) \
+            / (1 + drift_v2 / tolerance_v ** 2)
+    squares = ((residual_v / comparison.scale_v_per_mps2) ** 2).mean(axis=1)
+    return np.add.reduceat(np.where(comparison.used, squares, 0.0), edges[:-1])

@@ -12,36 +12,57 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""A hypothesis about values of its coefficients: differentiated there, fitted, simulated again."""
+"""The fit of a hypothesis: linearised at its coefficients, fitted, and simulated again."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from adxl_ros.diagnose import evidence
-from adxl_ros.diagnose.baseline_comparison import Series
-from adxl_ros.diagnose.evidence import Channel, Fit
-from adxl_ros.diagnose.linear_model import BEYOND, of_sensor, STRAIGHT, straight, Study
-from adxl_ros.diagnose.noise_whitening import drifts_among, flicker_g_per_rthz, near
-from adxl_ros.diagnose.sensitivities import limits, WIDE
+from adxl_ros.diagnose.drift_checks import ResidualChannel, weakest_walk
+from adxl_ros.diagnose.evidence import LinearFit, WhitenedChannel
+from adxl_ros.diagnose.linear_model import (
+    calibration_takes_up,
+    hints_of,
+    LinearModel,
+    NumberedColumn,
+    straight_line_parts,
+    TOLERANCE_STDS,
+)
+from adxl_ros.diagnose.noise_whitening import drifts_among, fitted_density, neighbouring_filters
+from adxl_ros.diagnose.sensitivities import limits, PRIOR_WIDTH, sensitivities_at
 from adxl_ros.model.coefficients import fitted_of, get, parameter_of, put, with_neutral
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Coefficient, Role
+from adxl_ros.model.gauss_newton import gauss_newton, Iterate
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
-_STEPS = {True: 10, False: 5}
-"""Of smooth effects, and of others, whose slopes are those of a wide step and never quite true."""
-_HALVED = 2
-_CHANGED = 1e-3
-_FORM = 0.03
-"""No form but geometry's is quite the sensor's: a coefficient is not known better than this."""
-_ELSEWHERE = 3.0
-"""By how much less sure of a coefficient some blocks are than all, that others determine it."""
-_GAINS, _SHARE = 0.05, 1e-4
-"""A step that gains less, in nats, is the last; one that would, or less than this of what all have
-gained, is not made."""
+_SMOOTH_EVALUATIONS = 10
+"""Largest number of simulations of a hypothesis of smooth effects. Chosen: most need five."""
+_ROUGH_EVALUATIONS = 5
+"""The same of other hypotheses. Chosen: their derivatives are those of wide steps, and more steps
+do not improve them."""
+_HALVINGS = 2
+"""How often a step that lowers the log evidence is halved. Chosen."""
+_EVIDENCE_TOLERANCE = 1e-3
+"""A step may lower the log evidence by this. Chosen: far below one unit."""
+_SMALLEST_STEP = 1e-3
+"""Smallest step, in prior standard deviations. Chosen."""
+_SMALLEST_GAIN = 0.05
+"""Gain of log evidence below which the fit has converged. Chosen: far below one unit."""
+_SMALLEST_GAIN_SHARE = 1e-4
+"""The same by the gain of all steps. Chosen: a large effect needs no more digits."""
+_FORM_ERROR = 0.03
+"""Relative standard deviation of a coefficient by the form of its effect, which only geometry and
+clocks have exactly. Tuned by hand on simulated recordings of the working seeds of the blind
+check."""
+_UNDETERMINED_PRIOR_SHARE = 0.5
+"""A posterior standard deviation above this share of the prior's is not determined. Chosen."""
+_UNDETERMINED_RATIO = 3.0
+"""Some blocks do not determine a coefficient if their standard deviation exceeds that of all
+blocks by this factor. Chosen: a quarter of the blocks is held out."""
 
 
 @dataclass(frozen=True)
@@ -52,15 +73,21 @@ class Hypothesis:
     Attributes
     ----------
     effects
-        Names; none for no gap.
+        Names of the effects; none for no gap.
     sensor
-        The baseline with the effects, and all that is free in every hypothesis, as fitted.
-    names, values, std
-        Fitted coefficients of the effects, as departures from the baseline.
+        The baseline with the effects and the nuisance parameters, as fitted.
+    names
+        Names of the k fitted coefficients of the effects, (k,).
+    values
+        Their values, as departures from the baseline, (k,).
+    std
+        Their standard deviations, (k,).
     log_evidence
-        Nats.
+        Log evidence.
     fit
-        The last linear step.
+        The last linear fit.
+    converged
+        Whether the Gauss-Newton iteration has converged.
 
     """
 
@@ -70,316 +97,450 @@ class Hypothesis:
     values: np.ndarray
     std: np.ndarray
     log_evidence: float
-    fit: Fit
+    fit: LinearFit
+    converged: bool = True
 
 
 @dataclass(frozen=True)
-class Local:
+class LinearisedHypothesis:
     """
-    A hypothesis differentiated about values of its coefficients.
+    A hypothesis linearised at values of its k coefficients; the first j are of the effects.
 
-    What is free in every hypothesis is differentiated at the baseline: it stays near it.
+    Nuisance parameters stay near the baseline and are linearised there.
 
     Attributes
     ----------
     effects
-        Names.
+        Names of the effects.
     sensor
-        At the values.
+        The sensor at the values.
     names
         Coefficients, those of the effects first, (k,).
-    middle, prior
-        Mean and standard deviation beforehand, (k,).
+    prior_mean
+        Prior mean of the coefficients, (k,).
+    prior_std
+        Prior standard deviation of the coefficients, (k,).
     values
-        Of the coefficients of the effects, (j,).
+        Values of the coefficients of the effects, (j,).
     channels
-        Whitened: residuals as at the mean beforehand, and columns.
+        Whitened residuals, as they would be at the prior mean, and columns.
 
     """
 
     effects: tuple[str, ...]
     sensor: Sensor
     names: tuple[Coefficient, ...]
-    middle: np.ndarray
-    prior: np.ndarray
+    prior_mean: np.ndarray
+    prior_std: np.ndarray
     values: np.ndarray
-    channels: list[Channel]
-
-    def fit(self, blocks: np.ndarray | None = None, wanders: Sequence[str] = ()) -> Fit:
-        """Fit all coefficients to some blocks, all unless given, (b,)."""
-        return evidence.fit(self.channels, range(len(self.names)), self.prior, self.most, blocks,
-                            wanders=(*wanders, *drifts_among(self.sensor.effects)))
+    channels: list[WhitenedChannel]
 
     @property
-    def most(self) -> np.ndarray:
-        """How large coefficients may be: a healthy unit stays within its tolerance, (k,)."""
-        own = np.arange(len(self.names)) < len(self.values)
-        return np.where(own, np.inf, BEYOND * self.prior)
+    def effect_names(self) -> tuple[Coefficient, ...]:
+        """Names of the coefficients of the effects, (j,)."""
+        return self.names[:len(self.values)]
 
-    def fitted(self, found: Fit, moved: bool = True, whole: Fit | None = None) -> Sensor:
+    @property
+    def bounds(self) -> np.ndarray:
+        """Largest deviation from the prior mean: a healthy unit keeps its tolerance, (k,)."""
+        of_effects = np.arange(len(self.names)) < len(self.values)
+        return np.where(of_effects, np.inf, TOLERANCE_STDS * self.prior_std)
+
+    def fit(self, blocks: np.ndarray | None = None, drifts: Sequence[str] = ()) -> LinearFit:
         """
-        Return the sensor after a fit, within bounds; the effects as they are if not moved.
+        Fit all coefficients.
 
-        What is free beside them is then at its posterior mean given them: they may differ much
-        from the fit's along what zero-g and scale factor can take up. `whole` is a fit to all
-        blocks, see `moved`.
+        Parameters
+        ----------
+        blocks
+            Blocks that count, (blocks,) bool; None for all.
+        drifts
+            Effects by which the zero-g drifts, beside those of the sensor.
+
+        Returns
+        -------
+        LinearFit
+            Departures from the prior mean.
+
         """
-        if moved:
-            values = self.moved(found, whole)
-        else:
-            own = np.arange(len(self.values))
-            values = np.clip(evidence.given(found, own, self.values - self.middle[own]),
-                             -self.most, self.most)
-        return put(self.sensor, self.names, _within(self.names, self.middle + values))
+        return evidence.fit_columns(self.channels, range(len(self.names)), self.prior_std,
+                                    self.bounds, blocks,
+                                    drifts=(*drifts, *drifts_among(self.sensor.effects)))
 
-    def moved(self, found: Fit, whole: Fit | None = None) -> np.ndarray:
+    def sensor_at_values(self, fit: LinearFit) -> Sensor:
         """
-        Return departures from the mean beforehand after a fit, (k,).
+        Return the sensor with the effects at their values.
 
-        A limit or a shape that the samples do not determine stays, for its mean beforehand is
-        nowhere in particular, and so does one that only other blocks than those of the fit do:
-        where they alone clip, the others tell nothing of it. One that is determined moves by half
-        or double at most.
+        The nuisance parameters are at their posterior mean given these values. Their mean by the
+        fit itself may differ much, along what they and the effects have in common.
         """
-        own = slice(len(self.values))
-        of = [parameter_of(name) for name in self.names[own]]
-        spread = np.sqrt(np.diag(found.covariance)[own])
-        lost = spread > self.prior[own] / 2
-        if whole is not None:
-            lost |= spread > _ELSEWHERE * np.sqrt(np.diag(whole.covariance)[own])
-        there = self.middle[own] + found.values[own]
-        there = np.where(lost & ~np.array([p.is_size for p in of], bool), self.values, there)
-        near = np.where([p.role is Role.SHAPE for p in of], np.clip(
-            there, *np.sort([self.values / 2, self.values * 2], axis=0)), there)
-        held = np.flatnonzero(near != self.middle[own] + found.values[own])
-        return evidence.given(found, held, near[held] - self.middle[held])
+        of_effects = np.arange(len(self.values))
+        departures = np.clip(
+            evidence.conditional_mean(fit, of_effects,
+                                      self.values - self.prior_mean[of_effects]),
+            -self.bounds, self.bounds)
+        return put(self.sensor, self.names,
+                   _within_bounds(self.names, self.prior_mean + departures))
 
-    def log_evidence(self, found: Fit) -> float:
-        """Return the log-evidence at the values themselves, nats."""
-        return found.log_evidence - evidence.lost(
-            self.channels, found, self.values - self.middle[:len(self.values)], self.prior)
+    def refitted_sensor(self, fit: LinearFit, full_fit: LinearFit) -> Sensor:
+        """
+        Return the sensor after a fit to some blocks.
+
+        Parameters
+        ----------
+        fit
+            The fit to some blocks.
+        full_fit
+            The fit to all blocks.
+
+        Returns
+        -------
+        Sensor
+            All coefficients as fitted, within their bounds.
+
+        """
+        return put(self.sensor, self.names, _within_bounds(
+            self.names, self.prior_mean + self.departures(fit, full_fit)))
+
+    def departures(self, fit: LinearFit, full_fit: LinearFit | None = None) -> np.ndarray:
+        """
+        Return the departures from the prior mean after a fit.
+
+        A limit or a shape that the samples do not determine stays, because its prior mean is no
+        better guess. The same holds where only the blocks outside the fit determine it. A shape
+        changes by a factor of two at most.
+
+        Parameters
+        ----------
+        fit
+            The fit.
+        full_fit
+            The fit to all blocks, where `fit` is to some.
+
+        Returns
+        -------
+        numpy.ndarray
+            Departures, (k,).
+
+        """
+        j = len(self.values)
+        parameters = [parameter_of(name) for name in self.effect_names]
+        std = np.sqrt(np.diag(fit.covariance)[:j])
+        undetermined = std > self.prior_std[:j] * _UNDETERMINED_PRIOR_SHARE
+        if full_fit is not None:
+            undetermined |= std > _UNDETERMINED_RATIO * np.sqrt(np.diag(full_fit.covariance)[:j])
+        fitted = self.prior_mean[:j] + fit.values[:j]
+        sized = np.array([p.is_size for p in parameters], bool)
+        values = np.where(undetermined & ~sized, self.values, fitted)
+        shape_range = np.sort([self.values / 2, self.values * 2], axis=0)
+        is_shape = [p.role is Role.SHAPE for p in parameters]
+        values = np.where(is_shape, np.clip(values, *shape_range), values)
+        changed = np.flatnonzero(values != fitted)
+        return evidence.conditional_mean(fit, changed, values[changed] - self.prior_mean[changed])
+
+    def log_evidence(self, fit: LinearFit) -> float:
+        """Return the log evidence at the values themselves."""
+        return fit.log_evidence - evidence.log_posterior_loss(
+            self.channels, fit, self.values - self.prior_mean[:len(self.values)], self.prior_std)
 
 
-def local(of: Study, effects: Sequence[str], sensor: Sensor,
-          beside: Sequence[np.ndarray] = (), noise: Sequence[int] | None = None) -> Local:
+def linearise(linear_model: LinearModel, effects: Sequence[str], sensor: Sensor,
+              extra_columns: Sequence[np.ndarray] = (),
+              filter_indices: Sequence[int] | None = None) -> LinearisedHypothesis:
     """
-    Differentiate the effects of a hypothesis about a sensor.
+    Linearise a hypothesis at the coefficients of a sensor.
 
     Parameters
     ----------
-    of
+    linear_model
         The recordings.
     effects
-        Names.
+        Names of the effects.
     sensor
-        Has them; its coefficients are the values.
-    beside
-        More columns by recording, (n, j), V a unit, each axis with coefficients of its own: they
-        are numbered on, axis by axis.
-    noise
-        Numbers of the filters about which the noise of each channel is, where it is known.
+        A sensor with the effects.
+    extra_columns
+        More columns by recording, V per unit, (n, e). Each axis has coefficients of its own,
+        numbered after those of the hypothesis, axis by axis.
+    filter_indices
+        Number of the whitening filter of each channel, where the noise is known.
+
+    Returns
+    -------
+    LinearisedHypothesis
+        Whitened residuals and columns.
 
     """
-    held = with_neutral(of.series[0].sensor, effects)
-    own = [name for effect in effects for name in fitted_of(effect_named(effect), held.axes)
-           if not parameter_of(name).is_size or name in of.names or limits(effect_named(effect))]
-    free = [n for n in dict.fromkeys(n for names in of.free for n in names)
-            if n.effect not in effects]
-    held = with_neutral(held, dict.fromkeys(n.effect for n in free))
-    parameters = [parameter_of(name) for name in own]
-    middle = np.array([float(get(held, [name])[0]) if p.is_size else p.scale
-                       for name, p in zip(own, parameters)])
-    values = get(sensor, own)
-    sensor = put(held, own, values)
-    prior = [p.scale * (WIDE if p.is_size else 1) for p in parameters]
-    names = [*own, *free]
-    channels: list[Channel] = []
+    start = with_neutral(linear_model.baseline, effects)
+    names = _fitted_names(linear_model, effects)
+    nuisances = [n for n in dict.fromkeys(n for channel in linear_model.nuisance_columns
+                                          for n in channel) if n.effect not in effects]
+    start = with_neutral(start, dict.fromkeys(n.effect for n in nuisances))
+    prior_mean, prior_std = _prior(start, names)
+    values = get(sensor, names)
+    sensor = put(start, names, values)
+    all_names = [*names, *nuisances]
+    channels: list[WhitenedChannel] = []
     lines: list[dict[int, np.ndarray]] = []
-    does: list[list[tuple[int, np.ndarray]]] = []
-    count = len(names)
-    for number, (one, mask) in enumerate(zip(of.series, of.used)):
-        more = beside[number] if beside else np.zeros((len(one), 0))
-        at_rate = replace(sensor, rate_hz=one.sensor.rate_hz)
-        there = one.simulated(at_rate)
-        columns = columns_at(one, at_rate, own, values, there)
-        taken_up = there - _else(of, number, at_rate, held, effects)
-        for d in range(len(held.axes)):
-            at = [i for i, n in enumerate(own)
-                  if n.axis in ('', held.axes[d])]
-            known = of.free[len(channels)]
-            also = [n for n in free if n in known]
-            lines.append({names.index(n): column for n, column in known.items()
-                          if n.effect in STRAIGHT})
-            does.append([(0, taken_up[:, d])])
-            design = columns[:, d, at]
-            residual = one.volts[:, d] - there[:, d] + design @ (values - middle)[at]
-            tried = of.filters[len(channels)]
-            channels.append(evidence.channel(
-                residual, np.column_stack([design, *(known[n] for n in also), more]),
-                np.array([*at, *(names.index(n) for n in also),
-                          *range(count, count + more.shape[1])], int), mask,
-                tried if noise is None else near(tried, noise[len(channels)])))
-            count += more.shape[1]
-    looks = straight(lines, does, 1)
+    changes: list[list[NumberedColumn]] = []
+    count = len(all_names)
+    for number, comparison in enumerate(linear_model.comparisons):
+        extra = extra_columns[number] if extra_columns else np.zeros((len(comparison), 0))
+        at_rate = replace(sensor, rate_hz=comparison.sensor.rate_hz)
+        output_v = comparison.simulated_v(at_rate)
+        columns = sensitivities_at(comparison.simulated_v, at_rate, names, values, output_v)
+        change_v = output_v - _output_beside_sensor_effects(linear_model, number, at_rate, start,
+                                                            effects)
+        for d in range(len(start.axes)):
+            places = [i for i, n in enumerate(names) if n.axis in ('', start.axes[d])]
+            own_nuisances = linear_model.nuisance_columns[len(channels)]
+            free = [n for n in nuisances if n in own_nuisances]
+            lines.append({all_names.index(n): column for n, column in own_nuisances.items()
+                          if hints_of(n).straight_line})
+            changes.append([(0, change_v[:, d])])
+            design = columns[:, d, places]
+            residual_v = comparison.volts[:, d] - output_v[:, d] \
+                + design @ (values - prior_mean)[places]
+            filters = linear_model.filters[len(channels)]
+            if filter_indices is not None:
+                filters = neighbouring_filters(filters, filter_indices[len(channels)])
+            channels.append(evidence.whiten_channel(
+                residual_v, np.column_stack([design, *(own_nuisances[n] for n in free), extra]),
+                np.array([*places, *(all_names.index(n) for n in free),
+                          *range(count, count + extra.shape[1])], int),
+                comparison.used, filters))
+            count += extra.shape[1]
+    parts = straight_line_parts(lines, changes, 1)
     drifts = drifts_among(effects)
-    prior += [float(np.hypot(of.tolerance(n, drifts), looks[i][0] if i in looks else 0.0))
-              for i, n in enumerate(free, len(own))]
-    return Local(tuple(effects), sensor, tuple(names), np.concatenate([middle, get(held, free)]),
-                 np.array(prior), values, channels)
+    prior_std += [float(np.hypot(linear_model.tolerance(n, drifts),
+                                 parts[i][0] if i in parts else 0.0))
+                  for i, n in enumerate(nuisances, len(names))]
+    return LinearisedHypothesis(
+        tuple(effects), sensor, tuple(all_names),
+        np.concatenate([prior_mean, get(start, nuisances)]), np.array(prior_std), values,
+        channels)
 
 
-def _else(of: Study, number: int, sensor: Sensor, baseline: Sensor,
-          effects: Sequence[str]) -> np.ndarray:
-    """Simulate a recording with those effects alone that no calibration takes up, V, (n, m)."""
-    own = [effect for effect in effects if of_sensor(effect)]
-    if len(own) == len(effects):
-        return of.base[number]
-    values = {**sensor.values, **{effect: baseline.values[effect] for effect in own}}
-    return of.series[number].simulated(replace(sensor, values=values))
+def _fitted_names(linear_model: LinearModel, effects: Sequence[str]
+                  ) -> list[Coefficient]:
+    """Return the coefficients of effects that the recordings show, and limits and shapes."""
+    return [name for effect in effects
+            for name in fitted_of(effect_named(effect), linear_model.baseline.axes)
+            if not parameter_of(name).is_size or name in linear_model.names
+            or limits(effect_named(effect))]
 
 
-def refined(of: Study, effects: Sequence[str], start: dict[Coefficient, float],
-            shapes: dict[Coefficient, float]) -> Hypothesis:
+def _prior(sensor: Sensor, names: Sequence[Coefficient]) -> tuple[np.ndarray, list[float]]:
+    """Return prior means and standard deviations of the coefficients of effects, (k,) each."""
+    parameters = [parameter_of(name) for name in names]
+    mean = np.array([float(get(sensor, [name])[0]) if p.is_size else p.scale
+                     for name, p in zip(names, parameters)])
+    return mean, [p.scale * (PRIOR_WIDTH if p.is_size else 1) for p in parameters]
+
+
+def _output_beside_sensor_effects(linear_model: LinearModel, number: int, sensor: Sensor,
+                                  start: Sensor, effects: Sequence[str]) -> np.ndarray:
+    """Simulate a recording without the effects that a calibration takes up, V, (n, m)."""
+    taken_up = [effect for effect in effects if calibration_takes_up(effect)]
+    if len(taken_up) == len(effects):
+        return linear_model.baseline_v[number]
+    values = {**sensor.values, **{effect: start.values[effect] for effect in taken_up}}
+    return linear_model.comparisons[number].simulated_v(replace(sensor, values=values))
+
+
+@dataclass(frozen=True)
+class _HypothesisIterate(Iterate):
+    """An iterate of the fit: the linearised hypothesis and its linear fit."""
+
+    linearised: LinearisedHypothesis
+    fit: LinearFit
+
+    @property
+    def log_evidence(self) -> float:
+        """Log evidence at the values."""
+        return -self.cost
+
+
+def fit_hypothesis(linear_model: LinearModel, effects: Sequence[str],
+                   start: Mapping[Coefficient, float],
+                   shapes: Mapping[Coefficient, float]) -> Hypothesis:
     """
-    Fit a set of effects by re-simulation, parameters of shape included.
+    Fit a set of effects by re-simulation, shape parameters included.
 
-    Gauss-Newton: simulate and differentiate at the present values, whiten, fit, until the
-    evidence no longer gains; a step that loses is halved.
+    Each Gauss-Newton step simulates, differentiates, whitens and fits at the present values. The
+    iteration ends where the log evidence no longer gains.
 
     Parameters
     ----------
-    of
+    linear_model
         The recordings.
     effects
-        Their names.
+        Names of the effects.
     start
-        Departures from the baseline to begin with, by coefficient.
+        First departures from the baseline by coefficient.
     shapes
-        Parameters of shape to begin with, by name without axis.
+        First values of shape parameters, by coefficient without axis.
+
+    Returns
+    -------
+    Hypothesis
+        The fitted hypothesis, converged or not.
+
+    Raises
+    ------
+    UserError
+        An effect has nothing to act on.
 
     """
     effects = tuple(dict.fromkeys(effects))
-    sensor = with_neutral(of.series[0].sensor, effects)
-    names = [n for effect in effects for n in fitted_of(effect_named(effect), sensor.axes)]
-    begin = []
+    neutral_sensor = with_neutral(linear_model.baseline, effects)
+    names = _fitted_names(linear_model, effects)
+
+    def linearised_at(values: np.ndarray) -> _HypothesisIterate:
+        linearised = linearise(linear_model, effects,
+                               put(neutral_sensor, names, _within_bounds(names, values)))
+        fit = linearised.fit()
+        j = len(linearised.values)
+        step = linearised.departures(fit)[:j] + linearised.prior_mean[:j] - linearised.values
+        return _HypothesisIterate(linearised.values, step, -linearised.log_evidence(fit),
+                                  linearised, fit)
+
+    smooth = all(effect_named(effect).smooth for effect in effects)
+    solution = gauss_newton(
+        linearised_at, _first_values(neutral_sensor, names, start, shapes), _has_converged,
+        _SMOOTH_EVALUATIONS if smooth else _ROUGH_EVALUATIONS, _HALVINGS, _EVIDENCE_TOLERANCE)
+    linearised, fit = solution.last.linearised, solution.last.fit
+    j = len(linearised.values)
+    std = np.sqrt(evidence.robust_std(linearised.channels, fit, linearised.prior_std)[:j] ** 2
+                  + _encoder_std(linear_model, linearised.effect_names) ** 2
+                  + _form_std(linearised, fit) ** 2)
+    return Hypothesis(
+        effects, _with_drift_densities(linear_model, effects, linearised.sensor_at_values(fit),
+                                       fit),
+        linearised.effect_names, linearised.values - linearised.prior_mean[:j], std,
+        solution.last.log_evidence + _sparsity_log_bayes_factor(linearised, fit), fit,
+        solution.converged)
+
+
+def _first_values(sensor: Sensor, names: Sequence[Coefficient], start: Mapping[Coefficient, float],
+                  shapes: Mapping[Coefficient, float]) -> np.ndarray:
+    """Return the first values of the coefficients, (k,)."""
+    values = []
     for name in names:
         p = parameter_of(name)
-        middle = float(get(sensor, [name])[0]) if p.is_size else p.scale
-        short = name.without_axis
-        begin.append(shapes[short] if not p.is_size and short in shapes
-                     else middle + start.get(name, 0.0))
-    sensor = put(sensor, names, _within(names, np.array(begin)))
-    best: tuple[float, Local, Fit] | None = None
-    step, first, halved = np.zeros(0), 0.0, 0
-    for _ in range(_STEPS[all(effect_named(effect).smooth for effect in effects)]):
-        here = local(of, effects, sensor)
-        found = here.fit()
-        reached = here.log_evidence(found)
-        first = reached if best is None else first
-        own = slice(len(here.values))
-        if best is not None and reached < best[0] - _CHANGED:
-            step, halved = step / 2, halved + 1
-            if halved > _HALVED:
-                break
-            sensor = put(sensor, here.names[own], _within(here.names[own],
-                                                          best[1].values + step))
-            continue
-        done = best is not None and reached - best[0] < _GAINS
-        best, halved = (reached, here, found), 0
-        step = here.moved(found)[own] + here.middle[own] - here.values
-        if done or found.log_evidence - reached < max(_GAINS, _SHARE * (reached - first)) \
-                or np.all(np.abs(step) < _CHANGED * here.prior[own]):
-            break
-        sensor = put(sensor, here.names[own], _within(here.names[own], here.values + step))
-    assert best is not None
-    reached, here, found = best
-    own = slice(len(here.values))
-    fitted = here.fitted(found, False)
+        mean = float(get(sensor, [name])[0]) if p.is_size else p.scale
+        parameter = name.without_axis
+        values.append(shapes[parameter] if not p.is_size and parameter in shapes
+                      else mean + start.get(name, 0.0))
+    return np.array(values)
+
+
+def _has_converged(first: _HypothesisIterate, previous: _HypothesisIterate | None,
+                   present: _HypothesisIterate) -> bool:
+    """Determine whether another step would gain nothing."""
+    if previous is not None and present.log_evidence - previous.log_evidence < _SMALLEST_GAIN:
+        return True
+    smallest = max(_SMALLEST_GAIN,
+                   _SMALLEST_GAIN_SHARE * (present.log_evidence - first.log_evidence))
+    if present.fit.log_evidence - present.log_evidence < smallest:
+        return True
+    prior_std = present.linearised.prior_std[:len(present.step)]
+    return bool(np.all(np.abs(present.step) < _SMALLEST_STEP * prior_std))
+
+
+def _with_drift_densities(linear_model: LinearModel, effects: Sequence[str], sensor: Sensor,
+                          fit: LinearFit) -> Sensor:
+    """Return the sensor with the densities of its drifts in the first recording."""
     for drift in drifts_among(effects):
-        densities = np.zeros(len(fitted.axes))
+        densities = np.zeros(len(sensor.axes))
         for d in range(len(densities)):
-            whiten = of.filters[d][found.walks[d]]
-            if whiten.drift == drift:
-                densities[d] = whiten.density if drift == 'bias_walk' else flicker_g_per_rthz(
-                    whiten, found.variance[d], of.series[0], d)
-        fitted = replace(fitted, values={**fitted.values, drift: {
+            whitener = linear_model.filters[d][fit.filter_indices[d]]
+            if whitener.effect == drift:
+                densities[d] = fitted_density(
+                    whitener, fit.innovation_variance_v2[d], linear_model.comparisons[0].dt_s,
+                    linear_model.baseline.scale_v_per_g[d])
+        sensor = replace(sensor, values={**sensor.values, drift: {
             effect_named(drift).parameters[0].name: densities}})
-    return Hypothesis(effects, fitted, here.names[own],
-                      here.values - here.middle[own],
-                      np.sqrt(evidence.robust_std(here.channels, found, here.prior)[own] ** 2
-                              + _of_stage(of, here.names[own]) ** 2
-                              + _of_form(here, found) ** 2),
-                      reached + _of_those_that_show(here, found), found)
+    return sensor
 
 
-def _of_stage(of: Study, names: Sequence[Coefficient]) -> np.ndarray:
-    """Return standard deviations below which the stage's step tells no angle, (k,)."""
-    return np.where([parameter_of(n).unit == 'rad' for n in names], of.least_angle_rad(), 0.0)
+def _encoder_std(linear_model: LinearModel, names: Sequence[Coefficient]) -> np.ndarray:
+    """Return standard deviations of angles by the step of the encoder, (k,)."""
+    return np.where([parameter_of(n).unit == 'rad' for n in names],
+                    linear_model.smallest_angle_rad(), 0.0)
 
 
-def _of_form(here: Local, found: Fit) -> np.ndarray:
-    """Return standard deviations of coefficients by a form that is not quite true, (k,)."""
-    names = here.names[:len(here.values)]
-    whole = np.where([parameter_of(n).is_size for n in names], found.values[:len(names)],
-                     here.values)
-    return np.where([effect_named(n.effect).exact for n in names], 0.0, _FORM * whole)
+def _form_std(linearised: LinearisedHypothesis, fit: LinearFit) -> np.ndarray:
+    """Return standard deviations of coefficients by the form of their effects, (j,)."""
+    names = linearised.effect_names
+    size = np.where([parameter_of(n).is_size for n in names], fit.values[:len(names)],
+                    linearised.values)
+    exact = [effect_named(n.effect).exact for n in names]
+    return np.where(exact, 0.0, _FORM_ERROR * size)
 
 
-def _of_those_that_show(here: Local, found: Fit) -> float:
+def _sparsity_log_bayes_factor(linearised: LinearisedHypothesis, fit: LinearFit) -> float:
     """
-    Return what the log-evidence gains by what an effect need not be, nats.
+    Return what the log evidence gains because an effect need not show in all coefficients.
 
-    It may be smaller than usual, and need not act on all axes: each set of its coefficients is as
-    likely beforehand as any other. What leaving one out gains is the ratio of its posterior and
-    prior densities at nothing (Dickey 1971); they are left out one by one, at least one of an
-    effect stays.
+    Every set of an effect's coefficients is equally probable beforehand, and its amplitude is
+    log-uniform. Omitting a coefficient gains the ratio of its posterior and prior densities at
+    zero (Dickey 1971). They are omitted one by one; at least one of an effect stays.
     """
-    mean, covariance = found.values.copy(), found.covariance.copy()
+    mean, covariance = fit.values.copy(), fit.covariance.copy()
     gain = 0.0
-    for effect in here.effects:
-        own = [i for i, name in enumerate(here.names[:len(here.values)])
-               if name.effect == effect and parameter_of(name).is_size]
-        if own:
-            gain -= float(np.log(2.0 ** len(own) - 1))
-        while len(own) > 1:
-            spread = np.diag(covariance)[own]
-            gains = 0.5 * (np.log(here.prior[own] ** 2 / spread) - mean[own] ** 2 / spread)
+    for effect in linearised.effects:
+        kept = [i for i, name in enumerate(linearised.effect_names)
+                if name.effect == effect and parameter_of(name).is_size]
+        if not kept:
+            continue
+        gain -= float(np.log(2.0 ** len(kept) - 1))
+        while len(kept) > 1:
+            variance = np.diag(covariance)[kept]
+            gains = 0.5 * (np.log(linearised.prior_std[kept] ** 2 / variance)
+                           - mean[kept] ** 2 / variance)
             if gains.max() <= 0:
                 break
             gain += float(gains.max())
-            j = own.pop(int(np.argmax(gains)))
-            across = covariance[:, j] / covariance[j, j]
-            mean = mean - across * mean[j]
-            covariance = covariance - np.outer(across, covariance[j])
-        if own:
-            gain += evidence.of_any_size(mean[own], covariance[np.ix_(own, own)],
-                                         here.prior[own])
+            j = kept.pop(int(np.argmax(gains)))
+            regression = covariance[:, j] / covariance[j, j]
+            mean = mean - regression * mean[j]
+            covariance = covariance - np.outer(regression, covariance[j])
+        gain += evidence.amplitude_log_bayes_factor(
+            mean[kept], covariance[np.ix_(kept, kept)], linearised.prior_std[kept])
     return gain
 
 
-def _within(names: Sequence[Coefficient], values: np.ndarray) -> np.ndarray:
-    lower, upper = (np.array([getattr(parameter_of(n), side) for n in names])
-                    for side in ('lower', 'upper'))
-    return np.clip(values, lower, upper)
+def _within_bounds(names: Sequence[Coefficient], values: np.ndarray) -> np.ndarray:
+    """Clip values to the bounds of their parameters, (k,)."""
+    return np.clip(values, np.array([parameter_of(n).lower for n in names]),
+                   np.array([parameter_of(n).upper for n in names]))
 
 
-def columns_at(series: Series, sensor: Sensor, names: Sequence[Coefficient], values: np.ndarray,
-               there: np.ndarray) -> np.ndarray:
-    """Differentiate volts by coefficients at their values, (n, m, p); all axes at once."""
-    out = np.zeros((*there.shape, len(names)))
-    groups: dict[Coefficient, list[int]] = {}
-    for i, name in enumerate(names):
-        groups.setdefault(name.without_axis, []).append(i)
-    for of in groups.values():
-        p = parameter_of(names[of[0]])
-        by = p.scale * (0.3 if p.role is not Role.LIMIT and not effect_named(
-            names[of[0]].effect).smooth else 0.02)
-        if values[of[0]] + by > p.upper:
-            by = -by
-        moved = series.simulated(put(sensor, [names[i] for i in of], values[of] + by))
-        for i in of:
-            axis = names[i].axis
-            axes = [sensor.axes.index(axis)] if axis else range(len(sensor.axes))
-            for d in axes:
-                out[:, d, i] = (moved[:, d] - there[:, d]) / by
-    return out
+def residual_channels(linear_model: LinearModel, hypothesis: Hypothesis
+                      ) -> Iterator[ResidualChannel]:
+    """
+    Compute the residual of a hypothesis, channel by channel.
+
+    Parameters
+    ----------
+    linear_model
+        The recordings.
+    hypothesis
+        A fitted hypothesis.
+
+    Yields
+    ------
+    ResidualChannel
+        Residual and noise of one axis of one recording.
+
+    """
+    number = 0
+    for comparison in linear_model.comparisons:
+        residual_v = evidence.bridged(comparison.residual_v(hypothesis.sensor), comparison.used)
+        for axis_v in residual_v.T:
+            filters = linear_model.filters[number]
+            yield ResidualChannel(
+                axis_v, comparison.used, comparison.sensor.rate_hz,
+                filters[hypothesis.fit.filter_indices[number]], weakest_walk(filters),
+                float(hypothesis.fit.innovation_variance_v2[number]))
+            number += 1

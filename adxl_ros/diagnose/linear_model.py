@@ -13,264 +13,351 @@
 # limitations under the License.
 
 """
-Recordings of one unit beside the baseline, differentiated by the whole library.
+The linear model of all recordings about the baseline: sensitivities to the whole library.
 
-Some coefficients are never exactly those of the file: zero-g and scale factor age, the resistor
-and capacitor of the filter have tolerances, stamps have a latency. They are free in every
-hypothesis, within what a healthy unit shows, so that they neither steal from an effect nor lend
-to it, and are only named where they go beyond that. Whatever an effect of the sensor does in a
-straight line, calibration has taken up, or not: zero-g and scale factor are as free as that beside
-it. What stage and place do is no part of the sensor's figures: gravity that is not the stated one
-is nothing but a straight line.
+Some coefficients of a healthy unit differ from the parameter file: zero-g and scale factor age,
+the parts of the RC filter have tolerances, and stamps have a latency. These nuisance parameters
+are free in every hypothesis, within the tolerance of a healthy unit, and are named only beyond it.
+
+A calibration has taken up an unknown share of the straight line in the output of a sensor effect.
+Beside such an effect, zero-g and scale factor are as free as that straight line. An effect of the
+stage or of the specific force is no part of the calibrated sensor and leaves them as they are.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 from adxl_ros.diagnose import evidence, noise_whitening
-from adxl_ros.diagnose.baseline_comparison import Series
-from adxl_ros.diagnose.evidence import Channel, Fit
+from adxl_ros.diagnose.baseline_comparison import BaselineComparison, Reference
+from adxl_ros.diagnose.evidence import LinearFit, WhitenedChannel
+from adxl_ros.diagnose.noise_whitening import drifts_among, Whitener
 from adxl_ros.diagnose.sensitivities import candidates, Variant, variants
-from adxl_ros.model.effects import effect_named
+from adxl_ros.model.diagnosis_hints import DiagnosisHints, StraightLine
+from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.effects.base import Coefficient, Place
+from adxl_ros.model.sensor import Sensor
 import numpy as np
 
-TOLERANCE = {'bias': 1e-4, 'scale_factor': 1e-4, 'bandwidth': 0.02, 'time_offset': 1e-4}
-"""What a healthy unit shows from day to day, beside the file's covariance, as standard deviations:
-zero-g in g, scale factor, resistance of the filter, and latency of the stamps in s."""
-STRAIGHT = ('bias', 'scale_factor')
-"""Of these, what a straight line is made of."""
-FOLLOWED = (*TOLERANCE, 'gravity')
-"""What they take up whole, so that leaving it out leaves no more: gravity scales all axes."""
-_DRIFTED_G = 0.02
-BEYOND = 4.0
-"""So many of these, and the unit is not healthy: it takes an effect."""
+_DRIFTED_STD_G = 0.02
+"""Prior standard deviation of the zero-g where it drifts, g: it has drifted before the recording,
+too. Tuned by hand on simulated recordings of the working seeds of the blind check."""
+TOLERANCE_STDS = 4.0
+"""Largest deviation of a healthy unit, in standard deviations. Chosen: beyond it an effect is more
+probable than chance."""
+
+NumberedColumn = tuple[int, np.ndarray]
+"""Number of a column and its sensitivity, V per unit, (n,)."""
+
+
+def hints_of(name: Coefficient) -> DiagnosisHints:
+    """Return the hints of the effect of a coefficient."""
+    return effect_named(name.effect).diagnosis
 
 
 @dataclass(frozen=True)
-class Study:
+class LinearModel:
     """
-    Recordings of one unit, and the tangents at its baseline.
+    Recordings of one unit, and the sensitivities at their baseline; a channel is one axis of one.
 
     Attributes
     ----------
-    series, used, base
-        Recordings, the samples of each that count, and what the baseline says, V, (n, m).
-    variants, ids
-        Of the library, and the numbers of their columns.
-    names, prior
-        Of all columns.
+    comparisons
+        The recordings at the rate of the search.
+    baseline_v
+        Simulated output of the baseline in each recording, V, (n, m).
+    variants
+        Variants of the effects of the library.
+    column_ids
+        Numbers of the columns of each variant.
+    names
+        Coefficient of each column.
+    prior_std
+        Prior standard deviation of each coefficient, (columns,).
     channels
         Whitened residuals and columns at the baseline.
     filters
-        That whiten, by channel.
-    free
-        By channel: what is free in every hypothesis, and its columns, volts a unit, (n,).
-    straight
-        By coefficient of zero-g and scale factor: how much of it a unit of each column looks like,
-        (all,).
+        Whitening filters of each channel.
+    nuisance_columns
+        By channel: nuisance parameters and their sensitivities, V per unit, (n,).
+    straight_line_parts
+        By coefficient of zero-g or scale factor: its amount in a unit of each column, (columns,).
 
     """
 
-    series: list[Series]
-    used: list[np.ndarray]
-    base: list[np.ndarray]
+    comparisons: list[BaselineComparison]
+    baseline_v: list[np.ndarray]
     variants: list[Variant]
-    ids: list[list[int]]
+    column_ids: list[list[int]]
     names: list[Coefficient]
-    prior: np.ndarray
-    channels: list[Channel]
-    filters: list[list[noise_whitening.Whitener]] = field(default_factory=list)
-    free: list[dict[Coefficient, np.ndarray]] = field(default_factory=list)
-    straight: dict[Coefficient, np.ndarray] = field(default_factory=dict)
+    prior_std: np.ndarray
+    channels: list[WhitenedChannel]
+    filters: list[list[Whitener]]
+    nuisance_columns: list[dict[Coefficient, np.ndarray]]
+    straight_line_parts: dict[Coefficient, np.ndarray]
 
-    def nuisances(self) -> list[int]:
-        """Return the numbers of the columns of what is free in every hypothesis."""
-        return [i for v, of in zip(self.variants, self.ids) if v.effect in TOLERANCE for i in of]
+    @property
+    def baseline(self) -> Sensor:
+        """The baseline of the first recording."""
+        return self.comparisons[0].sensor
 
-    def least_angle_rad(self) -> float:
-        """Return the standard deviation below which the stage's step tells no angle."""
-        return max(one.sensor.stage_resolution_rad if one.reference == 'stage' else 0.0
-                   for one in self.series) / 12 ** 0.5
+    @property
+    def pose_known(self) -> bool:
+        """Whether all recordings have a reference."""
+        return all(c.reference is not Reference.NONE for c in self.comparisons)
 
-    def priors(self, chosen: Sequence[int], drifts: Sequence[str] = ()
-               ) -> tuple[np.ndarray, np.ndarray]:
+    def nuisance_ids(self) -> list[int]:
+        """Return the numbers of the columns of nuisance parameters."""
+        return [i for variant, ids in zip(self.variants, self.column_ids)
+                if effect_named(variant.effect).diagnosis.nuisance for i in ids]
+
+    def smallest_angle_rad(self) -> float:
+        """Return the standard deviation of an angle by the step of the stage's encoder, rad."""
+        return max(c.sensor.stage_resolution_rad if c.reference is Reference.STAGE else 0.0
+                   for c in self.comparisons) / 12 ** 0.5
+
+    def prior(self, chosen: Sequence[int], drifts: Sequence[str] = ()
+              ) -> tuple[np.ndarray, np.ndarray]:
         """
-        Return prior deviations of all columns, and how large each may be.
+        Return prior standard deviations and bounds of all coefficients.
 
-        Only the chosen variants, by number, go beyond the tolerance of a healthy unit.
+        Parameters
+        ----------
+        chosen
+            Numbers of the variants of the hypothesis, which alone exceed their tolerance.
+        drifts
+            Effects by which the zero-g drifts.
+
+        Returns
+        -------
+        tuple of numpy.ndarray
+            Standard deviations and largest magnitudes, (columns,) each.
+
         """
-        prior, most = self.prior.copy(), np.full(len(self.prior), np.inf)
+        prior_std, bounds = self.prior_std.copy(), np.full(len(self.prior_std), np.inf)
         effects = {self.variants[i].effect for i in chosen}
-        columns = [k for i in chosen if of_sensor(self.variants[i].effect) for k in self.ids[i]]
-        for i in self.nuisances():
+        columns = [k for i in chosen if calibration_takes_up(self.variants[i].effect)
+                   for k in self.column_ids[i]]
+        for i in self.nuisance_ids():
             name = self.names[i]
-            if name.effect not in effects:
-                looks = self.straight.get(name, np.zeros(len(prior)))[columns] * prior[columns]
-                prior[i] = np.hypot(self.tolerance(name, drifts), np.sqrt(np.sum(looks ** 2)))
-                # How large the chosen are is not known yet, nor is their straight part.
-                most[i] = np.inf if np.any(looks) else BEYOND * prior[i]
-        return prior, most
+            if name.effect in effects:
+                continue
+            parts = self.straight_line_parts.get(name, np.zeros(len(prior_std)))[columns] \
+                * prior_std[columns]
+            prior_std[i] = np.hypot(self.tolerance(name, drifts), np.sqrt(np.sum(parts ** 2)))
+            # The size of the chosen effects is unknown, and so is that of their straight part.
+            bounds[i] = np.inf if np.any(parts) else TOLERANCE_STDS * prior_std[i]
+        return prior_std, bounds
 
     def tolerance(self, name: Coefficient, drifts: Sequence[str] = ()) -> float:
         """
-        Return how far a coefficient may be from the file's in a healthy unit.
+        Return the standard deviation of a nuisance parameter in a healthy unit.
 
-        Where the sensor rests, its pose is not known, so that only changes of zero-g tell; where
-        its zero-g drifts, it has done so before, too.
+        Without a known pose the zero-g is free, because only its changes show.
+
+        Parameters
+        ----------
+        name
+            Name of the coefficient.
+        drifts
+            Effects by which the zero-g drifts.
+
+        Returns
+        -------
+        float
+            Standard deviation about the value of the parameter file, in the parameter's unit.
+
         """
-        effect = name.effect
-        if effect not in STRAIGHT:
-            return TOLERANCE[effect]
-        sensor = self.series[0].sensor
+        hints = hints_of(name)
+        assert hints.healthy_std is not None
+        if hints.straight_line is None:
+            return hints.healthy_std
+        sensor = self.baseline
         scale = float(sensor.scale_v_per_g[sensor.axes.index(name.axis)])
-        if effect == 'bias' and any(one.reference == 'rest' for one in self.series):
+        zero_g = hints.straight_line is StraightLine.ZERO_G
+        if zero_g and not self.pose_known:
             return scale
-        known = (_DRIFTED_G * scale) ** 2 if effect == 'bias' and drifts else 0.0
+        variance = (_DRIFTED_STD_G * scale) ** 2 if zero_g and drifts else 0.0
         if name in sensor.covariance_names:
             i = sensor.covariance_names.index(name)
-            known += float(sensor.covariance[i, i])
-        return float(np.hypot(TOLERANCE[effect] * scale, np.sqrt(known)))
+            variance += float(sensor.covariance[i, i])
+        return float(np.hypot(hints.healthy_std * scale, np.sqrt(variance)))
+
+    def zero_g_tolerance_v(self, axis: str) -> float:
+        """Return the standard deviation of the zero-g of one axis in a healthy unit, V."""
+        effect = next(e for e in library().values()
+                      if e.diagnosis.straight_line is StraightLine.ZERO_G)
+        return self.tolerance(Coefficient(effect.name, effect.parameters[0].name, axis))
+
+    def fit_variants(self, chosen: Sequence[int], start: LinearFit | None = None,
+                     drifts: Sequence[str] = ()) -> LinearFit:
+        """
+        Fit a set of variants on the sensitivities at the baseline.
+
+        Parameters
+        ----------
+        chosen
+            Numbers of the variants.
+        start
+            A fit whose noise is close to that of this fit.
+        drifts
+            Effects by which the zero-g drifts, beside those of the baseline.
+
+        Returns
+        -------
+        LinearFit
+            The fit; its log evidence has the log-uniform prior over amplitudes.
+
+        """
+        drifts = (*drifts, *drifts_among(self.baseline.effects))
+        ids = set(self.nuisance_ids()).union(*(self.column_ids[i] for i in chosen))
+        prior_std, bounds = self.prior(chosen, drifts)
+        fit = evidence.fit_columns(self.channels, sorted(ids), prior_std, bounds, None, start,
+                                   drifts)
+        gain = 0.0
+        for i in chosen:
+            places = np.flatnonzero(np.isin(fit.column_ids, self.column_ids[i]))
+            gain += evidence.amplitude_log_bayes_factor(
+                fit.values[places], fit.covariance[np.ix_(places, places)],
+                prior_std[fit.column_ids[places]])
+        return replace(fit, log_evidence=fit.log_evidence + gain)
 
 
-def of_sensor(effect: str) -> bool:
-    """Tell whether a calibration takes up what an effect does in a straight line."""
+def calibration_takes_up(effect: str) -> bool:
+    """Determine whether a calibration takes up the straight line in the output of an effect."""
     return effect_named(effect).place not in (Place.STAGE, Place.FORCE)
 
 
-def study(series: Sequence[Series], used: Sequence[np.ndarray],
-          show: Callable[[float], None], noise: Sequence[int] | None = None,
-          only: Sequence[str] | None = None) -> Study:
+def build_linear_model(comparisons: Sequence[BaselineComparison],
+                       show_progress: Callable[[float], None] = lambda fraction: None,
+                       filter_indices: Sequence[int] | None = None,
+                       only: Sequence[str] | None = None) -> LinearModel:
     """
     Differentiate the baseline by the whole library in all recordings.
 
     Parameters
     ----------
-    series
-        Of one unit, with one baseline.
-    used
-        Samples that count, (n,) by recording.
-    show
+    comparisons
+        Recordings of one unit, with one baseline.
+    show_progress
         Takes the fraction that is done.
-    noise
-        Numbers of the filters about which the noise of each channel is, where it is known.
+    filter_indices
+        Number of the whitening filter of each channel, where the noise is known.
     only
-        These effects and what is free, not the whole library.
+        Names of the effects beside the nuisance parameters; None for the whole library.
+
+    Returns
+    -------
+    LinearModel
+        The linear model.
 
     """
-    every: dict[tuple, dict[int, Variant]] = {}
-    effects = [e for e in candidates() if only is None or e.name in (*only, *TOLERANCE)]
-    bases = [one.simulated(one.sensor) for one in series]
-    for i, (one, base) in enumerate(zip(series, bases)):
-        for k, effect in enumerate(effects):
-            for found in variants(one, effect, base):
-                key = (found.effect, tuple(found.shape.items()), found.size)
-                every.setdefault(key, {})[i] = found
-            show((i + (k + 1) / len(effects)) / len(series))
+    baseline_v = [c.simulated_v(c.sensor) for c in comparisons]
     names: list[Coefficient] = []
-    prior: list[float] = []
-    kept, ids = [], []
-    columns: list[list[list[tuple[int, np.ndarray]]]] = [
-        [[] for _ in one.sensor.axes] for one in series]
-    for of in every.values():
-        first = next(iter(of.values()))
-        number: dict[Coefficient, int] = {}
-        for i, found in of.items():
-            for name, sd in zip(found.names, found.prior):
-                if name not in number:
-                    number[name] = len(names)
+    prior_std: list[float] = []
+    kept: list[Variant] = []
+    column_ids: list[list[int]] = []
+    columns: list[list[list[NumberedColumn]]] = [[[] for _ in c.sensor.axes] for c in comparisons]
+    for by_recording in _variants(comparisons, baseline_v, show_progress, only):
+        numbers: dict[Coefficient, int] = {}
+        for i, variant in by_recording.items():
+            for name, std in zip(variant.names, variant.prior_std):
+                if name not in numbers:
+                    numbers[name] = len(names)
                     names.append(name)
-                    prior.append(float(sd))
-            for d, (at, values) in enumerate(found.columns):
-                columns[i][d] += [(number[found.names[j]], values[:, c])
-                                  for c, j in enumerate(at)]
-        kept.append(replace(first, names=tuple(number), prior=np.array(
-            [prior[j] for j in number.values()])))
-        ids.append(list(number.values()))
-    channels: list[Channel] = []
-    filters: list[list[noise_whitening.Whitener]] = []
-    for one, mask, of_series in zip(series, used, columns):
-        residual = one.residual(one.sensor)
-        for d, of_axis in enumerate(of_series):
-            tried = noise_whitening.whiteners(one, d)
-            filters.append(tried if noise is None else noise_whitening.near(
-                tried, noise[len(filters)]))
-            channels.append(evidence.channel(
-                residual[:, d], np.column_stack([c for _, c in of_axis]),
-                np.array([i for i, _ in of_axis]), mask, filters[-1]))
-    free = [{names[i]: column for i, column in of_axis if names[i].effect in TOLERANCE}
-            for of_series in columns for of_axis in of_series]
-    looks = straight([{names.index(name): column for name, column in of.items()
-                       if name.effect in STRAIGHT} for of in free],
-                     [of_axis for of_series in columns for of_axis in of_series], len(names))
-    return Study(list(series), list(used), bases, kept, ids, names, np.array(prior), channels,
-                 filters, free, {names[i]: of for i, of in looks.items()})
+                    prior_std.append(float(std))
+            for d, (places, values) in enumerate(variant.columns):
+                columns[i][d] += [(numbers[variant.names[j]], values[:, c])
+                                  for c, j in enumerate(places)]
+        ids = list(numbers.values())
+        kept.append(replace(next(iter(by_recording.values())), names=tuple(numbers),
+                            prior_std=np.array([prior_std[j] for j in ids])))
+        column_ids.append(ids)
+    channels, filters = _whitened_channels(comparisons, columns, filter_indices)
+    by_channel = [axis_columns for recording_columns in columns
+                  for axis_columns in recording_columns]
+    nuisance_columns = [{names[i]: column for i, column in axis_columns
+                         if hints_of(names[i]).nuisance} for axis_columns in by_channel]
+    parts = straight_line_parts(
+        [{names.index(name): column for name, column in channel.items()
+          if hints_of(name).straight_line} for channel in nuisance_columns],
+        by_channel, len(names))
+    return LinearModel(list(comparisons), baseline_v, kept, column_ids, names,
+                       np.array(prior_std), channels, filters, nuisance_columns,
+                       {names[i]: amounts for i, amounts in parts.items()})
 
 
-def straight(lines: Sequence[dict[int, np.ndarray]],
-             columns: Sequence[Sequence[tuple[int, np.ndarray]]], count: int
-             ) -> dict[int, np.ndarray]:
+def _variants(comparisons: Sequence[BaselineComparison], baseline_v: Sequence[np.ndarray],
+              show_progress: Callable[[float], None], only: Sequence[str] | None
+              ) -> list[dict[int, Variant]]:
+    """Return the variants of the library, each by the number of the recording."""
+    effects = [e for e in candidates()
+               if only is None or e.name in only or e.diagnosis.nuisance]
+    every: dict[tuple, dict[int, Variant]] = {}
+    for i, (comparison, output_v) in enumerate(zip(comparisons, baseline_v)):
+        for k, effect in enumerate(effects):
+            for variant in variants(comparison.simulated_v, comparison.sensor, effect, output_v,
+                                    comparison.reference is not Reference.NONE):
+                key = (variant.effect, tuple(variant.shape.items()), variant.step)
+                every.setdefault(key, {})[i] = variant
+            show_progress((i + (k + 1) / len(effects)) / len(comparisons))
+    return list(every.values())
+
+
+def _whitened_channels(comparisons: Sequence[BaselineComparison],
+                       columns: Sequence[Sequence[Sequence[NumberedColumn]]],
+                       filter_indices: Sequence[int] | None
+                       ) -> tuple[list[WhitenedChannel], list[list[Whitener]]]:
+    """Whiten residual and columns of each channel; return them with the filters."""
+    channels: list[WhitenedChannel] = []
+    filters: list[list[Whitener]] = []
+    for comparison, by_axis in zip(comparisons, columns):
+        residual_v = comparison.residual_v(comparison.sensor)
+        for d, axis_columns in enumerate(by_axis):
+            tried = noise_whitening.whiteners(comparison.sensor, d, comparison.dt_s,
+                                              comparison.span_s)
+            if filter_indices is not None:
+                tried = noise_whitening.neighbouring_filters(tried, filter_indices[len(filters)])
+            filters.append(tried)
+            channels.append(evidence.whiten_channel(
+                residual_v[:, d], np.column_stack([column for _, column in axis_columns]),
+                np.array([i for i, _ in axis_columns]), comparison.used, tried))
+    return channels, filters
+
+
+def straight_line_parts(lines: Sequence[dict[int, np.ndarray]],
+                        columns: Sequence[Sequence[NumberedColumn]], count: int
+                        ) -> dict[int, np.ndarray]:
     """
-    Say how much of a straight line columns look like, by least squares.
+    Fit straight lines between force and volts to columns, by least squares.
 
     Parameters
     ----------
     lines
-        By channel: number and column, (n,), of what makes the line.
+        By channel: columns of zero-g and scale factor by number, V per unit, (n,).
     columns
-        By channel: numbers, below `count`, and columns, (n,).
+        By channel: numbers, below `count`, and columns, V per unit, (n,).
     count
-        Of the columns.
+        Number of the columns.
 
     Returns
     -------
     dict
-        By number of what makes the line: its amount a unit of each column, (count,).
+        By number of a line's column: its amount in a unit of each column, (count,).
 
     """
     grams: dict[tuple[int, ...], np.ndarray] = {}
-    pulls: dict[tuple[int, ...], np.ndarray] = {}
-    for line, of in zip(lines, columns):
-        if not line or not of:
+    products: dict[tuple[int, ...], np.ndarray] = {}
+    for line, channel_columns in zip(lines, columns):
+        if not line or not channel_columns:
             continue
         key, matrix = tuple(line), np.column_stack(list(line.values()))
         grams[key] = grams.get(key, 0.0) + matrix.T @ matrix
-        pull = pulls.setdefault(key, np.zeros((len(line), count)))
-        for i, column in of:
-            pull[:, i] += matrix.T @ column
-    out: dict[int, np.ndarray] = {}
+        product = products.setdefault(key, np.zeros((len(line), count)))
+        for i, column in channel_columns:
+            product[:, i] += matrix.T @ column
+    amounts: dict[int, np.ndarray] = {}
     for key, gram in grams.items():
-        out |= dict(zip(key, np.linalg.lstsq(gram, pulls[key])[0]))
-    return out
-
-
-def on_tangents(of: Study, chosen: Sequence[int], start: Fit | None = None,
-                wanders: Sequence[str] = ()) -> Fit:
-    """
-    Fit a set of variants, by number, on the tangents at the baseline.
-
-    Parameters
-    ----------
-    of
-        The recordings.
-    chosen
-        Numbers of variants.
-    start
-        A fit with noise like that of this one.
-    wanders
-        Effects by which the zero-g may wander more than that of a healthy unit, beside those of
-        the baseline.
-
-    """
-    wanders = (*wanders, *noise_whitening.drifts_among(of.series[0].sensor.effects))
-    ids = set(of.nuisances()).union(*(of.ids[i] for i in chosen))
-    prior, most = of.priors(chosen, wanders)
-    found = evidence.fit(of.channels, sorted(ids), prior, most, None, start, wanders)
-    gain = 0.0
-    for i in chosen:
-        own = np.flatnonzero(np.isin(found.ids, of.ids[i]))
-        gain += evidence.of_any_size(found.values[own], found.covariance[np.ix_(own, own)],
-                                     prior[found.ids[own]])
-    return replace(found, log_evidence=found.log_evidence + gain)
+        amounts |= dict(zip(key, np.linalg.lstsq(gram, products[key])[0]))
+    return amounts

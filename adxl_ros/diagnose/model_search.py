@@ -13,217 +13,268 @@
 # limitations under the License.
 
 """
-The search: every effect alone, pairs and triples, by evidence on tangents and then in full.
+The search for hypotheses: single effects, pairs and triples.
 
-Tangents serve to look at hundreds of hypotheses within a second; the best are fitted by
-re-simulation, shapes included, because a delay of 7 ms under a 40 Hz shaker is no longer linear.
+The linear model ranks hundreds of hypotheses within a second. The best are fitted by
+re-simulation, shapes included, because a delay of 7 ms under a 40 Hz shaker is not linear.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
+from typing import NamedTuple
 
 from adxl_ros.diagnose.drift_checks import unevenness
-from adxl_ros.diagnose.evidence import Fit
-from adxl_ros.diagnose.hypothesis_fit import Hypothesis, local, refined
-from adxl_ros.diagnose.linear_model import on_tangents, STRAIGHT, Study, study, TOLERANCE
-from adxl_ros.diagnose.noise_whitening import DRIFTS, drifts_among
+from adxl_ros.diagnose.evidence import LinearFit
+from adxl_ros.diagnose.hypothesis_fit import (
+    fit_hypothesis,
+    Hypothesis,
+    linearise,
+    residual_channels,
+)
+from adxl_ros.diagnose.linear_model import build_linear_model, LinearModel
+from adxl_ros.diagnose.noise_whitening import drift_effects, drifts_among
 from adxl_ros.diagnose.sensitivities import Variant
 from adxl_ros.errors import UserError
 from adxl_ros.model.coefficients import parameter_of, with_neutral
+from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Coefficient
 import numpy as np
 
-MOST_EFFECTS = 3
-_REFINED, _PAIRED = 8, 8
-WORTH = 5.0
-"""Nats that a hypothesis must gain on tangents to be fitted in full, and a drift held out."""
-_UNEVEN = 1.4
+LARGEST_SET = 3
+"""Largest number of effects in a hypothesis. Chosen: more are not separable in one recording."""
+_SINGLES = 8
+"""Number of single effects that are fitted, and whose pairs are tried. Chosen: run time."""
+_FURTHER = 4
+"""Number of other hypotheses that each step of the search fits. Chosen: run time."""
+WORTH_LOG_BAYES_FACTOR = 5.0
+"""Log Bayes factor on the linear model from which a hypothesis is fitted, and on held-out blocks
+from which a drift is kept. Tuned by hand on simulated recordings of the working seeds of the
+blind check."""
+_LARGEST_UNEVENNESS = 1.4
+"""Largest unevenness of the noise beside a drift. Tuned as the limit above."""
+
+Hypotheses = dict[tuple[str, ...], Hypothesis]
+"""Hypotheses by the names of their effects, in the order of the search."""
 
 
-def search(of: Study, show: Callable[[float], None]) -> list[Hypothesis]:
+class _RankedSet(NamedTuple):
+    """A set of variants on the linear model: gain of log evidence, their numbers, the fit."""
+
+    gain: float
+    chosen: tuple[int, ...]
+    fit: LinearFit
+
+
+def search(linear_model: LinearModel, show_progress: Callable[[float], None]
+           ) -> list[Hypothesis]:
     """
-    Look at every effect, at pairs and at triples; the most probable first.
+    Search single effects, pairs and triples.
 
-    Pairs are looked for around the best effect, where what it leaves is straight, and among the
-    best of all effects, because two can mask each other.
+    Pairs are tried around the best hypothesis, where what it leaves is linear, and among the best
+    single effects, because two effects can mask each other.
 
     Parameters
     ----------
-    of
-        The recordings and their tangents.
-    show
+    linear_model
+        The recordings and their sensitivities.
+    show_progress
         Takes the fraction that is done.
 
+    Returns
+    -------
+    list of Hypothesis
+        Fitted hypotheses by falling log evidence; the empty one is among them.
+
     """
-    found: dict[tuple[str, ...], Hypothesis] = {(): refined(of, (), {}, {})}
-    none = on_tangents(of, [])
-    singles = _ranked(of, [(i,) for i in _told(of)], none)
-    _refine(of, singles[:_REFINED], none, found)
-    show(0.3)
-    # A file of stated figures lacks both, and what lacks both may not look like either.
-    line = [i for i in _told(of) if of.variants[i].effect in STRAIGHT]
-    _refine(of, _ranked(of, list(combinations(line, 2)), none), none, found)
-    best = _best(found)
+    hypotheses: Hypotheses = {(): fit_hypothesis(linear_model, (), {}, {})}
+    null_fit = linear_model.fit_variants([])
+    singles = _ranked(linear_model, [(i,) for i in _identifiable(linear_model)], null_fit)
+    _fit_best(linear_model, singles[:_SINGLES], null_fit, hypotheses)
+    show_progress(0.3)
+    # A nominal parameter file has neither zero-g nor scale factor of the unit, and their sum may
+    # look like neither.
+    straight = [i for i in _identifiable(linear_model)
+                if effect_named(linear_model.variants[i].effect).diagnosis.straight_line]
+    _fit_best(linear_model, _ranked(linear_model, list(combinations(straight, 2)), null_fit),
+              null_fit, hypotheses)
+    best = _best(hypotheses)
     if best.effects:
-        _forward(of, best, found)
-        show(0.6)
-        first = [chosen[0] for _, chosen, _ in singles[:_PAIRED]]
-        pairs = _ranked(of, list(combinations(sorted(first), 2)), none)
-        worth = _best(found).log_evidence - none.log_evidence + WORTH
-        _refine(of, [one for one in pairs if one[0] > worth][:_REFINED // 2], none, found)
-        best = _best(found)
-        if 1 < len(best.effects) < MOST_EFFECTS:
-            _forward(of, best, found)
-    _less(of, _best(found), found)
-    if _drifts(of, _best(found)):
-        _wandering(of, found)
-    show(1.0)
-    return sorted(found.values(), key=lambda h: -h.log_evidence)
+        _add_effect(linear_model, best, hypotheses)
+        show_progress(0.6)
+        first = [ranked.chosen[0] for ranked in singles[:_SINGLES]]
+        pairs = _ranked(linear_model, list(combinations(sorted(first), 2)), null_fit)
+        smallest_gain = _best(hypotheses).log_evidence - null_fit.log_evidence \
+            + WORTH_LOG_BAYES_FACTOR
+        _fit_best(linear_model, [pair for pair in pairs if pair.gain > smallest_gain][:_FURTHER],
+                  null_fit, hypotheses)
+        best = _best(hypotheses)
+        if 1 < len(best.effects) < LARGEST_SET:
+            _add_effect(linear_model, best, hypotheses)
+    _remove_each_effect(linear_model, _best(hypotheses), hypotheses)
+    if _drift_shows(linear_model, _best(hypotheses)):
+        _add_drifts(linear_model, hypotheses)
+    show_progress(1.0)
+    return sorted(hypotheses.values(), key=lambda h: -h.log_evidence)
 
 
-def _told(of: Study) -> list[int]:
-    """Return numbers of variants that can be told: no zero-g where the pose is not known."""
-    rests = any(one.reference == 'rest' for one in of.series)
-    return [i for i, v in enumerate(of.variants) if not rests or v.effect not in STRAIGHT]
+def _identifiable(linear_model: LinearModel) -> list[int]:
+    """Return the variants that can show: no zero-g or scale factor without a known pose."""
+    return [i for i, variant in enumerate(linear_model.variants) if linear_model.pose_known
+            or not effect_named(variant.effect).diagnosis.straight_line]
 
 
-def _best(found: dict[tuple[str, ...], Hypothesis]) -> Hypothesis:
-    return max(found.values(), key=lambda h: h.log_evidence)
+def _best(hypotheses: Hypotheses) -> Hypothesis:
+    """Return the hypothesis of the largest log evidence."""
+    return max(hypotheses.values(), key=lambda h: h.log_evidence)
 
 
-def _drifts(of: Study, best: Hypothesis) -> bool:
-    """Tell whether what a hypothesis leaves is likelier with a zero-g that wanders."""
-    here = local(of, best.effects, best.sensor)
-    return here.fit(wanders=DRIFTS).log_evidence - here.fit().log_evidence > WORTH
+def _drift_shows(linear_model: LinearModel, best: Hypothesis) -> bool:
+    """Determine whether the residual of a hypothesis is more probable with a drift."""
+    linearised = linearise(linear_model, best.effects, best.sensor)
+    return linearised.fit(drifts=drift_effects()).log_evidence \
+        - linearised.fit().log_evidence > WORTH_LOG_BAYES_FACTOR
 
 
-def _wandering(of: Study, found: dict[tuple[str, ...], Hypothesis]) -> None:
+def _add_drifts(linear_model: LinearModel, hypotheses: Hypotheses) -> None:
     """
-    Let the zero-g wander, alone, beside the best so far, and beside what is best with it.
+    Let the zero-g drift, alone, beside the best hypotheses, and beside effects best with a drift.
 
-    Such noise is the same all the time; what shows in some stretches more than in others is not
-    that.
+    A drift has the same power all the time; hypotheses with uneven noise are removed.
     """
-    ranked = sorted(found.values(), key=lambda h: -h.log_evidence)
-    several = [h for h in ranked if 0 < len(h.effects) < MOST_EFFECTS][:_REFINED // 2]
-    for drift in DRIFTS:
-        for h in several:
-            start = dict(zip(h.names, h.values))
-            one = _resimulated(of, (*h.effects, drift), start, {})
-            if one is not None:
-                found[one.effects] = one
-        drifting = on_tangents(of, [], None, (drift,))
-        alone = refined(of, (drift,), {}, {})
-        found[alone.effects] = alone
-        beside = _ranked(of, [(i,) for i in _told(of)], drifting, (drift,))
-        _refine(of, beside[:_REFINED // 2], drifting, found, (drift,))
-    for h in list(found.values()):
-        if drifts_among(h.effects) and unevenness(of, h) > _UNEVEN:
-            del found[h.effects]
+    ranked = sorted(hypotheses.values(), key=lambda h: -h.log_evidence)
+    best = [h for h in ranked if 0 < len(h.effects) < LARGEST_SET][:_FURTHER]
+    for drift in drift_effects():
+        for h in best:
+            _add(hypotheses, _fit_or_none(linear_model, (*h.effects, drift),
+                                          dict(zip(h.names, h.values)), {}))
+        drift_fit = linear_model.fit_variants([], None, (drift,))
+        _add(hypotheses, fit_hypothesis(linear_model, (drift,), {}, {}))
+        beside_drift = _ranked(linear_model, [(i,) for i in _identifiable(linear_model)],
+                               drift_fit, (drift,))
+        _fit_best(linear_model, beside_drift[:_FURTHER], drift_fit, hypotheses, (drift,))
+    for h in list(hypotheses.values()):
+        if drifts_among(h.effects) \
+                and unevenness(list(residual_channels(linear_model, h))) > _LARGEST_UNEVENNESS:
+            del hypotheses[h.effects]
 
 
-def around(of: Study, best: Hypothesis) -> Study:
+def _model_about(linear_model: LinearModel, best: Hypothesis) -> LinearModel:
     """
-    Return the study about a hypothesis: residuals and tangents at its fit.
+    Return the linear model about a hypothesis: residuals and sensitivities at its fit.
 
-    Filter and latency stay where the file has them, so that they are as free as before.
+    Nuisance parameters that are no straight line stay at the parameter file, so that they are as
+    free as before.
     """
-    at_file = with_neutral(of.series[0].sensor, best.sensor.effects).values
-    kept = (*best.effects, *STRAIGHT)
-    values = {effect: at_file[effect] if effect in TOLERANCE and effect not in kept
-              else of_effect for effect, of_effect in best.sensor.values.items()}
-    there = [replace(one, sensor=replace(best.sensor, values=values, rate_hz=one.sensor.rate_hz))
-             for one in of.series]
-    return study(there, of.used, lambda done: None, best.fit.walks)
+    file_values = with_neutral(linear_model.baseline, best.sensor.effects).values
+
+    def stays(effect: str) -> bool:
+        hints = effect_named(effect).diagnosis
+        return hints.nuisance and not hints.straight_line and effect not in best.effects
+
+    values = {effect: file_values[effect] if stays(effect) else fitted
+              for effect, fitted in best.sensor.values.items()}
+    comparisons = [replace(c, sensor=replace(best.sensor, values=values,
+                                             rate_hz=c.sensor.rate_hz))
+                   for c in linear_model.comparisons]
+    return build_linear_model(comparisons, filter_indices=best.fit.filter_indices)
 
 
-def _forward(of: Study, best: Hypothesis, found: dict[tuple[str, ...], Hypothesis]) -> None:
-    """Add one effect more to a hypothesis: on tangents about it, then in full."""
-    there = around(of, best)
-    own = [i for i, v in enumerate(there.variants) if v.effect in best.effects]
-    wanders = drifts_among(best.effects)
-    alone = on_tangents(there, own, None, wanders)
-    gains = []
-    for i in _told(there):
-        if there.variants[i].effect in best.effects:
-            continue
-        fit = on_tangents(there, [*own, i], alone, wanders)
-        gains.append((fit.log_evidence - alone.log_evidence, i, fit))
-    base = {v.effect for v in of.variants}
-    for gain, i, fit in sorted(gains, key=lambda one: -one[0])[:_REFINED // 2]:
-        if gain < WORTH:
+def _add_effect(linear_model: LinearModel, best: Hypothesis, hypotheses: Hypotheses) -> None:
+    """Add one effect to a hypothesis: on the linear model about it, then in full."""
+    about = _model_about(linear_model, best)
+    of_best = [i for i, v in enumerate(about.variants) if v.effect in best.effects]
+    drifts = drifts_among(best.effects)
+    best_fit = about.fit_variants(of_best, None, drifts)
+    ranked = []
+    for i in _identifiable(about):
+        if about.variants[i].effect not in best.effects:
+            fit = about.fit_variants([*of_best, i], best_fit, drifts)
+            ranked.append(_RankedSet(fit.log_evidence - best_fit.log_evidence, (i,), fit))
+    with_variants = {v.effect for v in linear_model.variants}
+    for gain, (i,), fit in sorted(ranked, key=lambda r: -r.gain)[:_FURTHER]:
+        if gain < WORTH_LOG_BAYES_FACTOR:
             break
-        effects = (*best.effects, there.variants[i].effect)
-        if not all(e in base or e in DRIFTS for e in effects):
+        added = about.variants[i]
+        effects = (*best.effects, added.effect)
+        if not with_variants.union(drifts).issuperset(effects):
             continue
         start = dict(zip(best.names, best.values))
-        start |= {there.names[k]: v for k, v in zip(fit.ids, fit.values)
-                  if k in there.ids[i]} | _begin(there.variants[i])
-        shape = {Coefficient(there.variants[i].effect, p): v
-                 for p, v in there.variants[i].shape.items()}
-        one = _resimulated(of, effects, start, shape)
-        if one is not None:
-            found[one.effects] = one
+        start |= {about.names[k]: value for k, value in zip(fit.column_ids, fit.values)
+                  if k in about.column_ids[i]}
+        start |= _limit_start(added)
+        _add(hypotheses, _fit_or_none(linear_model, effects, start, _named_shape(added)))
 
 
-def _less(of: Study, best: Hypothesis, found: dict[tuple[str, ...], Hypothesis]) -> None:
-    """Leave out each effect of a hypothesis: the first that was found may have been a stand-in."""
+def _remove_each_effect(linear_model: LinearModel, best: Hypothesis, hypotheses: Hypotheses
+                        ) -> None:
+    """Remove each effect of a hypothesis once: the first one may stand in for two others."""
     start = dict(zip(best.names, best.values))
-    known = {frozenset(effects) for effects in found}
+    present = {frozenset(effects) for effects in hypotheses}
     for effect in best.effects:
-        fewer = tuple(e for e in best.effects if e != effect)
-        if frozenset(fewer) not in known:
-            one = _resimulated(of, fewer, start, {})
-            if one is not None:
-                found[one.effects] = one
+        remaining = tuple(e for e in best.effects if e != effect)
+        if frozenset(remaining) not in present:
+            _add(hypotheses, _fit_or_none(linear_model, remaining, start, {}))
 
 
-def _ranked(of: Study, sets: Sequence[tuple[int, ...]], none: Fit,
-            wanders: Sequence[str] = ()) -> list[tuple[float, tuple[int, ...], Fit]]:
-    """Fit sets of variants on tangents; the best of each set of effects, the best first."""
-    best: dict[frozenset[str], tuple[float, tuple[int, ...], Fit]] = {}
+def _ranked(linear_model: LinearModel, sets: Sequence[tuple[int, ...]], null_fit: LinearFit,
+            drifts: Sequence[str] = ()) -> list[_RankedSet]:
+    """Fit sets of variants on the linear model; return the best of each set of effects, ranked."""
+    best: dict[frozenset[str], _RankedSet] = {}
     for chosen in sets:
-        key = frozenset(of.variants[i].effect for i in chosen)
-        if len(key) < len(chosen):
+        effects = frozenset(linear_model.variants[i].effect for i in chosen)
+        if len(effects) < len(chosen):
             continue
-        found = on_tangents(of, chosen, none, wanders)
-        gain = found.log_evidence - none.log_evidence
-        if key not in best or gain > best[key][0]:
-            best[key] = (gain, chosen, found)
-    return sorted(best.values(), key=lambda one: -one[0])
+        fit = linear_model.fit_variants(chosen, null_fit, drifts)
+        gain = fit.log_evidence - null_fit.log_evidence
+        if effects not in best or gain > best[effects].gain:
+            best[effects] = _RankedSet(gain, chosen, fit)
+    return sorted(best.values(), key=lambda r: -r.gain)
 
 
-def _refine(of: Study, ranked: Iterable[tuple[float, tuple[int, ...], Fit]], none: Fit,
-            found: dict[tuple[str, ...], Hypothesis], also: tuple[str, ...] = ()) -> None:
-    """Fit the best on tangents in full; those that gain less than is worth it are left."""
+def _fit_best(linear_model: LinearModel, ranked: Iterable[_RankedSet], null_fit: LinearFit,
+              hypotheses: Hypotheses, drifts: tuple[str, ...] = ()) -> None:
+    """Fit the ranked sets in full, with drifts beside them, that gain enough."""
     for gain, chosen, fit in ranked:
-        if gain < WORTH:
+        variants = [linear_model.variants[i] for i in chosen]
+        effects = (*(v.effect for v in variants), *drifts)
+        if gain < WORTH_LOG_BAYES_FACTOR or effects in hypotheses:
             continue
-        start = dict(zip([of.names[i] for i in fit.ids], fit.values))
-        for i in chosen:
-            start |= _begin(of.variants[i])
-        shapes = {Coefficient(of.variants[i].effect, p): value for i in chosen
-                  for p, value in of.variants[i].shape.items()}
-        effects = (*(of.variants[i].effect for i in chosen), *also)
-        if effects in found:
-            continue
-        one = _resimulated(of, effects, start, shapes)
-        if one is not None and one.log_evidence > none.log_evidence:
-            found[one.effects] = one
+        start = dict(zip([linear_model.names[i] for i in fit.column_ids], fit.values))
+        shapes: dict[Coefficient, float] = {}
+        for variant in variants:
+            start |= _limit_start(variant)
+            shapes |= _named_shape(variant)
+        hypothesis = _fit_or_none(linear_model, effects, start, shapes)
+        if hypothesis is not None and hypothesis.log_evidence > null_fit.log_evidence:
+            _add(hypotheses, hypothesis)
 
 
-def _begin(variant: Variant) -> dict[Coefficient, float]:
-    """Return where a limit begins, as departures from what they are held against."""
+def _limit_start(variant: Variant) -> dict[Coefficient, float]:
+    """Return where the fit of a limit starts, as departures from the prior mean."""
     return {name: value - (0.0 if parameter_of(name).is_size else parameter_of(name).scale)
-            for name, value in variant.begin.items()}
+            for name, value in variant.limit_start.items()}
 
 
-def _resimulated(of: Study, effects: Sequence[str], start: dict[Coefficient, float],
-                 shapes: dict[Coefficient, float]) -> Hypothesis | None:
+def _named_shape(variant: Variant) -> dict[Coefficient, float]:
+    """Return the shape parameters of a variant by coefficient without axis."""
+    return {Coefficient(variant.effect, parameter): value
+            for parameter, value in variant.shape.items()}
+
+
+def _add(hypotheses: Hypotheses, hypothesis: Hypothesis | None) -> None:
+    """Add a hypothesis, if it could be fitted."""
+    if hypothesis is not None:
+        hypotheses[hypothesis.effects] = hypothesis
+
+
+def _fit_or_none(linear_model: LinearModel, effects: Sequence[str],
+                 start: Mapping[Coefficient, float],
+                 shapes: Mapping[Coefficient, float]) -> Hypothesis | None:
+    """Fit a hypothesis; return None where it cannot be simulated or is singular."""
     try:
-        return refined(of, effects, start, shapes)
+        return fit_hypothesis(linear_model, effects, start, shapes)
     except (UserError, np.linalg.LinAlgError):
         return None

@@ -13,138 +13,227 @@
 # limitations under the License.
 
 """
-The next manoeuvre: which of a menu would tell what this recording could not.
+The next experiment: the manoeuvre that separates what the recordings could not.
 
 Each manoeuvre is simulated with the best hypothesis, noise included, and its rivals are fitted to
-it: by how much more likely the truth is than its nearest rival, per minute, is what it is worth.
+the result. Its worth is the log Bayes factor of the truth over the nearest rival, per minute.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
-from adxl_ros.diagnose.baseline_comparison import Series, thinned
+from adxl_ros.diagnose.baseline_comparison import (
+    at_search_rate,
+    BaselineComparison,
+    Reference,
+)
 from adxl_ros.diagnose.decision import Verdict
-from adxl_ros.diagnose.linear_model import on_tangents, study
+from adxl_ros.diagnose.linear_model import build_linear_model
 from adxl_ros.errors import UserError
 from adxl_ros.model.coefficients import with_neutral
+from adxl_ros.model.diagnosis_hints import Manoeuvre
+from adxl_ros.model.effects import effect_named, library
+from adxl_ros.model.effects.base import Effect
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.simulate import trajectories
 from adxl_ros.simulate.response import Response
 import numpy as np
 
 _RATE_HZ = 62.5
-_TURNED = 'stage_offset:beta_rad=3.141593'
-_LEAST_NATS = 3.0
+"""Sample rate of the simulated manoeuvres, Hz. Chosen: run time."""
+_SMALLEST_LOG_BAYES_FACTOR = 3.0
+"""Log Bayes factor below which a manoeuvre does not show an effect. Chosen: 20 to 1."""
+
+
+class ManoeuvreDescription(NamedTuple):
+    """
+    How a manoeuvre is made.
+
+    Attributes
+    ----------
+    text
+        What to do, for people.
+    trajectory
+        Name of the trajectory of `simulate`.
+    remounted
+        Whether the sensor is remounted, turned by 180° about z.
+
+    """
+
+    text: str
+    trajectory: str
+    remounted: bool = False
+
+
 MENU = {
-    'shaker': ('shake along x from 2 to 40 Hz', 'shaker', False,
-               ('time_offset', 'bandwidth', 'mount_resonance', 'vibration_rectification')),
-    'speeds': ('turn two planes at two speeds, forth and back, with reversals', 'rich', False,
-               ('backlash', 'hysteresis', 'lever_arm', 'clock_skew')),
-    'plane': ('sweep a second plane', 'tilt_both', False,
-              ('misalignment', 'cross_axis', 'cross_axis_z', 'scale_factor_z', 'nonlinearity',
-               'quadratic', 'stage_eccentricity', 'base_tilt')),
-    'remount': ('remount the sensor turned by 180 deg about z, and sweep again', 'tilt_both', True,
-                ('stage_offset', 'gravity', 'scale_factor', 'bias', 'adc_inl')),
-    'heat': ('dwell, heat and cool', 'soak', False,
-             ('temperature_bias', 'temperature_scale', 'warm_up', 'bias_walk', 'flicker')),
-    'supply': ('step the supply at rest', 'soak', False, ('supply',)),
+    Manoeuvre.SHAKE: ManoeuvreDescription('shake along x from 2 to 40 Hz', 'shaker'),
+    Manoeuvre.SPEEDS: ManoeuvreDescription(
+        'turn two planes at two speeds, forth and back, with reversals', 'rich'),
+    Manoeuvre.PLANES: ManoeuvreDescription('sweep a second plane', 'tilt_both'),
+    Manoeuvre.REMOUNT: ManoeuvreDescription(
+        'remount the sensor turned by 180 deg about z, and sweep again', 'tilt_both', True),
+    Manoeuvre.HEAT: ManoeuvreDescription('dwell, heat and cool', 'soak'),
+    Manoeuvre.SUPPLY: ManoeuvreDescription('step the supply at rest', 'soak'),
 }
-"""In words, the trajectory of `simulate`, whether remounted, and what it shows best."""
+"""All manoeuvres. An effect names the one that reveals it best in its own file."""
+
+
+class ManoeuvreWorth(NamedTuple):
+    """
+    What a manoeuvre is expected to show.
+
+    Attributes
+    ----------
+    text
+        What to do, for people.
+    minutes
+        Duration, min.
+    log_bayes_factor_per_minute
+        Log Bayes factor of the truth over its nearest rival, 1/min.
+
+    """
+
+    text: str
+    minutes: float
+    log_bayes_factor_per_minute: float
 
 
 @dataclass(frozen=True)
-class Next:
+class NextExperiment:
     """
     What to record next.
 
     Attributes
     ----------
-    manoeuvre, why, command
-        In words, and for `simulate`.
-    nats_per_minute
-        What it is expected to tell; None where there is nothing to tell apart.
+    manoeuvre
+        What to do, for people.
+    why
+        The reason, for people.
+    command
+        Command that simulates the manoeuvre.
+    log_bayes_factor_per_minute
+        What it is expected to show; None where nothing has to be separated.
     menu
-        The same of all manoeuvres: words, minutes, nats a minute; the best first.
+        All manoeuvres, the best first; empty where nothing has to be separated.
 
     """
 
     manoeuvre: str
     why: str
     command: str
-    nats_per_minute: float | None = None
-    menu: tuple[tuple[str, float, float], ...] = ()
+    log_bayes_factor_per_minute: float | None = None
+    menu: tuple[ManoeuvreWorth, ...] = ()
 
 
-def proposed(verdict: Verdict, missing: Sequence[str], seed: int) -> Next | None:
+def propose_next_experiment(verdict: Verdict, not_covered: Sequence[str], seed: int
+                            ) -> NextExperiment | None:
     """
-    Propose the manoeuvre that tells most of what is not told apart; None if all is told.
+    Propose the manoeuvre that separates most of what is not separated.
 
     Parameters
     ----------
     verdict
-        With its groups.
-    missing
-        What the recordings do not cover.
+        The verdict with its groups.
+    not_covered
+        What the recordings do not cover, for people.
     seed
-        Of the simulated noise.
+        Seed of the simulated noise.
+
+    Returns
+    -------
+    NextExperiment or None
+        None where nothing more is needed.
 
     """
     if verdict.groups:
-        group = verdict.groups[0]
-        worth = {name: _nats_per_minute(name, verdict.best.sensor, group, seed) for name in MENU}
-        order = sorted(MENU, key=lambda name: -worth[name][1])
-        return _next(order[0], f'to tell {" from ".join(group)}', worth[order[0]][1], tuple(
-            (MENU[name][0], *worth[name]) for name in order))
-    if verdict.status == 'no_gap' and not missing:
+        return _separating_experiment(verdict, seed)
+    if verdict.status == 'no_gap' and not not_covered:
         return None
-    best = max(MENU, key=lambda name: len(set(MENU[name][3]) & set(verdict.effects)))
-    if not set(MENU[best][3]) & set(verdict.effects):
-        best = 'speeds' if verdict.status == 'unknown' or not missing else 'plane'
-    return _next(best, 'what is unknown shows elsewhere, too' if verdict.status == 'unknown' else
-                 f'this recording has no {", no ".join(missing)}' if missing else
-                 'to confirm it on another recording')
+    if verdict.status == 'unknown':
+        why = 'what is unknown shows elsewhere, too'
+    elif not_covered:
+        why = f'this recording has no {", no ".join(not_covered)}'
+    else:
+        why = 'to confirm it on another recording'
+    return _experiment(_revealing_manoeuvre(verdict, bool(not_covered)), why)
 
 
-def _next(name: str, why: str, nats_per_minute: float | None = None,
-          menu: tuple[tuple[str, float, float], ...] = ()) -> Next:
-    words, path, turned, _ = MENU[name]
-    effect = f' --effect {_TURNED}' if turned else ''
-    return Next(words, why, f'ros2 run adxl_ros simulate {path}{effect} -o next.csv',
-                nats_per_minute, menu)
+def _separating_experiment(verdict: Verdict, seed: int) -> NextExperiment:
+    """Simulate the whole menu for the first group of the verdict; propose the best manoeuvre."""
+    group = verdict.groups[0]
+    worth = {m: _worth(m, verdict.best.sensor, group, seed) for m in MENU}
+    order = sorted(MENU, key=lambda m: -worth[m].log_bayes_factor_per_minute)
+    return replace(_experiment(order[0], f'to tell {" from ".join(group)}'),
+                   log_bayes_factor_per_minute=worth[order[0]].log_bayes_factor_per_minute,
+                   menu=tuple(worth[m] for m in order))
 
 
-def _nats_per_minute(name: str, sensor: Sensor, group: Sequence[str], seed: int
-                     ) -> tuple[float, float]:
-    """Return the minutes of a manoeuvre and what it tells a minute, nats."""
-    _, path, turned, _ = MENU[name]
-    motion = trajectories.TRAJECTORIES[path](np.random.default_rng(seed))
+def _revealing_manoeuvre(verdict: Verdict, lacks_coverage: bool) -> Manoeuvre:
+    """Return the manoeuvre that reveals most of the effects of a verdict."""
+    revealed_by = [effect_named(e).diagnosis.revealed_by for e in verdict.effects]
+    best = max(MENU, key=revealed_by.count)
+    if best in revealed_by:
+        return best
+    return Manoeuvre.SPEEDS if verdict.status == 'unknown' or not lacks_coverage \
+        else Manoeuvre.PLANES
+
+
+def _experiment(manoeuvre: Manoeuvre, why: str) -> NextExperiment:
+    """Describe a manoeuvre with its command."""
+    described = MENU[manoeuvre]
+    option = ''
+    if described.remounted:
+        effect = _remounting_effect()
+        option = f' --effect {effect.name}:{effect.diagnosis.half_turn}={np.pi:.6f}'
+    return NextExperiment(
+        described.text, why,
+        f'ros2 run adxl_ros simulate {described.trajectory}{option} -o next.csv')
+
+
+def _worth(manoeuvre: Manoeuvre, sensor: Sensor, group: Sequence[str], seed: int
+           ) -> ManoeuvreWorth:
+    """Simulate a manoeuvre, and fit each effect of a group to it."""
+    described = MENU[manoeuvre]
+    motion = trajectories.TRAJECTORIES[described.trajectory](np.random.default_rng(seed))
     minutes = motion.duration_s / 60
     truth = replace(sensor, rate_hz=_RATE_HZ)
     baseline = replace(truth, effects=tuple(e for e in truth.effects if e not in group))
-    if turned:
-        truth, baseline = (_remounted(one) for one in (truth, baseline))
+    if described.remounted:
+        truth, baseline = _remounted(truth), _remounted(baseline)
     time_s = np.arange(round(motion.duration_s * _RATE_HZ)) / _RATE_HZ
     try:
         volts = Response(truth, motion, seed)(time_s)
     except UserError:
-        return minutes, 0.0
-    still = np.zeros(len(time_s), bool)
-    one = thinned(Series(name, time_s, volts, motion, baseline, 'stage', {}, still))
-    there = study([one], [np.ones(len(one), bool)], lambda done: None, only=group)
-    none = on_tangents(there, [])
-    gains = {effect: max((on_tangents(there, [i], none).log_evidence - none.log_evidence
-                          for i, v in enumerate(there.variants) if v.effect == effect),
-                         default=0.0) for effect in group}
-    ranked = sorted(gains.values())
-    apart = ranked[-1] - max(ranked[-2], 0.0) if ranked[-1] > _LEAST_NATS else 0.0
-    return minutes, apart / minutes
+        return ManoeuvreWorth(described.text, minutes, 0.0)
+    comparison = BaselineComparison(
+        described.text, time_s, volts, motion, baseline, Reference.STAGE, True,
+        np.zeros(len(time_s), bool), np.ones(len(time_s), bool))
+    linear_model = build_linear_model([at_search_rate(comparison)], only=group)
+    null_fit = linear_model.fit_variants([])
+    gains = []
+    for effect in group:
+        fits = [linear_model.fit_variants([i], null_fit)
+                for i, v in enumerate(linear_model.variants) if v.effect == effect]
+        gains.append(max((fit.log_evidence - null_fit.log_evidence for fit in fits),
+                         default=0.0))
+    *_, second, first = sorted(gains)
+    separated = first - max(second, 0.0) if first > _SMALLEST_LOG_BAYES_FACTOR else 0.0
+    return ManoeuvreWorth(described.text, minutes, separated / minutes)
+
+
+def _remounting_effect() -> Effect:
+    """Return the effect that turns the sensor on its stage."""
+    return next(e for e in library().values() if e.diagnosis.half_turn)
 
 
 def _remounted(sensor: Sensor) -> Sensor:
-    """Turn the sensor on its stage: the encoder's zero is half a turn away."""
-    turned = with_neutral(sensor, ['stage_offset'])
-    values = turned.values['stage_offset']
-    return replace(turned, values={**turned.values, 'stage_offset': {
-        **values, 'beta_rad': np.asarray(values['beta_rad']) + np.pi}})
+    """Turn the sensor on its stage by half a turn: the encoder's zero changes by π."""
+    effect = _remounting_effect()
+    turned = with_neutral(sensor, [effect.name])
+    values = dict(turned.values[effect.name])
+    parameter = effect.diagnosis.half_turn
+    values[parameter] = np.asarray(values[parameter]) + np.pi
+    return replace(turned, values={**turned.values, effect.name: values})

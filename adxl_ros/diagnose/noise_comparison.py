@@ -13,118 +13,130 @@
 # limitations under the License.
 
 """
-How alike recorded and simulated noise are: power by band, Allan deviation, likelihood.
+Recorded noise compared with simulated noise: power by band, Allan deviation, likelihood.
 
-The rms of a gap is blind to what is noise-like; here the residual about the mean is compared with
-noise that the simulator itself makes, without and with what was found.
+The rms of a gap is blind to noise-like effects. Here the residual is compared with noise that the
+simulator draws, for the baseline and for the verdict's sensor.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 
-from adxl_ros.diagnose.baseline_comparison import Series
-from adxl_ros.diagnose.evidence import bridged
-from adxl_ros.model.sensor import Sensor
-from adxl_ros.simulate.response import Response
 import numpy as np
 from scipy.signal import periodogram, welch
 
 _BANDS = 5
+"""Number of bands of frequency. Chosen: two decades and a half."""
+_LOWEST_EDGE_HZ = 0.05
+"""Upper edge of the lowest band is at least this, Hz. Chosen: 20 s."""
 _TIMES_S = (0.1, 1.0, 10.0)
+"""Averaging times of the Allan deviation, s. Chosen: one a decade."""
 _SEGMENT_S = 16.0
+"""Segment of the simulated spectrum, s. Chosen: some ten segments in three minutes."""
+_LOWEST_POWER = 1e-6
+"""Smallest power of the simulated spectrum, by its largest. Chosen: above rounding errors."""
 
 
 @dataclass(frozen=True)
-class Likeness:
+class NoiseComparison:
     """
-    Recorded noise by simulated noise, axes together.
+    Recorded noise by simulated noise, all axes together.
 
     Attributes
     ----------
-    bands_hz
-        Edges of bands of frequency, (k + 1,).
-    power
-        Ratio of power by band, (k,); 1 is alike.
-    times_s, allan
-        Averaging times, (j,), and the ratio of Allan deviations, (j,).
+    band_edges_hz
+        Edges of the k bands of frequency, Hz, (k + 1,).
+    power_ratio
+        Recorded by simulated power of each band, (k,).
+    averaging_times_s
+        Averaging times of the Allan deviation, s, (j,).
+    allan_ratio
+        Recorded by simulated Allan deviation, (j,).
     log_likelihood
-        Of the recorded spectrum under the simulated one (Whittle 1953), nats.
-    sigma_mps2
-        Of the simulated noise, rms over samples and axes.
+        Of the recorded spectrum under the simulated one (Whittle 1953).
+    simulated_std_mps2
+        Rms of the simulated noise over samples and axes, m/s².
 
     """
 
-    bands_hz: tuple[float, ...]
-    power: tuple[float, ...]
-    times_s: tuple[float, ...]
-    allan: tuple[float, ...]
+    band_edges_hz: tuple[float, ...]
+    power_ratio: tuple[float, ...]
+    averaging_times_s: tuple[float, ...]
+    allan_ratio: tuple[float, ...]
     log_likelihood: float
-    sigma_mps2: float
+    simulated_std_mps2: float
 
 
-def likeness(full: Series, residual_v: np.ndarray, used: np.ndarray, sensor: Sensor, seed: int
-             ) -> Likeness:
+def compare_noise(residual_v: np.ndarray, simulated_v: np.ndarray, rate_hz: float,
+                  scale_v_per_mps2: np.ndarray) -> NoiseComparison:
     """
-    Compare what is left of a recording with the noise of a sensor.
+    Compare a residual with drawn noise.
 
     Parameters
     ----------
-    full
-        The recording at its full rate.
     residual_v
-        Less the mean of the output, V, (n, m).
-    used
-        Samples that count, (n,); the others are bridged.
-    sensor
-        Whose noise.
-    seed
-        Of the simulated noise.
+        Residual, bridged over samples that do not count, V, (n, m).
+    simulated_v
+        Drawn noise, V, (n, m).
+    rate_hz
+        Sample rate, Hz.
+    scale_v_per_mps2
+        Scale factor by axis, V/(m/s²), (m,).
+
+    Returns
+    -------
+    NoiseComparison
+        Ratios and likelihood.
 
     """
-    noise_v = simulated_noise(full, sensor, seed)
-    rate_hz = full.sensor.rate_hz
-    seen, made = ((v - v.mean(axis=0)) / full.scale_v_per_mps2
-                  for v in (bridged(residual_v, used), noise_v))
-    frequency, power = periodogram(seen, rate_hz, axis=0)
-    _, other = periodogram(made, rate_hz, axis=0)
-    edges = np.geomspace(max(frequency[1], 0.05), rate_hz / 2, _BANDS + 1)
-    edges[0] = 0.0
-    ratios = [float(power[inside].sum() / other[inside].sum())
-              for inside in ((frequency > low) & (frequency <= high)
-                             for low, high in pairwise(edges))]
-    length = min(round(_SEGMENT_S * rate_hz), len(made))
-    at, level = welch(made, rate_hz, nperseg=max(length, 8), axis=0)
-    expected = np.column_stack([np.interp(frequency[1:], at[1:], v[1:]) for v in level.T])
-    expected = np.maximum(expected, 1e-6 * expected.max())
-    times_s = [t for t in _TIMES_S if t * rate_hz >= 2 and t * 10 < len(seen) / rate_hz]
-    allans = [[allan_deviation(v, round(t * rate_hz)) for v in (seen, made)] for t in times_s]
-    return Likeness(tuple(edges.tolist()), tuple(ratios), tuple(times_s),
-                    tuple(float(np.sqrt(np.mean((a / b) ** 2))) for a, b in allans),
-                    -float(np.sum(power[1:] / expected + np.log(expected))),
-                    float(np.sqrt(np.mean(made ** 2))))
+    recorded = (residual_v - residual_v.mean(axis=0)) / scale_v_per_mps2
+    simulated = (simulated_v - simulated_v.mean(axis=0)) / scale_v_per_mps2
+    frequency_hz, power = periodogram(recorded, rate_hz, axis=0)
+    _, simulated_power = periodogram(simulated, rate_hz, axis=0)
+    edges_hz = np.geomspace(max(frequency_hz[1], _LOWEST_EDGE_HZ), rate_hz / 2, _BANDS + 1)
+    edges_hz[0] = 0.0
+    bands = [(frequency_hz > low) & (frequency_hz <= high) for low, high in pairwise(edges_hz)]
+    length = min(round(_SEGMENT_S * rate_hz), len(simulated))
+    welch_hz, level = welch(simulated, rate_hz, nperseg=max(length, 8), axis=0)
+    expected = np.column_stack([np.interp(frequency_hz[1:], welch_hz[1:], v[1:])
+                                for v in level.T])
+    expected = np.maximum(expected, _LOWEST_POWER * expected.max())
+    times_s = [t for t in _TIMES_S
+               if t * rate_hz >= 2 and t * 10 < len(recorded) / rate_hz]
+    return NoiseComparison(
+        tuple(edges_hz.tolist()),
+        tuple(float(power[band].sum() / simulated_power[band].sum()) for band in bands),
+        tuple(times_s),
+        tuple(_allan_ratio(recorded, simulated, round(t * rate_hz)) for t in times_s),
+        -float(np.sum(power[1:] / expected + np.log(expected))),
+        float(np.sqrt(np.mean(simulated ** 2))))
 
 
-def simulated_noise(full: Series, sensor: Sensor, seed: int) -> np.ndarray:
-    """Return a sensor's output about its own mean, V, (n, m), drawn."""
-    at_rate = replace(sensor, rate_hz=full.sensor.rate_hz)
-    loud = Response(at_rate, full.motion, seed, float(full.time_s[0]))(full.time_s)
-    return loud - full.simulated(at_rate)
+def _allan_ratio(recorded: np.ndarray, simulated: np.ndarray, count: int) -> float:
+    """Return the rms over axes of the ratio of Allan deviations of `count` samples."""
+    ratio = allan_deviation(recorded, count) / allan_deviation(simulated, count)
+    return float(np.sqrt(np.mean(ratio ** 2)))
 
 
 def allan_deviation(values: np.ndarray, count: int) -> np.ndarray:
     """
-    Return the overlapping Allan deviation of means of `count` samples (IEEE 1554), (m,).
+    Compute the overlapping Allan deviation of means of `count` samples (IEEE 1554).
 
     Parameters
     ----------
     values
-        (n, m).
+        Series of m axes, (n, m).
     count
         Samples in a mean, less than n/2.
 
+    Returns
+    -------
+    numpy.ndarray
+        Allan deviation by axis, in the unit of the values, (m,).
+
     """
     total = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
-    twice = total[2 * count:] - 2 * total[count:-count] + total[:-2 * count]
-    return np.sqrt(np.mean(twice ** 2, axis=0) / 2) / count
+    second_difference = total[2 * count:] - 2 * total[count:-count] + total[:-2 * count]
+    return np.sqrt(np.mean(second_difference ** 2, axis=0) / 2) / count

@@ -12,287 +12,446 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Effects that show in statistics and not in the mean, each against what the file promises."""
+"""
+Effects that show in the statistics of the noise and not in the mean, each with its detector.
+
+An effect names its detector in its own file. What a detector estimates are the effect's
+parameters.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from adxl_ros.diagnose.baseline_comparison import Series
-from adxl_ros.diagnose.evidence import bridged
-from adxl_ros.diagnose.noise_comparison import simulated_noise
-from adxl_ros.diagnose.noise_floor import runs
 from adxl_ros.model import noise
+from adxl_ros.model.diagnosis_hints import Detector
+from adxl_ros.model.effects import library
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 from scipy.signal import lfilter, periodogram
 
+UNKNOWN = 'unknown'
+"""Name of what no effect of the library explains."""
 _MAINS_HZ = (50.0, 60.0)
-_MAINS_WITHIN_HZ = 0.6
-_LINE_NATS = 14.0
-"""Excess of the largest ordinate of a periodogram over what thousands of them reach by chance."""
-_SPIKE_SIGMA = 7.0
-_EXCESS = 1.2
-"""Noise density by the stated one: units differ by less."""
-_STEPS = 1.6
-_NEAREST, _FEWEST = 2, 500
-_CALM_S = 10.0
-_LEVELS, _ODD = 0.02, 4.0
-"""Of the range: levels that spikes are counted by; how much rarer others may be there."""
+"""Mains frequencies, Hz."""
+_MAINS_TOLERANCE_HZ = 0.6
+"""Largest deviation of a mains line, Hz. Chosen: 1 % of the clock or of the mains."""
+_LINE_LOWEST_HZ = 1.0
+"""Lowest frequency of a line, Hz. Chosen: below it the residual of slow effects is no line."""
+_LINE_FEWEST_ORDINATES = 64
+"""Fewest ordinates of a periodogram in which a line is looked for. Chosen."""
+_LINE_LOG_EXCESS = 14.0
+"""Log likelihood ratio of a line beyond the largest of all ordinates by chance. Chosen: exp(−14)
+is one in a million."""
+_LOCAL_ORDINATES = 201
+"""Ordinates over which the local level of a periodogram is taken. Chosen: much wider than a
+line."""
+_SPIKE_STDS = 7.0
+"""Deviation of a spike from its neighbours, in robust standard deviations. Chosen: normal noise
+exceeds it once in 4·10¹¹ samples."""
+_SPIKE_FEWEST = 3
+"""Fewest spikes of an axis. Chosen: one or two may be anything."""
+_SPIKE_NEIGHBOUR = 2
+"""Distance of the neighbours to which a sample is compared, samples. Chosen: beyond the sample
+next to it, which an RC filter shares."""
+_SPIKE_LOCAL_S = 0.2
+"""Width of the blocks of the local scale, s. Chosen: shorter than a move of the stage."""
+_SPIKE_LOCAL_FEWEST = 9
+"""Fewest samples of such a block. Chosen: a median of nine."""
+_SPIKE_LOG_BAYES_FACTOR = 10.0
+"""Log Bayes factor of one isolated sample, rough: it only ranks detections."""
+_MAD_PER_STD = 0.6745
+"""Median absolute deviation of normal noise by its standard deviation."""
+_NOISE_EXCESS = 1.2
+"""Noise by the stated noise from which it is excessive. Chosen: units differ by less."""
+_COARSE_STEPS = 1.6
+"""Distance of codes, in stated steps, from which codes are coarse. Chosen: between 1 and 2."""
+_COARSE_LOG_BAYES_FACTOR = 1e3
+"""Log Bayes factor of coarse codes, rough: there is no other explanation."""
+_CODES_FEWEST = 8
+"""Fewest distances between codes from which their step is estimated. Chosen."""
+_RESTING_FEWEST = 500
+"""Fewest resting samples from which the level of the noise is estimated. Chosen: 3 %."""
+_LINE_REST_S = 10.0
+"""Shortest total rest in which a line that is no mains must show, s. Chosen: 0.1 Hz resolution."""
+_LEVEL_CELL = 0.02
+"""Width of a cell of levels, in parts of the range, in which spikes are counted. Chosen."""
+_LEVEL_RARITY = 4.0
+"""Spikes cluster at some levels where these hold less than one by this of all samples. Chosen."""
+_LEVEL_FEWEST = 10
+"""Fewest spikes of which the levels are compared. Chosen."""
+_REPEAT_CHANCE = 1e-4
+"""Probability of one run of equal samples by chance in a recording. Chosen."""
+_REPEAT_SHORTEST = 3
+"""Shortest run of equal samples, samples. Chosen."""
+_REPEAT_LOG_BAYES_FACTOR = 5.0
+"""Log Bayes factor of one run of equal samples, rough: it only ranks detections."""
 
 
 @dataclass(frozen=True)
-class Sign:
+class Detection:
     """
     One noise-like effect that shows.
 
     Attributes
     ----------
     effect
-        Its name; 'unknown' for a line that is no mains.
+        Name of the effect; 'unknown' for a line that is no mains frequency.
     values
-        Its parameters, by name: arrays by axis, or one figure.
-    nats
-        How much more likely the recording is with it, about.
-    words
-        For people.
+        Parameters of the effect by name, (m,) or () each.
+    log_bayes_factor
+        Approximate log Bayes factor of the effect.
+    message
+        What was found, for people.
 
     """
 
     effect: str
     values: dict[str, np.ndarray]
-    nats: float
-    words: str
+    log_bayes_factor: float
+    message: str
 
 
-def bad_samples(volts: np.ndarray, time_s: np.ndarray, sensor: Sensor, coarse: bool = False
-                ) -> tuple[np.ndarray, list[Sign]]:
+def detected_effect(detector: Detector) -> str:
+    """Return the name of the effect that a detector shows."""
+    return next(e.name for e in library().values() if e.diagnosis.detector is detector)
+
+
+def runs(chosen: np.ndarray) -> list[tuple[int, int]]:
+    """Return begin and end of each run of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], chosen.astype(np.int8), [0]])))
+    return list(zip(edges[::2].tolist(), edges[1::2].tolist()))
+
+
+def repeated_samples(volts: np.ndarray, time_s: np.ndarray, used: np.ndarray, sensor: Sensor
+                     ) -> tuple[np.ndarray, list[Detection]]:
     """
-    Find samples that say nothing: stuck, spikes, missing.
+    Find samples that repeat the one before in all axes, in runs too long for chance.
 
     Parameters
     ----------
-    volts, time_s
-        As recorded, (n, m) and (n,).
+    volts
+        As recorded, V, (n, m).
+    time_s
+        Stamps, s, (n,).
+    used
+        Samples that count so far, (n,) bool.
     sensor
         The baseline.
-    coarse
-        Whether the steps of the ADC are so large that samples repeat by them.
 
     Returns
     -------
     tuple
-        Samples that count, (n,); the effects behind those that do not.
+        The samples that count, (n,) bool, and the detection or none.
 
     """
-    finite = np.isfinite(volts).all(axis=1)
-    good, signs = finite.copy(), []
-    stuck = _stuck(volts, sensor) & finite & (not coarse)
-    if stuck.any():
-        begins = runs(stuck)
-        span = float(time_s[-1] - time_s[0])
-        held_s = float(np.median([time_s[b - 1] - time_s[a] for a, b in begins]))
-        good &= ~stuck
-        signs.append(Sign('stuck', {
-            'rate_hz': np.array(len(begins) / span),
-            'duration_s': np.array(max(held_s + 1 / sensor.rate_hz, 1 / sensor.rate_hz))},
-            5.0 * len(begins), f'{len(begins)} times the samples repeat, {held_s:.3g} s long'))
-    spikes, size = _spikes(volts, good, sensor)
-    if spikes.any() and not _by_level(volts, spikes):
-        count = int(spikes.any(axis=1).sum())
-        good &= ~spikes.any(axis=1)
-        rate_hz = spikes.sum() / len(sensor.axes) / float(time_s[-1] - time_s[0])
-        signs.append(Sign('spikes', {'rate_hz': np.array(rate_hz), 'amplitude_v': size},
-                          10.0 * count, f'{count} samples stand alone, by '
-                          f'{size.max() * 1e3:.3g} mV'))
-    return good, signs
+    same = np.concatenate([[False], (np.diff(volts, axis=0) == 0).all(axis=1)])
+    # Neighbours are correlated, so that the root of the independent probability is safe.
+    probability = float(np.sqrt(np.prod([np.mean(np.diff(v) == 0) for v in volts.T])))
+    probability = max(probability, 1e-3 if len(sensor.axes) > 1 else 0.05)
+    shortest = max(_REPEAT_SHORTEST, int(np.ceil(np.log(_REPEAT_CHANCE / len(volts))
+                                                 / np.log(min(probability, 0.5)))))
+    repeated = np.zeros(len(volts), bool)
+    for begin, end in runs(same):
+        if end - begin >= shortest:
+            repeated[begin:end] = True
+    repeated &= used
+    if not repeated.any():
+        return used, []
+    repeats = runs(repeated)
+    duration_s = float(np.median([time_s[end - 1] - time_s[begin] for begin, end in repeats]))
+    return used & ~repeated, [Detection(detected_effect(Detector.REPEATED_SAMPLES), {
+        'rate_hz': np.array(len(repeats) / float(time_s[-1] - time_s[0])),
+        'duration_s': np.array(max(duration_s + 1 / sensor.rate_hz, 1 / sensor.rate_hz))},
+        _REPEAT_LOG_BAYES_FACTOR * len(repeats),
+        f'{len(repeats)} times the samples repeat, {duration_s:.3g} s long')]
 
 
-def still_alone(spikes: Sign, residual_v: np.ndarray, used: np.ndarray, sensor: Sensor) -> bool:
+def isolated_samples(volts: np.ndarray, time_s: np.ndarray, used: np.ndarray, sensor: Sensor
+                     ) -> tuple[np.ndarray, Detection | None]:
     """
-    Tell whether spikes also leave the line in what the best hypothesis leaves.
+    Find samples that leave the line between their neighbours and come back.
 
-    The sensor's own motion may look like spikes until it is taken off.
+    Parameters
+    ----------
+    volts
+        As recorded, V, (n, m).
+    time_s
+        Stamps, s, (n,).
+    used
+        Samples that count so far, (n,) bool.
+    sensor
+        The baseline.
+
+    Returns
+    -------
+    tuple
+        The samples that count, (n,) bool, and the detection or None.
+
+    """
+    spikes, size_v = _spikes(volts, used, sensor)
+    if not spikes.any() or _at_few_levels(volts, spikes):
+        return used, None
+    count = int(spikes.any(axis=1).sum())
+    rate_hz = spikes.sum() / len(sensor.axes) / float(time_s[-1] - time_s[0])
+    return used & ~spikes.any(axis=1), Detection(
+        detected_effect(Detector.ISOLATED_SAMPLES),
+        {'rate_hz': np.array(rate_hz), 'amplitude_v': size_v}, _SPIKE_LOG_BAYES_FACTOR * count,
+        f'{count} samples stand alone, by {size_v.max() * 1e3:.3g} mV')
+
+
+def residual_shows_spikes(spikes: Detection, residual_v: np.ndarray, used: np.ndarray,
+                          sensor: Sensor) -> bool:
+    """
+    Determine whether the residual of the best hypothesis shows the spikes of the recording.
+
+    Without this check the sensor's own motion may look like spikes.
 
     Parameters
     ----------
     spikes
-        As found in the recording.
-    residual_v, used
-        V, (n, m), and samples that count, (n,): spikes are not among them.
+        Detection in the recording.
+    residual_v
+        Residual, V, (n, m).
+    used
+        Samples that count, (n,) bool; spikes are not among them.
     sensor
-        Of the hypothesis.
+        Sensor of the hypothesis, at the rate of the recording.
+
+    Returns
+    -------
+    bool
+        Whether more than half of the spikes show.
 
     """
-    alone, _ = _spikes(residual_v, np.isfinite(residual_v).all(axis=1), sensor)
+    isolated, _ = _spikes(residual_v, np.isfinite(residual_v).all(axis=1), sensor)
     expected = float(spikes.values['rate_hz']) * len(sensor.axes) * len(used) / sensor.rate_hz
-    return bool(alone[~used].sum() > expected / 2)
+    return bool(isolated[~used].sum() > expected / 2)
 
 
-def _stuck(volts: np.ndarray, sensor: Sensor) -> np.ndarray:
-    """Tell samples that repeat the one before in all axes, longer than chance does."""
-    same = np.concatenate([[False], (np.diff(volts, axis=0) == 0).all(axis=1)])
-    # Neighbours go along with each other: the root is on the safe side.
-    usual = float(np.sqrt(np.prod([np.mean(np.diff(v) == 0) for v in volts.T])))
-    chance = max(usual, 1e-3 if len(sensor.axes) > 1 else 0.05)
-    longest = max(3, int(np.ceil(np.log(1e-4 / len(volts)) / np.log(min(chance, 0.5)))))
-    out = np.zeros(len(volts), bool)
-    for begin, end in runs(same):
-        if end - begin >= longest:
-            out[begin:end] = True
-    return out
-
-
-def _spikes(volts: np.ndarray, good: np.ndarray, sensor: Sensor
+def _spikes(volts: np.ndarray, used: np.ndarray, sensor: Sensor
             ) -> tuple[np.ndarray, np.ndarray]:
-    """Tell samples that leave the line between their neighbours and come back."""
-    middle = volts - (np.roll(volts, _NEAREST, 0) + np.roll(volts, -_NEAREST, 0)) / 2
-    out, size = np.zeros(volts.shape, bool), np.zeros(volts.shape[1])
-    # What comes back after samples that repeat, or are missing, is no spike.
-    whole = np.convolve(good, np.ones(4 * _NEAREST + 1), 'same') > 4 * _NEAREST
-    for d in range(volts.shape[1]):
-        off = middle[:, d]
-        calm = np.nanmedian(np.abs(off[good])) / 0.6745
-        # What moves is not told from spikes by this: compare with what is around it, too.
-        local = _local_scale(np.nan_to_num(off), round(max(sensor.rate_hz * 0.2, 9)))
-        far = (np.abs(off) > _SPIKE_SIGMA * np.maximum(local, max(calm, sensor.lsb_v))) & whole
-        far[:_NEAREST] = far[-_NEAREST:] = False
-        # The neighbours of a spike leave the line by half of it.
-        peak = np.abs(off) >= np.maximum.reduce([
-            np.abs(np.roll(off, k)) for k in range(-_NEAREST, _NEAREST + 1)])
-        alone = far & peak
-        if alone.sum() >= 3:
-            out[:, d] = alone
-            size[d] = float(np.median(np.abs(off[alone])))
-    return out, size
+    """Return isolated samples, (n, m) bool, and their median size by axis, V, (m,)."""
+    near = _SPIKE_NEIGHBOUR
+    deviation_v = volts - (np.roll(volts, near, 0) + np.roll(volts, -near, 0)) / 2
+    isolated, size_v = np.zeros(volts.shape, bool), np.zeros(volts.shape[1])
+    # A return after repeated or missing samples is no spike.
+    undisturbed = np.convolve(used, np.ones(4 * near + 1), 'same') > 4 * near
+    for d, deviation in enumerate(deviation_v.T):
+        std_v = np.nanmedian(np.abs(deviation[used])) / _MAD_PER_STD
+        # Motion deviates from the line, too, so that the scale around a sample counts as well.
+        local_v = _local_std(np.nan_to_num(deviation),
+                             round(max(sensor.rate_hz * _SPIKE_LOCAL_S, _SPIKE_LOCAL_FEWEST)))
+        outside = (np.abs(deviation)
+                   > _SPIKE_STDS * np.maximum(local_v, max(std_v, sensor.lsb_v))) & undisturbed
+        outside[:near] = outside[-near:] = False
+        # The neighbours of a spike deviate by half of it.
+        peak = np.abs(deviation) >= np.maximum.reduce([
+            np.abs(np.roll(deviation, k)) for k in range(-near, near + 1)])
+        axis_spikes = outside & peak
+        if axis_spikes.sum() >= _SPIKE_FEWEST:
+            isolated[:, d] = axis_spikes
+            size_v[d] = float(np.median(np.abs(deviation[axis_spikes])))
+    return isolated, size_v
 
 
-def _by_level(volts: np.ndarray, spikes: np.ndarray) -> bool:
-    """Tell samples that leave the line at some levels only: steps of the ADC do, spikes do not."""
-    usual, odd = 0.0, 0
-    for v, alone in zip(volts.T, spikes.T):
-        level = np.floor(v / (_LEVELS * max(np.nanmax(v) - np.nanmin(v), 1e-9)))
-        before = np.roll(level, _NEAREST)
-        there = np.isin(before, np.unique(before[alone]))
-        usual += float(there.mean()) * alone.sum()
-        odd += int(alone.sum())
-    return bool(odd > 10 and usual / odd < 1 / _ODD)
+def _at_few_levels(volts: np.ndarray, spikes: np.ndarray) -> bool:
+    """Determine whether spikes cluster at some levels, as steps of an ADC do."""
+    expected, count = 0.0, 0
+    for v, isolated in zip(volts.T, spikes.T):
+        level = np.floor(v / (_LEVEL_CELL * max(np.nanmax(v) - np.nanmin(v), 1e-9)))
+        level_before = np.roll(level, _SPIKE_NEIGHBOUR)
+        at_levels = np.isin(level_before, np.unique(level_before[isolated]))
+        expected += float(at_levels.mean()) * isolated.sum()
+        count += int(isolated.sum())
+    return bool(count > _LEVEL_FEWEST and expected / count < 1 / _LEVEL_RARITY)
 
 
-def _local_scale(values: np.ndarray, width: int) -> np.ndarray:
-    """Rms of the values around, without the largest: by blocks, interpolated."""
+def _local_std(values: np.ndarray, width: int) -> np.ndarray:
+    """Return a robust standard deviation of the values around each, by blocks, interpolated."""
     count = max(len(values) // width, 1)
     blocks = np.abs(values[:count * width]).reshape(count, -1)
-    scale = np.median(blocks, axis=1) / 0.6745
-    return np.interp(np.arange(len(values)), (np.arange(count) + 0.5) * width, scale)
+    std = np.median(blocks, axis=1) / _MAD_PER_STD
+    return np.interp(np.arange(len(values)), (np.arange(count) + 0.5) * width, std)
 
 
-def coarse_steps(volts: np.ndarray, sensor: Sensor) -> Sign | None:
-    """Tell an ADC whose codes are coarser than stated."""
-    if not sensor.lsb_v:
-        return None
-    lost = []
-    for v in volts.T:
-        levels = np.unique(v[np.isfinite(v)])
-        apart = np.diff(levels)
-        apart = apart[apart > sensor.lsb_v * 0.3]
-        if len(apart) < 8:
-            return None
-        step = float(np.median(apart[apart < 1.5 * apart.min()]))
-        lost.append(np.log2(step / sensor.lsb_v))
-    bits = float(np.median(lost))
-    if bits < np.log2(_STEPS):
-        return None
-    return Sign('quantisation', {'lost_bits': np.array(bits)}, 1e3,
-                f'codes are {2 ** bits:.3g} steps apart')
-
-
-def of_residual(residual_v: np.ndarray, used: np.ndarray, series: Series) -> list[Sign]:
+def coarse_codes(volts: np.ndarray, sensor: Sensor) -> Detection | None:
     """
-    Look at what the best hypothesis of the mean leaves.
+    Find an ADC whose codes are coarser than stated.
 
     Parameters
     ----------
-    residual_v
-        V, (n, m).
-    used
-        Samples that count, (n,).
-    series
-        Of the same samples.
+    volts
+        As recorded, V, (n, m).
+    sensor
+        The baseline, with its stated ADC.
+
+    Returns
+    -------
+    Detection or None
+        None where the codes are as stated.
 
     """
-    sensor = series.sensor
-    signs = []
-    data = bridged(residual_v, used)
+    if not sensor.lsb_v:
+        return None
+    lost_bits = []
+    for v in volts.T:
+        distance_v = np.diff(np.unique(v[np.isfinite(v)]))
+        distance_v = distance_v[distance_v > sensor.lsb_v * 0.3]
+        if len(distance_v) < _CODES_FEWEST:
+            return None
+        step_v = float(np.median(distance_v[distance_v < 1.5 * distance_v.min()]))
+        lost_bits.append(np.log2(step_v / sensor.lsb_v))
+    bits = float(np.median(lost_bits))
+    if bits < np.log2(_COARSE_STEPS):
+        return None
+    return Detection(detected_effect(Detector.COARSE_CODES), {'lost_bits': np.array(bits)},
+                     _COARSE_LOG_BAYES_FACTOR, f'codes are {2 ** bits:.3g} steps apart')
+
+
+@dataclass(frozen=True)
+class NoiseSamples:
+    """
+    The residual of the best hypothesis beside drawn noise, n samples of m axes.
+
+    Attributes
+    ----------
+    time_s
+        Stamps, s, (n,).
+    residual_v
+        Residual, bridged over samples that do not count, V, (n, m).
+    raw_residual_v
+        Residual as it is, V, (n, m).
+    simulated_v
+        Noise that the simulator draws, V, (n, m).
+    at_rest
+        Samples that rest and count, (n,) bool.
+    used
+        Samples that count, (n,) bool.
+
+    """
+
+    time_s: np.ndarray
+    residual_v: np.ndarray
+    raw_residual_v: np.ndarray
+    simulated_v: np.ndarray
+    at_rest: np.ndarray
+    used: np.ndarray
+
+
+def residual_detections(samples: NoiseSamples, sensor: Sensor) -> list[Detection]:
+    """
+    Find lines and excess noise in the residual of the best hypothesis.
+
+    Parameters
+    ----------
+    samples
+        The residual and drawn noise.
+    sensor
+        Sensor of the hypothesis, at the rate of the samples.
+
+    Returns
+    -------
+    list of Detection
+        A line, a level of noise, both or none.
+
+    """
+    # The first differences take out a zero-g that drifts.
+    white = np.diff(_before_filter(samples.residual_v, sensor), axis=0)
+    at_rest = samples.at_rest[2:]
+    found = [_line(white, at_rest, samples, sensor), _excess(white, at_rest, samples, sensor)]
+    return [detection for detection in found if detection is not None]
+
+
+def _before_filter(volts: np.ndarray, sensor: Sensor) -> np.ndarray:
+    """Undo the RC filter for noise: innovations of an AR(1) sequence, (n − 1, m)."""
     rc_s, _ = noise.electronics(sensor)
     decay = np.exp(-1 / (sensor.rate_hz * np.where(rc_s > 0, rc_s, 1e-9)))
-    white = np.column_stack([lfilter([1.0, -a], [1.0], r)[1:] for r, a in zip(data.T, decay)])
-    # Differences, so that a wandering zero-g is no line.
-    apart, rests = np.diff(white, axis=0), (series.still & used)[2:]
-    line = _line(apart, sensor, residual_v, series.time_s)
-    if line is not None and line.effect == 'unknown':
-        # What does not show while the sensor rests is a trace of how it moves.
-        resting = None if rests.sum() < _CALM_S * sensor.rate_hz else _line(
-            apart * rests[:, None], sensor, residual_v, series.time_s)
-        line = None if resting is None or resting.effect != 'unknown' else line
-    if line is not None:
-        signs.append(line)
-    # Differences, so that a wandering zero-g is none of it; where it moves, what is not modelled
-    # would pass for noise.
-    made = simulated_noise(series, sensor, 0)
-    other = np.diff(np.column_stack([lfilter([1.0, -a], [1.0], r)[1:]
-                                     for r, a in zip(made.T, decay)]), axis=0)
-    chosen = rests if rests.sum() > _FEWEST else used[2:]
-    ratio = np.median(np.abs(apart[chosen]), axis=0) / np.median(np.abs(other[chosen]), axis=0)
-    if rests.sum() > _FEWEST:
-        # Noise that the filter did not pass looks like more of it, sample by sample.
-        ratio = np.minimum(ratio, np.std(data[2:][rests], axis=0) / np.std(made[2:][rests],
-                                                                           axis=0))
-    # A line is no noise: the median over frequencies does not see it.
-    ratio = np.minimum(ratio, _level(apart, sensor) / _level(other, sensor))
-    if np.max(ratio) > _EXCESS:
-        signs.append(Sign('noise_excess', {'ratio': ratio - 1},
-                          len(white) * float(np.log(np.max(ratio)) ** 2),
-                          f'white noise is {np.max(ratio):.2f} of what is stated'))
-    return signs
+    return np.column_stack([lfilter([1.0, -a], [1.0], v)[1:] for v, a in zip(volts.T, decay)])
 
 
-def _level(white: np.ndarray, sensor: Sensor) -> np.ndarray:
-    """Return the level of noise by its spectrum's median, (m,)."""
-    _, power = periodogram(white, sensor.rate_hz, 'hann', axis=0)
+def _excess(white: np.ndarray, at_rest: np.ndarray, samples: NoiseSamples, sensor: Sensor
+            ) -> Detection | None:
+    """Find noise above the level of drawn noise."""
+    simulated = np.diff(_before_filter(samples.simulated_v, sensor), axis=0)
+    enough_rest = at_rest.sum() > _RESTING_FEWEST
+    # In motion, effects that are not modelled would pass for noise.
+    chosen = at_rest if enough_rest else samples.used[2:]
+    ratio = np.median(np.abs(white[chosen]), axis=0) \
+        / np.median(np.abs(simulated[chosen]), axis=0)
+    if enough_rest:
+        # Noise past the RC filter looks excessive in the innovations, but not in the samples.
+        ratio = np.minimum(ratio, np.std(samples.residual_v[2:][at_rest], axis=0)
+                           / np.std(samples.simulated_v[2:][at_rest], axis=0))
+    # The median over frequencies ignores a line.
+    ratio = np.minimum(ratio, _spectral_level(white, sensor.rate_hz)
+                       / _spectral_level(simulated, sensor.rate_hz))
+    largest = np.max(ratio)
+    if largest <= _NOISE_EXCESS:
+        return None
+    return Detection(detected_effect(Detector.NOISE_LEVEL), {'ratio': ratio - 1},
+                     (len(white) + 1) * float(np.log(largest) ** 2),
+                     f'white noise is {largest:.2f} of what is stated')
+
+
+def _spectral_level(white: np.ndarray, rate_hz: float) -> np.ndarray:
+    """Return the root of the median of the power spectrum, (m,)."""
+    _, power = periodogram(white, rate_hz, 'hann', axis=0)
     return np.sqrt(np.median(power, axis=0))
 
 
-def _line(white: np.ndarray, sensor: Sensor, residual_v: np.ndarray, time_s: np.ndarray
-          ) -> Sign | None:
-    frequency, power = periodogram(white, sensor.rate_hz, 'hann', axis=0)
-    keep = frequency > 1.0
-    frequency, power = frequency[keep], power[keep]
-    if len(frequency) < 64:
+def _line(white: np.ndarray, at_rest: np.ndarray, samples: NoiseSamples, sensor: Sensor
+          ) -> Detection | None:
+    """Find a line in the spectrum; one that is no mains frequency must show at rest, too."""
+    line = _strongest_line(white, samples, sensor)
+    if line is None or line.effect != UNKNOWN:
+        return line
+    if at_rest.sum() < _LINE_REST_S * sensor.rate_hz:
         return None
-    around = np.column_stack([_local_level(p) for p in power.T])
-    excess = (power / around).sum(axis=1)
+    resting = _strongest_line(white * at_rest[:, None], samples, sensor)
+    return line if resting is not None and resting.effect == UNKNOWN else None
+
+
+def _strongest_line(white: np.ndarray, samples: NoiseSamples, sensor: Sensor
+                    ) -> Detection | None:
+    """Return the strongest line of a spectrum, None where chance explains it."""
+    frequency_hz, power = periodogram(white, sensor.rate_hz, 'hann', axis=0)
+    kept = frequency_hz > _LINE_LOWEST_HZ
+    frequency_hz, power = frequency_hz[kept], power[kept]
+    if len(frequency_hz) < _LINE_FEWEST_ORDINATES:
+        return None
+    level = np.column_stack([_local_level(p) for p in power.T])
+    excess = (power / level).sum(axis=1)
     best = int(np.argmax(excess))
-    nats = float(excess[best]) - np.log(len(frequency)) - len(sensor.axes)
-    if nats < _LINE_NATS:
+    log_excess = float(excess[best]) - np.log(len(frequency_hz)) - len(sensor.axes)
+    if log_excess < _LINE_LOG_EXCESS:
         return None
-    at = float(frequency[best])
-    for mains in _MAINS_HZ:
-        for k in (1, 2):
-            alias = abs((k * mains + sensor.rate_hz / 2) % sensor.rate_hz - sensor.rate_hz / 2)
-            if abs(alias - at) < _MAINS_WITHIN_HZ:
-                turn = np.exp(-2j * np.pi * at * time_s)
-                amplitude = 2 * np.abs(np.nanmean(residual_v * turn[:, None], axis=0))
-                true = k * mains + (at - alias)
-                return Sign('mains_hum', {
-                    'amplitude_v': amplitude, 'frequency_hz': np.array(true),
-                    'phase_rad': np.array(0.0)}, nats,
-                    f'a line at {at:.2f} Hz, {amplitude.max() * 1e3:.3g} mV')
-    return Sign('unknown', {}, nats, f'a line at {at:.2f} Hz, which is no mains frequency')
+    line_hz = float(frequency_hz[best])
+    mains_hz = _mains_frequency_hz(line_hz, sensor.rate_hz)
+    if mains_hz is None:
+        return Detection(UNKNOWN, {}, log_excess,
+                         f'a line at {line_hz:.2f} Hz, which is no mains frequency')
+    turn = np.exp(-2j * np.pi * line_hz * samples.time_s)
+    amplitude_v = 2 * np.abs(np.nanmean(samples.raw_residual_v * turn[:, None], axis=0))
+    return Detection(detected_effect(Detector.MAINS_LINE), {
+        'amplitude_v': amplitude_v, 'frequency_hz': np.array(mains_hz),
+        'phase_rad': np.array(0.0)}, log_excess,
+        f'a line at {line_hz:.2f} Hz, {amplitude_v.max() * 1e3:.3g} mV')
 
 
-def _local_level(power: np.ndarray, width: int = 201) -> np.ndarray:
-    """Mean of the ordinates around by their median."""
+def _mains_frequency_hz(line_hz: float, rate_hz: float) -> float | None:
+    """Return the true frequency of a line that is an alias of the mains or its double."""
+    for mains_hz in _MAINS_HZ:
+        for harmonic in (1, 2):
+            alias_hz = abs((harmonic * mains_hz + rate_hz / 2) % rate_hz - rate_hz / 2)
+            if abs(alias_hz - line_hz) < _MAINS_TOLERANCE_HZ:
+                return harmonic * mains_hz + (line_hz - alias_hz)
+    return None
+
+
+def _local_level(power: np.ndarray) -> np.ndarray:
+    """Return the mean of the ordinates around each, from their median."""
+    width = _LOCAL_ORDINATES
     count = max(len(power) // width, 1)
     blocks = power[:count * width].reshape(count, -1) if len(power) >= width else power[None]
     level = np.median(blocks, axis=1) / np.log(2)

@@ -12,36 +12,48 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The floor: what noise and the stage's stated resolution leave, whatever is modelled."""
+"""Estimators of the noise floor: noise at rest, differences of repeats, steps of the encoder."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
-from adxl_ros.diagnose.baseline_comparison import Series
+from adxl_ros.diagnose.noise_detectors import runs
 from adxl_ros.model import noise
 from adxl_ros.model.kinematics import specific_force
+from adxl_ros.model.sensor import Sensor
 import numpy as np
 
-_SHORTEST_S = 1.0
-_FEWEST = 200
-_OVERLAP_S, _APART_S, _STEPS, _MOVED = 20.0, 10.0, 5.0, 0.05
+_REST_S = 1.0
+"""Length of a rest whose mean is subtracted, s. Chosen: slower changes are part of the gap."""
+FEWEST_SAMPLES = 200
+"""Fewest samples of an estimate. Chosen: 5 % of the standard deviation."""
+_REPEAT_SHORTEST_S = 20.0
+"""Shortest repeat of a trajectory, s. Chosen: a few moves."""
+_REPEAT_DELAY_S = 10.0
+"""Smallest delay of a repeat in the same recording, s. Chosen: beyond the correlation of a move
+with itself."""
+_REPEAT_STEPS = 5.0
+"""Rms deviation between repeats, in steps of the encoder. Chosen."""
+_SMALLEST_RESOLUTION_RAD = 1e-5
+"""Smallest step of the encoder that is assumed for repeats, rad. Chosen."""
+_REPEAT_MOTION = 0.05
+"""Standard deviation of the direction of gravity in a repeat, rad. Chosen: it must move."""
 
 
 @dataclass(frozen=True)
-class Floor:
+class NoiseFloor:
     """
-    Rms of what is no gap, over samples and measured axes, m/s², and where it is known from.
+    Rms of what no model can predict, over samples and measured axes.
 
     Attributes
     ----------
     noise_v
-        Of the samples about their mean, by axis, V, (m,).
+        Standard deviation of the samples about their mean, V, (m,).
     rms_mps2
-        With the stage's resolution.
+        Noise and the steps of the stage's encoder, m/s².
     source
-        'still' stretches, 'repeats' of a trajectory, or 'assumed' from the parameter file.
+        'still' for rests, 'repeats' of a trajectory, or 'assumed' from the parameter file.
 
     """
 
@@ -50,104 +62,150 @@ class Floor:
     source: str
 
 
-def runs(chosen: np.ndarray) -> list[tuple[int, int]]:
-    """Return begin and end of each run of True."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], chosen.astype(np.int8), [0]])))
-    return list(zip(edges[::2].tolist(), edges[1::2].tolist()))
-
-
-def floor(series: Sequence[Series], used: Sequence[np.ndarray]) -> Floor:
+@dataclass(frozen=True)
+class SquareSum:
     """
-    Find the floor: noise about the mean of still stretches; else what differs between repeats.
+    A sum of squares and its number of samples.
 
-    With neither it is what the parameters promise.
+    Attributes
+    ----------
+    squares_v2
+        Sum over samples by axis, V², (m,).
+    count
+        Number of samples.
 
-    Where the sensor never moves, slow changes are what is asked about: a stretch is a second.
     """
-    squares, count = 0.0, 0
-    for one, mask in zip(series, used):
-        length = max(round(_SHORTEST_S * one.sensor.rate_hz), 4)
-        for begin, end in runs(one.still & mask):
-            for a in range(begin, end - length + 1, length):
-                part = one.volts[a:a + length]
-                squares = squares + ((part - part.mean(axis=0)) ** 2).sum(axis=0) \
-                    * length / (length - _independent(one, length))
-                count += length
-    first = series[0]
-    repeated = None if count >= _FEWEST else repeats_v(series, used)
-    if count >= _FEWEST:
-        sigma, source = np.sqrt(squares / count), 'still'
-    elif repeated is not None:
-        sigma, source = repeated, 'repeats'
-    else:
-        sigma, source = noise.sigma_v(first.sensor), 'assumed'
-    by_stage = np.mean([_by_stage(one, mask) for one, mask in zip(series, used)])
-    mps2 = sigma / first.scale_v_per_mps2
-    return Floor(sigma, float(np.sqrt(np.mean(mps2 ** 2) + by_stage)), source)
+
+    squares_v2: np.ndarray
+    count: int
+
+    def __add__(self, other: SquareSum) -> SquareSum:
+        """Add the sums of two stretches."""
+        return SquareSum(self.squares_v2 + other.squares_v2, self.count + other.count)
 
 
-def repeats_v(series: Sequence[Series], used: Sequence[np.ndarray]) -> np.ndarray | None:
+def squares_at_rest(volts: np.ndarray, at_rest: np.ndarray, sensor: Sensor) -> SquareSum:
     """
-    Return what differs between repeats of a trajectory, by √2, V, (m,); None without repeats.
+    Sum the squares about the mean of each second at rest.
 
-    A repeat is a stretch of moving samples, in one recording or in two, over which the stage
-    points where it pointed before, to a few steps of its encoder.
+    Parameters
+    ----------
+    volts
+        Output, V, (n, m).
+    at_rest
+        Samples that rest and count, (n,) bool.
+    sensor
+        The baseline at the rate of the samples.
+
+    Returns
+    -------
+    SquareSum
+        Squares, corrected for the degree of freedom of the means.
+
     """
-    squares, count = 0.0, 0
-    for i, one in enumerate(series):
-        for j, other in enumerate(series[i:], i):
-            if one.reference == 'stage' and other.reference == 'stage':
-                found = _repeat(one, other, i == j)
-                if found is not None:
-                    here, there = found
-                    both = used[i][here] & used[j][there]
-                    apart = (other.residual(other.sensor)[there]
-                             - one.residual(one.sensor)[here])[both]
-                    squares = squares + ((apart - apart.mean(axis=0)) ** 2).sum(axis=0) / 2
-                    count += len(apart)
-    return np.sqrt(squares / count) if count >= _FEWEST else None
+    length = max(round(_REST_S * sensor.rate_hz), 4)
+    # The mean of correlated samples takes more out of their variance than one sample.
+    independent = length / float(noise.effective_samples(length, 1 / sensor.rate_hz,
+                                                         sensor.rc_s))
+    total = SquareSum(np.zeros(volts.shape[1]), 0)
+    for begin, end in runs(at_rest):
+        for first in range(begin, end - length + 1, length):
+            part = volts[first:first + length]
+            squares_v2 = ((part - part.mean(axis=0)) ** 2).sum(axis=0) \
+                * length / (length - independent)
+            total += SquareSum(squares_v2, length)
+    return total
 
 
-def _repeat(one: Series, other: Series, same: bool) -> tuple[slice, slice] | None:
-    """Find the shift by which two recordings of directions agree best over 20 s at least."""
-    rate = one.sensor.rate_hz
-    if abs(rate / other.sensor.rate_hz - 1) > 1e-3:
-        return None
-    a, b = (np.array(specific_force(s.motion.alpha(s.time_s), s.motion.beta(s.time_s), 1.0))
-            for s in (one, other))
-    least, apart = round(_OVERLAP_S * rate), round(_APART_S * rate) if same else 0
-    size = 2 ** int(np.ceil(np.log2(a.shape[1] + b.shape[1])))
-    alike = np.fft.irfft((np.conj(np.fft.rfft(a, size)) * np.fft.rfft(b, size)).sum(axis=0), size)
-    lags = np.arange(apart, max(b.shape[1] - least, apart))
-    overlap = np.minimum(a.shape[1], b.shape[1] - lags)
-    lags, overlap = lags[overlap >= least], overlap[overlap >= least]
+def squares_of_difference(first_v: np.ndarray, second_v: np.ndarray) -> SquareSum:
+    """
+    Sum half of the squares of the difference between two repeats.
+
+    Parameters
+    ----------
+    first_v, second_v
+        Residuals of the same trajectory, V, (n, m).
+
+    Returns
+    -------
+    SquareSum
+        Squares about the mean difference, of one repeat.
+
+    """
+    difference_v = second_v - first_v
+    return SquareSum(((difference_v - difference_v.mean(axis=0)) ** 2).sum(axis=0) / 2,
+                     len(difference_v))
+
+
+def find_repeat(first: np.ndarray, second: np.ndarray, rate_hz: float, resolution_rad: float,
+                same_recording: bool) -> tuple[slice, slice] | None:
+    """
+    Find the shift by which the directions of gravity in two recordings agree best.
+
+    Parameters
+    ----------
+    first, second
+        Direction of gravity in the sensor's frame, unit vectors, (3, n) and (3, n').
+    rate_hz
+        Sample rate of both, Hz.
+    resolution_rad
+        Step of the encoder, rad.
+    same_recording
+        Whether both are one recording, which agrees with itself without a shift.
+
+    Returns
+    -------
+    tuple of slice or None
+        Samples of the first and of the second; None without a repeat.
+
+    """
+    shortest = round(_REPEAT_SHORTEST_S * rate_hz)
+    smallest_lag = round(_REPEAT_DELAY_S * rate_hz) if same_recording else 0
+    size = 2 ** int(np.ceil(np.log2(first.shape[1] + second.shape[1])))
+    products = np.fft.irfft((np.conj(np.fft.rfft(first, size))
+                             * np.fft.rfft(second, size)).sum(axis=0), size)
+    lags = np.arange(smallest_lag, max(second.shape[1] - shortest, smallest_lag))
+    overlap = np.minimum(first.shape[1], second.shape[1] - lags)
+    lags, overlap = lags[overlap >= shortest], overlap[overlap >= shortest]
     if not len(lags):
         return None
-    off = 2 - 2 * alike[lags] / overlap
-    best = int(np.argmin(off))
+    # |a − b|² of unit vectors is 2 − 2·a·b.
+    mean_square = 2 - 2 * products[lags] / overlap
+    best = int(np.argmin(mean_square))
     lag, count = int(lags[best]), int(overlap[best])
-    resolution = max(one.sensor.stage_resolution_rad, 1e-5)
-    moved = a[:, :count].std(axis=1).max()
-    if off[best] > (_STEPS * resolution) ** 2 or moved < _MOVED:
+    moved = first[:, :count].std(axis=1).max()
+    if mean_square[best] > (_REPEAT_STEPS * max(resolution_rad, _SMALLEST_RESOLUTION_RAD)) ** 2 \
+            or moved < _REPEAT_MOTION:
         return None
     return slice(0, count), slice(lag, lag + count)
 
 
-def _independent(series: Series, length: int) -> float:
-    """Return how many samples the mean of a stretch takes out of its variance."""
-    return length / float(noise.effective_samples(length, 1 / series.sensor.rate_hz,
-                                                  series.sensor.rc_s))
+def directions(alpha_rad: np.ndarray, beta_rad: np.ndarray) -> np.ndarray:
+    """Return the direction of gravity in the sensor's frame, unit vectors, (3, n)."""
+    return np.array(specific_force(alpha_rad, beta_rad, 1.0))
 
 
-def _by_stage(series: Series, used: np.ndarray) -> float:
-    """Mean square that the encoder's step makes, over samples and axes, (m/s²)²."""
-    step = series.sensor.stage_resolution_rad
-    if series.reference != 'stage' or not step:
-        return 0.0
-    alpha, beta = (getattr(series.motion, j)(series.time_s)[used] for j in ('alpha', 'beta'))
-    g, measured = series.sensor.local_gravity_mps2, len(series.sensor.axes)
-    by_alpha = np.array([np.cos(alpha) * np.cos(beta), -np.cos(alpha) * np.sin(beta),
-                         -np.sin(alpha)])[:measured]
-    by_beta = np.array([-np.sin(alpha) * np.sin(beta), -np.sin(alpha) * np.cos(beta),
-                        0 * alpha])[:measured]
-    return float(g ** 2 * step ** 2 / 12 * np.mean(by_alpha ** 2 + by_beta ** 2))
+def encoder_mean_square(alpha_rad: np.ndarray, beta_rad: np.ndarray, sensor: Sensor) -> float:
+    """
+    Return the mean square that the steps of the encoder make, over samples and axes.
+
+    Parameters
+    ----------
+    alpha_rad, beta_rad
+        Angles of the stage, rad, (n,).
+    sensor
+        The baseline, with the resolution of its stage.
+
+    Returns
+    -------
+    float
+        step²/12 times the squared slope of gravity, (m/s²)².
+
+    """
+    measured = len(sensor.axes)
+    by_alpha = np.array([np.cos(alpha_rad) * np.cos(beta_rad),
+                         -np.cos(alpha_rad) * np.sin(beta_rad), -np.sin(alpha_rad)])[:measured]
+    by_beta = np.array([-np.sin(alpha_rad) * np.sin(beta_rad),
+                        -np.sin(alpha_rad) * np.cos(beta_rad), 0 * alpha_rad])[:measured]
+    return float(sensor.local_gravity_mps2 ** 2 * sensor.stage_resolution_rad ** 2 / 12
+                 * np.mean(by_alpha ** 2 + by_beta ** 2))

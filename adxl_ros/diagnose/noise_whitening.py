@@ -13,15 +13,15 @@
 # limitations under the License.
 
 """
-Noise that can drift, whitened: white noise behind the filter, the ADC's steps, a wandering zero-g.
+Whitening filters for noise that can drift.
 
-y = n + w + d with n an AR(1) sequence of a = exp(−dt/RC), w white and d a random walk is
-(1 − aL)(1 − L)·y = an MA(2), whose factor is found from its spectrum (Brockwell and Davis 1991,
-section 3.2). Below the corner where 1/f noise meets the white, poles and zeros in turn whiten it,
-one pair a decade (Corsini and Saletti 1988, IEEE Trans. Instrum. Meas. 37). The innovations are
-white; their variance is fitted, so that the level of the noise need not be known, only how fast
-the zero-g wanders by it, which is searched on a grid. Whitened residuals are therefore neither
-fooled by correlation nor by drift.
+The noise is white noise behind the RC filter, the ADC's steps, and a zero-g that drifts. For a
+random walk, y = n + w + d with n an AR(1) sequence of a = exp(−dt/RC), w white and d the walk;
+then (1 − aL)(1 − L)·y is an MA(2), whose factor follows from its spectrum (Brockwell and Davis
+1991, section 3.2). Below the corner where 1/f noise meets the white noise, poles and zeros in
+turn whiten it, one pair a decade (Corsini and Saletti 1988, IEEE Trans. Instrum. Meas. 37). The
+variance of the innovations is fitted, so that the filter depends on the ratio of drift and noise
+only, which is searched on a grid.
 """
 
 from __future__ import annotations
@@ -29,134 +29,243 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from adxl_ros.diagnose.baseline_comparison import Series
 from adxl_ros.model import noise
+from adxl_ros.model.diagnosis_hints import DriftSpectrum
+from adxl_ros.model.effects import effect_named, library
+from adxl_ros.model.sensor import Sensor
 import numpy as np
 from scipy.signal import sosfilt, sosfreqz, tf2sos, zpk2sos
 
-DRIFTS = ('bias_walk', 'flicker')
-"""The effects that let the zero-g wander."""
-WALKS_G_PER_RTS = (1e-7, 3e-6, 1e-5, 3e-5, 3.8e-5, 5e-5, 8e-5, 2e-4, 6e-4, 2e-3)
-"""Densest where healthy ends: between two steps a walk would look like something unknown."""
+RANDOM_WALKS_G_PER_RTS = (1e-7, 3e-6, 1e-5, 3e-5, 3.8e-5, 5e-5, 8e-5, 2e-4, 6e-4, 2e-3)
+"""Grid of densities of a random walk, g/√s. It is densest where a healthy unit ends, because a
+walk between two coarse steps would look like an unknown effect. Tuned by hand on simulated
+recordings of the working seeds of the blind check."""
 FLICKERS_G_PER_RTHZ = (3e-5, 6e-5, 8e-5, 1.2e-4, 2.5e-4, 5e-4, 1e-3, 2e-3, 4e-3)
-HEALTHY = {'bias_walk': 3e-5, 'flicker': 6e-5}
-"""What a unit without these effects may show: 0.3 mg within 100 s, 0.2 mg over five decades."""
-USUAL, _DECADES = 1e-5, 1.0
-"""What is usual of both, and how far it may be from that, as a standard deviation."""
+"""Grid of densities of 1/f noise at 1 Hz, g/√Hz. Tuned as the grid of random walks."""
+USUAL_DENSITY = 1e-5
+"""Usual density of both drifts, g/√s and g/√Hz. Chosen: 0.1 mg within 100 s."""
+_DENSITY_DECADES = 1.0
+"""Prior standard deviation of the logarithm of the density, decades. Chosen: a factor of ten."""
 _LOWEST_NOISE_V = 1e-7
+"""Smallest standard deviation of the noise, V: whitening needs some. Chosen: below any ADC."""
+_TOP_OF_RATE = 0.25
+"""Highest frequency of the corner of 1/f noise, by the sample rate. Chosen: half of Nyquist."""
+_UNFILTERED_TOP_OF_RATE = 0.4
+"""Highest pole of 1/f noise that bypasses the RC filter, by the sample rate. Chosen."""
+
+
+def drift_effects() -> tuple[str, ...]:
+    """Return the names of the effects that let the zero-g drift."""
+    return tuple(e.name for e in library().values() if e.diagnosis.drift)
 
 
 def drifts_among(effects: Iterable[str]) -> tuple[str, ...]:
-    """Return those by which the zero-g may wander."""
-    return tuple(e for e in effects if e in DRIFTS)
+    """Return the effects, of those given, that let the zero-g drift."""
+    return tuple(e for e in effects if effect_named(e).diagnosis.drift)
+
+
+def _drift_effect(spectrum: DriftSpectrum) -> str:
+    """Return the name of the effect that drifts with a spectrum."""
+    return next(e.name for e in library().values() if e.diagnosis.drift is spectrum)
 
 
 @dataclass(frozen=True)
 class Whitener:
     """
-    A filter that makes noise white, and how likely such noise is.
+    A filter that makes noise white.
 
     Attributes
     ----------
     sections
-        Of second order, (s, 6).
+        Second-order sections, (s, 6).
     log_prior
-        Of such noise.
-    drift, density
-        Effect that it is for, and how much of that, in its own unit.
+        Log prior probability of such noise, up to a constant.
+    effect
+        Name of the drift effect that the filter is for.
+    density
+        Density of the drift, in the unit of the effect's parameter.
 
     """
 
     sections: np.ndarray
     log_prior: float
-    drift: str
+    effect: str
     density: float
 
     @property
+    def spectrum(self) -> DriftSpectrum:
+        """Spectrum of the drift."""
+        spectrum = effect_named(self.effect).diagnosis.drift
+        assert spectrum is not None
+        return spectrum
+
+    @property
     def healthy(self) -> bool:
-        """Whether a unit without the effect may wander so."""
-        return self.density <= HEALTHY[self.drift]
+        """Whether a unit without the effect may drift as much."""
+        return self.density <= effect_named(self.effect).diagnosis.healthy_density
 
     def __call__(self, values: np.ndarray) -> np.ndarray:
-        """Filter series, (k, n)."""
+        """Filter k series, (k, n)."""
         return sosfilt(self.sections, values)
 
 
-def whiteners(series: Series, d: int) -> list[Whitener]:
-    """Return the filters for the noise that is tried, for axis d of a recording."""
-    sensor = series.sensor
-    rc_s, _ = noise.electronics(sensor)
-    dt_s = float(np.median(np.diff(series.time_s)))
-    a = float(np.exp(-dt_s / rc_s[d])) if rc_s[d] else 0.0
-    level = max(float(noise.analog_sigma_v(sensor)[d]), _LOWEST_NOISE_V)
-    steps = sensor.lsb_v / np.sqrt(12)
+def whiteners(sensor: Sensor, d: int, dt_s: float, span_s: float) -> list[Whitener]:
+    """
+    Return the filters that are tried for the noise of one axis of a recording.
+
+    Parameters
+    ----------
+    sensor
+        The baseline.
+    d
+        Number of the axis.
+    dt_s
+        Time between samples, s.
+    span_s
+        Length of the recording, s.
+
+    Returns
+    -------
+    list of Whitener
+        Random walks first, ascending, then 1/f noise.
+
+    """
+    rc_s = float(noise.electronics(sensor)[0][d])
+    a = float(np.exp(-dt_s / rc_s)) if rc_s else 0.0
+    std_v = max(float(noise.analog_sigma_v(sensor)[d]), _LOWEST_NOISE_V)
+    step_std_v = sensor.lsb_v / np.sqrt(12)
     scale = float(sensor.scale_v_per_g[d])
-    pole, apart = np.array([1, -a]), np.array([1, -1.0])
-    out = []
-    for walk in WALKS_G_PER_RTS:
-        spectrum = (level ** 2 * (1 - a * a) * _square(apart, 2)
-                    + steps ** 2 * _square(np.convolve(pole, apart), 2)
-                    + (walk * scale) ** 2 * dt_s * _square(pole, 2))
-        out.append(_whitener(tf2sos(np.convolve(pole, apart), _factor(spectrum, 2)),
-                             'bias_walk', walk))
-    still = _factor(level ** 2 * (1 - a * a) * _square(np.ones(1), 1)
-                    + steps ** 2 * _square(pole, 1), 1)
-    white_v2_per_hz = 2 * dt_s * (level ** 2 * (1 + a) / (1 - a) + steps ** 2)
-    span_s = float(series.time_s[-1] - series.time_s[0])
+    walks = _walk_whiteners(a, std_v, step_std_v, scale, dt_s)
+    # The MA(1) of noise and steps without drift.
+    healthy_zero = -_spectral_factor(
+        std_v ** 2 * (1 - a * a) * _power(np.ones(1), 1)
+        + step_std_v ** 2 * _power(np.array([1, -a]), 1), 1)[1]
+    white_v2_per_hz = 2 * dt_s * (std_v ** 2 * (1 + a) / (1 - a) + step_std_v ** 2)
+    flickers = []
+    flicker = _drift_effect(DriftSpectrum.FLICKER)
     for density in FLICKERS_G_PER_RTHZ:
         corner_hz = (density * scale) ** 2 / white_v2_per_hz
-        top_hz = min(corner_hz, 0.25 / dt_s)
+        top_hz = min(corner_hz, _TOP_OF_RATE / dt_s)
         decades = int(np.ceil(max(np.log10(top_hz * span_s), 0.0)))
-        zeros, poles = _in_turn(top_hz, decades, dt_s)
-        out.append(_whitener(zpk2sos([a, *zeros], [-still[1], *poles], 1.0), 'flicker', density))
+        zeros, poles = _flicker_zeros_and_poles(top_hz, decades, dt_s)
+        flickers.append(_whitener(zpk2sos([a, *zeros], [healthy_zero, *poles], 1.0), flicker,
+                                  density))
         if corner_hz > top_hz:
             break
-    # 1/f noise that the filter did not pass is all there is where it exceeds the rest at the
-    # filter's corner.
     if a:
-        zeros, poles = _in_turn(0.4 / dt_s, int(np.ceil(np.log10(span_s / dt_s))), dt_s)
-        least = np.sqrt(white_v2_per_hz / (2 * np.pi * rc_s[d])) / scale
-        out.append(_whitener(zpk2sos(zeros, poles, 1.0), 'flicker',
-                             max(float(least), 2 * HEALTHY['flicker'])))
+        # 1/f noise that bypasses the RC filter covers all other noise where it exceeds it at the
+        # filter's corner.
+        zeros, poles = _flicker_zeros_and_poles(_UNFILTERED_TOP_OF_RATE / dt_s,
+                                                int(np.ceil(np.log10(span_s / dt_s))), dt_s)
+        lowest = np.sqrt(white_v2_per_hz / (2 * np.pi * rc_s)) / scale
+        healthy = effect_named(flicker).diagnosis.healthy_density
+        flickers.append(_whitener(zpk2sos(zeros, poles, 1.0), flicker,
+                                  max(float(lowest), 2 * healthy)))
+    return walks + flickers
+
+
+def _walk_whiteners(a: float, std_v: float, step_std_v: float, scale_v_per_g: float, dt_s: float
+                    ) -> list[Whitener]:
+    """Return the filters for random walks; a is the pole of the RC filter."""
+    pole, difference = np.array([1, -a]), np.array([1, -1.0])
+    walk = _drift_effect(DriftSpectrum.RANDOM_WALK)
+    out = []
+    for density in RANDOM_WALKS_G_PER_RTS:
+        spectrum = (std_v ** 2 * (1 - a * a) * _power(difference, 2)
+                    + step_std_v ** 2 * _power(np.convolve(pole, difference), 2)
+                    + (density * scale_v_per_g) ** 2 * dt_s * _power(pole, 2))
+        out.append(_whitener(tf2sos(np.convolve(pole, difference),
+                                    _spectral_factor(spectrum, 2)), walk, density))
     return out
 
 
-def _in_turn(top_hz: float, decades: int, dt_s: float) -> tuple[np.ndarray, np.ndarray]:
+def _flicker_zeros_and_poles(top_hz: float, decades: int, dt_s: float
+                             ) -> tuple[np.ndarray, np.ndarray]:
     """Return zeros and poles, one pair a decade, that rise as the root of frequency to the top."""
-    bends_hz = top_hz * 10.0 ** -np.arange(decades)
-    return (np.exp(-2 * np.pi * dt_s * bends_hz * 10 ** -0.5),
-            np.exp(-2 * np.pi * dt_s * bends_hz))
+    corners_hz = top_hz * 10.0 ** -np.arange(decades)
+    return (np.exp(-2 * np.pi * dt_s * corners_hz * 10 ** -0.5),
+            np.exp(-2 * np.pi * dt_s * corners_hz))
 
 
-def _whitener(sections: np.ndarray, drift: str, density: float) -> Whitener:
-    return Whitener(sections, -0.5 * (np.log10(density / USUAL) / _DECADES) ** 2, drift, density)
+def _whitener(sections: np.ndarray, effect: str, density: float) -> Whitener:
+    """Make a filter with its log-normal prior."""
+    log_prior = -0.5 * (np.log10(density / USUAL_DENSITY) / _DENSITY_DECADES) ** 2
+    return Whitener(sections, log_prior, effect, density)
 
 
-def flicker_g_per_rthz(whiten: Whitener, variance_v2: float, series: Series, d: int) -> float:
-    """Return the density at 1 Hz, root of one-sided, of noise that a filter makes white."""
-    dt_s = float(np.median(np.diff(series.time_s)))
-    _, gain = sosfreqz(whiten.sections, [2 * np.pi * dt_s])
-    at_1_hz_v = np.sqrt(2 * dt_s * variance_v2) / np.abs(gain[0])
-    return float(at_1_hz_v / series.sensor.scale_v_per_g[d])
+def fitted_density(whitener: Whitener, variance_v2: float, dt_s: float, scale_v_per_g: float
+                   ) -> float:
+    """
+    Return the density of the drift that a filter makes white.
+
+    Parameters
+    ----------
+    whitener
+        The filter.
+    variance_v2
+        Variance of the whitened residual, V².
+    dt_s
+        Time between samples, s.
+    scale_v_per_g
+        Scale factor of the axis, V/g.
+
+    Returns
+    -------
+    float
+        Of a random walk the density of the grid, g/√s; of 1/f noise the root of the one-sided
+        density at 1 Hz, g/√Hz.
+
+    """
+    if whitener.spectrum is DriftSpectrum.RANDOM_WALK:
+        return whitener.density
+    _, gain = sosfreqz(whitener.sections, [2 * np.pi * dt_s])
+    density_v_per_rthz = np.sqrt(2 * dt_s * variance_v2) / np.abs(gain[0])
+    return float(density_v_per_rthz / scale_v_per_g)
 
 
-def near(filters: Sequence[Whitener], best: int) -> list[Whitener]:
+def expected_drift_g(spectrum: DriftSpectrum, density: float, span_s: float, rate_hz: float
+                     ) -> float:
+    """
+    Return the expected rms of a drift about its mean over a recording.
+
+    Parameters
+    ----------
+    spectrum
+        Spectrum of the drift.
+    density
+        Its density w, g/√s or g/√Hz.
+    span_s
+        Length T of the recording, s.
+    rate_hz
+        Sample rate, Hz.
+
+    Returns
+    -------
+    float
+        Of a random walk w·√(T/6), of 1/f noise w·√(ln(T·rate/2)), g.
+
+    """
+    if spectrum is DriftSpectrum.RANDOM_WALK:
+        return float(density * np.sqrt(span_s / 6))
+    return float(density * np.sqrt(np.log(rate_hz / 2 * span_s)))
+
+
+def neighbouring_filters(filters: Sequence[Whitener], best: int) -> list[Whitener]:
     """Return the best filter and its neighbours, enough where the noise is already known."""
     return [f for i, f in enumerate(filters)
-            if abs(i - best) <= 1 and f.drift == filters[best].drift]
+            if abs(i - best) <= 1 and f.effect == filters[best].effect]
 
 
-def _square(polynomial: np.ndarray, order: int) -> np.ndarray:
+def _power(polynomial: np.ndarray, order: int) -> np.ndarray:
     """Return |p(L)|² by powers of L from −order to order."""
-    whole = np.convolve(polynomial, polynomial[::-1])
-    spare = order - (len(polynomial) - 1)
-    return np.pad(whole, spare)
+    square = np.convolve(polynomial, polynomial[::-1])
+    return np.pad(square, order - (len(polynomial) - 1))
 
 
-def _factor(spectrum: np.ndarray, order: int) -> np.ndarray:
-    """Return the monic polynomial with all roots inside the circle whose square is this."""
+def _spectral_factor(spectrum: np.ndarray, order: int) -> np.ndarray:
+    """Return the monic polynomial with all roots inside the unit circle and this spectrum."""
     trimmed = np.trim_zeros(np.where(np.abs(spectrum) > 1e-14 * spectrum.max(), spectrum, 0.0))
     roots = np.roots(trimmed)
     inside = roots[np.argsort(np.abs(roots))[:len(roots) // 2]]
-    found = np.atleast_1d(np.real(np.poly(inside)))
-    return np.pad(found, (0, order + 1 - len(found)))
+    factor = np.atleast_1d(np.real(np.poly(inside)))
+    return np.pad(factor, (0, order + 1 - len(factor)))

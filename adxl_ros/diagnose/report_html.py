@@ -12,19 +12,20 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The diagnosis as one page that opens offline."""
+"""The diagnosis as one HTML page that opens offline."""
 
 from __future__ import annotations
 
 from base64 import b64encode
+from collections.abc import Sequence
 from html import escape
 from io import BytesIO
 from itertools import pairwise
 from typing import Any
 
 from adxl_ros.diagnose.diagnosis import Diagnosis
-from adxl_ros.diagnose.report_json import as_json, sentence, shares
-from adxl_ros.diagnose.residual_map import SHOWS_P
+from adxl_ros.diagnose.report_json import as_json, shares_of_gap, summary
+from adxl_ros.diagnose.residual_map import RANGES, SIGNIFICANT_P
 from adxl_ros.files.plot_file import pyplot
 from adxl_ros.model.constants import G0_MPS2
 import numpy as np
@@ -38,173 +39,218 @@ border-bottom:1px solid #ddd;text-align:left;vertical-align:top}img{width:100%}
 .verdict{background:#eef4fb;border-left:5px solid #36c;padding:.8em 1em;font-size:1.1em}
 code{background:#f3f3f3;padding:.1em .3em}@media print{body{margin:0}h2{break-after:avoid}}
 """
-_SHOWN = 20_000
-_COLUMNS = 8
+_PLOTTED_SAMPLES = 20_000
+"""Largest number of samples in a plot. Chosen: the page stays small."""
+_SPECTRUM_SAMPLES = 2048
+"""Samples in a segment of a spectrum. Chosen: 0.06 Hz at 125 Hz."""
+_TABLE_ROWS = 10
+"""Rows of the tables of hypotheses and candidates. Chosen."""
+_CELL_ROWS = 12
+"""Rows of the table of cells. Chosen."""
 
 
-def page(found: Diagnosis, title: str) -> str:
+def page(diagnosis: Diagnosis, title: str) -> str:
     """
-    Lay the page out.
+    Lay out the page.
 
     Parameters
     ----------
-    found
+    diagnosis
         The diagnosis.
     title
         Names of the recordings.
 
+    Returns
+    -------
+    str
+        The page, HTML.
+
     """
-    parts = [f'<h1>{escape(title)}</h1>', f'<p class="verdict">{escape(sentence(found))}</p>']
-    if found.fault is None and found.verdict is not None:
-        report = as_json(found)
-        parts += ['<h2>How far it shrinks</h2>', _picture(_bar(found)),
-                  '<h2>Before and after</h2>', _picture(_overlay(found)),
-                  '<h2>Noise, recorded by simulated</h2>', _noise(report),
-                  '<h2>Where</h2>', _picture(_map(found)), _where(report),
-                  _list('Not covered by this recording', report['not_covered']),
-                  '<h2>Which</h2>', _hypotheses(report), _candidates(report),
-                  '<h2>What cannot be told apart, and what to do next</h2>', _next(report)]
+    parts = [f'<h1>{escape(title)}</h1>', f'<p class="verdict">{escape(summary(diagnosis))}</p>']
+    if diagnosis.data_fault is None and diagnosis.verdict is not None:
+        report = as_json(diagnosis)
+        parts += ['<h2>How far the gap closes</h2>', _image(_bar_plot(diagnosis)),
+                  '<h2>Recording minus simulation, before and after</h2>',
+                  _image(_residual_plot(diagnosis)),
+                  '<h2>Recorded noise by simulated noise</h2>', _noise_table(report),
+                  '<h2>Where the gap lies</h2>', _image(_map_plot(diagnosis)),
+                  _cell_table(report), _not_covered(report['not_covered']),
+                  '<h2>Which effects cause it</h2>', _hypothesis_table(report),
+                  _candidate_table(report),
+                  '<h2>What is not separable, and what to record next</h2>',
+                  _next_experiment(report)]
     return (f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{escape(title)}'
             f'</title><style>{_STYLE}</style></head><body>{"".join(parts)}</body></html>\n')
 
 
-def _picture(figure: Any) -> str:
+def _image(plot: Any) -> str:
+    """Return a plot as an image within the page."""
     out = BytesIO()
-    figure.savefig(out, dpi=100, format='png', metadata={'Software': None})
-    pyplot().close(figure)
+    plot.savefig(out, dpi=100, format='png', metadata={'Software': None})
+    pyplot().close(plot)
     return f'<img alt="" src="data:image/png;base64,{b64encode(out.getvalue()).decode()}">'
 
 
-def _bar(found: Diagnosis) -> Any:
-    """Draw the squares of the gap: the floor, each effect's part, what is left."""
-    assert found.shrunk is not None
-    far = found.shrunk
-    squares = [(1e3 * v / G0_MPS2) ** 2 for v in (far.floor_mps2, far.after_mps2,
-                                                  far.before_mps2)]
-    floor, after, before = squares[0], max(squares[0], squares[1]), max(squares)
-    parts = {'floor': floor, 'left': after - floor} | {
-        effect: share * (before - floor) for effect, share in shares(found).items()}
-    if sum(parts.values()) < before:
-        parts['not explained'] = before - sum(parts.values())
-    figure, axis = pyplot().subplots(figsize=(10, 1.8), layout='constrained')
+def _mg(value_mps2: Any) -> Any:
+    """Convert m/s² to mg."""
+    return 1e3 * value_mps2 / G0_MPS2
+
+
+def _bar_plot(diagnosis: Diagnosis) -> Any:
+    """Draw the mean square of the gap: noise floor, share of each effect, and the rest."""
+    assert diagnosis.gap_closure is not None
+    closure = diagnosis.gap_closure
+    floor = _mg(closure.floor_mps2) ** 2
+    after = max(floor, _mg(closure.after_mps2) ** 2)
+    before = max(after, _mg(closure.before_mps2) ** 2)
+    widths = {'noise floor': floor, 'not closed': after - floor} | {
+        effect: share * (before - floor) for effect, share in shares_of_gap(diagnosis).items()}
+    if sum(widths.values()) < before:
+        widths['not explained'] = before - sum(widths.values())
+    plot, axis = pyplot().subplots(figsize=(10, 1.8), layout='constrained')
     begin = 0.0
-    for i, (label, width) in enumerate(parts.items()):
-        axis.barh(0, width, left=begin, color='#999' if label == 'floor' else f'C{i + 1}',
+    for i, (label, width) in enumerate(widths.items()):
+        axis.barh(0, width, left=begin, color='#999' if label == 'noise floor' else f'C{i + 1}',
                   label=f'{label}: {width:.3g} mg²')
         begin += width
-    for label, square in zip(('after', 'before'), (after, before)):
+    for label, square in (('after', after), ('before', before)):
         axis.axvline(square, color='k', lw=0.8)
         axis.annotate(f'{label} {np.sqrt(square):.3g} mg', (square, 0.45), rotation=30,
                       fontsize=8, annotation_clip=False)
-    axis.set(yticks=[], ylim=(-0.4, 1.0), xlabel='mean square, held out, mg²')
-    axis.legend(fontsize=8, ncols=len(parts), loc='upper right', frameon=False)
+    axis.set(yticks=[], ylim=(-0.4, 1.0), xlabel='mean square on held-out blocks, mg²')
+    axis.legend(fontsize=8, ncols=len(widths), loc='upper right', frameon=False)
     axis.spines[['top', 'right', 'left']].set_visible(False)
-    return figure
+    return plot
 
 
-def _overlay(found: Diagnosis) -> Any:
-    assert found.verdict is not None
-    one = found.series[0]
-    before, after = one.residual(one.sensor), one.residual(found.verdict.best.sensor)
-    count = len(one.sensor.axes)
-    figure, grid = pyplot().subplots(count, 2, figsize=(12, 2.6 * count), layout='constrained',
-                                     squeeze=False, width_ratios=(2, 1))
-    every = max(len(one) // _SHOWN, 1)
-    for d, row in enumerate(grid):
-        for off, colour, label in ((before, '#c44', 'before'), (after, '#484', 'after')):
-            mg = 1e3 * off[:, d] / one.scale_v_per_mps2[d] / G0_MPS2
-            row[0].plot(one.time_s[::every], mg[::every], lw=0.5, color=colour, label=label)
-            f, power = welch(np.nan_to_num(mg), one.sensor.rate_hz,
-                             nperseg=min(2048, len(mg)))
-            row[1].loglog(f[1:], np.sqrt(power[1:]), lw=1, color=colour)
-        row[0].set(ylabel=f'{one.sensor.axes[d]}: recording less simulator, mg')
-        row[1].set(ylabel='mg/√Hz')
+def _residual_plot(diagnosis: Diagnosis) -> Any:
+    """Draw the residual of the first recording over time, and its spectrum, before and after."""
+    assert diagnosis.verdict is not None
+    comparison = diagnosis.comparisons[0]
+    residuals = (('before', '#c44', comparison.residual_v(comparison.sensor)),
+                 ('after', '#484', comparison.residual_v(diagnosis.verdict.best.sensor)))
+    axes = comparison.sensor.axes
+    plot, grid = pyplot().subplots(len(axes), 2, figsize=(12, 2.6 * len(axes)),
+                                   layout='constrained', squeeze=False, width_ratios=(2, 1))
+    every = max(len(comparison) // _PLOTTED_SAMPLES, 1)
+    for d, (over_time, spectrum) in enumerate(grid):
+        for label, colour, residual_v in residuals:
+            mg = _mg(residual_v[:, d] / comparison.scale_v_per_mps2[d])
+            over_time.plot(comparison.time_s[::every], mg[::every], lw=0.5, color=colour,
+                           label=label)
+            frequency_hz, power = welch(np.nan_to_num(mg), comparison.sensor.rate_hz,
+                                        nperseg=min(_SPECTRUM_SAMPLES, len(mg)))
+            spectrum.loglog(frequency_hz[1:], np.sqrt(power[1:]), lw=1, color=colour)
+        over_time.set(ylabel=f'{axes[d]}: recording minus simulation, mg')
+        spectrum.set(ylabel='mg/√Hz')
     grid[0, 0].legend(loc='upper right', fontsize=8)
     grid[-1, 0].set(xlabel='time, s')
     grid[-1, 1].set(xlabel='frequency, Hz')
-    return figure
+    return plot
 
 
-def _map(found: Diagnosis) -> Any:
-    """Draw all cells of the map: mean residual by range, ringed where it shows."""
-    cells = [c for c in found.cells if c.statistic == 'mean']
+def _map_plot(diagnosis: Diagnosis) -> Any:
+    """Draw the mean residual of all cells; significant cells have a ring."""
+    cells = [c for c in diagnosis.residual_cells if c.statistic == 'mean']
     rows = sorted({(c.dimension, c.axis) for c in cells})
-    limit = max((abs(c.mean_mps2) for c in cells), default=1.0) * 1e3 / G0_MPS2
-    figure, axis = pyplot().subplots(figsize=(10, 0.8 + 0.24 * len(rows)), layout='constrained')
+    largest_mg = _mg(max((abs(c.mean_mps2) for c in cells), default=G0_MPS2 / 1e3))
+    plot, axis = pyplot().subplots(figsize=(10, 0.8 + 0.24 * len(rows)), layout='constrained')
     drawn = None
     for i, row in enumerate(rows):
-        own = sorted((c for c in cells if (c.dimension, c.axis) == row), key=lambda c: c.low)
-        shows = ['k' if c.p < SHOWS_P else 'none' for c in own]
-        drawn = axis.scatter(np.arange(len(own)), np.full(len(own), i), marker='s', s=180,
-                             c=[1e3 * c.mean_mps2 / G0_MPS2 for c in own], cmap='RdBu_r',
-                             vmin=-limit, vmax=limit, edgecolors=shows)
-        axis.text(_COLUMNS, i, f'{own[0].low:.4g} to {own[-1].high:.4g}', fontsize=8, va='center')
-    axis.set(yticks=range(len(rows)), xticks=[], xlim=(-0.5, _COLUMNS + 2),
-             xlabel='from the lowest range to the highest; ringed: p < 0.05, family-wise')
+        in_row = sorted((c for c in cells if (c.dimension, c.axis) == row), key=lambda c: c.low)
+        drawn = axis.scatter(
+            np.arange(len(in_row)), np.full(len(in_row), i), marker='s', s=180,
+            c=[_mg(c.mean_mps2) for c in in_row], cmap='RdBu_r', vmin=-largest_mg,
+            vmax=largest_mg, edgecolors=['k' if c.p < SIGNIFICANT_P else 'none' for c in in_row])
+        axis.text(RANGES, i, f'{in_row[0].low:.4g} to {in_row[-1].high:.4g}', fontsize=8,
+                  va='center')
+    axis.set(yticks=range(len(rows)), xticks=[], xlim=(-0.5, RANGES + 2),
+             xlabel=f'lowest to highest range; ring: family-wise p < {SIGNIFICANT_P:g}')
     axis.set_yticklabels([f'{dimension}  {name}' for dimension, name in rows], fontsize=8)
     if drawn is not None:
-        figure.colorbar(drawn, label='mean residual, mg', shrink=0.6)
-    return figure
+        plot.colorbar(drawn, label='mean residual, mg', shrink=0.6)
+    return plot
 
 
-def _table(head: list[str], rows: list[list[str]]) -> str:
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Return a table, or a word where it has no rows."""
     if not rows:
-        return '<p>Nothing.</p>'
+        return '<p>None.</p>'
     top = ''.join(f'<th>{escape(h)}</th>' for h in head)
-    body = ''.join('<tr>' + ''.join(f'<td>{escape(c)}</td>' for c in row) + '</tr>'
-                   for row in rows)
+    body = ''.join(f'<tr>{"".join(f"<td>{escape(c)}</td>" for c in row)}</tr>' for row in rows)
     return f'<table><tr>{top}</tr>{body}</table>'
 
 
-def _where(report: dict[str, Any]) -> str:
-    return _table(['axis', 'dimension', 'of', 'range', 'mg', 'in floors', 'share', 'p (family)'], [
-        [c['axis'], c['dimension'], c['statistic'], f'{c["range"][0]:.4g} to {c["range"][1]:.4g}',
-         f'{1e3 * c["mean"] / G0_MPS2:+.2f}', f'{c["floor_units"]:+.1f}',
-         f'{100 * c["share"]:.1f} %', f'{c["p"]:.3f}'] for c in report['where'][:12]])
+def _p_text(p: float) -> str:
+    """Return a probability as text."""
+    return '< 0.001' if p < 1e-3 else f'{p:.3f}'
 
 
-def _noise(report: dict[str, Any]) -> str:
+def _cell_table(report: dict[str, Any]) -> str:
+    """Return the significant cells with the largest shares."""
     rows = []
-    for one in report['gap']['noise']:
-        bands = one['bands_hz']
-        names = [f'{low:.3g} to {high:.3g} Hz' for low, high in pairwise(bands)]
-        names += [f'Allan deviation at {t:g} s' for t in one['allan_s']]
-        rows += [[name, f'{before:.2f}', f'{after:.2f}'] for name, before, after in zip(
-            names, *([*one[f'power_ratio_{when}'], *one[f'allan_ratio_{when}']]
-                     for when in ('before', 'after')))]
-        rows.append(['log-likelihood gained, nats', '', f'{one["log_likelihood_gain"]:.0f}'])
-    return _table(['power or deviation, recorded by simulated', 'before', 'after'], rows)
+    for c in report['where'][:_CELL_ROWS]:
+        low, high = c['range']
+        rows.append([c['axis'], c['dimension'], c['statistic'], f'{low:.4g} to {high:.4g}',
+                     f'{_mg(c["mean"]):+.2f}', f'{c["floor_units"]:+.1f}',
+                     f'{100 * c["share"]:.1f} %', _p_text(c['p'])])
+    return _table(['axis', 'dimension', 'statistic', 'range', 'mg', 'by the noise floor',
+                   'share of the squares', 'family-wise p'], rows)
 
 
-def _hypotheses(report: dict[str, Any]) -> str:
+def _noise_table(report: dict[str, Any]) -> str:
+    """Return ratios of recorded and simulated noise, before and after."""
+    rows = []
+    for noise in report['gap']['noise']:
+        names = [f'{low:.3g} to {high:.3g} Hz' for low, high in pairwise(noise['bands_hz'])]
+        names += [f'Allan deviation at {t:g} s' for t in noise['allan_s']]
+        before, after = ([*noise[f'power_ratio_{when}'], *noise[f'allan_ratio_{when}']]
+                         for when in ('before', 'after'))
+        rows += [[name, f'{b:.2f}', f'{a:.2f}'] for name, b, a in zip(names, before, after)]
+        rows.append(['gain of log likelihood', '', f'{noise["log_likelihood_gain"]:.0f}'])
+    return _table(['power or Allan deviation, recorded by simulated', 'before', 'after'], rows)
+
+
+def _hypothesis_table(report: dict[str, Any]) -> str:
+    """Return the most probable hypotheses."""
     return _table(['hypothesis', 'probability'], [
         [', '.join(h['effects']) or 'no gap', f'{h["probability"]:.4f}']
-        for h in report['hypotheses'][:10]])
+        for h in report['hypotheses'][:_TABLE_ROWS]])
 
 
-def _candidates(report: dict[str, Any]) -> str:
-    rows = []
-    for one in report['candidates'][:10]:
-        parameters = '; '.join(
-            f'{name} = {p["value"]:.4g} ({p["ci"][0]:.3g} to {p["ci"][1]:.3g}) {p["unit"]}'
-            if 'ci' in p else f'{name} = {p["value"]}' for name, p in one['parameters'].items())
-        rows.append([one['effect'], f'{one["probability"]:.3f}', parameters,
-                     ', '.join(one['inseparable_from']), one['cause']])
-    return _table(['effect', 'probability', 'parameters (90 %)', 'not told from', 'cause'], rows)
+def _candidate_table(report: dict[str, Any]) -> str:
+    """Return the most probable effects with their parameters."""
+    rows = [[c['effect'], f'{c["probability"]:.3f}',
+             '; '.join(_parameter_text(name, p) for name, p in c['parameters'].items()),
+             ', '.join(c['inseparable_from']), c['cause']]
+            for c in report['candidates'][:_TABLE_ROWS]]
+    return _table(['effect', 'probability', 'parameters (90 % interval)', 'inseparable from',
+                   'cause'], rows)
 
 
-def _list(title: str, words: list[str]) -> str:
-    return f'<p>{escape(title)}: {escape(", ".join(words))}.</p>' if words else ''
+def _parameter_text(name: str, parameter: dict[str, Any]) -> str:
+    """Return a parameter with its interval, if it has one, as text."""
+    if 'ci' not in parameter:
+        return f'{name} = {parameter["value"]}'
+    low, high = parameter['ci']
+    return f'{name} = {parameter["value"]:.4g} ({low:.3g} to {high:.3g}) {parameter["unit"]}'
 
 
-def _next(report: dict[str, Any]) -> str:
-    groups = [f'<p>This recording cannot tell {escape(" from ".join(group))}.</p>'
-              for group in report['verdict']['groups']]
-    step = report['next_experiment']
-    if step is None:
-        return ''.join(groups) + '<p>Nothing more is asked for.</p>'
-    menu = '' if not step['menu'] else _table(['manoeuvre', 'minutes', 'nats a minute'], [
-        [one['manoeuvre'], f'{one["minutes"]:.1f}', f'{one["nats_per_minute"]:.1f}']
-        for one in step['menu']])
-    return ''.join(groups) + (f'<p>{escape(step["manoeuvre"])}: {escape(step["why"])}.</p>'
-                              f'<p><code>{escape(step["command"])}</code></p>{menu}')
+def _not_covered(names: Sequence[str]) -> str:
+    """Return what the recordings do not cover."""
+    return f'<p>Not covered by these recordings: {escape(", ".join(names))}.</p>' if names else ''
+
+
+def _next_experiment(report: dict[str, Any]) -> str:
+    """Return the inseparable groups, and the manoeuvre that is proposed."""
+    groups = ''.join(f'<p>These recordings cannot separate {escape(" from ".join(group))}.</p>'
+                     for group in report['verdict']['groups'])
+    proposal = report['next_experiment']
+    if proposal is None:
+        return f'{groups}<p>No further recording is needed.</p>'
+    menu = '' if not proposal['menu'] else _table(
+        ['manoeuvre', 'minutes', 'log Bayes factor per minute'], [
+            [m['manoeuvre'], f'{m["minutes"]:.1f}', f'{m["nats_per_minute"]:.1f}']
+            for m in proposal['menu']])
+    return (f'{groups}<p>{escape(proposal["manoeuvre"])}: {escape(proposal["why"])}.</p>'
+            f'<p><code>{escape(proposal["command"])}</code></p>{menu}')

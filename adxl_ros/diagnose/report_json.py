@@ -12,199 +12,269 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The diagnosis in the words of interfaces: report.json, and a screenful for the terminal."""
+"""The diagnosis as `report.json`, and as a screen of text for the terminal."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Any
 
+from adxl_ros.diagnose.decision import Verdict, WeightedHypothesis
 from adxl_ros.diagnose.diagnosis import Diagnosis
+from adxl_ros.diagnose.gap_closure import GapClosure
 from adxl_ros.diagnose.hypothesis_fit import Hypothesis
-from adxl_ros.diagnose.residual_map import SHOWS_P
+from adxl_ros.diagnose.next_experiment import NextExperiment
+from adxl_ros.diagnose.residual_map import ResidualCell, SIGNIFICANT_P
 from adxl_ros.model.coefficients import get, parameter_of
-from adxl_ros.model.constants import Z_90
+from adxl_ros.model.constants import G0_MPS2, Z_90
 from adxl_ros.model.effects import effect_named, library
 import numpy as np
 
 _DIGITS = 6
+"""Significant digits of the report. Chosen: more than any of its numbers has."""
+_MOST_CELLS = 40
+"""Largest number of cells in the report. Chosen."""
+_SCREEN_ROWS = 6
+"""Rows of each table on the terminal. Chosen: all of it fits on one screen."""
+_SCREEN_CANDIDATES = 3
+"""Candidates on the terminal. Chosen."""
+_SCREEN_PROBABILITY = 0.05
+"""Smallest probability of a candidate on the terminal. Chosen."""
 
 
-def as_json(found: Diagnosis) -> dict[str, Any]:
-    """Return the report; see interfaces, "`diagnose` writes"."""
-    if found.fault is not None:
+def as_json(diagnosis: Diagnosis) -> dict[str, Any]:
+    """Return the report as the objects of JSON; docs/interfaces.md lists its keys."""
+    fault = diagnosis.data_fault
+    if fault is not None:
         return {'schema': 1, 'verdict': {
-            'status': found.fault.status, 'effects': [], 'groups': [],
-            'data_fault': found.fault.name if found.fault.status == 'bad_data' else None,
+            'status': fault.status, 'effects': [], 'groups': [],
+            'data_fault': fault.name if fault.status == 'bad_data' else None,
             'probability': 1.0}, 'hypotheses': [], 'gap': None, 'where': [], 'candidates': [],
-            'next_experiment': None, 'summary': found.fault.words}
-    assert found.verdict is not None and found.shrunk is not None and found.floor is not None
-    v, far = found.verdict, found.shrunk
+            'next_experiment': None, 'summary': fault.message}
+    assert diagnosis.verdict is not None
+    verdict = diagnosis.verdict
     return {
         'schema': 1,
-        'verdict': {'status': v.status, 'effects': list(v.effects),
-                    'groups': [list(group) for group in v.groups], 'data_fault': None,
-                    'probability': _round(v.probability)},
-        'hypotheses': [{'effects': list(effects), 'probability': p}
-                       for effects, p in _summing_to_one(v.hypotheses)],
-        'gap': {'unit': 'm/s^2', 'before': _round(far.before_mps2),
-                'after': _round(far.after_mps2), 'floor': _round(far.floor_mps2),
-                'floor_source': found.floor.source, 'closed': _round(far.closed),
-                'closed_ci': [_round(c) for c in far.closed_ci],
-                'noise': _noise(found)},
-        'where': [{'axis': c.axis, 'dimension': c.dimension, 'statistic': c.statistic,
-                   'range': [_round(c.low), _round(c.high)], 'mean': _round(c.mean_mps2),
-                   'floor_units': _round(c.floor_units), 'share': _round(c.share),
-                   'p': _round(c.p)} for c in found.cells if c.p < SHOWS_P][:40],
-        'not_covered': list(found.missing),
-        'unknown_where': list(v.places),
-        'candidates': _candidates(found),
-        'noise_like': [{'effect': s.effect, 'words': s.words, 'nats': _round(s.nats)}
-                       for s in found.signs],
-        'next_experiment': None if found.proposal is None else {
-            'manoeuvre': found.proposal.manoeuvre, 'why': found.proposal.why,
-            'command': found.proposal.command,
-            'nats_per_minute': found.proposal.nats_per_minute and _round(
-                found.proposal.nats_per_minute),
-            'menu': [{'manoeuvre': words, 'minutes': _round(minutes),
-                      'nats_per_minute': _round(worth)}
-                     for words, minutes, worth in found.proposal.menu]},
-        'summary': sentence(found)}
+        'verdict': {'status': verdict.status, 'effects': list(verdict.effects),
+                    'groups': [list(group) for group in verdict.groups], 'data_fault': None,
+                    'probability': _rounded(verdict.probability)},
+        'hypotheses': [{'effects': list(h.effects), 'probability': h.probability}
+                       for h in _summing_to_one(verdict.hypotheses)],
+        'gap': _gap(diagnosis),
+        'where': [_cell(c) for c in diagnosis.residual_cells if c.p < SIGNIFICANT_P][:_MOST_CELLS],
+        'not_covered': list(diagnosis.not_covered),
+        'unknown_where': list(verdict.unknown_where),
+        'candidates': _candidates(diagnosis),
+        'noise_like': [{'effect': d.effect, 'words': d.message,
+                        'nats': _rounded(d.log_bayes_factor)} for d in diagnosis.detections],
+        'next_experiment': _next_experiment(diagnosis.next_experiment),
+        'summary': summary(diagnosis)}
 
 
-def _noise(found: Diagnosis) -> list[dict[str, Any]]:
+def _gap(diagnosis: Diagnosis) -> dict[str, Any]:
+    """Return the gap before and after, and the noise recording by recording."""
+    assert diagnosis.gap_closure is not None and diagnosis.noise_floor is not None
+    closure = diagnosis.gap_closure
+    return {'unit': 'm/s^2', 'before': _rounded(closure.before_mps2),
+            'after': _rounded(closure.after_mps2), 'floor': _rounded(closure.floor_mps2),
+            'floor_source': diagnosis.noise_floor.source, 'closed': _rounded(closure.closed),
+            'closed_ci': [_rounded(c) for c in closure.closed_ci],
+            'noise': _noise(diagnosis)}
+
+
+def _cell(cell: ResidualCell) -> dict[str, Any]:
+    """Return one cell of the residual map."""
+    return {'axis': cell.axis, 'dimension': cell.dimension, 'statistic': cell.statistic,
+            'range': [_rounded(cell.low), _rounded(cell.high)],
+            'mean': _rounded(cell.mean_mps2), 'floor_units': _rounded(cell.floor_units),
+            'share': _rounded(cell.share), 'p': _rounded(cell.p)}
+
+
+def _next_experiment(proposal: NextExperiment | None) -> dict[str, Any] | None:
+    """Return what to record next."""
+    if proposal is None:
+        return None
+    worth = proposal.log_bayes_factor_per_minute
+    return {'manoeuvre': proposal.manoeuvre, 'why': proposal.why, 'command': proposal.command,
+            'nats_per_minute': worth and _rounded(worth),
+            'menu': [{'manoeuvre': w.text, 'minutes': _rounded(w.minutes),
+                      'nats_per_minute': _rounded(w.log_bayes_factor_per_minute)}
+                     for w in proposal.menu]}
+
+
+def _noise(diagnosis: Diagnosis) -> list[dict[str, Any]]:
     """Compare recorded with simulated noise, recording by recording."""
-    return [{'recording': one.name, 'log_likelihood_gain': _round(
-                after.log_likelihood - before.log_likelihood),
-             'bands_hz': [_round(f) for f in after.bands_hz],
-             'power_ratio_before': [_round(r) for r in before.power],
-             'power_ratio_after': [_round(r) for r in after.power],
-             'allan_s': list(after.times_s),
-             'allan_ratio_before': [_round(r) for r in before.allan],
-             'allan_ratio_after': [_round(r) for r in after.allan]}
-            for one, before, after in zip(found.series, *found.alike)]
+    return [{'recording': comparison.name,
+             'log_likelihood_gain': _rounded(after.log_likelihood - before.log_likelihood),
+             'bands_hz': [_rounded(f) for f in after.band_edges_hz],
+             'power_ratio_before': [_rounded(r) for r in before.power_ratio],
+             'power_ratio_after': [_rounded(r) for r in after.power_ratio],
+             'allan_s': list(after.averaging_times_s),
+             'allan_ratio_before': [_rounded(r) for r in before.allan_ratio],
+             'allan_ratio_after': [_rounded(r) for r in after.allan_ratio]}
+            for comparison, before, after in zip(diagnosis.comparisons, diagnosis.noise_before,
+                                                 diagnosis.noise_after)]
 
 
-def shares(found: Diagnosis) -> dict[str, float]:
-    """Split the squares that close, before less after, among the effects by what each makes."""
-    assert found.shrunk is not None
-    parts = {effect: rms ** 2 for effect, rms in found.contributions.items()}
-    whole = sum(parts.values())
-    closes = max(found.shrunk.before_mps2 ** 2 - found.shrunk.after_mps2 ** 2, 0.0)
-    gap = max(found.shrunk.before_mps2 ** 2 - found.shrunk.floor_mps2 ** 2, 1e-30)
-    return {effect: float(min(closes / gap, 1.0) * part / whole) if whole else 0.0
-            for effect, part in parts.items()}
+def shares_of_gap(diagnosis: Diagnosis) -> dict[str, float]:
+    """Split the closed share of the squared gap among the effects by their contributions."""
+    assert diagnosis.gap_closure is not None
+    closure = diagnosis.gap_closure
+    squares = {effect: rms ** 2 for effect, rms in diagnosis.contributions_mps2.items()}
+    total = sum(squares.values())
+    closed = max(closure.before_mps2 ** 2 - closure.after_mps2 ** 2, 0.0)
+    gap = max(closure.before_mps2 ** 2 - closure.floor_mps2 ** 2, 1e-30)
+    return {effect: float(min(closed / gap, 1.0) * square / total) if total else 0.0
+            for effect, square in squares.items()}
 
 
-def _round(value: float) -> float | None:
+def _rounded(value: float) -> float | None:
+    """Round to the digits of the report; None for NaN and infinity."""
     return float(f'{value:.{_DIGITS}g}') if np.isfinite(value) else None
 
 
-def _summing_to_one(hypotheses: Sequence[tuple[tuple[str, ...], float]]
-                    ) -> list[tuple[tuple[str, ...], float]]:
-    rounded = [(effects, round(p, _DIGITS)) for effects, p in hypotheses]
-    (effects, _), rest = rounded[0], rounded[1:]
-    return [(effects, round(1 - sum(p for _, p in rest), _DIGITS)), *rest]
+def _summing_to_one(hypotheses: Sequence[WeightedHypothesis]) -> list[WeightedHypothesis]:
+    """Round probabilities so that they still sum to 1."""
+    first, *others = [WeightedHypothesis(h.effects, round(h.probability, _DIGITS))
+                      for h in hypotheses]
+    rest = sum(h.probability for h in others)
+    return [WeightedHypothesis(first.effects, round(1 - rest, _DIGITS)), *others]
 
 
-def _candidates(found: Diagnosis) -> list[dict[str, Any]]:
-    """Lay out what was weighed, effect by effect, the most probable first."""
-    assert found.verdict is not None and found.shrunk is not None
-    v = found.verdict
-    chance: dict[str, float] = {}
-    for effects, p in v.hypotheses:
-        for effect in effects:
-            chance[effect] = chance.get(effect, 0.0) + p
-    seen: dict[str, Hypothesis] = {}
-    for h in found.hypotheses:
+def _candidates(diagnosis: Diagnosis) -> list[dict[str, Any]]:
+    """Return every effect that was weighed, the most probable first."""
+    assert diagnosis.verdict is not None and diagnosis.gap_closure is not None
+    verdict = diagnosis.verdict
+    probability: dict[str, float] = {}
+    for weighted in verdict.hypotheses:
+        for effect in weighted.effects:
+            probability[effect] = probability.get(effect, 0.0) + weighted.probability
+    best_with: dict[str, Hypothesis] = {}
+    for h in diagnosis.hypotheses:
         for effect in h.effects:
-            seen.setdefault(effect, h)
-    rivals = {effect: [e for e in group if e != effect] for group in v.groups for effect in group}
-    share = shares(found)
-    out = []
+            best_with.setdefault(effect, h)
+    rivals = {effect: [e for e in group if e != effect]
+              for group in verdict.groups for effect in group}
+    shares = shares_of_gap(diagnosis)
+    candidates = []
     for name in library():
-        if name not in chance and name not in seen:
+        if name not in probability and name not in best_with:
             continue
-        score = found.scores.get(name)
-        signs = [s for s in found.signs if s.effect == name]
-        best = name in v.best.effects or bool(signs)
-        out.append({
-            'effect': name, 'probability': _round(min(chance.get(name, 0.0), 1.0)),
-            'closed': _round(found.shrunk.closed) if best and not signs else None,
-            'p': _round(score.p) if score else float(np.exp(-signs[0].nats)) if signs else None,
-            'parameters': _parameters(seen.get(name), name),
-            'share': _round(share[name]) if name in share else None,
-            'visibility': _round(score.visibility) if score else 1.0,
+        test = diagnosis.single_effect_tests.get(name)
+        detection = next((d for d in diagnosis.detections if d.effect == name), None)
+        chance = float(np.exp(-detection.log_bayes_factor)) if detection else None
+        candidates.append({
+            'effect': name, 'probability': _rounded(min(probability.get(name, 0.0), 1.0)),
+            'closed': _rounded(diagnosis.gap_closure.closed)
+            if name in verdict.best.effects and not detection else None,
+            'p': _rounded(test.p) if test else chance,
+            'parameters': _parameters(best_with.get(name), name) if detection is None
+            else {parameter: {'value': np.asarray(value).tolist()}
+                  for parameter, value in detection.values.items()},
+            'share': _rounded(shares[name]) if name in shares else None,
+            'visibility': _rounded(test.visibility) if test else 1.0,
             'inseparable_from': rivals.get(name, []), 'cause': effect_named(name).cause})
-        if signs:
-            out[-1]['parameters'] = {p: {'value': np.asarray(value).tolist()}
-                                     for p, value in signs[0].values.items()}
-    return sorted(out, key=lambda one: (-(one['probability'] or 0.0), one['effect']))
+    return sorted(candidates, key=lambda c: (-(c['probability'] or 0.0), c['effect']))
 
 
-def _parameters(h: Hypothesis | None, effect: str) -> dict[str, Any]:
-    if h is None:
+def _parameters(hypothesis: Hypothesis | None, effect: str) -> dict[str, Any]:
+    """Return the parameters of an effect as the parameter file has them, baseline included."""
+    if hypothesis is None:
         return {}
-    out = {}
-    for name, std in zip(h.names, h.std):
+    parameters = {}
+    for name, std in zip(hypothesis.names, hypothesis.std):
         if name.effect != effect:
             continue
-        p = parameter_of(name)
-        # As in the parameter file, what the baseline has of it included.
-        middle = float(get(h.sensor, [name])[0])
+        value = float(get(hypothesis.sensor, [name])[0])
         key = f'{name.parameter}.{name.axis}' if name.axis else name.parameter
-        out[key] = {
-            'value': _round(middle), 'ci': [_round(middle - Z_90 * std),
-                                            _round(middle + Z_90 * std)], 'unit': p.unit}
-    return out
+        parameters[key] = {
+            'value': _rounded(value),
+            'ci': [_rounded(value - Z_90 * std), _rounded(value + Z_90 * std)],
+            'unit': parameter_of(name).unit}
+    return parameters
 
 
-def sentence(found: Diagnosis) -> str:
-    """Say the verdict in one sentence."""
-    if found.fault is not None:
-        return found.fault.words
-    assert found.verdict is not None and found.shrunk is not None
-    v, far = found.verdict, found.shrunk
-    mg = [1e3 * x / 9.80665 for x in (far.before_mps2, far.after_mps2, far.floor_mps2)]
-    if v.status == 'no_gap':
-        return (f'No gap: the recording differs from the simulator by {mg[0]:.2f} mg rms, the '
-                f'floor is {mg[2]:.2f} mg (probability {v.probability:.2f}).')
-    if v.status == 'insufficient':
-        return 'Insufficient: nothing moves or warms, so that no effect could show.'
-    if v.status == 'unknown':
-        where = f' over {", ".join(v.places[:3])}' if v.places else ''
-        return (f'Unknown: a gap of {mg[0]:.2f} mg rms above a floor of {mg[2]:.2f} mg that no '
-                f'effect of the library explains shows{where} (probability {v.probability:.2f}).')
-    parts = [*v.effects, *(f'one of {", ".join(group)}' for group in v.groups)]
-    closed = '' if not np.isfinite(far.closed) else \
-        f': {mg[0]:.2f} mg rms shrink to {mg[1]:.2f} above a floor of {mg[2]:.2f}, ' \
-        f'{100 * far.closed:.0f} % of the gap'
-    return f'{" and ".join(parts)} (probability {v.probability:.2f}){closed}.'
+def summary(diagnosis: Diagnosis) -> str:
+    """Return the verdict in one sentence."""
+    if diagnosis.data_fault is not None:
+        return diagnosis.data_fault.message
+    assert diagnosis.verdict is not None and diagnosis.gap_closure is not None
+    verdict, closure = diagnosis.verdict, diagnosis.gap_closure
+    before_mg, floor_mg = _mg(closure.before_mps2), _mg(closure.floor_mps2)
+    probability = f'(probability {verdict.probability:.2f})'
+    if verdict.status == 'no_gap':
+        return (f'No gap: the recording differs from the simulator by {before_mg:.2f} mg rms, '
+                f'and the noise floor is {floor_mg:.2f} mg {probability}.')
+    if verdict.status == 'insufficient':
+        return 'Insufficient: nothing moves or warms, so that no effect can show.'
+    if verdict.status == 'unknown':
+        where = f' over {", ".join(verdict.unknown_where[:3])}' if verdict.unknown_where else ''
+        return (f'Unknown: no effect of the library explains the gap of {before_mg:.2f} mg rms '
+                f'above a noise floor of {floor_mg:.2f} mg; it shows{where} {probability}.')
+    return f'{_named_effects(verdict)} {probability}{_closed_text(closure)}.'
 
 
-def screenful(found: Diagnosis) -> list[str]:
-    """Lay the diagnosis out for a terminal."""
-    lines = [sentence(found)]
-    if found.fault is not None or found.verdict is None:
+def _named_effects(verdict: Verdict) -> str:
+    """Return the effects of a verdict, and its groups, as text."""
+    return ' and '.join([*verdict.effects, *(f'one of {", ".join(group)}'
+                                             for group in verdict.groups)])
+
+
+def _closed_text(closure: GapClosure) -> str:
+    """Return how far the gap closes as text, empty where there is no gap to close."""
+    if not np.isfinite(closure.closed):
+        return ''
+    return (f': the gap falls from {_mg(closure.before_mps2):.2f} to '
+            f'{_mg(closure.after_mps2):.2f} mg rms above a noise floor of '
+            f'{_mg(closure.floor_mps2):.2f} mg ({100 * closure.closed:.0f} % closed)')
+
+
+def _mg(value_mps2: float) -> float:
+    """Convert m/s² to mg."""
+    return 1e3 * value_mps2 / G0_MPS2
+
+
+def terminal_lines(diagnosis: Diagnosis) -> list[str]:
+    """Return the diagnosis as lines for a terminal."""
+    lines = [summary(diagnosis)]
+    if diagnosis.data_fault is not None or diagnosis.verdict is None:
         return lines
-    report = as_json(found)
-    lines += ['', f'floor from {report["gap"]["floor_source"]} samples; closed share on stretches '
-              f'held out: {report["gap"]["closed"]} (90 %: {report["gap"]["closed_ci"]})', '',
-              f'{"hypothesis":44} {"probability":>11}']
+    assert diagnosis.gap_closure is not None and diagnosis.noise_floor is not None
+    report, closure = as_json(diagnosis), diagnosis.gap_closure
+    source = {'still': 'rests', 'repeats': 'repeats of a trajectory',
+              'assumed': 'the parameter file'}[diagnosis.noise_floor.source]
+    lines += ['', f'The noise floor is from {source}.']
+    if np.isfinite(closure.closed):
+        low, high = closure.closed_ci
+        lines += [f'Closed on held-out blocks: {100 * closure.closed:.1f} % '
+                  f'(90 %: {100 * low:.1f} to {100 * high:.1f} %).']
+    lines += ['', f'{"hypothesis":44} {"probability":>11}']
     lines += [f'{", ".join(h["effects"]) or "no gap":44} {h["probability"]:11.3f}'
-              for h in report['hypotheses'][:6]]
+              for h in report['hypotheses'][:_SCREEN_ROWS]]
     if report['where']:
         lines += ['', 'where the gap shows most:']
-        lines += [f'  {c["axis"]}  {c["dimension"]:16} {c["range"][0]:9.4g} to '
-                  f'{c["range"][1]:9.4g}  {1e3 * c["mean"] / 9.80665:+8.2f} mg  '
-                  f'{100 * c["share"]:5.1f} %  p {c["p"]:.3f}' for c in report['where'][:6]]
-    for one in report['candidates'][:3]:
-        if (one['probability'] or 0) < 0.05:
-            continue
-        lines += ['', f'{one["effect"]}: {one["cause"]}']
-        lines += [f'  {name:32} {p["value"]:.5g} ({p["ci"][0]:.4g} to {p["ci"][1]:.4g}) '
-                  f'{p["unit"]}' for name, p in one['parameters'].items() if 'ci' in p]
-    if found.proposal is not None:
-        lines += ['', f'next: {found.proposal.manoeuvre}, {found.proposal.why}',
-                  f'  {found.proposal.command}']
+        lines += [_cell_line(cell) for cell in report['where'][:_SCREEN_ROWS]]
+    for candidate in report['candidates'][:_SCREEN_CANDIDATES]:
+        if (candidate['probability'] or 0) >= _SCREEN_PROBABILITY:
+            lines += _candidate_lines(candidate)
+    if diagnosis.next_experiment is not None:
+        proposal = diagnosis.next_experiment
+        lines += ['', f'next: {proposal.manoeuvre}, {proposal.why}', f'  {proposal.command}']
+    return lines
+
+
+def _cell_line(cell: dict[str, Any]) -> str:
+    """Return one line for a cell of the residual map."""
+    low, high = cell['range']
+    return (f'  {cell["axis"]}  {cell["dimension"]:16} {low:9.4g} to {high:9.4g}  '
+            f'{_mg(cell["mean"]):+8.2f} mg  {100 * cell["share"]:5.1f} %  p {cell["p"]:.3f}')
+
+
+def _candidate_lines(candidate: dict[str, Any]) -> list[str]:
+    """Return the lines for a candidate: its cause and its parameters."""
+    lines = ['', f'{candidate["effect"]}: {candidate["cause"]}']
+    for name, p in candidate['parameters'].items():
+        if 'ci' in p:
+            low, high = p['ci']
+            lines.append(f'  {name:32} {p["value"]:.5g} ({low:.4g} to {high:.4g}) {p["unit"]}')
     return lines

@@ -13,11 +13,11 @@
 # limitations under the License.
 
 """
-Where the gap lies: the residual's mean and variance over axis and dimension, tested as a whole.
+Where the gap lies: mean and variance of the residual over axis and dimension, tested together.
 
-Cells are judged by the largest of all their statistics under a bootstrap of whole blocks with
-random signs (max-T; Westfall and Young 1993), so that 200 cells do not give ten false ones. Bands
-of frequency are judged by the power that the noise should have there.
+The largest of all statistics under random signs of whole blocks decides (max-T; Westfall and Young
+1993), so that 200 cells do not give ten false ones. The power in bands of frequency is compared
+with that of the stated noise.
 """
 
 from __future__ import annotations
@@ -25,42 +25,70 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
-from adxl_ros.diagnose.baseline_comparison import Series
-from adxl_ros.diagnose.motion_history import direction, since_move_s
+from adxl_ros.diagnose.baseline_comparison import BaselineComparison, Reference
+from adxl_ros.diagnose.motion_history import direction_of_last_move, time_since_move_s
 from adxl_ros.model import noise
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.kinematics import specific_force
+from adxl_ros.model.sensor import Sensor
 import numpy as np
 from scipy.signal import periodogram
 from scipy.stats import gamma
 
-_CELLS = 8
+RANGES = 8
+"""Number of ranges of a dimension, with equally many samples. Chosen: a row of the page."""
 _DRAWS = 500
+"""Number of draws of random signs. Chosen: probabilities down to 0.002."""
 _BLOCK_S = 2.0
-_FEWEST = 3
-SHOWS_P = 0.05
+"""Length of the blocks that change sign together, s. Chosen: beyond the correlation of noise."""
+_FEWEST_BLOCKS = 3
+"""Fewest blocks of a cell that is tested. Chosen."""
+SIGNIFICANT_P = 0.05
+"""Family-wise probability below which a cell is reported. Chosen: the usual level."""
 _BANDS_HZ = (0.0, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 500.0)
+"""Edges of the bands of frequency, Hz. Chosen: half a decade each."""
+_SMALLEST_RANGE = 1e-3
+"""Range of a dimension, in its unit, below which it is constant. Chosen."""
+_SMALLEST_WARMING_C = 1.0
+"""Range of the temperature below which other temperatures are missing, °C. Chosen."""
+_LONGEST_SINCE_MOVE_S = 60.0
+"""Longest time since the last move that is mapped, s. Chosen."""
+_COVERAGE = {
+    'alpha_rad': 'planes of another alpha',
+    'beta_rad': 'turns of beta',
+    'rate_rad_s': 'motion',
+    'temperature_c': 'other temperatures',
+    'supply_v': 'other supplies',
+    'direction_beta': 'reversals',
+}
+"""Dimensions that recordings should cover, and how the report names them."""
 
 
 @dataclass(frozen=True)
-class Cell:
+class ResidualCell:
     """
-    The residual in one range of one dimension on one axis.
+    The residual of one axis in one range of one dimension.
 
     Attributes
     ----------
+    axis
+        Name of the axis.
+    dimension
+        Name of the dimension, with its unit.
     statistic
         'mean', 'variance', or 'power' of a band of frequency.
     low, high
-        Of the dimension, in the unit of its name.
-    mean_mps2, floor_units
-        Mean residual (of the others: root of what is more than elsewhere, or than noise), and by
-        the floor.
+        Range of the dimension, in its unit.
+    mean_mps2
+        Mean residual; of variance and power the root of the excess, m/s².
+    floor_units
+        The same by the noise floor.
     share
-        Of the squares of the residual.
+        Share of the squares of the residual.
     p
-        Family-wise probability under no gap.
+        Family-wise probability without a gap.
 
     """
 
@@ -75,127 +103,153 @@ class Cell:
     p: float
 
 
-def dimensions(series: Series) -> dict[str, np.ndarray]:
-    """Return what the residual is mapped over, (n,) by name; what does not vary is left out."""
-    time_s, motion = series.time_s, series.motion
-    out = {'time_s': time_s - time_s[0]}
-    if series.reference == 'stage':
-        alpha, beta = motion.alpha(time_s), motion.beta(time_s)
-        out |= {'alpha_rad': alpha, 'beta_rad': beta % (2 * np.pi)}
-        force = specific_force(alpha, beta, 1.0)
-        out |= {f'force_{axis}_g': f for axis, f in zip(AXES, force)}
+class _Candidate(NamedTuple):
+    """A cell before the test; sum and count of samples are by block."""
+
+    axis: str
+    dimension: str
+    statistic: str
+    low: float
+    high: float
+    sums: np.ndarray
+    counts: np.ndarray
+
+
+def dimensions(comparison: BaselineComparison) -> dict[str, np.ndarray]:
+    """Return what the residual is mapped over by name, (n,) each, without what is constant."""
+    time_s, motion = comparison.time_s, comparison.motion
+    values = {'time_s': time_s - time_s[0]}
+    if comparison.reference is Reference.STAGE:
+        alpha_rad, beta_rad = motion.alpha(time_s), motion.beta(time_s)
+        values |= {'alpha_rad': alpha_rad, 'beta_rad': beta_rad % (2 * np.pi)}
+        force = specific_force(alpha_rad, beta_rad, 1.0)
+        values |= {f'force_{axis}_g': f for axis, f in zip(AXES, force)}
         rates = [motion.alpha(time_s, 1), motion.beta(time_s, 1)]
-        out['rate_rad_s'] = np.hypot(*rates)
-        out['direction_alpha'], out['direction_beta'] = map(direction, rates)
-        out['since_move_s'] = np.minimum(since_move_s(time_s, rates), 60.0)
-    elif series.reference == 'sim' and motion.force is not None:
-        out |= {f'force_{axis}_g': f / G0_MPS2 for axis, f in zip(AXES, motion.force(time_s))}
-    for name in ('temperature_c', 'supply_v'):
-        path = getattr(motion, name)
-        if path is not None:
-            out[name] = path(time_s)
-    return {name: v for name, v in out.items() if np.ptp(v) > 1e-3}
+        values['rate_rad_s'] = np.hypot(*rates)
+        values['direction_alpha'], values['direction_beta'] = map(direction_of_last_move, rates)
+        values['since_move_s'] = np.minimum(time_since_move_s(time_s, rates),
+                                            _LONGEST_SINCE_MOVE_S)
+    elif comparison.reference is Reference.SIMULATOR and motion.force is not None:
+        values |= {f'force_{axis}_g': f / G0_MPS2
+                   for axis, f in zip(AXES, motion.force(time_s))}
+    if motion.temperature_c is not None:
+        values['temperature_c'] = motion.temperature_c(time_s)
+    if motion.supply_v is not None:
+        values['supply_v'] = motion.supply_v(time_s)
+    return {name: v for name, v in values.items() if np.ptp(v) > _SMALLEST_RANGE}
 
 
-def covered(series: Sequence[Series]) -> list[str]:
+def not_covered(comparisons: Sequence[BaselineComparison]) -> list[str]:
     """Name what no recording covers."""
-    seen: set[str] = set()
-    for one in series:
-        seen |= set(dimensions(one))
-        temperature = one.motion.temperature_c
-        if temperature is not None and np.ptp(temperature(one.time_s)) < 1.0:
-            seen -= {'temperature_c'}
-    wanted = {'alpha_rad': 'planes of another alpha', 'beta_rad': 'turns of beta',
-              'rate_rad_s': 'motion', 'temperature_c': 'other temperatures',
-              'supply_v': 'other supplies', 'direction_beta': 'reversals'}
-    return [words for name, words in wanted.items() if name not in seen]
+    covered: set[str] = set()
+    for comparison in comparisons:
+        covered |= set(dimensions(comparison))
+        temperature = comparison.motion.temperature_c
+        if temperature is not None \
+                and np.ptp(temperature(comparison.time_s)) < _SMALLEST_WARMING_C:
+            covered -= {'temperature_c'}
+    return [text for name, text in _COVERAGE.items() if name not in covered]
 
 
-def map_of(series: Series, residual_v: np.ndarray, used: np.ndarray, floor_mps2: float, seed: int
-           ) -> list[Cell]:
+def residual_map(comparison: BaselineComparison, floor_mps2: float, seed: int
+                 ) -> list[ResidualCell]:
     """
-    Map the residual of a recording; all cells that can be tested, the largest share first.
+    Map the residual of a recording.
 
     Parameters
     ----------
-    series
-        The recording.
-    residual_v
-        Of the baseline, V, (n, m).
-    used
-        Samples that count, (n,).
+    comparison
+        The recording beside the baseline.
     floor_mps2
-        From `floor`.
+        Noise floor, m/s².
     seed
-        Of the bootstrap.
+        Seed of the random signs.
+
+    Returns
+    -------
+    list of ResidualCell
+        All cells that can be tested, by falling share.
 
     """
-    off = residual_v / series.scale_v_per_mps2
-    off = np.where(used[:, None], off - off[used].mean(axis=0), 0.0)
-    out = [*_over(series, off, used, floor_mps2, seed),
-           *_over_frequency(series, off, floor_mps2)]
-    return sorted(out, key=lambda cell: -cell.share)
+    used = comparison.used
+    residual = comparison.residual_v(comparison.sensor) / comparison.scale_v_per_mps2
+    residual = np.where(used[:, None], residual - residual[used].mean(axis=0), 0.0)
+    cells = [*_cells_over_dimensions(comparison, residual, floor_mps2, seed),
+             *_cells_over_frequency(comparison.sensor, residual, floor_mps2)]
+    return sorted(cells, key=lambda cell: -cell.share)
 
 
-def _over(series: Series, off: np.ndarray, used: np.ndarray, floor_mps2: float, seed: int
-          ) -> Iterator[Cell]:
-    """Test mean and variance over all dimensions at once."""
-    block = max(round(_BLOCK_S * series.sensor.rate_hz), 2)
-    number = np.arange(len(off)) // block
-    blocks = int(number[-1]) + 1
-    squares = off ** 2
-    about = squares - squares[used].mean(axis=0)
-    names: list[tuple[str, str, str, float, float]] = []
-    sums, counts = [], []
-    for name, values in dimensions(series).items():
-        edges = np.unique(np.quantile(values[used], np.linspace(0, 1, _CELLS + 1)))
-        inside = np.clip(np.searchsorted(edges, values, 'right') - 1, 0, len(edges) - 2)
-        for cell, (low, high) in enumerate(pairwise(edges)):
-            chosen = used & (inside == cell)
-            n = np.bincount(number[chosen], minlength=blocks)
-            for d, axis in enumerate(series.sensor.axes):
-                for statistic, of in (('mean', off), ('variance', about)):
-                    names.append((axis, name, statistic, float(low), float(high)))
-                    sums.append(np.bincount(number[chosen], of[chosen, d], minlength=blocks))
-                    counts.append(n)
-    total, size = np.array(sums), np.array(counts).sum(axis=1)
-    spread = np.sqrt((total ** 2).sum(axis=1))
-    enough = ((np.array(counts) > 0).sum(axis=1) >= _FEWEST) & (spread > 0)
-    signs = np.random.default_rng(seed).choice([-1.0, 1.0], (blocks, _DRAWS))
+def _candidates(comparison: BaselineComparison, residual: np.ndarray) -> list[_Candidate]:
+    """Sum residual and excess square over each range of each dimension, by block."""
+    block = max(round(_BLOCK_S * comparison.sensor.rate_hz), 2)
+    number = np.arange(len(residual)) // block
+    blocks, used = int(number[-1]) + 1, comparison.used
+    squares = residual ** 2
+    excess = squares - squares[used].mean(axis=0)
+    out = []
+    for name, values in dimensions(comparison).items():
+        edges = np.unique(np.quantile(values[used], np.linspace(0, 1, RANGES + 1)))
+        place = np.clip(np.searchsorted(edges, values, 'right') - 1, 0, len(edges) - 2)
+        for i, (low, high) in enumerate(pairwise(edges)):
+            chosen = used & (place == i)
+            counts = np.bincount(number[chosen], minlength=blocks)
+            for d, axis in enumerate(comparison.sensor.axes):
+                for statistic, signal in (('mean', residual), ('variance', excess)):
+                    sums = np.bincount(number[chosen], signal[chosen, d], minlength=blocks)
+                    out.append(_Candidate(axis, name, statistic, float(low), float(high), sums,
+                                          counts))
+    return out
+
+
+def _cells_over_dimensions(comparison: BaselineComparison, residual: np.ndarray,
+                           floor_mps2: float, seed: int) -> Iterator[ResidualCell]:
+    """Test mean and variance over all dimensions together."""
+    candidates = _candidates(comparison, residual)
+    sums = np.array([c.sums for c in candidates])
+    counts = np.array([c.counts for c in candidates])
+    size = counts.sum(axis=1)
+    spread = np.sqrt((sums ** 2).sum(axis=1))
+    enough = ((counts > 0).sum(axis=1) >= _FEWEST_BLOCKS) & (spread > 0)
+    signs = np.random.default_rng(seed).choice([-1.0, 1.0], (sums.shape[1], _DRAWS))
     with np.errstate(all='ignore'):
-        mean = total.sum(axis=1) / size
-        seen = np.where(enough, np.abs(total.sum(axis=1)) / spread, 0.0)
-        drawn = np.where(enough[:, None], np.abs(total @ signs) / spread[:, None], 0.0)
-    p = (1 + (drawn.max(axis=0)[None] >= seen[:, None]).sum(axis=1)) / (_DRAWS + 1)
-    whole = float(np.sum(squares))
-    for i, (axis, name, statistic, low, high) in enumerate(names):
-        if not enough[i] or (statistic == 'variance' and mean[i] <= 0):
+        mean = sums.sum(axis=1) / size
+        statistic = np.where(enough, np.abs(sums.sum(axis=1)) / spread, 0.0)
+        drawn = np.where(enough[:, None], np.abs(sums @ signs) / spread[:, None], 0.0)
+    p = (1 + (drawn.max(axis=0)[None] >= statistic[:, None]).sum(axis=1)) / (_DRAWS + 1)
+    total = float(np.sum(residual ** 2))
+    for i, c in enumerate(candidates):
+        of_mean = c.statistic == 'mean'
+        if not enough[i] or (not of_mean and mean[i] <= 0):
             continue
-        square = mean[i] ** 2 if statistic == 'mean' else mean[i]
-        size_mps2 = mean[i] if statistic == 'mean' else np.sqrt(mean[i])
-        yield Cell(axis, name, statistic, low, high, float(size_mps2),
-                   float(size_mps2 / floor_mps2), float(min(square * size[i] / whole, 1.0)),
-                   float(p[i]))
+        square = mean[i] ** 2 if of_mean else mean[i]
+        size_mps2 = mean[i] if of_mean else np.sqrt(mean[i])
+        yield ResidualCell(c.axis, c.dimension, c.statistic, c.low, c.high, float(size_mps2),
+                           float(size_mps2 / floor_mps2),
+                           float(min(square * size[i] / total, 1.0)), float(p[i]))
 
 
-def _over_frequency(series: Series, off: np.ndarray, floor_mps2: float) -> Iterator[Cell]:
-    """Compare the power in bands with that of the stated noise; p by Bonferroni."""
-    rate_hz = series.sensor.rate_hz
-    frequency, power = periodogram(off, rate_hz, axis=0)
-    promised = noise.density_v2_per_hz(series.sensor, frequency) / series.scale_v_per_mps2 ** 2
-    step = float(frequency[1])
+def _cells_over_frequency(sensor: Sensor, residual: np.ndarray, floor_mps2: float
+                          ) -> Iterator[ResidualCell]:
+    """Compare the power in bands with that of the stated noise (gamma, Bonferroni)."""
+    rate_hz = sensor.rate_hz
+    frequency_hz, power = periodogram(residual, rate_hz, axis=0)
+    stated = noise.density_v2_per_hz(sensor, frequency_hz) \
+        / (sensor.scale_v_per_g / G0_MPS2) ** 2
+    step_hz = float(frequency_hz[1])
     bands = [(low, min(high, rate_hz / 2)) for low, high in pairwise(_BANDS_HZ)
              if low < rate_hz / 2]
     for low, high in bands:
-        inside = (frequency > low) & (frequency <= high)
+        inside = (frequency_hz > low) & (frequency_hz <= high)
         count = int(inside.sum())
-        for d, axis in enumerate(series.sensor.axes):
-            if not count:
-                continue
-            seen, usual = power[inside, d].sum(), promised[inside, d].sum()
-            p = float(gamma.sf(seen / usual * count, count)) * len(bands) * off.shape[1]
-            more = max(seen - usual, 0.0) * step
-            yield Cell(axis, 'frequency_hz', 'power', low, high, float(np.sqrt(more)),
-                       float(np.sqrt(more) / floor_mps2),
-                       float(min(more / np.sum(np.mean(off ** 2, axis=0)), 1.0)),
-                       float(np.clip(p, 1e-12, 1.0)))
+        if not count:
+            continue
+        for d, axis in enumerate(sensor.axes):
+            measured, expected = power[inside, d].sum(), stated[inside, d].sum()
+            p = float(gamma.sf(measured / expected * count, count)) * len(bands) \
+                * residual.shape[1]
+            excess = max(measured - expected, 0.0) * step_hz
+            yield ResidualCell(
+                axis, 'frequency_hz', 'power', low, high, float(np.sqrt(excess)),
+                float(np.sqrt(excess) / floor_mps2),
+                float(min(excess / np.sum(np.mean(residual ** 2, axis=0)), 1.0)),
+                float(np.clip(p, 1e-12, 1.0)))

@@ -12,66 +12,82 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""How the simulated output follows each parameter of the library: the tangents of the search."""
+"""Sensitivities: how the simulated output changes with each parameter of the library."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
-from adxl_ros.diagnose.baseline_comparison import Series
 from adxl_ros.errors import UserError
 from adxl_ros.model.coefficients import names_of, parameter_of, put, with_neutral
-from adxl_ros.model.effects import library
+from adxl_ros.model.diagnosis_hints import StraightLine
+from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.effects.base import ActsOn, Coefficient, Effect, Parameter, Role
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
-WIDE = 5.0
-"""Standard deviation of a coefficient beforehand, by its typical size: faults are not typical."""
-_SHAPES = (0.2, 1.0, 5.0)
-"""Shapes that are tried, by the typical one."""
-_SMALL = 0.2
-"""Step of a smooth parameter, by its typical size."""
-_LARGE = (1.0, 4.0, 16.0)
-"""Steps of one that is not: what a play of 1 mrad does tells little of one of 15."""
-_CLIPPED = (0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.3)
-"""Part of the samples that a limit clips where it is tried."""
+PRIOR_WIDTH = 5.0
+"""Prior standard deviation of a coefficient by its typical size. Chosen: faults are larger than
+typical values. Smaller amplitudes have a prior of their own (`evidence.AMPLITUDES`)."""
+_SHAPE_FACTORS = (0.2, 1.0, 5.0)
+"""Values of a shape parameter that are tried, by the typical value. Chosen: fits reach the values
+between."""
+_SMOOTH_STEP = 0.2
+"""Step of a smooth parameter by its typical size. Chosen: small for a fault."""
+_ROUGH_STEPS = (1.0, 4.0, 16.0)
+"""Steps of a parameter that is not smooth, by its typical size. Chosen: the derivative at a play
+of 1 mrad says little about one of 15 mrad."""
+_CLIPPED_SHARES = (0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.3)
+"""Shares of the samples that a limit clips where it is tried. Chosen: half an octave to one
+octave apart."""
+_FIT_STEP = 0.02
+"""Step of a smooth parameter at its fitted value, by its typical size. Chosen: a derivative."""
+_ROUGH_FIT_STEP = 0.3
+"""The same of a parameter that is not smooth. Chosen: wider than the noise of its derivative."""
+_SMALLEST_V = 1e-9
+"""Change of the output, V, that is a rounding error."""
+
+Simulate = Callable[[Sensor], np.ndarray]
+"""Mean output of a sensor in one recording, V, (n, m)."""
 
 
 @dataclass(frozen=True)
 class Variant:
     """
-    An effect with its shape held, and how the output follows its coefficients.
+    An effect with fixed shape parameters, and the sensitivities to its p coefficients.
 
     Attributes
     ----------
     effect
-        Its name.
+        Name of the effect.
     shape
-        Values of the parameters of shape.
-    size
-        Step that it was differentiated by, in typical sizes.
-    names, prior
-        Coefficients and the standard deviation that they may have, (p,).
+        Values of the shape parameters.
+    step
+        Step of the derivative, in typical sizes; for a limit the number of its level.
+    names
+        Names of the coefficients, (p,).
+    prior_std
+        Their prior standard deviations, (p,).
     columns
-        By axis: numbers of the coefficients that it follows, and volts a unit, (n, of them).
-    begin
-        Where the fit of a limit begins, by coefficient; its columns are what that limit does.
+        By axis: numbers of the coefficients that it follows, and the sensitivities, V per unit,
+        (n, numbers).
+    limit_start
+        Where the fit of a limit starts, by coefficient; its columns are the change by that limit.
 
     """
 
     effect: str
     shape: dict[str, float]
-    size: float
+    step: float
     names: tuple[Coefficient, ...]
-    prior: np.ndarray
+    prior_std: np.ndarray
     columns: tuple[tuple[np.ndarray, np.ndarray], ...]
-    begin: dict[Coefficient, float] = field(default_factory=dict)
+    limit_start: dict[Coefficient, float] = field(default_factory=dict)
 
 
 def candidates() -> list[Effect]:
-    """Return the effects of the library that act on the mean and have tangents."""
+    """Return the effects of the library that act on the mean of the output."""
     return [effect for effect in library().values() if effect.acts_on is ActsOn.MEAN]
 
 
@@ -80,99 +96,132 @@ def limits(effect: Effect) -> list[Parameter]:
     return [p for p in effect.parameters if p.role is Role.LIMIT]
 
 
-def variants(series: Series, effect: Effect, base: np.ndarray) -> Iterator[Variant]:
+def variants(simulate: Simulate, sensor: Sensor, effect: Effect, baseline_v: np.ndarray,
+             pose_known: bool) -> Iterator[Variant]:
     """
-    Differentiate the simulated output by the parameters of an effect, shape by shape.
+    Differentiate the simulated output by the parameters of an effect, for each shape.
 
-    One that has nothing to act on in this recording has no variant.
+    Parameters
+    ----------
+    simulate
+        Simulates a sensor in the recording.
+    sensor
+        The baseline.
+    effect
+        The effect.
+    baseline_v
+        Simulated output of the baseline, V, (n, m).
+    pose_known
+        Whether the recording has a reference; if not, the means mean nothing.
+
+    Yields
+    ------
+    Variant
+        One shape of the effect; none where the effect has nothing to act on.
+
     """
+    modelled = effect.name in sensor.effects
     if limits(effect):
-        if effect.name not in series.sensor.effects:
-            yield from _limited(series, effect, limits(effect)[0], base)
+        if not modelled:
+            yield from _limit_variants(simulate, sensor, effect, limits(effect)[0], baseline_v)
         return
-    # An effect that the sensor has keeps its shape; one with a shape is linear beside it.
-    bends = not effect.smooth and not any(p.role is Role.SHAPE for p in effect.parameters)
-    for shape in [{}] if effect.name in series.sensor.effects else shapes(effect):
-        for size in _LARGE if bends else (_SMALL,):
+    # An effect with a shape is linear beside the shape; one of the baseline keeps its shape.
+    rough = not effect.smooth and not any(p.role is Role.SHAPE for p in effect.parameters)
+    for shape in [{}] if modelled else shapes(effect):
+        for step in _ROUGH_STEPS if rough else (_SMOOTH_STEP,):
             try:
-                found = variant(series, effect, shape, size, base)
+                variant = _variant(simulate, sensor, effect, shape, step, baseline_v, pose_known)
             except UserError:
                 return
-            if found is not None:
-                yield found
+            if variant is not None:
+                yield variant
 
 
-def _limited(series: Series, effect: Effect, limit: Parameter, base: np.ndarray
-             ) -> Iterator[Variant]:
-    """Try a limit where it clips a small part of the samples, and more: one, or by axis."""
-    axes = series.sensor.axes
-    held = with_neutral(series.sensor, [effect.name])
+def _limit_variants(simulate: Simulate, sensor: Sensor, effect: Effect, limit: Parameter,
+                    baseline_v: np.ndarray) -> Iterator[Variant]:
+    """Try a limit where it clips small parts of the samples: by axis, and one for all axes."""
+    axes = sensor.axes
+    with_effect = with_neutral(sensor, [effect.name])
     names = names_of(replace(effect, parameters=(limit,)), axes)
-    # What else it has is no size until it clips.
-    beside = {name: p.scale for p in effect.parameters if p.is_size
-              for name in names_of(replace(effect, parameters=(p,)), axes)}
-    g = np.abs(base - series.sensor.zero_g_v) / series.sensor.scale_v_per_g
-    levels = [level for part in _CLIPPED for level in (
-        np.quantile(g, 1 - part, axis=0), np.full(len(axes), np.quantile(g, 1 - part)))]
+    # The other parameters have no effect until the limit clips.
+    start = {name: p.scale for p in effect.parameters if p.is_size
+             for name in names_of(replace(effect, parameters=(p,)), axes)}
+    magnitude_g = np.abs(baseline_v - sensor.zero_g_v) / sensor.scale_v_per_g
+    levels = []
+    for share in _CLIPPED_SHARES:
+        levels.append(np.quantile(magnitude_g, 1 - share, axis=0))
+        levels.append(np.full(len(axes), np.quantile(magnitude_g, 1 - share)))
     for number, level in enumerate(levels):
         values = np.clip(level, limit.lower, limit.upper)
-        does = series.simulated(put(held, names, values)) - base
-        seen = [d for d in range(len(axes)) if np.any(np.abs(does[:, d]) > 1e-9)]
-        if seen:
-            yield Variant(effect.name, {}, float(number), tuple(names[d] for d in seen), np.ones(
-                len(seen)), tuple((np.array([seen.index(d)] if d in seen else [], int),
-                                   does[:, [d]] if d in seen else np.zeros((len(base), 0)))
-                                  for d in range(len(axes))),
-                          dict(zip(names, values)) | beside)
+        change_v = simulate(put(with_effect, names, values)) - baseline_v
+        clipped = [d for d in range(len(axes)) if np.any(np.abs(change_v[:, d]) > _SMALLEST_V)]
+        if clipped:
+            yield Variant(effect.name, {}, float(number), tuple(names[d] for d in clipped),
+                          np.ones(len(clipped)), _limit_columns(change_v, clipped),
+                          dict(zip(names, values)) | start)
+
+
+def _limit_columns(change_v: np.ndarray, clipped: list[int]
+                   ) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
+    """Return by axis the number of its limit, if it clips, and the change, V, (n, 0 or 1)."""
+    return tuple((np.array([clipped.index(d)] if d in clipped else [], int),
+                  change_v[:, [d]] if d in clipped else np.zeros((len(change_v), 0)))
+                 for d in range(change_v.shape[1]))
 
 
 def shapes(effect: Effect) -> list[dict[str, float]]:
-    """Return the shapes of an effect that are tried: each parameter of shape by a few factors."""
-    of_shape = [p for p in effect.parameters if p.role is Role.SHAPE and not p.held]
-    if not of_shape:
+    """Return the values of the shape parameters that are tried; the first parameter varies."""
+    shape_parameters = [p for p in effect.parameters if p.role is Role.SHAPE and not p.held]
+    if not shape_parameters:
         return [{}]
-    first, rest = of_shape[0], {p.name: p.scale for p in of_shape[1:]}
-    values = [float(np.clip(first.scale * by, first.lower, first.upper)) for by in _SHAPES]
-    return [{first.name: value, **rest} for value in dict.fromkeys(values)]
+    first, others = shape_parameters[0], {p.name: p.scale for p in shape_parameters[1:]}
+    values = [float(np.clip(first.scale * factor, first.lower, first.upper))
+              for factor in _SHAPE_FACTORS]
+    return [{first.name: value, **others} for value in dict.fromkeys(values)]
 
 
-def variant(series: Series, effect: Effect, shape: dict[str, float], size: float,
-            base: np.ndarray) -> Variant | None:
-    """Differentiate by one effect's coefficients at one shape; None where nothing follows."""
-    axes = series.sensor.axes
-    held = _shaped(with_neutral(series.sensor, [effect.name]), effect, shape)
+def _variant(simulate: Simulate, sensor: Sensor, effect: Effect, shape: dict[str, float],
+             step: float, baseline_v: np.ndarray, pose_known: bool) -> Variant | None:
+    """Differentiate by one effect's coefficients at one shape; None where nothing changes."""
+    axes = sensor.axes
+    start = _with_shape(with_neutral(sensor, [effect.name]), effect, shape)
     names: list[Coefficient] = []
-    prior: list[float] = []
+    prior_std: list[float] = []
     columns: list[list[tuple[int, np.ndarray]]] = [[] for _ in axes]
-    start = base if not shape else series.simulated(held)
+    start_v = baseline_v if not shape else simulate(start)
     for p in effect.parameters:
         if p.role is Role.SHAPE:
             continue
-        step = p.scale * size
-        if not p.lower <= np.max(values := np.asarray(held.values[effect.name][p.name])) + step \
-                <= p.upper:
-            step = (p.upper - float(np.max(values))) or -p.scale * size
-        moved = (series.simulated(_stepped(held, effect.name, p, step)) - start) / step
-        if series.reference == 'rest' and effect.name != 'bias':
-            moved -= moved.mean(axis=0)
-        own = names_of(replace(effect, parameters=(p,)), axes)
-        for name in own:
-            reach = [axes.index(name.axis)] if p.axes else range(len(axes))
-            if not np.any(np.abs(moved[:, list(reach)]) * p.scale > 1e-9):
+        size = _step_within(p, np.asarray(start.values[effect.name][p.name]), p.scale * step)
+        change = (simulate(_stepped(start, effect.name, p, size)) - start_v) / size
+        # Without a known pose only changes show, except of the zero-g itself.
+        if not pose_known and effect.diagnosis.straight_line is not StraightLine.ZERO_G:
+            change -= change.mean(axis=0)
+        for name in names_of(replace(effect, parameters=(p,)), axes):
+            reached = [axes.index(name.axis)] if p.axes else range(len(axes))
+            if not np.any(np.abs(change[:, list(reached)]) * p.scale > _SMALLEST_V):
                 continue
-            for d in reach:
-                columns[d].append((len(names), moved[:, d]))
+            for d in reached:
+                columns[d].append((len(names), change[:, d]))
             names.append(name)
-            prior.append(WIDE * parameter_of(name).scale)
+            prior_std.append(PRIOR_WIDTH * p.scale)
     if not names:
         return None
-    return Variant(effect.name, shape, size, tuple(names), np.array(prior), tuple(
-        (np.array([i for i, _ in of], int),
-         np.column_stack([c for _, c in of]) if of else np.zeros((len(base), 0)))
-        for of in columns))
+    return Variant(effect.name, shape, step, tuple(names), np.array(prior_std), tuple(
+        (np.array([i for i, _ in axis_columns], int),
+         np.column_stack([c for _, c in axis_columns]) if axis_columns
+         else np.zeros((len(baseline_v), 0))) for axis_columns in columns))
 
 
-def _shaped(sensor: Sensor, effect: Effect, shape: dict[str, float]) -> Sensor:
+def _step_within(parameter: Parameter, values: np.ndarray, step: float) -> float:
+    """Return a step that keeps values within their bounds."""
+    if parameter.lower <= np.max(values) + step <= parameter.upper:
+        return step
+    return (parameter.upper - float(np.max(values))) or -step
+
+
+def _with_shape(sensor: Sensor, effect: Effect, shape: dict[str, float]) -> Sensor:
+    """Return the sensor with given shape parameters of an effect that it has."""
     values = {**sensor.values[effect.name]}
     for p in effect.parameters:
         if p.name in shape:
@@ -181,7 +230,53 @@ def _shaped(sensor: Sensor, effect: Effect, shape: dict[str, float]) -> Sensor:
     return replace(sensor, values={**sensor.values, effect.name: values})
 
 
-def _stepped(sensor: Sensor, effect: str, p: Parameter, step: float) -> Sensor:
+def _stepped(sensor: Sensor, effect: str, parameter: Parameter, step: float) -> Sensor:
+    """Return the sensor with all coefficients of a parameter changed by a step."""
     values = dict(sensor.values[effect])
-    values[p.name] = np.asarray(values[p.name], float) + step
+    values[parameter.name] = np.asarray(values[parameter.name], float) + step
     return replace(sensor, values={**sensor.values, effect: values})
+
+
+def sensitivities_at(simulate: Simulate, sensor: Sensor, names: Sequence[Coefficient],
+                     values: np.ndarray, output_v: np.ndarray) -> np.ndarray:
+    """
+    Differentiate the output by p coefficients at their values.
+
+    Coefficients of one parameter change together, for an axis follows its own alone.
+
+    Parameters
+    ----------
+    simulate
+        Simulates a sensor in the recording.
+    sensor
+        Sensor with the coefficients at their values.
+    names
+        Names of the coefficients, (p,).
+    values
+        Their values, (p,).
+    output_v
+        Simulated output of the sensor, V, (n, m).
+
+    Returns
+    -------
+    numpy.ndarray
+        Sensitivities, V per unit, (n, m, p).
+
+    """
+    out = np.zeros((*output_v.shape, len(names)))
+    groups: dict[Coefficient, list[int]] = {}
+    for i, name in enumerate(names):
+        groups.setdefault(name.without_axis, []).append(i)
+    for group in groups.values():
+        first = names[group[0]]
+        p, smooth = parameter_of(first), effect_named(first.effect).smooth
+        step = p.scale * (_FIT_STEP if p.role is Role.LIMIT or smooth else _ROUGH_FIT_STEP)
+        if values[group[0]] + step > p.upper:
+            step = -step
+        changed_v = simulate(put(sensor, [names[i] for i in group], values[group] + step))
+        for i in group:
+            axis = names[i].axis
+            axes = [sensor.axes.index(axis)] if axis else range(len(sensor.axes))
+            for d in axes:
+                out[:, d, i] = (changed_v[:, d] - output_v[:, d]) / step
+    return out

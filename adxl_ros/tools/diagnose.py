@@ -20,7 +20,8 @@ import argparse
 import json
 from pathlib import Path
 
-from adxl_ros.diagnose import diagnosis as gap, report_html, report_json
+from adxl_ros.diagnose import report_html, report_json
+from adxl_ros.diagnose.diagnosis import diagnose as diagnose_recordings
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.atomic_write import atomic_path
@@ -57,16 +58,17 @@ def diagnose(options: argparse.Namespace) -> int:
         recordings.append(recording.read(path))
         say_notes('diagnose', recordings[-1])
     with progress('diagnose') as show:
-        found = gap.diagnose(recordings, sensor, sim, options.seed, show)
+        diagnosis = diagnose_recordings(recordings, sensor, sim, options.seed, show)
     folder = Path(options.output)
     make_folder(folder)
-    text = json.dumps(report_json.as_json(found), indent=1, allow_nan=False) + '\n'
+    text = json.dumps(report_json.as_json(diagnosis), indent=1, allow_nan=False) + '\n'
     _write(folder / 'report.json', text)
-    _write(folder / 'report.html', report_html.page(found, ', '.join(
+    _write(folder / 'report.html', report_html.page(diagnosis, ', '.join(
         Path(path).name for path in options.recording)))
-    if found.sensor is not None:
-        parameter_file.save(folder / 'params.yaml', found.sensor, report_json.screenful(found))
-    print(text if options.json else '\n'.join(report_json.screenful(found)))
+    lines = report_json.terminal_lines(diagnosis)
+    if diagnosis.sensor is not None:
+        parameter_file.save(folder / 'params.yaml', diagnosis.sensor, lines)
+    print(text if options.json else '\n'.join(lines))
     return 0
 
 

@@ -18,13 +18,13 @@ from dataclasses import replace
 import json
 
 from adxl_ros.diagnose import report_json
-from adxl_ros.diagnose.baseline_comparison import series_of
+from adxl_ros.diagnose.baseline_comparison import compare
 from adxl_ros.diagnose.decision import Verdict
 from adxl_ros.diagnose.diagnosis import diagnose
-from adxl_ros.diagnose.gap_closure import held_out
-from adxl_ros.diagnose.hypothesis_fit import Hypothesis, refined
-from adxl_ros.diagnose.linear_model import study
-from adxl_ros.diagnose.next_experiment import proposed
+from adxl_ros.diagnose.gap_closure import held_out_residual
+from adxl_ros.diagnose.hypothesis_fit import fit_hypothesis, Hypothesis
+from adxl_ros.diagnose.linear_model import build_linear_model
+from adxl_ros.diagnose.next_experiment import propose_next_experiment
 from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.stream_info import sensor_info
@@ -80,21 +80,21 @@ def made(sensor, effects=(), seed=3, change=None):
 
 def diagnosed(sensor, *effects, change=None):
     """Diagnose such a recording by the library call."""
-    found = diagnose([made(sensor, effects, change=change)], sensor)
-    told = report_json.as_json(found)
-    assert set(told) >= KEYS
-    return told, found
+    diagnosis = diagnose([made(sensor, effects, change=change)], sensor)
+    report = report_json.as_json(diagnosis)
+    assert set(report) >= KEYS
+    return report, diagnosis
 
 
 def test_no_gap():
     """A unit that is what its file says, but for a little drift."""
-    told, _ = diagnosed(unit(), 'bias_walk:density_g_per_rts=2e-5')
-    probability = told['verdict'].pop('probability')
-    assert told['verdict'] == {'status': 'no_gap', 'effects': [], 'groups': [],
+    report, _ = diagnosed(unit(), 'bias_walk:density_g_per_rts=2e-5')
+    probability = report['verdict'].pop('probability')
+    assert report['verdict'] == {'status': 'no_gap', 'effects': [], 'groups': [],
                                'data_fault': None}
     assert 0.5 < probability <= 1
-    assert told['gap']['floor_source'] == 'still'
-    assert told['gap']['before'] == pytest.approx(5.3e-3, rel=0.1)
+    assert report['gap']['floor_source'] == 'still'
+    assert report['gap']['before'] == pytest.approx(5.3e-3, rel=0.1)
 
 
 @pytest.mark.parametrize('option, parameter, value', [
@@ -108,12 +108,12 @@ def test_no_gap():
 def test_one_effect_is_named_and_the_gap_closed(option, parameter, value):
     """Name, parameter, and nearly all of the gap closed."""
     name = option.split(':')[0]
-    told, _ = diagnosed(unit(), option)
-    assert (told['verdict']['status'], told['verdict']['effects']) == ('explained', [name])
-    found = next(c for c in told['candidates'] if c['effect'] == name)
-    assert found['parameters'][parameter]['value'] == pytest.approx(value, rel=0.1)
-    assert told['gap']['closed'] > 0.95
-    assert sum(h['probability'] for h in told['hypotheses']) == pytest.approx(1, abs=1e-9)
+    report, _ = diagnosed(unit(), option)
+    assert (report['verdict']['status'], report['verdict']['effects']) == ('explained', [name])
+    candidate = next(c for c in report['candidates'] if c['effect'] == name)
+    assert candidate['parameters'][parameter]['value'] == pytest.approx(value, rel=0.1)
+    assert report['gap']['closed'] > 0.95
+    assert sum(h['probability'] for h in report['hypotheses']) == pytest.approx(1, abs=1e-9)
 
 
 def test_what_the_library_does_not_hold_is_unknown():
@@ -124,12 +124,12 @@ def test_what_the_library_does_not_hold_is_unknown():
                 4 * columns['beta_rad'] + phase)
         return columns
 
-    told, _ = diagnosed(unit(), change=change)
-    assert told['verdict']['status'] == 'unknown'
-    likeliest = told['hypotheses'][0]
+    report, _ = diagnosed(unit(), change=change)
+    assert report['verdict']['status'] == 'unknown'
+    likeliest = report['hypotheses'][0]
     assert likeliest['effects'] == ['unknown']
-    assert 0.5 < likeliest['probability'] == told['verdict']['probability'] <= 1
-    assert 'beta_rad' in told['unknown_where']
+    assert 0.5 < likeliest['probability'] == report['verdict']['probability'] <= 1
+    assert 'beta_rad' in report['unknown_where']
 
 
 def test_a_file_of_stated_figures_lacks_zero_g_and_scale_factor():
@@ -140,9 +140,9 @@ def test_a_file_of_stated_figures_lacks_zero_g_and_scale_factor():
             columns[f'{axis}_v'] = columns[f'{axis}_v'] + zero_v + scale * g
         return columns
 
-    told, _ = diagnosed(unit(), change=change)
-    assert told['verdict']['effects'] == ['bias', 'scale_factor']
-    assert told['gap']['closed'] > 0.95
+    report, _ = diagnosed(unit(), change=change)
+    assert report['verdict']['effects'] == ['bias', 'scale_factor']
+    assert report['gap']['closed'] > 0.95
 
 
 @pytest.mark.parametrize('amplitude_v, tau_s', [(0.01, 20.0), (0.002, 43.0)])
@@ -153,15 +153,16 @@ def test_a_shape_far_from_the_typical_is_found_and_the_zero_g_fits_it(amplitude_
         columns['z_v'] = columns['z_v'] + amplitude_v * (settled - 0.42)
         return columns
 
-    recorded = made(unit(), change=change)
-    found = diagnose([recorded], unit())
-    told = report_json.as_json(found)
-    assert told['verdict']['effects'] == ['warm_up']
-    assert told['gap']['closed'] > 0.9
-    tau = next(c for c in told['candidates'] if c['effect'] == 'warm_up')['parameters']['tau_s']
+    recording = made(unit(), change=change)
+    diagnosis = diagnose([recording], unit())
+    report = report_json.as_json(diagnosis)
+    assert report['verdict']['effects'] == ['warm_up']
+    assert report['gap']['closed'] > 0.9
+    tau = next(c for c in report['candidates'] if c['effect'] == 'warm_up')['parameters']['tau_s']
     assert tau['ci'][0] < tau_s < tau['ci'][1]
-    one = series_of(recorded, found.sensor)
-    level_mps2 = (one.residual(found.sensor) / one.scale_v_per_mps2).mean(axis=0)
+    comparison = compare(recording, diagnosis.sensor)
+    level_mps2 = (comparison.residual_v(diagnosis.sensor)
+                  / comparison.scale_v_per_mps2).mean(axis=0)
     assert np.abs(level_mps2).max() < 2e-4
 
 
@@ -173,10 +174,10 @@ def test_the_straight_part_of_an_effect_may_be_in_the_scale_factor():
             columns[f'{axis}_v'] = columns[f'{axis}_v'] + 0.02 * (g ** 3 - g)
         return columns
 
-    told, _ = diagnosed(unit(), change=change)
-    assert (told['verdict']['status'], told['verdict']['effects']) == (
+    report, _ = diagnosed(unit(), change=change)
+    assert (report['verdict']['status'], report['verdict']['effects']) == (
         'explained', ['nonlinearity'])
-    assert told['gap']['closed'] > 0.95
+    assert report['gap']['closed'] > 0.95
 
 
 @pytest.mark.parametrize('option, effect', [
@@ -202,17 +203,17 @@ def test_strong_flicker_of_another_colour_is_flicker():
         return named(diagnosed(unit(), change=change)[1])
 
     # A drift of 10 mg looks like a second effect in some recordings, here in the first.
-    found = [drifting(seed) for seed in (8, 9)]
-    assert all('flicker' in effects for effects in found)
-    assert {'flicker'} in found
+    named_effects = [drifting(seed) for seed in (8, 9)]
+    assert all('flicker' in effects for effects in named_effects)
+    assert {'flicker'} in named_effects
 
 
 def test_a_weak_effect_shows_in_long_recordings():
     """A twentieth of the noise, of which a latency within its tolerance takes up most."""
     sensor = unit()
-    found = diagnose([made(sensor, ['clock_skew:ratio=1.4e-6'], seed) for seed in (3, 4, 5, 6)],
-                     sensor)
-    assert (found.verdict.status, named(found)) == ('explained', {'clock_skew'})
+    recordings = [made(sensor, ['clock_skew:ratio=1.4e-6'], seed) for seed in (3, 4, 5, 6)]
+    diagnosis = diagnose(recordings, sensor)
+    assert (diagnosis.verdict.status, named(diagnosis)) == ('explained', {'clock_skew'})
 
 
 def test_what_drifts_more_smoothly_than_any_drift_is_unknown():
@@ -226,9 +227,9 @@ def test_what_drifts_more_smoothly_than_any_drift_is_unknown():
             columns[f'{axis}_v'] = columns[f'{axis}_v'] + 4e-3 * wander / wander.std()
         return columns
 
-    told, _ = diagnosed(unit(), change=change)
-    assert told['verdict']['status'] == 'unknown'
-    assert 'time_s' in told['unknown_where']
+    report, _ = diagnosed(unit(), change=change)
+    assert report['verdict']['status'] == 'unknown'
+    assert 'time_s' in report['unknown_where']
 
 
 def test_a_soft_clip_is_saturation():
@@ -240,8 +241,9 @@ def test_a_soft_clip_is_saturation():
         return columns | {'y_v': sensor.zero_g_v[1] + np.where(
             np.abs(g) < 0.9, g, np.sign(g) * (0.9 + 0.1 * np.tanh((np.abs(g) - 0.9) / 0.1)))}
 
-    told, _ = diagnosed(sensor, change=change)
-    assert (told['verdict']['status'], told['verdict']['effects']) == ('explained', ['saturation'])
+    report, _ = diagnosed(sensor, change=change)
+    assert report['verdict']['status'] == 'explained'
+    assert report['verdict']['effects'] == ['saturation']
 
 
 def test_a_limit_that_one_stretch_alone_reaches_is_not_guessed_from_the_others():
@@ -256,16 +258,17 @@ def test_a_limit_that_one_stretch_alone_reaches_is_not_guessed_from_the_others()
     g = (columns['y_v'] - sensor.zero_g_v[1]) / sensor.scale_v_per_g[1]
     beyond = [knee_g * np.logaddexp(0.0, (sign * g - limit_g) / knee_g) for sign in (1, -1)]
     columns['y_v'] -= sensor.scale_v_per_g[1] * (beyond[0] - beyond[1])
-    one = series_of(Recording('made', columns.pop('time_s'), columns, sensor_info(sensor)), sensor)
-    used = [np.ones(len(one), bool)]
-    of = study([one], used, lambda done: None, only=['saturation'])
+    comparison = compare(Recording('made', columns.pop('time_s'), columns, sensor_info(sensor)),
+                         sensor)
+    linear_model = build_linear_model([comparison], only=['saturation'])
     start = {Coefficient('saturation', 'limit_g', 'y'): limit_g - 1.0,
              Coefficient('saturation', 'knee_g'): knee_g}
-    found = refined(of, ['saturation'], start, {})
-    without, held = (held_out(of, [one], used, effects, there).squares for effects, there in (
-        ([], sensor), (found.effects, found.sensor)))
+    hypothesis = fit_hypothesis(linear_model, ['saturation'], start, {})
+    without = held_out_residual(linear_model, [comparison], [], sensor).squares
+    held_out = held_out_residual(linear_model, [comparison], hypothesis.effects,
+                                 hypothesis.sensor).squares
     assert without.max() > 3 * np.median(without)
-    assert held.max() < 1.3 * np.median(held)
+    assert held_out.max() < 1.3 * np.median(held_out)
 
 
 def test_what_shows_only_while_it_turns_is_no_drift():
@@ -282,8 +285,8 @@ def test_stretches_without_numbers_are_left_out():
         late = (columns['time_s'] > 20) & (columns['time_s'] < 35)
         return columns | {'y_v': np.where(late, np.nan, columns['y_v'])}
 
-    told, _ = diagnosed(unit(), 'misalignment:alpha_rad=0.003,beta_rad=-0.002', change=change)
-    assert told['verdict']['effects'] == ['misalignment']
+    report, _ = diagnosed(unit(), 'misalignment:alpha_rad=0.003,beta_rad=-0.002', change=change)
+    assert report['verdict']['effects'] == ['misalignment']
 
 
 @pytest.mark.parametrize('option, effect', [
@@ -309,29 +312,29 @@ def test_noise_like_effects_are_named(option, effect):
     (lambda c: c | {'x_v': np.clip(c['x_v'], 2.4, 2.6)}, 'saturated')])
 def test_faults_of_the_recording_are_called_what_they_are(change, fault):
     """Never a confident wrong effect: the fault is named and nothing else is."""
-    told, found = diagnosed(unit(), change=change)
-    assert (told['verdict']['status'], told['verdict']['data_fault']) == ('bad_data', fault)
-    assert told['verdict']['effects'] == [] and found.sensor is None
+    report, diagnosis = diagnosed(unit(), change=change)
+    assert (report['verdict']['status'], report['verdict']['data_fault']) == ('bad_data', fault)
+    assert report['verdict']['effects'] == [] and diagnosis.sensor is None
 
 
 def test_too_short_is_insufficient():
     """Ten seconds say nothing."""
-    told, _ = diagnosed(unit(), change=lambda c: {k: v[:1250] for k, v in c.items()})
-    assert told['verdict']['status'] == 'insufficient'
-    assert 'too short' in told['summary']
+    report, _ = diagnosed(unit(), change=lambda c: {k: v[:1250] for k, v in c.items()})
+    assert report['verdict']['status'] == 'insufficient'
+    assert 'too short' in report['summary']
 
 
 def test_the_command_leaves_report_page_and_parameters(run_tool, tmp_path):
     """Twice the same to the byte; with the parameters that it writes there is no gap left."""
     sensor = unit('xy')
-    read = made(sensor, ['temperature_bias:per_k=4e-4'])
-    recording.write(tmp_path / 'run.csv', read, sensor)
+    recorded_run = made(sensor, ['temperature_bias:per_k=4e-4'])
+    recording.write(tmp_path / 'run.csv', recorded_run, sensor)
     parameter_file.save(tmp_path / 'unit.yaml', sensor)
     files = []
     for name in ('a', 'b'):
-        done = run_tool('diagnose', 'run.csv', '--params', 'unit.yaml', '-o', name)
-        assert (done.returncode, done.stderr) == (0, '')
-        assert done.stdout.startswith('temperature_bias (probability')
+        run = run_tool('diagnose', 'run.csv', '--params', 'unit.yaml', '-o', name)
+        assert (run.returncode, run.stderr) == (0, '')
+        assert run.stdout.startswith('temperature_bias (probability')
         files.append([(tmp_path / name / f).read_bytes()
                       for f in ('report.json', 'report.html', 'params.yaml')])
     assert files[0] == files[1]
@@ -348,10 +351,10 @@ def test_several_recordings_and_bags(run_tool, tmp_path):
     for name, seed in (('a.csv', 3), ('b.mcap', 4)):
         recording.write(tmp_path / name, made(sensor, ['time_offset:offset_s=0.004'], seed),
                         sensor)
-    done = run_tool('diagnose', 'a.csv', 'b.mcap', '--params', 'unit.yaml', '-o', 'out', '--json')
-    told = json.loads(done.stdout)
-    assert told['verdict']['effects'] == ['time_offset']
-    assert [one['recording'] for one in told['gap']['noise']] == ['a.csv', 'b.mcap']
+    run = run_tool('diagnose', 'a.csv', 'b.mcap', '--params', 'unit.yaml', '-o', 'out', '--json')
+    report = json.loads(run.stdout)
+    assert report['verdict']['effects'] == ['time_offset']
+    assert [noise['recording'] for noise in report['gap']['noise']] == ['a.csv', 'b.mcap']
 
 
 def turning(alphas, speeds, rests_s=2.0):
@@ -367,16 +370,16 @@ def turning(alphas, speeds, rests_s=2.0):
     return script
 
 
-def recorded(sensor, motion, effects=(), seed=3):
+def record(sensor, motion, effects=(), seed=3):
     """Simulate a recording of a manoeuvre."""
     columns = simulate(with_effects(sensor, list(effects)), motion, seed)
     time_s = columns.pop('time_s')
     return Recording('made', time_s, columns, sensor_info(sensor))
 
 
-def named(found):
+def named(diagnosis):
     """Return all that a verdict names, for certain or in a group."""
-    verdict = report_json.as_json(found)['verdict']
+    verdict = report_json.as_json(diagnosis)['verdict']
     return {*verdict['effects'], *(e for group in verdict['groups'] for e in group)}
 
 
@@ -386,21 +389,21 @@ def test_a_poor_manoeuvre_widens_the_answer_and_makes_none_wrong(effect):
     sensor = unit('xy')
     script = turning([np.pi / 2], [0.7] * 3, 4.0)
     alpha, beta = script.joints()
-    found = diagnose([recorded(sensor, Motion(script.now, alpha, beta),
+    diagnosis = diagnose([record(sensor, Motion(script.now, alpha, beta),
                                [effect] if effect else [])], sensor)
     if effect is None:
-        assert found.verdict.status == 'no_gap'
+        assert diagnosis.verdict.status == 'no_gap'
     else:
-        assert effect.split(':')[0] in named(found)
+        assert effect.split(':')[0] in named(diagnosis)
 
 
 def test_what_does_not_move_is_not_called_free_of_a_gap():
     """A minute at rest: no verdict, and what was not covered."""
     sensor = unit('xy')
-    found = diagnose([recorded(sensor, Motion(60.0, Held(1.0), Held(0.5)))], sensor)
-    told = report_json.as_json(found)
-    assert told['verdict']['status'] == 'insufficient'
-    assert 'motion' in told['not_covered'] and told['next_experiment']
+    diagnosis = diagnose([record(sensor, Motion(60.0, Held(1.0), Held(0.5)))], sensor)
+    report = report_json.as_json(diagnosis)
+    assert report['verdict']['status'] == 'insufficient'
+    assert 'motion' in report['not_covered'] and report['next_experiment']
 
 
 def test_repeats_tell_the_floor_where_nothing_rests():
@@ -410,17 +413,17 @@ def test_repeats_tell_the_floor_where_nothing_rests():
     alpha, beta = (Knots(time_s, 1.0 + 0.4 * np.sin(rate * time_s), 0.4 * rate * np.cos(
         rate * time_s)) for rate in (0.31, 0.53))
     motion = Motion(65.0, alpha, beta)
-    found = diagnose([recorded(sensor, motion, seed=seed) for seed in (1, 2)], sensor)
-    told = report_json.as_json(found)
-    assert told['gap']['floor_source'] == 'repeats'
+    diagnosis = diagnose([record(sensor, motion, seed=seed) for seed in (1, 2)], sensor)
+    report = report_json.as_json(diagnosis)
+    assert report['gap']['floor_source'] == 'repeats'
     # 110 ug/rtHz behind 15 Hz and 16 bit at 5 V.
-    assert told['gap']['floor'] == pytest.approx(5.3e-3, rel=0.1)
+    assert report['gap']['floor'] == pytest.approx(5.3e-3, rel=0.1)
 
 
 def test_noise_is_compared_where_the_mean_is_blind():
     """Twice the noise: four times the power, until the simulator has it, too."""
-    told, _ = diagnosed(unit(), 'noise_excess:ratio=1.0')
-    noise = told['gap']['noise'][0]
+    report, _ = diagnosed(unit(), 'noise_excess:ratio=1.0')
+    noise = report['gap']['noise'][0]
     assert noise['power_ratio_before'][-1] == pytest.approx(4.0, rel=0.1)
     assert noise['power_ratio_after'][-1] == pytest.approx(1.0, rel=0.1)
     assert noise['log_likelihood_gain'] > 100
@@ -430,27 +433,28 @@ def test_the_next_manoeuvre_is_the_one_that_tells_most():
     """Temperature or warm-up: heating tells, a shaker does not; both are simulated."""
     sensor = with_effects(unit('xy'), ['temperature_bias:per_k=3e-4'])
     best = Hypothesis(('temperature_bias',), sensor, (), np.zeros(0), np.zeros(0), 0.0, None)
-    answer = Verdict('inseparable', (), (('temperature_bias', 'warm_up'),), 0.9, (), best)
-    asked = proposed(answer, [], 0)
-    worth = {words: rate for words, _, rate in asked.menu}
-    assert asked.nats_per_minute == max(worth.values()) == worth[asked.manoeuvre]
-    assert worth['dwell, heat and cool'] > 0.5 * asked.nats_per_minute > 5
-    assert worth['shake along x from 2 to 40 Hz'] < 0.1 * asked.nats_per_minute
+    verdict = Verdict('inseparable', (), (('temperature_bias', 'warm_up'),), 0.9, (), best)
+    proposal = propose_next_experiment(verdict, [], 0)
+    worth = {m.text: m.log_bayes_factor_per_minute for m in proposal.menu}
+    best_worth = proposal.log_bayes_factor_per_minute
+    assert best_worth == max(worth.values()) == worth[proposal.manoeuvre]
+    assert worth['dwell, heat and cool'] > 0.5 * best_worth > 5
+    assert worth['shake along x from 2 to 40 Hz'] < 0.1 * best_worth
 
 
 def test_temperature_is_named_in_a_climatic_chamber(run_tool, tmp_path, shared_dir):
     """A real recording at rest, and the slopes of its README: +0.16, -0.15, -0.43 mg/degC."""
-    done = run_tool('diagnose', shared_dir / 'real' / 'thermal_chamber.csv', '-o', tmp_path,
+    run = run_tool('diagnose', shared_dir / 'real' / 'thermal_chamber.csv', '-o', tmp_path,
                     '--json')
-    told = json.loads(done.stdout)
-    assert 'temperature_bias' in told['verdict']['effects']
-    found = next(c for c in told['candidates'] if c['effect'] == 'temperature_bias')
+    report = json.loads(run.stdout)
+    assert 'temperature_bias' in report['verdict']['effects']
+    candidate = next(c for c in report['candidates'] if c['effect'] == 'temperature_bias')
     # The README's are those of straight lines, through what is a parabola about 25 degC.
     warm_k = recording.read(shared_dir / 'real' / 'thermal_chamber.csv').columns[
         'temperature_c'] - 25
     slopes = []
     for axis in 'xyz':
-        per_k, per_k2 = (found['parameters'][f'{name}.{axis}']['value']
+        per_k, per_k2 = (candidate['parameters'][f'{name}.{axis}']['value']
                          for name in ('per_k', 'per_k2'))
         slopes.append(np.polyfit(warm_k, per_k * warm_k + per_k2 * warm_k ** 2, 1)[0])
     assert slopes == pytest.approx([1.6e-4, -1.5e-4, -4.3e-4], rel=0.1)
@@ -458,17 +462,17 @@ def test_temperature_is_named_in_a_climatic_chamber(run_tool, tmp_path, shared_d
 
 def test_another_simulator_takes_the_place_of_the_stage(run_tool, tmp_path, shared_dir):
     """Optical tracking is no simulator of an IMU: a gap, and no effect is claimed for it."""
-    done = run_tool('diagnose', shared_dir / 'real' / 'broad_02_real.csv', '--sim',
+    run = run_tool('diagnose', shared_dir / 'real' / 'broad_02_real.csv', '--sim',
                     shared_dir / 'real' / 'broad_02_sim.csv', '-o', tmp_path, '--json')
-    told = json.loads(done.stdout)
-    assert (told['verdict']['status'], told['verdict']['effects']) == ('unknown', [])
-    assert any(c['dimension'] == 'frequency_hz' for c in told['where'])
+    report = json.loads(run.stdout)
+    assert (report['verdict']['status'], report['verdict']['effects']) == ('unknown', [])
+    assert any(c['dimension'] == 'frequency_hz' for c in report['where'])
 
 
 def test_a_sensor_that_moves_without_a_reference_gets_no_verdict(run_tool, tmp_path, shared_dir):
     """Turned by hand: one line says what is missing."""
-    done = run_tool('diagnose', shared_dir / 'real' / 'mpu9150_0.csv', '-o', tmp_path, '--json')
-    verdict = json.loads(done.stdout)['verdict']
+    run = run_tool('diagnose', shared_dir / 'real' / 'mpu9150_0.csv', '-o', tmp_path, '--json')
+    verdict = json.loads(run.stdout)['verdict']
     assert (verdict['status'], verdict['data_fault']) == ('bad_data', 'reference')
 
 
@@ -477,8 +481,8 @@ def test_samples_of_another_generator(run_tool, tmp_path, shared_dir, name):
     """The three samples come out right from `fit --model linear` and `diagnose`."""
     folder = shared_dir / 'samples' / name
     run_tool('fit', folder / 'cal.csv', '--model', 'linear', '-o', tmp_path / 'unit.yaml')
-    done = run_tool('diagnose', folder / 'run.csv', '--params', tmp_path / 'unit.yaml', '-o',
+    run = run_tool('diagnose', folder / 'run.csv', '--params', tmp_path / 'unit.yaml', '-o',
                     tmp_path / 'out', '--json')
-    verdict = json.loads(done.stdout)['verdict']
+    verdict = json.loads(run.stdout)['verdict']
     assert verdict['effects'] == ([] if name == 'no_gap' else [name])
     assert verdict['status'] == ('no_gap' if name == 'no_gap' else 'explained')

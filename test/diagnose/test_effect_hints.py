@@ -1,0 +1,61 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What the diagnosis needs to know about an effect stands in the effect's own file."""
+
+import ast
+from collections import Counter
+from pathlib import Path
+
+from adxl_ros import diagnose
+from adxl_ros.diagnose.next_experiment import MENU
+from adxl_ros.model.diagnosis_hints import Detector, DriftSpectrum, Manoeuvre, StraightLine
+from adxl_ros.model.effects import library
+import pytest
+
+MODULES = sorted(Path(diagnose.__file__).parent.glob('*.py'))
+
+
+@pytest.mark.parametrize('module', MODULES, ids=lambda path: path.stem)
+def test_diagnosis_names_no_effect(module):
+    """A new effect needs no change of the diagnosis, because no table names effects."""
+    tree = ast.parse(module.read_text(encoding='utf-8'))
+    texts = {node.value for node in ast.walk(tree)
+             if isinstance(node, ast.Constant) and isinstance(node.value, str)}
+    assert not texts & set(library())
+
+
+def test_each_detector_drift_and_straight_line_has_one_effect():
+    """The diagnosis finds the effect of a detector, so that there must be exactly one."""
+    hints = [effect.diagnosis for effect in library().values()]
+    declared = Counter(value for hint in hints
+                       for value in (hint.detector, hint.drift, hint.straight_line) if value)
+    assert declared == Counter([*Detector, *DriftSpectrum, *StraightLine])
+
+
+def test_effects_of_detectors_have_the_parameters_that_are_estimated():
+    """A detection becomes the values of its effect in the parameter file."""
+    estimated = {Detector.REPEATED_SAMPLES: {'rate_hz', 'duration_s'},
+                 Detector.ISOLATED_SAMPLES: {'rate_hz', 'amplitude_v'},
+                 Detector.COARSE_CODES: {'lost_bits'},
+                 Detector.MAINS_LINE: {'amplitude_v', 'frequency_hz', 'phase_rad'},
+                 Detector.NOISE_LEVEL: {'ratio'}}
+    for effect in library().values():
+        if effect.diagnosis.detector:
+            assert {p.name for p in effect.parameters} == estimated[effect.diagnosis.detector]
+
+
+def test_menu_holds_every_manoeuvre():
+    """An effect may name any manoeuvre."""
+    assert set(MENU) == set(Manoeuvre)
