@@ -307,13 +307,13 @@ def _unknown(findings: Findings) -> tuple[float, tuple[str, ...]]:
 
 def _discrepancy_is_unknown(findings: Findings) -> bool:
     """Determine whether the flexible term shows more than an error of the form of an effect."""
-    best, found = findings.hypotheses[0], findings.discrepancy
-    large = found.rms_mps2 > max(UNKNOWN_SHARE_OF_NOISE * findings.noise_mps2,
+    best, term = findings.hypotheses[0], findings.discrepancy
+    large = term.rms_mps2 > max(UNKNOWN_SHARE_OF_NOISE * findings.noise_mps2,
                                  UNKNOWN_SHARE_OF_EXPLAINED * findings.explained_mps2,
                                  findings.code_step_mps2)
     form_error = bool(best.effects) and not drifts_among(best.effects) and \
         findings.unexplained_mps2 <= FORM_SHARE_OF_EXPLAINED * findings.explained_mps2
-    return found.log_bayes_factor > UNKNOWN_LOG_BAYES_FACTOR and large and not form_error
+    return term.log_bayes_factor > UNKNOWN_LOG_BAYES_FACTOR and large and not form_error
 
 
 def _dimensions(discrepancy: Discrepancy) -> list[str]:

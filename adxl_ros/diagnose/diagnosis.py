@@ -178,7 +178,7 @@ def _decided(checked: Sequence[CheckedRecording], linear_model: LinearModel, flo
                                     floor.rms_mps2, seed)
     best = confirmed[0]
     show_progress(0.8)
-    beside = discrepancy(linear_model, best)
+    beside_best = discrepancy(linear_model, best)
     instead = discrepancy_instead_of_drift(linear_model, confirmed)
     detections = _detections(checked, best)
     named_sensor = _with_detections(best, detections, sensor)
@@ -189,7 +189,7 @@ def _decided(checked: Sequence[CheckedRecording], linear_model: LinearModel, flo
     walk = walk_log_bayes_factor(list(residual_channels(linear_model, best))) \
         if drifts_among(best.effects) else 0.0
     verdict = decision.decide(Findings(
-        confirmed, library_size, beside, instead, walk, detections, noise_mps2,
+        confirmed, library_size, beside_best, instead, walk, detections, noise_mps2,
         float(np.sqrt(max(closure.before_mps2 ** 2 - closure.fitted_rms_mps2 ** 2, 0.0))),
         gap_closure.unexplained_mps2(linear_model, best, closure, simulated_noise_mps2),
         max(float(c.sensor.lsb_v / np.min(c.scale_v_per_mps2)) / 12 ** 0.5

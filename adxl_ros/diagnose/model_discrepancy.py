@@ -117,12 +117,12 @@ def discrepancy(linear_model: LinearModel, hypothesis: Hypothesis) -> Discrepanc
 
     """
     bases = [flexible_basis(c) for c in linear_model.comparisons]
-    found = _fitted(linear_model, hypothesis, bases)
+    term = _fitted(linear_model, hypothesis, bases)
     if not drifts_among(hypothesis.effects) \
-            or found.log_bayes_factor < UNKNOWN_LOG_BAYES_FACTOR:
-        return found
+            or term.log_bayes_factor < UNKNOWN_LOG_BAYES_FACTOR:
+        return term
     shifted = _fitted(linear_model, hypothesis, [_shifted(basis) for basis in bases])
-    return replace(found, log_bayes_factor=found.log_bayes_factor - _SHIFTED_GAIN_FACTOR
+    return replace(term, log_bayes_factor=term.log_bayes_factor - _SHIFTED_GAIN_FACTOR
                    * max(shifted.log_bayes_factor, 0.0))
 
 
@@ -151,11 +151,11 @@ def _fitted(linear_model: LinearModel, hypothesis: Hypothesis, bases: Sequence[B
     without = fit(own_ids)
     gains, amplitude_cost = {}, float(np.log(len(evidence.AMPLITUDES)))
     for dimension, ids in ids_by_dimension.items():
-        found = fit([*own_ids, *ids], without)
-        places = np.searchsorted(found.column_ids, ids)
+        with_term = fit([*own_ids, *ids], without)
+        places = np.searchsorted(with_term.column_ids, ids)
         by_amplitude = evidence.log_bayes_factor_by_amplitude(
-            found.values[places], found.covariance[np.ix_(places, places)], prior_std[ids])
-        gains[dimension] = found.log_evidence + float(by_amplitude.max()) \
+            with_term.values[places], with_term.covariance[np.ix_(places, places)], prior_std[ids])
+        gains[dimension] = with_term.log_evidence + float(by_amplitude.max()) \
             - without.log_evidence - amplitude_cost
         prior_std[ids] *= evidence.AMPLITUDES[np.argmax(by_amplitude)]
     kept = [dimension for dimension, gain in gains.items() if gain > 0]
@@ -210,9 +210,9 @@ def discrepancy_instead_of_drift(linear_model: LinearModel, hypotheses: Sequence
     if not drifts_among(best.effects):
         return None
     without_drift = next(h for h in hypotheses if not drifts_among(h.effects))
-    found = discrepancy(linear_model, without_drift)
-    gain = without_drift.log_evidence + found.log_bayes_factor - best.log_evidence
-    return replace(found, log_bayes_factor=gain) if gain > 0 else None
+    term = discrepancy(linear_model, without_drift)
+    gain = without_drift.log_evidence + term.log_bayes_factor - best.log_evidence
+    return replace(term, log_bayes_factor=gain) if gain > 0 else None
 
 
 def _rms_mps2(linear_model: LinearModel, bases: Sequence[Basis], values: np.ndarray) -> float:

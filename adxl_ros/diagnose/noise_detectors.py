@@ -359,8 +359,8 @@ def residual_detections(samples: NoiseSamples, sensor: Sensor) -> list[Detection
     # The first differences take out a zero-g that drifts.
     white = np.diff(_before_filter(samples.residual_v, sensor), axis=0)
     at_rest = samples.at_rest[2:]
-    found = [_line(white, at_rest, samples, sensor), _excess(white, at_rest, samples, sensor)]
-    return [detection for detection in found if detection is not None]
+    detections = [_line(white, at_rest, samples, sensor), _excess(white, at_rest, samples, sensor)]
+    return [detection for detection in detections if detection is not None]
 
 
 def _before_filter(volts: np.ndarray, sensor: Sensor) -> np.ndarray:

@@ -181,7 +181,20 @@ def find_repeat(first: np.ndarray, second: np.ndarray, rate_hz: float, resolutio
 
 
 def directions(alpha_rad: np.ndarray, beta_rad: np.ndarray) -> np.ndarray:
-    """Return the direction of gravity in the sensor's frame, unit vectors, (3, n)."""
+    """
+    Return the direction of gravity in the sensor's frame.
+
+    Parameters
+    ----------
+    alpha_rad, beta_rad
+        Angles of the stage, rad, (n,).
+
+    Returns
+    -------
+    numpy.ndarray
+        Unit vectors, (3, n).
+
+    """
     return np.array(specific_force(alpha_rad, beta_rad, 1.0))
 
 

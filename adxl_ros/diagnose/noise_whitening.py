@@ -251,7 +251,22 @@ def expected_drift_g(spectrum: DriftSpectrum, density: float, span_s: float, rat
 
 
 def neighbouring_filters(filters: Sequence[Whitener], best: int) -> list[Whitener]:
-    """Return the best filter and its neighbours, enough where the noise is already known."""
+    """
+    Return the best filter and its neighbours, which are enough where the noise is known.
+
+    Parameters
+    ----------
+    filters
+        All filters of a channel.
+    best
+        Number of the best one.
+
+    Returns
+    -------
+    list of Whitener
+        Filters of the same drift.
+
+    """
     return [f for i, f in enumerate(filters)
             if abs(i - best) <= 1 and f.effect == filters[best].effect]
 
