@@ -44,23 +44,29 @@ of tilt."""
 _CORRELATED = 0.9
 """Correlation from which two signals are the same one. Chosen: noise of 0.4 times the signal."""
 _UNCORRELATED = 0.5
-"""Correlation below which the output does not follow the reference. Chosen."""
+"""Correlation below which the output does not follow the reference. Chosen: noise of 1.7
+times the signal."""
 _LARGEST_MISSING_SHARE = 0.3
-"""Share of samples that may be missing, or at the end of the range. Chosen."""
+"""Share of samples that may be missing, or at the end of the range. Chosen: the rest still
+shows the effects."""
 _SEARCHED_DELAY_S = 1.0
 """Largest delay that the effect of a time offset models, s: its upper bound."""
 _LARGEST_DELAY_S = 30.0
 """Largest delay that is looked for, s. Chosen: a recording started by hand."""
 _CORRELATION_GAIN = 0.05
-"""Correlation that a delay must gain to be a fault. Chosen."""
+"""Correlation that a delay must gain to be a fault. Chosen: above its error by noise."""
 _JUMP_STEPS = 20.0
-"""A step of the stamps of this many usual steps is a jump. Chosen."""
+"""A step of the stamps of this many usual steps is a jump. Chosen: lost samples make
+shorter gaps."""
 _LARGEST_JUMP_SHARE = 0.2
-"""Share of the recording that jumps of the stamps may have. Chosen."""
+"""Share of the recording that jumps of the stamps may have. Chosen: gaps of a lossy
+link are no fault of the clock."""
 _RAIL_SHARE = 0.05
-"""Share of the samples at one extreme value from which it is the end of the range. Chosen."""
+"""Share of the samples at one extreme value from which it is the end of the range.
+Chosen: a sensor at rest has an extreme value seldom."""
 _SMALLEST_RANGE_V = 0.05
-"""Range of the output, V, below which an extreme value is not the end of the range. Chosen."""
+"""Range of the output, V, below which an extreme value is not the end of the range.
+Chosen: 50 mg, a sensor that hardly moves."""
 _UNIT_TOLERANCE = 0.1
 """Relative deviation of a gain from the ratio of two units. Chosen: above any scale error."""
 _UNIT_RATIOS = {

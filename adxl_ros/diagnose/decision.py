@@ -57,7 +57,8 @@ BESIDE_DRIFT_LOG_BAYES_FACTOR = 25.0
 """Smallest log Bayes factor of an effect beside a drift: no drift has exactly the model's spectrum
 at its slowest."""
 RIVAL_RATIO = 0.05
-"""Smallest probability of an inseparable rival, by that of the best hypothesis. Chosen."""
+"""Smallest probability of an inseparable rival, by that of the best hypothesis. Chosen:
+odds of 20 to 1."""
 CERTAIN = 0.5
 """Probability of unknown above which the verdict is unknown. Chosen: more likely than not."""
 UNKNOWN_SHARE_OF_EXPLAINED = 0.3

@@ -51,9 +51,11 @@ from adxl_ros.simulate.motion import Motion
 import numpy as np
 
 _SMALLEST_WARMING_C = 1.0
-"""Range of the temperature, °C, below which nothing warms. Chosen."""
+"""Range of the temperature, °C, below which nothing warms. Chosen: 0.1 mg of a typical
+sensor."""
 _SMALLEST_SUPPLY_CHANGE_V = 0.02
-"""Range of the supply, V, below which it does not change. Chosen."""
+"""Range of the supply, V, below which it does not change. Chosen: twice the ripple of a
+regulator."""
 
 
 @dataclass(frozen=True)

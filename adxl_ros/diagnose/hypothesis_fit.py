@@ -45,11 +45,12 @@ _ROUGH_EVALUATIONS = 5
 """The same of other hypotheses. Chosen: their derivatives are those of wide steps, and more steps
 do not improve them."""
 _HALVINGS = 2
-"""How often a step that lowers the log evidence is halved. Chosen."""
+"""How often a step that lowers the log evidence is halved. Chosen: a quarter of a step is
+enough for the library."""
 _EVIDENCE_TOLERANCE = 1e-3
 """A step may lower the log evidence by this. Chosen: far below one unit."""
 _SMALLEST_STEP = 1e-3
-"""Smallest step, in prior standard deviations. Chosen."""
+"""Smallest step, in prior standard deviations. Chosen: far below any interval."""
 _SMALLEST_GAIN = 0.05
 """Gain of log evidence below which the fit has converged. Chosen: far below one unit."""
 _SMALLEST_GAIN_SHARE = 1e-4
@@ -59,7 +60,8 @@ _FORM_ERROR = 0.03
 clocks have exactly. Tuned by hand on simulated recordings of the working seeds of the blind
 check."""
 _UNDETERMINED_PRIOR_SHARE = 0.5
-"""A posterior standard deviation above this share of the prior's is not determined. Chosen."""
+"""A posterior standard deviation above this share of the prior's is not determined.
+Chosen: the samples then say less than the prior."""
 _UNDETERMINED_RATIO = 3.0
 """Some blocks do not determine a coefficient if their standard deviation exceeds that of all
 blocks by this factor. Chosen: a quarter of the blocks is held out."""

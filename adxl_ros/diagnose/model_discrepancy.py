@@ -44,7 +44,7 @@ _CREEP_S = (2.0, 10.0, 50.0)
 _RELAXATION_S = (1, 4, 16)
 """Time constants of relaxation after a move, s. Chosen: a factor of four apart."""
 _SPLINES = 12
-"""Splines over an angle or a component of the force. Chosen: 30° or less each."""
+"""Splines over an angle or a component of the force. Chosen: a tenth of the range each."""
 _SURROUNDING_SPLINES = 5
 """Splines over temperature or supply. Chosen: smooth laws."""
 _HARMONICS = 8

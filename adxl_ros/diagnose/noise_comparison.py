@@ -28,7 +28,7 @@ import numpy as np
 from scipy.signal import periodogram, welch
 
 _BANDS = 5
-"""Number of bands of frequency. Chosen: two decades and a half."""
+"""Number of bands of frequency. Chosen: some half a decade each."""
 _LOWEST_EDGE_HZ = 0.05
 """Upper edge of the lowest band is at least this, Hz. Chosen: 20 s."""
 _TIMES_S = (0.1, 1.0, 10.0)

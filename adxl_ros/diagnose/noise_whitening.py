@@ -51,7 +51,8 @@ _LOWEST_NOISE_V = 1e-7
 _TOP_OF_RATE = 0.25
 """Highest frequency of the corner of 1/f noise, by the sample rate. Chosen: half of Nyquist."""
 _UNFILTERED_TOP_OF_RATE = 0.4
-"""Highest pole of 1/f noise that bypasses the RC filter, by the sample rate. Chosen."""
+"""Highest pole of 1/f noise that bypasses the RC filter, by the sample rate. Chosen: below
+Nyquist."""
 
 
 def drift_effects() -> tuple[str, ...]:

@@ -44,9 +44,9 @@ _PLOTTED_SAMPLES = 20_000
 _SPECTRUM_SAMPLES = 2048
 """Samples in a segment of a spectrum. Chosen: 0.06 Hz at 125 Hz."""
 _TABLE_ROWS = 10
-"""Rows of the tables of hypotheses and candidates. Chosen."""
+"""Rows of the tables of hypotheses and candidates. Chosen: others are improbable."""
 _CELL_ROWS = 12
-"""Rows of the table of cells. Chosen."""
+"""Rows of the table of cells. Chosen: the map above it shows all."""
 
 
 def page(diagnosis: Diagnosis, title: str) -> str:

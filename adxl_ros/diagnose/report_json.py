@@ -33,13 +33,13 @@ import numpy as np
 _DIGITS = 6
 """Significant digits of the report. Chosen: more than any of its numbers has."""
 _MOST_CELLS = 40
-"""Largest number of cells in the report. Chosen."""
+"""Largest number of cells in the report. Chosen: cells of small share say little."""
 _SCREEN_ROWS = 6
 """Rows of each table on the terminal. Chosen: all of it fits on one screen."""
 _SCREEN_CANDIDATES = 3
-"""Candidates on the terminal. Chosen."""
+"""Candidates on the terminal. Chosen: a verdict names three effects at most."""
 _SCREEN_PROBABILITY = 0.05
-"""Smallest probability of a candidate on the terminal. Chosen."""
+"""Smallest probability of a candidate on the terminal. Chosen: that of a rival."""
 
 
 def as_json(diagnosis: Diagnosis) -> dict[str, Any]:

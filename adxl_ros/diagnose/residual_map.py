@@ -44,17 +44,19 @@ _DRAWS = 500
 _BLOCK_S = 2.0
 """Length of the blocks that change sign together, s. Chosen: beyond the correlation of noise."""
 _FEWEST_BLOCKS = 3
-"""Fewest blocks of a cell that is tested. Chosen."""
+"""Fewest blocks of a cell that is tested. Chosen: signs of fewer have four patterns."""
 SIGNIFICANT_P = 0.05
 """Family-wise probability below which a cell is reported. Chosen: the usual level."""
 _BANDS_HZ = (0.0, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 500.0)
 """Edges of the bands of frequency, Hz. Chosen: half a decade each."""
 _SMALLEST_RANGE = 1e-3
-"""Range of a dimension, in its unit, below which it is constant. Chosen."""
+"""Range of a dimension, in its unit, below which it is constant. Chosen: steps of an
+encoder."""
 _SMALLEST_WARMING_C = 1.0
-"""Range of the temperature below which other temperatures are missing, °C. Chosen."""
+"""Range of the temperature below which other temperatures are missing, °C. Chosen: 0.1 mg
+of a typical sensor."""
 _LONGEST_SINCE_MOVE_S = 60.0
-"""Longest time since the last move that is mapped, s. Chosen."""
+"""Longest time since the last move that is mapped, s. Chosen: creep has ended."""
 _COVERAGE = {
     'alpha_rad': 'planes of another alpha',
     'beta_rad': 'turns of beta',

@@ -39,8 +39,8 @@ _ROUGH_STEPS = (1.0, 4.0, 16.0)
 """Steps of a parameter that is not smooth, by its typical size. Chosen: the derivative at a play
 of 1 mrad says little about one of 15 mrad."""
 _CLIPPED_SHARES = (0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.3)
-"""Shares of the samples that a limit clips where it is tried. Chosen: half an octave to one
-octave apart."""
+"""Shares of the samples that a limit clips where it is tried. Chosen: factors of 1.5
+to 2.5."""
 _FIT_STEP = 0.02
 """Step of a smooth parameter at its fitted value, by its typical size. Chosen: a derivative."""
 _ROUGH_FIT_STEP = 0.3
