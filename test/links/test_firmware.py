@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The encoder of the firmware, compiled on the host: its frames are those of the reference."""
+"""The encoder of the firmware, compiled on the host, against the reference encoder."""
 
 import ctypes
 import shutil
@@ -27,11 +27,14 @@ SOURCE = REPO / 'firmware' / 'adxl_board' / 'frame.c'
 
 
 class Counts(ctypes.Structure):
+    """`struct frame_counts` of frame.h."""
+
     _fields_ = [('block_seq', ctypes.c_uint32), ('flags', ctypes.c_uint16)]
 
 
 @pytest.fixture(scope='module')
 def library(tmp_path_factory):
+    """Compile frame.c and load it."""
     compiler = shutil.which('cc') or shutil.which('gcc') or shutil.which('clang')
     if compiler is None:
         pytest.skip('no C compiler: apt install gcc')
@@ -44,6 +47,7 @@ def library(tmp_path_factory):
 
 
 def data(library, counts, time_us, index, overruns, codes, bits=16):
+    """Encode a frame of samples by the firmware, and check that it stays within its room."""
     count, channels = codes.shape
     room = 24 + 2 * codes.size + 4 + (28 + 2 * codes.size) // 254 + 2
     out = (ctypes.c_uint8 * (room + 8))(*[0xAA] * (room + 8))
@@ -63,13 +67,13 @@ def test_the_vector_of_the_interfaces(library):
     vector = bytes.fromhex('03010101020701010440420f01010101024601010101030202028001093412ffff'
                            'e9e413f100')
     assert decode(vector[:-1]).flags == 0
-    found = decode(frame[:-1])
-    assert found.flags == RAIL
-    assert np.array_equal(found.codes, codes)
-    assert (found.sequence, found.time_us, found.index) == (7, 1_000_000, 70)
+    decoded = decode(frame[:-1])
+    assert decoded.flags == RAIL
+    assert np.array_equal(decoded.codes, codes)
+    assert (decoded.sequence, decoded.time_us, decoded.index) == (7, 1_000_000, 70)
 
 
-def test_every_frame_is_that_of_the_reference(library):
+def test_every_frame_equals_that_of_the_reference(library):
     rng = np.random.default_rng(1)
     info = BoardInfo(1000.0, 16, 3, 5.0, 'adxl-0001')
     reference, counts = Encoder(info), Counts(0, AFTER_RESET)
@@ -82,10 +86,10 @@ def test_every_frame_is_that_of_the_reference(library):
         # Few zeros make long runs without one, which COBS cuts at 254 bytes.
         codes = rng.integers(1, 2 ** 16, (count, channels)) | (0x0101 * int(rng.integers(2)))
         time_us, index = int(rng.integers(2 ** 53)), int(rng.integers(2 ** 32))
-        mine = data(library, counts, time_us, index, count, codes)
-        theirs = reference.sample_frame(time_us, index, codes, count)
-        assert mine.count(b'\0') == 1
-        found, wanted = decode(mine[:-1]), decode(theirs[:-1])
-        assert found.check == wanted.check
-        assert np.array_equal(found.codes, codes)
-        assert len(mine) - len(theirs) in (0, 1), 'a last run of 254 may be closed twice'
+        actual = data(library, counts, time_us, index, count, codes)
+        expected = reference.sample_frame(time_us, index, codes, count)
+        assert actual.count(b'\0') == 1
+        decoded = decode(actual[:-1])
+        assert decoded.check == decode(expected[:-1]).check
+        assert np.array_equal(decoded.codes, codes)
+        assert len(actual) - len(expected) in (0, 1), 'a last run of 254 may be closed twice'

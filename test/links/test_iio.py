@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The IIO link by the real libiio, on a small IIOD: formats, figures, channels, faults."""
+"""The IIO link with the real libiio, on a small IIOD: formats, rates, channels, faults."""
 
 import json
 import time
@@ -40,10 +40,10 @@ def served():
     """Give a function that starts a server and opens a link on it."""
     opened = []
 
-    def serve(sensor=None, setting=None, **options):
-        server = Helper('iiod.py', json.dumps(setting or {}))
+    def serve(sensor=None, adc=None, **settings):
+        server = Helper('iiod.py', json.dumps(adc or {}))
         link = iio.open_link(sensor or nominal(), iio.Settings(
-            uri=f'ip:127.0.0.1:{server.first}', **options))
+            uri=f'ip:127.0.0.1:{server.first}', **settings))
         link.begin(0)
         opened.append((server, link))
         return server, link
@@ -53,16 +53,16 @@ def served():
         server.kill()
 
 
-def taken(link, count, timeout_s=10.0):
-    """Read so many samples, or what comes in the time."""
-    got, end = [], time.monotonic() + timeout_s
-    while sum(len(s.stamp_ns) for s in got) < count and time.monotonic() < end:
-        got.append(link.read(0))
-    return got
+def read_samples(link, count, timeout_s=10.0):
+    """Read until so many samples have come or the time is over, and return the parts."""
+    parts, end_s = [], time.monotonic() + timeout_s
+    while sum(len(part.stamp_ns) for part in parts) < count and time.monotonic() < end_s:
+        parts.append(link.read(0))
+    return parts
 
 
-def column(name, got):
-    return np.concatenate([s.references[name] for s in got if len(s.stamp_ns)])
+def column(name, parts):
+    return np.concatenate([part.references[name] for part in parts if len(part.stamp_ns)])
 
 
 FORMATS = ['le:u16/16>>0', 'be:u16/16>>0', 'le:u12/16>>4', 'be:s12/16>>4', 'le:s24/32>>8',
@@ -72,10 +72,10 @@ FORMATS = ['le:u16/16>>0', 'be:u16/16>>0', 'le:u12/16>>4', 'be:s12/16>>4', 'le:s
 @pytest.mark.parametrize('form', FORMATS)
 def test_every_format_gives_the_volts_of_its_codes(served, form):
     scale, offset = 0.05, -3
-    setting = {'channels': [{'id': 'voltage0', 'format': form, 'scale': scale, 'offset': offset},
+    adc = {'channels': [{'id': 'voltage0', 'format': form, 'scale': scale, 'offset': offset},
                             {'id': 'voltage1', 'format': form, 'scale': scale}]}
-    _, link = served(setting=setting)
-    volts = np.concatenate([s.volts for s in taken(link, 200)])
+    _, link = served(adc=adc)
+    volts = np.concatenate([part.volts for part in read_samples(link, 200)])
     assert len(volts) >= 200
     _, sign, bits, *_ = iiod.format_of({'format': form})
     shift = 2 ** (bits - 1) if sign == 's' else 0
@@ -83,22 +83,22 @@ def test_every_format_gives_the_volts_of_its_codes(served, form):
     first = int(codes[0]) - 1
     k = first + np.arange(len(codes))
     assert np.array_equal(codes, iiod.code(k, 0, bits))
-    other = np.rint(volts[:, 1] / (scale * 1e-3)) + shift
-    # A code of few bits tells the number of a sample only up to its period.
+    other_codes = np.rint(volts[:, 1] / (scale * 1e-3)) + shift
+    # A code of few bits determines the number of a sample only up to its period.
     period = 2 ** bits - 2
     turns = np.arange(3 if period % 3 == 0 else 1) * period
-    assert any(np.array_equal(other, iiod.code(k + turn, 1, bits)) for turn in turns)
+    assert any(np.array_equal(other_codes, iiod.code(k + turn, 1, bits)) for turn in turns)
 
 
 def test_labels_choose_the_channels_and_the_third_is_the_supply(served):
-    _, link = served(setting={'channels': [
+    _, link = served(adc={'channels': [
         {'id': 'voltage0', 'label': 'supply', 'scale': 0.1}, {'id': 'voltage3', 'label': 'y'},
         {'id': 'voltage5', 'label': 'x'}]}, supply_scale=2.0)
-    got = taken(link, 500)
-    codes = np.concatenate([s.volts for s in got]) / nominal().lsb_v
+    parts = read_samples(link, 500)
+    codes = np.concatenate([part.volts for part in parts]) / nominal().lsb_v
     k = np.rint(codes[:, 0] - 2000).astype(int) - 1
     assert np.array_equal(np.rint(codes[:, 1]), iiod.code(k // 5, 1, 16))
-    supply = column('supply_v', got)
+    supply = column('supply_v', parts)
     assert np.isfinite(supply).sum() >= 3
 
 
@@ -106,49 +106,49 @@ def test_labels_choose_the_channels_and_the_third_is_the_supply(served):
                                                                     'supply=voltage2'],
                                      'right,left,voltage2'])
 def test_channels_are_named_by_id_label_or_role(served, entries):
-    _, link = served(setting={'channels': [
+    _, link = served(adc={'channels': [
         {'id': 'voltage0', 'label': 'left', 'scale': 1.0},
         {'id': 'voltage1', 'label': 'right', 'scale': 2.0},
         {'id': 'voltage2', 'scale': 3.0}]}, channels=entries)
-    got = taken(link, 300)
-    first = next(s for s in got if len(s.volts)).volts[0]
+    parts = read_samples(link, 300)
+    first = next(part for part in parts if len(part.volts)).volts[0]
     k = round(first[1] / 1e-3) - 1
     assert round(first[0] / 2e-3) == iiod.code(k, 1, 16)
-    assert np.isfinite(column('supply_v', got)).any()
+    assert np.isfinite(column('supply_v', parts)).any()
 
 
 def test_the_rate_is_set_and_read_back(served):
     _, link = served(nominal(rate_hz=500.0))
-    taken(link, 100)
+    read_samples(link, 100)
     assert link.sensor.rate_hz == 500
     assert link.status().text == 'streaming at 500 Hz'
     _, link = served(nominal(rate_hz=900.0), {'rates': [475, 860], 'rate': 860})
-    taken(link, 100)
+    read_samples(link, 100)
     assert link.sensor.rate_hz == 860
     assert link.status().text == 'streaming at 860 Hz (900 Hz were asked for)'
 
 
-def test_a_thermometer_beside_the_buffer_is_read_once_a_second(served):
-    _, link = served(setting={'channels': [
+def test_a_thermometer_outside_the_buffer_is_read_once_a_second(served):
+    _, link = served(adc={'channels': [
         {'id': 'voltage0', 'label': 'x'}, {'id': 'voltage1', 'label': 'y'},
         {'id': 'temp', 'label': 'temperature', 'unbuffered': True, 'raw': 400, 'scale': 62.5,
          'offset': -20}]})
-    told = column('temperature_c', taken(link, 400))
-    assert told[np.isfinite(told)] == pytest.approx((400 - 20) * 0.0625)
-    assert np.isfinite(told).any()
+    temperature_c = column('temperature_c', read_samples(link, 400))
+    assert temperature_c[np.isfinite(temperature_c)] == pytest.approx((400 - 20) * 0.0625)
+    assert np.isfinite(temperature_c).any()
 
 
 def test_a_digital_sensor_gives_pseudo_volts(served):
     sensor = nominal('xyz')
     _, link = served(sensor, {'channels': [
         {'id': f'accel_{a}', 'format': 'le:s16/16>>0', 'scale': 0.01} for a in 'xyz']})
-    volts = np.concatenate([s.volts for s in taken(link, 50)])
+    volts = np.concatenate([part.volts for part in read_samples(link, 50)])
     mps2 = (volts[:, 0] - 2.5) * 9.80665
     assert np.rint(mps2 / 0.01) == pytest.approx(mps2 / 0.01, abs=1e-6)
     assert link.sensor.adc_bits == 0
 
 
-@pytest.mark.parametrize('setting, options, why', [
+@pytest.mark.parametrize('adc, settings, reason', [
     ({'channels': [{'id': 'voltage0', 'scale': None}, {'id': 'voltage1'}]}, {},
      'voltage0: its attribute scale cannot be read'),
     ({'channels': [{'id': 'voltage0', 'scale': 'nan'}, {'id': 'voltage1'}]}, {}, "is 'nan'"),
@@ -158,30 +158,30 @@ def test_a_digital_sensor_gives_pseudo_volts(served):
     ({}, {'device': 'ads9999'}, "'ads9999' is not there; with buffered channels there are: adc"),
     ({'channels': [{'id': 'temp'}, {'id': 'voltage1'}]}, {'channels': 'temp,voltage1'},
      'temp cannot be x')])
-def test_what_does_not_fit_is_said_and_nothing_made_up(served, setting, options, why):
-    _, link = served(setting=setting, **options)
-    assert not sum(len(s.stamp_ns) for s in taken(link, 1, 0.4))
-    state = link.status()
-    assert state.level == Level.ERROR
-    assert why in state.text, state.text
+def test_a_misfit_is_reported_and_no_value_invented(served, adc, settings, reason):
+    _, link = served(adc=adc, **settings)
+    assert not sum(len(part.stamp_ns) for part in read_samples(link, 1, 0.4))
+    status = link.status()
+    assert status.level == Level.ERROR
+    assert reason in status.text, status.text
 
 
 def test_stamps_are_those_of_the_devices_clock(served):
-    _, link = served(setting={'ppm': 80, 'offset_ns': -3_000_000_000})
-    got = taken(link, 9000, 15.0)
-    stamps = np.concatenate([s.stamp_ns for s in got])
+    _, link = served(adc={'ppm': 80, 'offset_ns': -3_000_000_000})
+    parts = read_samples(link, 9000, 15.0)
+    stamps = np.concatenate([part.stamp_ns for part in parts])
     assert (np.diff(stamps) > 0).all()
     # The map approaches the drift of 80 ppm within some seconds; then the link is steady.
     x = np.arange(len(stamps))[5000:]
     line = np.polyval(np.polyfit(x, stamps[5000:] - stamps[0], 1), x)
     assert (stamps[5000:] - stamps[0] - line).std() < 20_000
-    assert sum(s.missing for s in got) == 0
+    assert sum(part.missing for part in parts) == 0
     assert abs(time.time_ns() - stamps[-1]) < 60e6
 
 
 def test_a_server_that_is_not_there_is_waited_for(served):
     link = iio.open_link(nominal(), iio.Settings(uri='ip:127.0.0.1:1'))
-    taken(link, 1, 0.3)
+    read_samples(link, 1, 0.3)
     assert link.status().text == 'ip:127.0.0.1:1: Connection refused'
 
 

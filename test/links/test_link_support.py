@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The parts of the links without ROS: the map of the clock, the count, the channels."""
+"""The parts of links without ROS: clock map, frame counter, channels."""
 
 from dataclasses import replace
 
@@ -30,33 +30,34 @@ MS, S = 1_000_000, 1_000_000_000
 START = 5_000 * S
 
 
-class Link:
-    """Frames of ten samples at 1 kHz by a device's clock, late by what a link takes."""
+class DelayedFrames:
+    """Frames of ten samples at 1 kHz by a device's clock, with the delay of a link."""
 
-    def __init__(self, ppm=0.0, least_ms=0.1, most_ms=5.0, delay_s=0.0, seed=0):
+    def __init__(self, ppm=0.0, min_ms=0.1, max_ms=5.0, delay_s=0.0, seed=0):
         self.map = ClockMap(delay_s)
         self.scale = 1 + ppm * 1e-6
-        self.least, self.most = least_ms * MS, most_ms * MS
+        self.min_ns, self.max_ns = min_ms * MS, max_ms * MS
         self.rng = np.random.default_rng(seed)
         self.origin, self.count = 0, 0
         self.held, self.stamps, self.truth = [], [], []
         self.arrived = 0
 
     def run(self, frames, late_ms=0.0, device_ms=0.0, truth_ms=0.0):
-        """Send frames; of device time, and of true time, so much more has passed."""
+        """Send frames with an extra delay, after a step of device time or of true time, ms."""
         self.origin += truth_ms * MS
         for _ in range(frames):
             number = self.count + np.arange(10)
             self.count += 10
             device = (number * MS + S + device_ms * MS).astype(np.int64)
             true = START + self.origin + number * MS * self.scale
-            late = self.rng.uniform(self.least, self.most) + late_ms * MS
+            late = self.rng.uniform(self.min_ns, self.max_ns) + late_ms * MS
             self.arrived = max(int(true[-1] + late), self.arrived)
             self.map.observe(int(device[-1]), self.arrived)
             self.held.append((device, true))
-            self.take()
+            self.stamp()
 
-    def take(self):
+    def stamp(self):
+        """Stamp the frames that wait, when the map is ready."""
         if self.map.ready(self.arrived):
             for device, true in self.held:
                 self.stamps.append(self.map.host_ns(device))
@@ -64,63 +65,63 @@ class Link:
             self.held = []
 
     def errors(self):
-        """Return the errors of the stamps, ms, after having looked at their order."""
+        """Check the order of the stamps and return their errors, ms."""
         stamps = np.concatenate(self.stamps)
         assert (np.diff(stamps) > 0).all(), 'stamps never go backwards'
         return (stamps - np.concatenate(self.truth)) / MS
 
 
-@pytest.mark.parametrize('ppm, least, most, delay_s', [
+@pytest.mark.parametrize('ppm, min_ms, max_ms, delay_s', [
     (100, 0.0, 5.0, 0), (-100, 0.2, 5.2, 0), (100, 3.0, 8.0, 0.003), (0, 0.1, 5.1, 0)])
-def test_stamps_of_a_jittery_link_are_true_to_a_millisecond(ppm, least, most, delay_s):
-    link = Link(ppm, least, most, delay_s, seed=ppm % 7)
-    link.run(4000)
-    errors = link.errors()
+def test_stamps_of_a_jittery_link_are_true_to_a_millisecond(ppm, min_ms, max_ms, delay_s):
+    frames = DelayedFrames(ppm, min_ms, max_ms, delay_s, seed=ppm % 7)
+    frames.run(4000)
+    errors = frames.errors()
     assert np.abs(errors).max() < 1.0, 'from the first sample on'
     assert np.abs(errors[5000:]).max() < 0.4
-    assert link.map.drift_ppm == pytest.approx(ppm, abs=10)
+    assert frames.map.drift_ppm == pytest.approx(ppm, abs=10)
 
 
 def test_stamps_of_a_steady_link_have_no_jitter():
-    link = Link(80, 0.05, 0.15)
-    link.run(4000)
-    stamps = np.concatenate(link.stamps)[5000:]
+    frames = DelayedFrames(80, 0.05, 0.15)
+    frames.run(4000)
+    stamps = np.concatenate(frames.stamps)[5000:]
     x = np.arange(len(stamps))
     line = np.polyval(np.polyfit(x, stamps - stamps[0], 1), x)
     assert (stamps - stamps[0] - line).std() < 20_000
     assert np.diff(stamps).std() < 1000
-    assert link.map.steps == 0
+    assert frames.map.steps == 0
 
 
-def test_a_map_is_not_led_astray_by_what_comes_late():
-    link = Link(-60, 0.05, 0.1)
-    link.run(2000)
-    link.run(20, late_ms=180)
-    link.run(500)
-    link.run(3, late_ms=5000)
-    link.run(1500)
-    assert np.abs(link.errors()[1000:]).max() < 0.5
-    assert link.map.steps == 0
+def test_late_frames_do_not_disturb_the_map():
+    frames = DelayedFrames(-60, 0.05, 0.1)
+    frames.run(2000)
+    frames.run(20, late_ms=180)
+    frames.run(500)
+    frames.run(3, late_ms=5000)
+    frames.run(1500)
+    assert np.abs(frames.errors()[1000:]).max() < 0.5
+    assert frames.map.steps == 0
 
 
 @pytest.mark.parametrize('step_ms', [400, -400, 30, -60, 3_600_000])
 def test_a_step_of_the_device_clock_is_recognised(step_ms):
-    link = Link(50, 0.05, 0.5)
-    link.run(1500)
-    link.run(1500, device_ms=step_ms)
-    errors = link.errors()
-    assert link.map.steps == 1
+    frames = DelayedFrames(50, 0.05, 0.5)
+    frames.run(1500)
+    frames.run(1500, device_ms=step_ms)
+    errors = frames.errors()
+    assert frames.map.steps == 1
     assert np.abs(errors[:15000]).max() < 1
     assert np.abs(errors[15000 + 3000:]).max() < 1.0, 'from three seconds after the step on'
 
 
 def test_a_clock_that_stood_still_is_a_step_and_a_gap():
-    link = Link(50, 0.05, 0.5)
-    link.run(1500)
-    link.run(1500, truth_ms=3000)
-    errors = link.errors()
-    assert link.map.steps == 1
-    assert np.abs(errors).max() < 1.5, 'not one stamp lies in the time that was not lived'
+    frames = DelayedFrames(50, 0.05, 0.5)
+    frames.run(1500)
+    frames.run(1500, truth_ms=3000)
+    errors = frames.errors()
+    assert frames.map.steps == 1
+    assert np.abs(errors).max() < 1.5, 'no stamp lies in the time for which the clock stood still'
 
 
 def test_ros_time_follows_the_system_clock_when_it_is_set(monkeypatch):
@@ -139,113 +140,114 @@ def test_ros_time_follows_the_system_clock_when_it_is_set(monkeypatch):
 
 
 def data(index, time_us=None, flags=0, overruns=0, seed=0, count=10):
-    """Return a frame at its time by 1 kHz, unless another is given."""
+    """Return a frame, by default at its time at 1 kHz."""
     time_us = index * 1000 if time_us is None else time_us
     check = hash((index, time_us, flags, seed))
     return SampleFrame(flags, 0, time_us, index % 2 ** 32, overruns, np.zeros((count, 2)), check)
 
 
-def judged(*frames, arrived_us=None):
-    count = FrameCounter()
-    count.restart(1000.0)
-    found = []
+def counted(*frames, arrived_us=None):
+    """Return a counter that has taken frames, and (index, lost, stepped) of the accepted ones."""
+    counter = FrameCounter()
+    counter.restart(1000.0)
+    accepted = []
     for frame in frames:
-        found += count.accept(frame, (arrived_us or (lambda f: f.time_us))(frame) * 1000)
-    return count, [(f.frame.index, f.lost, f.stepped) for f in found]
+        arrival_us = frame.time_us if arrived_us is None else arrived_us(frame)
+        accepted += counter.accept(frame, arrival_us * 1000)
+    return counter, [(part.frame.index, part.lost, part.stepped) for part in accepted]
 
 
-def test_every_sample_that_lacks_is_counted_over_the_wrap_too():
+def test_missing_samples_are_counted_across_the_wrap():
     base = 2 ** 32 - 15
-    _, found = judged(*(data(base + k, time_us=k * 1000) for k in (0, 10, 20, 50)))
-    assert found == [(base, None, False), (base + 10, 0, False), (5, 0, False), (35, 20, False)]
+    _, accepted = counted(*(data(base + k, time_us=k * 1000) for k in (0, 10, 20, 50)))
+    assert accepted == [(base, None, False), (base + 10, 0, False), (5, 0, False), (35, 20, False)]
 
 
-def test_repeated_and_late_frames_are_not_taken():
-    count, found = judged(data(0), data(10), data(10), data(0), data(20), data(50), data(30),
+def test_repeated_and_late_frames_are_not_accepted():
+    counter, accepted = counted(data(0), data(10), data(10), data(0), data(20), data(50), data(30),
                           data(60))
-    assert [i for i, *_ in found] == [0, 10, 20, 50, 60]
-    assert [lost for _, lost, _ in found] == [None, 0, 0, 20, 0]
-    assert count.repeated == 30
+    assert [i for i, *_ in accepted] == [0, 10, 20, 50, 60]
+    assert [lost for _, lost, _ in accepted] == [None, 0, 0, 20, 0]
+    assert counter.repeated == 30
 
 
-def test_a_reset_begins_a_new_count_whether_it_is_said_or_not():
-    _, found = judged(data(500), data(510), data(0, 100, AFTER_RESET), data(10, 10100))
-    assert found == [(500, None, False), (510, 0, False), (0, None, False), (10, 0, False)]
-    _, found = judged(data(500), data(510), data(30, 30100), data(50, 50100), data(60, 60100))
-    assert found == [(500, None, False), (510, 0, False), (30, None, False), (50, 10, False),
+def test_a_reset_begins_a_new_count_with_and_without_its_flag():
+    _, accepted = counted(data(500), data(510), data(0, 100, AFTER_RESET), data(10, 10100))
+    assert accepted == [(500, None, False), (510, 0, False), (0, None, False), (10, 0, False)]
+    _, accepted = counted(data(500), data(510), data(30, 30100), data(50, 50100), data(60, 60100))
+    assert accepted == [(500, None, False), (510, 0, False), (30, None, False), (50, 10, False),
                      (60, 0, False)]
 
 
-def test_a_board_that_does_the_same_again_after_its_reset_is_heard_again():
+def test_a_board_that_repeats_itself_after_its_reset_is_accepted_again():
     first = [data(10 * k) for k in range(300)]
     arrivals = iter(range(0, 10 ** 9, 10_000))
-    _, found = judged(*first, *first, arrived_us=lambda f: next(arrivals))
-    again = [lost for _, lost, _ in found].index(None, 1)
+    _, accepted = counted(*first, *first, arrived_us=lambda f: next(arrivals))
+    again = [lost for _, lost, _ in accepted].index(None, 1)
     assert again == 300
-    assert 2900 <= len(found) * 10 - 2500 <= 3000, 'half a second makes it sure'
+    assert 2900 <= len(accepted) * 10 - 2500 <= 3000, 'the decision takes half a second'
 
 
-def test_a_step_of_the_clock_without_a_loss_is_told():
-    _, found = judged(data(0), data(10), data(20, 5_020_000), data(30, 5_030_000))
-    assert found == [(0, None, False), (10, 0, False), (20, 0, True), (30, 0, False)]
+def test_a_step_of_the_clock_without_a_loss_is_reported():
+    _, accepted = counted(data(0), data(10), data(20, 5_020_000), data(30, 5_030_000))
+    assert accepted == [(0, None, False), (10, 0, False), (20, 0, True), (30, 0, False)]
 
 
 @pytest.mark.parametrize('index, away_s, lost', [
     (1010, 1.0, 1000), (10, 0.05, 0), (10, 9.0, 0), (1010, 3.0, None), (0, 1.0, None)])
-def test_a_count_goes_on_over_a_closed_port_if_the_clocks_agree(index, away_s, lost):
-    count = FrameCounter()
-    count.restart(1000.0)
-    count.accept(data(0), 0)
-    count.reopened()
-    count.reopened()
-    found = count.accept(data(index, seed=1), round(away_s * 1e9) + 10 * MS)
-    assert [f.lost for f in found] == [lost]
+def test_a_count_continues_across_a_closed_port_if_the_clocks_agree(index, away_s, lost):
+    counter = FrameCounter()
+    counter.restart(1000.0)
+    counter.accept(data(0), 0)
+    counter.reopened()
+    counter.reopened()
+    accepted = counter.accept(data(index, seed=1), round(away_s * 1e9) + 10 * MS)
+    assert [f.lost for f in accepted] == [lost]
 
 
-def test_the_devices_own_losses_are_counted_over_the_wrap():
-    count, _ = judged(data(0, overruns=65530), data(20, overruns=4), data(30, overruns=4),
+def test_overruns_of_the_device_are_counted_across_the_wrap():
+    counter, _ = counted(data(0, overruns=65530), data(20, overruns=4), data(30, overruns=4),
                       data(0, 50, AFTER_RESET, overruns=0), data(20, 20050, overruns=10))
-    assert count.overruns == 10 + 10
+    assert counter.overruns == 10 + 10
 
 
 @settings(max_examples=200)
 @given(st.lists(st.integers(0, 60), max_size=60))
-def test_no_frame_is_taken_twice_and_none_backwards(order):
-    _, found = judged(*(data(10 * k) for k in order), arrived_us=lambda f: 0)
-    taken = [index for index, *_ in found]
-    session = []
-    for index, lost, _ in found:
-        session = session + [index] if lost is not None else [index]
-        assert session == sorted(set(session))
-    assert len(taken) <= len(order)
+def test_no_frame_is_accepted_twice_or_out_of_order(order):
+    _, accepted = counted(*(data(10 * k) for k in order), arrived_us=lambda f: 0)
+    run = []
+    for index, lost, _ in accepted:
+        run = run + [index] if lost is not None else [index]
+        assert run == sorted(set(run))
+    assert len(accepted) <= len(order)
 
 
-def test_channels_are_listed_both_ways():
+def test_channels_are_a_list_or_a_string():
     roles = ['x', 'y', 'supply']
     assert channels.parse_channels('x, y,supply') == channels.parse_channels(roles) == roles
     assert channels.parse_channels('') == channels.parse_channels(()) == []
 
 
-@pytest.mark.parametrize('roles, why', [
+@pytest.mark.parametrize('roles, reason', [
     ('x', 'no channel for y'), ('x,y,x', 'twice'), ('x,y,z', 'no axis z'), ('x,y,w', "'w' is")])
-def test_channels_that_do_not_fit_the_sensor_are_refused(roles, why):
-    with pytest.raises(UserError, match=why):
+def test_channels_that_do_not_fit_the_sensor_are_refused(roles, reason):
+    with pytest.raises(UserError, match=reason):
         channels.check_roles(channels.parse_channels(roles), 'xy')
 
 
 def test_slow_values_are_means_of_a_tenth_of_a_second():
-    thin = channels.PeriodMeans()
+    means = channels.PeriodMeans()
     stamps = np.arange(1000) * MS
     values = np.arange(1000.0)
-    out = np.concatenate([thin.thin(stamps[k:k + 10], {'supply_v': values[k:k + 10]})['supply_v']
+    out = np.concatenate([means.thin(stamps[k:k + 10], {'supply_v': values[k:k + 10]})['supply_v']
                           for k in range(0, 1000, 10)])
     rows = np.flatnonzero(np.isfinite(out))
     assert rows.tolist() == list(range(100, 1000, 100))
     assert out[rows] == pytest.approx([row - 50.5 for row in rows])
 
 
-@pytest.mark.parametrize('change, why', [({'adc_bits': 0}, 'adc_bits'), ({'adc_bits': 24}, '24'),
-                                         ({'serial': 'x' * 17}, 'serial')])
-def test_a_sensor_that_no_board_can_be_is_refused(change, why):
-    with pytest.raises(UserError, match=why):
+@pytest.mark.parametrize('change, reason', [
+    ({'adc_bits': 0}, 'adc_bits'), ({'adc_bits': 24}, '24'), ({'serial': 'x' * 17}, 'serial')])
+def test_a_sensor_beyond_the_wire_format_is_refused(change, reason):
+    with pytest.raises(UserError, match=reason):
         emulated_board.check_sensor(replace(nominal(), **change))

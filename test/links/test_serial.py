@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The serial link on real terminals, without ROS: what it makes of frames, and of what is none."""
+"""The serial link on real terminals, without ROS: frames, faults, settings."""
 
 import os
 import pty
@@ -33,8 +33,12 @@ from units import nominal
 INFO = BoardInfo(1000.0, 16, 2, 5.0, 'A7')
 
 
-class Line:
-    """A terminal pair, the board's end written by hand, and a link that reads the other."""
+class ConnectedBoard:
+    """
+    A board that the test plays on one end of a terminal, and a link on the other end.
+
+    `codes` are those of the next frame, `index` is the number of its first sample.
+    """
 
     def __init__(self, tmp_path, info=INFO, sensor=None, **settings):
         self.path = tmp_path / 'port'
@@ -45,302 +49,332 @@ class Line:
                                      serial.Settings(port=str(self.path), **settings))
         self.link.begin(0)
         self.encoder = Encoder(info)
-        self.samples = []
         self.link.read(0)
 
     def plug(self):
-        self.ours, self.theirs = pty.openpty()
-        tty.setraw(self.theirs)
+        """Make the terminal and its name."""
+        self.board_fd, self.driver_fd = pty.openpty()
+        tty.setraw(self.driver_fd)
         self.path.unlink(missing_ok=True)
-        self.path.symlink_to(os.ttyname(self.theirs))
+        self.path.symlink_to(os.ttyname(self.driver_fd))
 
     def unplug(self):
-        # Its name first: a terminal's number may soon be another's.
+        """Remove the name first: another terminal may soon have the same number."""
         self.path.unlink(missing_ok=True)
-        os.close(self.ours)
-        os.close(self.theirs)
+        os.close(self.board_fd)
+        os.close(self.driver_fd)
 
     def send(self, raw):
-        os.write(self.ours, raw)
+        """Send bytes."""
+        os.write(self.board_fd, raw)
 
-    def inform(self):
+    def send_info(self):
+        """Send an info frame."""
         self.send(self.encoder.info_frame())
 
-    def frames(self, count=1, pace_s=0.0):
+    def send_frames(self, count=1, pause_s=0.0):
+        """Send frames of samples, with a pause after each."""
         for _ in range(count):
             self.send(self.encoder.sample_frame(self.index * 1000, self.index, self.codes))
             self.index += len(self.codes)
-            time.sleep(pace_s)
+            time.sleep(pause_s)
 
-    def read(self, until=None, timeout_s=5.0):
-        """Read until a condition holds, or for 0.2 s; returns all samples of that."""
-        end = time.monotonic() + (timeout_s if until else 0.2)
-        got = []
-        while time.monotonic() < end and not (until and until(got)):
+    def read(self, timeout_s=0.2, until=lambda parts: False):
+        """Read the link until a condition holds, and return the parts with samples."""
+        end_s = time.monotonic() + timeout_s
+        parts = []
+        while time.monotonic() < end_s and not until(parts):
             samples = self.link.read(0)
             if len(samples.stamp_ns):
-                got.append(samples)
-        self.samples += got
-        return got
+                parts.append(samples)
+        return parts
 
-    def number(self, got):
-        return sum(len(samples.stamp_ns) for samples in got)
+    def read_samples(self, count, timeout_s=5.0):
+        """Read until so many samples have come, and return the parts."""
+        return self.read(timeout_s, lambda parts: sample_count(parts) >= count)
 
     def value(self, name):
+        """Return one of the link's statistics."""
         return self.link.status().values()[name]
 
     def close(self):
+        """Close the link, then the terminal."""
         self.link.close()
         self.unplug()
 
 
+def sample_count(parts):
+    return sum(len(part.stamp_ns) for part in parts)
+
+
+def missing(parts):
+    return sum(part.missing for part in parts)
+
+
+def estimated(parts):
+    return sum(part.estimated for part in parts)
+
+
+def volts_of(parts):
+    return np.concatenate([part.volts for part in parts])
+
+
+def stamps_of(parts):
+    return np.concatenate([part.stamp_ns for part in parts])
+
+
+def reference(name, parts):
+    """Return the values of a reference that are not NaN."""
+    values = np.concatenate([part.references[name] for part in parts])
+    return values[np.isfinite(values)]
+
+
 @pytest.fixture
-def line(tmp_path):
-    lines = []
+def connect(tmp_path):
+    """Give a function that connects a board."""
+    boards = []
 
-    def make(**options):
-        lines.append(Line(tmp_path, **options))
-        return lines[-1]
+    def make(**settings):
+        boards.append(ConnectedBoard(tmp_path, **settings))
+        return boards[-1]
     yield make
-    for one in lines:
-        one.close()
+    for board in boards:
+        board.close()
 
 
-def test_samples_are_volts_of_the_codes_at_the_rate_of_the_board(line):
-    one = line(info=BoardInfo(500.0, 12, 2, 3.3, 'B9'))
-    one.codes %= 4096
-    one.inform()
-    one.frames(5)
-    got = one.read(lambda g: one.number(g) >= 50)
-    volts = np.concatenate([s.volts for s in got])
-    assert volts[:10] == pytest.approx(one.codes * np.float32(3.3) / 4096, rel=1e-7)
-    assert (one.link.sensor.serial, one.link.sensor.rate_hz, one.link.sensor.adc_bits) == (
+def test_samples_are_volts_of_the_codes_at_the_rate_of_the_board(connect):
+    board = connect(info=BoardInfo(500.0, 12, 2, 3.3, 'B9'))
+    board.codes %= 4096
+    board.send_info()
+    board.send_frames(5)
+    parts = board.read_samples(50)
+    volts = volts_of(parts)
+    assert volts[:10] == pytest.approx(board.codes * np.float32(3.3) / 4096, rel=1e-7)
+    assert (board.link.sensor.serial, board.link.sensor.rate_hz, board.link.sensor.adc_bits) == (
         'B9', 500.0, 12)
-    assert one.link.sensor.adc_vref_v == pytest.approx(3.3)
-    assert one.link.status().level == base.Level.OK
-    assert one.link.status().text == 'streaming'
-    assert sum(s.missing for s in got) == 0
+    assert board.link.sensor.adc_vref_v == pytest.approx(3.3)
+    assert board.link.status().level == base.Level.OK
+    assert board.link.status().text == 'streaming'
+    assert missing(parts) == 0
 
 
-def test_data_before_the_first_info_is_held_back_and_counted(line):
-    one = line()
-    one.frames(7)
-    assert not one.read()
-    assert one.value('held_back') == 70
-    one.inform()
-    one.frames(3)
-    got = one.read(lambda g: one.number(g) >= 30)
-    assert one.number(got) == 30
-    assert one.value('held_back') == 70
-    assert sum(s.missing for s in got) == 0
+def test_data_before_the_first_info_is_held_back_and_counted(connect):
+    board = connect()
+    board.send_frames(7)
+    assert not board.read()
+    assert board.value('held_back') == 70
+    board.send_info()
+    board.send_frames(3)
+    parts = board.read_samples(30)
+    assert sample_count(parts) == 30
+    assert board.value('held_back') == 70
+    assert missing(parts) == 0
 
 
-def test_a_frame_that_was_lost_is_missing_exactly(line):
-    one = line()
-    one.inform()
-    one.frames(3)
-    one.index += 4321
-    one.frames(3)
-    got = one.read(lambda g: one.number(g) >= 60)
-    assert sum(s.missing for s in got) == 4321
-    assert sum(s.estimated for s in got) == 0
-    stamps = np.concatenate([s.stamp_ns for s in got])
+def test_a_frame_that_was_lost_is_missing_exactly(connect):
+    board = connect()
+    board.send_info()
+    board.send_frames(3)
+    board.index += 4321
+    board.send_frames(3)
+    parts = board.read_samples(60)
+    assert missing(parts) == 4321
+    assert estimated(parts) == 0
+    stamps = stamps_of(parts)
     assert (np.diff(stamps) > 0).all()
     assert np.diff(stamps)[29] == pytest.approx(4.322e9, rel=0.06), 'the gap shows in the stamps'
 
 
-def test_a_repeated_frame_is_not_published_again(line):
-    one = line()
-    one.inform()
-    raw = one.encoder.sample_frame(0, 0, one.codes)
-    one.send(raw + raw)
-    one.index = 10
-    one.frames(2)
-    one.send(raw)
-    one.frames(1)
-    got = one.read(lambda g: one.number(g) >= 40)
-    assert one.number(got) == 40
-    assert one.value('repeated') == 20
+def test_a_repeated_frame_is_not_published_again(connect):
+    board = connect()
+    board.send_info()
+    raw = board.encoder.sample_frame(0, 0, board.codes)
+    board.send(raw + raw)
+    board.index = 10
+    board.send_frames(2)
+    board.send(raw)
+    board.send_frames(1)
+    parts = board.read_samples(40)
+    assert sample_count(parts) == 40
+    assert board.value('repeated') == 20
 
 
-def test_a_reset_is_told_apart_from_a_loss_and_estimated(line):
-    one = line()
-    one.inform()
-    one.frames(20, 0.01)
-    before = one.read(lambda g: one.number(g) >= 200)
+def test_the_loss_of_a_reset_is_estimated(connect):
+    board = connect()
+    board.send_info()
+    board.send_frames(20, 0.01)
+    before = board.read_samples(200)
     time.sleep(0.5)
-    one.encoder, one.index = Encoder(one.info), 0
-    one.inform()
-    one.frames(20, 0.01)
-    after = one.read(lambda g: one.number(g) >= 200)
-    assert one.value('resets') == 1
-    lost = sum(s.missing for s in after)
-    assert lost == sum(s.estimated for s in after)
+    board.encoder, board.index = Encoder(board.info), 0
+    board.send_info()
+    board.send_frames(20, 0.01)
+    after = board.read_samples(200)
+    assert board.value('resets') == 1
+    lost = missing(after)
+    assert lost == estimated(after)
     gap_s = (after[0].stamp_ns[0] - before[-1].stamp_ns[-1]) * 1e-9
     assert lost == pytest.approx(gap_s * 1000 - 1, abs=1)
     assert 450 < lost < 900
 
 
-def test_another_board_on_the_port_is_another_sensor(line):
-    one = line()
-    one.inform()
-    one.frames(3)
-    one.read(lambda g: one.number(g) >= 30)
-    one.encoder, one.index = Encoder(BoardInfo(1000.0, 12, 2, 2.5, 'Z1')), 0
-    one.codes = np.full((10, 2), 2048)
-    one.inform()
-    one.frames(3)
-    got = one.read(lambda g: one.number(g) >= 30)
-    assert one.link.sensor.serial == 'Z1'
-    assert np.concatenate([s.volts for s in got]) == pytest.approx(1.25)
+def test_another_board_on_the_port_is_another_sensor(connect):
+    board = connect()
+    board.send_info()
+    board.send_frames(3)
+    board.read_samples(30)
+    board.encoder, board.index = Encoder(BoardInfo(1000.0, 12, 2, 2.5, 'Z1')), 0
+    board.codes = np.full((10, 2), 2048)
+    board.send_info()
+    board.send_frames(3)
+    parts = board.read_samples(30)
+    assert board.link.sensor.serial == 'Z1'
+    assert volts_of(parts) == pytest.approx(1.25)
 
 
-@pytest.mark.parametrize('listed', ['x,y,supply,temperature', ['y', '-', 'x', 'supply']])
-def test_channels_are_what_the_parameter_says(line, listed):
-    one = line(info=BoardInfo(1000.0, 16, 4, 5.0, ''), channels=listed, supply_scale=2.0)
-    one.codes = np.tile(np.array([20000, 30000, 32000, 40000]), (10, 1))
-    one.inform()
-    one.frames(40, 0.005)
-    got = one.read(lambda g: one.number(g) >= 400)
-    volts = dict(zip(listed.split(',') if isinstance(listed, str) else listed,
-                     one.codes[0] * 5 / 2 ** 16))
-    assert np.concatenate([s.volts for s in got])[0] == pytest.approx([volts['x'], volts['y']])
-    supply = np.concatenate([s.references['supply_v'] for s in got])
-    assert supply[np.isfinite(supply)] == pytest.approx(2 * volts['supply'])
-    assert 2 <= np.isfinite(supply).sum() <= 5, 'ten a second'
+@pytest.mark.parametrize('roles', ['x,y,supply,temperature', ['y', '-', 'x', 'supply']])
+def test_channels_are_what_the_parameter_states(connect, roles):
+    board = connect(info=BoardInfo(1000.0, 16, 4, 5.0, ''), channels=roles, supply_scale=2.0)
+    board.codes = np.tile(np.array([20000, 30000, 32000, 40000]), (10, 1))
+    board.send_info()
+    board.send_frames(40, 0.005)
+    parts = board.read_samples(400)
+    volts = dict(zip(roles.split(',') if isinstance(roles, str) else roles,
+                     board.codes[0] * 5 / 2 ** 16))
+    assert volts_of(parts)[0] == pytest.approx([volts['x'], volts['y']])
+    supply_v = reference('supply_v', parts)
+    assert supply_v == pytest.approx(2 * volts['supply'])
+    assert 2 <= len(supply_v) <= 5, 'ten a second'
     if 'temperature' in volts:
-        told = np.concatenate([s.references['temperature_c'] for s in got])
-        assert told[np.isfinite(told)] == pytest.approx((volts['temperature'] - 0.5) / 0.01)
-    assert one.link.sensor.serial == nominal().serial, 'a board without a serial number'
+        temperature_c = reference('temperature_c', parts)
+        assert temperature_c == pytest.approx((volts['temperature'] - 0.5) / 0.01)
+    assert board.link.sensor.serial == nominal().serial, 'the board states no serial number'
 
 
-def test_by_default_the_channels_are_x_y_z_supply(line):
-    one = line(info=BoardInfo(1000.0, 16, 4, 5.0, ''), sensor=nominal('xyz'))
-    one.inform()
-    one.frames(30, 0.005)
-    got = one.read(lambda g: one.number(g) >= 300)
-    assert got[0].volts.shape[1] == 3
-    supply = np.concatenate([s.references['supply_v'] for s in got])
-    assert supply[np.isfinite(supply)] == pytest.approx(
-        one.codes[:, 3].mean() * 5 / 2 ** 16, rel=1e-3)
+def test_by_default_the_channels_are_x_y_z_supply(connect):
+    board = connect(info=BoardInfo(1000.0, 16, 4, 5.0, ''), sensor=nominal('xyz'))
+    board.send_info()
+    board.send_frames(30, 0.005)
+    parts = board.read_samples(300)
+    assert parts[0].volts.shape[1] == 3
+    assert reference('supply_v', parts) == pytest.approx(
+        board.codes[:, 3].mean() * 5 / 2 ** 16, rel=1e-3)
 
 
-@pytest.mark.parametrize('info, options, why', [
+@pytest.mark.parametrize('info, settings, reason', [
     (BoardInfo(1000.0, 16, 1, 5.0, ''), {}, 'no channel for y'),
     (INFO, {'channels': 'x,y,supply'}, '3 are named, the board has 2')])
-def test_a_board_that_does_not_fit_publishes_nothing_and_says_why(line, info, options, why):
-    one = line(info=info, **options)
-    one.inform()
-    one.frames(5)
-    assert not one.read()
-    state = one.link.status()
-    assert state.level == base.Level.ERROR
-    assert why in state.text
-    assert one.value('held_back') == 50
+def test_a_board_that_does_not_fit_states_why(connect, info, settings, reason):
+    board = connect(info=info, **settings)
+    board.send_info()
+    board.send_frames(5)
+    assert not board.read()
+    status = board.link.status()
+    assert status.level == base.Level.ERROR
+    assert reason in status.text
+    assert board.value('held_back') == 50
 
 
-def test_a_channel_that_the_sensor_does_not_have_is_not_published(line):
-    one = line(info=BoardInfo(1000.0, 16, 3, 5.0, ''))
-    one.inform()
-    one.frames(5)
-    got = one.read(lambda g: one.number(g) >= 50)
-    assert got[0].volts.shape[1] == 2
-    assert 'the channel of z is not used' in one.link.status().text
+def test_a_channel_that_the_sensor_does_not_have_is_not_published(connect):
+    board = connect(info=BoardInfo(1000.0, 16, 3, 5.0, ''))
+    board.send_info()
+    board.send_frames(5)
+    parts = board.read_samples(50)
+    assert parts[0].volts.shape[1] == 2
+    assert 'the channel of z is not used' in board.link.status().text
 
 
-def test_frames_that_the_info_frame_rules_out_are_not_published(line):
-    one = line(info=BoardInfo(1000.0, 12, 2, 5.0, ''))
-    one.codes %= 4096
-    one.inform()
-    one.frames(2)
-    one.codes[3, 1] = 4096
-    one.frames(1)
-    one.codes = np.full((10, 3), 1000)
-    one.frames(1)
-    one.codes = np.full((10, 2), 1000)
-    one.frames(1)
-    got = one.read(lambda g: one.number(g) >= 30)
-    assert one.number(got) == 30
-    assert sum(s.missing for s in got) == 20
-    assert one.value('bad_frames') == 2
+def test_frames_that_contradict_the_info_frame_are_not_published(connect):
+    board = connect(info=BoardInfo(1000.0, 12, 2, 5.0, ''))
+    board.codes %= 4096
+    board.send_info()
+    board.send_frames(2)
+    board.codes[3, 1] = 4096
+    board.send_frames(1)
+    board.codes = np.full((10, 3), 1000)
+    board.send_frames(1)
+    board.codes = np.full((10, 2), 1000)
+    board.send_frames(1)
+    parts = board.read_samples(30)
+    assert sample_count(parts) == 30
+    assert missing(parts) == 20
+    assert board.value('bad_frames') == 2
 
 
-def test_another_version_of_the_format_is_said(line):
-    one = line()
-    one.send(encode_payload(b'\1\2' + bytes(30)))
-    assert not one.read()
-    assert 'speaks wire format 2' in one.link.status().text
-    one.inform()
-    one.frames(3)
-    one.read(lambda g: one.number(g) >= 30)
-    assert one.link.status().text == 'streaming'
+def test_another_version_of_the_format_is_reported(connect):
+    board = connect()
+    board.send(encode_payload(b'\1\2' + bytes(30)))
+    assert not board.read()
+    assert 'speaks wire format 2' in board.link.status().text
+    board.send_info()
+    board.send_frames(3)
+    board.read_samples(30)
+    assert board.link.status().text == 'streaming'
 
 
-def test_nothing_and_nonsense_are_told_apart(line):
-    one = line()
-    one.inform()
-    one.frames(3)
-    one.read()
+def test_silence_and_bytes_without_a_frame_are_distinguished(connect):
+    board = connect()
+    board.send_info()
+    board.send_frames(3)
+    board.read()
     time.sleep(0.6)
-    one.read()
-    assert 'silent' in one.link.status().text
-    end = time.monotonic() + 1.5
-    while time.monotonic() < end:
-        one.send(os.urandom(50).replace(b'\0', b'\1') + b'\0')
-        one.link.read(0)
-    assert 'is link.baud (115200) that of the board?' in one.link.status().text
-    one.frames(3)
-    one.read(lambda g: one.number(g) >= 30)
-    assert one.link.status().text == 'streaming'
+    board.read()
+    assert 'silent' in board.link.status().text
+    end_s = time.monotonic() + 1.5
+    while time.monotonic() < end_s:
+        board.send(os.urandom(50).replace(b'\0', b'\1') + b'\0')
+        board.link.read(0)
+    assert 'is link.baud (115200) that of the board?' in board.link.status().text
+    board.send_frames(3)
+    board.read_samples(30)
+    assert board.link.status().text == 'streaming'
 
 
-def test_frames_faster_than_a_board_can_mean_wait(line):
-    one = line()
-    one.inform()
-    stop = time.monotonic() + 2.0
+def test_frames_far_above_the_stated_rate_wait(connect):
+    board = connect()
+    board.send_info()
+    stop_s = time.monotonic() + 2.0
 
     def flood():
-        while time.monotonic() < stop:
-            one.frames(10)
+        while time.monotonic() < stop_s:
+            board.send_frames(10)
     writer = threading.Thread(target=flood)
     writer.start()
-    got = one.read(lambda g: time.monotonic() > stop)
+    parts = board.read(5.0, lambda parts: time.monotonic() > stop_s)
     while writer.is_alive():
-        got += one.read()
-    assert one.number(got) < 2.5 * 20 * 1000 + 6000, 'twenty times the rate, and what is credited'
+        parts += board.read()
     writer.join()
-    stamps = np.concatenate([s.stamp_ns for s in got])
-    assert (np.diff(stamps) > 0).all()
+    assert sample_count(parts) < 2.5 * 20 * 1000 + 6000, 'twenty times the rate, and the credit'
+    assert (np.diff(stamps_of(parts)) > 0).all()
 
 
-def test_a_port_comes_back_and_the_count_goes_on(line):
-    one = line()
-    one.inform()
-    one.frames(20, 0.01)
-    one.read(lambda g: one.number(g) >= 200)
-    one.unplug()
-    went = time.monotonic()
-    one.read(lambda g: one.link.status().level == base.Level.ERROR)
-    assert one.link.status().level == base.Level.ERROR
+def test_a_port_comes_back_and_the_count_goes_on(connect):
+    board = connect()
+    board.send_info()
+    board.send_frames(20, 0.01)
+    board.read_samples(200)
+    board.unplug()
+    unplugged_s = time.monotonic()
+    board.read(5.0, lambda parts: board.link.status().level == base.Level.ERROR)
+    assert board.link.status().level == base.Level.ERROR
     time.sleep(0.3)
-    one.plug()
-    back = time.monotonic()
-    one.index += round((time.monotonic() - went) * 1000)
-    lost = one.index - 200
-    got = []
-    while one.number(got) < 100:
-        one.frames(1, 0.01)
-        got += one.read(lambda g: one.number(g) >= 10, 0.02)
-        assert time.monotonic() < back + 5
-    assert one.value('connections') == 2
-    assert one.value('resets') == 0
-    said = sum(s.missing for s in got)
-    assert said >= lost
-    assert (said - lost) % 10 == 0, 'frames sent before the port was open again are missing, too'
-    assert sum(s.estimated for s in got) == 0
+    board.plug()
+    plugged_s = time.monotonic()
+    board.index += round((time.monotonic() - unplugged_s) * 1000)
+    lost = board.index - 200
+    parts = []
+    while sample_count(parts) < 100:
+        board.send_frames(1, 0.01)
+        parts += board.read_samples(10, 0.02)
+        assert time.monotonic() < plugged_s + 5
+    assert board.value('connections') == 2
+    assert board.value('resets') == 0
+    assert missing(parts) >= lost
+    extra = missing(parts) - lost
+    assert extra % 10 == 0, 'frames sent before the port was open again are missing, too'
+    assert estimated(parts) == 0
 
 
-def test_a_socket_is_a_port_too():
+def test_a_socket_is_a_port():
     with socket.create_server(('127.0.0.1', 0)) as server:
         link = serial.open_link(nominal(), serial.Settings(
             port=f'socket://127.0.0.1:{server.getsockname()[1]}'))
@@ -351,10 +385,10 @@ def test_a_socket_is_a_port_too():
         thread.join()
         encoder, codes, count = Encoder(INFO), np.full((10, 2), 1000), 0
         accepted[0].sendall(encoder.info_frame())
-        began = time.monotonic()
+        began_s = time.monotonic()
         for k in range(300):
             accepted[0].sendall(encoder.sample_frame(10_000 * k, 10 * k, codes))
-        while count < 3000 and time.monotonic() < began + 5:
+        while count < 3000 and time.monotonic() < began_s + 5:
             count += len(link.read(0).stamp_ns)
         assert count == 3000
         accepted[0].close()
@@ -363,25 +397,25 @@ def test_a_socket_is_a_port_too():
         link.close()
 
 
-@pytest.mark.parametrize('options, why', [
+@pytest.mark.parametrize('settings, reason', [
     ({'port': ''}, 'link.port: names no port'), ({'channels': 'x,w'}, "'w'"),
     ({'channels': 'x'}, 'no channel for y'), ({'temperature_v_per_c': 0.0}, 'temperature_v_per')])
-def test_options_that_cannot_be_are_refused(options, why):
-    with pytest.raises(UserError, match=why):
-        serial.open_link(nominal(), serial.Settings(**{'port': '/dev/null', **options}))
+def test_settings_that_cannot_work_are_refused(settings, reason):
+    with pytest.raises(UserError, match=reason):
+        serial.open_link(nominal(), serial.Settings(**{'port': '/dev/null', **settings}))
 
 
-@pytest.mark.parametrize('port, why', [
+@pytest.mark.parametrize('port, reason', [
     ('/no/such/port', 'No such file'), ('gopher://x', 'gopher|URL|protocol'),
     ('socket://127.0.0.1:1', 'refused'), ('/etc/hostname', 'configure|ioctl|Inappropriate')])
-def test_a_port_that_does_not_open_says_why(port, why):
+def test_a_port_that_does_not_open_states_why(port, reason):
     link = serial.open_link(nominal(), serial.Settings(port=port))
     link.read(0)
-    state = link.status()
-    assert state.level == base.Level.ERROR
-    assert port in state.text
-    assert '\n' not in state.text
-    assert re.search(why, state.text), state.text
+    status = link.status()
+    assert status.level == base.Level.ERROR
+    assert port in status.text
+    assert '\n' not in status.text
+    assert re.search(reason, status.text), status.text
     link.close()
 
 
@@ -397,11 +431,11 @@ def test_a_board_on_a_terminal_is_read_to_the_last_sample(tmp_path):
         link.read(0)
         thread = threading.Thread(target=sender.send, args=(columns,))
         thread.start()
-        got, end = [], time.monotonic() + 10
-        while sum(map(len, got)) < 1000 and time.monotonic() < end:
-            got.append(link.read(0).volts)
+        volts_parts, end_s = [], time.monotonic() + 10
+        while sum(map(len, volts_parts)) < 1000 and time.monotonic() < end_s:
+            volts_parts.append(link.read(0).volts)
         thread.join()
-        volts = np.concatenate(got)
+        volts = np.concatenate(volts_parts)
         assert volts.shape == (1000, 2)
         assert np.abs(volts - np.column_stack([columns['x_v'], columns['y_v']])).max() <= \
             sensor.lsb_v

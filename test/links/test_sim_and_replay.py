@@ -15,9 +15,11 @@
 """The links without ROS: the simulated sensor and stage, and the replay."""
 
 from dataclasses import replace
+import sys
 import time
 
 from adxl_ros.errors import UserError
+import adxl_ros.links
 from adxl_ros.links import replay, sim
 from adxl_ros.links.support import base
 from adxl_ros.links.support.simulated_stage import SimulatedStage
@@ -26,6 +28,7 @@ from adxl_ros.model.effects.base import Joint
 from adxl_ros.model.kinematics import felt, specific_force
 from adxl_ros.model.sensor import to_nominal_mps2
 import numpy as np
+from processes import REPO
 import pytest
 from units import nominal
 
@@ -41,11 +44,11 @@ def simulated(sensor=None, alpha=np.pi / 2, beta=0.0, seed=0):
 
 
 def ideal():
-    """Return a sensor without noise, filter and ADC, which shows what it feels."""
+    """Return a sensor without noise, filter and ADC: its output is the specific force."""
     return nominal('xyz', noise_density_g_per_rthz=np.zeros(3), rc_capacitance_f=0.0, adc_bits=0)
 
 
-def taken(link, until_ns, step_ns):
+def read_until(link, until_ns, step_ns):
     parts = [link.read(now) for now in range(START, until_ns + 1, step_ns)]
     return (np.concatenate([p.stamp_ns for p in parts]), np.concatenate([p.volts for p in parts]))
 
@@ -59,9 +62,24 @@ def test_every_link_can_be_opened_by_its_name():
         assert all(isinstance(option, base.Option) for option in base.options(module.Settings))
 
 
-def test_sim_samples_a_pose_with_the_noise_that_the_figures_promise():
+def test_the_example_of_the_documentation_is_a_link(tmp_path, monkeypatch):
+    text = (REPO / 'docs' / 'links.md').read_text(encoding='utf-8')
+    (tmp_path / 'constant.py').write_text(text.split('```python\n')[1].split('```')[0])
+    monkeypatch.setattr(adxl_ros.links, '__path__', [*adxl_ros.links.__path__, str(tmp_path)])
+    monkeypatch.delitem(sys.modules, 'adxl_ros.links.constant', raising=False)
+    assert 'constant' in base.link_names()
+    module = base.link_module('constant')
+    assert [option.name for option in base.options(module.Settings)] == ['level_v']
+    link = module.open_link(nominal(), module.Settings(level_v=1.5))
+    assert link.begin(0) == 0
+    assert link.read(0).volts.tolist() == [[1.5, 1.5]]
+    assert link.status() == base.LinkStatus(base.Level.OK, 'streaming')
+    link.close()
+
+
+def test_sim_samples_a_pose_with_the_stated_noise():
     sensor = nominal()
-    stamps, volts = taken(simulated(sensor), START + 20_000 * MS, 4 * MS)
+    stamps, volts = read_until(simulated(sensor), START + 20_000 * MS, 4 * MS)
     assert np.array_equal(stamps, START + MS * np.arange(20_001))
     expected = [2.5 + 9.80665 / 9.80665, 2.5]
     count = noise.effective_samples(len(volts), 1e-3, sensor.rc_s)
@@ -69,21 +87,22 @@ def test_sim_samples_a_pose_with_the_noise_that_the_figures_promise():
     assert volts.std(0) == pytest.approx(noise.sigma_v(sensor), rel=0.15)
 
 
-def test_sim_gives_the_same_samples_whoever_asks_how_often():
-    often = taken(simulated(), START + 1000 * MS, 3 * MS)
-    seldom = taken(simulated(), START + 1000 * MS, 250 * MS)
+def test_samples_of_sim_do_not_depend_on_the_number_of_reads():
+    often = read_until(simulated(), START + 1000 * MS, 3 * MS)
+    seldom = read_until(simulated(), START + 1000 * MS, 250 * MS)
     assert np.array_equal(often[1][:1000], seldom[1][:1000])
-    assert not np.array_equal(often[1], taken(simulated(seed=1), START + 1000 * MS, 3 * MS)[1])
+    other_seed = read_until(simulated(seed=1), START + 1000 * MS, 3 * MS)
+    assert not np.array_equal(often[1], other_seed[1])
 
 
 def turning(t):
-    """Return a smooth motion: alpha, beta, shift and their rates."""
+    """Return a smooth motion at a time, s: positions and velocities by joint."""
     return ({'alpha': 0.5 + 0.4 * np.sin(3 * t), 'beta': -2 * np.cos(t),
              'shift': 0.01 * np.sin(8 * t)},
             {'alpha': 1.2 * np.cos(3 * t), 'beta': 2 * np.sin(t), 'shift': 0.08 * np.cos(8 * t)})
 
 
-def test_sim_feels_the_true_motion_at_its_samples():
+def test_sim_senses_the_true_motion_at_its_samples():
     link = simulated(ideal())
     for k in range(101):
         link.sense_stage(START + k * 10 * MS, *turning(k * 0.01))
@@ -120,7 +139,7 @@ def test_sim_waits_for_a_stage_and_holds_the_pose_of_a_lost_one(monkeypatch):
     assert link.read(START + 9000 * MS).until_ns == START + 1310 * MS
 
 
-def test_sim_takes_the_word_of_a_stage_that_was_started_anew():
+def test_sim_follows_a_stage_that_has_started_again():
     link = simulated(ideal())
     for k in range(11):
         link.sense_stage(START + k * 10 * MS, {'alpha': 0.3, 'beta': 0.0}, {})
@@ -131,20 +150,20 @@ def test_sim_takes_the_word_of_a_stage_that_was_started_anew():
     assert to_nominal_mps2(samples.volts, ideal())[-1, 2] == pytest.approx(9.80665 * np.cos(0.7))
 
 
-@pytest.mark.parametrize('stamp, alpha, why', [
+@pytest.mark.parametrize('stamp, alpha, reason', [
     (START + 3600 * 1000 * MS, 0.1, 'another clock'), (START - 3000 * MS, 0.1, 'another clock'),
     (START + 10 * MS, np.nan, 'not finite')])
-def test_sim_does_not_feel_nonsense(stamp, alpha, why):
+def test_sim_ignores_motion_that_cannot_be(stamp, alpha, reason):
     link = simulated(ideal(), alpha=0.2)
     link.sense_stage(stamp, {'alpha': alpha, 'beta': 0.0}, {'alpha': 0.0, 'beta': 0.0})
     assert link.status().level == base.Level.WARN
-    assert why in link.status().text
+    assert reason in link.status().text
     samples = link.read(START + 100 * MS)
     assert len(samples.stamp_ns) == 101
     assert to_nominal_mps2(samples.volts, ideal())[-1, 2] == pytest.approx(9.80665 * np.cos(0.2))
 
 
-def test_sim_counts_what_a_jump_of_the_clock_leaves_out():
+def test_sim_counts_the_samples_that_a_jump_of_the_clock_skips():
     link = simulated()
     link.read(START + 100 * MS)
     assert link.begin(START + 3100 * MS) == 3000
@@ -152,12 +171,12 @@ def test_sim_counts_what_a_jump_of_the_clock_leaves_out():
 
 
 def a_stage(**changes):
-    figures = {'pose': np.zeros(3), 'slew': np.array([0.5, 0.5, 0.01]), 'settling_s': 0.3,
+    settings = {'pose': np.zeros(3), 'slew': np.array([0.5, 0.5, 0.01]), 'settling_s': 0.3,
                'resolution': np.array([1.5e-3, 1.5e-3, 0.0]), 'seed': 3} | changes
-    return SimulatedStage(**figures)
+    return SimulatedStage(**settings)
 
 
-def test_stage_moves_at_the_slew_rate_and_comes_to_rest_in_the_encoder_step_told():
+def test_stage_moves_at_the_slew_rate_to_the_commanded_encoder_step():
     stage = a_stage()
     stage.command({'alpha': 0.5, 'beta': -0.3})
     fastest = 0.0
@@ -167,12 +186,12 @@ def test_stage_moves_at_the_slew_rate_and_comes_to_rest_in_the_encoder_step_told
     assert fastest == pytest.approx(0.5, rel=1e-3)
     assert not stage.moving()
     assert stage.encoder()[:2] == pytest.approx(np.rint(np.array([0.5, -0.3]) / 1.5e-3) * 1.5e-3)
-    off = np.abs(stage.position - stage.encoder())[:2]
-    assert (off <= 0.75e-3).all()
-    assert (off > 1e-6).all(), 'the true pose differs from what the encoder shows'
+    difference = np.abs(stage.position - stage.encoder())[:2]
+    assert (difference <= 0.75e-3).all()
+    assert (difference > 1e-6).all(), 'the true pose differs from the reading of the encoder'
 
 
-def test_stage_rests_elsewhere_in_the_step_when_it_comes_again():
+def test_stage_rests_at_another_place_of_the_step_after_each_command():
     stage, rests = a_stage(), []
     for target in (0.3, 0.0, 0.3):
         for _ in range(200):
@@ -183,7 +202,7 @@ def test_stage_rests_elsewhere_in_the_step_when_it_comes_again():
     assert abs(rests[0] - rests[2]) < 1.5e-3
 
 
-def test_stage_does_the_same_in_long_and_short_steps():
+def test_motion_of_the_stage_does_not_depend_on_the_time_step():
     coarse, fine = a_stage(), a_stage()
     for stage, count in ((coarse, 30), (fine, 3000)):
         stage.command({'alpha': 0.3, 'shift': -0.5})
@@ -195,7 +214,7 @@ def test_stage_does_the_same_in_long_and_short_steps():
 
 @pytest.mark.parametrize('command', [
     {'gamma': 0.1}, {'alpha': np.nan}, {'alpha': 0.1, 'beta': np.inf}, {'alpha': 1e38}])
-def test_stage_refuses_a_command_as_a_whole(command):
+def test_stage_refuses_a_command_with_one_invalid_joint_completely(command):
     stage = a_stage()
     before = stage.position.copy()
     with pytest.raises(UserError, match=list(command)[-1]):
@@ -218,7 +237,7 @@ def opened(path, loop=False, sensor=None):
 ROWS = [(5.0 + 0.01 * k, 0.1 * k, -1.0, 9.8) for k in range(50)]
 
 
-def test_replay_gives_every_row_at_its_time(tmp_path):
+def test_replay_returns_every_row_at_its_time(tmp_path):
     link = opened(written(tmp_path / 'r.csv', ROWS))
     assert link.sensor.axes == 'xyz'
     assert link.sensor.rate_hz == pytest.approx(100)
@@ -245,12 +264,12 @@ def test_replay_loops_without_a_gap(tmp_path):
     assert link.status().text == 'playing'
 
 
-def test_replay_counts_the_rows_that_a_recording_lacks(tmp_path):
+def test_replay_counts_the_missing_rows_of_a_recording(tmp_path):
     link = opened(written(tmp_path / 'r.csv', ROWS[:20] + ROWS[23:]))
     assert link.read(START + 1000 * MS).missing == 3
 
 
-def test_replay_goes_by_the_figures_of_the_recording(tmp_path):
+def test_replay_uses_what_the_recording_states(tmp_path):
     path = tmp_path / 'r.csv'
     path.write_text('# serial: 17\n# rate_hz: 200.0\n# nominal_zero_g_v: 1.5, 1.6\n'
                     '# nominal_scale_v_per_g: 0.3, 0.4\ntime_s,x_v,y_v,temperature_c\n'
@@ -265,22 +284,23 @@ def test_replay_goes_by_the_figures_of_the_recording(tmp_path):
     assert np.isnan(samples.references['temperature_c'][1])
 
 
-@pytest.mark.parametrize('text, why', [
+@pytest.mark.parametrize('text, reason', [
     ('', 'empty'), ('time_s,x_v\n', 'no samples'), ('time_s,a\n0.0,1.0\n', 'column'),
     ('time_s,x_v\n0.0,1.0\n0.1,two\n', 'two'), ('time_s,x_v\n0.0,1.0\n0.1,nan\n', ':3'),
     ('time_s,x_v\n1.0,1.0\n0.5,1.0\n', ':3'), ('time_s,x_v\n0.0,1.0\n0.1,1e38\n', ':3'),
     ('# rate_hz: fast\ntime_s,x_v\n0.0,1.0\n', 'rate_hz')])
-def test_replay_says_in_one_line_what_is_wrong(tmp_path, text, why):
+def test_replay_reports_a_fault_in_one_line(tmp_path, text, reason):
     path = tmp_path / 'bad.csv'
     path.write_text(text)
     with pytest.raises(UserError) as error:
         opened(path).read(START + 10_000 * MS)
     assert str(path) in str(error.value)
-    assert why in str(error.value)
+    assert reason in str(error.value)
     assert '\n' not in str(error.value)
 
 
-@pytest.mark.parametrize('recording, why', [('', 'link.recording'), ('/no/such.csv', 'No such')])
-def test_replay_without_a_recording_is_refused(recording, why):
-    with pytest.raises(UserError, match=why):
+@pytest.mark.parametrize('recording, reason', [
+    ('', 'link.recording'), ('/no/such.csv', 'No such')])
+def test_replay_without_a_recording_is_refused(recording, reason):
+    with pytest.raises(UserError, match=reason):
         replay.open_link(nominal(), replay.Settings(recording=recording))

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The serial wire format: its vector, what it refuses, what no stream of bytes can do to it."""
+"""The serial wire format: its test vector, invalid frames, arbitrary streams of bytes."""
 
 from dataclasses import replace
 import zlib
@@ -41,7 +41,7 @@ FRAME = bytes.fromhex(
 INFO = BoardInfo(1000.0, 16, 2, 5.0, 'A7')
 
 
-def test_the_vector_of_the_interfaces():
+def test_the_vector_is_encoded_and_decoded():
     assert zlib.crc32(PAYLOAD).to_bytes(4, 'little') == bytes.fromhex('e9e413f1')
     assert encode_payload(PAYLOAD) == FRAME
     data = decode(FRAME[:-1])
@@ -50,7 +50,7 @@ def test_the_vector_of_the_interfaces():
     assert data.codes.tolist() == [[0x8000, 0], [0x1234, 0xffff]]
 
 
-def test_the_encoder_makes_the_vector_but_for_the_flags_that_it_sets():
+def test_the_encoder_makes_the_vector_and_sets_flags():
     encoder = Encoder(INFO)
     for _ in range(7):
         encoder.info_frame()
@@ -61,7 +61,7 @@ def test_the_encoder_makes_the_vector_but_for_the_flags_that_it_sets():
         replace(decode(FRAME[:-1]), check=0, codes=None)
 
 
-def test_info_comes_back_as_it_was_and_the_reset_is_told_until_the_first_samples():
+def test_info_is_decoded_and_the_reset_flag_lasts_until_the_first_samples():
     encoder = Encoder(BoardInfo(333.25, 12, 3, 3.3, 'board 17'))
     info = decode(encoder.info_frame()[:-1])
     assert info == BoardInfo(333.25, 12, 3, pytest.approx(3.3, rel=1e-7), 'board 17')
@@ -71,14 +71,14 @@ def test_info_comes_back_as_it_was_and_the_reset_is_told_until_the_first_samples
     assert decode(encoder.info_frame()[:-1]).flags == 0
 
 
-@pytest.mark.parametrize('change, why', [
+@pytest.mark.parametrize('change, reason', [
     (lambda p: p[:1] + b'\2' + p[2:], 'wire format 2'), (lambda p: b'\3' + p[1:], 'type 3'),
     (lambda p: p[:-1], '32 bytes|31 bytes'), (lambda p: p[:22] + b'\3' + p[23:], 'samples'),
     (lambda p: p[:8] + b'\xff' * 8 + p[16:], 'at 18446744073709551615 us'),
     (lambda p: p[:6], '6 bytes|does not match')])
-def test_what_cannot_be_is_refused(change, why):
-    kind = VersionError if 'format' in why else WireError
-    with pytest.raises(kind, match=why):
+def test_an_invalid_payload_is_refused(change, reason):
+    kind = VersionError if 'format' in reason else WireError
+    with pytest.raises(kind, match=reason):
         decode(encode_payload(change(PAYLOAD))[:-1])
 
 
@@ -86,18 +86,18 @@ def test_what_cannot_be_is_refused(change, why):
     replace(INFO, rate_hz=float('nan')), replace(INFO, rate_hz=0.0), replace(INFO, bits=0),
     replace(INFO, bits=17), replace(INFO, channels=0), replace(INFO, channels=200),
     replace(INFO, vref_v=float('inf')), replace(INFO, vref_v=-1.0), replace(INFO, serial='\n')])
-def test_an_info_frame_that_makes_no_sense_is_refused(info):
+def test_an_info_frame_out_of_range_is_refused(info):
     with pytest.raises(WireError, match='an info frame'):
         decode(Encoder(info).info_frame()[:-1])
 
 
-def test_a_single_changed_lost_or_added_byte_is_never_taken_for_a_frame():
+def test_a_single_changed_lost_or_added_byte_never_decodes():
     rng = np.random.default_rng(0)
     raw = FRAME[:-1]
     for _ in range(3000):
-        at, byte = int(rng.integers(len(raw))), bytes([rng.integers(256)])
-        for bad in (raw[:at] + byte + raw[at + 1:], raw[:at] + raw[at + 1:],
-                    raw[:at] + byte + raw[at:]):
+        k, byte = int(rng.integers(len(raw))), bytes([rng.integers(256)])
+        for bad in (raw[:k] + byte + raw[k + 1:], raw[:k] + raw[k + 1:],
+                    raw[:k] + byte + raw[k:]):
             for part in bad.split(b'\0'):
                 if part == raw:
                     continue
@@ -106,41 +106,41 @@ def test_a_single_changed_lost_or_added_byte_is_never_taken_for_a_frame():
 
 
 def test_a_stream_without_an_end_is_skipped_and_not_kept():
-    cut = Splitter()
-    assert cut.split(b'noise\0') == [b'noise']
+    splitter = Splitter()
+    assert splitter.split(b'noise\0') == [b'noise']
     for _ in range(100):
-        assert cut.split(b'\x55' * 1000) == []
-        assert len(cut._incomplete) <= MAX_FRAME_BYTES
-    assert cut.split(b'tail\0' + FRAME + FRAME[:5]) == [FRAME[:-1]]
-    assert cut.skipped == 100_004
-    assert cut.split(FRAME[5:]) == [FRAME[:-1]]
+        assert splitter.split(b'\x55' * 1000) == []
+        assert len(splitter._incomplete) <= MAX_FRAME_BYTES
+    assert splitter.split(b'tail\0' + FRAME + FRAME[:5]) == [FRAME[:-1]]
+    assert splitter.skipped == 100_004
+    assert splitter.split(FRAME[5:]) == [FRAME[:-1]]
 
 
 @settings(max_examples=300)
 @given(st.binary(max_size=400))
 def test_any_bytes_are_a_frame_or_an_error(raw):
     try:
-        found = decode(raw)
+        frame = decode(raw)
     except WireError:
         return
-    assert isinstance(found, BoardInfo | SampleFrame)
+    assert isinstance(frame, BoardInfo | SampleFrame)
 
 
 @settings(max_examples=200)
 @given(st.lists(st.one_of(st.binary(max_size=50), st.just(FRAME)), max_size=20),
        st.integers(1, 30))
-def test_how_a_stream_is_cut_into_chunks_changes_nothing(parts, size):
+def test_the_size_of_chunks_changes_nothing(parts, size):
     stream = b''.join(parts) + b'\0'
-    whole = Splitter().split(stream)
-    cut = Splitter()
-    pieces = [raw for i in range(0, len(stream), size) for raw in cut.split(stream[i:i + size])]
-    assert pieces == whole
+    splitter = Splitter()
+    pieces = [raw for i in range(0, len(stream), size)
+              for raw in splitter.split(stream[i:i + size])]
+    assert pieces == Splitter().split(stream)
 
 
 @settings(max_examples=200)
 @given(st.integers(1, 12), st.integers(1, 8), st.integers(0, 2 ** 53), st.integers(0, 2 ** 40),
        st.randoms(use_true_random=False))
-def test_every_frame_comes_back_as_it_was(count, channels, time_us, index, random):
+def test_every_frame_is_decoded_as_it_was_encoded(count, channels, time_us, index, random):
     codes = np.array([[random.randrange(2 ** 16) for _ in range(channels)]
                       for _ in range(count)], np.uint16)
     raw = Encoder(replace(INFO, channels=channels)).sample_frame(time_us, index, codes)
