@@ -48,7 +48,7 @@ def stage_force(unit: Sensor, alpha_rad: np.ndarray, beta_rad: np.ndarray) -> Co
     """Return the specific force at rest on the unit's stage with its errors, m/s², three (k,)."""
     signals = Signals(NOMINAL_ENVIRONMENT, alpha=Joint(alpha_rad), beta=Joint(beta_rad),
                       up=list(UPRIGHT), gravity_mps2=unit.local_gravity_mps2)
-    for apply, values in signal_chain.applied(unit, Place.STAGE):
+    for apply, values in signal_chain.effects_at(unit, Place.STAGE):
         apply(signals, values)
     return specific_force(signals.alpha.position, signals.beta.position, signals.gravity_mps2,
                           0.0, signals.up)

@@ -18,7 +18,7 @@ The RC filter undone: u = v + RC·dv/dt, in amplitude and phase.
 The derivative is the maximally flat central difference over `HALF` samples each way (Fornberg
 1988): exact for polynomials of degree 2·HALF, within 1 % of amplitude up to a third of the sample
 rate, and without phase. Off-line that is all; live, a sample is known `HALF` samples later, and
-keeps its own stamp. What a filter takes of the noise comes back, too: see `variance_v2`.
+keeps its own stamp. What a filter takes of the noise comes back, too: see `noise_variance_v2`.
 """
 
 from __future__ import annotations
@@ -41,14 +41,14 @@ GAP = 1.5
 """Samples further apart than so many periods are not neighbours."""
 
 
-def difference(half: int) -> np.ndarray:
+def derivative_weights(half: int) -> np.ndarray:
     """Weights of the samples −half … half in a derivative by samples, (2·half + 1,)."""
     one_side = [-(-1) ** k * factorial(half) ** 2
                 / (k * factorial(half - k) * factorial(half + k)) for k in range(1, half + 1)]
     return np.array([*(-w for w in reversed(one_side)), 0.0, *one_side])
 
 
-def undone(volts: np.ndarray, time_s: np.ndarray, rc_s: np.ndarray, rate_hz: float) -> np.ndarray:
+def undo(volts: np.ndarray, time_s: np.ndarray, rc_s: np.ndarray, rate_hz: float) -> np.ndarray:
     """
     Undo the filter of a stretch, phase and all.
 
@@ -83,21 +83,21 @@ def undone(volts: np.ndarray, time_s: np.ndarray, rc_s: np.ndarray, rate_hz: flo
         rows = np.flatnonzero(reach == half)
         if len(rows):
             near = volts[rows[:, None] + np.arange(-half, half + 1)]
-            slope[rows] = np.einsum('nkm,k->nm', near, difference(half))
+            slope[rows] = np.einsum('nkm,k->nm', near, derivative_weights(half))
     return volts + rc_s * rate_hz * slope
 
 
-def undone_blocks(blocks: Iterable[tuple[Token, np.ndarray, np.ndarray]], rc_s: np.ndarray,
+def undo_blocks(blocks: Iterable[tuple[Token, np.ndarray, np.ndarray]], rc_s: np.ndarray,
                   rate_hz: float) -> Iterator[tuple[Token, np.ndarray]]:
     """
-    Undo the filter block by block, as `undone` does of the whole.
+    Undo the filter block by block, as `undo` does of the whole.
 
     Parameters
     ----------
     blocks
         What is to come out with a block, its stamps, s, (n,), and volts, (n, m).
     rc_s, rate_hz
-        As for `undone`.
+        As for `undo`.
 
     """
     before_s, before_v = np.empty(0), np.empty((0, len(rc_s)))
@@ -108,7 +108,7 @@ def undone_blocks(blocks: Iterable[tuple[Token, np.ndarray, np.ndarray]], rc_s: 
             after_s, after_v = (x[:HALF] for x in (block or held)[1:])
             if not block:
                 after_s, after_v = after_s[:0], after_v[:0]
-            out = undone(np.concatenate([before_v, volts, after_v]),
+            out = undo(np.concatenate([before_v, volts, after_v]),
                          np.concatenate([before_s, time_s, after_s]), rc_s, rate_hz)
             yield token, out[len(before_s):len(before_s) + len(time_s)]
             before_s = np.concatenate([before_s, time_s])[-HALF:]
@@ -116,17 +116,17 @@ def undone_blocks(blocks: Iterable[tuple[Token, np.ndarray, np.ndarray]], rc_s: 
         held = block
 
 
-def variance_v2(sensor: Sensor) -> np.ndarray:
+def noise_variance_v2(sensor: Sensor) -> np.ndarray:
     """
-    Variance of one sample behind `undone` by axis, V², (m,).
+    Variance of one sample behind `undo` by axis, V², (m,).
 
     The analog noise is an AR(1) sequence of correlation exp(−|lag|/RC), the ADC's is white.
     """
-    rc_s = noise.electronics(sensor)[0]
+    rc_s = noise.electronics(sensor).rc_s
     lag = np.abs(np.subtract.outer(np.arange(2 * HALF + 1), np.arange(2 * HALF + 1)))
     out = []
-    for rc, sigma in zip(rc_s, noise.analog_sigma_v(sensor)):
-        weights = rc * sensor.rate_hz * difference(HALF)
+    for rc, sigma in zip(rc_s, noise.analog_std_v(sensor)):
+        weights = rc * sensor.rate_hz * derivative_weights(HALF)
         weights[HALF] += 1
         alike = np.exp(-lag / (rc * sensor.rate_hz)) if rc else np.eye(len(weights))
         out.append(sigma ** 2 * weights @ alike @ weights
@@ -134,15 +134,15 @@ def variance_v2(sensor: Sensor) -> np.ndarray:
     return np.array(out)
 
 
-class Delayed:
-    """`undone` for a stream: gives a sample when it has `HALF` neighbours after it."""
+class DelayedInversion:
+    """`undo` for a stream: gives a sample when it has `HALF` neighbours after it."""
 
     def __init__(self, rc_s: np.ndarray, rate_hz: float) -> None:
         self._rc_s, self._rate_hz = rc_s, rate_hz
         self._near: deque[tuple[float, list[float], object]] = deque()
         self._given = 0
         gain = rc_s * rate_hz
-        self._kernels = [[(gain * w).tolist() for w in difference(half)]
+        self._kernels = [[(gain * w).tolist() for w in derivative_weights(half)]
                          for half in range(HALF + 1)]
 
     def __call__(self, time_s: float, volts: list[float], token: object

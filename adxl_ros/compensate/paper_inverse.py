@@ -70,8 +70,8 @@ def inverse(sensor: Sensor, z_sign: np.ndarray | None = None, maths: Maths = ARR
     gravity_g = signal_chain.gravity_mps2(sensor) / G0_MPS2
     up: Value = sensor.z_sign if z_sign is None else z_sign
     directions = _directions(sensor)
-    element = signal_chain.applied(sensor, Place.ELEMENT, True)
-    electronics = signal_chain.applied(sensor, Place.ELECTRONICS, True)
+    element = signal_chain.effects_at(sensor, Place.ELEMENT, True)
+    electronics = signal_chain.effects_at(sensor, Place.ELECTRONICS, True)
     zero_g_v = sensor.nominal_zero_g_v.tolist()
     scale_v_per_g = sensor.nominal_scale_v_per_g.tolist()
 
@@ -86,7 +86,7 @@ def inverse(sensor: Sensor, z_sign: np.ndarray | None = None, maths: Maths = ARR
                           scale_v_per_g=list(scale_v_per_g))
         for apply, values in electronics:
             apply(signals, values)
-        return signal_chain.converted(signals)
+        return signal_chain.output_volts(signals)
 
     def invert(volts: Components, environment: Environment = NOMINAL_ENVIRONMENT) -> Components:
         zero = converted([0.0 * volts[0]] * 3, environment)
@@ -96,7 +96,7 @@ def inverse(sensor: Sensor, z_sign: np.ndarray | None = None, maths: Maths = ARR
             linear[d] = (v - v0) / (v1 - v0)                                        # (3)
         if 2 not in measured:
             rest = gravity_g ** 2 - linear[0] ** 2 - linear[1] ** 2
-            linear[2] = up * maths.sqrt(maths.most(rest, 0.0))                      # (5)
+            linear[2] = up * maths.sqrt(maths.maximum(rest, 0.0))                      # (5)
         sensed = list(linear)
         for d in measured:
             inputs = list(linear)
@@ -122,6 +122,6 @@ def _away_from_zero(value: Value) -> Value:
 def _directions(sensor: Sensor) -> list[list[float]]:
     """Rows Θ of the measured axes, (18) and (19), as the mounting effects have them."""
     signals = Signals(NOMINAL_ENVIRONMENT, sensed=[np.array(row) for row in np.eye(3)])
-    for apply, values in signal_chain.applied(sensor, Place.MOUNTING, True):
+    for apply, values in signal_chain.effects_at(sensor, Place.MOUNTING, True):
         apply(signals, values)
     return [np.asarray(row).tolist() for row in signals.sensed]

@@ -107,7 +107,7 @@ class RecordingEstimator:
         self._begin_s = float(first.time_s[0])
         self._inverse = (paper_inverse if paper else signal_chain).inverse(sensor)
         self._leverage = leverage(sensor)
-        self._variance_v2 = filter_inversion.variance_v2(sensor) if undo_filter else None
+        self._variance_v2 = filter_inversion.noise_variance_v2(sensor) if undo_filter else None
 
     def blocks(self, recording: Iterable[Recording]) -> Iterator[tuple[Recording, Estimates]]:
         """Yield each block of the recording with its estimates."""
@@ -121,9 +121,9 @@ class RecordingEstimator:
         sensor = self._sensor
         if not self._undo_filter:
             return ((block, block.volts(sensor)) for block in recording)
-        return filter_inversion.undone_blocks(
+        return filter_inversion.undo_blocks(
             ((block, block.time_s, block.volts(sensor)) for block in recording),
-            noise.electronics(sensor)[0], sensor.rate_hz)
+            noise.electronics(sensor).rc_s, sensor.rate_hz)
 
     def _environment(self, block: Recording) -> Environment:
         """Return the surroundings of the samples; nominal where they are not measured."""
@@ -143,7 +143,7 @@ class RecordingEstimator:
         with np.errstate(all='ignore'):  # no force explains some volts
             force = self._inverse(list(volts.T), environment)
             covariance = force_covariance(sensor, force, self._variance_v2, environment)
-            outside = np.isfinite(force[0]) & sensor.envelope.lies_outside(
+            outside = np.isfinite(force[0]) & sensor.envelope.is_outside(
                 environment.temperature_c, force,
                 self._leverage(force) if sensor.envelope.leverage else 0.0)
             covariance[:, :, at_rail] = np.inf

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""One sample after the other: the inverse, the covariance and the tilt of a live stream."""
+"""Inverse, covariance and tilt of a live stream, sample by sample."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from adxl_ros.compensate import filter_inversion, paper_inverse
 from adxl_ros.model import noise, signal_chain
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.covariance import (
-    equation_5,
+    derived_z_covariance,
     leverage,
     measured_covariance,
     UNMEASURED_VARIANCE,
@@ -34,40 +34,56 @@ from adxl_ros.model.tilt import angles, roll_pitch_covariance
 import numpy as np
 
 _CELL_MPS2 = 0.5
-"""Forces this near share a tangent and the covariance of the calibration, which vary slowly."""
-_MOST_CELLS = 4096
-_NEAR = Environment(0.0, 0.5, 0.01)
-"""Surroundings this near, °C and V, share them, too."""
-_LIMIT_MPS2 = 1e6
-"""No sensor gives as much."""
+"""Width of a cell of the grid of forces, m/s²; chosen: within it the tangent and the covariance by
+the coefficients hardly vary, so that its samples share them."""
+
+_MAX_CELLS = 4096
+"""Largest number of cells in memory; chosen: the forces of all poses fill about as many."""
+
+_CELL_ENVIRONMENT = Environment(time_s=0.0, temperature_c=0.5, supply_v=0.01)
+"""Change of the surroundings, °C and V, from which the cells are computed again; chosen: the
+tangent hardly varies within it. Time has no limit."""
+
+_MAX_ACCEL_MPS2 = 1e6
+"""Acceleration that no sensor outputs, m/s²; chosen: far beyond any range."""
+
 _TOLERANCE_MPS2 = 1e-8
-"""What the next step of the inverse would add at most."""
-_MOST_STEPS = 8
+"""Largest next step of a converged inverse, m/s²; chosen: far below any noise."""
+
+_MAX_STEPS = 8
+"""Newton steps after which the inverse starts from zero; chosen: one or two suffice usually."""
+
 _MOTION_S = 0.5
-"""Time over which motion is told from noise: some 24 independent samples behind the filter."""
+"""Interval of the variance that separates motion from noise, s; chosen: the RC filter leaves some
+24 independent samples in it."""
+
 _PAUSE_S = 1.0
-"""Time without a sample after which motion is learnt anew."""
+"""Time without a sample after which the variance begins again, s; chosen: two intervals."""
+
+_NOISE_FACTOR = 2
+"""Multiple of the noise variance that does not count as motion; chosen: the variance of some 24
+samples hardly exceeds it by chance."""
 
 
 class Estimate(NamedTuple):
     """
-    What one sample says.
+    Estimate from one sample.
 
     Attributes
     ----------
     force
-        Specific force in the case frame, m/s².
+        Specific force in the case frame, m/s², three floats.
     covariance
-        Of the force: xx, xy, xz, yy, yz, zz, (m/s²)².
+        Covariance of the force: xx, xy, xz, yy, yz, zz, (m/s²)².
     roll, pitch, inclination
-        Angle, rad, and its variance, rad²; those of an angle that is not shown pass
+        Angle, rad, and its variance, rad². The variance of an angle that is not shown exceeds
         `tilt.UNOBSERVABLE_RAD2`.
     roll_pitch
         Covariance of roll and pitch, rad².
     saturated
-        Whether the ADC was at a rail, so that the variances are those of no measurement.
+        Whether the ADC is at a rail; the variances are then those of an unmeasured axis.
     outside
-        What lies outside of what was calibrated, in words; the variances have it.
+        Texts on how the sample lies outside of the validity range; the variances include it.
 
     """
 
@@ -82,149 +98,186 @@ class Estimate(NamedTuple):
 
 
 class _Cell(NamedTuple):
-    at: signal_chain.Tangent
-    measured: tuple[float, ...]
+    """
+    What the forces of one cell of the grid share.
+
+    Attributes
+    ----------
+    tangent
+        Tangent of the inverse at the middle of the cell.
+    covariance
+        Covariance by noise and coefficients: xx, xy, xz, yy, yz, zz, (m/s²)².
+    outside
+        Texts on how the cell lies outside of the validity range.
+
+    """
+
+    tangent: signal_chain.Tangent
+    covariance: tuple[float, ...]
     outside: tuple[str, ...]
 
 
-class Live:
+class LiveEstimator:
     """
-    Follows one sensor sample by sample, in floats.
+    Estimates specific force, its covariance and tilt of a live stream, sample by sample.
 
-    The force is that of `signal_chain.inverse`: to 1e-8 m/s² where |f| = g has a solution, and to
-    a few hundredths of its standard deviation at alpha = ±90° where it has none.
+    All calculations are in floats, which are ten times faster than arrays of one sample. The
+    force is that of `signal_chain.inverse`: to 1e-8 m/s² where |f| = g has a solution, and to a
+    few hundredths of its standard deviation at alpha = ±90°, where it may have none.
 
-    What moves is not only under gravity, so that the z of equation 5 and the angles are off: the
-    variance of the in-plane force over half a second, of the last two half seconds the larger,
-    is added to theirs as far as it exceeds twice that of the noise. A derived z also gets the
-    noise variance of a measured axis.
+    Angles, and the z of equation 5, hold at rest only. Motion adds to their variances: the
+    variance of the in-plane force over half a second, as far as it exceeds twice that of the
+    noise. The larger of the last two half seconds counts. A derived z also gets the noise
+    variance of a measured axis.
     """
 
     def __init__(self, sensor: Sensor, paper: bool = False, undo_filter: bool = False) -> None:
         """
-        Prepare for a sensor.
+        Prepare for a unit.
 
         Parameters
         ----------
         sensor
-            The unit.
+            The unit by its calibration, at the sample rate of the stream.
         paper
-            By the paper's approximate inverse instead of the exact one.
+            Whether the paper's approximate inverse applies instead of the exact one.
         undo_filter
-            The samples come from `filter_inversion.Delayed`, so that their noise is that before
-            the filter.
+            Whether the samples come from `filter_inversion.DelayedInversion`. Their noise then
+            is that before the filter.
 
         """
         self.sensor = sensor
-        self._paper = paper_inverse.inverse(sensor, maths=FLOATS) if paper else None
-        variance_v2 = filter_inversion.variance_v2(sensor) if undo_filter \
-            else noise.sigma_v(sensor) ** 2
-        self._zero_v = sensor.nominal_zero_g_v.tolist()
-        self._volts = (sensor.nominal_scale_v_per_g / G0_MPS2).tolist()
+        self._paper_inverse = paper_inverse.inverse(sensor, maths=FLOATS) if paper else None
+        self._variance_v2 = filter_inversion.noise_variance_v2(sensor) if undo_filter \
+            else noise.sample_std_v(sensor) ** 2
+        self._zero_g_v = sensor.nominal_zero_g_v.tolist()
+        self._v_per_mps2 = (sensor.nominal_scale_v_per_g / G0_MPS2).tolist()
         self._rails = (0.0, sensor.adc_vref_v - sensor.lsb_v, sensor.lsb_v / 2)
         self._respond = signal_chain.analog_response(sensor)
-        self._before_adc = signal_chain.before_adc(sensor)
-        self._step = signal_chain.step(sensor.axes, signal_chain.gravity_mps2(sensor),
-                                       sensor.z_sign, FLOATS)
+        self._undo_adc = signal_chain.adc_inverse(sensor)
+        self._newton_step = signal_chain.newton_step(
+            sensor.axes, signal_chain.gravity_mps2(sensor), sensor.z_sign, FLOATS)
         self._invert = signal_chain.inverse(sensor)
-        self._variance_v2 = variance_v2
-        self._within(sensor.without_temperature_range())
+        self._use(sensor.without_temperature_range())
         self._cells: dict[tuple[int, int, int], _Cell] = {}
-        quiet = np.sqrt(variance_v2) / sensor.scale_v_per_g * G0_MPS2
-        self._noise = (quiet[:2] ** 2).tolist()
+        noise_mps2 = np.sqrt(self._variance_v2) / sensor.scale_v_per_g * G0_MPS2
+        self._noise_variance = (noise_mps2[:2] ** 2).tolist()
         self._derives_z = sensor.axes == 'xy'
-        # A force, and the volts at the ADC's input that respond to it.
+        # The last force, and the volts at the ADC's input that respond to it.
         self._force: Components = [0.0, 0.0, 0.0]
-        self._around = self._cells_around = NOMINAL_ENVIRONMENT
+        self._environment = self._cells_environment = NOMINAL_ENVIRONMENT
         self._last_volts = self._respond(self._force)
         self._time_s = float('-inf')
 
     def __call__(self, accel_mps2: Components, time_s: float) -> Estimate | None:
         """
-        Estimate from one sample; None if no force explains it.
+        Estimate from one sample.
 
         Parameters
         ----------
         accel_mps2
-            Nominally converted specific force, m/s², three floats, of which those of the
-            measured axes count.
+            Nominally converted specific force, m/s², three floats; only measured axes count.
         time_s
             Stamp of the sample, s.
 
+        Returns
+        -------
+        Estimate or None
+            The estimate; None if no force explains the sample.
+
         """
         volts = self.volts(accel_mps2)
-        return self.of_volts(volts, time_s) if volts else None
+        return self.from_volts(volts, time_s) if volts else None
 
     def volts(self, accel_mps2: Components) -> Components:
-        """Undo the nominal conversion; empty if no sensor gives as much."""
+        """Undo the nominal conversion; an empty list if a value exceeds that of any sensor."""
         volts = [zero + a * scale for zero, a, scale in
-                 zip(self._zero_v, accel_mps2, self._volts) if abs(a) < _LIMIT_MPS2]
-        return volts if len(volts) == len(self._volts) else []
+                 zip(self._zero_g_v, accel_mps2, self._v_per_mps2) if abs(a) < _MAX_ACCEL_MPS2]
+        return volts if len(volts) == len(self._v_per_mps2) else []
 
-    def of_volts(self, volts: Components, time_s: float) -> Estimate | None:
-        """Estimate from the volts of one sample; see the call."""
+    def from_volts(self, volts: Components, time_s: float) -> Estimate | None:
+        """
+        Estimate from the volts of one sample.
+
+        Parameters
+        ----------
+        volts
+            Volts of each measured axis, V.
+        time_s
+            Stamp of the sample, s.
+
+        Returns
+        -------
+        Estimate or None
+            The estimate; None if no force explains the sample.
+
+        """
         force = self._inverse(volts)
         if force is None:
             return None
         saturated = self._at_a_rail(volts)
         unknown = UNMEASURED_VARIANCE if saturated else 0.0
-        motion = self._motion(force, time_s) + unknown
-        spread = self._covariance(force, unknown, motion)
-        # Of the angles, all of gravity is the signal and all motion is noise.
-        loose = (spread[0] + motion, spread[1], spread[2], spread[3] + motion, spread[4],
-                 spread[5] if self._derives_z else spread[5] + motion)
-        roll, pitch, inclination, _ = angles(force, loose, FLOATS)
-        return Estimate(force, spread, roll, pitch, inclination,
-                        roll_pitch_covariance(force, loose, FLOATS), saturated,
-                        self._cell(force).outside)
+        motion = self._motion_variance(force, time_s) + unknown
+        cell = self._cell(force)
+        covariance = self._covariance(force, cell, unknown, motion)
+        # For the angles gravity is the signal, and motion adds to the noise of each axis.
+        moved = (covariance[0] + motion, covariance[1], covariance[2], covariance[3] + motion,
+                 covariance[4], covariance[5] if self._derives_z else covariance[5] + motion)
+        roll, pitch, inclination, _ = angles(force, moved, FLOATS)
+        return Estimate(force, covariance, roll, pitch, inclination,
+                        roll_pitch_covariance(force, moved, FLOATS), saturated, cell.outside)
 
-    def surround(self, temperature_c: float | None = None, supply_v: float | None = None
-                 ) -> None:
+    def set_environment(self, temperature_c: float | None = None, supply_v: float | None = None
+                        ) -> None:
         """
-        Take the surroundings from now on; those that are not named stay.
+        Set the surroundings of the samples that follow.
 
         Parameters
         ----------
         temperature_c
-            Of the sensor, °C.
+            Temperature of the sensor, °C; None leaves it.
         supply_v
-            Of the sensor, V.
+            Supply voltage of the sensor, V; None leaves it.
 
         """
-        if temperature_c is not None and not self._knows_temperature:
-            self._within(self.sensor)
+        if temperature_c is not None:
+            if not self._knows_temperature:
+                self._use(self.sensor)
+                self._cells.clear()
+            self._environment = self._environment._replace(temperature_c=temperature_c)
+        if supply_v is not None:
+            self._environment = self._environment._replace(supply_v=supply_v)
+        if any(abs(now - then) > limit for now, then, limit in zip(
+                self._environment[1:], self._cells_environment[1:], _CELL_ENVIRONMENT[1:])):
             self._cells.clear()
-        self._around = self._around._replace(**{name: value for name, value in (
-            ('temperature_c', temperature_c), ('supply_v', supply_v)) if value is not None})
-        if any(abs(now - then) > near for now, then, near in zip(
-                self._around[1:], self._cells_around[1:], _NEAR[1:])):
-            self._cells.clear()
-            self._cells_around = self._around
-        self._last_volts = self._respond(self._force, self._around)
+            self._cells_environment = self._environment
+        self._last_volts = self._respond(self._force, self._environment)
 
-    def _within(self, sensor: Sensor) -> None:
-        self._measured = measured_covariance(sensor, self._variance_v2)
+    def _use(self, sensor: Sensor) -> None:
+        """Take covariance and validity range from the unit, with its temperatures or without."""
+        self._measured_covariance = measured_covariance(sensor, self._variance_v2)
         self._leverage, self._envelope = leverage(sensor), sensor.envelope
         self._knows_temperature = sensor is self.sensor
 
     def _inverse(self, volts: Components) -> Components | None:
-        """Start where the last sample ended: its volts are the response to its force."""
-        if self._paper:
-            self._force = self._paper(volts, self._around)
+        """Invert the chain, beginning at the force of the last sample; None without a solution."""
+        if self._paper_inverse:
+            self._force = self._paper_inverse(volts, self._environment)
             return self._force if abs(sum(self._force)) < float('inf') else None
-        at = self._cell(self._force).at
-        force, moved = self._force, 0.0
-        response, input_v = self._last_volts, self._before_adc(volts)
-        for _ in range(_MOST_STEPS):
-            before, moved_before = force, moved
-            force = self._step([v - r for v, r in zip(input_v, response)], before, at)
-            moved = max(abs(f - b) for f, b in zip(force, before))
-            # Each step is shorter than the one before by the same factor, or a smaller one.
-            if moved * moved <= _TOLERANCE_MPS2 * moved_before:
+        tangent = self._cell(self._force).tangent
+        force, change = self._force, 0.0
+        response, input_v = self._last_volts, self._undo_adc(volts)
+        for _ in range(_MAX_STEPS):
+            previous, previous_change = force, change
+            force = self._newton_step([v - r for v, r in zip(input_v, response)], previous,
+                                      tangent)
+            change = max(abs(f - p) for f, p in zip(force, previous))
+            # Steps shrink by the same factor or faster, which bounds the next one.
+            if change * change <= _TOLERANCE_MPS2 * previous_change:
                 break
-            response = self._respond(force, self._around)
+            response = self._respond(force, self._environment)
         else:
-            force = self._invert(volts, self._around)
+            force = self._invert(volts, self._environment)
         if not abs(force[0]) + abs(force[1]) + abs(force[2]) < float('inf'):
             return None
         self._force, self._last_volts = force, input_v
@@ -235,54 +288,60 @@ class Live:
         return any((v < low + half_lsb and v > low - half_lsb)
                    or (v > high - half_lsb and v < high + half_lsb) for v in volts)
 
-    def _motion(self, force: Components, time_s: float) -> float:
-        """Return how far the in-plane force of late has varied beyond its noise, (m/s²)²."""
+    def _motion_variance(self, force: Components, time_s: float) -> float:
+        """Return the variance of the recent in-plane force beyond its noise, (m/s²)²."""
         if not 0 <= time_s - self._time_s < _PAUSE_S:
-            self._motion_before = 0.0
-            self._begin(time_s)
-        elif time_s - self._began_s > _MOTION_S:
-            self._motion_before = self._excess()
-            self._begin(time_s)
+            self._previous_excess = 0.0
+            self._begin_interval(time_s)
+        elif time_s - self._begin_s > _MOTION_S:
+            self._previous_excess = self._excess()
+            self._begin_interval(time_s)
         self._time_s = time_s
         self._count += 1
-        for d, value in enumerate(force[:len(self._noise)]):
-            off = value - self._mean[d]
-            self._mean[d] += off / self._count
-            self._squares[d] += off * (value - self._mean[d])
-        return max(self._excess(), self._motion_before)
+        # Welford's recurrence of mean and sum of squares.
+        for d, value in enumerate(force[:len(self._noise_variance)]):
+            deviation = value - self._mean[d]
+            self._mean[d] += deviation / self._count
+            self._squares[d] += deviation * (value - self._mean[d])
+        return max(self._excess(), self._previous_excess)
 
-    def _begin(self, time_s: float) -> None:
-        self._began_s, self._count = time_s, 0
+    def _begin_interval(self, time_s: float) -> None:
+        self._begin_s, self._count = time_s, 0
         self._mean, self._squares = [0.0, 0.0], [0.0, 0.0]
 
     def _excess(self) -> float:
-        return max(0.0, *(squares / self._count - 2 * quiet
-                          for squares, quiet in zip(self._squares, self._noise)))
+        """Return the variance of this interval beyond that of the noise, (m/s²)²."""
+        return max(0.0, *(squares / self._count - _NOISE_FACTOR * variance
+                          for squares, variance in zip(self._squares, self._noise_variance)))
 
-    def _covariance(self, force: Components, unknown: float, motion: float) -> tuple[float, ...]:
-        cell = self._cell(force)
+    def _covariance(self, force: Components, cell: _Cell, unknown: float, motion: float
+                    ) -> tuple[float, ...]:
+        """Return the covariance of a force, with a variance that each axis gets, (m/s²)²."""
         if not self._derives_z:
-            xx, xy, xz, yy, yz, zz = cell.measured
+            xx, xy, xz, yy, yz, zz = cell.covariance
             return xx + unknown, xy, xz, yy + unknown, yz, zz + unknown
-        xx, xy, _, yy, _, _ = cell.measured
-        xx, xy, xz, yy, yz, zz = equation_5(force, (xx, xy, yy), cell.at.slope, FLOATS)
-        return xx + unknown, xy, xz, yy + unknown, yz, zz + self._noise[0] + motion
+        xx, xy, _, yy, _, _ = cell.covariance
+        xx, xy, xz, yy, yz, zz = derived_z_covariance(force, (xx, xy, yy), cell.tangent.slope,
+                                                      FLOATS)
+        return xx + unknown, xy, xz, yy + unknown, yz, zz + self._noise_variance[0] + motion
 
     def _cell(self, force: Components) -> _Cell:
-        """Return the tangent and the covariance of the measured axes at the nearest grid point."""
+        """Return the cell of a force."""
         key = (round(force[0] / _CELL_MPS2), round(force[1] / _CELL_MPS2),
                round(force[2] / _CELL_MPS2))
         cell = self._cells.get(key)
         if cell is None:
-            if len(self._cells) >= _MOST_CELLS:
+            if len(self._cells) >= _MAX_CELLS:
                 self._cells.clear()
-            middle = [float(k * _CELL_MPS2) for k in key]
-            covariance, at = self._measured(middle, self._around)
-            outside = self._envelope.outside(self._around.temperature_c, middle,
-                                             float(self._leverage(middle)[0]))
-            full = np.diag([0.0, UNMEASURED_VARIANCE, UNMEASURED_VARIANCE])
-            axes = [AXES.index(a) for a in self.sensor.axes]
-            full[np.ix_(axes, axes)] = covariance[:, :, 0]
-            cell = self._cells[key] = _Cell(at, tuple(full[np.triu_indices(3)].tolist()),
-                                            outside)
+            cell = self._cells[key] = self._new_cell([float(k * _CELL_MPS2) for k in key])
         return cell
+
+    def _new_cell(self, middle: Components) -> _Cell:
+        """Compute the cell around a force, m/s², three floats."""
+        measured, tangent = self._measured_covariance(middle, self._environment)
+        outside = self._envelope.describe_outside(self._environment.temperature_c, middle,
+                                                  float(self._leverage(middle)[0]))
+        covariance = np.diag([0.0, UNMEASURED_VARIANCE, UNMEASURED_VARIANCE])
+        axes = [AXES.index(axis) for axis in self.sensor.axes]
+        covariance[np.ix_(axes, axes)] = measured[:, :, 0]
+        return _Cell(tangent, tuple(covariance[np.triu_indices(3)].tolist()), outside)

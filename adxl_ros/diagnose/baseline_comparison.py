@@ -26,7 +26,7 @@ from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import ActsOn
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals.rest_detection import find_rests
-from adxl_ros.simulate.from_recording import followed, surroundings
+from adxl_ros.simulate.from_recording import environment_paths, motion_from_references
 from adxl_ros.simulate.motion import Motion, Path
 from adxl_ros.simulate.response import Response
 import numpy as np
@@ -273,13 +273,13 @@ def at_search_rate(comparison: BaselineComparison) -> BaselineComparison:
 def _motion(recording: Recording, sensor: Sensor, volts: np.ndarray, sim: Motion | None
             ) -> tuple[Motion, Reference]:
     """Return the motion of a recording and what determines it."""
-    paths = surroundings(recording)
+    paths = environment_paths(recording)
     temperature_c, supply_v = paths.get('temperature_c'), paths.get('supply_v')
     if sim is not None:
         return replace(sim, temperature_c=temperature_c,
                        supply_v=supply_v), Reference.SIMULATOR
     if _stage_moves(recording):
-        return followed(recording, sensor), Reference.STAGE
+        return motion_from_references(recording, sensor), Reference.STAGE
     # The median output stands for the unknown pose.
     force = signal_chain.inverse(sensor)([float(v) for v in np.nanmedian(volts, axis=0)])
     return Motion(float(recording.time_s[-1] - recording.time_s[0]),

@@ -145,7 +145,7 @@ def estimate_noise_floor(comparisons: Sequence[BaselineComparison]) -> NoiseFloo
     if total.count < FEWEST_SAMPLES:
         total, source = sum(_repeat_squares(comparisons), nothing), 'repeats'
     if total.count < FEWEST_SAMPLES:
-        noise_v, source = noise.sigma_v(baseline), 'assumed'
+        noise_v, source = noise.sample_std_v(baseline), 'assumed'
     else:
         noise_v = np.sqrt(total.squares_v2 / total.count)
     encoder = np.mean([_encoder_mean_square(c) for c in comparisons])

@@ -369,7 +369,7 @@ def residual_detections(samples: NoiseSamples, sensor: Sensor) -> list[Detection
 
 def _before_filter(volts: np.ndarray, sensor: Sensor) -> np.ndarray:
     """Undo the RC filter for noise: innovations of an AR(1) sequence, (n − 1, m)."""
-    rc_s, _ = noise.electronics(sensor)
+    rc_s = noise.electronics(sensor).rc_s
     decay = np.exp(-1 / (sensor.rate_hz * np.where(rc_s > 0, rc_s, 1e-9)))
     return np.column_stack([lfilter([1.0, -a], [1.0], v)[1:] for v, a in zip(volts.T, decay)])
 

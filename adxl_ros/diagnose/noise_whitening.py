@@ -131,9 +131,9 @@ def whiteners(sensor: Sensor, d: int, dt_s: float, span_s: float) -> list[Whiten
         Random walks first, ascending, then 1/f noise.
 
     """
-    rc_s = float(noise.electronics(sensor)[0][d])
+    rc_s = float(noise.electronics(sensor).rc_s[d])
     a = float(np.exp(-dt_s / rc_s)) if rc_s else 0.0
-    std_v = max(float(noise.analog_sigma_v(sensor)[d]), _LOWEST_NOISE_V)
+    std_v = max(float(noise.analog_std_v(sensor)[d]), _LOWEST_NOISE_V)
     step_std_v = sensor.lsb_v / np.sqrt(12)
     scale = float(sensor.scale_v_per_g[d])
     walks = _walk_whiteners(a, std_v, step_std_v, scale, dt_s)

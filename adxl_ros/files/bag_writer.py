@@ -38,7 +38,7 @@ from adxl_ros.files.bag_topics import (
 from adxl_ros.files.recording_columns import COMMANDS, JOINTS, Recording
 from adxl_ros.files.stream_info import converted_info
 from adxl_ros.model.constants import G0_MPS2
-from adxl_ros.model.noise import sigma_v
+from adxl_ros.model.noise import sample_std_v
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
@@ -247,7 +247,7 @@ def _imu_template(types: Any, sensor: Sensor) -> bytes:
     absent = np.zeros(9)
     absent[0] = -1.0
     variance = np.full(3, _ABSENT_VARIANCE)
-    noise = sigma_v(sensor) / sensor.nominal_scale_v_per_g * G0_MPS2
+    noise = sample_std_v(sensor) / sensor.nominal_scale_v_per_g * G0_MPS2
     variance[:len(sensor.axes)] = noise ** 2
     vector = types.types['geometry_msgs/msg/Vector3'](x=0.0, y=0.0, z=0.0)
     message = types.types[IMU](

@@ -13,9 +13,9 @@
 # limitations under the License.
 
 """
-Covariance of a sample's specific force: its noise and what the calibration left unknown.
+Covariance of the specific force of samples: noise and uncertain coefficients.
 
-Where a sample lies outside of what was calibrated, `validity` adds to it.
+Outside of the validity range of the calibration, `validity` adds to the covariance.
 """
 
 from __future__ import annotations
@@ -30,47 +30,60 @@ from adxl_ros.model.sensor import Sensor
 import numpy as np
 
 UNMEASURED_VARIANCE = 1e6
-"""Variance of an axis that the sensor does not have, (m/s²)²."""
+"""Variance of an axis that the sensor does not have, (m/s²)²; chosen: far above any force."""
 
-_NOTHING = 1e-30
-"""Square of a force that is none, (m/s²)²; keeps a divisor from 0."""
+_FORCE2_FLOOR = 1e-30
+"""Square of a negligible force, (m/s²)²; chosen: below any noise, it keeps divisors from 0."""
 
 _OVERHANG_MPS2 = -0.5
-"""A sensor that is said to be upright may still lean over by 3°."""
+"""Lowest z of a sensor that is stated to be upright, m/s²; chosen: it may lean over by 3°."""
+
+_RELATIVE_STEP = 1e-3
+"""Step of the central differences by coefficients, in typical sizes; chosen: the chain is smooth
+and nearly linear in them."""
+
+_ROOT_MEAN = 1.25
+"""Blunts the divisor of derived z where the in-plane force is g: there z² = 2·σ·g·n for normal
+noise n > 0, so that the variance of z is 0.8·σ·g = σ·g/1.25."""
 
 
 def force_covariance(sensor: Sensor, force: Components,
                      sample_variance_v2: np.ndarray | None = None,
                      environment: Environment = NOMINAL_ENVIRONMENT) -> np.ndarray:
     """
-    Covariance of the specific force that `signal_chain.inverse` gives, (m/s²)², (3, 3, n).
+    Return the covariance of the specific force that `signal_chain.inverse` estimates.
 
-    Noise and parameter covariance go through the inverse's tangent. For an x/y sensor, z comes
-    from |f| = g; see `equation_5`.
+    Noise and covariance of the coefficients go through the tangent of the inverse. The z of an
+    x/y sensor is derived from |f| = g; see `derived_z_covariance`.
 
     Parameters
     ----------
     sensor
-        Calibrated figures with their covariance.
+        Calibrated unit with the covariance of its coefficients.
     force
         Specific force in the case frame, m/s², three components (n,).
     sample_variance_v2
-        Variance of the volts by axis, V², (m,); that of one sample's noise unless given.
+        Variance of the volts by axis, V², (m,); that of the noise of one sample unless given.
     environment
-        Around the samples.
+        Surroundings of the samples.
+
+    Returns
+    -------
+    ndarray
+        Covariance, (m/s²)², (3, 3, n).
 
     """
     force = [np.atleast_1d(np.asarray(f, float)) for f in force]
-    measured, at = measured_covariance(sensor, sample_variance_v2)(force, environment)
-    axes = [AXES.index(a) for a in sensor.axes]
-    full = np.zeros((3, 3, len(force[0])))
-    full[1, 1] = full[2, 2] = UNMEASURED_VARIANCE
-    full[np.ix_(axes, axes)] = measured
+    measured, tangent = measured_covariance(sensor, sample_variance_v2)(force, environment)
+    axes = [AXES.index(axis) for axis in sensor.axes]
+    covariance = np.zeros((3, 3, len(force[0])))
+    covariance[1, 1] = covariance[2, 2] = UNMEASURED_VARIANCE
+    covariance[np.ix_(axes, axes)] = measured
     if sensor.axes == 'xy':
-        xx, xy, xz, yy, yz, zz = equation_5(force, (measured[0, 0], measured[0, 1],
-                                                    measured[1, 1]), at.slope, ARRAYS)
-        full = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    return full
+        in_plane = measured[0, 0], measured[0, 1], measured[1, 1]
+        xx, xy, xz, yy, yz, zz = derived_z_covariance(force, in_plane, tangent.slope, ARRAYS)
+        covariance = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    return covariance
 
 
 def measured_covariance(sensor: Sensor, sample_variance_v2: np.ndarray | None = None
@@ -80,136 +93,145 @@ def measured_covariance(sensor: Sensor, sample_variance_v2: np.ndarray | None = 
 
     Parameters
     ----------
-    sensor, sample_variance_v2
-        As for `force_covariance`.
+    sensor
+        Calibrated unit with the covariance of its coefficients.
+    sample_variance_v2
+        Variance of the volts by axis, V², (m,); that of the noise of one sample unless given.
 
     Returns
     -------
     callable
-        Maps specific force, m/s², three arrays (n,) or floats, and an `Environment`, if it is
-        not the nominal one, to the covariance, (m/s²)²,
-        (m, m, n), and the `signal_chain.Tangent` there.
+        Maps specific force, m/s², three components (n,) or floats, and an `Environment` (the
+        nominal one unless given) to the covariance, (m/s²)², (m, m, n), and to the
+        `signal_chain.Tangent` at the force.
 
     """
     if sample_variance_v2 is None:
-        sample_variance_v2 = noise.sigma_v(sensor) ** 2
+        sample_variance_v2 = noise.sample_std_v(sensor) ** 2
     m = len(sensor.axes)
-    respond, by_parameter = signal_chain.analog_response(sensor), _parameter_tangent(sensor)
-    at_leverage = leverage(sensor)
+    respond = signal_chain.analog_response(sensor)
+    by_coefficient = coefficient_tangent(sensor)
+    force_leverage = leverage(sensor)
 
     def covariance(force: Components, environment: Environment = NOMINAL_ENVIRONMENT
                    ) -> tuple[np.ndarray, signal_chain.Tangent]:
-        at = signal_chain.tangent(respond, sensor.axes, force, environment)
+        tangent = signal_chain.tangent(respond, sensor.axes, force, environment)
         volts = np.diag(sample_variance_v2)
         if len(sensor.covariance):
-            of = by_parameter(force, environment).reshape(m, len(sensor.covariance), -1)
-            of = np.moveaxis(of, 2, 0)
-            volts = volts + of @ sensor.covariance @ np.swapaxes(of, 1, 2)
-        back: np.ndarray = np.moveaxis(np.array(at.back).reshape(m, m, -1), 2, 0)
-        found = np.moveaxis(back @ volts @ np.swapaxes(back, 1, 2), 0, 2)
-        if sensor.envelope.temperature_c or sensor.envelope.leverage:
-            far = sensor.envelope.reach(
-                force, at_leverage(force) if sensor.envelope.leverage else 0.0)
+            slope = by_coefficient(force, environment).reshape(m, len(sensor.covariance), -1)
+            slope = np.moveaxis(slope, 2, 0)
+            volts = volts + slope @ sensor.covariance @ np.swapaxes(slope, 1, 2)
+        back: np.ndarray = np.moveaxis(np.array(tangent.back).reshape(m, m, -1), 2, 0)
+        measured = np.moveaxis(back @ volts @ np.swapaxes(back, 1, 2), 0, 2)
+        envelope = sensor.envelope
+        if envelope.temperature_c or envelope.leverage:
+            extrapolation = envelope.extrapolation(
+                force, force_leverage(force) if envelope.leverage else 0.0)
             for d, axis in enumerate(sensor.axes):
-                found[d, d] += sensor.envelope.added(
-                    force[AXES.index(axis)], environment.temperature_c, far, G0_MPS2)
-        return found, at
+                measured[d, d] += envelope.added_variance(
+                    force[AXES.index(axis)], environment.temperature_c, extrapolation, G0_MPS2)
+        return measured, tangent
 
     return covariance
 
 
 def leverage(sensor: Sensor) -> Callable[[Components], np.ndarray]:
     """
-    Prepare what the calibration's covariance alone makes of a force; see `validity`.
+    Prepare the leverage of forces: the trace of their covariance by the coefficients alone.
 
     Returns
     -------
     callable
-        Maps specific force, m/s², three arrays (n,) or floats, to the trace of its covariance
-        over the measured axes at nominal surroundings, (m/s²)², (n,); 0 without a covariance.
+        Maps specific force, m/s², three components (n,) or floats, to the trace over the
+        measured axes in the nominal environment, (m/s²)², (n,); 0 without a covariance.
 
     """
     m = len(sensor.axes)
-    respond, by_parameter = signal_chain.analog_response(sensor), _parameter_tangent(sensor)
+    respond = signal_chain.analog_response(sensor)
+    by_coefficient = coefficient_tangent(sensor)
 
-    def of(force: Components) -> np.ndarray:
+    def force_leverage(force: Components) -> np.ndarray:
         if not sensor.covariance_names:
             return np.zeros(np.shape(force[0]) or 1)
-        slope = np.moveaxis(by_parameter(force).reshape(m, len(sensor.covariance), -1), 2, 0)
-        at = signal_chain.tangent(respond, sensor.axes, force)
-        back: np.ndarray = np.moveaxis(np.array(at.back).reshape(m, m, -1), 2, 0)
-        by_force = back @ slope
-        return np.einsum('nap,pq,naq->n', by_force, sensor.covariance, by_force)
+        slope = np.moveaxis(by_coefficient(force).reshape(m, len(sensor.covariance), -1), 2, 0)
+        tangent = signal_chain.tangent(respond, sensor.axes, force)
+        back: np.ndarray = np.moveaxis(np.array(tangent.back).reshape(m, m, -1), 2, 0)
+        force_slope = back @ slope
+        return np.einsum('nap,pq,naq->n', force_slope, sensor.covariance, force_slope)
 
-    return of
+    return force_leverage
 
 
-def equation_5(force: Components, measured: tuple[Value, Value, Value], slope: Components,
-               maths: Maths) -> tuple[Value, ...]:
+def derived_z_covariance(force: Components, measured: tuple[Value, Value, Value],
+                         slope: Components, maths: Maths) -> tuple[Value, ...]:
     """
-    Spread the in-plane covariance to z = √(g² − x² − y²).
+    Propagate the in-plane covariance to z = √(g² − x² − y²), equation 5.
 
-    x = x₀ + s·z, hence dz = −(x·dx₀ + y·dy₀)/(z + x·s). Where the divisor vanishes, at alpha =
-    ±90°, the error of z is the root of the noise, z² = 2·σ·g·n where n > 0, not its multiple: its
-    variance is 0.8·σ·g there, and hardly any of it goes with dx₀ and dy₀. Near there |f|² = g²
-    has a second solution, z − 2·divisor/(1 + s²). Where that is upright, too, nothing tells the
-    two apart, so that half the square of their distance is added.
+    With x = x₀ + s·z, dz = −(x·dx₀ + y·dy₀)/(z + x·s). Where the divisor vanishes, at alpha =
+    ±90°, the error of z is the root of the noise and not its multiple: its variance is 0.8·σ·g,
+    and it hardly correlates with dx₀ and dy₀. Near alpha = ±90°, |f|² = g² has a second solution,
+    z − 2·divisor/(1 + s²). Where that is upright, too, either may be true, so that half the
+    square of their distance is added.
 
     Parameters
     ----------
     force
         Specific force, m/s², three components.
     measured
-        Its variances xx, xy and yy given z, (m/s²)².
+        Variances xx, xy and yy of the force given z, (m/s²)².
     slope
-        What z adds to x and y, s; see `signal_chain.Tangent`.
+        Derivative s of the estimates of x and y by z; see `signal_chain.Tangent`.
     maths
-        For arrays or for floats.
+        Functions for arrays or for floats.
 
     Returns
     -------
     tuple
-        xx, xy, xz, yy, yz, zz, (m/s²)².
+        xx, xy, xz, yy, yz and zz, (m/s²)².
 
     """
     x, y, z = force
     xx, xy, yy = measured
-    along = maths.sqrt(maths.most(x * x * xx + 2 * x * y * xy + y * y * yy, 0.0))
+    along = maths.sqrt(maths.maximum(x * x * xx + 2 * x * y * xy + y * y * yy, 0.0))
     divisor = z + x * slope[0] + y * slope[1]
-    blunted2 = divisor * divisor + 1.25 * along + _NOTHING
+    blunted2 = divisor * divisor + _ROOT_MEAN * along + _FORCE2_FLOOR
     by_x, by_y = -x * divisor / blunted2, -y * divisor / blunted2
-    apart = 2 * divisor / (1 + slope[0] ** 2 + slope[1] ** 2)
-    upright = maths.where(divisor < 0, -1.0, 1.0) * (z - apart) > _OVERHANG_MPS2
-    own = (1.25 * along * along * along / (blunted2 * blunted2)
-           + maths.where(upright, apart * apart / 2, 0.0))
+    distance = 2 * divisor / (1 + slope[0] ** 2 + slope[1] ** 2)
+    upright = maths.where(divisor < 0, -1.0, 1.0) * (z - distance) > _OVERHANG_MPS2
+    independent = (_ROOT_MEAN * along * along * along / (blunted2 * blunted2)
+                   + maths.where(upright, distance * distance / 2, 0.0))
     rows = ((1 + slope[0] * by_x, slope[0] * by_y, slope[0]),
             (slope[1] * by_x, 1 + slope[1] * by_y, slope[1]), (by_x, by_y, 1.0))
-    return tuple(a * c * xx + (a * d + b * c) * xy + b * d * yy + e * f * own
+    return tuple(a * c * xx + (a * d + b * c) * xy + b * d * yy + e * f * independent
                  for i, (a, b, e) in enumerate(rows) for c, d, f in rows[i:])
 
 
-def parameter_tangent(sensor: Sensor, force: Components) -> np.ndarray:
+def coefficient_tangent(sensor: Sensor) -> Callable[..., np.ndarray]:
     """
-    Differentiate volts by the parameters in `sensor.covariance_names`, V a unit, (m, k, n).
+    Prepare the derivatives of the volts by the coefficients in `sensor.covariance_names`.
 
-    Central differences by a thousandth of the parameter's scale.
+    Returns
+    -------
+    callable
+        Maps specific force, m/s², three components (n,) or floats, and an `Environment` (the
+        nominal one unless given) to derivatives by axis and coefficient, V by the unit of the
+        coefficient, (m, k, n). They are central differences.
+
     """
-    return _parameter_tangent(sensor)(force)
-
-
-def _parameter_tangent(sensor: Sensor) -> Callable[..., np.ndarray]:
     differences = []
     for name in sensor.covariance_names:
-        at, step = coefficients.get(sensor, [name]), 1e-3 * coefficients.parameter_of(name).scale
-        above, below = (signal_chain.static_response(coefficients.put(sensor, [name], at + by))
-                        for by in (step, -step))
+        value = coefficients.get(sensor, [name])
+        step = _RELATIVE_STEP * coefficients.parameter_of(name).scale
+        above, below = (
+            signal_chain.static_response(coefficients.put(sensor, [name], value + change))
+            for change in (step, -step))
         differences.append((above, below, 2 * step))
 
-    def by_parameter(force: Components,
-                     environment: Environment = NOMINAL_ENVIRONMENT) -> np.ndarray:
-        columns = [[(a - b) / apart for a, b in zip(above(force, environment),
-                                                    below(force, environment))]
-                   for above, below, apart in differences]
+    def by_coefficient(force: Components,
+                       environment: Environment = NOMINAL_ENVIRONMENT) -> np.ndarray:
+        columns = [[(a - b) / distance for a, b in zip(above(force, environment),
+                                                       below(force, environment))]
+                   for above, below, distance in differences]
         return np.swapaxes(np.array(columns), 0, 1)
 
-    return by_parameter
+    return by_coefficient

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Continuous-time filters, exact for an input that is a polynomial between its samples."""
+"""Continuous-time filters, exact for inputs that are polynomials between their samples."""
 
 from __future__ import annotations
 
@@ -23,25 +23,36 @@ import numpy as np
 from scipy.signal import lfilter
 
 ORDER = 6
-"""Samples that the polynomial runs through: the newest ones, so that no filter looks ahead."""
-_QUADRATURE = 24
+"""Number of newest samples that the polynomial interpolates; chosen: the error is of order 6."""
+
+_QUADRATURE_NODES = 24
+"""Nodes of the Gauss-Legendre quadrature; chosen: exact to rounding for |z| < `_STIFF`."""
+
 _STIFF = 8.0
+"""|z| from which the weights are integrated by parts; chosen: that is stable for large z only."""
 
 
 def low_pass(x: np.ndarray, tau_s: float, dt_s: float, memory: dict[str, Any]) -> np.ndarray:
     """
-    Filter by 1/(1 + τ·s); at rest at its first input before the first block.
+    Filter by 1/(1 + τ·s).
+
+    Before the first block the filter is at rest at its first input.
 
     Parameters
     ----------
     x
         Input, (n,).
     tau_s
-        Time constant, s; 0 passes the input on.
+        Time constant τ, s; 0 passes the input on.
     dt_s
         Time between samples, s.
     memory
-        What it keeps from one block to the next.
+        State that the filter keeps from one block to the next; empty before the first.
+
+    Returns
+    -------
+    ndarray
+        Output, (n,), in the unit of the input.
 
     """
     if not tau_s:
@@ -52,16 +63,27 @@ def low_pass(x: np.ndarray, tau_s: float, dt_s: float, memory: dict[str, Any]) -
 def resonator(x: np.ndarray, frequency_hz: float, damping_ratio: float, dt_s: float,
               memory: dict[str, Any]) -> np.ndarray:
     """
-    Filter by ω²/(s² + 2·ζ·ω·s + ω²), ζ < 1, by partial fractions; otherwise as `low_pass`.
+    Filter by ω²/(s² + 2·ζ·ω·s + ω²), ζ < 1, by partial fractions.
+
+    Before the first block the filter is at rest at its first input.
 
     Parameters
     ----------
-    x, dt_s, memory
-        As for `low_pass`.
+    x
+        Input, (n,).
     frequency_hz
-        ω/2π, undamped.
+        Undamped natural frequency ω/2π, Hz.
     damping_ratio
-        ζ.
+        ζ, damping divided by the critical one.
+    dt_s
+        Time between samples, s.
+    memory
+        State that the filter keeps from one block to the next; empty before the first.
+
+    Returns
+    -------
+    ndarray
+        Output, (n,), in the unit of the input.
 
     """
     omega = 2 * np.pi * frequency_hz
@@ -72,10 +94,11 @@ def resonator(x: np.ndarray, frequency_hz: float, damping_ratio: float, dt_s: fl
 
 def pole(x: np.ndarray, rate: complex, dt_s: float, memory: dict[str, Any]) -> np.ndarray:
     """
-    Solve w' = rate·w + x: exact for x a polynomial through the newest `ORDER` samples.
+    Solve w' = rate·w + x, exactly for x a polynomial through the newest `ORDER` samples.
 
-    The error is of order (ω·dt)^6 for an input of angular frequency ω. An exponential
-    Adams-Moulton method (Hochbruck and Ostermann 2010, section 2.6).
+    The error is of order (ω·dt)^6 for an input of angular frequency ω. This is an exponential
+    Adams-Moulton method (Hochbruck and Ostermann 2010, section 2.6). The polynomial uses past
+    samples only, so that the filter does not look ahead.
 
     Parameters
     ----------
@@ -86,21 +109,26 @@ def pole(x: np.ndarray, rate: complex, dt_s: float, memory: dict[str, Any]) -> n
     dt_s
         Time between samples, s.
     memory
-        Holds the newest inputs and the last w; empty before the first block, when w is at rest
-        at the first input.
+        Keeps the newest inputs and the last w. It is empty before the first block, when w is at
+        rest at the first input.
+
+    Returns
+    -------
+    ndarray
+        w at the samples, (n,), in the unit of the input times s; complex for a complex rate.
 
     """
     if not len(x):
         return x
     first = not memory
-    before = memory.get('inputs', np.full(ORDER - 1, x[0]))
-    at = memory.get('w', -x[0] / rate)
-    inputs = np.concatenate([before, x])
+    previous = memory.get('inputs', np.full(ORDER - 1, x[0]))
+    last_w = memory.get('w', -x[0] / rate)
+    inputs = np.concatenate([previous, x])
     drive = np.convolve(inputs, _weights(rate * dt_s) * dt_s, 'valid')
     decay = np.exp(rate * dt_s)
     if first:
         drive[0] = -x[0] / rate * (1 - decay)
-    w, _ = lfilter([1.0], [1.0, -decay], drive, zi=np.array([decay * at]))
+    w, _ = lfilter([1.0], [1.0, -decay], drive, zi=np.array([decay * last_w]))
     memory['inputs'], memory['w'] = inputs[-(ORDER - 1):], w[-1]
     return w
 
@@ -112,11 +140,11 @@ def _weights(z: complex) -> np.ndarray:
     lagrange = [np.poly(np.delete(nodes, j)) / np.prod(nodes[j] - np.delete(nodes, j))
                 for j in range(ORDER)]
     if abs(z) < _STIFF:
-        s, weight = np.polynomial.legendre.leggauss(_QUADRATURE)
+        s, weight = np.polynomial.legendre.leggauss(_QUADRATURE_NODES)
         s, weight = (s + 1) / 2, weight / 2
         growth = weight * np.exp(z * (1 - s))
         return np.array([np.sum(growth * np.polyval(c, s)) for c in lagrange])
-    # The integrals of s^k by parts: stable for a large z only.
+    # The integrals of s^k by parts.
     moments = [(np.exp(z) - 1) / z]
     for k in range(1, ORDER):
         moments.append((k * moments[-1] - 1) / z)

@@ -20,6 +20,7 @@ from adxl_ros.model.effects.base import Components, Joint, Value
 import numpy as np
 
 UPRIGHT = (0.0, 0.0, 1.0)
+"""The vertical in the frame of a level base, a unit vector."""
 
 
 def specific_force(alpha_rad: Value, beta_rad: Value, gravity_mps2: float,
@@ -57,12 +58,57 @@ def specific_force(alpha_rad: Value, beta_rad: Value, gravity_mps2: float,
             z * cos_alpha - x * sin_alpha]
 
 
+def specific_force_in_motion(alpha: Joint, beta: Joint, shift: Joint, gravity_mps2: float,
+                             up: Components | tuple[float, float, float] = UPRIGHT
+                             ) -> Components:
+    """
+    Specific force in the case frame of a sensor while all joints move, m/s².
+
+    A shifted sensor is carried by the turning stage, and the Coriolis acceleration adds to its
+    force.
+
+    Parameters
+    ----------
+    alpha, beta, shift
+        Joints with their derivatives, rad and m, arrays or floats of one shape.
+    gravity_mps2
+        Local gravity, m/s².
+    up
+        The vertical in the frame of the stage's base; its y is the axis of alpha.
+
+    Returns
+    -------
+    list
+        The three components, each in the shape of the joints.
+
+    """
+    force = specific_force(alpha.position, beta.position, gravity_mps2, shift.acceleration, up)
+    if np.any(shift.position) and (np.any(alpha.velocity) or np.any(beta.velocity)):
+        omega, omega_dot = angular_motion(alpha, beta)
+        arm = [shift.position, 0.0, 0.0]
+        carried = carried_acceleration(omega, omega_dot, arm)
+        coriolis = cross_product(omega, [2 * shift.velocity, 0.0, 0.0])
+        force = [f + c + w for f, c, w in zip(force, carried, coriolis)]
+    return force
+
+
 def angular_motion(alpha: Joint, beta: Joint) -> tuple[Components, Components]:
     """
-    Angular velocity and acceleration of the sensor, in its own frame, rad/s and rad/s².
+    Angular velocity and acceleration of the sensor in the case frame.
 
-    ω = β̇·[0 0 1] − α̇·[sin β, cos β, 0], which leaves f(α, β) of a fixed vertical as above:
+    ω = β̇·[0 0 1] − α̇·[sin β, cos β, 0]. A fixed vertical then moves as in `specific_force`:
     ḟ = −ω × f.
+
+    Parameters
+    ----------
+    alpha, beta
+        Joints with their derivatives, rad, arrays or floats of one shape.
+
+    Returns
+    -------
+    tuple
+        Angular velocity, rad/s, and angular acceleration, rad/s², three components each.
+
     """
     sin_beta, cos_beta = np.sin(beta.position), np.cos(beta.position)
     along, across = sin_beta * alpha.velocity, cos_beta * alpha.velocity
@@ -72,46 +118,42 @@ def angular_motion(alpha: Joint, beta: Joint) -> tuple[Components, Components]:
              beta.acceleration])
 
 
-def carried(omega: Components, omega_dot: Components, r: Components) -> Components:
+def carried_acceleration(omega: Components, omega_dot: Components, r: Components) -> Components:
     """
-    Acceleration of a point that a turning body carries: ω × (ω × r) + ω̇ × r, m/s².
+    Acceleration of a point that a turning body carries: ω × (ω × r) + ω̇ × r.
 
     Parameters
     ----------
-    omega, omega_dot
-        From `angular_motion`.
+    omega
+        Angular velocity of the body in its frame, rad/s, three components.
+    omega_dot
+        Angular acceleration of the body in its frame, rad/s², three components.
     r
-        From the axis to the point, in the body's frame, m.
+        Vector from the axis to the point in the frame of the body, m, three components.
+
+    Returns
+    -------
+    list
+        Acceleration in the frame of the body, m/s², three components.
 
     """
-    centripetal = cross(omega, cross(omega, r))
-    return [c + t for c, t in zip(centripetal, cross(omega_dot, r))]
+    centripetal = cross_product(omega, cross_product(omega, r))
+    return [c + t for c, t in zip(centripetal, cross_product(omega_dot, r))]
 
 
-def cross(a: Components, b: Components) -> Components:
-    """Return the vector product, component by component."""
-    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
-
-
-def felt(alpha: Joint, beta: Joint, shift: Joint, gravity_mps2: float,
-         up: Components | tuple[float, float, float] = UPRIGHT) -> Components:
+def cross_product(a: Components, b: Components) -> Components:
     """
-    Specific force of a sensor at the axes while all joints move, m/s².
-
-    A shifted sensor is carried by the turning stage and feels Coriolis' acceleration.
+    Return the vector product a × b.
 
     Parameters
     ----------
-    alpha, beta, shift
-        Joints with their derivatives.
-    gravity_mps2, up
-        As for `specific_force`.
+    a, b
+        Vectors of three components, arrays or floats of one shape.
+
+    Returns
+    -------
+    list
+        Three components.
 
     """
-    force = specific_force(alpha.position, beta.position, gravity_mps2, shift.acceleration, up)
-    if np.any(shift.position) and (np.any(alpha.velocity) or np.any(beta.velocity)):
-        omega, omega_dot = angular_motion(alpha, beta)
-        arm = [shift.position, 0.0, 0.0]
-        coriolis = cross(omega, [2 * shift.velocity, 0.0, 0.0])
-        force = [f + c + w for f, c, w in zip(force, carried(omega, omega_dot, arm), coriolis)]
-    return force
+    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]

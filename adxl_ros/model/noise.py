@@ -12,9 +12,11 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Noise of the chain: density and effective sample counts."""
+"""Noise of the samples: standard deviations, spectral density and effective sample counts."""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 from adxl_ros.model import signal_chain
 from adxl_ros.model.effects import effect_named
@@ -23,16 +25,25 @@ from adxl_ros.model.sensor import Sensor
 import numpy as np
 
 
-def electronics(sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:
+class Electronics(NamedTuple):
     """
-    Return what the sensor's effects make of the filter and of the white noise.
+    RC filter and white noise of a unit.
 
-    Returns
-    -------
-    tuple
-        Time constant of the filter by axis, s, (m,); noise density by the stated one, (m,).
+    Attributes
+    ----------
+    rc_s
+        Time constant of the RC filter by axis, s, (m,).
+    noise_ratio
+        Noise density divided by the nominal one, by axis, (m,).
 
     """
+
+    rc_s: np.ndarray
+    noise_ratio: np.ndarray
+
+
+def electronics(sensor: Sensor) -> Electronics:
+    """Return filter and white noise of a unit by its effects."""
     count = len(sensor.axes)
     signals = Signals(NOMINAL_ENVIRONMENT, zero_g_v=sensor.nominal_zero_g_v.tolist(),
                       scale_v_per_g=sensor.nominal_scale_v_per_g.tolist(),
@@ -41,53 +52,52 @@ def electronics(sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:
     for effect in map(effect_named, sensor.effects):
         if effect.needs in ((Need.FILTER,), (Need.NOISE,)) and effect.place is Place.ELECTRONICS:
             effect.apply(signals, signal_chain.parameters(sensor, effect.name))
-    return np.array(signals.rc_s), np.array(signals.noise_ratio)
+    return Electronics(np.array(signals.rc_s), np.array(signals.noise_ratio))
 
 
-def analog_sigma_v(sensor: Sensor) -> np.ndarray:
+def analog_std_v(sensor: Sensor) -> np.ndarray:
     """
-    Give the standard deviation of the analog noise by axis, V, (m,): white noise through the RC.
+    Return the standard deviation of the analog noise by axis, V, (m,).
 
-    A first-order filter of time constant RC passes the noise bandwidth 1/(4·RC) = f_c·π/2; with
-    no filter it is half the sample rate.
-
-    Parameters
-    ----------
-    sensor
-        Stated figures, and effects of its filter and its noise.
-
+    The noise is white before the RC filter. A first-order filter of time constant RC has the
+    noise bandwidth 1/(4·RC) = f_c·π/2. Without a filter it is half the sample rate.
     """
-    rc_s, ratio = electronics(sensor)
+    rc_s, noise_ratio = electronics(sensor)
     bandwidth_hz = np.where(rc_s > 0, 0.25 / np.where(rc_s > 0, rc_s, 1.0), sensor.rate_hz / 2)
-    density = ratio * sensor.noise_density_g_per_rthz * sensor.nominal_scale_v_per_g
+    density = noise_ratio * sensor.noise_density_g_per_rthz * sensor.nominal_scale_v_per_g
     return density * np.sqrt(bandwidth_hz)
 
 
-def sigma_v(sensor: Sensor) -> np.ndarray:
-    """Add LSB²/12 to the analog noise: standard deviation of one sample by axis, V, (m,)."""
-    return np.hypot(analog_sigma_v(sensor), sensor.lsb_v / np.sqrt(12))
+def sample_std_v(sensor: Sensor) -> np.ndarray:
+    """Return the standard deviation of one sample by axis, V, (m,): analog noise and LSB²/12."""
+    return np.hypot(analog_std_v(sensor), sensor.lsb_v / np.sqrt(12))
 
 
 def density_v2_per_hz(sensor: Sensor, frequency_hz: np.ndarray) -> np.ndarray:
     """
-    Return the one-sided spectral density of the samples' noise, V²/Hz, (k, m).
+    Return the one-sided spectral density of the samples' noise.
 
-    An AR(1) sequence (Percival and Walden 1993, section 9.2) and the ADC's steps, which are
-    white.
+    The noise is the sum of an AR(1) sequence (Percival and Walden 1993, section 9.2) and of the
+    ADC's quantisation, which is white.
 
     Parameters
     ----------
     sensor
-        Stated figures, sampled at its rate.
+        The unit, sampled at its rate.
     frequency_hz
-        Up to half the rate, (k,).
+        Frequencies up to half the sample rate, Hz, (k,).
+
+    Returns
+    -------
+    ndarray
+        Density by frequency and axis, V²/Hz, (k, m).
 
     """
-    rc_s, _ = electronics(sensor)
+    rc_s = electronics(sensor).rc_s
     decay = np.where(rc_s > 0, np.exp(-1 / (sensor.rate_hz * np.where(rc_s > 0, rc_s, 1.0))), 0.0)
     turn = np.exp(-2j * np.pi * frequency_hz / sensor.rate_hz)[:, None]
     shape = (1 - decay ** 2) / np.abs(1 - decay * turn) ** 2
-    return 2 / sensor.rate_hz * (analog_sigma_v(sensor) ** 2 * shape + sensor.lsb_v ** 2 / 12)
+    return 2 / sensor.rate_hz * (analog_std_v(sensor) ** 2 * shape + sensor.lsb_v ** 2 / 12)
 
 
 def effective_samples(count: int | np.ndarray, dt_s: float, rc_s: float) -> np.ndarray:
@@ -101,11 +111,16 @@ def effective_samples(count: int | np.ndarray, dt_s: float, rc_s: float) -> np.n
     Parameters
     ----------
     count
-        Samples in the mean, N.
+        Number of samples in the mean, N.
     dt_s
         Time between samples, s.
     rc_s
         Time constant of the filter, s; 0 for none.
+
+    Returns
+    -------
+    ndarray
+        Number of independent samples, in the shape of `count`.
 
     """
     n = np.asarray(count, float)

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The play operator: what backlash and hysteresis are made of."""
+"""The play operator, which backlash and hysteresis consist of."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ def play(x: np.ndarray, half_width: float, memory: dict[str, Any]) -> np.ndarray
     """
     Follow the input with a dead band: yₙ = max(xₙ − r, min(xₙ + r, yₙ₋₁)).
 
-    A step clamps the output between xₙ − r and xₙ + r. Clamps one after the other are a clamp
-    again, so that stretches of the input are run side by side and then joined.
+    A step clamps the output between xₙ − r and xₙ + r. Consecutive clamps combine to one clamp.
+    The input is therefore split into stretches, which run in parallel and are joined afterwards.
 
     Parameters
     ----------
@@ -36,8 +36,8 @@ def play(x: np.ndarray, half_width: float, memory: dict[str, Any]) -> np.ndarray
     half_width
         r, in the unit of the input.
     memory
-        Keeps the last output from one block to the next; empty before the first, when the output
-        is in the middle of its dead band.
+        Keeps the last output from one block to the next. It is empty before the first block,
+        when the output is in the middle of its dead band.
 
     Returns
     -------
@@ -50,15 +50,15 @@ def play(x: np.ndarray, half_width: float, memory: dict[str, Any]) -> np.ndarray
     length = ceil(np.sqrt(len(x)) / 3)
     padded = np.concatenate([x, np.full(-len(x) % length, x[-1])])
     stretches = np.ascontiguousarray(padded.reshape(-1, length).T)
-    # By place in each stretch: what the stretch has done to an output so far, as one clamp.
+    # low[n] and high[n] are the clamp that the first n + 1 steps of each stretch combine to.
     low, high = stretches - half_width, stretches + half_width
     for n in range(1, length):
         np.maximum(low[n], np.minimum(high[n], high[n - 1]), out=high[n])
         np.maximum(low[n], np.minimum(high[n], low[n - 1]), out=low[n])
-    at = memory.get('output', float(x[0]))
-    begin = []
+    output = memory.get('output', float(x[0]))
+    starts = []
     for bottom, top in zip(low[-1].tolist(), high[-1].tolist()):
-        begin.append(at)
-        at = max(bottom, min(top, at))
-    memory['output'] = at
-    return np.maximum(low, np.minimum(high, begin)).T.ravel()[:len(x)]
+        starts.append(output)
+        output = max(bottom, min(top, output))
+    memory['output'] = output
+    return np.maximum(low, np.minimum(high, starts)).T.ravel()[:len(x)]

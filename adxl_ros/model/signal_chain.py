@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The order of the signal chain: forward, and its exact inverse."""
+"""The signal chain at rest, from specific force to volts, and its exact inverse."""
 
 from __future__ import annotations
 
@@ -36,58 +36,74 @@ from adxl_ros.model.sensor import Sensor
 import numpy as np
 
 _TOLERANCE_MPS2 = 1e-10
-_LOST_MPS2 = 1e-6
-"""Rounding moves the z of equation 5 by up to this near alpha = ±90°, where it is a root of 0."""
-_MOST_ITERATIONS = 60
+"""Newton step below which the inverse has converged, m/s²; chosen: near rounding."""
+
+_UNSOLVED_MPS2 = 1e-6
+"""Last Newton step from which a sample has no solution, m/s²; chosen: near alpha = ±90°, where
+the z of equation 5 is a root of 0, rounding alone moves it by up to this."""
+
+_MAX_ITERATIONS = 60
+"""Largest number of iterations of either inverse; chosen: samples with a
+solution need far fewer."""
+
 _SETTLED_V = 1e-13
+"""Change below which the inverse of the ADC's effects has converged, V; chosen: near rounding."""
+
+_DIFFERENCE_MPS2 = 1e-3
+"""Half step of the central differences by force, m/s²; chosen: the chain is smooth and nearly
+linear, so that a wide step loses nothing."""
 
 
 def static_response(sensor: Sensor) -> Callable[..., Components]:
     """
-    Prepare the chain from specific force to volts at rest: its invertible effects.
+    Prepare the chain from specific force to volts at rest, by its invertible effects.
 
-    Filter, noise, the steps of the ADC, the stage, and effects with a memory are left to
-    `simulate.response`.
+    `simulate.response` adds filter, noise, quantisation, stage, and effects with a memory.
 
     Returns
     -------
     callable
         Maps the three components of specific force in the case frame, m/s² (arrays of one shape,
-        or floats), and, if it is not the nominal one, an `Environment` of such a shape, to the
+        or floats), and an `Environment` of that shape (the nominal one unless given) to the
         volts of each measured axis.
 
     """
     respond, convert = analog_response(sensor), _adc(sensor)
     if convert is None:
         return respond
-    return lambda force, environment=NOMINAL_ENVIRONMENT: convert(respond(force, environment))
+
+    def respond_with_adc(force: Components, environment: Environment = NOMINAL_ENVIRONMENT
+                         ) -> Components:
+        return convert(respond(force, environment))
+
+    return respond_with_adc
 
 
 def analog_response(sensor: Sensor) -> Callable[..., Components]:
-    """Prepare `static_response` as far as the input of the ADC, whose steps have no slope."""
-    run = {place: applied(sensor, place, True) for place in Place}
+    """Prepare `static_response` up to the input of the ADC, whose steps have no slope."""
+    effects = {place: effects_at(sensor, place, True) for place in Place}
     zero_g_v = sensor.nominal_zero_g_v.tolist()
     scale_v_per_g = sensor.nominal_scale_v_per_g.tolist()
 
     def respond(force: Components, environment: Environment = NOMINAL_ENVIRONMENT) -> Components:
         signals = Signals(environment, sensed=[f / G0_MPS2 for f in force],
                           nominal_scale_v_per_g=scale_v_per_g)
-        for apply, values in run[Place.MOUNTING]:
+        for apply, values in effects[Place.MOUNTING]:
             apply(signals, values)
         signals.output = list(signals.sensed)
-        for apply, values in run[Place.ELEMENT]:
+        for apply, values in effects[Place.ELEMENT]:
             apply(signals, values)
         signals.zero_g_v, signals.scale_v_per_g = list(zero_g_v), list(scale_v_per_g)
-        for apply, values in run[Place.ELECTRONICS]:
+        for apply, values in effects[Place.ELECTRONICS]:
             apply(signals, values)
-        return converted(signals)
+        return output_volts(signals)
 
     return respond
 
 
 def _adc(sensor: Sensor) -> Callable[[Components], Components] | None:
-    """Prepare the ADC's effects at rest, volts at its input to volts; None without any."""
-    effects = applied(sensor, Place.ADC, True)
+    """Prepare the ADC's effects at rest, from volts at its input to volts; None without any."""
+    effects = effects_at(sensor, Place.ADC, True)
     if not effects:
         return None
 
@@ -101,52 +117,57 @@ def _adc(sensor: Sensor) -> Callable[[Components], Components] | None:
     return convert
 
 
-def before_adc(sensor: Sensor) -> Callable[[Components], Components]:
+def adc_inverse(sensor: Sensor) -> Callable[[Components], Components]:
     """
-    Prepare the inverse of the ADC's effects: what it gave, V by axis, to volts at its input.
+    Prepare the inverse of the ADC's effects: volts of the ADC to volts at its input, by axis.
 
-    By itself and before the rest of the inverse, for a bit of a wrong weight makes steps, in
-    which Newton's method has no slope: two inputs near a step give the same volts, of which one
-    is taken, or none gives them, and the middle of the gap is taken.
+    A bit of a wrong weight makes steps, in which Newton's method has no slope. The ADC is
+    therefore inverted apart from the rest of the chain. Where two inputs near a step give the
+    same volts, one of them is returned; where none does, the middle of the gap.
     """
     convert = _adc(sensor)
     if convert is None:
         return list
 
     def undo(volts: Components) -> Components:
-        before, after = list(volts), list(volts)
+        previous, current = list(volts), list(volts)
         with np.errstate(all='ignore'):
-            for _ in range(_MOST_ITERATIONS):
-                moves = [v - c for v, c in zip(volts, convert(after))]
-                # What has settled stays, so that a sample does not depend on its neighbours.
-                moves = [m * (abs(m) >= _SETTLED_V) for m in moves]
-                before, after = after, [a + m for a, m in zip(after, moves)]
-                if not any(np.any(m) for m in moves):
+            for _ in range(_MAX_ITERATIONS):
+                changes = [v - c for v, c in zip(volts, convert(current))]
+                # A converged sample stays, so that it does not depend on its neighbours.
+                changes = [change * (abs(change) >= _SETTLED_V) for change in changes]
+                previous, current = current, [v + change for v, change in zip(current, changes)]
+                if not any(np.any(change) for change in changes):
                     break
-        return [(a + b) / 2 for a, b in zip(after, before)]
+        return [(a + b) / 2 for a, b in zip(current, previous)]
 
     return undo
 
 
-def converted(signals: Signals) -> Components:
+def output_volts(signals: Signals) -> Components:
     """Turn the output of the element into volts, by measured axis."""
     return [zero + scale * out for zero, scale, out in
             zip(signals.zero_g_v, signals.scale_v_per_g, signals.output)]
 
 
-def applied(sensor: Sensor, place: Place, invertible: bool | None = None
-            ) -> list[tuple[Callable[[Signals, Parameters], None], Parameters]]:
+def effects_at(sensor: Sensor, place: Place, invertible: bool | None = None
+               ) -> list[tuple[Callable[[Signals, Parameters], None], Parameters]]:
     """
-    Return what the sensor's effects of a place apply, and with which parameters.
+    Return the effects of a sensor at a place of the chain.
 
     Parameters
     ----------
     sensor
         The unit.
     place
-        Of the chain.
+        Place of the chain.
     invertible
-        Only those that the inverse undoes.
+        Whether to return only effects that the inverse undoes.
+
+    Returns
+    -------
+    list
+        The function `apply` and the parameters of each effect, in the sensor's order.
 
     """
     effects = [effect_named(name) for name in sensor.effects]
@@ -155,16 +176,31 @@ def applied(sensor: Sensor, place: Place, invertible: bool | None = None
 
 
 def parameters(sensor: Sensor, effect: str) -> Parameters:
-    """Return the parameters of one of the sensor's effects as its `apply` takes them."""
-    listed = {name: np.asarray(value, float).tolist()
+    """
+    Return the parameters of one effect in the form that its `apply` takes.
+
+    Parameters
+    ----------
+    sensor
+        A sensor with the effect.
+    effect
+        Name of the effect.
+
+    Returns
+    -------
+    dict
+        By name: a tuple of floats, one for each measured axis, or a float.
+
+    """
+    values = {name: np.asarray(value, float).tolist()
               for name, value in sensor.values[effect].items()}
-    return {name: tuple(v) if isinstance(v, list) else v for name, v in listed.items()}
+    return {name: tuple(v) if isinstance(v, list) else v for name, v in values.items()}
 
 
 def gravity_mps2(sensor: Sensor) -> float:
-    """Return the local gravity with what effects add to it."""
+    """Return local gravity with the effects on it, m/s²."""
     signals = Signals(NOMINAL_ENVIRONMENT, gravity_mps2=sensor.local_gravity_mps2)
-    for apply, values in applied(sensor, Place.STAGE, True):
+    for apply, values in effects_at(sensor, Place.STAGE, True):
         apply(signals, values)
     return signals.gravity_mps2
 
@@ -172,17 +208,28 @@ def gravity_mps2(sensor: Sensor) -> float:
 def jacobian(respond: Callable[..., Components], force: Components,
              environment: Environment = NOMINAL_ENVIRONMENT) -> np.ndarray:
     """
-    Differentiate volts by specific force at one or many points, V/(m/s²).
+    Differentiate volts by specific force, by central differences.
 
-    Central differences; the chain is smooth and nearly linear, so a wide step of 1 mm/s² loses
-    nothing. Returns (m, 3), or (m, 3, n) for arrays.
+    Parameters
+    ----------
+    respond
+        From `analog_response`.
+    force
+        Specific force in the case frame, m/s², three components (n,) or floats.
+    environment
+        Surroundings in the shape of the force.
+
+    Returns
+    -------
+    ndarray
+        Derivatives, V/(m/s²), (m, 3), or (m, 3, n) for arrays.
+
     """
-    step = 1e-3
     columns = []
     for c in range(3):
         above, below = list(force), list(force)
-        above[c], below[c] = above[c] + step, below[c] - step
-        columns.append([(a - b) / (2 * step) for a, b in zip(
+        above[c], below[c] = above[c] + _DIFFERENCE_MPS2, below[c] - _DIFFERENCE_MPS2
+        columns.append([(a - b) / (2 * _DIFFERENCE_MPS2) for a, b in zip(
             respond(above, environment), respond(below, environment))])
     return np.swapaxes(np.array(columns), 0, 1)
 
@@ -195,9 +242,10 @@ class Tangent:
     Attributes
     ----------
     back
-        Force along the measured axes by volts, (m/s²)/V, m rows of m components.
+        Derivatives of the force along the measured axes by the volts, (m/s²)/V, m rows of m
+        components.
     slope
-        What z adds to the estimate of x and y; empty unless z is derived (equation 5).
+        Derivatives of the estimates of x and y by z; empty unless z is derived (equation 5).
 
     """
 
@@ -208,7 +256,7 @@ class Tangent:
 def tangent(respond: Callable[..., Components], axes: str, force: Components,
             environment: Environment = NOMINAL_ENVIRONMENT) -> Tangent:
     """
-    Linearise the inverse of `static_response` around a force, m/s², arrays or floats.
+    Linearise the inverse of `static_response` around a force.
 
     Parameters
     ----------
@@ -217,35 +265,42 @@ def tangent(respond: Callable[..., Components], axes: str, force: Components,
     axes
         Measured axes.
     force
-        Three components.
+        Specific force in the case frame, m/s², three components (n,) or floats.
     environment
-        Of their shape.
+        Surroundings in the shape of the force.
+
+    Returns
+    -------
+    Tangent
+        Derivatives at the force, in its shape.
 
     """
     by_force: Any = jacobian(respond, force, environment)
     if isinstance(force[0], float):
         by_force = by_force.tolist()
     measured = [AXES.index(a) for a in axes]
-    back = _inverted([[row[c] for c in measured] for row in by_force])
+    back = _inverse_matrix([[row[c] for c in measured] for row in by_force])
     if axes != 'xy':
         return Tangent(back, [])
     return Tangent(back, [-sum(b * row[2] for b, row in zip(line, by_force)) for line in back])
 
 
-def _inverted(a: list[Components]) -> list[Components]:
+def _inverse_matrix(a: list[Components]) -> list[Components]:
     """Invert 1×1 to 3×3 matrices by their minors, component by component."""
     if len(a) == 1:
         return [[1 / a[0][0]]]
     if len(a) == 2:
-        whole = a[0][0] * a[1][1] - a[0][1] * a[1][0]
-        return [[a[1][1] / whole, -a[0][1] / whole], [-a[1][0] / whole, a[0][0] / whole]]
+        determinant = a[0][0] * a[1][1] - a[0][1] * a[1][0]
+        return [[a[1][1] / determinant, -a[0][1] / determinant],
+                [-a[1][0] / determinant, a[0][0] / determinant]]
     next_two = ((1, 2), (2, 0), (0, 1))
     minors = [[a[i][p] * a[j][q] - a[i][q] * a[j][p] for p, q in next_two] for i, j in next_two]
-    whole = sum(v * m for v, m in zip(a[0], minors[0]))
-    return [[minors[d][c] / whole for d in range(3)] for c in range(3)]
+    determinant = sum(v * m for v, m in zip(a[0], minors[0]))
+    return [[minors[d][c] / determinant for d in range(3)] for c in range(3)]
 
 
-def step(axes: str, gravity_mps2: float, up: Value, maths: Maths) -> Callable[..., Components]:
+def newton_step(axes: str, gravity_mps2: float, up: Value, maths: Maths
+                ) -> Callable[..., Components]:
     """
     Prepare one Newton step of the inverse.
 
@@ -254,41 +309,41 @@ def step(axes: str, gravity_mps2: float, up: Value, maths: Maths) -> Callable[..
     axes
         Measured axes.
     gravity_mps2
-        |f| at rest, for the z of equation 5.
+        |f| at rest, m/s², for the z of equation 5.
     up
-        The sign of that z.
+        Sign of that z, 1 or −1.
     maths
-        For arrays or for floats.
+        Functions for arrays or for floats.
 
     Returns
     -------
     callable
-        Maps what the volts miss of the response to a force, V, that force, m/s², and a
-        `Tangent` near it to the next force.
+        Maps volts minus the response to a force, V, that force, m/s², and a `Tangent` near it to
+        the next force, m/s².
 
     """
     measured = [AXES.index(a) for a in axes]
 
-    def next_force(miss: Components, force: Components, at: Tangent) -> Components:
+    def next_force(residual_v: Components, force: Components, tangent: Tangent) -> Components:
         force = list(force)
-        for d, row in zip(measured, at.back):
-            for by_volt, m in zip(row, miss):
-                force[d] = force[d] + by_volt * m
-        if at.slope:
-            _complete(force, at.slope, gravity_mps2, up, maths)
+        for d, row in zip(measured, tangent.back):
+            for by_volt, r in zip(row, residual_v):
+                force[d] = force[d] + by_volt * r
+        if tangent.slope:
+            _derive_z(force, tangent.slope, gravity_mps2, up, maths)
         return force
 
     return next_force
 
 
-def _complete(force: Components, slope: Components, gravity: float, up: Value,
+def _derive_z(force: Components, slope: Components, gravity: float, up: Value,
               maths: Maths) -> None:
-    """Put z in by |f| = g and take what it adds to x and y out of them (equation 5)."""
+    """Set z by |f| = g, and remove its contribution from x and y (equation 5)."""
     x, y = force[0] - slope[0] * force[2], force[1] - slope[1] * force[2]
     a = 1 + slope[0] * slope[0] + slope[1] * slope[1]
     half_b = x * slope[0] + y * slope[1]
-    rest = half_b * half_b - a * (x * x + y * y - gravity * gravity)
-    z = (up * maths.sqrt(maths.most(rest, 0.0)) - half_b) / a
+    discriminant = half_b * half_b - a * (x * x + y * y - gravity * gravity)
+    z = (up * maths.sqrt(maths.maximum(discriminant, 0.0)) - half_b) / a
     force[:] = [x + slope[0] * z, y + slope[1] * z, z]
 
 
@@ -296,62 +351,85 @@ def inverse(sensor: Sensor, z_sign: np.ndarray | None = None) -> Callable[..., C
     """
     Prepare the exact inverse of `static_response`: volts to specific force, by Newton's method.
 
-    An x/y sensor gets its z from |f| = g (equation 5), at rest only: with the in-plane force a
-    linear function of z near the solution, |f|² = g² is quadratic in z; where noise puts the
-    in-plane force beyond g, the z of the smallest |f| is taken, so that there is no jump and no
-    NaN at alpha = ±90°. A sensor of one axis gets 0 for the others.
+    The z of an x/y sensor is derived from |f| = g (equation 5), which holds at rest only. The
+    in-plane force is linear in z near the solution, so that |f|² = g² is quadratic in z. Where
+    noise puts the in-plane force beyond g, the z of the smallest |f| is taken: there is no jump
+    and no NaN at alpha = ±90°. A sensor of one axis gets 0 for the others.
 
     Parameters
     ----------
     sensor
-        The figures and effects to undo.
+        The unit with the effects to undo.
     z_sign
-        Which way up, by sample, (n,), where it is known better than `sensor.z_sign`.
+        Sign of z by sample, (n,), where it is known better than by `sensor.z_sign`.
 
     Returns
     -------
     callable
-        Maps the volts of each axis, arrays (n,) or floats, and, if it is not the nominal one, an
-        `Environment` to three components, m/s². Samples that have no solution come back as
-        NaN.
+        Maps the volts of each axis, arrays (n,) or floats, and an `Environment` (the nominal one
+        unless given) to three components, m/s². Samples without a solution are NaN.
 
     """
     respond, gravity = analog_response(sensor), gravity_mps2(sensor)
-    undo_adc = before_adc(sensor)
+    undo_adc = adc_inverse(sensor)
     up = np.asarray(sensor.z_sign if z_sign is None else z_sign)
 
     def invert(volts: Components, environment: Environment = NOMINAL_ENVIRONMENT) -> Components:
-        data = np.array(undo_adc(list(np.array(volts, float).reshape(len(volts), -1))))
-        signs = np.broadcast_to(up, data.shape[1])
-        force = np.zeros((3, data.shape[1]))
-        lost = np.ones(data.shape[1], bool)
-        left = np.flatnonzero(np.isfinite(data).all(axis=0))
-        around = Environment(*(np.broadcast_to(np.asarray(e, float), data.shape[1])
-                               for e in environment))
-        at = tangent(respond, sensor.axes, list(force[:, left]),
-                     Environment(*(e[left] for e in around)))
+        input_v = np.array(undo_adc(list(np.array(volts, float).reshape(len(volts), -1))))
+        count = input_v.shape[1]
+        signs = np.broadcast_to(up, count)
+        force = np.zeros((3, count))
+        unsolved = np.ones(count, bool)
+        active = np.flatnonzero(np.isfinite(input_v).all(axis=0))
+        surroundings = Environment(*(np.broadcast_to(np.asarray(e, float), count)
+                                     for e in environment))
+        slope = tangent(respond, sensor.axes, list(force[:, active]),
+                        _select(surroundings, active))
         with np.errstate(all='ignore'):
-            for _ in range(_MOST_ITERATIONS):
-                here, there = list(force[:, left]), Environment(*(e[left] for e in around))
-                miss = [v - r for v, r in zip(data[:, left], respond(here, there))]
-                advance = step(sensor.axes, gravity, signs[left], ARRAYS)
-                after = np.array(advance(miss, here, at))
-                moved = np.abs(after - here).max(axis=0)
-                force[:, left], lost[left] = after, ~(moved < _LOST_MPS2)
-                # Those that have become NaN or infinite fail the comparison, too.
-                left = left[(moved >= _TOLERANCE_MPS2) & (moved < np.inf)]
-                if not len(left):
+            for _ in range(_MAX_ITERATIONS):
+                current = list(force[:, active])
+                response_v = respond(current, _select(surroundings, active))
+                residual_v = [v - r for v, r in zip(input_v[:, active], response_v)]
+                advance = newton_step(sensor.axes, gravity, signs[active], ARRAYS)
+                following = np.array(advance(residual_v, current, slope))
+                change = np.abs(following - current).max(axis=0)
+                force[:, active], unsolved[active] = following, ~(change < _UNSOLVED_MPS2)
+                # NaN and infinity fail the comparison, too.
+                active = active[(change >= _TOLERANCE_MPS2) & (change < np.inf)]
+                if not len(active):
                     break
-                at = tangent(respond, sensor.axes, list(force[:, left]),
-                             Environment(*(e[left] for e in around)))
-        force[:, lost] = np.nan
+                slope = tangent(respond, sensor.axes, list(force[:, active]),
+                                _select(surroundings, active))
+        force[:, unsolved] = np.nan
         return list(force) if np.ndim(volts[0]) else force[:, 0].tolist()
 
     return invert
 
 
+def _select(environment: Environment, samples: np.ndarray) -> Environment:
+    """Return the surroundings of some samples, given by number, (k,)."""
+    return Environment(*(values[samples] for values in environment))
+
+
 def quantise(volts: np.ndarray, sensor: Sensor, lsb_v: float) -> np.ndarray:
-    """Round volts to steps of the ADC, V, at most its rails; unchanged without an ADC."""
+    """
+    Round volts to the steps of the ADC, within its rails.
+
+    Parameters
+    ----------
+    volts
+        Volts at the ADC, V, (n, m).
+    sensor
+        The unit with the rails of its ADC.
+    lsb_v
+        Step, V, which may be coarser than that of the ADC; 0 does not quantise.
+
+    Returns
+    -------
+    ndarray
+        Rounded volts, V, (n, m).
+
+    """
     if not lsb_v:
         return volts
     highest = sensor.adc_vref_v - sensor.lsb_v
@@ -360,9 +438,22 @@ def quantise(volts: np.ndarray, sensor: Sensor, lsb_v: float) -> np.ndarray:
 
 def at_a_rail(volts: np.ndarray, sensor: Sensor) -> np.ndarray:
     """
-    Tell samples (n, m), V, of which an axis reads the lowest or highest code of the ADC, (n,).
+    Return the samples of which an axis reads the lowest or highest code of the ADC.
 
-    Volts beyond the rails come from another ADC, or from none, and are no sign of saturation.
+    Volts beyond the rails come from another ADC, or from none, and do not indicate saturation.
+
+    Parameters
+    ----------
+    volts
+        Volts of the ADC, V, (n, m).
+    sensor
+        The unit with the rails of its ADC.
+
+    Returns
+    -------
+    ndarray
+        Whether each sample is at a rail, (n,).
+
     """
     rails = np.array([0.0, sensor.adc_vref_v - sensor.lsb_v])
     return (np.abs(volts[:, :, None] - rails) < sensor.lsb_v / 2).any(axis=(1, 2))

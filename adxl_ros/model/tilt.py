@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Specific force at rest to angles, each with its variance and what it does not show."""
+"""Tilt: angles of a sensor at rest by its specific force, with their variances."""
 
 from __future__ import annotations
 
@@ -23,22 +23,38 @@ from adxl_ros.model.scalar_or_array import ARRAYS, Maths
 import numpy as np
 
 UNOBSERVABLE_RAD2 = 1.0
-"""An angle whose variance passes this is not shown: even a guess is 1.8 rad off, rms."""
+"""Variance from which an angle counts as not shown, rad²; chosen: a guess has 1.8 rad rms."""
 
 INFINITE = float('inf')
+"""Variance of an angle that the force does not determine, rad²."""
 
-_NOTHING = 1e-30
-"""Square of a force that is none, (m/s²)²; keeps divisors from 0 and is lost beside any noise."""
+_FORCE2_FLOOR = 1e-30
+"""Square of a negligible force, (m/s²)²; chosen: far below any noise, it keeps divisors from 0."""
 
 
 @dataclass(frozen=True)
 class Tilt:
     """
-    Angles of one or many samples, rad, (n,): NaN with standard deviation inf where not shown.
+    Angles of samples at rest, by the specific force a in the case frame.
 
-    roll = atan2(a_y, a_z), pitch = atan2(−a_x, hypot(a_y, a_z)), inclination and the stage's
-    alpha = atan2(hypot(a_x, a_y), a_z), beta = atan2(−a_y, a_x). A sensor without z cannot tell
-    alpha from π − alpha: there alpha is at most π/2.
+    An angle that is not shown is NaN and has an infinite standard deviation. The force of a
+    sensor without z axis does not determine whether it is upright, so that alpha is at most π/2.
+
+    Attributes
+    ----------
+    roll
+        atan2(a_y, a_z), rad, (n,).
+    pitch
+        atan2(−a_x, hypot(a_y, a_z)), rad, (n,).
+    inclination
+        atan2(hypot(a_x, a_y), a_z), rad, (n,).
+    alpha
+        Angle of the stage: the inclination, rad, (n,).
+    beta
+        Angle of the stage: atan2(−a_y, a_x), rad, (n,).
+    roll_std, pitch_std, inclination_std, alpha_std, beta_std
+        Standard deviations of the angles, rad, (n,).
+
     """
 
     roll: np.ndarray
@@ -55,51 +71,57 @@ class Tilt:
 
 def tilt(force: Components, covariance: np.ndarray, measures_z: bool = True) -> Tilt:
     """
-    Angles with first-order standard deviations.
+    Return the angles of samples with first-order standard deviations.
 
     Parameters
     ----------
     force
         Specific force at rest in the case frame, m/s², three components (n,).
     covariance
-        Of the force, (m/s²)², (3, 3, n).
+        Covariance of the force, (m/s²)², (3, 3, n).
     measures_z
         Whether the sensor has a z axis.
 
+    Returns
+    -------
+    Tilt
+        Angles of the n samples.
+
     """
     force = [np.asarray(f, float) for f in force]
-    spread = tuple(covariance[i, j] for i in range(3) for j in range(i, 3))
+    components = tuple(covariance[i, j] for i in range(3) for j in range(i, 3))
     with np.errstate(over='ignore', invalid='ignore'):
-        shown = [_shown(*one) for one in angles(force, spread, ARRAYS)]
-    (roll, roll_std), (pitch, pitch_std), (inclination, inclination_std), (beta, beta_std) = shown
-    alpha = inclination if measures_z else np.minimum(inclination, np.pi - inclination)
-    return Tilt(roll, pitch, inclination, alpha, beta, roll_std, pitch_std, inclination_std,
-                inclination_std, beta_std)
+        roll, pitch, inclination, beta = (
+            _shown(angle, variance) for angle, variance in angles(force, components, ARRAYS))
+    alpha = inclination[0] if measures_z else np.minimum(inclination[0], np.pi - inclination[0])
+    return Tilt(roll[0], pitch[0], inclination[0], alpha, beta[0],
+                roll[1], pitch[1], inclination[1], inclination[1], beta[1])
 
 
 def _shown(angle: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Give the angle its standard deviation, or NaN and inf where it cannot be seen."""
-    seen = variance < UNOBSERVABLE_RAD2
-    return np.where(seen, angle, np.nan), np.where(seen, np.sqrt(np.maximum(variance, 0)), np.inf)
+    """Return the angle and its standard deviation; NaN and inf where it is not shown."""
+    shows = variance < UNOBSERVABLE_RAD2
+    return (np.where(shows, angle, np.nan),
+            np.where(shows, np.sqrt(np.maximum(variance, 0)), np.inf))
 
 
 def angles(force: Components, covariance: tuple[Value, ...],
            maths: Maths) -> tuple[tuple[Value, Value], ...]:
     """
-    Angles with first-order variances.
+    Return roll, pitch, inclination and beta with first-order variances.
 
-    Where the component of the force that shows an angle is lost in its noise, roll and beta can
-    be anything: their variance is inf. Pitch and inclination are then the length of a small
-    vector of any direction.
+    Where noise exceeds the part of the force that shows roll or beta, the angle can be anything:
+    its variance is infinite. Pitch and inclination are then the length of a small vector of any
+    direction.
 
     Parameters
     ----------
     force
         Specific force at rest in the case frame, m/s², three components.
     covariance
-        Of the force, (m/s²)²: xx, xy, xz, yy, yz, zz.
+        Covariance of the force, (m/s²)²: xx, xy, xz, yy, yz, zz.
     maths
-        For arrays or for floats.
+        Functions for arrays or for floats.
 
     Returns
     -------
@@ -109,12 +131,12 @@ def angles(force: Components, covariance: tuple[Value, ...],
     """
     x, y, z = force
     xx, xy, xz, yy, yz, zz = covariance
-    plane2, side2 = x * x + y * y + _NOTHING, y * y + z * z + _NOTHING
+    plane2, side2 = x * x + y * y + _FORCE2_FLOOR, y * y + z * z + _FORCE2_FLOOR
     total2 = plane2 + z * z
     total4 = total2 * total2
     in_plane, in_side = xx + yy, yy + zz
     along = y * y * yy + 2 * y * z * yz + z * z * zz
-    roll = maths.where(side2 > in_side + _NOTHING,
+    roll = maths.where(side2 > in_side + _FORCE2_FLOOR,
                        (z * z * yy - 2 * y * z * yz + y * y * zz) / (side2 * side2), INFINITE)
     pitch = maths.where(
         side2 > in_side,
@@ -125,7 +147,7 @@ def angles(force: Components, covariance: tuple[Value, ...],
         plane2 > in_plane,
         (z * z * along / plane2 - 2 * z * (x * xz + y * yz) + plane2 * zz) / total4,
         in_plane / total2)
-    beta = maths.where(plane2 > in_plane + _NOTHING,
+    beta = maths.where(plane2 > in_plane + _FORCE2_FLOOR,
                        (y * y * xx - 2 * x * y * xy + x * x * yy) / (plane2 * plane2), INFINITE)
     return ((maths.atan2(y, z), roll), (maths.atan2(-x, maths.sqrt(side2)), pitch),
             (maths.atan2(maths.sqrt(plane2), z), inclination), (maths.atan2(0.0 - y, x), beta))
@@ -133,9 +155,26 @@ def angles(force: Components, covariance: tuple[Value, ...],
 
 def roll_pitch_covariance(force: Components, covariance: tuple[Value, ...],
                           maths: Maths) -> Value:
-    """Covariance of roll and pitch to first order, rad²; arguments as for `angles`."""
+    """
+    Return the first-order covariance of roll and pitch.
+
+    Parameters
+    ----------
+    force
+        Specific force at rest in the case frame, m/s², three components.
+    covariance
+        Covariance of the force, (m/s²)²: xx, xy, xz, yy, yz, zz.
+    maths
+        Functions for arrays or for floats.
+
+    Returns
+    -------
+    Value
+        Covariance, rad².
+
+    """
     x, y, z = force
     _, xy, xz, yy, yz, zz = covariance
-    side2 = y * y + z * z + _NOTHING
+    side2 = y * y + z * z + _FORCE2_FLOOR
     by_pitch = x * (y * (z * yy - y * yz) + z * (z * yz - y * zz)) / side2 - (z * xy - y * xz)
     return by_pitch / (maths.sqrt(side2) * (x * x + side2))

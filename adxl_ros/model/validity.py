@@ -13,30 +13,33 @@
 # limitations under the License.
 
 """
-Where a calibration holds, and by how much its covariance grows beyond.
+Validity range of a calibration, and how its covariance grows outside.
 
-Temperature. Beyond the temperatures at which the poses were taken, by ΔT more than `MARGIN_K`,
-what the model does not follow drifts as the datasheet says: a measured axis of specific force f
-gets
+Temperature. A model that ignores temperature drifts outside of the temperatures of its poses, as
+the datasheet states. By ΔT more than `MARGIN_K` outside, an axis with specific force f gets the
+variance
 
     (g·k_zero·ΔT)² + (f·k_scale·ΔT)²
 
 with the typical slopes k of zero-g and scale factor, one standard deviation each. A model that
-follows the temperature has slopes of its own, whose covariance grows by itself.
+follows temperature has slopes of its own, whose covariance grows by itself.
 
-Pose. How far out a force lies, ρ, is the larger of two. The leverage h = trace(∂f/∂θ·Σ·∂f/∂θᵀ),
-what the calibration's covariance makes of the force, by the largest of its poses (the regressor
-variable hull: Montgomery, Peck, Vining, Introduction to Linear Regression Analysis, "hidden
-extrapolation"). And, as a model says nothing of terms that it lacks, the square of the distance
-from the middle of the poses' forces by half of their range and `MARGIN_MPS2`, in the component in
-which it is largest. Beyond 1 the force is outside. Terms of the model grow with ρ in squares, and
-so does the covariance; what the model lacks is of higher order and grows faster, at least as ρ².
-With u the misfit that poses held out showed, each measured axis gets
+Pose. The extrapolation ρ of a force is the larger of two ratios:
+
+- The leverage h = trace(∂f/∂θ·Σ·∂f/∂θᵀ) by the largest leverage of the poses, h_max. This is the
+  regressor variable hull (Montgomery, Peck, Vining, Introduction to Linear Regression Analysis,
+  "hidden extrapolation").
+- The square of the distance from the middle of the poses' forces, divided by half of their range
+  plus `MARGIN_MPS2`, in the component where it is largest. It covers terms that the model lacks.
+
+A force is outside where ρ > 1. The squares of the model's terms grow as ρ, and the covariance
+does, too. What the model lacks is of higher order: its square grows at least as ρ². With the
+misfit u of held-out poses, an axis gets the variance
 
     u²·(ρ² − 1), where ρ > 1
 
-h_max is taken at the poses and at `STRETCH` times their force, as noise and tangents that
-neighbours share must not count as outside.
+h_max is taken at the forces of the poses and at `STRETCH` times them. Otherwise noise, and forces
+that share a tangent with their neighbours, would count as outside.
 """
 
 from __future__ import annotations
@@ -48,31 +51,36 @@ from typing import Any
 import numpy as np
 
 MARGIN_K = 2.0
-"""Temperatures so near to those of the poses are within: 0.2 mg by the datasheet, less than the
-noise of a sample, and no sensor of temperature is at the same spot as the element."""
+"""Distance from the temperatures of the poses that still counts as inside, K; chosen: it is
+0.2 mg by the datasheet, below the noise of a sample, and no thermometer is at the element."""
+
 STRETCH = 1.1
+"""Factor of the poses' forces at which h_max is taken, too; chosen: see the text above."""
+
 MARGIN_MPS2 = 2.0
-"""Room around the forces of the poses: planes from 30° on leave 1.3 m/s² up to level, and forces
-that are near each other share what is said of them."""
+"""Distance from the forces of the poses that still counts as inside, m/s²; chosen: planes from
+30° on leave 1.3 m/s² to level, and nearby forces share one result."""
 
 
 @dataclass(frozen=True)
 class Envelope:
     """
-    What a calibration was taken in.
+    Validity range of a calibration.
 
     Attributes
     ----------
     temperature_c
-        Lowest and highest temperature of its poses, °C; None where it was not measured.
-    zero_g_per_k, scale_per_k
-        Slopes of what the model does not follow, g/K and 1/K: typical ones by the datasheet.
+        Lowest and highest temperature of the poses, °C; None if it was not measured.
+    zero_g_per_k
+        Typical slope of the zero-g, g/K, by the datasheet; 0 if the model follows temperature.
+    scale_per_k
+        Typical slope of the scale factor, 1/K, by the datasheet; 0 if the model follows it.
     leverage
-        Largest of its poses, h_max, (m/s²)²; 0 is not known.
+        Largest leverage of the poses, h_max, (m/s²)²; 0 if unknown.
     misfit_mps2
-        What poses held out showed beyond noise and stage, by axis, m/s².
+        Misfit of held-out poses beyond noise and stage error, by axis, m/s².
     force_low_mps2, force_high_mps2
-        Least and greatest specific force of its poses by component, m/s²; empty is not known.
+        Lowest and highest specific force of the poses by component, m/s²; empty if unknown.
 
     """
 
@@ -85,66 +93,111 @@ class Envelope:
     force_high_mps2: tuple[float, ...] = ()
 
     def beyond_k(self, temperature_c: Any) -> Any:
-        """Return by how much temperatures lie outside, margin excluded, K; 0 within."""
+        """Return the distance of temperatures, °C, outside of range and margin, K; 0 inside."""
         if self.temperature_c is None:
             return np.zeros(np.shape(temperature_c))
         low, high = self.temperature_c
         return np.maximum(0.0, np.maximum(low - MARGIN_K - temperature_c,
                                           temperature_c - high - MARGIN_K))
 
-    def reach(self, force: Sequence[Any], leverage: Any) -> Any:
+    def extrapolation(self, force: Sequence[Any], leverage: Any) -> Any:
         """
-        Return how far out forces lie, ρ, at least 1; see the module.
+        Return the extrapolation ρ of forces, at least 1.
 
         Parameters
         ----------
         force
-            Specific force, m/s², three of (n,) or floats.
+            Specific force, m/s², three components, (n,) or floats.
         leverage
-            Of the forces, (m/s²)², (n,).
+            Leverage of the forces, (m/s²)², (n,).
+
+        Returns
+        -------
+        ndarray
+            ρ, (n,); 1 inside.
 
         """
-        far = np.maximum(1.0, leverage / self.leverage if self.leverage else 1.0)
+        rho = np.maximum(1.0, leverage / self.leverage if self.leverage else 1.0)
         for value, low, high in zip(force, self.force_low_mps2, self.force_high_mps2):
-            off = np.abs(value - (low + high) / 2) / ((high - low) / 2 + MARGIN_MPS2)
-            far = np.maximum(far, off ** 2)
-        return far
+            distance = np.abs(value - (low + high) / 2) / ((high - low) / 2 + MARGIN_MPS2)
+            rho = np.maximum(rho, distance ** 2)
+        return rho
 
-    def added(self, axis_mps2: Any, temperature_c: Any, reach: Any, gravity_mps2: float) -> Any:
+    def added_variance(self, axis_mps2: Any, temperature_c: Any, extrapolation: Any,
+                       gravity_mps2: float) -> Any:
         """
-        Return the variance that an axis gets, (m/s²)².
+        Return the variance that an axis gets outside of the validity range.
 
         Parameters
         ----------
         axis_mps2
             Specific force along the axis, m/s², (n,).
         temperature_c
-            °C, (n,) or one.
-        reach
-            How far out the force lies, (n,).
+            Temperature, °C, (n,) or one value.
+        extrapolation
+            Extrapolation ρ of the forces, (n,).
         gravity_mps2
-            One g.
+            One g, m/s².
+
+        Returns
+        -------
+        ndarray
+            Variance, (m/s²)², (n,).
 
         """
-        off_k = self.beyond_k(temperature_c)
-        return ((gravity_mps2 * self.zero_g_per_k * off_k) ** 2
-                + (axis_mps2 * self.scale_per_k * off_k) ** 2
-                + self.misfit_mps2 ** 2 * (reach ** 2 - 1))
+        beyond_k = self.beyond_k(temperature_c)
+        return ((gravity_mps2 * self.zero_g_per_k * beyond_k) ** 2
+                + (axis_mps2 * self.scale_per_k * beyond_k) ** 2
+                + self.misfit_mps2 ** 2 * (extrapolation ** 2 - 1))
 
-    def outside(self, temperature_c: float, force: Sequence[float], leverage: float
-                ) -> tuple[str, ...]:
-        """Say what lies outside at one sample, in words; nothing within."""
-        words = []
+    def is_outside(self, temperature_c: Any, force: Sequence[Any], leverage: Any) -> np.ndarray:
+        """
+        Return which samples lie outside of the validity range.
+
+        Parameters
+        ----------
+        temperature_c
+            Temperature, °C, (n,) or one value.
+        force
+            Specific force, m/s², three components, (n,) or floats.
+        leverage
+            Leverage of the forces, (m/s²)², (n,).
+
+        Returns
+        -------
+        ndarray
+            Whether each sample is outside, (n,).
+
+        """
+        return (self.beyond_k(temperature_c) > 0) | (self.extrapolation(force, leverage) > 1)
+
+    def describe_outside(self, temperature_c: float, force: Sequence[float], leverage: float
+                         ) -> tuple[str, ...]:
+        """
+        Describe in words how one sample lies outside of the validity range.
+
+        Parameters
+        ----------
+        temperature_c
+            Temperature, °C.
+        force
+            Specific force, m/s², three components.
+        leverage
+            Leverage of the force, (m/s²)².
+
+        Returns
+        -------
+        tuple
+            A text for temperature and one for the force; empty inside.
+
+        """
+        texts = []
         if self.temperature_c is not None and self.beyond_k(temperature_c) > 0:
             low, high = self.temperature_c
-            words.append(f'temperature {temperature_c:.1f} degC, calibrated at {low:.1f} to '
+            texts.append(f'temperature {temperature_c:.1f} degC, calibrated at {low:.1f} to '
                          f'{high:.1f}')
-        far = float(self.reach(force, leverage))
-        if far > 1:
-            words.append(f'force near {", ".join(f"{f:.1f}" for f in force)} m/s^2, '
-                         f'{far ** 0.5:.2g} times as far out as the calibrated poses')
-        return tuple(words)
-
-    def lies_outside(self, temperature_c: Any, force: Sequence[Any], leverage: Any) -> np.ndarray:
-        """Tell samples that lie outside, (n,)."""
-        return (self.beyond_k(temperature_c) > 0) | (self.reach(force, leverage) > 1)
+        rho = float(self.extrapolation(force, leverage))
+        if rho > 1:
+            texts.append(f'force near {", ".join(f"{f:.1f}" for f in force)} m/s^2, '
+                         f'{rho ** 0.5:.2g} times as far out as the calibrated poses')
+        return tuple(texts)

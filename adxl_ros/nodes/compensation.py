@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from adxl_ros.compensate import filter_inversion
-from adxl_ros.compensate.sample_by_sample import Estimate, Live
+from adxl_ros.compensate.sample_by_sample import Estimate, LiveEstimator
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store, imu_message
 from adxl_ros.files.cdr import CdrError
@@ -67,8 +67,8 @@ _CLOCK_DAYS = 0.01
 class _Chain(NamedTuple):
     """What corrects a sample; replaced as one."""
 
-    live: Live
-    delayed: filter_inversion.Delayed
+    live: LiveEstimator
+    delayed: filter_inversion.DelayedInversion
 
 
 class Compensation(Node):
@@ -117,8 +117,8 @@ class Compensation(Node):
         self._loop.close()
 
     def _use(self, sensor: Sensor, source: str) -> None:
-        live = Live(sensor, self._paper, self._undo_filter)
-        live.surround(**self._known)
+        live = LiveEstimator(sensor, self._paper, self._undo_filter)
+        live.set_environment(**self._known)
         self._source = source
         self._chain = _Chain(live, self._new_delayed(sensor))
         of = f'{sensor.serial}, model {sensor.model}' if sensor.effects else \
@@ -130,8 +130,9 @@ class Compensation(Node):
     def _sensor(self) -> Sensor:
         return self._chain.live.sensor
 
-    def _new_delayed(self, sensor: Sensor) -> filter_inversion.Delayed:
-        return filter_inversion.Delayed(noise.electronics(sensor)[0], self._rate_hz(sensor))
+    def _new_delayed(self, sensor: Sensor) -> filter_inversion.DelayedInversion:
+        return filter_inversion.DelayedInversion(noise.electronics(sensor).rc_s,
+                                                 self._rate_hz(sensor))
 
     def _rate_hz(self, sensor: Sensor) -> float:
         """Return the rate that the stream states, else that of the calibration."""
@@ -231,7 +232,7 @@ class Compensation(Node):
         chain = self._chain
         if self._around:
             around, self._around = self._around, {}
-            chain.live.surround(**around)
+            chain.live.set_environment(**around)
             self._known |= around
         volts = chain.live.volts(accel)
         if not volts:
@@ -242,8 +243,9 @@ class Compensation(Node):
         else:
             self._estimate(chain.live, time_s, volts, raw)
 
-    def _estimate(self, live: Live, time_s: float, volts: list[float], raw: bytes) -> None:
-        estimate = live.of_volts(volts, time_s)
+    def _estimate(self, live: LiveEstimator, time_s: float, volts: list[float], raw: bytes
+                  ) -> None:
+        estimate = live.from_volts(volts, time_s)
         if estimate is None:
             self._counts['dropped'] += 1
             return

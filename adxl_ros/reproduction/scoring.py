@@ -186,7 +186,7 @@ def motion(fitted: Sensor, time_s: np.ndarray, volts: np.ndarray, reference_mps2
         The figures; filtered estimate and reference, m/s², (n,) each.
 
     """
-    before = filter_inversion.undone(volts, time_s, noise.electronics(fitted)[0], fitted.rate_hz)
+    before = filter_inversion.undo(volts, time_s, noise.electronics(fitted).rc_s, fitted.rate_hz)
     estimate = signal_chain.inverse(fitted)(list(before.T))[0]
     b, a = butter(2, 20.0, fs=fitted.rate_hz)
     smooth, expected = lfilter(b, a, estimate), lfilter(b, a, reference_mps2)

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from adxl_ros.model.noise import effective_samples, sigma_v
+from adxl_ros.model.noise import effective_samples, sample_std_v
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals.block_statistics import block_samples, Blocks
 import numpy as np
@@ -57,7 +57,7 @@ class Noise:
 
 def datasheet_noise(sensor: Sensor) -> Noise:
     """Return the noise that the figures of a sensor promise, V."""
-    return Noise(sigma_v(sensor), sensor.rc_s)
+    return Noise(sample_std_v(sensor), sensor.rc_s)
 
 
 @dataclass(frozen=True)

@@ -24,14 +24,14 @@ from adxl_ros.files import recording
 from adxl_ros.files.recording_columns import JOINTS, Recording, stamped_rate_hz
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.simulate.motion import Held, Motion, Path
-from adxl_ros.simulate.smoothed_paths import Force, Smoothed
+from adxl_ros.simulate.smoothed_paths import ForcePath, SmoothedPath
 import numpy as np
 
 _FASTEST_RAD_S = 100.0
 """No stage turns a sensor faster; a jump in the angle is no motion."""
 
 
-def felt(path: str | os.PathLike, resampled: bool) -> tuple[Motion, float]:
+def motion_from_force(path: str | os.PathLike, resampled: bool) -> tuple[Motion, float]:
     """
     Make a motion of the specific force of a recording; return it and when it begins, s.
 
@@ -54,11 +54,11 @@ def felt(path: str | os.PathLike, resampled: bool) -> tuple[Motion, float]:
     begin_s = float(time_s[0])
     duration_s = float(time_s[-1] - begin_s)
     rate = stamped_rate_hz(time_s)
-    return Motion(duration_s + 1 / rate, force=Force(time_s, force),
+    return Motion(duration_s + 1 / rate, force=ForcePath(time_s, force),
                   internal_rate_hz=rate if resampled else max(rate, 1000.0)), begin_s
 
 
-def followed(read: Recording, sensor: Sensor) -> Motion:
+def motion_from_references(read: Recording, sensor: Sensor) -> Motion:
     """
     Make the motion of a recording's references.
 
@@ -74,7 +74,7 @@ def followed(read: Recording, sensor: Sensor) -> Motion:
                             f'say simulate imu --force {read.path}')
     steps = {'alpha': sensor.stage_resolution_rad, 'beta': sensor.stage_resolution_rad,
              'shift': 0.0}
-    paths: dict[str, Any] = dict(surroundings(read))
+    paths: dict[str, Any] = dict(environment_paths(read))
     for joint, name in JOINTS.items():
         values = read.columns.get(name)
         if values is None or np.isnan(values).all():
@@ -82,13 +82,13 @@ def followed(read: Recording, sensor: Sensor) -> Motion:
             continue
         if joint != 'shift':
             _check_speed(read, name, steps[joint])
-        paths[joint] = Smoothed(read.time_s, values, steps[joint])
+        paths[joint] = SmoothedPath(read.time_s, values, steps[joint])
     return Motion(float(read.time_s[-1] - read.time_s[0]), **paths)
 
 
-def surroundings(read: Recording) -> dict[str, Path]:
+def environment_paths(read: Recording) -> dict[str, Path]:
     """Return what a recording holds of temperature, °C, and supply, V, as paths by name."""
-    return {name: Smoothed(read.time_s, read.columns[name], 0.0)
+    return {name: SmoothedPath(read.time_s, read.columns[name], 0.0)
             for name in ('temperature_c', 'supply_v')
             if name in read.columns and np.isfinite(read.columns[name]).any()}
 

@@ -35,7 +35,7 @@ from adxl_ros.model.effects.base import (
     Signals,
 )
 from adxl_ros.model.filters import low_pass
-from adxl_ros.model.kinematics import felt, UPRIGHT
+from adxl_ros.model.kinematics import specific_force_in_motion, UPRIGHT
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.simulate.motion import Motion
 import numpy as np
@@ -187,7 +187,7 @@ class Response:
                 Joint(*(joint(at_s, order) for order in range(3)))
                 for joint in (self._motion.alpha, self._motion.beta, self._motion.shift))
             self._apply(Place.STAGE, signals)
-            signals.force = felt(signals.alpha, signals.beta, signals.shift,
+            signals.force = specific_force_in_motion(signals.alpha, signals.beta, signals.shift,
                                  signals.gravity_mps2, signals.up)
         self._apply(Place.FORCE, signals)
         signals.sensed = [f / G0_MPS2 for f in signals.force]
@@ -201,7 +201,7 @@ class Response:
         signals.lsb_v = self.sensor.lsb_v
         self._apply(Place.ELECTRONICS, signals)
         volts = np.empty((len(at_s), m))
-        for d, v in enumerate(signal_chain.converted(signals)):
+        for d, v in enumerate(signal_chain.output_volts(signals)):
             volts[:, d] = low_pass(np.broadcast_to(v, len(at_s)), signals.rc_s[d], self._dt_s,
                                    self._filters[d])
         return volts, signals
@@ -213,7 +213,7 @@ class Response:
         Samples that are missing are drawn, too, as far as the filter remembers.
         """
         rc_s, rate_hz = np.array(signals.rc_s), self.sensor.rate_hz
-        sigma = noise.analog_sigma_v(self.sensor)
+        sigma = noise.analog_std_v(self.sensor)
         if not sigma.any():
             return np.zeros((len(stamps_s), len(sigma)))
         decay = np.array([np.exp(-1 / (rate_hz * rc)) if rc else 0.0 for rc in rc_s])

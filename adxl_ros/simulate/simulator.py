@@ -38,11 +38,11 @@ def simulate(sensor: Sensor, motion: Motion, seed: int) -> Columns:
         encoders, temperature and supply where the manoeuvre has them.
 
     """
-    parts = list(blocks(sensor, motion, seed))
+    parts = list(simulate_blocks(sensor, motion, seed))
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
-def blocks(sensor: Sensor, motion: Motion, seed: int, begin_s: float = 0.0
+def simulate_blocks(sensor: Sensor, motion: Motion, seed: int, begin_s: float = 0.0
            ) -> Iterator[Columns]:
     """
     Run a manoeuvre block by block; see `simulate`.
@@ -66,15 +66,15 @@ def blocks(sensor: Sensor, motion: Motion, seed: int, begin_s: float = 0.0
         volts = respond(time_s)
         yield {'time_s': time_s,
                **{f'{axis}_v': volts[:, d] for d, axis in enumerate(sensor.axes)},
-               **references(sensor, motion, time_s)}
+               **reference_columns(sensor, motion, time_s)}
 
 
-def references(sensor: Sensor, motion: Motion, time_s: np.ndarray) -> Columns:
+def reference_columns(sensor: Sensor, motion: Motion, time_s: np.ndarray) -> Columns:
     """Return what is recorded beside the sensor at the stamps, (n,) by column."""
     columns = {}
     if motion.force is None:
-        columns['alpha_rad'] = encoder(motion.alpha(time_s), sensor.stage_resolution_rad)
-        columns['beta_rad'] = encoder(motion.beta(time_s), sensor.stage_resolution_rad)
+        columns['alpha_rad'] = encoder_reading(motion.alpha(time_s), sensor.stage_resolution_rad)
+        columns['beta_rad'] = encoder_reading(motion.beta(time_s), sensor.stage_resolution_rad)
         if not isinstance(motion.shift, Held):
             columns['shift_m'] = motion.shift(time_s)
     if motion.temperature_c:
@@ -84,7 +84,7 @@ def references(sensor: Sensor, motion: Motion, time_s: np.ndarray) -> Columns:
     return columns
 
 
-def encoder(angle_rad: np.ndarray, resolution_rad: float) -> np.ndarray:
+def encoder_reading(angle_rad: np.ndarray, resolution_rad: float) -> np.ndarray:
     """Round angles to the encoder's steps; unchanged for a resolution of 0."""
     if not resolution_rad:
         return angle_rad

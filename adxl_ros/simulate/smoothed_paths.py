@@ -40,7 +40,7 @@ _LOCAL_S, _ALLOWED = 0.3, 1.7
 _STRENGTHS = (10.0 ** np.arange(-12, 13, 0.5)).tolist()
 
 
-class Smoothed:
+class SmoothedPath:
     """
     A joint behind its encoder: a smoothing spline matched to the encoder's step.
 
@@ -108,7 +108,7 @@ class Smoothed:
 def smoothing_spline(time_s: np.ndarray, reading: np.ndarray, strength: float, step: float
                      ) -> BSpline:
     """
-    Fit one window; see `Smoothed`.
+    Fit one window; see `SmoothedPath`.
 
     Parameters
     ----------
@@ -222,7 +222,7 @@ def _moving(reading: np.ndarray) -> np.ndarray:
     return np.cumsum(edges[:-1]) > 0
 
 
-class Force:
+class ForcePath:
     """Specific force that was recorded or simulated elsewhere, as cubic splines, m/s²."""
 
     def __init__(self, time_s: np.ndarray, force_mps2: np.ndarray) -> None:

@@ -25,7 +25,7 @@ from adxl_ros.diagnose.diagnosis import diagnose as diagnose_recordings
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.atomic_write import atomic_path
-from adxl_ros.simulate.from_recording import felt
+from adxl_ros.simulate.from_recording import motion_from_force
 from adxl_ros.tools.common import make_folder, progress, run, say_notes
 
 
@@ -52,7 +52,7 @@ def diagnose(options: argparse.Namespace) -> int:
         raise UserError(f'--sim {options.sim}: goes with one recording, but '
                         f'{len(options.recording)} are given')
     sensor = parameter_file.load(options.params or parameter_file.nominal_path())
-    sim = felt(options.sim, False)[0] if options.sim else None
+    sim = motion_from_force(options.sim, False)[0] if options.sim else None
     recordings = []
     for path in options.recording:
         recordings.append(recording.read(path))

@@ -31,7 +31,7 @@ from adxl_ros.files.stream_info import sensor_info
 from adxl_ros.links.support import emulated_board
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.simulate import simulator
-from adxl_ros.simulate.from_recording import felt, followed
+from adxl_ros.simulate.from_recording import motion_from_force, motion_from_references
 from adxl_ros.simulate.motion import Motion
 from adxl_ros.simulate.response import Response
 from adxl_ros.simulate.trajectories import TRAJECTORIES
@@ -140,21 +140,22 @@ def _run(sensor: Sensor, options: argparse.Namespace
         raise UserError('--force RECORDING goes with the trajectory imu, and imu with it: '
                         'simulate imu --force RECORDING')
     if name == 'imu':
-        motion, begin_s = felt(options.force, options.rate is None)
+        motion, begin_s = motion_from_force(options.force, options.rate is None)
         if options.rate is None:
             sensor = replace(sensor, rate_hz=motion.internal_rate_hz)
             motion = replace(motion, internal_rate_hz=max(sensor.rate_hz, 1000.0))
-        blocks = simulator.blocks(sensor, motion, options.seed, begin_s)
+        blocks = simulator.simulate_blocks(sensor, motion, options.seed, begin_s)
         return sensor, motion.duration_s, begin_s, blocks
     if name in TRAJECTORIES:
         motion = TRAJECTORIES[name](np.random.default_rng(options.seed))
-        return sensor, motion.duration_s, 0.0, simulator.blocks(sensor, motion, options.seed)
+        blocks = simulator.simulate_blocks(sensor, motion, options.seed)
+        return sensor, motion.duration_s, 0.0, blocks
     read = recording.read(name)
     say_notes('simulate', read)
-    motion = followed(read, sensor)
+    motion = motion_from_references(read, sensor)
     begin_s, end_s = float(read.time_s[0]), float(read.time_s[-1])
     if options.rate is not None:
-        return sensor, end_s - begin_s, begin_s, simulator.blocks(
+        return sensor, end_s - begin_s, begin_s, simulator.simulate_blocks(
             sensor, replace(motion, duration_s=end_s - begin_s), options.seed, begin_s)
     sensor = replace(sensor, rate_hz=read.rate_hz)
     return sensor, end_s - begin_s, begin_s, _again(sensor, motion, read, options.seed)

@@ -18,7 +18,7 @@ from dataclasses import replace
 from itertools import pairwise
 
 from adxl_ros.compensate import filter_inversion, paper_inverse
-from adxl_ros.compensate.sample_by_sample import Live
+from adxl_ros.compensate.sample_by_sample import LiveEstimator
 from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.stream_info import sensor_info
@@ -52,7 +52,7 @@ def test_amplitude_and_phase_come_back():
         return np.sin(62.8 * t) + 0.5 * np.cos(377 * t) + 0.2 * np.sin(942 * t)
 
     time_s, volts = filtered([felt, lambda t: 2 * felt(t)])
-    back = filter_inversion.undone(volts, time_s, RC_S, RATE_HZ)[300:-20]
+    back = filter_inversion.undo(volts, time_s, RC_S, RATE_HZ)[300:-20]
     expected = np.column_stack([felt(time_s), 2 * felt(time_s)])[300:-20]
     assert np.abs(back - expected).max() < 2e-3
 
@@ -62,8 +62,8 @@ def test_a_gap_is_not_bridged():
     time_s, volts = filtered([np.sin, np.cos])
     kept = np.ones(len(time_s), bool)
     kept[900:1400] = False
-    back = filter_inversion.undone(volts[kept], time_s[kept], RC_S, RATE_HZ)
-    whole = filter_inversion.undone(volts, time_s, RC_S, RATE_HZ)[kept]
+    back = filter_inversion.undo(volts[kept], time_s[kept], RC_S, RATE_HZ)
+    whole = filter_inversion.undo(volts, time_s, RC_S, RATE_HZ)[kept]
     assert np.abs(back - whole)[500:].max() < 0.03
     np.testing.assert_array_equal(back[900], volts[kept][900])
 
@@ -74,10 +74,10 @@ def test_blocks_give_what_the_whole_gives(sizes):
     time_s, volts = filtered([np.sin, np.cos])
     cuts = np.cumsum([0, *sizes])
     blocks = [(i, time_s[a:b], volts[a:b]) for i, (a, b) in enumerate(pairwise(cuts))]
-    parts = list(filter_inversion.undone_blocks(blocks, RC_S, RATE_HZ))
+    parts = list(filter_inversion.undo_blocks(blocks, RC_S, RATE_HZ))
     assert [token for token, _ in parts] == list(range(len(sizes)))
     back = np.concatenate([part for _, part in parts])
-    whole = filter_inversion.undone(volts, time_s, RC_S, RATE_HZ)
+    whole = filter_inversion.undo(volts, time_s, RC_S, RATE_HZ)
     if min(sizes) >= filter_inversion.HALF:
         np.testing.assert_allclose(back, whole, atol=1e-12)
     assert np.abs(back - whole)[50:].max() < 1e-3
@@ -87,7 +87,7 @@ def test_a_stream_gives_the_same_eight_samples_later():
     """Delayed is the zero-phase inverse, sample by sample, with the samples' own stamps."""
     time_s, volts = filtered([np.sin, np.cos])
     kept = np.r_[0:500, 700:1200]
-    delayed = filter_inversion.Delayed(RC_S, RATE_HZ)
+    delayed = filter_inversion.DelayedInversion(RC_S, RATE_HZ)
     out, late = [], []
     for i in kept:
         for stamp, back, token in delayed(float(time_s[i]), volts[i].tolist(), i):
@@ -98,20 +98,20 @@ def test_a_stream_gives_the_same_eight_samples_later():
     count = len(out)
     np.testing.assert_array_equal(out[:, 0], kept[:count])
     assert count == len(kept) - filter_inversion.HALF
-    expected = filter_inversion.undone(volts[kept], time_s[kept], RC_S, RATE_HZ)[:count]
+    expected = filter_inversion.undo(volts[kept], time_s[kept], RC_S, RATE_HZ)[:count]
     np.testing.assert_allclose(out[:, 1:], expected, atol=1e-9)
     assert sorted(late)[len(late) // 2] == filter_inversion.HALF
 
 
 def test_the_variance_is_that_of_the_noise_that_comes_back():
-    """Noise of a simulated sensor at rest behind the inverse, against `variance_v2`."""
+    """Noise of a simulated sensor at rest behind the inverse, against `noise_variance_v2`."""
     sensor = put(with_neutral(nominal(), ['bandwidth']),
                  [Coefficient('bandwidth', 'resistance_ratio', 'x')], [-0.2])
     time_s = np.arange(200_000) / sensor.rate_hz
     volts = Response(sensor, Motion(200.0, Held(0.5), Held(0.7)), 3)(time_s)
-    back = filter_inversion.undone(volts, time_s, noise.electronics(sensor)[0], sensor.rate_hz)
+    back = filter_inversion.undo(volts, time_s, noise.electronics(sensor).rc_s, sensor.rate_hz)
     assert back[100:-100].std(axis=0) ** 2 == pytest.approx(
-        filter_inversion.variance_v2(sensor), rel=0.02)
+        filter_inversion.noise_variance_v2(sensor), rel=0.02)
 
 
 def test_motion_through_apply(run_tool, tmp_path):
@@ -176,11 +176,11 @@ def test_the_papers_inverse_live_is_that_of_arrays():
     volts = signal_chain.static_response(sensor)(poses(5))
     whole = np.transpose(paper_inverse.inverse(sensor)(volts))
     single = paper_inverse.inverse(sensor, maths=FLOATS)
-    live = Live(sensor, paper=True)
+    live = LiveEstimator(sensor, paper=True)
     for i, expected in enumerate(whole):
         one = [float(v[i]) for v in volts]
         np.testing.assert_allclose(single(one), expected, atol=1e-12)
-        np.testing.assert_allclose(live.of_volts(one, float(i)).force, expected, atol=1e-12)
+        np.testing.assert_allclose(live.from_volts(one, float(i)).force, expected, atol=1e-12)
 
 
 def test_the_papers_inverse_needs_two_axes(run_tool, tmp_path):

@@ -17,14 +17,14 @@
 from dataclasses import replace
 
 from adxl_ros.compensate import sample_by_sample
-from adxl_ros.compensate.sample_by_sample import Live
+from adxl_ros.compensate.sample_by_sample import LiveEstimator
 from adxl_ros.files import imu_message
 from adxl_ros.files.cdr import CdrError
 from adxl_ros.model import signal_chain
 from adxl_ros.model.covariance import force_covariance, UNMEASURED_VARIANCE
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.kinematics import specific_force
-from adxl_ros.model.noise import sigma_v
+from adxl_ros.model.noise import sample_std_v
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
 from adxl_ros.model.tilt import tilt
 from geometry_msgs.msg import Vector3Stamped
@@ -66,7 +66,7 @@ def at_rest(alpha: float, beta: float, count: int) -> list[np.ndarray]:
 def test_agrees_with_blocks(axes: str) -> None:
     sensor = unit(axes)
     accel = samples(sensor, turning(2.0))
-    follow = Live(sensor)
+    follow = LiveEstimator(sensor)
     found = [follow(a, i / 1000) for i, a in enumerate(accel)]
     volts = sensor.nominal_zero_g_v + np.array(accel)[:, :len(axes)] / G * \
         sensor.nominal_scale_v_per_g
@@ -89,10 +89,10 @@ def test_agrees_with_blocks(axes: str) -> None:
 def test_at_rest_z_gets_the_noise_of_a_measured_axis() -> None:
     sensor = unit('xy')
     accel = samples(sensor, at_rest(0.6, 1.0, 3000))
-    follow = Live(sensor)
+    follow = LiveEstimator(sensor)
     found = [follow(a, i / 1000) for i, a in enumerate(accel)]
     zz = force_covariance(sensor, [np.array([v]) for v in found[-1].force])[2, 2, 0]
-    noise = (sigma_v(sensor)[0] / sensor.scale_v_per_g[0] * G) ** 2
+    noise = (sample_std_v(sensor)[0] / sensor.scale_v_per_g[0] * G) ** 2
     assert found[-1].covariance[5] == pytest.approx(zz + noise, rel=0.1)
     assert max(f.covariance[5] for f in found) < 2 * (zz + noise)
 
@@ -103,7 +103,7 @@ def test_motion_widens_z_and_the_angles_and_passes() -> None:
     force = at_rest(0.6, 1.0, 9000)
     shaken = slice(2000, 5000)
     force[0][shaken] += 2 * 2 ** 0.5 * np.sin(2 * np.pi * 3 * np.arange(3000) / 1000)
-    follow = Live(sensor)
+    follow = LiveEstimator(sensor)
     found = [follow(a, i / 1000) for i, a in enumerate(samples(sensor, force))]
     std = np.sqrt([f.covariance[5] for f in found])
     assert 1.5 < np.median(std[3500:5000]) < 3
@@ -111,7 +111,7 @@ def test_motion_widens_z_and_the_angles_and_passes() -> None:
     # The x axis itself is measured, moving or not.
     assert max(f.covariance[0] for f in found) < 1.1 * found[0].covariance[0]
     assert std[-1] < 1.1 * std[1900]
-    three_axes = Live(unit('xyz'))
+    three_axes = LiveEstimator(unit('xyz'))
     for i, a in enumerate(samples(unit('xyz'), force)[:4000]):
         last = three_axes(a, i / 1000)
     assert last.covariance[5] < 1e-3
@@ -120,7 +120,7 @@ def test_motion_widens_z_and_the_angles_and_passes() -> None:
 
 def test_a_pause_or_a_clock_set_back_is_no_motion() -> None:
     sensor = nominal('xyz')
-    follow = Live(sensor)
+    follow = LiveEstimator(sensor)
     for i in range(1000):
         follow([0.0, 0.0, G], i / 1000)
     for time_s in (5.0, 1.0):
@@ -131,7 +131,7 @@ def test_a_pause_or_a_clock_set_back_is_no_motion() -> None:
 def test_at_the_vertical_it_differs_by_less_than_its_uncertainty() -> None:
     sensor = unit('xy')
     accel = samples(sensor, at_rest(np.pi / 2, 0.4, 2000))
-    follow = Live(sensor)
+    follow = LiveEstimator(sensor)
     found = [follow(a, i / 1000) for i, a in enumerate(accel)]
     volts = sensor.nominal_zero_g_v + np.array(accel)[:, :2] / G * sensor.nominal_scale_v_per_g
     force = np.array(signal_chain.inverse(sensor)(list(volts.T)))
@@ -146,7 +146,7 @@ def test_at_the_vertical_it_differs_by_less_than_its_uncertainty() -> None:
 def test_what_no_force_explains_is_none_and_spoils_nothing(axes: str, bad: float) -> None:
     sensor = unit(axes)
     accel = samples(sensor, at_rest(0.6, 1.0, 40))
-    follow, again = Live(sensor), Live(sensor)
+    follow, again = LiveEstimator(sensor), LiveEstimator(sensor)
     for i, a in enumerate(accel):
         if i % 10 == 5:
             assert again([bad, *a[1:]], i / 1000) is None
@@ -155,7 +155,7 @@ def test_what_no_force_explains_is_none_and_spoils_nothing(axes: str, bad: float
 
 def test_at_a_rail_nothing_is_sure() -> None:
     sensor = nominal('xyz')
-    follow = Live(sensor)
+    follow = LiveEstimator(sensor)
     rail = (5.0 - sensor.lsb_v - 2.5) * G
     for _ in range(2):
         assert not follow([0.0, 0.0, G], 0.0).saturated
@@ -167,8 +167,8 @@ def test_at_a_rail_nothing_is_sure() -> None:
 
 
 def test_memory_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sample_by_sample, '_MOST_CELLS', 10)
-    follow = Live(nominal('xyz'))
+    monkeypatch.setattr(sample_by_sample, '_MAX_CELLS', 10)
+    follow = LiveEstimator(nominal('xyz'))
     for a in np.random.default_rng(3).normal(size=(100, 3)) * 5:
         assert follow(a.tolist(), 0.0).force == pytest.approx(a.tolist())
         assert len(follow._cells) <= 10

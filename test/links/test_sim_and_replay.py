@@ -25,7 +25,7 @@ from adxl_ros.links.support import base
 from adxl_ros.links.support.simulated_stage import SimulatedStage
 from adxl_ros.model import noise
 from adxl_ros.model.effects.base import Joint
-from adxl_ros.model.kinematics import felt, specific_force
+from adxl_ros.model.kinematics import specific_force, specific_force_in_motion
 from adxl_ros.model.sensor import to_nominal_mps2
 import numpy as np
 from processes import REPO
@@ -83,8 +83,9 @@ def test_sim_samples_a_pose_with_the_stated_noise():
     assert np.array_equal(stamps, START + MS * np.arange(20_001))
     expected = [2.5 + 9.80665 / 9.80665, 2.5]
     count = noise.effective_samples(len(volts), 1e-3, sensor.rc_s)
-    assert np.abs(volts.mean(0) - expected).max() < 5 * noise.sigma_v(sensor)[0] / count ** 0.5
-    assert volts.std(0) == pytest.approx(noise.sigma_v(sensor), rel=0.15)
+    std_v = noise.sample_std_v(sensor)
+    assert np.abs(volts.mean(0) - expected).max() < 5 * std_v[0] / count ** 0.5
+    assert volts.std(0) == pytest.approx(std_v, rel=0.15)
 
 
 def test_samples_of_sim_do_not_depend_on_the_number_of_reads():
@@ -111,7 +112,7 @@ def test_sim_senses_the_true_motion_at_its_samples():
     t = (samples.stamp_ns - START) * 1e-9
     position, rate = turning(t)
     growth = {'alpha': -3.6 * np.sin(3 * t), 'beta': 2 * np.cos(t), 'shift': -0.64 * np.sin(8 * t)}
-    truth = np.column_stack(felt(*(Joint(position[j], rate[j], growth[j])
+    truth = np.column_stack(specific_force_in_motion(*(Joint(position[j], rate[j], growth[j])
                                    for j in ('alpha', 'beta', 'shift')), 9.80665))
     error = np.abs(to_nominal_mps2(samples.volts, ideal()) - truth)[1:]
     assert error.max() < 1e-3, 'second derivatives are those of the interpolation'

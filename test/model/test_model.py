@@ -36,8 +36,8 @@ def test_noise_of_the_filter():
     """110 µg/√Hz behind 32 kΩ and 0.33 µF: 0.535 mg, which is 5.25 mm/s²."""
     sensor = nominal()
     assert 1 / (2 * np.pi * sensor.rc_s) == pytest.approx(15.07, abs=0.005)
-    assert noise.analog_sigma_v(sensor)[0] == pytest.approx(0.535e-3, rel=1e-3)
-    assert noise.analog_sigma_v(sensor)[0] * 9.80665 == pytest.approx(5.25e-3, rel=1e-3)
+    assert noise.analog_std_v(sensor)[0] == pytest.approx(0.535e-3, rel=1e-3)
+    assert noise.analog_std_v(sensor)[0] * 9.80665 == pytest.approx(5.25e-3, rel=1e-3)
 
 
 def test_effective_samples_of_a_dwell():
@@ -53,10 +53,10 @@ def test_mean_of_simulated_noise_scatters_as_promised():
     volts = np.vstack([fed([np.zeros(50000), np.zeros(50000), np.full(50000, 9.8)])
                        for _ in range(40)])
     means = volts.reshape(400, 5000, 2).mean(axis=1)
-    promised = noise.sigma_v(sensor)[0] / np.sqrt(noise.effective_samples(
+    promised = noise.sample_std_v(sensor)[0] / np.sqrt(noise.effective_samples(
         5000, 1e-3, sensor.rc_s))
     assert means.std() == pytest.approx(promised, rel=0.1)
-    assert volts.std() == pytest.approx(noise.sigma_v(sensor)[0], rel=0.02)
+    assert volts.std() == pytest.approx(noise.sample_std_v(sensor)[0], rel=0.02)
 
 
 def test_filter_at_10_hz():

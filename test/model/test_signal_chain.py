@@ -19,7 +19,7 @@ from dataclasses import replace
 from adxl_ros.errors import UserError
 from adxl_ros.model import noise, signal_chain
 from adxl_ros.model.coefficients import get, names_of, parameter_of, put, with_neutral
-from adxl_ros.model.covariance import force_covariance, parameter_tangent
+from adxl_ros.model.covariance import coefficient_tangent, force_covariance
 from adxl_ros.model.effects import library
 from adxl_ros.model.effects.base import Coefficient, Need, Role
 from adxl_ros.model.kinematics import specific_force
@@ -159,7 +159,7 @@ def test_intervals_cover_what_they_promise(axes: str) -> None:
         drawn = get(sensor, sensor.covariance_names) + root @ rng.normal(size=len(root))
         volts.append(signal_chain.static_response(put(sensor, sensor.covariance_names, drawn))(
             list(force)))
-    volts = np.array(volts) + noise.sigma_v(sensor)[:, None] * rng.normal(
+    volts = np.array(volts) + noise.sample_std_v(sensor)[:, None] * rng.normal(
         size=(draws, len(axes), len(beta)))
     volts = np.moveaxis(volts, 1, 0).reshape(len(axes), -1)
     found = signal_chain.inverse(sensor)(list(volts))
@@ -178,7 +178,7 @@ def covered(error: np.ndarray, std: np.ndarray) -> None:
     assert 0.88 < np.mean(np.abs(error) < 1.6449 * std) < 0.92
 
 
-def test_parameter_tangent_is_the_paper_s() -> None:
+def test_coefficient_tangent_is_the_paper_s() -> None:
     """∂V/∂B = 1, ∂V/∂SF = A of equation 3."""
     sensor = replace(nominal(), effects=('bias', 'scale_factor'), values={
         'bias': {'offset_v': np.array([0.1, 0.0])},
@@ -186,7 +186,7 @@ def test_parameter_tangent_is_the_paper_s() -> None:
         covariance=np.eye(2) * 1e-6,
         covariance_names=(Coefficient('bias', 'offset_v', 'x'),
                           Coefficient('scale_factor', 'offset_v_per_g', 'x')))
-    found = parameter_tangent(sensor, [np.array([G / 2]), np.array([1.0]), np.array([0.0])])
+    found = coefficient_tangent(sensor)([np.array([G / 2]), np.array([1.0]), np.array([0.0])])
     np.testing.assert_allclose(found[:, :, 0], [[1, 0.5], [0, 0]], atol=1e-9)
 
 
@@ -195,7 +195,7 @@ def test_vertical_z_scatters_as_promised() -> None:
     sensor = nominal(adc_bits=0)
     rng = np.random.default_rng(6)
     volts = 2.5 + np.array([[1.0], [0.0]]) + rng.normal(size=(2, 50000)) * \
-        noise.sigma_v(sensor)[:, None]
+        noise.sample_std_v(sensor)[:, None]
     force = signal_chain.inverse(sensor)(list(volts))
     covariance = force_covariance(sensor, [np.array([v]) for v in (G, 0.0, 0.0)])
     assert np.sqrt(np.mean(force[2] ** 2)) == pytest.approx(np.sqrt(covariance[2, 2, 0]), rel=0.02)

@@ -566,7 +566,7 @@ def test_the_filter_is_undone_late_and_with_own_stamps(robot: Robot, start: Star
         robot.send([*row.tolist(), 0.0])
     robot.graph.spin_until(lambda: len(robot.data) == 32, 10.0, '32 of 40 samples')
     assert [stamp_ns(m) for m in robot.data] == [k * 10 ** 9 for k in range(1, 33)]
-    back = filter_inversion.undone(volts, np.arange(1.0, 41.0), np.full(2, sensor.rc_s), 1.0)
+    back = filter_inversion.undo(volts, np.arange(1.0, 41.0), np.full(2, sensor.rc_s), 1.0)
     expected = np.transpose(signal_chain.inverse(sensor)(list(back.T)))[:32]
     got = np.array([accel(m) for m in robot.data])
     np.testing.assert_allclose(got[8:, :2], expected[8:, :2], atol=1e-5)

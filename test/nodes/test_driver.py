@@ -95,7 +95,7 @@ def test_sim_publishes_every_sample_as_the_interfaces_say(start):
     assert first.header.frame_id == 'case'
     assert first.orientation_covariance[0] == first.angular_velocity_covariance[0] == -1
     variance = first.linear_acceleration_covariance.reshape(3, 3)
-    sigma = noise.sigma_v(sensor) * 9.80665
+    sigma = noise.sample_std_v(sensor) * 9.80665
     assert variance == pytest.approx(np.diag([*sigma ** 2, 1e6]))
     told = {pair.key: pair.value for pair in info[0].values}
     assert told == sensor_info(sensor) | {'serial': 'A7'}

@@ -24,7 +24,7 @@ from adxl_ros.model.effects.base import ActsOn, Coefficient, Need
 from adxl_ros.simulate.motion import Knots, Motion
 from adxl_ros.simulate.response import Response
 from adxl_ros.simulate.simulator import simulate
-from adxl_ros.simulate.smoothed_paths import Smoothed
+from adxl_ros.simulate.smoothed_paths import SmoothedPath
 from adxl_ros.simulate.trajectories import rich, sweep, TRAJECTORIES
 import numpy as np
 from pace import within
@@ -93,7 +93,7 @@ def test_noise_has_the_stated_spectrum_and_allan_deviation():
     density = density.mean(axis=1)
     decay = np.exp(-1e-3 / sensor.rc_s)
     # One-sided density of an AR(1) sequence of the filter's variance.
-    variance = noise.analog_sigma_v(sensor)[0] ** 2
+    variance = noise.analog_std_v(sensor)[0] ** 2
     theory = 2e-3 * variance * (1 - decay ** 2) / (
         1 - 2 * decay * np.cos(2 * np.pi * f * 1e-3) + decay ** 2)
     for low, high in ((0.5, 3), (3, 15), (15, 60), (60, 450)):
@@ -120,7 +120,7 @@ def test_codes_are_as_frequent_as_the_noise_says():
     sensor = nominal('x', noise_density_g_per_rthz=np.full(1, 30e-6))
     codes = np.rint(simulate(replace(sensor, rate_hz=50.0), Motion(
         20000.0, internal_rate_hz=50.0), 0)['x_v'] / sensor.lsb_v)
-    sigma = noise.analog_sigma_v(sensor)[0]
+    sigma = noise.analog_std_v(sensor)[0]
     for code in np.unique(codes):
         edges = (code + np.array([-0.5, 0.5])) * sensor.lsb_v - 2.5
         expected = np.diff(ndtr(edges / sigma))[0]
@@ -148,9 +148,9 @@ def test_joints_behind_an_encoder_are_smoothed():
     for step, tolerance in ((1.4544e-3, 0.06), (1e-5, 0.01), (0.0, 1e-3)):
         reading = motion.beta(time_s)
         reading = np.rint(reading / step) * step if step else reading
-        found, true = Smoothed(time_s, reading, step)(time_s, 2), motion.beta(time_s, 2)
+        found, true = SmoothedPath(time_s, reading, step)(time_s, 2), motion.beta(time_s, 2)
         assert np.sqrt(np.mean((found - true) ** 2)) < tolerance * np.sqrt(np.mean(true ** 2))
-        position = Smoothed(time_s, reading, step)(time_s)
+        position = SmoothedPath(time_s, reading, step)(time_s)
         assert np.abs(position - motion.beta(time_s)).max() < step + 1e-9
 
 
@@ -268,7 +268,7 @@ def test_quick_moves_among_slow_ones_are_followed():
     moves = Knots([0, 40, 41, 41.6, 60, 60.5, 61, 90], [0, 1, 1, 2, 2, 3, 2.5, 3.2])
     time_s = np.arange(0, 90, 0.008)
     true = moves(time_s)
-    path = Smoothed(time_s, np.rint(true / step) * step, step)
+    path = SmoothedPath(time_s, np.rint(true / step) * step, step)
     off = path(time_s) - true
     assert np.abs(off).max() < 2 * step
     assert np.sqrt(np.mean(off ** 2)) < 0.3 * step

@@ -76,7 +76,7 @@ def swept(rng, truth, planes_rad=PLANES_RAD, check_poses=16, noisy=True, per_set
     force = pose_response.stage_force(truth, alpha + off[0], beta + off[1])
     volts = np.column_stack(signal_chain.static_response(truth)(force))
     count = noise.effective_samples(5000, 1e-3, truth.rc_s)
-    std = np.broadcast_to(noise.sigma_v(truth) / np.sqrt(count), volts.shape)
+    std = np.broadcast_to(noise.sample_std_v(truth) / np.sqrt(count), volts.shape)
     volts = volts + noisy * std * rng.normal(size=volts.shape)
     return Poses(volts, std, alpha, beta, np.zeros((len(alpha), 2)),
                  np.array([t.check for t in targets]))

@@ -162,7 +162,7 @@ def from_poses(sensor: Sensor, poses: Poses, dwell_s: float, stage_rad: float,
     count = noise.effective_samples(round(dwell_s * sensor.rate_hz), 1 / sensor.rate_hz,
                                     sensor.rc_s)
     return Known(unit, names, np.linalg.inv(information), prior, stage,
-                 np.maximum(noise.sigma_v(sensor) / np.sqrt(count), _LEAST_STD_V), len(poses))
+                 np.maximum(noise.sample_std_v(sensor) / np.sqrt(count), _LEAST_STD_V), len(poses))
 
 
 def tilt_error_rad(sensor: Sensor, pose_std_v: np.ndarray) -> float:

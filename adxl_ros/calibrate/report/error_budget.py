@@ -397,7 +397,8 @@ def gravity_error_budgets(fit: GravityFit, fitted: Sensor, force: np.ndarray, ke
 
 def sample_noise_mps2(sensor: Sensor) -> float:
     """Return the noise of one sample, rms over the axes, m/s²."""
-    return float(np.sqrt(np.mean((noise.sigma_v(sensor) / sensor.scale_v_per_g) ** 2))) * G0_MPS2
+    noise_g = noise.sample_std_v(sensor) / sensor.scale_v_per_g
+    return float(np.sqrt(np.mean(noise_g ** 2))) * G0_MPS2
 
 
 def rms_mg(mean_square: float) -> float:

@@ -20,7 +20,7 @@ from collections.abc import Mapping
 from math import exp
 
 from adxl_ros.errors import UserError
-from adxl_ros.simulate.simulator import encoder
+from adxl_ros.simulate.simulator import encoder_reading
 import numpy as np
 
 JOINTS = ('alpha', 'beta', 'shift')
@@ -123,7 +123,8 @@ class SimulatedStage:
     def encoder(self) -> np.ndarray:
         """Return the readings of the encoders, rad, rad, m, (3,)."""
         # + 0.0 turns -0.0 into 0.0.
-        return np.array([encoder(p, r) for p, r in zip(self.position, self._resolution)]) + 0.0
+        return np.array([encoder_reading(position, resolution) for position, resolution in
+                         zip(self.position, self._resolution)]) + 0.0
 
     def moving(self) -> bool:
         """Return whether a joint is more than an encoder step from its goal."""
@@ -132,5 +133,5 @@ class SimulatedStage:
 
     def _reachable(self, target: np.ndarray) -> np.ndarray:
         """Return where the joints come to rest for a target, (3,)."""
-        on_step = np.array([encoder(p, r) for p, r in zip(target, self._resolution)])
+        on_step = np.array([encoder_reading(p, r) for p, r in zip(target, self._resolution)])
         return on_step + self._resolution * self._rng.uniform(-0.5, 0.5, 3)

@@ -16,14 +16,14 @@
 
 from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre
 from adxl_ros.model.effects.base import Effect, Need, Parameter, Parameters, Place, Signals
-from adxl_ros.model.kinematics import angular_motion, carried
+from adxl_ros.model.kinematics import angular_motion, carried_acceleration
 
 
 def apply(signals: Signals, p: Parameters) -> None:
     """Add ω × (ω × r) + ω̇ × r: centripetal and tangential, m/s²."""
     r = [p['x_m'], p['y_m'], p['z_m']]
     if any(r):
-        added = carried(*angular_motion(signals.alpha, signals.beta), r)
+        added = carried_acceleration(*angular_motion(signals.alpha, signals.beta), r)
         signals.force = [f + a for f, a in zip(signals.force, added)]
 
 

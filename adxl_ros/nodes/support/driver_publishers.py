@@ -62,7 +62,7 @@ def imu_message(sensor: Sensor, frame_id: str) -> Imu:
     message.header.frame_id = frame_id
     message.orientation_covariance[0] = message.angular_velocity_covariance[0] = -1.0
     variance = np.full(3, UNMEASURED_VARIANCE)
-    sigma_g = noise.sigma_v(sensor) / sensor.nominal_scale_v_per_g
+    sigma_g = noise.sample_std_v(sensor) / sensor.nominal_scale_v_per_g
     variance[:len(sensor.axes)] = (sigma_g * G0_MPS2) ** 2
     message.linear_acceleration_covariance = np.diag(variance).ravel()
     return message
