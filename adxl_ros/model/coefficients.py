@@ -78,25 +78,71 @@ def parameter_of(name: Coefficient) -> Parameter:
 
 
 def neutral(effect: Effect, axes: str) -> dict[str, np.ndarray]:
-    """Return the values that leave the chain as it is, (m,) or () by parameter."""
+    """
+    Return the neutral values of an effect.
+
+    Parameters
+    ----------
+    effect
+        An effect of the library.
+    axes
+        Measured axes of the sensor.
+
+    Returns
+    -------
+    dict
+        Values by parameter, (m,) or (), each in the unit of its parameter.
+
+    """
     return {p.name: np.full(len(axes), p.neutral) if p.axes else np.array(p.neutral)
             for p in effect.parameters}
 
 
 def typical(effect: Effect, axes: str) -> dict[str, np.ndarray]:
-    """Return typical values, (m,) or () by parameter, for the axes that they mean something."""
+    """
+    Return the typical values of an effect.
+
+    Parameters
+    ----------
+    effect
+        An effect of the library.
+    axes
+        Measured axes of the sensor.
+
+    Returns
+    -------
+    dict
+        Values by parameter, (m,) or (), each in the unit of its parameter. Axes that a parameter
+        does not have keep the neutral value.
+
+    """
     values = neutral(effect, axes)
     for p in effect.parameters:
-        chosen = [a in p.axes for a in axes] if p.axes else ()
-        values[p.name][chosen] = p.scale if p.typical is None else p.typical
+        has_axis = [a in p.axes for a in axes] if p.axes else ()
+        values[p.name][has_axis] = p.scale if p.typical is None else p.typical
     return values
 
 
 def with_neutral(sensor: Sensor, effects: Iterable[str]) -> Sensor:
-    """Add the effects that the sensor does not have, at their neutral values."""
-    new = [name for name in dict.fromkeys(effects) if name not in sensor.effects]
-    values = {name: neutral(effect_named(name), sensor.axes) for name in new}
-    return replace(sensor, effects=(*sensor.effects, *new), values={**sensor.values, **values})
+    """
+    Add effects to a sensor at their neutral values.
+
+    Parameters
+    ----------
+    sensor
+        The unit; effects that it has stay as they are.
+    effects
+        Names of the effects.
+
+    Returns
+    -------
+    Sensor
+        The unit with all of the effects, which responds as before.
+
+    """
+    added = [name for name in dict.fromkeys(effects) if name not in sensor.effects]
+    values = {name: neutral(effect_named(name), sensor.axes) for name in added}
+    return replace(sensor, effects=(*sensor.effects, *added), values={**sensor.values, **values})
 
 
 def get(sensor: Sensor, names: Sequence[Coefficient]) -> np.ndarray:

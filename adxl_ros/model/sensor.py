@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""A sensor's stated figures, its fitted departures from them, and where they come from."""
+"""A sensor: its nominal values, its effects with their coefficients, and its provenance."""
 
 from __future__ import annotations
 
@@ -26,11 +26,12 @@ from adxl_ros.model.validity import Envelope
 import numpy as np
 
 MODELS = ('nominal', 'linear', 'physical', 'full', 'gravity')
+"""Names of the models that can be fitted."""
 
 
-def _figure(key: str, doc: str, unit: str = '', lower: float | None = None,
-            upper: float | None = None, choices: tuple[str, ...] = ()) -> Any:
-    """Declare one stated figure: its key in a parameter file, its unit, bounds and meaning."""
+def _nominal(key: str, doc: str, unit: str = '', lower: float | None = None,
+             upper: float | None = None, choices: tuple[str, ...] = ()) -> Any:
+    """Declare a nominal value: its key in the parameter file, meaning, unit and bounds."""
     return field(metadata={'key': key, 'doc': doc, 'unit': unit, 'lower': lower,
                            'upper': upper, 'choices': choices})
 
@@ -38,46 +39,93 @@ def _figure(key: str, doc: str, unit: str = '', lower: float | None = None,
 @dataclass(frozen=True)
 class Sensor:
     """
-    One unit: the nominal chain by its stated figures, and the effects that depart from it.
+    One unit: the nominal chain by its nominal values, and the effects that depart from it.
 
-    The metadata of each field is the only description of the figure: the parameter file, the
-    nodes' parameters and the error messages all read it. Arrays marked (m,) have one entry an
-    axis of `axes`.
+    The metadata of the fields are the only description of the nominal values. Parameter files,
+    the nodes' parameters and error messages use them. Arrays marked (m,) have one entry for each
+    measured axis.
 
-    `datasheet` has the typical and the greatest departure by `effect.parameter` as the maker
-    states them, in the parameter's unit, 0 where he does not; `datasheet_name` is what they are
-    of.
+    Attributes
+    ----------
+    serial
+        Serial number; "nominal" is no unit in particular.
+    axes
+        Measured axes: x, xy or xyz.
+    nominal_zero_g_v
+        Zero-g by the datasheet, V, (m,).
+    nominal_scale_v_per_g
+        Scale factor by the datasheet, V/g, (m,).
+    noise_density_g_per_rthz
+        Density of the white noise by the datasheet, g/√Hz, (m,).
+    rc_resistance_ohm
+        Output resistance that the filter capacitor sees, Ω.
+    rc_capacitance_f
+        Filter capacitor, F; 0 for no filter.
+    adc_bits
+        Resolution of the ADC, bit; 0 does not quantise.
+    adc_vref_v
+        Full scale of the ADC, V.
+    rate_hz
+        Sample rate, Hz.
+    range_g
+        Measuring range by the datasheet, g.
+    local_gravity_mps2
+        Local gravity, m/s².
+    z_sign
+        Sign of the z of equation 5: 1 is upright, −1 is upside down.
+    stage_resolution_rad
+        Step of the stage's encoders, rad.
+    model
+        Model that was fitted, one of `MODELS`.
+    effects
+        Names of the effects.
+    values
+        Values by effect and parameter, (m,) or (), each in the unit of its parameter.
+    covariance
+        Covariance of the coefficients in `covariance_names`, (k, k).
+    covariance_names
+        Coefficients with a covariance, (k,). The others count as exact.
+    provenance
+        Texts by key: when, from what and by which version the coefficients were fitted.
+    envelope
+        Validity range of the calibration.
+    datasheet_name
+        Name of the datasheet of `datasheet`.
+    datasheet
+        Typical and largest departure by parameter, as the datasheet states them, each in the
+        unit of the parameter; 0 where it does not.
+
     """
 
-    serial: str = _figure('sensor.serial', 'serial number; nominal is no unit in particular')
-    axes: str = _figure('sensor.axes', 'measured axes', choices=('x', 'xy', 'xyz'))
-    nominal_zero_g_v: np.ndarray = _figure(
+    serial: str = _nominal('sensor.serial', 'serial number; nominal is no unit in particular')
+    axes: str = _nominal('sensor.axes', 'measured axes', choices=('x', 'xy', 'xyz'))
+    nominal_zero_g_v: np.ndarray = _nominal(
         'sensor.nominal_zero_g_v', 'zero-g output by the datasheet, by axis', 'V', -10.0, 10.0)
-    nominal_scale_v_per_g: np.ndarray = _figure(
+    nominal_scale_v_per_g: np.ndarray = _nominal(
         'sensor.nominal_scale_v_per_g', 'scale factor by the datasheet, by axis', 'V/g',
         1e-3, 10.0)
-    noise_density_g_per_rthz: np.ndarray = _figure(
+    noise_density_g_per_rthz: np.ndarray = _nominal(
         'sensor.noise_density_g_per_rthz', 'white noise density, by axis', 'g/sqrt(Hz)',
         0.0, 0.1)
-    rc_resistance_ohm: float = _figure(
+    rc_resistance_ohm: float = _nominal(
         'sensor.rc_resistance_ohm', 'output resistance that the filter capacitor sees', 'Ohm',
         0.0, 1e9)
-    rc_capacitance_f: float = _figure(
+    rc_capacitance_f: float = _nominal(
         'sensor.rc_capacitance_f', 'filter capacitor; 0 is no filter', 'F', 0.0, 1.0)
-    adc_bits: int = _figure('sensor.adc_bits', 'resolution of the ADC; 0 does not quantise',
-                            'bit', 0, 32)
-    adc_vref_v: float = _figure('sensor.adc_vref_v', 'full scale of the ADC', 'V', 0.1, 100.0)
-    rate_hz: float = _figure('sensor.rate_hz', 'sample rate', 'Hz', 0.01, 100000.0)
-    range_g: float = _figure('sensor.range_g', 'measuring range by the datasheet', 'g',
+    adc_bits: int = _nominal('sensor.adc_bits', 'resolution of the ADC; 0 does not quantise',
+                             'bit', 0, 32)
+    adc_vref_v: float = _nominal('sensor.adc_vref_v', 'full scale of the ADC', 'V', 0.1, 100.0)
+    rate_hz: float = _nominal('sensor.rate_hz', 'sample rate', 'Hz', 0.01, 100000.0)
+    range_g: float = _nominal('sensor.range_g', 'measuring range by the datasheet', 'g',
                              0.1, 1000.0)
-    local_gravity_mps2: float = _figure(
+    local_gravity_mps2: float = _nominal(
         'sensor.local_gravity_mps2', 'gravity where the sensor is', 'm/s^2', 9.7, 9.9)
-    z_sign: int = _figure(
+    z_sign: int = _nominal(
         'sensor.z_sign', 'which way up, for the z of equation 5: 1 or -1', '', -1, 1)
-    stage_resolution_rad: float = _figure(
+    stage_resolution_rad: float = _nominal(
         'stage.resolution_rad', "step of the stage's encoder, or of the scale read by hand",
         'rad', 0.0, 1.0)
-    model: str = _figure('model', 'what was fitted', choices=MODELS)
+    model: str = _nominal('model', 'what was fitted', choices=MODELS)
     effects: tuple[str, ...] = ()
     values: dict[str, dict[str, np.ndarray]] = field(default_factory=dict)
     covariance: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
@@ -108,7 +156,7 @@ class Sensor:
         return self.adc_vref_v / 2 ** self.adc_bits if self.adc_bits else 0.0
 
     def saturated(self, volts: np.ndarray) -> np.ndarray:
-        """Tell where volts, (n, m), are at a rail of the ADC or beyond the range, (n, m)."""
+        """Return where volts, (n, m), are at a rail of the ADC or beyond the range, (n, m)."""
         beyond = np.abs(volts - self.nominal_zero_g_v) > self.range_g * self.nominal_scale_v_per_g
         if self.adc_bits:
             beyond |= (volts <= 0) | (volts >= self.adc_vref_v - self.lsb_v)
@@ -123,28 +171,33 @@ class Sensor:
         return replace(self, envelope=replace(self.envelope, temperature_c=None))
 
     def _value(self, effect: str, parameter: str) -> np.ndarray:
-        known = self.values.get(effect, {})
-        return known.get(parameter, np.zeros(len(self.axes)))
+        """Return a coefficient by axis, (m,); 0 without the effect."""
+        return self.values.get(effect, {}).get(parameter, np.zeros(len(self.axes)))
 
 
 def with_axes(sensor: Sensor, axes: str) -> Sensor:
     """
-    Give a nominal sensor the axes of the stream at hand.
+    Give a nominal sensor the axes of a stream.
 
-    Axes are left out from the end, or added with the figures that all axes share.
+    Axes are removed from the end, or added with the values that all axes share.
 
     Parameters
     ----------
     sensor
-        Not calibrated, unless it has these axes.
+        A sensor without effects, unless it has these axes.
     axes
-        x, xy or xyz.
+        Axes of the stream: x, xy or xyz.
+
+    Returns
+    -------
+    Sensor
+        The sensor with the axes.
 
     Raises
     ------
     UserError
-        The sensor is calibrated, or its axes differ in a figure, so that what an added axis
-        would be is not known.
+        The sensor is calibrated for other axes, or its axes differ, so that the values of
+        further axes are unknown.
 
     """
     if axes == sensor.axes:
@@ -152,30 +205,35 @@ def with_axes(sensor: Sensor, axes: str) -> Sensor:
     if sensor.effects:
         raise UserError(f'the parameters of {sensor.serial} are calibrated for the axes '
                         f'{sensor.axes}, not {axes}; name the parameter file of this sensor')
-    figures: dict[str, Any] = {name: getattr(sensor, name) for name in (
-        'nominal_zero_g_v', 'nominal_scale_v_per_g', 'noise_density_g_per_rthz')}
-    for name, of in list(figures.items()):
-        if len(axes) > len(of) and np.ptp(of) > 0:
-            raise UserError(f'sensor.{name}: {of.tolist()} for {sensor.axes} does not tell the '
-                            f'figure of the other axes of {axes}; name a parameter file for '
-                            f'{axes}')
-        figures[name] = np.array([*of, *[of[0]] * 3])[:len(axes)]
+    changed: dict[str, Any] = {}
+    for name in ('nominal_zero_g_v', 'nominal_scale_v_per_g', 'noise_density_g_per_rthz'):
+        values = getattr(sensor, name)
+        if len(axes) > len(values) and np.ptp(values) > 0:
+            raise UserError(f'sensor.{name}: {values.tolist()} for {sensor.axes} does not '
+                            f'determine the value of the other axes of {axes}; name a parameter '
+                            f'file for {axes}')
+        changed[name] = np.array([*values, *[values[0]] * 3])[:len(axes)]
     if len(axes) > len(sensor.axes):
-        # A part with more axes is another part.
-        figures |= {'datasheet_name': '', 'datasheet': {}}
-    return replace(sensor, axes=axes, **figures)
+        # A part with more axes has another datasheet.
+        changed |= {'datasheet_name': '', 'datasheet': {}}
+    return replace(sensor, axes=axes, **changed)
 
 
 def to_volts(accel_mps2: np.ndarray, sensor: Sensor) -> np.ndarray:
     """
-    Undo the nominal conversion: m/s² (n, m) to V (n, m), affine and exact.
+    Undo the nominal conversion, which is affine and exact.
 
     Parameters
     ----------
     accel_mps2
         Nominally converted specific force, m/s², (n, m).
     sensor
-        Whose nominal zero-g and scale factor apply.
+        The sensor with its nominal zero-g and scale factor.
+
+    Returns
+    -------
+    ndarray
+        Volts of the ADC, V, (n, m).
 
     """
     return sensor.nominal_zero_g_v + accel_mps2 / G0_MPS2 * sensor.nominal_scale_v_per_g
@@ -183,14 +241,19 @@ def to_volts(accel_mps2: np.ndarray, sensor: Sensor) -> np.ndarray:
 
 def to_nominal_mps2(volts: np.ndarray, sensor: Sensor) -> np.ndarray:
     """
-    Convert V (n, m) to m/s² (n, m) by the nominal zero-g and scale factor (equation 3).
+    Convert volts by the nominal zero-g and scale factor (equation 3).
 
     Parameters
     ----------
     volts
-        ADC volts, (n, m).
+        Volts of the ADC, V, (n, m).
     sensor
-        Whose nominal zero-g and scale factor apply.
+        The sensor with its nominal zero-g and scale factor.
+
+    Returns
+    -------
+    ndarray
+        Nominally converted specific force, m/s², (n, m).
 
     """
     return (volts - sensor.nominal_zero_g_v) / sensor.nominal_scale_v_per_g * G0_MPS2

@@ -23,6 +23,7 @@ from typing import Any
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import (
+    Apply,
     Components,
     Environment,
     NOMINAL_ENVIRONMENT,
@@ -151,7 +152,7 @@ def output_volts(signals: Signals) -> Components:
 
 
 def effects_at(sensor: Sensor, place: Place, invertible: bool | None = None
-               ) -> list[tuple[Callable[[Signals, Parameters], None], Parameters]]:
+               ) -> list[tuple[Apply, Parameters]]:
     """
     Return the effects of a sensor at a place of the chain.
 

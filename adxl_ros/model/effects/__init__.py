@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The library of effects: one file an effect, found by being here."""
+"""The library of effects: each file of this folder holds one."""
 
 from __future__ import annotations
 
@@ -29,22 +29,27 @@ from adxl_ros.model.effects.base import Effect
 @cache
 def library() -> dict[str, Effect]:
     """
-    Collect every effect by name: the files of this folder and the users' entry points.
+    Collect the effects of this folder and those of other packages.
 
-    A package adds its own with an entry point in the group `adxl_ros.effects` that names an
+    A package adds an effect by an entry point in the group `adxl_ros.effects` that names an
     `Effect`.
+
+    Returns
+    -------
+    dict
+        Effects by name.
 
     Raises
     ------
     UserError
-        Two effects claim one name.
+        Two effects have one name.
 
     """
-    found = [import_module(f'{__name__}.{module.name}').EFFECT
-             for module in pkgutil.iter_modules(__path__) if module.name != 'base']
-    found += [point.load() for point in entry_points(group='adxl_ros.effects')]
+    collected = [import_module(f'{__name__}.{module.name}').EFFECT
+                 for module in pkgutil.iter_modules(__path__) if module.name != 'base']
+    collected += [point.load() for point in entry_points(group='adxl_ros.effects')]
     effects: dict[str, Effect] = {}
-    for effect in found:
+    for effect in collected:
         if effect.name in effects:
             raise UserError(f'two effects are named {effect.name}; rename one')
         effects[effect.name] = effect
@@ -58,7 +63,7 @@ def effect_named(name: str) -> Effect:
     Raises
     ------
     UserError
-        There is none; the nearest name is suggested.
+        No effect has the name; the message suggests the nearest one.
 
     """
     effects = library()

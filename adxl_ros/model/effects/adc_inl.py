@@ -23,20 +23,22 @@ def apply(signals: Signals, p: Parameters) -> None:
     """
     Add A·sin(2π·n·V/V_ref) and the wrong weights of the heaviest bits to the volts of each axis.
 
-    A converter that weighs bit by bit is off by the error of each bit that is set (van de
-    Plassche, "CMOS Integrated Analog-to-Digital Converters", 2003): half of it up or down.
+    The output of a converter that weighs bit by bit has the errors of all bits that are set (van
+    de Plassche, "CMOS Integrated Analog-to-Digital Converters", 2003): half of each, up or down.
     """
     turn = 2 * np.pi * p['cycles'] / signals.vref_v
     for d, volts in enumerate(signals.input_v):
-        off = p['amplitude_v'] * np.sin(turn * volts)
+        error_v = p['amplitude_v'] * np.sin(turn * volts)
         for bit, name in enumerate(_BITS, 1):
             if p[name]:
-                off = off + p[name] * (np.floor(volts / signals.vref_v * 2 ** bit) % 2 - 0.5)
-        signals.volts[d] = signals.volts[d] + off
+                is_set = np.floor(volts / signals.vref_v * 2 ** bit) % 2
+                error_v = error_v + p[name] * (is_set - 0.5)
+        signals.volts[d] = signals.volts[d] + error_v
 
 
 _BITS = ('first_bit_v', 'second_bit_v', 'third_bit_v', 'fourth_bit_v', 'fifth_bit_v',
          'sixth_bit_v')
+"""Parameters of the bits, the heaviest first."""
 
 
 EFFECT = Effect(
@@ -49,12 +51,12 @@ EFFECT = Effect(
                   'periods of the deviation over the full scale', '', neutral=8.0,
                   role=Role.SHAPE),
         *(Parameter(name, 'V', -0.05, 0.05, 3e-4, 'physics: 4 LSB of 16 bit at 5 V',
-                    f'error of the weight of bit {i} from above', '', typical=0.0,
+                    f'error of the weight of bit {i}, the heaviest being 1', '', typical=0.0,
                     role=Role.OPTIONAL)
           for i, name in enumerate(_BITS, 1)),
     ),
     apply=apply,
     invertible=True,
-    cause='The ADC is not straight; calibrate it with a source of volts, or choose another.',
+    cause='The ADC is nonlinear; calibrate it with a voltage source, or choose another.',
     diagnosis=DiagnosisHints(revealed_by=Manoeuvre.REMOUNT),
 )

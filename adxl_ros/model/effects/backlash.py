@@ -12,23 +12,26 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Backlash of the stage: the joint follows its encoder with play."""
+"""Backlash of the stage: a joint follows its encoder with play."""
 
 from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre
 from adxl_ros.model.effects.base import Effect, Joint, Need, Parameter, Parameters, Place, Signals
 from adxl_ros.model.play_operator import play
 
+_ROUNDING = 1e-9
+"""Relative rounding error of a dead band; chosen: far above that of float64."""
+
 
 def apply(signals: Signals, p: Parameters) -> None:
-    """Let the joint follow with a dead band; it moves only while its flanks touch."""
+    """Let each joint follow with a dead band; it moves while the flanks of its gears touch."""
     for joint in ('alpha', 'beta'):
         half = p[f'{joint}_rad'] / 2
         if half:
-            q, rate, growth = getattr(signals, joint)
+            q, velocity, acceleration = getattr(signals, joint)
             memory = signals.memory.setdefault(joint, {})
-            followed = play(q, half, memory)
-            touches = abs(q - followed) >= half * (1 - 1e-9)
-            setattr(signals, joint, Joint(followed, rate * touches, growth * touches))
+            position = play(q, half, memory)
+            touches = abs(q - position) >= half * (1 - _ROUNDING)
+            setattr(signals, joint, Joint(position, velocity * touches, acceleration * touches))
 
 
 EFFECT = Effect(

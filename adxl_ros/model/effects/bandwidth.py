@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Bandwidth of the output filter: the on-chip resistor is known to a quarter only."""
+"""Bandwidth of the RC filter: the on-chip resistor has a tolerance of 25 %."""
 
 from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre
 from adxl_ros.model.effects.base import Effect, Need, Parameter, Parameters, Place, Signals
@@ -30,7 +30,7 @@ EFFECT = Effect(
     parameters=(
         Parameter('resistance_ratio', '1', -0.95, 10.0, 0.15,
                   'ADXL203 datasheet: 32 kOhm +-25 %',
-                  "filter's resistance by the stated one, minus 1"),
+                  "filter's resistance divided by the stated one, minus 1"),
     ),
     apply=apply,
     needs=(Need.FILTER,),

@@ -12,36 +12,37 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What an effect is, and the signals that run through the chain."""
+"""Descriptions of effects, and the signals of the chain that they change."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import auto, Enum, IntEnum
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 from adxl_ros.model.constants import NOMINAL_SUPPLY_V, NOMINAL_TEMPERATURE_C
 from adxl_ros.model.diagnosis_hints import DiagnosisHints
 import numpy as np
 
 Value = Any
-"""One component of a signal: an array over samples, or a float for one sample.
+"""One component of a signal: an array over samples, (n,), or a float for one sample.
 
-Effects compute component by component with plain arithmetic, so that one description serves
-recordings (arrays) and a live sample (floats, without the cost of small arrays)."""
+Effects compute component by component with plain arithmetic. One description then serves
+recordings (arrays) and live samples (floats, which avoid the cost of small arrays)."""
 
 Components = list[Value]
+"""Components of a vector: those of the case frame, or one for each measured axis."""
+
 Parameters = dict[str, Any]
-"""By name: a tuple of floats, one an axis, or a float where a parameter has no axes."""
+"""Values by name: a tuple of floats, one for each measured axis, or a float without axes."""
 
 
 class Place(IntEnum):
     """
-    Where in the chain an effect acts; the chain runs in this order.
+    Place of an effect in the chain; the chain runs in this order.
 
-    The clock comes last, for it says which instant a sample is stamped with; it is evaluated
-    first, so that a sample is taken at its instant and nothing is resampled.
+    The clock is last because it decides which stamp a sample gets. It is evaluated first: samples
+    are taken at their instants, and nothing is resampled.
     """
 
     STAGE = 1
@@ -79,7 +80,17 @@ NOMINAL_ENVIRONMENT = Environment(time_s=float('inf'))
 
 
 class Joint(NamedTuple):
-    """Motion of one joint of the stage: rad or m, and its first two derivatives by time."""
+    """
+    Motion of one joint of the stage.
+
+    Attributes
+    ----------
+    position
+        Angle, rad, or shift, m.
+    velocity, acceleration
+        First and second derivative of the position by time.
+
+    """
 
     position: Value = 0.0
     velocity: Value = 0.0
@@ -89,47 +100,50 @@ class Joint(NamedTuple):
 @dataclass
 class Signals:
     """
-    What runs through the chain, component by component; a place reads and writes its own.
+    Signals of the chain, component by component. Effects change the signals of their place.
 
     Attributes
     ----------
     environment
-        At the instants of the samples.
+        Surroundings at the instants of the samples.
     time_s
-        CLOCK: stamps, to be turned into the instants at which the samples are taken, s.
+        CLOCK: stamps, s, which effects turn into the instants of the samples.
     alpha, beta, shift
-        STAGE: joints as the encoder has them, to be turned into true ones.
+        STAGE: joints as the encoders read them, which effects turn into the true ones.
     up
         STAGE: the vertical in the frame of the stage's base, a unit vector.
     gravity_mps2
-        STAGE: true local gravity.
+        STAGE: local gravity, m/s².
     force
-        FORCE: specific force in the case frame, m/s², three.
+        FORCE: specific force in the case frame, m/s², three components.
     sensed
-        MOUNTING: specific force along the sensing axes, g, always three: axes that are not
-        measured keep the component along the case's axis.
+        MOUNTING: specific force along the sensing axes, g, always three components. Axes that
+        are not measured keep the component along the axis of the case.
     output
-        ELEMENT: what the element makes of it, g; starts as `sensed`. Effects read `sensed` and
-        add to `output`, so that their order does not matter.
+        ELEMENT: output of the sensing element, g; it begins as `sensed`. Effects read `sensed`
+        and add to `output`, so that their order does not matter.
     zero_g_v, scale_v_per_g
-        ELECTRONICS: figures of the conversion to volts, by measured axis.
-    rc_s, noise_ratio, lsb_v
-        ELECTRONICS: time constant of the output filter, s, and white noise by its stated
-        density, by measured axis; step of the ADC, V.
-    input_v, volts
-        ADC: volts by measured axis at the input of the ADC, and with what effects add to them;
-        effects read the first and add to the second. CODE: `volts` are what the ADC gives.
+        ELECTRONICS: zero-g, V, and scale factor, V/g, by measured axis.
+    rc_s
+        ELECTRONICS: time constant of the RC filter by measured axis, s.
+    noise_ratio
+        ELECTRONICS: density of the white noise divided by the nominal one, by measured axis.
+    lsb_v
+        ELECTRONICS: step of the ADC, V.
+    input_v
+        ADC: volts at the input of the ADC by measured axis. Effects only read them.
+    volts
+        ADC: `input_v` with the contributions of effects. CODE: volts that the ADC outputs.
     nominal_scale_v_per_g
-        The stated scale factor by measured axis, which turns g into volts at the ADC.
+        Nominal scale factor by measured axis, V/g, which turns g into volts at the ADC.
     vref_v
         Full scale of the ADC, V.
     dt_s
         Time between the samples of the arrays, s.
     memory
-        What the effect that is being applied keeps from one block to the next; empty at the
-        beginning.
+        What the current effect keeps from one block to the next; empty before the first.
     rng
-        Source of randomness of the effect that is being applied, its own by the seed.
+        Random generator of the current effect, seeded for it alone.
 
     """
 
@@ -162,14 +176,16 @@ class Coefficient:
     """
     Name of one coefficient: a parameter of an effect, for one axis.
 
-    Files, messages and reports have it as text: `effect.parameter.axis`.
+    Files, messages and reports show it as text: `effect.parameter.axis`.
 
     Attributes
     ----------
-    effect, parameter
-        Their names.
+    effect
+        Name of the effect.
+    parameter
+        Name of the parameter.
     axis
-        x, y or z; empty for a parameter without axes, or for all of its axes.
+        x, y or z; empty for a parameter without axes, and for all axes of a parameter.
 
     """
 
@@ -192,29 +208,29 @@ class Coefficient:
 
 
 class Role(Enum):
-    """What a parameter is to its effect; fits and the diagnosis treat each role differently."""
+    """Role of a parameter in its effect; fits and the diagnosis treat each role differently."""
 
     SIZE = auto()
-    """How strong the effect is: at its neutral value the effect does nothing."""
+    """Strength of the effect, which does nothing at the neutral value."""
     OPTIONAL = auto()
-    """A size that an effect usually lacks: fits leave it out, and so may files."""
+    """A size that is usually neutral: fits leave it out, and files may do so."""
     SHAPE = auto()
-    """A frequency, a time constant and the like: it means nothing where the sizes are neutral."""
+    """A frequency, time constant or the like, without influence where the sizes are neutral."""
     LIMIT = auto()
-    """A bound of the signal: it does nothing where no sample reaches it."""
+    """A bound of the signal, without influence where no sample reaches it."""
 
 
 class ActsOn(Enum):
-    """Where the effect shows in the output."""
+    """Property of the output in which an effect shows."""
 
     MEAN = 'mean'
-    """In the mean of the output."""
+    """The mean of the output."""
     NOISE = 'noise'
-    """In the statistics of the noise only."""
+    """The statistics of the noise only."""
 
 
 class Need(Enum):
-    """A part of the simulated chain without which an effect has nothing to act on."""
+    """Part of the chain without which an effect has nothing to act on."""
 
     STAGE = 'stage'
     FILTER = 'filter'
@@ -229,20 +245,29 @@ class Parameter:
 
     Attributes
     ----------
+    name
+        Name, which ends in its unit where it has one.
+    unit
+        Unit, as messages show it.
+    lower, upper
+        Bounds.
     scale
-        A typical magnitude, with its source (datasheet, paper or physics).
+        Typical magnitude.
+    source
+        Source of the typical magnitude: datasheet, paper or physics.
+    doc
+        Meaning, in words that continue "it is the ...".
     axes
-        The axes that it means something for, an entry an axis, those of others 0; empty for one
-        figure without axes.
+        Axes that it applies to, with one value for each measured axis; values of other axes are
+        neutral. Empty for one value without axes.
     neutral
-        The value that leaves the chain as it is; a figure of shape (a frequency, a time
-        constant), which means nothing while its amplitude is neutral, has its typical value.
+        Value at which the effect does nothing. A parameter of shape has its typical value there.
     typical
-        The value that the effect takes where only its name is given; `scale` unless stated.
+        Value of an effect that is stated by name only; `scale` unless given.
     held
-        Whether fits leave it as it is: what it does, zero-g and scale factor do as well.
+        Whether fits leave it as it is, because zero-g and scale factor can take its place.
     role
-        What it is to its effect; the size unless stated.
+        Role in its effect.
 
     """
 
@@ -261,43 +286,66 @@ class Parameter:
 
     @property
     def is_size(self) -> bool:
-        """Whether it says how strong the effect is; at its neutral value it does nothing."""
+        """Whether it is a strength of the effect, and not a shape or a limit."""
         return self.role in (Role.SIZE, Role.OPTIONAL)
+
+
+class Apply(Protocol):
+    """Function of an effect, which changes the signals of its place."""
+
+    def __call__(self, signals: Signals, p: Parameters, /) -> None:
+        """
+        Apply the effect.
+
+        Parameters
+        ----------
+        signals
+            Signals of the chain, which it changes in place.
+        p
+            Values of the parameters of the effect.
+
+        """
 
 
 @dataclass(frozen=True)
 class Effect:
     """
-    One effect of a real sensor: what the simulator, the inverse and the fits know of it.
+    One effect of a real sensor, as the simulator, the inverse and the fits use it.
 
     Attributes
     ----------
+    name
+        Name, which is unique in the library.
+    place
+        Place in the chain.
+    parameters
+        Its parameters.
     apply
-        Changes the signals of its place, given the parameters; vectorised.
+        Its function, for arrays, and for floats where it is invertible.
     cause
-        One sentence for a report: what causes it and what to do about it.
+        Sentence for a report: the cause, and what to do about it.
     smooth
-        Whether the output is differentiable in the parameters.
+        Whether the output is differentiable by the parameters.
     exact
-        Whether its form, geometry or a clock, is beyond doubt: what it leaves looks like no other.
+        Whether its form is certain, as that of geometry or of a clock.
     acts_on
-        Where it shows in the output. The text 'mean' or 'noise' is accepted, too.
+        Property of the output in which it shows; the text 'mean' or 'noise' is accepted, too.
     invertible
-        Whether it is a smooth function of the sample's own force and environment, which the
-        inverse undoes; an effect of the stage, of memory or of noise is not.
+        Whether it is a smooth function of force and environment of one sample, which the inverse
+        undoes. Effects of the stage, with a memory or with noise are not.
     needs
-        Parts of the chain that it acts on. Their names as text are accepted, too.
+        Parts of the chain that it acts on; their names as text are accepted, too.
     follows
-        The fields of `Environment` that it follows.
+        Names of the fields of `Environment` that it depends on.
     diagnosis
-        What only the diagnosis needs to know of it.
+        Properties that only the diagnosis uses.
 
     """
 
     name: str
     place: Place
     parameters: tuple[Parameter, ...]
-    apply: Callable[[Signals, Parameters], None]
+    apply: Apply
     cause: str
     smooth: bool = True
     exact: bool = False

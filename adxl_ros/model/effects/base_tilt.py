@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Tilt of the stage's base: its vertical is not the plumb line."""
+"""Tilt of the stage's base: it is not level."""
 
 from math import cos, sin
 
@@ -21,7 +21,7 @@ from adxl_ros.model.effects.base import Effect, Need, Parameter, Parameters, Pla
 
 
 def apply(signals: Signals, p: Parameters) -> None:
-    """Turn the vertical about the base's x and then its y, the axis of alpha."""
+    """Turn the vertical about the base's x, and then about its y, the axis of alpha."""
     x, y, z = signals.up
     c, s = cos(p['x_rad']), sin(p['x_rad'])
     y, z = y * c - z * s, y * s + z * c
@@ -36,7 +36,7 @@ EFFECT = Effect(
         Parameter('x_rad', 'rad', -0.5, 0.5, 1.75e-3, 'paper: level of 0.1 deg',
                   "turn of the vertical about the base's x, across the axis of alpha", ''),
         Parameter('y_rad', 'rad', -0.5, 0.5, 1.75e-3, 'paper: level of 0.1 deg',
-                  'turn of the vertical about the axis of alpha; the same as an offset of alpha',
+                  'turn of the vertical about the axis of alpha; it equals an offset of alpha',
                   ''),
     ),
     apply=apply,

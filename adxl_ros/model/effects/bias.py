@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Zero-g of this unit beside the datasheet's (B of equation 2)."""
+"""Zero-g of a unit minus the nominal one (B of equation 2)."""
 
 from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre, StraightLine
 from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals

@@ -20,7 +20,7 @@ import numpy as np
 
 
 def apply(signals: Signals, p: Parameters) -> None:
-    """Add the sum of independent steps; after a time t it is k·√t off, rms, g."""
+    """Add the sum of independent steps, g; after a time t its rms is k·√t."""
     assert signals.rng is not None
     density = np.array(p['density_g_per_rts'])
     drawn = signals.rng.standard_normal((len(signals.environment.time_s), len(density)))
@@ -40,7 +40,7 @@ EFFECT = Effect(
     parameters=(
         Parameter('density_g_per_rts', 'g/sqrt(s)', 0.0, 0.1, 2e-5,
                   'physics: slow stress in package and solder',
-                  'growth of the wandering zero-g with the root of time'),
+                  'rms of the wandering zero-g divided by the root of time'),
     ),
     apply=apply,
     acts_on=ActsOn.NOISE,

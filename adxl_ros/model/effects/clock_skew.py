@@ -19,7 +19,7 @@ from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Si
 
 
 def apply(signals: Signals, p: Parameters) -> None:
-    """Take samples earlier than stamped by a part of the time since the beginning."""
+    """Take samples earlier than their stamps by a fraction of the time since the beginning."""
     signals.time_s = signals.time_s - p['ratio'] * signals.time_s
 
 
@@ -28,7 +28,7 @@ EFFECT = Effect(
     place=Place.CLOCK,
     parameters=(
         Parameter('ratio', 's/s', -0.01, 0.01, 1e-4, 'physics: crystals, 100 ppm',
-                  "by how much the stamps' clock runs fast", ''),
+                  "relative excess of the rate of the clock that makes the stamps", ''),
     ),
     apply=apply,
     exact=True,

@@ -18,7 +18,7 @@ from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre
 from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
 
 OTHER = (1, 0, 0)
-"""Number of the axis c by the number of the own axis: x has y, y has x, and z has x."""
+"""Index of the other axis c by axis: x has y, y has x, and z has x."""
 
 
 def apply(signals: Signals, p: Parameters) -> None:

@@ -18,7 +18,7 @@ from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre
 from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
 
 OTHER = (2, 2, 1)
-"""Number of the other axis by the number of the own axis: x and y have z, and z has y."""
+"""Index of the other axis by axis: x and y have z, and z has y."""
 
 
 def apply(signals: Signals, p: Parameters) -> None:

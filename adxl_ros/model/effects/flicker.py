@@ -22,39 +22,42 @@ import numpy as np
 from scipy.signal import lfilter
 
 _LOWEST_HZ = 1e-5
-_HIGHEST = 10 ** -0.5
-"""Highest corner by the rate: what folds back makes up for those that are missing above it."""
+"""Lowest corner, Hz; chosen: the density is 1/f from ten times this."""
+
+_HIGHEST_RATIO = 10 ** -0.5
+"""Highest corner divided by the sample rate; chosen: aliasing replaces the missing corners."""
+
 _PER_DECADE = 2
-"""With so many corners a decade the sum is 1/f within 2 % up to a fifth of the rate."""
+"""Corners per decade; chosen: the sum is 1/f within 2 % up to a fifth of the sample rate."""
 
 
 def apply(signals: Signals, p: Parameters) -> None:
     """
     Add noise of the one-sided density k²/f, g²/Hz, from 10⁻⁴ Hz up to a fifth of the rate.
 
-    Processes of one variance at corners evenly spaced by their logarithm sum up to 1/f (van der
-    Ziel 1950); each is sampled exactly.
+    Ornstein-Uhlenbeck processes of equal variance, whose corners are evenly spaced on a
+    logarithmic axis, sum up to 1/f (van der Ziel 1950). Each is sampled exactly.
     """
     assert signals.rng is not None
     corners = corners_hz(1 / signals.dt_s)
     count = len(signals.environment.time_s)
     drawn = signals.rng.standard_normal((count, len(p['density_g_per_rthz']), len(corners)))
-    # Variance of each: its density, σ²·2/(π·f_c)/(1 + (f/f_c)²), summed over ln f is σ²/(f·Δln f).
+    # The densities of the processes, σ²·2/(π·f_c)/(1 + (f/f_c)²), sum up to σ²/(f·Δln f).
     sigma = np.sqrt(np.log(10) / _PER_DECADE)
     decay = np.exp(-2 * np.pi * corners * signals.dt_s)
     for d, density in enumerate(p['density_g_per_rthz']):
         if not density or not count:
             continue
-        before = signals.memory.get(d)
+        previous = signals.memory.get(d)
         noise = np.zeros(count)
         last = np.empty(len(corners))
         for i, a in enumerate(decay):
             step = np.sqrt(1 - a * a)
             steps = drawn[:, d, i].copy()
-            if before is None:
-                steps[0] /= step       # stationary from the first sample on
-            x, _ = lfilter([step], [1.0, -a], steps, zi=[0.0 if before is None
-                                                         else a * before[i]])
+            if previous is None:
+                steps[0] /= step  # stationary from the first sample on
+            state = 0.0 if previous is None else a * previous[i]
+            x, _ = lfilter([step], [1.0, -a], steps, zi=[state])
             noise += x
             last[i] = x[-1]
         signals.memory[d] = last
@@ -64,8 +67,8 @@ def apply(signals: Signals, p: Parameters) -> None:
 
 @lru_cache(maxsize=8)
 def corners_hz(rate_hz: float) -> np.ndarray:
-    """Return the corners of the processes that a sample rate needs, Hz."""
-    highest = _HIGHEST * rate_hz
+    """Return the corners of the processes for a sample rate, Hz, the highest first."""
+    highest = _HIGHEST_RATIO * rate_hz
     count = int(np.log10(highest / _LOWEST_HZ) * _PER_DECADE) + 1
     return highest * 10 ** (-np.arange(count) / _PER_DECADE)
 
@@ -76,7 +79,7 @@ EFFECT = Effect(
     parameters=(
         Parameter('density_g_per_rthz', 'g/sqrt(Hz)', 0.0, 0.1, 1e-4,
                   'physics: corner near 1 Hz beside 110 ug/sqrt(Hz)',
-                  'density at 1 Hz; it grows as one over the root of the frequency'),
+                  'density at 1 Hz; it falls with the root of the frequency'),
     ),
     apply=apply,
     acts_on=ActsOn.NOISE,

@@ -19,22 +19,23 @@ from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Ro
 from adxl_ros.model.play_operator import play
 
 _THRESHOLDS = (0.25, 0.5, 0.75, 1.0)
-"""Of the reach: one stop operator each, with equal weights."""
+"""Thresholds of the stop operators, divided by the reach; chosen: four of equal weight."""
 
 
 def apply(signals: Signals, p: Parameters) -> None:
     """
-    Let the output lag by a mean of stop operators, x − play(x), each by its threshold.
+    Let the output lag by a mean of stop operators, x − play(x), each divided by its threshold.
 
-    The lag is at most `half_width_g`, which it reaches `reach_g`·2 after a reversal
-    (Prandtl-Ishlinskii; Brokate and Sprekels, "Hysteresis and Phase Transitions", 1996).
+    The lag is at most `half_width_g`. It reaches that when the input has changed by 2·`reach_g`
+    after a reversal (Prandtl-Ishlinskii; Brokate and Sprekels, "Hysteresis and Phase
+    Transitions", 1996).
     """
     for d, half_width in enumerate(p['half_width_g']):
         if not half_width:
             continue
         sensed, lag = signals.sensed[d], 0.0
-        for i, part in enumerate(_THRESHOLDS):
-            threshold = part * p['reach_g']
+        for i, fraction in enumerate(_THRESHOLDS):
+            threshold = fraction * p['reach_g']
             memory = signals.memory.setdefault((d, i), {})
             lag = lag + (sensed - play(sensed, threshold, memory)) / threshold
         signals.output[d] = signals.output[d] - half_width / len(_THRESHOLDS) * lag
@@ -45,14 +46,14 @@ EFFECT = Effect(
     place=Place.ELEMENT,
     parameters=(
         Parameter('half_width_g', 'g', -0.1, 0.1, 2e-3, 'physics: friction in die and package',
-                  'largest lag behind the input, half of the width of the loop'),
+                  'largest lag behind the input: half of the width of the loop'),
         Parameter('reach_g', 'g', 1e-3, 2.0, 0.2, 'physics: part of the range',
                   'change of the input after a reversal that builds up half of the lag', '',
                   neutral=0.2, role=Role.SHAPE),
     ),
     apply=apply,
     smooth=False,
-    cause='The reading depends on where the sensor comes from; approach poses from both sides '
-          'and average, or relieve the package of mounting stress.',
+    cause='The reading depends on the direction of the last change; approach poses from both '
+          'sides and average, or relieve the package of mounting stress.',
     diagnosis=DiagnosisHints(revealed_by=Manoeuvre.SPEEDS),
 )

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Lever arm: a sensor off the axes of the stage feels the turning."""
+"""Lever arm: rotation accelerates a sensor that is not on the axes of the stage."""
 
 from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre
 from adxl_ros.model.effects.base import Effect, Need, Parameter, Parameters, Place, Signals
@@ -20,7 +20,7 @@ from adxl_ros.model.kinematics import angular_motion, carried_acceleration
 
 
 def apply(signals: Signals, p: Parameters) -> None:
-    """Add ω × (ω × r) + ω̇ × r: centripetal and tangential, m/s²."""
+    """Add the centripetal and tangential acceleration ω × (ω × r) + ω̇ × r, m/s²."""
     r = [p['x_m'], p['y_m'], p['z_m']]
     if any(r):
         added = carried_acceleration(*angular_motion(signals.alpha, signals.beta), r)
@@ -37,6 +37,6 @@ EFFECT = Effect(
     apply=apply,
     exact=True,
     needs=(Need.STAGE,),
-    cause='The sensor is off the axis of rotation; mount it on the axis, or state the arm.',
+    cause='The sensor is not on the axis of rotation; mount it there, or state the arm.',
     diagnosis=DiagnosisHints(revealed_by=Manoeuvre.SPEEDS),
 )

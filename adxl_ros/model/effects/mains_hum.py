@@ -34,11 +34,11 @@ EFFECT = Effect(
                   'amplitude of the sine'),
         Parameter('frequency_hz', 'Hz', 1.0, 1000.0, 50.0, 'mains: 50 or 60 Hz',
                   'frequency of the sine', '', neutral=50.0, role=Role.SHAPE),
-        Parameter('phase_rad', 'rad', -7.0, 7.0, 1.0, 'any', 'phase at time 0', '',
+        Parameter('phase_rad', 'rad', -7.0, 7.0, 1.0, 'chosen: any', 'phase at time 0', '',
                   typical=0.0, role=Role.OPTIONAL),
     ),
     apply=apply,
     acts_on=ActsOn.NOISE,
-    cause='The mains couple in; shield and twist the cable, and ground it at one end.',
+    cause='The mains couple into the signal; shield and twist the cable, and ground one end.',
     diagnosis=DiagnosisHints(detector=Detector.MAINS_LINE),
 )

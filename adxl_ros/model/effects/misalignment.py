@@ -36,6 +36,19 @@ def direction(axis: int, alpha_rad: float, beta_rad: float) -> Components:
 
     Θx = R_y(α)·R_z(β)·[1 0 0]ᵀ (18), Θy = R_x(α)·R_z(β)·[0 1 0]ᵀ (19), and in the same manner
     Θz = R_x(α)·R_y(β)·[0 0 1]ᵀ.
+
+    Parameters
+    ----------
+    axis
+        Index of the sensing axis.
+    alpha_rad, beta_rad
+        Angles α and β of the axis, rad.
+
+    Returns
+    -------
+    list
+        Three components.
+
     """
     sa, ca, sb, cb = sin(alpha_rad), cos(alpha_rad), sin(beta_rad), cos(beta_rad)
     return [[ca * cb, sb, -sa * cb], [-sb, ca * cb, sa * cb], [sb, -sa * cb, ca * cb]][axis]

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Resonance of the mount: the sensor feels the motion through a spring and a damper."""
+"""Resonance of the mount: it transmits the motion like a spring and a damper."""
 
 from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre
 from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Role, Signals
@@ -20,13 +20,13 @@ from adxl_ros.model.filters import resonator
 
 
 def apply(signals: Signals, p: Parameters) -> None:
-    """Let a part of the force come through ω²/(s² + 2·ζ·ω·s + ω²)."""
+    """Filter a part of the force by ω²/(s² + 2·ζ·ω·s + ω²)."""
     for d, gain in enumerate(p['gain']):
         if gain:
             sensed = signals.sensed[d]
-            through = resonator(sensed, p['frequency_hz'], p['damping_ratio'], signals.dt_s,
-                                signals.memory.setdefault(d, {}))
-            signals.sensed[d] = sensed + gain * (through - sensed)
+            transmitted = resonator(sensed, p['frequency_hz'], p['damping_ratio'], signals.dt_s,
+                                    signals.memory.setdefault(d, {}))
+            signals.sensed[d] = sensed + gain * (transmitted - sensed)
 
 
 EFFECT = Effect(
@@ -38,7 +38,7 @@ EFFECT = Effect(
         Parameter('frequency_hz', 'Hz', 2.0, 450.0, 120.0, 'physics: a board on standoffs',
                   'natural frequency, undamped', '', neutral=120.0, role=Role.SHAPE),
         Parameter('damping_ratio', '1', 0.001, 0.95, 0.05, 'physics: metal and FR4',
-                  'damping by the critical one', '', neutral=0.05, role=Role.SHAPE),
+                  'damping divided by the critical one', '', neutral=0.05, role=Role.SHAPE),
     ),
     apply=apply,
     cause='The mount is a spring; stiffen it, or keep the motion away from its resonance.',

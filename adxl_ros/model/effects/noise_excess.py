@@ -30,11 +30,11 @@ EFFECT = Effect(
     parameters=(
         Parameter('ratio', '1', -0.99, 100.0, 0.3,
                   'ADXL203 datasheet: 190 instead of 110 ug/sqrt(Hz) at 3 V',
-                  'noise density by the stated one, minus 1'),
+                  'noise density divided by the stated one, minus 1'),
     ),
     apply=apply,
     acts_on=ActsOn.NOISE,
     needs=(Need.NOISE,),
-    cause='The noise is not the stated one; look at the supply, its decoupling and the cable.',
+    cause='The noise is not the stated one; check the supply, its decoupling and the cable.',
     diagnosis=DiagnosisHints(detector=Detector.NOISE_LEVEL),
 )

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Odd nonlinearity of an axis: its scale factor falls or grows with its own input."""
+"""Odd nonlinearity of an axis: its scale factor changes with its own input."""
 
 from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre
 from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
@@ -21,8 +21,8 @@ from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Si
 def apply(signals: Signals, p: Parameters) -> None:
     """Add k·a³ of the axis's own acceleration, g."""
     for d, k in enumerate(p['cubic_per_g2']):
-        own = signals.sensed[d]
-        signals.output[d] = signals.output[d] + k * own * own * own
+        sensed = signals.sensed[d]
+        signals.output[d] = signals.output[d] + k * sensed * sensed * sensed
 
 
 EFFECT = Effect(
@@ -31,7 +31,7 @@ EFFECT = Effect(
     parameters=(
         Parameter('cubic_per_g2', '1/g^2', -0.1, 0.1, 7e-4,
                   'ADXL203 datasheet: nonlinearity 0.2 % of 1.7 g full scale',
-                  'coefficient of the cube of the own axis'),
+                  'coefficient of the cube of the acceleration along the axis'),
     ),
     apply=apply,
     invertible=True,

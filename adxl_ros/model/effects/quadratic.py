@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Even nonlinearity of an axis: the two directions differ in scale factor."""
+"""Even nonlinearity of an axis: its scale factors up and down differ."""
 
 from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre
 from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
@@ -21,8 +21,8 @@ from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Si
 def apply(signals: Signals, p: Parameters) -> None:
     """Add k·a² of the axis's own acceleration, g."""
     for d, k in enumerate(p['quadratic_per_g']):
-        own = signals.sensed[d]
-        signals.output[d] = signals.output[d] + k * own * own
+        sensed = signals.sensed[d]
+        signals.output[d] = signals.output[d] + k * sensed * sensed
 
 
 EFFECT = Effect(
@@ -31,10 +31,10 @@ EFFECT = Effect(
     parameters=(
         Parameter('quadratic_per_g', '1/g', -0.1, 0.1, 1.2e-3,
                   'ADXL203 datasheet: nonlinearity 0.2 % of 1.7 g full scale',
-                  'coefficient of the square of the own axis'),
+                  'coefficient of the square of the acceleration along the axis'),
     ),
     apply=apply,
     invertible=True,
-    cause='Up and down differ in scale factor; calibrate, and let no supply clip one side.',
+    cause='Scale factors up and down differ; calibrate, and let no supply clip one side.',
     diagnosis=DiagnosisHints(revealed_by=Manoeuvre.PLANES),
 )

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Quantisation coarser than the ADC's bits."""
+"""Quantisation that is coarser than the resolution of the ADC."""
 
 from adxl_ros.model.diagnosis_hints import Detector, DiagnosisHints
 from adxl_ros.model.effects.base import ActsOn, Effect, Need, Parameter, Parameters, Place, Signals
@@ -28,12 +28,12 @@ EFFECT = Effect(
     place=Place.ELECTRONICS,
     parameters=(
         Parameter('lost_bits', 'bit', 0.0, 12.0, 3.0, 'physics: a driver that drops low bits',
-                  'bits fewer than stated', ''),
+                  'number of bits that the ADC loses', ''),
     ),
     apply=apply,
     smooth=False,
     acts_on=ActsOn.NOISE,
     needs=(Need.ADC,),
-    cause='The ADC resolves less than stated; look at its setting, reference and format.',
+    cause='The ADC resolves less than stated; check its setting, reference and format.',
     diagnosis=DiagnosisHints(detector=Detector.COARSE_CODES),
 )

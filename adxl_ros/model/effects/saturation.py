@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Saturation: the output stage goes no farther than its limit."""
+"""Saturation: the output stage clips at its limit."""
 
 from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Role, Signals
 import numpy as np
@@ -22,7 +22,7 @@ def apply(signals: Signals, p: Parameters) -> None:
     """
     Clip the output of each axis at plus and minus its limit, g.
 
-    With a knee of w the clip is soft: x − w·ln(1 + exp((x − limit)/w)), and so on the other side.
+    With a knee w the clip is soft: x − w·ln(1 + exp((x − limit)/w)), and the same below.
     """
     knee_g = float(p['knee_g'])
     for d, limit in enumerate(p['limit_g']):
@@ -40,10 +40,10 @@ EFFECT = Effect(
     parameters=(
         Parameter('limit_g', 'g', 0.1, 1000.0, 1.0,
                   'ADXL203 datasheet: range 1.7 g at least; lower with a low supply',
-                  'largest output of either sign; 1000 is none', neutral=1000.0,
+                  'largest output of either sign; 1000 does not clip', neutral=1000.0,
                   role=Role.LIMIT),
         Parameter('knee_g', 'g', 0.0, 0.5, 0.02, 'physics: an amplifier near its rail',
-                  'how soft the clip is; 0 is hard', '', typical=0.0,
+                  'width of a soft clip; 0 is hard', '', typical=0.0,
                   role=Role.OPTIONAL),
     ),
     apply=apply,

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Scale factor of this unit beside the datasheet's (SF of equation 1)."""
+"""Scale factor of a unit minus the nominal one (SF of equation 1)."""
 
 from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre, StraightLine
 from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals

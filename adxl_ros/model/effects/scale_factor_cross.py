@@ -13,17 +13,17 @@
 # limitations under the License.
 
 """
-Scale factor that depends on the other in-plane axis; of the z axis, on x.
+Scale factor that depends on the other in-plane axis; that of the z axis depends on x.
 
-The paper has only the dependence on z (15). At rest A_c² of the other axis is g² less the squares
-of the two others, so that a quadratic term here would be `nonlinearity`, `scale_factor_z` and
-`scale_factor` together: the effect has none.
+The paper has only the dependence on z (15). At rest A_c² of the other axis is g² minus the squares
+of the other two. A quadratic term would equal a sum of `nonlinearity`, `scale_factor_z` and
+`scale_factor`, so that the effect has none.
 """
 
 from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
 
 OTHER = (1, 0, 0)
-"""Number of the axis c by the number of the own axis: x has y, y has x, and z has x."""
+"""Index of the other axis c by axis: x has y, y has x, and z has x."""
 
 
 def apply(signals: Signals, p: Parameters) -> None:

@@ -15,14 +15,14 @@
 """
 Scale factor that depends on the out-of-plane axis: equations 15 and 17, centred and in g.
 
-For the z axis it is the scale factor that depends on y.
+The scale factor of the z axis depends on y.
 """
 
 from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre
 from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
 
 OTHER = (2, 2, 1)
-"""Number of the other axis by the number of the own axis: x and y have z, and z has y."""
+"""Index of the other axis by axis: x and y have z, and z has y."""
 
 
 def apply(signals: Signals, p: Parameters) -> None:

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Spikes: single samples that are far off."""
+"""Spikes: single samples with a large error."""
 
 from adxl_ros.model.diagnosis_hints import Detector, DiagnosisHints
 from adxl_ros.model.effects.base import ActsOn, Effect, Parameter, Parameters, Place, Signals
@@ -20,7 +20,7 @@ import numpy as np
 
 
 def apply(signals: Signals, p: Parameters) -> None:
-    """Throw samples off by plus or minus A, each axis for itself, at a mean rate."""
+    """Add plus or minus A to random samples of each axis, at a mean rate."""
     assert signals.rng is not None
     axes = len(signals.volts)
     drawn = signals.rng.random((len(signals.environment.time_s), axes, 2))
@@ -35,13 +35,13 @@ EFFECT = Effect(
     place=Place.ADC,
     parameters=(
         Parameter('rate_hz', 'Hz', 0.0, 1000.0, 0.2, 'physics: loose contacts, switching loads',
-                  'spikes a second and axis', ''),
+                  'spikes per second and axis', ''),
         Parameter('amplitude_v', 'V', 0.0, 10.0, 0.05, 'physics: loose contacts',
                   'size of a spike, of either sign'),
     ),
     apply=apply,
     smooth=False,
     acts_on=ActsOn.NOISE,
-    cause='Single samples are far off; look for loose contacts and loads that switch.',
+    cause='Single samples have large errors; check for loose contacts and loads that switch.',
     diagnosis=DiagnosisHints(detector=Detector.ISOLATED_SAMPLES),
 )

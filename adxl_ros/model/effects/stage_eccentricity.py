@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Eccentricity of the stage's encoder discs: an error of one period a turn."""
+"""Eccentricity of the stage's encoder discs: an error with one period per turn."""
 
 from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre
 from adxl_ros.model.effects.base import Effect, Joint, Need, Parameter, Parameters, Place, Signals
@@ -20,16 +20,16 @@ import numpy as np
 
 
 def apply(signals: Signals, p: Parameters) -> None:
-    """Add s·sin q + c·cos q to each joint, and what follows for its motion."""
+    """Add s·sin q + c·cos q to each joint, and its derivatives to the motion."""
     for joint in ('alpha', 'beta'):
         s, c = p[f'{joint}_sine_rad'], p[f'{joint}_cosine_rad']
         if s or c:
-            q, rate, growth = getattr(signals, joint)
+            q, velocity, acceleration = getattr(signals, joint)
             sine, cosine = np.sin(q), np.cos(q)
             slope, bend = s * cosine - c * sine, -s * sine - c * cosine
             setattr(signals, joint, Joint(
-                q + s * sine + c * cosine, rate + slope * rate,
-                growth + slope * growth + bend * rate * rate))
+                q + s * sine + c * cosine, velocity + slope * velocity,
+                acceleration + slope * acceleration + bend * velocity * velocity))
 
 
 EFFECT = Effect(
@@ -42,6 +42,6 @@ EFFECT = Effect(
         for joint in ('alpha', 'beta') for wave in ('sine', 'cosine')),
     apply=apply,
     needs=(Need.STAGE,),
-    cause='The disc of an encoder is off its axis; use two reading heads, or a table of errors.',
+    cause='The disc of an encoder is not centred on its axis; use two reading heads, or a table of errors.',
     diagnosis=DiagnosisHints(revealed_by=Manoeuvre.PLANES),
 )

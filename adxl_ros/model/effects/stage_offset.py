@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Offset of the stage's encoders."""
+"""Offset of the stage's encoders: true angle minus reading."""
 
 from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre
 from adxl_ros.model.effects.base import Effect, Need, Parameter, Parameters, Place, Signals
@@ -37,6 +37,6 @@ EFFECT = Effect(
     apply=apply,
     exact=True,
     needs=(Need.STAGE,),
-    cause='The zero of an encoder is off; set it by a level, or remount the sensor by 180 deg.',
+    cause='The zero of an encoder is wrong; set it by a level, or remount the sensor by 180 deg.',
     diagnosis=DiagnosisHints(revealed_by=Manoeuvre.REMOUNT, half_turn='beta_rad'),
 )

@@ -18,23 +18,26 @@ from adxl_ros.model.diagnosis_hints import Detector, DiagnosisHints
 from adxl_ros.model.effects.base import ActsOn, Effect, Parameter, Parameters, Place, Role, Signals
 import numpy as np
 
+_NEVER = -2 ** 40
+"""Index of a start that lies before any recording; chosen: far below 0."""
+
 
 def apply(signals: Signals, p: Parameters) -> None:
-    """Hold all axes for a fixed time, beginning at random at a mean rate."""
+    """Hold all axes for a fixed time, beginning at random instants at a mean rate."""
     assert signals.rng is not None
     count = len(signals.environment.time_s)
-    begins = signals.rng.random(count) < p['rate_hz'] * signals.dt_s
+    starts = signals.rng.random(count) < p['rate_hz'] * signals.dt_s
     length = max(round(p['duration_s'] / signals.dt_s), 1)
-    numbers = np.arange(count)
-    # A sample is stuck where the newest beginning is less than the length behind.
-    newest = np.maximum.accumulate(np.where(begins, numbers, -2 ** 40))
-    newest = np.where(newest < 0, signals.memory.get('newest', -2 ** 40), newest)
-    good = numbers - newest >= length
-    # Each stuck sample repeats the last good one, which may be in the block before.
-    source = np.maximum.accumulate(np.where(good, numbers, -1))
+    index = np.arange(count)
+    # A sample is stuck where the newest start is less than the length behind.
+    newest = np.maximum.accumulate(np.where(starts, index, _NEVER))
+    newest = np.where(newest < 0, signals.memory.get('newest', _NEVER), newest)
+    fresh = index - newest >= length
+    # Each stuck sample repeats the last fresh one, which may be in the previous block.
+    source = np.maximum.accumulate(np.where(fresh, index, -1))
     for d, volts in enumerate(signals.volts):
-        before = signals.memory.get(d, volts[0] if count else 0.0)
-        held = np.where(source < 0, before, volts[source])
+        previous = signals.memory.get(d, volts[0] if count else 0.0)
+        held = np.where(source < 0, previous, volts[source])
         signals.volts[d] = held
         if count:
             signals.memory[d] = held[-1]
@@ -47,13 +50,13 @@ EFFECT = Effect(
     place=Place.CODE,
     parameters=(
         Parameter('rate_hz', 'Hz', 0.0, 1000.0, 0.1, 'physics: a bus that times out',
-                  'beginnings a second', ''),
+                  'starts per second', ''),
         Parameter('duration_s', 's', 1e-4, 100.0, 0.05, 'physics: a few frames',
                   'time that the sample is held', '', neutral=0.05, role=Role.SHAPE),
     ),
     apply=apply,
     smooth=False,
     acts_on=ActsOn.NOISE,
-    cause='The link repeats samples; look at the bus, its load and its buffers.',
+    cause='The link repeats samples; check the bus, its load and its buffers.',
     diagnosis=DiagnosisHints(detector=Detector.REPEATED_SAMPLES),
 )

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Zero-g that moves with temperature."""
+"""Zero-g that changes with temperature."""
 
 from adxl_ros.model.constants import NOMINAL_TEMPERATURE_C
 from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre
@@ -21,9 +21,9 @@ from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Ro
 
 def apply(signals: Signals, p: Parameters) -> None:
     """Add k·(T − 25 °C) + k2·(T − 25 °C)² to the output, g."""
-    off_k = signals.environment.temperature_c - NOMINAL_TEMPERATURE_C
+    warmer_k = signals.environment.temperature_c - NOMINAL_TEMPERATURE_C
     for d, (per_k, per_k2) in enumerate(zip(p['per_k'], p['per_k2'])):
-        signals.output[d] = signals.output[d] + off_k * (per_k + off_k * per_k2)
+        signals.output[d] = signals.output[d] + warmer_k * (per_k + warmer_k * per_k2)
 
 
 EFFECT = Effect(

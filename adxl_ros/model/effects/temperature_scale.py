@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Scale factor that moves with temperature."""
+"""Scale factor that changes with temperature."""
 
 from adxl_ros.model.constants import NOMINAL_TEMPERATURE_C
 from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre
@@ -21,9 +21,9 @@ from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Si
 
 def apply(signals: Signals, p: Parameters) -> None:
     """Multiply the scale factor by 1 + k·(T − 25 °C)."""
-    off_k = signals.environment.temperature_c - NOMINAL_TEMPERATURE_C
+    warmer_k = signals.environment.temperature_c - NOMINAL_TEMPERATURE_C
     for d, per_k in enumerate(p['per_k']):
-        signals.scale_v_per_g[d] = signals.scale_v_per_g[d] * (1 + per_k * off_k)
+        signals.scale_v_per_g[d] = signals.scale_v_per_g[d] * (1 + per_k * warmer_k)
 
 
 EFFECT = Effect(
@@ -32,7 +32,7 @@ EFFECT = Effect(
     parameters=(
         Parameter('per_k', '1/K', -0.01, 0.01, 1e-4,
                   'ADXL203 datasheet: sensitivity +-0.3 % over temperature',
-                  'relative change of the scale factor with temperature, from 25 degC on'),
+                  'relative slope of the scale factor over temperature, from 25 degC on'),
     ),
     apply=apply,
     invertible=True,

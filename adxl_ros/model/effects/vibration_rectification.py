@@ -20,7 +20,7 @@ from adxl_ros.model.filters import low_pass
 
 
 def apply(signals: Signals, p: Parameters) -> None:
-    """Add k times the mean square of what the axis feels beyond its own mean, g."""
+    """Add k times the mean square of the acceleration along the axis about its mean, g."""
     tau_s = p['tau_s']
     for d, k in enumerate(p['coefficient_per_g']):
         if not k:
@@ -38,7 +38,7 @@ EFFECT = Effect(
     parameters=(
         Parameter('coefficient_per_g', 'g/g^2', -1.0, 1.0, 0.05,
                   'physics: asymmetry of the element, clipping of fast peaks',
-                  'shift of the zero-g by the mean square of the vibration'),
+                  'shift of the zero-g divided by the mean square of the vibration'),
         Parameter('tau_s', 's', 0.01, 60.0, 0.5, 'physics: slower than any vibration',
                   'time over which the mean square is taken', '', neutral=0.5, role=Role.SHAPE),
     ),
