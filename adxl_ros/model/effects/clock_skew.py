@@ -28,7 +28,7 @@ EFFECT = Effect(
     place=Place.CLOCK,
     parameters=(
         Parameter('ratio', 's/s', -0.01, 0.01, 1e-4, 'physics: crystals, 100 ppm',
-                  "relative excess of the rate of the clock that makes the stamps", ''),
+                  'relative excess of the rate of the clock that makes the stamps', ''),
     ),
     apply=apply,
     exact=True,

@@ -42,6 +42,7 @@ EFFECT = Effect(
         for joint in ('alpha', 'beta') for wave in ('sine', 'cosine')),
     apply=apply,
     needs=(Need.STAGE,),
-    cause='The disc of an encoder is not centred on its axis; use two reading heads, or a table of errors.',
+    cause='The disc of an encoder is not centred on its axis; '
+          'use two reading heads, or a table of errors.',
     diagnosis=DiagnosisHints(revealed_by=Manoeuvre.PLANES),
 )
