@@ -276,8 +276,9 @@ def _fit(model: str, sensor: Sensor, fitting: Poses, parts: Sequence[Poses],
     found, terms = term_selection.fit_selected(sensor, fitting, effects)
     if len(parts) > 1:
         require_one_mounting(found, parts, sources)
+    lines = full_fit_text.report_lines(found, fitting, terms)
     return _Found(found.fitted, lambda sensor, poses: term_selection.fit_selected(
-        sensor, poses, effects)[0].fitted, full_fit_text.words(found, fitting, terms), found)
+        sensor, poses, effects).full.fitted, lines, found)
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The volts that the chain promises in poses of the stage, and how they follow what is unknown."""
+"""Predicted volts of poses on a stage, and their Jacobians."""
 
 from __future__ import annotations
 
@@ -35,17 +35,54 @@ from adxl_ros.model.sensor import Sensor
 import numpy as np
 
 _ANGLE_STEP_RAD = 1e-4
+"""Step of the central differences by an angle, rad. Chosen: the chain
+is smooth, so that the error of the slope, of order step², is far below the noise."""
+_COEFFICIENT_STEP = 1e-3
+"""Step of the central differences by a coefficient, by its typical size. Chosen: the chain is
+nearly linear over a thousandth of a typical size."""
 
 
-def predicted_volts(unit: Sensor, poses: Poses, off_rad: tuple[float, float] = (0.0, 0.0)
+def predicted_volts(unit: Sensor, poses: Poses, shift_rad: tuple[float, float] = (0.0, 0.0)
                     ) -> np.ndarray:
-    """Return the volts that the chain promises at the stage's angles and `off_rad`, (k, m)."""
-    force = stage_force(unit, poses.alpha_rad + off_rad[0], poses.beta_rad + off_rad[1])
+    """
+    Predict the mean output of a unit in poses.
+
+    Parameters
+    ----------
+    unit
+        A sensor with its effects, those of the stage among them.
+    poses
+        k poses with angles, temperature and supply.
+    shift_rad
+        Added to alpha and beta of all poses, rad.
+
+    Returns
+    -------
+    ndarray
+        Volts, (k, m).
+
+    """
+    force = stage_force(unit, poses.alpha_rad + shift_rad[0], poses.beta_rad + shift_rad[1])
     return np.column_stack(signal_chain.static_response(unit)(force, poses.environment))
 
 
 def stage_force(unit: Sensor, alpha_rad: np.ndarray, beta_rad: np.ndarray) -> Components:
-    """Return the specific force at rest on the unit's stage with its errors, m/s², three (k,)."""
+    """
+    Return the specific force at rest on a stage with the stage effects of a unit.
+
+    Parameters
+    ----------
+    unit
+        A sensor with its local gravity and with effects of the stage.
+    alpha_rad, beta_rad
+        Angles of the encoder, rad, (k,).
+
+    Returns
+    -------
+    list
+        Three components in the case frame, m/s², (k,).
+
+    """
     signals = Signals(NOMINAL_ENVIRONMENT, alpha=Joint(alpha_rad), beta=Joint(beta_rad),
                       up=list(UPRIGHT), gravity_mps2=unit.local_gravity_mps2)
     for apply, values in signal_chain.effects_at(unit, Place.STAGE):
@@ -55,38 +92,74 @@ def stage_force(unit: Sensor, alpha_rad: np.ndarray, beta_rad: np.ndarray) -> Co
 
 
 def angle_jacobian(unit: Sensor, poses: Poses) -> np.ndarray:
-    """Differentiate volts by alpha and beta, V/rad, (k, m, 2)."""
-    h = _ANGLE_STEP_RAD
-    ends = [[predicted_volts(unit, poses, (side * a, side * b)) for side in (h, -h)]
-            for a, b in ((1, 0), (0, 1))]
-    return np.stack([(above - below) / (2 * h) for above, below in ends], axis=2)
+    """
+    Differentiate the predicted volts by alpha and beta.
+
+    Parameters
+    ----------
+    unit, poses
+        As for `predicted_volts`.
+
+    Returns
+    -------
+    ndarray
+        Jacobian, V/rad, (k, m, 2).
+
+    """
+    def slope(alpha_rad: float, beta_rad: float) -> np.ndarray:
+        above = predicted_volts(unit, poses, (alpha_rad, beta_rad))
+        below = predicted_volts(unit, poses, (-alpha_rad, -beta_rad))
+        return (above - below) / (2 * _ANGLE_STEP_RAD)
+
+    return np.stack([slope(_ANGLE_STEP_RAD, 0.0), slope(0.0, _ANGLE_STEP_RAD)], axis=2)
 
 
 def coefficient_jacobian(unit: Sensor, poses: Poses, names: Sequence[Coefficient]) -> np.ndarray:
-    """Differentiate volts by coefficients, V a unit, (k, m, p)."""
-    columns = []
-    for name in names:
-        at, step = get(unit, [name]), 1e-3 * parameter_of(name).scale
-        above, below = (predicted_volts(put(unit, [name], at + by), poses) for by in (step, -step))
-        columns.append((above - below) / (2 * step))
-    return np.stack(columns, axis=2)
+    """
+    Differentiate the predicted volts by coefficients.
+
+    Parameters
+    ----------
+    unit, poses
+        As for `predicted_volts`.
+    names
+        Coefficients, (p,).
+
+    Returns
+    -------
+    ndarray
+        Jacobian, V per unit of the coefficient, (k, m, p).
+
+    """
+    def slope(name: Coefficient) -> np.ndarray:
+        value, step = get(unit, [name]), _COEFFICIENT_STEP * parameter_of(name).scale
+        above = predicted_volts(put(unit, [name], value + step), poses)
+        below = predicted_volts(put(unit, [name], value - step), poses)
+        return (above - below) / (2 * step)
+
+    return np.stack([slope(name) for name in names], axis=2)
 
 
 def volts_covariance(unit: Sensor, poses: Poses, error: StageError,
-               kept: np.ndarray | None = None) -> PoseCovariance:
+                     kept: np.ndarray | None = None) -> PoseCovariance:
     """
     Return the covariance of the volts of all poses about the model.
 
     Parameters
     ----------
     unit
-        Where the volts are differentiated by the angles.
+        Sensor at whose coefficients the volts are differentiated by the angles.
     poses
-        Noise of the means, angles and settings.
+        Noise of the means, angles and settings of k poses.
     error
-        Standard deviations of the stage.
+        Standard deviations of the stage's error.
     kept
         Poses that count, (k,) bool; None for all.
+
+    Returns
+    -------
+    PoseCovariance
+        Covariance of k·m volts.
 
     """
     return PoseCovariance(angle_jacobian(unit, poses), poses, shared_settings(poses), error, kept)

@@ -12,72 +12,84 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Whether several recordings are of one unit in one mounting."""
+"""Check that several recordings are of one unit in one mounting."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 from adxl_ros.calibrate import pose_response
-from adxl_ros.calibrate.fits import full_model
+from adxl_ros.calibrate.fits.full_model import FullFit
 from adxl_ros.calibrate.poses import Poses, reference_force
 from adxl_ros.errors import UserError
 from adxl_ros.model import signal_chain
+from adxl_ros.model.constants import AXES
 import numpy as np
 
-_FARTHEST_RAD = np.radians(0.3)
-_FARTHEST_G = 0.02
-"""A zero-g may move by so much between two days; more is another unit, or a damaged one."""
-_SURE = 6.0
-"""Standard deviations."""
+_MAX_TURN_RAD = np.radians(0.3)
+"""Largest turn of the case between recordings, rad. Chosen: above the 0.1° of the stage's level in
+either recording, far below a new mounting."""
+_MAX_ZERO_G_SHIFT_G = 0.02
+"""Largest shift of the zero-g between recordings, g. Chosen: a healthy unit may shift by so much
+between two days."""
+_MIN_DEVIATIONS = 6.0
+"""A turn or shift counts beyond this many of its standard deviations."""
+_MIN_EIGENVALUE_RATIO = 1e-10
+"""Directions of a smaller relative eigenvalue are not determined by a recording."""
+_MIN_VARIANCE = 1e-30
+"""Smallest variance of a turn, rad², or shift, g², as a divisor."""
 
 
-def require_one_mounting(found: full_model.FullFit, parts: Sequence[Poses], names: Sequence[str]
-                         ) -> None:
+def require_one_mounting(full: FullFit, parts: Sequence[Poses], names: Sequence[str]) -> None:
     """
-    Refuse recordings of which one asks for another mounting or another zero-g than the rest.
+    Refuse recordings of which one has another mounting or another zero-g than the others.
 
-    Each recording's residuals about the common fit are explained by a turn of the case and a
-    shift of the zero-g of each axis, by least squares.
+    A turn of the case and a shift of the zero-g of each axis are fitted by least squares to the
+    residuals of each recording about the common fit.
 
     Parameters
     ----------
-    found
-        The common fit.
+    full
+        The fit of all recordings.
     parts
-        Poses by recording.
+        Poses of each recording.
     names
-        Of the recordings.
+        Name of each recording.
 
     Raises
     ------
     UserError
-        Names the recording, the figure and its standard deviations.
+        The message names the recording, and the turn or shift with its standard deviations.
 
     """
-    fitted = found.unit
+    axes = full.unit.axes
+    limits = np.repeat([_MAX_TURN_RAD, _MAX_ZERO_G_SHIFT_G], [3, len(axes)])
     for poses, name in zip(parts, names):
-        force = reference_force(poses, fitted.local_gravity_mps2)
-        slope = np.moveaxis(signal_chain.jacobian(signal_chain.analog_response(fitted), force,
-                                                  poses.environment), 2, 0)
-        f = np.column_stack(force)
-        turns = np.stack([np.cross(axis, f) for axis in np.eye(3)], axis=2)
-        shifts = np.broadcast_to(np.diag(fitted.scale_v_per_g),
-                                 (len(poses), len(fitted.axes), len(fitted.axes)))
-        off = poses.volts - pose_response.predicted_volts(fitted, poses)
-        products = pose_response.volts_covariance(fitted, poses, found.stage).products(
-            np.concatenate([slope @ turns, shifts, off[:, :, None]], axis=2))
-        spread = np.linalg.pinv(products[:-1, :-1], rcond=1e-10)
-        asked = spread @ products[:-1, -1]
-        sigma = np.sqrt(np.maximum(np.diag(spread), 1e-30))
-        count = len(fitted.axes)
-        limit = np.repeat([_FARTHEST_RAD, _FARTHEST_G], [3, count])
-        deviations = np.where(np.abs(asked) > limit, np.abs(asked) / sigma, 0.0)
+        changes, std = _turn_and_shifts(full, poses)
+        deviations = np.where(np.abs(changes) > limits, np.abs(changes) / std, 0.0)
         worst = int(np.argmax(deviations))
-        if deviations[worst] > _SURE:
-            text = f'is turned by {np.degrees(asked[worst]):.2f} deg ({"xyz"[worst]})' \
-                if worst < 3 else \
-                f'has its zero-g off by {1e3 * asked[worst]:.2f} mg ({fitted.axes[worst - 3]})'
-            raise UserError(
-                f'{name}: {text} about the fit of all recordings, {deviations[worst]:.0f} '
-                'standard deviations: another unit or another mounting; fit it alone')
+        if deviations[worst] <= _MIN_DEVIATIONS:
+            continue
+        change = f'case is turned by {np.degrees(changes[worst]):.2f} deg about {AXES[worst]}' \
+            if worst < 3 else \
+            f'zero-g of {axes[worst - 3]} is shifted by {1e3 * changes[worst]:.2f} mg'
+        raise UserError(
+            f'{name}: {change} from the fit of all recordings ({deviations[worst]:.0f} standard '
+            'deviations): another unit or another mounting; fit this recording separately')
+
+
+def _turn_and_shifts(full: FullFit, poses: Poses) -> tuple[np.ndarray, np.ndarray]:
+    """Fit the turn of the case, rad, (3,), and the zero-g shifts, g, (m,); values and std."""
+    unit = full.unit
+    force = reference_force(poses, unit.local_gravity_mps2)
+    by_force = np.moveaxis(signal_chain.jacobian(
+        signal_chain.analog_response(unit), force, poses.environment), 2, 0)
+    turned = np.stack([np.cross(axis, np.column_stack(force)) for axis in np.eye(3)], axis=2)
+    shifted = np.broadcast_to(np.diag(unit.scale_v_per_g),
+                              (len(poses), len(unit.axes), len(unit.axes)))
+    normal = pose_response.volts_covariance(unit, poses, full.stage).normal_equations(
+        np.concatenate([by_force @ turned, shifted], axis=2),
+        poses.volts - pose_response.predicted_volts(unit, poses))
+    covariance = np.linalg.pinv(normal.information, rcond=_MIN_EIGENVALUE_RATIO)
+    return (covariance @ normal.gradient,
+            np.sqrt(np.maximum(np.diag(covariance), _MIN_VARIANCE)))

@@ -13,19 +13,19 @@
 # limitations under the License.
 
 """
-The error of the stage's angles: one for each setting of a joint, and one for each pose.
+The error of the stage's angles: one part for each setting of a joint, one part for each pose.
 
 A joint that has not moved keeps its error; after a move it has a new one. The true angles of pose
-k are those of the encoder plus u[i(k)] + ε_k a joint, where i(k) numbers the settings of the
-joint, u ~ N(0, σ_s²) and ε ~ N(0, σ_p²). Both joints have these levels, alpha's times r and
-beta's over r. With J = ∂V/∂(α, β)·diag(r, 1/r) the volts of all poses have the
+k are those of the encoder plus u[i(k)] + ε_k for each joint. Here i(k) is the setting of the joint
+in pose k, u ~ N(0, σ_s²) and ε ~ N(0, σ_p²). These standard deviations are multiplied by r for
+alpha and divided by r for beta. With J = ∂V/∂(α, β)·diag(r, 1/r) the volts of all poses have the
 covariance
 
     S = diag(std²) + σ_p²·JJᵀ (block by block) + σ_s²·ZZᵀ,
 
-where Z has a column for each setting. S is never formed for a fit: its blocks are inverted pose
-by pose, and the columns of settings that several poses share come in by the formula of Woodbury
-(Henderson's mixed-model equations; Searle, Casella and McCulloch 1992, chapter 7).
+where Z has a column for each setting. S is never formed. Its blocks are inverted pose by pose, and
+the columns of settings that several poses share are added by the Woodbury formula (Henderson's
+mixed-model equations; Searle, Casella and McCulloch 1992, chapter 7).
 """
 
 from __future__ import annotations
@@ -38,23 +38,23 @@ from adxl_ros.calibrate.poses import Poses
 import numpy as np
 from scipy.linalg import solve_triangular
 
-_NO_VARIANCE = 1e-24
-"""Least variance of an angle to divide by, rad²."""
+_MIN_VARIANCE_RAD2 = 1e-24
+"""Smallest variance of an angle as a divisor, rad². Chosen: avoids 0/0 on a perfect stage."""
 
 
 @dataclass(frozen=True)
 class StageError:
     """
-    Standard deviations of a joint's error, rad.
+    Standard deviations of the error of a joint.
 
     Attributes
     ----------
     setting_rad
-        Of the part that is common to the poses of one setting of the joint, σ_s.
+        Of the part that is common to the poses of one setting of the joint, σ_s, rad.
     pose_rad
-        Of the part that is new with each pose, σ_p.
+        Of the part that is new with each pose, σ_p, rad.
     ratio
-        Of alpha's levels to their geometric mean with beta's, r.
+        Standard deviations of alpha over their geometric mean with those of beta, r.
 
     """
 
@@ -64,7 +64,7 @@ class StageError:
 
     @property
     def joints(self) -> np.ndarray:
-        """Return the levels of alpha and beta over their geometric mean, (2,)."""
+        """Return the factors r and 1/r of alpha and beta, (2,)."""
         return np.array([self.ratio, 1 / self.ratio])
 
     @property
@@ -82,7 +82,7 @@ class SharedSettings(NamedTuple):
     number
         Column of the setting of each joint, (k, 2); −1 where no other pose shares it.
     columns
-        How many there are.
+        Count of shared settings, q.
 
     """
 
@@ -90,152 +90,213 @@ class SharedSettings(NamedTuple):
     columns: int
 
 
+class NormalEquations(NamedTuple):
+    """
+    Normal equations of a generalised least-squares problem.
+
+    Attributes
+    ----------
+    information
+        XᵀS⁻¹X of the design X, (p, p).
+    gradient
+        XᵀS⁻¹r of the residuals r, (p,).
+
+    """
+
+    information: np.ndarray
+    gradient: np.ndarray
+
+
 class PoseCovariance:
     """
-    The covariance S of the volts of all poses about the model, as an operator.
+    The covariance S of the volts of k poses with m axes about the model, as an operator.
 
     Parameters
     ----------
-    slope
+    jacobian
         Volts by alpha and beta, V/rad, (k, m, 2).
     poses
-        Their `std_v`.
+        The poses; `std_v` is used.
     shared
         From `shared_settings` of the poses.
     error
-        Standard deviations of the stage.
+        Standard deviations of the stage's error.
     kept
         Poses that count, (k,) bool; the others have no weight.
 
     """
 
-    def __init__(self, slope: np.ndarray, poses: Poses, shared: SharedSettings,
+    def __init__(self, jacobian: np.ndarray, poses: Poses, shared: SharedSettings,
                  error: StageError, kept: np.ndarray | None = None) -> None:
-        # Errors of either joint in units of the common levels.
-        self._slope, self._error = slope * error.joints, error
-        slope = self._slope
+        # Scaled by r and 1/r, so that both joints have the same standard deviations.
+        self._jacobian, self._error = jacobian * error.joints, error
         self._kept = np.ones(len(poses), bool) if kept is None else kept
         self._number, self._shared = shared
-        # A setting of one pose is as good as an error of the pose.
-        self._own_rad2 = error.pose_rad ** 2 + np.where(
+        # The error of a setting that has one pose only is an error of the pose.
+        self._pose_rad2 = error.pose_rad ** 2 + np.where(
             self._number < 0, error.setting_rad ** 2, 0.0)
-        noise = poses.std_v[:, :, None] ** 2 * np.eye(slope.shape[1])
-        self.blocks = noise + (slope * self._own_rad2[:, None, :]) @ np.swapaxes(slope, 1, 2)
+        noise = poses.std_v[:, :, None] ** 2 * np.eye(jacobian.shape[1])
+        self.blocks = noise + (self._jacobian * self._pose_rad2[:, None, :]) @ np.swapaxes(
+            self._jacobian, 1, 2)
         self._root = np.linalg.cholesky(self.blocks)
-        self._white = np.linalg.inv(self._root)
+        self._whitening = np.linalg.inv(self._root)
 
     @cached_property
     def _settings(self) -> np.ndarray:
         """Return σ_s·Z of the shared settings, V, (k, m, q)."""
-        columns = np.zeros((*self._slope.shape[:2], self._shared))
+        columns = np.zeros((*self._jacobian.shape[:2], self._shared))
         for joint in range(2):
             rows = np.flatnonzero(self._number[:, joint] >= 0)
-            columns[rows, :, self._number[rows, joint]] += self._slope[rows, :, joint]
+            columns[rows, :, self._number[rows, joint]] += self._jacobian[rows, :, joint]
         return self._error.setting_rad * columns
 
     @cached_property
-    def _columns(self) -> np.ndarray:
+    def _white_settings(self) -> np.ndarray:
         """Return σ_s·Z whitened block by block, (k·m, q)."""
-        return self.by_blocks(self._settings)
+        return self.whiten_by_pose(self._settings)
 
     @cached_property
-    def _joint_root(self) -> np.ndarray:
+    def _settings_root(self) -> np.ndarray:
         """Return the Cholesky factor of 1 + σ_s²·Zᵀ B⁻¹ Z, (q, q)."""
-        return np.linalg.cholesky(np.eye(self._shared) + self._columns.T @ self._columns)
+        return np.linalg.cholesky(
+            np.eye(self._shared) + self._white_settings.T @ self._white_settings)
 
-    def _by_joint(self, products: np.ndarray) -> np.ndarray:
-        return solve_triangular(self._joint_root, products, lower=True)
+    def _solve_settings(self, products: np.ndarray) -> np.ndarray:
+        return solve_triangular(self._settings_root, products, lower=True)
 
-    def by_blocks(self, columns: np.ndarray) -> np.ndarray:
-        """Whiten columns by the blocks alone, (k, m, c) to (k·m, c); 0 where a pose is out."""
-        white = self._white @ columns
+    def whiten_by_pose(self, columns: np.ndarray) -> np.ndarray:
+        """Whiten columns by the blocks only, (k, m, c) to (k·m, c); 0 where a pose is left out."""
+        white = self._whitening @ columns
         white[~self._kept] = 0.0
         return white.reshape(np.prod(white.shape[:2]), white.shape[2])
 
     def products(self, columns: np.ndarray) -> np.ndarray:
         """Return CᵀS⁻¹C of columns C, (k, m, c) to (c, c)."""
-        white = self.by_blocks(columns)
-        joint = self._by_joint(self._columns.T @ white)
-        return white.T @ white - joint.T @ joint
+        white = self.whiten_by_pose(columns)
+        by_setting = self._solve_settings(self._white_settings.T @ white)
+        return white.T @ white - by_setting.T @ by_setting
+
+    def normal_equations(self, design: np.ndarray, residual: np.ndarray) -> NormalEquations:
+        """
+        Return the normal equations of a linear model of the volts.
+
+        Parameters
+        ----------
+        design
+            Derivatives of the volts, (k, m, p).
+        residual
+            Measured volts minus predicted volts, V, (k, m).
+
+        Returns
+        -------
+        NormalEquations
+            Information and gradient of p parameters.
+
+        """
+        products = self.products(np.concatenate([design, residual[:, :, None]], axis=2))
+        return NormalEquations(products[:-1, :-1], products[:-1, -1])
 
     def log_determinant(self) -> float:
         """Return log |S| of the poses that count."""
         blocks = np.diagonal(self._root, axis1=1, axis2=2)[self._kept]
-        return 2 * float(np.log(blocks).sum() + np.log(np.diag(self._joint_root)).sum())
+        return 2 * float(np.log(blocks).sum() + np.log(np.diag(self._settings_root)).sum())
 
     def penalty(self, errors: AngleErrors) -> float:
-        """Return the sum of squared errors of the angles over their variances."""
-        of_pose, of_setting = (part / self._error.joints for part in (
-            errors.of_pose_rad, errors.of_setting_rad))
-        total = np.sum((of_pose ** 2 / np.maximum(self._own_rad2, _NO_VARIANCE))[self._kept])
+        """Return the sum of the squared angle errors over their variances."""
+        pose_rad, setting_rad = (part / self._error.joints for part in (
+            errors.pose_rad, errors.setting_rad))
+        total = np.sum((pose_rad ** 2 / np.maximum(self._pose_rad2, _MIN_VARIANCE_RAD2))[
+            self._kept])
         for joint in range(2):
             _, first = np.unique(self._number[:, joint], return_index=True)
             shared = first[self._number[first, joint] >= 0]
-            total += np.sum(of_setting[shared, joint] ** 2) / max(
-                self._error.setting_rad ** 2, _NO_VARIANCE)
+            total += np.sum(setting_rad[shared, joint] ** 2) / max(
+                self._error.setting_rad ** 2, _MIN_VARIANCE_RAD2)
         return float(total)
 
-    def predicted(self, residual: np.ndarray) -> AngleErrors:
+    def predicted_errors(self, residual: np.ndarray) -> AngleErrors:
         """
-        Predict the errors of the angles from what the model leaves of the volts.
-
-        The best linear unbiased prediction.
+        Predict the angle errors from the residuals (best linear unbiased prediction).
 
         Parameters
         ----------
         residual
-            Volts minus those of the model at the encoder's angles, V, (k, m).
+            Measured volts minus the predicted volts at the encoder's angles, V, (k, m).
+
+        Returns
+        -------
+        AngleErrors
+            Errors of both joints in each pose, ε = σ²·Jᵀ·B⁻¹·(residual − settings).
 
         """
-        joint = self._by_joint(self._columns.T @ self.by_blocks(residual[:, :, None]))
-        factor = solve_triangular(self._joint_root, joint, lower=True, trans=1)[:, 0]
+        by_setting = self._solve_settings(
+            self._white_settings.T @ self.whiten_by_pose(residual[:, :, None]))
+        factor = solve_triangular(self._settings_root, by_setting, lower=True, trans=1)[:, 0]
         setting = np.append(self._error.setting_rad * factor, 0.0)[self._number]
-        left = (self._white @ (residual - self._settings @ factor)[:, :, None])[:, :, 0]
-        # ε = σ²·Jᵀ·B⁻¹·(what the settings leave).
-        weighted = np.swapaxes(self._white, 1, 2) @ left[:, :, None]
-        own = self._own_rad2 * (np.swapaxes(self._slope, 1, 2) @ weighted)[:, :, 0]
+        white = (self._whitening @ (residual - self._settings @ factor)[:, :, None])[:, :, 0]
+        weighted = np.swapaxes(self._whitening, 1, 2) @ white[:, :, None]
+        pose = self._pose_rad2 * (np.swapaxes(self._jacobian, 1, 2) @ weighted)[:, :, 0]
         joints = self._error.joints
-        return AngleErrors(np.where(self._number >= 0, setting, 0.0) * joints, own * joints,
-                           np.sum(left ** 2, axis=1), float(factor @ factor))
+        return AngleErrors(np.where(self._number >= 0, setting, 0.0) * joints, pose * joints,
+                           np.sum(white ** 2, axis=1), float(factor @ factor))
 
 
 @dataclass(frozen=True)
 class AngleErrors:
     """
-    Predicted errors of alpha and beta.
+    Predicted errors of alpha and beta in k poses.
 
     Attributes
     ----------
-    of_setting_rad, of_pose_rad
-        Their parts by setting and by pose, rad, (k, 2).
-    distances
+    setting_rad, pose_rad
+        Parts of the error by setting and by pose, rad, (k, 2).
+    squared_distances
         Squared Mahalanobis distance of each pose from the model, given its settings, (k,).
     setting_penalty
-        Sum of the squares of the settings' errors over σ_s².
+        Sum of the squared errors of the settings over σ_s².
 
     """
 
-    of_setting_rad: np.ndarray
-    of_pose_rad: np.ndarray
-    distances: np.ndarray
+    setting_rad: np.ndarray
+    pose_rad: np.ndarray
+    squared_distances: np.ndarray
     setting_penalty: float
+
+    @classmethod
+    def zeros(cls, count: int) -> AngleErrors:
+        """Return no errors in `count` poses."""
+        return cls(np.zeros((count, 2)), np.zeros((count, 2)), np.zeros(count), 0.0)
 
     @property
     def total_rad(self) -> np.ndarray:
-        """Return both parts together, rad, (k, 2)."""
-        return self.of_setting_rad + self.of_pose_rad
+        """Return the sum of both parts, rad, (k, 2)."""
+        return self.setting_rad + self.pose_rad
 
-    def towards(self, other: AngleErrors, share: float) -> AngleErrors:
-        """Return errors a share, 0 to 1, of the way to others, with the distances of these."""
+    def interpolated(self, other: AngleErrors, share: float) -> AngleErrors:
+        """
+        Return errors between these and others.
+
+        Parameters
+        ----------
+        other
+            Errors in the same poses.
+        share
+            0 gives these errors, 1 the others.
+
+        Returns
+        -------
+        AngleErrors
+            Interpolated errors, with the distances of the others.
+
+        """
         return replace(
             other,
-            of_setting_rad=self.of_setting_rad + share * (
-                other.of_setting_rad - self.of_setting_rad),
-            of_pose_rad=self.of_pose_rad + share * (other.of_pose_rad - self.of_pose_rad))
+            setting_rad=self.setting_rad + share * (other.setting_rad - self.setting_rad),
+            pose_rad=self.pose_rad + share * (other.pose_rad - self.pose_rad))
 
 
 def shared_settings(poses: Poses) -> SharedSettings:
-    """Give a column to each setting that several poses share."""
+    """Return the numbers of the settings that several poses share."""
     numbers, count = np.full((len(poses), 2), -1), 0
     for joint, setting in enumerate((poses.alpha_setting, poses.beta_setting)):
         _, index, size = np.unique(setting, return_inverse=True, return_counts=True)

@@ -29,6 +29,7 @@ from adxl_ros.diagnose.noise_detectors import (
     isolated_samples,
     repeated_samples,
 )
+from adxl_ros.signals.axis_polarity import find_polarity_fault
 import numpy as np
 
 SHORTEST_S = 30.0
@@ -43,6 +44,9 @@ _LARGEST_UNEXPLAINED_MOTION_G = 0.3
 of tilt."""
 _CORRELATED = 0.9
 """Correlation from which two signals are the same one. Chosen: noise of 0.4 times the signal."""
+_SWAPPED_CORRELATION = 0.7
+"""An axis is swapped only if its correlation with its own reference is smaller. Chosen: halfway
+between two signals that are the same and two that have nothing in common."""
 _UNCORRELATED = 0.5
 """Correlation below which the output does not follow the reference. Chosen: noise of 1.7
 times the signal."""
@@ -260,19 +264,11 @@ def _axis_fault(comparison: BaselineComparison) -> DataFault | None:
 
 def _order_fault(axes: list[str], correlation: np.ndarray) -> DataFault | None:
     """Find an inverted or swapped axis; rows of the correlation are measured axes."""
-    for i, axis in enumerate(axes):
-        if correlation[i, i] < -_CORRELATED:
-            return DataFault('axis_inverted', 'bad_data', f'{axis} reads against the reference '
-                             f'(correlation {correlation[i, i]:.2f}): the axis is inverted; '
-                             'correct its sign or the mounting')
-        best = int(np.argmax(np.abs(correlation[i])))
-        uncorrelated = 2 * abs(correlation[i, i]) - 0.5 < _CORRELATED
-        if best != i and uncorrelated and abs(correlation[i, best]) > _CORRELATED:
-            sign = 'against' if correlation[i, best] < 0 else 'with'
-            return DataFault('axis_swapped', 'bad_data', f'{axis} moves {sign} the reference of '
-                             f'{axes[best]} (correlation {correlation[i, best]:.2f}): axes are '
-                             'swapped; correct the wiring or the mounting')
-    return None
+    fault = find_polarity_fault(correlation, list(range(len(axes))), _SWAPPED_CORRELATION)
+    if fault is None:
+        return None
+    return DataFault('axis_inverted' if fault.axis == fault.follows else 'axis_swapped',
+                     'bad_data', fault.describe(axes[fault.axis], axes[fault.follows]))
 
 
 def _unit_fault(simulated_g: np.ndarray, measured_g: np.ndarray, correlation: np.ndarray

@@ -27,6 +27,7 @@ from adxl_ros.model import noise
 from adxl_ros.model.diagnosis_hints import Detector
 from adxl_ros.model.effects import library
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.signals.runs import true_runs
 import numpy as np
 from scipy.signal import lfilter, periodogram
 
@@ -121,12 +122,6 @@ def detected_effect(detector: Detector) -> str:
     return next(e.name for e in library().values() if e.diagnosis.detector is detector)
 
 
-def runs(chosen: np.ndarray) -> list[tuple[int, int]]:
-    """Return begin and end of each run of True."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], chosen.astype(np.int8), [0]])))
-    return list(zip(edges[::2].tolist(), edges[1::2].tolist()))
-
-
 def repeated_samples(volts: np.ndarray, time_s: np.ndarray, used: np.ndarray, sensor: Sensor
                      ) -> tuple[np.ndarray, list[Detection]]:
     """
@@ -156,13 +151,13 @@ def repeated_samples(volts: np.ndarray, time_s: np.ndarray, used: np.ndarray, se
     shortest = max(_REPEAT_SHORTEST, int(np.ceil(np.log(_REPEAT_CHANCE / len(volts))
                                                  / np.log(min(probability, 0.5)))))
     repeated = np.zeros(len(volts), bool)
-    for begin, end in runs(same):
+    for begin, end in true_runs(same):
         if end - begin >= shortest:
             repeated[begin:end] = True
     repeated &= used
     if not repeated.any():
         return used, []
-    repeats = runs(repeated)
+    repeats = true_runs(repeated)
     duration_s = float(np.median([time_s[end - 1] - time_s[begin] for begin, end in repeats]))
     return used & ~repeated, [Detection(detected_effect(Detector.REPEATED_SAMPLES), {
         'rate_hz': np.array(len(repeats) / float(time_s[-1] - time_s[0])),

@@ -18,10 +18,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from adxl_ros.diagnose.noise_detectors import runs
 from adxl_ros.model import noise
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.signals.runs import true_runs
 import numpy as np
 
 _REST_S = 1.0
@@ -110,7 +110,7 @@ def squares_at_rest(volts: np.ndarray, at_rest: np.ndarray, sensor: Sensor) -> S
     independent = length / float(noise.effective_samples(length, 1 / sensor.rate_hz,
                                                          sensor.rc_s))
     total = SquareSum(np.zeros(volts.shape[1]), 0)
-    for begin, end in runs(at_rest):
+    for begin, end in true_runs(at_rest):
         for first in range(begin, end - length + 1, length):
             part = volts[first:first + length]
             squares_v2 = ((part - part.mean(axis=0)) ** 2).sum(axis=0) \

@@ -205,9 +205,8 @@ def _anywhere(truth: Sensor, rng: np.random.Generator) -> tuple[Poses, np.ndarra
 def _resting(truth: Sensor, read_rad: np.ndarray, rng: np.random.Generator) -> Poses:
     samples = round(_DWELL_S * truth.rate_hz)
     count = noise.effective_samples(samples, 1 / truth.rate_hz, truth.rc_s)
-    std_v = np.tile(noise.sample_std_v(truth) / np.sqrt(count), (len(read_rad), 1))
-    return Poses(np.zeros_like(std_v), std_v, read_rad[:, 0], read_rad[:, 1],
-                 np.zeros((len(read_rad), 2)), np.zeros(len(read_rad), bool))
+    return Poses.without_volts(read_rad[:, 0], read_rad[:, 1],
+                               noise.sample_std_v(truth) / np.sqrt(count))
 
 
 def _read(truth: Sensor, poses: Poses, true_rad: np.ndarray, rng: np.random.Generator) -> Poses:

@@ -17,7 +17,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from itertools import pairwise
 
 import numpy as np
 
@@ -178,13 +177,6 @@ class BlockCutter:
         bounds = np.stack([np.fmin.reduce(angles, axis=2), np.fmax.reduce(angles, axis=2)])
         return Blocks(self._row + start, block[0][:, [0, -1]], run, count, mean.T, squares.T,
                       step.T, bounds.transpose(2, 0, 1))
-
-
-def runs_of(still: np.ndarray, run: np.ndarray) -> list[tuple[int, int]]:
-    """List the bounds of consecutive blocks that are all `still` and in one gapless run."""
-    group = np.where(still, run, -1)
-    edges = np.concatenate([[0], np.flatnonzero(np.diff(group)) + 1, [len(group)]])
-    return [(int(a), int(b)) for a, b in pairwise(edges) if a < b and still[a]]
 
 
 def angle_bounds(blocks: Blocks) -> np.ndarray:

@@ -32,7 +32,7 @@ from adxl_ros.errors import UserError
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.noise import effective_samples
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.signals.block_statistics import angle_bounds, BlockCutter, Blocks, runs_of
+from adxl_ros.signals.block_statistics import angle_bounds, BlockCutter, Blocks
 from adxl_ros.signals.noise_limits import (
     adc_step,
     batch_scatter,
@@ -50,6 +50,7 @@ from adxl_ros.signals.noise_limits import (
     unlike_beginning,
     window_variance,
 )
+from adxl_ros.signals.runs import true_runs
 import numpy as np
 
 HELD_S, STAGED_S = 1.4, 0.6
@@ -211,7 +212,8 @@ class RestFinder:
         quiet = quiet_blocks(blocks, windows, limits.variance, self._spans.window)
         still = quiet & ~self._drifting(blocks, quiet, limits)
         bounds = None if self.angle_tolerance_rad is None else angle_bounds(blocks)
-        posed = [part for run in runs_of(still, blocks.run) for part in self._turned(bounds, *run)]
+        posed = [part for run in true_runs(still, blocks.run)
+                 for part in self._turned(bounds, *run)]
         parts = [self._without_ends(blocks.mean, first + self._settle, stop, limits)
                  for first, stop in posed]
         parts = [part for part in parts if part[1] - part[0] >= self._spans.window]
@@ -239,7 +241,7 @@ class RestFinder:
             np.add.at(marks, places - half // 2, 1)
             np.add.at(marks, places + half // 2, -1)
             drifting |= np.cumsum(marks)[:-1] > 0
-        for first, stop in runs_of(quiet & ~drifting, blocks.run):
+        for first, stop in true_runs(quiet & ~drifting, blocks.run):
             between = first and stop < len(blocks) and drifting[first - 1] and drifting[stop]
             if between and stop - first < self._spans.longest:
                 drifting[first:stop] = True

@@ -75,8 +75,8 @@ def test_predicted_errors_are_the_best_linear_ones(poses):
         expected[:, joint] += ERROR.setting_rad ** 2 * (
             setting[:, None] == setting) @ felt[:, joint]
     expected *= ERROR.joints ** 2
-    np.testing.assert_allclose(covariance.predicted(residual).total_rad, expected, rtol=1e-7,
-                               atol=1e-15)
+    np.testing.assert_allclose(covariance.predicted_errors(residual).total_rad, expected,
+                               rtol=1e-7, atol=1e-15)
 
 
 def test_poses_that_do_not_count_change_nothing(poses):

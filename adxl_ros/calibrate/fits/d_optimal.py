@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-Poses chosen by D-optimality: those that shrink the joint interval of all coefficients the most.
+Selection of poses by D-optimality: the smallest joint confidence region of all coefficients.
 
 V. V. Fedorov, Theory of Optimal Experiments, 1972.
 """
@@ -27,24 +27,28 @@ from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
+GRID_RAD = np.radians(15.0)
+"""Step of the grid of candidates in alpha and beta, rad. Chosen: such angles can be set by hand on
+a scale."""
+
 
 def choose_poses(rows: np.ndarray, information: np.ndarray, count: int) -> list[int]:
     """
-    Choose poses one after the other, each that of the greatest gain in log |information|.
+    Choose poses one by one, each with the greatest gain in log |information|.
 
     Parameters
     ----------
     rows
-        Whitened derivatives of each candidate by the coefficients, (n, m, p).
+        Whitened Jacobian of each of n candidates, (n, m, p).
     information
-        What is known before the first of them, (p, p), of full rank.
+        Information before the first choice, (p, p), of full rank.
     count
         How many to choose; a candidate may be chosen again.
 
     Returns
     -------
     list
-        Numbers of the candidates, in the order of the choice.
+        Indices of the candidates, in the order of the choice.
 
     """
     chosen = []
@@ -57,44 +61,40 @@ def choose_poses(rows: np.ndarray, information: np.ndarray, count: int) -> list[
     return chosen
 
 
-def candidate_poses(std_v: np.ndarray, step_rad: float) -> Poses:
+def candidate_poses(std_v: np.ndarray) -> Poses:
     """
-    Lay candidates over the sphere, each a new setting of both joints.
+    Lay candidates over the sphere by `GRID_RAD`, each a new setting of both joints.
 
-    Parameters
-    ----------
-    std_v
-        Noise of the mean of a pose, V, (m,).
-    step_rad
-        Step of alpha from 0 to π and of beta from 0 to 2π.
-
+    Alpha covers 0 to π and beta covers 0 to 2π. `std_v` is the noise of the mean of a pose, V,
+    (m,).
     """
-    alpha, beta = (angles.ravel() for angles in np.meshgrid(
-        np.arange(round(np.pi / step_rad) + 1) * step_rad,
-        np.arange(round(2 * np.pi / step_rad)) * step_rad))
-    count = len(alpha)
-    return Poses(np.zeros((count, len(std_v))), np.tile(std_v, (count, 1)), alpha, beta,
-                 np.zeros((count, 2)), np.zeros(count, bool), alpha_setting=np.arange(count),
-                 beta_setting=np.arange(count))
+    alpha, beta = np.meshgrid(np.arange(round(np.pi / GRID_RAD) + 1) * GRID_RAD,
+                              np.arange(round(2 * np.pi / GRID_RAD)) * GRID_RAD)
+    return Poses.without_volts(alpha.ravel(), beta.ravel(), std_v, np.arange(alpha.size))
 
 
 def whitened_jacobian(unit: Sensor, poses: Poses, names: tuple[Coefficient, ...],
-            stage: StageError) -> np.ndarray:
+                      stage: StageError) -> np.ndarray:
     """
-    Return the derivatives of single poses by coefficients, whitened, (k, m, p).
+    Return the Jacobian of each pose by coefficients, whitened by noise and stage error.
 
     Parameters
     ----------
     unit
-        Where they are taken.
+        Sensor at whose coefficients the volts are differentiated.
     poses
-        Each of settings of its own.
+        k poses that share no setting.
     names
         Coefficients, (p,).
     stage
-        Levels of the stage's error.
+        Standard deviations of the stage's error.
+
+    Returns
+    -------
+    ndarray
+        Whitened Jacobian, (k, m, p).
 
     """
     design = pose_response.coefficient_jacobian(unit, poses, names)
     covariance = pose_response.volts_covariance(unit, poses, stage)
-    return covariance.by_blocks(design).reshape(design.shape)
+    return covariance.whiten_by_pose(design).reshape(design.shape)

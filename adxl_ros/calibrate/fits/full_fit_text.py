@@ -12,11 +12,12 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What a full fit says for people: the stage, disturbed poses, weak directions, terms."""
+"""Report of a full fit as lines of text: stage, outliers, weakest direction, terms."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 from adxl_ros.calibrate.fits import full_model
 from adxl_ros.calibrate.fits.term_selection import Term
@@ -26,87 +27,126 @@ from adxl_ros.model.constants import Z_90
 from adxl_ros.model.effects.base import Coefficient
 import numpy as np
 
-_WARMED_K = 3.0
-"""Temperature that moved by more is worth a word: 0.3 mg by the datasheet's 0.1 mg/°C."""
-_SMALL_SHARE = 0.1
-"""An error new with each pose is named from this share of that of a setting on."""
 NOT_CONVERGED = ('the fit did not converge: coefficients and intervals are those of its last '
                  'step; add poses, or leave out terms')
-_WORSE = 1.5
-"""A stage that errs by so much more than stated is said to."""
+"""Line of a fit that did not converge."""
+_MAX_WARMING_K = 3.0
+"""Change of temperature from which the report warns, K: 0.3 mg by the datasheet's 0.1 mg/°C."""
+_TYPICAL_DRIFT_MG_PER_K = 0.1
+"""Typical drift of the zero-g, mg/°C (ADXL203 datasheet)."""
+_MIN_POSE_SHARE = 0.1
+"""Ratio of the stage error by pose to that by setting from which it is reported."""
+_BAD_STAGE_RATIO = 1.5
+"""Ratio of the estimated to the stated stage error from which the report warns."""
+_MIN_STAGE_EXCESS_RAD = 1e-5
+"""Excess over that ratio from which the report warns, rad, for a stage without a stated error."""
+_MAX_OUTLIERS_NAMED = 8
+"""Largest count of outliers in the report."""
+_MAX_PARTS = 4
+"""Largest count of components of the weakest direction in the report."""
+_MIN_PART = 0.2
+"""Smallest component of the weakest direction, a unit vector, in the report."""
 
 
-def weakest(found: full_model.FullFit) -> tuple[float, float, list[tuple[Coefficient, float]]]:
+class WeakestDirection(NamedTuple):
     """
-    Return the condition number, and the weakest direction of the sensor's coefficients.
+    The direction of the sensor's coefficients that the poses determine least.
 
-    Returns
-    -------
-    tuple
-        Condition number of the information with each coefficient in units of its typical size;
-        standard deviation along the weakest direction, in the same; its largest parts by name.
+    Attributes
+    ----------
+    condition_number
+        Of the information, each coefficient in units of its typical size; square root of the
+        ratio of the extreme eigenvalues.
+    std
+        Standard deviation along the direction, in typical sizes.
+    parts
+        Largest components of its unit vector.
 
     """
-    names = found.fitted.covariance_names
+
+    condition_number: float
+    std: float
+    parts: list[tuple[Coefficient, float]]
+
+
+def weakest_direction(full: full_model.FullFit) -> WeakestDirection:
+    """Return the weakest direction of a fit and its condition number."""
+    names = full.fitted.covariance_names
     scale = np.array([parameter_of(name).scale for name in names])
-    values, vectors = np.linalg.eigh(found.fitted.covariance / np.outer(scale, scale))
-    order = np.argsort(-np.abs(vectors[:, -1]))[:4]
-    parts = [(names[i], float(vectors[i, -1])) for i in order if abs(vectors[i, -1]) > 0.2]
-    return (float(np.sqrt(values[-1] / values[0])), float(np.sqrt(values[-1])), parts)
+    values, vectors = np.linalg.eigh(full.fitted.covariance / np.outer(scale, scale))
+    order = np.argsort(-np.abs(vectors[:, -1]))[:_MAX_PARTS]
+    parts = [(names[i], float(vectors[i, -1])) for i in order if abs(vectors[i, -1]) > _MIN_PART]
+    return WeakestDirection(float(np.sqrt(values[-1] / values[0])), float(np.sqrt(values[-1])),
+                            parts)
 
 
-def words(found: full_model.FullFit, poses: Poses, judged: Sequence[Term]) -> list[str]:
+def report_lines(full: full_model.FullFit, poses: Poses, terms: Sequence[Term]) -> list[str]:
     """
-    Lay out for people what the fit found beside the sensor.
+    Report the stage, the outliers, the weakest direction and the terms of a fit.
 
     Parameters
     ----------
-    found, judged
+    full, terms
         From `term_selection.fit_selected`.
     poses
-        That it was made of.
+        The fitted poses.
+
+    Returns
+    -------
+    list
+        Lines of text.
 
     """
-    setting, pose = (np.degrees(level * found.stage.joints) for level in (
-        found.stage.setting_rad, found.stage.pose_rad))
-    beside = f', and {pose[0]:.2g} and {pose[1]:.2g} deg new with each pose' \
-        if pose[0] > _SMALL_SHARE * setting[0] else ''
-    lines = [f'stage: a setting of alpha has an error of {setting[0]:.2g} deg rms, of beta '
-             f'{setting[1]:.2g} deg{beside} (stated {np.degrees(found.stated_std_rad):.2g})'
-             f'{_of_the_stage(found)}']
-    if not found.converged:
-        lines.append(NOT_CONVERGED)
-    if found.stage_std_rad > _WORSE * found.stated_std_rad + 1e-5:
-        lines.append('the reference is worse than stated, or the model lacks something that '
-                     'looks like it: poses weigh accordingly, and the sensor is not blamed')
-    if found.outliers:
-        worst = [f'{i + 1} (alpha {np.degrees(poses.alpha_rad[i]):.1f}, beta '
-                 f'{np.degrees(poses.beta_rad[i]):.1f} deg, from {poses.time_s[i, 0]:.1f} s, '
-                 f'{np.sqrt(found.distances[i]):.0f} sigma)' for i in found.outliers[:8]]
-        lines.append(f'left out, disturbed: pose {", ".join(worst)}')
-    condition, spread, parts = weakest(found)
-    direction = ' '.join(f'{value:+.2f} {name}' for name, value in parts)
-    lines.append(f'condition number {condition:.0f}; known least ({spread:.2g} of typical '
-                 f'sizes): {direction}')
-    helpful = full_model.next_poses(found.unit, poses, found.names, found.stage)
-    add = ', '.join(f'({np.degrees(a):.0f}, {np.degrees(b):.0f})' for a, b in helpful)
-    lines.append(f'next poses that would help most, (alpha, beta) in deg: {add}')
-    warmed = np.ptp(poses.environment.temperature_c)
-    if warmed > _WARMED_K and 'temperature_bias' not in found.fitted.effects:
-        lines.append(
-            f'temperature moved by {warmed:.1f} degC, which the model does not know: by the '
-            f'datasheet up to {0.1 * warmed:.1f} mg; keep it steady, or fit --effect '
-            'temperature_bias')
-    lines.append('terms by the evidence for them, log Bayes factor in nats:')
-    lines += [f'  {term.name:20} {term.log_bayes_factor:10.1f}'
-              f'{"" if term.earns else "   not shown by these poses"}' for term in judged]
+    weakest = weakest_direction(full)
+    direction = ' '.join(f'{value:+.2f} {name}' for name, value in weakest.parts)
+    next_poses = full_model.next_poses(full.unit, poses, full.names, full.stage)
+    return [
+        *_stage_lines(full),
+        *([] if full.converged else [NOT_CONVERGED]),
+        *_outlier_lines(full, poses),
+        f'least determined: {direction}, std {weakest.std:.2g} typical sizes '
+        f'(condition number {weakest.condition_number:.0f})',
+        f'next poses that would help most, (alpha, beta) in deg: '
+        f'{full_model.format_poses(next_poses)}',
+        *_temperature_lines(full, poses),
+        'log Bayes factor of each term, nats; above 0 the poses support it:',
+        *(f'  {term.name:20} {term.log_bayes_factor:10.1f}'
+          f'{"" if term.is_supported else "   not supported by these poses"}' for term in terms)]
+
+
+def _stage_lines(full: full_model.FullFit) -> list[str]:
+    setting, pose = (np.degrees(std_rad * full.stage.joints) for std_rad in (
+        full.stage.setting_rad, full.stage.pose_rad))
+    by_pose = f'; {pose[0]:.2g} and {pose[1]:.2g} deg rms by pose' \
+        if pose[0] > _MIN_POSE_SHARE * setting[0] else ''
+    lines = [f'stage error: alpha {setting[0]:.2g}, beta {setting[1]:.2g} deg rms by setting'
+             f'{by_pose} (stated {np.degrees(full.stated_std_rad):.2g} deg)']
+    std = np.sqrt(np.diag(np.linalg.inv(full.information)))
+    values = [f'{name} {value:.2g} +- {Z_90 * value_std:.1g} {parameter_of(name).unit}'
+              for name, value, value_std in zip(full.names, get(full.unit, full.names), std)
+              if full_model.belongs_to_stage(name)]
+    lines.append(f'stage: {", ".join(values)} (90 % intervals)')
+    if full.stage_std_rad > _BAD_STAGE_RATIO * full.stated_std_rad + _MIN_STAGE_EXCESS_RAD:
+        lines.append('the reference is worse than stated, or the model lacks an effect that looks '
+                     'like a stage error; poses are weighted accordingly')
     return lines
 
 
-def _of_the_stage(found: full_model.FullFit) -> str:
-    """Lay out what was found of the stage itself, with its 90 % intervals."""
-    std = np.sqrt(np.diag(np.linalg.inv(found.information)))
-    return ''.join(
-        f', {name} {value:.2g} +- {Z_90 * s:.1g} {parameter_of(name).unit}'
-        for name, value, s in zip(found.names, get(found.unit, found.names), std)
-        if full_model.belongs_to_stage(name))
+def _outlier_lines(full: full_model.FullFit, poses: Poses) -> list[str]:
+    if not full.outliers:
+        return []
+    named = [f'{i + 1} (alpha {np.degrees(poses.alpha_rad[i]):.1f}, beta '
+             f'{np.degrees(poses.beta_rad[i]):.1f} deg, from {poses.time_s[i, 0]:.1f} s, '
+             f'{np.sqrt(full.squared_distances[i]):.0f} sigma)'
+             for i in full.outliers[:_MAX_OUTLIERS_NAMED]]
+    rest = len(full.outliers) - len(named)
+    return [f'left out, disturbed: pose {", ".join(named)}{f" and {rest} others" if rest else ""}']
+
+
+def _temperature_lines(full: full_model.FullFit, poses: Poses) -> list[str]:
+    change_k = np.ptp(poses.environment.temperature_c)
+    if change_k <= _MAX_WARMING_K or 'temperature_bias' in full.fitted.effects:
+        return []
+    return [f'temperature moved by {change_k:.1f} degC, which the model ignores: typically up to '
+            f'{_TYPICAL_DRIFT_MG_PER_K * change_k:.1f} mg; keep it steady, or fit --effect '
+            'temperature_bias']

@@ -13,26 +13,26 @@
 # limitations under the License.
 
 """
-The full model: one maximum-likelihood fit of all poses, all axes, with errors of the stage.
+The full model: one maximum-likelihood fit of all poses and axes, with the error of the stage.
 
-The volts of a pose are the chain's at angles that the stage has not quite reached,
-V = h(f(α + δα, β + δβ; tilt); θ) + noise of the mean. A joint has one error for each of its
-settings, and may have one for each pose beside it (`stage_error`). The errors are integrated out:
-poses weigh by the inverse of their common covariance S (errors in variables; Fuller 1987, section
-3.2), taken at the most likely angles, so that a stage that is off by degrees is still straight.
-The levels of the stage's error are those of the greatest restricted likelihood (`linearised`).
-The tilt of the base is fitted beside the sensor, with its prior, and left out of the result.
+The volts of a pose are V = h(f(α + δα, β + δβ; tilt); θ) + noise of the mean: the stage has not
+quite reached the angles of the encoder. A joint has one error for each of its settings, and may
+have another for each pose (`stage_error`). The errors are integrated out: poses weigh by the
+inverse of their common covariance S (errors in variables; Fuller 1987, section 3.2). S is taken at
+the most likely angles, so that the model is linear there even if the stage is degrees off. The
+stage error maximises the restricted likelihood (`linearised`). The tilt of the base is a nuisance
+parameter with a prior.
 
-Gauge: p0, q0 of (11) and (13) belong to the zero-g and r0 of (15) to the scale factor; p1 and q1
+Gauge: p0, q0 of (11) and (13) belong to the zero-g and r0 of (15) to the scale factor. p1 and q1
 are the misalignment to first order, so that `cross_axis.linear` and `cross_axis_z.linear` stay 0.
-Products tell them apart, by r1·p1·z·c and the like: where poses held out ask for it (see
-`term_selection`), the two are fitted, too, with the datasheet's 1.5 % for prior. At rest
-x² + y² + z² is g², so that a square of the own axis is those of the others and `quadratic` stays
-out. The case's x is where beta = 0 points, so that an offset of beta is part of the misalignment.
+Products such as r1·p1·z·c distinguish them. Where these are significant (`term_selection`), both
+are fitted, with the datasheet's 1.5 % as prior. At rest x² + y² + z² is g², so that a square of
+the own axis equals those of the others, and `quadratic` is not fitted. The case's x is where
+beta = 0 points, so that an offset of beta is part of the misalignment.
 
 A three-axis unit has the same kinds of terms on each axis: squares of both other axes
 (`cross_axis`, `cross_axis_z`), a scale factor that depends on either (`scale_factor_cross`,
-`scale_factor_z`), and a cube. A two-axis unit has those of the paper.
+`scale_factor_z`), and a cube. A two-axis unit has those of the paper and a cube.
 """
 
 from __future__ import annotations
@@ -40,10 +40,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from adxl_ros.calibrate import pose_response
 from adxl_ros.calibrate.fits import d_optimal, linear
 from adxl_ros.calibrate.fits.linearised import Linearised, linearised
-from adxl_ros.calibrate.pose_response import predicted_volts
+from adxl_ros.calibrate.pose_response import angle_jacobian, predicted_volts
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.calibrate.stage_error import AngleErrors, PoseCovariance, StageError
 from adxl_ros.errors import UserError
@@ -57,73 +56,97 @@ from scipy.stats import chi2
 
 TERMS = ('bias', 'scale_factor', 'misalignment', 'cross_axis', 'cross_axis_z', 'scale_factor_z',
          'nonlinearity')
+"""Terms of a two-axis unit: those of the paper, and a cube."""
 _THREE_AXES = ('scale_factor_cross',)
-"""Terms that a three-axis unit has beside those of the paper."""
-_OPTIONAL = ('nonlinearity',)
-"""Terms that may stay as open as their prior leaves them: most units hardly have them."""
+"""Terms that only a three-axis unit has."""
+_PRIOR_SUFFICES = ('nonlinearity',)
+"""Terms that the poses need not determine: most units hardly have them."""
 GAUGE = ('cross_axis.linear', 'cross_axis_z.linear')
-"""Terms that are 0 unless the poses show them beside the misalignment."""
+"""Terms that are 0 unless the poses distinguish them from the misalignment."""
+_BASE_TILT = (Coefficient('base_tilt', 'x_rad'), Coefficient('base_tilt', 'y_rad'))
+"""Nuisance parameters: the level of the stage's base."""
+
 LEVEL_STD_RAD = np.radians(0.1)
-"""Standard deviation of the level of the base, each way: the paper's 0.1°."""
-_STAGE = (Coefficient('base_tilt', 'x_rad'), Coefficient('base_tilt', 'y_rad'))
-_HARDLY = 5.0
-_KNOCKED = 1e-6
-"""A pose less likely than this is disturbed, as long as such poses are few."""
-_MOST_KNOCKED = 0.2
-_ROUNDS = 16
-"""Rounds of levels, coefficients and angles."""
-_STEPS = 12
-"""Gauss-Newton steps to the first solution."""
-_STEPS_A_ROUND = 2
-_HALVINGS = 7
-_SHRINK, _STRAIGHT = 0.2, 0.1
-_CONVERGED = 1e-4
-"""A step shorter than this, in standard deviations of each coefficient, is the last."""
-_SHORT = 1e-2
-"""Coefficients that move by less in a round, in standard deviations, have settled."""
-_SETTLED = 1e-2
-"""The levels have settled when the deviance changes by less in a round."""
-_GRID_RAD = np.radians(15.0)
-"""Step of the grid from which further poses are chosen."""
-_SHAPE_STEP, _SHAPE_STEPS = 1.05, 60
-"""Figures of shape are searched by steps of 5 %, up to 19 times the typical one each way."""
-_FINE = 15
-"""Values tried between the neighbours of the likeliest."""
-_FEW = 3
-"""Starts of a figure of shape."""
-_LONGEST = 3.0
-"""Longest step, in typical sizes."""
+"""Prior standard deviation of the level of the base, rad: the paper's 0.1°."""
+_SENSOR_PRIOR_SIZES = 5.0
+"""Prior standard deviation of a coefficient of the sensor, by its typical size. Chosen: wider
+than any healthy unit, so that it has no weight where the poses have any."""
+_STAGE_PRIOR_SIZES = 3.0
+"""Prior standard deviation of a coefficient of the stage, by its typical size. Chosen: as for the
+sensor."""
+_GAUGE_PRIOR_SIZES = 1.0
+"""Prior standard deviation of a term of `GAUGE`, by its typical size: the datasheet's 1.5 %."""
+_REGULARISATION = 1e-6
+"""Added to the information in units of typical sizes, so that it can be inverted."""
+
+_MAX_ROUNDS = 16
+"""Largest count of rounds of stage error, coefficients and angles; a fit that needs more is
+reported as not converged."""
+_FIRST_ROUND_LEVELS = 3
+"""Estimates of the stage error in the first round, where it is not known yet."""
+_START_STEPS = 12
+"""Gauss-Newton steps before the first round."""
+_ROUND_STEPS = 2
+"""Gauss-Newton steps of a round."""
+_MAX_HALVINGS = 7
+"""How often the step of a round is halved."""
+_MAX_STEP_SIZES = 3.0
+"""Longest step of a coefficient, by its typical size."""
+_LAST_STEP_STD = 1e-4
+"""A step shorter than this is the last, in standard deviations of each coefficient."""
+_SETTLED_STD = 1e-2
+"""Coefficients have converged if a round moves them by less, in their standard deviations."""
+_SETTLED_DEVIANCE = 1e-2
+"""The stage error has converged if a round changes the deviance by less."""
+_CURVATURE_SHRINK = 0.2
+"""Share of the curvature of the angles that a round leaves."""
+_MAX_CURVATURE = 0.1
+"""Curvature that may remain when a round is assessed, by the noise of a mean."""
+
+_OUTLIER_CHANCE = 1e-6
+"""A pose less likely than this is an outlier."""
+_MAX_OUTLIERS = 0.2
+"""Largest share of outliers. Chosen: more of them are a fault of the model."""
+
+_SHAPE_STEP = 1.05
+"""Ratio of neighbouring trial values of a shape parameter."""
+_SHAPE_STEPS = 60
+"""Trial values on each side of the typical one: up to 19 times as large and as small."""
+_FINE_SHAPES = 15
+"""Trial values between the neighbours of the likeliest."""
+_SHAPE_STARTS = 3
+"""Starts of the fit for a shape parameter."""
 
 
 @dataclass(frozen=True)
 class FullFit:
     """
-    What the fit found beside the sensor.
+    Result of the fit of k poses.
 
     Attributes
     ----------
     fitted
-        The unit with its covariance.
+        The unit with its covariance, without effects of the stage.
     unit
-        The same with what was fitted of the stage, which belongs to no sensor.
+        The unit with the fitted effects of the stage.
     names
-        Fitted coefficients, those of the stage last.
+        Fitted coefficients, (p,).
     stage
-        Levels of the stage's error.
+        Estimated standard deviations of the stage's error.
     stated_std_rad
-        Standard deviation of a joint's error as it is stated: step/√12, rad.
+        Stated standard deviation of a joint's error: step/√12, rad.
     outliers
-        Numbers of the poses that were left out as disturbed.
+        Indices of the poses that were left out as disturbed.
     information
-        Inverse covariance of `names`, priors included.
-    distances
+        Inverse covariance of `names`, priors included, (p, p).
+    squared_distances
         Squared Mahalanobis distance of each pose, given its settings, (k,).
-    at
-        The poses turned to the most likely angles, in which the model is straight.
+    linear_poses
+        The poses at the most likely angles, about which the model is linear.
     deviance
-        −2 times the logarithm of the restricted likelihood, but for a constant.
+        −2 times the logarithm of the restricted likelihood, up to a constant.
     converged
-        Whether coefficients, levels and the choice of disturbed poses settled.
+        Whether coefficients, stage error and outliers have converged.
 
     """
 
@@ -134,8 +157,8 @@ class FullFit:
     stated_std_rad: float
     outliers: tuple[int, ...]
     information: np.ndarray
-    distances: np.ndarray
-    at: Poses
+    squared_distances: np.ndarray
+    linear_poses: Poses
     deviance: float
     converged: bool
 
@@ -146,8 +169,8 @@ class FullFit:
 
     @property
     def kept(self) -> np.ndarray:
-        """Tell which poses were not left out, (k,)."""
-        return ~np.isin(np.arange(len(self.at)), self.outliers)
+        """Mark the poses that are no outliers, (k,) bool."""
+        return ~np.isin(np.arange(len(self.linear_poses)), self.outliers)
 
 
 def default_terms(axes: str) -> tuple[str, ...]:
@@ -157,39 +180,43 @@ def default_terms(axes: str) -> tuple[str, ...]:
 
 def fit_full(sensor: Sensor, poses: Poses, terms: Sequence[str] | None = None) -> FullFit:
     """
-    Fit the terms to the poses; see the module.
+    Fit the terms to the poses by maximum likelihood.
 
-    A term that is not convex, in a figure of shape, is started several times; the fit of the
-    greatest likelihood counts.
+    A shape parameter makes the likelihood multimodal. The fit then has several starts, and the
+    result with the greatest likelihood counts.
 
     Parameters
     ----------
     sensor
-        Nominal figures; its stage resolution is the stated error of the stage.
+        Nominal values of the unit. Its stage resolution states the error of the stage.
     poses
-        Of one unit on one stage.
+        k poses of one unit on one stage.
     terms
-        Effects to fit, of the sensor or of the stage, and names of `GAUGE`; `default_terms` the
-        sensor's axes unless given.
+        Effects to fit, of the sensor or of the stage, and names of `GAUGE`. By default
+        `default_terms` of the sensor's axes.
+
+    Returns
+    -------
+    FullFit
+        The fit, converged or not.
 
     Raises
     ------
     UserError
-        A coefficient is not determined; says which and which poses would help.
+        The poses do not determine a coefficient. The message names it and poses to add.
 
     """
     terms = default_terms(sensor.axes) if terms is None else terms
-    start = linear.fit(sensor, poses)
     effects = [effect_of(term) for term in terms]
-    unit = with_neutral(start.without_covariance(), effects)
+    unit = with_neutral(linear.fit(sensor, poses).without_covariance(), effects)
     unit = with_neutral(unit, ['base_tilt'])
-    names = fitted_coefficients(unit.axes, terms)
-    stated = StageError(sensor.stage_resolution_rad / np.sqrt(12))
+    problem = _Problem(poses, fitted_coefficients(unit.axes, terms),
+                       StageError(sensor.stage_resolution_rad / np.sqrt(12)))
     fits, failure = [], None
-    for begin in _starts(unit, poses, names, effects, stated):
+    for start in _starts(unit, problem, effects):
         try:
-            require_determined(begin, poses, names, stated)
-            fits.append(_fit_from(begin, poses, names, stated))
+            require_determined(start, poses, problem.names, problem.stated)
+            fits.append(_fit_from(start, problem))
         except UserError as error:
             failure = failure or error
     if not fits:
@@ -198,99 +225,211 @@ def fit_full(sensor: Sensor, poses: Poses, terms: Sequence[str] | None = None) -
     return min(fits, key=lambda fit: fit.deviance)
 
 
-def _starts(unit: Sensor, poses: Poses, names: Sequence[Coefficient], effects: Sequence[str],
-            stage: StageError) -> list[Sensor]:
+@dataclass(frozen=True)
+class _Problem:
     """
-    Return the units from which a fit begins: several where a term is not convex.
+    What is fitted to what.
 
-    The volts are nearly linear in all coefficients but in figures of shape (periods, time
+    Attributes
+    ----------
+    poses
+        As measured, at the angles of the encoder.
+    names
+        Coefficients to fit, (p,).
+    stated
+        Stated error of the stage.
+
+    """
+
+    poses: Poses
+    names: tuple[Coefficient, ...]
+    stated: StageError
+
+    @property
+    def precision(self) -> np.ndarray:
+        """Return the prior's inverse variances, (p,)."""
+        return prior_precision(self.names)
+
+    def linearised(self, unit: Sensor, poses: Poses, kept: np.ndarray | None = None
+                   ) -> Linearised:
+        """
+        Linearise poses about a unit.
+
+        Parameters
+        ----------
+        unit
+            Sensor with the coefficients.
+        poses
+            The poses, at the angles about which the model is linear.
+        kept
+            Poses that count, (k,) bool; None for all.
+
+        Returns
+        -------
+        Linearised
+            Residuals and Jacobians.
+
+        """
+        return linearised(unit, poses, self.names, self.precision, kept)
+
+
+def _starts(unit: Sensor, problem: _Problem, effects: Sequence[str]) -> list[Sensor]:
+    """
+    Return the units from which a fit begins.
+
+    The volts are nearly linear in all coefficients but shape parameters (periods, time
     constants). Those are searched over their range, and the likeliest few are the starts.
     """
     starts = [unit]
-    for name in effects:
-        for p in effect_named(name).parameters:
-            if p.role is not Role.SHAPE or p.held or not effect_named(name).invertible:
+    for effect in effects:
+        if not effect_named(effect).invertible:
+            continue
+        for parameter in effect_named(effect).parameters:
+            if parameter.role is not Role.SHAPE or parameter.held:
                 continue
-            coarse = p.scale * _SHAPE_STEP ** np.arange(-_SHAPE_STEPS, _SHAPE_STEPS + 1)
-            likely = _likeliest(unit, poses, names, (name, p), coarse, stage)[:_FEW]
-            fine = likely[0] * _SHAPE_STEP ** np.linspace(-1, 1, _FINE)
-            best = _likeliest(unit, poses, names, (name, p), fine, stage)[0]
-            starts += [_shaped(unit, (name, p), shape) for shape in (best, *likely[1:])]
+            shape = (effect, parameter)
+            coarse = parameter.scale * _SHAPE_STEP ** np.arange(-_SHAPE_STEPS, _SHAPE_STEPS + 1)
+            likely = _likeliest(unit, problem, shape, coarse)[:_SHAPE_STARTS]
+            fine = likely[0] * _SHAPE_STEP ** np.linspace(-1, 1, _FINE_SHAPES)
+            best = _likeliest(unit, problem, shape, fine)[0]
+            starts += [_with_shape(unit, shape, value) for value in (best, *likely[1:])]
     return starts
 
 
-def _likeliest(unit: Sensor, poses: Poses, names: Sequence[Coefficient],
-               shape: tuple[str, Parameter], values: np.ndarray, stage: StageError
-               ) -> list[float]:
-    """Return values of a figure of shape within its bounds, the likeliest first."""
+def _likeliest(unit: Sensor, problem: _Problem, shape: tuple[str, Parameter],
+               values: np.ndarray) -> list[float]:
+    """Return the values of a shape parameter that are within its bounds, the likeliest first."""
     _, parameter = shape
     within = values[(parameter.lower <= values) & (values <= parameter.upper)]
-    precision = prior_precision(names)
-    misfit = [linearised(_shaped(unit, shape, value), poses, names, precision).misfit(stage)
-              for value in within]
+    misfit = [problem.linearised(_with_shape(unit, shape, value), problem.poses)
+              .misfit(problem.stated) for value in within]
     return [float(value) for value in within[np.argsort(misfit)]]
 
 
-def _shaped(unit: Sensor, shape: tuple[str, Parameter], value: float) -> Sensor:
-    name, parameter = shape
-    values = unit.values[name]
+def _with_shape(unit: Sensor, shape: tuple[str, Parameter], value: float) -> Sensor:
+    effect, parameter = shape
+    values = unit.values[effect]
     changed = {**values, parameter.name: np.full(np.shape(values[parameter.name]), value)}
-    return replace(unit, values={**unit.values, name: changed})
+    return replace(unit, values={**unit.values, effect: changed})
 
 
-def _fit_from(unit: Sensor, poses: Poses, names: tuple[Coefficient, ...],
-              stated: StageError) -> FullFit:
-    """Fit from a start: levels, coefficients and angles in turn, until all of them settle."""
-    known, everything = prior_precision(names), np.ones(len(poses), bool)
-    kept, stage, at, std_v = everything, stated, poses, poses.std_v
-    unit = put(unit, names, _solved(unit, poses, names, stage, kept, _STEPS).last.values)
-    error_rad = AngleErrors(*(np.zeros((len(poses), 2)),) * 2, np.zeros(len(poses)), 0.0)
+@dataclass(frozen=True)
+class _State:
+    """
+    State of the fit between two rounds.
+
+    Attributes
+    ----------
+    unit
+        Sensor with the coefficients.
+    stage
+        Standard deviations of the stage's error.
+    errors
+        Predicted errors of the angles.
+    poses
+        The poses turned by these errors; see `_turned_linearly`.
+    kept
+        Poses that are no outliers, (k,) bool.
+    curvature_v
+        Volts by which the model departs from its linearisation, (m,).
+
+    """
+
+    unit: Sensor
+    stage: StageError
+    errors: AngleErrors
+    poses: Poses
+    kept: np.ndarray
+    curvature_v: np.ndarray
+
+
+def _fit_from(unit: Sensor, problem: _Problem) -> FullFit:
+    """Fit from a start: stage error, coefficients and angles in turn until all converge."""
+    poses = problem.poses
+    everything = np.ones(len(poses), bool)
+    start = _solved(unit, problem, poses, problem.stated, everything, _START_STEPS)
+    state = _State(put(unit, problem.names, start.last.values), problem.stated,
+                   AngleErrors.zeros(len(poses)), poses, everything, np.zeros(len(unit.axes)))
     converged, deviance = False, np.inf
-    for i in range(_ROUNDS):
-        kept_before, deviance_before = kept, deviance
-        for _ in range(1 if i else 3):
-            about = linearised(unit, replace(at, std_v=std_v), names, known, kept)
-            stage = about.stage_error(stated.total_rad, stage)
-            # Angles off by δ leave δ²/2 of g beside the straight line, until they are found.
-            bent_v = unit.nominal_scale_v_per_g * stage.total_rad ** 2 * _SHRINK ** i
-            std_v = np.hypot(poses.std_v, bent_v)
-        unit, error_rad, length = _stepped(unit, poses, replace(at, std_v=std_v), names, stage,
-                                           kept, error_rad)
-        at = _moved(unit, poses, error_rad.total_rad)
-        if np.any(bent_v > _STRAIGHT * poses.std_v.mean(axis=0)):
+    for number in range(_MAX_ROUNDS):
+        state, step_std = _round(state, problem, number)
+        if np.any(state.curvature_v > _MAX_CURVATURE * poses.std_v.mean(axis=0)):
             continue
-        about = linearised(unit, at, names, known, kept)
-        deviance = about.deviance(stage)
-        distances = about.covariance(stage).predicted(about.residual).distances
-        kept = distances < chi2.isf(_KNOCKED, len(unit.axes))
-        if kept.mean() < 1 - _MOST_KNOCKED:
-            kept = everything
-        if np.array_equal(kept, kept_before) and length < _SHORT and \
-                abs(deviance - deviance_before) < _SETTLED:
-            converged = True
+        about = problem.linearised(state.unit, state.poses, state.kept)
+        kept_before, deviance_before = state.kept, deviance
+        deviance = about.deviance(state.stage)
+        state = replace(state, kept=_inliers(about, state.stage))
+        converged = (np.array_equal(state.kept, kept_before) and step_std < _SETTLED_STD
+                     and abs(deviance - deviance_before) < _SETTLED_DEVIANCE)
+        if converged:
             break
-    about = linearised(unit, at, names, known, kept)
-    covariance = about.covariance(stage)
-    _, fisher = about.solve(covariance)
-    of_sensor = [i for i, name in enumerate(names) if not belongs_to_stage(name)]
+    return _result(state, problem, converged)
+
+
+def _round(state: _State, problem: _Problem, number: int) -> tuple[_State, float]:
+    """Estimate the stage error, then the coefficients and angles; see `_step` for the length."""
+    stage, curvature_v = state.stage, state.curvature_v
+    for _ in range(1 if number else _FIRST_ROUND_LEVELS):
+        std_v = np.hypot(problem.poses.std_v, curvature_v)
+        about = problem.linearised(state.unit, replace(state.poses, std_v=std_v), state.kept)
+        stage = about.stage_error(problem.stated.total_rad, stage)
+        # Angle errors δ that are not predicted yet change the force by δ²/2 of g.
+        curvature_v = state.unit.nominal_scale_v_per_g * stage.total_rad ** 2 \
+            * _CURVATURE_SHRINK ** number
+    std_v = np.hypot(problem.poses.std_v, curvature_v)
+    unit, errors, step_std = _step(replace(
+        state, stage=stage, poses=replace(state.poses, std_v=std_v)), problem)
+    turned = _turned_linearly(unit, problem.poses, errors.total_rad)
+    return _State(unit, stage, errors, turned, state.kept, curvature_v), step_std
+
+
+def _inliers(about: Linearised, stage: StageError) -> np.ndarray:
+    """Mark the poses that are no outliers, (k,) bool; all poses if too many are outliers."""
+    errors = about.covariance(stage).predicted_errors(about.residual)
+    kept = errors.squared_distances < chi2.isf(_OUTLIER_CHANCE, about.residual.shape[1])
+    return kept if kept.mean() >= 1 - _MAX_OUTLIERS else np.ones(len(kept), bool)
+
+
+def _result(state: _State, problem: _Problem, converged: bool) -> FullFit:
+    about = problem.linearised(state.unit, state.poses, state.kept)
+    covariance = about.covariance(state.stage)
+    _, information = about.solve(covariance)
+    of_sensor = [i for i, name in enumerate(problem.names) if not belongs_to_stage(name)]
     fitted = replace(
-        _without_stage(unit), model='full',
-        covariance=np.linalg.inv(fisher)[np.ix_(of_sensor, of_sensor)],
-        covariance_names=tuple(names[i] for i in of_sensor))
-    return FullFit(fitted, unit, names, stage, stated.total_rad,
-                   tuple(np.flatnonzero(~kept).tolist()), fisher,
-                   covariance.predicted(about.residual).distances, at, about.deviance(stage),
-                   converged)
+        _without_stage(state.unit), model='full',
+        covariance=np.linalg.inv(information)[np.ix_(of_sensor, of_sensor)],
+        covariance_names=tuple(problem.names[i] for i in of_sensor))
+    return FullFit(
+        fitted=fitted, unit=state.unit, names=problem.names, stage=state.stage,
+        stated_std_rad=problem.stated.total_rad,
+        outliers=tuple(np.flatnonzero(~state.kept).tolist()), information=information,
+        squared_distances=covariance.predicted_errors(about.residual).squared_distances,
+        linear_poses=state.poses, deviance=about.deviance(state.stage), converged=converged)
 
 
 def fitted_coefficients(axes: str, terms: Sequence[str]) -> tuple[Coefficient, ...]:
-    """Name what is fitted: the terms' coefficients but for the gauge, and the base's tilt."""
-    named = [name for effect in dict.fromkeys(map(effect_of, terms))
-             for name in names_of(effect_named(effect), axes)
+    """
+    Name the coefficients that a fit of some terms estimates.
+
+    Parameters
+    ----------
+    axes
+        Measured axes of the unit.
+    terms
+        Effects and names of `GAUGE`.
+
+    Returns
+    -------
+    tuple
+        Coefficients of the sensor, then the tilt of the base, then other errors of the stage.
+
+    """
+    effects = dict.fromkeys(map(effect_of, terms))
+    names = [name for effect in effects for name in names_of(effect_named(effect), axes)
              if parameter_of(name).role not in (Role.SHAPE, Role.OPTIONAL)
              and term_of(name) in terms]
-    return (*(n for n in named if not belongs_to_stage(n)), *_STAGE,
-            *(n for n in named if belongs_to_stage(n) and n not in _STAGE))
+    of_stage = [name for name in names if belongs_to_stage(name) and name not in _BASE_TILT]
+    return (*(name for name in names if not belongs_to_stage(name)), *_BASE_TILT, *of_stage)
 
 
 def term_of(name: Coefficient) -> str:
@@ -305,33 +444,42 @@ def effect_of(term: str) -> str:
 
 
 def prior_precision(names: Sequence[Coefficient]) -> np.ndarray:
-    """
-    Return the inverse variances that are known beforehand, (p,).
-
-    The level and the gauge are known; a coefficient of the sensor is hardly ever beyond five
-    times its typical size, which says nothing where the poses say anything.
-    """
-    spread = [LEVEL_STD_RAD if name in _STAGE else parameter_of(name).scale * (
-        1 if term_of(name) in GAUGE else 3 if belongs_to_stage(name) else _HARDLY)
-        for name in names]
-    return 1 / np.square(spread)
+    """Return the inverse prior variances of coefficients about 0, (p,)."""
+    return 1 / np.square([_prior_std(name) for name in names])
 
 
-def fisher_information(unit: Sensor, poses: Poses, names: Sequence[Coefficient], stage: StageError
-                ) -> np.ndarray:
+def _prior_std(name: Coefficient) -> float:
+    if name in _BASE_TILT:
+        return float(LEVEL_STD_RAD)
+    if term_of(name) in GAUGE:
+        sizes = _GAUGE_PRIOR_SIZES
+    else:
+        sizes = _STAGE_PRIOR_SIZES if belongs_to_stage(name) else _SENSOR_PRIOR_SIZES
+    return parameter_of(name).scale * sizes
+
+
+def fisher_information(unit: Sensor, poses: Poses, names: Sequence[Coefficient],
+                       stage: StageError) -> np.ndarray:
     """
-    Fisher information of poses about coefficients, priors of the stage included, (p, p).
+    Return the Fisher information of poses about coefficients, priors included.
 
     Its inverse is the Cramér-Rao bound.
 
     Parameters
     ----------
     unit
-        Where it is taken.
+        Sensor at whose coefficients the volts are differentiated.
     poses
-        With the noise of their means, angles and settings.
-    names, stage
-        As `FullFit` has them.
+        k poses with the noise of their means, angles and settings.
+    names
+        Coefficients, (p,).
+    stage
+        Standard deviations of the stage's error.
+
+    Returns
+    -------
+    ndarray
+        Information, (p, p).
 
     """
     about = linearised(unit, poses, names, prior_precision(names))
@@ -352,40 +500,27 @@ class _Iterate(Iterate):
         return float(np.abs(self.step * np.sqrt(np.diag(self.information))).max())
 
 
-def _solved(unit: Sensor, poses: Poses, names: Sequence[Coefficient], stage: StageError,
-            kept: np.ndarray, steps: int) -> Solution[_Iterate]:
+def _solved(unit: Sensor, problem: _Problem, poses: Poses, stage: StageError, kept: np.ndarray,
+            steps: int) -> Solution[_Iterate]:
     """Take Gauss-Newton steps; the chain is nearly linear in its coefficients."""
-    sizes = np.array([parameter_of(name).scale for name in names])
+    sizes = np.array([parameter_of(name).scale for name in problem.names])
 
     def linearise(values: np.ndarray) -> _Iterate:
-        about = linearised(put(unit, names, values), poses, names, prior_precision(names), kept)
+        about = problem.linearised(put(unit, problem.names, values), poses, kept)
         covariance = about.covariance(stage)
         step, information = about.solve(covariance)
-        step *= min(1.0, _LONGEST / np.abs(step / sizes).max())
+        step *= min(1.0, _MAX_STEP_SIZES / np.abs(step / sizes).max())
         return _Iterate(values, step, 0.0, about, covariance, information)
 
     return gauss_newton(
-        linearise, get(unit, names),
-        lambda _, previous, __: previous is not None and previous.step_std < _CONVERGED,
+        linearise, get(unit, problem.names),
+        lambda _, previous, __: previous is not None and previous.step_std < _LAST_STEP_STD,
         steps + 1)
 
 
-def _stepped(unit: Sensor, poses: Poses, at: Poses, names: Sequence[Coefficient],
-             stage: StageError, kept: np.ndarray, before: AngleErrors
-             ) -> tuple[Sensor, AngleErrors, float]:
+def _step(state: _State, problem: _Problem) -> tuple[Sensor, AngleErrors, float]:
     """
-    Go to the most likely coefficients and angles, or as far on the way as it gets better.
-
-    Parameters
-    ----------
-    unit
-        Where the round begins.
-    poses, at
-        As measured, and the same turned to the angles before; see `_moved`.
-    names, stage, kept
-        Coefficients, levels of the stage's error, and poses that count.
-    before
-        Errors of the angles before.
+    Move coefficients and angles to the most likely ones, or part of the way if that is better.
 
     Returns
     -------
@@ -394,101 +529,136 @@ def _stepped(unit: Sensor, poses: Poses, at: Poses, names: Sequence[Coefficient]
         deviations.
 
     """
-    solved = _solved(unit, at, names, stage, kept, _STEPS_A_ROUND).last
-    covariance, known = solved.covariance, prior_precision(names)
-    errors = covariance.predicted(solved.about.residual)
-    start, end = get(unit, names), solved.values
+    solved = _solved(state.unit, problem, state.poses, state.stage, state.kept, _ROUND_STEPS).last
+    covariance, precision = solved.covariance, problem.precision
+    errors = covariance.predicted_errors(solved.about.residual)
+    start = get(state.unit, problem.names)
 
-    def between(share: float) -> tuple[np.ndarray, AngleErrors]:
-        return start + share * (end - start), before.towards(errors, share)
+    def attempt(share: float) -> tuple[np.ndarray, AngleErrors]:
+        return (start + share * (solved.values - start),
+                state.errors.interpolated(errors, share))
 
     def cost(values: np.ndarray, angles: AngleErrors) -> float:
-        left = poses.volts - predicted_volts(put(unit, names, values),
-                                             _turned(poses, angles.total_rad))
-        return float(np.sum((left / at.std_v)[kept] ** 2) + np.sum(known * values ** 2)
-                     + covariance.penalty(angles))
+        residual = problem.poses.volts - predicted_volts(
+            put(state.unit, problem.names, values), _turned(problem.poses, angles.total_rad))
+        return float(np.sum((residual / state.poses.std_v)[state.kept] ** 2)
+                     + np.sum(precision * values ** 2) + covariance.penalty(angles))
 
-    highest = cost(start, before)
-    (values, angles), _, _ = halve_until(between, lambda trial: cost(*trial) <= highest, _HALVINGS)
-    length = np.abs((values - start) * np.sqrt(np.diag(solved.information))).max()
-    return put(unit, names, values), angles, float(length)
-
-
-def _turned(poses: Poses, step_rad: np.ndarray) -> Poses:
-    return replace(poses, alpha_rad=poses.alpha_rad + step_rad[:, 0],
-                   beta_rad=poses.beta_rad + step_rad[:, 1])
+    highest = cost(start, state.errors)
+    (values, angles), _, _ = halve_until(
+        attempt, lambda trial: cost(*trial) <= highest, _MAX_HALVINGS)
+    step_std = np.abs((values - start) * np.sqrt(np.diag(solved.information))).max()
+    return put(state.unit, problem.names, values), angles, float(step_std)
 
 
-def _moved(unit: Sensor, poses: Poses, step_rad: np.ndarray) -> Poses:
+def _turned(poses: Poses, errors_rad: np.ndarray) -> Poses:
+    """Add angle errors, (k, 2), to the angles of the encoder."""
+    return replace(poses, alpha_rad=poses.alpha_rad + errors_rad[:, 0],
+                   beta_rad=poses.beta_rad + errors_rad[:, 1])
+
+
+def _turned_linearly(unit: Sensor, poses: Poses, errors_rad: np.ndarray) -> Poses:
     """
-    Turn poses to more likely angles, (k, 2) of steps.
+    Turn poses by angle errors, (k, 2), and add the linear effect of the errors to the volts.
 
-    What the model makes of the steps is added to the volts, so that they are linear in the error
-    of the measured angles.
+    The residuals are then linear in the whole error about the angles of the encoder.
     """
-    there = _turned(poses, step_rad)
-    return replace(there, volts=poses.volts + (pose_response.angle_jacobian(unit, there)
-                                               @ step_rad[:, :, None])[:, :, 0])
+    turned = _turned(poses, errors_rad)
+    effect_v = (angle_jacobian(unit, turned) @ errors_rad[:, :, None])[:, :, 0]
+    return replace(turned, volts=poses.volts + effect_v)
 
 
 def belongs_to_stage(name: Coefficient) -> bool:
-    """Tell whether a coefficient is the stage's and not the sensor's."""
+    """Return whether a coefficient describes the stage, not the sensor."""
     return effect_named(name.effect).place is Place.STAGE
 
 
 def _without_stage(unit: Sensor) -> Sensor:
-    effects = tuple(e for e in unit.effects if effect_named(e).place is not Place.STAGE)
-    return replace(unit, effects=effects, values={e: unit.values[e] for e in effects})
+    effects = tuple(effect for effect in unit.effects
+                    if effect_named(effect).place is not Place.STAGE)
+    return replace(unit, effects=effects, values={name: unit.values[name] for name in effects})
 
 
 def require_determined(unit: Sensor, poses: Poses, names: Sequence[Coefficient],
                        stage: StageError) -> None:
     """
-    Refuse poses that tell less of a coefficient than its typical size does.
+    Refuse poses that leave a coefficient as uncertain as its typical size.
+
+    Parameters
+    ----------
+    unit
+        Sensor at whose coefficients the volts are differentiated.
+    poses
+        k poses with the noise of their means, angles and settings.
+    names
+        Coefficients, (p,).
+    stage
+        Standard deviations of the stage's error.
 
     Raises
     ------
     UserError
-        Names the coefficients and the poses that would determine them.
+        The message names the coefficients and poses that would determine them.
 
     """
     scale = np.array([parameter_of(name).scale for name in names])
-    vague = [not belongs_to_stage(name) and term_of(name) not in (*GAUGE, *_OPTIONAL)
-             for name in names]
-    told = fisher_information(unit, poses, names, stage) - np.diag(prior_precision(names) * vague)
-    known = told * np.outer(scale, scale)
-    weak = np.linalg.inv(known + 1e-6 * np.eye(len(names)))
-    lost = [str(name) for name, variance, need in zip(names, np.diag(weak), vague)
-            if variance > 1.0 and need]
-    if lost or poses.volts.size <= len(names):
-        add = ', '.join(f'({np.degrees(a):.0f}, {np.degrees(b):.0f})'
-                        for a, b in next_poses(unit, poses, names, stage))
-        raise UserError(
-            f'the full model is not determined by {len(poses)} poses: they do not tell '
-            f'{", ".join(lost) or "more than they have figures"}; add poses (alpha, beta) = {add} '
-            'deg, or fit --model physical or linear')
+    required = [not belongs_to_stage(name) and term_of(name) not in (*GAUGE, *_PRIOR_SUFFICES)
+                for name in names]
+    # Without its prior a required coefficient must be determined by the poses.
+    information = fisher_information(unit, poses, names, stage) - np.diag(
+        prior_precision(names) * required)
+    variances = np.diag(np.linalg.inv(
+        information * np.outer(scale, scale) + _REGULARISATION * np.eye(len(names))))
+    undetermined = [str(name) for name, variance, is_required
+                    in zip(names, variances, required) if is_required and variance > 1.0]
+    if not undetermined and poses.volts.size > len(names):
+        return
+    reason = f'they do not determine {", ".join(undetermined)}' if undetermined else \
+        f'they have {poses.volts.size} values for {len(names)} coefficients'
+    raise UserError(
+        f'the full model is not determined by {len(poses)} poses: {reason}; add poses (alpha, '
+        f'beta) = {format_poses(next_poses(unit, poses, names, stage))} deg, or fit --model '
+        'physical or linear')
 
 
 def next_poses(unit: Sensor, poses: Poses, names: Sequence[Coefficient], stage: StageError,
                count: int = 4) -> list[tuple[float, float]]:
     """
-    Choose poses that would help most, one after the other: alpha and beta, rad.
+    Choose the poses that would help most, one by one.
 
-    Each is the one of a grid of 15° that shrinks the volume of the joint interval of all
-    coefficients, in units of their typical size, the most (D-optimality; Fedorov 1972). Each is a
+    Each pose is the one of a 15° grid that shrinks the joint confidence region of all
+    coefficients the most, in units of their typical size (D-optimality; Fedorov 1972). Each is a
     new setting of both joints.
 
     Parameters
     ----------
-    unit, poses, names, stage
-        As the fit has them.
+    unit
+        Sensor at whose coefficients the volts are differentiated.
+    poses
+        The poses so far.
+    names
+        Coefficients, (p,).
+    stage
+        Standard deviations of the stage's error.
     count
-        How many.
+        How many to choose.
+
+    Returns
+    -------
+    list
+        Alpha and beta of each pose, rad.
 
     """
-    grid = d_optimal.candidate_poses(np.median(poses.std_v, axis=0), _GRID_RAD)
+    grid = d_optimal.candidate_poses(np.median(poses.std_v, axis=0))
     scale = np.array([parameter_of(name).scale for name in names])
     rows = d_optimal.whitened_jacobian(unit, grid, tuple(names), stage) * scale
-    known = fisher_information(unit, poses, names, stage) * np.outer(scale, scale)
-    return [(float(grid.alpha_rad[i]), float(grid.beta_rad[i])) for i in
-            d_optimal.choose_poses(rows, known + 1e-6 * np.eye(len(names)), count)]
+    information = fisher_information(unit, poses, names, stage) * np.outer(scale, scale)
+    chosen = d_optimal.choose_poses(rows, information + _REGULARISATION * np.eye(len(names)),
+                                    count)
+    return [(float(grid.alpha_rad[i]), float(grid.beta_rad[i])) for i in chosen]
+
+
+def format_poses(angles_rad: Sequence[tuple[float, float]]) -> str:
+    """Format poses as `(alpha, beta)` in degrees."""
+    return ', '.join(f'({np.degrees(alpha):.0f}, {np.degrees(beta):.0f})'
+                     for alpha, beta in angles_rad)

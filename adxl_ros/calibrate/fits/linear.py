@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 from adxl_ros.calibrate.poses import Poses, reference_force
 from adxl_ros.errors import UserError
@@ -25,61 +26,94 @@ from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
-_UPRIGHT = np.cos(np.radians(0.5))
-"""Within 0.5° an axis counts as at ±1 g: the cosine errs by 40 µg at most."""
+_UPRIGHT_COS = np.cos(np.radians(0.5))
+"""Within 0.5° of the vertical an axis counts as at ±1 g: the error of the cosine is 40 µg."""
+_MIN_SPAN_G = 0.2
+"""Smallest span of the reference that determines a scale factor, g. Chosen: a line through less
+has a scale factor that cross-axis terms dominate."""
+
+
+class _Line(NamedTuple):
+    """
+    A line fitted to one axis.
+
+    Attributes
+    ----------
+    zero_g_v
+        Volts at 0 g.
+    scale_v_per_g
+        Volts per g.
+    covariance
+        Of both, (2, 2).
+
+    """
+
+    zero_g_v: float
+    scale_v_per_g: float
+    covariance: np.ndarray
 
 
 def fit(sensor: Sensor, poses: Poses) -> Sensor:
     """
     Fit scale factor and zero-g of each axis by least squares over the reference.
 
-    Where an axis has been at +1 g and at −1 g, those poses alone count, which is
-    SF = (V₊ − V₋)/2 (1) and B = (V₊ + V₋)/2 (2), in g of 9.80665 m/s²; else all poses do. The
-    covariance is scaled to the residuals over all poses, so that it covers what the linear
+    Where an axis has been at +1 g and at −1 g, only those poses count, which is
+    SF = (V₊ − V₋)/2 (1) and B = (V₊ + V₋)/2 (2), in g of 9.80665 m/s². Otherwise all poses count.
+    The covariance is scaled to the residuals over all poses, so that it covers what the linear
     model leaves out.
+
+    Parameters
+    ----------
+    sensor
+        Nominal values and local gravity of the unit.
+    poses
+        Poses on the stage.
+
+    Returns
+    -------
+    Sensor
+        The fitted unit with its covariance.
 
     Raises
     ------
     UserError
-        An axis has not been turned far enough to tell its scale factor.
+        An axis has not been turned far enough to determine its scale factor.
 
     """
+    gravity_g = sensor.local_gravity_mps2 / G0_MPS2
     force = np.column_stack(reference_force(poses, sensor.local_gravity_mps2)) / G0_MPS2
-    zero, scale, covariance = [], [], []
-    for d, axis in enumerate(sensor.axes):
-        b, s, c = _one_axis(axis, force[:, AXES.index(axis)], poses.volts[:, d],
-                            poses.std_v[:, d], sensor.local_gravity_mps2 / G0_MPS2)
-        zero.append(b)
-        scale.append(s)
-        covariance.append(c)
+    lines = [_fit_line(axis, force[:, AXES.index(axis)], poses.volts[:, d], poses.std_v[:, d],
+                       gravity_g) for d, axis in enumerate(sensor.axes)]
     count = len(sensor.axes)
-    full = np.zeros((2 * count, 2 * count))
-    for d, c in enumerate(covariance):
-        full[np.ix_([d, count + d], [d, count + d])] = c
-    values = {'bias': {'offset_v': np.array(zero) - sensor.nominal_zero_g_v},
-              'scale_factor': {'offset_v_per_g': np.array(scale) - sensor.nominal_scale_v_per_g}}
-    names = [Coefficient('bias', 'offset_v', axis) for axis in sensor.axes] + \
-            [Coefficient('scale_factor', 'offset_v_per_g', axis) for axis in sensor.axes]
+    covariance = np.zeros((2 * count, 2 * count))
+    for d, line in enumerate(lines):
+        covariance[np.ix_([d, count + d], [d, count + d])] = line.covariance
+    zero_g_v = np.array([line.zero_g_v for line in lines])
+    scale_v_per_g = np.array([line.scale_v_per_g for line in lines])
+    values = {'bias': {'offset_v': zero_g_v - sensor.nominal_zero_g_v},
+              'scale_factor': {'offset_v_per_g': scale_v_per_g - sensor.nominal_scale_v_per_g}}
+    names = [Coefficient(effect, parameter, axis) for effect, by_parameter in values.items()
+             for parameter in by_parameter for axis in sensor.axes]
     return replace(sensor, model='linear', effects=('bias', 'scale_factor'), values=values,
-                   covariance=full, covariance_names=tuple(names))
+                   covariance=covariance, covariance_names=tuple(names))
 
 
-def upright(reference_g: np.ndarray, gravity_g: float) -> np.ndarray:
-    """Tell which poses have the axis at ±1 g, (k,) of its reference in g."""
-    return np.abs(reference_g) >= gravity_g * _UPRIGHT
+def _is_upright(reference_g: np.ndarray, gravity_g: float) -> np.ndarray:
+    """Mark the poses that have an axis within 0.5° of the vertical, (k,) bool."""
+    return np.abs(reference_g) >= gravity_g * _UPRIGHT_COS
 
 
-def _one_axis(axis: str, reference_g: np.ndarray, volts: np.ndarray, std_v: np.ndarray,
-              gravity_g: float) -> tuple[float, float, np.ndarray]:
-    used = upright(reference_g, gravity_g)
+def _fit_line(axis: str, reference_g: np.ndarray, volts: np.ndarray, std_v: np.ndarray,
+              gravity_g: float) -> _Line:
+    used = _is_upright(reference_g, gravity_g)
     if not ((reference_g[used] > 0).any() and (reference_g[used] < 0).any()):
         used = np.ones(len(volts), bool)
-    if used.sum() < 2 or np.ptp(reference_g[used]) < 0.2:
+    if used.sum() < 2 or np.ptp(reference_g[used]) < _MIN_SPAN_G:
         raise UserError(f'{axis}: its reference spans {np.ptp(reference_g[used]):.2f} g over '
                         f'{used.sum()} poses, which does not determine the scale factor; add '
                         'poses with the axis up and down')
     design = np.column_stack([np.ones(used.sum()), reference_g[used]])
     (zero, scale), *_ = np.linalg.lstsq(design, volts[used], rcond=None)
     residual = volts - zero - scale * reference_g
-    spread = max(np.sum(residual ** 2) / max(len(volts) - 2, 1), np.mean(std_v ** 2))
-    return zero, scale, spread * np.linalg.inv(design.T @ design)
+    variance = max(np.sum(residual ** 2) / max(len(volts) - 2, 1), np.mean(std_v ** 2))
+    return _Line(zero, scale, variance * np.linalg.inv(design.T @ design))

@@ -13,19 +13,20 @@
 # limitations under the License.
 
 """
-Which terms the full model holds: a comparison by Bayes factors.
+Selection of the full model's terms by Bayes factors.
 
-A term is weighed by the marginal likelihood of the poses with it and without it: coefficients are
-integrated over their priors, at the levels of the stage's error of the richer of the two models.
-A candidate gets levels of its own, so that what it explains is no error of the stage.
-Poses that share a setting of a joint share its error, so that a term that follows alpha, which is
-set a few times only, must explain more than that error does by chance.
+A Bayes factor is the ratio of the marginal likelihoods of the poses with a term and without it.
+Coefficients are integrated over their priors, and both models have the stage error of the richer
+one. A candidate has a stage error of its own, so that what it explains is no error of the stage.
+Poses that share a setting of a joint share its error. A term that follows alpha, which is set a
+few times only, must therefore explain more than that error does by chance.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from adxl_ros.calibrate.fits import full_model
 from adxl_ros.calibrate.fits.linearised import Linearised, linearised
@@ -37,139 +38,171 @@ import numpy as np
 from scipy.stats import chi2
 
 ALWAYS = ('bias', 'scale_factor')
-"""What every fit has; other terms are weighed by leaving them out, or by adding them."""
-_MOVED = {'temperature_c': 0.5, 'supply_v': 0.02}
-"""Surroundings that moved by more than this, °C and V, may have moved the sensor."""
-_ROUNDS = 6
-"""Terms that are added at most."""
+"""Terms that every fit has and that are not compared."""
+_MIN_CHANGE = {'temperature_c': 0.5, 'supply_v': 0.02}
+"""Smallest range of temperature, °C, and supply, V, for which effects that follow them are
+candidates. Chosen: 0.5 °C changes the zero-g by 0.05 mg, about the noise of a mean."""
+_MAX_ADDED = 6
+"""Largest count of added terms."""
 _GAUGE_CHANCE = 0.01
-"""Chance at which the linear cross-axis terms are freed although they are 0."""
+"""Probability of freeing the linear cross-axis terms although they are 0."""
 
 
 @dataclass(frozen=True)
 class Term:
     """
-    What a term is worth.
+    Evidence for a term.
 
     Attributes
     ----------
     name
         Effect, or one of `full_model.GAUGE`.
-    inside
-        Whether the fit has it.
+    is_fitted
+        Whether the fit has the term.
     log_bayes_factor
         Log marginal likelihood of the poses with the term minus that without, nats.
 
     """
 
     name: str
-    inside: bool
+    is_fitted: bool
     log_bayes_factor: float
 
     @property
-    def earns(self) -> bool:
-        """Tell whether the poses are more likely with the term than without it."""
+    def is_supported(self) -> bool:
+        """Return whether the poses are more likely with the term than without it."""
         return self.log_bayes_factor > 0.0
 
 
+class SelectedFit(NamedTuple):
+    """
+    A full fit with selected terms.
+
+    Attributes
+    ----------
+    full
+        The fit.
+    terms
+        Evidence for its terms and for the candidates.
+
+    """
+
+    full: full_model.FullFit
+    terms: list[Term]
+
+
 def candidates(poses: Poses) -> tuple[str, ...]:
-    """Name the terms that these poses can ask for beyond those of the model."""
-    moved = {name for name, least in _MOVED.items()
-             if np.ptp(getattr(poses.environment, name)) > least}
-    follow = [name for name, effect in library().items()
-              if effect.invertible and moved & set(effect.follows)]
-    return ('stage_eccentricity', *follow)
+    """Name the terms that these poses may need beyond the default ones."""
+    changed = {name for name, change in _MIN_CHANGE.items()
+               if np.ptp(getattr(poses.environment, name)) > change}
+    following = [name for name, effect in library().items()
+                 if effect.invertible and changed & set(effect.follows)]
+    return ('stage_eccentricity', *following)
 
 
 def fit(sensor: Sensor, poses: Poses) -> Sensor:
-    """Return the unit alone of `fit_selected`."""
-    return fit_selected(sensor, poses)[0].fitted
-
-
-def fit_selected(sensor: Sensor, poses: Poses, effects: Sequence[str] = ()
-               ) -> tuple[full_model.FullFit, list[Term]]:
     """
-    Fit the full model with the further terms that the poses speak for.
+    Fit the full model with selected terms.
+
+    Parameters
+    ----------
+    sensor, poses
+        As for `full_model.fit_full`.
+
+    Returns
+    -------
+    Sensor
+        The fitted unit with its covariance.
+
+    """
+    return fit_selected(sensor, poses).full.fitted
+
+
+def fit_selected(sensor: Sensor, poses: Poses, effects: Sequence[str] = ()) -> SelectedFit:
+    """
+    Fit the full model, and add the terms that the poses support one by one.
 
     Parameters
     ----------
     sensor, poses
         As for `full_model.fit_full`.
     effects
-        Further terms in any case.
+        Further terms that are fitted in any case.
 
     Returns
     -------
-    tuple
-        The fit, and what its terms, and those that it could have, are worth.
+    SelectedFit
+        The fit and the evidence for each term.
 
     Raises
     ------
     UserError
-        See `full_model.fit_full`.
+        The poses do not determine a coefficient.
 
     """
     terms = tuple(dict.fromkeys((*full_model.default_terms(sensor.axes), *effects)))
-    found = full_model.fit_full(sensor, poses, terms)
-    if gauge_is_identifiable(found):
+    full = full_model.fit_full(sensor, poses, terms)
+    if gauge_is_identifiable(full):
         terms = (*terms, *full_model.GAUGE)
-        found = full_model.fit_full(sensor, poses, terms)
-    judged = compare_terms(found)
-    for _ in range(_ROUNDS):
-        asked = [term for term in judged if not term.inside and term.earns]
-        if not asked:
+        full = full_model.fit_full(sensor, poses, terms)
+    compared = compare_terms(full)
+    for _ in range(_MAX_ADDED):
+        supported = [term for term in compared if not term.is_fitted and term.is_supported]
+        if not supported:
             break
-        # One after the other: what one term explains, another need not.
-        terms = (*terms, max(asked, key=lambda term: term.log_bayes_factor).name)
-        found = full_model.fit_full(sensor, poses, terms)
-        judged = compare_terms(found)
-    return found, judged
+        # One at a time: what one term explains, another need not.
+        terms = (*terms, max(supported, key=lambda term: term.log_bayes_factor).name)
+        full = full_model.fit_full(sensor, poses, terms)
+        compared = compare_terms(full)
+    return SelectedFit(full, compared)
 
 
-def compare_terms(found: full_model.FullFit) -> list[Term]:
+def compare_terms(full: full_model.FullFit) -> list[Term]:
     """
-    Compare the fit with those without a term, and with one more.
+    Compare the fit with models that have one term less or one term more.
 
-    Linearised at the fit, where the chain is linear in its coefficients to far below the noise.
+    All are linearised at the fit, where the chain is linear to far below the noise.
     """
-    about, term = _linearised(found, ())
-    inside = -about.deviance(found.stage) / 2
-    judged = []
+    about, term = _linearised(full, ())
+    log_likelihood = -about.deviance(full.stage) / 2
+    compared = []
     for name in dict.fromkeys(term):
         if name in ALWAYS or name in full_model.GAUGE:
             continue
-        own = term == name
+        excluded = term == name
         if name == 'misalignment':
-            # The linear cross-axis terms would stand in for it.
-            own = own | np.isin(term, full_model.GAUGE)
-        poorer = -about.without(own).deviance(found.stage) / 2
-        judged.append(Term(str(name), True, inside - poorer))
-    for name in candidates(found.at):
+            # The linear cross-axis terms would take its place.
+            excluded = excluded | np.isin(term, full_model.GAUGE)
+        poorer = -about.without(excluded).deviance(full.stage) / 2
+        compared.append(Term(str(name), True, log_likelihood - poorer))
+    for name in candidates(full.linear_poses):
         if name not in term:
-            richer, _ = _linearised(found, [name])
-            stage = richer.stage_error(found.stated_std_rad, found.stage)
-            judged.append(Term(name, False, -richer.deviance(stage) / 2 - inside))
-    return judged
+            richer, _ = _linearised(full, [name])
+            stage = richer.stage_error(full.stated_std_rad, full.stage)
+            compared.append(Term(name, False, -richer.deviance(stage) / 2 - log_likelihood))
+    return compared
 
 
-def gauge_is_identifiable(found: full_model.FullFit) -> bool:
+def gauge_is_identifiable(full: full_model.FullFit) -> bool:
     """
-    Tell whether the poses show the linear cross-axis terms apart from the misalignment.
+    Test whether the poses distinguish the linear cross-axis terms from the misalignment.
 
-    By the likelihood ratio of all of them (two an axis): a fit without them is off by their
-    products with the other terms, and no longer by much where the ratio is that of chance.
+    The test is the likelihood ratio of all of these terms, two for each axis. A fit without them
+    has errors of the size of their products with other terms.
     """
-    about, term = _linearised(found, full_model.GAUGE)
+    about, term = _linearised(full, full_model.GAUGE)
     gauge = np.isin(term, full_model.GAUGE)
-    ratio = about.without(gauge).misfit(found.stage) - about.misfit(found.stage)
+    ratio = about.without(gauge).misfit(full.stage) - about.misfit(full.stage)
     return bool(ratio > chi2.isf(_GAUGE_CHANCE, gauge.sum()))
 
 
-def _linearised(found: full_model.FullFit, more: Sequence[str]) -> tuple[Linearised, np.ndarray]:
-    """Linearise the fit with further terms; returns the term of each coefficient, too."""
-    unit = with_neutral(found.unit, map(full_model.effect_of, more))
-    names = (*found.names, *(n for name in more
-                             for n in full_model.fitted_coefficients(unit.axes, (name,))
-                             if n not in found.names))
-    return (linearised(unit, found.at, names, full_model.prior_precision(names), found.kept),
+def _linearised(full: full_model.FullFit, added: Sequence[str]) -> tuple[Linearised, np.ndarray]:
+    """Linearise the fit with further terms; also return the term of each coefficient, (p,)."""
+    unit = with_neutral(full.unit, map(full_model.effect_of, added))
+    further = [name for term in added
+               for name in full_model.fitted_coefficients(unit.axes, (term,))
+               if name not in full.names]
+    names = (*full.names, *further)
+    return (linearised(unit, full.linear_poses, names, full_model.prior_precision(names),
+                       full.kept),
             np.array([full_model.term_of(name) for name in names]))

@@ -31,7 +31,6 @@ from adxl_ros.calibrate.poses import Poses
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
-_GRID_RAD = np.radians(15.0)
 _SPARE = 40
 """Readings beyond the coefficients: by these the stage's error and disturbed poses are judged."""
 _MOST = 90
@@ -62,7 +61,7 @@ def quick(sensor: Sensor, dwell_s: float, tilt_error_rad: float, check_poses: in
     """
     start = nothing_known(sensor, dwell_s)
     fewest = -(-(len(start.names) + _SPARE) // len(sensor.axes))
-    grid = d_optimal.candidate_poses(start.pose_std_v, _GRID_RAD)
+    grid = d_optimal.candidate_poses(start.pose_std_v)
     rows = d_optimal.whitened_jacobian(start.unit, grid, start.names, start.stage)
     chosen = [Target(float(grid.alpha_rad[i]), float(grid.beta_rad[i])) for i in
               d_optimal.choose_poses(rows, np.diag(1 / start.prior ** 2), max(_MOST, fewest))]
@@ -75,9 +74,7 @@ def quick(sensor: Sensor, dwell_s: float, tilt_error_rad: float, check_poses: in
 
 def nothing_known(sensor: Sensor, dwell_s: float) -> running_estimate.Known:
     """Return what the datasheet alone tells of a unit, with poses of a dwell in s to come."""
-    axes = len(sensor.axes)
-    empty = Poses(np.zeros((0, axes)), np.zeros((0, axes)), np.zeros(0), np.zeros(0),
-                  np.zeros((0, 2)), np.zeros(0, bool))
+    empty = Poses.without_volts(np.zeros(0), np.zeros(0), np.zeros(len(sensor.axes)))
     return running_estimate.from_poses(
         sensor, empty, dwell_s, sensor.stage_resolution_rad / np.sqrt(12))
 

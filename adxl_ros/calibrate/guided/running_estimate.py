@@ -80,7 +80,7 @@ class Known:
 
     def reading(self, alpha_rad: float, beta_rad: float) -> tuple[np.ndarray, np.ndarray]:
         """Predict the volts of a pose and their standard deviations, (m,) each."""
-        pose = _at(np.array([alpha_rad]), np.array([beta_rad]), self.pose_std_v)
+        pose = Poses.without_volts(np.array([alpha_rad]), np.array([beta_rad]), self.pose_std_v)
         slope = pose_response.coefficient_jacobian(self.unit, pose, self.names)[0]
         covariance = slope @ self.covariance @ slope.T + pose_response.volts_covariance(
             self.unit, pose, self.stage).blocks[0]
@@ -96,8 +96,8 @@ class Known:
         """
         step, by = np.zeros(2), 1 / _LOOKED_RAD ** 2
         for _ in range(_TURNS):
-            pose = _at(np.array([alpha_rad + step[0]]), np.array([beta_rad + step[1]]),
-                       self.pose_std_v)
+            pose = Poses.without_volts(np.array([alpha_rad + step[0]]),
+                                       np.array([beta_rad + step[1]]), self.pose_std_v)
             off = (volts - pose_response.predicted_volts(self.unit, pose)[0]) / slack_v
             slope = pose_response.angle_jacobian(self.unit, pose)[0] / slack_v[:, None]
             more = np.linalg.solve(slope.T @ slope + by * np.eye(2), slope.T @ off - by * step)
@@ -110,8 +110,8 @@ class Known:
         """Return what will be known once those poses are taken, too."""
         if not targets:
             return self
-        poses = _at(np.array([t.alpha_rad for t in targets]),
-                    np.array([t.beta_rad for t in targets]), self.pose_std_v)
+        poses = Poses.without_volts(np.array([t.alpha_rad for t in targets]),
+                                    np.array([t.beta_rad for t in targets]), self.pose_std_v)
         nothing = np.zeros(len(self.names))
         about = linearised(self.unit, poses, self.names, nothing)
         told = about.solve(about.covariance(self.stage))[1]
@@ -221,9 +221,3 @@ def by_term(names: Sequence[Coefficient], values: np.ndarray, std: np.ndarray, p
         worst = float(np.min(1 - np.clip(std[at] / prior[at], 0, 1)))
         table.append((f'{term}, {unit}' if unit else str(term), shown, worst))
     return table
-
-
-def _at(alpha_rad: np.ndarray, beta_rad: np.ndarray, std_v: np.ndarray) -> Poses:
-    count = len(alpha_rad)
-    return Poses(np.zeros((count, len(std_v))), np.tile(std_v, (count, 1)), alpha_rad, beta_rad,
-                 np.zeros((count, 2)), np.zeros(count, bool))

@@ -342,10 +342,9 @@ class Sweep:
 
     def _learned(self, before: running_estimate.Known | None) -> running_estimate.Known:
         stage_rad = self.sensor.stage_resolution_rad / np.sqrt(12)
-        entries = [record for record in self.results() if not record.check]
-        poses = Poses.from_records(entries) if entries else Poses(
-            *(np.zeros((0, len(self.sensor.axes))),) * 2, *(np.zeros(0),) * 2, np.zeros((0, 2)),
-            np.zeros(0, bool))
+        records = [record for record in self.results() if not record.check]
+        poses = Poses.from_records(records) if records else Poses.without_volts(
+            np.zeros(0), np.zeros(0), np.zeros(len(self.sensor.axes)))
         return running_estimate.from_poses(
             self.sensor, poses, self.settings.dwell_s, stage_rad, before)
 

@@ -107,11 +107,11 @@ def test_a_fit_that_does_not_converge_says_so(monkeypatch):
     sensor, _, poses = swept_unit(2)
     found, judged = term_selection.fit_selected(sensor, poses)
     assert found.converged
-    assert full_fit_text.NOT_CONVERGED not in full_fit_text.words(found, poses, judged)
-    monkeypatch.setattr(full_model, '_ROUNDS', 1)
+    assert full_fit_text.NOT_CONVERGED not in full_fit_text.report_lines(found, poses, judged)
+    monkeypatch.setattr(full_model, '_MAX_ROUNDS', 1)
     found, judged = term_selection.fit_selected(sensor, poses)
     assert not found.converged
-    assert full_fit_text.NOT_CONVERGED in full_fit_text.words(found, poses, judged)
+    assert full_fit_text.NOT_CONVERGED in full_fit_text.report_lines(found, poses, judged)
 
 
 def test_a_term_that_is_not_convex_is_found_from_several_starts():
@@ -183,7 +183,7 @@ def test_knocked_poses_are_named_and_left_out():
     off, std = errors(found, truth)
     assert np.sqrt(np.mean((off / std) ** 2)) < 1.6
     assert any('left out, disturbed: pose 8 (alpha' in line
-               for line in full_fit_text.words(found, poses, judged))
+               for line in full_fit_text.report_lines(found, poses, judged))
 
 
 @pytest.mark.parametrize('stage_deg', [1.0, 3.0])
@@ -197,7 +197,7 @@ def test_a_bad_stage_is_found_and_the_sensor_is_not_blamed(stage_deg):
     zero_g = [name.effect == 'bias' for name in found.fitted.covariance_names]
     assert np.abs(off[zero_g]).max() < 1e-4
     assert any('the reference is worse than stated' in line
-               for line in full_fit_text.words(found, poses, judged))
+               for line in full_fit_text.report_lines(found, poses, judged))
 
 
 def test_terms_that_are_not_there_do_not_earn_their_place():
@@ -205,7 +205,7 @@ def test_terms_that_are_not_there_do_not_earn_their_place():
     rng = np.random.default_rng(8)
     truth = drawn(rng, nominal(), ('bias', 'scale_factor', 'misalignment'))
     judged = term_selection.fit_selected(nominal(), swept(rng, truth))[1]
-    assert [term.name for term in judged if term.earns] == ['misalignment']
+    assert [term.name for term in judged if term.is_supported] == ['misalignment']
 
 
 def test_the_next_poses_help_more_than_others():
@@ -232,13 +232,13 @@ def test_temperature_that_moved_is_said_and_fitted():
     sensor, truth, poses = swept_unit(10, check_poses=0)
     warm = replace(poses, temperature_c=np.linspace(20, 35, len(poses)))
     found, judged = term_selection.fit_selected(sensor, warm)
-    words = full_fit_text.words(found, warm, judged)
+    words = full_fit_text.report_lines(found, warm, judged)
     assert any('temperature moved by 15.0 degC' in line for line in words)
     drift = 1e-3 * truth.scale_v_per_g * (warm.temperature_c[:, None] - 25)
     found, judged = term_selection.fit_selected(sensor, replace(warm, volts=warm.volts + drift))
     assert found.fitted.values['temperature_bias']['per_k'] == pytest.approx([1e-3] * 2, rel=0.1)
     assert not any('temperature moved' in line
-                   for line in full_fit_text.words(found, warm, judged))
+                   for line in full_fit_text.report_lines(found, warm, judged))
 
 
 @pytest.mark.parametrize('planes_deg, lost', [
@@ -246,7 +246,8 @@ def test_temperature_that_moved_is_said_and_fitted():
 def test_poses_of_too_few_planes_are_refused(planes_deg, lost):
     """The message names what is open and which poses to add."""
     sensor, _, poses = swept_unit(1, planes_rad=np.radians(planes_deg), check_poses=0)
-    with pytest.raises(UserError, match=rf'do not tell .*{lost}.*add poses \(alpha, beta\) = '):
+    with pytest.raises(UserError,
+                       match=rf'do not determine .*{lost}.*add poses \(alpha, beta\) = '):
         full_model.fit_full(sensor, poses)
 
 
@@ -271,9 +272,10 @@ def test_several_recordings_of_one_unit():
 
 @pytest.mark.parametrize('change, words', [
     (lambda truth: put(truth, [Coefficient('misalignment', 'alpha_rad', axis) for axis in 'xy'],
-                       truth.values['misalignment']['alpha_rad'] + [0.02, 0.02]), 'is turned by'),
+                       truth.values['misalignment']['alpha_rad'] + [0.02, 0.02]),
+     'case is turned by'),
     (lambda truth: put(truth, [Coefficient('bias', 'offset_v', 'x')],
-                       truth.values['bias']['offset_v'][:1] + 0.08), 'has its zero-g off by')])
+                       truth.values['bias']['offset_v'][:1] + 0.08), 'zero-g of x is shifted by')])
 def test_recordings_that_contradict_each_other_are_refused(change, words):
     """Another mounting or another unit: the message has the figure and its significance."""
     rng = np.random.default_rng(13)

@@ -147,7 +147,7 @@ def test_z_dependence_and_hysteresis_like_paths():
 
 
 @pytest.mark.parametrize('change, words', [
-    (lambda v: v * [-1, 1] + [5, 0], 'x: reads against the stage'),
+    (lambda v: v * [-1, 1] + [5, 0], 'x reads against its reference'),
     (lambda v: v[:, ::-1], 'axes are swapped')])
 def test_wrong_polarity_is_named(change, words):
     """An inverted or swapped axis is named before anything is fitted."""
