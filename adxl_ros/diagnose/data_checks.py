@@ -254,8 +254,9 @@ def _axis_fault(comparison: BaselineComparison) -> DataFault | None:
     if delay is not None:
         return delay
     simulated_g, measured_g = simulated_g[finite][:, moving], measured_g[finite][:, moving]
-    correlation = np.array([[_correlation(measured, simulated) for simulated in simulated_g.T]
-                            for measured in measured_g.T])
+    correlation = np.empty((len(moving), len(moving)))
+    for i, measured in enumerate(measured_g.T):
+        correlation[i] = [_correlation(measured, simulated) for simulated in simulated_g.T]
     axes = [sensor.axes[d] for d in moving]
     return (_order_fault(axes, correlation)
             or _unit_fault(simulated_g, measured_g, np.diag(correlation))

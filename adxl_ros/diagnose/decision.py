@@ -85,7 +85,17 @@ UNKNOWN_PROBABILITY = 0.75
 
 
 class WeightedHypothesis(NamedTuple):
-    """Effects of a hypothesis, 'unknown' among them, and its probability."""
+    """
+    A hypothesis with its probability.
+
+    Attributes
+    ----------
+    effects
+        Names of the effects; 'unknown' may be among them.
+    probability
+        Probability of the hypothesis.
+
+    """
 
     effects: tuple[str, ...]
     probability: float
@@ -190,9 +200,12 @@ def material_hypotheses(sized: Sequence[SizedHypothesis], library_size: int, noi
 
     """
     by_effects = {frozenset(s.hypothesis.effects): s for s in sized}
-    kept = [s.hypothesis for s in sized
-            if all(_is_material(s, effect, by_effects, noise_mps2, smallest_angle_rad)
-                   for effect in s.hypothesis.effects)]
+
+    def material(s: SizedHypothesis) -> bool:
+        return all(_is_material(s, effect, by_effects, noise_mps2, smallest_angle_rad)
+                   for effect in s.hypothesis.effects)
+
+    kept = [s.hypothesis for s in sized if material(s)]
     weights = _log_weights(kept, library_size)
     return [kept[i] for i in np.argsort(-weights, kind='stable')]
 

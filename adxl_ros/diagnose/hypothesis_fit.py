@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 
 from adxl_ros.diagnose import evidence
 from adxl_ros.diagnose.drift_checks import ResidualChannel, weakest_walk
@@ -274,8 +275,8 @@ def linearise(linear_model: LinearModel, effects: Sequence[str], sensor: Sensor,
     """
     start = with_neutral(linear_model.baseline, effects)
     names = _fitted_names(linear_model, effects)
-    nuisances = [n for n in dict.fromkeys(n for channel in linear_model.nuisance_columns
-                                          for n in channel) if n.effect not in effects]
+    nuisances = [n for n in dict.fromkeys(chain(*linear_model.nuisance_columns))
+                 if n.effect not in effects]
     start = with_neutral(start, dict.fromkeys(n.effect for n in nuisances))
     prior_mean, prior_std = _prior(start, names)
     values = get(sensor, names)

@@ -28,6 +28,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 
 from adxl_ros.diagnose import evidence, noise_whitening
 from adxl_ros.diagnose.baseline_comparison import BaselineComparison, Reference
@@ -258,7 +259,7 @@ def build_linear_model(comparisons: Sequence[BaselineComparison],
     prior_std: list[float] = []
     kept: list[Variant] = []
     column_ids: list[list[int]] = []
-    columns: list[list[list[NumberedColumn]]] = [[[] for _ in c.sensor.axes] for c in comparisons]
+    columns: list[list[list[NumberedColumn]]] = [_empty_by_axis(c) for c in comparisons]
     for by_recording in _variants(comparisons, baseline_v, show_progress, only):
         numbers: dict[Coefficient, int] = {}
         for i, variant in by_recording.items():
@@ -275,17 +276,31 @@ def build_linear_model(comparisons: Sequence[BaselineComparison],
                             prior_std=np.array([prior_std[j] for j in ids])))
         column_ids.append(ids)
     channels, filters = _whitened_channels(comparisons, columns, filter_indices)
-    by_channel = [axis_columns for recording_columns in columns
-                  for axis_columns in recording_columns]
-    nuisance_columns = [{names[i]: column for i, column in axis_columns
-                         if hints_of(names[i]).nuisance} for axis_columns in by_channel]
-    parts = straight_line_parts(
-        [{names.index(name): column for name, column in channel.items()
-          if hints_of(name).straight_line} for channel in nuisance_columns],
-        by_channel, len(names))
+    by_channel = list(chain(*columns))
+    nuisance_columns = [_nuisance_columns(channel, names) for channel in by_channel]
+    parts = straight_line_parts([_straight_columns(channel, names)
+                                 for channel in nuisance_columns], by_channel, len(names))
     return LinearModel(list(comparisons), baseline_v, kept, column_ids, names,
                        np.array(prior_std), channels, filters, nuisance_columns,
                        {names[i]: amounts for i, amounts in parts.items()})
+
+
+def _empty_by_axis(comparison: BaselineComparison) -> list[list[NumberedColumn]]:
+    """Return an empty list for each axis."""
+    return [[] for _ in comparison.sensor.axes]
+
+
+def _nuisance_columns(channel: Sequence[NumberedColumn], names: Sequence[Coefficient]
+                      ) -> dict[Coefficient, np.ndarray]:
+    """Return the columns of nuisance parameters of a channel by coefficient."""
+    return {names[i]: column for i, column in channel if hints_of(names[i]).nuisance}
+
+
+def _straight_columns(channel: dict[Coefficient, np.ndarray], names: list[Coefficient]
+                      ) -> dict[int, np.ndarray]:
+    """Return the columns of zero-g and scale factor of a channel by number."""
+    return {names.index(name): column for name, column in channel.items()
+            if hints_of(name).straight_line}
 
 
 def _variants(comparisons: Sequence[BaselineComparison], baseline_v: Sequence[np.ndarray],

@@ -24,6 +24,7 @@ from itertools import pairwise
 from typing import Any
 
 from adxl_ros.diagnose.diagnosis import Diagnosis
+from adxl_ros.diagnose.hypothesis_fit import Hypothesis
 from adxl_ros.diagnose.report_json import as_json, shares_of_gap, summary
 from adxl_ros.diagnose.residual_map import RANGES, SIGNIFICANT_P
 from adxl_ros.files.plot_file import pyplot
@@ -76,7 +77,7 @@ def page(diagnosis: Diagnosis, title: str) -> str:
                   '<h2>Where the gap lies</h2>', _image(_map_plot(diagnosis)),
                   _cell_table(report), _not_covered(report['not_covered']),
                   '<h2>Which effects cause it</h2>', _hypothesis_table(report),
-                  _candidate_table(report),
+                  _convergence(diagnosis.verdict.best), _candidate_table(report),
                   '<h2>What is not separable, and what to record next</h2>',
                   _next_experiment(report)]
     return (f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{escape(title)}'
@@ -177,8 +178,12 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     if not rows:
         return '<p>None.</p>'
     top = ''.join(f'<th>{escape(h)}</th>' for h in head)
-    body = ''.join(f'<tr>{"".join(f"<td>{escape(c)}</td>" for c in row)}</tr>' for row in rows)
-    return f'<table><tr>{top}</tr>{body}</table>'
+    return f'<table><tr>{top}</tr>{"".join(map(_row, rows))}</table>'
+
+
+def _row(cells: Sequence[str]) -> str:
+    """Return a row of a table."""
+    return f'<tr>{"".join(f"<td>{escape(c)}</td>" for c in cells)}</tr>'
 
 
 def _p_text(p: float) -> str:
@@ -218,12 +223,21 @@ def _hypothesis_table(report: dict[str, Any]) -> str:
         for h in report['hypotheses'][:_TABLE_ROWS]])
 
 
+def _convergence(best: Hypothesis) -> str:
+    """Return a warning where the fit of the best hypothesis has not converged."""
+    if best.converged:
+        return ''
+    return ('<p>The fit of the most probable hypothesis has not converged. Its parameters may be '
+            'less accurate than their intervals.</p>')
+
+
 def _candidate_table(report: dict[str, Any]) -> str:
     """Return the most probable effects with their parameters."""
-    rows = [[c['effect'], f'{c["probability"]:.3f}',
-             '; '.join(_parameter_text(name, p) for name, p in c['parameters'].items()),
-             ', '.join(c['inseparable_from']), c['cause']]
-            for c in report['candidates'][:_TABLE_ROWS]]
+    rows = []
+    for c in report['candidates'][:_TABLE_ROWS]:
+        parameters = '; '.join(_parameter_text(name, p) for name, p in c['parameters'].items())
+        rows.append([c['effect'], f'{c["probability"]:.3f}', parameters,
+                     ', '.join(c['inseparable_from']), c['cause']])
     return _table(['effect', 'probability', 'parameters (90 % interval)', 'inseparable from',
                    'cause'], rows)
 

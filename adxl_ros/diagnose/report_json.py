@@ -106,12 +106,12 @@ def _noise(diagnosis: Diagnosis) -> list[dict[str, Any]]:
     """Compare recorded with simulated noise, recording by recording."""
     return [{'recording': comparison.name,
              'log_likelihood_gain': _rounded(after.log_likelihood - before.log_likelihood),
-             'bands_hz': [_rounded(f) for f in after.band_edges_hz],
-             'power_ratio_before': [_rounded(r) for r in before.power_ratio],
-             'power_ratio_after': [_rounded(r) for r in after.power_ratio],
+             'bands_hz': list(map(_rounded, after.band_edges_hz)),
+             'power_ratio_before': list(map(_rounded, before.power_ratio)),
+             'power_ratio_after': list(map(_rounded, after.power_ratio)),
              'allan_s': list(after.averaging_times_s),
-             'allan_ratio_before': [_rounded(r) for r in before.allan_ratio],
-             'allan_ratio_after': [_rounded(r) for r in after.allan_ratio]}
+             'allan_ratio_before': list(map(_rounded, before.allan_ratio)),
+             'allan_ratio_after': list(map(_rounded, after.allan_ratio))}
             for comparison, before, after in zip(diagnosis.comparisons, diagnosis.noise_before,
                                                  diagnosis.noise_after)]
 
@@ -153,8 +153,6 @@ def _candidates(diagnosis: Diagnosis) -> list[dict[str, Any]]:
     for h in diagnosis.hypotheses:
         for effect in h.effects:
             best_with.setdefault(effect, h)
-    rivals = {effect: [e for e in group if e != effect]
-              for group in verdict.groups for effect in group}
     shares = shares_of_gap(diagnosis)
     candidates = []
     for name in library():
@@ -173,8 +171,14 @@ def _candidates(diagnosis: Diagnosis) -> list[dict[str, Any]]:
                   for parameter, value in detection.values.items()},
             'share': _rounded(shares[name]) if name in shares else None,
             'visibility': _rounded(test.visibility) if test else 1.0,
-            'inseparable_from': rivals.get(name, []), 'cause': effect_named(name).cause})
+            'inseparable_from': _rivals(name, verdict), 'cause': effect_named(name).cause})
     return sorted(candidates, key=lambda c: (-(c['probability'] or 0.0), c['effect']))
+
+
+def _rivals(effect: str, verdict: Verdict) -> list[str]:
+    """Return the effects that are inseparable from an effect."""
+    group = next((g for g in reversed(verdict.groups) if effect in g), ())
+    return [other for other in group if other != effect]
 
 
 def _parameters(hypothesis: Hypothesis | None, effect: str) -> dict[str, Any]:

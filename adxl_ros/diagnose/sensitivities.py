@@ -208,9 +208,15 @@ def _variant(simulate: Simulate, sensor: Sensor, effect: Effect, shape: dict[str
     if not names:
         return None
     return Variant(effect.name, shape, step, tuple(names), np.array(prior_std), tuple(
-        (np.array([i for i, _ in axis_columns], int),
-         np.column_stack([c for _, c in axis_columns]) if axis_columns
-         else np.zeros((len(baseline_v), 0))) for axis_columns in columns))
+        _stacked(axis_columns, len(baseline_v)) for axis_columns in columns))
+
+
+def _stacked(columns: list[tuple[int, np.ndarray]], count: int
+             ) -> tuple[np.ndarray, np.ndarray]:
+    """Return the numbers of columns, and the columns side by side, (count, numbers)."""
+    if not columns:
+        return np.zeros(0, int), np.zeros((count, 0))
+    return np.array([i for i, _ in columns], int), np.column_stack([c for _, c in columns])
 
 
 def _step_within(parameter: Parameter, values: np.ndarray, step: float) -> float:
