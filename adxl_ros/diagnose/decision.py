@@ -76,8 +76,8 @@ UNEXPLAINED_SHARE_OF_NOISE = 0.5
 """Unexplained rms, by the noise, above which the verdict is unknown."""
 HIDDEN_EFFECT_WITHOUT_GAP = 0.22
 """Probability of an effect that is too weak to show, where no effect shows. It is rounded from 17
-of 72 recordings of working seeds 9406 and 9407 of the blind check, and presumes its mix: a quarter
-without a gap, a fifth pairs, strengths log-uniform from 0.02 of the noise."""
+of 72 recordings of working seeds 9406 and 9407 of the blind check. It presumes the mix of that
+check: a quarter without a gap, a fifth pairs, strengths log-uniform from 0.02 of the noise."""
 HIDDEN_EFFECT_BESIDE_EFFECTS = 0.3
 """The same beside effects that show: rounded from 20 of 62 recordings."""
 UNKNOWN_PROBABILITY = 0.75

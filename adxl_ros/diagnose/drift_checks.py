@@ -93,9 +93,9 @@ def unevenness(channels: Sequence[ResidualChannel]) -> float:
     """
     Return how much the power of the noise differs between blocks.
 
-    It is the rms, over blocks, of the deviation of each block's squares from the mean, in standard
-    deviations of such a sum (of correlated samples by Bartlett 1946), on the axis where it is
-    largest. Noise that is the same all the time has about 1.
+    It is the rms, over blocks, of the deviation of each block's squares from the mean. Its unit is
+    the standard deviation of such a sum (of correlated samples by Bartlett 1946). The axis with
+    the largest value counts. Noise that is the same all the time has about 1.
     """
     largest = 0.0
     for channel in channels:

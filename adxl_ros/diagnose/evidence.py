@@ -360,8 +360,8 @@ def robust_std(channels: Sequence[WhitenedChannel], fit: LinearFit, prior_std: n
     """
     Return standard deviations that also hold where the model is not exact.
 
-    They are the larger of the model's and of the sandwich estimate from the scores of blocks
-    (White 1982, Econometrica 50), whose samples may be correlated.
+    They are the larger of the model's and of the sandwich estimate (White 1982, Econometrica 50).
+    The sandwich is from the scores of blocks, because samples may be correlated.
 
     Parameters
     ----------

@@ -51,8 +51,8 @@ above the change by refitting."""
 _BOOTSTRAP_DRAWS = 400
 """Number of draws of the interval. Chosen: the 5 % quantile has 20 draws below it."""
 _DRIFT_QUANTILE = 2.0
-"""Mean square of a random walk by its expected value, which nine of ten recordings do not
-reach: derived for a random walk about its mean."""
+"""Mean square of a random walk about its mean, by its expected value, in the 90 % quantile of
+recordings. Derived from the random walk."""
 
 
 @dataclass(frozen=True)

@@ -15,9 +15,10 @@
 """
 The linear model of all recordings about the baseline: sensitivities to the whole library.
 
-Some coefficients of a healthy unit differ from the parameter file: zero-g and scale factor age,
+Some coefficients of a healthy unit differ from the parameter file. Zero-g and scale factor age,
 the parts of the RC filter have tolerances, and stamps have a latency. These nuisance parameters
-are free in every hypothesis, within the tolerance of a healthy unit, and are named only beyond it.
+are free in every hypothesis, within the tolerance of a healthy unit. They are named only beyond
+it.
 
 A calibration has taken up an unknown share of the straight line in the output of a sensor effect.
 Beside such an effect, zero-g and scale factor are as free as that straight line. An effect of the

@@ -73,8 +73,8 @@ def search(linear_model: LinearModel, show_progress: Callable[[float], None]
     """
     Search single effects, pairs and triples.
 
-    Pairs are tried around the best hypothesis, where what it leaves is linear, and among the best
-    single effects, because two effects can mask each other.
+    Pairs are tried around the best hypothesis, whose residual is nearly linear in a second effect.
+    They are also tried among the best single effects, because two effects can mask each other.
 
     Parameters
     ----------

@@ -15,13 +15,15 @@
 """
 Whitening filters for noise that can drift.
 
-The noise is white noise behind the RC filter, the ADC's steps, and a zero-g that drifts. For a
-random walk, y = n + w + d with n an AR(1) sequence of a = exp(−dt/RC), w white and d the walk;
-then (1 − aL)(1 − L)·y is an MA(2), whose factor follows from its spectrum (Brockwell and Davis
-1991, section 3.2). Below the corner where 1/f noise meets the white noise, poles and zeros in
-turn whiten it, one pair a decade (Corsini and Saletti 1988, IEEE Trans. Instrum. Meas. 37). The
-variance of the innovations is fitted, so that the filter depends on the ratio of drift and noise
-only, which is searched on a grid.
+The noise is white noise behind the RC filter, the ADC's steps, and a zero-g that drifts. With a
+random walk it is y = n + w + d. Here n is an AR(1) sequence with a = exp(−dt/RC), w is white, and
+d is the walk. Then (1 − aL)(1 − L)·y is an MA(2). Its factor follows from its spectrum (Brockwell
+and Davis 1991, section 3.2).
+
+Poles and zeros in turn, one pair a decade, whiten 1/f noise below the corner where it meets the
+white noise (Corsini and Saletti 1988, IEEE Trans. Instrum. Meas. 37). The variance of the
+innovations is fitted. The filter then only depends on the ratio of drift and noise, which is
+searched on a grid.
 """
 
 from __future__ import annotations
@@ -213,8 +215,8 @@ def fitted_density(whitener: Whitener, variance_v2: float, dt_s: float, scale_v_
     Returns
     -------
     float
-        Of a random walk the density of the grid, g/√s; of 1/f noise the root of the one-sided
-        density at 1 Hz, g/√Hz.
+        Density of the grid for a random walk, g/√s. Root of the one-sided density at 1 Hz for 1/f
+        noise, g/√Hz.
 
     """
     if whitener.spectrum is DriftSpectrum.RANDOM_WALK:

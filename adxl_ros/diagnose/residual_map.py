@@ -16,7 +16,7 @@
 Where the gap lies: mean and variance of the residual over axis and dimension, tested together.
 
 The largest of all statistics under random signs of whole blocks decides (max-T; Westfall and Young
-1993), so that 200 cells do not give ten false ones. The power in bands of frequency is compared
+1993). Otherwise 200 cells would give ten false ones. The power in bands of frequency is compared
 with that of the stated noise.
 """
 

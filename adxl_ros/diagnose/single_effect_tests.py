@@ -16,9 +16,9 @@
 Tests of each effect alone: gain of evidence, its probability without a gap, and visibility.
 
 They use the linear model at the baseline, with the noise of the null hypothesis. Chi-square is
-wrong for the best of many effects, and where a width or a frequency means nothing at zero. The
-probability is that of the largest gain of all candidates in drawn recordings without a gap
-(parametric bootstrap); for linear columns only their products with the noise need be drawn.
+wrong for the best of many effects, and where a width or a frequency means nothing at zero. A
+parametric bootstrap gives the probability instead: the largest gain of all candidates in drawn
+recordings without a gap. For linear columns only their products with the noise are drawn.
 """
 
 from __future__ import annotations
