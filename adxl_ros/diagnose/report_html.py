@@ -25,7 +25,7 @@ from typing import Any
 
 from adxl_ros.diagnose.diagnosis import Diagnosis
 from adxl_ros.diagnose.hypothesis_fit import Hypothesis
-from adxl_ros.diagnose.report_json import as_json, shares_of_gap, summary
+from adxl_ros.diagnose.report_json import as_json, p_text, shares_of_gap, summary
 from adxl_ros.diagnose.residual_map import RANGES, SIGNIFICANT_P
 from adxl_ros.files.plot_file import pyplot
 from adxl_ros.model.constants import G0_MPS2
@@ -186,11 +186,6 @@ def _row(cells: Sequence[str]) -> str:
     return f'<tr>{"".join(f"<td>{escape(c)}</td>" for c in cells)}</tr>'
 
 
-def _p_text(p: float) -> str:
-    """Return a probability as text."""
-    return '< 0.001' if p < 1e-3 else f'{p:.3f}'
-
-
 def _cell_table(report: dict[str, Any]) -> str:
     """Return the significant cells with the largest shares."""
     rows = []
@@ -198,7 +193,7 @@ def _cell_table(report: dict[str, Any]) -> str:
         low, high = c['range']
         rows.append([c['axis'], c['dimension'], c['statistic'], f'{low:.4g} to {high:.4g}',
                      f'{_mg(c["mean"]):+.2f}', f'{c["floor_units"]:+.1f}',
-                     f'{100 * c["share"]:.1f} %', _p_text(c['p'])])
+                     f'{100 * c["share"]:.1f} %', p_text(c['p'])])
     return _table(['axis', 'dimension', 'statistic', 'range', 'mg', 'by the noise floor',
                    'share of the squares', 'family-wise p'], rows)
 

@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from textwrap import wrap
 from typing import Any
 
 from adxl_ros.diagnose.decision import Verdict, WeightedHypothesis
@@ -34,6 +35,8 @@ _DIGITS = 6
 """Significant digits of the report. Chosen: more than any of its numbers has."""
 _MOST_CELLS = 40
 """Largest number of cells in the report. Chosen: cells of small share say little."""
+_SCREEN_COLUMNS = 79
+"""Columns of text on the terminal. Chosen: a terminal of 80 columns."""
 _SCREEN_ROWS = 6
 """Rows of each table on the terminal. Chosen: all of it fits on one screen."""
 _SCREEN_CANDIDATES = 3
@@ -238,9 +241,14 @@ def _mg(value_mps2: float) -> float:
     return 1e3 * value_mps2 / G0_MPS2
 
 
+def p_text(p: float) -> str:
+    """Return a probability as text."""
+    return '< 0.001' if p < 1e-3 else f'{p:.3f}'
+
+
 def terminal_lines(diagnosis: Diagnosis) -> list[str]:
     """Return the diagnosis as lines for a terminal."""
-    lines = [summary(diagnosis)]
+    lines = wrap(summary(diagnosis), _SCREEN_COLUMNS)
     if diagnosis.data_fault is not None or diagnosis.verdict is None:
         return lines
     assert diagnosis.gap_closure is not None and diagnosis.noise_floor is not None
@@ -263,7 +271,8 @@ def terminal_lines(diagnosis: Diagnosis) -> list[str]:
             lines += _candidate_lines(candidate)
     if diagnosis.next_experiment is not None:
         proposal = diagnosis.next_experiment
-        lines += ['', f'next: {proposal.manoeuvre}, {proposal.why}', f'  {proposal.command}']
+        lines += ['', *wrap(f'next: {proposal.manoeuvre}, {proposal.why}', _SCREEN_COLUMNS,
+                            subsequent_indent='      '), f'  {proposal.command}']
     return lines
 
 
@@ -271,12 +280,12 @@ def _cell_line(cell: dict[str, Any]) -> str:
     """Return one line for a cell of the residual map."""
     low, high = cell['range']
     return (f'  {cell["axis"]}  {cell["dimension"]:16} {low:9.4g} to {high:9.4g}  '
-            f'{_mg(cell["mean"]):+8.2f} mg  {100 * cell["share"]:5.1f} %  p {cell["p"]:.3f}')
+            f'{_mg(cell["mean"]):+8.2f} mg  {100 * cell["share"]:5.1f} %  p {p_text(cell["p"])}')
 
 
 def _candidate_lines(candidate: dict[str, Any]) -> list[str]:
     """Return the lines for a candidate: its cause and its parameters."""
-    lines = ['', f'{candidate["effect"]}: {candidate["cause"]}']
+    lines = ['', *wrap(f'{candidate["effect"]}: {candidate["cause"]}', _SCREEN_COLUMNS)]
     for name, p in candidate['parameters'].items():
         if 'ci' in p:
             low, high = p['ci']
