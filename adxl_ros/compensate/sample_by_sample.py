@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 from adxl_ros.compensate import filter_inversion, paper_inverse
@@ -189,7 +190,7 @@ class LiveEstimator:
         volts = self.volts(accel_mps2)
         return self.from_volts(volts, time_s) if volts else None
 
-    def volts(self, accel_mps2: Components) -> Components:
+    def volts(self, accel_mps2: Sequence[float]) -> Components:
         """Undo the nominal conversion; an empty list if a value exceeds that of any sensor."""
         volts = [zero + a * scale for zero, a, scale in
                  zip(self._zero_g_v, accel_mps2, self._v_per_mps2) if abs(a) < _MAX_ACCEL_MPS2]

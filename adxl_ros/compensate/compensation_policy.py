@@ -1,0 +1,378 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The decisions of a live compensation: which calibration applies, to whose stream, and where."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from enum import auto, Enum
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from adxl_ros.errors import UserError
+from adxl_ros.files import calibration_store
+from adxl_ros.files.stream_info import NO_UNIT, StreamInfo
+from adxl_ros.files.stream_unit import check_unit
+from adxl_ros.model.effects import effect_named
+from adxl_ros.model.effects.base import NOMINAL_ENVIRONMENT
+from adxl_ros.model.sensor import Sensor
+
+_STALE_S = 60.0
+"""Age at which a temperature or supply is not known any more, s; chosen: a room warms by less than
+0.1 K in that time."""
+_CLOCK_TOLERANCE_DAYS = 0.01
+"""Largest difference of two clocks, days; chosen: a quarter of an hour. A calibration that is
+dated further ahead comes from the future."""
+_SHORTEST_SILENCE_S = 0.5
+"""Shortest interval in which samples are missed, s; chosen. A report on a change of level may
+follow the last one by less than a sample period."""
+
+
+class State(Enum):
+    """States of a compensated stream; of several that hold, the first one is reported."""
+
+    REFUSED = auto()
+    SILENT = auto()
+    DROPPING = auto()
+    SATURATED = auto()
+    NOT_CONFIRMED = auto()
+    SURROUNDINGS_UNKNOWN = auto()
+    NOT_CALIBRATED = auto()
+    OUTSIDE = auto()
+    NEWER_CALIBRATION = auto()
+    COMPENSATING = auto()
+
+
+class Status(NamedTuple):
+    """
+    State of a compensated stream.
+
+    Attributes
+    ----------
+    state
+        The state.
+    text
+        The state in one line for people, with its reason.
+
+    """
+
+    state: State
+    text: str
+
+
+class Topics(NamedTuple):
+    """
+    Full names of the topics, for messages.
+
+    Attributes
+    ----------
+    data_raw, sensor_info, temperature, supply
+        Name of the topic.
+
+    """
+
+    data_raw: str
+    sensor_info: str
+    temperature: str
+    supply: str
+
+
+@dataclass(frozen=True)
+class Interval:
+    """
+    What a stream has shown since the last report.
+
+    Attributes
+    ----------
+    duration_s
+        Length of the interval, s.
+    counts
+        Samples in the interval, by the names of `live_stream.COUNTS`.
+    outside
+        What the newest sample outside of the calibrated range exceeds, in words.
+    surroundings
+        Temperature, °C, and supply, V, that the inverse uses, by name.
+    ages_s
+        Time since each of them was heard, s, by name.
+
+    """
+
+    duration_s: float
+    counts: Mapping[str, int]
+    outside: tuple[str, ...]
+    surroundings: Mapping[str, float]
+    ages_s: Mapping[str, float]
+
+
+class CompensationPolicy:
+    """
+    Decides which calibration applies to a stream, and whether it applies at all.
+
+    A calibration that is named stands. Otherwise the newest one of the unit in the store applies,
+    as soon as the stream states its serial number.
+
+    Parameters
+    ----------
+    paper
+        Whether the paper's inverse is used, which needs the axes x and y.
+    store
+        Folder of calibrations; empty for none.
+    topics
+        Names of the topics.
+
+    Attributes
+    ----------
+    sensor
+        The sensor whose coefficients are used.
+    source
+        Where the coefficients come from.
+    stored_path
+        File that was taken from the store, '' if none was.
+    info
+        What the stream states of itself (`sensor_info`), None before it does.
+    refusal
+        Why the sensor cannot correct the stream, or ''.
+
+    """
+
+    sensor: Sensor
+    source: str
+
+    def __init__(self, paper: bool, store: str, topics: Topics) -> None:
+        self._paper, self._store, self._topics = paper, store, topics
+        self._warnings: set[str] = set()
+        self.stored_path = ''
+        self.info: StreamInfo | None = None
+        self.refusal = ''
+
+    @property
+    def rate_hz(self) -> float:
+        """Sample rate that the stream states, Hz, else that of the calibration."""
+        try:
+            stated_hz = self.info.rate_hz if self.info else None
+        except UserError:
+            # `check` refuses such a stream.
+            stated_hz = None
+        return stated_hz or self.sensor.rate_hz
+
+    def check(self, sensor: Sensor) -> None:
+        """
+        Refuse a sensor that cannot correct the stream.
+
+        Raises
+        ------
+        UserError
+            The sensor lacks an axis of the paper's inverse, belongs to another unit than the
+            stream, or the stream states no sample rate.
+
+        """
+        if self._paper and sensor.axes == 'x':
+            raise UserError("inverse: the paper's needs the axes x and y, the sensor has x")
+        if self.info is not None:
+            check_unit(self.info, self.info.axes or sensor.axes, sensor)
+            _ = self.info.rate_hz  # raises where it is no rate
+
+    def use(self, sensor: Sensor, source: str) -> str:
+        """
+        Apply a sensor from now on.
+
+        Parameters
+        ----------
+        sensor
+            The sensor, with its coefficients.
+        source
+            Where they come from.
+
+        Returns
+        -------
+        str
+            What is used, in one line.
+
+        """
+        self.sensor, self.source = sensor, source
+        model = f'{sensor.serial}, model {sensor.model}' if sensor.effects else \
+            f'{sensor.serial}, which is not calibrated'
+        return f'compensating by {source}: {model}'
+
+    def assess(self) -> bool:
+        """Find out whether the sensor corrects the stream; tell whether `refusal` has changed."""
+        before, self.refusal = self.refusal, ''
+        try:
+            self.check(self.sensor)
+        except UserError as error:
+            self.refusal = str(error)
+        return self.refusal != before
+
+    def is_named(self, calibration: str) -> bool:
+        """Tell whether a user named the calibration; `calibration` is the parameter's value."""
+        return calibration != self.stored_path if calibration else bool(self.sensor.effects)
+
+    def choose(self, calibration: str) -> tuple[str, list[str]]:
+        """
+        Choose the newest calibration of the stream's unit, unless one was named.
+
+        Parameters
+        ----------
+        calibration
+            Value of the parameter `calibration`.
+
+        Returns
+        -------
+        tuple
+            The file that is to be used, '' if nothing changes; and new warnings about the store.
+
+        """
+        serial = self.info.serial if self.info else NO_UNIT
+        if not self._store or serial == NO_UNIT or self.is_named(calibration):
+            return '', []
+        path, refused = calibration_store.newest(self._store, serial, self.check)
+        warnings = [f'passed over: {reason}' for reason in refused]
+        if path is None:
+            warnings.append(f'no calibration of {serial} in {self._store}')
+        unchanged = path is None or str(path) == self.stored_path
+        return '' if unchanged else str(path), self.new_warnings(warnings)
+
+    def new_warnings(self, warnings: list[str]) -> list[str]:
+        """Return the warnings that were not given before."""
+        new = [text for text in dict.fromkeys(warnings) if text not in self._warnings]
+        self._warnings.update(new)
+        return new
+
+    def newer(self) -> Path | None:
+        """Return a calibration that was put into the store after the one in use."""
+        sensor = self.sensor
+        if not self._store or not sensor.effects or sensor.serial == NO_UNIT:
+            return None
+        return calibration_store.newer(self._store, sensor)
+
+    def status(self, interval: Interval, newer: Path | None, calibration: str) -> Status:
+        """
+        Return the state of the stream.
+
+        Parameters
+        ----------
+        interval
+            What the stream has shown since the last report.
+        newer
+            A newer calibration in the store, as `newer` returns it.
+        calibration
+            Value of the parameter `calibration`.
+
+        Returns
+        -------
+        Status
+            The first state that holds.
+
+        """
+        counts = interval.counts
+        if self.refusal:
+            return Status(State.REFUSED, f'publishing nothing: {self.refusal}')
+        if not counts.get('received') and interval.duration_s > _SHORTEST_SILENCE_S:
+            return Status(State.SILENT, f'no samples on {self._topics.data_raw}')
+        if counts.get('dropped'):
+            return Status(State.DROPPING,
+                          f'{counts["dropped"]} samples dropped that no force explains')
+        if counts.get('saturated'):
+            return Status(State.SATURATED,
+                          f'{counts["saturated"]} samples with the ADC at its rail')
+        if self.info is None:
+            return Status(State.NOT_CONFIRMED,
+                          f'unit not confirmed: nothing on {self._topics.sensor_info}')
+        unknown = self._unknown_surroundings(interval)
+        if unknown:
+            return Status(State.SURROUNDINGS_UNKNOWN, unknown)
+        if not self.sensor.effects:
+            return Status(State.NOT_CALIBRATED, 'not calibrated: the nominal figures apply')
+        if counts.get('outside'):
+            return Status(State.OUTSIDE, (
+                f'{counts["outside"]} samples outside of what was calibrated, their covariance '
+                f'raised: {"; ".join(interval.outside)}'))
+        if newer is not None and not self.is_named(calibration):
+            return Status(State.NEWER_CALIBRATION, (
+                f'a newer calibration is in the store: {newer}; set calibration to it, or start '
+                'again'))
+        return Status(State.COMPENSATING, 'compensating')
+
+    def _unknown_surroundings(self, interval: Interval) -> str:
+        """Name an effect whose temperature or supply nobody publishes, or return ''."""
+        topics = {'temperature_c': self._topics.temperature, 'supply_v': self._topics.supply}
+        for effect in map(effect_named, self.sensor.effects):
+            for name in effect.follows:
+                if name not in topics:
+                    continue
+                if name not in interval.surroundings:
+                    nominal = getattr(NOMINAL_ENVIRONMENT, name)
+                    return f'{effect.name} is taken at {nominal:g}: nothing on {topics[name]}'
+                if interval.ages_s[name] > _STALE_S:
+                    return (f'{effect.name} is taken at {interval.surroundings[name]:g}: nothing '
+                            f'on {topics[name]} for {interval.ages_s[name]:.0f} s')
+        return ''
+
+    def values(self, interval: Interval, newer: Path | None) -> dict[str, Any]:
+        """
+        Return what diagnostics report of the calibration in use.
+
+        Parameters
+        ----------
+        interval
+            What the stream has shown since the last report.
+        newer
+            A newer calibration in the store, as `newer` returns it.
+
+        Returns
+        -------
+        dict
+            Values by key.
+
+        """
+        sensor = self.sensor
+        unit = 'other' if self.refusal else 'confirmed' if self.info else 'not confirmed'
+        age_days = _age_days(sensor) if sensor.effects else None
+        return {
+            'unit': unit, 'calibration': self.source, 'serial': sensor.serial,
+            'axes': sensor.axes, 'model': sensor.model, 'effects': ', '.join(sensor.effects),
+            'calibration_id': calibration_store.calibration_id(sensor) if sensor.effects else '',
+            'age_days': '' if age_days is None else round(age_days, 3),
+            'validity': self._validity(interval, age_days), 'newer': str(newer or ''),
+            **{f'provenance.{key}': value for key, value in sensor.provenance.items()}}
+
+    def _validity(self, interval: Interval, age_days: float | None) -> str:
+        """Tell in words whether the calibration holds for what the stream has shown."""
+        sensor = self.sensor
+        if not sensor.effects:
+            return 'not calibrated'
+        if self.refusal:
+            return f'of another unit: {self.refusal}'
+        if interval.counts.get('outside'):
+            return f'outside: {"; ".join(interval.outside)}'
+        if age_days is not None and age_days < -_CLOCK_TOLERANCE_DAYS:
+            return 'dated in the future: the clock here, or there, is wrong'
+        if not sensor.covariance_names:
+            return 'within, as far as is known: it states no covariance'
+        if sensor.envelope.temperature_c is None \
+                or 'temperature_c' not in interval.surroundings \
+                or interval.ages_s['temperature_c'] > _STALE_S:
+            return 'valid, temperature not known'
+        return 'valid'
+
+
+def _age_days(sensor: Sensor) -> float | None:
+    """Return the age of a calibration, days; None where its file states no date."""
+    date = calibration_store.date_of(sensor)
+    if date is None:
+        return None
+    return (datetime.now(timezone.utc) - date).total_seconds() / 86400

@@ -1,0 +1,190 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""A live stream of serialized messages: samples come in, corrected samples and tilt go out."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from math import cos, sin
+from typing import Any, NamedTuple
+
+from adxl_ros.compensate import filter_inversion
+from adxl_ros.compensate.sample_by_sample import Estimate, LiveEstimator
+from adxl_ros.files import imu_message
+from adxl_ros.files.cdr import CdrError
+from adxl_ros.model import noise
+from adxl_ros.model.sensor import Sensor
+from adxl_ros.model.tilt import UNOBSERVABLE_RAD2
+
+UNKNOWN_ANGLE_RAD2 = 1e6
+"""Variance of an angle that is not known, rad²; yaw is never known.
+
+π²/3, that of a uniform angle, would let a filter that fuses 1000 samples a second believe in
+yaw = 0 before long. 1e6, as for an axis that is not there, never counts."""
+
+COUNTS = ('received', 'published', 'dropped', 'saturated', 'outside')
+"""What a stream counts: samples, and those to which something happened."""
+
+
+class _Chain(NamedTuple):
+    """What corrects a sample; replaced as a whole."""
+
+    live: LiveEstimator
+    delayed: filter_inversion.DelayedInversion
+
+
+class LiveStream:
+    """
+    Corrects the samples of one stream.
+
+    One thread calls it with samples; another one may replace the sensor and the surroundings
+    meanwhile. A sample has the coefficients before or after a replacement, never some of both.
+
+    Parameters
+    ----------
+    paper
+        Whether the paper's approximate inverse is used instead of the exact one.
+    undo_filter
+        Whether the RC filter is undone; a sample then comes out `filter_inversion.HALF` samples
+        later.
+    publish_imu
+        Takes a corrected sample, a serialized sensor_msgs/Imu.
+    publish_tilt
+        Takes roll, pitch and inclination, rad, a serialized geometry_msgs/Vector3Stamped.
+
+    Attributes
+    ----------
+    counts
+        Samples since the start, by the names of `COUNTS`.
+    outside
+        What the newest sample outside of the calibrated range exceeds, in words.
+    surroundings
+        Temperature, °C, and supply, V, that the inverse uses, by name; those that are known.
+    refused
+        Whether the stream belongs to another unit; then its samples are counted only.
+
+    """
+
+    def __init__(self, paper: bool, undo_filter: bool, publish_imu: Callable[[bytes], None],
+                 publish_tilt: Callable[[bytes], None]) -> None:
+        self._paper, self._undo_filter = paper, undo_filter
+        self._publish_imu, self._publish_tilt = publish_imu, publish_tilt
+        self._chain: _Chain
+        self._angles_rad = [0.0, 0.0, 0.0]
+        self._new_surroundings: dict[str, float] = {}
+        self.counts: Counter[str] = Counter()
+        self.outside: tuple[str, ...] = ()
+        self.surroundings: dict[str, float] = {}
+        self.refused = False
+
+    def use(self, sensor: Sensor, rate_hz: float) -> None:
+        """
+        Correct by a sensor from the next sample on.
+
+        Parameters
+        ----------
+        sensor
+            The unit, with its coefficients.
+        rate_hz
+            Sample rate of the stream, Hz.
+
+        """
+        live = LiveEstimator(sensor, self._paper, self._undo_filter)
+        live.set_environment(**self.surroundings)
+        self._chain = _Chain(live, _delayed(sensor, rate_hz))
+
+    def restart_filter(self, rate_hz: float) -> None:
+        """Forget the samples that wait for their neighbours; the stream has a rate, Hz."""
+        self._chain = self._chain._replace(delayed=_delayed(self._chain.live.sensor, rate_hz))
+
+    def surround(self, name: str, value: float) -> None:
+        """
+        Take a temperature or supply into account, from the next sample on.
+
+        Parameters
+        ----------
+        name
+            `temperature_c` or `supply_v`.
+        value
+            Its value, °C or V, finite.
+
+        """
+        self._new_surroundings = {**self._new_surroundings, name: value}
+
+    def __call__(self, raw: bytes) -> None:
+        """Correct one sample, a serialized sensor_msgs/Imu, and publish the result."""
+        self.counts['received'] += 1
+        if self.refused:
+            return
+        try:
+            time_s, accel_mps2 = imu_message.read(raw)
+        except CdrError:
+            self.counts['dropped'] += 1
+            return
+        # Read once: another thread may replace the chain at any time.
+        chain = self._chain
+        if self._new_surroundings:
+            new, self._new_surroundings = self._new_surroundings, {}
+            chain.live.set_environment(**new)
+            self.surroundings |= new
+        volts = chain.live.volts(accel_mps2)
+        if not volts:
+            self.counts['dropped'] += 1
+        elif self._undo_filter:
+            for ready in chain.delayed(time_s, volts, raw):
+                self._correct(chain.live, *ready)
+        else:
+            self._correct(chain.live, time_s, volts, raw)
+
+    def _correct(self, live: LiveEstimator, time_s: float, volts: list[float], raw: Any) -> None:
+        estimate = live.from_volts(volts, time_s)
+        if estimate is None:
+            self.counts['dropped'] += 1
+            return
+        self.counts['saturated'] += estimate.saturated
+        if estimate.outside:
+            self.counts['outside'] += 1
+            self.outside = estimate.outside
+        xx, xy, xz, yy, yz, zz = estimate.covariance
+        self._publish_imu(imu_message.corrected(
+            raw, self._orientation(estimate),
+            (*estimate.force, xx, xy, xz, xy, yy, yz, xz, yz, zz)))
+        self._publish_tilt(imu_message.vector3_stamped(raw, self._angles_rad))
+        self.counts['published'] += 1
+
+    def _orientation(self, estimate: Estimate) -> tuple[float, ...]:
+        """
+        Return the quaternion with yaw 0 (x, y, z, w), and its covariance, rad², row by row.
+
+        An angle that the pose does not show keeps its last value, with a very large variance.
+        """
+        variances = []
+        for i, (angle, variance) in enumerate((estimate.roll, estimate.pitch,
+                                               estimate.inclination)):
+            observable = variance < UNOBSERVABLE_RAD2
+            if observable:
+                self._angles_rad[i] = angle
+            variances.append(variance if observable else UNKNOWN_ANGLE_RAD2)
+        roll, pitch, _ = variances
+        both = estimate.roll_pitch if max(roll, pitch) < UNKNOWN_ANGLE_RAD2 else 0.0
+        half_roll, half_pitch = self._angles_rad[0] / 2, self._angles_rad[1] / 2
+        sr, cr, sp, cp = sin(half_roll), cos(half_roll), sin(half_pitch), cos(half_pitch)
+        return (sr * cp, cr * sp, -sr * sp, cr * cp,
+                roll, both, 0.0, both, pitch, 0.0, 0.0, 0.0, UNKNOWN_ANGLE_RAD2)
+
+
+def _delayed(sensor: Sensor, rate_hz: float) -> filter_inversion.DelayedInversion:
+    return filter_inversion.DelayedInversion(noise.electronics(sensor).rc_s, rate_hz)

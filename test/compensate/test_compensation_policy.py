@@ -1,0 +1,211 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Which calibration corrects a stream, whether it may, and in which state the stream is."""
+
+from dataclasses import replace
+from datetime import datetime, timedelta, timezone
+from pathlib import Path
+
+from adxl_ros.compensate.compensation_policy import CompensationPolicy, Interval, State, Topics
+from adxl_ros.errors import UserError
+from adxl_ros.files import calibration_store
+from adxl_ros.files.stream_info import sensor_info, StreamInfo
+from adxl_ros.model.coefficients import with_neutral
+from adxl_ros.model.effects.base import Coefficient
+from adxl_ros.model.sensor import Sensor
+import numpy as np
+import pytest
+from units import drawn, nominal
+
+TOPICS = Topics('/imu/data_raw', '/sensor_info', '/temperature', '/supply')
+QUIET = Interval(1.0, {'received': 1000, 'published': 1000}, (), {}, {})
+
+
+def unit(serial: str = '17', axes: str = 'xy', seed: int = 1) -> Sensor:
+    sensor = drawn(np.random.default_rng(seed), nominal(axes))
+    return replace(sensor, serial=serial, covariance_names=(Coefficient('bias', 'offset_v', 'x'),),
+                   covariance=np.array([[1e-6]]))
+
+
+def policy_for(sensor: Sensor, store: Path | str = '', paper: bool = False,
+               **info: str) -> CompensationPolicy:
+    """Return the policy of a stream of this sensor, but for some keys of what it states."""
+    policy = CompensationPolicy(paper, str(store), TOPICS)
+    policy.use(sensor, 'a file')
+    policy.info = StreamInfo({**sensor_info(sensor), **info}, '/sensor_info')
+    policy.assess()
+    return policy
+
+
+def stored(folder: Path, sensor: Sensor, days_old: float) -> Path:
+    made = datetime.now(timezone.utc) - timedelta(days=days_old)
+    path = calibration_store.put(folder, replace(sensor, provenance={
+        'date': made.isoformat(timespec='seconds'), 'data_sha256': f'{days_old:064.3f}'}))
+    assert path is not None
+    return path
+
+
+def test_the_source_is_named_in_one_line() -> None:
+    policy = CompensationPolicy(False, '', TOPICS)
+    assert policy.use(nominal(), 'the file') == \
+        'compensating by the file: nominal, which is not calibrated'
+    assert policy.use(unit(), 'the file').startswith('compensating by the file: 17, model ')
+
+
+@pytest.mark.parametrize(('key', 'value', 'reason'), [
+    ('serial', '18', 'is of the sensor 18, but the parameters are of 17'),
+    ('axes', 'xyz', 'axes xyz, but the parameters of 17 are for xy'),
+    ('nominal_zero_g_v', '1.65, 1.65', 'nominal_zero_g_v is [1.65, 1.65], but [2.5, 2.5]'),
+    ('format', '99', 'format version 99'),
+    ('rate_hz', 'nan', "rate_hz is 'nan', expected samples a second"),
+    ('rate_hz', '-1', "rate_hz is '-1', expected samples a second"),
+])
+def test_another_stream_is_refused_until_it_is_that_of_the_unit(key: str, value: str,
+                                                                reason: str) -> None:
+    policy = policy_for(unit(), **{key: value})
+    assert reason in policy.refusal
+    assert policy.refusal.startswith('/sensor_info: ')
+    assert not policy.assess(), 'the refusal is as before'
+    status = policy.status(QUIET, None, '')
+    assert status == (State.REFUSED, f'publishing nothing: {policy.refusal}')
+    assert policy.values(QUIET, None)['unit'] == 'other'
+    assert policy.values(QUIET, None)['validity'] == f'of another unit: {policy.refusal}'
+    policy.info = StreamInfo(sensor_info(unit()), '/sensor_info')
+    assert policy.assess()
+    assert policy.status(QUIET, None, '') == (State.COMPENSATING, 'compensating')
+
+
+def test_the_papers_inverse_needs_two_axes() -> None:
+    with pytest.raises(UserError, match='needs the axes x and y'):
+        policy_for(unit(), paper=True).check(nominal('x'))
+    policy_for(unit(axes='xyz'), paper=True).check(nominal('xyz'))
+
+
+def test_the_rate_is_the_streams_else_the_calibrations() -> None:
+    assert policy_for(unit(), rate_hz='250.0').rate_hz == 250.0
+    assert policy_for(unit(), rate_hz='none').rate_hz == 1000.0
+    policy = CompensationPolicy(False, '', TOPICS)
+    policy.use(unit(), '')
+    assert policy.rate_hz == 1000.0
+
+
+def test_the_newest_calibration_of_the_unit_is_chosen(tmp_path: Path) -> None:
+    stored(tmp_path, unit(seed=1), 30.0)
+    newest = stored(tmp_path, unit(seed=2), 10.0)
+    stored(tmp_path, unit('18', seed=3), 1.0)
+    three = stored(tmp_path, unit(axes='xyz', seed=4), 5.0)
+    policy = policy_for(nominal(serial='17'), tmp_path)
+    path, warnings = policy.choose('')
+    assert path == str(newest)
+    assert len(warnings) == 1
+    assert warnings[0].startswith(f'passed over: {three}: ')
+    policy.stored_path = path
+    assert policy.choose(path) == ('', []), 'it is in use, and a warning is given once'
+    assert not policy.is_named(path)
+    fresh = stored(tmp_path, unit(seed=5), 0.0)
+    assert policy.choose(path) == (str(fresh), [])
+
+
+def test_a_named_calibration_stands(tmp_path: Path) -> None:
+    stored(tmp_path, unit(seed=2), 0.0)
+    named = policy_for(nominal(serial='17'), tmp_path)
+    assert named.is_named('/a/file.yaml')
+    assert named.choose('/a/file.yaml') == ('', [])
+    with_coefficients = policy_for(unit(), tmp_path)
+    assert with_coefficients.choose('') == ('', [])
+
+
+def test_without_a_unit_or_a_store_nothing_is_chosen(tmp_path: Path) -> None:
+    stored(tmp_path, unit(), 0.0)
+    assert policy_for(nominal(), tmp_path).choose('') == ('', [])
+    assert policy_for(nominal(serial='17')).choose('') == ('', [])
+    assert policy_for(nominal(serial='18'), tmp_path).choose('') == (
+        '', [f'no calibration of 18 in {tmp_path}'])
+
+
+def test_a_newer_calibration_is_announced_unless_one_was_named(tmp_path: Path) -> None:
+    old = stored(tmp_path, unit(), 3.0)
+    dated = (datetime.now(timezone.utc) - timedelta(days=3)).isoformat(timespec='seconds')
+    policy = policy_for(replace(unit(), provenance={'date': dated}), tmp_path)
+    assert policy.newer() is None
+    fresh = stored(tmp_path, unit(seed=2), 1.0)
+    assert policy.newer() == fresh
+    policy.stored_path = str(old)
+    status = policy.status(QUIET, fresh, str(old))
+    assert status.state is State.NEWER_CALIBRATION
+    assert str(fresh) in status.text
+    assert policy.status(QUIET, fresh, '/named.yaml').state is State.COMPENSATING
+    assert policy.values(QUIET, fresh)['newer'] == str(fresh)
+    assert policy.values(QUIET, fresh)['age_days'] == pytest.approx(3.0, abs=0.01)
+
+
+@pytest.mark.parametrize(('counts', 'state', 'text'), [
+    ({'received': 0}, State.SILENT, 'no samples on /imu/data_raw'),
+    ({'received': 9, 'dropped': 5}, State.DROPPING, '5 samples dropped'),
+    ({'received': 9, 'saturated': 2}, State.SATURATED, '2 samples with the ADC at its rail'),
+    ({'received': 9, 'outside': 3}, State.OUTSIDE, '3 samples outside of what was calibrated'),
+])
+def test_states_of_the_samples(counts: dict[str, int], state: State, text: str) -> None:
+    interval = replace(QUIET, counts=counts, outside=('temperature 40.0 degC',))
+    status = policy_for(unit()).status(interval, None, '')
+    assert status.state is state
+    assert text in status.text
+
+
+def test_a_short_interval_is_no_silence() -> None:
+    interval = replace(QUIET, counts={'received': 0}, duration_s=0.01)
+    assert policy_for(unit()).status(interval, None, '').state is State.COMPENSATING
+
+
+def test_states_of_the_stream() -> None:
+    policy = CompensationPolicy(False, '', TOPICS)
+    policy.use(unit(), 'a file')
+    assert policy.status(QUIET, None, '') == (
+        State.NOT_CONFIRMED, 'unit not confirmed: nothing on /sensor_info')
+    assert policy.values(QUIET, None)['unit'] == 'not confirmed'
+    assert policy_for(nominal()).status(QUIET, None, '').state is State.NOT_CALIBRATED
+    assert policy_for(nominal()).values(QUIET, None)['validity'] == 'not calibrated'
+
+
+def test_surroundings_that_an_effect_follows_must_be_heard() -> None:
+    policy = policy_for(with_neutral(unit(), ['supply']))
+    assert policy.status(QUIET, None, '') == (
+        State.SURROUNDINGS_UNKNOWN, 'supply is taken at 5: nothing on /supply')
+    heard = replace(QUIET, surroundings={'supply_v': 4.8}, ages_s={'supply_v': 1.0})
+    assert policy.status(heard, None, '').state is State.COMPENSATING
+    old = replace(heard, ages_s={'supply_v': 3600.0})
+    assert policy.status(old, None, '') == (
+        State.SURROUNDINGS_UNKNOWN, 'supply is taken at 4.8: nothing on /supply for 3600 s')
+
+
+def test_validity() -> None:
+    sensor = unit()
+    calibrated = replace(sensor, envelope=replace(sensor.envelope, temperature_c=(20.0, 25.0)))
+    at_23_c = replace(QUIET, surroundings={'temperature_c': 23.0}, ages_s={'temperature_c': 1.0})
+
+    def validity(sensor: Sensor, interval: Interval) -> str:
+        return policy_for(sensor).values(interval, None)['validity']
+
+    assert validity(calibrated, at_23_c) == 'valid'
+    unknown = 'valid, temperature not known'
+    assert validity(sensor, at_23_c) == unknown
+    assert validity(calibrated, QUIET) == unknown
+    assert validity(calibrated, replace(at_23_c, ages_s={'temperature_c': 61.0})) == unknown
+    outside = replace(at_23_c, counts={'received': 9, 'outside': 1}, outside=('force', 'heat'))
+    assert validity(calibrated, outside) == 'outside: force; heat'
+    no_covariance = replace(calibrated, covariance_names=(), covariance=np.zeros((0, 0)))
+    assert 'states no covariance' in validity(no_covariance, at_23_c)
+    future = (datetime.now(timezone.utc) + timedelta(days=1)).isoformat()
+    assert 'in the future' in validity(replace(calibrated, provenance={'date': future}), at_23_c)

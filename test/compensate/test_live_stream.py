@@ -1,0 +1,142 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Serialized samples in, corrected samples and tilt out, without a graph."""
+
+from dataclasses import replace
+
+from adxl_ros.compensate import filter_inversion
+from adxl_ros.compensate.live_stream import LiveStream, UNKNOWN_ANGLE_RAD2
+from adxl_ros.model import signal_chain
+from adxl_ros.model.coefficients import put, with_neutral
+from adxl_ros.model.effects.base import Coefficient, Environment, NOMINAL_ENVIRONMENT
+from adxl_ros.model.kinematics import specific_force
+from adxl_ros.model.sensor import Sensor, to_nominal_mps2
+from geometry_msgs.msg import Vector3Stamped
+import numpy as np
+import pytest
+from rclpy.serialization import deserialize_message, serialize_message
+from sensor_msgs.msg import Imu
+from units import drawn, nominal
+
+G = 9.80665
+
+
+class Stream(LiveStream):
+    """A stream whose results are kept."""
+
+    def __init__(self, sensor: Sensor, undo_filter: bool = False, period_ns: int = 2 * 10 ** 9
+                 ) -> None:
+        self.data: list[bytes] = []
+        self.tilt: list[bytes] = []
+        super().__init__(False, undo_filter, self.data.append, self.tilt.append)
+        self.use(sensor, 1000.0)
+        self.period_ns, self.time_ns = period_ns, 0
+
+    def send(self, sensor: Sensor, alpha: float, beta: float,
+             around: Environment = NOMINAL_ENVIRONMENT) -> None:
+        """Give the stream a sample of a sensor at rest in a pose."""
+        force = [float(f) for f in specific_force(alpha, beta, G)]
+        volts = np.array([signal_chain.static_response(sensor)(force, around)])
+        message = Imu()
+        self.time_ns += self.period_ns
+        message.header.stamp.sec, message.header.stamp.nanosec = divmod(self.time_ns, 10 ** 9)
+        a = message.linear_acceleration
+        a.x, a.y, a.z = [*to_nominal_mps2(volts, sensor)[0].tolist(), 0.0][:3]
+        self(serialize_message(message))
+
+    def force(self) -> np.ndarray:
+        """Return the newest corrected force, m/s², (3,)."""
+        a = deserialize_message(self.data[-1], Imu).linear_acceleration
+        return np.array([a.x, a.y, a.z])
+
+
+def unit(seed: int = 1, axes: str = 'xy') -> Sensor:
+    return drawn(np.random.default_rng(seed), nominal(axes))
+
+
+def test_samples_are_corrected_and_counted() -> None:
+    stream = Stream(unit())
+    stream.send(unit(), 0.7, -1.2)
+    np.testing.assert_allclose(stream.force(), specific_force(0.7, -1.2, G), atol=1e-7)
+    tilt = deserialize_message(stream.tilt[-1], Vector3Stamped)
+    assert tilt.header == deserialize_message(stream.data[-1], Imu).header
+    assert tilt.vector.z == pytest.approx(0.7, abs=1e-7)
+    assert (stream.counts['received'], stream.counts['published']) == (1, 1)
+
+
+def test_a_refused_stream_is_counted_only() -> None:
+    stream = Stream(unit())
+    stream.refused = True
+    stream.send(unit(), 0.7, -1.2)
+    assert (stream.counts['received'], stream.data) == (1, [])
+
+
+def test_what_is_no_sample_is_dropped() -> None:
+    stream = Stream(unit())
+    stream(b'too short')
+    stream(serialize_message(Imu())[:-8])
+    message = Imu()
+    message.linear_acceleration.x = float('nan')
+    stream(serialize_message(message))
+    assert (stream.counts['dropped'], stream.data) == (3, [])
+
+
+def test_coefficients_are_replaced_as_a_whole() -> None:
+    stream = Stream(unit(1))
+    stream.send(unit(1), 0.7, 0.4)
+    stream.use(unit(2), 1000.0)
+    stream.send(unit(2), 0.7, 0.4)
+    np.testing.assert_allclose(stream.force(), specific_force(0.7, 0.4, G), atol=1e-7)
+
+
+def test_surroundings_are_used_from_the_next_sample_on() -> None:
+    sensor = put(with_neutral(unit(), ['temperature_bias']), [Coefficient('temperature_bias', 'per_k', 'x')], [1e-3])
+    warm = NOMINAL_ENVIRONMENT._replace(temperature_c=35.0)
+    stream = Stream(sensor)
+    stream.surround('temperature_c', 35.0)
+    assert stream.surroundings == {}
+    stream.send(sensor, 0.7, 0.4, warm)
+    assert stream.surroundings == {'temperature_c': 35.0}
+    np.testing.assert_allclose(stream.force(), specific_force(0.7, 0.4, G), atol=1e-6)
+    # A new sensor knows them, too.
+    stream.use(sensor, 1000.0)
+    stream.send(sensor, 0.6, 0.4, warm)
+    np.testing.assert_allclose(stream.force(), specific_force(0.6, 0.4, G), atol=1e-6)
+
+
+def test_an_angle_that_is_not_shown_keeps_its_value() -> None:
+    """With x upright, roll is not observable."""
+    sensor = unit(axes='xyz')
+    stream = Stream(sensor)
+    stream.send(sensor, 0.7, -1.2)
+    roll = deserialize_message(stream.tilt[-1], Vector3Stamped).vector.x
+    stream.send(sensor, np.pi / 2, 0.0)
+    assert deserialize_message(stream.tilt[-1], Vector3Stamped).vector.x == roll
+    covariance = deserialize_message(stream.data[-1], Imu).orientation_covariance.reshape(3, 3)
+    assert covariance[0, 0] == covariance[2, 2] == UNKNOWN_ANGLE_RAD2
+    assert covariance[0, 1] == covariance[1, 0] == 0
+    assert 0 < covariance[1, 1] < 1e-5
+
+
+def test_with_the_filter_undone_samples_come_late() -> None:
+    sensor = replace(unit(), rc_capacitance_f=1e-7)
+    stream = Stream(sensor, undo_filter=True, period_ns=1_000_000)
+    for _ in range(20):
+        stream.send(sensor, 0.7, 0.4)
+    assert len(stream.data) == 20 - filter_inversion.HALF
+    stream.restart_filter(500.0)
+    for _ in range(filter_inversion.HALF):
+        stream.send(sensor, 0.7, 0.4)
+    assert len(stream.data) == 20 - filter_inversion.HALF, 'the samples that waited are forgotten'
