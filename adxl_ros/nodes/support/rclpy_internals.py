@@ -107,11 +107,11 @@ class MessageWait:
             The largest number of messages.
 
         """
-        handle = self._subscription.handle
-        with handle, self._context.handle:
+        handle, context = self._subscription.handle, self._context.handle
+        assert context is not None, 'a node has a context'
+        with handle, context:
             if self._wait_set is None:
-                self._wait_set = rclpy_implementation.WaitSet(1, 0, 0, 0, 0, 0,
-                                                              self._context.handle)
+                self._wait_set = rclpy_implementation.WaitSet(1, 0, 0, 0, 0, 0, context)
             self._wait_set.clear_entities()
             self._wait_set.add_subscription(handle)
             self._wait_set.wait(_LONGEST_WAIT_NS)

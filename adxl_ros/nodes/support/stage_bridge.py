@@ -25,6 +25,7 @@ unwrapped.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 from adxl_ros.nodes.support.diagnostics import DiagnosticsReporter, Level, Status
 from adxl_ros.nodes.support.parameters import declare, parameter_error
@@ -148,9 +149,10 @@ class StageBridge:
             self._refuse(f'stage/command: {positions}: expected finite positions of alpha and '
                          'beta')
             return
-        goal = {name: positions.get(name, self._goal.get(name, joint.angle_rad))
-                for name, joint in self._joints.items()}
-        if None in goal.values():
+        goal: dict[str, Any] = {
+            name: positions.get(name, self._goal.get(name, joint.angle_rad))
+            for name, joint in self._joints.items()}
+        if any(angle_rad is None for angle_rad in goal.values()):
             self._refuse('stage/command: the position of the stage is not known yet')
             return
         now_ns = self._steady.now().nanoseconds
@@ -245,7 +247,8 @@ class StageBridge:
         late_s = (self._steady.now().nanoseconds - self._commanded_ns) * 1e-9
         angles = ', '.join(f'{name} is at {np.degrees(joint.angle_rad):.1f}° of '
                            f'{np.degrees(self._goal[name]):.1f}°'
-                           for name, joint in self._joints.items())
+                           for name, joint in self._joints.items()
+                           if joint.angle_rad is not None)
         return f'the controller has not followed for {late_s:.0f} s: {angles}'
 
 

@@ -1,0 +1,249 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The thread that reads the driver's link, from its activation to its deactivation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import ExitStack
+import time
+
+from adxl_ros.errors import UserError
+from adxl_ros.links.support.base import Level, Link, LinkStatus, StageLink
+from adxl_ros.nodes.support.driver_publishers import References, SampleOutput
+from adxl_ros.nodes.support.rclpy_internals import NotForExecutors, take_messages
+from adxl_ros.nodes.support.receive_thread import PeriodicTurn, RepeatingThread
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from rclpy.subscription import Subscription
+from sensor_msgs.msg import JointState
+
+_PERIOD_S = 0.004
+"""Time between two reads of a link that gives what is due, s. A wake-up costs as much as ten
+samples; at 1 kHz it publishes four of them."""
+_LONGEST_STEP_NS = 20_000_000
+"""Longest step of real time that is caught up where sensor time is the graph's clock, ns; chosen:
+a clock that leaps after a late wake-up would flood the other nodes."""
+_JUMP_NS = 2_000_000_000
+"""Smallest step of the system clock that counts as a jump, ns; chosen."""
+_DISCOVERY_NS = 300_000_000
+"""Time after which a new subscriber is sure to receive, ns; chosen."""
+_QUEUE = 5000
+"""Messages of the stage that are kept between two reads."""
+_LOG_INTERVAL_S = 1.0
+"""Shortest time between two log lines about the state of a link, s; chosen."""
+
+
+class LinkReader:
+    """
+    Reads a link in a thread and publishes its samples, until closed.
+
+    Parameters
+    ----------
+    node
+        The node.
+    link
+        The open link; it is closed with the reader, and where the reader cannot start.
+    output
+        Publishes and counts the samples.
+    speed
+        Sensor time per real time, for a link that gives what is due.
+    on_error
+        Called when the link can give no more samples.
+    on_level
+        Called with the level of the link's status when it has changed.
+
+    """
+
+    def __init__(self, node: Node, link: Link, output: SampleOutput, speed: float,
+                 on_error: Callable[[UserError], None], on_level: Callable[[Level], None]) -> None:
+        self._node, self._link, self._output, self._speed = node, link, output, speed
+        self._on_error, self._on_level = on_error, on_level
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._wall = Clock(clock_type=ClockType.SYSTEM_TIME)
+        self._failed = False
+        self._now_ns: int | None = None
+        self._subscribed_ns = 0
+        self._ticked_ns = self._steady.now().nanoseconds
+        self._stage: Subscription | None = None
+        with ExitStack() as on_close:
+            on_close.callback(link.close)
+            self._start(on_close)
+            self._on_close = on_close.pop_all()
+
+    def _start(self, on_close: ExitStack) -> None:
+        node, link = self._node, self._link
+        if link.live and node.get_parameter('use_sim_time').value:
+            node.get_logger().warning('use_sim_time: a real device lives in real time; its '
+                                      'samples are stamped by the system clock')
+        self._references = References(node, self._output.frame_id, link.references)
+        on_close.callback(self._references.destroy)
+        status = link.status()
+        self._level = status.level
+        self._log = StatusLog(node, status.text)
+        if link.sensor is not None:
+            self._output.use(link.sensor)
+        if isinstance(link, StageLink):
+            self._stage = node.create_subscription(
+                JointState, link.joint_state_topic, self._sense_stage, QoSProfile(depth=_QUEUE),
+                callback_group=NotForExecutors())
+            on_close.callback(node.destroy_subscription, self._stage)
+        turn = self._live_turn if link.live else PeriodicTurn(self._tick, _PERIOD_S)
+        on_close.callback(RepeatingThread(node, turn, 'link').close)
+
+    def close(self) -> None:
+        """End the thread and close the link."""
+        self._on_close.close()
+
+    def status(self) -> LinkStatus:
+        """Return how the link works."""
+        if not self._link.live and self._now_ns is None:
+            return LinkStatus(Level.OK, 'waiting for a subscriber of imu/data_raw')
+        status = self._link.status()
+        if self._link.live:
+            # A long read holds the thread up, but not the log.
+            self._log(status)
+        return status
+
+    def _live_turn(self) -> None:
+        """Publish what a device sends; the link waits for it."""
+        try:
+            samples = self._link.read(time.time_ns())
+        except UserError as error:
+            self._fail(error)
+        if not self._node.context.ok():
+            return
+        if self._failed:
+            time.sleep(_PERIOD_S)
+            return
+        sensor = self._link.sensor
+        if sensor is not None and sensor is not self._output.sensor:
+            self._output.use(sensor)
+        if self._now_ns is None:
+            self._output.tally.begin(samples.until_ns)
+        self._now_ns = samples.until_ns
+        self._output.publish(samples, self._references)
+        status = self._link.status()
+        self._log(status)
+        if samples.missing and status.level is Level.OK:
+            self._on_level(Level.WARN)
+        elif status.level is not self._level:
+            self._on_level(status.level)
+        self._level = status.level
+
+    def _tick(self) -> None:
+        """Publish the samples that are due."""
+        if self._failed:
+            return
+        steady_ns = self._steady.now().nanoseconds
+        step_ns, self._ticked_ns = steady_ns - self._ticked_ns, steady_ns
+        if self._now_ns is None:
+            if not self._may_begin(step_ns):
+                return
+            self._now_ns = self._begin()
+        if self._stage is not None:
+            for message in take_messages(self._stage, JointState, False, _QUEUE):
+                self._sense_stage(message)
+        try:
+            samples = self._link.read(self._due_ns(self._now_ns, step_ns))
+        except UserError as error:
+            self._fail(error)
+            return
+        self._now_ns = samples.until_ns
+        self._output.publish(samples, self._references)
+        if samples.missing:
+            self._on_level(Level.WARN)
+
+    def _may_begin(self, step_ns: int) -> bool:
+        """Tell whether somebody receives the first sample of a link that waits for that."""
+        self._subscribed_ns = self._subscribed_ns + step_ns if self._output.subscribed() else 0
+        return not self._link.waits_for_listener or self._subscribed_ns >= _DISCOVERY_NS
+
+    def _begin(self) -> int:
+        """Let the first sample be due; return its sensor time, ns."""
+        start_ns = self._link.start_ns if self._output.is_clock else None
+        now_ns = self._wall.now().nanoseconds if start_ns is None else start_ns
+        self._link.begin(now_ns)
+        self._output.tally.begin(now_ns)
+        return now_ns
+
+    def _due_ns(self, now_ns: int, step_ns: int) -> int:
+        """Return the sensor time up to which samples are due, ns."""
+        if self._output.is_clock:
+            return now_ns + round(min(step_ns, _LONGEST_STEP_NS) * self._speed)
+        wall_ns = self._wall.now().nanoseconds
+        jump_ns = wall_ns - now_ns
+        if not -_PERIOD_S * 1e9 < jump_ns < _JUMP_NS:
+            self._output.tally.missing += self._link.begin(wall_ns)
+            self._output.tally.begin(wall_ns)
+            self._node.get_logger().warning(f'the clock jumped by {jump_ns * 1e-9:+.3f} s; '
+                                            'the samples go on from there')
+        return wall_ns
+
+    def _sense_stage(self, message: JointState) -> None:
+        """Give the motion of the stage to a simulated sensor."""
+        assert isinstance(self._link, StageLink), 'the link that has subscribed'
+        stamp = message.header.stamp
+        self._link.sense_stage(stamp.sec * 10 ** 9 + stamp.nanosec,
+                               dict(zip(message.name, message.position)),
+                               dict(zip(message.name, message.velocity)))
+
+    def _fail(self, error: UserError) -> None:
+        self._failed = True
+        self._on_error(error)
+
+
+class StatusLog:
+    """
+    Logs the status of a link when its text or an event is new, once a second at most.
+
+    Parameters
+    ----------
+    node
+        The node that logs.
+    text
+        Text of the present status, which is not logged.
+
+    """
+
+    def __init__(self, node: Node, text: str) -> None:
+        self._logger, self._text = node.get_logger(), text
+        self._logged_s = -_LOG_INTERVAL_S
+        self._counts: dict[str, int] = {}
+
+    def __call__(self, status: LinkStatus) -> None:
+        """Log a status where it is new."""
+        now_s = time.monotonic()
+        if now_s - self._logged_s < _LOG_INTERVAL_S:
+            return
+        new_events = [event for event in status.events
+                      if event.count > self._counts.get(event.message, 0)]
+        new_text = status.text != self._text
+        if not new_events and not new_text:
+            return
+        for event in new_events:
+            self._logger.warning(event.message)
+            self._counts[event.message] = event.count
+        self._text, self._logged_s = status.text, now_s
+        if not new_text:
+            return
+        # rclpy permits one severity for each line of code.
+        if status.level is Level.OK:
+            self._logger.info(status.text)
+        elif status.level is Level.WARN:
+            self._logger.warning(status.text)
+        else:
+            self._logger.error(status.text)
