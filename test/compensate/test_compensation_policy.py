@@ -205,7 +205,6 @@ def test_validity() -> None:
     assert validity(calibrated, replace(at_23_c, ages_s={'temperature_c': 61.0})) == unknown
     outside = replace(at_23_c, counts={'received': 9, 'outside': 1}, outside=('force', 'heat'))
     assert validity(calibrated, outside) == 'outside: force; heat'
-    no_covariance = replace(calibrated, covariance_names=(), covariance=np.zeros((0, 0)))
-    assert 'states no covariance' in validity(no_covariance, at_23_c)
+    assert 'states no covariance' in validity(calibrated.without_covariance(), at_23_c)
     future = (datetime.now(timezone.utc) + timedelta(days=1)).isoformat()
     assert 'in the future' in validity(replace(calibrated, provenance={'date': future}), at_23_c)

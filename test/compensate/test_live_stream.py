@@ -102,7 +102,8 @@ def test_coefficients_are_replaced_as_a_whole() -> None:
 
 
 def test_surroundings_are_used_from_the_next_sample_on() -> None:
-    sensor = put(with_neutral(unit(), ['temperature_bias']), [Coefficient('temperature_bias', 'per_k', 'x')], [1e-3])
+    sensor = put(with_neutral(unit(), ['temperature_bias']),
+                 [Coefficient('temperature_bias', 'per_k', 'x')], [1e-3])
     warm = NOMINAL_ENVIRONMENT._replace(temperature_c=35.0)
     stream = Stream(sensor)
     stream.surround('temperature_c', 35.0)

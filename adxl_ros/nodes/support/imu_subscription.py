@@ -101,6 +101,7 @@ def _no_number(finite: np.ndarray, unit: Sensor) -> str:
     """Name the axes that make all samples useless, (n, m), or return ''."""
     if finite.all(axis=1).any():
         return ''
-    dead = ' and '.join(axis for axis, ever in zip(unit.axes, np.asarray(finite.any(axis=0))) if not ever)
+    dead = ' and '.join(axis for axis, ever in zip(unit.axes, np.asarray(finite.any(axis=0)))
+                        if not ever)
     return f'{dead or "one axis or another"} is not a number in all samples; check its wiring ' \
            'and the driver'

@@ -1,0 +1,106 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The driver's life cycle within one process: a failed activation leaves nothing open."""
+
+from collections.abc import Iterator
+import os
+import pty
+from types import SimpleNamespace
+
+from adxl_ros.errors import UserError
+from adxl_ros.links import serial as serial_link
+from adxl_ros.links.support import base
+from adxl_ros.model.sensor import Sensor
+from adxl_ros.nodes.driver import Driver
+import pytest
+import rclpy
+from rclpy.lifecycle import TransitionCallbackReturn
+import serial
+
+
+@pytest.fixture
+def port() -> Iterator[str]:
+    """Return the name of a terminal that stands for a serial port."""
+    board, device = pty.openpty()
+    name = os.ttyname(device)
+    os.close(device)
+    yield name
+    os.close(board)
+
+
+class HalfOpen:
+    """A serial link whose port is open, and which cannot state what it measures."""
+
+    def __init__(self, link: serial_link.SerialLink, failure: Exception | None) -> None:
+        self._link, self._failure = link, failure
+        while not link.read(0).until_ns or link.state().values['connections'] == 0:
+            pass
+
+    def __getattr__(self, name: str) -> object:
+        if name == 'references' and self._failure is not None:
+            raise self._failure
+        return getattr(self._link, name)
+
+
+@pytest.fixture
+def make_driver(ros_env: dict[str, str], port: str, monkeypatch: pytest.MonkeyPatch
+                ) -> Iterator[SimpleNamespace]:
+    """Give a driver on the port, and the failure of its next activation."""
+    setting = SimpleNamespace(failure=None)
+
+    def open_link(sensor: Sensor, options: dict[str, object]) -> HalfOpen:
+        return HalfOpen(serial_link.open_link(sensor, options), setting.failure)
+
+    monkeypatch.setattr(base, 'module_of', lambda _: SimpleNamespace(
+        OPTIONS=serial_link.OPTIONS, open_link=open_link))
+    rclpy.init(args=['--ros-args', '-p', 'link.type:=serial', '-p', f'link.port:={port}', '-p',
+                     'autostart:=false'])
+    setting.driver = Driver()
+    yield setting
+    setting.driver.close()
+    setting.driver.destroy_node()
+    rclpy.try_shutdown()
+
+
+def is_free(port: str) -> bool:
+    """Tell whether nobody holds a port."""
+    try:
+        serial.Serial(port, exclusive=True).close()
+    except serial.SerialException:
+        return False
+    return True
+
+
+@pytest.mark.parametrize(('failure', 'result'), [
+    (UserError('no such channel'), TransitionCallbackReturn.FAILURE),
+    (RuntimeError('broken'), TransitionCallbackReturn.ERROR)])
+def test_a_failed_activation_leaves_no_link_open(make_driver: SimpleNamespace, port: str,
+                                                 failure: Exception, result: object) -> None:
+    driver = make_driver.driver
+    assert driver.trigger_configure() == TransitionCallbackReturn.SUCCESS
+    make_driver.failure = failure
+    assert driver.trigger_activate() == result
+    assert is_free(port)
+    # What has failed once can be tried again, after an error from the beginning.
+    make_driver.failure = None
+    if result == TransitionCallbackReturn.ERROR:
+        assert driver.trigger_configure() == TransitionCallbackReturn.SUCCESS
+    assert driver.trigger_activate() == TransitionCallbackReturn.SUCCESS
+    assert not is_free(port)
+    assert driver.count_publishers('imu/data_raw') == 1
+    assert driver.trigger_deactivate() == TransitionCallbackReturn.SUCCESS
+    assert is_free(port)
+    assert driver.trigger_cleanup() == TransitionCallbackReturn.SUCCESS
+    assert driver.count_publishers('imu/data_raw') == 0
