@@ -17,26 +17,18 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
-import os
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 import subprocess
 import sys
 import tempfile
 import time
 
-from adxl_ros.calibrate import pose_extraction
-from adxl_ros.calibrate.fits import paper_regression
 from adxl_ros.errors import UserError
-from adxl_ros.files import cdr, parameter_file, recording
-from adxl_ros.files.recording_columns import Recording
-from adxl_ros.files.stream_info import sensor_info
-from adxl_ros.files.stream_unit import recorded_unit
-from adxl_ros.links.support import wire_format
-from adxl_ros.nodes.demo import end
-from adxl_ros.simulate.simulator import simulate
-from adxl_ros.simulate.trajectories import sweep
+from adxl_ros.files import cdr
+from adxl_ros.nodes.support import offline_benchmark
+from adxl_ros.nodes.support.processes import cpu_time_s, executable, running, use_own_graph
 import numpy as np
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
@@ -45,11 +37,30 @@ from rclpy.qos import qos_profile_sensor_data, QoSProfile
 from sensor_msgs.msg import Imu
 
 _RATE_HZ = 1000.0
-_ROWS = 3_000_000
+"""Sample rate of all measurements, Hz."""
+_SECONDS = 20.0
+"""Default duration of one live measurement, s."""
+_START_S = 20.0
+"""Longest time until the first messages, s; chosen: a busy machine starts a node in 10 s."""
+_FIRST_MESSAGES = 50
+"""Messages after which a stream has begun."""
+_WARM_UP_S = 2.0
+"""Time between the begin of a stream and its measurement, s; chosen."""
+_READ_BYTES = 65536
 
 
 class Listener(Node):
-    """Keeps the arrival time and the bytes of each message."""
+    """
+    Keeps the arrival time and the bytes of each message.
+
+    Attributes
+    ----------
+    raw
+        Serialized messages.
+    arrived_ns
+        Their arrival times, ns.
+
+    """
 
     def __init__(self, topic: str) -> None:
         super().__init__('listener')
@@ -59,14 +70,44 @@ class Listener(Node):
                                  QoSProfile(depth=1000,
                                             reliability=qos_profile_sensor_data.reliability),
                                  raw=True)
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(self)
 
     def _on_message(self, raw: bytes) -> None:
         self.arrived_ns.append(time.time_ns())
         self.raw.append(raw)
 
+    def listen(self, seconds: float, limit: float = np.inf) -> None:
+        """
+        Keep the messages of some time.
+
+        Parameters
+        ----------
+        seconds
+            Duration, s.
+        limit
+            Number of messages after which it ends early.
+
+        Raises
+        ------
+        UserError
+            There is no message.
+
+        """
+        end_s = time.monotonic() + seconds
+        while time.monotonic() < end_s and len(self.raw) < limit:
+            self._executor.spin_once(timeout_sec=0.1)
+        if not self.raw:
+            raise UserError(f'no messages for {seconds:g} s')
+
+    def clear(self) -> None:
+        """Forget the messages so far."""
+        self.raw.clear()
+        self.arrived_ns.clear()
+
 
 class BarePublisher(Node):
-    """The least that publishes Imu at 1 kHz: a timer and one message."""
+    """The smallest node that publishes Imu at 1 kHz: a timer and one message."""
 
     def __init__(self) -> None:
         super().__init__('bare_publisher')
@@ -80,7 +121,7 @@ class BarePublisher(Node):
 
 
 class BareRelay(Node):
-    """The least that passes Imu on."""
+    """The smallest node that passes Imu on."""
 
     def __init__(self) -> None:
         super().__init__('bare_relay')
@@ -88,35 +129,30 @@ class BareRelay(Node):
         self.create_subscription(Imu, 'bare', publisher.publish, qos_profile_sensor_data)
 
 
-_BARE = {'publisher': BarePublisher, 'relay': BareRelay}
+_BARE_NODES = {'publisher': BarePublisher, 'relay': BareRelay}
 
 
 def main() -> int:
-    """Run the benchmark; returns the exit status."""
-    parse = argparse.ArgumentParser(prog='bench', description=__doc__)
-    parse.add_argument('--seconds', type=float, default=20.0, help='of each live measurement')
-    parse.add_argument('--iiod', metavar='FILE', help="the tests' IIOD, for the link iio")
-    parse.add_argument('--bare', choices=list(_BARE), help=argparse.SUPPRESS)
-    parse.add_argument('--read', metavar='PORT', help=argparse.SUPPRESS)
-    options = parse.parse_args()
+    """Run the benchmark; return the exit status."""
+    parser = argparse.ArgumentParser(prog='bench', description=__doc__)
+    parser.add_argument('--seconds', type=float, default=_SECONDS,
+                        help='duration of each live measurement')
+    parser.add_argument('--iiod', metavar='FILE', help="the tests' IIOD, for the link iio")
+    parser.add_argument('--bare', choices=list(_BARE_NODES), help=argparse.SUPPRESS)
+    parser.add_argument('--read', metavar='PORT', help=argparse.SUPPRESS)
+    options = parser.parse_args()
     if options.bare:
-        return _bare(_BARE[options.bare])
+        return _run_bare_node(_BARE_NODES[options.bare])
     if options.read:
-        return _bare_reader(options.read)
-    os.environ.setdefault('ROS_DOMAIN_ID', str(60 + os.getpid() % 40))
-    os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+        return _run_bare_reader(options.read)
+    use_own_graph()
     try:
-        print(f'{"1 kHz for " + format(options.seconds, "g") + " s":36} {"rate Hz":>8} '
-              f'{"missing":>8} {"p50 ms":>7} {"p99 ms":>7}   CPU of a core')
-        bare = [[sys.executable, sys.argv[0], '--bare', kind] for kind in _BARE]
-        node = [str(Path(sys.argv[0]).with_name(name)) for name in ('driver', 'compensation')]
-        _live('bare publisher', 'bare', bare[:1], options.seconds)
-        _live('bare publisher and relay', 'relayed', bare, options.seconds)
-        _live('driver', 'imu/data_raw', [[node[0]]], options.seconds)
-        _live('driver and compensation', 'imu/data', [[node[0]], [node[1]]], options.seconds)
-        _links(node[0], options.iiod, options.seconds)
-        _decoding()
-        _reading()
+        _measure_nodes(options.seconds)
+        _measure_serial(options.seconds)
+        if options.iiod is not None:
+            _measure_iio(options.iiod, options.seconds)
+        offline_benchmark.measure_decoding()
+        offline_benchmark.measure_recordings()
     except UserError as error:
         print(f'bench: {error}', file=sys.stderr)
         return 1
@@ -125,7 +161,7 @@ def main() -> int:
     return 0
 
 
-def _bare(make: type[Node]) -> int:
+def _run_bare_node(make: Callable[[], Node]) -> int:
     rclpy.init()
     executor = SingleThreadedExecutor()
     executor.add_node(make())
@@ -134,145 +170,96 @@ def _bare(make: type[Node]) -> int:
     return 0
 
 
-def _bare_reader(port: str) -> int:
+def _run_bare_reader(port: str) -> int:
     """Read what a board sends, and do nothing with it."""
     with open(port, 'rb', buffering=0) as file, suppress(KeyboardInterrupt, OSError):
-        while file.read(65536):
+        while file.read(_READ_BYTES):
             pass
     return 0
 
 
-def _links(driver: str, iiod: str | None, seconds: float) -> None:
-    """Print the rows of the links: the driver on a board, and on an IIOD, beside a bare reader."""
+def _measure_nodes(seconds: float) -> None:
+    """Print the rows of the nodes beside those of bare ones, of a duration each, s."""
+    print(f'{"1 kHz for " + format(seconds, "g") + " s":36} {"rate Hz":>8} '
+          f'{"missing":>8} {"p50 ms":>7} {"p99 ms":>7}   CPU of a core')
+    bare = [[sys.executable, sys.argv[0], '--bare', kind] for kind in _BARE_NODES]
+    driver, compensation = [executable('driver')], [executable('compensation')]
+    _measure_stream('bare publisher', 'bare', bare[:1], seconds)
+    _measure_stream('bare publisher and relay', 'relayed', bare, seconds)
+    _measure_stream('driver', 'imu/data_raw', [driver], seconds)
+    _measure_stream('driver and compensation', 'imu/data', [driver, compensation], seconds)
+
+
+def _measure_serial(seconds: float) -> None:
+    """Print the rows of an emulated board: a bare reader of its bytes, and the driver."""
     with tempfile.TemporaryDirectory() as folder:
         port = str(Path(folder, 'board'))
-        simulate = str(Path(sys.argv[0]).with_name('simulate'))
-        with _running([[simulate, 'soak', '--port', port]]):
-            _until(Path(port).exists, 'the board')
-            _bare_reading(port, seconds)
-            _live('driver, serial, 2 axes and 2 more', 'imu/data_raw', [[
-                driver, '--ros-args', '-p', 'link.type:=serial', '-p', f'link.port:={port}', '-p',
-                'link.channels:=x,y,supply,temperature']], seconds)
-    if iiod is None:
-        return
+        with running([[executable('simulate'), 'soak', '--port', port]]):
+            _wait_for_port(port)
+            _measure_bare_reader(port, seconds)
+            _measure_stream('driver, serial, 2 axes and 2 more', 'imu/data_raw', [[
+                executable('driver'), '--ros-args', '-p', 'link.type:=serial', '-p',
+                f'link.port:={port}', '-p', 'link.channels:=x,y,supply,temperature']], seconds)
+
+
+def _wait_for_port(port: str) -> None:
+    end_s = time.monotonic() + _START_S
+    while not Path(port).exists():
+        if time.monotonic() > end_s:
+            raise UserError('the board does not begin')
+        time.sleep(0.05)
+
+
+def _measure_bare_reader(port: str, seconds: float) -> None:
+    with running([[sys.executable, sys.argv[0], '--read', port]]) as (reader,):
+        time.sleep(_WARM_UP_S)
+        before_s = cpu_time_s(reader.pid)
+        time.sleep(seconds)
+        load = 100 * (cpu_time_s(reader.pid) - before_s) / seconds
+    print(f'{"bare reader, decodes nothing":36} {"":8} {"":8} {"":7} {"":7}   {load:.1f} %',
+          flush=True)
+
+
+def _measure_iio(iiod: str, seconds: float) -> None:
+    """Print the row of the driver on an IIOD, a Python file that prints its port."""
     with subprocess.Popen([sys.executable, iiod], stdout=subprocess.PIPE, text=True) as server:
+        assert server.stdout is not None, 'a pipe was asked for'
         try:
             uri = f'ip:127.0.0.1:{server.stdout.readline().strip()}'
-            _live('driver, iio, 2 axes and supply', 'imu/data_raw', [[
-                driver, '--ros-args', '-p', 'link.type:=iio', '-p', f'link.uri:={uri}']], seconds)
+            _measure_stream('driver, iio, 2 axes and supply', 'imu/data_raw', [[
+                executable('driver'), '--ros-args', '-p', 'link.type:=iio', '-p',
+                f'link.uri:={uri}']], seconds)
         except UserError as error:
             print(f'{"driver, iio":36} {error}: is libiio 0.x installed?')
         finally:
             server.kill()
 
 
-def _bare_reading(port: str, seconds: float) -> None:
-    with _running([[sys.executable, sys.argv[0], '--read', port]]) as (reader,):
-        time.sleep(2.0)
-        before = _cpu_s(reader.pid)
-        time.sleep(seconds)
-        load = 100 * (_cpu_s(reader.pid) - before) / seconds
-    print(f'{"bare reader, decodes nothing":36} {"":8} {"":8} {"":7} {"":7}   {load:.1f} %',
-          flush=True)
-
-
-def _until(condition: Callable[[], bool], what: str) -> None:
-    end_s = time.monotonic() + 20
-    while not condition():
-        if time.monotonic() > end_s:
-            raise UserError(f'{what} does not begin')
-        time.sleep(0.05)
-
-
-def _decoding() -> None:
-    """Print how many frames of the serial link are decoded in a second."""
-    encoder = wire_format.Encoder(wire_format.BoardInfo(_RATE_HZ, 16, 3, 5.0, 'bench'))
-    codes = np.random.default_rng(0).integers(1, 65535, (10, 3))
-    stream = b''.join(encoder.sample_frame(10_000 * k, 10 * k, codes) for k in range(20_000))
-    splitter = wire_format.Splitter()
-    began = time.perf_counter()
-    count = sum(isinstance(wire_format.decode(raw), wire_format.SampleFrame)
-                for i in range(0, len(stream), 4096)
-                for raw in splitter.split(stream[i:i + 4096]))
-    print(f'\n{"frames decoded a second":36} {count / (time.perf_counter() - began):8.0f}')
-
-
-def _live(label: str, topic: str, commands: Sequence[Sequence[str]], seconds: float) -> None:
+def _measure_stream(label: str, topic: str, commands: Sequence[Sequence[str]], seconds: float
+                    ) -> None:
     """Print one row: rate, missing samples, age on arrival, CPU of each process."""
-    with _running(commands) as processes:
+    with running(commands) as processes:
         rclpy.init(args=[])
         listener = Listener(topic)
-        executor = SingleThreadedExecutor()
-        executor.add_node(listener)
         try:
-            _hear(executor, listener, 50, 20.0)
-            _hear(executor, listener, 10 ** 9, 2.0)
-            listener.raw.clear()
-            listener.arrived_ns.clear()
-            before = [_cpu_s(p.pid) for p in processes]
-            began = time.monotonic()
-            _hear(executor, listener, 10 ** 9, seconds)
-            lasted = time.monotonic() - began
-            after = [_cpu_s(p.pid) for p in processes]
+            listener.listen(_START_S, _FIRST_MESSAGES)
+            listener.listen(_WARM_UP_S)
+            listener.clear()
+            before_s = [cpu_time_s(process.pid) for process in processes]
+            began_s = time.monotonic()
+            listener.listen(seconds)
+            duration_s = time.monotonic() - began_s
+            after_s = [cpu_time_s(process.pid) for process in processes]
         finally:
             listener.destroy_node()
             rclpy.try_shutdown()
-    stamps = np.concatenate([table.stamp_ns() for table in cdr.tables(listener.raw, cdr.imu)])
-    age_ms = (np.array(listener.arrived_ns) - stamps) * 1e-6
-    steps = np.rint(np.diff(np.sort(stamps)) * 1e-9 * _RATE_HZ)
-    # A bare timer's stamps wander, so that only steps of two periods and more are a loss.
-    missing = int(np.sum(np.maximum(steps - 1, 0)))
-    p50, p99 = np.percentile(age_ms, [50, 99])
-    load = ' + '.join(f'{100 * (b - a) / lasted:.1f} %' for a, b in zip(before, after))
-    print(f'{label:36} {len(stamps) / lasted:8.1f} {missing:8d} {p50:7.2f} {p99:7.2f}   {load}',
-          flush=True)
-
-
-def _hear(executor: SingleThreadedExecutor, listener: Listener, count: int,
-          seconds: float) -> None:
-    end = time.monotonic() + seconds
-    while time.monotonic() < end and len(listener.raw) < count:
-        executor.spin_once(timeout_sec=0.1)
-    if not listener.raw:
-        raise UserError(f'no messages for {seconds:g} s')
-
-
-@contextmanager
-def _running(commands: Sequence[Sequence[str]]) -> Iterator[list[subprocess.Popen]]:
-    processes = [subprocess.Popen(command, stderr=subprocess.DEVNULL) for command in commands]
-    try:
-        yield processes
-    finally:
-        end(processes)
-
-
-def _cpu_s(pid: int) -> float:
-    fields = Path(f'/proc/{pid}/stat').read_text().rsplit(')', 1)[1].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf('SC_CLK_TCK')
-
-
-def _reading() -> None:
-    """Print how long 3 million rows take to read, and the physical fit of a sweep."""
-    sensor = parameter_file.load(parameter_file.nominal_path())
-    columns = simulate(sensor, sweep(np.random.default_rng(0)), 0)
-    count = len(columns['time_s'])
-    whole = {name: np.resize(values, _ROWS) for name, values in columns.items()}
-    time_s = np.arange(_ROWS) / sensor.rate_hz
-    whole.pop('time_s')
-    made = Recording('bench', time_s, whole, sensor_info(sensor))
-    print(f'\n{"reading":36} {"rows":>8} {"s":>8}')
-    with tempfile.TemporaryDirectory() as folder:
-        for name in ('made.csv', 'made_bag'):
-            path = Path(folder) / name
-            recording.write(path, made, sensor)
-            began = time.perf_counter()
-            read = recording.read(path)
-            print(f'{name:36} {len(read):8d} {time.perf_counter() - began:8.1f}', flush=True)
-    once = Recording('bench', time_s[:count], {k: v[:count] for k, v in whole.items()},
-                     sensor_info(sensor))
-    began = time.perf_counter()
-    poses = pose_extraction.extract_poses(once, recorded_unit(sensor, once))
-    print(f'{"rests of a sweep":36} {count:8d} {time.perf_counter() - began:8.2f}')
-    began = time.perf_counter()
-    paper_regression.fit(sensor, poses)
-    print(f'{"physical fit":36} {len(poses):8d} {time.perf_counter() - began:8.2f}')
+    stamps_ns = np.concatenate([table.stamp_ns() for table in cdr.tables(listener.raw, cdr.imu)])
+    age_ms = (np.array(listener.arrived_ns) - stamps_ns) * 1e-6
+    periods = np.rint(np.diff(np.sort(stamps_ns)) * 1e-9 * _RATE_HZ)
+    # The stamps of a bare timer wander: only steps of two periods and more are a loss.
+    missing = int(np.sum(np.maximum(periods - 1, 0)))
+    p50_ms, p99_ms = np.percentile(age_ms, [50, 99])
+    loads = ' + '.join(f'{100 * (after - before) / duration_s:.1f} %'
+                       for before, after in zip(before_s, after_s))
+    print(f'{label:36} {len(stamps_ns) / duration_s:8.1f} {missing:8d} {p50_ms:7.2f} '
+          f'{p99_ms:7.2f}   {loads}', flush=True)

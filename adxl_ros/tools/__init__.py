@@ -14,8 +14,6 @@
 
 """The command-line tools: argument parsing and progress."""
 
-import os
+from adxl_ros.blas_threads import use_one_thread
 
-# Before numpy is loaded: matrices here are small, and on busy cores the threads of OpenBLAS wait
-# for each other (a fit of 614 poses took 35 s of CPU instead of 2 s).
-os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
+use_one_thread()

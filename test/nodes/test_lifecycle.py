@@ -45,7 +45,7 @@ class HalfOpen:
 
     def __init__(self, link: serial_link.SerialLink, failure: Exception | None) -> None:
         self._link, self._failure = link, failure
-        while not link.read(0).until_ns or link.state().values['connections'] == 0:
+        while not link.read(0).until_ns or link.status().values()['connections'] == 0:
             pass
 
     def __getattr__(self, name: str) -> object:
@@ -60,11 +60,11 @@ def make_driver(ros_env: dict[str, str], port: str, monkeypatch: pytest.MonkeyPa
     """Give a driver on the port, and the failure of its next activation."""
     setting = SimpleNamespace(failure=None)
 
-    def open_link(sensor: Sensor, options: dict[str, object]) -> HalfOpen:
-        return HalfOpen(serial_link.open_link(sensor, options), setting.failure)
+    def open_link(sensor: Sensor, settings: serial_link.Settings) -> HalfOpen:
+        return HalfOpen(serial_link.open_link(sensor, settings), setting.failure)
 
-    monkeypatch.setattr(base, 'module_of', lambda _: SimpleNamespace(
-        OPTIONS=serial_link.OPTIONS, open_link=open_link))
+    monkeypatch.setattr(base, 'link_module', lambda _: SimpleNamespace(
+        Settings=serial_link.Settings, open_link=open_link))
     rclpy.init(args=['--ros-args', '-p', 'link.type:=serial', '-p', f'link.port:={port}', '-p',
                      'autostart:=false'])
     setting.driver = Driver()

@@ -79,6 +79,7 @@ class LinkReader:
         self._subscribed_ns = 0
         self._ticked_ns = self._steady.now().nanoseconds
         self._stage: Subscription | None = None
+        self._stage_link: StageLink | None = None
         with ExitStack() as on_close:
             on_close.callback(link.close)
             self._start(on_close)
@@ -97,6 +98,7 @@ class LinkReader:
         if link.sensor is not None:
             self._output.use(link.sensor)
         if isinstance(link, StageLink):
+            self._stage_link = link
             self._stage = node.create_subscription(
                 JointState, link.joint_state_topic, self._sense_stage, QoSProfile(depth=_QUEUE),
                 callback_group=NotForExecutors())
@@ -195,11 +197,11 @@ class LinkReader:
 
     def _sense_stage(self, message: JointState) -> None:
         """Give the motion of the stage to a simulated sensor."""
-        assert isinstance(self._link, StageLink), 'the link that has subscribed'
+        assert self._stage_link is not None, 'a stage link subscribes'
         stamp = message.header.stamp
-        self._link.sense_stage(stamp.sec * 10 ** 9 + stamp.nanosec,
-                               dict(zip(message.name, message.position)),
-                               dict(zip(message.name, message.velocity)))
+        self._stage_link.sense_stage(stamp.sec * 10 ** 9 + stamp.nanosec,
+                                     dict(zip(message.name, message.position)),
+                                     dict(zip(message.name, message.velocity)))
 
     def _fail(self, error: UserError) -> None:
         self._failed = True

@@ -1,0 +1,70 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Processes of a job that runs executables of this package: start, stop and load."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+import os
+from pathlib import Path
+import signal
+import subprocess
+import sys
+
+_END_S = 10.0
+"""Longest time that a process may take to end, s; chosen: a node ends within 1 s."""
+_FIRST_DOMAIN, _DOMAINS = 60, 40
+"""ROS domains of jobs; chosen: beyond those that robots use, below the last safe one, 101."""
+_USER_TIME, _SYSTEM_TIME = 11, 12
+"""Fields of /proc/PID/stat behind the name of the command, counted from 0 (man 5 proc)."""
+
+
+def use_own_graph() -> None:
+    """Keep the nodes of this job apart from other graphs: they must move no robot."""
+    os.environ.setdefault('ROS_DOMAIN_ID', str(_FIRST_DOMAIN + os.getpid() % _DOMAINS))
+    os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+
+
+def executable(name: str) -> str:
+    """Return the path of an executable, which stands beside the running one."""
+    return str(Path(sys.argv[0]).with_name(name))
+
+
+@contextmanager
+def running(commands: Sequence[Sequence[str]]) -> Iterator[list[subprocess.Popen]]:
+    """Run commands without their error output, and stop them at the end; yields processes."""
+    processes = [subprocess.Popen(command, stderr=subprocess.DEVNULL) for command in commands]
+    try:
+        yield processes
+    finally:
+        stop(processes)
+
+
+def stop(processes: Sequence[subprocess.Popen]) -> None:
+    """Interrupt processes, and kill those that do not end within 10 s."""
+    for process in processes:
+        process.send_signal(signal.SIGINT)
+    for process in processes:
+        try:
+            process.wait(_END_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+
+
+def cpu_time_s(pid: int) -> float:
+    """Return the time that a process has spent on a core so far, s."""
+    fields = Path(f'/proc/{pid}/stat').read_text().rsplit(')', 1)[1].split()
+    return (int(fields[_USER_TIME]) + int(fields[_SYSTEM_TIME])) / os.sysconf('SC_CLK_TCK')
