@@ -1,0 +1,129 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Results of a calibration as lines of a terminal with 79 columns."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from adxl_ros.calibrate.fits.gravity_fit import GravityFit
+from adxl_ros.calibrate.report import acceptance
+from adxl_ros.calibrate.report.against_truth import Comparison
+from adxl_ros.calibrate.report.cross_validation import HeldOutErrors
+from adxl_ros.model.constants import G0_MPS2
+from adxl_ros.model.sensor import Sensor
+import numpy as np
+
+_MODELS = {'nominal': 'datasheet values', 'linear': 'linear calibration',
+           'physical': 'physical calibration', 'full': 'full calibration'}
+"""Models in words."""
+_LONGEST_LABEL = 26
+"""Columns that a coefficient's name may take, so that its line has at most 79."""
+_COVERED = 0.9
+"""Share of the 90 % intervals that contain the true value if the intervals are right."""
+_MOST_DECIMALS = 7
+"""Largest number of decimals in the table of coefficients, which has room for 10 columns."""
+_UNKNOWN_DECIMALS = 4
+"""Number of decimals of a coefficient without an interval."""
+
+
+def error_table(models: Sequence[HeldOutErrors]) -> list[str]:
+    """Lay out the errors of the models on held-out poses; the file holds the last model."""
+    lines = [f' {"":24}tilt error     acceleration error     (rms)']
+    lines += [f' {_MODELS[errors.model]:22} {_three_digits(errors.tilt_deg.rms):>9} ° '
+              f'{_three_digits(errors.accel_mg.rms):>18} mg' for errors in models]
+    lines[-1] += '           <- saved'
+    return lines
+
+
+def _three_digits(value: float) -> str:
+    """Write a value so that the decimal points of a right-aligned column stand in one line."""
+    if np.isnan(value):
+        return '-   '
+    decimals = 1 if value >= 10 else 2 if value >= 1 else 3
+    return f'{value:.{decimals}f}'.ljust(len(f'{value:.3f}'))
+
+
+def truth_table(comparisons: Sequence[Comparison]) -> list[str]:
+    """Lay out each fitted coefficient beside the true one, in 79 columns."""
+    longest = max((len(row.label) for row in comparisons), default=0)
+    width = max(min(longest + 1, _LONGEST_LABEL), len('coefficient'))
+    inside = sum(row.inside for row in comparisons)
+    return [f' {"coefficient":{width}}     fitted (90 %) {"":16}true',
+            *(_truth_row(row, width) for row in comparisons),
+            f' ({inside} of {len(comparisons)} inside their 90 % intervals; about '
+            f'{_COVERED * len(comparisons):.0f} are expected)']
+
+
+def _truth_row(row: Comparison, width: int) -> str:
+    """Lay out one coefficient, whose label has a width."""
+    decimals = _decimals(row.half_width)
+    fitted, half_width, truth = (f'{round(value, decimals) + 0.0:.{decimals}f}'
+                                 for value in (row.fitted, row.half_width, row.truth))
+    truth = '0' if row.truth == 0 else truth
+    return (f' {row.label[:width]:{width}} {row.axis:1} {fitted:>10} ± {half_width:8} '
+            f'{row.unit:5} {truth:>10}   {"ok" if row.inside else "MISSED"}')
+
+
+def _decimals(half_width: float) -> int:
+    """Return how many decimals show two digits of an interval."""
+    if not half_width > 0:
+        return _UNKNOWN_DECIMALS
+    exponent = int(f'{half_width:.1e}'.partition('e')[2])
+    return min(max(1 - exponent, 0), _MOST_DECIMALS)
+
+
+def acceptance_lines(fitted: Sensor) -> list[str]:
+    """Tell whether the calibration is as good as the datasheet: value, limit and meaning."""
+    provenance = fitted.provenance
+    if 'own_accel_mg' not in provenance:
+        return [f' {acceptance.NOT_SHOWN}  no pose was kept out of the fit to assess it']
+    error_mg = float(provenance['own_accel_mg'])
+    limit = f'{1e3 * acceptance.nonlinearity_mps2(fitted) / G0_MPS2:.2g} mg'
+    accel = provenance.get('verdict_datasheet', '')
+    tilt = provenance.get('verdict_tilt_datasheet', '')
+    result = f'calibration error {error_mg:#.2g} mg; the datasheet allows {limit}'
+    if acceptance.FAIL in (accel, tilt):
+        if accel != acceptance.FAIL:
+            tilt_deg = float(provenance['own_tilt_deg'])
+            result = f'tilt error {tilt_deg:.2g}°, more than {limit} causes'
+        return [f' {acceptance.FAIL}  {result}',
+                '       The sensor is worse than its datasheet states: do not use this file.']
+    if acceptance.NOT_SHOWN in (accel, tilt):
+        return [f' {acceptance.NOT_SHOWN}  {result}',
+                '            The check poses are too few to show that the limit is kept.']
+    return [f' {acceptance.PASS}  {result}']
+
+
+def added_effect_lines(effects: Sequence[str]) -> list[str]:
+    """Name each effect that the fit has and the simulated unit has not."""
+    return [f'       The fit has the term {effect}, which this unit does not have.'
+            for effect in effects]
+
+
+def gravity_lines(fit: GravityFit) -> list[str]:
+    """Lay out the errors of a calibration against gravity, before and after."""
+    used = np.setdiff1d(np.arange(len(fit.before_mps2)), fit.outliers)
+    before, after, held_out = (
+        _three_digits(1e3 * float(np.sqrt(np.mean(values[used] ** 2))) / G0_MPS2)
+        for values in (fit.before_mps2, fit.residual_mps2, fit.leave_one_out_mps2))
+    lines = [f' error of the magnitude of gravity, rms over {len(used)} rests',
+             f' {"datasheet values":22} {before:>9} mg',
+             f' {"gravity calibration":22} {after:>9} mg   '
+             f'(on held-out rests {held_out.strip()} mg)    <- saved']
+    if fit.outliers:
+        count = len(fit.outliers)
+        lines.append(f' {count} disturbed {"rest was" if count == 1 else "rests were"} left out')
+    return lines

@@ -1,0 +1,207 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Fitted coefficients beside the true ones, and the results as tables of a terminal."""
+
+from dataclasses import replace
+import re
+
+from adxl_ros.calibrate.fits import gravity_fit
+from adxl_ros.calibrate.fits.full_model import TERMS
+from adxl_ros.calibrate.report import acceptance, cross_validation
+from adxl_ros.calibrate.report.against_truth import added_effects, compare
+from adxl_ros.calibrate.report.text_tables import (
+    acceptance_lines,
+    added_effect_lines,
+    error_table,
+    gravity_lines,
+    truth_table,
+)
+from adxl_ros.errors import UserError
+from adxl_ros.model import signal_chain
+from adxl_ros.model.coefficients import get, names_of, put, with_neutral
+from adxl_ros.model.effects import effect_named
+from adxl_ros.model.effects.base import Coefficient
+from adxl_ros.model.kinematics import specific_force
+import numpy as np
+import pytest
+from units import drawn, nominal
+
+LINEAR = (Coefficient('cross_axis', 'linear'), Coefficient('cross_axis_z', 'linear'))
+STD = 1e-3
+
+
+def fitted_of(truth, names, off=0.0):
+    """Return the unit as a fit of some coefficients finds it, each off by so much."""
+    unit = with_neutral(truth, [name.effect for name in names])
+    return replace(put(unit, names, get(unit, names) + off), model='full', covariance_names=names,
+                   covariance=STD ** 2 * np.eye(len(names)))
+
+
+def names_for(axes, terms=TERMS, without=()):
+    return tuple(name for term in terms for name in names_of(effect_named(term), axes)
+                 if name.without_axis not in without)
+
+
+def made(off=0.0, axes='xy', without=LINEAR):
+    truth = drawn(np.random.default_rng(1), nominal(axes))
+    return fitted_of(truth, names_for(axes, without=without), off), truth
+
+
+def named(compared, name, axis):
+    return next(one for one in compared if (one.name, one.axis) == (name, axis))
+
+
+def test_each_fitted_coefficient_is_compared() -> None:
+    fitted, truth = made()
+    compared = compare(fitted, truth)
+    assert [f'{one.name}.{one.axis}' for one in compared] == \
+        list(map(str, fitted.covariance_names))
+    assert all(one.fitted == pytest.approx(one.truth, abs=1e-9) and one.inside for one in compared)
+    zero_g = named(compared, 'bias.offset_v', 'y')
+    assert (zero_g.label, zero_g.unit) == ('zero-g', 'V')
+    assert zero_g.truth == pytest.approx(truth.zero_g_v[1])
+    assert zero_g.half_width == pytest.approx(1.6449 * STD)
+    scale = named(compared, 'scale_factor.offset_v_per_g', 'x')
+    assert scale.truth == pytest.approx(truth.scale_v_per_g[0])
+    alpha = named(compared, 'misalignment.alpha_rad', 'x')
+    assert (alpha.unit, alpha.half_width) == ('°', pytest.approx(np.degrees(1.6449 * STD)))
+    assert alpha.truth == pytest.approx(np.degrees(truth.values['misalignment']['alpha_rad'][0]))
+    assert named(compared, 'cross_axis.quadratic_per_g', 'x').label == 'bias, y²'
+    assert named(compared, 'cross_axis.quadratic_per_g', 'y').label == 'bias, x²'
+    assert named(compared, 'scale_factor_z.quadratic_per_g2', 'y').label == 'scale, z²'
+    # Which the unit does not have.
+    assert named(compared, 'nonlinearity.cubic_per_g2', 'x').truth == 0
+
+
+@pytest.mark.parametrize(('off', 'inside'), [(1.6 * STD, True), (-1.6 * STD, True),
+                                             (1.7 * STD, False), (-1.7 * STD, False)])
+def test_an_interval_is_90_percent(off: float, inside: bool) -> None:
+    assert {one.inside for one in compare(*made(off))} == {inside}
+
+
+def test_other_axes_are_refused() -> None:
+    with pytest.raises(UserError, match='axes xy, the true unit has xyz'):
+        compare(made()[0], made(axes='xyz')[1])
+
+
+@pytest.mark.parametrize('axes', ['xy', 'xyz'])
+def test_linear_terms_that_the_fit_lacks_are_misalignment(axes: str) -> None:
+    """The unit with what is compared for coefficients responds as the true one."""
+    rng = np.random.default_rng(2)
+    truth = drawn(rng, nominal(axes), ('bias', 'scale_factor', 'misalignment'))
+    linear = [name for name in names_for(axes, ('cross_axis', 'cross_axis_z'))
+              if name.without_axis in LINEAR]
+    truth = put(with_neutral(truth, ['cross_axis', 'cross_axis_z']), linear,
+                0.02 * rng.normal(size=len(linear)))
+    fitted = fitted_of(truth, names_for(axes, ('bias', 'scale_factor', 'misalignment')))
+    compared = compare(fitted, truth)
+    nominal_of = {'bias.offset_v': 2.5, 'scale_factor.offset_v_per_g': 1.0}
+    values = [np.radians(one.truth) if one.unit == '°' else
+              one.truth - nominal_of[one.name] for one in compared]
+    bare = put(fitted, linear, np.zeros(len(linear)))
+    same = put(bare, fitted.covariance_names, values)
+    force = specific_force(rng.uniform(0, np.pi, 50), rng.uniform(0, 2 * np.pi, 50), 9.80665)
+    np.testing.assert_allclose(signal_chain.static_response(same)(force),
+                               signal_chain.static_response(truth)(force), rtol=0, atol=1e-12)
+
+
+def test_linear_terms_that_the_fit_has_are_compared() -> None:
+    truth = drawn(np.random.default_rng(3), nominal())
+    truth = put(truth, [Coefficient('cross_axis', 'linear', 'x')], [0.02])
+    compared = compare(fitted_of(truth, names_for('xy')), truth)
+    linear = named(compared, 'cross_axis.linear', 'x')
+    assert (linear.label, linear.truth, linear.inside) == ('bias, y', 0.02, True)
+    beta = named(compared, 'misalignment.beta_rad', 'x')
+    assert beta.truth == pytest.approx(np.degrees(truth.values['misalignment']['beta_rad'][0]))
+
+
+def test_terms_that_the_unit_lacks_are_named() -> None:
+    truth = drawn(np.random.default_rng(3), nominal())
+    fitted = fitted_of(truth, (*names_for('xy'), Coefficient('temperature_bias', 'per_k', 'x')))
+    assert added_effects(fitted, truth) == ['temperature_bias']
+    assert added_effects(fitted, with_neutral(truth, ['temperature_bias'])) == []
+    assert added_effect_lines(added_effects(fitted, truth)) == [
+        '       The fit has the term temperature_bias, which this unit does not have.']
+
+
+def test_table_of_the_truth() -> None:
+    fitted, truth = made(without=())
+    fitted = put(fitted, [Coefficient('scale_factor_z', 'quadratic_per_g2', 'x')], [
+        truth.values['scale_factor_z']['quadratic_per_g2'][0] + 0.002])
+    lines = truth_table(compare(fitted, truth))
+    rows = {re.sub(' +', ' ', line[:24]).strip(): line for line in lines}
+    assert rows['zero-g x'].split()[2:] == [
+        f'{truth.zero_g_v[0]:.4f}', '±', '0.0016', 'V', f'{truth.zero_g_v[0]:.4f}', 'ok']
+    assert rows['scale, z² x'].endswith('   MISSED')
+    assert rows['cubic y'].split()[-2:] == ['0', 'ok']
+    assert rows['misalignment alpha y'].split()[6] == '°'
+    assert [line.endswith('MISSED') for line in lines].count(True) == 1
+    assert lines[-1] == ' (21 of 22 inside their 90 % intervals; about 20 are expected)'
+    assert max(map(len, lines)) <= 79
+
+
+def test_table_of_the_truth_has_room() -> None:
+    """Also for what has no name in words, a large interval, and a small one."""
+    fitted, truth = made()
+    compared = compare(fitted, truth)
+    wide = replace(compared[0], name='vibration_rectification.per_g2', axis='x',
+                   label='vibration_rectification.per_g2', unit='g/K²', fitted=-12345.678,
+                   half_width=1234.5, truth=-13000.0)
+    narrow = replace(wide, fitted=-0.000999951, half_width=9.96e-8, truth=0.0)
+    lines = truth_table([*compared, wide, narrow, replace(narrow, half_width=0.0)])
+    assert max(map(len, lines)) <= 79
+    assert ' -12346 ± 1234 ' in lines[-4]
+    assert ' -0.0010000 ± 0.0000001 ' in lines[-3]
+
+
+def test_table_of_errors() -> None:
+    errors = cross_validation.PoseErrors(*np.zeros((2, 3)), np.full((3, 2), 0.45),
+                                     np.radians(np.full(3, 7.2)), np.zeros((3, 3)))
+    fitted = replace(errors, accel_mps2=errors.accel_mps2 / 100, tilt_rad=np.full(3, np.nan))
+    models = [cross_validation.summarise('nominal', errors),
+              cross_validation.summarise('full', fitted)]
+    lines = error_table(models)
+    assert lines[1].split() == ['datasheet', 'values', '7.20', '°', '45.9', 'mg']
+    assert lines[2].split() == ['full', 'calibration', '-', '°', '0.459', 'mg', '<-', 'saved']
+    assert lines[1].index('45.9') + 1 == lines[2].index('0.459')
+    assert max(map(len, lines)) <= 79
+
+
+@pytest.mark.parametrize(('accel', 'tilt', 'begin'), [
+    ('PASS', 'PASS', [' PASS  calibration error 0.20 mg; the datasheet allows 3.4 mg']),
+    ('PASS', '', [' PASS  calibration error 0.20 mg; the datasheet allows 3.4 mg']),
+    ('FAIL', 'PASS', [' FAIL  calibration error 0.20 mg; the datasheet allows 3.4 mg',
+                      'do not use']),
+    ('PASS', 'FAIL', [' FAIL  tilt error 0.33°, more than 3.4 mg causes', 'do not use']),
+    ('PASS', 'NOT SHOWN', [' NOT SHOWN  calibration error 0.20 mg', 'too few']),
+])
+def test_acceptance(accel: str, tilt: str, begin: list[str]) -> None:
+    said = {'own_accel_mg': '0.201', 'own_tilt_deg': '0.3251', 'verdict_datasheet': accel,
+            'verdict_tilt_datasheet': tilt}
+    lines = acceptance_lines(replace(made()[0], provenance=said))
+    assert len(lines) == len(begin) and max(map(len, lines)) <= 79
+    assert all(text in line for text, line in zip(begin, lines))
+    assert acceptance_lines(made()[0])[0].startswith(f' {acceptance.NOT_SHOWN}')
+
+
+def test_table_of_gravity() -> None:
+    rests = np.full(24, 1e-3 * 9.80665)
+    fit = gravity_fit.GravityFit({}, np.zeros((0, 0)), 21.3 * rests, 0.16 * rests,
+                                 np.where(np.arange(24) == 3, 9.9, 0.24) * rests, rests, 0.0, (3,))
+    lines = gravity_lines(fit)
+    assert lines[0].endswith('over 23 rests') and lines[3] == ' 1 disturbed rest was left out'
+    assert lines[1].split() == ['datasheet', 'values', '21.3', 'mg']
+    assert lines[2].split()[2:8] == ['0.160', 'mg', '(on', 'held-out', 'rests', '0.240']
+    assert max(map(len, lines)) <= 79
