@@ -13,12 +13,12 @@
 # limitations under the License.
 
 """
-The RC filter undone: u = v + RC·dv/dt, in amplitude and phase.
+Inversion of the RC filter: u = v + RC·dv/dt, in amplitude and phase.
 
 The derivative is the maximally flat central difference over `HALF` samples each way (Fornberg
-1988): exact for polynomials of degree 2·HALF, within 1 % of amplitude up to a third of the sample
-rate, and without phase. Off-line that is all; live, a sample is known `HALF` samples later, and
-keeps its own stamp. What a filter takes of the noise comes back, too: see `noise_variance_v2`.
+1988). It is exact for polynomials of degree 2·HALF, within 1 % of amplitude up to a third of the
+sample rate, and without phase. In a stream a sample is available `HALF` samples later, and keeps
+its own stamp. The inversion also amplifies noise; see `noise_variance_v2`.
 """
 
 from __future__ import annotations
@@ -36,13 +36,15 @@ import numpy as np
 Token = TypeVar('Token')
 
 HALF = 8
-"""Samples each way."""
-GAP = 1.5
-"""Samples further apart than so many periods are not neighbours."""
+"""Samples of the central difference each way; chosen: within 1 % up to a third of the rate."""
+
+MAX_GAP = 1.5
+"""Distance of neighbours in sample periods from which they count as a gap; chosen: it is between
+that of one and of two samples."""
 
 
 def derivative_weights(half: int) -> np.ndarray:
-    """Weights of the samples −half … half in a derivative by samples, (2·half + 1,)."""
+    """Weights of the samples −half … half in a derivative by the sample number, (2·half + 1,)."""
     one_side = [-(-1) ** k * factorial(half) ** 2
                 / (k * factorial(half - k) * factorial(half + k)) for k in range(1, half + 1)]
     return np.array([*(-w for w in reversed(one_side)), 0.0, *one_side])
@@ -50,30 +52,30 @@ def derivative_weights(half: int) -> np.ndarray:
 
 def undo(volts: np.ndarray, time_s: np.ndarray, rc_s: np.ndarray, rate_hz: float) -> np.ndarray:
     """
-    Undo the filter of a stretch, phase and all.
+    Undo the filter of a stretch.
 
-    Within `HALF` samples of its ends, and of gaps, the difference reaches as far as there are
-    neighbours; a sample with none on one side stays as it is.
+    Near the ends of the stretch, and near gaps, the difference uses as many neighbours as both
+    sides have. A sample without a neighbour on one side stays as it is.
 
     Parameters
     ----------
     volts
-        Behind the filter, (n, m).
+        Volts behind the filter, V, (n, m).
     time_s
-        Stamps, (n,).
+        Stamps, s, (n,).
     rc_s
-        Time constants by axis, s, (m,).
+        Time constants of the filter by axis, s, (m,).
     rate_hz
-        Sample rate.
+        Sample rate, Hz.
 
     Returns
     -------
-    np.ndarray
-        Before the filter, V, (n, m).
+    ndarray
+        Volts before the filter, V, (n, m).
 
     """
-    apart = np.diff(time_s) * rate_hz
-    breaks = np.concatenate([[0], np.flatnonzero(~((apart > 0) & (apart < GAP))) + 1,
+    distance = np.diff(time_s) * rate_hz
+    breaks = np.concatenate([[0], np.flatnonzero(~((distance > 0) & (distance < MAX_GAP))) + 1,
                              [len(time_s)]])
     run = np.searchsorted(breaks, np.arange(len(time_s)), 'right')
     row = np.arange(len(time_s))
@@ -90,57 +92,75 @@ def undo(volts: np.ndarray, time_s: np.ndarray, rc_s: np.ndarray, rate_hz: float
 def undo_blocks(blocks: Iterable[tuple[Token, np.ndarray, np.ndarray]], rc_s: np.ndarray,
                   rate_hz: float) -> Iterator[tuple[Token, np.ndarray]]:
     """
-    Undo the filter block by block, as `undo` does of the whole.
+    Undo the filter block by block, with the result of `undo` for the whole.
 
     Parameters
     ----------
     blocks
-        What is to come out with a block, its stamps, s, (n,), and volts, (n, m).
-    rc_s, rate_hz
-        As for `undo`.
+        For each block: a token, stamps, s, (n,), and volts behind the filter, V, (n, m).
+    rc_s
+        Time constants of the filter by axis, s, (m,).
+    rate_hz
+        Sample rate, Hz.
+
+    Yields
+    ------
+    tuple
+        For each block: its token, and volts before the filter, V, (n, m).
 
     """
-    before_s, before_v = np.empty(0), np.empty((0, len(rc_s)))
-    held = None
-    for block in itertools.chain(blocks, [None]):
-        if held is not None:
-            token, time_s, volts = held
-            after_s, after_v = (x[:HALF] for x in (block or held)[1:])
-            if not block:
-                after_s, after_v = after_s[:0], after_v[:0]
-            out = undo(np.concatenate([before_v, volts, after_v]),
-                         np.concatenate([before_s, time_s, after_s]), rc_s, rate_hz)
-            yield token, out[len(before_s):len(before_s) + len(time_s)]
-            before_s = np.concatenate([before_s, time_s])[-HALF:]
-            before_v = np.concatenate([before_v, volts])[-HALF:]
-        held = block
+    previous_s, previous_v = np.empty(0), np.empty((0, len(rc_s)))
+    current = None
+    for following in itertools.chain(blocks, [None]):
+        if current is not None:
+            token, time_s, volts = current
+            following_s, following_v = np.empty(0), np.empty((0, len(rc_s)))
+            if following is not None:
+                following_s, following_v = following[1][:HALF], following[2][:HALF]
+            undone_v = undo(np.concatenate([previous_v, volts, following_v]),
+                            np.concatenate([previous_s, time_s, following_s]), rc_s, rate_hz)
+            yield token, undone_v[len(previous_s):len(previous_s) + len(time_s)]
+            previous_s = np.concatenate([previous_s, time_s])[-HALF:]
+            previous_v = np.concatenate([previous_v, volts])[-HALF:]
+        current = following
 
 
 def noise_variance_v2(sensor: Sensor) -> np.ndarray:
     """
-    Variance of one sample behind `undo` by axis, V², (m,).
+    Return the variance of one sample behind `undo` by axis, V², (m,).
 
     The analog noise is an AR(1) sequence of correlation exp(−|lag|/RC), the ADC's is white.
     """
     rc_s = noise.electronics(sensor).rc_s
     lag = np.abs(np.subtract.outer(np.arange(2 * HALF + 1), np.arange(2 * HALF + 1)))
-    out = []
-    for rc, sigma in zip(rc_s, noise.analog_std_v(sensor)):
+    variances = []
+    for rc, std_v in zip(rc_s, noise.analog_std_v(sensor)):
         weights = rc * sensor.rate_hz * derivative_weights(HALF)
         weights[HALF] += 1
-        alike = np.exp(-lag / (rc * sensor.rate_hz)) if rc else np.eye(len(weights))
-        out.append(sigma ** 2 * weights @ alike @ weights
-                   + sensor.lsb_v ** 2 / 12 * weights @ weights)
-    return np.array(out)
+        correlation = np.exp(-lag / (rc * sensor.rate_hz)) if rc else np.eye(len(weights))
+        variances.append(std_v ** 2 * weights @ correlation @ weights
+                         + sensor.lsb_v ** 2 / 12 * weights @ weights)
+    return np.array(variances)
 
 
 class DelayedInversion:
-    """`undo` for a stream: gives a sample when it has `HALF` neighbours after it."""
+    """`undo` for a stream: returns a sample when it has `HALF` neighbours after it."""
 
     def __init__(self, rc_s: np.ndarray, rate_hz: float) -> None:
-        self._rc_s, self._rate_hz = rc_s, rate_hz
+        """
+        Prepare for a stream.
+
+        Parameters
+        ----------
+        rc_s
+            Time constants of the filter by axis, s, (m,).
+        rate_hz
+            Sample rate, Hz.
+
+        """
+        self._rate_hz = rate_hz
         self._near: deque[tuple[float, list[float], object]] = deque()
-        self._given = 0
+        self._index = 0
         gain = rc_s * rate_hz
         self._kernels = [[(gain * w).tolist() for w in derivative_weights(half)]
                          for half in range(HALF + 1)]
@@ -148,29 +168,42 @@ class DelayedInversion:
     def __call__(self, time_s: float, volts: list[float], token: object
                  ) -> Iterator[tuple[float, list[float], object]]:
         """
-        Take a sample, and give those that are ready: stamp, s, volts, and what came with it.
+        Take a sample. At a gap, all samples before it become ready.
 
-        A gap ends a stretch: what is left of it comes out at once.
+        Parameters
+        ----------
+        time_s
+            Stamp of the sample, s.
+        volts
+            Volts behind the filter by axis, V.
+        token
+            Anything that belongs to the sample.
+
+        Yields
+        ------
+        tuple
+            Each sample that is ready: its stamp, s, volts before the filter, V, and its token.
+
         """
         near = self._near
-        if near and not 0 < (time_s - near[-1][0]) * self._rate_hz < GAP:
-            while self._given < len(near):
-                yield self._give()
+        if near and not 0 < (time_s - near[-1][0]) * self._rate_hz < MAX_GAP:
+            while self._index < len(near):
+                yield self._next()
             near.clear()
-            self._given = 0
+            self._index = 0
         near.append((time_s, volts, token))
-        if len(near) - self._given > HALF:
-            yield self._give()
+        if len(near) - self._index > HALF:
+            yield self._next()
 
-    def _give(self) -> tuple[float, list[float], object]:
-        near, at = self._near, self._given
-        half = min(at, len(near) - 1 - at, HALF)
-        stamp, volts, token = near[at]
+    def _next(self) -> tuple[float, list[float], object]:
+        near, index = self._near, self._index
+        half = min(index, len(near) - 1 - index, HALF)
+        stamp_s, volts, token = near[index]
         kernel = self._kernels[half]
-        undone_v = [v + sum(kernel[k][d] * near[at - half + k][1][d]
+        undone_v = [v + sum(kernel[k][d] * near[index - half + k][1][d]
                             for k in range(2 * half + 1)) for d, v in enumerate(volts)]
-        if at >= HALF:
+        if index >= HALF:
             near.popleft()
         else:
-            self._given += 1
-        return stamp, undone_v, token
+            self._index += 1
+        return stamp_s, undone_v, token

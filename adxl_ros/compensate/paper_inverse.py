@@ -13,10 +13,10 @@
 # limitations under the License.
 
 """
-The paper's compensation, equations 14 to 21: its neighbours are not corrected.
+The paper's compensation, equations 14 to 21, which ignores the errors of the other axes.
 
-Kept to compare with: the default is `signal_chain.inverse`, which is exact. Both read the same
-effects.
+It serves comparisons. The default inverse is `signal_chain.inverse`, which is exact. Both use the
+same effects.
 """
 
 from __future__ import annotations
@@ -38,32 +38,32 @@ from adxl_ros.model.sensor import Sensor
 import numpy as np
 
 _NEAR_ZERO_G = 1e-6
-"""Below this the scale factor is that of this input."""
+"""Input below which the scale factor is taken at `_NEAR_ZERO_G`, g; chosen: it avoids 0/0."""
 
 
 def inverse(sensor: Sensor, z_sign: np.ndarray | None = None, maths: Maths = ARRAYS
             ) -> Callable[..., Components]:
     """
-    Prepare the paper's approximate inverse; as `signal_chain.inverse`, without iterations.
+    Prepare the paper's approximate inverse, which has no iterations.
 
-    Each axis is first taken as linear (3), z by equation 5 where it is not measured. The terms of
-    the others at those inputs are subtracted, and the rest divided by the scale factor there
-    (14, 16); the misalignment is taken out one axis after the other (20, 21).
+    First each axis is linear (3), and z follows from equation 5 if it is not measured. Then the
+    bias by the other axes is subtracted, and the result is divided by the scale factor at those
+    inputs (14, 16). Finally the misalignment is removed, one axis after the other (20, 21).
 
     Parameters
     ----------
     sensor
-        The figures and effects to undo; measures x and y at least.
+        The unit with the effects to undo; it measures x and y at least.
     z_sign
-        Which way up, by sample, (n,), where it is known better than `sensor.z_sign`.
+        Sign of z by sample, (n,), where it is known better than by `sensor.z_sign`.
     maths
-        For arrays or for floats.
+        Functions for arrays or for floats.
 
     Returns
     -------
     callable
-        Maps the volts of each axis and, if it is not the nominal one, an `Environment` to three
-        components, m/s².
+        Maps the volts of each axis, and an `Environment` (the nominal one unless given), to
+        three components of specific force, m/s².
 
     """
     measured = [AXES.index(axis) for axis in sensor.axes]
@@ -89,14 +89,14 @@ def inverse(sensor: Sensor, z_sign: np.ndarray | None = None, maths: Maths = ARR
         return signal_chain.output_volts(signals)
 
     def invert(volts: Components, environment: Environment = NOMINAL_ENVIRONMENT) -> Components:
-        zero = converted([0.0 * volts[0]] * 3, environment)
-        one = converted([0.0 * volts[0] + 1.0] * 3, environment)
+        at_0_g = converted([0.0 * volts[0]] * 3, environment)
+        at_1_g = converted([0.0 * volts[0] + 1.0] * 3, environment)
         linear = [0.0 * volts[0]] * 3
-        for d, v, v0, v1 in zip(measured, volts, zero, one):
+        for d, v, v0, v1 in zip(measured, volts, at_0_g, at_1_g):
             linear[d] = (v - v0) / (v1 - v0)                                        # (3)
         if 2 not in measured:
-            rest = gravity_g ** 2 - linear[0] ** 2 - linear[1] ** 2
-            linear[2] = up * maths.sqrt(maths.maximum(rest, 0.0))                      # (5)
+            z2 = gravity_g ** 2 - linear[0] ** 2 - linear[1] ** 2
+            linear[2] = up * maths.sqrt(maths.maximum(z2, 0.0))                     # (5)
         sensed = list(linear)
         for d in measured:
             inputs = list(linear)
@@ -115,12 +115,13 @@ def inverse(sensor: Sensor, z_sign: np.ndarray | None = None, maths: Maths = ARR
 
 
 def _away_from_zero(value: Value) -> Value:
+    """Return the value, moved away from 0 if it is smaller than `_NEAR_ZERO_G`."""
     small = abs(value) < _NEAR_ZERO_G
     return value + _NEAR_ZERO_G * 2 * small
 
 
 def _directions(sensor: Sensor) -> list[list[float]]:
-    """Rows Θ of the measured axes, (18) and (19), as the mounting effects have them."""
+    """Return the rows Θ of the sensing axes, (18) and (19), by the effects of the mounting."""
     signals = Signals(NOMINAL_ENVIRONMENT, sensed=[np.array(row) for row in np.eye(3)])
     for apply, values in signal_chain.effects_at(sensor, Place.MOUNTING, True):
         apply(signals, values)

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""A recording's references as a motion that can be followed again."""
+"""Motions that follow the references of a recording."""
 
 from __future__ import annotations
 
@@ -21,59 +21,81 @@ from typing import Any
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import recording
-from adxl_ros.files.recording_columns import JOINTS, Recording, stamped_rate_hz
+from adxl_ros.files.recording_columns import JOINTS, Recording
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.simulate.motion import Held, Motion, Path
+from adxl_ros.simulate.motion import Held, INTERNAL_RATE_HZ, Motion, Path
 from adxl_ros.simulate.smoothed_paths import ForcePath, SmoothedPath
 import numpy as np
 
-_FASTEST_RAD_S = 100.0
-"""No stage turns a sensor faster; a jump in the angle is no motion."""
+_MAX_SPEED_RAD_S = 100.0
+"""Largest angular velocity of a stage, rad/s; chosen: a faster change is a jump of the reading."""
+
+_MIN_FORCE_SAMPLES = 4
+"""Fewest samples of specific force; a cubic spline needs them."""
 
 
 def motion_from_force(path: str | os.PathLike, resampled: bool) -> tuple[Motion, float]:
     """
-    Make a motion of the specific force of a recording; return it and when it begins, s.
+    Make a motion from the specific force of a recording.
 
     Parameters
     ----------
     path
-        Of the recording.
+        Recording with specific force in the case frame, m/s².
     resampled
-        Its internal rate is that of the samples, else 1 kHz at least.
+        Whether the chain runs at the rate of the samples; otherwise at 1 kHz at least.
+
+    Returns
+    -------
+    tuple
+        The motion, and the time at which it begins, s.
 
     Raises
     ------
     UserError
-        There are fewer than four samples.
+        The recording has fewer than four samples.
 
     """
-    time_s, force = recording.read_ideal(path)
-    if len(time_s) < 4:
-        raise UserError(f'{path}: {len(time_s)} samples of specific force; at least 4 are needed')
+    time_s, force_mps2 = recording.read_ideal(path)
+    if len(time_s) < _MIN_FORCE_SAMPLES:
+        raise UserError(f'{path}: {len(time_s)} samples of specific force; at least '
+                        f'{_MIN_FORCE_SAMPLES} are needed')
     begin_s = float(time_s[0])
     duration_s = float(time_s[-1] - begin_s)
-    rate = stamped_rate_hz(time_s)
-    return Motion(duration_s + 1 / rate, force=ForcePath(time_s, force),
-                  internal_rate_hz=rate if resampled else max(rate, 1000.0)), begin_s
+    rate_hz = round(1 / float(np.median(np.diff(time_s))), 6)
+    return Motion(
+        duration_s + 1 / rate_hz, force=ForcePath(time_s, force_mps2),
+        internal_rate_hz=rate_hz if resampled else max(rate_hz, INTERNAL_RATE_HZ)), begin_s
 
 
 def motion_from_references(read: Recording, sensor: Sensor) -> Motion:
     """
-    Make the motion of a recording's references.
+    Make a motion from the stage angles, temperature and supply of a recording.
+
+    Parameters
+    ----------
+    read
+        The recording.
+    sensor
+        The unit with the resolution of its stage.
+
+    Returns
+    -------
+    Motion
+        A motion that begins with the recording.
 
     Raises
     ------
     UserError
-        There are no stage angles, or they jump as no stage does.
+        The recording has no stage angles, or an angle jumps.
 
     """
     for name in ('alpha_rad', 'beta_rad'):
         if name not in read.columns or np.isnan(read.columns[name]).all():
             raise UserError(f'{read.path}: no stage angle {name} to follow; for specific force '
                             f'say simulate imu --force {read.path}')
-    steps = {'alpha': sensor.stage_resolution_rad, 'beta': sensor.stage_resolution_rad,
-             'shift': 0.0}
+    resolution = {'alpha': sensor.stage_resolution_rad, 'beta': sensor.stage_resolution_rad,
+                  'shift': 0.0}
     paths: dict[str, Any] = dict(environment_paths(read))
     for joint, name in JOINTS.items():
         values = read.columns.get(name)
@@ -81,25 +103,26 @@ def motion_from_references(read: Recording, sensor: Sensor) -> Motion:
             paths[joint] = Held()
             continue
         if joint != 'shift':
-            _check_speed(read, name, steps[joint])
-        paths[joint] = SmoothedPath(read.time_s, values, steps[joint])
+            _check_speed(read, name, resolution[joint])
+        paths[joint] = SmoothedPath(read.time_s, values, resolution[joint])
     return Motion(float(read.time_s[-1] - read.time_s[0]), **paths)
 
 
 def environment_paths(read: Recording) -> dict[str, Path]:
-    """Return what a recording holds of temperature, °C, and supply, V, as paths by name."""
+    """Return the recorded temperature, °C, and supply, V, as paths by column."""
     return {name: SmoothedPath(read.time_s, read.columns[name], 0.0)
             for name in ('temperature_c', 'supply_v')
             if name in read.columns and np.isfinite(read.columns[name]).any()}
 
 
-def _check_speed(read: Recording, name: str, step: float) -> None:
-    known = np.flatnonzero(np.isfinite(read.columns[name]))
-    moved = np.abs(np.diff(read.columns[name][known]))
-    passed = np.diff(read.time_s[known])
-    fast = np.flatnonzero(moved - 2 * step > _FASTEST_RAD_S * passed)
-    if len(fast):
-        i = fast[0]
-        raise UserError(f'{read.path}: {name} jumps by {moved[i]:.3g} rad within {passed[i]:.3g} '
-                        f's at {read.time_s[known[i]]:.6g} s, which no stage does; unwrap the '
-                        'angle, or cut the recording there')
+def _check_speed(read: Recording, name: str, resolution_rad: float) -> None:
+    """Refuse an angle that changes faster than a stage turns."""
+    sampled = np.flatnonzero(np.isfinite(read.columns[name]))
+    change_rad = np.abs(np.diff(read.columns[name][sampled]))
+    interval_s = np.diff(read.time_s[sampled])
+    jumps = np.flatnonzero(change_rad - 2 * resolution_rad > _MAX_SPEED_RAD_S * interval_s)
+    if len(jumps):
+        i = jumps[0]
+        raise UserError(f'{read.path}: {name} jumps by {change_rad[i]:.3g} rad within '
+                        f'{interval_s[i]:.3g} s at {read.time_s[sampled[i]]:.6g} s, which no '
+                        'stage does; unwrap the angle, or cut the recording there')

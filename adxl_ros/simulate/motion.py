@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""A manoeuvre: what the joints of the stage and the surroundings do over time."""
+"""Manoeuvres: motion of the joints of the stage, and surroundings, over time."""
 
 from __future__ import annotations
 
@@ -25,57 +25,85 @@ import numpy as np
 from scipy.interpolate import BPoly, PPoly
 
 INTERNAL_RATE_HZ = 1000.0
-"""The chain runs at least this fast, so that what lies between slow samples is felt, too."""
+"""Lowest rate at which the chain runs, Hz; chosen: slow samples then get the motion between
+them, up to the bandwidth of the sensor."""
 
 
 class Path(Protocol):
-    """A quantity over time that can be differentiated."""
+    """A quantity over time with its derivatives."""
 
     def __call__(self, time_s: np.ndarray, order: int = 0) -> np.ndarray:
-        """Return the derivative of an order (0, 1 or 2) at times, (n,); at rest outside."""
+        """
+        Return a derivative of the quantity.
+
+        Parameters
+        ----------
+        time_s
+            Times, s, (n,). Outside of its own range the quantity is at rest.
+        order
+            Order of the derivative: 0, 1 or 2.
+
+        Returns
+        -------
+        ndarray
+            Derivative, (n,).
+
+        """
 
 
 @dataclass(frozen=True)
 class Held:
-    """Stays as it is."""
+    """
+    A constant quantity.
+
+    Attributes
+    ----------
+    value
+        The constant.
+
+    """
 
     value: float = 0.0
 
     def __call__(self, time_s: np.ndarray, order: int = 0) -> np.ndarray:
-        """See `Path`."""
+        """Return a derivative; see `Path`."""
         return np.full(len(time_s), 0.0 if order else self.value)
 
 
 class Knots:
     """
-    Runs through knots by polynomials of degree 5, continuous to the second derivative.
+    A path through knots, by polynomials of degree 5 with continuous second derivatives.
 
-    Between two knots at rest that is the motion of least jerk, 10·u³ − 15·u⁴ + 6·u⁵.
+    Between two knots at rest it is the motion of minimum jerk, 10·u³ − 15·u⁴ + 6·u⁵.
     """
 
     def __init__(self, time_s: Sequence[float] | np.ndarray,
                  position: Sequence[float] | np.ndarray,
                  velocity: Sequence[float] | np.ndarray | None = None) -> None:
         """
-        Take positions and, unless it is at rest there, velocities at ascending times.
+        Interpolate knots.
 
         Parameters
         ----------
-        time_s, position, velocity
-            (k,) each; s, rad or m, and its rate.
+        time_s
+            Ascending times of the knots, s, (k,).
+        position
+            Values at the knots, (k,).
+        velocity
+            First derivatives at the knots, (k,); 0 unless given. The second are 0.
 
         """
         rates = np.zeros(len(time_s)) if velocity is None else np.asarray(velocity, float)
         derivatives = np.column_stack([position, rates, np.zeros(len(time_s))])
         pieces = PPoly.from_bernstein_basis(BPoly.from_derivatives(time_s, derivatives))
         self._orders = [pieces, pieces.derivative(), pieces.derivative(2)]
-        self._begin, self._end = float(time_s[0]), float(time_s[-1])
+        self._begin_s, self._end_s = float(time_s[0]), float(time_s[-1])
 
     def __call__(self, time_s: np.ndarray, order: int = 0) -> np.ndarray:
-        """See `Path`."""
-        values = self._orders[order](np.clip(time_s, self._begin, self._end))
-        if order and len(time_s) and (time_s[0] < self._begin or time_s[-1] > self._end):
-            values[(time_s < self._begin) | (time_s > self._end)] = 0.0
+        """Return a derivative; see `Path`."""
+        values = self._orders[order](np.clip(time_s, self._begin_s, self._end_s))
+        if order and len(time_s) and (time_s[0] < self._begin_s or time_s[-1] > self._end_s):
+            values[(time_s < self._begin_s) | (time_s > self._end_s)] = 0.0
         return values
 
 
@@ -87,16 +115,17 @@ class Motion:
     Attributes
     ----------
     duration_s
-        How long it lasts.
+        Duration, s.
     alpha, beta, shift
-        Joints: rad, rad, m.
+        Joints, rad, rad and m.
     temperature_c, supply_v
-        Surroundings where they change or are measured; else the nominal ones.
+        Temperature, °C, and supply voltage, V, if they change or are measured; None for the
+        nominal ones.
     force
-        Specific force in the case frame, m/s², three components by time, where no stage moves
-        the sensor; the joints then mean nothing.
+        Maps times, s, (n,), to specific force in the case frame, m/s², three components, where
+        no stage moves the sensor. The joints then have no meaning.
     internal_rate_hz
-        Rate that follows what it does; see `INTERNAL_RATE_HZ`.
+        Lowest rate at which the chain runs, Hz.
 
     """
 

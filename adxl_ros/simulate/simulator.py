@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""A whole recording from a manoeuvre: what the sensor says and what the encoder says."""
+"""Simulated recordings: samples of a sensor during a manoeuvre, and the stage's encoders."""
 
 from __future__ import annotations
 
@@ -24,18 +24,30 @@ from adxl_ros.simulate.response import Response
 import numpy as np
 
 Columns = dict[str, np.ndarray]
-_BLOCK = 32768
+"""Columns of a recording by canonical name, (n,) each."""
+
+_BLOCK_ROWS = 32768
+"""Samples of a block; chosen: its arrays stay small beside those of the internal grid."""
 
 
 def simulate(sensor: Sensor, motion: Motion, seed: int) -> Columns:
     """
-    Run a manoeuvre through the chain and read the stage by its encoder.
+    Simulate a whole recording.
+
+    Parameters
+    ----------
+    sensor
+        The unit, sampled at its rate.
+    motion
+        The manoeuvre.
+    seed
+        Seed of all randomness; equal seeds give equal bits.
 
     Returns
     -------
     dict
-        Columns of a recording by canonical name, each (n,): `time_s`, volts, the joints'
-        encoders, temperature and supply where the manoeuvre has them.
+        Columns by canonical name, (n,) each: `time_s`, volts by axis, readings of the encoders,
+        and temperature and supply if the manoeuvre has them.
 
     """
     parts = list(simulate_blocks(sensor, motion, seed))
@@ -43,26 +55,31 @@ def simulate(sensor: Sensor, motion: Motion, seed: int) -> Columns:
 
 
 def simulate_blocks(sensor: Sensor, motion: Motion, seed: int, begin_s: float = 0.0
-           ) -> Iterator[Columns]:
+                    ) -> Iterator[Columns]:
     """
-    Run a manoeuvre block by block; see `simulate`.
+    Simulate a recording block by block.
 
     Parameters
     ----------
     sensor
         The unit, sampled at its rate.
     motion
-        What it feels.
+        The manoeuvre.
     seed
-        Of all randomness: the same gives the same to the bit.
+        Seed of all randomness; equal seeds give equal bits.
     begin_s
-        Time of the first sample.
+        Stamp of the first sample, s.
+
+    Yields
+    ------
+    dict
+        Columns of the next samples, as `simulate` returns them.
 
     """
     respond = Response(sensor, motion, seed, begin_s)
     count = max(int(round(motion.duration_s * sensor.rate_hz, 6)), 1)
-    for begin in range(0, count, _BLOCK):
-        time_s = begin_s + np.arange(begin, min(begin + _BLOCK, count)) / sensor.rate_hz
+    for begin in range(0, count, _BLOCK_ROWS):
+        time_s = begin_s + np.arange(begin, min(begin + _BLOCK_ROWS, count)) / sensor.rate_hz
         volts = respond(time_s)
         yield {'time_s': time_s,
                **{f'{axis}_v': volts[:, d] for d, axis in enumerate(sensor.axes)},
@@ -70,11 +87,29 @@ def simulate_blocks(sensor: Sensor, motion: Motion, seed: int, begin_s: float = 
 
 
 def reference_columns(sensor: Sensor, motion: Motion, time_s: np.ndarray) -> Columns:
-    """Return what is recorded beside the sensor at the stamps, (n,) by column."""
+    """
+    Return the columns that a recording has beside those of the sensor.
+
+    Parameters
+    ----------
+    sensor
+        The unit with the resolution of its stage.
+    motion
+        The manoeuvre.
+    time_s
+        Stamps, s, (n,).
+
+    Returns
+    -------
+    dict
+        Readings of the encoders, temperature and supply by canonical name, (n,) each.
+
+    """
     columns = {}
     if motion.force is None:
-        columns['alpha_rad'] = encoder_reading(motion.alpha(time_s), sensor.stage_resolution_rad)
-        columns['beta_rad'] = encoder_reading(motion.beta(time_s), sensor.stage_resolution_rad)
+        resolution_rad = sensor.stage_resolution_rad
+        columns['alpha_rad'] = encoder_reading(motion.alpha(time_s), resolution_rad)
+        columns['beta_rad'] = encoder_reading(motion.beta(time_s), resolution_rad)
         if not isinstance(motion.shift, Held):
             columns['shift_m'] = motion.shift(time_s)
     if motion.temperature_c:
@@ -85,7 +120,22 @@ def reference_columns(sensor: Sensor, motion: Motion, time_s: np.ndarray) -> Col
 
 
 def encoder_reading(angle_rad: np.ndarray, resolution_rad: float) -> np.ndarray:
-    """Round angles to the encoder's steps; unchanged for a resolution of 0."""
+    """
+    Round angles to the steps of an encoder.
+
+    Parameters
+    ----------
+    angle_rad
+        Angles, rad, (n,).
+    resolution_rad
+        Step, rad; 0 for an exact encoder.
+
+    Returns
+    -------
+    ndarray
+        Readings, rad, (n,).
+
+    """
     if not resolution_rad:
         return angle_rad
     return np.rint(angle_rad / resolution_rad) * resolution_rad

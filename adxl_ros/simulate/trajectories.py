@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Manoeuvres of the stage and of what surrounds it: what `simulate` can be asked for."""
+"""Manoeuvres of the stage and its surroundings, by name, for the tool simulate."""
 
 from __future__ import annotations
 
@@ -24,27 +24,56 @@ from adxl_ros.simulate.motion import Held, Knots, Motion, Path
 import numpy as np
 
 SLEW_RAD_S = np.pi / 4
-"""Fastest turn of the stage from pose to pose; a 30° step then takes 1.25 s."""
+"""Largest angular velocity of the stage between poses, rad/s; chosen: 30° take 1.25 s."""
+
 DWELL_S = 5.0
-"""The paper averages 5 s a pose."""
+"""Dwell of a pose, s: the time over which the paper averages."""
+
 SETTLE_S = 0.2
+"""Time to settle before a dwell, s; chosen: 20 time constants of the RC filter."""
+
+_JERK_PEAK = 1.875
+"""Peak velocity of the motion of minimum jerk, divided by its mean: 15/8."""
+
 _RUN_UP_S = 1.0
-"""Time in which a joint reaches a constant speed."""
-_SHAKE_HZ = (2.0, 40.0)
+"""Time in which a joint reaches a constant velocity, s; chosen."""
+
+_SHAKE_LOW_HZ = 2.0
+"""Lowest frequency of the shaker, Hz; chosen: its stroke is 13 mm."""
+
+_SHAKE_HIGH_HZ = 40.0
+"""Highest frequency of the shaker, Hz; chosen: near the bandwidth of the sensor."""
+
 _SHAKE_MPS2 = 1.0
+"""Amplitude of the shaker, m/s²; chosen: a tenth of gravity."""
+
 _SHAKE_S = 40.0
-_EDGE_S = 2.0
+"""Duration of the shaker, s; chosen."""
+
+_FADE_S = 2.0
+"""Time over which the shaker fades in and out, s; chosen: four periods of its lowest
+frequency."""
 
 
 @dataclass(frozen=True)
 class Sine:
-    """A sine from time 0 on: amplitude in m, frequency in Hz."""
+    """
+    A sine from time 0 on.
+
+    Attributes
+    ----------
+    amplitude_m
+        Amplitude, m.
+    frequency_hz
+        Frequency, Hz.
+
+    """
 
     amplitude_m: float
     frequency_hz: float
 
     def __call__(self, time_s: np.ndarray, order: int = 0) -> np.ndarray:
-        """See `motion.Path`."""
+        """Return a derivative; see `motion.Path`."""
         omega = 2 * np.pi * self.frequency_hz
         return self.amplitude_m * omega ** order * np.sin(omega * time_s + order * np.pi / 2)
 
@@ -57,67 +86,110 @@ class SweptSine:
     """
 
     def __init__(self, begin_s: float, duration_s: float) -> None:
-        """Begin at a time, s, and last so long."""
-        low, high = _SHAKE_HZ
+        """
+        Set the times of the sine.
+
+        Parameters
+        ----------
+        begin_s
+            Time at which it begins, s.
+        duration_s
+            Duration, s.
+
+        """
         self._begin_s, self._end_s = begin_s, begin_s + duration_s
-        self._omega, self._k = 2 * np.pi * low, np.log(high / low) / duration_s
-        self._window = Knots([0, _EDGE_S, duration_s - _EDGE_S, duration_s], [0, 1, 1, 0])
+        self._omega = 2 * np.pi * _SHAKE_LOW_HZ
+        self._k = np.log(_SHAKE_HIGH_HZ / _SHAKE_LOW_HZ) / duration_s
+        self._window = Knots([0, _FADE_S, duration_s - _FADE_S, duration_s], [0, 1, 1, 0])
 
     def __call__(self, time_s: np.ndarray, order: int = 0) -> np.ndarray:
-        """See `motion.Path`."""
-        out = np.zeros(len(time_s))
-        on = (time_s > self._begin_s) & (time_s < self._end_s)
-        if not on.any():
-            return out
-        t, k = time_s[on] - self._begin_s, self._k
+        """Return a derivative; see `motion.Path`."""
+        values = np.zeros(len(time_s))
+        active = (time_s > self._begin_s) & (time_s < self._end_s)
+        if not active.any():
+            return values
+        t, k = time_s[active] - self._begin_s, self._k
         omega = self._omega * np.exp(k * t)
         phase = (omega - self._omega) / k
         sine, cosine = np.sin(phase), np.cos(phase)
-        size = _SHAKE_MPS2 / omega ** 2
+        amplitude = _SHAKE_MPS2 / omega ** 2
         w0, w1, w2 = (self._window(t, i) for i in range(3))
-        e0, e1 = size * w0, size * (w1 - 2 * k * w0)
+        e0, e1 = amplitude * w0, amplitude * (w1 - 2 * k * w0)
         if order == 0:
-            out[on] = -e0 * sine
+            values[active] = -e0 * sine
         elif order == 1:
-            out[on] = -e1 * sine - e0 * omega * cosine
+            values[active] = -e1 * sine - e0 * omega * cosine
         else:
-            e2 = size * (w2 - 4 * k * w1 + 4 * k * k * w0)
-            out[on] = ((e0 * omega ** 2 - e2) * sine - (2 * e1 + k * e0) * omega * cosine)
-        return out
+            e2 = amplitude * (w2 - 4 * k * w1 + 4 * k * k * w0)
+            values[active] = ((e0 * omega ** 2 - e2) * sine
+                              - (2 * e1 + k * e0) * omega * cosine)
+        return values
 
 
 @dataclass(frozen=True)
 class Sum:
-    """Several paths, one upon the other."""
+    """
+    A sum of paths.
+
+    Attributes
+    ----------
+    parts
+        The paths.
+
+    """
 
     parts: tuple[Path, ...]
 
     def __call__(self, time_s: np.ndarray, order: int = 0) -> np.ndarray:
-        """See `motion.Path`."""
+        """Return a derivative; see `motion.Path`."""
         return np.sum([part(time_s, order) for part in self.parts], axis=0)
 
 
 @dataclass(frozen=True)
 class Steps:
-    """Steps to levels at times, s, each approached with a time constant, s."""
+    """
+    Steps to levels, each approached exponentially.
+
+    Attributes
+    ----------
+    begin
+        Level at the beginning.
+    steps
+        Time, s, and level of each step.
+    tau_s
+        Time constant of each step, s.
+
+    """
 
     begin: float
     steps: tuple[tuple[float, float], ...]
     tau_s: float
 
     def __call__(self, time_s: np.ndarray, order: int = 0) -> np.ndarray:
-        """See `motion.Path`; only of order 0."""
-        value, before = np.full(len(time_s), self.begin), self.begin
-        for at_s, level in self.steps:
-            passed = np.maximum(time_s - at_s, 0.0)
-            value += (level - before) * -np.expm1(-passed / self.tau_s)
-            before = level
-        return value
+        """Return the value; see `motion.Path`. It has no derivatives."""
+        values, previous = np.full(len(time_s), self.begin), self.begin
+        for step_s, level in self.steps:
+            elapsed_s = np.maximum(time_s - step_s, 0.0)
+            values += (level - previous) * -np.expm1(-elapsed_s / self.tau_s)
+            previous = level
+        return values
 
 
 @dataclass
 class Script:
-    """Writes down what both angles do, one move after the other; rad and s."""
+    """
+    Builds the paths of both angles, move by move.
+
+    Attributes
+    ----------
+    alpha, beta
+        Angles at present, rad.
+    now
+        Time at present, s.
+    rows
+        Knots: time, s, alpha and beta, rad, and their derivatives, rad/s.
+
+    """
 
     alpha: float
     beta: float
@@ -125,35 +197,59 @@ class Script:
     rows: list[tuple[float, ...]] = field(default_factory=list)
 
     def rest(self, seconds: float) -> None:
-        """Stay."""
+        """Rest for a time, s."""
         self._knot(0.0, 0.0)
         self.now += seconds
         self._knot(0.0, 0.0)
 
     def go(self, alpha: float, beta: float) -> None:
-        """Move by least jerk, whose speed peaks at 1.875 times the mean, at the slew rate."""
-        far = max(abs(alpha - self.alpha), abs(beta - self.beta))
+        """
+        Move to a pose by minimum jerk, whose velocity peaks at the slew rate.
+
+        Parameters
+        ----------
+        alpha, beta
+            Angles of the pose, rad.
+
+        """
+        distance = max(abs(alpha - self.alpha), abs(beta - self.beta))
         self._knot(0.0, 0.0)
-        self.now += 1.875 * far / SLEW_RAD_S
+        self.now += _JERK_PEAK * distance / SLEW_RAD_S
         self.alpha, self.beta = alpha, beta
         self._knot(0.0, 0.0)
 
     def run(self, joint: str, to: float, speed: float) -> None:
-        """Turn one joint at a constant speed, rad/s, between a run-up and a stop."""
-        way = to - getattr(self, joint)
-        rate = np.copysign(speed, way)
-        rates = {'alpha': 0.0, 'beta': 0.0, joint: rate}
-        up = rate * _RUN_UP_S / 2
+        """
+        Turn one joint at a constant velocity, between a run-up and a stop.
+
+        Parameters
+        ----------
+        joint
+            Name of the joint: alpha or beta.
+        to
+            Angle at the end, rad.
+        speed
+            Magnitude of the velocity, rad/s.
+
+        """
+        distance = to - getattr(self, joint)
+        rate = np.copysign(speed, distance)
+        run_up = rate * _RUN_UP_S / 2
+        constant = distance - 2 * run_up
         self._knot(0.0, 0.0)
-        for part, seconds, moving in ((up, _RUN_UP_S, 1),
-                                      (way - 2 * up, abs(way - 2 * up) / speed, 1),
-                                      (up, _RUN_UP_S, 0)):
-            setattr(self, joint, getattr(self, joint) + part)
-            self.now += seconds
-            self._knot(rates['alpha'] * moving, rates['beta'] * moving)
+        self._turn(joint, run_up, _RUN_UP_S, rate)
+        self._turn(joint, constant, abs(constant) / speed, rate)
+        self._turn(joint, run_up, _RUN_UP_S, 0.0)
+
+    def _turn(self, joint: str, angle: float, seconds: float, rate: float) -> None:
+        """Turn a joint by an angle, rad, within a time, s, up to a velocity, rad/s."""
+        setattr(self, joint, getattr(self, joint) + angle)
+        self.now += seconds
+        rates = {'alpha': 0.0, 'beta': 0.0, joint: rate}
+        self._knot(rates['alpha'], rates['beta'])
 
     def joints(self) -> tuple[Knots, Knots]:
-        """Return alpha and beta over time."""
+        """Return the paths of alpha and beta."""
         time_s, alpha, beta, alpha_rate, beta_rate = np.array(self.rows).T
         return Knots(time_s, alpha, alpha_rate), Knots(time_s, beta, beta_rate)
 
@@ -165,14 +261,19 @@ class Script:
 
 def visit(poses_rad: Sequence[tuple[float, float]], dwell_s: float = DWELL_S) -> Motion:
     """
-    Rest in each pose (alpha, beta), rad, and move between them.
+    Rest in poses and move between them.
 
     Parameters
     ----------
     poses_rad
-        In this order.
+        Alpha and beta of each pose, rad, in order.
     dwell_s
-        Rest in each, beside the time to settle.
+        Dwell of each pose, s, without the time to settle.
+
+    Returns
+    -------
+    Motion
+        The manoeuvre.
 
     """
     script = Script(*poses_rad[0])
@@ -184,7 +285,7 @@ def visit(poses_rad: Sequence[tuple[float, float]], dwell_s: float = DWELL_S) ->
 
 
 def sweep(_: np.random.Generator) -> Motion:
-    """Visit planes alpha 90, 60, 30, 120, 150°, forth and back (experiments 1 and 2)."""
+    """Visit planes alpha 90, 60, 30, 120, 150° forth and back (experiments 1 and 2)."""
     forth = list(range(0, 361, 30))
     return _visit_deg([(alpha, beta) for alpha in (90, 60, 30, 120, 150)
                        for beta in forth + forth[::-1]])
@@ -196,7 +297,7 @@ def tilt_alpha(_: np.random.Generator) -> Motion:
 
 
 def tilt_beta(_: np.random.Generator) -> Motion:
-    """Turn beta at alpha 90°: the paper says 0, where beta does not show (figure 10b)."""
+    """Turn beta at alpha 90° (figure 10b); at 0, as printed, beta would not show."""
     return _visit_deg([(90, angle) for angle in range(-180, 181, 30)])
 
 
@@ -237,8 +338,8 @@ def tumble(rng: np.random.Generator) -> Motion:
 
 
 def rich(_: np.random.Generator) -> Motion:
-    """Do all of it in 7 min: planes at two speeds, reversals, shaker, warm spell, supply step."""
-    script, shakes = Script(np.pi / 2, 0.0), []
+    """Combine planes at two speeds, reversals, shaker, warming and a supply step in 7 min."""
+    script = Script(np.pi / 2, 0.0)
     script.rest(8.0)
     for alpha in np.radians([90, 45, 120]):
         script.go(alpha, 0.0)
@@ -251,14 +352,14 @@ def rich(_: np.random.Generator) -> Motion:
             script.rest(2.0)
             script.run('alpha', to, speed)
     script.go(np.radians(60), np.radians(45))
-    for size in np.radians([20, 10, 5]):
+    for amplitude in np.radians([20, 10, 5]):
         for joint in ('beta', 'alpha'):
             middle = getattr(script, joint)
-            for to in (middle + size, middle - size, middle):
-                script.run(joint, to, size / 2)
+            for to in (middle + amplitude, middle - amplitude, middle):
+                script.run(joint, to, amplitude / 2)
             script.rest(1.0)
     script.go(np.pi / 4, np.pi / 2)
-    shakes.append(_shake(script))
+    shift = _shake(script)
     for alpha, beta in np.radians([(0, 0), (90, 90), (180, 90), (90, 270), (90, 180), (30, 30)]):
         script.go(alpha, beta)
         script.rest(DWELL_S)
@@ -266,15 +367,15 @@ def rich(_: np.random.Generator) -> Motion:
     temperature_c = Steps(NOMINAL_TEMPERATURE_C,
                           ((0.25 * end, 35.0), (0.6 * end, NOMINAL_TEMPERATURE_C)), 30.0)
     supply_v = Steps(NOMINAL_SUPPLY_V, ((0.4 * end, 4.85), (0.8 * end, NOMINAL_SUPPLY_V)), 0.5)
-    return Motion(end, *script.joints(), Sum(tuple(shakes)), temperature_c=temperature_c,
-                  supply_v=supply_v)
+    return Motion(end, *script.joints(), shift, temperature_c, supply_v)
 
 
 def _shake(script: Script) -> SweptSine:
+    """Rest while the shaker runs, and return its path."""
     script.rest(2.0)
-    begin = script.now
+    begin_s = script.now
     script.rest(_SHAKE_S + 2.0)
-    return SweptSine(begin, _SHAKE_S)
+    return SweptSine(begin_s, _SHAKE_S)
 
 
 def _visit_deg(poses: Sequence[tuple[float, float]]) -> Motion:
@@ -284,3 +385,4 @@ def _visit_deg(poses: Sequence[tuple[float, float]]) -> Motion:
 TRAJECTORIES: dict[str, Callable[[np.random.Generator], Motion]] = {
     f.__name__: f for f in (sweep, tilt_alpha, tilt_beta, tilt_both, motion, shaker, soak,
                             tumble, rich)}
+"""Manoeuvres by name; each takes a random generator."""

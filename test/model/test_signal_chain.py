@@ -261,7 +261,7 @@ def test_axes_of_a_nominal_sensor() -> None:
     with pytest.raises(UserError, match='calibrated for the axes xy, not xyz'):
         with_axes(one_of('xy', 1), 'xyz')
     uneven = nominal(nominal_scale_v_per_g=np.array([1.0, 0.9]))
-    with pytest.raises(UserError, match=r'\[1.0, 0.9\] for xy does not tell'):
+    with pytest.raises(UserError, match=r'\[1.0, 0.9\] for xy does not determine'):
         with_axes(uneven, 'xyz')
 
 
