@@ -23,7 +23,7 @@ from adxl_ros.links.support.base import Level
 import iiod
 import numpy as np
 import pytest
-from rig import Helper
+from rig import ScriptProcess
 from units import nominal
 
 
@@ -41,9 +41,9 @@ def served():
     opened = []
 
     def serve(sensor=None, adc=None, **settings):
-        server = Helper('iiod.py', json.dumps(adc or {}))
+        server = ScriptProcess('iiod.py', json.dumps(adc or {}))
         link = iio.open_link(sensor or nominal(), iio.Settings(
-            uri=f'ip:127.0.0.1:{server.first}', **settings))
+            uri=f'ip:127.0.0.1:{server.first_line}', **settings))
         link.begin(0)
         opened.append((server, link))
         return server, link
@@ -77,8 +77,8 @@ def test_every_format_gives_the_volts_of_its_codes(served, form):
     _, link = served(adc=adc)
     volts = np.concatenate([part.volts for part in read_samples(link, 200)])
     assert len(volts) >= 200
-    _, sign, bits, *_ = iiod.format_of({'format': form})
-    shift = 2 ** (bits - 1) if sign == 's' else 0
+    parsed = iiod.parse_format({'format': form})
+    bits, shift = parsed.bits, 2 ** (parsed.bits - 1) if parsed.sign == 's' else 0
     codes = np.rint(volts[:, 0] / (scale * 1e-3)) - offset + shift
     first = int(codes[0]) - 1
     k = first + np.arange(len(codes))

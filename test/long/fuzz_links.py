@@ -13,13 +13,13 @@
 # limitations under the License.
 
 """
-Hostile bytes for the decoder and the serial link, two minutes of them.
+Hostile bytes for the decoder and the serial link, for two minutes.
 
-    make fuzz                       guided by coverage where atheris is installed, else by chance
+    make fuzz                       guided by coverage where atheris is installed, else random
     make fuzz ARGS='10'             for so many seconds
 
-A part of the inputs is put into frames whose CRC is right, and a part into data frames with
-fields as they come: what a liar with a good CRC can say.
+Some inputs are put into frames with a right CRC. Others are the fields of frames with samples,
+which a faulty board with a right CRC can send.
 """
 
 from collections import Counter
@@ -46,12 +46,20 @@ import numpy as np
 from units import nominal
 
 SETTINGS = serial.Settings(port='/dev/null')
+"""Settings of the link; its port is replaced."""
 SENSOR = nominal()
+"""Sensor of the link."""
+MAX_INPUT = 1000
+"""Most bytes of an input."""
+MAX_CHUNKS = 50
+"""Most chunks of an input."""
+MAX_POOL = 500
+"""Most inputs that are kept for mutation."""
 counts = Counter()
 
 
-class Script:
-    """A port that gives chunks, and nothing when they are over; None is a port that was closed."""
+class ScriptedPort:
+    """A port that delivers chunks, then nothing; None stands for a port that was closed."""
 
     error = ''
     received_bytes = connections = 0
@@ -61,22 +69,23 @@ class Script:
         self.chunks = chunks
 
     def read(self):
+        """Return the next chunk."""
         return self.chunks.pop(0) if self.chunks else b''
 
     def confirm(self):
-        pass
+        """Do nothing: this port never fails."""
 
     def close(self):
-        pass
+        """Do nothing."""
 
 
-def frames_of(data):
-    """Make chunks of an input: raw, in frames, or as the fields of frames."""
-    chunks, at = [], 0
-    while at + 2 <= len(data) and len(chunks) < 50:
-        kind, size = data[at] % 6, data[at + 1]
-        part = data[at + 2:at + 2 + size]
-        at += 2 + size
+def chunks_of(data):
+    """Make chunks of an input: bytes as they are, frames, or frames of the fields."""
+    chunks, begin = [], 0
+    while begin + 2 <= len(data) and len(chunks) < MAX_CHUNKS:
+        kind, size = data[begin] % 6, data[begin + 1]
+        part = data[begin + 2:begin + 2 + size]
+        begin += 2 + size
         if kind == 0:
             chunks.append(part)
         elif kind == 1:
@@ -84,50 +93,59 @@ def frames_of(data):
         elif kind == 2:
             chunks.append(None)
         elif kind == 3:
-            fields = part[:12].ljust(12, b'\1')
-            rate, bits, channels = struct.unpack('<fBB', fields[:6])
-            chunks.append(wire_format.encode_payload(struct.pack(
-                '<BBHIfBBf16s', 2, 1, fields[6], 0, rate, bits % 18, channels % 9, 5.0, b'fuzz')))
+            chunks.append(info_frame(part))
         else:
-            fields = part[:16].ljust(16, b'\2')
-            index, time_us, flags, overruns, shape = struct.unpack('<IQBHB', fields)
-            if kind == 5:  # near to what goes on
-                index, time_us = index % 1000, time_us % 10 ** 6
-            count, channels = shape % 16 + 1, shape // 16 % 4 + 1
-            codes = (part * 130)[:2 * count * channels].ljust(2 * count * channels, b'\3')
-            chunks.append(wire_format.encode_payload(struct.pack(
-                '<BBHIQIHBB', 1, 1, flags, 0, time_us, index, overruns, count, channels) + codes))
+            chunks.append(sample_frame(part, plausible=kind == 5))
     return chunks
 
 
-def one(data):
-    """Run the link on an input; whatever it is, samples are sound and in order."""
+def info_frame(part):
+    """Make an info frame whose fields come from bytes."""
+    fields = part[:12].ljust(12, b'\1')
+    rate, bits, channels = struct.unpack('<fBB', fields[:6])
+    return wire_format.encode_payload(struct.pack(
+        '<BBHIfBBf16s', 2, 1, fields[6], 0, rate, bits % 18, channels % 9, 5.0, b'fuzz'))
+
+
+def sample_frame(part, plausible):
+    """Make a frame of samples whose fields come from bytes; a plausible one is near a count."""
+    fields = part[:16].ljust(16, b'\2')
+    index, time_us, flags, overruns, shape = struct.unpack('<IQBHB', fields)
+    if plausible:
+        index, time_us = index % 1000, time_us % 10 ** 6
+    count, channels = shape % 16 + 1, shape // 16 % 4 + 1
+    codes = (part * 130)[:2 * count * channels].ljust(2 * count * channels, b'\3')
+    return wire_format.encode_payload(struct.pack(
+        '<BBHIQIHBB', 1, 1, flags, 0, time_us, index, overruns, count, channels) + codes)
+
+
+def run_input(data):
+    """Run the link on an input, and check that its samples are finite and in order."""
     link = serial.open_link(SENSOR, SETTINGS)
-    chunks = frames_of(data)
-    link._port = Script(chunks)
+    chunks = chunks_of(data)
+    link._port = ScriptedPort(chunks)
     link._throttle = lambda size, samples: None
-    last = -1
-    while True:
-        done = not chunks and not link._arrivals
-        if done:
+    last_ns = -1
+    complete = False
+    while not complete:
+        complete = not chunks and not link._arrivals
+        if complete:
             link._stamper.flush()
         samples = link.read(0)
         assert np.isfinite(samples.volts).all()
         assert samples.missing >= samples.estimated >= 0
         if len(samples.stamp_ns):
-            assert samples.stamp_ns[0] > last
+            assert samples.stamp_ns[0] > last_ns
             assert (np.diff(samples.stamp_ns) > 0).all()
-            last = samples.stamp_ns[-1]
+            last_ns = samples.stamp_ns[-1]
         counts['samples'] += len(samples.stamp_ns)
-        if done:
-            break
     assert len(link._splitter._incomplete) <= wire_format.MAX_FRAME_BYTES
     link.status()
     counts['inputs'] += 1
 
 
-def sound():
-    """Make an input that a good board could be: two axes, frames in order, one lost."""
+def valid_input():
+    """Make an input that a board could send: two axes, frames in order, one of them lost."""
     info = struct.pack('<fBB6x', 1000.0, 16, 2)
     data = bytes([3, len(info)]) + info
     for index in (0, 10, 20, 40, 50, 0, 10):
@@ -136,31 +154,32 @@ def sound():
     return data
 
 
-def by_chance(seconds, seed):
-    """Mutate inputs that worked, without guidance."""
-    draw, end = random.Random(seed), time.monotonic() + seconds
-    pool = [sound()]
-    while time.monotonic() < end:
+def run_random(duration_s, seed):
+    """Run random mutations of earlier inputs, without guidance by coverage."""
+    draw, end_s = random.Random(seed), time.monotonic() + duration_s
+    pool = [valid_input()]
+    while time.monotonic() < end_s:
         data = bytearray(draw.choice(pool))
         for _ in range(draw.randrange(1, 8)):
-            at = draw.randrange(len(data) + 1)
-            data[at:at + draw.randrange(3)] = draw.randbytes(draw.randrange(4))
-        one(bytes(data[:1000]))
-        if len(pool) < 500:
-            pool.append(bytes(data[:1000]))
-    print(f'fuzz: {counts["inputs"]} inputs in {seconds:g} s without atheris, seed {seed}: '
-          f'{counts["samples"]} samples, nothing wrong')
+            k = draw.randrange(len(data) + 1)
+            data[k:k + draw.randrange(3)] = draw.randbytes(draw.randrange(4))
+        run_input(bytes(data[:MAX_INPUT]))
+        if len(pool) < MAX_POOL:
+            pool.append(bytes(data[:MAX_INPUT]))
+    print(f'fuzz: {counts["inputs"]} inputs in {duration_s:g} s without atheris, seed {seed}: '
+          f'{counts["samples"]} samples, no failure')
 
 
 def main():
-    seconds = int(sys.argv[1]) if len(sys.argv) > 1 else 120
+    """Run inputs for a time."""
+    duration_s = int(sys.argv[1]) if len(sys.argv) > 1 else 120
     if atheris is None:
-        by_chance(seconds, 1)
+        run_random(duration_s, 1)
         return
     with tempfile.TemporaryDirectory() as corpus:
-        Path(corpus, 'sound').write_bytes(sound())
-        atheris.Setup([sys.argv[0], f'-max_total_time={seconds}', '-max_len=1000', '-seed=1',
-                       '-print_final_stats=1', corpus], one)
+        Path(corpus, 'valid').write_bytes(valid_input())
+        atheris.Setup([sys.argv[0], f'-max_total_time={duration_s}', f'-max_len={MAX_INPUT}',
+                       '-seed=1', '-print_final_stats=1', corpus], run_input)
         atheris.Fuzz()
 
 

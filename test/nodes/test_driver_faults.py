@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The driver on devices that are hurt: whatever happens, it stays up, right and countable."""
+"""The driver on devices with faults: it stays up, and its samples are right and counted."""
 
 from contextlib import contextmanager
 from dataclasses import replace
@@ -30,7 +30,7 @@ from adxl_ros.links import iio
 from adxl_ros.links.support import emulated_board
 from adxl_ros.model.effects import effect_named
 from diagnostic_msgs.msg import DiagnosticStatus
-from faults import bytes_hurt, IIO, Row, run, SERIAL
+from faults import byte_fault, Fault, IIO_FAULTS, run_fault, SERIAL_FAULTS
 from graph import accel, Graph, stamp_ns
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import GetState
@@ -44,9 +44,9 @@ ROS = '--ros-args'
 
 
 @contextmanager
-def board_rig(tmp_path, setting=None):
+def board_rig(tmp_path, options=None):
     with Graph() as graph:
-        rig = SerialRig(graph, tmp_path, setting)
+        rig = SerialRig(graph, tmp_path, options)
         try:
             yield rig
         finally:
@@ -58,41 +58,41 @@ def lines(process):
 
 
 def test_every_fault_of_a_board_is_counted_exactly(start, tmp_path):
-    """One page of the book for all faults over which the board's count goes on."""
-    by_name = {row.name: row for row in SERIAL}
-    page = [*(bytes_hurt(kind, 1e-3) for kind in ('flip', 'lose', 'insert', 'burst')),
-            *(by_name[name] for name in (
-                'wrong baud rate', '100 kB without a delimiter', '200 kB of noise',
-                '137 samples lost by the board', 'unplugged for 1 s, in a read',
-                'board and clock halted for 1 s', 'reader stopped for 3 s'))]
+    """One report covers all faults during which the board's count continues."""
+    by_name = {fault.name: fault for fault in SERIAL_FAULTS}
+    faults = [*(byte_fault(kind, 1e-3) for kind in ('flip', 'lose', 'insert', 'burst')),
+              *(by_name[name] for name in (
+                  'wrong baud rate', '100 kB without a delimiter', '200 kB of noise',
+                  '137 samples lost by the board', 'unplugged for 1 s, in a read',
+                  'board and clock halted for 1 s', 'reader stopped for 3 s'))]
     with board_rig(tmp_path, {'banner': True, 'ppm': 60}) as rig:
-        driver = start('driver', ROS, *rig.parameters())
-        rig.count(500, 30)
+        driver = start('driver', ROS, *rig.driver_parameters())
+        rig.wait_for_samples(500, 30)
 
-        def all_of_it(rig, pid, seconds):
-            def recovers(row):
-                back_ns = row.act(rig, pid, seconds)
-                return not back_ns or rig.recovered_ms(back_ns) < 1000
+        def inject_all(rig, pid, duration_s):
+            def recovers(fault):
+                back_ns = fault.inject(rig, pid, duration_s)
+                return not back_ns or rig.recovery_ms(back_ns) < 1000
 
-            for row in page:
-                # Once of three times: a busy machine may keep any of the three processes waiting.
-                assert any(recovers(row) for _ in range(3)), row.name
-                rig.count(100, 20, row.name)
+            for fault in faults:
+                # One of three attempts: a busy machine may delay any of the three processes.
+                assert any(recovers(fault) for _ in range(3)), fault.name
+                rig.wait_for_samples(100, 20, fault.name)
             return 0
-        book, _ = run(Row('all', all_of_it), rig, driver.popen.pid, 0.7)
-        assert book.wrong == 0
-        assert book.missing > 1137, 'there were faults'
-        assert book.missing == book.said
-        assert book.estimated == 0
-        assert book.error_ms < 20
-        reset = by_name['reset, away for 0.5 s']
-        book, recovered_ms = run(reset, rig, driver.popen.pid, 1.0)
-        assert book.wrong == 0
-        # A board that was reset has lost its count: the host's time tells, to the delay of a read.
-        assert book.said == book.estimated == pytest.approx(book.missing, rel=0.02)
-        assert 450 < book.missing < 700
-        assert recovered_ms < 1000
-        assert rig.said('resets') == 1
+        report = run_fault(Fault('all', inject_all), rig, driver.popen.pid, 0.7).report
+        assert report.wrong == 0
+        assert report.missing > 1137, 'there were faults'
+        assert report.missing == report.counted
+        assert report.estimated == 0
+        assert report.max_error_ms < 20
+        outcome = run_fault(by_name['reset, away for 0.5 s'], rig, driver.popen.pid, 1.0)
+        report = outcome.report
+        assert report.wrong == 0
+        # A board that was reset has lost its count: the host's time gives it, to a read's delay.
+        assert report.counted == report.estimated == pytest.approx(report.missing, rel=0.02)
+        assert 450 < report.missing < 700
+        assert outcome.recovery_ms < 1000
+        assert rig.diagnostic('resets') == 1
         assert float(rig.graph.value('driver', 'clock_drift_ppm')) == pytest.approx(60, abs=200)
     assert driver.popen.poll() is None
     assert driver.stop() == 0
@@ -106,22 +106,24 @@ def test_every_fault_of_an_iiod_is_survived(start, tmp_path):
         pytest.skip(str(error))
     with Graph() as graph:
         rig = IioRig(graph)
-        driver = start('driver', ROS, *rig.parameters())
-        rig.count(500, 30)
-        for row in IIO:
-            book, recovered_ms = run(row, rig, driver.popen.pid, 1.0)
-            assert book.wrong == 0, row.name
-            assert book.said == book.estimated == pytest.approx(book.missing, abs=2), row.name
-            assert book.missing > 500, row.name
-            assert recovered_ms is None or recovered_ms < 1000, row.name
+        driver = start('driver', ROS, *rig.driver_parameters())
+        rig.wait_for_samples(500, 30)
+        for fault in IIO_FAULTS:
+            outcome = run_fault(fault, rig, driver.popen.pid, 1.0)
+            report = outcome.report
+            assert report.wrong == 0, fault.name
+            assert report.counted == report.estimated == pytest.approx(report.missing, abs=2), \
+                fault.name
+            assert report.missing > 500, fault.name
+            assert outcome.recovery_ms is None or outcome.recovery_ms < 1000, fault.name
         assert graph.value('driver', 'link_state') == 'streaming at 1000 Hz'
         rig.end()
     assert driver.stop() == 0
-    own = [line for line in lines(driver) if '[driver]' in line]
-    assert len(own) <= 2 + 2 * 4, own
+    messages = [line for line in lines(driver) if '[driver]' in line]
+    assert len(messages) <= 2 + 2 * 4, messages
 
 
-def test_a_device_that_comes_late_is_found_and_each_state_is_said_once(start, tmp_path):
+def test_a_late_device_is_opened_and_each_state_is_logged_once(start, tmp_path):
     with Graph() as graph:
         driver = start('driver', ROS, '-p', 'link.type:=serial', '-p',
                        f'link.port:={tmp_path / "board"}')
@@ -129,47 +131,48 @@ def test_a_device_that_comes_late_is_found_and_each_state_is_said_once(start, tm
         assert graph.diagnostics['driver'].level == DiagnosticStatus.ERROR
         graph.spin(1.5)
         rig = SerialRig(graph, tmp_path)
-        came = time.monotonic()
-        rig.count(100, 20)
-        assert time.monotonic() - came < 2
+        began_s = time.monotonic()
+        rig.wait_for_samples(100, 20)
+        assert time.monotonic() - began_s < 2
         graph.spin_until(lambda: graph.said('driver', 'streaming'), 5, 'streaming')
         rig.end()
         graph.spin_until(lambda: graph.said('driver', 'No such file'), 5, 'the end of the board')
     assert driver.stop() == 0
-    told = [re.sub(r'^\[(\w+)\] \[[\d.]+\] \[driver\]: ', r'\1 ', line) for line in lines(driver)]
+    messages = [re.sub(r'^\[(\w+)\] \[[\d.]+\] \[driver\]: ', r'\1 ', line)
+                for line in lines(driver)]
     path = tmp_path / 'board'
-    assert told[0] == f'ERROR {path}: No such file or directory'
-    assert [line.split(';')[0] for line in told[1:3]] == ['INFO connecting', 'INFO streaming']
-    assert 4 <= len(told) <= 5, told
+    assert messages[0] == f'ERROR {path}: No such file or directory'
+    assert [line.split(';')[0] for line in messages[1:3]] == ['INFO connecting', 'INFO streaming']
+    assert 4 <= len(messages) <= 5, messages
 
 
 def test_two_drivers_cannot_have_one_port(start, tmp_path):
     with board_rig(tmp_path) as rig:
-        first = start('driver', ROS, *rig.parameters())
-        rig.count(500, 30)
-        rig.begin()
-        second = start('driver', ROS, *rig.parameters(), '-r', '__node:=second')
+        first = start('driver', ROS, *rig.driver_parameters())
+        rig.wait_for_samples(500, 30)
+        rig.begin_report()
+        second = start('driver', ROS, *rig.driver_parameters(), '-r', '__node:=second')
         graph = rig.graph
         graph.spin_until(lambda: graph.said('second', 'in use'), 20, 'the refusal')
         graph.spin(1.0)
-        book = rig.close()
-        assert (book.wrong, book.missing, book.said) == (0, 0, 0)
+        report = rig.report()
+        assert (report.wrong, report.missing, report.counted) == (0, 0, 0)
         first.stop()
         graph.spin_until(lambda: graph.said('second', 'streaming'), 10, 'taking over')
     assert second.popen.poll() is None
 
 
-def test_a_hostile_stream_costs_no_memory_and_no_other_link(start, tmp_path):
-    """Noise as fast as it is taken, then frames with lengths that lie, on a socket."""
+def test_a_hostile_stream_costs_no_memory_and_disturbs_no_other_link(start, tmp_path):
+    """Send noise as fast as it is read, then frames with false lengths, on a socket."""
     with board_rig(tmp_path) as rig, socket.create_server(('127.0.0.1', 0)) as server:
-        start('driver', ROS, *rig.parameters())
+        start('driver', ROS, *rig.driver_parameters())
         port = server.getsockname()[1]
         hurt = start('driver', ROS, '-p', 'link.type:=serial', '-p',
                      f'link.port:=socket://127.0.0.1:{port}', '-r', '__ns:=/hurt')
         peer, _ = server.accept()
         peer.sendall(b'hello')
-        rig.count(500, 30)
-        rig.begin()
+        rig.wait_for_samples(500, 30)
+        rig.begin_report()
         before = memory_mib(hurt.popen.pid)
         rng = np.random.default_rng(0)
         chunk = rng.bytes(1_000_000)
@@ -182,19 +185,19 @@ def test_a_hostile_stream_costs_no_memory_and_no_other_link(start, tmp_path):
                 sent += peer.send(chunk if sent % 2 else bombs)
             except TimeoutError:
                 pass
-            except OSError:  # silent before: the driver has connected anew
+            except OSError:  # the driver has connected again
                 peer = server.accept()[0]
             rig.graph.spin(0.01)
         after = memory_mib(hurt.popen.pid)
-        book = rig.close()
+        report = rig.report()
         assert sent > 5_000_000
-        assert (book.wrong, book.missing, book.said) == (0, 0, 0)
+        assert (report.wrong, report.missing, report.counted) == (0, 0, 0)
         assert after - before < 8, f'{before} MiB before, {after} MiB after'
         assert hurt.popen.poll() is None
         peer.close()
 
 
-def test_a_full_disk_for_the_log_stops_nothing(start, ros_env, tmp_path, monkeypatch):
+def test_a_full_disk_for_the_log_does_not_stop_the_driver(start, ros_env, tmp_path, monkeypatch):
     folder = tmp_path / 'full'
     folder.mkdir()
     mount = ['mount', '-t', 'tmpfs', '-o', 'size=4k', 'tmpfs', folder]
@@ -204,14 +207,14 @@ def test_a_full_disk_for_the_log_stops_nothing(start, ros_env, tmp_path, monkeyp
         (folder / 'fill').write_bytes(b'x' * 4096)
         ros_env['ROS_LOG_DIR'] = str(folder)
         with board_rig(tmp_path) as rig:
-            driver = start('driver', ROS, *rig.parameters())
-            rig.count(500, 30)
-            rig.begin()
+            driver = start('driver', ROS, *rig.driver_parameters())
+            rig.wait_for_samples(500, 30)
+            rig.begin_report()
             for _ in range(3):
-                rig.tell_board('unplug 0.3')
-                rig.count(300, 20)
-            book = rig.close()
-            assert book.right, book
+                rig.command('unplug 0.3')
+                rig.wait_for_samples(300, 20)
+            report = rig.report()
+            assert report.exact, report
             assert driver.popen.poll() is None
         assert driver.stop() == 0
         assert 'Traceback' not in driver.output()
@@ -219,10 +222,10 @@ def test_a_full_disk_for_the_log_stops_nothing(start, ros_env, tmp_path, monkeyp
         subprocess.run(['umount', '-l', folder], check=True)
 
 
-def test_a_manager_has_the_driver_in_its_hand(start, tmp_path):
+def test_a_system_manager_changes_the_state_of_the_driver(start, tmp_path):
     with board_rig(tmp_path) as rig:
         graph = rig.graph
-        driver = start('driver', ROS, *rig.parameters(), '-p', 'autostart:=false')
+        driver = start('driver', ROS, *rig.driver_parameters(), '-p', 'autostart:=false')
         for transition, state in ((None, 'unconfigured'),
                                   (Transition.TRANSITION_CONFIGURE, 'inactive'),
                                   (Transition.TRANSITION_ACTIVATE, 'active'),
@@ -235,24 +238,24 @@ def test_a_manager_has_the_driver_in_its_hand(start, tmp_path):
             answer = graph.call(GetState, 'driver/get_state', GetState.Request())
             assert answer.current_state.label == state
             if state == 'active':
-                rig.count(300, 20)
+                rig.wait_for_samples(300, 20)
                 continue
-            rig.take()
+            rig.collect()
             rig.graph.spin(0.3)
-            rig.take()
+            rig.collect()
             before = len(rig.numbers)
             graph.diagnostics.clear()
             graph.spin_until(lambda: graph.said('driver', 'inactive'), 5, 'inactive')
-            rig.take()
-            assert len(rig.numbers) == before, 'inactive it reads nothing'
+            rig.collect()
+            assert len(rig.numbers) == before, 'an inactive driver reads nothing'
             held = [os.readlink(f) for f in Path(f'/proc/{driver.popen.pid}/fd').iterdir()
                     if f.is_symlink() and os.path.lexists(f)]
             assert os.path.realpath(rig.path) not in held
         assert rig.wrong == 0
 
 
-def feeding(tmp_path, sensor, columns):
-    """Let a board send the same again and again; returns its port and how to end it."""
+def repeat_on_board(tmp_path, sensor, columns):
+    """Let a board repeat the same samples; return its port and a function that ends it."""
     path, stop = str(tmp_path / 'fed'), threading.Event()
     ready = threading.Event()
 
@@ -268,15 +271,15 @@ def feeding(tmp_path, sensor, columns):
     return path, lambda: (stop.set(), thread.join())
 
 
-def test_a_measured_supply_takes_the_supply_out(start, tmp_path):
-    """At 4.8 V a ratiometric sensor shows -0.2 V / (1 V/g) at 0 g, unless it is corrected."""
+def test_a_measured_supply_corrects_the_supply_effect(start, tmp_path):
+    """Without correction, a ratiometric sensor at 4.8 V shows -0.2 V / (1 V/g) at 0 g."""
     effect = effect_named('supply')
     sensor = replace(nominal(), effects=('supply',), values={'supply': {
         p.name: np.full(2, 1.0) if p.axes else np.array(5.0) for p in effect.parameters}})
     parameter_file.save(tmp_path / 'unit.yaml', sensor)
     columns = {'x_v': np.full(200, 2.4), 'y_v': np.full(200, 2.4 + 0.96 / 2),
                'supply_v': np.full(200, 4.8), 'temperature_c': np.full(200, 31.0)}
-    path, end = feeding(tmp_path, nominal(), columns)
+    path, end = repeat_on_board(tmp_path, nominal(), columns)
     try:
         with Graph() as graph:
             raw = graph.listen(Imu, 'imu/data_raw')
@@ -288,7 +291,7 @@ def test_a_measured_supply_takes_the_supply_out(start, tmp_path):
                   'stamp_offset:=0.0105')
             start('compensation', ROS, '--params-file', tmp_path / 'unit.yaml')
             graph.spin_until(lambda: supply and temperature and corrected, 30, 'all of it')
-            # A supply that stays is said once a second: the compensation may not know it yet.
+            # A constant supply is published once a second: the compensation may not have it yet.
             graph.spin_until(lambda: abs(accel(corrected[-1])[0]) < 0.01, 10, 'the correction')
             newest_s = (stamp_ns(raw[-1]) - graph.node.get_clock().now().nanoseconds) * 1e-9
     finally:
@@ -300,7 +303,7 @@ def test_a_measured_supply_takes_the_supply_out(start, tmp_path):
     assert newest_s < -0.0105, 'the delay of the filter is taken out of the stamps'
 
 
-def test_simulate_is_a_board(start, run_tool, tmp_path):
+def test_simulate_emulates_a_board(start, run_tool, tmp_path):
     with Graph() as graph:
         sender = start('simulate', 'tilt_alpha', '--port', 'bench', '--seed', '3')
         sender.wait_for('link.port:=bench')

@@ -13,106 +13,131 @@
 # limitations under the License.
 
 """
-The matrix of faults: what is done to a device, and what its driver must have published then.
+The faults of devices: each is injected, and the driver must then have published the right samples.
 
-    make faults     every row for longer than in the tests, as a table
+    make faults     all faults for longer than in the tests, as a table
 """
 
+from collections.abc import Callable
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 import subprocess
 import sys
 import tempfile
 import time
 
-from ament_index_python.packages import get_package_prefix
-from rig import graph_of_own, hold, IioRig, SerialRig
+from processes import executable
+from rig import IioRig, private_graph, SampleReport, SerialRig, suspend
+
+TABLE_HEAD = ('| fault | published | wrong | missing | counted | recovered in '
+              '| worst stamp, ms |\n|---|---|---|---|---|---|---|')
+"""Head of the tables in docs/links.md."""
 
 
 @dataclass(frozen=True)
-class Row:
+class Fault:
     """
-    A fault.
+    A fault of a device or of its driver.
 
     Attributes
     ----------
     name
-        For the table.
-    act
-        Does it, given the rig, the driver's process id and a time; returns when the device was
-        well again, ns of the monotonic clock, or 0 where it has not been away.
+        Name in the table.
+    inject
+        Function of the rig, the process id of the driver and a duration, s. It returns the
+        monotonic time at which the device works again, ns, or 0 where it was never absent.
     exact
-        Whether the device's own count goes on, so that what is missing is known exactly.
+        Whether the device's count continues, so that the missing samples are counted exactly.
 
     """
 
     name: str
-    act: object
+    inject: Callable
     exact: bool = True
 
 
-def bytes_hurt(kind, rate):
-    def act(rig, pid, seconds):
-        rig.tell_board(f'fault {kind} {rate:g}')
-        rig.graph.spin(seconds)
-        rig.tell_board('clear')
+@dataclass(frozen=True)
+class Outcome:
+    """
+    What came of a fault.
+
+    Attributes
+    ----------
+    report
+        Samples during the fault and after it.
+    recovery_ms
+        Time until samples came again, ms; None where the device was never absent.
+
+    """
+
+    report: SampleReport
+    recovery_ms: float | None
+
+
+def byte_fault(kind, rate):
+    """Return a fault of the bytes at a rate."""
+    def inject(rig, pid, duration_s):
+        rig.command(f'fault {kind} {rate:g}')
+        rig.graph.spin(duration_s)
+        rig.command('clear')
         return 0
-    return Row(f'{kind} {rate:g} a byte' if rate else 'wrong baud rate', act)
+    return Fault(f'{kind} {rate:g} a byte' if rate else 'wrong baud rate', inject)
 
 
-def told(name, command, exact=True):
-    def act(rig, pid, seconds):
-        return rig.tell_board(command)
-    return Row(name, act, exact)
+def board_fault(name, command, exact=True):
+    """Return a fault that a command of the board injects."""
+    def inject(rig, pid, duration_s):
+        return rig.command(command)
+    return Fault(name, inject, exact)
 
 
-def board_stopped(rig, pid, seconds):
-    hold(rig.board.popen.pid, 3.0, rig.graph)
+def stop_board(rig, pid, duration_s):
+    suspend(rig.board.popen.pid, 3.0, rig.graph)
     return 0
 
 
-def driver_stopped(rig, pid, seconds):
-    hold(pid, 3.0, rig.graph)
+def stop_driver(rig, pid, duration_s):
+    suspend(pid, 3.0, rig.graph)
     return 0
 
 
-def server_stopped(rig, pid, seconds):
-    return hold(rig.server.popen.pid, 2.0, rig.graph)
+def stop_server(rig, pid, duration_s):
+    return suspend(rig.server.popen.pid, 2.0, rig.graph)
 
 
-def server_killed(rig, pid, seconds):
+def kill_server(rig, pid, duration_s):
     rig.server.kill()
     rig.graph.spin(1.0)
     rig.start()
     return time.monotonic_ns()
 
 
-SERIAL = (
-    *(bytes_hurt(kind, rate) for kind in ('flip', 'lose', 'insert', 'burst')
+SERIAL_FAULTS = (
+    *(byte_fault(kind, rate) for kind in ('flip', 'lose', 'insert', 'burst')
       for rate in (1e-4, 1e-3)),
-    bytes_hurt('baud', 0),
-    told('100 kB without a delimiter', 'flat 100000'),
-    told('200 kB of noise', 'noise 200000'),
-    told('137 samples lost by the board', 'drop 137'),
-    told('unplugged for 1 s, in a read', 'unplug 1'),
-    told('reset, away for 0.5 s', 'reset 0.5', False),
-    told('board and clock halted for 1 s', 'halt 1'),
-    Row('board stopped for 3 s', board_stopped),
-    Row('reader stopped for 3 s', driver_stopped),
+    byte_fault('baud', 0),
+    board_fault('100 kB without a delimiter', 'flat 100000'),
+    board_fault('200 kB of noise', 'noise 200000'),
+    board_fault('137 samples lost by the board', 'drop 137'),
+    board_fault('unplugged for 1 s, in a read', 'unplug 1'),
+    board_fault('reset, away for 0.5 s', 'reset 0.5', False),
+    board_fault('board and clock halted for 1 s', 'halt 1'),
+    Fault('board stopped for 3 s', stop_board),
+    Fault('reader stopped for 3 s', stop_driver),
 )
-IIO = (
-    Row('iiod: SIGSTOP for 2 s', server_stopped, False),
-    Row('iiod: SIGKILL, back after 1 s', server_killed, False),
-    Row('iio: reader stopped for 3 s', driver_stopped, False),
+"""Faults of the serial link."""
+IIO_FAULTS = (
+    Fault('iiod: SIGSTOP for 2 s', stop_server, False),
+    Fault('iiod: SIGKILL, back after 1 s', kill_server, False),
+    Fault('iio: reader stopped for 3 s', stop_driver, False),
 )
+"""Faults of the IIO link."""
 
 
 @contextmanager
 def driver(*parameters):
-    """Run the installed driver; gives its process."""
-    path = Path(get_package_prefix('adxl_ros')) / 'lib' / 'adxl_ros' / 'driver'
-    popen = subprocess.Popen([path, '--ros-args', *map(str, parameters)],
+    """Run the installed driver; give its process."""
+    popen = subprocess.Popen([executable('driver'), '--ros-args', *map(str, parameters)],
                              stderr=subprocess.DEVNULL)
     try:
         yield popen
@@ -121,41 +146,51 @@ def driver(*parameters):
         popen.wait()
 
 
-def run(row, rig, pid, seconds):
-    """Do what a row says; return the book, and after how many ms samples flowed again."""
-    rig.begin()
-    back_ns = row.act(rig, pid, seconds)
-    recovered_ms = rig.recovered_ms(back_ns) if back_ns else None
-    rig.count(200, 20, f'samples after: {row.name}')
-    return rig.close(), recovered_ms
+def run_fault(fault, rig, pid, duration_s):
+    """Inject a fault into a rig with the driver `pid`, and return its outcome."""
+    rig.begin_report()
+    back_ns = fault.inject(rig, pid, duration_s)
+    recovery_ms = rig.recovery_ms(back_ns) if back_ns else None
+    rig.wait_for_samples(200, 20, f'samples after: {fault.name}')
+    return Outcome(rig.report(), recovery_ms)
 
 
-def line(row, book, recovered_ms):
-    """Write a row of the table."""
-    known = f'{book.said}, {book.estimated} of them estimated' if book.estimated else \
-        'exactly that' if book.missing == book.said else f'{book.said}'
-    after = '' if recovered_ms is None else f'{recovered_ms:.0f} ms'
-    return (f'| {row.name} | {book.published} | {book.wrong} | {book.missing} | {known} | '
-            f'{after} | {book.error_ms:.2f} |')
+def table_cells(outcome):
+    """Return the cells of a row of the table, without the name of the fault."""
+    report = outcome.report
+    counted = 'exact' if report.missing == report.counted else str(report.counted)
+    if report.estimated:
+        counted = f'{report.counted}, {report.estimated} estimated'
+    recovery = '' if outcome.recovery_ms is None else f'{outcome.recovery_ms:.0f} ms'
+    return (report.published, report.wrong, report.missing, counted, recovery,
+            f'{report.max_error_ms:.2f}')
 
 
-HEAD = ('| fault | published | wrong | missing | said | recovered in | worst stamp, ms |\n'
-        '|---|---|---|---|---|---|---|')
+def table_row(*cells):
+    """Return a row of a table in Markdown."""
+    return f'| {" | ".join(map(str, cells))} |'
+
+
+def print_rows(faults, make_rig, duration_s):
+    """Inject faults into a new rig and print a row for each."""
+    with private_graph() as graph:
+        rig = make_rig(graph)
+        with driver(*rig.driver_parameters()) as process:
+            rig.wait_for_samples(1000, 30)
+            for fault in faults:
+                outcome = run_fault(fault, rig, process.pid, duration_s)
+                print(table_row(fault.name, *table_cells(outcome)), flush=True)
+        rig.end()
 
 
 def main():
-    seconds = float(sys.argv[1]) if len(sys.argv) > 1 else 20.0
-    print(HEAD)
+    """Print the table of all faults."""
+    duration_s = float(sys.argv[1]) if len(sys.argv) > 1 else 20.0
+    print(TABLE_HEAD)
     with tempfile.TemporaryDirectory() as folder:
-        for rows, make in ((SERIAL, lambda graph: SerialRig(graph, folder, {'banner': True})),
-                           (IIO, IioRig)):
-            with graph_of_own() as graph:
-                rig = make(graph)
-                with driver(*rig.parameters()) as process:
-                    rig.count(1000, 30)
-                    for row in rows:
-                        print(line(row, *run(row, rig, process.pid, seconds)), flush=True)
-                rig.end()
+        print_rows(SERIAL_FAULTS, lambda graph: SerialRig(graph, folder, {'banner': True}),
+                   duration_s)
+    print_rows(IIO_FAULTS, IioRig, duration_s)
     return 0
 
 

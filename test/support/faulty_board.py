@@ -13,23 +13,23 @@
 # limitations under the License.
 
 """
-A board on a pseudo-terminal that can be hurt, for the tests of the serial link.
+A board with faults on a pseudo-terminal, for the tests of the serial link.
 
     python faulty_board.py PATH [JSON]
 
-Channel x of sample k is `k % 65534 + 1`, channel y `mark(k)`: each published sample tells which
-one it was. Sample k is taken at `origin + k / rate` of the host's monotonic clock; the line
-{"origin_ns": ...} on stdout says where that is. Commands come on stdin, one a line, and are
-answered by one line when they are done:
+Channel x of sample k is `k % CODES + 1`, channel y is `mark(k)`. So each published sample has its
+number. The board takes sample k at `origin + k / rate` of the host's monotonic clock. Its first
+line on stdout is {"origin_ns": ...}. Each line on stdin is a command, and a line of JSON answers
+when it is done:
 
-    fault KIND RATE     flip, lose, insert or burst, bytes of the stream at a rate; baud: all
-    clear               no fault any more
-    noise N             so many random bytes; zeros are among them
-    flat N              so many bytes without a delimiter
-    drop N              samples that the device loses itself and says so
-    unplug S            close the terminal, and be there again after so long
-    reset S             stop, and begin anew with count and clock at 0 after so long
-    halt S              stop, the clock and the count, too; then go on
+    fault KIND RATE     flip, lose, insert or burst bytes of the stream at a rate; baud: all bytes
+    clear               end the fault
+    noise N             send N random bytes, zeros among them
+    flat N              send N bytes without a delimiter
+    drop N              lose N samples on the device and count them
+    unplug S            close the terminal and open it again after S seconds
+    reset S             stop, and begin with count and clock at 0 after S seconds
+    halt S              stop for S seconds with clock and count, then continue
 """
 
 import json
@@ -45,175 +45,184 @@ import tty
 from adxl_ros.links.support.wire_format import BoardInfo, Encoder
 import numpy as np
 
+CODES = 65534
+"""Number of codes between the rails of a 16 bit ADC."""
 BLOCK = 10
+"""Samples of a frame, as the firmware sends them."""
+BANNER = b'\r\nets Jun  8 2016 00:22:57\r\nrst:0x1 (POWERON_RESET)\0\r\nboot\r\n'
+"""What an ESP32 prints when it starts."""
 
 
 def mark(k):
-    """Return what channel y has at sample k."""
-    return (k * 40503 + 12345) % 65534 + 1
+    """Return the code of channel y at sample k."""
+    return (k * 40503 + 12345) % CODES + 1
 
 
 class FaultyBoard:
     """The board; `turn` runs it for a few milliseconds."""
 
-    def __init__(self, path, setting):
+    def __init__(self, path, options):
         self.path = Path(path)
-        self.rate = setting.get('rate', 1000.0)
-        self.channels = setting.get('channels', 3)
-        self.ppm = setting.get('ppm', 0.0)
-        self.random = random.Random(setting.get('seed', 1))
-        self.fault, self.chance = '', 0.0
-        self.ours = self.theirs = None
-        self.info = BoardInfo(self.rate, 16, self.channels, 5.0, setting.get('serial', 'T1'))
+        self.rate = options.get('rate', 1000.0)
+        self.channels = options.get('channels', 3)
+        self.ppm = options.get('ppm', 0.0)
+        self.random = random.Random(options.get('seed', 1))
+        self.fault, self.fault_rate = '', 0.0
+        self.board_fd = self.driver_fd = None
+        self.info = BoardInfo(self.rate, 16, self.channels, 5.0, options.get('serial', 'T1'))
         self.halted_ns = 0
-        self.start_ns = time.monotonic_ns()
-        self.k = self.first_k = self.overruns = 0
+        self.origin_ns = time.monotonic_ns()
+        self.next_sample = self.first_sample = self.overruns = 0
         self.encoder = Encoder(self.info)
         self.informed_ns = 0
-        self.rest = b''
+        self.unsent = b''
         self.plug()
-        if setting.get('banner'):
-            self.write(b'\r\nets Jun  8 2016 00:22:57\r\nrst:0x1 (POWERON_RESET)\0\r\nboot\r\n')
+        if options.get('banner'):
+            self.write(BANNER)
 
     def plug(self):
-        self.ours, self.theirs = pty.openpty()
-        tty.setraw(self.theirs)
-        os.set_blocking(self.ours, False)
+        """Make the terminal and its name."""
+        self.board_fd, self.driver_fd = pty.openpty()
+        tty.setraw(self.driver_fd)
+        os.set_blocking(self.board_fd, False)
         link = self.path.with_suffix('.new')
         link.unlink(missing_ok=True)
-        link.symlink_to(os.ttyname(self.theirs))
+        link.symlink_to(os.ttyname(self.driver_fd))
         link.rename(self.path)
-        self.rest = b''
+        self.unsent = b''
 
-    def pull(self):
+    def unplug(self):
+        """Remove the name and the terminal."""
         self.path.unlink()
-        os.close(self.ours)
-        os.close(self.theirs)
-        self.ours = None
+        os.close(self.board_fd)
+        os.close(self.driver_fd)
+        self.board_fd = None
 
     def time_ns(self, k):
-        """Return when sample k is taken, by the host's monotonic clock."""
-        return self.start_ns + self.halted_ns + round(k * 1e9 / self.rate * (1 + self.ppm * 1e-6))
+        """Return when sample k is taken, by the host's monotonic clock, ns."""
+        period_ns = 1e9 / self.rate * (1 + self.ppm * 1e-6)
+        return self.origin_ns + self.halted_ns + round(k * period_ns)
 
     def turn(self):
+        """Send what is due; return the time until the next frame, s."""
         now = time.monotonic_ns()
         if now - self.informed_ns > 1e9 and self.write(self.encoder.info_frame()):
             self.informed_ns = now
-        while self.time_ns(self.k + BLOCK - 1) <= time.monotonic_ns():
-            self.block()
-        due = self.time_ns(self.k + BLOCK - 1)
-        return max(min((due - time.monotonic_ns()) * 1e-9, 0.02), 0)
+        while self.time_ns(self.next_sample + BLOCK - 1) <= time.monotonic_ns():
+            self.send_frame()
+        due_ns = self.time_ns(self.next_sample + BLOCK - 1)
+        return max(min((due_ns - time.monotonic_ns()) * 1e-9, 0.02), 0)
 
-    def block(self):
-        k = np.arange(self.k, self.k + BLOCK)
+    def send_frame(self):
+        """Send the next frame of samples."""
+        k = np.arange(self.next_sample, self.next_sample + BLOCK)
         codes = np.full((BLOCK, self.channels), 32768)
-        codes[:, 0], codes[:, 1] = k % 65534 + 1, mark(k)
-        index = self.k - self.first_k
+        codes[:, 0], codes[:, 1] = k % CODES + 1, mark(k)
+        index = self.next_sample - self.first_sample
         raw = self.encoder.sample_frame(round(index * 1e6 / self.rate), index,
-                                      codes.astype(np.uint16), self.overruns)
+                                        codes.astype(np.uint16), self.overruns)
         if not self.write(raw):
             self.overruns += BLOCK
-        self.k += BLOCK
+        self.next_sample += BLOCK
 
     def write(self, raw):
-        """Write, hurt as it may be; tell whether there was room."""
-        if self.ours is None:
+        """Write bytes with the present fault; return whether there was room."""
+        if self.board_fd is None:
             return False
         try:
-            if self.rest:
-                self.rest = self.rest[os.write(self.ours, self.rest):]
-            if self.rest:
+            if self.unsent:
+                self.unsent = self.unsent[os.write(self.board_fd, self.unsent):]
+            if self.unsent:
                 return False
-            hurt = self.hurt(raw)
-            self.rest = hurt[os.write(self.ours, hurt):] if hurt else b''
+            damaged = self.damage(raw)
+            self.unsent = damaged[os.write(self.board_fd, damaged):] if damaged else b''
         except BlockingIOError:
             return False
         return True
 
-    def hurt(self, raw):
+    def damage(self, raw):
+        """Return bytes with the present fault."""
         draw = self.random
         if self.fault == 'baud':
             return bytes(draw.randrange(256) for _ in raw)
         if not self.fault:
             return raw
-        out, left = bytearray(), 0
+        out, burst = bytearray(), 0
         for byte in raw:
-            if left:
-                left -= 1
+            if burst:
+                burst -= 1
                 out.append(draw.randrange(256))
-            elif draw.random() >= self.chance:
+            elif draw.random() >= self.fault_rate:
                 out.append(byte)
             elif self.fault == 'flip':
                 out.append(byte ^ 1 << draw.randrange(8))
             elif self.fault == 'insert':
                 out += bytes([draw.randrange(256), byte])
             elif self.fault == 'burst':
-                left = draw.randrange(5, 60)
+                burst = draw.randrange(5, 60)
         return bytes(out)
 
-    def push(self, raw):
-        """Write all of it, however long that takes; nothing else is sent meanwhile."""
-        while self.rest:
-            self.rest = self.rest[self.some(self.rest):]
+    def write_all(self, raw):
+        """Write all bytes, however long it takes; nothing else is sent meanwhile."""
+        raw, self.unsent = self.unsent + raw, b''
         while raw:
-            raw = raw[self.some(raw):]
-
-    def some(self, raw):
-        select.select([], [self.ours], [], 0.1)
-        try:
-            return os.write(self.ours, raw[:4096])
-        except BlockingIOError:
-            return 0
+            select.select([], [self.board_fd], [], 0.1)
+            try:
+                raw = raw[os.write(self.board_fd, raw[:4096]):]
+            except BlockingIOError:
+                continue
 
     def obey(self, words):
+        """Carry out a command."""
         name, *rest = words
         number = float(rest[-1]) if rest else 0.0
         if name == 'fault':
-            self.fault, self.chance = rest[0], number
+            self.fault, self.fault_rate = rest[0], number
         elif name == 'clear':
             self.fault = ''
         elif name == 'noise':
-            self.push(self.random.randbytes(int(number)))
+            self.write_all(self.random.randbytes(int(number)))
         elif name == 'flat':
-            self.push(b'\x55' * int(number))
+            self.write_all(b'\x55' * int(number))
         elif name == 'drop':
-            self.k += int(number)
+            self.next_sample += int(number)
             self.overruns += int(number)
         elif name == 'unplug':
-            self.pull()
+            self.unplug()
             time.sleep(number)
             self.skip()
             self.plug()
         elif name == 'reset':
             time.sleep(number)
             self.skip()
-            self.first_k, self.overruns = self.k, 0
+            self.first_sample, self.overruns = self.next_sample, 0
             self.encoder, self.informed_ns = Encoder(self.info), 0
         elif name == 'halt':
             time.sleep(number)
             self.halted_ns += round(number * 1e9)
 
     def skip(self):
-        """Leave out what could not be sent, block by block as its time is over."""
-        while self.time_ns(self.k + BLOCK - 1) <= time.monotonic_ns():
-            self.k += BLOCK
+        """Lose the frames that were due in the meantime."""
+        while self.time_ns(self.next_sample + BLOCK - 1) <= time.monotonic_ns():
+            self.next_sample += BLOCK
             self.overruns += BLOCK
 
 
 def main():
-    setting = json.loads(sys.argv[2]) if len(sys.argv) > 2 else {}
-    board = FaultyBoard(sys.argv[1], setting)
-    print(json.dumps({'origin_ns': board.start_ns}), flush=True)
-    wait = 0.0
+    """Run the board until stdin ends."""
+    options = json.loads(sys.argv[2]) if len(sys.argv) > 2 else {}
+    board = FaultyBoard(sys.argv[1], options)
+    print(json.dumps({'origin_ns': board.origin_ns}), flush=True)
+    wait_s = 0.0
     while True:
-        if select.select([sys.stdin], [], [], wait)[0]:
+        if select.select([sys.stdin], [], [], wait_s)[0]:
             line = sys.stdin.readline()
             if not line:
                 return
             board.obey(line.split())
-            print(json.dumps({'at_ns': time.monotonic_ns(), 'k': board.k,
-                              'halted_ns': board.halted_ns}), flush=True)
-        wait = board.turn()
+            print(json.dumps({'done_ns': time.monotonic_ns(), 'next_sample': board.next_sample}),
+                  flush=True)
+        wait_s = board.turn()
 
 
 if __name__ == '__main__':

@@ -13,30 +13,47 @@
 # limitations under the License.
 
 """
-A small IIOD: the text protocol of libiio 0.x, with one ADC whose samples tell who they are.
+A small IIOD: the text protocol of libiio 0.x, with one ADC whose samples carry their numbers.
 
     python iiod.py '{"port": 0, "rate": 1000, "channels": [...]}'
 
-prints the port it listens on. Code of channel c at sample k: `code(k, c, bits)`; its time stamp
-is t0 + k / rate of the device's clock. Like a kernel that nobody reads it keeps the samples of its
-buffers, and loses those that come then.
+It prints the port on which it listens. Channel c has `code(k, c, bits)` at sample k, and the time
+stamp t0 + k / rate of the device's clock. Like a kernel without a reader, it keeps the samples of
+its buffers and loses later ones.
 """
 
+from collections import deque
 import json
 import socketserver
 import sys
 import time
+from typing import NamedTuple
 
-KNOWN = {'context': 'name version-major version-minor version-git description',
-         'device': 'id name', 'channel': 'id type', 'attribute': 'name filename',
-         'scan-element': 'index format'}
-GRAMMAR = ''.join(
-    f'<!ELEMENT {name} ANY><!ATTLIST {name} '
-    + ' '.join(f'{attribute} CDATA #IMPLIED' for attribute in attributes.split()) + '>'
-    for name, attributes in KNOWN.items())
+ATTRIBUTES = {'context': 'name version-major version-minor version-git description',
+              'device': 'id name', 'channel': 'id type', 'attribute': 'name filename',
+              'scan-element': 'index format'}
+"""Attributes of the elements of a context, by element."""
 
+
+def declaration(element, attributes):
+    """Return the declaration of an element in the document type of a context."""
+    listed = ' '.join(f'{attribute} CDATA #IMPLIED' for attribute in attributes.split())
+    return f'<!ELEMENT {element} ANY><!ATTLIST {element} {listed}>'
+
+
+GRAMMAR = ''.join(declaration(*item) for item in ATTRIBUTES.items())
+"""Document type of a context, which libiio demands."""
 CHANNELS = [{'id': 'voltage0', 'label': 'x'}, {'id': 'voltage1', 'label': 'y'},
             {'id': 'voltage2', 'label': 'supply'}]
+"""Channels without other ones in the options."""
+FORMAT = 'le:u16/16>>0'
+"""Format of a channel without another one."""
+STAMP_FORMAT = 'le:S64/64>>0'
+"""Format of the time stamps."""
+DEFAULTS = {'scale': 0.0762939453125, 'raw': 100}
+"""Attributes of a channel without other values; the scale is 5 V / 2^16 in mV."""
+EIO, EINVAL = -5, -22
+"""Error numbers of the protocol."""
 
 
 def code(k, c, bits):
@@ -44,127 +61,143 @@ def code(k, c, bits):
     return (k * (2 * c + 1) + 1000 * c) % (2 ** bits - 2) + 1
 
 
-def format_of(channel):
-    """Return byte order, signedness, used and stored bits and the shift of a channel."""
-    text = channel.get('format', 'le:u16/16>>0')
-    order, rest = text.split(':')
+class Format(NamedTuple):
+    """Byte order, signedness, used bits, stored bits and shift of a channel's codes."""
+
+    order: str
+    sign: str
+    bits: int
+    stored: int
+    shift: int
+
+
+def parse_format(channel):
+    """Return the format of a channel."""
+    order, rest = channel.get('format', FORMAT).split(':')
     bits, rest = rest[1:].split('/')
     stored, shift = rest.split('>>')
-    return order, text[3], int(bits), int(stored), int(shift)
+    return Format(order, channel.get('format', FORMAT)[3], int(bits), int(stored), int(shift))
 
 
 class Adc:
     """The device: its clock, its attributes, its buffer."""
 
-    def __init__(self, setting):
-        self.setting = setting
-        self.rate = float(setting.get('rate', 1000.0))
-        self.channels = [*setting.get('channels', CHANNELS)]
-        # libiio numbers the channels of the buffer, its stamps last, before the others.
-        self.last = sum(not c.get('unbuffered') for c in self.channels)
+    def __init__(self, options):
+        self.options = options
+        self.rate = float(options.get('rate', 1000.0))
+        self.channels = [*options.get('channels', CHANNELS)]
+        # libiio numbers the channels of the buffer first, with the time stamps as the last one.
+        self.stamp_index = sum(not channel.get('unbuffered') for channel in self.channels)
         self.attributes = {'sampling_frequency': str(self.rate),
-                           'current_timestamp_clock': 'realtime', **setting.get('attributes', {})}
-        self.offset_ns = setting.get('offset_ns', 7_000_000_000)
-        self.drift = 1 + setting.get('ppm', 0) * 1e-6
-        # A server that is started anew finds the same device.
-        self.began_ns = setting.get('began_ns') or time.monotonic_ns()
+                           'current_timestamp_clock': 'realtime', **options.get('attributes', {})}
+        self.offset_ns = options.get('offset_ns', 7_000_000_000)
+        self.drift = 1 + options.get('ppm', 0) * 1e-6
+        # A server that is started again has the same device.
+        self.began_ns = options.get('began_ns') or time.monotonic_ns()
         self.buffers, self.count = 4, 20
-        self.next = 0
+        self.next_sample = 0
         self.lost = 0
         self.enabled = []
+        self.queue = deque()
 
-    def now(self):
+    def sample_count(self):
         """Return how many samples have been taken."""
         return int((time.monotonic_ns() - self.began_ns) * self.drift * self.rate * 1e-9)
 
     def stamp(self, k):
+        """Return the time stamp of sample k, ns."""
         return self.began_ns + self.offset_ns + round(k * 1e9 / self.rate)
 
     def begin(self, count, mask):
-        self.enabled = [i for i in range(self.last + 1) if mask >> i & 1]
-        self.count, self.next = count, self.now()
+        """Begin a buffer of a number of samples, with the channels of a mask."""
+        self.enabled = [i for i in range(self.stamp_index + 1) if mask >> i & 1]
+        self.count, self.next_sample = count, self.sample_count()
 
     def samples(self, count):
         """Wait for samples and return their numbers."""
         numbers = []
         while len(numbers) < count:
-            now, kept = self.now(), self.buffers * self.count
-            if now - self.next > kept and not numbers:
-                self.queue = list(range(self.next, self.next + kept))
-                self.lost += now - self.next - kept
-                self.next = now
-            queue = getattr(self, 'queue', [])
-            while queue and len(numbers) < count:
-                numbers.append(queue.pop(0))
-            while self.next < now and len(numbers) < count:
-                numbers.append(self.next)
-                self.next += 1
+            available, kept = self.sample_count(), self.buffers * self.count
+            if available - self.next_sample > kept and not numbers:
+                self.queue = deque(range(self.next_sample, self.next_sample + kept))
+                self.lost += available - self.next_sample - kept
+                self.next_sample = available
+            while self.queue and len(numbers) < count:
+                numbers.append(self.queue.popleft())
+            while self.next_sample < available and len(numbers) < count:
+                numbers.append(self.next_sample)
+                self.next_sample += 1
             if len(numbers) < count:
                 time.sleep(0.001)
         return numbers
 
     def packed(self, k):
-        """Lay a sample out as the kernel does: each element at a multiple of its size."""
+        """Pack a sample as the kernel does: each element at a multiple of its size."""
+        elements = [self.element(i, k) for i in self.enabled]
         out = b''
-        for i in self.enabled:
-            if i == self.last:
-                size, order, value = 8, 'le', self.stamp(k)
-            else:
-                order, sign, bits, stored, shift = format_of(self.channels[i])
-                size, value = stored // 8, code(k, i, bits)
-                if sign == 's':
-                    value -= 2 ** (bits - 1)
-                value = (value % 2 ** bits) << shift
-            out += b'\0' * (-len(out) % size)
-            signed = i == self.last
-            out += value.to_bytes(size, 'big' if order == 'be' else 'little', signed=signed)
-        largest = max(8 if i == self.last else format_of(self.channels[i])[3] // 8
-                      for i in self.enabled)
-        return out + b'\0' * (-len(out) % largest)
+        for element in elements:
+            out += b'\0' * (-len(out) % len(element)) + element
+        return out + b'\0' * (-len(out) % max(map(len, elements)))
+
+    def element(self, i, k):
+        """Return the bytes of channel i at sample k."""
+        if i == self.stamp_index:
+            return self.stamp(k).to_bytes(8, 'little', signed=True)
+        form = parse_format(self.channels[i])
+        value = code(k, i, form.bits)
+        if form.sign == 's':
+            value -= 2 ** (form.bits - 1)
+        value = (value % 2 ** form.bits) << form.shift
+        return value.to_bytes(form.stored // 8, 'big' if form.order == 'be' else 'little')
+
+    def channel_xml(self, i):
+        """Return the element of channel i."""
+        channel = self.channels[i]
+        names = [name for name in ('label', 'offset', 'scale', 'raw')
+                 if name in channel or name in DEFAULTS]
+        attributes = ''.join(
+            f'<attribute name="{name}" filename="in_{channel["id"]}_{name}" />' for name in names)
+        scan = '' if channel.get('unbuffered') else scan_xml(i, channel.get('format', FORMAT))
+        return f'<channel id="{channel["id"]}" type="input">{scan}{attributes}</channel>'
 
     def xml(self):
-        def attribute(channel, name):
-            return f'<attribute name="{name}" filename="in_{channel["id"]}_{name}" />'
-
-        parts = []
-        for i, c in enumerate(self.channels):
-            scan = '' if c.get('unbuffered') else \
-                f'<scan-element index="{i}" format="{c.get("format", "le:u16/16>>0")}" />'
-            names = [n for n in ('label', 'offset', 'scale', 'raw')
-                     if n in c or n == 'raw' or (n == 'scale' and 'scale' not in c)]
-            parts.append(f'<channel id="{c["id"]}" type="input">'.replace('>>', '&gt;&gt;')
-                         + scan.replace('>>', '&gt;&gt;')
-                         + ''.join(attribute(c, n) for n in names) + '</channel>')
-        stamp = '' if self.setting.get('unstamped') else (
-            '<channel id="timestamp" type="input"><scan-element index='
-            f'"{self.last}" format="le:S64/64&gt;&gt;0" /></channel>')
-        own = ''.join(f'<attribute name="{n}" />' for n in self.attributes)
-        return ('<?xml version="1.0" encoding="utf-8"?><!DOCTYPE context ['
-                + GRAMMAR + ']>'
+        """Return the context."""
+        channels = ''.join(map(self.channel_xml, range(len(self.channels))))
+        stamp = '' if self.options.get('unstamped') else (
+            '<channel id="timestamp" type="input">'
+            f'{scan_xml(self.stamp_index, STAMP_FORMAT)}</channel>')
+        attributes = ''.join(f'<attribute name="{name}" />' for name in self.attributes)
+        return (f'<?xml version="1.0" encoding="utf-8"?><!DOCTYPE context [{GRAMMAR}]>'
                 '<context name="network" version-major="0" version-minor="24" '
                 'version-git="v0.24" description="fixture">'
-                f'<device id="iio:device0" name="adc">{"".join(parts)}{stamp}{own}</device>'
+                f'<device id="iio:device0" name="adc">{channels}{stamp}{attributes}</device>'
                 '</context>').encode()
 
     def read(self, words):
-        """Return an attribute's text, or an error number."""
+        """Return the text of an attribute, or an error number."""
         if words[0] in ('INPUT', 'OUTPUT'):
-            channel = next(c for c in self.channels if c['id'] == words[1])
-            value = channel.get(words[2], {'scale': 0.0762939453125, 'raw': 100}.get(words[2]))
+            channel = next(channel for channel in self.channels if channel['id'] == words[1])
+            value = channel.get(words[2], DEFAULTS.get(words[2]))
         else:
             value = self.attributes.get(words[0])
-        return -5 if value is None else str(value)
+        return EIO if value is None else str(value)
 
     def write(self, words, text):
+        """Set an attribute; return the length of its text, or an error number."""
         if words[0] == 'sampling_frequency':
-            allowed = self.setting.get('rates')
-            if allowed and float(text) not in allowed:
-                return -22
+            permitted = self.options.get('rates')
+            if permitted and float(text) not in permitted:
+                return EINVAL
             self.rate = float(text)
         if words[0] not in self.attributes:
-            return -5
+            return EIO
         self.attributes[words[0]] = text
         return len(text)
+
+
+def scan_xml(index, form):
+    """Return the element that places a channel in the buffer."""
+    return f'<scan-element index="{index}" format="{form.replace(">>", "&gt;&gt;")}" />'
 
 
 class Client(socketserver.StreamRequestHandler):
@@ -173,62 +206,66 @@ class Client(socketserver.StreamRequestHandler):
     disable_nagle_algorithm = True
 
     def answer(self, number, data=b''):
+        """Answer a command by a number and data."""
         self.wfile.write(b'%d\n' % number + data)
 
     def handle(self):
-        adc = self.server.adc
+        """Answer commands until the client leaves."""
         for line in self.rfile:
             words = line.decode().split()
-            if not words:
-                continue
-            command, rest = words[0], words[1:]
-            if command == 'VERSION':
-                self.wfile.write(b'0.24.v0.24  \n')
-            elif command == 'PRINT':
-                self.answer(len(adc.xml()), adc.xml() + b'\n')
-            elif command == 'READ':
-                value = adc.read(rest[1:])
-                if isinstance(value, int):
-                    self.answer(value)
-                else:
-                    self.answer(len(value) + 1, value.encode() + b'\0\n')
-            elif command == 'WRITE':
-                text = self.rfile.read(int(rest[-1])).rstrip(b'\0').decode()
-                self.answer(adc.write(rest[1:-1], text))
-            elif command == 'SET':
-                adc.buffers = int(rest[-1])
-                self.answer(0)
-            elif command == 'OPEN':
-                adc.begin(int(rest[1]), int(rest[2], 16))
-                self.mask = rest[2]
-                self.answer(0)
-            elif command == 'READBUF':
-                size = int(rest[1])
-                per_sample = len(adc.packed(0))
-                data = b''.join(map(adc.packed, adc.samples(size // per_sample)))
-                self.answer(len(data), self.mask.encode() + b'\n' + data)
-            elif command in ('CLOSE', 'TIMEOUT'):
-                self.answer(0)
-            elif command == 'EXIT':
+            if words and words[0] == 'EXIT':
                 return
+            if words:
+                self.obey(words[0], words[1:])
+
+    def obey(self, command, rest):
+        """Answer one command."""
+        adc = self.server.adc
+        if command == 'VERSION':
+            self.wfile.write(b'0.24.v0.24  \n')
+        elif command == 'PRINT':
+            self.answer(len(adc.xml()), adc.xml() + b'\n')
+        elif command == 'READ':
+            value = adc.read(rest[1:])
+            if isinstance(value, int):
+                self.answer(value)
             else:
-                self.answer(-22)
+                self.answer(len(value) + 1, value.encode() + b'\0\n')
+        elif command == 'WRITE':
+            text = self.rfile.read(int(rest[-1])).rstrip(b'\0').decode()
+            self.answer(adc.write(rest[1:-1], text))
+        elif command == 'SET':
+            adc.buffers = int(rest[-1])
+            self.answer(0)
+        elif command == 'OPEN':
+            adc.begin(int(rest[1]), int(rest[2], 16))
+            self.mask = rest[2]
+            self.answer(0)
+        elif command == 'READBUF':
+            size = int(rest[1]) // len(adc.packed(0))
+            data = b''.join(map(adc.packed, adc.samples(size)))
+            self.answer(len(data), self.mask.encode() + b'\n' + data)
+        elif command in ('CLOSE', 'TIMEOUT'):
+            self.answer(0)
+        else:
+            self.answer(EINVAL)
 
 
 class Server(socketserver.ThreadingTCPServer):
-    """The server; a port that was just in use is taken again."""
+    """The server; it takes a port that was just in use."""
 
     allow_reuse_address = True
     daemon_threads = True
 
     def handle_error(self, request, client_address):
-        """Say nothing: a client that has gone is no news."""
+        """Print nothing: clients leave without a word."""
 
 
 def main():
-    setting = json.loads(sys.argv[1]) if len(sys.argv) > 1 else {}
-    with Server(('127.0.0.1', setting.get('port', 0)), Client) as server:
-        server.adc = Adc(setting)
+    """Serve until the process is ended."""
+    options = json.loads(sys.argv[1]) if len(sys.argv) > 1 else {}
+    with Server(('127.0.0.1', options.get('port', 0)), Client) as server:
+        server.adc = Adc(options)
         print(server.server_address[1], flush=True)
         server.serve_forever()
 

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""A driver on a hurt device, and the book that is kept of its samples."""
+"""A driver on an emulated device with faults, and a report of what it published."""
 
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ import time
 
 from adxl_ros.model.sensor import to_volts
 from domain import own_domain
-from faulty_board import mark
+from faulty_board import CODES, mark
 from graph import Graph, imu_table
 import iiod
 import numpy as np
@@ -34,22 +34,35 @@ from sensor_msgs.msg import Imu
 from units import nominal
 
 HERE = Path(__file__).resolve().parent
+"""Folder of the scripts."""
 
 
-class Helper:
-    """A process of the tests' own that answers lines with lines."""
+class ScriptProcess:
+    """
+    A script of this folder that answers lines with lines of JSON.
+
+    Attributes
+    ----------
+    popen
+        The process.
+    first_line
+        Its first line on stdout.
+
+    """
 
     def __init__(self, script, *args):
         self.popen = subprocess.Popen(
             [sys.executable, HERE / script, *map(str, args)], text=True, bufsize=1,
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True)
-        self.first = self.popen.stdout.readline().strip()
+        self.first_line = self.popen.stdout.readline().strip()
 
-    def __call__(self, line):
+    def ask(self, line):
+        """Send a line and return the answer."""
         self.popen.stdin.write(line + '\n')
         return json.loads(self.popen.stdout.readline())
 
     def kill(self):
+        """Kill the process."""
         self.popen.kill()
         self.popen.wait()
         self.popen.stdin.close()
@@ -57,177 +70,237 @@ class Helper:
 
 
 @dataclass(frozen=True)
-class Book:
-    """What was published, and what the driver says of it."""
+class SampleReport:
+    """
+    What a driver has published, and what it reports about it.
+
+    Attributes
+    ----------
+    published
+        Samples that were published.
+    wrong
+        Samples with wrong values or in a wrong order.
+    missing
+        Samples that the device took and that were not published.
+    counted
+        Missing samples, as diagnostics report them.
+    estimated
+        Part of `counted` that diagnostics call an estimate.
+    max_error_ms
+        Largest error of a stamp, ms.
+
+    """
 
     published: int
     wrong: int
     missing: int
-    said: int
+    counted: int
     estimated: int
-    error_ms: float
+    max_error_ms: float
 
     @property
-    def right(self):
-        """Tell whether nothing was wrong, and the count exact."""
-        return not self.wrong and self.missing == self.said
+    def exact(self):
+        """Whether no sample is wrong and the missing ones are counted exactly."""
+        return not self.wrong and self.missing == self.counted
 
 
-class Rig:
-    """Keeps the samples of a driver; `who` tells which sample volts are, `when` its time, ns."""
+class DriverRig:
+    """
+    Collects the samples of a driver and identifies them on the device.
 
-    def __init__(self, graph, who, when):
-        self.graph, self.who, self.when = graph, who, when
-        self.raws = graph.listen(Imu, 'imu/data_raw', raw=True)
+    Attributes
+    ----------
+    numbers, stamps, errors
+        Number of each sample on the device, its stamp, ns, and the error of the stamp, ms.
+    wrong
+        Samples with wrong values or in a wrong order.
+
+    """
+
+    def __init__(self, graph, rate_hz):
+        self.graph = graph
+        self._rate_hz = rate_hz
+        self._raws = graph.listen(Imu, 'imu/data_raw', raw=True)
         self.numbers = np.zeros(0, np.int64)
         self.stamps = np.zeros(0, np.int64)
         self.errors = np.zeros(0)
-        self.wrong = self.base = self.base_estimated = 0
+        self.wrong = self._counted_before = self._estimated_before = 0
 
-    def take(self):
-        """Enter what has come into the book."""
-        if not self.raws:
+    def identify(self, codes, stamps):
+        """Return the numbers of samples by codes and stamps, and how many codes are wrong."""
+        raise NotImplementedError
+
+    def taken_ns(self, numbers):
+        """Return the ROS times at which the device took samples, ns."""
+        raise NotImplementedError
+
+    def collect(self):
+        """Identify the samples that have come."""
+        if not self._raws:
             return
-        stamps, accel = imu_table(self.raws)
-        self.raws.clear()
+        stamps, accel = imu_table(self._raws)
+        self._raws.clear()
         codes = to_volts(accel[:, :2], nominal()) / nominal().lsb_v
-        numbers, wrong = self.who(codes, stamps)
-        order = np.concatenate([self.stamps[-1:], stamps])
-        before = np.concatenate([self.numbers[-1:], numbers])
-        self.wrong += wrong + int((np.diff(order) <= 0).sum() + (np.diff(before) <= 0).sum())
+        numbers, wrong = self.identify(codes, stamps)
+        stamp_steps = np.diff(np.concatenate([self.stamps[-1:], stamps]))
+        number_steps = np.diff(np.concatenate([self.numbers[-1:], numbers]))
+        self.wrong += wrong + int((stamp_steps <= 0).sum() + (number_steps <= 0).sum())
         self.numbers = np.concatenate([self.numbers, numbers])
         self.stamps = np.concatenate([self.stamps, stamps])
-        self.errors = np.concatenate([self.errors, (stamps - self.when(numbers)) * 1e-6])
+        self.errors = np.concatenate([self.errors, (stamps - self.taken_ns(numbers)) * 1e-6])
 
-    def said(self, key):
-        """Return a number of the newest diagnostics."""
+    def diagnostic(self, key):
+        """Return a number of the newest diagnostics, 0 without any."""
         return float(self.graph.value('driver', key)) if 'driver' in self.graph.diagnostics else 0
 
-    def count(self, count, timeout_s, what='samples'):
-        """Listen until so many more samples have come."""
-        wanted = len(self.numbers) + count
+    def wait_for_samples(self, count, timeout_s, purpose='samples'):
+        """Listen until so many further samples have come; fail with the purpose otherwise."""
+        target = len(self.numbers) + count
 
-        def there():
-            self.take()
-            return len(self.numbers) >= wanted
-        self.graph.spin_until(there, timeout_s, what)
+        def complete():
+            self.collect()
+            return len(self.numbers) >= target
+        self.graph.spin_until(complete, timeout_s, purpose)
 
-    def begin(self):
-        """Begin a new page."""
-        self.settle()
-        keep = slice(len(self.numbers) - 1, None)
-        self.numbers, self.stamps = self.numbers[keep], self.stamps[keep]
-        self.errors = self.errors[keep]
+    def begin_report(self):
+        """Begin a new report with the next sample."""
+        self._settle()
+        last = slice(len(self.numbers) - 1, None)
+        self.numbers, self.stamps = self.numbers[last], self.stamps[last]
+        self.errors = self.errors[last]
         self.wrong = 0
-        self.base, self.base_estimated = self.said('missing'), self.said('missing_estimated')
+        self._counted_before = self.diagnostic('missing')
+        self._estimated_before = self.diagnostic('missing_estimated')
 
-    def settle(self):
-        """Wait for diagnostics that know all that has been published."""
-        self.count(round(0.3 * self.setting.get('rate', 1000.0)), 30)
+    def report(self):
+        """Return the report since its beginning."""
+        self._settle()
+        expected = int(self.numbers[-1] - self.numbers[0]) + 1
+        return SampleReport(
+            len(self.numbers) - 1, self.wrong, expected - len(self.numbers),
+            round(self.diagnostic('missing') - self._counted_before),
+            round(self.diagnostic('missing_estimated') - self._estimated_before),
+            float(np.abs(self.errors).max()))
+
+    def _settle(self):
+        """Wait for diagnostics that include all published samples."""
+        self.wait_for_samples(round(0.3 * self._rate_hz), 30)
         self.graph.diagnostics.clear()
         self.graph.spin_until(lambda: 'driver' in self.graph.diagnostics, 10, 'diagnostics')
         self.graph.spin(0.05)
-        self.take()
+        self.collect()
 
-    def recovered_ms(self, back_ns):
-        """Wait for a sample taken after a monotonic time; return how long after it came, ms."""
+    def recovery_ms(self, back_ns):
+        """Wait for a sample taken after a monotonic time, and return how long that took, ms."""
         ros_ns = back_ns + time.time_ns() - time.monotonic_ns()
 
-        def there():
-            self.take()
+        def recovered():
+            self.collect()
             return self.stamps[-1] >= ros_ns
-        self.graph.spin_until(there, 20, 'a new sample')
+        self.graph.spin_until(recovered, 20, 'a new sample')
         return (time.monotonic_ns() - back_ns) * 1e-6
 
-    def close(self):
-        """Return what stands on the page."""
-        self.settle()
-        return Book(len(self.numbers) - 1, self.wrong,
-                    int(self.numbers[-1] - self.numbers[0]) - len(self.numbers) + 1,
-                    round(self.said('missing') - self.base),
-                    round(self.said('missing_estimated') - self.base_estimated),
-                    float(np.abs(self.errors).max()))
 
+class SerialRig(DriverRig):
+    """
+    A driver on a faulty board.
 
-class SerialRig(Rig):
-    """A driver on a faulty board."""
+    Attributes
+    ----------
+    path
+        Port of the board.
+    board
+        Process of the board.
 
-    def __init__(self, graph, folder, setting=None):
+    """
+
+    def __init__(self, graph, folder, options=None):
+        options = options or {}
+        super().__init__(graph, options.get('rate', 1000.0))
         self.path = Path(folder) / 'board'
-        self.setting = setting or {}
-        self.board = Helper('faulty_board.py', self.path, json.dumps(self.setting))
-        self.origin_ns = json.loads(self.board.first)['origin_ns']
-        self.halted = [(0, 0)]
-        super().__init__(graph, self.tell, self.taken)
+        self.board = ScriptProcess('faulty_board.py', self.path, json.dumps(options))
+        self._origin_ns = json.loads(self.board.first_line)['origin_ns']
+        self._period_ns = 1e9 / self._rate_hz * (1 + options.get('ppm', 0) * 1e-6)
+        self._halts = [(0, 0)]
 
     def end(self):
-        """Take the board away, its name first: a terminal's number may soon be another's."""
+        """Remove the name of the port first: another terminal may soon have the same number."""
         self.path.unlink(missing_ok=True)
         self.board.kill()
-        self.raws.clear()
+        self._raws.clear()
 
-    def parameters(self):
+    def driver_parameters(self):
+        """Return the arguments of a driver that reads this board."""
         return ['-p', 'link.type:=serial', '-p', f'link.port:={self.path}', '-p',
                 'link.channels:=x,y,supply']
 
-    def tell(self, codes, stamps):
-        """Return the numbers of samples by their codes, and how many make no sense."""
-        low = np.rint(codes[:, 0]).astype(np.int64) - 1
-        guess = (stamps - self.taken(np.array([0]))) * 1e-9 * self.setting.get('rate', 1000.0)
-        number = low + np.rint((guess - low) / 65534).astype(np.int64) * 65534
+    def identify(self, codes, stamps):
+        """Return the numbers of samples by codes and stamps, and how many codes are wrong."""
+        remainder = np.rint(codes[:, 0]).astype(np.int64) - 1
+        estimate = (stamps - self.taken_ns(np.array([0]))) * 1e-9 * self._rate_hz
+        numbers = remainder + np.rint((estimate - remainder) / CODES).astype(np.int64) * CODES
         wrong = np.abs(codes - np.rint(codes)).max(axis=1) > 1e-3
-        wrong |= np.rint(codes[:, 1]) != mark(number)
-        return number, int(wrong.sum())
+        wrong |= np.rint(codes[:, 1]) != mark(numbers)
+        return numbers, int(wrong.sum())
 
-    def taken(self, number):
-        """Return the ROS time at which samples were taken, ns."""
-        held = sum(np.where(number >= k, ns, 0) for k, ns in self.halted)
-        step = 1e9 / self.setting.get('rate', 1000.0) * (1 + self.setting.get('ppm', 0) * 1e-6)
-        return (self.origin_ns + time.time_ns() - time.monotonic_ns() + held
-                + np.rint(number * step).astype(np.int64))
+    def taken_ns(self, numbers):
+        """Return the ROS times at which the board took samples, ns."""
+        halted_ns = sum(np.where(numbers >= first, ns, 0) for first, ns in self._halts)
+        return (self._origin_ns + time.time_ns() - time.monotonic_ns() + halted_ns
+                + np.rint(numbers * self._period_ns).astype(np.int64))
 
-    def tell_board(self, line):
-        """Let the board do something; returns when it is done."""
-        answer = self.board(line)
+    def command(self, line):
+        """Send a command to the board; return the monotonic time at which it is done, ns."""
+        answer = self.board.ask(line)
         if line.startswith('halt'):
-            self.halted.append((answer['k'], float(line.split()[1]) * 1e9))
-        return answer['at_ns']
+            self._halts.append((answer['next_sample'], float(line.split()[1]) * 1e9))
+        return answer['done_ns']
 
 
-class IioRig(Rig):
-    """A driver on the IIOD of the tests."""
+class IioRig(DriverRig):
+    """
+    A driver on the IIOD of the tests.
 
-    def __init__(self, graph, setting=None):
-        self.setting = {'port': 0, 'began_ns': time.monotonic_ns(), **(setting or {})}
+    Attributes
+    ----------
+    server
+        Process of the IIOD.
+
+    """
+
+    def __init__(self, graph):
+        super().__init__(graph, 1000.0)
+        self._options = {'port': 0, 'began_ns': time.monotonic_ns()}
         self.start()
-        super().__init__(graph, self.tell, self.taken)
 
     def start(self):
-        self.server = Helper('iiod.py', json.dumps(self.setting))
-        self.setting['port'] = int(self.server.first)
+        """Start the server, on the same port as before."""
+        self.server = ScriptProcess('iiod.py', json.dumps(self._options))
+        self._options['port'] = int(self.server.first_line)
 
     def end(self):
         """End the server."""
         self.server.kill()
 
-    def parameters(self):
-        return ['-p', 'link.type:=iio', '-p', f'link.uri:=ip:127.0.0.1:{self.setting["port"]}',
+    def driver_parameters(self):
+        """Return the arguments of a driver that reads this server."""
+        return ['-p', 'link.type:=iio', '-p', f'link.uri:=ip:127.0.0.1:{self._options["port"]}',
                 '-p', 'link.device:=adc']
 
-    def taken(self, number):
-        """Return the ROS time at which samples were taken, ns."""
-        return (self.setting['began_ns'] + time.time_ns() - time.monotonic_ns()
-                + np.rint(number * 1e6).astype(np.int64))
-
-    def tell(self, codes, stamps):
-        """Return the numbers of samples by their codes, and how many make no sense."""
+    def identify(self, codes, stamps):
+        """Return the numbers of samples by codes, and how many codes are wrong."""
         numbers = np.rint(codes[:, 0]).astype(np.int64) - 1
-        right = iiod.code(numbers, 1, 16) == np.rint(codes[:, 1])
-        return numbers, int((~right).sum())
+        wrong = iiod.code(numbers, 1, 16) != np.rint(codes[:, 1])
+        return numbers, int(wrong.sum())
+
+    def taken_ns(self, numbers):
+        """Return the ROS times at which the device took samples, ns."""
+        return (self._options['began_ns'] + time.time_ns() - time.monotonic_ns()
+                + np.rint(numbers * 1e6).astype(np.int64))
 
 
 @contextmanager
-def graph_of_own():
+def private_graph():
     """Give a graph outside pytest, in a domain of its own."""
     with own_domain() as domain:
         os.environ['ROS_DOMAIN_ID'] = str(domain)
@@ -236,15 +309,15 @@ def graph_of_own():
             yield graph
 
 
-def hold(pid, seconds, graph):
-    """Stop a process for so long, and listen meanwhile; returns when it goes on, ns."""
+def suspend(pid, duration_s, graph):
+    """Stop a process for a time and listen meanwhile; return when it continues, ns."""
     os.kill(pid, signal.SIGSTOP)
-    graph.spin(seconds)
+    graph.spin(duration_s)
     os.kill(pid, signal.SIGCONT)
     return time.monotonic_ns()
 
 
 def memory_mib(pid):
-    """Return what a process holds in memory, MiB."""
+    """Return the resident memory of a process, MiB."""
     text = Path(f'/proc/{pid}/status').read_text()
     return int(text.split('VmRSS:')[1].split()[0]) / 1024
