@@ -13,32 +13,34 @@
 # limitations under the License.
 
 """
-Nine parameters of a three-axis sensor from the magnitude of gravity over its rests.
+Fit of nine parameters of a three-axis sensor to the magnitude of gravity over its rests.
 
-At rest the specific force has the magnitude of local gravity, whatever the pose. Zero-g, scale
-factor and three angles between the sensing axes make it so: V = zero-g + scale·(Θ·f/g₀) with
-Θ of equations 18 and 19. The magnitude cannot tell how the case turns with the axes, which is
-three angles: the gauge holds Θx on the case's x and Θy in its x-y plane.
+At rest the specific force has the magnitude of local gravity in every pose. Zero-g, scale factor
+and three angles between the sensing axes are fitted: V = zero-g + scale·(Θ·f/g₀) with Θ of
+equations 18 and 19. The magnitude does not show how the case turns with the axes, which is three
+angles. The gauge holds Θx on the case's x and Θy in its x-y plane.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from adxl_ros.calibrate.fits.gravity_model import (
     effect_values,
     fisher_information,
-    iterated,
     magnitude,
     magnitude_jacobian,
     magnitude_variance,
     NAMES,
     nominal_rests,
-    Rests,
+    NominalRests,
+    posterior_information,
+    regularised_fit,
     TRIAL_STD_G,
     undetermined,
 )
-from adxl_ros.calibrate.fits.orientations import poses_to_add
+from adxl_ros.calibrate.fits.orientations import rests_to_add
 from adxl_ros.errors import UserError
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.sensor import Sensor
@@ -47,44 +49,56 @@ from scipy.optimize import brentq, least_squares
 from scipy.special import gammaln, stdtrit
 
 MIN_RESTS = len(NAMES) + 1
-"""One rest more than coefficients: with fewer, nothing says how good the fit is."""
-OUTLIER_CHANCE = 0.01
-"""Chance that a fit without knocks takes any of its rests for one."""
-STARTS = 20
-"""Fits to ten rests each, that one of them may be without knocks."""
-FIRST_STEPS = 4
-"""Gauss-Newton steps with the ten rests of a start."""
-STEPS = 11
+"""Smallest count of rests: one more than coefficients, so that residuals show the error."""
+_TOLERANCE = 1e-12
+"""Relative tolerance of `least_squares` in cost, parameters and gradient."""
+_MAX_ROUNDS = 20
+"""Largest count of rounds of parameters and excess variance."""
+_EXCESS_TOLERANCE = 1e-6
+"""The excess variance has converged if it changes by less, relative to the variance."""
+
+_OUTLIER_CHANCE = 0.01
+"""Probability that a fit without outliers takes any of its rests for one."""
+_MAX_OUTLIERS = 0.25
+"""Largest share of outliers."""
+_OUTLIER_RANGE_G = 0.03
+"""Range of the magnitude of an outlier, g. Chosen: the size of a knock or of a hand's motion."""
+_LTS_STARTS = 20
+"""Starts of the least trimmed squares, with ten rests each: one of them is free of outliers."""
+_LTS_FIRST_STEPS = 4
+"""Gauss-Newton steps with the rests of a start."""
+_LTS_STEPS = 11
 """Gauss-Newton steps with the rests that fit best."""
-KNOCK = 0.03
-"""Width of what a knock can make of a magnitude, g."""
-OUTLIERS = 0.25
-"""Share of the rests that may be knocks, at most."""
+_LTS_MAX_DEVIATIONS = 5.0
+"""Standard deviations up to which a rest belongs to the best fit of most rests."""
+_MIN_GRAVITY_RATIO = 0.5
+"""Smallest ratio of the measured magnitude to local gravity; a smaller one is a wrong unit."""
+_MAX_GRAVITY_RATIO = 2.0
+"""Largest ratio of the measured magnitude to local gravity; a larger one is a wrong unit."""
 
 
 @dataclass(frozen=True)
 class GravityFit:
     """
-    What the rests say about the sensor.
+    Result of the fit of k rests.
 
     Attributes
     ----------
     values
-        Effects' parameters by axis, as `Sensor.values` holds them.
+        Parameters of effects by axis, as `Sensor.values` has them.
     covariance
-        Of the fitted coefficients in the units of NAMES, (9, 9).
+        Of the coefficients NAMES, in their units, (9, 9).
     before_mps2, residual_mps2, leave_one_out_mps2
-        Magnitude less local gravity at every rest, (k,): by the nominal figures, by the fit, and
-        by the fit to all other rests.
+        Magnitude minus local gravity, m/s², (k,): by nominal values, by the fit, and by the fit to
+        all other rests.
     expected_mps2
-        Standard deviation of a rest's magnitude, (k,): of its mean, and what the means' noise
-        leaves unexplained.
+        Standard deviation of a rest's magnitude, m/s², (k,): noise of the mean and excess.
     excess_mps2
-        The part of it that the noise of the means leaves unexplained.
+        The part of it that the noise of the means does not explain, m/s².
     outliers
-        Numbers of the rests that do not fit the others, and were left out.
+        Indices of the rests that were left out as disturbed.
     converged
-        Whether parameters and excess variance settled.
+        Whether parameters and excess variance have converged.
 
     """
 
@@ -99,82 +113,102 @@ class GravityFit:
     converged: bool = True
 
 
-def fit_gravity(mean_v: np.ndarray, standard_error_v: np.ndarray, sensor: Sensor) -> GravityFit:
+class _Estimate(NamedTuple):
     """
-    Fit the nine parameters by maximum likelihood.
+    An estimate of the parameters.
 
-    The likelihood is that of the magnitudes; errors across gravity change them by nothing to
-    first order. Real rests scatter by more than the noise of their means (flicker, hysteresis,
-    what nine parameters do not hold): a common excess variance is estimated with the fit, so
-    that the covariance tells what the rests bear out.
+    Attributes
+    ----------
+    parameters
+        The nine parameters, (9,).
+    excess_g2
+        Variance of the magnitudes beyond the noise of the means, g².
+    converged
+        Whether both have converged.
+
+    """
+
+    parameters: np.ndarray
+    excess_g2: float
+    converged: bool
+
+
+def fit_gravity(mean_v: np.ndarray, std_v: np.ndarray, sensor: Sensor) -> GravityFit:
+    """
+    Fit the nine parameters by maximum likelihood of the magnitudes.
+
+    Errors across gravity do not change the magnitude to first order. Real rests scatter by more
+    than the noise of their means (flicker, hysteresis, effects beyond nine parameters). A common
+    excess variance is therefore estimated with the parameters, and widens the covariance.
 
     Parameters
     ----------
-    mean_v, standard_error_v
-        Mean of each rest and its standard error, V, (k, 3).
+    mean_v, std_v
+        Mean of each rest and its standard deviation, V, (k, 3).
     sensor
-        Nominal figures and local gravity of a three-axis sensor.
+        Nominal values and local gravity of a three-axis sensor.
+
+    Returns
+    -------
+    GravityFit
+        The fit, converged or not.
 
     Raises
     ------
     UserError
-        If the rests do not determine the parameters: it names those, and rests to add; or if
-        what they read is not gravity at all.
+        The rests do not determine the parameters, or do not read gravity. The message names the
+        coefficients and rests to add.
 
     """
-    rests = nominal_rests(mean_v, standard_error_v, sensor)
+    rests = nominal_rests(mean_v, std_v, sensor)
     nominal = np.zeros(len(NAMES))
     _require_determined(rests, nominal, 0.0)
     kept = _inliers(rests, nominal)
-    found, excess, converged = _fit(rests[kept], nominal)
-    _require_determined(rests[kept], found, excess)
-    variance = magnitude_variance(rests, found) + excess
-    jacobian = magnitude_jacobian(rests[kept].mean, found) / np.sqrt(variance[kept, None])
-    covariance = np.linalg.inv(jacobian.T @ jacobian)
+    parameters, excess, converged = _fit(rests[kept], nominal)
+    _require_determined(rests[kept], parameters, excess)
+    variance = magnitude_variance(rests, parameters) + excess
+    covariance = np.linalg.inv(fisher_information(rests[kept], parameters, excess))
     covariance *= _t_factor(excess, variance[kept])
-    values, to_units = effect_values(found, sensor)
-    residual = magnitude(rests.mean, found) - rests.gravity
+    effects = effect_values(parameters, sensor)
+    residual = _residual(rests, parameters)
     return GravityFit(
-        values=values,
-        covariance=covariance * np.outer(to_units, to_units),
-        before_mps2=G0_MPS2 * (np.linalg.norm(rests.mean, axis=1) - rests.gravity),
+        values=effects.values,
+        covariance=covariance * np.outer(effects.units, effects.units),
+        before_mps2=G0_MPS2 * (np.linalg.norm(rests.mean, axis=1) - rests.gravity_g),
         residual_mps2=G0_MPS2 * residual,
-        leave_one_out_mps2=G0_MPS2 * _leave_one_out(rests, kept, found, variance, residual),
+        leave_one_out_mps2=G0_MPS2 * _leave_one_out(rests, kept, parameters, variance, residual),
         expected_mps2=G0_MPS2 * np.sqrt(variance),
         excess_mps2=G0_MPS2 * float(np.sqrt(excess)),
         outliers=tuple(int(i) for i in np.flatnonzero(~kept)),
         converged=converged)
 
 
-def _solve(rests: Rests, start: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, bool]:
-    """Fit with given variances of the magnitudes, g², (k,); tells whether it converged, too."""
-    sigma = np.sqrt(variance)
-    found = least_squares(lambda p: (magnitude(rests.mean, p) - rests.gravity) / sigma, start,
-                          lambda p: magnitude_jacobian(rests.mean, p) / sigma[:, None],
-                          method='lm', xtol=1e-12, ftol=1e-12, gtol=1e-12)
-    return found.x, bool(found.success)
+def _residual(rests: NominalRests, parameters: np.ndarray) -> np.ndarray:
+    """Return magnitude minus local gravity, g, (k,)."""
+    return magnitude(rests.mean, parameters) - rests.gravity_g
 
 
-def _fit(rests: Rests, start: np.ndarray) -> tuple[np.ndarray, float, bool]:
-    """
-    Fit the parameters, and the excess variance, g², that makes chi-squared its freedom.
+def _solve(rests: NominalRests, start: np.ndarray, variance: np.ndarray
+           ) -> tuple[np.ndarray, bool]:
+    """Fit with given variances of the magnitudes, g², (k,); also return whether it converged."""
+    std = np.sqrt(variance)
+    solution = least_squares(lambda p: _residual(rests, p) / std, start,
+                             lambda p: magnitude_jacobian(rests.mean, p) / std[:, None],
+                             method='lm', xtol=_TOLERANCE, ftol=_TOLERANCE, gtol=_TOLERANCE)
+    return solution.x, bool(solution.success)
 
-    Returns
-    -------
-    tuple
-        Parameters, (9,); excess variance, g²; whether both converged.
 
-    """
-    found, excess = start, 0.0
+def _fit(rests: NominalRests, start: np.ndarray) -> _Estimate:
+    """Fit the parameters, and the excess variance that makes χ² equal its degrees of freedom."""
+    parameters, excess = start, 0.0
     freedom = len(rests.mean) - len(NAMES)
-    for _ in range(20):
-        variance = magnitude_variance(rests, found)
-        found, solved = _solve(rests, found, variance + excess)
-        squares = (magnitude(rests.mean, found) - rests.gravity) ** 2
-        before, excess = excess, _excess(squares, variance, freedom)
-        if abs(excess - before) <= 1e-6 * (excess + variance.min()):
-            return found, excess, solved
-    return found, excess, False
+    for _ in range(_MAX_ROUNDS):
+        variance = magnitude_variance(rests, parameters)
+        parameters, solved = _solve(rests, parameters, variance + excess)
+        before, excess = excess, _excess(_residual(rests, parameters) ** 2, variance, freedom)
+        if abs(excess - before) <= _EXCESS_TOLERANCE * (excess + variance.min()):
+            return _Estimate(parameters, excess, solved)
+    return _Estimate(parameters, excess, False)
 
 
 def _excess(squares: np.ndarray, variance: np.ndarray, freedom: int) -> float:
@@ -187,128 +221,131 @@ def _excess(squares: np.ndarray, variance: np.ndarray, freedom: int) -> float:
 
 
 def _t_factor(excess: float, variance: np.ndarray) -> float:
-    """Widen the covariance for an excess that ν rests told: Student's variance, ν/(ν − 2)."""
+    """Return the factor of the covariance for an excess that ν rests determine: ν/(ν − 2)."""
     # The share of the variance that the noise of the means explains needs no such allowance.
     freedom = len(variance) - len(NAMES)
     return 1 + excess / variance.mean() * 2 / max(freedom - 2, 1)
 
 
-def _inliers(rests: Rests, start: np.ndarray) -> np.ndarray:
+def _inliers(rests: NominalRests, start: np.ndarray) -> np.ndarray:
     """
-    Tell which rests fit the others, (k,): the rest are knocks, or were no rests.
+    Mark the rests that fit the others, (k,) bool.
 
-    Rests leave or come back, one at a time, by their studentised distance from the fit to the
-    others: once from all of them, and once from the best fit to most of them, where several
-    knocks cannot hide one another. The likelihood tells which of the two results is right.
+    Rests leave or return, one at a time, by their studentised distance from the fit to the
+    others. This begins once with all rests, and once with the best fit to most of them, where
+    several outliers cannot hide one another. The result with the greater likelihood counts.
     """
     count = len(rests.mean)
-    most = min(int(OUTLIERS * count), count - MIN_RESTS)
+    max_outliers = min(int(_MAX_OUTLIERS * count), count - MIN_RESTS)
     everything = np.ones(count, bool)
-    if most < 1:
+    if max_outliers < 1:
         return everything
-    results = [_exchanged(rests, begin, start, most)
-               for begin in (everything, _robust_inliers(rests, start, most))]
-    return min(results, key=lambda kept: _unlikeliness(rests, kept, start))
+    results = [_exchanged(rests, begin, start, max_outliers)
+               for begin in (everything, _robust_inliers(rests, start, max_outliers))]
+    return min(results, key=lambda kept: _negative_log_likelihood(rests, kept, start))
 
 
-def _exchanged(rests: Rests, kept: np.ndarray, start: np.ndarray, most: int) -> np.ndarray:
-    """Let rests leave or come back until each kept one fits, and each other does not, (k,)."""
+def _exchanged(rests: NominalRests, kept: np.ndarray, start: np.ndarray, max_outliers: int
+               ) -> np.ndarray:
+    """Let rests leave or return until each kept rest fits and each other does not, (k,) bool."""
     kept = kept.copy()
-    for _ in range(2 * most):
+    for _ in range(2 * max_outliers):
         distance = _studentised(rests, kept, start)
         freedom = max(kept.sum() - MIN_RESTS, 1)
-        allowed = -stdtrit(freedom, OUTLIER_CHANCE / (2 * len(kept)))
-        back = np.where(kept, np.inf, distance)
-        out = np.where(kept, distance, 0)
-        if back.min() <= allowed:
-            kept[back.argmin()] = True
-        elif out.max() > allowed and (~kept).sum() < most:
-            kept[out.argmax()] = False
+        limit = -stdtrit(freedom, _OUTLIER_CHANCE / (2 * len(kept)))
+        excluded = np.where(kept, np.inf, distance)
+        included = np.where(kept, distance, 0)
+        if excluded.min() <= limit:
+            kept[excluded.argmin()] = True
+        elif included.max() > limit and (~kept).sum() < max_outliers:
+            kept[included.argmax()] = False
         else:
             break
     return kept
 
 
-def _unlikeliness(rests: Rests, kept: np.ndarray, start: np.ndarray) -> float:
-    """Negative logarithm of the residual likelihood, knocks being anywhere within KNOCK."""
-    found, excess, _ = _fit(rests[kept], start)
-    variance = magnitude_variance(rests[kept], found).mean() + excess
-    count, knocks = len(kept), (~kept).sum()
-    ways = gammaln(count + 1) - gammaln(knocks + 1) - gammaln(count - knocks + 1)
+def _negative_log_likelihood(rests: NominalRests, kept: np.ndarray, start: np.ndarray) -> float:
+    """Return −ln of the residual likelihood; outliers are uniform within `_OUTLIER_RANGE_G`."""
+    parameters, excess, _ = _fit(rests[kept], start)
+    variance = magnitude_variance(rests[kept], parameters).mean() + excess
+    count, outliers = len(kept), (~kept).sum()
+    log_choices = gammaln(count + 1) - gammaln(outliers + 1) - gammaln(count - outliers + 1)
     return float((kept.sum() - len(NAMES)) / 2 * np.log(variance * 2 * np.pi * np.e)
-                 + knocks * np.log(KNOCK) + ways)
+                 + outliers * np.log(_OUTLIER_RANGE_G) + log_choices)
 
 
-def _robust_inliers(rests: Rests, start: np.ndarray, most: int) -> np.ndarray:
+def _robust_inliers(rests: NominalRests, start: np.ndarray, max_outliers: int) -> np.ndarray:
     """
-    Tell which rests the best fit to all but `most` of them does not leave far off, (k,).
+    Mark the rests that are near the best fit to all but `max_outliers` rests, (k,) bool.
 
-    Least trimmed squares: from fits to a few rests each, step by step with the rests that each
-    fit suits best, to the one that suits its rests best.
+    This is least trimmed squares: each start fits a few rests, then repeatedly the rests that
+    its fit suits best (Rousseeuw and Van Driessen 2006).
     """
     count = len(rests.mean)
-    draw = np.random.default_rng(0)
+    rng = np.random.default_rng(0)
 
-    def nearest(values: np.ndarray) -> Rests:
-        squares = (magnitude(rests.mean, values) - rests.gravity) ** 2
-        return rests[np.argsort(squares)[:count - most]]
+    def nearest(parameters: np.ndarray) -> NominalRests:
+        squares = _residual(rests, parameters) ** 2
+        return rests[np.argsort(squares)[:count - max_outliers]]
 
-    best, least = start, np.inf
-    for _ in range(STARTS):
-        few = rests[draw.choice(count, MIN_RESTS, replace=False)]
-        found = iterated(few, start, FIRST_STEPS)
-        found = iterated(nearest, found, STEPS)
-        left = np.sum((magnitude(nearest(found).mean, found) - rests.gravity) ** 2)
-        if left < least:
-            best, least = found, left
-    freedom = max(count - most - len(NAMES), 1)
-    spread = np.sqrt(least / freedom + magnitude_variance(rests, best).mean())
-    return np.abs(magnitude(rests.mean, best) - rests.gravity) <= 5 * spread
+    best, smallest_sum = start, np.inf
+    for _ in range(_LTS_STARTS):
+        few = rests[rng.choice(count, MIN_RESTS, replace=False)]
+        parameters = regularised_fit(few, start, _LTS_FIRST_STEPS)
+        parameters = regularised_fit(nearest, parameters, _LTS_STEPS)
+        trimmed_sum = np.sum(_residual(nearest(parameters), parameters) ** 2)
+        if trimmed_sum < smallest_sum:
+            best, smallest_sum = parameters, trimmed_sum
+    freedom = max(count - max_outliers - len(NAMES), 1)
+    std = np.sqrt(smallest_sum / freedom + magnitude_variance(rests, best).mean())
+    return np.abs(_residual(rests, best)) <= _LTS_MAX_DEVIATIONS * std
 
 
-def _studentised(rests: Rests, kept: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """Distance of each rest from the fit to the others, in its standard deviations, (k,)."""
-    found, excess, _ = _fit(rests[kept], start)
-    variance = magnitude_variance(rests, found) + excess
-    covariance = np.linalg.inv(fisher_information(rests[kept], found, excess))
-    jacobian = magnitude_jacobian(rests.mean, found)
+def _studentised(rests: NominalRests, kept: np.ndarray, start: np.ndarray) -> np.ndarray:
+    """Return the distance of each rest from the fit to the others by its std, (k,)."""
+    parameters, excess, _ = _fit(rests[kept], start)
+    variance = magnitude_variance(rests, parameters) + excess
+    covariance = np.linalg.inv(posterior_information(rests[kept], parameters, excess))
+    jacobian = magnitude_jacobian(rests.mean, parameters)
     leverage = np.einsum('ki,ij,kj->k', jacobian, covariance, jacobian) / variance
-    distance = np.abs(magnitude(rests.mean, found) - rests.gravity) / np.sqrt(variance)
+    distance = np.abs(_residual(rests, parameters)) / np.sqrt(variance)
     inside = distance / np.sqrt(np.maximum(1 - leverage, 1e-9))
-    # What remains of chi-squared without the rest itself; the means' noise is there in any case.
+    # χ² per degree of freedom without the rest itself, at least that of the means' noise.
     freedom = kept.sum() - len(NAMES)
     others = (max((distance[kept] ** 2).sum(), freedom) - inside ** 2) / max(freedom - 1, 1)
     inside = inside / np.sqrt(np.maximum(others, np.median(1 - excess / variance)))
     return np.where(kept, inside, distance / np.sqrt(1 + leverage))
 
 
-def _leave_one_out(rests: Rests, kept: np.ndarray, found: np.ndarray, variance: np.ndarray,
-                   residual: np.ndarray) -> np.ndarray:
-    """Error of each rest's magnitude by the fit to all others, g, (k,)."""
+def _leave_one_out(rests: NominalRests, kept: np.ndarray, parameters: np.ndarray,
+                   variance: np.ndarray, residual: np.ndarray) -> np.ndarray:
+    """Return magnitude minus gravity by the fit to all other rests, g, (k,)."""
     errors = residual.copy()
     for i in np.flatnonzero(kept):
         others = kept.copy()
         others[i] = False
-        without, _ = _solve(rests[others], found, variance[others])
-        errors[i] = magnitude(rests.mean[i:i + 1], without)[0] - rests.gravity
+        without, _ = _solve(rests[others], parameters, variance[others])
+        errors[i] = _residual(rests[np.array([i])], without)[0]
     return errors
 
 
-def _require_determined(rests: Rests, found: np.ndarray, excess: float) -> None:
-    """Refuse rests that leave a coefficient open, or read something else than gravity."""
-    information = fisher_information(rests, found, excess)
-    lost, count = undetermined(information), len(rests.mean)
-    read = np.median(magnitude(rests.mean, found)) if count else rests.gravity
-    if not 0.5 < read / rests.gravity < 2:
-        raise UserError(f'gravity: the rests read {read * G0_MPS2:.3g} m/s², not '
-                        f'{rests.gravity * G0_MPS2:.3g}: put nominal_zero_g_v, '
-                        'nominal_scale_v_per_g or local_gravity_mps2 right')
-    if count >= MIN_RESTS and not lost:
+def _require_determined(rests: NominalRests, parameters: np.ndarray, excess: float) -> None:
+    """Refuse rests that do not determine a coefficient, or that do not read gravity."""
+    count = len(rests.mean)
+    measured = np.median(magnitude(rests.mean, parameters)) if count else rests.gravity_g
+    if not _MIN_GRAVITY_RATIO < measured / rests.gravity_g < _MAX_GRAVITY_RATIO:
+        raise UserError(f'gravity: the rests read {measured * G0_MPS2:.3g} m/s², not '
+                        f'{rests.gravity_g * G0_MPS2:.3g}: correct nominal_zero_g_v, '
+                        'nominal_scale_v_per_g or local_gravity_mps2')
+    information = posterior_information(rests, parameters, excess)
+    missing = undetermined(information)
+    if count >= MIN_RESTS and not missing:
         return
-    what = 'all nine coefficients' if len(lost) == len(NAMES) else ', '.join(map(str, lost))
-    lacking = f'leave {what} open' if lost else f'are too few, {MIN_RESTS} are the least'
+    names = 'all nine coefficients' if len(missing) == len(NAMES) else \
+        ', '.join(map(str, missing))
+    reason = f'do not determine {names}' if missing else f'are too few, at least {MIN_RESTS}'
     scatter = f' and scatter by {1e3 * np.sqrt(excess):.2g} mg' if excess else ''
-    poses = poses_to_add(max(MIN_RESTS - count, 0), information, found, rests.gravity,
-                         TRIAL_STD_G ** 2 + excess)
-    raise UserError(f'gravity: the {count} rests that were found {lacking}{scatter}: add rests '
-                    f'with {", ".join(poses)}')
+    rests_needed = rests_to_add(max(MIN_RESTS - count, 0), information, parameters,
+                                rests.gravity_g, TRIAL_STD_G ** 2 + excess)
+    raise UserError(f'gravity: the {count} rests {reason}{scatter}; add rests with '
+                    f'{", ".join(rests_needed)}')

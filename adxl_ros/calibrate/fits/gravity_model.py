@@ -12,12 +12,13 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The magnitude that a three-axis sensor reads at rest, and what rests tell of its parameters."""
+"""The magnitude of specific force that a three-axis sensor reads at rest, by nine parameters."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.effects.base import Coefficient
@@ -30,152 +31,302 @@ NAMES = (*(Coefficient('bias', 'offset_v', axis) for axis in AXES),
          Coefficient('misalignment', 'beta_rad', 'y'),
          Coefficient('misalignment', 'alpha_rad', 'z'),
          Coefficient('misalignment', 'beta_rad', 'z'))
-PRIOR = 0.1
-"""Coefficients can be this far from nominal, in g, of the scale factor and in rad."""
-DETERMINED = 0.01
-"""A coefficient counts as determined below this: 10 mg, 1 %, 0.6°, what datasheets promise."""
-ROUNDING = 1e-9
-"""Error of a mean without noise, g."""
-_LARGEST = 0.5
-"""Largest departure from nominal in a step, in g, of the scale factor and in rad."""
-_SHORTEST_STEP = 1e-12
-"""A step with no larger component is not taken, in g, of the scale factor and in rad."""
+"""The nine coefficients. In the fits of gravity they are zero-g shifts in g, relative changes of
+the scale factor and angles in rad: the "parameters" below, (9,)."""
+PRIOR_STD = 0.1
+"""Prior standard deviation of each parameter. Chosen: ten times what datasheets promise."""
+DETERMINED_STD = 0.01
+"""A parameter is determined below this standard deviation: 10 mg, 1 %, 0.6°, what datasheets
+promise."""
 TRIAL_STD_G = 1e-4
-"""Excess of a rest's magnitude, g, to begin with."""
+"""Standard deviation of a rest's magnitude before the excess is estimated, g."""
+_ROUNDING_STD_G = 1e-9
+"""Standard deviation of a mean without noise, g."""
+_MAX_VALUE = 0.5
+"""Largest magnitude of a parameter in an iteration. Chosen: five prior standard deviations."""
+_MIN_STEP = 1e-12
+"""A Gauss-Newton step with no larger component is not taken."""
+_PRIOR_INFORMATION = np.eye(len(NAMES)) / PRIOR_STD ** 2
+"""Inverse covariance of the prior about 0, (9, 9)."""
 
 
 @dataclass(frozen=True)
-class Rests:
-    """Rests by nominal figures, g, (k, 3): means, variances of the means, and gravity, g."""
+class NominalRests:
+    """
+    k rests, converted by the nominal zero-g and scale factor.
+
+    Attributes
+    ----------
+    mean
+        Means, g, (k, 3).
+    variance
+        Variances of the means, g², (k, 3).
+    gravity_g
+        Local gravity, g.
+
+    """
 
     mean: np.ndarray
     variance: np.ndarray
-    gravity: float
+    gravity_g: float
 
-    def __getitem__(self, part: np.ndarray) -> Rests:
-        return Rests(self.mean[part], self.variance[part], self.gravity)
+    def __getitem__(self, part: np.ndarray) -> NominalRests:
+        return NominalRests(self.mean[part], self.variance[part], self.gravity_g)
 
 
-def nominal_rests(mean_v: np.ndarray, standard_error_v: np.ndarray, sensor: Sensor) -> Rests:
+def nominal_rests(mean_v: np.ndarray, std_v: np.ndarray, sensor: Sensor) -> NominalRests:
     """
-    Take means of rests by the nominal figures.
+    Convert means of rests by the nominal zero-g and scale factor.
 
     Parameters
     ----------
-    mean_v, standard_error_v
-        Mean of each rest and its standard error, V, (k, 3).
+    mean_v, std_v
+        Mean of each rest and its standard deviation, V, (k, 3).
     sensor
-        Whose nominal figures and local gravity apply.
+        Nominal values and local gravity of the unit.
+
+    Returns
+    -------
+    NominalRests
+        The rests in g.
 
     """
     scale = sensor.nominal_scale_v_per_g
-    return Rests((mean_v - sensor.nominal_zero_g_v) / scale,
-                 (standard_error_v / scale) ** 2 + ROUNDING ** 2,
-                 sensor.local_gravity_mps2 / G0_MPS2)
+    return NominalRests((mean_v - sensor.nominal_zero_g_v) / scale,
+                        (std_v / scale) ** 2 + _ROUNDING_STD_G ** 2,
+                        sensor.local_gravity_mps2 / G0_MPS2)
 
 
-def effect_values(found: np.ndarray, sensor: Sensor
-             ) -> tuple[dict[str, dict[str, np.ndarray]], np.ndarray]:
-    """Return what was found in the effects' parameters, and the units of NAMES in it, (9,)."""
+class EffectValues(NamedTuple):
+    """
+    Parameters in the units of the effects.
+
+    Attributes
+    ----------
+    values
+        Parameters of effects, (3,) each, as `Sensor.values` has them.
+    units
+        Unit of each of NAMES by that of the parameter, (9,).
+
+    """
+
+    values: dict[str, dict[str, np.ndarray]]
+    units: np.ndarray
+
+
+def effect_values(parameters: np.ndarray, sensor: Sensor) -> EffectValues:
+    """
+    Convert parameters into the units of the effects.
+
+    Parameters
+    ----------
+    parameters
+        The nine parameters, (9,).
+    sensor
+        Nominal values of the unit.
+
+    Returns
+    -------
+    EffectValues
+        Values of the effects, and the factors of the conversion.
+
+    """
     scale = sensor.nominal_scale_v_per_g
-    to_units = np.concatenate([scale, scale, np.ones(3)])
-    values = found * to_units
-    return {'bias': {'offset_v': values[:3]},
-            'scale_factor': {'offset_v_per_g': values[3:6]},
-            'misalignment': {'alpha_rad': np.array([0.0, 0.0, values[7]]),
-                             'beta_rad': np.array([0.0, values[6], values[8]])}}, to_units
+    units = np.concatenate([scale, scale, np.ones(3)])
+    values = parameters * units
+    return EffectValues(
+        {'bias': {'offset_v': values[:3]},
+         'scale_factor': {'offset_v_per_g': values[3:6]},
+         'misalignment': {'alpha_rad': np.array([0.0, 0.0, values[7]]),
+                          'beta_rad': np.array([0.0, values[6], values[8]])}}, units)
 
 
-def sensing_axes(found: np.ndarray) -> np.ndarray:
-    """Directions of the sensing axes in the gauge, rows Θx, Θy, Θz, (3, 3)."""
-    sy, cy = np.sin(found[6]), np.cos(found[6])
-    sa, ca, sb, cb = np.sin(found[7]), np.cos(found[7]), np.sin(found[8]), np.cos(found[8])
+def sensing_axes(parameters: np.ndarray) -> np.ndarray:
+    """Return the directions of the sensing axes in the gauge, rows Θx, Θy, Θz, (3, 3)."""
+    sy, cy = np.sin(parameters[6]), np.cos(parameters[6])
+    sa, ca = np.sin(parameters[7]), np.cos(parameters[7])
+    sb, cb = np.sin(parameters[8]), np.cos(parameters[8])
     return np.array([[1.0, 0.0, 0.0], [-sy, cy, 0.0], [sb, -sa * cb, ca * cb]])
 
 
-def force_g(mean: np.ndarray, found: np.ndarray) -> np.ndarray:
-    """Specific force of each rest in the case frame, g, (k, 3)."""
-    sensed = (mean - found[:3]) / (1 + found[3:6])
-    return np.linalg.solve(sensing_axes(found), sensed.T).T
+def force_g(mean: np.ndarray, parameters: np.ndarray) -> np.ndarray:
+    """
+    Return the specific force of rests in the case frame.
+
+    Parameters
+    ----------
+    mean
+        Means by nominal values, g, (k, 3).
+    parameters
+        The nine parameters, (9,).
+
+    Returns
+    -------
+    ndarray
+        Specific force, g, (k, 3).
+
+    """
+    sensed = (mean - parameters[:3]) / (1 + parameters[3:6])
+    return np.linalg.solve(sensing_axes(parameters), sensed.T).T
 
 
-def magnitude(mean: np.ndarray, found: np.ndarray) -> np.ndarray:
-    """Magnitude of each rest's specific force, g, (k,)."""
-    return np.linalg.norm(force_g(mean, found), axis=1)
+def magnitude(mean: np.ndarray, parameters: np.ndarray) -> np.ndarray:
+    """
+    Return the magnitude of the specific force of rests.
+
+    Parameters
+    ----------
+    mean, parameters
+        As for `force_g`.
+
+    Returns
+    -------
+    ndarray
+        Magnitude, g, (k,).
+
+    """
+    return np.linalg.norm(force_g(mean, parameters), axis=1)
 
 
-def output_gradient(force: np.ndarray, found: np.ndarray) -> np.ndarray:
-    """Differentiate each magnitude by what the axes sense: Θ⁻ᵀ·f/|f|, (k, 3)."""
-    along = force / np.linalg.norm(force, axis=1, keepdims=True)
-    return np.linalg.solve(sensing_axes(found).T, along.T).T
+def _sensed_gradient(force: np.ndarray, parameters: np.ndarray) -> np.ndarray:
+    """Differentiate magnitudes by the force along the sensing axes: Θ⁻ᵀ·f/|f|, (k, 3)."""
+    direction = force / np.linalg.norm(force, axis=1, keepdims=True)
+    return np.linalg.solve(sensing_axes(parameters).T, direction.T).T
 
 
-def magnitude_jacobian(mean: np.ndarray, found: np.ndarray) -> np.ndarray:
-    """Differentiate each magnitude by the nine parameters, (k, 9)."""
-    force = force_g(mean, found)
-    by_sensed = output_gradient(force, found)
-    by_output = by_sensed / (1 + found[3:6])
-    sensed = (mean - found[:3]) / (1 + found[3:6])
-    sy, cy = np.sin(found[6]), np.cos(found[6])
-    sa, ca, sb, cb = np.sin(found[7]), np.cos(found[7]), np.sin(found[8]), np.cos(found[8])
-    turns = ((1, [-cy, -sy, 0.0]), (2, [0.0, -ca * cb, -sa * cb]), (2, [cb, sa * sb, -ca * sb]))
-    by_angles = [by_sensed[:, axis] * (force @ np.array(row)) for axis, row in turns]
+def magnitude_jacobian(mean: np.ndarray, parameters: np.ndarray) -> np.ndarray:
+    """
+    Differentiate the magnitudes by the parameters.
+
+    Parameters
+    ----------
+    mean, parameters
+        As for `force_g`.
+
+    Returns
+    -------
+    ndarray
+        Jacobian, g by parameter, (k, 9).
+
+    """
+    force = force_g(mean, parameters)
+    by_sensed = _sensed_gradient(force, parameters)
+    by_output = by_sensed / (1 + parameters[3:6])
+    sensed = (mean - parameters[:3]) / (1 + parameters[3:6])
+    sy, cy = np.sin(parameters[6]), np.cos(parameters[6])
+    sa, ca = np.sin(parameters[7]), np.cos(parameters[7])
+    sb, cb = np.sin(parameters[8]), np.cos(parameters[8])
+    # Rows of ∂Θ/∂angle: of Θy by its angle, of Θz by both of its angles.
+    by_angles = [by_sensed[:, 1] * (force @ np.array([-cy, -sy, 0.0])),
+                 by_sensed[:, 2] * (force @ np.array([0.0, -ca * cb, -sa * cb])),
+                 by_sensed[:, 2] * (force @ np.array([cb, sa * sb, -ca * sb]))]
     return -np.column_stack([by_output, by_output * sensed, *by_angles])
 
 
-def magnitude_variance(rests: Rests, found: np.ndarray) -> np.ndarray:
-    """Variance of each magnitude that the noise of the means explains, g², (k,)."""
-    by_output = output_gradient(force_g(rests.mean, found), found) / (1 + found[3:6])
-    return (by_output ** 2 * rests.variance).sum(axis=1)
-
-
-def iterated(rests: Rests | Callable[[np.ndarray], Rests], start: np.ndarray, steps: int
-             ) -> np.ndarray:
+def magnitude_variance(rests: NominalRests, parameters: np.ndarray) -> np.ndarray:
     """
-    Take Gauss-Newton steps of a fit that the prior holds where the rests do not.
+    Return the variance of each magnitude that comes from the noise of the means.
 
     Parameters
     ----------
     rests
-        The rests to fit, or a function that selects them by the parameters.
+        k rests.
+    parameters
+        The nine parameters, (9,).
+
+    Returns
+    -------
+    ndarray
+        Variance, g², (k,).
+
+    """
+    by_output = _sensed_gradient(force_g(rests.mean, parameters), parameters) / (
+        1 + parameters[3:6])
+    return (by_output ** 2 * rests.variance).sum(axis=1)
+
+
+def regularised_fit(rests: NominalRests | Callable[[np.ndarray], NominalRests],
+                    start: np.ndarray, steps: int) -> np.ndarray:
+    """
+    Fit rests with the prior, by Gauss-Newton steps.
+
+    Parameters
+    ----------
+    rests
+        The rests, or a function that selects them by the parameters.
     start
-        First values of the nine parameters, (9,).
+        First values of the parameters, (9,).
     steps
         Largest count of steps.
 
     Returns
     -------
-    np.ndarray
-        The nine parameters, (9,).
+    ndarray
+        Parameters, (9,).
 
     """
-    def linearise(values: np.ndarray) -> Iterate:
-        values = np.clip(values, -_LARGEST, _LARGEST)
-        part = rests if isinstance(rests, Rests) else rests(values)
-        rows = magnitude_jacobian(part.mean, values)
-        weight = 1 / (magnitude_variance(part, values).mean() + TRIAL_STD_G ** 2)
-        gradient = (weight * rows.T @ (magnitude(part.mean, values) - part.gravity)
-                    + values / PRIOR ** 2)
-        information = weight * rows.T @ rows + np.eye(len(NAMES)) / PRIOR ** 2
-        return Iterate(values, -np.linalg.solve(information, gradient), 0.0)
+    def linearise(parameters: np.ndarray) -> Iterate:
+        parameters = np.clip(parameters, -_MAX_VALUE, _MAX_VALUE)
+        part = rests if isinstance(rests, NominalRests) else rests(parameters)
+        rows = magnitude_jacobian(part.mean, parameters)
+        weight = 1 / (magnitude_variance(part, parameters).mean() + TRIAL_STD_G ** 2)
+        residual = part.gravity_g - magnitude(part.mean, parameters)
+        gradient = weight * rows.T @ residual - parameters / PRIOR_STD ** 2
+        information = weight * rows.T @ rows + _PRIOR_INFORMATION
+        return Iterate(parameters, np.linalg.solve(information, gradient), 0.0)
 
     return gauss_newton(
-        linearise, start,
-        lambda _, __, present: bool(np.abs(present.step).max() < _SHORTEST_STEP),
+        linearise, start, lambda _, __, present: bool(np.abs(present.step).max() < _MIN_STEP),
         steps + 1).last.values
 
 
-def fisher_information(rests: Rests, found: np.ndarray, excess: float) -> np.ndarray:
-    """Information of the rests about the nine parameters, with that of the prior, (9, 9)."""
-    information = np.eye(len(NAMES)) / PRIOR ** 2
-    if len(rests.mean):
-        rows = magnitude_jacobian(rests.mean, found)
-        variance = magnitude_variance(rests, found) + excess
-        information += rows.T @ (rows / variance[:, None])
-    return information
+def fisher_information(rests: NominalRests, parameters: np.ndarray, excess_g2: float
+                       ) -> np.ndarray:
+    """
+    Return the Fisher information of rests about the parameters, without the prior.
+
+    Parameters
+    ----------
+    rests
+        k rests, which may be none.
+    parameters
+        The nine parameters, (9,).
+    excess_g2
+        Variance of the magnitudes beyond the noise of the means, g².
+
+    Returns
+    -------
+    ndarray
+        Information, (9, 9).
+
+    """
+    if not len(rests.mean):
+        return np.zeros((len(NAMES), len(NAMES)))
+    rows = magnitude_jacobian(rests.mean, parameters)
+    variance = magnitude_variance(rests, parameters) + excess_g2
+    return rows.T @ (rows / variance[:, None])
+
+
+def posterior_information(rests: NominalRests, parameters: np.ndarray, excess_g2: float
+                          ) -> np.ndarray:
+    """
+    Return the information of prior and rests about the parameters.
+
+    Parameters
+    ----------
+    rests, parameters, excess_g2
+        As for `fisher_information`.
+
+    Returns
+    -------
+    ndarray
+        Inverse covariance, (9, 9).
+
+    """
+    return _PRIOR_INFORMATION + fisher_information(rests, parameters, excess_g2)
 
 
 def undetermined(information: np.ndarray) -> list[Coefficient]:
-    """Name the coefficients that the information does not determine."""
-    sigma = np.sqrt(np.diag(np.linalg.inv(information)))
-    return [name for name, s in zip(NAMES, sigma) if s > DETERMINED]
+    """Name the coefficients that the information, (9, 9), does not determine."""
+    std = np.sqrt(np.diag(np.linalg.inv(information)))
+    return [name for name, parameter_std in zip(NAMES, std) if parameter_std > DETERMINED_STD]

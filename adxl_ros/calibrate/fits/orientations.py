@@ -12,11 +12,12 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Directions in which a sensor is held by hand: what they tell, and their names."""
+"""Directions in which a sensor is held by hand: their information and their names."""
 
 from __future__ import annotations
 
 from itertools import product
+from typing import NamedTuple
 
 from adxl_ros.calibrate.fits.gravity_model import (
     magnitude_jacobian,
@@ -27,76 +28,127 @@ from adxl_ros.calibrate.fits.gravity_model import (
 from adxl_ros.model.constants import AXES
 import numpy as np
 
-CANDIDATES = np.array([c for c in product((0, 1, -1), repeat=3) if any(c)])
+CANDIDATES = np.array([signs for signs in product((0, 1, -1), repeat=3) if any(signs)])
 """Faces, edges and corners of a cube, one of which points up, (26, 3)."""
 UP = CANDIDATES / np.linalg.norm(CANDIDATES, axis=1, keepdims=True)
-_COVERED = np.cos(np.radians(22.0))
-"""A rest nearer than this to a direction covers it: half of the 45° to the next."""
-_NEARLY = 0.5
-"""Directions that tell as much as this of the best one's: the nearest of them is asked for."""
+"""The candidates as unit vectors, (26, 3)."""
+_COVERED_COS = np.cos(np.radians(22.0))
+"""Cosine of the angle up to which a rest covers a direction: half of the 45° to the next one."""
+_NEARLY_BEST = 0.5
+"""Share of the greatest gain from which a direction is as good as the best; the nearest of them
+is chosen."""
 
 
-def information_gain(information: np.ndarray, found: np.ndarray, gravity: float
-         ) -> tuple[np.ndarray, np.ndarray]:
+class InformationGain(NamedTuple):
     """
-    Return what a rest in each candidate tells, (26,), and its derivatives, (26, 9).
+    What a further rest in each candidate would add.
+
+    Attributes
+    ----------
+    gain
+        Variance of the predicted magnitude, g², by the number of axes that are not horizontal,
+        (26,). With one or two axes along gravity a pose is easier to hold.
+    rows
+        Derivatives of the magnitude by the parameters, (26, 9).
+
+    """
+
+    gain: np.ndarray
+    rows: np.ndarray
+
+
+def information_gain(information: np.ndarray, parameters: np.ndarray, gravity_g: float
+                     ) -> InformationGain:
+    """
+    Return what a rest in each candidate would add.
 
     Parameters
     ----------
     information
-        What is known, (9, 9).
-    found
-        Where it is taken, (9,).
-    gravity
+        Information of the rests so far, (9, 9).
+    parameters
+        The nine parameters of `gravity_model`, (9,).
+    gravity_g
         Local gravity, g.
 
+    Returns
+    -------
+    InformationGain
+        Gain and derivatives of each candidate.
+
     """
-    outputs = found[:3] + (1 + found[3:6]) * (gravity * UP @ sensing_axes(found).T)
-    rows = magnitude_jacobian(outputs, found)
-    told = np.einsum('ki,ij,kj->k', rows, np.linalg.inv(information), rows)
-    # With one or two axes along gravity a pose is easier to hold.
-    return told / np.count_nonzero(CANDIDATES, axis=1), rows
+    outputs = parameters[:3] + (1 + parameters[3:6]) * (
+        gravity_g * UP @ sensing_axes(parameters).T)
+    rows = magnitude_jacobian(outputs, parameters)
+    variance = np.einsum('ki,ij,kj->k', rows, np.linalg.inv(information), rows)
+    return InformationGain(variance / np.count_nonzero(CANDIDATES, axis=1), rows)
 
 
-def poses_to_add(fewest: int, information: np.ndarray, found: np.ndarray, gravity: float,
-                 variance: float) -> list[str]:
-    """Name the poses that tell most, one after the other, until all coefficients are told."""
-    poses: list[str] = []
-    left = np.ones(len(UP), bool)
-    while (len(poses) < fewest or undetermined(information)) and len(poses) <= len(NAMES):
-        told, rows = information_gain(information, found, gravity)
-        best = int(np.argmax(np.where(left, told, -np.inf)))
-        information = information + np.outer(rows[best], rows[best]) / variance
-        left[best] = False
-        poses.append(' and '.join(f'{axis} {"up" if sign > 0 else "down"}' for axis, sign
-                                  in zip(AXES, CANDIDATES[best]) if sign))
-    return poses
-
-
-def covered(up: np.ndarray) -> np.ndarray:
-    """Tell which candidates rests in the directions `up`, (k, 3), cover, (26,)."""
-    return np.any(up @ UP.T > _COVERED, axis=0) if len(up) else np.zeros(len(UP), bool)
-
-
-def next_up(told: np.ndarray, open_: np.ndarray, now: np.ndarray | None) -> int | None:
+def rests_to_add(count: int, information: np.ndarray, parameters: np.ndarray, gravity_g: float,
+                 variance_g2: float) -> list[str]:
     """
-    Choose the candidate to turn to: it tells nearly the most, and is the nearest of those.
+    Name the rests with the greatest gain, one by one, until all coefficients are determined.
 
     Parameters
     ----------
-    told
-        What each candidate tells, (26,).
-    open_
-        Which may be chosen, (26,).
-    now
-        What points up at present, (3,), if that is known.
+    count
+        Smallest count of rests.
+    information
+        Information of the rests so far, (9, 9).
+    parameters
+        The nine parameters of `gravity_model`, (9,).
+    gravity_g
+        Local gravity, g.
+    variance_g2
+        Variance of the magnitude of a rest, g².
+
+    Returns
+    -------
+    list
+        Names such as 'x up and y down'.
 
     """
-    if not open_.any():
+    rests: list[str] = []
+    available = np.ones(len(UP), bool)
+    while (len(rests) < count or undetermined(information)) and len(rests) <= len(NAMES):
+        gain, rows = information_gain(information, parameters, gravity_g)
+        best = int(np.argmax(np.where(available, gain, -np.inf)))
+        information = information + np.outer(rows[best], rows[best]) / variance_g2
+        available[best] = False
+        rests.append(' and '.join(f'{axis} {"up" if sign > 0 else "down"}' for axis, sign
+                                  in zip(AXES, CANDIDATES[best]) if sign))
+    return rests
+
+
+def covered(up: np.ndarray) -> np.ndarray:
+    """Mark the candidates that rests in the directions `up`, (k, 3), cover, (26,) bool."""
+    return np.any(up @ UP.T > _COVERED_COS, axis=0) if len(up) else np.zeros(len(UP), bool)
+
+
+def next_up(gain: np.ndarray, available: np.ndarray, now: np.ndarray | None) -> int | None:
+    """
+    Choose the candidate to turn to: the nearest of those with nearly the greatest gain.
+
+    Parameters
+    ----------
+    gain
+        Gain of each candidate, (26,).
+    available
+        Candidates that may be chosen, (26,) bool.
+    now
+        Direction that points up at present, (3,), if known.
+
+    Returns
+    -------
+    int or None
+        Index of the candidate; None where none is available.
+
+    """
+    if not available.any():
         return None
-    worth = np.where(open_, told, 0.0)
-    good = np.flatnonzero(worth >= _NEARLY * worth.max())
-    return int(good[np.argmax(worth[good])] if now is None else good[np.argmax(UP[good] @ now)])
+    worth = np.where(available, gain, 0.0)
+    best = np.flatnonzero(worth >= _NEARLY_BEST * worth.max())
+    return int(best[np.argmax(worth[best])] if now is None else best[np.argmax(UP[best] @ now)])
 
 
 def name_up(candidate: int) -> str:
@@ -107,7 +159,7 @@ def name_up(candidate: int) -> str:
 
 
 def points_up(name: str) -> str:
-    """Make a sentence of a name: '+x points up', '+x and −y point up equally'."""
+    """Return a sentence for a name: '+x points up', '+x and −y point up equally'."""
     if ' and ' not in name:
         return f'{name} points up'
     return f'{name.removesuffix(" equally")} point up equally'

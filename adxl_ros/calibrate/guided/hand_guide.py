@@ -24,12 +24,12 @@ from adxl_ros.calibrate.fits import orientations
 from adxl_ros.calibrate.fits.gravity_fit import MIN_RESTS
 from adxl_ros.calibrate.fits.gravity_model import (
     effect_values,
-    fisher_information,
     force_g,
-    iterated,
     NAMES,
     nominal_rests,
-    PRIOR,
+    posterior_information,
+    PRIOR_STD,
+    regularised_fit,
     TRIAL_STD_G,
 )
 from adxl_ros.calibrate.guided import pose_checks, running_estimate
@@ -226,17 +226,17 @@ class Tumble:
                          self.sensor)
         self._found = np.zeros(len(NAMES))
         if len(mean):
-            self._found = iterated(rests, self._found, _STEPS)
-        information = fisher_information(rests, self._found, TRIAL_STD_G ** 2)
+            self._found = regularised_fit(rests, self._found, _STEPS)
+        information = posterior_information(rests, self._found, TRIAL_STD_G ** 2)
         values, to_units = effect_values(self._found, self.sensor)
-        self.names, self.values, self.prior = NAMES, self._found * to_units, PRIOR * to_units
+        self.names, self.values, self.prior = NAMES, self._found * to_units, PRIOR_STD * to_units
         covariance = np.linalg.inv(information) * np.outer(to_units, to_units)
         self.std = np.sqrt(np.diag(covariance))
         self._fitted = replace(self.sensor, effects=tuple(values), values=values,
                                covariance=covariance, covariance_names=NAMES)
         force = force_g(rests.mean, self._found)
         self.covered = orientations.covered(force / np.linalg.norm(force, axis=1, keepdims=True))
-        self._told = orientations.information_gain(information, self._found, rests.gravity)[0]
+        self._told = orientations.information_gain(information, self._found, rests.gravity_g)[0]
         self._choose()
 
     def tilt_error_rad(self) -> float:

@@ -211,8 +211,8 @@ def test_refuses_what_the_rests_leave_open(poses, names, advice):
     with pytest.raises(UserError) as refused:
         fit_gravity(means, errors, bare(sensor))
     text = str(refused.value)
-    assert text.startswith(f'gravity: the {len(poses)} rests that were found leave ')
-    assert f'{names} open: add rests with ' in text
+    assert text.startswith(f'gravity: the {len(poses)} rests do not determine ')
+    assert f'{names}; add rests with ' in text
     assert advice in text.split('add rests with')[1]
     assert '\n' not in text
 
