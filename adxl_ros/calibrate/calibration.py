@@ -129,9 +129,9 @@ class CalibrationResult:
         """
         if not str(folder):
             return 'not kept in a store'
-        there = (path for path, _ in calibration_store.history(folder, self.fitted.serial)[0])
+        stored = calibration_store.history(folder, self.fitted.serial).calibrations
         try:
-            path = next(filter(self._is_in, there), None) or \
+            path = next(filter(self._is_in, (path for path, _ in stored)), None) or \
                 calibration_store.put(folder, self.fitted, self.comments())
         except UserError as error:
             return f'no copy in the store: {error}'

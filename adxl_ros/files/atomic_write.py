@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Whole files or none."""
+"""Files and directories that appear as a whole under their name, or not at all."""
 
 from __future__ import annotations
 
@@ -27,7 +27,8 @@ import tempfile
 
 from adxl_ros.errors import UserError
 
-_LEFT = '.part'
+_SUFFIX = '.part'
+"""End of the names of directories in which new files are written."""
 
 
 @contextmanager
@@ -36,7 +37,7 @@ def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
     Yield a path beside `path`; what is written there replaces `path` when the block succeeds.
 
     The new file or directory is synced to disk before the exchange, so that a power cut leaves
-    the old or the new, and it is removed when the block fails.
+    the old or the new one. It is removed when the block fails.
 
     Raises
     ------
@@ -46,7 +47,7 @@ def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
     """
     target = Path(path)
     try:
-        folder = Path(tempfile.mkdtemp(_LEFT, f'.{target.name}.', target.parent or '.'))
+        folder = Path(tempfile.mkdtemp(_SUFFIX, f'.{target.name}.', target.parent or '.'))
     except OSError as error:
         raise UserError(f'{target}: cannot write into {target.parent}: {error.strerror}; '
                         'choose a directory that exists and can be written') from None
@@ -54,7 +55,7 @@ def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
     try:
         with _locked(folder):
             yield fresh
-            _sync(fresh)
+            _sync_tree(fresh)
             _exchange(fresh, target, folder)
             sync(target.parent)
     except OSError as error:
@@ -63,15 +64,23 @@ def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def clear_left(folder: str | os.PathLike, name: str) -> None:
+def remove_unfinished(folder: str | os.PathLike, name: str) -> None:
     """
-    Remove what writers that were killed have left of files whose names begin with `name`.
+    Remove the unfinished files of writers that were killed.
 
-    What another process is writing is locked, and stays.
+    A file that another process is writing is locked, and stays.
+
+    Parameters
+    ----------
+    folder
+        The directory of the files.
+    name
+        Beginning of their names.
+
     """
-    for left in Path(folder).glob(f'.{escape(name)}*{_LEFT}'):
-        with suppress(OSError), _locked(left):
-            shutil.rmtree(left, ignore_errors=True)
+    for unfinished in Path(folder).glob(f'.{escape(name)}*{_SUFFIX}'):
+        with suppress(OSError), _locked(unfinished):
+            shutil.rmtree(unfinished, ignore_errors=True)
 
 
 @contextmanager
@@ -87,17 +96,17 @@ def _locked(folder: Path) -> Iterator[None]:
 
 def keep_previous(path: str | os.PathLike) -> None:
     """
-    Keep the file at `path`, if there is one, as `path`.previous, before it is replaced.
+    Copy the file `path`, if it exists, to `path`.previous before it is replaced.
 
     Raises
     ------
     UserError
-        See `atomic_path`.
+        The copy cannot be written.
 
     """
     if Path(path).is_file():
-        with atomic_path(f'{path}.previous') as kept:
-            shutil.copyfile(path, kept)
+        with atomic_path(f'{path}.previous') as fresh:
+            shutil.copyfile(path, fresh)
 
 
 def _exchange(fresh: Path, target: Path, folder: Path) -> None:
@@ -107,15 +116,15 @@ def _exchange(fresh: Path, target: Path, folder: Path) -> None:
     os.replace(fresh, target)
 
 
-def _sync(path: Path) -> None:
+def _sync_tree(path: Path) -> None:
     if path.is_dir():
-        for below in path.iterdir():
-            _sync(below)
+        for child in path.iterdir():
+            _sync_tree(child)
     sync(path)
 
 
 def sync(path: Path) -> None:
-    """Wait until a file's bytes, or a directory's entries, are on the disk."""
+    """Wait until the bytes of a file, or the entries of a directory, are on the disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)

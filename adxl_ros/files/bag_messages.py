@@ -13,11 +13,11 @@
 # limitations under the License.
 
 """
-The messages of a rosbag2 recording, whatever keeps them.
+The messages of a rosbag2 recording, in any storage and compression.
 
-Each file of it is read by the library rosbags or, where a recorder that was killed left an MCAP
-file without its end, record by record up to the cut. metadata.yaml gives no more than the list of
-the files: a killed recorder leaves none, and compressed files and messages show as such.
+The library rosbags reads the files. An MCAP file without its end, which a killed recorder leaves,
+is read record by record up to the cut. metadata.yaml gives only the list of the files: a killed
+recorder leaves none, and the bytes of files and messages show their compression.
 """
 
 from __future__ import annotations
@@ -36,11 +36,23 @@ from adxl_ros.files import mcap_recovery
 import yaml
 
 _ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
+"""First bytes of data that zstd compressed (RFC 8878, section 3.1.1)."""
+
 _ENDINGS = ('.mcap', '.db3', '.mcap.zstd', '.db3.zstd')
 
 
 class Part(Protocol):
-    """One file of a recording."""
+    """
+    One file of a recording.
+
+    Attributes
+    ----------
+    done
+        Fraction of the file that has been read.
+    types
+        Topics that hold messages, each with its type.
+
+    """
 
     done: float
     types: set[tuple[str, str]]
@@ -56,16 +68,28 @@ class Bag:
     Attributes
     ----------
     path
-        Where it is, for messages.
+        The file or directory, for messages.
     types
         Topics that hold messages, each with its type.
     cut
-        Where a damaged file ends, if one does.
+        Where damaged files end; empty if all are whole.
 
     """
 
     def __init__(self, path: str, parts: list[Part], cut: str) -> None:
-        """Take the files in the order of time."""
+        """
+        Take the files of a recording.
+
+        Parameters
+        ----------
+        path
+            The file or directory, for messages.
+        parts
+            Its files in the order of time.
+        cut
+            Where damaged files end.
+
+        """
         self.path = path
         self.cut = cut
         self.types: set[tuple[str, str]] = set().union(*(part.types for part in parts))
@@ -103,7 +127,7 @@ class Bag:
             raise UserError(f'{self.path}: topic {topic}: {error}') from None
 
 
-class _Whole:
+class _RosbagsPart:
     """A file that rosbags reads."""
 
     def __init__(self, path: Path, reader: Any) -> None:
@@ -115,7 +139,7 @@ class _Whole:
     def messages(self, topics: Collection[str]) -> Iterator[tuple[str, bytes]]:
         connections = [c for c in self._reader.connections if c.topic in topics and c.msgcount]
         if not connections:
-            return  # rosbags takes an empty choice for all of them
+            return  # for rosbags, an empty choice means all connections
         for connection in connections:
             if connection.ext.serialization_format != 'cdr':
                 raise UserError(f'{self._path}: topic {connection.topic} is serialized as '
@@ -128,13 +152,13 @@ class _Whole:
                 self.done = count * share
                 yield connection.topic, raw
         except Exception as error:
-            # A damaged file shows in as many kinds of errors as rosbags has lines.
+            # In a damaged file, rosbags can raise errors of any kind.
             raise _unreadable(self._path, error) from error
 
 
 def _unreadable(path: Path, error: Exception) -> UserError:
-    said = ' '.join(str(error).split()) or f'damaged ({type(error).__name__})'
-    return UserError(f'{path}: cannot read it as a rosbag2 recording: {said}')
+    reason = ' '.join(str(error).split()) or f'damaged ({type(error).__name__})'
+    return UserError(f'{path}: cannot read it as a rosbag2 recording: {reason}')
 
 
 def import_rosbags() -> Any:
@@ -144,7 +168,7 @@ def import_rosbags() -> Any:
     Raises
     ------
     UserError
-        It is not installed.
+        The library is not installed.
 
     """
     try:
@@ -166,18 +190,18 @@ def open_bag(path: str | os.PathLike) -> Iterator[Bag]:
         There is no recording, or it cannot be read.
 
     """
-    place = Path(path)
+    bag_path = Path(path)
     rosbag2 = import_rosbags()
     with ExitStack() as stack:
         parts: list[Part] = []
         cuts = []
-        for name in _files(place):
+        for name in _files(bag_path):
             file = _unzipped(stack, name) if name.suffix == '.zstd' else name
             part = _opened(stack, rosbag2, name, file)
             parts.append(part)
             if isinstance(part, mcap_recovery.ScannedMcap) and part.cut:
                 cuts.append(f'{name}: {part.cut}')
-        yield Bag(str(place), parts, '; '.join(cuts))
+        yield Bag(str(bag_path), parts, '; '.join(cuts))
 
 
 def _opened(stack: ExitStack, rosbag2: Any, name: Path, file: Path) -> Part:
@@ -189,13 +213,13 @@ def _opened(stack: ExitStack, rosbag2: Any, name: Path, file: Path) -> Part:
     except Exception as error:
         raise _unreadable(name, error) from error
     if is_mcap and not reader.storage.chunks:
-        # Without an index, rosbags wants the messages of all topics in the order of time.
+        # Without an index, rosbags demands the messages of all topics in the order of time.
         return stack.enter_context(mcap_recovery.open_scan(file))
-    return _Whole(name, reader)
+    return _RosbagsPart(name, reader)
 
 
 def _unzipped(stack: ExitStack, path: Path) -> Path:
-    """Unpack what `--compression-mode file` packed, as far as it goes."""
+    """Unpack a file of `--compression-mode file`, up to its cut if it has one."""
     from backports import zstd
     folder = stack.enter_context(TemporaryDirectory())
     file = Path(folder, path.stem)
@@ -203,7 +227,7 @@ def _unzipped(stack: ExitStack, path: Path) -> Path:
         with zstd.open(path, 'rb') as packed, open(file, 'wb') as unpacked:
             shutil.copyfileobj(packed, unpacked)
     except EOFError:
-        pass  # it is cut off, which shows again in the file inside
+        pass  # the packed file is cut off; the unpacked one shows the cut again
     except (OSError, zstd.ZstdError) as error:
         raise _unreadable(path, error) from error
     return file

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Bags, read in blocks: the sensor's samples with the references brought to their stamps."""
+"""Bags, read in blocks: the sensor's samples with references aligned with their stamps."""
 
 from __future__ import annotations
 
@@ -26,7 +26,6 @@ from adxl_ros.files.bag_messages import Bag, open_bag
 from adxl_ros.files.bag_topics import find_ideal, find_topics, read_info, Topics
 from adxl_ros.files.recording_columns import (
     ACCEL,
-    Alignment,
     COMMANDS,
     JOINTS,
     LIMIT,
@@ -36,14 +35,14 @@ from adxl_ros.files.reference_alignment import Command, seconds, Track
 from adxl_ros.model.constants import AXES
 import numpy as np
 
-# Samples held back for the references to come; after that many they are handed on without.
 _HOLD_ROWS = 1 << 19
+"""Samples that wait for references to come; later ones are handed on without (chosen: 15 MB)."""
 
 _ABSENT_VARIANCE = 1e5
-"""An axis that the sensor does not have is published with variance 1e6."""
+"""Variance from which an axis counts as absent, (m/s²)²; absent axes are written with 1e6."""
 
-# Up to here float64 seconds resolve single nanoseconds.
 _EXACT_NS = 1 << 53
+"""Up to here float64 resolves single nanoseconds, ns."""
 
 
 def blocks(path: str | os.PathLike, rows: int, ideal: bool = False) -> Iterator[Recording]:
@@ -59,10 +58,15 @@ def blocks(path: str | os.PathLike, rows: int, ideal: bool = False) -> Iterator[
     ideal
         Whether it is another simulator's specific force: any sensor_msgs/Imu, all three axes.
 
+    Yields
+    ------
+    Recording
+        The blocks in the order of time.
+
     Raises
     ------
     UserError
-        With the topic and the figure that is wrong.
+        The bag cannot be read, or a value is wrong. The message names the topic.
 
     """
     with open_bag(path) as bag:
@@ -89,7 +93,17 @@ def blocks(path: str | os.PathLike, rows: int, ideal: bool = False) -> Iterator[
 
 @dataclass
 class _Batch:
-    """Messages by topic, and how many samples of the batch came before each command."""
+    """
+    Messages in the order of recording.
+
+    Attributes
+    ----------
+    messages
+        Their bytes by topic.
+    samples_before
+        How many samples of the batch precede each command, (k,).
+
+    """
 
     messages: dict[str, list[bytes]]
     samples_before: list[int]
@@ -112,7 +126,27 @@ def _batches(bag: Bag, topics: Topics, rows: int) -> Iterator[tuple[_Batch, bool
 
 
 class _Samples:
-    """The sensor's samples that have been read but not yet handed on."""
+    """
+    The sensor's samples that have been read but not yet handed on.
+
+    Attributes
+    ----------
+    where
+        File and topic, for messages.
+    axes
+        Measured axes; None before the first sample, if sensor_info does not state them.
+    epoch_ns
+        Origin of the times, ns.
+    count
+        Samples so far.
+    stamp_ns
+        Stamps of the waiting samples, ns, (n,).
+    accel
+        Their specific force, m/s², (n, 3).
+    arrived_ns
+        Stamps of the newest batch after the stamp of the sample before it, ns; 0 is none.
+
+    """
 
     def __init__(self, where: str, axes: str | None) -> None:
         self.where = where
@@ -122,7 +156,6 @@ class _Samples:
         self.stamp_ns = np.zeros(0, np.int64)
         self.accel = np.zeros((0, 3))
         self.arrived_ns = np.zeros(1, np.int64)
-        """Stamps of the newest samples, the last one of those before them first; 0 is none."""
         self._last_ns: int | None = None
         self._frame: str | None = None
 
@@ -147,10 +180,11 @@ class _Samples:
         self.accel = np.concatenate([self.accel, accel])
 
     def ready(self, tracks: dict[str, Track]) -> int:
-        """Return how many samples no reference can add to any more; never the last one."""
-        seen_ns = min([track.seen_ns for track in tracks.values()] or [self.stamp_ns[-1]])
-        known = int(np.searchsorted(self.stamp_ns, seen_ns, 'right'))
-        return max(min(known, len(self.stamp_ns) - 1), len(self.stamp_ns) - _HOLD_ROWS)
+        """Return how many samples have all their references; the last one always waits."""
+        known_until_ns = min([track.known_until_ns for track in tracks.values()]
+                             or [self.stamp_ns[-1]])
+        count = int(np.searchsorted(self.stamp_ns, known_until_ns, 'right'))
+        return max(min(count, len(self.stamp_ns) - 1), len(self.stamp_ns) - _HOLD_ROWS)
 
     def drop(self, count: int) -> None:
         """Forget the oldest samples."""
@@ -162,7 +196,7 @@ class _Samples:
         table = next(_tables(self.where, [raw], cdr.imu))
         variance = table.numbers('linear_acceleration_covariance')[0, [0, 4, 8]]
         if variance[0] == -1:
-            raise UserError(f'{self.where}: says that it has no linear acceleration: '
+            raise UserError(f'{self.where}: states no linear acceleration: '
                             'linear_acceleration_covariance[0] is -1')
         if self.axes is None:
             present = variance < _ABSENT_VARIANCE
@@ -208,7 +242,7 @@ def _tables(where: str, raws: list[bytes],
 
 def _tracks(bag: Bag, topics: Topics) -> dict[str, Track]:
     """Return a track for each reference column that the bag can fill."""
-    columns = dict.fromkeys(JOINTS.values(), topics.joints)
+    columns: dict[str, str | None] = dict.fromkeys(JOINTS.values(), topics.joints)
     columns.update(temperature_c=topics.temperature, supply_v=topics.supply)
     return {column: Track(f'{bag.path}: topic {topic}')
             for column, topic in columns.items() if topic}
@@ -237,7 +271,7 @@ def _add_commands(where: str, commands: dict[str, Command], raws: list[bytes],
     """
     Add commands; one without a stamp counts from the newest sample that was recorded before it.
 
-    What is no angle is no command: the stage refuses it.
+    A value that is no angle is left out, because the stage refuses it.
     """
     for column, (stamp_ns, value) in _joints(where, raws, COMMANDS).items():
         commands[column].add(np.where(stamp_ns == 0, arrived_ns, stamp_ns),
@@ -278,13 +312,13 @@ def _block(bag: Bag, samples: _Samples, tracks: dict[str, Track], commands: dict
                for i, name in enumerate(ACCEL[:len(samples.axes or '')])}
     alignments = {}
     for name, track in tracks.items():
-        columns[name] = track.at(stamp_ns)
+        columns[name] = track.interpolate(stamp_ns)
         track.forget(int(stamp_ns[-1]))
-        alignments[name] = Alignment(track.residual, track.gap_s)
+        alignments[name] = track.alignment
     for name, command in commands.items():
-        columns[name] = command.at(stamp_ns)
+        columns[name] = command.in_force(stamp_ns)
         command.forget(int(stamp_ns[-1]))
-    # Divided, not multiplied by 1e-9: that gives the float64 nearest to the decimal figure.
+    # A division gives the float64 nearest to the decimal number, a product with 1e-9 does not.
     time_s = (stamp_ns - samples.epoch_ns) / 1e9
     cut = f'{bag.cut}; the last sample read is at {seconds(stamp_ns[-1])}' if bag.cut else ''
     return Recording(bag.path, time_s, columns, dict(info), alignments, cut, samples.epoch_ns,
@@ -292,7 +326,7 @@ def _block(bag: Bag, samples: _Samples, tracks: dict[str, Track], commands: dict
 
 
 def drop_unsampled(recording: Recording) -> None:
-    """Take out the joints without a single position, and those without a single command."""
+    """Remove the columns of joints without a single position or command."""
     for column in (*JOINTS.values(), *COMMANDS.values()):
         if column in recording.columns and np.isnan(recording.columns[column]).all():
             del recording.columns[column]

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Which topics of a bag are the sensor and its references, and what sensor_info says."""
+"""The topics of a bag that hold the sensor and its references, and what it states of itself."""
 
 from __future__ import annotations
 
@@ -29,11 +29,28 @@ TEMPERATURE = 'sensor_msgs/msg/Temperature'
 BATTERY_STATE = 'sensor_msgs/msg/BatteryState'
 
 _IDENTITY = ('serial', 'axes', 'nominal_zero_g_v', 'nominal_scale_v_per_g')
+"""Keys of sensor_info that must not change within a recording."""
 
 
 @dataclass(frozen=True)
 class Topics:
-    """Full names of the topics in a bag; None is one that it does not hold."""
+    """
+    Full names of the topics in a bag; None where the bag does not hold it.
+
+    Attributes
+    ----------
+    imu
+        The sensor's output.
+    joints
+        Positions of the stage.
+    info
+        What the sensor states of itself.
+    temperature, supply
+        References of these quantities.
+    command
+        Commands of the stage.
+
+    """
 
     imu: str
     joints: str | None = None
@@ -50,7 +67,7 @@ class Topics:
 
 def find_topics(bag: Bag) -> Topics:
     """
-    Find the topics by their names of interfaces, in any namespace, and their types.
+    Find the topics by their names, in any namespace, and their types.
 
     Raises
     ------
@@ -60,13 +77,14 @@ def find_topics(bag: Bag) -> Topics:
     """
     imu = _only(bag, 'imu/data_raw', IMU)
     if imu is None:
-        raise UserError(f'{bag.path}: no topic imu/data_raw of type {IMU}; it holds {_held(bag)}')
+        raise UserError(f'{bag.path}: no topic imu/data_raw of type {IMU}; '
+                        f'it holds {_contents(bag)}')
     space = imu.removesuffix('imu/data_raw')
     joints = _beside(bag, space, 'stage/joint_states', JOINT_STATE)
     stage = (joints or f'{space}stage/joint_states').removesuffix('joint_states')
     return Topics(imu, joints,
                   _beside(bag, space, 'sensor_info', DIAGNOSTIC_STATUS),
-                  # Others use these names as well: only the right type is meant.
+                  # Other nodes use these names, too: a topic of another type is ignored.
                   _typed(bag, space + 'temperature', TEMPERATURE),
                   _typed(bag, space + 'supply', BATTERY_STATE),
                   _typed(bag, stage + 'command', JOINT_STATE))
@@ -82,15 +100,15 @@ def find_ideal(bag: Bag) -> Topics:
         There is none, or there are several and none of them is `imu/data_raw`.
 
     """
-    found = sorted(topic for topic, kind in bag.types if kind == IMU)
-    if len(found) == 1:
-        return Topics(found[0])
-    if not found:
-        raise UserError(f'{bag.path}: no topic of type {IMU}; it holds {_held(bag)}')
+    candidates = sorted(topic for topic, kind in bag.types if kind == IMU)
+    if len(candidates) == 1:
+        return Topics(candidates[0])
+    if not candidates:
+        raise UserError(f'{bag.path}: no topic of type {IMU}; it holds {_contents(bag)}')
     imu = _only(bag, 'imu/data_raw', IMU)
     if imu is None:
         raise UserError(f'{bag.path}: several topics of type {IMU}, none of them imu/data_raw: '
-                        f'{", ".join(found)}; record one')
+                        f'{", ".join(candidates)}; record one')
     return Topics(imu)
 
 
@@ -104,17 +122,18 @@ def _beside(bag: Bag, space: str, name: str, kind: str) -> str | None:
 
 
 def _only(bag: Bag, name: str, kind: str) -> str | None:
-    found = sorted(item for item in bag.types if f'/{item[0]}'.endswith(f'/{name}'))
-    for topic, other in found:
+    """Return the topic of this name in any namespace; None if there is none."""
+    candidates = sorted(item for item in bag.types if f'/{item[0]}'.endswith(f'/{name}'))
+    for topic, other in candidates:
         if other != kind:
             raise UserError(f'{bag.path}: topic {topic} is of type {other}, expected {kind}')
-    if len(found) > 1:
+    if len(candidates) > 1:
         raise UserError(f'{bag.path}: several topics {name}: '
-                        f'{", ".join(topic for topic, _ in found)}; record one sensor')
-    return found[0][0] if found else None
+                        f'{", ".join(topic for topic, _ in candidates)}; record one sensor')
+    return candidates[0][0] if candidates else None
 
 
-def _held(bag: Bag) -> str:
+def _contents(bag: Bag) -> str:
     listed = ', '.join(f'{topic} ({kind})' for topic, kind in sorted(bag.types))
     return (listed or 'no messages') + (f'; {bag.cut}' if bag.cut else '')
 
@@ -127,12 +146,24 @@ def typestore() -> Any:
 
 def read_info(bag: Bag, topic: str | None) -> dict[str, str]:
     """
-    Return the keys and values of `sensor_info`, those of its last message.
+    Return what the sensor states in the last message of `sensor_info`.
+
+    Parameters
+    ----------
+    bag
+        The recording.
+    topic
+        Full name of the topic; None if there is none.
+
+    Returns
+    -------
+    dict
+        Values by key; empty without a topic.
 
     Raises
     ------
     UserError
-        The sensor changes in the middle of the recording, or its axes are no axes.
+        A message is damaged, the sensor changes within the recording, or its axes are unknown.
 
     """
     info: dict[str, str] = {}
@@ -143,7 +174,7 @@ def read_info(bag: Bag, topic: str | None) -> dict[str, str]:
         try:
             message = types.deserialize_cdr(raw, DIAGNOSTIC_STATUS)
         except Exception as error:
-            # rosbags generates its decoder: damaged bytes fail in it in any way.
+            # In damaged bytes, the decoder of rosbags can raise errors of any kind.
             raise UserError(f'{bag.path}: topic {topic}: damaged message: {error}') from error
         new = {pair.key: pair.value for pair in message.values}
         for key in _IDENTITY:

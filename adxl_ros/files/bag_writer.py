@@ -12,16 +12,16 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Bags, written block by block: whole or not at all."""
+"""Bags, written block by block, whole or not at all."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 import os
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, NamedTuple
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import cdr
@@ -42,25 +42,49 @@ from adxl_ros.model.noise import sample_std_v
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
-FRAME = 'imu_link'
+_FRAME = 'imu_link'
+"""Frame of the sensor's messages (REP-145)."""
 
 _ABSENT_VARIANCE = 1e6
-_ROWS_AT_ONCE = 65536
-_LAST_STAMP_NS = (1 << 31) * 1_000_000_000  # builtin_interfaces/Time has 32 bits of seconds
+"""Variance of an axis that the sensor does not have, (m/s²)² (chosen: no consumer weighs it)."""
 
-# Messages of one layout: their topic's connection, the rows they belong to, and their bytes.
-_Batch = tuple[Any, np.ndarray, bytes]
+_ROWS_AT_ONCE = 65536
+"""Samples that are made into messages at a time (chosen: some 20 MB)."""
+
+_LAST_STAMP_NS = (1 << 31) * 1_000_000_000
+"""First stamp that is too late, ns: builtin_interfaces/Time has 32 bits of signed seconds."""
+
+
+class _Batch(NamedTuple):
+    """
+    Messages of one layout.
+
+    Attributes
+    ----------
+    connection
+        Their topic in the bag.
+    rows
+        Samples that they belong to, (n,).
+    data
+        Their bytes, one message after the other.
+
+    """
+
+    connection: Any
+    rows: np.ndarray
+    data: bytes
 
 
 class BagWriter:
     """
-    Write recordings to a bag, block by block: a rosbag2 directory, or one file for a name.mcap.
+    Writes a bag block by block: a rosbag2 directory, or one file for a name.mcap.
 
-    A context manager: the bag appears under its name when the block ends without an error. Each
-    sample becomes a message of `imu/data_raw` and, where the references were sampled, one of
-    `stage/joint_states`, `temperature` and `supply` with the same stamp. Where a command changes,
-    and once every 65536 samples, it becomes a message of `stage/command`. The voltage of
-    sensor_msgs/BatteryState is float32. Columns that are none of the package's are left out.
+    A context manager: the bag appears under its name when the block ends without an error.
+
+    Each sample becomes a message of `imu/data_raw`. Sampled references become messages of
+    `stage/joint_states`, `temperature` and `supply` with the same stamp; the voltage of
+    sensor_msgs/BatteryState is float32. A command becomes a message of `stage/command` where it
+    changes, and once every 65536 samples. Columns that are none of the package's are left out.
     """
 
     def __init__(self, path: str | os.PathLike, sensor: Sensor) -> None:
@@ -93,7 +117,7 @@ class BagWriter:
             fresh = stack.enter_context(atomic_path(self._path))
             folder = fresh
             if self._path.suffix == '.mcap':
-                # rosbags writes directories: of this one only the file inside is kept.
+                # rosbags writes directories; only the file inside is kept.
                 folder = fresh.with_suffix('')
                 stack.callback(_keep_file, folder / f'{folder.name}.mcap', fresh)
             self._writer = stack.enter_context(self._rosbag2.Writer(
@@ -156,7 +180,7 @@ class BagWriter:
         force = np.zeros((len(accel), 3))
         force[:, :accel.shape[1]] = accel
         data = cdr.fill(self._imu, cdr.imu(self._imu), stamp_ns, {'linear_acceleration': force})
-        return self._connection('/imu/data_raw', IMU), np.arange(len(accel)), data
+        return _Batch(self._connection('/imu/data_raw', IMU), np.arange(len(accel)), data)
 
     def _joint_batches(self, stamp_ns: np.ndarray, columns: dict[str, np.ndarray],
                        names: Mapping[str, str], topic: str) -> list[_Batch]:
@@ -165,42 +189,43 @@ class BagWriter:
         if not joints:
             return []
         values = np.column_stack(list(joints.values()))
-        sampled = ~np.isnan(values)
+        is_sampled = ~np.isnan(values)
         batches = []
-        for pattern in np.unique(sampled, axis=0):
-            rows = np.flatnonzero((sampled == pattern).all(axis=1))
-            sampled_joints = [joint for joint, is_there in zip(joints, pattern) if is_there]
+        for pattern in np.unique(is_sampled, axis=0):
+            rows = np.flatnonzero((is_sampled == pattern).all(axis=1))
+            sampled_joints = [joint for joint, sampled in zip(joints, pattern) if sampled]
             if sampled_joints:
                 template = _joint_template(self._types, sampled_joints)
                 data = cdr.fill(template, cdr.joint_state(template), stamp_ns[rows],
                                 {'position': values[rows][:, pattern]})
-                batches.append((self._connection(topic, JOINT_STATE), rows, data))
+                batches.append(_Batch(self._connection(topic, JOINT_STATE), rows, data))
         return batches
 
     def _scalar_batches(self, stamp_ns: np.ndarray,
                         references: dict[str, np.ndarray]) -> list[_Batch]:
+        """Return the batches of temperature and supply, where they were sampled."""
         batches = []
-        for column, topic, kind, field, template, find in (
-                ('temperature_c', '/temperature', TEMPERATURE, 'temperature',
-                 _temperature_template, cdr.temperature),
-                ('supply_v', '/supply', BATTERY_STATE, 'voltage',
-                 _battery_template, cdr.battery_state)):
-            rows = np.flatnonzero(~np.isnan(references.get(column, np.zeros(0))))
+        for scalar in _SCALARS:
+            values = references.get(scalar.column, np.zeros(0))
+            rows = np.flatnonzero(~np.isnan(values))
             if len(rows):
-                raw = template(self._types)
-                data = cdr.fill(raw, find(raw), stamp_ns[rows], {field: references[column][rows]})
-                batches.append((self._connection(topic, kind), rows, data))
+                template = scalar.template(self._types)
+                data = cdr.fill(template, scalar.layout(template), stamp_ns[rows],
+                                {scalar.field: values[rows]})
+                batches.append(_Batch(self._connection(scalar.topic, scalar.kind), rows, data))
         return batches
 
     def _write_in_order(self, stamp_ns: np.ndarray, batches: list[_Batch]) -> None:
-        rows = np.concatenate([batch_rows for _, batch_rows, _ in batches])
-        owner = np.repeat(np.arange(len(batches)), [len(batch[1]) for batch in batches])
-        place = np.concatenate([np.arange(len(batch[1])) for batch in batches])
+        """Write the messages of all batches sample by sample."""
+        rows = np.concatenate([batch.rows for batch in batches])
+        batch_numbers = np.repeat(np.arange(len(batches)), [len(batch.rows) for batch in batches])
+        positions = np.concatenate([np.arange(len(batch.rows)) for batch in batches])
         order = np.argsort(rows, kind='stable')
-        sizes = [len(data) // len(batch_rows) for _, batch_rows, data in batches]
+        sizes = [len(batch.data) // len(batch.rows) for batch in batches]
         stamps = stamp_ns.tolist()
         write = self._writer.write
-        for row, k, i in zip(rows[order].tolist(), owner[order].tolist(), place[order].tolist()):
+        for row, k, i in zip(rows[order].tolist(), batch_numbers[order].tolist(),
+                             positions[order].tolist()):
             connection, _, data = batches[k]
             write(connection, stamps[row], data[i * sizes[k]:(i + 1) * sizes[k]])
 
@@ -216,13 +241,40 @@ def _changes(columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     return changed
 
 
+class _Scalar(NamedTuple):
+    """
+    A reference with a topic of its own.
+
+    Attributes
+    ----------
+    column
+        Its column in a recording.
+    topic, kind
+        The topic and its type.
+    field
+        The message's field with the value.
+    template
+        Makes a message, from the message types.
+    layout
+        Finds the fields of a message.
+
+    """
+
+    column: str
+    topic: str
+    kind: str
+    field: str
+    template: Callable[[Any], bytes]
+    layout: Callable[[bytes], cdr.Layout]
+
+
 def _keep_file(file: Path, target: Path) -> None:
     if file.exists():
         os.replace(file, target)
 
 
 def _qos(is_latched: bool) -> Any:
-    """Return what `ros2 bag play` publishes with: reliable, and kept for those who come late."""
+    """Return the QoS of `ros2 bag play`: reliable, and latched for late subscribers if asked."""
     from rosbags.interfaces import (
         Qos,
         QosDurability,
@@ -251,7 +303,7 @@ def _imu_template(types: Any, sensor: Sensor) -> bytes:
     variance[:len(sensor.axes)] = noise ** 2
     vector = types.types['geometry_msgs/msg/Vector3'](x=0.0, y=0.0, z=0.0)
     message = types.types[IMU](
-        header=_header(types, FRAME),
+        header=_header(types, _FRAME),
         orientation=types.types['geometry_msgs/msg/Quaternion'](x=0.0, y=0.0, z=0.0, w=1.0),
         orientation_covariance=absent,
         angular_velocity=vector, angular_velocity_covariance=absent,
@@ -269,7 +321,7 @@ def _joint_template(types: Any, names: list[str]) -> bytes:
 
 def _temperature_template(types: Any) -> bytes:
     message = types.types[TEMPERATURE](
-        header=_header(types, FRAME), temperature=0.0, variance=0.0)
+        header=_header(types, _FRAME), temperature=0.0, variance=0.0)
     return bytes(types.serialize_cdr(message, TEMPERATURE))
 
 
@@ -278,8 +330,17 @@ def _battery_template(types: Any) -> bytes:
     unknown = float('nan')
     none = np.zeros(0, np.float32)
     message = types.types[BATTERY_STATE](
-        header=_header(types, FRAME), voltage=0.0, temperature=unknown, current=unknown,
+        header=_header(types, _FRAME), voltage=0.0, temperature=unknown, current=unknown,
         charge=unknown, capacity=unknown, design_capacity=unknown, percentage=unknown,
         power_supply_status=0, power_supply_health=0, power_supply_technology=0, present=True,
         cell_voltage=none, cell_temperature=none, location='', serial_number='')
     return bytes(types.serialize_cdr(message, BATTERY_STATE))
+
+
+_SCALARS = (
+    _Scalar('temperature_c', '/temperature', TEMPERATURE, 'temperature', _temperature_template,
+            cdr.temperature),
+    _Scalar('supply_v', '/supply', BATTERY_STATE, 'voltage', _battery_template,
+            cdr.battery_state),
+)
+"""References that are one number."""

@@ -13,11 +13,12 @@
 # limitations under the License.
 
 """
-The store of calibrations: one folder, in it one a unit by serial number, in it one file by id.
+The calibration store: a folder with one folder for each unit, and in it one file by id.
 
-An id is serial, date (UTC) and the beginning of the data's hash, `17-20261121T143000Z-5f3a09c1`,
-and names its file, so that the files of a unit sort by date. They are parameter files, written
-as a whole and never changed; others that are put beside them count by the date inside.
+An id is serial number, date (UTC) and the beginning of the data's SHA-256, such as
+`17-20261121T143000Z-5f3a09c1`. It names the file, so that the files of a unit sort by date. The
+files are parameter files, written as a whole and never changed. Files that people add count by
+the date inside.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ from functools import lru_cache
 import hashlib
 import os
 from pathlib import Path
+from typing import NamedTuple
 from urllib.parse import quote
 
 from adxl_ros.errors import UserError
@@ -37,9 +39,70 @@ from adxl_ros.files.stream_info import NO_UNIT
 from adxl_ros.model.sensor import Sensor
 
 _DATE = '%Y%m%dT%H%M%SZ'
+"""Date in file names, ISO 8601 basic format."""
+
 _OLDEST = datetime.min.replace(tzinfo=timezone.utc)
-_LONGEST = 120
-"""Characters of a serial number in names, which file systems end at 255."""
+"""Date of a calibration without a date, which sorts first."""
+
+_HASH_DIGITS = 8
+"""Digits of the data's SHA-256 in an id (chosen: enough for calibrations of one second)."""
+
+_MAX_NAME = 120
+"""Characters of a serial number in a file name (chosen: file systems permit 255 bytes)."""
+
+_CACHED_DATES = 256
+"""Dates of files without a date in their name that are kept in memory (chosen: some kB)."""
+
+
+class StoredCalibration(NamedTuple):
+    """
+    One calibration of a unit.
+
+    Attributes
+    ----------
+    path
+        Its file.
+    sensor
+        The fitted sensor.
+
+    """
+
+    path: Path
+    sensor: Sensor
+
+
+class UnitHistory(NamedTuple):
+    """
+    All calibrations of a unit.
+
+    Attributes
+    ----------
+    calibrations
+        Oldest first; those without a date come before them.
+    refused
+        Why further files cannot be used.
+
+    """
+
+    calibrations: list[StoredCalibration]
+    refused: list[str]
+
+
+class Choice(NamedTuple):
+    """
+    The calibration to use.
+
+    Attributes
+    ----------
+    path
+        Its file; None if there is none.
+    refused
+        Why newer or unreadable files are not used.
+
+    """
+
+    path: Path | None
+    refused: list[str]
 
 
 def default_folder() -> Path:
@@ -49,58 +112,74 @@ def default_folder() -> Path:
 
 
 def calibration_id(sensor: Sensor) -> str:
-    """Return the id of a calibration; of one of an older version what serves for it."""
+    """Return the id of a calibration; one without an id gets it from date and data."""
     return sensor.provenance.get('id') or f'{sensor.serial}-{_version(sensor)}'
 
 
 def _version(sensor: Sensor) -> str:
-    """Return date and hash, which tell the calibrations of a unit apart and sort by date."""
-    made = date_of(sensor)
-    when = f'{made:{_DATE}}' if made else '00000000T000000Z'
-    return '-'.join(filter(None, (when, sensor.provenance.get('data_sha256', '')[:8])))
+    """Return date and hash, which differ between the calibrations of a unit and sort by date."""
+    date = date_of(sensor)
+    text = f'{date:{_DATE}}' if date else '00000000T000000Z'
+    checksum = sensor.provenance.get('data_sha256', '')[:_HASH_DIGITS]
+    return f'{text}-{checksum}' if checksum else text
 
 
 def date_of(sensor: Sensor) -> datetime | None:
-    """Return when a calibration was made, UTC; None where its file does not say."""
+    """Return the date of a calibration, UTC; None where its file states none."""
     try:
-        made = datetime.fromisoformat(sensor.provenance.get('date', '').replace('Z', '+00:00'))
+        date = datetime.fromisoformat(sensor.provenance.get('date', '').replace('Z', '+00:00'))
     except ValueError:
         return None
-    return made.astimezone(timezone.utc) if made.tzinfo else made.replace(tzinfo=timezone.utc)
+    return date.astimezone(timezone.utc) if date.tzinfo else date.replace(tzinfo=timezone.utc)
 
 
 def unit_folder(folder: str | os.PathLike, serial: str) -> Path:
-    """Return the folder of a unit."""
-    return Path(folder) / _name(serial)
-
-
-def _name(serial: str) -> str:
-    """Quote by % what a name cannot have; a serial number that is too long is cut and hashed."""
-    quoted = quote(serial, safe=" #+,;=@()[]'")
-    if not quoted.strip('.'):
-        quoted = quoted.replace('.', '%2E')
-    if len(quoted) <= _LONGEST:
-        return quoted
-    return f'{quoted[:_LONGEST]}-{hashlib.sha256(serial.encode()).hexdigest()[:16]}'
-
-
-def put(folder: str | os.PathLike, sensor: Sensor, comments: Iterable[str] = ()) -> Path | None:
     """
-    Keep a calibration.
+    Return the folder of a unit.
 
     Parameters
     ----------
     folder
-        The store; made if it is not there.
-    sensor
-        A fitted unit with provenance.
-    comments
-        Lines for people, put before the parameters.
+        The store.
+    serial
+        Serial number.
 
     Returns
     -------
     Path
-        The file; None for the serial number `nominal`, which is no unit in particular.
+        The folder, which may not exist.
+
+    """
+    return Path(folder) / _name(serial)
+
+
+def _name(serial: str) -> str:
+    """Return a serial number as a file name: quoted by %, and hashed where it is too long."""
+    quoted = quote(serial, safe=" #+,;=@()[]'")
+    if not quoted.strip('.'):
+        quoted = quoted.replace('.', '%2E')
+    if len(quoted) <= _MAX_NAME:
+        return quoted
+    return f'{quoted[:_MAX_NAME]}-{hashlib.sha256(serial.encode()).hexdigest()[:16]}'
+
+
+def put(folder: str | os.PathLike, sensor: Sensor, comments: Iterable[str] = ()) -> Path | None:
+    """
+    Store a calibration.
+
+    Parameters
+    ----------
+    folder
+        The store, created if it does not exist.
+    sensor
+        A fitted unit with provenance.
+    comments
+        Lines for people, before the parameters.
+
+    Returns
+    -------
+    Path
+        The file; None for the serial number `nominal`, which is no particular unit.
 
     Raises
     ------
@@ -110,23 +189,35 @@ def put(folder: str | os.PathLike, sensor: Sensor, comments: Iterable[str] = ())
     """
     if sensor.serial == NO_UNIT:
         return None
-    own = unit_folder(folder, sensor.serial)
+    folder_of_unit = unit_folder(folder, sensor.serial)
     try:
-        own.mkdir(parents=True, exist_ok=True)
+        folder_of_unit.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise UserError(f'{own}: cannot be made: {error.strerror}; name another store') from None
-    path = own / _file_name(sensor)
+        raise UserError(f'{folder_of_unit}: cannot be made: {error.strerror}; name another store'
+                        ) from None
+    path = folder_of_unit / f'{_name(sensor.serial)}-{_version(sensor)}.yaml'
     parameter_file.save(path, sensor, comments)
     return path
 
 
-def history(folder: str | os.PathLike, serial: str) -> tuple[list[tuple[Path, Sensor]], list[str]]:
+def history(folder: str | os.PathLike, serial: str) -> UnitHistory:
     """
-    Return the calibrations of a unit by date, oldest first, and why others cannot be read.
+    Return the calibrations of a unit by date.
 
-    Files whose date is missing come first.
+    Parameters
+    ----------
+    folder
+        The store.
+    serial
+        Serial number.
+
+    Returns
+    -------
+    UnitHistory
+        The calibrations, and why files cannot be used.
+
     """
-    found, refused = [], []
+    calibrations, refused = [], []
     for path in sorted(unit_folder(folder, serial).glob('*.yaml')):
         try:
             sensor = parameter_file.load(path)
@@ -135,44 +226,59 @@ def history(folder: str | os.PathLike, serial: str) -> tuple[list[tuple[Path, Se
         except UserError as error:
             refused.append(str(error))
             continue
-        found.append((path, sensor))
-    return sorted(found, key=lambda one: date_of(one[1]) or _OLDEST), refused
+        calibrations.append(StoredCalibration(path, sensor))
+    calibrations.sort(key=lambda stored: date_of(stored.sensor) or _OLDEST)
+    return UnitHistory(calibrations, refused)
 
 
-def newest(folder: str | os.PathLike, serial: str, fits: Callable[[Sensor], None]
-           ) -> tuple[Path | None, list[str]]:
+def newest(folder: str | os.PathLike, serial: str, check: Callable[[Sensor], None]) -> Choice:
     """
-    Find the newest calibration of a unit.
+    Return the newest calibration of a unit that can be used.
 
     Parameters
     ----------
-    folder, serial
-        Where, and of which unit.
-    fits
-        Raises `UserError` for one that cannot be used.
+    folder
+        The store.
+    serial
+        Serial number.
+    check
+        Raises `UserError` for a calibration that cannot be used.
 
     Returns
     -------
-    tuple
-        Its file, None if there is none; and why newer ones, or unreadable ones, were passed over.
+    Choice
+        Its file, and why other files are not used.
 
     """
-    found, refused = history(folder, serial)
-    for path, sensor in reversed(found):
+    calibrations, refused = history(folder, serial)
+    for path, sensor in reversed(calibrations):
         try:
-            fits(sensor)
+            check(sensor)
         except UserError as error:
             refused.append(f'{path}: {error}')
             continue
-        return path, refused
-    return None, refused
+        return Choice(path, refused)
+    return Choice(None, refused)
 
 
 def newer(folder: str | os.PathLike, sensor: Sensor) -> Path | None:
     """
-    Return the newest file of a unit if it is of a later date than a calibration.
+    Return the newest file of a unit if its date is later than that of a calibration.
 
-    This is quick: the names that the store gives say the date, other files are read once.
+    This is quick: file names of the store hold the date, and other files are read once.
+
+    Parameters
+    ----------
+    folder
+        The store.
+    sensor
+        The calibration.
+
+    Returns
+    -------
+    Path or None
+        The newest file, if it is newer.
+
     """
     dated = {path: _dated(path, sensor.serial)
              for path in unit_folder(folder, sensor.serial).glob('*.yaml')}
@@ -181,18 +287,19 @@ def newer(folder: str | os.PathLike, sensor: Sensor) -> Path | None:
 
 
 def _dated(path: Path, serial: str) -> datetime:
-    named = path.name.removeprefix(f'{_name(serial)}-').split('-')[0].removesuffix('.yaml')
+    """Return the date of a file by its name, else by its content."""
+    text = path.name.removeprefix(f'{_name(serial)}-').split('-')[0].removesuffix('.yaml')
     with suppress(ValueError):
-        return datetime.strptime(named, _DATE).replace(tzinfo=timezone.utc)
+        return datetime.strptime(text, _DATE).replace(tzinfo=timezone.utc)
     try:
         return _date_inside(path, path.stat().st_mtime_ns, serial)
     except OSError:
         return _OLDEST
 
 
-@lru_cache(maxsize=256)
+@lru_cache(maxsize=_CACHED_DATES)
 def _date_inside(path: Path, _: int, serial: str) -> datetime:
-    """Return the date of a file that was named by hand; it is read again when it has changed."""
+    """Return the date inside a file; it is read again after a change, by its time of change."""
     try:
         sensor = parameter_file.load(path)
     except UserError:
@@ -201,9 +308,5 @@ def _date_inside(path: Path, _: int, serial: str) -> datetime:
 
 
 def _second_of(sensor: Sensor) -> datetime:
-    """Return the date as names have it, which end at seconds."""
+    """Return the date of a calibration in whole seconds, as in file names."""
     return (date_of(sensor) or _OLDEST).replace(microsecond=0)
-
-
-def _file_name(sensor: Sensor) -> str:
-    return f'{_name(sensor.serial)}-{_version(sensor)}.yaml'

@@ -15,9 +15,9 @@
 """
 ROS messages in CDR, the wire format of DDS (OMG DDSI-RTPS, section 10), as arrays.
 
-Messages of one topic nearly always have the same layout: the same strings and array lengths,
-hence the same offsets. The offsets are found in the first message, and all messages that agree
-with it in strings and lengths are read, or written, as one table of bytes.
+Messages of one topic usually have the same strings and array lengths, and thus the same layout.
+The first message determines the offsets. All messages with its strings and lengths are read, or
+written, as one table of bytes.
 """
 
 from __future__ import annotations
@@ -29,77 +29,118 @@ import struct
 import numpy as np
 
 _ORDERS = {b'\x00\x00': '>', b'\x00\x01': '<'}
-_BODY = 4  # the encapsulation header; alignment counts from behind it
+"""Byte orders of numpy by the identifier of plain CDR (DDSI-RTPS, 10.5)."""
+
+_BODY_OFFSET = 4
+"""Size of the encapsulation header, bytes; alignment counts from its end (DDSI-RTPS, 10.2)."""
 
 
 class CdrError(ValueError):
-    """A message that is not what its type says."""
+    """A message that does not match its type."""
+
+
+@dataclass(frozen=True)
+class NumberField:
+    """
+    Numbers within a message.
+
+    Attributes
+    ----------
+    offset
+        Offset of the first one, bytes.
+    code
+        Their numpy type without byte order, such as f8.
+    count
+        How many there are.
+
+    """
+
+    offset: int
+    code: str
+    count: int
 
 
 class Layout:
     """
-    Offsets of the fields of one message, found by walking along it.
+    Offsets of the fields of one message, found from its beginning to its end.
 
     Attributes
     ----------
     order
         Byte order, < or >.
     fields
-        Offset, numpy type code and number of values by name.
+        The number fields by name.
     texts
         Strings by name, in the order of the message.
     fixed
-        Offsets of the bytes that a message with the same layout has in common with this one.
+        Offsets of the bytes that all messages of this layout share: lengths and strings.
 
     """
 
     def __init__(self, raw: bytes) -> None:
-        """Start behind the encapsulation header of `raw`."""
+        """Start after the encapsulation header of `raw`."""
         self._raw = raw
         if raw[:2] not in _ORDERS:
             raise CdrError(f'encapsulation 0x{raw[:2].hex()} is not plain CDR')
         self.order = _ORDERS[raw[:2]]
-        self.fields: dict[str, tuple[int, str, int]] = {}
+        self.fields: dict[str, NumberField] = {}
         self.texts: dict[str, str] = {}
         self.fixed: list[int] = [0, 1]
-        self._at = _BODY
+        self._offset = _BODY_OFFSET
 
     def numbers(self, name: str, code: str, count: int = 1) -> None:
-        """Walk along `count` numbers of a numpy type, such as f8."""
+        """
+        Pass over numbers.
+
+        Parameters
+        ----------
+        name
+            Their name in `fields`.
+        code
+            Their numpy type, such as f8.
+        count
+            How many there are.
+
+        Raises
+        ------
+        CdrError
+            The message ends before them.
+
+        """
         if not count:
             return
         size = int(code[1:])
         start = self._aligned(size)
         self._advance(start, size * count)
-        self.fields[name] = (start, code, count)
+        self.fields[name] = NumberField(start, code, count)
 
     def length(self) -> int:
-        """Walk along the length of a string or sequence and return it."""
+        """Pass over the length of a string or sequence, and return it."""
         start = self._aligned(4)
         self._advance(start, 4)
         self.fixed += range(start, start + 4)
         return struct.unpack_from(self.order + 'I', self._raw, start)[0]
 
     def text(self, name: str) -> None:
-        """Walk along a string."""
+        """Pass over a string."""
         size = self.length()
-        start = self._at
+        start = self._offset
         self._advance(start, size)
         self.fixed += range(start, start + size)
         self.texts[name] = self._raw[start:start + size].rstrip(b'\0').decode(errors='replace')
 
     def header(self) -> None:
-        """Walk along a std_msgs/Header."""
+        """Pass over a std_msgs/Header."""
         self.numbers('sec', 'i4')
         self.numbers('nanosec', 'u4')
         self.text('frame_id')
 
     def _aligned(self, size: int) -> int:
-        return self._at + (_BODY - self._at) % size
+        return self._offset + (_BODY_OFFSET - self._offset) % size
 
     def _advance(self, start: int, size: int) -> None:
-        self._at = start + size
-        if self._at > len(self._raw):
+        self._offset = start + size
+        if self._offset > len(self._raw):
             raise CdrError(f'{len(self._raw)} bytes are too few for it')
 
 
@@ -141,7 +182,19 @@ def battery_state(raw: bytes) -> Layout:
 
 @dataclass(frozen=True)
 class Table:
-    """Messages of one layout: which of those asked for they are, and their bytes (n, size)."""
+    """
+    Messages of one layout.
+
+    Attributes
+    ----------
+    rows
+        Their indices among the messages that were given, (n,).
+    data
+        Their bytes, (n, size).
+    layout
+        Where their fields are.
+
+    """
 
     rows: np.ndarray
     data: np.ndarray
@@ -149,9 +202,10 @@ class Table:
 
     def numbers(self, name: str) -> np.ndarray:
         """Return a field of all messages as float64, (n, count)."""
-        start, code, count = self.layout.fields[name]
-        part = np.ascontiguousarray(self.data[:, start:start + int(code[1:]) * count])
-        return part.view(self.layout.order + code).astype(np.float64)
+        field = self.layout.fields[name]
+        size = int(field.code[1:]) * field.count
+        part = np.ascontiguousarray(self.data[:, field.offset:field.offset + size])
+        return part.view(self.layout.order + field.code).astype(np.float64)
 
     def stamp_ns(self) -> np.ndarray:
         """Return the headers' stamps, ns, (n,) int64."""
@@ -161,7 +215,7 @@ class Table:
 
 def tables(raws: Sequence[bytes], find: Callable[[bytes], Layout]) -> Iterator[Table]:
     """
-    Sort messages by layout.
+    Group messages by layout.
 
     Parameters
     ----------
@@ -170,35 +224,40 @@ def tables(raws: Sequence[bytes], find: Callable[[bytes], Layout]) -> Iterator[T
     find
         Finds the layout of a message of that type, such as `imu`.
 
+    Yields
+    ------
+    Table
+        The messages of one layout.
+
     Raises
     ------
     CdrError
         A message is too short or in another encoding.
 
     """
-    rest = np.arange(len(raws))
-    while len(rest):
-        first = raws[rest[0]]
+    remaining = np.arange(len(raws))
+    while len(remaining):
+        first = raws[remaining[0]]
         layout = find(first)
-        rows = np.array([i for i in rest.tolist() if len(raws[i]) == len(first)])
+        rows = np.array([i for i in remaining.tolist() if len(raws[i]) == len(first)])
         data = np.frombuffer(b''.join([raws[i] for i in rows.tolist()]), np.uint8)
         data = data.reshape(len(rows), len(first))
-        same = (data[:, layout.fixed] == data[0, layout.fixed]).all(axis=1)
-        if not same.all():
-            rows, data = rows[same], data[same]
+        is_same = (data[:, layout.fixed] == data[0, layout.fixed]).all(axis=1)
+        if not is_same.all():
+            rows, data = rows[is_same], data[is_same]
         yield Table(rows, data, layout)
-        rest = np.setdiff1d(rest, rows, assume_unique=True)
+        remaining = np.setdiff1d(remaining, rows, assume_unique=True)
 
 
 def fill(template: bytes, layout: Layout, stamp_ns: np.ndarray,
          fields: Mapping[str, np.ndarray]) -> bytes:
     """
-    Write one message a stamp.
+    Return one message for each stamp.
 
     Parameters
     ----------
     template
-        A message with the strings and lengths, and with the values of what is not in `fields`.
+        A message with the strings and lengths, and with the values of all other fields.
     layout
         Where its fields are.
     stamp_ns
@@ -208,13 +267,15 @@ def fill(template: bytes, layout: Layout, stamp_ns: np.ndarray,
 
     Returns
     -------
-    The messages, one after the other, each as long as the template.
+    bytes
+        The messages, one after the other, each as long as the template.
 
     """
     data = np.tile(np.frombuffer(template, np.uint8), (len(stamp_ns), 1))
     sec, nanosec = np.divmod(stamp_ns, 1_000_000_000)
     for name, values in {'sec': sec, 'nanosec': nanosec, **fields}.items():
-        start, code, count = layout.fields[name]
-        part = np.ascontiguousarray(values.reshape(-1, count).astype(layout.order + code))
-        data[:, start:start + part.itemsize * count] = part.view(np.uint8)
+        field = layout.fields[name]
+        part = np.ascontiguousarray(
+            values.reshape(-1, field.count).astype(layout.order + field.code))
+        data[:, field.offset:field.offset + part.itemsize * field.count] = part.view(np.uint8)
     return data.tobytes()

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Which data a calibration was made of."""
+"""The checksum that states which recordings a calibration was made from."""
 
 from __future__ import annotations
 
@@ -23,34 +23,38 @@ from pathlib import Path
 
 from adxl_ros.errors import UserError
 
+_READ_BYTES = 1 << 20
+"""Bytes that are read at a time (chosen: bounds the memory for files of any size)."""
+
 
 def sha256(paths: Sequence[str | os.PathLike]) -> str:
     """
-    Return the SHA-256 of recordings, hexadecimal; of one file that of `sha256sum`.
+    Return the SHA-256 of recordings, hexadecimal; for one file, that of `sha256sum`.
 
-    Of several files it is that of their own sums, a line each, in the order that is given, those
-    of a bag's directory by name: their place on the disk does not matter.
+    For several files it is the SHA-256 of their own checksums, one a line, in the given order.
+    The files of a bag's directory are in the order of their names. Paths do not enter.
 
     Raises
     ------
     UserError
-        One cannot be read.
+        A file cannot be read.
 
     """
     files: list[Path] = []
     for path in map(Path, paths):
         files += sorted(p for p in path.rglob('*') if p.is_file()) if path.is_dir() else [path]
-    sums = [_of_file(path) for path in files]
-    return sums[0] if len(sums) == 1 else \
-        hashlib.sha256(''.join(f'{one}\n' for one in sums).encode()).hexdigest()
+    checksums = [_file_sha256(path) for path in files]
+    if len(checksums) == 1:
+        return checksums[0]
+    return hashlib.sha256(''.join(f'{line}\n' for line in checksums).encode()).hexdigest()
 
 
-def _of_file(path: Path) -> str:
+def _file_sha256(path: Path) -> str:
     try:
         with open(path, 'rb') as file:
-            found = hashlib.sha256()
-            while block := file.read(1 << 20):
-                found.update(block)
+            checksum = hashlib.sha256()
+            while block := file.read(_READ_BYTES):
+                checksum.update(block)
     except OSError as error:
         raise UserError(f'{path}: cannot be read: {error.strerror}') from None
-    return found.hexdigest()
+    return checksum.hexdigest()

@@ -15,8 +15,8 @@
 """
 CSV recordings, read in blocks.
 
-A block of lines that holds nothing but numbers is parsed in one go. Where that fails, it is read
-field by field, which takes text and quotes, and finds the line and column to name.
+A block of lines with numbers alone is parsed as a whole. Any other block is parsed field by
+field, which accepts text and quotes, and finds the line and column to name in a message.
 """
 
 from __future__ import annotations
@@ -35,26 +35,48 @@ from adxl_ros.files.recording_columns import LIMIT, Recording, TIME
 import numpy as np
 
 _CHUNK_BYTES = 1 << 22
-_LONGEST_LINE_BYTES = 1 << 20
+"""Bytes that are read at a time (chosen: bounds the memory to some 50 MB)."""
 
-# As nanoseconds, a stamp has to fit in 64 bits.
+_LONGEST_LINE_BYTES = 1 << 20
+"""Longer lines are refused, bytes (chosen: no recording has them; a file without newlines must
+not fill the memory)."""
+
 _TIME_LIMIT_S = 9e9
+"""Largest magnitude of a time, s: in nanoseconds it fits into 64 bits (9.2e18)."""
 
 _INFO = re.compile(r'#+\s*([A-Za-z_][\w.]*)\s*:(?:\s+(.*))?$')
+"""A comment line with key and value."""
+
 _NUMBER = re.compile(r'\s*([-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?|[-+]?(nan|inf|infinity))?\s*',
                      re.ASCII | re.IGNORECASE)
+"""A field that is a number, or empty."""
 
 
 @dataclass
 class _Lines:
-    """Lines of samples, each with its newline, their numbers in the file, and what follows."""
+    """
+    Lines of samples.
+
+    Attributes
+    ----------
+    data
+        The lines, each with a newline.
+    numbers
+        Their numbers in the file, from 1.
+    done
+        Fraction of the file that has been read at their end.
+    is_open_ended
+        Whether the last one has no newline in the file.
+
+    """
 
     data: bytes
     numbers: Sequence[int]
     done: float
-    open_end: bool
+    is_open_ended: bool
 
     def where(self, path: str, row: int, column: int) -> str:
+        """Return file, line and column of a field, for messages."""
         return f'{path}:{self.numbers[row]}:{column + 1}'
 
     def fields(self, path: str, row: int) -> list[str]:
@@ -85,7 +107,25 @@ def _decode(path: str, line: bytes, number: int) -> str:
 
 @dataclass
 class _State:
-    """What reading the earlier blocks left behind."""
+    """
+    What earlier blocks leave behind.
+
+    Attributes
+    ----------
+    path
+        The file, for messages.
+    header
+        Its columns.
+    used
+        Columns that hold numbers so far.
+    epoch_ns
+        Origin of the times, ns.
+    last_time_s
+        Time of the newest sample, s.
+    last_line
+        Number of its line.
+
+    """
 
     path: str
     header: Header
@@ -107,13 +147,18 @@ def blocks(path: str | os.PathLike, rows: int,
     rows
         Largest number of samples of a block.
     needed
-        Columns beside `time_s` that must have a number in every row; None is the sensor's output
+        Columns besides `time_s` that must have a number in every row; None is the sensor's output
         in any form.
+
+    Yields
+    ------
+    Recording
+        The blocks in the order of time.
 
     Raises
     ------
     UserError
-        With file, line and column of what is wrong.
+        The file cannot be read, or a field is wrong. The message names file, line and column.
 
     """
     path = str(path)
@@ -149,7 +194,7 @@ def _blocks(path: str, file: BinaryIO, rows: int,
 
 def _begin(path: str, lines: _Lines, info: dict[str, str],
            needed: tuple[str, ...] | None) -> _State:
-    """Take the header off the first lines."""
+    """Parse the header, and remove it from the first lines."""
     header = parse_header(f'{path}:{lines.numbers[0]}', lines.fields(path, 0), needed)
     lines.data = lines.data.split(b'\n', 1)[1]
     lines.numbers = lines.numbers[1:]
@@ -164,16 +209,17 @@ def _epoch_ns(path: str, info: dict[str, str]) -> int:
 
 
 def _chunks(path: str, file: BinaryIO, info: dict[str, str]) -> Iterator[_Lines]:
-    """Cut the file into whole lines; comments go to `info`, empty lines nowhere."""
+    """Yield the lines of samples; comments are added to `info`, empty lines are dropped."""
     size = os.fstat(file.fileno()).st_size
     number = 1
     for data in _whole_lines(path, file):
         if number == 1:
-            data = _without_mark(path, data)
-        open_end = not data.endswith(b'\n')
-        data = data.replace(b'\r\n', b'\n') + b'\n' * open_end
+            data = _without_byte_order_mark(path, data)
+        is_open_ended = not data.endswith(b'\n')
+        data = data.replace(b'\r\n', b'\n') + b'\n' * is_open_ended
         count = data.count(b'\n')
-        lines = _Lines(data, range(number, number + count), file.tell() / max(size, 1), open_end)
+        lines = _Lines(data, range(number, number + count), file.tell() / max(size, 1),
+                       is_open_ended)
         number += count
         if _has_other_lines(data):
             _drop_other_lines(path, lines, info)
@@ -196,14 +242,14 @@ def _whole_lines(path: str, file: BinaryIO) -> Iterator[bytes]:
         yield rest
 
 
-def _without_mark(path: str, data: bytes) -> bytes:
+def _without_byte_order_mark(path: str, data: bytes) -> bytes:
     if data[:2] in (b'\xff\xfe', b'\xfe\xff'):
         raise UserError(f'{path}:1:1: is UTF-16; save the file as UTF-8')
     return data.removeprefix(b'\xef\xbb\xbf')
 
 
 def _has_other_lines(data: bytes) -> bool:
-    """Tell whether there may be comments or empty lines."""
+    """Return whether there may be comments or empty lines."""
     return data.startswith(b'\n') or any(
         mark in data for mark in (b'#', b'\n\n', b' \n', b'\t\n'))
 
@@ -213,8 +259,8 @@ def _drop_other_lines(path: str, lines: _Lines, info: dict[str, str]) -> None:
     for line, number in zip(lines.data.split(b'\n'), lines.numbers):
         text = line.strip()
         if text.startswith(b'#'):
-            if found := _INFO.match(_decode(path, text, number)):
-                info[found[1]] = (found[2] or '').strip()
+            if entry := _INFO.match(_decode(path, text, number)):
+                info[entry[1]] = (entry[2] or '').strip()
         elif text:
             kept.append(line + b'\n')
             numbers.append(number)
@@ -223,7 +269,7 @@ def _drop_other_lines(path: str, lines: _Lines, info: dict[str, str]) -> None:
 
 def _columns(state: _State, lines: _Lines) -> dict[str, np.ndarray]:
     """Parse and check the samples of some lines; return the columns that are numbers."""
-    table = _fast(state, lines)
+    table = _all_at_once(state, lines)
     if table is None:
         table = _field_by_field(state, lines)
     columns = {name: np.ascontiguousarray(table[:, i]) for i, name in enumerate(state.used)}
@@ -232,8 +278,8 @@ def _columns(state: _State, lines: _Lines) -> dict[str, np.ndarray]:
     return columns
 
 
-def _fast(state: _State, lines: _Lines) -> np.ndarray | None:
-    """Parse all lines in one go; None where a line needs a closer look."""
+def _all_at_once(state: _State, lines: _Lines) -> np.ndarray | None:
+    """Parse all lines as one text; None where a line must be parsed field by field."""
     names = state.header.names
     data = _unpadded(lines.data)
     bounds = _bounds(data, len(names))
@@ -241,7 +287,7 @@ def _fast(state: _State, lines: _Lines) -> np.ndarray | None:
         return None
     used = [state.header.index(name) for name in state.used]
     data = _blanked(data, bounds, sorted(set(range(len(names))) - set(used)))
-    # numpy reads a field of nothing but white space as -1.
+    # numpy reads a field of white space as -1.
     if any(space in data for space in b' \t\v\f\r'):
         return None
     text = data.replace(b'\n', b',')
@@ -251,7 +297,7 @@ def _fast(state: _State, lines: _Lines) -> np.ndarray | None:
     while b',,' in text:
         text = text.replace(b',,', b',nan,')
     with warnings.catch_warnings():
-        # Older numpy only warns of text, and stops there.
+        # Older numpy warns of text and stops there; an error leads to the other parser.
         warnings.simplefilter('error')
         try:
             values = np.fromstring(text, sep=',')
@@ -262,7 +308,7 @@ def _fast(state: _State, lines: _Lines) -> np.ndarray | None:
 
 
 def _unpadded(data: bytes) -> bytes:
-    """Take out the spaces beside commas and newlines."""
+    """Remove the spaces next to commas and newlines."""
     if b'\t' in data:
         data = data.replace(b'\t', b' ')
     if b' ' in data:
@@ -274,34 +320,34 @@ def _unpadded(data: bytes) -> bytes:
 
 def _bounds(data: bytes, count: int) -> np.ndarray | None:
     """
-    Return where the fields are bounded, by line; None where a line has not `count` fields.
+    Return the bounds of the fields, (lines, count + 1); None if a line has not `count` fields.
 
-    Field k stands between bounds k and k + 1, the places of the commas and newlines beside it.
+    Field k is between bounds k and k + 1, the positions of the commas and newlines next to it.
     """
     characters = np.frombuffer(data, np.uint8)
-    ends = np.flatnonzero(characters == ord('\n'))
+    newlines = np.flatnonzero(characters == ord('\n'))
     commas = np.flatnonzero(characters == ord(','))
-    if len(commas) != (count - 1) * len(ends):
+    if len(commas) != (count - 1) * len(newlines):
         return None
-    starts = np.concatenate([[-1], ends[:-1]])
-    bounds = np.column_stack([starts, commas.reshape(len(ends), count - 1), ends])
+    starts = np.concatenate([[-1], newlines[:-1]])
+    bounds = np.column_stack([starts, commas.reshape(len(newlines), count - 1), newlines])
     return bounds if (np.diff(bounds, axis=1) > 0).all() else None
 
 
 def _blanked(data: bytes, bounds: np.ndarray, unused: list[int]) -> bytes:
-    """Take out the text of unused fields."""
+    """Remove the text of unused fields."""
     if not unused:
         return data
     change = np.zeros(len(data) + 1, np.int8)
     for k in unused:
         change[bounds[:, k] + 1] += 1
         change[bounds[:, k + 1]] -= 1
-    kept = np.cumsum(change[:-1], dtype=np.int8) == 0
-    return np.frombuffer(data, np.uint8)[kept].tobytes()
+    is_kept = np.cumsum(change[:-1], dtype=np.int8) == 0
+    return np.frombuffer(data, np.uint8)[is_kept].tobytes()
 
 
 def _field_by_field(state: _State, lines: _Lines) -> np.ndarray:
-    """Parse with Python, naming what is no number and dropping other columns with text."""
+    """Parse with Python; refuse a field that is no number, and drop other columns with text."""
     header = state.header
     rows = lines.rows(state.path)
     for i, fields in enumerate(rows):
@@ -311,9 +357,9 @@ def _field_by_field(state: _State, lines: _Lines) -> np.ndarray:
     for name in list(state.used):
         index = header.index(name)
         fields = [row[index] for row in rows]
-        wrong = next((i for i, one in enumerate(fields) if not _NUMBER.fullmatch(one)), None)
+        wrong = next((i for i, field in enumerate(fields) if not _NUMBER.fullmatch(field)), None)
         if wrong is None:
-            columns.append([float(one) if one.strip() else np.nan for one in fields])
+            columns.append([float(field) if field.strip() else np.nan for field in fields])
         elif header.is_other(name):
             state.used.remove(name)
         else:
@@ -329,35 +375,40 @@ def _refuse_field_count(state: _State, lines: _Lines, row: int, count: int) -> N
 
 
 def _cut_hint(lines: _Lines, row: int) -> str:
-    if lines.open_end and row == len(lines.numbers) - 1:
+    if lines.is_open_ended and row == len(lines.numbers) - 1:
         return '; the file ends in the middle of this line: delete it'
     return ''
 
 
 def _check_values(state: _State, lines: _Lines, columns: dict[str, np.ndarray]) -> None:
     """Refuse the first row with a number that no sensor, reference or clock gives."""
-    first: tuple[int, str] | None = None
+    refused: list[tuple[int, str]] = []
     for name in (*state.header.needed, *state.header.references):
-        limit = _TIME_LIMIT_S if name == TIME else LIMIT
-        size = np.abs(columns[name])
-        wrong = size > limit if name in state.header.references else ~(size <= limit)
+        magnitude = np.abs(columns[name])
+        wrong = magnitude > _limit(name) if name in state.header.references else \
+            ~(magnitude <= _limit(name))
         if wrong.any():
-            row = int(wrong.argmax())
-            first = (row, name) if first is None else min(first, (row, name))
-    if first is None:
-        return
-    row, name = first
+            refused.append((int(wrong.argmax()), name))
+    if refused:
+        row, name = min(refused)
+        _refuse_value(state, lines, row, name, columns[name][row])
+
+
+def _limit(name: str) -> float:
+    """Return the largest magnitude of a column, in its unit."""
+    return _TIME_LIMIT_S if name == TIME else LIMIT
+
+
+def _refuse_value(state: _State, lines: _Lines, row: int, name: str, value: float) -> None:
     index = state.header.index(name)
     text = lines.fields(state.path, row)[index].strip()
-    value = columns[name][row]
     where = lines.where(state.path, row, index)
     if not text:
         raise UserError(f'{where}: {name} is empty; every sample needs it')
     if not np.isfinite(value):
         raise UserError(f'{where}: {name} is {text}, not a finite number; delete the line')
-    limit = _TIME_LIMIT_S if name == TIME else LIMIT
-    raise UserError(f'{where}: {name} is {text}, beyond ±{limit:g}; delete the line or mend '
-                    'its unit')
+    raise UserError(f'{where}: {name} is {text}, beyond ±{_limit(name):g}; delete the line or '
+                    'correct its unit')
 
 
 def _check_time(state: _State, lines: _Lines, time_s: np.ndarray) -> None:

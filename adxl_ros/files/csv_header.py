@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The header of a CSV recording: which columns there are, and in which units."""
+"""The header of a CSV recording: its columns and their units."""
 
 from __future__ import annotations
 
@@ -22,7 +22,6 @@ from dataclasses import dataclass
 from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import ACCEL, REFERENCES, sensor_columns, TIME, VOLTS
 
-# Names by which people write other units; the canonical column's own unit comes first.
 _UNITS = (
     ('s', 'ms', 'us', 'ns', 'min', 'h', 'sec'),
     ('v', 'mv', 'uv', 'kv', 'volt', 'volts', 'lsb', 'adc', 'counts'),
@@ -31,18 +30,32 @@ _UNITS = (
     ('m', 'mm', 'cm', 'um', 'nm'),
     ('c', 'k', 'f', 'degc', 'degf', 'celsius', 'kelvin', 'fahrenheit'),
 )
-_SPOKEN = {'s': 's', 'v': 'V', 'mps2': 'm/s²', 'rad': 'rad', 'm': 'm', 'c': '°C'}
+"""Ends of column names by quantity: the unit of this package first, then other units that people
+write. A column with another unit is refused, not taken for a further column."""
+
+_SYMBOLS = {'s': 's', 'v': 'V', 'mps2': 'm/s²', 'rad': 'rad', 'm': 'm', 'c': '°C'}
+"""Symbols of the package's units, for messages."""
 
 
 @dataclass(frozen=True)
 class Header:
-    """The names of the columns of a CSV file, and where the sensor's output stands."""
+    """
+    The columns of a CSV file.
+
+    Attributes
+    ----------
+    names
+        All columns, in order; an empty name is a column that is not read.
+    sensor
+        The columns with the sensor's output.
+
+    """
 
     names: tuple[str, ...]
     sensor: tuple[str, ...]
 
     def index(self, name: str) -> int:
-        """Return where the column stands, from 0."""
+        """Return the index of a column, from 0."""
         return self.names.index(name)
 
     @property
@@ -56,7 +69,7 @@ class Header:
         return tuple(name for name in self.names if name in REFERENCES)
 
     def is_other(self, name: str) -> bool:
-        """Tell whether a column is none of the package's own, so that it may hold anything."""
+        """Return whether a column is none of the package's own, so that it may hold text."""
         return name not in self.needed and name not in REFERENCES
 
 
@@ -73,6 +86,11 @@ def parse_header(where: str, fields: list[str], needed: tuple[str, ...] | None) 
     needed
         The columns that must be there; None is any form of the sensor's output.
 
+    Returns
+    -------
+    Header
+        The checked columns.
+
     Raises
     ------
     UserError
@@ -82,21 +100,21 @@ def parse_header(where: str, fields: list[str], needed: tuple[str, ...] | None) 
     names = tuple(name.strip() for name in fields)
     _refuse_delimiter(where, names)
     _refuse_duplicates(where, names)
-    known = [name for name in names if name]
+    named = [name for name in names if name]
     for column in _wanted(names):
         _refuse_other_unit(where, names, column)
     if TIME not in names:
-        raise UserError(f'{where}: no column {TIME}; the columns are {", ".join(known)}')
+        raise UserError(f'{where}: no column {TIME}; the columns are {", ".join(named)}')
     if needed is None:
-        return Header(names, sensor_columns(known, where))
+        return Header(names, sensor_columns(named, where))
     for column in needed:
         if column not in names:
-            raise UserError(f'{where}: no column {column}; the columns are {", ".join(known)}')
+            raise UserError(f'{where}: no column {column}; the columns are {", ".join(named)}')
     return Header(names, needed)
 
 
 def _wanted(names: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the columns to look for in other units; only one form of the sensor's output is."""
+    """Return the columns that may stand there in other units, for one form of output only."""
     if any(name in names for name in VOLTS):
         return (TIME, *VOLTS, *REFERENCES)
     if any(name in names for name in ACCEL):
@@ -105,18 +123,18 @@ def _wanted(names: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def _refuse_delimiter(where: str, names: tuple[str, ...]) -> None:
-    for mark, spoken in ((';', 'semicolons'), ('\t', 'tabs')):
+    for mark, name in ((';', 'semicolons'), ('\t', 'tabs')):
         if len(names) == 1 and mark in names[0]:
-            raise UserError(f'{where}: the columns are parted by {spoken}, expected commas '
+            raise UserError(f'{where}: the columns are separated by {name}, expected commas '
                             'and a decimal point')
 
 
 def _refuse_duplicates(where: str, names: tuple[str, ...]) -> None:
     for name, count in Counter(names).items():
         if name and count > 1:
-            places = [str(i + 1) for i, other in enumerate(names) if other == name]
-            raise UserError(f'{where}:{places[1]}: column {name} stands {count} times, '
-                            f'in the fields {", ".join(places)}; keep one')
+            fields = [str(i + 1) for i, other in enumerate(names) if other == name]
+            raise UserError(f'{where}:{fields[1]}: column {name} stands {count} times, '
+                            f'in the fields {", ".join(fields)}; keep one')
 
 
 def _refuse_other_unit(where: str, names: tuple[str, ...], column: str) -> None:
@@ -127,4 +145,4 @@ def _refuse_other_unit(where: str, names: tuple[str, ...], column: str) -> None:
     for i, name in enumerate(names):
         if name.lower() in {f'{stem}_{other}' for other in others}:
             raise UserError(f'{where}:{i + 1}: column {name} is in another unit; expected '
-                            f'{_SPOKEN[unit]}, in a column named {column}')
+                            f'{_SYMBOLS[unit]}, in a column named {column}')

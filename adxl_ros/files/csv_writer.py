@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""CSV recordings, written block by block: whole or not at all."""
+"""CSV recordings, written block by block, whole or not at all."""
 
 from __future__ import annotations
 
@@ -27,6 +27,7 @@ from adxl_ros.files.recording_columns import Recording, TIME
 import numpy as np
 
 _ROWS_AT_ONCE = 65536
+"""Rows that are made into text at a time (chosen: some MB of text)."""
 
 
 class CsvWriter:
@@ -44,9 +45,10 @@ class CsvWriter:
         Parameters
         ----------
         path
-            Replaced if it exists.
+            The file, replaced if it exists.
         digits
-            Significant digits of all columns but the first, where fewer do: twelve cost a third.
+            Significant digits of all columns but the first; None keeps every bit. Twelve digits
+            take a third of the time.
 
         """
         self._path = path
@@ -77,7 +79,7 @@ class CsvWriter:
         columns
             Arrays (n,) by column name, in the order of the file; the same names every time.
         info
-            What stands as `# key: value` above the header; taken the first time.
+            Lines `# key: value` above the header, from the first call.
 
         """
         if not self._names:
@@ -110,7 +112,7 @@ def _fields(values: np.ndarray) -> list[str]:
 
 
 def recording_info(recording: Recording) -> dict[str, str]:
-    """Return what stands above the header of a recording's CSV file."""
+    """Return the `# key: value` lines of a recording's CSV file."""
     info = {key: value for key, value in recording.info.items() if key != 'epoch_ns'}
     return {**info, 'epoch_ns': str(recording.epoch_ns)} if recording.epoch_ns else info
 

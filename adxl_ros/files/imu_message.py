@@ -13,10 +13,11 @@
 # limitations under the License.
 
 """
-One serialized sensor_msgs/Imu after the other: what is read of it, and what is made of it.
+Serialized sensor_msgs/Imu messages, read and corrected one by one.
 
 A corrected message differs from the raw one in some numbers only, so that these are replaced in
-the bytes: a tenth of the cost of making messages of them and back. Byte order and header stay.
+its bytes. That takes a tenth of the time of a conversion to a message object and back. Byte order
+and header stay.
 """
 
 from __future__ import annotations
@@ -27,17 +28,43 @@ from typing import NamedTuple
 
 from adxl_ros.files import cdr
 
-_ORIENTATION, _ACCELERATION = 'orientation', 'linear_acceleration'
-_MOST_LAYOUTS = 64
+_STAMP_OFFSET = 4
+"""Offset of the header's stamp, bytes."""
+
+_COVARIANCE_BYTES = 72
+"""Size of a covariance: nine float64."""
+
+_MAX_LAYOUTS = 64
+"""Layouts that are kept (chosen: a stream has one; bounds the memory for any input)."""
 
 
 class _Layout(NamedTuple):
+    """
+    Where the numbers of an Imu are, and how they are packed.
+
+    Attributes
+    ----------
+    stamp
+        Two integers: s, ns.
+    vector
+        Three float64: x, y, z.
+    orientation
+        Thirteen float64: quaternion and covariance.
+    acceleration
+        Twelve float64: x, y, z and covariance.
+    orientation_offset, acceleration_offset
+        Offsets in the message, bytes.
+    size
+        Length of the message, bytes.
+
+    """
+
     stamp: struct.Struct
     vector: struct.Struct
     orientation: struct.Struct
     acceleration: struct.Struct
-    orientation_at: int
-    acceleration_at: int
+    orientation_offset: int
+    acceleration_offset: int
     size: int
 
 
@@ -51,57 +78,78 @@ def read(raw: bytes) -> tuple[float, Sequence[float]]:
     Raises
     ------
     CdrError
-        It is too short or in another encoding.
+        The message is too short or in another encoding.
 
     """
     layout = _layout(raw)
-    sec, nanosec = layout.stamp.unpack_from(raw, 4)
-    return sec + nanosec * 1e-9, layout.vector.unpack_from(raw, layout.acceleration_at)
+    sec, nanosec = layout.stamp.unpack_from(raw, _STAMP_OFFSET)
+    return sec + nanosec * 1e-9, layout.vector.unpack_from(raw, layout.acceleration_offset)
 
 
 def corrected(raw: bytes, orientation: Sequence[float], acceleration: Sequence[float]) -> bytes:
     """
-    Return an Imu with other numbers.
+    Return an Imu with another orientation and acceleration.
 
     Parameters
     ----------
     raw
-        The message, serialized, that `read` has read.
+        The message, serialized, that `read` accepted.
     orientation
-        x, y, z, w and the covariance by rows, rad², (13,).
+        Quaternion x, y, z, w and the covariance by rows, rad², (13,).
     acceleration
         x, y, z, m/s², and the covariance by rows, (m/s²)², (12,).
 
+    Returns
+    -------
+    bytes
+        The new message, serialized.
+
     """
     layout = _layout(raw)
-    made = bytearray(raw)
-    layout.orientation.pack_into(made, layout.orientation_at, *orientation)
-    layout.acceleration.pack_into(made, layout.acceleration_at, *acceleration)
-    return bytes(made)
+    message = bytearray(raw)
+    layout.orientation.pack_into(message, layout.orientation_offset, *orientation)
+    layout.acceleration.pack_into(message, layout.acceleration_offset, *acceleration)
+    return bytes(message)
 
 
 def vector3_stamped(raw: bytes, vector: Sequence[float]) -> bytes:
-    """Return a geometry_msgs/Vector3Stamped under the header of the Imu `raw`."""
+    """
+    Return a geometry_msgs/Vector3Stamped with the header of an Imu.
+
+    Parameters
+    ----------
+    raw
+        The Imu, serialized.
+    vector
+        x, y, z, (3,).
+
+    Returns
+    -------
+    bytes
+        The message, serialized.
+
+    """
     layout = _layout(raw)
     # In both messages, numbers of eight bytes follow the header.
-    return raw[:layout.orientation_at] + layout.vector.pack(*vector)
+    return raw[:layout.orientation_offset] + layout.vector.pack(*vector)
 
 
 def _layout(raw: bytes) -> _Layout:
-    # The byte order and the length of the frame's name decide where everything is.
+    """Return the layout of a message; byte order and length of the frame's name determine it."""
     head = raw[:2] + raw[12:16]
     layout = _layouts.get(head)
     if layout is None or len(raw) < layout.size:
-        layout = _found(raw)
-        if len(_layouts) >= _MOST_LAYOUTS:
+        layout = _find_layout(raw)
+        if len(_layouts) >= _MAX_LAYOUTS:
             _layouts.clear()
         _layouts[head] = layout
     return layout
 
 
-def _found(raw: bytes) -> _Layout:
-    whole = cdr.imu(raw)
-    fields = whole.fields
-    return _Layout(*(struct.Struct(whole.order + code) for code in ('iI', '3d', '13d', '12d')),
-                   fields[_ORIENTATION][0], fields[_ACCELERATION][0],
-                   fields[f'{_ACCELERATION}_covariance'][0] + 72)
+def _find_layout(raw: bytes) -> _Layout:
+    imu = cdr.imu(raw)
+    return _Layout(
+        struct.Struct(imu.order + 'iI'), struct.Struct(imu.order + '3d'),
+        struct.Struct(imu.order + '13d'), struct.Struct(imu.order + '12d'),
+        imu.fields['orientation'].offset, imu.fields['linear_acceleration'].offset,
+        imu.fields['linear_acceleration_covariance'].offset + _COVARIANCE_BYTES)

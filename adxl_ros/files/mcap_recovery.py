@@ -13,12 +13,12 @@
 # limitations under the License.
 
 """
-MCAP files without an index, read from front to back.
+MCAP files without an index, read from the front.
 
-A recorder that is killed, or a full disk, leaves a file without the end by which MCAP files are
-read, and the fastest storage preset of ros2 bag writes no index of the messages. The records
-themselves (https://mcap.dev/spec) stand one behind the other, each with its length, so they can
-be read in turn until one is not whole.
+Readers of MCAP begin with the index at the end of a file. A killed recorder or a full disk leaves
+a file without an end, and the fastest storage preset of ros2 bag writes no index. The records
+(https://mcap.dev/spec) follow each other, each with its length, so that they can be read in turn
+up to the first one that is not whole.
 """
 
 from __future__ import annotations
@@ -28,25 +28,71 @@ from contextlib import contextmanager
 import os
 from pathlib import Path
 import struct
-from typing import BinaryIO
+from typing import BinaryIO, NamedTuple
 import zlib
 
 from adxl_ros.errors import UserError
 
 _MAGIC = b'\x89MCAP0\r\n'
-_SCHEMA, _CHANNEL, _MESSAGE, _CHUNK = 3, 4, 5, 6
-_LAST_KNOWN, _FIRST_PRIVATE = 0x0F, 0x80
-_RECORD_HEAD = struct.Struct('<BQ')
-_CHUNK_HEAD = struct.Struct('<QQQII')  # first and last time, size, CRC-32, length of a string
-_MESSAGE_HEAD_BYTES = 22  # channel, sequence, two times
-_LEAST_BYTES = {_SCHEMA: 6, _CHANNEL: 8, _MESSAGE: _MESSAGE_HEAD_BYTES}
+"""First and last bytes of a whole file (specification, "Magic")."""
 
-Record = tuple[int, bytes, int, int]
-"""Operation code, the bytes that hold the record, and where its content begins and ends."""
+_SCHEMA = 3
+"""Operation code of a schema record (specification, "Records"; so are the next ones)."""
+
+_CHANNEL = 4
+"""Operation code of a channel record."""
+
+_MESSAGE = 5
+"""Operation code of a message record."""
+
+_CHUNK = 6
+"""Operation code of a chunk, which holds further records."""
+
+_LAST_CODE = 0x0F
+"""Largest operation code of the specification."""
+
+_FIRST_PRIVATE_CODE = 0x80
+"""Smallest operation code of records that the specification leaves to applications."""
+
+_RECORD_HEAD = struct.Struct('<BQ')
+"""Operation code and length of a record."""
+
+_CHUNK_HEAD = struct.Struct('<QQQII')
+"""First and last time of a chunk, its size, CRC-32, and the length of its compression's name."""
+
+_LENGTH_BYTES = 8
+"""Size of the length of a chunk's records, which follows the compression's name."""
+
+_MESSAGE_HEAD_BYTES = 22
+"""Size of the beginning of a message record: channel, sequence, two times."""
+
+_SMALLEST_BYTES = {_SCHEMA: 6, _CHANNEL: 8, _MESSAGE: _MESSAGE_HEAD_BYTES}
+"""Smallest size of the content of a record, by operation code."""
+
+
+class Record(NamedTuple):
+    """
+    One whole record.
+
+    Attributes
+    ----------
+    code
+        Operation code.
+    data
+        Bytes that hold the record.
+    start, stop
+        Where its content begins and ends in them.
+
+    """
+
+    code: int
+    data: bytes
+    start: int
+    stop: int
 
 
 def is_whole(path: Path) -> bool:
-    """Tell whether an MCAP file was closed: whether the magic bytes stand at its end too."""
+    """Return whether an MCAP file was closed, so that the magic bytes are at its end, too."""
     try:
         with open(path, 'rb') as file:
             return _has_end(file)
@@ -62,16 +108,28 @@ def _has_end(file: BinaryIO) -> bool:
 
 def unpack(compression: str, data: bytes) -> bytes:
     """
-    Decompress as much as is there.
+    Decompress data up to its cut, if it has one.
+
+    Parameters
+    ----------
+    compression
+        Name of the compression in MCAP: zstd, lz4, or empty for none.
+    data
+        The compressed bytes.
+
+    Returns
+    -------
+    bytes
+        The data.
 
     Raises
     ------
     ValueError
-        The data is damaged, or compressed in a way that MCAP does not know.
+        The data is damaged, or the compression is unknown.
 
     """
     from backports import zstd
-    from lz4.frame import LZ4FrameDecompressor
+    from lz4.frame import LZ4FrameDecompressor  # type: ignore[import-untyped]
     openers = {'': bytes,
                'zstd': lambda packed: zstd.ZstdDecompressor().decompress(packed),
                'lz4': lambda packed: LZ4FrameDecompressor().decompress(packed)}
@@ -91,7 +149,7 @@ def open_scan(path: Path) -> Iterator[ScannedMcap]:
     Raises
     ------
     UserError
-        It is empty or no MCAP file.
+        The file is empty or no MCAP file.
 
     """
     with open(path, 'rb') as file:
@@ -105,7 +163,7 @@ def open_scan(path: Path) -> Iterator[ScannedMcap]:
 
 class ScannedMcap:
     """
-    An MCAP file: what can be read of it from the front.
+    An MCAP file that is read from the front.
 
     Attributes
     ----------
@@ -119,88 +177,90 @@ class ScannedMcap:
     """
 
     def __init__(self, file: BinaryIO) -> None:
-        """Look through the whole file for its channels and the cut."""
+        """Read the whole file once for its channels and the cut."""
         self.done = 0.0
         self.types: set[tuple[str, str]] = set()
         self._file = file
         self._size = os.fstat(file.fileno()).st_size
-        self._at = 0
+        self._offset = 0
         self._channels: dict[int, tuple[str, str]] = {}
         schemas: dict[int, str] = {}
-        for code, data, start, _ in self._records():
-            if code == _MESSAGE and (channel := self._channels.get(_u16(data, start))):
+        for record in self._records():
+            data, start = record.data, record.start
+            if record.code == _MESSAGE and (channel := self._channels.get(_u16(data, start))):
                 self.types.add(channel)
-            elif code == _SCHEMA:
+            elif record.code == _SCHEMA:
                 schemas[_u16(data, start)] = _text(data, start + 2)
-            elif code == _CHANNEL:
+            elif record.code == _CHANNEL:
                 kind = schemas.get(_u16(data, start + 2), '')
                 self._channels[_u16(data, start)] = (_text(data, start + 4), kind)
         self.cut = ''
-        if self._at != self._size - len(_MAGIC) or not _has_end(file):
-            self.cut = (f'cut off or damaged in the record that begins at byte {self._at} '
+        if self._offset != self._size - len(_MAGIC) or not _has_end(file):
+            self.cut = (f'cut off or damaged in the record that begins at byte {self._offset} '
                         f'of {self._size}')
 
     def messages(self, topics: Collection[str]) -> Iterator[tuple[str, bytes]]:
         """Yield topic and CDR of each whole message of some topics, in the order of the file."""
         wanted = {key: topic for key, (topic, _) in self._channels.items() if topic in topics}
-        for code, data, start, end in self._records():
+        for code, data, start, stop in self._records():
             if code == _MESSAGE and (topic := wanted.get(_u16(data, start))) is not None:
-                yield topic, data[start + _MESSAGE_HEAD_BYTES:end]
+                yield topic, data[start + _MESSAGE_HEAD_BYTES:stop]
 
     def _records(self) -> Iterator[Record]:
-        """Yield the whole records, those inside a chunk in place of the chunk."""
-        self._at = len(_MAGIC)
-        self._file.seek(self._at)
+        """Yield the whole records, and the records of a chunk in its place."""
+        self._offset = len(_MAGIC)
+        self._file.seek(self._offset)
         while len(head := self._file.read(_RECORD_HEAD.size)) == _RECORD_HEAD.size:
             code, size = _RECORD_HEAD.unpack(head)
             if not _is_record(code, size):
                 return
-            begin = self._at + len(head)
+            begin = self._offset + len(head)
             content = self._file.read(min(size, self._size - begin))
             is_whole = len(content) == size
             if code == _CHUNK:
                 is_whole = yield from _chunk(content, is_whole)
             elif is_whole:
-                yield code, content, 0, size
+                yield Record(code, content, 0, size)
             if not is_whole:
                 return
-            self._at = begin + size
-            self.done = self._at / self._size
+            self._offset = begin + size
+            self.done = self._offset / self._size
 
 
 def _chunk(content: bytes, is_whole: bool) -> Generator[Record, None, bool]:
-    """Yield the records of a chunk, whose end may be missing; return whether it was whole."""
+    """Yield the records of a chunk, whose end may be missing; return whether it is whole."""
     if len(content) < _CHUNK_HEAD.size:
         return False
     _, _, _, crc, length = _CHUNK_HEAD.unpack_from(content)
-    begin = _CHUNK_HEAD.size + length + 8
+    begin = _CHUNK_HEAD.size + length + _LENGTH_BYTES
     try:
         data = unpack(_text(content, _CHUNK_HEAD.size - 4), content[begin:])
     except ValueError:
-        return False  # what is cut here is the chunk
+        return False  # a chunk cut within compressed data cannot be decompressed
     if is_whole and crc and zlib.crc32(data) != crc:
         return False
-    at = 0
-    while at + _RECORD_HEAD.size <= len(data):
-        code, size = _RECORD_HEAD.unpack_from(data, at)
-        start = at + _RECORD_HEAD.size
-        at = start + size
-        if at > len(data) or not _is_record(code, size):
+    offset = 0
+    while offset + _RECORD_HEAD.size <= len(data):
+        code, size = _RECORD_HEAD.unpack_from(data, offset)
+        start = offset + _RECORD_HEAD.size
+        offset = start + size
+        if offset > len(data) or not _is_record(code, size):
             return False
-        yield code, data, start, at
+        yield Record(code, data, start, offset)
     return is_whole
 
 
 def _is_record(code: int, size: int) -> bool:
-    is_known = 0 < code <= _LAST_KNOWN or code >= _FIRST_PRIVATE
-    return is_known and size >= _LEAST_BYTES.get(code, 0)
+    """Return whether a record can begin so; damaged bytes rarely look like one."""
+    is_known = 0 < code <= _LAST_CODE or code >= _FIRST_PRIVATE_CODE
+    return is_known and size >= _SMALLEST_BYTES.get(code, 0)
 
 
-def _u16(data: bytes, at: int) -> int:
-    return data[at] | data[at + 1] << 8
+def _u16(data: bytes, offset: int) -> int:
+    return data[offset] | data[offset + 1] << 8
 
 
-def _text(data: bytes, at: int) -> str:
-    start = at + 4
-    end = start + int.from_bytes(data[at:start], 'little')
-    return data[start:end].decode(errors='replace')
+def _text(data: bytes, offset: int) -> str:
+    start = offset + 4
+    stop = start + int.from_bytes(data[offset:start], 'little')
+    return data[start:stop].decode(errors='replace')

@@ -13,10 +13,10 @@
 # limitations under the License.
 
 """
-Recordings, whatever their format: rosbag2 directories, single bag files, CSV.
+Recordings of any format: rosbag2 directories, single bag files, CSV.
 
-What a path holds is told by what is there when it is read, and by its name when it is written:
-`.csv` is CSV, `.mcap` one bag file, everything else a rosbag2 directory.
+The content of a file decides its format when it is read, its name when it is written: `.csv` is
+CSV, `.mcap` one bag file, everything else a rosbag2 directory.
 """
 
 from __future__ import annotations
@@ -35,8 +35,14 @@ from adxl_ros.model.sensor import Sensor
 import numpy as np
 
 _BLOCK_ROWS = 65536
-_MAGIC = {b'\x89MCAP': '.mcap', b'SQLite format 3': '.db3', b'\x28\xb5\x2f\xfd': '.zstd',
-          b'#ROSBAG': '.bag'}
+"""Samples that are read at a time (chosen: some MB)."""
+
+_MAGIC_BYTES = 16
+"""Bytes at the beginning of a file that show its format."""
+
+_ENDINGS = {b'\x89MCAP': '.mcap', b'SQLite format 3': '.db3', b'\x28\xb5\x2f\xfd': '.zstd',
+            b'#ROSBAG': '.bag'}
+"""Usual ends of file names by the first bytes of the files."""
 
 
 def read(path: str | os.PathLike) -> Recording:
@@ -46,26 +52,38 @@ def read(path: str | os.PathLike) -> Recording:
     Raises
     ------
     UserError
-        It cannot be read, or holds something that no sensor gives.
+        The recording cannot be read, or holds values that no sensor gives.
 
     """
-    whole = concatenate(blocks(path, _BLOCK_ROWS))
+    recording = concatenate(blocks(path, _BLOCK_ROWS))
     if _is_bag(path):
-        bag_reader.drop_unsampled(whole)
-    return whole
+        bag_reader.drop_unsampled(recording)
+    return recording
 
 
 def blocks(path: str | os.PathLike, rows: int) -> Iterator[Recording]:
     """
-    Read a recording in blocks of at most `rows` samples, in memory bounded by a block.
+    Read a recording in blocks; the memory is bounded by a block.
 
-    All blocks have the same columns, but for a CSV column that turns out to be text further down.
-    The notes of a block tell of the recording up to its end.
+    All blocks have the same columns, except for a CSV column that turns out to be text further
+    down. Alignments and cut of a block are those up to its end.
+
+    Parameters
+    ----------
+    path
+        The recording.
+    rows
+        Largest number of samples of a block.
+
+    Returns
+    -------
+    iterator
+        The blocks in the order of time.
 
     Raises
     ------
     UserError
-        It cannot be read, or holds something that no sensor gives.
+        The recording cannot be read, or holds values that no sensor gives.
 
     """
     return bag_reader.blocks(path, rows) if _is_bag(path) else csv_file.blocks(path, rows)
@@ -73,7 +91,7 @@ def blocks(path: str | os.PathLike, rows: int) -> Iterator[Recording]:
 
 def read_ideal(path: str | os.PathLike, epoch_ns: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """
-    Read the ideal specific force that another simulator gave.
+    Read the ideal specific force of another simulator.
 
     Parameters
     ----------
@@ -81,16 +99,19 @@ def read_ideal(path: str | os.PathLike, epoch_ns: int = 0) -> tuple[np.ndarray, 
         A CSV file with `time_s, ax_mps2, ay_mps2, az_mps2`, or a bag with one topic of type
         sensor_msgs/Imu, or several of which one is `imu/data_raw`.
     epoch_ns
-        What the times shall count from: `epoch_ns` of the real recording of the manoeuvre.
+        Origin of the times, ns: `epoch_ns` of the real recording of the manoeuvre.
 
     Returns
     -------
-    Times, s, (n,), and specific force in the case frame, m/s², (n, 3).
+    time_s : ndarray
+        Times, s, (n,).
+    force_mps2 : ndarray
+        Specific force in the case frame, m/s², (n, 3).
 
     Raises
     ------
     UserError
-        It cannot be read, or an axis is missing.
+        The file cannot be read, or an axis is missing.
 
     """
     parts = (bag_reader.blocks(path, _BLOCK_ROWS, ideal=True) if _is_bag(path)
@@ -103,26 +124,33 @@ def read_ideal(path: str | os.PathLike, epoch_ns: int = 0) -> tuple[np.ndarray, 
 @contextmanager
 def writer(path: str | os.PathLike, sensor: Sensor) -> Iterator[Callable[[Recording], None]]:
     """
-    Yield a function that appends a block of samples to the recording `path`.
+    Open a new recording, and yield a function that appends a block of samples to it.
 
     The recording appears under its name when the block ends without an error, or not at all.
 
     Parameters
     ----------
     path
-        Its ending tells the format.
+        The recording; its ending determines the format.
     sensor
-        The unit whose nominal conversion a bag holds.
+        The unit whose nominal conversion a bag holds. A CSV file does not need it.
+
+    Yields
+    ------
+    callable
+        Takes the samples to append.
 
     Raises
     ------
     UserError
-        It cannot be written.
+        The recording cannot be written.
 
     """
     if Path(path).suffix == '.csv':
         with CsvWriter(path) as file:
-            yield lambda part: file.write(recording_columns(part), recording_info(part))
+            def append(block: Recording) -> None:
+                file.write(recording_columns(block), recording_info(block))
+            yield append
     else:
         with BagWriter(path, sensor) as bag:
             yield bag.write
@@ -130,12 +158,21 @@ def writer(path: str | os.PathLike, sensor: Sensor) -> Iterator[Callable[[Record
 
 def write(path: str | os.PathLike, recording: Recording, sensor: Sensor) -> None:
     """
-    Write a whole recording, in the format that the ending of `path` tells.
+    Write a whole recording.
+
+    Parameters
+    ----------
+    path
+        The file or directory, replaced if it exists; its ending determines the format.
+    recording
+        The samples and references.
+    sensor
+        The unit whose nominal conversion a bag holds.
 
     Raises
     ------
     UserError
-        It cannot be written.
+        The recording cannot be written.
 
     """
     with writer(path, sensor) as append:
@@ -143,22 +180,22 @@ def write(path: str | os.PathLike, recording: Recording, sensor: Sensor) -> None
 
 
 def _is_bag(path: str | os.PathLike) -> bool:
-    """Tell bags from CSV files, refusing what is neither or has a misleading name."""
-    place = Path(path)
-    if place.is_dir():
+    """Return whether a file is a bag or CSV; refuse other formats and misleading names."""
+    file_path = Path(path)
+    if file_path.is_dir():
         return True
     try:
-        with open(place, 'rb') as file:
-            head = file.read(16)
+        with open(file_path, 'rb') as file:
+            head = file.read(_MAGIC_BYTES)
     except OSError as error:
-        raise UserError(f'{place}: cannot read: {error.strerror or error}') from None
-    ending = next((ending for magic, ending in _MAGIC.items() if head.startswith(magic)), None)
+        raise UserError(f'{file_path}: cannot read: {error.strerror or error}') from None
+    ending = next((ending for magic, ending in _ENDINGS.items() if head.startswith(magic)), None)
     if ending == '.bag':
-        raise UserError(f'{place}: is a bag of ROS 1; convert it: rosbags-convert --src {place} '
-                        f'--dst {place.with_suffix("")}')
+        raise UserError(f'{file_path}: is a bag of ROS 1; convert it: rosbags-convert --src '
+                        f'{file_path} --dst {file_path.with_suffix("")}')
     if ending == '.zstd':
-        raise UserError(f'{place}: is compressed; name the directory with its metadata.yaml, '
-                        f'or unpack it: zstd -d {place}')
-    if ending and place.suffix != ending:
-        raise UserError(f'{place}: is a bag; rename it so that it ends in {ending}')
-    return place.suffix in ('.mcap', '.db3')
+        raise UserError(f'{file_path}: is compressed; name the directory with its metadata.yaml, '
+                        f'or unpack it: zstd -d {file_path}')
+    if ending and file_path.suffix != ending:
+        raise UserError(f'{file_path}: is a bag; rename it so that it ends in {ending}')
+    return file_path.suffix in ('.mcap', '.db3')

@@ -12,41 +12,42 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""References that were sampled by a clock of their own, brought to the sensor's stamps."""
+"""References and commands with stamps of their own, aligned with the stamps of the samples."""
 
 from __future__ import annotations
 
 from adxl_ros.errors import UserError
+from adxl_ros.files.recording_columns import Alignment
 import numpy as np
 
 
 def seconds(stamp_ns: int) -> str:
-    """Write a stamp, ns, in seconds, to the nanosecond."""
-    whole, rest = divmod(int(stamp_ns), 1_000_000_000)
-    return f'{whole}.{rest:09d} s'
+    """Return a stamp, ns, as text in seconds with all nanoseconds."""
+    whole_s, rest_ns = divmod(int(stamp_ns), 1_000_000_000)
+    return f'{whole_s}.{rest_ns:09d} s'
 
 
 class Track:
     """
-    One reference over time, interpolated as its messages and the sensor's samples come in.
+    One reference over time, interpolated while its messages and the samples arrive.
 
-    Between two messages the value is on the straight line between theirs; angles are taken as
-    they are, unwrapped. Up to one period of the reference beyond its first and last message the
-    value there is held; farther out it is NaN.
+    Between two messages the value is on the straight line between theirs; angles are not
+    wrapped. Before the first and after the last message their value is held for one period of the
+    reference; beyond that the reference is NaN.
 
     Attributes
     ----------
-    seen_ns
-        Stamp of the newest message, whether it had a number or not: up to there, the reference
-        is known. Less than any stamp before the second message, which shows the period.
+    known_until_ns
+        Stamp of the newest message, with or without a number, ns. The reference is known up to
+        there. -1 before the second message, which shows the period.
 
     """
 
     def __init__(self, where: str) -> None:
         """Start with no message; `where` names the topic in error messages."""
-        self.seen_ns = -1
-        self._seen = 0
+        self.known_until_ns = -1
         self._where = where
+        self._message_count = 0
         self._stamp_ns = np.zeros(0, np.int64)
         self._value = np.zeros(0)
         self._period_ns = 0.0
@@ -56,14 +57,14 @@ class Track:
 
     def add(self, stamp_ns: np.ndarray, value: np.ndarray) -> None:
         """
-        Append messages; one without a number is one that was not sampled.
+        Append messages.
 
         Parameters
         ----------
         stamp_ns
             Stamps, ns, (k,). Of messages with the same stamp the last one counts.
         value
-            What the reference said, (k,).
+            Values of the reference, in its unit, (k,); NaN where it was not sampled.
 
         Raises
         ------
@@ -73,82 +74,83 @@ class Track:
         """
         if not len(stamp_ns):
             return
-        self._seen += len(stamp_ns)
-        if self._seen > 1:
-            self.seen_ns = int(stamp_ns[-1])
-        known = len(self._stamp_ns)
-        sampled = ~np.isnan(value)
-        stamps = np.concatenate([self._stamp_ns, stamp_ns[sampled]])
-        values = np.concatenate([self._value, value[sampled]])
+        self._message_count += len(stamp_ns)
+        if self._message_count > 1:
+            self.known_until_ns = int(stamp_ns[-1])
+        compared = max(len(self._stamp_ns) - 2, 0)
+        is_sampled = ~np.isnan(value)
+        stamps = np.concatenate([self._stamp_ns, stamp_ns[is_sampled]])
+        values = np.concatenate([self._value, value[is_sampled]])
         step = np.diff(stamps)
         if (step < 0).any():
             i = int((step < 0).argmax())
             raise UserError(f'{self._where}: time runs backwards: {seconds(stamps[i + 1])} comes '
                             f'after {seconds(stamps[i])}')
-        last = np.append(step > 0, True)[:len(stamps)]
-        self._stamp_ns, self._value = stamps[last], values[last]
+        is_last = np.append(step > 0, True)[:len(stamps)]
+        self._stamp_ns, self._value = stamps[is_last], values[is_last]
         if len(self._stamp_ns) > 1:
             self._period_ns = float(np.median(np.diff(self._stamp_ns)))
-        self._compare(max(known - 2, 0))
+        self._compare(compared)
 
     def _compare(self, start: int) -> None:
         """Compare each message after `start` with the line between its neighbours."""
-        x = (self._stamp_ns[start:] - self._stamp_ns[start:start + 1]).astype(float)
-        y = self._value[start:]
-        if len(x) < 3:
+        time_ns = (self._stamp_ns[start:] - self._stamp_ns[start:start + 1]).astype(float)
+        value = self._value[start:]
+        if len(time_ns) < 3:
             return
-        share = (x[1:-1] - x[:-2]) / (x[2:] - x[:-2])
-        miss = y[1:-1] - (y[:-2] + share * (y[2:] - y[:-2]))
-        self._square_sum += float(miss @ miss)
-        self._square_count += len(miss)
+        share = (time_ns[1:-1] - time_ns[:-2]) / (time_ns[2:] - time_ns[:-2])
+        residual = value[1:-1] - (value[:-2] + share * (value[2:] - value[:-2]))
+        self._square_sum += float(residual @ residual)
+        self._square_count += len(residual)
 
-    def at(self, stamp_ns: np.ndarray) -> np.ndarray:
-        """Return the reference at ascending stamps, ns, (n,): (n,), NaN where it is not known."""
+    def interpolate(self, stamp_ns: np.ndarray) -> np.ndarray:
+        """Return the reference at ascending stamps, ns, (n,): (n,), NaN where it is unknown."""
         if not len(self._stamp_ns):
             return np.full(len(stamp_ns), np.nan)
-        here = (stamp_ns - self._stamp_ns[0]).astype(float)
-        there = (self._stamp_ns - self._stamp_ns[0]).astype(float)
-        value = np.interp(here, there, self._value)
-        known = (here >= -self._period_ns) & (here <= there[-1] + self._period_ns)
-        value[~known] = np.nan
-        if known.any():
-            after = np.searchsorted(there, here[known]).clip(1, max(len(there) - 1, 1))
-            nearest = np.minimum(np.abs(here[known] - there[after - 1]),
-                                 np.abs(here[known] - there[after.clip(max=len(there) - 1)]))
-            self._gap_ns = max(self._gap_ns, int(nearest.max()))
+        sample_ns = (stamp_ns - self._stamp_ns[0]).astype(float)
+        message_ns = (self._stamp_ns - self._stamp_ns[0]).astype(float)
+        value = np.interp(sample_ns, message_ns, self._value)
+        is_known = ((sample_ns >= -self._period_ns)
+                    & (sample_ns <= message_ns[-1] + self._period_ns))
+        value[~is_known] = np.nan
+        if is_known.any():
+            self._gap_ns = max(self._gap_ns, _largest_gap_ns(sample_ns[is_known], message_ns))
         return value
 
     def forget(self, stamp_ns: int) -> None:
-        """Drop what no sample from `stamp_ns` on needs."""
+        """Drop the messages that no sample from `stamp_ns` on needs."""
         start = int(np.searchsorted(self._stamp_ns, stamp_ns)) - 2
         if start > 0:
             self._stamp_ns, self._value = self._stamp_ns[start:], self._value[start:]
 
     @property
-    def gap_s(self) -> float:
-        """Largest time between a sample and the message nearest to it, s."""
-        return self._gap_ns * 1e-9
-
-    @property
-    def residual(self) -> float:
+    def alignment(self) -> Alignment:
         """
-        Residual of the alignment, in the unit of the reference.
+        How well the reference was aligned so far.
 
-        Rms difference between each message and the straight line between the two beside it,
-        which is what interpolation over twice the period misses: a bound for what it misses over
-        one. 0 where every sample has a message with its own stamp, so that none is interpolated.
+        The residual is the rms difference between each message and the straight line between its
+        neighbours. Interpolation over twice the period misses it, so that it bounds the error
+        over one period. It is 0 where every sample has a message with its own stamp.
         """
         if not self._gap_ns or not self._square_count:
-            return 0.0
-        return (self._square_sum / self._square_count) ** 0.5
+            return Alignment(0.0, self._gap_ns * 1e-9)
+        return Alignment((self._square_sum / self._square_count) ** 0.5, self._gap_ns * 1e-9)
+
+
+def _largest_gap_ns(sample_ns: np.ndarray, message_ns: np.ndarray) -> int:
+    """Return the largest time from a sample, ns, (n,), to its nearest message, ns, (k,)."""
+    after = np.searchsorted(message_ns, sample_ns).clip(1, max(len(message_ns) - 1, 1))
+    nearest_ns = np.minimum(np.abs(sample_ns - message_ns[after - 1]),
+                            np.abs(sample_ns - message_ns[after.clip(max=len(message_ns) - 1)]))
+    return int(nearest_ns.max())
 
 
 class Command:
     """
-    One joint's commands over time: each is in force from its stamp to the stamp of the next.
+    Commands of one joint over time: each is in force from its stamp to the stamp of the next.
 
-    Commands are few and far between, so that samples are not held back for them: a command that
-    is read after later samples have been handed on counts from the next sample on.
+    Commands are few and far between, so that no sample waits for them. A command that is read
+    after later samples were handed on counts from the next sample on.
     """
 
     def __init__(self) -> None:
@@ -165,22 +167,22 @@ class Command:
         stamp_ns
             Stamps, ns, (k,), in any order. Of messages with the same stamp the last one counts.
         value
-            Where the joint shall go, (k,); NaN in a message that does not say it.
+            Commanded positions, rad, (k,); NaN in a message without a position of this joint.
 
         """
-        given = ~np.isnan(value)
-        stamps = np.concatenate([self._stamp_ns, stamp_ns[given]])
+        is_given = ~np.isnan(value)
+        stamps = np.concatenate([self._stamp_ns, stamp_ns[is_given]])
         order = np.argsort(stamps, kind='stable')
         self._stamp_ns = stamps[order]
-        self._value = np.concatenate([self._value, value[given]])[order]
+        self._value = np.concatenate([self._value, value[is_given]])[order]
 
-    def at(self, stamp_ns: np.ndarray) -> np.ndarray:
+    def in_force(self, stamp_ns: np.ndarray) -> np.ndarray:
         """Return the command in force at stamps, ns, (n,): (n,), NaN before the first one."""
         return np.concatenate([[np.nan], self._value])[
             np.searchsorted(self._stamp_ns, stamp_ns, 'right')]
 
     def forget(self, stamp_ns: int) -> None:
-        """Drop what no sample from `stamp_ns` on needs."""
+        """Drop the commands that no sample from `stamp_ns` on needs."""
         start = int(np.searchsorted(self._stamp_ns, stamp_ns, 'right')) - 1
         if start > 0:
             self._stamp_ns, self._value = self._stamp_ns[start:], self._value[start:]

@@ -151,7 +151,7 @@ def test_any_serial_has_a_folder_of_its_own(tmp_path, serial):
     assert calibration_store.newer(tmp_path / 'store', sensor) is None
     old = replace(sensor, provenance={'date': '2025-01-02T03:04:05+00:00'})
     assert calibration_store.newer(tmp_path / 'store', old) == path
-    (found, again), = calibration_store.history(tmp_path / 'store', serial)[0]
+    (found, again), = calibration_store.history(tmp_path / 'store', serial).calibrations
     assert found == path and again.serial == serial
 
 

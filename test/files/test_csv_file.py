@@ -186,7 +186,7 @@ def test_a_gap_in_time_is_kept(tmp_path: Path) -> None:
     (f'time_ms,x_v\n{GOOD}', ':1:1: column time_ms is in another unit; expected s'),
     (f'time_s,x_v,temperature_k\n{GOOD}', ':1:3: column temperature_k is in another unit; '
                                           'expected °C'),
-    ('time_s;x_v\n0;1\n', ':1: the columns are parted by semicolons'),
+    ('time_s;x_v\n0;1\n', ':1: the columns are separated by semicolons'),
     (f'{HEADER}\n{GOOD}0.003,2.5x,2,1,1\n', ":5:2: x_v is '2.5x', not a number"),
     (f'{HEADER}\n{GOOD}0.003,2_5,2,1,1\n', ":5:2: x_v is '2_5', not a number"),
     (f'{HEADER}\n\n# remark\n{GOOD}0.003,2.5,2,--,1\n', ":7:4: alpha_rad is '--', not a "),

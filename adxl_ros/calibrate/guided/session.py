@@ -31,7 +31,7 @@ from adxl_ros.calibrate.guided.stage_guide import Sweep
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store
-from adxl_ros.files.atomic_write import clear_left
+from adxl_ros.files.atomic_write import remove_unfinished
 from adxl_ros.files.sweep_journal import (
     accepted_poses,
     Fitted,
@@ -183,7 +183,7 @@ class Session:
         self.unit, self.asked = unit, asked
         self.newest = Newest(unit)
         self.journal = Journal(asked.journal, asked.head(unit), anew)
-        self._clear_left()
+        self._remove_unfinished()
         self._fitted: list[PoseRecord] = []
         self._unchecked = any(isinstance(entry, MountingUnchecked)
                               for entry in self.journal.entries)
@@ -193,7 +193,7 @@ class Session:
                           skipped_poses(self.journal.entries)) if targets else \
             Tumble(unit, asked.settings.temperature_span_c, accepted)
 
-    def _clear_left(self) -> None:
+    def _remove_unfinished(self) -> None:
         """Clear what a kill within a write has left."""
         asked = self.asked
         places = [(path.parent, path.name) for path in (asked.output, asked.journal)]
@@ -202,7 +202,7 @@ class Session:
         if asked.store:
             places.append((calibration_store.unit_folder(asked.store, self.unit.serial), ''))
         for folder, name in places:
-            clear_left(folder, name)
+            remove_unfinished(folder, name)
 
     @property
     def done(self) -> int:

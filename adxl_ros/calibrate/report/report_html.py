@@ -107,7 +107,8 @@ def write(folder: str | os.PathLike, result: CalibrationResult,
         matplotlib is not installed, or a file cannot be written.
 
     """
-    past = calibration_store.history(store, result.fitted.serial)[0] if str(store) else []
+    past = calibration_store.history(store, result.fitted.serial).calibrations \
+        if str(store) else []
     _write_page(Path(folder) / 'report.html', result, [sensor for _, sensor in past])
     # Where the poses do not suffice for the figures of the paper, the page states why.
     with suppress(UserError):
@@ -163,7 +164,7 @@ def _summary(result: CalibrationResult) -> str:
     fitted = result.fitted
     assessment = next((row for row in result.assessments if row.model == fitted.model), None)
     if assessment is None:
-        return ('<p class="said open">Too few poses were held out to assess this calibration. '
+        return ('<p class="summary open">Too few poses were held out to assess this calibration. '
                 'Take more poses.</p>')
     beyond = beyond_datasheet(fitted)
     outcomes = {
@@ -187,7 +188,7 @@ def _summary(result: CalibrationResult) -> str:
     lines += [f'Beyond the datasheet: {line}.' for line in beyond]
     shown = ' '.join(outcomes.values())
     kind = 'bad' if FAIL in shown else 'open' if NOT_SHOWN in shown else 'good'
-    return f'<p class="said {kind}">' + '<br>'.join(map(escape, lines)) + '</p>'
+    return f'<p class="summary {kind}">' + '<br>'.join(map(escape, lines)) + '</p>'
 
 
 def _with_interval(statistic: ErrorStatistic) -> str:

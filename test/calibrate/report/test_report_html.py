@@ -79,7 +79,7 @@ def reported(tmp_path_factory):
         '--seed', '5', '-o', 'sweep.csv')
     run('fit', 'sweep.csv', '--model', 'physical', '-o', 'unit.yaml', '--store', 'store',
         '--report', 'first')
-    (path, sensor), = calibration_store.history(folder / 'store', '<U&7>')[0]
+    (path, sensor), = calibration_store.history(folder / 'store', '<U&7>').calibrations
     path.unlink()
     bias = sensor.values['bias']['offset_v'] - [0.004, 0.0]
     old = replace(sensor, values={**sensor.values, 'bias': {'offset_v': bias}}, provenance={
