@@ -380,7 +380,7 @@ CUT_IMU = bytes(STORE.serialize_cdr(imu(T[1]).message, IMU))[:100]
      ': topic /imu/data_raw: message 2, stamped 1750000000.124456789 s: linear_acceleration.z is '
      '1e+38 m/s²'),
     ([imu(T[0], variance=(-1, 0, 0))],
-     ': topic /imu/data_raw: says that it has no linear acceleration'),
+     ': topic /imu/data_raw: states no linear acceleration'),
     ([imu(T[0], variance=(1, 1e6, 1))],
      ': topic /imu/data_raw: linear_acceleration_covariance gives the axes xz'),
     ([imu(T[0]), Sent('/imu/data_raw', IMU, T[1], raw=CUT_IMU)],
