@@ -64,6 +64,27 @@ def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
         shutil.rmtree(folder, ignore_errors=True)
 
 
+def write_text(path: str | os.PathLike, text: str) -> None:
+    """
+    Write a text file, UTF-8, as a whole or not at all.
+
+    Parameters
+    ----------
+    path
+        The file, replaced if it exists.
+    text
+        Its content.
+
+    Raises
+    ------
+    UserError
+        The file cannot be written.
+
+    """
+    with atomic_path(path) as fresh:
+        fresh.write_text(text, encoding='utf-8')
+
+
 def remove_unfinished(folder: str | os.PathLike, name: str) -> None:
     """
     Remove the unfinished files of writers that were killed.

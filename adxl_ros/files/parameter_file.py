@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import Any
 
 from adxl_ros.errors import UserError
-from adxl_ros.files.atomic_write import atomic_path
+from adxl_ros.files.atomic_write import write_text
 from adxl_ros.model.coefficients import names_of, neutral
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Coefficient, Effect, Parameter, Role
@@ -198,8 +198,7 @@ def save(path: str | os.PathLike, sensor: Sensor, comments: Iterable[str] = ()) 
         branch[leaf] = value
     text = yaml.dump({'/**': {'ros__parameters': tree}}, Dumper=_Dumper, sort_keys=False,
                      default_flow_style=None, width=99, allow_unicode=True)
-    with atomic_path(path) as fresh:
-        fresh.write_text(''.join(f'# {line}\n' for line in comments) + text, encoding='utf-8')
+    write_text(path, ''.join(f'# {line}\n' for line in comments) + text)
 
 
 class _Dumper(yaml.SafeDumper):

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The command-line tools: argument parsing and progress."""
+"""The command-line tools: arguments, progress and messages."""
 
 from adxl_ros.blas_threads import use_one_thread
 

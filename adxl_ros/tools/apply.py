@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Correct a recording by its parameter file: acceleration and tilt, from the sensor alone."""
+"""Correct a recording by a parameter file: acceleration and tilt from the sensor alone."""
 
 from __future__ import annotations
 
@@ -33,12 +33,14 @@ from adxl_ros.model.constants import AXES
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import NOMINAL_ENVIRONMENT
 from adxl_ros.model.sensor import Sensor, with_axes
-from adxl_ros.tools.common import progress, run, say_notes
+from adxl_ros.tools.common import progress, report_reading, run
 import numpy as np
 
 _BLOCK_ROWS = 16384
+"""Samples that are corrected at a time (chosen: some MB)."""
+
 _DIGITS = 12
-"""Of an estimate: a millionth of the noise at least."""
+"""Significant digits of an estimate (chosen: a millionth of the noise, or finer)."""
 
 
 def parser() -> argparse.ArgumentParser:
@@ -48,10 +50,11 @@ def parser() -> argparse.ArgumentParser:
     parse.add_argument('--params', metavar='FILE', default=None,
                        help='the calibrated sensor (default: the nominal sensor)')
     parse.add_argument('--inverse', choices=('exact', 'paper'), default='exact',
-                       help="of the model: exact, or the paper's approximation (14) to (21)")
+                       help="exact inverse of the model, or the paper's approximation (14) to (21)")
     parse.add_argument('--undo-filter', action='store_true',
-                       help='take the RC filter out, amplitude and phase, for what moves')
-    parse.add_argument('-o', dest='output', metavar='OUT.csv', required=True)
+                       help='undo the RC filter, amplitude and phase, for a sensor that moves')
+    parse.add_argument('-o', dest='output', metavar='OUT.csv', required=True,
+                       help='acceleration and tilt, with standard deviations')
     return parse
 
 
@@ -71,11 +74,11 @@ def apply(options: argparse.Namespace) -> int:
             at_rail += int(estimates.at_rail.sum())
             show(block.done)
     _report(unsolved, rows, 'have no solution: their cells are empty')
-    _report(outside, rows, 'lie outside of what was calibrated (temperature or force): their '
+    _report(outside, rows, 'lie outside of the validity range (temperature or force): their '
             'standard deviations are raised')
     _report(at_rail, rows, 'have the ADC at its rail: their standard deviations are inf')
     if block is not None:
-        say_notes('apply', block)
+        report_reading('apply', block)
     return 0
 
 
@@ -94,28 +97,30 @@ def _estimated(options: argparse.Namespace, sensor: Sensor
 
 
 def _of_unit(block: Recording, sensor: Sensor) -> Sensor:
+    """Return the sensor with the axes of the recording; refuse that of another unit."""
     if not sensor.effects:
         sensor = with_axes(sensor, block.axes)
     check_unit(block.stream_info, block.axes, sensor)
     return sensor
 
 
-def _report(count: int, rows: int, what: str) -> None:
+def _report(count: int, rows: int, statement: str) -> None:
     if count:
-        print(f'apply: {count} of {rows} samples {what}', file=sys.stderr)
+        print(f'apply: {count} of {rows} samples {statement}', file=sys.stderr)
 
 
 def _report_effects(block: Recording, sensor: Sensor, undo_filter: bool) -> None:
     """Name the effects that are not undone, or undone for nominal surroundings."""
-    left = effects_left(sensor, undo_filter)
+    not_undone = effects_left(sensor, undo_filter)
     for effect in map(effect_named, sensor.effects):
-        if effect in left:
-            print(f'apply: {effect.name} is not undone: no single sample tells it',
+        if effect in not_undone:
+            print(f'apply: {effect.name} is not undone: a single sample does not determine it',
                   file=sys.stderr)
         for name in effect.follows:
             if name != 'time_s' and not np.isfinite(block.columns.get(name, np.nan)).all():
-                print(f'apply: {block.path}: {name} is not there or has gaps: {effect.name} is '
-                      f'taken at {getattr(NOMINAL_ENVIRONMENT, name):g} there', file=sys.stderr)
+                print(f'apply: {block.path}: {name} is missing or has gaps: {effect.name} is '
+                      f'undone for {getattr(NOMINAL_ENVIRONMENT, name):g} there',
+                      file=sys.stderr)
 
 
 def _columns(estimates: Estimates) -> dict[str, np.ndarray]:

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What every tool shares: how it ends, its default sensor, and its progress."""
+"""What the tools share: exit status, messages about recordings, and progress."""
 
 from __future__ import annotations
 
@@ -31,20 +31,20 @@ from adxl_ros.files.recording_columns import Recording
 
 def run(parser: argparse.ArgumentParser, command: Callable[[argparse.Namespace], int]) -> int:
     """
-    Parse the command line and run a tool; return its exit status.
+    Parse the command line and run a tool.
 
     Parameters
     ----------
     parser
-        Ends the process with status 2 on wrong usage.
+        The tool's arguments. It ends the process with status 2 on wrong usage.
     command
-        The tool; it may raise `UserError`.
+        The tool, which returns its exit status; it may raise `UserError`.
 
     Returns
     -------
     int
-        What the tool returns, 1 with one line on stderr if it could not do what was asked, 130
-        after Ctrl-C.
+        The exit status: that of the tool, 1 after an error (one line on stderr), 130 after
+        Ctrl-C.
 
     """
     signal.signal(signal.SIGTERM, _terminated)
@@ -58,25 +58,25 @@ def run(parser: argparse.ArgumentParser, command: Callable[[argparse.Namespace],
         print(f'{parser.prog}: interrupted; nothing was written', file=sys.stderr)
         return 130
     except BrokenPipeError:
-        # The reader of stdout has seen enough; Python must not complain when it flushes at exit.
+        # The reader of stdout has ended; Python must not report that when it flushes at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     return status
 
 
 def _terminated(number: int, frame: FrameType | None) -> None:
-    """End by an exception, so that files begun are removed on the way out."""
+    """End by an exception, so that unfinished files are removed."""
     sys.exit(128 + number)
 
 
 def make_folder(folder: Path) -> None:
     """
-    Make a folder for what a tool leaves.
+    Create a folder for the output of a tool, if it does not exist.
 
     Raises
     ------
     UserError
-        It cannot be made.
+        The folder cannot be created.
 
     """
     try:
@@ -85,25 +85,25 @@ def make_folder(folder: Path) -> None:
         raise UserError(f'{folder}: cannot be made: {error.strerror}') from None
 
 
-def say_notes(tool: str, read: Recording) -> None:
+def report_reading(tool: str, recording: Recording) -> None:
     """
-    Tell on stderr what reading a recording showed: where it was cut, how well it is aligned.
+    Report on stderr where a recording is cut, and how well its references are aligned.
 
     Parameters
     ----------
     tool
-        Who says it.
-    read
+        Name of the tool, for the message.
+    recording
         The recording, or its last block.
 
     """
-    if read.cut:
-        print(f'{tool}: {read.cut}', file=sys.stderr)
-    for name, alignment in read.alignments.items():
-        # References with the sensor's own stamps need no alignment.
+    if recording.cut:
+        print(f'{tool}: {recording.cut}', file=sys.stderr)
+    for name, alignment in recording.alignments.items():
+        # References with the stamps of the samples need no alignment.
         if alignment.gap_s:
             unit = {'rad': 'rad', 'm': 'm', 'c': 'degC', 'v': 'V'}[name.rsplit('_', 1)[1]]
-            print(f'{tool}: {read.path}: {name} aligned by its stamps: residual '
+            print(f'{tool}: {recording.path}: {name} aligned by its stamps: residual '
                   f'{alignment.residual:.3g} {unit} rms, nearest message at most '
                   f'{alignment.gap_s:.3g} s away', file=sys.stderr)
 
@@ -111,12 +111,12 @@ def say_notes(tool: str, read: Recording) -> None:
 @contextmanager
 def progress(title: str) -> Iterator[Callable[[float], None]]:
     """
-    Show a bar on a terminal, where rich is installed; else nothing.
+    Show a progress bar on a terminal where rich is installed, else nothing.
 
     Yields
     ------
     callable
-        Takes the fraction that is done.
+        Takes the fraction that is done, 0 to 1.
 
     """
     try:

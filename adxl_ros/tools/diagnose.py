@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Find where a recording differs from the simulator, and which effect causes it."""
+"""Find where a recording differs from its simulation, and which effects cause it."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from adxl_ros.diagnose import report_html, report_json
 from adxl_ros.diagnose.diagnosis import diagnose as diagnose_recordings
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file, recording
-from adxl_ros.files.atomic_write import atomic_path
+from adxl_ros.files.atomic_write import write_text
 from adxl_ros.simulate.from_recording import motion_from_force
-from adxl_ros.tools.common import make_folder, progress, run, say_notes
+from adxl_ros.tools.common import make_folder, progress, report_reading, run
 
 
 def parser() -> argparse.ArgumentParser:
@@ -38,9 +38,10 @@ def parser() -> argparse.ArgumentParser:
                        help='what the simulator models (default: the nominal sensor)')
     parse.add_argument('--sim', metavar='RECORDING',
                        help='ideal specific force of the same manoeuvre by another simulator')
-    parse.add_argument('--seed', type=int, default=0, help='of bootstraps (default 0)')
+    parse.add_argument('--seed', type=int, default=0, help='seed of the bootstraps (default 0)')
     parse.add_argument('--json', action='store_true', help='print the report as JSON')
-    parse.add_argument('-o', dest='output', metavar='DIR', required=True)
+    parse.add_argument('-o', dest='output', metavar='DIR', required=True,
+                       help='report.json, report.html and params.yaml')
     return parse
 
 
@@ -56,25 +57,20 @@ def diagnose(options: argparse.Namespace) -> int:
     recordings = []
     for path in options.recording:
         recordings.append(recording.read(path))
-        say_notes('diagnose', recordings[-1])
+        report_reading('diagnose', recordings[-1])
     with progress('diagnose') as show:
         diagnosis = diagnose_recordings(recordings, sensor, sim, options.seed, show)
     folder = Path(options.output)
     make_folder(folder)
     text = json.dumps(report_json.as_json(diagnosis), indent=1, allow_nan=False) + '\n'
-    _write(folder / 'report.json', text)
-    _write(folder / 'report.html', report_html.page(diagnosis, ', '.join(
+    write_text(folder / 'report.json', text)
+    write_text(folder / 'report.html', report_html.page(diagnosis, ', '.join(
         Path(path).name for path in options.recording)))
     lines = report_json.terminal_lines(diagnosis)
     if diagnosis.sensor is not None:
         parameter_file.save(folder / 'params.yaml', diagnosis.sensor, lines)
     print(text if options.json else '\n'.join(lines))
     return 0
-
-
-def _write(path: Path, text: str) -> None:
-    with atomic_path(path) as fresh:
-        Path(fresh).write_text(text, encoding='utf-8')
 
 
 def main() -> int:

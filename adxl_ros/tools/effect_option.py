@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Effects as the command line states them: NAME[:key=value,...]."""
+"""Effects of the command line: NAME[:key=value,...]."""
 
 from __future__ import annotations
 
@@ -27,26 +27,32 @@ from adxl_ros.model.effects.base import Coefficient, Effect, Parameter
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
-SYNTAX = ('NAME alone takes typical values; KEY=VALUE sets a parameter for all its axes, '
-          'KEY.AXIS=VALUE for one; those that are not named are neutral')
+SYNTAX = ('NAME alone has typical values; KEY=VALUE sets a parameter for all its axes, '
+          'KEY.AXIS=VALUE for one axis; parameters without a value are neutral')
+"""What an option may be, for help texts."""
 
 
 def with_effects(sensor: Sensor, texts: Sequence[str]) -> Sensor:
     """
-    Add effects, or change their parameters, as the command line states them.
+    Add effects to a sensor, or change their parameters.
 
     Parameters
     ----------
     sensor
-        The effects of its parameter file stay.
+        The sensor of the parameter file; its effects stay.
     texts
-        One an option `--effect`.
+        The options `--effect`, one text each.
+
+    Returns
+    -------
+    Sensor
+        The sensor with the effects.
 
     Raises
     ------
     UserError
-        Unknown effect, parameter or axis (the nearest is suggested), no number, out of bounds,
-        or stated twice.
+        An effect, parameter or axis is unknown (the nearest name is suggested), a value is no
+        number or out of bounds, or a parameter is stated twice.
 
     """
     stated: dict[Coefficient, str] = {}
@@ -55,15 +61,15 @@ def with_effects(sensor: Sensor, texts: Sequence[str]) -> Sensor:
         effect = _effect(name, text)
         if not rest:
             values = coefficients.typical(effect, sensor.axes)
-            sensor = _with(sensor, effect, values)
+            sensor = _with_values(sensor, effect, values)
         for part in filter(None, rest.split(',')):
-            key, _, figure = part.partition('=')
+            key, _, number = part.partition('=')
             coefficient = Coefficient(name, *key.strip().split('.', 1))
             if coefficient in stated:
-                raise UserError(f'--effect {text}: {key} of {name} is stated twice, in '
-                                f'{stated[coefficient]}, too; keep one')
+                raise UserError(f'--effect {text}: {key} of {name} is stated twice, also in '
+                                f'{stated[coefficient]}; keep one')
             stated[coefficient] = text
-            sensor = _set(sensor, effect, key.strip(), figure.strip(), text)
+            sensor = _with_value(sensor, effect, key.strip(), number.strip(), text)
     return sensor
 
 
@@ -74,28 +80,29 @@ def _effect(name: str, text: str) -> Effect:
         raise UserError(f'--effect {text}: {error}') from None
 
 
-def _with(sensor: Sensor, effect: Effect, values: dict[str, np.ndarray]) -> Sensor:
+def _with_values(sensor: Sensor, effect: Effect, values: dict[str, np.ndarray]) -> Sensor:
     effects = sensor.effects if effect.name in sensor.effects else (*sensor.effects, effect.name)
     return replace(sensor, effects=effects, values={**sensor.values, effect.name: values})
 
 
-def _set(sensor: Sensor, effect: Effect, key: str, figure: str, text: str) -> Sensor:
+def _with_value(sensor: Sensor, effect: Effect, key: str, number: str, text: str) -> Sensor:
+    """Set one parameter, for all its axes or one; `text` is the option, for messages."""
     name, _, axis = key.partition('.')
     parameter = _parameter(effect, name, text)
-    value = _number(parameter, figure, text)
+    value = _number(parameter, number, text)
     values = dict(sensor.values.get(effect.name) or coefficients.neutral(effect, sensor.axes))
     if not parameter.axes:
         if axis:
-            raise UserError(f'--effect {text}: {name} is one figure without axes; write '
-                            f'{name}={figure}')
-        return _with(sensor, effect, {**values, name: np.array(value)})
+            raise UserError(f'--effect {text}: {name} is one number without axes; write '
+                            f'{name}={number}')
+        return _with_values(sensor, effect, {**values, name: np.array(value)})
     chosen = [i for i, a in enumerate(sensor.axes) if a in parameter.axes and axis in ('', a)]
     if not chosen:
         raise UserError(f'--effect {text}: no axis {axis!r} to act on; the sensor has '
                         f'{sensor.axes}, {name} acts on {parameter.axes}')
     changed = np.array(values[name], float)
     changed[chosen] = value
-    return _with(sensor, effect, {**values, name: changed})
+    return _with_values(sensor, effect, {**values, name: changed})
 
 
 def _parameter(effect: Effect, name: str, text: str) -> Parameter:
@@ -107,11 +114,11 @@ def _parameter(effect: Effect, name: str, text: str) -> Parameter:
     return by_name[name]
 
 
-def _number(parameter: Parameter, figure: str, text: str) -> float:
+def _number(parameter: Parameter, number: str, text: str) -> float:
     try:
-        value = float(figure)
+        value = float(number)
     except ValueError:
-        raise UserError(f'--effect {text}: {figure!r} is not a number; {parameter.name} is in '
+        raise UserError(f'--effect {text}: {number!r} is not a number; {parameter.name} is in '
                         f'{parameter.unit}, written without the unit') from None
     if not parameter.lower <= value <= parameter.upper:
         raise UserError(f'--effect {text}: {value:g} {parameter.unit} is outside '

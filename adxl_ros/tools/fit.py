@@ -26,8 +26,7 @@ from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store, parameter_file, recording, sweep_journal
 from adxl_ros.files.checksum import sha256
 from adxl_ros.files.stream_unit import recorded_unit
-from adxl_ros.model.sensor import Sensor
-from adxl_ros.tools.common import make_folder, run, say_notes
+from adxl_ros.tools.common import make_folder, report_reading, run
 
 
 def parser() -> argparse.ArgumentParser:
@@ -36,21 +35,22 @@ def parser() -> argparse.ArgumentParser:
     parse.add_argument('recording', nargs='+',
                        help='rosbag2 directory, .mcap or CSV, all of one unit')
     parse.add_argument('--params', metavar='FILE', default=None,
-                       help='figures that are not fitted (default: the nominal sensor)')
+                       help='values that are not fitted (default: the nominal sensor)')
     parse.add_argument('--model', choices=list(calibration.STAGE_FITS),
-                       help='against stage angles (default: the richest that the poses '
-                            'determine); a three-axis recording without them is '
+                       help='model to fit to stage angles (default: the richest that the poses '
+                            'determine); a three-axis recording without angles is '
                             'calibrated against gravity')
     parse.add_argument('--effect', metavar='NAME', action='append', default=[],
-                       help='an effect more for the full model to find')
+                       help='a further effect that the full model fits')
     parse.add_argument('--journal', metavar='FILE',
-                       help='use the rests that the journal of this very run names')
-    parse.add_argument('-o', dest='output', metavar='FILE.yaml', required=True)
+                       help='use the rests that the journal of this sweep names')
+    parse.add_argument('-o', dest='output', metavar='FILE.yaml', required=True,
+                       help='the parameter file of the calibrated sensor')
     parse.add_argument('--report', metavar='DIR',
-                       help='leave a page there, report.html, and the figures')
+                       help='write the page report.html and its plots there')
     parse.add_argument('--store', metavar='DIR', default=str(calibration_store.default_folder()),
-                       help="the folder of all units' calibrations, which gets a copy (default: "
-                            '%(default)s); empty for none')
+                       help='the calibration store, which gets a copy (default: %(default)s); '
+                            'empty for none')
     return parse
 
 
@@ -61,28 +61,29 @@ def fit(options: argparse.Namespace) -> int:
                         f'{len(options.recording)} are given')
     sensor = parameter_file.load(options.params or parameter_file.nominal_path())
     records = _records(options.journal)
-    unit: Sensor | None = None
+    unit = sensor
     parts, filters = [], []
     for path in options.recording:
         read = recording.read(path)
-        say_notes('fit', read)
-        unit = recorded_unit(unit or sensor, read)
+        report_reading('fit', read)
+        unit = recorded_unit(unit, read)
         parts.append(pose_extraction.extract_poses(read, unit, records))
         filters.append(pose_extraction.estimate_filters(read, unit, parts[-1]))
-    found = calibration.calibrate(unit, parts, options.model,
-                                  [Path(path).name for path in options.recording],
-                                  options.effect, filters, sha256(options.recording))
+    result = calibration.calibrate(unit, parts, options.model,
+                                   [Path(path).name for path in options.recording],
+                                   options.effect, filters, sha256(options.recording))
     if options.report:
         make_folder(Path(options.report))
-        report_html.write(options.report, found, options.store)
-    found.save(options.output)
-    kept = found.keep(options.store)
-    print('\n'.join(found.comments()))
+        report_html.write(options.report, result, options.store)
+    result.save(options.output)
+    kept = result.keep(options.store)
+    print('\n'.join(result.comments()))
     print(f'fit: {kept}', file=sys.stderr)
     return 0
 
 
 def _records(path: str | None) -> list[sweep_journal.PoseRecord] | None:
+    """Return the poses that a journal names; None without a journal."""
     return None if path is None else sweep_journal.poses_to_fit(sweep_journal.read(path).entries)
 
 

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The paper's experiments on simulated units, or its calibration of recordings."""
+"""Repeat the paper's experiments on simulated units, or its calibration on recordings."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from adxl_ros.calibrate import calibration, pose_extraction, provenance
 from adxl_ros.calibrate.report import plots as sweep_figures, report_html
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file, recording
-from adxl_ros.files.atomic_write import atomic_path
+from adxl_ros.files.atomic_write import write_text
 from adxl_ros.files.stream_unit import recorded_unit
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.reproduction import coverage, experiments, plots, report_page, scoring, units
 from adxl_ros.reproduction.report_page import FIGURES
-from adxl_ros.tools.common import make_folder, progress, run, say_notes
+from adxl_ros.tools.common import make_folder, progress, report_reading, run
 import numpy as np
 
 
@@ -41,14 +41,15 @@ def parser() -> argparse.ArgumentParser:
     parse.add_argument('recording', nargs='*',
                        help='sweeps of one unit; without any, units are simulated')
     parse.add_argument('--params', metavar='FILE', default=None,
-                       help='figures that units are drawn about, or one unit with its effects '
+                       help='values about which units are drawn, or one unit with its effects '
                             '(default: the nominal sensor)')
-    parse.add_argument('--seed', type=int, default=0)
-    parse.add_argument('--units', type=int, default=20, help='how many are drawn')
+    parse.add_argument('--seed', type=int, default=0, help='seed of the units (default 0)')
+    parse.add_argument('--units', type=int, default=20, help='units that are drawn (default 20)')
     parse.add_argument('--draws', type=int, default=0,
-                       help='units and stages more that are drawn to check the intervals '
+                       help='further units and stages that check the intervals '
                             '(default: none; 300 take about a minute on two cores)')
-    parse.add_argument('-o', dest='output', metavar='DIR', required=True)
+    parse.add_argument('-o', dest='output', metavar='DIR', required=True,
+                       help='reproduction.md and its plots')
     return parse
 
 
@@ -65,10 +66,9 @@ def reproduce(options: argparse.Namespace) -> int:
     make_folder(folder / FIGURES)
     text = _of_recordings(sensor, options.recording, folder) if options.recording \
         else _simulated(sensor, options, folder)
-    with atomic_path(folder / 'reproduction.md') as fresh:
-        Path(fresh).write_text(text, encoding='utf-8')
+    write_text(folder / 'reproduction.md', text)
     print(text.split('## Figures')[0].strip())
-    print(f'\n{folder / "reproduction.md"} and its figures are written')
+    print(f'\nWrote {folder / "reproduction.md"} and its plots.')
     return 0
 
 
@@ -76,12 +76,12 @@ def _of_recordings(sensor: Sensor, paths: Sequence[str], folder: Path) -> str:
     unit, parts = sensor, []
     for path in paths:
         read = recording.read(path)
-        say_notes('reproduce', read)
+        report_reading('reproduce', read)
         unit = recorded_unit(unit, read)
         parts.append(pose_extraction.extract_poses(read, unit))
-    found = calibration.calibrate(unit, parts, 'full', [Path(path).name for path in paths])
-    report_html.draw(folder / FIGURES / 'sweep.png', found)
-    lines = '\n'.join(found.comments())
+    result = calibration.calibrate(unit, parts, 'full', [Path(path).name for path in paths])
+    report_html.draw(folder / FIGURES / 'sweep.png', result)
+    lines = '\n'.join(result.comments())
     return (f"# The paper's calibration of {', '.join(paths)}\n\n```\n{lines}\n```\n\n"
             f'The paper: alpha {report_page.in_words("alpha")}; '
             f'beta {report_page.in_words("beta")}.\n\n'
@@ -95,22 +95,22 @@ def _simulated(sensor: Sensor, options: argparse.Namespace, folder: Path) -> str
     if not options.units:
         return coverage_part
     with progress('reproduce') as show:
-        found = units.judge_all(sensor, options.units, options.seed, show)
+        results = units.judge_all(sensor, options.units, options.seed, show)
     first = 1000 * options.seed
     truth = experiments.draw(sensor, experiments.PAPER, np.random.default_rng([first, 0]))
     unit = experiments.calibrated(truth, first)
     pictures = folder / FIGURES
     sweep_figures.draw_sweep(pictures / 'sweep.png', experiments.bare(truth),
                              unit.fitted['physical'], unit.poses)
-    plots.draw_misalignment(pictures / 'misalignment.png', found['paper'][0].directions)
-    plots.draw_tilt(pictures / 'tilt.png', found['paper'][0])
+    plots.draw_misalignment(pictures / 'misalignment.png', results['paper'][0].directions)
+    plots.draw_tilt(pictures / 'tilt.png', results['paper'][0])
     plots.draw_motion(pictures / 'motion.png', unit.fitted, experiments.shaken(truth, first))
     plots.draw_components(pictures / 'components.png', truth, unit.fitted['physical'],
                           unit.fitted['linear'])
     drawn = 'one unit' if sensor.effects else f'{options.units} units'
     made = (f'adxl_ros {provenance.package_version()}, {date.today()}, {drawn} on each stage, '
             f'seed {options.seed}.')
-    return report_page.page(found, scoring.motion_bound_mmps2(sensor), made, coverage_part)
+    return report_page.page(results, scoring.motion_bound_mmps2(sensor), made, coverage_part)
 
 
 def _coverage(sensor: Sensor, options: argparse.Namespace) -> str:

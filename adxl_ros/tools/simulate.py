@@ -12,14 +12,14 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Simulate a recording: a manoeuvre and effects in, what sensor and encoder say out."""
+"""Simulate a recording of a manoeuvre by a sensor with effects."""
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
 import sys
@@ -35,12 +35,48 @@ from adxl_ros.simulate.from_recording import motion_from_force, motion_from_refe
 from adxl_ros.simulate.motion import Motion
 from adxl_ros.simulate.response import Response
 from adxl_ros.simulate.trajectories import TRAJECTORIES
-from adxl_ros.tools.common import progress, run, say_notes
+from adxl_ros.tools.common import progress, report_reading, run
 from adxl_ros.tools.effect_option import SYNTAX, with_effects
 import numpy as np
 
-_BLOCK = 32768
-Taker = Callable[[simulator.Columns], None]
+_BLOCK_ROWS = 32768
+"""Samples that are simulated at a time (chosen: some MB)."""
+
+_MIN_RATE_HZ = 0.01
+"""Lowest sample rate, Hz, as in a parameter file."""
+
+_MAX_RATE_HZ = 1e5
+"""Highest sample rate, Hz, as in a parameter file."""
+
+_MIN_INTERNAL_RATE_HZ = 1000.0
+"""Lowest rate of the simulation before the sampling, Hz: slow samples still see the motion."""
+
+Output = Callable[[simulator.Columns], None]
+"""Takes a block of simulated samples."""
+
+
+@dataclass(frozen=True)
+class _Run:
+    """
+    A simulation to be carried out.
+
+    Attributes
+    ----------
+    sensor
+        The sensor, at its sample rate.
+    begin_s
+        Time of the first sample, s.
+    duration_s
+        Time from the first to the last sample, s.
+    blocks
+        The samples.
+
+    """
+
+    sensor: Sensor
+    begin_s: float
+    duration_s: float
+    blocks: Iterator[simulator.Columns]
 
 
 def parser() -> argparse.ArgumentParser:
@@ -50,9 +86,9 @@ def parser() -> argparse.ArgumentParser:
     parse = argparse.ArgumentParser(
         prog='simulate', description=__doc__, formatter_class=argparse.RawTextHelpFormatter,
         epilog=f'trajectories:\n{about}\n'
-               '  imu         Feel the specific force of --force: ax_mps2, ay_mps2, az_mps2 or\n'
-               '              sensor_msgs/Imu, of any simulator.\n'
-               '  RECORDING   Follow the stage angles of a recording again, at its stamps.')
+               '  imu         Apply the specific force of --force: ax_mps2, ay_mps2, az_mps2 or\n'
+               '              sensor_msgs/Imu, from any simulator.\n'
+               '  RECORDING   Follow the stage angles of a recording, at its stamps.')
     parse.add_argument('trajectory', metavar='TRAJECTORY',
                        help=f'{", ".join(TRAJECTORIES)}, imu, or a recording')
     parse.add_argument('--params', metavar='FILE', default=None,
@@ -62,17 +98,40 @@ def parser() -> argparse.ArgumentParser:
     parse.add_argument('--force', metavar='RECORDING',
                        help='specific force for the trajectory imu')
     parse.add_argument('--rate', type=float, metavar='HZ', help='sample rate')
-    parse.add_argument('--seed', type=int, default=0, help='of noise and manoeuvre (default 0)')
+    parse.add_argument('--seed', type=int, default=0,
+                       help='seed of noise and manoeuvre (default 0)')
     parse.add_argument('--port', metavar='PATH',
-                       help='be a board: send the samples in real time to a terminal device, or\n'
-                       'to a new pseudo-terminal of this name')
+                       help='act as a board: send the samples in real time to a terminal device,\n'
+                       'or to a new pseudo-terminal of this name')
     parse.add_argument('-o', dest='output', metavar='RECORDING',
-                       help='.csv, .mcap or a rosbag2 directory (with --port: not needed)')
+                       help='.csv, .mcap or a rosbag2 directory (optional with --port)')
     return parse
 
 
 def simulate(options: argparse.Namespace) -> int:
     """Run the tool; see `parser`."""
+    _check(options)
+    sensor = parameter_file.load(options.params or parameter_file.nominal_path())
+    if options.rate is not None:
+        sensor = replace(sensor, rate_hz=options.rate)
+    simulation = _run(with_effects(sensor, options.effect), options)
+    with ExitStack() as stack:
+        outputs: list[Output] = []
+        if options.port:
+            outputs.append(_BoardOutput(stack, simulation.sensor, options.port))
+        if options.output:
+            outputs.append(_FileOutput(stack, simulation.sensor, options.output))
+        show = stack.enter_context(progress('simulate'))
+        for columns in simulation.blocks:
+            for output in outputs:
+                output(columns)
+            elapsed_s = columns['time_s'][-1] - simulation.begin_s
+            show(min(elapsed_s / max(simulation.duration_s, 1e-9), 1.0))
+    return 0
+
+
+def _check(options: argparse.Namespace) -> None:
+    """Refuse wrong usage."""
     if options.trajectory not in (*TRAJECTORIES, 'imu') and not Path(options.trajectory).exists():
         near = get_close_matches(options.trajectory, [*TRAJECTORIES, 'imu'], 1)
         parser().error(f'{options.trajectory}: neither a trajectory nor a recording'
@@ -80,97 +139,97 @@ def simulate(options: argparse.Namespace) -> int:
                        f'{", ".join(TRAJECTORIES)}, imu')
     if not options.output and not options.port:
         parser().error('the following arguments are required: -o, or --port')
-    sensor = parameter_file.load(options.params or parameter_file.nominal_path())
-    if options.rate is not None:
-        if not 0.01 <= options.rate <= 1e5:
-            raise UserError(f'--rate {options.rate:g}: outside 0.01 to 100000 Hz')
-        sensor = replace(sensor, rate_hz=options.rate)
+    if options.rate is not None and not _MIN_RATE_HZ <= options.rate <= _MAX_RATE_HZ:
+        raise UserError(f'--rate {options.rate:g}: outside {_MIN_RATE_HZ:g} to '
+                        f'{_MAX_RATE_HZ:g} Hz')
     if options.seed < 0:
         raise UserError(f'--seed {options.seed}: must be 0 or more')
     for path in filter(None, (options.trajectory, options.force)):
         if options.output and Path(path).resolve() == Path(options.output).resolve():
             raise UserError(f'{options.output}: is the input itself; choose another output')
-    sensor = with_effects(sensor, options.effect)
-    sensor, duration_s, begin_s, blocks = _run(sensor, options)
-    with ExitStack() as stack:
-        takers = []
-        if options.port:
-            takers.append(_sender(stack, sensor, options.port))
-        if options.output:
-            takers.append(_writer(stack, sensor, str(options.output)))
-        show = stack.enter_context(progress('simulate'))
-        for columns in blocks:
-            for take in takers:
-                take(columns)
-            show(min((columns['time_s'][-1] - begin_s) / max(duration_s, 1e-9), 1.0))
-    return 0
-
-
-def _writer(stack: ExitStack, sensor: Sensor, path: str) -> Taker:
-    write = stack.enter_context(recording.writer(path, sensor))
-
-    def take(columns: simulator.Columns) -> None:
-        others = {name: values for name, values in columns.items() if name != 'time_s'}
-        write(Recording(path, columns['time_s'], others, sensor_info(sensor)))
-
-    return take
-
-
-def _sender(stack: ExitStack, sensor: Sensor, port: str) -> Taker:
-    emulated_board.check_sensor(sensor)
-    fd = stack.enter_context(emulated_board.open_terminal(port))
-    sending: list[emulated_board.Board] = []
-
-    def take(columns: simulator.Columns) -> None:
-        if not sending:
-            roles = emulated_board.roles_of(sensor, columns)
-            sending.append(emulated_board.Board(sensor, roles, fd))
-            command = emulated_board.driver_command(port, roles)
-            print(f'simulate: sending: {command}', file=sys.stderr)
-        sending[0].send(columns)
-
-    return take
-
-
-def _run(sensor: Sensor, options: argparse.Namespace
-         ) -> tuple[Sensor, float, float, Iterator[simulator.Columns]]:
-    """Return the sensor at its rate, how long it runs from when, and the blocks."""
-    name = options.trajectory
-    if (name == 'imu') != bool(options.force):
-        raise UserError('--force RECORDING goes with the trajectory imu, and imu with it: '
+    if (options.trajectory == 'imu') != bool(options.force):
+        raise UserError('--force RECORDING and the trajectory imu need each other: '
                         'simulate imu --force RECORDING')
-    if name == 'imu':
-        motion, begin_s = motion_from_force(options.force, options.rate is None)
-        if options.rate is None:
-            sensor = replace(sensor, rate_hz=motion.internal_rate_hz)
-            motion = replace(motion, internal_rate_hz=max(sensor.rate_hz, 1000.0))
-        blocks = simulator.simulate_blocks(sensor, motion, options.seed, begin_s)
-        return sensor, motion.duration_s, begin_s, blocks
-    if name in TRAJECTORIES:
-        motion = TRAJECTORIES[name](np.random.default_rng(options.seed))
-        blocks = simulator.simulate_blocks(sensor, motion, options.seed)
-        return sensor, motion.duration_s, 0.0, blocks
-    read = recording.read(name)
-    say_notes('simulate', read)
+
+
+class _FileOutput:
+    """Writes samples to a recording."""
+
+    def __init__(self, stack: ExitStack, sensor: Sensor, path: str) -> None:
+        self._write = stack.enter_context(recording.writer(path, sensor))
+        self._path, self._info = path, sensor_info(sensor)
+
+    def __call__(self, columns: simulator.Columns) -> None:
+        others = {name: values for name, values in columns.items() if name != 'time_s'}
+        self._write(Recording(self._path, columns['time_s'], others, self._info))
+
+
+class _BoardOutput:
+    """Sends samples as an emulated board does."""
+
+    def __init__(self, stack: ExitStack, sensor: Sensor, port: str) -> None:
+        emulated_board.check_sensor(sensor)
+        self._sensor, self._port = sensor, port
+        self._descriptor = stack.enter_context(emulated_board.open_terminal(port))
+        self._board: emulated_board.Board | None = None
+
+    def __call__(self, columns: simulator.Columns) -> None:
+        if self._board is None:
+            roles = emulated_board.roles_of(self._sensor, columns)
+            self._board = emulated_board.Board(self._sensor, roles, self._descriptor)
+            command = emulated_board.driver_command(self._port, roles)
+            print(f'simulate: sending: {command}', file=sys.stderr)
+        self._board.send(columns)
+
+
+def _run(sensor: Sensor, options: argparse.Namespace) -> _Run:
+    if options.trajectory == 'imu':
+        return _simulate_force(sensor, options)
+    if options.trajectory in TRAJECTORIES:
+        motion = TRAJECTORIES[options.trajectory](np.random.default_rng(options.seed))
+        return _Run(sensor, 0.0, motion.duration_s,
+                    simulator.simulate_blocks(sensor, motion, options.seed))
+    return _simulate_recording(sensor, options)
+
+
+def _simulate_force(sensor: Sensor, options: argparse.Namespace) -> _Run:
+    """Apply the specific force of another simulator, at its rate or another."""
+    motion, begin_s = motion_from_force(options.force, options.rate is None)
+    if options.rate is None:
+        sensor = replace(sensor, rate_hz=motion.internal_rate_hz)
+        motion = replace(motion,
+                         internal_rate_hz=max(sensor.rate_hz, _MIN_INTERNAL_RATE_HZ))
+    return _Run(sensor, begin_s, motion.duration_s,
+                simulator.simulate_blocks(sensor, motion, options.seed, begin_s))
+
+
+def _simulate_recording(sensor: Sensor, options: argparse.Namespace) -> _Run:
+    """Follow the references of a recording, at its stamps or at another rate."""
+    read = recording.read(options.trajectory)
+    report_reading('simulate', read)
     motion = motion_from_references(read, sensor)
-    begin_s, end_s = float(read.time_s[0]), float(read.time_s[-1])
+    begin_s = float(read.time_s[0])
+    duration_s = float(read.time_s[-1]) - begin_s
     if options.rate is not None:
-        return sensor, end_s - begin_s, begin_s, simulator.simulate_blocks(
-            sensor, replace(motion, duration_s=end_s - begin_s), options.seed, begin_s)
+        motion = replace(motion, duration_s=duration_s)
+        return _Run(sensor, begin_s, duration_s,
+                    simulator.simulate_blocks(sensor, motion, options.seed, begin_s))
     sensor = replace(sensor, rate_hz=read.rate_hz)
-    return sensor, end_s - begin_s, begin_s, _again(sensor, motion, read, options.seed)
+    return _Run(sensor, begin_s, duration_s,
+                _at_stamps(sensor, motion, read, options.seed))
 
 
-def _again(sensor: Sensor, motion: Motion, read: Recording, seed: int
-           ) -> Iterator[simulator.Columns]:
-    """Sample at the stamps of a recording, beside its own references."""
-    respond = Response(sensor, motion, seed, float(read.time_s[0]))
-    for begin in range(0, len(read), _BLOCK):
-        part = slice(begin, begin + _BLOCK)
-        volts = respond(read.time_s[part])
+def _at_stamps(sensor: Sensor, motion: Motion, read: Recording, seed: int
+               ) -> Iterator[simulator.Columns]:
+    """Sample at the stamps of a recording, and yield its own references with the samples."""
+    response = Response(sensor, motion, seed, float(read.time_s[0]))
+    references = [name for name in REFERENCES if name in read.columns]
+    for begin in range(0, len(read), _BLOCK_ROWS):
+        part = slice(begin, begin + _BLOCK_ROWS)
+        volts = response(read.time_s[part])
         yield {'time_s': read.time_s[part],
                **{f'{axis}_v': volts[:, d] for d, axis in enumerate(sensor.axes)},
-               **{name: read.columns[name][part] for name in REFERENCES if name in read.columns}}
+               **{name: read.columns[name][part] for name in references}}
 
 
 def main() -> int:

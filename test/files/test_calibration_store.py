@@ -118,7 +118,7 @@ def test_apply_says_what_lies_outside(run_tool, swept_csv, tmp_path):
     (tmp_path / 'run.csv').write_text(f'{head}\ntime_s,x_v,y_v,temperature_c\n{rows}\n')
     done = run_tool('apply', 'run.csv', '--params', 'u.yaml', '-o', 'out.csv')
     assert done.returncode == 0
-    assert '2 of 4 samples lie outside of what was calibrated' in done.stderr
+    assert '2 of 4 samples lie outside of the validity range' in done.stderr
     out = np.genfromtxt(tmp_path / 'out.csv', delimiter=',', names=True)['ax_std_mps2']
     sensor = parameter_file.load(tmp_path / 'u.yaml')
     off_k = 60 - sensor.envelope.temperature_c[1] - 2
