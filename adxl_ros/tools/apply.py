@@ -50,7 +50,8 @@ def parser() -> argparse.ArgumentParser:
     parse.add_argument('--params', metavar='FILE', default=None,
                        help='the calibrated sensor (default: the nominal sensor)')
     parse.add_argument('--inverse', choices=('exact', 'paper'), default='exact',
-                       help="exact inverse of the model, or the paper's approximation (14) to (21)")
+                       help="inverse of the model: exact (default), or the paper's approximation, "
+                            'equations 14 to 21')
     parse.add_argument('--undo-filter', action='store_true',
                        help='undo the RC filter, amplitude and phase, for a sensor that moves')
     parse.add_argument('-o', dest='output', metavar='OUT.csv', required=True,

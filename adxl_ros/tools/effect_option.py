@@ -27,8 +27,8 @@ from adxl_ros.model.effects.base import Coefficient, Effect, Parameter
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
-SYNTAX = ('NAME alone has typical values; KEY=VALUE sets a parameter for all its axes, '
-          'KEY.AXIS=VALUE for one axis; parameters without a value are neutral')
+SYNTAX = ('NAME alone has typical values,\nKEY=VALUE sets a parameter for all its axes, '
+          'KEY.AXIS=VALUE for one;\nparameters without a value are neutral')
 """What an option may be, for help texts."""
 
 
