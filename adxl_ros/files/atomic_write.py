@@ -46,22 +46,25 @@ def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
 
     """
     target = Path(path)
+    folder = ''
+    # The directory is created within the block, so that a signal at any time removes it.
     try:
-        folder = Path(tempfile.mkdtemp(_SUFFIX, f'.{target.name}.', target.parent or '.'))
-    except OSError as error:
-        raise UserError(f'{target}: cannot write into {target.parent}: {error.strerror}; '
-                        'choose a directory that exists and can be written') from None
-    fresh = folder / target.name
-    try:
-        with _locked(folder):
+        try:
+            folder = tempfile.mkdtemp(_SUFFIX, f'.{target.name}.', target.parent)
+        except OSError as error:
+            raise UserError(f'{target}: cannot write into {target.parent}: {error.strerror}; '
+                            'choose a directory that exists and can be written') from None
+        fresh = Path(folder, target.name)
+        with _locked(Path(folder)):
             yield fresh
             _sync_tree(fresh)
-            _exchange(fresh, target, folder)
+            _exchange(fresh, target, Path(folder))
             sync(target.parent)
     except OSError as error:
         raise UserError(f'{target}: cannot write: {error.strerror or error}') from None
     finally:
-        shutil.rmtree(folder, ignore_errors=True)
+        if folder:
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 def write_text(path: str | os.PathLike, text: str) -> None:
