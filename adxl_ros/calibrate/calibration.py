@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The outcome of a calibration: the sensor, the verdict and the words for people."""
+"""Calibration of a unit from poses: fit, assessment, provenance, and its report."""
 
 from __future__ import annotations
 
@@ -53,31 +53,54 @@ import numpy as np
 
 STAGE_FITS = {'linear': linear.fit, 'physical': paper_regression.fit, 'full': term_selection.fit}
 """Models that are fitted against the stage, simplest first."""
+_SAME_FIT_TOLERANCE = 1e-6
+"""Relative difference up to which coefficients are those of the same fit: rounding in a file."""
+
+
+@dataclass(frozen=True)
+class RecordedPoses:
+    """
+    Poses of one recording.
+
+    Attributes
+    ----------
+    source
+        Name of the recording, for messages and the provenance.
+    poses
+        Its poses, with angles or without.
+    filters
+        Estimate of the output filter of each axis; empty where there is none.
+
+    """
+
+    source: str
+    poses: Poses
+    filters: Sequence[FilterNoise | None] = ()
 
 
 @dataclass(frozen=True)
 class CalibrationResult:
     """
-    A fitted sensor and what is known of it.
+    A calibrated unit with its assessment.
 
     Attributes
     ----------
     nominal, fitted
-        The unit as it was stated and as it is.
+        The unit before and after the fit.
     report_lines
-        How good it is, line by line.
+        Assessment as text.
     summary_lines
-        The same for a terminal of 80 columns, what matters most first.
+        Assessment as text for a terminal of 80 columns, the most important lines first.
     poses
-        What it was made of and judged by.
+        k poses, check poses among them.
     assessments
-        Acceptance of each model, the one that was taken last.
+        Acceptance of each model; the last one is that of `fitted`.
     held_out
         Errors of the models on held-out poses, the nominal sensor first.
     gravity_fit
-        Of a calibration against gravity.
+        The fit of a calibration against gravity.
     outliers
-        Numbers of the poses that were left out as disturbed.
+        Indices of the poses that were left out as disturbed.
 
     """
 
@@ -92,73 +115,76 @@ class CalibrationResult:
     outliers: tuple[int, ...] = ()
 
     def comments(self) -> list[str]:
-        """Lay out coefficients and verdict for people: the head of the parameter file."""
-        return [*coefficients(self.fitted), '', *self.report_lines]
+        """Return coefficients and assessment as text: the head of the parameter file."""
+        return [*coefficient_lines(self.fitted), '', *self.report_lines]
 
     def save(self, path: str | os.PathLike) -> None:
         """
-        Write the parameter file, whole or not at all; one that it replaces is kept beside it.
+        Write the parameter file atomically; a file of another fit becomes NAME.previous.
 
         Parameters
         ----------
         path
-            The file; an older one of another fit becomes NAME.previous.
+            The file.
 
         Raises
         ------
         UserError
-            It cannot be written; the older one is as it was.
+            The file cannot be written. The previous file is unchanged.
 
         """
-        # A finish that was cut short and comes again must not push out the one before.
+        # A session that ends twice must not replace the previous calibration by its own.
         if not self._is_in(path):
             keep_previous(path)
         parameter_file.save(path, self.fitted, self.comments())
 
     def keep(self, folder: str | os.PathLike) -> str:
         """
-        Keep a copy in the store, and say in a line where it is, or why there is none.
-
-        A store that cannot be written is no reason to lose a calibration that is saved.
+        Copy the calibration to the store. A store that cannot be written raises no error.
 
         Parameters
         ----------
         folder
             The store; empty for none.
 
+        Returns
+        -------
+        str
+            One line with the path, or with the reason why there is no copy.
+
         """
         if not str(folder):
             return 'not kept in a store'
         stored = calibration_store.history(folder, self.fitted.serial).calibrations
+        existing = [path for path, _ in stored if self._is_in(path)]
         try:
-            path = next(filter(self._is_in, (path for path, _ in stored)), None) or \
+            path = existing[0] if existing else \
                 calibration_store.put(folder, self.fitted, self.comments())
         except UserError as error:
             return f'no copy in the store: {error}'
         return f'kept as {path}' if path else \
-            f'not kept in {folder}: the serial number {NO_UNIT} is no unit ' \
-            'in particular'
+            f'not kept in {folder}: the serial number {NO_UNIT} names no unit'
 
     def _is_in(self, path: str | os.PathLike) -> bool:
-        """Tell whether a file holds this very fit: the same data, model and coefficients."""
+        """Return whether a file holds this fit: the same data, model and coefficients."""
         try:
-            there = parameter_file.load(path)
+            saved = parameter_file.load(path)
         except UserError:
             return False
-        names, own = self.fitted.covariance_names, self.fitted
-        return (there.model, there.effects, there.covariance_names) == (
-            own.model, own.effects, names) and \
-            there.provenance.get('data_sha256') == own.provenance['data_sha256'] and \
-            bool(np.allclose(get(there, names), get(own, names), rtol=1e-6))
+        fitted, names = self.fitted, self.fitted.covariance_names
+        return (saved.model, saved.effects, saved.covariance_names) == (
+            fitted.model, fitted.effects, names) and \
+            saved.provenance.get('data_sha256') == fitted.provenance['data_sha256'] and \
+            bool(np.allclose(get(saved, names), get(fitted, names), rtol=_SAME_FIT_TOLERANCE))
 
     @property
     def name(self) -> str:
-        """Name the unit and where its poses come from."""
+        """Return the serial number and the sources of the poses."""
         return f'{self.fitted.serial} ({self.fitted.provenance["source"]})'
 
     @property
     def inliers(self) -> np.ndarray:
-        """Tell the poses that were not knocked, which `held_out` counts, (k,)."""
+        """Mark the poses that are no outliers, which `held_out` counts, (k,) bool."""
         return ~np.isin(np.arange(len(self.poses)), self.outliers)
 
     @property
@@ -168,29 +194,28 @@ class CalibrationResult:
             paper_regression.fit(self.nominal, self.poses.subset(~self.poses.check))
 
 
-def calibrate(sensor: Sensor, parts: Sequence[Poses], model: str | None,
-              sources: Sequence[str], effects: Sequence[str] = (),
-              filters: Sequence[Sequence[FilterNoise | None]] = (),
-              data_sha256: str = '') -> CalibrationResult:
+def calibrate(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str | None = None,
+              effects: Sequence[str] = (), data_sha256: str = '') -> CalibrationResult:
     """
-    Fit the poses of one unit: against the stage where there are angles, else gravity.
+    Fit the poses of one unit: against the stage where there are angles, else against gravity.
 
     Parameters
     ----------
     sensor
         The nominal sensor of the unit.
-    parts
-        Its rests by recording, with angles or without.
+    recordings
+        Poses of each recording.
     model
-        'linear', 'physical' or 'full'; None is the richest that the poses determine.
-    sources
-        Where the poses come from, by recording, for messages and the provenance.
+        'linear', 'physical' or 'full'. None is the richest model that the poses determine.
     effects
-        What the full model is to hold beside its terms.
-    filters
-        What the noise says of the filter, by recording and axis, for the full model.
+        Further terms of the full model.
     data_sha256
-        Of the recordings' files; empty takes the hash of the poses.
+        Hash of the recordings' files. Empty takes the hash of the poses.
+
+    Returns
+    -------
+    CalibrationResult
+        The calibrated unit with its assessment.
 
     Raises
     ------
@@ -198,13 +223,14 @@ def calibrate(sensor: Sensor, parts: Sequence[Poses], model: str | None,
         The poses do not determine the model, or the recordings contradict each other.
 
     """
-    poses, source = join_poses(list(parts)), ', '.join(sources)
+    poses = join_poses([recording.poses for recording in recordings])
+    source = ', '.join(recording.source for recording in recordings)
     if np.isfinite(poses.alpha_rad).all():
         model = model or ('full' if effects else None)
-        return _against_stage(sensor, parts, model, sources, effects, filters, data_sha256)
+        return _against_stage(sensor, recordings, model, effects, data_sha256)
     if model not in (None, 'full'):
         raise UserError(f'{source}: the {model} model is fitted against stage angles (alpha_rad '
-                        'and beta_rad), which are not there; leave --model out to calibrate a '
+                        'and beta_rad), which are missing; leave --model out to calibrate a '
                         'three-axis sensor against gravity')
     if sensor.axes != 'xyz':
         raise UserError(f'{source}: no stage angles and only the axes {sensor.axes}: the '
@@ -212,135 +238,187 @@ def calibrate(sensor: Sensor, parts: Sequence[Poses], model: str | None,
     return _against_gravity(sensor, poses, source, data_sha256)
 
 
-def _against_stage(sensor: Sensor, parts: Sequence[Poses], model: str | None,
-                   sources: Sequence[str], effects: Sequence[str],
-                   filters: Sequence[Sequence[FilterNoise | None]], data_sha256: str
-                   ) -> CalibrationResult:
-    poses = join_poses(list(parts))
-    check_polarity(sensor, poses)
-    fitting = poses.subset(~poses.check)
-    refusals: list[str] = []
-    for name in ([model] if model else reversed(STAGE_FITS)):
-        try:
-            found = _fit(name, sensor, fitting, parts, sources, effects)
-            break
-        except UserError as error:
-            if name in (model, 'linear'):
-                raise
-            refusals.append(f'not {name}: {error}')
-    fitted = found.fitted
-    simpler = list(STAGE_FITS)[:list(STAGE_FITS).index(fitted.model)]
-    # What was knocked says nothing of the models.
-    knocked = tuple(np.flatnonzero(~poses.check)[list(found.full.outliers)].tolist()) \
-        if found.full else ()
-    sound = poses.subset(~np.isin(np.arange(len(poses)), knocked))
-    # What the full model found of the stage is no error of the sensor, by any model.
-    stage = found.full.unit if found.full else None
-    held_out = cross_validation.cross_validate({'nominal': lambda sensor, _: sensor,
-                                                **{name: STAGE_FITS[name] for name in simpler},
-                                                fitted.model: found.fit}, sensor, sound, stage)
-    assessments = tuple(
-        acceptance.assess(errors.model, error_budget.error_budgets(errors, sound, stage), sensor)
-        for errors in held_out if errors.model != 'nominal')
-    predicted = np.column_stack(signal_chain.static_response(fitted)(
-        reference_force(fitting, fitted.local_gravity_mps2), fitting.environment))
-    residual = (fitting.volts - predicted) / fitted.scale_v_per_g * 1e3
-    said = found.said
-    if fitted.model == 'full':
-        fitted, more = with_filter(fitted, filters)
-        said = [*said, *more]
-    own = [row for row in assessments if row.model == fitted.model]
-    force = np.column_stack(reference_force(poses, fitted.local_gravity_mps2))
-    error_mps2 = np.nan_to_num(np.sqrt(own[0].accel.calibration)).item() if own else 0.0
-    fitted = replace(fitted, envelope=envelope(fitted, force, poses, error_mps2))
-    fitted = with_provenance(fitted, ', '.join(sources), poses, data_sha256, {
-        'reference': 'stage', 'residual_mg': f'{np.sqrt(np.mean(residual ** 2)):.4f}',
-        **({'converged': _yes(found.full.converged)} if found.full else {}),
-        **acceptance.provenance_entries(own[0] if own else None, held_out)})
-    words, unit = acceptance.explanation(own[0], fitted) if own else [], \
-        acceptance.unit_line(fitted)
-    lines = [*refusals, *cross_validation.table(held_out),
-             *acceptance.table(assessments, held_out),
-             *words, *unit, *said]
-    brief = [*acceptance.headline(own[0] if own else None, held_out), *unit,
-             *acceptance.narrow_table(assessments, held_out), *words, *said, *refusals]
-    return CalibrationResult(sensor, fitted, lines, brief, poses, assessments, tuple(held_out),
-                             None, knocked)
-
-
-def _fit(model: str, sensor: Sensor, fitting: Poses, parts: Sequence[Poses],
-         sources: Sequence[str], effects: Sequence[str]) -> _Found:
-    """Fit one model; the full one with the terms more that poses held out ask for."""
-    if model != 'full':
-        return _Found(STAGE_FITS[model](sensor, fitting), STAGE_FITS[model], [])
-    found, terms = term_selection.fit_selected(sensor, fitting, effects)
-    if len(parts) > 1:
-        require_one_mounting(found, parts, sources)
-    lines = full_fit_text.report_lines(found, fitting, terms)
-    return _Found(found.fitted, lambda sensor, poses: term_selection.fit_selected(
-        sensor, poses, effects).full.fitted, lines, found)
-
-
 @dataclass(frozen=True)
-class _Found:
+class _StageFit:
+    """
+    A fit against the stage.
+
+    Attributes
+    ----------
+    fitted
+        The fitted unit.
+    fit
+        The fit as a function, for cross-validation.
+    report_lines
+        Report of a full fit.
+    refusals
+        Why richer models are not fitted.
+    full
+        The full fit, where it is one.
+
+    """
+
     fitted: Sensor
     fit: cross_validation.Fit
-    said: list[str]
+    report_lines: Sequence[str] = ()
+    refusals: Sequence[str] = ()
     full: FullFit | None = None
+
+
+def _against_stage(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str | None,
+                   effects: Sequence[str], data_sha256: str) -> CalibrationResult:
+    poses = join_poses([recording.poses for recording in recordings])
+    check_polarity(sensor, poses)
+    fit = _richest_fit(sensor, recordings, model, effects)
+    full, fitted = fit.full, fit.fitted
+    fitting = np.flatnonzero(~poses.check)
+    outliers = tuple(fitting[list(full.outliers)].tolist()) if full else ()
+    inliers = poses.subset(~np.isin(np.arange(len(poses)), outliers))
+    # Fitted errors of the stage are no errors of the sensor, for any model.
+    stage = full.unit if full else None
+    models = list(STAGE_FITS)
+    simpler = {name: STAGE_FITS[name] for name in models[:models.index(fitted.model)]}
+    held_out = cross_validation.cross_validate(
+        {'nominal': lambda sensor, _: sensor, **simpler, fitted.model: fit.fit},
+        sensor, inliers, stage)
+    assessments = tuple(
+        acceptance.assess(errors.model, error_budget.error_budgets(errors, inliers, stage), sensor)
+        for errors in held_out if errors.model != 'nominal')
+    assessment = next((row for row in assessments if row.model == fitted.model), None)
+    residual_mg = _rms_residual_mg(fitted, poses.subset(fitting))
+    fit_lines = list(fit.report_lines)
+    if fitted.model == 'full':
+        fitted, filter_lines = with_filter(
+            fitted, [recording.filters for recording in recordings if recording.filters])
+        fit_lines += filter_lines
+    force = np.column_stack(reference_force(poses, fitted.local_gravity_mps2))
+    error_mps2 = np.nan_to_num(np.sqrt(assessment.accel.calibration)).item() if assessment else 0.0
+    fitted = replace(fitted, envelope=envelope(fitted, force, poses, error_mps2))
+    fitted = with_provenance(
+        fitted, ', '.join(recording.source for recording in recordings), poses, data_sha256,
+        {'reference': 'stage', 'residual_mg': f'{residual_mg:.4f}',
+         **({'converged': _yes_or_no(full.converged)} if full else {}),
+         **acceptance.provenance_entries(assessment, held_out)})
+    explanation = acceptance.explanation(assessment, fitted) if assessment else []
+    unit_lines = acceptance.unit_line(fitted)
+    return CalibrationResult(
+        nominal=sensor, fitted=fitted, poses=poses, assessments=assessments,
+        held_out=tuple(held_out), outliers=outliers,
+        report_lines=[*fit.refusals, *cross_validation.table(held_out),
+                      *acceptance.table(assessments, held_out), *explanation, *unit_lines,
+                      *fit_lines],
+        summary_lines=[*acceptance.headline(assessment, held_out), *unit_lines,
+                       *acceptance.narrow_table(assessments, held_out), *explanation,
+                       *fit_lines, *fit.refusals])
+
+
+def _richest_fit(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str | None,
+                 effects: Sequence[str]) -> _StageFit:
+    """Fit the given model, or the richest one that the poses determine."""
+    if model:
+        return _fit(model, sensor, recordings, effects)
+    refusals: list[str] = []
+    for name in reversed(STAGE_FITS):
+        try:
+            return replace(_fit(name, sensor, recordings, effects), refusals=refusals)
+        except UserError as error:
+            if name == 'linear':
+                raise
+            refusals.append(f'not {name}: {error}')
+    raise AssertionError('the linear model returns or raises')
+
+
+def _fit(model: str, sensor: Sensor, recordings: Sequence[RecordedPoses], effects: Sequence[str]
+         ) -> _StageFit:
+    """Fit one model to all poses but the check poses."""
+    poses = join_poses([recording.poses for recording in recordings])
+    poses = poses.subset(~poses.check)
+    if model != 'full':
+        return _StageFit(STAGE_FITS[model](sensor, poses), STAGE_FITS[model])
+
+    def fit_full(sensor: Sensor, poses: Poses) -> Sensor:
+        return term_selection.fit_selected(sensor, poses, effects).full.fitted
+
+    full, terms = term_selection.fit_selected(sensor, poses, effects)
+    if len(recordings) > 1:
+        require_one_mounting(full, [recording.poses for recording in recordings],
+                             [recording.source for recording in recordings])
+    return _StageFit(full.fitted, fit_full, full_fit_text.report_lines(full, poses, terms),
+                     full=full)
+
+
+def _rms_residual_mg(fitted: Sensor, poses: Poses) -> float:
+    predicted = np.column_stack(signal_chain.static_response(fitted)(
+        reference_force(poses, fitted.local_gravity_mps2), poses.environment))
+    residual = (poses.volts - predicted) / fitted.scale_v_per_g * 1e3
+    return float(np.sqrt(np.mean(residual ** 2)))
 
 
 def _against_gravity(sensor: Sensor, poses: Poses, source: str, data_sha256: str
                      ) -> CalibrationResult:
-    found = gravity.fit_gravity(poses.volts, poses.std_v, sensor)
-    kept = np.setdiff1d(np.arange(len(poses)), found.outliers)
-    before, after, out = (_rms_mg(values[kept]) for values in (
-        found.before_mps2, found.residual_mps2, found.leave_one_out_mps2))
-    lines = [f'magnitude of gravity over {len(kept)} rests, rms in mg: nominal {before:.2f}, '
-             f'nine parameters {after:.3f}, leave-one-out {out:.3f}']
-    if not found.converged:
-        lines.append(full_fit_text.NOT_CONVERGED)
-    if found.outliers:
-        named = ', '.join(f'{i + 1} (from {poses.time_s[i, 0]:.1f} s)' for i in found.outliers)
-        lines.append(f'left out, disturbed: rest {named}')
+    fit = gravity.fit_gravity(poses.volts, poses.std_v, sensor)
+    kept = np.setdiff1d(np.arange(len(poses)), fit.outliers)
+    before, after, leave_one_out = (_rms_mg(values[kept]) for values in (
+        fit.before_mps2, fit.residual_mps2, fit.leave_one_out_mps2))
     fitted = replace(
         sensor, model='gravity', effects=('bias', 'scale_factor', 'misalignment'),
-        values=found.values, covariance=found.covariance, covariance_names=gravity.NAMES)
+        values=fit.values, covariance=fit.covariance, covariance_names=gravity.NAMES)
     force = np.column_stack(signal_chain.inverse(fitted)(list(poses.volts.T), poses.environment))
-    budgets = error_budget.gravity_error_budgets(found, fitted, force, kept)
-    own = acceptance.assess('gravity', budgets, fitted)
+    budgets = error_budget.gravity_error_budgets(fit, fitted, force, kept)
+    assessment = acceptance.assess('gravity', budgets, fitted)
     fitted = replace(fitted, envelope=envelope(fitted, force[kept], poses,
                                                float(np.sqrt(budgets.accel.model))))
     fitted = with_provenance(fitted, source, poses, data_sha256, {
-        'reference': 'gravity', 'residual_mg': f'{after:.4f}', 'leave_one_out_mg': f'{out:.4f}',
-        'converged': _yes(found.converged),
-        **acceptance.provenance_entries(own, ())})
-    lines += [acceptance.gravity_line(own, found.leave_one_out_mps2[kept]),
-              *acceptance.explanation(own, fitted), *acceptance.unit_line(fitted)]
-    return CalibrationResult(sensor, fitted, lines, [*acceptance.headline(own, ()), *lines], poses,
-                             (own,), (), found)
+        'reference': 'gravity', 'residual_mg': f'{after:.4f}',
+        'leave_one_out_mg': f'{leave_one_out:.4f}', 'converged': _yes_or_no(fit.converged),
+        **acceptance.provenance_entries(assessment, ())})
+    lines = [f'magnitude of gravity over {len(kept)} rests, rms in mg: nominal {before:.2f}, '
+             f'nine parameters {after:.3f}, leave-one-out {leave_one_out:.3f}',
+             *_gravity_fit_lines(fit, poses),
+             acceptance.gravity_line(assessment, fit.leave_one_out_mps2[kept]),
+             *acceptance.explanation(assessment, fitted), *acceptance.unit_line(fitted)]
+    return CalibrationResult(
+        nominal=sensor, fitted=fitted, poses=poses, assessments=(assessment,), gravity_fit=fit,
+        report_lines=lines, summary_lines=[*acceptance.headline(assessment, ()), *lines])
 
 
-def coefficients(sensor: Sensor) -> list[str]:
-    """Lay out the fitted coefficients with their 90 % intervals."""
-    std = dict(zip(sensor.covariance_names, np.sqrt(np.diag(sensor.covariance))))
-    lines = [f'{sensor.serial}: {sensor.model} model, coefficient +- half of its 90 % interval']
-    absolute = {('bias', 'offset_v'): ('zero-g', sensor.zero_g_v),
-                ('scale_factor', 'offset_v_per_g'): ('scale factor', sensor.scale_v_per_g)}
-    for effect, of_effect in sensor.values.items():
-        units = {p.name: p.unit for p in effect_named(effect).parameters}
-        for parameter, values in of_effect.items():
-            label, shown = absolute.get((effect, parameter), (f'{effect}.{parameter}', values))
-            ends = list(sensor.axes) if np.ndim(values) else ['']
-            entries = [f'{axis} {value:.6g} +- {Z_90 * std[key]:.2g}'.lstrip()
-                       for axis, value in zip(ends, np.ravel(shown))
-                       if (key := Coefficient(effect, parameter, axis)) in std]
-            if entries:
-                lines.append(f'  {label:34} {"   ".join(entries)} {units[parameter]}')
+def _gravity_fit_lines(fit: gravity.GravityFit, poses: Poses) -> list[str]:
+    lines = [] if fit.converged else [full_fit_text.NOT_CONVERGED]
+    if fit.outliers:
+        rests = ', '.join(f'{i + 1} (from {poses.time_s[i, 0]:.1f} s)' for i in fit.outliers)
+        lines.append(f'left out, disturbed: rest {rests}')
     return lines
 
 
-def _yes(whether: bool) -> str:
-    return 'yes' if whether else 'no'
+def coefficient_lines(sensor: Sensor) -> list[str]:
+    """Return the fitted coefficients with their 90 % intervals as text."""
+    std = dict(zip(sensor.covariance_names, np.sqrt(np.diag(sensor.covariance))))
+    lines = [f'{sensor.serial}: {sensor.model} model, coefficient +- half of its 90 % interval']
+    for effect in sensor.values:
+        for parameter in effect_named(effect).parameters:
+            if parameter.name not in sensor.values[effect]:
+                continue
+            label, values = _labelled(sensor, effect, parameter.name)
+            axes = list(sensor.axes) if np.ndim(values) else ['']
+            names = [Coefficient(effect, parameter.name, axis) for axis in axes]
+            entries = [f'{name.axis} {value:.6g} +- {Z_90 * std[name]:.2g}'.lstrip()
+                       for name, value in zip(names, np.ravel(values)) if name in std]
+            if entries:
+                lines.append(f'  {label:34} {"   ".join(entries)} {parameter.unit}')
+    return lines
+
+
+def _labelled(sensor: Sensor, effect: str, parameter: str) -> tuple[str, np.ndarray]:
+    """Return label and values of a parameter; zero-g and scale factor are absolute."""
+    if (effect, parameter) == ('bias', 'offset_v'):
+        return 'zero-g', sensor.zero_g_v
+    if (effect, parameter) == ('scale_factor', 'offset_v_per_g'):
+        return 'scale factor', sensor.scale_v_per_g
+    return f'{effect}.{parameter}', sensor.values[effect][parameter]
+
+
+def _yes_or_no(condition: bool) -> str:
+    return 'yes' if condition else 'no'
 
 
 def _rms_mg(values_mps2: np.ndarray) -> float:

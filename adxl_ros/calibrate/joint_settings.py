@@ -43,11 +43,12 @@ from adxl_ros.model.sensor import Sensor
 import numpy as np
 
 ENCODER_STEPS = 1.5
-"""An encoder has moved beyond so many of its steps: it flickers by one at the edge of a step."""
+"""An encoder has moved beyond this many of its steps. Chosen: it flickers by one step at the edge
+of a step."""
 COMMAND_RAD = 1e-9
-"""Commands that differ by less are the same, rad: rounding of a message is no command."""
-_KEPT = 20_000
-"""So many of the newest readings stay in memory; of older readings the extremes stay."""
+"""Commands that differ by less are equal, rad. Chosen: above the rounding of a message."""
+_MAX_READINGS = 20_000
+"""Largest count of the newest readings in memory; of older readings the extremes remain."""
 
 
 def angle_tolerance_rad(sensor: Sensor) -> float:
@@ -58,7 +59,7 @@ def angle_tolerance_rad(sensor: Sensor) -> float:
 def encoder_moved(low_rad: np.ndarray, high_rad: np.ndarray, mean_rad: np.ndarray,
                   tolerance_rad: float) -> np.ndarray:
     """
-    Tell whether the encoder has moved between poses; never where it is not known.
+    Return whether the encoder has moved between poses; False without readings.
 
     Parameters
     ----------
@@ -70,13 +71,18 @@ def encoder_moved(low_rad: np.ndarray, high_rad: np.ndarray, mean_rad: np.ndarra
     tolerance_rad
         From `angle_tolerance_rad`.
 
+    Returns
+    -------
+    ndarray
+        True where the joint has moved, of the same shape.
+
     """
     return np.fmax(high_rad - mean_rad, mean_rad - low_rad) > tolerance_rad
 
 
 def command_moved(low_rad: np.ndarray, high_rad: np.ndarray, held_rad: np.ndarray) -> np.ndarray:
     """
-    Tell whether the command has moved between poses.
+    Return whether the command has moved between poses.
 
     Parameters
     ----------
@@ -85,6 +91,11 @@ def command_moved(low_rad: np.ndarray, high_rad: np.ndarray, held_rad: np.ndarra
         was given.
     held_rad
         Command in force at the earlier pose, rad, of the same shape; NaN before the first one.
+
+    Returns
+    -------
+    ndarray
+        True where the command has moved, of the same shape.
 
     """
     changed = np.fmax(high_rad - held_rad, held_rad - low_rad) > COMMAND_RAD
@@ -106,12 +117,17 @@ def recorded_settings(rests: np.ndarray, readings_rad: np.ndarray | None,
     tolerance_rad
         From `angle_tolerance_rad`.
 
+    Returns
+    -------
+    ndarray
+        Numbers from 0 in the order of time, (k,) int.
+
     """
     order = np.argsort(rests[:, 0], kind='stable')
     start, stop = rests[order].T
     moved = np.zeros(max(len(start) - 1, 0), bool)
     if readings_rad is not None and len(moved):
-        mean = np.array([_mean_of_finite(readings_rad[a:b]) for a, b in zip(start, stop)])
+        mean = np.array([mean_of_finite(readings_rad[a:b]) for a, b in zip(start, stop)])
         low, high = _extremes(readings_rad, (start + stop) // 2)
         moved |= encoder_moved(np.fmin(low, mean[1:]), np.fmax(high, mean[1:]),
                                _last_finite(mean)[:-1], tolerance_rad)
@@ -143,7 +159,8 @@ def _last_finite(values: np.ndarray) -> np.ndarray:
     return np.where(last < 0, np.nan, values[last])
 
 
-def _mean_of_finite(values: np.ndarray) -> float:
+def mean_of_finite(values: np.ndarray) -> float:
+    """Return the mean of the finite values; NaN without any."""
     finite = values[np.isfinite(values)]
     return float(finite.mean()) if finite.size else float('nan')
 
@@ -173,11 +190,31 @@ class SettingTracker:
         self._unseen = True
 
     def read(self, stamp_ns: int, alpha_rad: float, beta_rad: float) -> None:
-        """Take an encoder reading."""
+        """
+        Add an encoder reading.
+
+        Parameters
+        ----------
+        stamp_ns
+            Its stamp, ns.
+        alpha_rad, beta_rad
+            Angles, rad.
+
+        """
         self._readings.add(stamp_ns, (alpha_rad, beta_rad))
 
     def command(self, stamp_ns: int, alpha_rad: float, beta_rad: float) -> None:
-        """Take a command, in force from its stamp on; NaN for a joint not commanded."""
+        """
+        Add a command, which is in force from its stamp on.
+
+        Parameters
+        ----------
+        stamp_ns
+            Its stamp, ns.
+        alpha_rad, beta_rad
+            Angles, rad; NaN for a joint that is not commanded.
+
+        """
         before = self._commands.newest
         new = tuple(a if np.isfinite(a) else b for a, b in zip((alpha_rad, beta_rad), before))
         if new != before:
@@ -205,6 +242,11 @@ class SettingTracker:
         alpha_rad, beta_rad
             Its mean angles, rad.
 
+        Returns
+        -------
+        tuple
+            Numbers of the settings of alpha and beta.
+
         """
         middle_ns, mean = (start_ns + stop_ns) // 2, np.array([alpha_rad, beta_rad])
         low, high = self._readings.extremes(middle_ns)
@@ -216,7 +258,15 @@ class SettingTracker:
         return int(alpha), int(beta)
 
     def take(self, start_ns: int, stop_ns: int, alpha_rad: float, beta_rad: float) -> None:
-        """Count a pose as the newest; the parameters are those of `settings`."""
+        """
+        Make a pose the newest one.
+
+        Parameters
+        ----------
+        start_ns, stop_ns, alpha_rad, beta_rad
+            As for `settings`.
+
+        """
         self._settings = np.array(self.settings(start_ns, stop_ns, alpha_rad, beta_rad))
         mean = np.array([alpha_rad, beta_rad])
         self._mean_rad = np.where(np.isfinite(mean), mean, self._mean_rad)
@@ -245,10 +295,20 @@ class _Window:
         self._older = np.full((2, 2), np.nan)
 
     def add(self, stamp_ns: int, angles_rad: tuple[float, ...]) -> None:
-        """Append angles."""
+        """
+        Append angles.
+
+        Parameters
+        ----------
+        stamp_ns
+            Their stamp, ns.
+        angles_rad
+            Angles of both joints, rad, (2,).
+
+        """
         self.newest = angles_rad
         self._recent.append((stamp_ns, angles_rad))
-        if len(self._recent) > _KEPT:
+        if len(self._recent) > _MAX_READINGS:
             _, oldest = self._recent.popleft()
             self._older = np.array([np.fmin(self._older[0], oldest),
                                     np.fmax(self._older[1], oldest)])

@@ -12,14 +12,14 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""From samples to poses: the same steps for a recording and for a live sweep."""
+"""Poses from recordings: rests, their means, angles and settings."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 from adxl_ros.calibrate import joint_settings
-from adxl_ros.calibrate.poses import Poses
+from adxl_ros.calibrate.poses import Poses, SAME_ANGLE_RAD
 from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import COMMANDS, JOINTS, Recording
 from adxl_ros.files.sweep_journal import PoseRecord
@@ -29,20 +29,32 @@ from adxl_ros.signals.noise_limits import datasheet_noise
 from adxl_ros.signals.rest_detection import find_rests, Rest, rest_means
 import numpy as np
 
-_GAP = 1.5
-"""Samples further apart than so many periods are not neighbours."""
-_FINEST_ANGLE_RAD = 1e-5
-"""An encoder is never taken to be better than this, so that rounding in a file is no motion."""
+_MAX_PERIODS = 1.5
+"""Neighbouring samples are at most this many sample periods apart."""
+_MIN_SAMPLES = 0.9
+"""Smallest share of the samples of a pose in the journal that its recording must have."""
 
 
 def named_rests(recording: Recording, records: Sequence[PoseRecord]) -> list[Rest]:
     """
     Find the rows of the rests that a journal names by their first and last stamp.
 
+    Parameters
+    ----------
+    recording
+        The recording of the run.
+    records
+        Poses of the journal of the run.
+
+    Returns
+    -------
+    list
+        One rest for each pose.
+
     Raises
     ------
     UserError
-        The recording lacks more than a tenth of the samples of one of them.
+        The recording lacks more than a tenth of the samples of a pose.
 
     """
     stamps = recording.stamp_ns
@@ -50,7 +62,7 @@ def named_rests(recording: Recording, records: Sequence[PoseRecord]) -> list[Res
     for number, record in enumerate(records, 1):
         start = int(np.searchsorted(stamps, record.start_ns, 'left'))
         stop = int(np.searchsorted(stamps, record.stop_ns, 'right'))
-        if stop - start < 0.9 * record.samples:
+        if stop - start < _MIN_SAMPLES * record.samples:
             raise UserError(f'{recording.path}: has {stop - start} samples between the stamps of '
                             f'pose {number} of the journal, which has {record.samples}; give '
                             'the recording of that very run')
@@ -62,88 +74,113 @@ def named_rests(recording: Recording, records: Sequence[PoseRecord]) -> list[Res
 def extract_poses(recording: Recording, sensor: Sensor,
                   records: Sequence[PoseRecord] | None = None) -> Poses:
     """
-    Find the rests of a recording, or take a journal's, and average each.
+    Find the rests of a recording, or take those of a journal, and average each.
 
     Parameters
     ----------
     recording
-        Read as a whole.
+        A whole recording.
     sensor
-        From `stream_unit.recorded_unit`.
+        The unit of the recording, from `stream_unit.recorded_unit`.
     records
-        Poses of the journal of the run, which name the rests, the angles, the settings of the
+        Poses of the journal of the run. They name the rests, the angles, the settings of the
         joints and the check poses.
+
+    Returns
+    -------
+    Poses
+        One pose for each rest.
 
     Raises
     ------
     UserError
-        There is no rest.
+        There is no rest, or the journal is of another recording.
 
     """
     volts, angles = recording.volts(sensor), recording.stage_angles
-    known = datasheet_noise(sensor)
+    noise = datasheet_noise(sensor)
     if records is None:
-        tolerance = max(sensor.stage_resolution_rad, _FINEST_ANGLE_RAD)
-        rests = find_rests(recording.time_s, volts, sensor.rate_hz, angles, known, learn=True,
+        tolerance = max(sensor.stage_resolution_rad, SAME_ANGLE_RAD)
+        rests = find_rests(recording.time_s, volts, sensor.rate_hz, angles, noise, learn=True,
                            angle_tolerance_rad=None if angles is None else tolerance)
     else:
         rests = named_rests(recording, records)
     if not rests:
         raise UserError(f'{recording.path}: the sensor is nowhere at rest; hold it still for at '
                         'least 1 s in each pose')
-    mean, std = rest_means(recording.time_s, volts, rests, sensor.rate_hz, known)
+    mean, std = rest_means(recording.time_s, volts, rests, sensor.rate_hz, noise)
     if records is None:
-        middle = rest_angles(angles, rests)
+        pose_angles = _rest_angles(angles, rests)
         check = np.zeros(len(rests), bool)
     else:
-        middle = np.array([[record.alpha_rad, record.beta_rad] for record in records])
+        pose_angles = np.array([[record.alpha_rad, record.beta_rad] for record in records])
         check = np.array([record.check for record in records], bool)
-    times = np.array([[r.time_start_s, r.time_stop_s] for r in rests])
-    settings = [_settings(recording, sensor, rests, joint, records) for joint in ('alpha', 'beta')]
-    return Poses(mean, std, middle[:, 0], middle[:, 1], times, check,
-                 *(_means(recording.columns.get(name), rests)
-                   for name in ('temperature_c', 'supply_v')), *settings)
+    return Poses(
+        volts=mean, std_v=std, alpha_rad=pose_angles[:, 0], beta_rad=pose_angles[:, 1],
+        time_s=np.array([[rest.time_start_s, rest.time_stop_s] for rest in rests]), check=check,
+        temperature_c=_rest_means(recording.columns.get('temperature_c'), rests),
+        supply_v=_rest_means(recording.columns.get('supply_v'), rests),
+        alpha_setting=_settings(recording, sensor, rests, 'alpha', records),
+        beta_setting=_settings(recording, sensor, rests, 'beta', records))
 
 
 def _settings(recording: Recording, sensor: Sensor, rests: Sequence[Rest], joint: str,
-              records: Sequence[PoseRecord] | None) -> np.ndarray | None:
-    """Return the settings of a joint, (k,): by the journal, else by its encoder and commands."""
+              records: Sequence[PoseRecord] | None) -> np.ndarray:
+    """
+    Return the settings of a joint, (k,), by the journal, else by its encoder and commands.
+
+    None stands for no encoder and no commands; `Poses` then numbers the settings by the angles.
+    """
     name = f'{joint}_setting'
     if records is not None and all(getattr(record, name) is not None for record in records):
         return np.array([getattr(record, name) for record in records])
     readings, commands = (recording.columns.get(name) for name in (JOINTS[joint], COMMANDS[joint]))
     if readings is None and commands is None:
-        return None
+        return None  # type: ignore[return-value]
     return joint_settings.recorded_settings(
         np.array([[rest.start, rest.stop] for rest in rests]), readings, commands,
         joint_settings.angle_tolerance_rad(sensor))
 
 
-def rest_angles(angles: np.ndarray | None, rests: Sequence[Rest]) -> np.ndarray:
+def _rest_angles(angles: np.ndarray | None, rests: Sequence[Rest]) -> np.ndarray:
     """Average the encoder over each rest, rad, (k, 2); NaN without a stage."""
     if angles is None:
         return np.full((len(rests), 2), np.nan)
-    return np.column_stack([_means(angles[:, joint], rests) for joint in range(2)])
+    return np.column_stack([_rest_means(angles[:, joint], rests) for joint in range(2)])
 
 
-def _means(values: np.ndarray | None, rests: Sequence[Rest]) -> np.ndarray:
+def _rest_means(values: np.ndarray | None, rests: Sequence[Rest]) -> np.ndarray:
+    """Average the finite values of each rest, (k,); NaN where there are none."""
     if values is None:
         return np.full(len(rests), np.nan)
-    return np.array([_mean_of_known(values[r.start:r.stop]) for r in rests])
-
-
-def _mean_of_known(values: np.ndarray) -> float:
-    known = values[np.isfinite(values)]
-    return float(known.mean()) if known.size else float('nan')
+    return np.array([joint_settings.mean_of_finite(values[rest.start:rest.stop])
+                     for rest in rests])
 
 
 def estimate_filters(recording: Recording, sensor: Sensor, poses: Poses
-                    ) -> list[filter_time_constant.FilterNoise | None]:
-    """Estimate the filter of each axis from the noise of the poses; see `filter_time_constant`."""
+                     ) -> list[filter_time_constant.FilterNoise | None]:
+    """
+    Estimate the output filter of each axis from the noise of the poses.
+
+    Parameters
+    ----------
+    recording
+        The recording of the poses.
+    sensor
+        The unit of the recording.
+    poses
+        Poses from `extract_poses`.
+
+    Returns
+    -------
+    list
+        Estimate of each axis; None where the noise does not show the filter.
+
+    """
     volts = recording.volts(sensor)
     first, last = np.searchsorted(recording.time_s, poses.time_s.T)
-    rests = [volts[a:b + 1] for a, b in zip(first, last)
-             if b > a and np.diff(recording.time_s[a:b + 1]).max() * sensor.rate_hz < _GAP]
+    rests = [volts[a:b + 1] for a, b in zip(first, last) if b > a and np.diff(
+        recording.time_s[a:b + 1]).max() * sensor.rate_hz < _MAX_PERIODS]
     return [filter_time_constant.estimate_filter(
         [rest[:, d] for rest in rests], sensor.rate_hz, sensor.rc_s, sensor.lsb_v)
         for d in range(len(sensor.axes))]

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Where a calibration comes from, and where it holds: what its parameter file says of it."""
+"""Provenance of a calibration and its validity range, as the parameter file has them."""
 
 from __future__ import annotations
 
@@ -32,6 +32,11 @@ from adxl_ros.model.sensor import Sensor
 from adxl_ros.model.validity import Envelope, STRETCH
 import numpy as np
 
+_SAME_BETA_RAD = 1e-3
+"""Smaller changes of beta are no step of the sweep, rad. Chosen: below any step of a plan."""
+_MAX_PLANES_LISTED = 12
+"""Largest count of planes that are listed one by one."""
+
 
 def package_version() -> str:
     """Return the version of this package; 'unknown' when it runs from its source."""
@@ -42,96 +47,109 @@ def package_version() -> str:
 
 
 def with_provenance(fitted: Sensor, source: str, poses: Poses, data_sha256: str,
-                    more: Mapping[str, str]) -> Sensor:
+                    results: Mapping[str, str]) -> Sensor:
     """
-    State a fitted unit's date, surroundings, sweep, data and id.
+    Add date, sources, sweep, data hash, results and id to a fitted unit.
 
     Parameters
     ----------
     fitted
-        The unit.
+        The fitted unit.
     source
         Names of the recordings.
     poses
-        All of them.
+        All poses, check poses among them.
     data_sha256
-        Of the recordings' files; empty takes the hash of the poses.
-    more
-        Keys and values more.
+        Hash of the recordings' files; empty takes the hash of the poses.
+    results
+        Further entries.
+
+    Returns
+    -------
+    Sensor
+        The unit with its provenance.
 
     """
-    said = {'date': datetime.now(timezone.utc).isoformat(timespec='seconds'),
-            'package_version': package_version(), 'source': source,
-            'data_sha256': data_sha256 or poses_sha256(poses),
-            'poses': str(int((~poses.check).sum())), 'check_poses': str(int(poses.check.sum())),
-            'sweep': sweep_in_words(poses), 'temperature_c': _around(poses.temperature_c, '.2f'),
-            'supply_v': _around(poses.supply_v, '.4f'), **more}
-    made = replace(fitted, provenance=said)
-    return replace(made, provenance={'id': calibration_store.calibration_id(made), **said})
+    entries = {
+        'date': datetime.now(timezone.utc).isoformat(timespec='seconds'),
+        'package_version': package_version(), 'source': source,
+        'data_sha256': data_sha256 or _poses_sha256(poses),
+        'poses': str(int((~poses.check).sum())), 'check_poses': str(int(poses.check.sum())),
+        'sweep': _sweep_text(poses), 'temperature_c': _mean_text(poses.temperature_c, '.2f'),
+        'supply_v': _mean_text(poses.supply_v, '.4f'), **results}
+    calibration_id = calibration_store.calibration_id(replace(fitted, provenance=entries))
+    return replace(fitted, provenance={'id': calibration_id, **entries})
 
 
-def poses_sha256(poses: Poses) -> str:
-    """Return the SHA-256 of the figures of poses, hexadecimal: volts, angles, times, marks."""
-    found = hashlib.sha256()
+def _poses_sha256(poses: Poses) -> str:
+    """Return the SHA-256 of all fields of poses, hexadecimal."""
+    digest = hashlib.sha256()
     for field in fields(poses):
         values = np.ascontiguousarray(getattr(poses, field.name), dtype='<f8')
-        found.update(f'{field.name} {values.shape}'.encode())
-        found.update(values.tobytes())
-    return found.hexdigest()
+        digest.update(f'{field.name} {values.shape}'.encode())
+        digest.update(values.tobytes())
+    return digest.hexdigest()
 
 
-def sweep_in_words(poses: Poses) -> str:
-    """Say which poses were visited, in degrees."""
+def _sweep_text(poses: Poses) -> str:
+    """Describe the fitted poses: planes, range and steps of beta, directions."""
     fitted = poses.subset(~poses.check)
     if not np.isfinite(fitted.alpha_rad).all():
         return f'{len(fitted)} rests in directions of its own, against gravity'
-    of = [fitted.subset(plane) for plane in planes(fitted.alpha_rad)]
-    ends = np.degrees([fitted.beta_rad.min(), fitted.beta_rad.max()])
-    steps = np.concatenate([np.abs(np.diff(fitted.beta_rad)), np.zeros(1)])
-    step = np.degrees(np.median(steps[steps > 1e-3])) if (steps > 1e-3).any() else 0.0
-    back = np.diff(fitted.beta_rad)
-    ways = 'both directions' if (back > 1e-3).any() and (back < -1e-3).any() else 'one direction'
-    alpha = [float(np.degrees(one.alpha_rad.mean())) for one in of]
-    said = ', '.join(f'{a:.0f}' for a in alpha) if len(alpha) <= 12 else \
+    alpha = [float(np.degrees(fitted.alpha_rad[plane].mean()))
+             for plane in planes(fitted.alpha_rad)]
+    alpha_text = ', '.join(f'{a:.0f}' for a in alpha) if len(alpha) <= _MAX_PLANES_LISTED else \
         f'{len(alpha)} planes from {alpha[0]:.0f} to {alpha[-1]:.0f}'
-    return (f'{len(fitted)} poses: alpha {said} deg; beta {ends[0]:.0f} to {ends[1]:.0f} deg, '
-            f'steps of {step:.0f}, {ways}')
+    lowest, highest = np.degrees([fitted.beta_rad.min(), fitted.beta_rad.max()])
+    changes = np.diff(fitted.beta_rad)
+    steps = np.abs(changes)[np.abs(changes) > _SAME_BETA_RAD]
+    step = np.degrees(np.median(steps)) if steps.size else 0.0
+    both_ways = (changes > _SAME_BETA_RAD).any() and (changes < -_SAME_BETA_RAD).any()
+    return (f'{len(fitted)} poses: alpha {alpha_text} deg; beta {lowest:.0f} to {highest:.0f} '
+            f'deg, steps of {step:.0f}, {"both directions" if both_ways else "one direction"}')
 
 
-def _around(values: np.ndarray, digits: str) -> str:
-    known = values[np.isfinite(values)]
-    return f'{known.mean():{digits}}' if known.size else 'not measured'
+def _mean_text(values: np.ndarray, digits: str) -> str:
+    finite = values[np.isfinite(values)]
+    return f'{finite.mean():{digits}}' if finite.size else 'not measured'
 
 
 def envelope(fitted: Sensor, force: np.ndarray, poses: Poses, misfit_mps2: float) -> Envelope:
     """
-    Return where a calibration holds; see `model.validity`.
+    Return the validity range of a calibration.
 
     Parameters
     ----------
     fitted
-        The unit with its covariance.
+        The fitted unit with its covariance.
     force
-        Specific force of all poses, those that judge it too, m/s², (k, 3).
+        Specific force of k poses, check poses among them, m/s², (k, 3).
     poses
-        The same poses.
+        The poses with their temperatures.
     misfit_mps2
-        What they showed beyond noise and stage, m/s².
+        Rms error of the model on these poses beyond noise and stage, m/s².
+
+    Returns
+    -------
+    Envelope
+        Ranges of temperature and force, and how the error grows beyond them.
 
     """
-    known = poses.temperature_c[np.isfinite(poses.temperature_c)]
-    slopes = {'zero_g_per_k': 'temperature_bias', 'scale_per_k': 'temperature_scale'}
-    drift = {name: 0.0 if effect in fitted.effects else _typical_slope(fitted, effect)
-             for name, effect in slopes.items()}
-    h = leverage(fitted)
-    largest = max(float(h(list(stretch * force.T)).max()) for stretch in (1.0, STRETCH))
-    return Envelope((float(known.min()), float(known.max())) if known.size else None,
-                    **drift, leverage=largest, misfit_mps2=misfit_mps2,
+    finite_c = poses.temperature_c[np.isfinite(poses.temperature_c)]
+    rest_leverage = leverage(fitted)
+    largest = max(float(rest_leverage(list(stretch * force.T)).max())
+                  for stretch in (1.0, STRETCH))
+    return Envelope((float(finite_c.min()), float(finite_c.max())) if finite_c.size else None,
+                    zero_g_per_k=_unmodelled_slope(fitted, 'temperature_bias'),
+                    scale_per_k=_unmodelled_slope(fitted, 'temperature_scale'),
+                    leverage=largest, misfit_mps2=misfit_mps2,
                     force_low_mps2=tuple(force.min(axis=0).tolist()),
                     force_high_mps2=tuple(force.max(axis=0).tolist()))
 
 
-def _typical_slope(sensor: Sensor, effect: str) -> float:
-    """Return the datasheet's typical slope, else that of the library."""
-    typical, _ = sensor.datasheet.get(Coefficient(effect, 'per_k'), (0.0, 0.0))
+def _unmodelled_slope(fitted: Sensor, effect: str) -> float:
+    """Return the typical slope of an effect by the datasheet, else by the library; 0 if fitted."""
+    if effect in fitted.effects:
+        return 0.0
+    typical, _ = fitted.datasheet.get(Coefficient(effect, 'per_k'), (0.0, 0.0))
     return typical or effect_named(effect).parameters[0].scale

@@ -62,16 +62,16 @@ def fit(options: argparse.Namespace) -> int:
     sensor = parameter_file.load(options.params or parameter_file.nominal_path())
     records = _records(options.journal)
     unit = sensor
-    parts, filters = [], []
+    recordings = []
     for path in options.recording:
         read = recording.read(path)
         report_reading('fit', read)
         unit = recorded_unit(unit, read)
-        parts.append(pose_extraction.extract_poses(read, unit, records))
-        filters.append(pose_extraction.estimate_filters(read, unit, parts[-1]))
-    result = calibration.calibrate(unit, parts, options.model,
-                                   [Path(path).name for path in options.recording],
-                                   options.effect, filters, sha256(options.recording))
+        poses = pose_extraction.extract_poses(read, unit, records)
+        recordings.append(calibration.RecordedPoses(
+            Path(path).name, poses, pose_extraction.estimate_filters(read, unit, poses)))
+    result = calibration.calibrate(unit, recordings, options.model, options.effect,
+                                   sha256(options.recording))
     if options.report:
         make_folder(Path(options.report))
         report_html.write(options.report, result, options.store)

@@ -73,13 +73,14 @@ def reproduce(options: argparse.Namespace) -> int:
 
 
 def _of_recordings(sensor: Sensor, paths: Sequence[str], folder: Path) -> str:
-    unit, parts = sensor, []
+    unit, recordings = sensor, []
     for path in paths:
         read = recording.read(path)
         report_reading('reproduce', read)
         unit = recorded_unit(unit, read)
-        parts.append(pose_extraction.extract_poses(read, unit))
-    result = calibration.calibrate(unit, parts, 'full', [Path(path).name for path in paths])
+        recordings.append(calibration.RecordedPoses(
+            Path(path).name, pose_extraction.extract_poses(read, unit)))
+    result = calibration.calibrate(unit, recordings, 'full')
     report_html.draw(folder / FIGURES / 'sweep.png', result)
     lines = '\n'.join(result.comments())
     return (f"# The paper's calibration of {', '.join(paths)}\n\n```\n{lines}\n```\n\n"

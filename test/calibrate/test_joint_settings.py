@@ -118,7 +118,7 @@ def test_a_joint_has_moved_when_its_encoder_or_its_command_has(
 
 def test_the_live_tracker_and_a_recording_agree_whatever_comes(monkeypatch):
     """Random walks of encoder and command, with gaps; the tracker remembers few readings."""
-    monkeypatch.setattr(joint_settings, '_KEPT', 12)
+    monkeypatch.setattr(joint_settings, '_MAX_READINGS', 12)
     rng = np.random.default_rng(5)
     moves = 0
     for _ in range(300):

@@ -290,8 +290,8 @@ class Session:
         if all(entry.check for entry in entries):
             raise UserError('only check poses are taken, which judge a fit and are no part of '
                             'it; take poses of the planes, too')
-        found = calibration.calibrate(self.unit, [Poses.from_records(entries)], None,
-                                      [self.journal.path.name])
+        found = calibration.calibrate(self.unit, [calibration.RecordedPoses(
+            self.journal.path.name, Poses.from_records(entries))])
         if self._unchecked:
             found = replace(found, fitted=replace(found.fitted, provenance={
                 **found.fitted.provenance, 'mounting': 'not checked after an interruption'}))

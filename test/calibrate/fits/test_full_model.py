@@ -254,7 +254,7 @@ def test_poses_of_too_few_planes_are_refused(planes_deg, lost):
 def test_what_is_not_determined_falls_back_and_says_so():
     """Without a choice the richest model that the poses determine is fitted."""
     sensor, _, poses = swept_unit(1, planes_rad=PLANES_RAD[2:3], check_poses=0)
-    found = calibration.calibrate(sensor, [poses], None, ['made'])
+    found = calibration.calibrate(sensor, [calibration.RecordedPoses('made', poses)])
     assert found.fitted.model == 'linear'
     assert found.report_lines[0].startswith('not full: the full model is not determined')
     assert found.report_lines[1].startswith('not physical: ')
@@ -265,8 +265,9 @@ def test_several_recordings_of_one_unit():
     rng = np.random.default_rng(12)
     truth = drawn(rng, nominal(), TERMS)
     parts = [swept(rng, truth, check_poses=0) for _ in range(2)]
-    one = calibration.calibrate(nominal(), parts[:1], 'full', ['a'])
-    both = calibration.calibrate(nominal(), parts, 'full', ['a', 'b'])
+    parts = [calibration.RecordedPoses(name, part) for name, part in zip('ab', parts)]
+    one = calibration.calibrate(nominal(), parts[:1], 'full')
+    both = calibration.calibrate(nominal(), parts, 'full')
     assert np.trace(both.fitted.covariance) < 0.7 * np.trace(one.fitted.covariance)
 
 
@@ -281,8 +282,10 @@ def test_recordings_that_contradict_each_other_are_refused(change, words):
     rng = np.random.default_rng(13)
     truth = drawn(rng, nominal(), TERMS)
     parts = [swept(rng, unit, check_poses=0) for unit in (truth, truth, change(truth))]
-    with pytest.raises(UserError, match=rf'{words} .* standard deviations: another unit'):
-        calibration.calibrate(nominal(), parts, 'full', ['a.csv', 'b.csv', 'c.csv'])
+    with pytest.raises(UserError, match=rf'{words} .* standard deviations\): another unit'):
+        calibration.calibrate(
+            nominal(), [calibration.RecordedPoses(f'{name}.csv', part)
+                        for name, part in zip('abc', parts)], 'full')
 
 
 @pytest.mark.perf

@@ -154,15 +154,15 @@ def test_wrong_polarity_is_named(change, words):
     rng = np.random.default_rng(4)
     poses = swept(rng, nominal())
     with pytest.raises(UserError, match=words):
-        calibration.calibrate(nominal(), [replace(poses, volts=change(poses.volts))], None,
-                              ['made'])
+        calibration.calibrate(nominal(), [calibration.RecordedPoses(
+            'made', replace(poses, volts=change(poses.volts)))])
 
 
 def test_verdict_without_check_poses_holds_out_folds():
     """A recording without check poses is judged by fits that leave a fifth out."""
     rng = np.random.default_rng(6)
     poses = swept(rng, drawn(rng, nominal()), check_poses=0)
-    found = calibration.calibrate(nominal(), [poses], None, ['made'])
+    found = calibration.calibrate(nominal(), [calibration.RecordedPoses('made', poses)])
     assert found.fitted.model == 'full'
     first_words = [line.split()[0] for line in found.report_lines[:5]]
     assert first_words == ['held', 'nominal', 'linear', 'physical', 'full']

@@ -36,7 +36,8 @@ def calibrated(seed, model=None, axes='xy', check=16, stage_rad=None, effects=TE
     truth = drawn(rng, sensor, effects)
     on = truth if stage_rad is None else replace(truth, stage_resolution_rad=stage_rad)
     poses = swept(rng, on, check_poses=check)
-    return truth, calibration.calibrate(sensor, [poses], model, ['made'])
+    return truth, calibration.calibrate(
+        sensor, [calibration.RecordedPoses('made', poses)], model)
 
 
 def true_errors(truth, found):
