@@ -29,6 +29,7 @@ from adxl_ros.model.sensor import Sensor
 from adxl_ros.simulate.motion import Motion
 from adxl_ros.simulate.response import Response
 import numpy as np
+import scipy.signal  # noqa: F401 (the simulator loads it at its first sample, which is late)
 
 _AHEAD_NS = 50_000_000
 """Length of a block of samples, ns. Chosen: a block costs less than its samples one by one."""

@@ -20,7 +20,6 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from scipy.signal import lfilter
 
 ORDER = 6
 """Number of newest samples that the polynomial interpolates; chosen: the error is of order 6."""
@@ -128,9 +127,37 @@ def pole(x: np.ndarray, rate: complex, dt_s: float, memory: dict[str, Any]) -> n
     decay = np.exp(rate * dt_s)
     if first:
         drive[0] = -x[0] / rate * (1 - decay)
-    w, _ = lfilter([1.0], [1.0, -decay], drive, zi=np.array([decay * last_w]))
+    w = first_order_recursion(1.0, decay, drive, last_w)
     memory['inputs'], memory['w'] = inputs[-(ORDER - 1):], w[-1]
     return w
+
+
+def first_order_recursion(gain: float, decay: complex, inputs: np.ndarray, previous: complex
+                          ) -> np.ndarray:
+    """
+    Filter by y[i] = decay · y[i − 1] + gain · inputs[i].
+
+    Parameters
+    ----------
+    gain
+        Weight of the input.
+    decay
+        Weight of the output before.
+    inputs
+        Inputs, (n,).
+    previous
+        Output before the first one.
+
+    Returns
+    -------
+    ndarray
+        Outputs, (n,).
+
+    """
+    # scipy.signal takes 0.3 s to import, and a node that does not simulate needs no filter.
+    from scipy.signal import lfilter
+    outputs, _ = lfilter([gain], [1.0, -decay], inputs, zi=np.array([decay * previous]))
+    return outputs
 
 
 @lru_cache(maxsize=64)

@@ -32,7 +32,6 @@ from adxl_ros.model.sensor import Sensor
 import numpy as np
 from scipy.linalg import block_diag
 from scipy.optimize import minimize
-from scipy.signal.windows import hann
 
 _SEGMENT_S = 1.0
 _FEWEST = 16
@@ -97,6 +96,8 @@ def estimate_filter(rests: Iterable[np.ndarray], rate_hz: float, rc_s: float, ls
         Step of the ADC, V.
 
     """
+    # scipy.signal takes 0.3 s to import, which a calibration needs only at its end.
+    from scipy.signal.windows import hann
     size = max(_FEWEST, round(_SEGMENT_S * rate_hz))
     window = hann(size, sym=False)
     window /= np.sqrt(np.sum(window ** 2))

@@ -33,12 +33,11 @@ from adxl_ros.model.effects.base import (
     Place,
     Signals,
 )
-from adxl_ros.model.filters import low_pass
+from adxl_ros.model.filters import first_order_recursion, low_pass
 from adxl_ros.model.kinematics import specific_force_in_motion, UPRIGHT
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.simulate.motion import Motion
 import numpy as np
-from scipy.signal import lfilter
 
 _BLOCK_STEPS = 65536
 """Steps of the internal grid in memory at once; chosen: some 10 MB of signals."""
@@ -239,8 +238,8 @@ class Response:
             self._noise = np.zeros(len(std_v))
         for d, a in enumerate(decay):
             if a:
-                drawn[:, d], _ = lfilter([np.sqrt(1 - a * a)], [1.0, -a], drawn[:, d],
-                                         zi=[a * self._noise[d]])
+                drawn[:, d] = first_order_recursion(np.sqrt(1 - a * a), a, drawn[:, d],
+                                                    self._noise[d])
         self._noise = drawn[-1].copy()
         return drawn[np.cumsum(passed) - 1] * std_v
 

@@ -52,7 +52,7 @@ from adxl_ros.model.effects.base import Coefficient, Parameter, Place, Role
 from adxl_ros.model.gauss_newton import gauss_newton, halve_until, Iterate, Solution
 from adxl_ros.model.sensor import Sensor
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 TERMS = ('bias', 'scale_factor', 'misalignment', 'cross_axis', 'cross_axis_z', 'scale_factor_z',
          'nonlinearity')
@@ -386,7 +386,7 @@ def _round(state: _State, problem: _Problem, number: int) -> tuple[_State, float
 def _inliers(about: Linearised, stage: StageError) -> np.ndarray:
     """Mark the poses that are no outliers, (k,) bool; all poses if too many are outliers."""
     errors = about.covariance(stage).predicted_errors(about.residual)
-    kept = errors.squared_distances < chi2.isf(_OUTLIER_CHANCE, about.residual.shape[1])
+    kept = errors.squared_distances < chdtri(about.residual.shape[1], _OUTLIER_CHANCE)
     return kept if kept.mean() >= 1 - _MAX_OUTLIERS else np.ones(len(kept), bool)
 
 

@@ -40,7 +40,7 @@ from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 from scipy.optimize import minimize
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 _MIN_TOTAL_RAD = 1e-7
 """Smallest standard deviation of an angle error, rad. Chosen: no encoder is as good."""
@@ -191,7 +191,7 @@ def _from_search(x: np.ndarray) -> StageError:
 @cache
 def _huber_bound(axes: int) -> float:
     """Return the squared distance beyond which a pose counts with its root."""
-    return float(chi2.isf(_HUBER_CHANCE, axes))
+    return float(chdtri(axes, _HUBER_CHANCE))
 
 
 def linearised(unit: Sensor, poses: Poses, names: Sequence[Coefficient], precision: np.ndarray,

@@ -28,7 +28,7 @@ from adxl_ros.model.covariance import force_covariance
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.model.tilt import tilt
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 Fit = Callable[[Sensor, Poses], Sensor]
 """A function that fits a nominal sensor to poses."""
@@ -278,8 +278,8 @@ def rms_interval(values: np.ndarray) -> tuple[float, float]:
     """Return the 90 % interval of the rms of correlated errors; see `degrees_of_freedom`."""
     with np.errstate(invalid='ignore'):
         rms, nu = _rms(values), degrees_of_freedom(values)
-    return rms * float(np.sqrt(nu / chi2.isf(0.05, nu))), \
-        rms * float(np.sqrt(nu / chi2.isf(0.95, nu)))
+    return rms * float(np.sqrt(nu / chdtri(nu, 0.05))), \
+        rms * float(np.sqrt(nu / chdtri(nu, 0.95)))
 
 
 def cross_validate(fits: dict[str, Fit], sensor: Sensor, poses: Poses,

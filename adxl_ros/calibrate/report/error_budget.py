@@ -52,7 +52,7 @@ from adxl_ros.model.covariance import force_covariance
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 from scipy.spatial import cKDTree
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 _SAME_POSE_RAD = np.radians(0.5)
 """Largest distance of the joint angles of two visits of the same pose, rad; chosen."""
@@ -277,8 +277,8 @@ def _budget(errors: np.ndarray, measured: float, known: _KnownParts,
 
     """
     mean_square, nu = float(np.mean(errors ** 2)), degrees_of_freedom(errors)
-    lower = mean_square * nu / float(chi2.isf(_CHANCE, nu))
-    upper = mean_square * nu / float(chi2.isf(_UPPER_QUANTILE, nu))
+    lower = mean_square * nu / float(chdtri(nu, _CHANCE))
+    upper = mean_square * nu / float(chdtri(nu, _UPPER_QUANTILE))
     largest_stage = known.stated_stage if unexplainable is None else \
         max(known.stated_stage, unexplainable)
     explained = known.noise + known.coefficients + largest_stage
@@ -384,7 +384,7 @@ def gravity_error_budgets(fit: GravityFit, fitted: Sensor, force: np.ndarray, ke
     covariance = force_covariance(fitted, list(force[kept].T), np.zeros(len(fitted.axes)))
     gravity, used = fitted.local_gravity_mps2, np.ones(len(kept), bool)
     measured, nu = float(np.mean(errors ** 2)), degrees_of_freedom(errors)
-    upper = max(measured * nu / float(chi2.isf(_UPPER_QUANTILE, nu)) - by_noise, excess)
+    upper = max(measured * nu / float(chdtri(nu, _UPPER_QUANTILE)) - by_noise, excess)
     accel = _axis_variance(covariance, [0, 1, 2], used)
     tilt = _tilt_variance(covariance, force[kept], gravity, used)
     # Three axes have a magnitude's error each; two of the three turn the vertical.

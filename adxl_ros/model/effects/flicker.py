@@ -18,8 +18,8 @@ from functools import lru_cache
 
 from adxl_ros.model.diagnosis_hints import DiagnosisHints, DriftSpectrum, Manoeuvre
 from adxl_ros.model.effects.base import ActsOn, Effect, Parameter, Parameters, Place, Signals
+from adxl_ros.model.filters import first_order_recursion
 import numpy as np
-from scipy.signal import lfilter
 
 _LOWEST_HZ = 1e-5
 """Lowest corner, Hz; chosen: the density is 1/f from ten times this."""
@@ -56,8 +56,7 @@ def apply(signals: Signals, p: Parameters) -> None:
             steps = drawn[:, d, i].copy()
             if previous is None:
                 steps[0] /= step  # stationary from the first sample on
-            state = 0.0 if previous is None else a * previous[i]
-            x, _ = lfilter([step], [1.0, -a], steps, zi=[state])
+            x = first_order_recursion(step, a, steps, 0.0 if previous is None else previous[i])
             noise += x
             last[i] = x[-1]
         signals.memory[d] = last
