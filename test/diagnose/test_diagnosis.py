@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""`diagnose`: gaps that are made on purpose, and recordings that are no good."""
+"""The diagnosis of simulated gaps, of faulty recordings, and of real recordings."""
 
 from dataclasses import replace
 import json
@@ -87,7 +87,7 @@ def diagnosed(sensor, *effects, change=None):
 
 
 def test_no_gap():
-    """A unit that is what its file says, but for a little drift."""
+    """A unit as in its file, with the drift of a healthy unit."""
     report, _ = diagnosed(unit(), 'bias_walk:density_g_per_rts=2e-5')
     probability = report['verdict'].pop('probability')
     assert report['verdict'] == {'status': 'no_gap', 'effects': [], 'groups': [],
@@ -106,7 +106,7 @@ def test_no_gap():
     # As in the parameter file: with what the baseline has of it.
     ('bias:offset_v=0.04', 'offset_v.y', 0.04)])
 def test_one_effect_is_named_and_the_gap_closed(option, parameter, value):
-    """Name, parameter, and nearly all of the gap closed."""
+    """The verdict names the effect, and its parameter closes nearly all of the gap."""
     name = option.split(':')[0]
     report, _ = diagnosed(unit(), option)
     assert (report['verdict']['status'], report['verdict']['effects']) == ('explained', [name])
@@ -116,8 +116,8 @@ def test_one_effect_is_named_and_the_gap_closed(option, parameter, value):
     assert sum(h['probability'] for h in report['hypotheses']) == pytest.approx(1, abs=1e-9)
 
 
-def test_what_the_library_does_not_hold_is_unknown():
-    """A zero-g that follows the fourth harmonic of beta: unknown, and over beta."""
+def test_an_effect_outside_the_library_is_unknown():
+    """A zero-g that follows the fourth harmonic of beta is unknown over beta."""
     def change(columns):
         for axis, phase in (('x', 0.0), ('y', 1.0), ('z', 2.0)):
             columns[f'{axis}_v'] = columns[f'{axis}_v'] + 4e-3 * np.sin(
@@ -132,8 +132,8 @@ def test_what_the_library_does_not_hold_is_unknown():
     assert 'beta_rad' in report['unknown_where']
 
 
-def test_a_file_of_stated_figures_lacks_zero_g_and_scale_factor():
-    """Other zero-g and scale factor on each axis, none of which is the largest gap alone."""
+def test_a_nominal_file_lacks_zero_g_and_scale_factor():
+    """Zero-g and scale factor differ on each axis, and neither alone is the largest gap."""
     def change(columns):
         for axis, zero_v, scale in (('x', 3e-3, 2e-3), ('y', -2e-3, -1.5e-3), ('z', 1e-3, 3e-3)):
             g = columns[f'{axis}_v'] - 2.5
@@ -147,7 +147,7 @@ def test_a_file_of_stated_figures_lacks_zero_g_and_scale_factor():
 
 @pytest.mark.parametrize('amplitude_v, tau_s', [(0.01, 20.0), (0.002, 43.0)])
 def test_a_shape_far_from_the_typical_is_found_and_the_zero_g_fits_it(amplitude_v, tau_s):
-    """A board that settles in a tenth of the usual time, calibrated when it was half warm."""
+    """A board settles in a tenth of the usual time. It was calibrated half warm."""
     def change(columns):
         settled = 1 - np.exp(-np.arange(len(columns['z_v'])) / 125.0 / tau_s)
         columns['z_v'] = columns['z_v'] + amplitude_v * (settled - 0.42)
@@ -167,7 +167,7 @@ def test_a_shape_far_from_the_typical_is_found_and_the_zero_g_fits_it(amplitude_
 
 
 def test_the_straight_part_of_an_effect_may_be_in_the_scale_factor():
-    """Bent between 0 and 1 g, right at both, as a tumble test leaves it: nonlinearity alone."""
+    """An output that is right at 0 and 1 g and bent between has nonlinearity alone."""
     def change(columns):
         for axis in 'xyz':
             g = columns[f'{axis}_v'] - 2.5
@@ -183,13 +183,13 @@ def test_the_straight_part_of_an_effect_may_be_in_the_scale_factor():
 @pytest.mark.parametrize('option, effect', [
     ('flicker:density_g_per_rthz=3e-4', 'flicker'),
     ('bias_walk:density_g_per_rts=6e-4', 'bias_walk')])
-def test_kinds_of_drift_are_told_apart(option, effect):
-    """1/f noise and a random walk, by their spectra, and by no other effect."""
+def test_spectrum_separates_the_drifts(option, effect):
+    """The spectrum separates 1/f noise from a random walk."""
     assert named(diagnosed(unit(), option)[1]) == {effect}
 
 
 def test_strong_flicker_of_another_colour_is_flicker():
-    """Relaxations from a third of a second to minutes, a hundred times the noise's power."""
+    """Relaxations of 0.3 s to minutes with a hundred times the power of the noise are flicker."""
     def drifting(seed):
         def change(columns):
             rng, dt_s = np.random.default_rng(seed), 1 / unit().rate_hz
@@ -209,15 +209,15 @@ def test_strong_flicker_of_another_colour_is_flicker():
 
 
 def test_a_weak_effect_shows_in_long_recordings():
-    """A twentieth of the noise, of which a latency within its tolerance takes up most."""
+    """An effect of a twentieth of the noise shows, although latency imitates most of it."""
     sensor = unit()
     recordings = [made(sensor, ['clock_skew:ratio=1.4e-6'], seed) for seed in (3, 4, 5, 6)]
     diagnosis = diagnose(recordings, sensor)
     assert (diagnosis.verdict.status, named(diagnosis)) == ('explained', {'clock_skew'})
 
 
-def test_what_drifts_more_smoothly_than_any_drift_is_unknown():
-    """A warm draught: a zero-g that comes and goes within half a minute, and not faster."""
+def test_a_drift_smoother_than_the_library_is_unknown():
+    """A warm draught changes the zero-g within half a minute, and not faster."""
     def change(columns):
         rng = np.random.default_rng(8)
         for axis in 'xyz':
@@ -233,7 +233,7 @@ def test_what_drifts_more_smoothly_than_any_drift_is_unknown():
 
 
 def test_a_soft_clip_is_saturation():
-    """A hyperbolic tangent's knee, in y alone."""
+    """A clip with the knee of a hyperbolic tangent on y alone is saturation."""
     sensor = unit()
 
     def change(columns):
@@ -246,8 +246,8 @@ def test_a_soft_clip_is_saturation():
     assert report['verdict']['effects'] == ['saturation']
 
 
-def test_a_limit_that_one_stretch_alone_reaches_is_not_guessed_from_the_others():
-    """A soft clip of y, which comes near it once: what is held out there is closed, too."""
+def test_a_limit_that_one_block_reaches_keeps_its_value():
+    """A limit that one block determines also closes the gap in that block, if held out."""
     script, limit_g, knee_g = trajectories.Script(np.pi / 2, 0.0), 1.1, 0.036
     for turn in range(14):
         for to, speed in ((0.8, 1.0), (-0.8, 1.3), *([(1.57, 1.2)] if turn == 7 else [])):
@@ -271,16 +271,16 @@ def test_a_limit_that_one_stretch_alone_reaches_is_not_guessed_from_the_others()
     assert held_out.max() < 1.3 * np.median(held_out)
 
 
-def test_what_shows_only_while_it_turns_is_no_drift():
-    """A ripple of the gears, 40 periods a turn."""
+def test_an_effect_of_turning_alone_is_no_drift():
+    """A ripple of the gears with 40 periods in a turn is unknown."""
     def change(columns):
         return columns | {'x_v': columns['x_v'] + 3e-3 * np.sin(40 * columns['beta_rad'])}
 
     assert diagnosed(unit(), change=change)[0]['verdict']['status'] == 'unknown'
 
 
-def test_stretches_without_numbers_are_left_out():
-    """Half a minute of one axis is missing: the same verdict."""
+def test_samples_without_numbers_are_ignored():
+    """A quarter of a minute without one axis does not change the verdict."""
     def change(columns):
         late = (columns['time_s'] > 20) & (columns['time_s'] < 35)
         return columns | {'y_v': np.where(late, np.nan, columns['y_v'])}
@@ -296,7 +296,7 @@ def test_stretches_without_numbers_are_left_out():
     ('stuck:rate_hz=0.2,duration_s=0.1', 'stuck'),
     ('quantisation:lost_bits=4', 'quantisation')])
 def test_noise_like_effects_are_named(option, effect):
-    """By their own statistics: a line, a level, what stands alone, what repeats, steps."""
+    """Lines, level, isolated samples, repeated samples and coarse codes have detectors."""
     verdict = diagnosed(unit(), option)[0]['verdict']
     assert (verdict['status'], verdict['effects']) == ('explained', [effect])
 
@@ -310,22 +310,22 @@ def test_noise_like_effects_are_named(option, effect):
     (lambda c: c | {a: np.roll(c[a], 300) for a in ('x_v', 'y_v', 'z_v')}, 'time_misaligned'),
     (lambda c: c | {'x_v': np.where(np.arange(len(c['x_v'])) % 2, np.nan, c['x_v'])}, 'missing'),
     (lambda c: c | {'x_v': np.clip(c['x_v'], 2.4, 2.6)}, 'saturated')])
-def test_faults_of_the_recording_are_called_what_they_are(change, fault):
-    """Never a confident wrong effect: the fault is named and nothing else is."""
+def test_faults_of_the_recording_are_named(change, fault):
+    """The verdict names the fault and no effect."""
     report, diagnosis = diagnosed(unit(), change=change)
     assert (report['verdict']['status'], report['verdict']['data_fault']) == ('bad_data', fault)
     assert report['verdict']['effects'] == [] and diagnosis.sensor is None
 
 
 def test_too_short_is_insufficient():
-    """Ten seconds say nothing."""
+    """A recording of ten seconds has no verdict."""
     report, _ = diagnosed(unit(), change=lambda c: {k: v[:1250] for k, v in c.items()})
     assert report['verdict']['status'] == 'insufficient'
     assert 'too short' in report['summary']
 
 
 def test_the_command_leaves_report_page_and_parameters(run_tool, tmp_path):
-    """Twice the same to the byte; with the parameters that it writes there is no gap left."""
+    """Two runs are equal to the byte. With the written parameters there is no gap."""
     sensor = unit('xy')
     recorded_run = made(sensor, ['temperature_bias:per_k=4e-4'])
     recording.write(tmp_path / 'run.csv', recorded_run, sensor)
@@ -345,7 +345,7 @@ def test_the_command_leaves_report_page_and_parameters(run_tool, tmp_path):
 
 
 def test_several_recordings_and_bags(run_tool, tmp_path):
-    """A CSV file and a bag of one unit are one diagnosis."""
+    """A CSV file and a bag of one unit have one diagnosis."""
     sensor = unit('xy')
     parameter_file.save(tmp_path / 'unit.yaml', sensor)
     for name, seed in (('a.csv', 3), ('b.mcap', 4)):
@@ -358,7 +358,7 @@ def test_several_recordings_and_bags(run_tool, tmp_path):
 
 
 def turning(alphas, speeds, rests_s=2.0):
-    """Turn beta forth and back in some planes at some speeds."""
+    """Turn beta forth and back in each plane at each speed."""
     script = trajectories.Script(alphas[0], 0.0)
     for alpha in alphas:
         script.go(alpha, 0.0)
@@ -378,14 +378,14 @@ def record(sensor, motion, effects=(), seed=3):
 
 
 def named(diagnosis):
-    """Return all that a verdict names, for certain or in a group."""
+    """Return the certain effects of a verdict and those of its groups."""
     verdict = report_json.as_json(diagnosis)['verdict']
     return {*verdict['effects'], *(e for group in verdict['groups'] for e in group)}
 
 
 @pytest.mark.parametrize('effect', ['backlash:beta_rad=0.003', 'time_offset:offset_s=0.005', None])
-def test_a_poor_manoeuvre_widens_the_answer_and_makes_none_wrong(effect):
-    """A minute, two axes, one plane, one speed: the truth is among what is named, or nothing."""
+def test_a_poor_manoeuvre_makes_no_wrong_verdict(effect):
+    """A minute on one plane at one speed names the truth, alone or in a group."""
     sensor = unit('xy')
     script = turning([np.pi / 2], [0.7] * 3, 4.0)
     alpha, beta = script.joints()
@@ -397,8 +397,8 @@ def test_a_poor_manoeuvre_widens_the_answer_and_makes_none_wrong(effect):
         assert effect.split(':')[0] in named(diagnosis)
 
 
-def test_what_does_not_move_is_not_called_free_of_a_gap():
-    """A minute at rest: no verdict, and what was not covered."""
+def test_a_recording_at_rest_is_insufficient():
+    """A minute at rest has no verdict. The report says what is not covered."""
     sensor = unit('xy')
     diagnosis = diagnose([record(sensor, Motion(60.0, Held(1.0), Held(0.5)))], sensor)
     report = report_json.as_json(diagnosis)
@@ -406,8 +406,8 @@ def test_what_does_not_move_is_not_called_free_of_a_gap():
     assert 'motion' in report['not_covered'] and report['next_experiment']
 
 
-def test_repeats_tell_the_floor_where_nothing_rests():
-    """Two runs of one trajectory without a rest: what differs between them is the floor."""
+def test_repeats_determine_the_noise_floor_where_nothing_rests():
+    """The difference of two runs of one trajectory is the noise floor."""
     sensor = replace(unit('xy'), stage_resolution_rad=1e-5)
     time_s = np.arange(0.0, 70.0, 0.5)
     alpha, beta = (Knots(time_s, 1.0 + 0.4 * np.sin(rate * time_s), 0.4 * rate * np.cos(
@@ -421,7 +421,7 @@ def test_repeats_tell_the_floor_where_nothing_rests():
 
 
 def test_noise_is_compared_where_the_mean_is_blind():
-    """Twice the noise: four times the power, until the simulator has it, too."""
+    """Twice the noise has four times the power, until the simulator has it, too."""
     report, _ = diagnosed(unit(), 'noise_excess:ratio=1.0')
     noise = report['gap']['noise'][0]
     assert noise['power_ratio_before'][-1] == pytest.approx(4.0, rel=0.1)
@@ -429,8 +429,8 @@ def test_noise_is_compared_where_the_mean_is_blind():
     assert noise['log_likelihood_gain'] > 100
 
 
-def test_the_next_manoeuvre_is_the_one_that_tells_most():
-    """Temperature or warm-up: heating tells, a shaker does not; both are simulated."""
+def test_next_experiment_separates_most():
+    """Heating separates temperature from warm-up, and a shaker does not."""
     sensor = with_effects(unit('xy'), ['temperature_bias:per_k=3e-4'])
     best = Hypothesis(('temperature_bias',), sensor, (), np.zeros(0), np.zeros(0), 0.0, None)
     verdict = Verdict('inseparable', (), (('temperature_bias', 'warm_up'),), 0.9, (), best)
@@ -443,7 +443,7 @@ def test_the_next_manoeuvre_is_the_one_that_tells_most():
 
 
 def test_temperature_is_named_in_a_climatic_chamber(run_tool, tmp_path, shared_dir):
-    """A real recording at rest, and the slopes of its README: +0.16, -0.15, -0.43 mg/degC."""
+    """A real recording at rest has the slopes of its README: 0.16, -0.15 and -0.43 mg/degC."""
     run = run_tool('diagnose', shared_dir / 'real' / 'thermal_chamber.csv', '-o', tmp_path,
                     '--json')
     report = json.loads(run.stdout)
@@ -461,7 +461,7 @@ def test_temperature_is_named_in_a_climatic_chamber(run_tool, tmp_path, shared_d
 
 
 def test_another_simulator_takes_the_place_of_the_stage(run_tool, tmp_path, shared_dir):
-    """Optical tracking is no simulator of an IMU: a gap, and no effect is claimed for it."""
+    """Optical tracking does not simulate an IMU. The gap is unknown, and no effect is named."""
     run = run_tool('diagnose', shared_dir / 'real' / 'broad_02_real.csv', '--sim',
                     shared_dir / 'real' / 'broad_02_sim.csv', '-o', tmp_path, '--json')
     report = json.loads(run.stdout)
@@ -470,7 +470,7 @@ def test_another_simulator_takes_the_place_of_the_stage(run_tool, tmp_path, shar
 
 
 def test_a_sensor_that_moves_without_a_reference_gets_no_verdict(run_tool, tmp_path, shared_dir):
-    """Turned by hand: one line says what is missing."""
+    """A sensor turned by hand has no reference, which one line says."""
     run = run_tool('diagnose', shared_dir / 'real' / 'mpu9150_0.csv', '-o', tmp_path, '--json')
     verdict = json.loads(run.stdout)['verdict']
     assert (verdict['status'], verdict['data_fault']) == ('bad_data', 'reference')
@@ -478,7 +478,7 @@ def test_a_sensor_that_moves_without_a_reference_gets_no_verdict(run_tool, tmp_p
 
 @pytest.mark.parametrize('name', ['no_gap', 'temperature_bias', 'time_offset'])
 def test_samples_of_another_generator(run_tool, tmp_path, shared_dir, name):
-    """The three samples come out right from `fit --model linear` and `diagnose`."""
+    """The shared samples have the right verdict after `fit --model linear`."""
     folder = shared_dir / 'samples' / name
     run_tool('fit', folder / 'cal.csv', '--model', 'linear', '-o', tmp_path / 'unit.yaml')
     run = run_tool('diagnose', folder / 'run.csv', '--params', tmp_path / 'unit.yaml', '-o',
