@@ -157,59 +157,108 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
     show_progress(0.05)
     linear_model = build_linear_model([c.search_comparison for c in checked],
                                       lambda done: show_progress(0.05 + 0.25 * done))
-    floor = gap_closure.estimate_noise_floor([c.comparison for c in checked])
     hypotheses = search(linear_model, lambda done: show_progress(0.3 + 0.4 * done))
-    return _decided(checked, linear_model, floor, hypotheses, sensor, seed, show_progress)
+    explanation = _explain(checked, linear_model, hypotheses, sensor, seed)
+    show_progress(0.8)
+    verdict = _decide(linear_model, explanation)
+    show_progress(0.9)
+    diagnosis = _with_report(linear_model, explanation, verdict, sensor, seed)
+    show_progress(1.0)
+    return diagnosis
 
 
-def _decided(checked: Sequence[CheckedRecording], linear_model: LinearModel, floor: NoiseFloor,
-             hypotheses: Sequence[Hypothesis], sensor: Sensor, seed: int,
-             show_progress: Callable[[float], None]) -> Diagnosis:
-    """Decide between the hypotheses of the search, and add what the report needs."""
+@dataclass(frozen=True)
+class _Explanation:
+    """
+    The hypotheses that hold on held-out blocks, and the noise beside the best of them.
+
+    Attributes
+    ----------
+    noise_floor
+        The noise floor.
+    noise_mps2
+        Rms of the noise without the steps of the encoder, m/s².
+    hypotheses
+        Material hypotheses that hold, the most probable first.
+    closure
+        Gap closure of the best hypothesis.
+    detections
+        Noise-like effects that show.
+    sensor
+        The baseline with the best hypothesis and the detections.
+    noise_before, noise_after
+        Recorded by simulated noise, for the baseline and for `sensor`.
+
+    """
+
+    noise_floor: NoiseFloor
+    noise_mps2: float
+    hypotheses: list[Hypothesis]
+    closure: GapClosure
+    detections: list[Detection]
+    sensor: Sensor
+    noise_before: tuple[NoiseComparison, ...]
+    noise_after: tuple[NoiseComparison, ...]
+
+
+def _explain(checked: Sequence[CheckedRecording], linear_model: LinearModel,
+             hypotheses: Sequence[Hypothesis], sensor: Sensor, seed: int) -> _Explanation:
+    """Keep the material hypotheses that hold on held-out blocks, and find noise-like effects."""
     comparisons = [c.comparison for c in checked]
-    search_comparisons = linear_model.comparisons
-    scale_v_per_mps2 = search_comparisons[0].scale_v_per_mps2
+    floor = gap_closure.estimate_noise_floor(comparisons)
+    scale_v_per_mps2 = linear_model.comparisons[0].scale_v_per_mps2
     noise_mps2 = float(np.sqrt(np.mean((floor.noise_v / scale_v_per_mps2) ** 2)))
-    library_size = len({v.effect for v in linear_model.variants})
     material = decision.material_hypotheses(
-        [gap_closure.size_of(linear_model, h) for h in hypotheses], library_size, noise_mps2,
-        linear_model.smallest_angle_rad())
+        [gap_closure.size_of(linear_model, h) for h in hypotheses], linear_model.library_size,
+        noise_mps2, linear_model.smallest_angle_rad())
     baseline_residual = gap_closure.held_out_residual(linear_model, comparisons, (),
                                                       linear_model.baseline)
     confirmed, closure = _confirmed(linear_model, comparisons, material, baseline_residual,
                                     floor.rms_mps2, seed)
-    best = confirmed[0]
-    show_progress(0.8)
-    beside_best = discrepancy(linear_model, best)
-    instead = discrepancy_instead_of_drift(linear_model, confirmed)
-    detections = _detections(checked, best)
-    named_sensor = _with_detections(best, detections, sensor)
-    noise_before = _noise_comparisons(comparisons, sensor, sensor, seed)
-    noise_after = _noise_comparisons(comparisons, best.sensor, named_sensor, seed)
+    detections = _detections(checked, confirmed[0])
+    named_sensor = _with_detections(confirmed[0], detections, sensor)
+    return _Explanation(
+        floor, noise_mps2, confirmed, closure, detections, named_sensor,
+        _noise_comparisons(comparisons, sensor, sensor, seed),
+        _noise_comparisons(comparisons, confirmed[0].sensor, named_sensor, seed))
+
+
+def _decide(linear_model: LinearModel, explanation: _Explanation) -> Verdict:
+    """Gather the findings beside the best hypothesis, and decide."""
+    best, closure = explanation.hypotheses[0], explanation.closure
     simulated_noise_mps2 = float(np.sqrt(np.mean(
-        [n.simulated_std_mps2 ** 2 for n in noise_after])))
+        [n.simulated_std_mps2 ** 2 for n in explanation.noise_after])))
     walk = walk_log_bayes_factor(list(residual_channels(linear_model, best))) \
         if drifts_among(best.effects) else 0.0
     verdict = decision.decide(Findings(
-        confirmed, library_size, beside_best, instead, walk, detections, noise_mps2,
+        explanation.hypotheses, linear_model.library_size, discrepancy(linear_model, best),
+        discrepancy_instead_of_drift(linear_model, explanation.hypotheses), walk,
+        explanation.detections, explanation.noise_mps2,
         float(np.sqrt(max(closure.before_mps2 ** 2 - closure.fitted_rms_mps2 ** 2, 0.0))),
         gap_closure.unexplained_mps2(linear_model, best, closure, simulated_noise_mps2),
         max(float(c.sensor.lsb_v / np.min(c.scale_v_per_mps2)) / 12 ** 0.5
-            for c in search_comparisons)))
-    if verdict.status == 'no_gap' and not any(map(_could_show, search_comparisons)):
-        verdict = replace(verdict, status='insufficient')
-    show_progress(0.9)
-    lacking = not_covered(search_comparisons)
-    diagnosis = Diagnosis(
-        None, search_comparisons, floor, verdict, tuple(confirmed), tuple(detections), closure,
-        tuple(residual_map(search_comparisons[0], floor.rms_mps2, seed)), tuple(lacking),
-        propose_next_experiment(verdict, lacking, seed),
-        {effect: gap_closure.contribution_mps2(linear_model, best, effect)
-         for effect in best.effects},
-        single_effect_tests(linear_model, seed), noise_before, noise_after,
-        sensor if verdict.status in ('no_gap', 'unknown', 'insufficient') else named_sensor)
-    show_progress(1.0)
-    return diagnosis
+            for c in linear_model.comparisons)))
+    if verdict.status == 'no_gap' and not any(map(_could_show, linear_model.comparisons)):
+        return replace(verdict, status='insufficient')
+    return verdict
+
+
+def _with_report(linear_model: LinearModel, explanation: _Explanation, verdict: Verdict,
+                 sensor: Sensor, seed: int) -> Diagnosis:
+    """Add to a verdict what the report shows beside it."""
+    comparisons, best = linear_model.comparisons, verdict.best
+    floor, lacking = explanation.noise_floor, not_covered(comparisons)
+    contributions_mps2 = {
+        effect: gap_closure.contribution_mps2(linear_model, best, effect)
+        for effect in best.effects}
+    named = verdict.status not in ('no_gap', 'unknown', 'insufficient')
+    return Diagnosis(
+        None, comparisons, floor, verdict, tuple(explanation.hypotheses),
+        tuple(explanation.detections), explanation.closure,
+        tuple(residual_map(comparisons[0], floor.rms_mps2, seed)), tuple(lacking),
+        propose_next_experiment(verdict, lacking, seed), contributions_mps2,
+        single_effect_tests(linear_model, seed), explanation.noise_before,
+        explanation.noise_after, explanation.sensor if named else sensor)
 
 
 def _confirmed(linear_model: LinearModel, comparisons: Sequence[BaselineComparison],

@@ -109,6 +109,11 @@ class LinearModel:
         """Whether all recordings have a reference."""
         return all(c.reference is not Reference.NONE for c in self.comparisons)
 
+    @property
+    def library_size(self) -> int:
+        """Number of effects that have something to act on."""
+        return len({v.effect for v in self.variants})
+
     def nuisance_ids(self) -> list[int]:
         """Return the numbers of the columns of nuisance parameters."""
         return [i for variant, ids in zip(self.variants, self.column_ids)
