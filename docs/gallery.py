@@ -12,14 +12,16 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Draw docs/effects.md: each effect of the library, clean and with it; `make gallery`."""
+"""Write docs/effects.md: each effect of the library with a plot of what it does."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
 import sys
+from textwrap import wrap
 
 from adxl_ros.files import parameter_file
 from adxl_ros.model.coefficients import put, typical
+from adxl_ros.model.constants import AXES
 from adxl_ros.model.effects import library
 from adxl_ros.model.effects.base import Coefficient, Effect, Need, Place
 from adxl_ros.model.sensor import Sensor, with_axes
@@ -36,11 +38,32 @@ from scipy.signal import welch
 DOCS = Path(__file__).resolve().parent
 COLOURS = {'x': 'tab:blue', 'y': 'tab:orange', 'z': 'tab:green'}
 TURN = 2 * np.pi
+"""One turn, rad."""
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A manoeuvre and how to look at it; `noisy` keeps the noise and the ADC."""
+    """
+    A manoeuvre and how its output is drawn.
+
+    Attributes
+    ----------
+    motion
+        The manoeuvre.
+    across
+        Column of the horizontal axis.
+    label
+        Label of the horizontal axis.
+    unit
+        Factor from the column to the horizontal axis.
+    noisy
+        Whether noise and ADC are simulated.
+    axes
+        Axes that are drawn.
+    kind
+        Kind of the plot: lines, spectrum or codes.
+
+    """
 
     motion: Motion
     across: str = 'time_s'
@@ -51,8 +74,42 @@ class Scene:
     kind: str = 'lines'
 
 
+@dataclass(frozen=True)
+class Pair:
+    """
+    Recordings of one manoeuvre without and with an effect.
+
+    Attributes
+    ----------
+    sensor
+        The unit without the effect.
+    clean, changed
+        Columns without and with the effect.
+
+    """
+
+    sensor: Sensor
+    clean: Columns
+    changed: Columns
+
+
 def turning(alpha_deg: float, seconds: float = 36.0) -> Motion:
-    """Turn beta forth and back at constant speed in one plane."""
+    """
+    Turn beta forth and back at constant velocity in one plane.
+
+    Parameters
+    ----------
+    alpha_deg
+        Alpha of the plane, degrees.
+    seconds
+        Duration, s.
+
+    Returns
+    -------
+    Motion
+        The manoeuvre.
+
+    """
     half, rate = seconds / 2, TURN / (seconds / 2 - 1)
     return Motion(seconds, Held(np.radians(alpha_deg)), Knots(
         [0, 1, half - 1, half, half + 1, seconds - 1, seconds],
@@ -61,7 +118,22 @@ def turning(alpha_deg: float, seconds: float = 36.0) -> Motion:
 
 
 def plane(alpha_deg: float, axes: str = 'xy') -> Scene:
-    """Look at one plane over beta."""
+    """
+    Draw the output over beta in one plane.
+
+    Parameters
+    ----------
+    alpha_deg
+        Alpha of the plane, degrees.
+    axes
+        Axes that are drawn.
+
+    Returns
+    -------
+    Scene
+        The scene.
+
+    """
     return Scene(turning(alpha_deg), 'beta_rad', f'beta at alpha = {alpha_deg:g}°, deg',
                  180 / np.pi, axes=axes)
 
@@ -92,26 +164,27 @@ SCENES = {
     'noise_excess': replace(OVER_TIME, kind='spectrum'),
     'quantisation': replace(OVER_TIME, kind='codes')}
 LOUDER = {Coefficient('stuck', 'rate_hz'): 1.0, Coefficient('stuck', 'duration_s'): 0.2,
-          **{Coefficient('saturation', 'limit_g', axis): 0.9 for axis in 'xyz'},
+          **{Coefficient('saturation', 'limit_g', axis): 0.9 for axis in AXES},
           Coefficient('clock_skew', 'ratio'): 1e-3,
           Coefficient('mount_resonance', 'frequency_hz'): 25.0}
-"""Where a typical value would not be seen on the manoeuvre."""
+"""Values of parameters whose typical value does not show in the plot."""
 
 
 def main(output: Path) -> None:
     """Draw every effect and write the page."""
-    nominal = with_axes(parameter_file.load(DOCS.parent / 'params' / 'adxl203.yaml'), 'xyz')
+    nominal = with_axes(parameter_file.load(DOCS.parent / 'params' / 'adxl203.yaml'), AXES)
     nominal = replace(nominal, rate_hz=500.0)
     (output / 'effects').mkdir(parents=True, exist_ok=True)
-    lines = ['# Gallery of effects', '', 'Made by `make gallery` from the library itself: '
-             'typical values, unless the caption says otherwise; seed 0.', '']
+    lines = ['# Gallery of effects', '', 'Each plot shows the output without and with one effect '
+             'at its typical values, unless the caption states others.', 'The program '
+             '`make gallery` writes this page from the library.', '']
     place = None
     for effect in sorted(library().values(), key=lambda e: (e.place, e.name)):
         if effect.place is not place:
             place = effect.place
             lines += [f'## {TITLES[place]}', '']
         caption = draw(nominal, effect, output / 'effects' / f'{effect.name}.png')
-        lines += page(effect, caption)
+        lines += section(effect, caption)
     (output / 'effects.md').write_text('\n'.join(lines), encoding='utf-8')
 
 
@@ -120,35 +193,67 @@ TITLES = {Place.STAGE: 'Stage', Place.FORCE: 'Specific force', Place.MOUNTING: '
           Place.ADC: 'Input of the ADC', Place.CODE: 'Codes and link', Place.CLOCK: 'Clock'}
 
 
-def page(effect: Effect, caption: str) -> list[str]:
-    """Say about an effect what the library knows."""
-    said = [f'Acts on the {effect.acts_on.value}',
-            'smooth in its parameters' if effect.smooth else 'not smooth in its parameters',
-            'undone by the inverse' if effect.invertible else 'not undone by the inverse']
-    said += [f'needs a {need.value}' for need in effect.needs]
-    said += [f'follows `{name}`' for name in effect.follows]
+def section(effect: Effect, caption: str) -> list[str]:
+    """
+    Return the section of an effect.
+
+    Parameters
+    ----------
+    effect
+        The effect.
+    caption
+        Caption of its plot.
+
+    Returns
+    -------
+    list
+        Lines of Markdown.
+
+    """
+    facts = [f'Acts on the {effect.acts_on.value}',
+             'smooth in its parameters' if effect.smooth else 'not smooth in its parameters',
+             'undone by the inverse' if effect.invertible else 'not undone by the inverse']
+    facts += [f'needs: {need.value}' for need in effect.needs]
+    facts += [f'follows `{name}`' for name in effect.follows]
     rows = [f'| `{p.name}` | {p.unit} | {p.neutral:g} | {p.lower:g} to {p.upper:g} | {p.scale:g} '
             f'| {", ".join(p.axes) or "-"} | {p.doc} | {p.source} |' for p in effect.parameters]
-    return [f'### {effect.name}', '', effect.cause, '', f'![{effect.name}](effects/'
-            f'{effect.name}.png)', '', caption, '', f'{"; ".join(said)}.', '',
+    return [f'### {effect.name}', '', *wrap(effect.cause, 119), '', f'![{effect.name}](effects/'
+            f'{effect.name}.png)', '', caption, '', f'{"; ".join(facts)}.', '',
             '| parameter | unit | neutral | bounds | typical | axes | meaning | source |',
             '|---|---|---|---|---|---|---|---|', *rows, '']
 
 
 def draw(nominal: Sensor, effect: Effect, path: Path) -> str:
-    """Draw one effect; return the caption."""
+    """
+    Draw one effect.
+
+    Parameters
+    ----------
+    nominal
+        The nominal sensor.
+    effect
+        The effect.
+    path
+        File of the plot.
+
+    Returns
+    -------
+    str
+        Caption of the plot.
+
+    """
     scene = SCENES.get(effect.name, plane(90))
     sensor = nominal if scene.noisy else replace(
-        nominal, noise_density_g_per_rthz=np.zeros(3), adc_bits=nominal.adc_bits * (
-            Need.ADC in effect.needs))
-    with_it = replace(sensor, effects=(effect.name,),
-                      values={effect.name: typical(effect, 'xyz')})
+        nominal, noise_density_g_per_rthz=np.zeros(3),
+        adc_bits=nominal.adc_bits if Need.ADC in effect.needs else 0)
+    changed = replace(sensor, effects=(effect.name,),
+                      values={effect.name: typical(effect, AXES)})
     louder = {name: value for name, value in LOUDER.items() if name.effect == effect.name}
-    with_it = put(with_it, list(louder), list(louder.values()))
-    clean, changed = (simulate(unit, scene.motion, 0) for unit in (sensor, with_it))
+    changed = put(changed, list(louder), list(louder.values()))
+    pair = Pair(sensor, simulate(sensor, scene.motion, 0), simulate(changed, scene.motion, 0))
     figure, (above, below) = plt.subplots(2, 1, figsize=(7.5, 4.6), constrained_layout=True)
-    {'lines': lines_of, 'spectrum': spectrum, 'codes': codes}[scene.kind](
-        above, below, scene, clean, changed, sensor)
+    {'lines': draw_lines, 'spectrum': draw_spectrum, 'codes': draw_codes}[scene.kind](
+        above, below, scene, pair)
     above.set_title(effect.name, loc='left', fontweight='bold')
     figure.savefig(path, dpi=85)
     plt.close(figure)
@@ -157,23 +262,34 @@ def draw(nominal: Sensor, effect: Effect, path: Path) -> str:
     return f'Here with {stated}.' if stated else 'Typical values.'
 
 
-def lines_of(above: plt.Axes, below: plt.Axes, scene: Scene, clean: Columns, changed: Columns,
-             sensor: Sensor) -> None:
-    """Draw output and difference over time or an angle, in the direction of travel."""
-    across = clean[scene.across] * scene.unit
+def draw_lines(above: plt.Axes, below: plt.Axes, scene: Scene, pair: Pair) -> None:
+    """
+    Draw output and difference over time or an angle, in the direction of travel.
+
+    Parameters
+    ----------
+    above, below
+        Axes of the output and of the difference.
+    scene
+        How it is drawn.
+    pair
+        The recordings.
+
+    """
+    across = pair.clean[scene.across] * scene.unit
     forth = np.ones(len(across), bool)
     if np.ptp(np.sign(np.diff(across))) == 2:
         forth[len(across) // 2:] = False
+    scale, zero = pair.sensor.nominal_scale_v_per_g[0], pair.sensor.nominal_zero_g_v[0]
     for axis in scene.axes:
-        column = f'{axis}_v'
-        scale, zero = sensor.nominal_scale_v_per_g[0], sensor.nominal_zero_g_v[0]
-        before, after = ((c[column] - zero) / scale for c in (clean, changed))
-        above.plot(across[forth], before[forth], color='0.7', lw=3)
-        above.plot(across[forth], after[forth], color=COLOURS[axis], lw=1, label=axis)
-        off = (after - before) * 1e3
-        below.plot(across[forth], off[forth], color=COLOURS[axis], lw=1.2)
+        clean_g, changed_g = ((columns[f'{axis}_v'] - zero) / scale
+                              for columns in (pair.clean, pair.changed))
+        above.plot(across[forth], clean_g[forth], color='0.7', lw=3)
+        above.plot(across[forth], changed_g[forth], color=COLOURS[axis], lw=1, label=axis)
+        difference_mg = (changed_g - clean_g) * 1e3
+        below.plot(across[forth], difference_mg[forth], color=COLOURS[axis], lw=1.2)
         if not forth.all():
-            below.plot(across[~forth], off[~forth], color=COLOURS[axis], lw=1, ls='--')
+            below.plot(across[~forth], difference_mg[~forth], color=COLOURS[axis], lw=1, ls='--')
     above.set_ylabel('output, g')
     above.plot([], [], color='0.7', lw=3, label='clean')
     above.legend(ncol=4, loc='lower right', bbox_to_anchor=(1, 1), fontsize=8, frameon=False)
@@ -187,15 +303,26 @@ def lines_of(above: plt.Axes, below: plt.Axes, scene: Scene, clean: Columns, cha
         ax.grid(alpha=0.3)
 
 
-def spectrum(above: plt.Axes, below: plt.Axes, scene: Scene, clean: Columns, changed: Columns,
-             sensor: Sensor) -> None:
-    """Draw a stretch and the noise densities."""
+def draw_spectrum(above: plt.Axes, below: plt.Axes, _: Scene, pair: Pair) -> None:
+    """
+    Draw a part of the output, and the noise densities.
+
+    Parameters
+    ----------
+    above, below
+        Axes of the output and of the densities.
+    _
+        Not used.
+    pair
+        The recordings.
+
+    """
     part = slice(0, 1000)
-    for columns, colour, width, label in ((clean, '0.7', 3, 'clean'),
-                                          (changed, COLOURS['x'], 1, 'with it')):
+    for columns, colour, width, label in ((pair.clean, '0.7', 3, 'clean'),
+                                          (pair.changed, COLOURS['x'], 1, 'with it')):
         volts = columns['x_v'] - columns['x_v'].mean()
         above.plot(columns['time_s'][part], volts[part] * 1e3, color=colour, lw=width / 2)
-        f, density = welch(volts, sensor.rate_hz, nperseg=16384)
+        f, density = welch(volts, pair.sensor.rate_hz, nperseg=16384)
         below.loglog(f[1:], np.sqrt(density[1:]) * 1e6, color=colour, lw=width, label=label)
     above.set_ylabel('x, mg')
     above.set_xlabel('time, s')
@@ -206,14 +333,25 @@ def spectrum(above: plt.Axes, below: plt.Axes, scene: Scene, clean: Columns, cha
         ax.grid(alpha=0.3, which='both')
 
 
-def codes(above: plt.Axes, below: plt.Axes, scene: Scene, clean: Columns, changed: Columns,
-          sensor: Sensor) -> None:
-    """Draw a stretch and how often each code comes."""
+def draw_codes(above: plt.Axes, below: plt.Axes, _: Scene, pair: Pair) -> None:
+    """
+    Draw a part of the output, and the share of each code.
+
+    Parameters
+    ----------
+    above, below
+        Axes of the output and of the codes.
+    _
+        Not used.
+    pair
+        The recordings.
+
+    """
     part = slice(0, 150)
-    for columns, colour, width, label in ((clean, '0.7', 3, 'clean'),
-                                          (changed, COLOURS['x'], 1.2, 'with it')):
+    for columns, colour, width, label in ((pair.clean, '0.7', 3, 'clean'),
+                                          (pair.changed, COLOURS['x'], 1.2, 'with it')):
         above.step(columns['time_s'][part], columns['x_v'][part] * 1e3, color=colour, lw=width)
-        code, count = np.unique(np.rint(columns['x_v'] / sensor.lsb_v), return_counts=True)
+        code, count = np.unique(np.rint(columns['x_v'] / pair.sensor.lsb_v), return_counts=True)
         below.vlines(code, 0, count / count.sum(), color=colour, lw=width * 1.5, label=label)
     above.set_ylabel('x, mV')
     above.set_xlabel('time, s')

@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 from enum import auto, Enum, IntEnum
 from typing import Any, NamedTuple, Protocol
 
-from adxl_ros.model.constants import NOMINAL_SUPPLY_V, NOMINAL_TEMPERATURE_C
+from adxl_ros.model.constants import AXES, NOMINAL_SUPPLY_V, NOMINAL_TEMPERATURE_C
 from adxl_ros.model.diagnosis_hints import DiagnosisHints
 import numpy as np
 
@@ -278,7 +278,7 @@ class Parameter:
     scale: float
     source: str
     doc: str
-    axes: str = 'xyz'
+    axes: str = AXES
     neutral: float = 0.0
     typical: float | None = None
     held: bool = False

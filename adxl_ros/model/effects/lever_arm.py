@@ -14,6 +14,7 @@
 
 """Lever arm: rotation accelerates a sensor that is not on the axes of the stage."""
 
+from adxl_ros.model.constants import AXES
 from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre
 from adxl_ros.model.effects.base import Effect, Need, Parameter, Parameters, Place, Signals
 from adxl_ros.model.kinematics import angular_motion, carried_acceleration
@@ -33,7 +34,7 @@ EFFECT = Effect(
     parameters=tuple(
         Parameter(f'{axis}_m', 'm', -2.0, 2.0, 0.02, 'physics: size of a board',
                   f"from the axis to the sensor along the sensor's {axis}", '')
-        for axis in 'xyz'),
+        for axis in AXES),
     apply=apply,
     exact=True,
     needs=(Need.STAGE,),
