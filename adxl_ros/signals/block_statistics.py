@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""A stream of samples cut into short blocks: all that the search for rests keeps of it."""
+"""Statistics of a stream of samples in short blocks, from which rests are found."""
 
 from __future__ import annotations
 
@@ -21,11 +21,13 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 BLOCK_S = 0.05
-"""Length of a block, s: well below a rest, well above the time between samples where it can be."""
+"""Length of a block, s. Chosen: well below a rest, and above the sample period of most sensors."""
 GAP_S = 0.1
-"""Time without a sample that ends a block and a rest, s (or five samples, if that is longer)."""
-CHUNK = 1 << 13
-"""Samples worked on at once: what fits a cache, so that long recordings cost no memory."""
+"""Time without a sample that ends a block and a rest, s."""
+_GAP_PERIODS = 5
+"""Sample periods without a sample that are needed as well to end a block."""
+_CHUNK = 1 << 13
+"""Rows processed at once. Chosen: they fit a cache, and long recordings need no memory."""
 
 
 def block_samples(rate_hz: float) -> int:
@@ -53,8 +55,8 @@ class Blocks:
     squares
         Sum of the squared deviations from the mean, (k, m).
     step
-        Smallest change between consecutive rows that is not 0, (k, m): the step of the ADC if
-        the noise reaches it; inf if nothing changes.
+        Smallest change between consecutive rows that is not 0, (k, m). It is the step of the ADC
+        if the noise reaches it; inf if nothing changes.
     angle
         Lowest and highest encoder angle, rad, (k, 2, a); NaN where none was sampled.
 
@@ -79,17 +81,17 @@ class Blocks:
 
     @staticmethod
     def join(parts: list[Blocks]) -> Blocks:
-        """Put the blocks of several parts of one stream in a row."""
+        """Concatenate the blocks of several parts of one stream."""
         return Blocks(*(np.concatenate([getattr(p, f.name) for p in parts])
                         for f in fields(Blocks)))
 
 
 class BlockCutter:
     """
-    Cuts a stream into blocks; how the stream is portioned makes no difference to them.
+    Cuts a stream into blocks, which do not depend on how the stream is fed in portions.
 
-    A gap in time, or time that runs backwards, begins a new run, and what is left of the block
-    before it is not used.
+    A gap in time, or time that runs backwards, begins a new run. The incomplete block before it
+    is not used.
 
     Parameters
     ----------
@@ -103,7 +105,7 @@ class BlockCutter:
     def __init__(self, rate_hz: float, axes: int, angles: int = 0):
         self.size = block_samples(rate_hz)
         self._axes = axes
-        self._gap_s = max(GAP_S, 5 / rate_hz)
+        self._gap_s = max(GAP_S, _GAP_PERIODS / rate_hz)
         self._rest = np.empty((1 + axes + angles, 0))
         self._mean = np.zeros((axes, 1))
         self._row = 0
@@ -113,7 +115,7 @@ class BlockCutter:
     def feed(self, time_s: np.ndarray, samples: np.ndarray,
              angles_rad: np.ndarray | None = None) -> Blocks:
         """
-        Take the next rows of the stream and return the blocks that they complete.
+        Add the next rows of the stream.
 
         Parameters
         ----------
@@ -124,30 +126,35 @@ class BlockCutter:
         angles_rad
             Encoder angles, rad, (n, a), NaN where not sampled.
 
+        Returns
+        -------
+        Blocks
+            The blocks that these rows complete.
+
         """
-        given = [time_s[:, None], samples] + ([] if angles_rad is None else [angles_rad])
+        columns = [time_s[:, None], samples] + ([] if angles_rad is None else [angles_rad])
         return Blocks.join([self.none()] + [
-            self._cut(np.concatenate([part[i:i + CHUNK].T for part in given]))
-            for i in range(0, len(time_s), CHUNK)])
+            self._cut(np.concatenate([part[i:i + _CHUNK].T for part in columns]))
+            for i in range(0, len(time_s), _CHUNK)])
 
     def none(self) -> Blocks:
-        """Give no blocks, of the right shape."""
+        """Return no blocks, of the right shape."""
         return self._summed(self._rest, np.empty(0, int), np.empty(0, int))
 
     def _cut(self, columns: np.ndarray) -> Blocks:
-        """Cut what is left of the rows before, and these, (1 + m + a, n)."""
+        """Cut the rows that are left over from before, and these, (1 + m + a, n)."""
         columns = np.concatenate([self._rest, columns], axis=1)
         count = columns.shape[1]
         step_s = np.diff(columns[0], prepend=self._last_time_s)
         begins = np.flatnonzero(~((step_s >= 0) & (step_s <= self._gap_s)))
         edges = np.unique(np.concatenate([[0], begins, [count]]))
-        whole = np.diff(edges) // self.size
-        start = np.repeat(edges[:-1] + self.size * (whole - np.cumsum(whole)), whole)
+        complete = np.diff(edges) // self.size
+        start = np.repeat(edges[:-1] + self.size * (complete - np.cumsum(complete)), complete)
         start += self.size * np.arange(len(start))
         blocks = self._summed(columns, start,
                               self._run + np.searchsorted(begins, start, side='right'))
-        # Breaks within what is kept for later are seen again then, with the same time before.
-        kept = int(edges[-2] + self.size * whole[-1])
+        # Gaps within the rows that are kept are counted later, with the same time before them.
+        kept = int(edges[-2] + self.size * complete[-1])
         self._run += int(np.searchsorted(begins, kept))
         self._row += kept
         if kept:
@@ -156,20 +163,20 @@ class BlockCutter:
         return blocks
 
     def _summed(self, columns: np.ndarray, start: np.ndarray, run: np.ndarray) -> Blocks:
-        """Sum the blocks that begin at the columns `start`, each by itself."""
+        """Compute the statistics of the blocks that begin at the columns `start`."""
         block = columns[:, start[:, None] + np.arange(self.size)]
         samples, angles = block[1:1 + self._axes], block[1 + self._axes:]
-        good = np.isfinite(samples).all(axis=0)
-        if not good.all():
-            good &= 2 * good.sum(axis=1, keepdims=True) > self.size
-            samples = np.where(good, samples, np.nan)
-        count = good.sum(axis=1)
+        finite = np.isfinite(samples).all(axis=0)
+        if not finite.all():
+            finite &= 2 * finite.sum(axis=1, keepdims=True) > self.size
+            samples = np.where(finite, samples, np.nan)
+        count = finite.sum(axis=1)
         change = np.abs(np.diff(samples, axis=2))
         step = np.where(change > 0, change, np.inf).min(axis=2, initial=np.inf)
-        # Spikes of 1e38 and worse overflow here: such a block is not at rest, whatever it holds.
+        # Spikes of 1e38 and more overflow here; such a block is never at rest.
         with np.errstate(over='ignore', invalid='ignore'):
-            mean = np.where(good, samples, 0).sum(axis=2) / np.maximum(count, 1)
-            squares = (np.where(good, samples - mean[..., None], 0) ** 2).sum(axis=2)
+            mean = np.where(finite, samples, 0).sum(axis=2) / np.maximum(count, 1)
+            squares = (np.where(finite, samples - mean[..., None], 0) ** 2).sum(axis=2)
         mean = np.concatenate([self._mean, mean], axis=1)
         mean = mean[:, np.maximum.accumulate(np.where(count, np.arange(1, len(count) + 1), 0))]
         if len(count):
@@ -181,15 +188,15 @@ class BlockCutter:
 
 def angle_bounds(blocks: Blocks) -> np.ndarray:
     """
-    Negative lowest and highest angle that each block can have had, (k, 2, a).
+    Return the negative lowest angle and the highest angle of each block, (k, 2, a).
 
-    An encoder that is read less often than the sensor leaves blocks without an angle, and even
-    in others it may turn between two readings: the readings before and after count too.
+    An encoder that is read less often than the sensor has blocks without a reading, and it may
+    turn between two readings. The readings before and after a block count too.
     """
     bounds = blocks.angle * np.array([[-1.0], [1.0]])
-    known = np.isfinite(bounds).all(axis=(1, 2))
-    place, last = np.arange(len(known)), len(known) - 1
-    before = np.maximum.accumulate(np.where(known, place, 0))
-    after = np.minimum.accumulate(np.where(known, place, last)[::-1])[::-1]
+    has_angle = np.isfinite(bounds).all(axis=(1, 2))
+    place, last = np.arange(len(has_angle)), len(has_angle) - 1
+    before = np.maximum.accumulate(np.where(has_angle, place, 0))
+    after = np.minimum.accumulate(np.where(has_angle, place, last)[::-1])[::-1]
     return np.fmax(bounds, np.fmax(bounds[before[np.maximum(place - 1, 0)]],
                                    bounds[after[np.minimum(place + 1, last)]]))

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What noise explains of a stream: figures over windows of blocks, known or learned limits."""
+"""Limits of variance and drift that noise explains, from the datasheet or learned."""
 
 from __future__ import annotations
 
@@ -25,22 +25,42 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy.special import chdtri
 
-WINDOW_S, WINDOW_SAMPLES = 0.25, 8
-"""A variance is judged over this time, s, and no fewer samples."""
-HALF_S = 0.5
-"""The shortest halves whose means are compared for a drift, s."""
+_WINDOW_S = 0.25
+"""Length of the window of a variance, s."""
+_WINDOW_SAMPLES = 8
+"""Smallest count of samples in that window."""
+_HALF_S = 0.5
+"""Length of the shortest neighbouring halves whose means are compared, s."""
 DRIFT_OCTAVES = 4
-"""Neighbouring halves of 0.5, 1, 2 and 4 s are compared: beyond, a sensor's flicker decides."""
-SPREAD_RATIO = (2.25, 9.0)
-"""A variance counts as noise up to 2.25 to 9 times the noise's: 1.5 to 3 times its rms."""
+"""Octaves of that length: 0.5, 1, 2 and 4 s. Chosen: beyond, a sensor's flicker dominates."""
+_MIN_VARIANCE_RATIO = 2.25
+"""Smallest limit of a variance, relative to that of the noise: 1.5 times its rms."""
+_MAX_VARIANCE_RATIO = 9.0
+"""Largest limit of a variance, relative to that of the noise: 3 times its rms."""
+_FALSE_ALARM = 1e-6
+"""Probability that the variance of noise exceeds its limit."""
+_QUIETEST_SHARE = 0.05
+"""Share of the windows at whose greatest variance the search for the noise begins."""
+_QUIET_RATIO = 3.0
+"""Windows up to this many times the noise's variance are quiet ones."""
+_QUIET_STEPS = 50
+"""Largest count of steps of that search."""
+_QUIET_DEVIATIONS = 5.0
+"""The limit is this many standard deviations of ln(variance) above the noise."""
+_MAD_TO_STD = 1.4826
+"""Standard deviation of a normal deviate by the median of its magnitude."""
+_QUARTILE_TO_STD = 0.3186
+"""Quartile of a normal deviate's magnitude, by its standard deviation."""
+_ROUNDING = 1e-9
+"""Relative rounding error of samples without noise."""
 END_SIGMAS = 3.5
-"""The ends of a rest are cut where they differ from the rest of it by more than this."""
+"""The ends of a rest are cut if they differ from its middle by more standard deviations."""
 
 
 @dataclass(frozen=True)
 class Noise:
     """
-    Noise of one sample as a parameter file states it.
+    Noise of one sample.
 
     Attributes
     ----------
@@ -56,23 +76,23 @@ class Noise:
 
 
 def datasheet_noise(sensor: Sensor) -> Noise:
-    """Return the noise that the figures of a sensor promise, V."""
+    """Return the noise of a sample by the datasheet values of a sensor, V."""
     return Noise(sample_std_v(sensor), sensor.rc_s)
 
 
 @dataclass(frozen=True)
 class Spans:
     """
-    Lengths of what is looked at, in blocks.
+    Lengths of windows in blocks.
 
     Attributes
     ----------
     size, dt_s
         Samples in a block, and the time between them, s.
     window
-        A variance is judged over this many, odd, so that one is in the middle.
+        Blocks of the window of a variance; odd, so that one is in the middle.
     half
-        The shortest halves whose means are compared.
+        Blocks of the shortest halves whose means are compared.
 
     """
 
@@ -83,37 +103,37 @@ class Spans:
 
     @staticmethod
     def at(rate_hz: float) -> Spans:
-        """Choose them for a sample rate, Hz."""
+        """Return the lengths for a sample rate, Hz."""
         size = block_samples(rate_hz)
         block_s = size / rate_hz
-        window = max(round(WINDOW_S / block_s), -(-WINDOW_SAMPLES // size)) // 2 * 2 + 1
-        return Spans(size, 1 / rate_hz, window, max(round(HALF_S / block_s), 4))
+        window = max(round(_WINDOW_S / block_s), -(-_WINDOW_SAMPLES // size)) // 2 * 2 + 1
+        return Spans(size, 1 / rate_hz, window, max(round(_HALF_S / block_s), 4))
 
     @property
     def block_s(self) -> float:
-        """Time of a block, s."""
+        """Return the time of a block, s."""
         return self.size * self.dt_s
 
     @property
     def longest(self) -> int:
-        """Count the blocks of both halves, where they are longest."""
+        """Return the count of blocks of both longest halves."""
         return self.half << DRIFT_OCTAVES
 
 
 @dataclass(frozen=True)
 class NoiseLimits:
     """
-    What noise explains, by axis, (m,).
+    Limits of what noise explains, for m axes.
 
     Attributes
     ----------
     variance
-        Largest variance within a window.
+        Largest variance within a window, (m,).
     drift
-        Standard deviation of the difference of two neighbouring halves, (DRIFT_OCTAVES, m),
-        by octaves of their length.
+        Standard deviation of the difference of two neighbouring halves, by octaves of their
+        length, (DRIFT_OCTAVES, m).
     step
-        Change of a mean that the ADC makes of none.
+        Largest change of a mean by rounding of the ADC, where the input does not change, (m,).
 
     """
 
@@ -121,39 +141,70 @@ class NoiseLimits:
     drift: np.ndarray
     step: np.ndarray
 
-    def or_more(self, other: NoiseLimits) -> NoiseLimits:
-        """Take the larger of each limit."""
+    def larger(self, other: NoiseLimits) -> NoiseLimits:
+        """Return the larger of each limit."""
         return NoiseLimits(np.maximum(self.variance, other.variance),
                       np.maximum(self.drift, other.drift), np.maximum(self.step, other.step))
 
     @property
     def flicker(self) -> np.ndarray:
-        """Noise of the difference of two means that is there however long they are, (m,)."""
+        """Return the noise of the difference of two very long means, (m,)."""
         white = self.drift[0] ** 2 / (1 << DRIFT_OCTAVES - 1)
         return np.sqrt(np.maximum(self.drift[-1] ** 2 - white, 0))
 
     def block_noise(self, spans: Spans) -> np.ndarray:
-        """Noise of the mean of one block, (m,)."""
+        """Return the standard deviation of the mean of one block, (m,)."""
         return self.drift[0] * np.sqrt(spans.half / 2)
 
-    def tells_apart(self, before: np.ndarray, after: np.ndarray, spans: Spans,
-                    sigmas: float) -> bool:
-        """Tell whether the means of two rows of blocks, (k, m) each, differ by more than noise."""
+    def differ(self, before: np.ndarray, after: np.ndarray, spans: Spans, sigmas: float) -> bool:
+        """
+        Return whether two sequences of blocks differ by more than noise.
+
+        Parameters
+        ----------
+        before, after
+            Means of blocks, (k, m) each.
+        spans
+            Lengths for the rate of the stream.
+        sigmas
+            Standard deviations up to which a difference is noise.
+
+        Returns
+        -------
+        bool
+            True if the means of an axis differ by more.
+
+        """
         white = self.block_noise(spans) ** 2 * (1 / len(before) + 1 / len(after))
         allowed = sigmas * np.sqrt(white + self.flicker ** 2) + self.step
         return bool((np.abs(before.mean(axis=0) - after.mean(axis=0)) > allowed).any())
 
 
-def known_limits(noise: Noise, step: np.ndarray, spans: Spans) -> NoiseLimits:
+def stated_limits(noise: Noise, step: np.ndarray, spans: Spans) -> NoiseLimits:
     """
-    NoiseLimits from known noise, and the ADC's step, (m,): a variance of samples is chi-squared.
+    Return the limits for a given noise. A variance of samples is chi-squared.
 
-    A first-order filter correlates neighbours by a = exp(−dt/τ), and the variance of n such
-    samples scatters as that of n·(1 − a²)/(1 + a²) independent ones.
+    A first-order filter correlates neighbours by a = exp(−dt/τ). The variance of n such samples
+    scatters as that of n·(1 − a²)/(1 + a²) independent ones.
+
+    Parameters
+    ----------
+    noise
+        Noise of one sample.
+    step
+        Step of the ADC, (m,).
+    spans
+        Lengths for the rate of the stream.
+
+    Returns
+    -------
+    NoiseLimits
+        Limits in the unit of the noise.
+
     """
     a = np.exp(-spans.dt_s / noise.tau_s) if noise.tau_s else 0.0
     freedom = max((spans.window * spans.size - 1) * (1 - a * a) / (1 + a * a), 1.0)
-    ratio = max(chdtri(freedom, 1e-6) / freedom, SPREAD_RATIO[0])
+    ratio = max(chdtri(freedom, _FALSE_ALARM) / freedom, _MIN_VARIANCE_RATIO)
     sigma = np.hypot(noise.sigma, step / np.sqrt(12))
     halves = spans.half * spans.size << np.arange(DRIFT_OCTAVES)
     drift = np.sqrt(2 / effective_samples(halves, spans.dt_s, noise.tau_s))[:, None] * sigma
@@ -163,20 +214,20 @@ def known_limits(noise: Noise, step: np.ndarray, spans: Spans) -> NoiseLimits:
 def learned_limits(blocks: Blocks, windows: np.ndarray, step: np.ndarray,
                    spans: Spans) -> NoiseLimits | None:
     """
-    Learn the limits from the quietest windows, never below what the ADC's step explains.
+    Learn the limits from the quietest windows, at least those of the ADC's step.
 
     Parameters
     ----------
     blocks, windows
-        All of a stream, and its `window_variance`.
+        Blocks of a stream and their `window_variance`.
     step
         Step of the ADC, (m,).
     spans
-        Those of the stream's rate.
+        Lengths for the rate of the stream.
 
     Returns
     -------
-    limits
+    NoiseLimits or None
         None while the stream is too short.
 
     """
@@ -201,9 +252,8 @@ def _drift_noise(moved: np.ndarray, valid: np.ndarray, half: int) -> np.ndarray 
     """
     Learn the standard deviation of the differences of halves, (m,); None if there are none.
 
-    A steady turn moves all of them by the same: where there are differences to subtract, it does
-    not count. The quartile of a normal deviate's magnitude, 0.3186 of its standard deviation,
-    stands even where most of what is quiet is no rest.
+    A steady turn changes all of them by the same, which differences of differences remove. The
+    quartile of the magnitude is valid even if most quiet blocks are no rest.
     """
     both = valid[:-2 * half] & valid[2 * half:]
     if both.any():
@@ -212,48 +262,61 @@ def _drift_noise(moved: np.ndarray, valid: np.ndarray, half: int) -> np.ndarray 
         differences = moved[valid]
     else:
         return None
-    return np.quantile(np.abs(differences), 0.25, axis=0) / 0.3186
+    return np.quantile(np.abs(differences), 0.25, axis=0) / _QUARTILE_TO_STD
 
 
 def quiet_variance(blocks: Blocks, windows: np.ndarray,
                    step: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
-    Learn the variance that the quietest windows have in common, and its upper limit, (m,) each.
+    Learn the variance that the quietest windows have in common, and its limit.
 
-    Two neighbouring codes in equal parts are what noise below the ADC's step shows at most, and
-    samples without any noise still have rounding.
+    Noise below the ADC's step shows as two neighbouring codes in equal parts at most. Samples
+    without any noise still have a rounding error.
+
+    Parameters
+    ----------
+    blocks, windows
+        Blocks of a stream and their `window_variance`.
+    step
+        Step of the ADC, (m,).
+
+    Returns
+    -------
+    tuple
+        Variance of the noise and limit of a variance, (m,) each.
+
     """
     middle = np.median(np.abs(blocks.mean), axis=0)
-    least = step ** 2 / 4 + (1e-9 * middle) ** 2 + 1e-300
-    found = [_quietest(v, low) for v, low in zip(windows.T, least)]
-    variance, ratio = np.array(found).T
+    smallest = step ** 2 / 4 + (_ROUNDING * middle) ** 2 + 1e-300
+    variance, ratio = np.array([_quietest(variances, limit)
+                                for variances, limit in zip(windows.T, smallest)]).T
     return variance, ratio * variance
 
 
-def _quietest(variances: np.ndarray, least: float) -> tuple[float, float]:
+def _quietest(variances: np.ndarray, smallest: float) -> tuple[float, float]:
     """
-    Find the variance that the quiet windows have in common, and by how much theirs scatters.
+    Return the variance that the quiet windows have in common, and the ratio of its limit.
 
-    From the 5 % of lowest variance the search climbs, or descends, to the median of all that is
-    below three times it: motion spreads over decades, noise does not. The second figure is the
-    ratio up to which a variance still belongs to them.
+    The search begins at the 5 % of lowest variance. It moves to the median of all variances
+    below three times the present one: motion spreads over decades, noise does not.
     """
-    values = np.sort(np.maximum(variances[np.isfinite(variances)], least))
+    values = np.sort(np.maximum(variances[np.isfinite(variances)], smallest))
     if not len(values):
-        return least, SPREAD_RATIO[0]
-    centre = values[len(values) // 20]
-    for _ in range(50):
-        near = values[:np.searchsorted(values, 3 * centre)]
+        return smallest, _MIN_VARIANCE_RATIO
+    centre = values[int(_QUIETEST_SHARE * len(values))]
+    for _ in range(_QUIET_STEPS):
+        near = values[:np.searchsorted(values, _QUIET_RATIO * centre)]
         centre, before = np.median(near), centre
         if centre == before:
             break
-    logs = np.log(values[:np.searchsorted(values, 3 * centre)])
-    scatter = 1.4826 * np.median(np.abs(logs - np.log(centre)))
-    return float(centre), float(np.clip(np.exp(5 * scatter), *SPREAD_RATIO))
+    logs = np.log(values[:np.searchsorted(values, _QUIET_RATIO * centre)])
+    scatter = _MAD_TO_STD * np.median(np.abs(logs - np.log(centre)))
+    return float(centre), float(np.clip(np.exp(_QUIET_DEVIATIONS * scatter),
+                                        _MIN_VARIANCE_RATIO, _MAX_VARIANCE_RATIO))
 
 
 def adc_step(blocks: Blocks) -> np.ndarray:
-    """Find the smallest change of the samples, (m,); 0 where nothing ever changes."""
+    """Return the smallest change of the samples, (m,); 0 where they never change."""
     changes = blocks.step
     if len(blocks) > 1 and (blocks.count <= 1).all():
         changes = np.abs(np.diff(blocks.mean, axis=0))
@@ -264,11 +327,24 @@ def adc_step(blocks: Blocks) -> np.ndarray:
 
 def undithered(step: np.ndarray, sigma: np.ndarray) -> np.ndarray:
     """
-    Error of a mean that rounding to `step` leaves when samples scatter by `sigma`, (m,).
+    Return the error of a mean by rounding that noise does not average out.
 
-    Noise dithers the first harmonic of the rounding error down to exp(−2π²σ²/step²) of itself
-    (Widrow's quantisation theorem): nothing from a step of noise on, all of it with none. A
-    scatter of up to half a step says nothing about the noise: two codes may just flicker.
+    Noise reduces the first harmonic of the rounding error to exp(−2π²σ²/step²) of itself
+    (Widrow's quantisation theorem). A scatter of up to half a step does not show the noise: the
+    codes may flicker between two values without any.
+
+    Parameters
+    ----------
+    step
+        Step of the ADC, (m,).
+    sigma
+        Standard deviation of the samples, (m,).
+
+    Returns
+    -------
+    ndarray
+        Error, (m,).
+
     """
     noise = np.maximum(sigma ** 2 - step ** 2 / 4, 0)
     return step * np.exp(-2 * np.pi ** 2 * noise / np.where(step > 0, step, np.inf) ** 2)
@@ -276,9 +352,20 @@ def undithered(step: np.ndarray, sigma: np.ndarray) -> np.ndarray:
 
 def window_variance(blocks: Blocks, spans: Spans) -> np.ndarray:
     """
-    Variance of the samples in every window, (k − window + 1, m).
+    Return the variance of the samples in every window.
 
-    It is inf across a gap, and where half the samples are missing.
+    Parameters
+    ----------
+    blocks
+        Blocks of a stream.
+    spans
+        Lengths for the rate of the stream.
+
+    Returns
+    -------
+    ndarray
+        Variance, (k − window + 1, m); inf across a gap or where half of the samples are missing.
+
     """
     window = spans.window
     if len(blocks) < window:
@@ -298,11 +385,28 @@ def window_variance(blocks: Blocks, spans: Spans) -> np.ndarray:
 
 def quiet_blocks(blocks: Blocks, windows: np.ndarray, limit: np.ndarray,
                  window: int) -> np.ndarray:
-    """Tell which blocks have a variance up to `limit` (m,) in the window around them, (k,)."""
+    """
+    Mark the blocks whose surroundings have the variance of noise.
+
+    Parameters
+    ----------
+    blocks, windows
+        Blocks of a stream and their `window_variance`.
+    limit
+        Largest variance of noise, (m,).
+    window
+        Blocks of a window.
+
+    Returns
+    -------
+    ndarray
+        True where the window around a block is within the limit, (k,) bool.
+
+    """
     quiet: np.ndarray = np.all(windows <= limit, axis=1)
     if not len(quiet):
         return np.zeros(len(blocks), bool)
-    # At the ends of a run the window cannot be centred: the outermost one counts there.
+    # At the ends of a run the outermost window counts, which is not centred.
     begin = np.searchsorted(blocks.run, blocks.run, side='left')
     end = np.searchsorted(blocks.run, blocks.run, side='right')
     first = np.clip(np.arange(len(blocks)) - window // 2, begin, np.maximum(end - window, begin))
@@ -312,19 +416,28 @@ def quiet_blocks(blocks: Blocks, windows: np.ndarray, limit: np.ndarray,
 def half_differences(blocks: Blocks, usable: np.ndarray,
                      half: int) -> tuple[np.ndarray, np.ndarray]:
     """
-    Compare the means of the `half` blocks before and after each place.
+    Compare the means of the blocks before and after each place.
+
+    Parameters
+    ----------
+    blocks
+        Blocks of a stream.
+    usable
+        Blocks that may be compared, (k,) bool.
+    half
+        Blocks of each half.
 
     Returns
     -------
-    moved, valid
-        Differences (k − 2·half + 1, m), the first at block `half`, and whether both halves are
-        `usable` (k,) throughout and without a gap.
+    tuple
+        Differences, (k − 2·half + 1, m), the first one at block `half`; and whether all blocks of
+        both halves are usable and without a gap.
 
     """
     places = len(blocks) - 2 * half + 1
     if places < 1:
         return np.empty((0, blocks.mean.shape[1])), np.zeros(0, bool)
-    # Sums of what is usable only: a spike of 1e38 would erase everything that is added to it.
+    # Only usable blocks are summed: a spike of 1e38 would erase all that is added to it.
     centre = np.median(blocks.mean[usable], axis=0) if usable.any() else 0.0
     total = np.zeros((len(blocks) + 1, blocks.mean.shape[1]))
     np.cumsum(np.where(usable[:, None], blocks.mean - centre, 0), axis=0, out=total[1:])
@@ -344,10 +457,15 @@ def unlike_beginning(means: np.ndarray, longest: int, white: np.ndarray, flicker
     means
         Means of the blocks of a rest, (k, m).
     longest
-        Blocks that may be cut at most.
+        Largest count of blocks to cut.
     white, flicker, step
-        Noise of a block's mean, noise of the difference of very long ones, and the ADC's share
-        of a change, (m,).
+        Standard deviation of a block's mean, of the difference of very long means, and largest
+        change by the ADC, (m,).
+
+    Returns
+    -------
+    int
+        Count of blocks.
 
     """
     total = np.cumsum(means, axis=0)
@@ -355,9 +473,9 @@ def unlike_beginning(means: np.ndarray, longest: int, white: np.ndarray, flicker
     cut = 0
     while (lengths := lengths[cut + lengths <= longest]).size:
         after = len(means) - cut - lengths
-        upto, whole = total[cut + lengths - 1], total[-1]
+        upto = total[cut + lengths - 1]
         begin = (upto - (total[cut - 1] if cut else 0.0)) / lengths[:, None]
-        bulk = (whole - upto) / after[:, None]
+        bulk = (total[-1] - upto) / after[:, None]
         noise = np.sqrt(white ** 2 * (1 / lengths + 1 / after)[:, None] + flicker ** 2)
         differs = (np.abs(begin - bulk) > END_SIGMAS * noise + step).any(axis=1)
         if not differs.any():
@@ -368,13 +486,20 @@ def unlike_beginning(means: np.ndarray, longest: int, white: np.ndarray, flicker
 
 def batch_scatter(means: np.ndarray, length: int) -> tuple[np.ndarray, int]:
     """
-    Scatter of batches of `length` blocks about their mean.
+    Return the scatter of batches of blocks about their mean.
+
+    Parameters
+    ----------
+    means
+        Means of blocks, (k, m).
+    length
+        Blocks of a batch.
 
     Returns
     -------
-    squares, freedom
-        Sum of squared deviations times `length`, (m,): over `freedom` degrees of freedom, the
-        long-run variance of a block's mean.
+    tuple
+        Sum of squared deviations times `length`, (m,), and its degrees of freedom. Their ratio is
+        the long-run variance of a block's mean.
 
     """
     count = len(means) // length

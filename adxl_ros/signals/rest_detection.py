@@ -13,15 +13,15 @@
 # limitations under the License.
 
 """
-Rests: the stretches of a stream in which the sensor lies still.
+Rest detection: the intervals of a stream in which the sensor does not move.
 
-One search serves recordings and live streams: it works on the sums over short blocks that a
-stream leaves behind, so that the rests of a finished stream are the same however it was fed. A
-block is quiet if the variance around it is the noise's. A row of quiet blocks is a rest if its
-mean does not move either: neither over 0.5 s to 4 s anywhere in it, nor at its ends, where a
-filter or a stage settles. A knock that leaves the mean where it was does not end a rest, but it
-is left out of the mean; a live stage, which only goes by known noise, begins its dwell anew. The
-noise is known (a parameter file's), learned from the quietest parts of the stream itself, or both.
+One search serves recordings and live streams. It works on the statistics of short blocks, so that
+the rests do not depend on how the stream is fed in portions. A block is quiet if the variance
+around it is that of the noise. A sequence of quiet blocks is a rest if its mean is constant as
+well: over 0.5 s to 4 s anywhere in it, and at its ends, where a filter or a stage settles. A knock
+that does not change the mean does not end a rest, and is left out of the mean. On a live stage,
+which uses the datasheet noise only, a knock begins the dwell again. The noise is that of the
+datasheet, learned from the quietest parts of the stream, or the larger of both.
 """
 
 from __future__ import annotations
@@ -39,13 +39,13 @@ from adxl_ros.signals.noise_limits import (
     DRIFT_OCTAVES,
     END_SIGMAS,
     half_differences,
-    known_limits,
     learned_limits,
     Noise,
     NoiseLimits,
     quiet_blocks,
     quiet_variance,
     Spans,
+    stated_limits,
     undithered,
     unlike_beginning,
     window_variance,
@@ -53,21 +53,39 @@ from adxl_ros.signals.noise_limits import (
 from adxl_ros.signals.runs import true_runs
 import numpy as np
 
-HELD_S, STAGED_S = 1.4, 0.6
-"""Shortest rest, s, less its margins of 0.3 s in all: a hand only pauses for less."""
-KNOCK_S = 1.0
+_HAND_HELD_S = 1.4
+"""Shortest rest of a hand-held sensor, s, without its margins of 0.3 s. Chosen: shorter rests are
+pauses of the hand."""
+_STAGE_S = 0.6
+"""Shortest rest on a stage, s, without its margins of 0.3 s."""
+_KNOCK_S = 1.0
 """Longest disturbance within a rest, s."""
-BATCHES = 20
-"""Parts of a rest whose scatter tells the error of its mean; at least 0.1 s long."""
-DRIFT_SIGMAS = 5.0
-"""A drift counts above this many of its standard deviations: one false alarm in hours."""
-SETTLE_TAUS = 8.0
-"""What the filter still shows of a step then, 0.03 %, is below the noise of a rest's mean."""
+_BATCHES = 20
+"""Largest count of parts of a rest whose scatter shows the error of its mean."""
+_MIN_BATCH_BLOCKS = 2
+"""Smallest length of such a part: 0.1 s."""
+_DRIFT_SIGMAS = 5.0
+"""A drift counts above this many standard deviations. Chosen: one false alarm in hours."""
+_SETTLE_TAUS = 8.0
+"""Settling time after a motion, in time constants of the filter. Chosen: the remainder of a step,
+0.03 %, is below the noise of a rest's mean."""
+_ROUNDING = 1e-9
+"""Relative excess over the angle tolerance that rounding explains."""
 
 
 @dataclass(frozen=True)
 class Rest:
-    """Rows `start` to `stop` (exclusive) of a stream, and the times of its first and last."""
+    """
+    A rest of a stream.
+
+    Attributes
+    ----------
+    start, stop
+        First row and row after the last.
+    time_start_s, time_stop_s
+        Times of the first and the last row, s.
+
+    """
 
     start: int
     stop: int
@@ -78,18 +96,18 @@ class Rest:
 @dataclass(frozen=True)
 class Stillness:
     """
-    Whether the newest samples are at rest, and by which figure not.
+    Whether the newest samples are at rest, with the statistic that decides it.
 
     Attributes
     ----------
     still
-        Whether all figures are within their limits.
+        Whether all statistics are within their limits.
     axis
-        Number of the axis that moves most.
-    figure
+        Index of the axis with the largest motion.
+    statistic
         'rms' of the samples about their mean over 0.25 s, or 'drift' of the mean over 0.5 s.
     value, limit
-        In the unit of the samples.
+        The statistic and its limit, in the unit of the samples.
 
     """
 
@@ -100,13 +118,30 @@ class Stillness:
     limit: float
 
     def describe(self, unit: str, scale: float = 1.0, axes: str = 'xyz') -> str:
-        """Say what moves and by how much; `scale` is `unit`s a unit of the samples."""
+        """
+        Return one line with the statistic and its limit.
+
+        Parameters
+        ----------
+        unit
+            Name of a unit.
+        scale
+            Units for one unit of the samples.
+        axes
+            Letters of the axes.
+
+        Returns
+        -------
+        str
+            For example 'moving: 0.2 m/s² on x, must be below 0.1'.
+
+        """
         how = 'at rest' if self.still else {'rms': 'moving', 'drift': 'drifting'}[self.statistic]
         return (f'{how}: {self.value * scale:.2g} {unit} on {axes[self.axis]}, '
                 f'must be below {self.limit * scale:.2g}')
 
     def describe_mps2(self, sensor: Sensor) -> str:
-        """Say it in m/s², for samples that are a sensor's volts."""
+        """Return that line in m/s², for samples that are volts of a sensor."""
         scale = G0_MPS2 / float(sensor.nominal_scale_v_per_g[self.axis])
         return self.describe('m/s²', scale, sensor.axes)
 
@@ -122,15 +157,16 @@ class RestFinder:
     axes
         Number of measured axes, m.
     noise
-        Known noise; without it, the noise is learned.
+        Noise of a sample; None learns it.
     learn
-        Learn the noise, with the known one as its least: for recordings of a unit that may be
-        noisier than its parameter file. A live stage knows its noise and need not wait.
+        Learn the noise, which is at least the given one. This is for recordings of a unit that
+        may be noisier than its parameter file. A live stage needs no time to learn.
     angle_tolerance_rad
-        With it, the stream has two encoder angles, and a rest ends where one of them is farther
-        than this from their middle.
+        The stream has two encoder angles, and a rest ends where one of them is farther than this
+        from its middle, rad. None for a stream without angles.
     min_rest_s
-        Shortest rest, s; HELD_S where noise is learned and there are no angles, else STAGED_S.
+        Shortest rest, s. By default 1.4 s where noise is learned and there are no angles, else
+        0.6 s.
 
     """
 
@@ -142,70 +178,82 @@ class RestFinder:
         staged = not self.learn or angle_tolerance_rad is not None
         self.angle_tolerance_rad = angle_tolerance_rad
         self._spans = Spans.at(rate_hz)
-        shortest_s = (STAGED_S if staged else HELD_S) if min_rest_s is None else min_rest_s
-        self._least = max(round(shortest_s / self._spans.block_s), self._spans.window)
-        # What is left of a motion that dies out below the limits is in the first block at least.
-        settle_s = SETTLE_TAUS * noise.tau_s if noise is not None else 0.0
+        shortest_s = (_STAGE_S if staged else _HAND_HELD_S) if min_rest_s is None else min_rest_s
+        self._min_blocks = max(round(shortest_s / self._spans.block_s), self._spans.window)
+        # A motion that has decayed below the limits may still be in the first block.
+        settle_s = _SETTLE_TAUS * noise.tau_s if noise is not None else 0.0
         self._settle = max(int(np.ceil(settle_s / self._spans.block_s)), 1)
         self._cutter = BlockCutter(rate_hz, axes, 0 if angle_tolerance_rad is None else 2)
         self._parts = [self._cutter.none()]
-        self._judged: tuple[int, NoiseLimits | None, list[Rest]] | None = None
+        self._result: tuple[int, NoiseLimits | None, list[Rest]] | None = None
 
     def feed(self, time_s: np.ndarray, samples: np.ndarray,
              angles_rad: np.ndarray | None = None) -> None:
-        """Take the next rows: time s (n,), samples (n, m) and, if asked for, angles (n, 2)."""
+        """
+        Add the next rows of the stream.
+
+        Parameters
+        ----------
+        time_s
+            Time of each row, s, (n,).
+        samples
+            Rows of the stream, (n, m).
+        angles_rad
+            Encoder angles, rad, (n, 2), if the stream has them.
+
+        """
         self._parts.append(self._cutter.feed(time_s, samples, angles_rad))
 
     def blocks(self) -> Blocks:
-        """Give what the stream left behind."""
+        """Return the blocks of the stream so far."""
         if len(self._parts) > 1:
             self._parts = [Blocks.join(self._parts)]
         return self._parts[0]
 
     def rests(self) -> list[Rest]:
         """List the rests so far; the last may still go on."""
-        return list(self._judge()[1])
+        return list(self._detect()[1])
 
     def means(self, rests: list[Rest]) -> tuple[np.ndarray, np.ndarray]:
-        """Mean and its standard error of every rest, (k, m) each, as `rest_means` gives them."""
+        """Return the mean of each rest and its standard deviation, (k, m) each."""
         blocks = self.blocks()
-        ends = [np.searchsorted(blocks.start, [rest.start, rest.stop]) for rest in rests]
-        return _means([blocks[slice(*end)] for end in ends], self._spans, self.noise)
+        bounds = [np.searchsorted(blocks.start, [rest.start, rest.stop]) for rest in rests]
+        return _means([blocks[first:stop] for first, stop in bounds], self._spans, self.noise)
 
     def stillness(self) -> Stillness | None:
-        """Judge the newest samples; None while there are too few of them."""
-        limits, _ = self._judge()
+        """Return whether the newest samples are at rest; None while there are too few."""
+        limits, _ = self._detect()
         half = self._spans.half
-        least = max(2 * half, self._spans.window)
-        newest = self.blocks()[-least:]
-        if limits is None or len(newest) < least or newest.run[0] != newest.run[-1]:
+        count = max(2 * half, self._spans.window)
+        newest = self.blocks()[-count:]
+        if limits is None or len(newest) < count or newest.run[0] != newest.run[-1]:
             return None
         rms = np.sqrt(window_variance(newest, self._spans)[-1])
         halves = newest.mean[-2 * half:].reshape(2, half, -1).mean(axis=1)
         values = np.nan_to_num(np.concatenate([rms, np.abs(halves[1] - halves[0])]), nan=np.inf)
         allowed = np.concatenate([np.sqrt(limits.variance),
-                                  DRIFT_SIGMAS * limits.drift[0] + limits.step])
+                                  _DRIFT_SIGMAS * limits.drift[0] + limits.step])
         worst = int(np.argmax(values / allowed))
         statistic, axis = divmod(worst, len(rms))
         return Stillness(bool(values[worst] <= allowed[worst]), axis, ('rms', 'drift')[statistic],
                          float(values[worst]), float(allowed[worst]))
 
-    def _judge(self) -> tuple[NoiseLimits | None, list[Rest]]:
-        """Judge the stream so far, once for every new block."""
+    def _detect(self) -> tuple[NoiseLimits | None, list[Rest]]:
+        """Find limits and rests of the stream so far, once for every new block."""
         blocks = self.blocks()
-        if self._judged is None or self._judged[0] != len(blocks):
+        if self._result is None or self._result[0] != len(blocks):
             windows = window_variance(blocks, self._spans)
             limits = self._limits(blocks, windows)
             rests = [] if limits is None else self._rests(blocks, windows, limits)
-            self._judged = len(blocks), limits, rests
-        return self._judged[1:]
+            self._result = len(blocks), limits, rests
+        return self._result[1:]
 
     def _limits(self, blocks: Blocks, windows: np.ndarray) -> NoiseLimits | None:
-        """Say what noise explains, known, learned or the larger; None if too little is known."""
+        """Return stated limits, learned limits or the larger ones; None without either."""
         step = adc_step(blocks)
-        known = known_limits(self.noise, step, self._spans) if self.noise is not None else None
+        stated = stated_limits(self.noise, step, self._spans) if self.noise is not None else None
         learned = learned_limits(blocks, windows, step, self._spans) if self.learn else None
-        return known.or_more(learned) if known and learned else known or learned
+        return stated.larger(learned) if stated and learned else stated or learned
 
     def _rests(self, blocks: Blocks, windows: np.ndarray, limits: NoiseLimits) -> list[Rest]:
         """Find the rests among the blocks of the whole stream."""
@@ -221,21 +269,21 @@ class RestFinder:
                      float(blocks.time_s[first, 0]), float(blocks.time_s[stop - 1, 1]))
                 for first, stop in (self._joined(blocks, bounds, parts, limits)
                                     if self.learn else parts)
-                if stop - first >= self._least]
+                if stop - first >= self._min_blocks]
 
     def _drifting(self, blocks: Blocks, quiet: np.ndarray, limits: NoiseLimits) -> np.ndarray:
         """
-        Tell which blocks lie where the mean moves, (k,), by comparing neighbouring halves.
+        Mark the blocks where the mean moves, (k,) bool, by comparing neighbouring halves.
 
-        Short halves come first, and longer ones look only where those saw nothing: a slip costs
-        its surroundings, and only a drift too slow for them costs more. What is left between two
-        drifting parts drifts as well, unless it is long enough for the longest halves.
+        Short halves come first, and longer halves compare only the blocks that these have not
+        marked. A slip thus marks its surroundings only; a slower drift marks more. Blocks between
+        two marked parts are marked as well, unless they are enough for the longest halves.
         """
         drifting = np.zeros(len(blocks), bool)
         for octave in range(DRIFT_OCTAVES):
             half = self._spans.half << octave
             moved, valid = half_differences(blocks, quiet & ~drifting, half)
-            allowed = DRIFT_SIGMAS * limits.drift[octave] + limits.step
+            allowed = _DRIFT_SIGMAS * limits.drift[octave] + limits.step
             places = half + np.flatnonzero(valid & (np.abs(moved) > allowed).any(axis=1))
             marks = np.zeros(len(blocks) + 1)
             np.add.at(marks, places - half // 2, 1)
@@ -249,7 +297,7 @@ class RestFinder:
 
     def _without_ends(self, means: np.ndarray, first: int, stop: int,
                       limits: NoiseLimits) -> tuple[int, int]:
-        """Cut the ends that differ from the bulk: settling, or a hand that comes."""
+        """Cut the ends that differ from the middle: settling, or an approaching hand."""
         longest = min((stop - first) // 4, self._spans.longest // 2)
         if longest > 0:
             noise = limits.block_noise(self._spans), limits.flicker, limits.step
@@ -271,14 +319,14 @@ class RestFinder:
         return [*parts, (begin, stop)]
 
     def _constant(self, bounds: np.ndarray) -> bool:
-        """Tell whether the angles within `bounds`, (2, a), count as one pose."""
+        """Return whether the angles within `bounds`, (2, a), are those of one pose."""
         assert self.angle_tolerance_rad is not None
-        allowed = 2 * self.angle_tolerance_rad * (1 + 1e-9)
+        allowed = 2 * self.angle_tolerance_rad * (1 + _ROUNDING)
         return not (bounds.sum(axis=0) > allowed).any()
 
     def _joined(self, blocks: Blocks, bounds: np.ndarray | None, parts: list[tuple[int, int]],
                 limits: NoiseLimits) -> list[tuple[int, int]]:
-        """Join parts between which a knock left the mean, and the angles, where they were."""
+        """Join parts if the disturbance between them has not changed mean and angles."""
         joined: list[tuple[int, int]] = []
         for first, stop in parts:
             begin, end = joined[-1] if joined else (0, 0)
@@ -291,15 +339,15 @@ class RestFinder:
         return joined
 
     def _near(self, blocks: Blocks, end: int, first: int) -> bool:
-        """Tell whether what begins at `first` follows shortly on what stops at `end`."""
-        longest = max(KNOCK_S / self._spans.block_s, self._spans.window)
+        """Return whether block `first` follows shortly on the part that stops at `end`."""
+        longest = max(_KNOCK_S / self._spans.block_s, self._spans.window)
         return first - end <= longest and bool(blocks.run[end - 1] == blocks.run[first])
 
     def _moved(self, means: np.ndarray, before: tuple[int, int], after: tuple[int, int],
                limits: NoiseLimits) -> bool:
-        """Tell whether the mean beside a disturbance is another before it than after it."""
+        """Return whether the mean before a disturbance differs from that after it."""
         reach = self._spans.longest // 2
-        return limits.tells_apart(means[max(before[0], before[1] - reach):before[1]],
+        return limits.differ(means[max(before[0], before[1] - reach):before[1]],
                                   means[after[0]:min(after[1], after[0] + reach)],
                                   self._spans, END_SIGMAS)
 
@@ -309,14 +357,19 @@ def find_rests(time_s: np.ndarray, samples: np.ndarray, rate_hz: float,
                learn: bool | None = None, angle_tolerance_rad: float | None = None,
                min_rest_s: float | None = None) -> list[Rest]:
     """
-    Find the rests of a recording: a `RestFinder` that is fed all of it.
+    Find the rests of a recording.
 
     Parameters
     ----------
     time_s, samples, angles_rad
         Time s (n,), samples (n, m) in any unit, encoder angles rad (n, 2).
     rate_hz, noise, learn, angle_tolerance_rad, min_rest_s
-        As `RestFinder` takes them.
+        As for `RestFinder`.
+
+    Returns
+    -------
+    list
+        Rests in the order of time.
 
     """
     finder = RestFinder(rate_hz, samples.shape[1], noise, learn, angle_tolerance_rad, min_rest_s)
@@ -327,7 +380,7 @@ def find_rests(time_s: np.ndarray, samples: np.ndarray, rate_hz: float,
 def rest_means(time_s: np.ndarray, samples: np.ndarray, rests: list[Rest], rate_hz: float,
                noise: Noise | None = None) -> tuple[np.ndarray, np.ndarray]:
     """
-    Average the rests of a recording; the same figures as those of the live `RestFinder.means`.
+    Average the rests of a recording, with the same results as `RestFinder.means`.
 
     Parameters
     ----------
@@ -336,18 +389,19 @@ def rest_means(time_s: np.ndarray, samples: np.ndarray, rests: list[Rest], rate_
     rests
         Rests in rows of the recording.
     rate_hz, noise
-        As the finder of the rests had them.
+        As for `RestFinder`.
 
     Returns
     -------
-    mean, standard_error
-        In the unit of the samples, (k, m). The error is that of the scatter between parts of the
-        rest, and not below that of the known noise. Other rests tell the step of the ADC only.
+    tuple
+        Mean and its standard deviation, (k, m) each, in the unit of the samples. The standard
+        deviation is that by the scatter between parts of the rest, and at least that of the given
+        noise.
 
     Raises
     ------
     UserError
-        If a rest holds no samples.
+        A rest has no samples.
 
     """
     parts = [BlockCutter(rate_hz, samples.shape[1]).feed(
@@ -361,8 +415,8 @@ def rest_means(time_s: np.ndarray, samples: np.ndarray, rests: list[Rest], rate_
 
 def _means(parts: list[Blocks], spans: Spans,
            noise: Noise | None) -> tuple[np.ndarray, np.ndarray]:
-    """Average the blocks of each rest, (k, m), with standard errors, (k, m)."""
-    # One ADC made them all: its step does not show in a rest where nothing changes.
+    """Average the blocks of each rest; mean and standard deviation, (k, m) each."""
+    # All rests have one ADC. Its step does not show in a rest where the codes are constant.
     step = adc_step(Blocks.join(parts)) if parts else np.empty(0)
     pairs = [_mean(_without_knocks(part, step, spans), step, spans, noise) for part in parts]
     mean, error = zip(*pairs) if pairs else ((), ())
@@ -372,14 +426,14 @@ def _means(parts: list[Blocks], spans: Spans,
 def _mean(part: Blocks, step: np.ndarray, spans: Spans,
           noise: Noise | None) -> tuple[np.ndarray, np.ndarray]:
     """
-    Average the blocks of a rest, (m,), with the standard error, (m,).
+    Average the blocks of a rest; mean and standard deviation, (m,) each.
 
-    The noise may have any spectrum: the means of up to twenty batches of the rest, so long that
-    they are nearly independent, scatter by its long-run variance.
+    The noise may have any spectrum. Means of up to twenty batches of the rest are nearly
+    independent, and scatter by its long-run variance (batch means; Law and Kelton 2000).
     """
     mean = part.count @ part.mean / part.count.sum()
     white = part.squares.sum(axis=0) / max((part.count - 1).sum(), 1)
-    squares, freedom = batch_scatter(part.mean, max(-(-len(part) // BATCHES), 2))
+    squares, freedom = batch_scatter(part.mean, max(-(-len(part) // _BATCHES), _MIN_BATCH_BLOCKS))
     variance = np.maximum(squares / max(freedom, 1), white / spans.size) / len(part)
     if noise is not None:
         count = effective_samples(len(part) * spans.size, spans.dt_s, noise.tau_s)
@@ -389,7 +443,7 @@ def _mean(part: Blocks, step: np.ndarray, spans: Spans,
 
 
 def _without_knocks(part: Blocks, step: np.ndarray, spans: Spans) -> Blocks:
-    """Leave out the blocks of a rest where the variance is not that of most of it."""
+    """Leave out the blocks of a rest whose variance differs from that of most blocks."""
     part = part[part.count > 0]
     windows = window_variance(part, spans)
     _, limit = quiet_variance(part, windows, step)
