@@ -17,9 +17,9 @@
 from dataclasses import replace
 
 from adxl_ros.calibrate import joint_settings, pose_extraction
-from adxl_ros.calibrate.guided.capture_settings import Settings
+from adxl_ros.calibrate.guided.capture_settings import CaptureSettings, StageMode
 from adxl_ros.calibrate.guided.pose_plan import Target
-from adxl_ros.calibrate.guided.stage_guide import Sweep
+from adxl_ros.calibrate.guided.stage_guide import StageGuide
 from adxl_ros.calibrate.joint_settings import recorded_settings, SettingTracker
 from adxl_ros.calibrate.poses import join_poses, Poses
 from adxl_ros.files import recording
@@ -153,8 +153,8 @@ PLAN = [Target(ALPHA, 0.0), Target(ALPHA, BETA), Target(1.2, BETA), Target(1.2, 
 
 def bench(mode='commanded', targets=PLAN, accepted=(), **settings):
     """Return a sweep with poses of 1 s, on a bench."""
-    chosen = Settings(1.0, np.radians(0.2), 20.0, mode, **settings)
-    return Bench(Sweep(nominal(), targets, chosen, accepted), nominal())
+    chosen = CaptureSettings(1.0, np.radians(0.2), 20.0, StageMode(mode), **settings)
+    return Bench(StageGuide(nominal(), targets, chosen, accepted), nominal())
 
 
 def take(on, alpha=None, beta=None):
@@ -210,7 +210,7 @@ def test_a_command_that_the_encoder_does_not_show_is_a_move():
     for commands in ([(ALPHA, 0.0)], [(ALPHA, 0.0), (ALPHA, NAN)], [(ALPHA, 0.1), (NAN, 0.0)],
                      [(ALPHA, np.inf)], [(1.0, 0.0)]):
         for command in commands:
-            by_others.sweep.command(*command)
+            by_others.sweep.read_command(*command)
         entries.append(take(by_others))
     assert numbers(entries) == ([0, 0, 0, 0, 1], [0, 0, 1, 1, 1])
 
@@ -241,11 +241,11 @@ def test_a_refused_pose_and_readings_after_the_dwell_move_nothing():
     on.run(0.2, ALPHA, 0.0)
     assert on.sweep.capture() == ''
     assert on.run(3, ALPHA, 0.0) is None
-    assert 'temperature moved' in on.sweep.refused()
+    assert 'temperature moved' in on.sweep.new_refusal()
     on.sweep.surroundings.temperature_c.add(on.now_ns, 20.0)
     on.sweep.capture()
     entry = on.run(3, ALPHA, 0.0)
-    on.sweep.stage(entry.stop_ns + 10_000_000, ALPHA + 0.02, 0.0)
+    on.sweep.read_encoder(entry.stop_ns + 10_000_000, ALPHA + 0.02, 0.0)
     again = on.sweep.accept()
     assert again.alpha_setting == entry.alpha_setting == 0
     on.sweep.take(again)
@@ -260,7 +260,7 @@ def test_after_an_interruption_both_joints_have_moved():
     assert numbers(before) == ([0, 0, 0], [0, 1, 1])
     begun, on = on, bench(targets=on.sweep.targets, accepted=before)
     on.now_ns = begun.now_ns
-    while on.sweep.verifying:
+    while on.sweep.poses_to_verify:
         target = on.sweep.target
         assert on.run(3, target.alpha_rad, target.beta_rad) is None
     after = [take(on) for _ in range(3)]
@@ -271,7 +271,7 @@ def test_after_an_interruption_both_joints_have_moved():
     on = bench(targets=on.sweep.targets, accepted=())
     entries = [take(on) for _ in range(2)]
     on.sweep.verify()
-    while on.sweep.verifying:
+    while on.sweep.poses_to_verify:
         target = on.sweep.target
         assert on.run(3, target.alpha_rad, target.beta_rad) is None
     entries.append(take(on))
@@ -286,7 +286,7 @@ def test_a_clock_that_goes_back_leaves_open_whether_the_stage_has_moved(mode, ba
     entries = [take(on) for _ in range(3)]
     on.now_ns -= back_s * 10 ** 9
     on.run(0.2, ALPHA, BETA)
-    while on.sweep.verifying:
+    while on.sweep.poses_to_verify:
         target = on.sweep.target
         on.sweep.capture()
         assert on.run(3, target.alpha_rad, target.beta_rad) is None
@@ -321,8 +321,8 @@ class Run:
         step = self.sensor.stage_resolution_rad
         self.stage = SimulatedStage(np.zeros(3), np.array([2.0, 2.0, 0.01]), 0.2,
                                     np.array([step, step, 0.0]), seed)
-        self.sweep = Sweep(self.sensor, targets, Settings(1.0, np.radians(0.2), 20.0,
-                                                          'commanded'))
+        self.sweep = StageGuide(self.sensor, targets, CaptureSettings(
+            1.0, np.radians(0.2), 20.0, StageMode.COMMANDED))
         self.fed = Fed(self.sensor, seed)
         self.now_ns, self.commanded = 1_750_000_000_000_000_000, None
         self.samples, self.joints, self.commands, self.entries = [], [], [], []
@@ -343,7 +343,7 @@ class Run:
         self.samples += zip(stamps.tolist(), volts)
         alpha, beta, _ = self.stage.encoder()
         self.joints.append((self.now_ns + 3_000_000, alpha, beta))
-        self.sweep.stage(*self.joints[-1])
+        self.sweep.read_encoder(*self.joints[-1])
         self.sweep.feed(stamps, volts)
         self.now_ns += 10_000_000
         entry = self.sweep.accept()

@@ -17,8 +17,8 @@
 import os
 import resource
 
-from adxl_ros.calibrate.guided.capture_settings import Settings
-from adxl_ros.calibrate.guided.session import Plan
+from adxl_ros.calibrate.guided.capture_settings import CaptureSettings, StageMode
+from adxl_ros.calibrate.guided.session_settings import SessionSettings
 from adxl_ros.files import parameter_file, sweep_journal
 from graph import Graph, RELIABLE
 import numpy as np
@@ -106,11 +106,12 @@ def test_a_fit_that_fails_at_the_end_waits_and_another_unit_ends_the_session(sta
     """No dead end: redo, finish and abort are still there; no pose of 18 in the journal of 17."""
     base = nominal(serial='N1')
     parameter_file.save(tmp_path / 'bare.yaml', base)
-    asked = Plan('stage', 'full', (np.pi / 2,), np.pi / 2, float(np.radians(0.1)), 0,
-                 Settings(0.5, np.radians(0.2), 60.0, 'manual', np.radians(2)),
-                 tmp_path / 'unit.yaml', tmp_path / 'unit.yaml.journal', '', '')
-    interrupted = sweep_journal.Journal(asked.journal, asked.head(base))
-    for i, target in enumerate(asked.targets(base)):
+    capture = CaptureSettings(0.5, np.radians(0.2), 60.0, StageMode.MANUAL, np.radians(2))
+    settings = SessionSettings(
+        'stage', 'full', (np.pi / 2,), np.pi / 2, float(np.radians(0.1)), 0, capture,
+        tmp_path / 'unit.yaml', tmp_path / 'unit.yaml.journal', '', '')
+    interrupted = sweep_journal.Journal(settings.journal, settings.head(base))
+    for i, target in enumerate(settings.targets(base)):
         interrupted.append(pose_record(
             i, alpha_rad=target.alpha_rad, beta_rad=target.beta_rad, samples=500,
             # Inverted: a unit that no fit takes.

@@ -125,7 +125,7 @@ class Bench:
             volts = self.fed(force)
             stamps = self.now_ns + np.arange(50) * 1_000_000
             if encoder:
-                self.sweep.stage(self.now_ns, alpha, beta)
+                self.sweep.read_encoder(self.now_ns, alpha, beta)
             self.sweep.feed(stamps, volts)
             self.now_ns += 50_000_000
             entry = self.sweep.accept()

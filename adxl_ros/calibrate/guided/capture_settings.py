@@ -12,57 +12,98 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""How poses are taken, and what a calibration waits for."""
+"""How poses are taken, and what a guided calibration waits for."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import Enum
 
-STAGE_MODES = ('commanded', 'encoder', 'manual')
+
+class StageMode(Enum):
+    """Who turns the stage, and which angle counts."""
+
+    COMMANDED = 'commanded'
+    """The stage turns itself to the pose; the encoder's angle counts."""
+    ENCODER = 'encoder'
+    """An operator turns the stage and captures; the encoder's angle counts."""
+    MANUAL = 'manual'
+    """An operator turns the stage by a scale and captures; the announced angle counts."""
 
 
 @dataclass(frozen=True)
-class Settings:
+class CaptureSettings:
     """
-    How poses are taken; times are sensor time.
+    How poses are taken; times are by the stamps of the samples.
 
     Attributes
     ----------
-    dwell_s, timeout_s
-        Time at rest a pose, and after which a pose is said to be late.
-    tolerance_rad, near_rad
-        Arrived within: a stage that moves itself, one that is turned by hand.
+    dwell_s
+        Time at rest for each pose, s.
+    tolerance_rad
+        A stage that turns itself has arrived within this of the pose, rad.
+    timeout_s
+        A pose that takes longer is reported as late, s.
     stage_mode
-        One of `STAGE_MODES`.
+        Who turns the stage.
+    near_rad
+        A stage that is turned by hand is captured within this of the pose, rad.
     temperature_span_c
-        How far the temperature may be from that of the first pose.
+        Largest difference of the temperature from that of the first pose, °C.
 
     """
 
     dwell_s: float
     tolerance_rad: float
     timeout_s: float
-    stage_mode: str
+    stage_mode: StageMode
     near_rad: float = 0.035
     temperature_span_c: float = 3.0
 
 
+class Phase(Enum):
+    """What a guided calibration waits for; the values are those of the diagnostics."""
+
+    IDLE = 'idle'
+    """A start."""
+    INFO = 'info'
+    """The sensor's data on `sensor_info`."""
+    QUESTION = 'question'
+    """The operator's answer on what to do with an interrupted calibration."""
+    SILENT = 'silent'
+    """Samples, which have stopped."""
+    OPERATOR = 'operator'
+    """The operator, who turns the stage and captures."""
+    STAGE = 'stage'
+    """The stage, which is on its way or silent."""
+    REST = 'rest'
+    """The sensor, which moves."""
+    DWELL = 'dwell'
+    """The end of the dwell."""
+    REFUSED = 'refused'
+    """Something to be put right."""
+    FIT = 'fit'
+    """The fit."""
+    DONE = 'done'
+    """Nothing: all poses are taken."""
+
+
 @dataclass(frozen=True)
-class State:
+class Status:
     """
-    What a calibration waits for.
+    What a guided calibration waits for, for people.
 
     Attributes
     ----------
     phase
-        'operator', 'stage', 'rest', 'dwell', 'refused' or 'done'.
+        What it waits for.
     text
-        The same for people, with figures.
+        One line with the values that matter.
     late
-        Whether it has waited longer than the time-out, or refuses what it gets.
+        Whether somebody should look: it waits longer than the time-out, or refuses its input.
 
     """
 
-    phase: str
+    phase: Phase
     text: str
     late: bool

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""One pose while it is averaged: the samples since the arrival, and the rests among them."""
+"""The dwell in one pose: the samples since the arrival, and the rests among them."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Dwell:
     sensor
         The nominal sensor of the stream; its noise decides what is at rest.
     arrived_ns
-        What was sampled before is no part of the pose.
+        Stamp of the arrival, ns; earlier samples do not belong to the pose.
 
     """
 
@@ -68,7 +68,17 @@ class Dwell:
         self._volts: list[np.ndarray] = []
 
     def feed(self, stamps_ns: np.ndarray, volts: np.ndarray) -> None:
-        """Take samples: stamps, ns, (n,), and volts, (n, m)."""
+        """
+        Take samples.
+
+        Parameters
+        ----------
+        stamps_ns
+            Their stamps, ns, (n,).
+        volts
+            The samples, V, (n, m).
+
+        """
         new = stamps_ns >= self.arrived_ns
         self._stamps.append(stamps_ns[new])
         self._volts.append(volts[new])
@@ -76,11 +86,11 @@ class Dwell:
         self._finder.feed((stamps_ns[new] - self.arrived_ns) * 1e-9, volts[new])
 
     def rests(self) -> list[Rest]:
-        """List the rests so far; the last may still go on."""
+        """Return the rests so far; the last one may still go on."""
         return self._finder.rests() if self._stamps else []
 
     def stillness(self) -> Stillness | None:
-        """Judge the newest samples; None while there are too few of them."""
+        """Return whether the newest samples are at rest; None while they are too few."""
         return self._finder.stillness()
 
     def at_rest_s(self) -> float:
@@ -89,7 +99,7 @@ class Dwell:
         return (rests[-1].stop - rests[-1].start) / self._sensor.rate_hz if rests else 0.0
 
     def at_rest(self) -> bool:
-        """Tell whether the newest samples are at rest."""
+        """Return whether the newest samples are known to be at rest."""
         still = self.stillness()
         return still is not None and still.still
 

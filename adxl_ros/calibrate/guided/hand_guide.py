@@ -12,13 +12,13 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The guided calibration by hand, free of ROS: samples in, rests out, no stage."""
+"""The guide of a hand-held sensor: samples go in, rests come out; there is no stage."""
 
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from adxl_ros.calibrate.fits import orientations
 from adxl_ros.calibrate.fits.gravity_fit import MIN_RESTS
@@ -32,234 +32,330 @@ from adxl_ros.calibrate.fits.gravity_model import (
     regularised_fit,
     TRIAL_STD_G,
 )
-from adxl_ros.calibrate.guided import pose_checks, running_estimate
-from adxl_ros.calibrate.guided.capture_settings import State
-from adxl_ros.calibrate.guided.live_window import Newest, Surroundings, went_back
-from adxl_ros.files.sweep_journal import PoseRecord
+from adxl_ros.calibrate.guided import coverage, pose_checks, running_estimate
+from adxl_ros.calibrate.guided.capture_settings import Phase, Status
+from adxl_ros.calibrate.guided.guide import NextPose
+from adxl_ros.calibrate.guided.live_window import NewestSamples, Surroundings, went_back
+from adxl_ros.calibrate.guided.screen_contents import Estimate, Progress
+from adxl_ros.files.sweep_journal import JournalEntry, PoseRecord
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals.noise_limits import datasheet_noise
 from adxl_ros.signals.rest_detection import Rest, RestFinder, Stillness
 import numpy as np
 
-_ENDED_S = 1.0
-"""A rest is announced when the stream has gone on for this long after it."""
 ENOUGH_RESTS = 24
-_JUDGE_NS = 500_000_000
-"""The whole stream is judged anew no more often than this: it costs more as it grows."""
+"""Rests that are recommended; chosen: nearly all of the 26 orientations."""
+_ENDED_S = 1.0
+"""A rest is announced when the stream has gone on for this long after it, s."""
+_SEARCH_PERIOD_NS = 500_000_000
+"""Shortest time between two searches for rests, ns: each one looks at the whole stream."""
 _STEPS = 3
-_SHARE = 0.01
-_NOW = 20
+"""Gauss-Newton steps after each rest; chosen: the estimate changes little with each rest."""
+_MOST_SATURATED = 0.01
+"""Largest share of a rest's samples at a rail; chosen: a knock does not spoil the mean."""
+_UP_SAMPLES = 20
+"""Samples whose mean shows what points up at present; chosen: quick and still steady."""
 
 
-class Tumble:
+@dataclass(frozen=True)
+class _Interval:
+    """Stamps of the first and the last sample of a rest, ns."""
+
+    first_ns: int
+    last_ns: int
+
+    def overlaps(self, record: PoseRecord) -> bool:
+        """Return whether a rest shares a sample with this one."""
+        return self.first_ns <= record.stop_ns and record.start_ns <= self.last_ns
+
+
+class HandGuide:
     """
-    Collects rests of a sensor that is turned by hand, and says where to turn it next.
+    Collects the rests of a hand-held sensor, and asks for the next direction; a `Guide`.
 
-    The noise of the unit is learned from its quietest stretches, so that what counts as a rest
-    can change while the stream runs: rests are announced as they end, and `results` judges the
-    whole stream once more, as `fit` does with a recording.
+    The noise of the unit is learned from the quietest parts of the stream, so that what counts as
+    a rest can change while the stream runs. Rests are announced as they end. `poses_to_fit` finds
+    the rests of the complete stream once more, as `fit` does with a recording.
 
     Parameters
     ----------
     sensor
         The nominal sensor of the stream, of three axes.
     temperature_span_c
-        How far the temperature may be from that of the first rest.
+        Largest difference of the temperature from that of the first rest, °C.
     accepted
-        Rests that an interrupted calibration has left.
+        Rests of an interrupted calibration.
 
     """
 
+    moves_itself = False
+    is_over = False
+    open_poses = 0
+    poses_to_verify = 0
+
     def __init__(self, sensor: Sensor, temperature_span_c: float,
-                 accepted: Sequence[PoseRecord] = ()):
+                 accepted: Sequence[PoseRecord] = ()) -> None:
         self.sensor = sensor
         self.accepted = {record.pose: record for record in accepted}
         self.surroundings = Surroundings()
         self.newest_ns: int | None = None
         self._span_c = temperature_span_c
         self._passed = np.zeros(len(orientations.UP), bool)
-        self._unsaid = ''
-        self._begin()
-        self._learn()
+        self._new_refusal = ''
+        self._begin_stream()
+        self._update_estimate()
 
-    def _begin(self) -> None:
-        """Begin to listen: what is accepted so far is of another stream."""
+    def _begin_stream(self) -> None:
+        """Begin a stream: the rests so far belong to another one."""
         self._resumed = list(self.accepted.values())
         self._stamps: list[np.ndarray] = []
-        self._newest = Newest(self.sensor)
-        self._said_ns = self._judge_ns = 0
-        self._dropped: list[tuple[int, int]] = []
-        self._saturated: list[int] = []
-        self._finder = RestFinder(self.sensor.rate_hz, len(self.sensor.axes),
-                                  datasheet_noise(self.sensor), learn=True)
+        self._newest = NewestSamples(self.sensor)
+        self._announced_ns = self._next_search_ns = 0
+        self._dropped: list[_Interval] = []
+        self._saturated_ns: list[int] = []
+        self._finder = RestFinder(
+            self.sensor.rate_hz, len(self.sensor.axes), datasheet_noise(self.sensor), learn=True)
+
+    @property
+    def pose_number(self) -> int:
+        """Return the number of the next rest, from 1."""
+        return len(self.accepted) + 1
+
+    @property
+    def previous(self) -> int | None:
+        """Return the number of the newest rest, from 0; None where there is none."""
+        return max(self.accepted, default=None)
+
+    def verify(self) -> None:
+        """Do nothing: without a stage no rest can be taken again in the same pose."""
+
+    def read_encoder(self, stamp_ns: int, alpha_rad: float, beta_rad: float) -> None:
+        """
+        Do nothing: no stage carries the sensor.
+
+        Parameters
+        ----------
+        stamp_ns
+            Stamp of the angles, ns.
+        alpha_rad, beta_rad
+            Angles of a stage that carries something else, rad.
+
+        """
+
+    def read_command(self, alpha_rad: float, beta_rad: float) -> None:
+        """
+        Do nothing: no stage carries the sensor.
+
+        Parameters
+        ----------
+        alpha_rad, beta_rad
+            Command for a stage that carries something else, rad.
+
+        """
 
     def feed(self, stamps_ns: np.ndarray, volts: np.ndarray) -> None:
-        """Take samples: stamps, ns, (n,), and volts, (n, m)."""
+        """
+        Take samples.
+
+        Parameters
+        ----------
+        stamps_ns
+            Their stamps, ns, (n,).
+        volts
+            The samples, V, (n, m).
+
+        """
         if not len(stamps_ns):
             return
         if self.newest_ns is not None and went_back(self.newest_ns, stamps_ns[0]):
-            self._begin()
+            self._begin_stream()
         self.newest_ns = int(stamps_ns[-1])
         self._stamps.append(stamps_ns)
         self._newest.feed(stamps_ns, volts)
-        self._saturated += stamps_ns[self.sensor.saturated(volts).any(axis=1)].tolist()
+        self._saturated_ns += stamps_ns[self.sensor.saturated(volts).any(axis=1)].tolist()
         self._finder.feed(self._time_s(stamps_ns), volts)
 
     def accept(self) -> PoseRecord | None:
         """Return the next rest that has ended, for the journal, else None."""
-        if not self._stamps or self._stamps[-1][-1] < self._judge_ns:
+        if not self._stamps or self._stamps[-1][-1] < self._next_search_ns:
             return None
         stamps = self._all_stamps()
-        self._judge_ns = int(stamps[-1]) + _JUDGE_NS
+        self._next_search_ns = int(stamps[-1]) + _SEARCH_PERIOD_NS
         for rest in self._finder.rests():
-            entry = self._entry(self._number(), rest, stamps)
-            ended = (stamps[-1] - entry.stop_ns) * 1e-9 > _ENDED_S
-            if ended and entry.start_ns > self._said_ns:
-                self._said_ns = entry.stop_ns
-                self._judge_ns = 0
-                self._unsaid = self._wrong(entry)
-                return None if self._unsaid else entry
+            record = self._record(max(self.accepted, default=-1) + 1, rest, stamps)
+            has_ended = (stamps[-1] - record.stop_ns) * 1e-9 > _ENDED_S
+            if has_ended and record.start_ns > self._announced_ns:
+                self._announced_ns = record.stop_ns
+                self._next_search_ns = 0
+                self._new_refusal = self._fault(record)
+                return None if self._new_refusal else record
         return None
 
-    def take(self, entry: PoseRecord) -> None:
+    def take(self, record: PoseRecord) -> None:
         """Count a rest that is on disk."""
-        self.accepted[entry.pose] = entry
-        self._learn()
+        self.accepted[record.pose] = record
+        self._update_estimate()
 
     def retry(self) -> None:
-        """Announce the newest rest once more."""
-        before = {e.pose for e in self._resumed}
-        self._said_ns = max((e.stop_ns for number, e in self.accepted.items()
-                             if number not in before), default=0)
-        self._judge_ns = (self.newest_ns or 0) + 2 * _JUDGE_NS
+        """Announce the newest rest once more, since its record is not on disk."""
+        resumed = {record.pose for record in self._resumed}
+        self._announced_ns = max((record.stop_ns for number, record in self.accepted.items()
+                                  if number not in resumed), default=0)
+        self._next_search_ns = (self.newest_ns or 0) + 2 * _SEARCH_PERIOD_NS
 
     def capture(self) -> str:
-        """Say that nothing needs a capture."""
+        """Return that nothing needs a capture."""
         return 'nothing to capture: hold the sensor still, and each rest is taken by itself'
 
+    def skip_entry(self) -> JournalEntry | None:
+        """Return None: a direction that is left out has no entry in the journal."""
+        return None
+
     def skip(self) -> str:
-        """Ask for another direction; return what is done, for people."""
+        """Ask for another direction; return a line for people."""
         if self.next_up is None:
             return 'there is no direction left to skip'
         self._passed[self.next_up] = True
-        left_out = orientations.name_up(self.next_up)
+        skipped = orientations.name_up(self.next_up)
         self._choose()
-        return f'{left_out} up is left out'
-
-    @property
-    def before(self) -> int | None:
-        """Return the number of the newest rest."""
-        return max(self.accepted, default=None)
+        return f'{skipped} up is left out'
 
     def redo(self) -> str:
-        """Forget the newest rest; return what is done, or '' where there is none."""
-        number = self.before
+        """Forget the newest rest; return a line for people, or '' where there is none."""
+        number = self.previous
         if number is None:
             return ''
         self.drop(self.accepted[number])
         return f'rest {number + 1} is forgotten; hold the sensor in that direction again'
 
-    def drop(self, entry: PoseRecord) -> None:
-        """Leave a rest out."""
-        del self.accepted[entry.pose]
-        resumed = [e for e in self._resumed if e.pose != entry.pose]
+    def drop(self, record: PoseRecord) -> None:
+        """Leave a rest out of the fit."""
+        del self.accepted[record.pose]
+        resumed = [other for other in self._resumed if other.pose != record.pose]
         if len(resumed) == len(self._resumed):
-            self._dropped.append((entry.start_ns, entry.stop_ns))
+            self._dropped.append(_Interval(record.start_ns, record.stop_ns))
         self._resumed = resumed
-        self._learn()
+        self._update_estimate()
 
-    def results(self) -> list[PoseRecord]:
-        """Return the rests to fit: those resumed, and all of this stream judged as a whole."""
-        entries = list(self._resumed)
-        if self._stamps:
-            stamps = self._all_stamps()
-            for rest in self._finder.rests():
-                entry = self._entry(len(entries), rest, stamps)
-                if not self._wrong(entry) and not any(
-                        first <= entry.stop_ns and entry.start_ns <= last
-                        for first, last in self._dropped):
-                    entries.append(entry)
-        return entries
+    def poses_to_fit(self) -> list[PoseRecord]:
+        """Return the rests of the interrupted calibration, and all rests of this stream."""
+        records = list(self._resumed)
+        if not self._stamps:
+            return records
+        stamps = self._all_stamps()
+        for rest in self._finder.rests():
+            record = self._record(len(records), rest, stamps)
+            is_dropped = any(interval.overlaps(record) for interval in self._dropped)
+            if not is_dropped and not self._fault(record):
+                records.append(record)
+        return records
 
-    def refused(self) -> str:
+    def new_refusal(self) -> str:
         """Return why a rest was refused since the last call, or ''."""
-        text, self._unsaid = self._unsaid, ''
+        text, self._new_refusal = self._new_refusal, ''
         return text
 
-    def stillness(self) -> Stillness | None:
-        """Judge the newest samples."""
+    def stillness(self, newest: NewestSamples) -> Stillness | None:
+        """Return whether the newest samples are at rest, by the noise that the stream shows."""
         return self._finder.stillness()
 
     def up(self) -> np.ndarray | None:
-        """Return what points up at present, (3,); None without samples."""
+        """Return the direction that points up at present, (3,); None without samples."""
         if not len(self._newest.volts):
             return None
-        mean = self._newest.volts[-_NOW:].mean(axis=0, keepdims=True)
-        force = force_g(nominal_rests(mean, 0 * mean, self.sensor).mean, self._found)[0]
+        mean_v = self._newest.volts[-_UP_SAMPLES:].mean(axis=0, keepdims=True)
+        rests = nominal_rests(mean_v, 0 * mean_v, self.sensor)
+        force = force_g(rests.mean, self._coefficients)[0]
         return force / max(float(np.linalg.norm(force)), 1e-9)
 
-    def where(self) -> str:
-        """Name the direction to turn to, in words."""
+    def destination(self) -> str:
+        """Name the direction to turn to, for people."""
         if self.next_up is None:
             return 'turn it to any direction not yet covered, and hold it still'
         return f'turn it so that {orientations.points_up(orientations.name_up(self.next_up))}, ' \
                'and hold it still'
 
-    def state(self) -> State:
-        """Say what is waited for, and by how much it is off."""
-        count = len(self.accepted)
-        need = f'{max(MIN_RESTS - count, 0)} more at least' if count < MIN_RESTS else \
-            'call finish when done' if count >= ENOUGH_RESTS else 'more make it better'
-        said = f'{count} rests ({need})'
-        still = self._finder.stillness()
-        if still is None:
-            return State('rest', f'{said}; waiting for samples', False)
-        if still.still:
-            return State('dwell', f'{said}; {still.describe_mps2(self.sensor)}; {self.where()}',
-                         False)
-        return State('rest', f'{said}; {still.describe_mps2(self.sensor)}; {self.where()}', False)
+    def next_pose(self) -> NextPose:
+        """Return the direction to announce."""
+        values: dict[str, str | float] = {'pose': str(self.pose_number)}
+        if self.next_up is not None:
+            up_x, up_y, up_z = map(float, orientations.UP[self.next_up])
+            values |= {'up_x': up_x, 'up_y': up_y, 'up_z': up_z}
+        return NextPose(self.destination(), values, None)
 
-    def _learn(self) -> None:
-        entries = [self.accepted[number] for number in sorted(self.accepted)]
-        mean = np.array([record.mean_v for record in entries]).reshape(-1, 3)
-        rests = nominal_rests(mean, np.array([record.std_v for record in entries]).reshape(-1, 3),
-                         self.sensor)
-        self._found = np.zeros(len(NAMES))
-        if len(mean):
-            self._found = regularised_fit(rests, self._found, _STEPS)
-        information = posterior_information(rests, self._found, TRIAL_STD_G ** 2)
-        values, to_units = effect_values(self._found, self.sensor)
-        self.names, self.values, self.prior = NAMES, self._found * to_units, PRIOR_STD * to_units
-        covariance = np.linalg.inv(information) * np.outer(to_units, to_units)
-        self.std = np.sqrt(np.diag(covariance))
-        self._fitted = replace(self.sensor, effects=tuple(values), values=values,
-                               covariance=covariance, covariance_names=NAMES)
-        force = force_g(rests.mean, self._found)
-        self.covered = orientations.covered(force / np.linalg.norm(force, axis=1, keepdims=True))
-        self._told = orientations.information_gain(information, self._found, rests.gravity_g)[0]
-        self._choose()
+    def status(self) -> Status:
+        """Return what the guide waits for, with the values that matter."""
+        count = len(self.accepted)
+        advice = f'{max(MIN_RESTS - count, 0)} more at least' if count < MIN_RESTS else \
+            'call finish when done' if count >= ENOUGH_RESTS else 'more make it better'
+        still = self._finder.stillness()
+        phase = Phase.DWELL if still is not None and still.still else Phase.REST
+        if still is None:
+            return Status(phase, f'{count} rests ({advice}); waiting for samples', False)
+        return Status(phase, f'{count} rests ({advice}); {still.describe_mps2(self.sensor)}; '
+                      f'{self.destination()}', False)
+
+    def progress(self) -> Progress:
+        """Return how far the calibration is, for the screen."""
+        up = self.up()
+        position = '' if up is None else \
+            f'{orientations.points_up(orientations.name_nearest(up))} now'
+        return Progress(
+            number=self.pose_number, destination=self.destination(), position=position,
+            accepted=len(self.accepted), total=ENOUGH_RESTS, skipped=0, remaining_s=None,
+            dwelt_s=None, dwell_s=None)
+
+    def estimate_contents(self) -> Estimate:
+        """Return what the rests determine so far, for the screen."""
+        return Estimate(
+            coverage=coverage.by_orientation(self._covered),
+            covered_faces=coverage.faces(self._covered), coefficients=self._rows,
+            tilt_error_deg=running_estimate.degrees_or_none(self.tilt_error_rad()),
+            final_tilt_error_deg=None)
 
     def tilt_error_rad(self) -> float:
-        """Return the rms error of alpha and beta to expect after the rests so far, rad."""
-        std_v = np.mean([e.std_v for e in self.accepted.values()] or
+        """Return the expected rms error of alpha and beta by the rests so far, rad."""
+        std_v = np.mean([record.std_v for record in self.accepted.values()] or
                         [tuple(datasheet_noise(self.sensor).sigma)], axis=0)
         return running_estimate.tilt_error_rad(self._fitted, std_v)
 
+    def _update_estimate(self) -> None:
+        """Fit the gravity model to the rests so far, with the priors of the datasheet."""
+        records = [self.accepted[number] for number in sorted(self.accepted)]
+        mean_v = np.array([record.mean_v for record in records]).reshape(-1, 3)
+        std_v = np.array([record.std_v for record in records]).reshape(-1, 3)
+        rests = nominal_rests(mean_v, std_v, self.sensor)
+        self._coefficients = np.zeros(len(NAMES))
+        if records:
+            self._coefficients = regularised_fit(rests, self._coefficients, _STEPS)
+        information = posterior_information(rests, self._coefficients, TRIAL_STD_G ** 2)
+        values, to_units = effect_values(self._coefficients, self.sensor)
+        covariance = np.linalg.inv(information) * np.outer(to_units, to_units)
+        self._rows = running_estimate.coefficient_rows(
+            NAMES, self._coefficients * to_units, np.sqrt(np.diag(covariance)),
+            PRIOR_STD * to_units)
+        self._fitted = replace(self.sensor, effects=tuple(values), values=values,
+                               covariance=covariance, covariance_names=NAMES)
+        force = force_g(rests.mean, self._coefficients)
+        self._covered = orientations.covered(force / np.linalg.norm(force, axis=1, keepdims=True))
+        self._gain = orientations.information_gain(information, self._coefficients,
+                                                   rests.gravity_g)[0]
+        self._choose()
+
     def _choose(self) -> None:
-        self.next_up = orientations.next_up(self._told, ~self.covered & ~self._passed, self.up())
+        """Choose the orientation to ask for."""
+        self.next_up = orientations.next_up(self._gain, ~self._covered & ~self._passed, self.up())
 
-    def _wrong(self, entry: PoseRecord) -> str:
-        first = next((record.temperature_c for record in self.accepted.values()
-                      if np.isfinite(record.temperature_c)), np.nan)
-        # A knock at the rail that leaves the rest as it was is left out of the mean.
-        at_rail = _SHARE * entry.samples < (bisect_right(self._saturated, entry.stop_ns)
-                                               - bisect_left(self._saturated, entry.start_ns))
-        return ('saturated: samples of the rest are beyond the range of '
-                f'±{self.sensor.range_g:g} g or at a rail of the ADC; check supply and wiring'
-                if at_rail else pose_checks.temperature(first, entry.temperature_c, self._span_c))
-
-    def _number(self) -> int:
-        return max(self.accepted, default=-1) + 1
+    def _fault(self, record: PoseRecord) -> str:
+        """Return what speaks against a rest, or ''."""
+        saturated = (bisect_right(self._saturated_ns, record.stop_ns)
+                     - bisect_left(self._saturated_ns, record.start_ns))
+        if saturated > _MOST_SATURATED * record.samples:
+            return ('saturated: samples of the rest are beyond the range of '
+                    f'±{self.sensor.range_g:g} g or at a rail of the ADC; check supply and wiring')
+        first_c = next((accepted.temperature_c for accepted in self.accepted.values()
+                        if np.isfinite(accepted.temperature_c)), np.nan)
+        return pose_checks.temperature(first_c, record.temperature_c, self._span_c)
 
     def _time_s(self, stamps_ns: np.ndarray) -> np.ndarray:
         # From the first stamp: float64 seconds since 1970 resolve only 0.2 µs.
@@ -269,11 +365,11 @@ class Tumble:
         self._stamps = [np.concatenate(self._stamps)]
         return self._stamps[0]
 
-    def _entry(self, number: int, rest: Rest, stamps: np.ndarray) -> PoseRecord:
-        mean, std = self._finder.means([rest])
-        span = int(stamps[rest.start]), int(stamps[rest.stop - 1])
+    def _record(self, number: int, rest: Rest, stamps_ns: np.ndarray) -> PoseRecord:
+        mean_v, std_v = self._finder.means([rest])
+        span = int(stamps_ns[rest.start]), int(stamps_ns[rest.stop - 1])
         return PoseRecord(
             pose=number, start_ns=span[0], stop_ns=span[1], samples=rest.stop - rest.start,
-            mean_v=tuple(mean[0].tolist()), std_v=tuple(std[0].tolist()),
+            mean_v=tuple(mean_v[0].tolist()), std_v=tuple(std_v[0].tolist()),
             temperature_c=self.surroundings.temperature_c.mean(*span),
             supply_v=self.surroundings.supply_v.mean(*span))

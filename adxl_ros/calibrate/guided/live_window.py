@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What arrives while a calibration runs, beside the poses: the newest samples, surroundings."""
+"""The newest samples of a stream, and readings of temperature and supply over time."""
 
 from __future__ import annotations
 
@@ -24,45 +24,90 @@ from adxl_ros.signals.noise_limits import datasheet_noise
 from adxl_ros.signals.rest_detection import RestFinder, Stillness
 import numpy as np
 
-_JUDGED_S, _SHOWN_S = 1.2, 0.5
-_SAMPLES = 20
+_REST_WINDOW_S = 1.2
+"""Newest samples that stay in memory, s; chosen: more than the rest detection looks at."""
+_SHOWN_S = 0.5
+"""Newest samples whose mean is shown, s; chosen: steady to read and still quick."""
+_FEWEST_SAMPLES = 20
+"""Samples that stay at the lowest rates; chosen: a median of 19 periods gives the rate."""
 _BACK_NS = 1_000_000_000
+"""Stamps that are earlier by more are of another clock, ns; chosen: above any disorder."""
 _KEPT_READINGS = 100_000
 """Readings that stay in memory; chosen: 1000 s at 100 Hz."""
 STALE_NS = 60_000_000_000
-"""A temperature or supply that is stamped so far from the samples is not theirs."""
+"""A reading that is stamped farther from the samples does not belong to them, ns; chosen."""
 
 
 def went_back(newest_ns: int, stamp_ns: int) -> bool:
-    """Tell whether stamps go back: a driver that was started anew, or a clock that was set."""
+    """
+    Return whether stamps go back, since the driver was restarted or a clock was set.
+
+    Parameters
+    ----------
+    newest_ns
+        Newest stamp so far, ns.
+    stamp_ns
+        The next stamp, ns.
+
+    Returns
+    -------
+    bool
+        Whether the next stamp is earlier by more than a second.
+
+    """
     return stamp_ns < newest_ns - _BACK_NS
 
 
-class Newest:
-    """The newest second of a stream, and at least twenty samples."""
+class NewestSamples:
+    """
+    The newest second of a stream, and at least twenty samples.
+
+    Parameters
+    ----------
+    sensor
+        The nominal sensor of the stream.
+
+    Attributes
+    ----------
+    stamps_ns
+        Stamps, ns, (n,).
+    volts
+        Samples, V, (n, m).
+
+    """
 
     def __init__(self, sensor: Sensor) -> None:
         self._sensor = sensor
-        self._keep, self._show = (max(round(seconds * sensor.rate_hz), _SAMPLES)
-                                  for seconds in (_JUDGED_S, _SHOWN_S))
+        self._keep = max(round(_REST_WINDOW_S * sensor.rate_hz), _FEWEST_SAMPLES)
+        self._show = max(round(_SHOWN_S * sensor.rate_hz), _FEWEST_SAMPLES)
         self.stamps_ns = np.zeros(0, np.int64)
         self.volts = np.zeros((0, len(sensor.axes)))
 
     def feed(self, stamps_ns: np.ndarray, volts: np.ndarray) -> None:
-        """Take samples: stamps, ns, (n,), and volts, (n, m)."""
+        """
+        Take samples.
+
+        Parameters
+        ----------
+        stamps_ns
+            Their stamps, ns, (n,).
+        volts
+            The samples, V, (n, m).
+
+        """
         self.stamps_ns = np.concatenate([self.stamps_ns, stamps_ns])[-self._keep:]
         self.volts = np.concatenate([self.volts, volts])[-self._keep:]
 
     def mean_mps2(self) -> list[float]:
-        """Return what the axes read on average, m/s², (m,)."""
+        """Return the mean of each axis, m/s², (m,)."""
         return self._shown().mean(axis=0).tolist()
 
     def rms_mps2(self) -> list[float]:
-        """Return how they scatter about it, m/s², (m,)."""
+        """Return the rms of each axis about its mean, m/s², (m,)."""
         return self._shown().std(axis=0).tolist()
 
     def stillness(self) -> Stillness | None:
-        """Judge by the noise of the figures whether they are at rest; None if too few."""
+        """Return whether the samples are at rest, by the datasheet's noise; None if too few."""
         finder = RestFinder(self._sensor.rate_hz, len(self._sensor.axes),
                             datasheet_noise(self._sensor), learn=False)
         if len(self.stamps_ns):
@@ -71,7 +116,7 @@ class Newest:
 
     def rate_hz(self) -> float:
         """Return the rate of the stamps, Hz; NaN while there are too few of them."""
-        if len(self.stamps_ns) < _SAMPLES:
+        if len(self.stamps_ns) < _FEWEST_SAMPLES:
             return float('nan')
         period_ns = float(np.median(np.diff(self.stamps_ns)))
         return 1e9 / period_ns if period_ns > 0 else float('nan')

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Whether the sensor is mounted as it was when the poses so far were taken."""
+"""The check that the sensor is mounted as it was when earlier poses were taken."""
 
 from __future__ import annotations
 
@@ -23,54 +23,60 @@ from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
-_SAME_G = 0.003
-"""A pose that is taken again after an interruption reads the same within this, g, and noise."""
-_NOISE = 3.0
-_ACROSS = 0.94
-"""Cosine of 20°: poses whose verticals are closer than this tell the same of the mounting."""
+_CHANGE_G = 0.003
+"""Largest change of a pose that is taken again, beside noise and stage, g; chosen: 0.17°."""
+_NOISE_STDS = 3.0
+"""Standard deviations of the noise that are permitted beside; chosen: one in 400."""
+_ACROSS_COSINE = 0.94
+"""Cosine of 20°: poses whose verticals are closer show the same turns of the mounting."""
 
 
 def to_take_again(records: Sequence[PoseRecord]) -> list[PoseRecord]:
     """
-    Choose the poses of a journal that tell of the mounting when they are taken again.
+    Choose the poses of a journal that show the mounting when they are taken again.
 
-    The newest, and, since a turn about its vertical does not show there, the one whose vertical
-    is nearest to 90° from it, if there is one.
+    A turn about the vertical of the newest pose does not show there. The pose whose vertical is
+    nearest to 90° from it comes second, if there is one.
     """
-    last = max(records, key=lambda record: record.stop_ns)
-    across = min(records, key=lambda record: _along(record, last))
-    return [last, across] if _along(across, last) < _ACROSS else [last]
+    newest = max(records, key=lambda record: record.stop_ns)
+    across = min(records, key=lambda record: _alignment(record, newest))
+    return [newest, across] if _alignment(across, newest) < _ACROSS_COSINE else [newest]
 
 
 def changed(sensor: Sensor, before: PoseRecord, now: PoseRecord, tolerance_rad: float) -> str:
     """
-    Refuse to go on where a pose that was taken before reads something else now.
+    Refuse to go on where an earlier pose reads something else now.
 
     Parameters
     ----------
     sensor
         The nominal sensor.
     before, now
-        The pose in the journal, and taken again.
+        The pose in the journal, and the same pose taken again.
     tolerance_rad
-        How far the stage may be off, each time.
+        How far the stage may be from its angles each time, rad.
+
+    Returns
+    -------
+    str
+        The axis that changed most, with its limit and what to do, or ''.
 
     """
     before_v, now_v = np.array(before.mean_v), np.array(now.mean_v)
-    off_g, noise_g = (np.abs(volts) / sensor.nominal_scale_v_per_g for volts in (
-        now_v - before_v, np.hypot(before.std_v, now.std_v)))
-    allowed = _SAME_G + _NOISE * noise_g + 2 * tolerance_rad
-    axis = int((off_g - allowed).argmax())
-    if off_g[axis] <= allowed[axis]:
+    change_g = np.abs(now_v - before_v) / sensor.nominal_scale_v_per_g
+    noise_g = np.hypot(before.std_v, now.std_v) / sensor.nominal_scale_v_per_g
+    limit_g = _CHANGE_G + _NOISE_STDS * noise_g + 2 * tolerance_rad
+    axis = int((change_g - limit_g).argmax())
+    if change_g[axis] <= limit_g[axis]:
         return ''
     return (f'mounting changed: in pose {before.pose + 1} {sensor.axes[axis]} reads '
             f'{now_v[axis]:.4f} V, but read {before_v[axis]:.4f} V before the interruption '
-            f'({off_g[axis] * 1e3:.1f} mg apart, {allowed[axis] * 1e3:.1f} mg are allowed); put '
-            'the sensor back as it was, or begin anew with resume:=anew')
+            f'({change_g[axis] * 1e3:.1f} mg apart, {limit_g[axis] * 1e3:.1f} mg are allowed); '
+            'put the sensor back as it was, or begin anew with resume:=anew')
 
 
-def _along(one: PoseRecord, other: PoseRecord) -> float:
+def _alignment(first: PoseRecord, second: PoseRecord) -> float:
     """Return the cosine of the angle between the verticals of two poses, without its sign."""
-    up, beside = (np.array(specific_force(e.alpha_rad, e.beta_rad, 1.0))
-                  for e in (one, other))
-    return abs(float(up @ beside))
+    first_up = np.array(specific_force(first.alpha_rad, first.beta_rad, 1.0))
+    second_up = np.array(specific_force(second.alpha_rad, second.beta_rad, 1.0))
+    return abs(float(first_up @ second_up))

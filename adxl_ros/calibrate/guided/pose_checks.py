@@ -13,34 +13,53 @@
 # limitations under the License.
 
 """
-Why a pose is not taken: one line with the figure that is wrong, and what to do.
+Checks of a pose: one line with the value that is wrong, and what to do.
 
-Each function returns that line, or '' where nothing is wrong.
+Each check returns that line, or '' where nothing is wrong.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from itertools import permutations, product
 
 from adxl_ros.calibrate.guided.pose_plan import Target
-from adxl_ros.calibrate.guided.running_estimate import in_g, Known
+from adxl_ros.calibrate.guided.running_estimate import in_g, RunningEstimate
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
-_UNLIKELY = 3.5
-"""A reading this many standard deviations from what it should be is that of another pose."""
-_MODEL_G = 5e-3
-"""What stage and model may miss beyond what is known of them, g."""
-_SAME_G = 0.2
-"""Readings within this are taken for the same when the kind of a mistake is told."""
-_TRUSTED = 4
-"""Poses after which the axes are known to be the right ones."""
-_CLOCKS_S = 2.0
-_RATE = 0.05
+_OUTLIER_STDS = 3.5
+"""A reading so many standard deviations from its prediction is refused; chosen: one in 2000."""
+_MODEL_STD_G = 5e-3
+"""Errors of stage and model beyond the predicted ones, g; chosen: units of twice the datasheet."""
+_SAME_READING_G = 0.2
+"""Readings within this count as equal when a kind of mistake is named, g; chosen."""
+_WIRING_POSES = 4
+"""Poses after which the wiring of the axes is taken as right; chosen: all axes have moved."""
+_CLOCK_OFFSET_S = 2.0
+"""Largest offset of the clocks of stage and sensor, s; chosen: above any delay of messages."""
+_RATE_ERROR = 0.05
+"""Largest relative error of the sample rate; chosen: above the error of any oscillator."""
 
 
 def angles(target: Target, alpha_rad: float, beta_rad: float, tolerance_rad: float) -> str:
-    """Compare where the stage is with where it was asked to be."""
+    """
+    Refuse a stage that is not at the pose.
+
+    Parameters
+    ----------
+    target
+        The pose.
+    alpha_rad, beta_rad
+        The angles of the stage, rad.
+    tolerance_rad
+        Largest permitted distance of a joint, rad.
+
+    Returns
+    -------
+    str
+        The joints that are too far, or ''.
+
+    """
     return ', '.join(
         f'{name} is {degrees(now - wanted)} from the asked {np.degrees(wanted):.4g}°'
         for name, now, wanted in (('alpha', alpha_rad, target.alpha_rad),
@@ -49,26 +68,75 @@ def angles(target: Target, alpha_rad: float, beta_rad: float, tolerance_rad: flo
 
 
 def moved(name: str, angles_rad: np.ndarray, tolerance_rad: float) -> str:
-    """Refuse a joint that turned while the pose was averaged, by its readings (n,)."""
-    by = float(np.ptp(angles_rad)) if len(angles_rad) else 0.0
-    return f'{name} moved {degrees(by)} while the pose was averaged; hold the stage still' \
-        if by > tolerance_rad else ''
+    """
+    Refuse a joint that turned while the pose was averaged.
+
+    Parameters
+    ----------
+    name
+        Name of the joint.
+    angles_rad
+        Its readings during the dwell, rad, (n,).
+    tolerance_rad
+        Largest permitted range, rad.
+
+    Returns
+    -------
+    str
+        How far the joint moved, or ''.
+
+    """
+    range_rad = float(np.ptp(angles_rad)) if len(angles_rad) else 0.0
+    if range_rad <= tolerance_rad:
+        return ''
+    return f'{name} moved {degrees(range_rad)} while the pose was averaged; hold the stage still'
 
 
 def saturated(sensor: Sensor, volts: np.ndarray) -> str:
-    """Refuse volts, (n, m), at a rail of the ADC or beyond the sensor's range."""
+    """
+    Refuse volts at a rail of the ADC or beyond the range of the sensor.
+
+    Parameters
+    ----------
+    sensor
+        The nominal sensor.
+    volts
+        Samples of the pose, V, (n, m).
+
+    Returns
+    -------
+    str
+        The first of these samples, or ''.
+
+    """
     rows, columns = np.nonzero(sensor.saturated(volts))
     if not len(rows):
         return ''
     axis = int(columns[0])
-    worst = volts[rows[0], axis]
-    reads = (worst - sensor.nominal_zero_g_v[axis]) / sensor.nominal_scale_v_per_g[axis]
-    return (f'saturated: {sensor.axes[axis]} reads {signed(reads)} g ({worst:.3f} V), beyond '
-            f'its range of ±{sensor.range_g:g} g or at a rail of the ADC; check supply and wiring')
+    reading_v = volts[rows[0], axis]
+    reading_g = (reading_v - sensor.nominal_zero_g_v[axis]) / sensor.nominal_scale_v_per_g[axis]
+    return (f'saturated: {sensor.axes[axis]} reads {signed(reading_g)} g ({reading_v:.3f} V), '
+            f'beyond its range of ±{sensor.range_g:g} g or at a rail of the ADC; check supply and '
+            'wiring')
 
 
 def temperature(first_c: float, now_c: float, span_c: float) -> str:
-    """Refuse a pose at another temperature than the first one; NaN is not measured."""
+    """
+    Refuse a pose at another temperature than that of the first pose.
+
+    Parameters
+    ----------
+    first_c, now_c
+        Temperature of the first pose and of this one, °C; NaN without a reading.
+    span_c
+        Largest permitted difference, °C.
+
+    Returns
+    -------
+    str
+        By how much the temperature moved, or ''.
+
+    """
     if not abs(now_c - first_c) > span_c:
         return ''
     return (f'temperature moved {abs(now_c - first_c):.1f} °C since the first pose '
@@ -77,16 +145,31 @@ def temperature(first_c: float, now_c: float, span_c: float) -> str:
 
 
 def rate(measured_hz: float, stated_hz: float) -> str:
-    """Compare the rate of the stamps with the one that sensor_info states."""
-    if not abs(measured_hz / stated_hz - 1) > _RATE:
+    """
+    Refuse samples at another rate than the stated one.
+
+    Parameters
+    ----------
+    measured_hz
+        Rate by the stamps, Hz; NaN where it is unknown.
+    stated_hz
+        Rate that `sensor_info` states, Hz.
+
+    Returns
+    -------
+    str
+        Both rates, or ''.
+
+    """
+    if not abs(measured_hz / stated_hz - 1) > _RATE_ERROR:
         return ''
     return (f'samples are {measured_hz:.4g} a second by their stamps, but sensor_info states '
             f'rate_hz {stated_hz:.4g}; put the rate of the driver right')
 
 
 def clocks(stage_ahead_s: float) -> str:
-    """Refuse a stage whose stamps are not of the samples' time."""
-    if not abs(stage_ahead_s) > _CLOCKS_S:
+    """Refuse a stage on another clock than the samples, by its offset, s."""
+    if not abs(stage_ahead_s) > _CLOCK_OFFSET_S:
         return ''
     side = 'ahead of' if stage_ahead_s > 0 else 'behind'
     return (f'stage/joint_states is stamped {_span(abs(stage_ahead_s))} {side} imu/data_raw: '
@@ -94,64 +177,71 @@ def clocks(stage_ahead_s: float) -> str:
             'synchronise their computers)')
 
 
-def reading(known: Known, target: Target, volts: np.ndarray, tolerance_rad: float) -> str:
+def reading(estimate: RunningEstimate, target: Target, volts: np.ndarray, tolerance_rad: float
+            ) -> str:
     """
-    Compare what a pose reads with what the poses so far, or the datasheet, let expect.
+    Refuse a pose whose mean is an outlier to the prediction from the poses so far.
 
     Parameters
     ----------
-    known
-        From the poses so far.
+    estimate
+        The unit by the poses so far and the datasheet.
     target
         The angles at which the pose was taken.
     volts
-        Their mean, (m,).
+        Mean of the pose, V, (m,).
     tolerance_rad
-        How far the stage may be off its angles.
+        How far the stage may be from its angles, rad.
+
+    Returns
+    -------
+    str
+        Measured and expected value with a probable cause, or ''.
 
     """
-    sensor = known.unit
-    expected_v, std_v = known.reading(target.alpha_rad, target.beta_rad)
-    slack_v = sensor.nominal_scale_v_per_g * np.hypot(_MODEL_G, tolerance_rad)
-    far = np.abs(volts - expected_v) / np.hypot(std_v, slack_v)
-    if far.max() <= _UNLIKELY:
+    sensor = estimate.unit
+    expected_v, std_v = estimate.predicted(target.alpha_rad, target.beta_rad)
+    slack_v = sensor.nominal_scale_v_per_g * np.hypot(_MODEL_STD_G, tolerance_rad)
+    residual_stds = np.abs(volts - expected_v) / np.hypot(std_v, slack_v)
+    if residual_stds.max() <= _OUTLIER_STDS:
         return ''
-    axis = int(far.argmax())
-    reads, expected = in_g(sensor, volts), in_g(sensor, expected_v)
-    said = (f'{sensor.axes[axis]} reads {signed(reads[axis])} g where '
-            f'{signed(expected[axis])} g was expected')
-    # The wiring that has read some poses right does not change; the operator may be mistaken.
-    if known.poses < _TRUSTED and _crossed(reads, expected):
-        return f'{said}: axis inverted or swapped; check wiring, mounting and pose'
-    before = ', or take the pose before again' if 0 < known.poses < _TRUSTED else ''
-    there = known.seen_at(target.alpha_rad, target.beta_rad, volts, slack_v)
-    off = angles(target, *there, tolerance_rad) if there else ''
-    if off:
-        return f'{said}: by the sensor, {off}; check the pose and the mounting{before}'
-    return f'{said}; check the pose, the mounting and the wiring{before}'
+    axis = int(residual_stds.argmax())
+    measured_g, expected_g = in_g(sensor, volts), in_g(sensor, expected_v)
+    finding = (f'{sensor.axes[axis]} reads {signed(measured_g[axis])} g where '
+               f'{signed(expected_g[axis])} g was expected')
+    # Wiring that has read some poses right does not change, but an operator may be mistaken.
+    is_wiring_unproven = estimate.poses < _WIRING_POSES
+    if is_wiring_unproven and _is_crossed(measured_g, expected_g):
+        return f'{finding}: axis inverted or swapped; check wiring, mounting and pose'
+    advice = ', or take the pose before again' if estimate.poses and is_wiring_unproven else ''
+    angles_rad = estimate.angles_of(target.alpha_rad, target.beta_rad, volts, slack_v)
+    distance = angles(target, *angles_rad, tolerance_rad) if angles_rad else ''
+    if distance:
+        return f'{finding}: by the sensor, {distance}; check the pose and the mounting{advice}'
+    return f'{finding}; check the pose, the mounting and the wiring{advice}'
 
 
 def degrees(angle_rad: float) -> str:
-    """Write the size of an angle."""
+    """Return the size of an angle as text, in degrees."""
     size = abs(float(np.degrees(angle_rad)))
     return f'{size:.2f}°' if size < 1 else f'{size:.1f}°'
 
 
 def signed(value: float) -> str:
-    """Write a figure with its sign."""
+    """Return a value as text, with its sign."""
     return f'{value:+.2f}'.replace('-', '−')
 
 
-def _crossed(reads: np.ndarray, expected: np.ndarray) -> bool:
-    """Tell whether axes with other signs, or in another order, read what was expected."""
-    def same(a: Sequence[float] | np.ndarray) -> bool:
-        return bool(np.abs(np.asarray(a) - expected).max() < _SAME_G)
+def _is_crossed(measured_g: np.ndarray, expected_g: np.ndarray) -> bool:
+    """Return whether axes with other signs, or in another order, read the expected values."""
+    def is_expected(values_g: np.ndarray) -> bool:
+        return bool(np.abs(values_g - expected_g).max() < _SAME_READING_G)
 
-    signs = np.array(np.meshgrid(*[[1, -1]] * len(reads))).reshape(len(reads), -1).T
-    orders = [np.roll(np.arange(len(reads)), i)[::step] for i in range(len(reads))
-              for step in (1, -1)]
-    return not same(reads) and any(same(sign * reads[order]) for order in orders
-                                   for sign in signs)
+    if is_expected(measured_g):
+        return False
+    signs = product((1, -1), repeat=len(measured_g))
+    orders = permutations(measured_g)
+    return any(is_expected(np.array(sign) * order) for sign, order in product(signs, orders))
 
 
 def _span(seconds: float) -> str:

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Which poses a sweep visits, and in what order."""
+"""The pose plan: which poses a sweep visits, in which order."""
 
 from __future__ import annotations
 
@@ -24,21 +24,34 @@ from adxl_ros.errors import UserError
 import numpy as np
 
 ORDER = 3
-"""To be raised with every change of `guided`: an interrupted sweep cannot go on in another."""
+"""Version of the order of `guided`: an interrupted sweep is resumed in the same order only."""
 KINDS = ('full', 'quick')
-"""Plans of a stage: the paper's planes, or the fewest poses that reach a tilt error."""
+"""Kinds of plans: planes as in the paper, or the fewest poses that reach a tilt error."""
 STEP_RAD = float(np.radians(30.0))
-"""Step of beta of the paper."""
+"""Step of beta, rad, as in the paper."""
 MOVE_S = 5.0
-"""Time from a pose to the next, beside the dwell, until there is some experience, s."""
+"""Time of a move and of the settling, s; chosen: it counts until poses show the real one."""
 _FLAT = 0.2
-"""Planes with |sin α| below this hardly show beta; the paper leaves them out of (15), too."""
+"""Planes with |sin α| below this hardly show beta; equation (15) of the paper excludes them."""
 _GOLDEN_RAD = np.pi * (3 - np.sqrt(5))
+"""The golden angle, rad."""
+_HIGHEST_COSINE = 0.97
+"""Cosine of alpha at the ends of the spiral of `spread`; chosen: not level, so that beta shows."""
 
 
 @dataclass(frozen=True)
 class Target:
-    """One pose to visit, rad; a `check` pose judges the fit and stays out of it."""
+    """
+    One pose to visit.
+
+    Attributes
+    ----------
+    alpha_rad, beta_rad
+        Angles of the joints, rad.
+    check
+        Whether the pose is kept out of the fit, to show how good the fit is.
+
+    """
 
     alpha_rad: float
     beta_rad: float
@@ -56,12 +69,17 @@ def sweep(planes_rad: Sequence[float], step_rad: float, check_poses: int) -> lis
     step_rad
         Step of beta from 0 to 2π and back; the paper's is 30°.
     check_poses
-        Poses off the grid after the sweep, spread evenly over the sphere by a golden spiral.
+        Number of poses off the grid after the sweep, spread evenly over the sphere.
+
+    Returns
+    -------
+    list
+        The poses in the order of the visit.
 
     Raises
     ------
     UserError
-        No planes, or a step that makes less than four or more than 720 poses a turn.
+        There is no plane, or the step makes less than four or more than 720 poses a turn.
 
     """
     forth = _turn(planes_rad, step_rad)
@@ -76,31 +94,39 @@ def default_planes_rad(axes: str) -> tuple[float, ...]:
 
     Without level planes a z axis is calibrated to 0.87 g only.
     """
-    ends = (0.0, 180.0) if 'z' in axes else (30.0, 150.0)
-    return tuple(float(angle) for angle in np.radians(np.arange(ends[0], ends[1] + 1, 30.0)))
+    first_deg, last_deg = (0.0, 180.0) if 'z' in axes else (30.0, 150.0)
+    return tuple(float(angle) for angle in np.radians(np.arange(first_deg, last_deg + 1, 30.0)))
 
 
 def guided(planes_rad: Sequence[float], step_rad: float, check_poses: int) -> list[Target]:
     """
     Order the poses of `sweep` for a real stage, whose joints keep their error until they move.
 
-    Beta turns forth and then back, and at each of its angles alpha goes through all planes, up
-    and down in turn. A joint takes a new error with each move, so that a plane has as many as it
-    has poses: with one setting a plane, the error of that setting would count in full. All planes
-    are there after half of the sweep, and each pose is reached in both directions of both joints.
+    Beta turns forth and then back. At each angle beta, alpha goes through all planes, up and down
+    in turn. A joint takes a new error with each move, so that the errors of a plane average out.
+    With one setting for a plane, the error of that setting would count in full. All planes are
+    complete after half of the sweep, and each pose is reached in both directions of both joints.
     Where |sin alpha| < 0.2 beta hardly shows, and quarter turns of beta are enough. Check poses
-    follow, in whole degrees, which can be set by hand on a scale, each the nearest to the one
-    before.
+    follow in whole degrees, which can be set by hand on a scale.
 
     Parameters
     ----------
-    planes_rad, step_rad, check_poses
-        As `sweep` takes them; planes in any order.
+    planes_rad
+        Angles alpha, in any order, rad.
+    step_rad
+        Step of beta from 0 to 2π and back, rad.
+    check_poses
+        Number of check poses.
+
+    Returns
+    -------
+    list
+        The poses in the order of the visit.
 
     Raises
     ------
     UserError
-        See `sweep`.
+        There is no plane, or the step makes less than four or more than 720 poses a turn.
 
     """
     forth = _turn(planes_rad, step_rad)
@@ -115,18 +141,34 @@ def guided(planes_rad: Sequence[float], step_rad: float, check_poses: int) -> li
 
 
 def with_checks(targets: list[Target], check_poses: int) -> list[Target]:
-    """Add check poses in whole degrees, each the nearest to the one before."""
-    checks = [Target(_whole(t.alpha_rad), _whole(t.beta_rad), True) for t in spread(check_poses)]
+    """
+    Add check poses in whole degrees, each the nearest to the pose before.
+
+    Parameters
+    ----------
+    targets
+        The poses of the fit.
+    check_poses
+        Number of check poses.
+
+    Returns
+    -------
+    list
+        All poses.
+
+    """
+    checks = [Target(_whole_degrees(target.alpha_rad), _whole_degrees(target.beta_rad), True)
+              for target in spread(check_poses)]
     return targets + nearest(targets[-1], checks)
 
 
 def travel_rad(targets: Sequence[Target]) -> float:
-    """Return the way of the slower joint over all moves, rad: the joints turn at one time."""
-    return sum(_apart(a, b) for a, b in pairwise(targets))
+    """Return the travel of the slower joint over all moves, rad: both joints turn at once."""
+    return sum(_distance_rad(first, second) for first, second in pairwise(targets))
 
 
 def _turn(planes_rad: Sequence[float], step_rad: float) -> np.ndarray:
-    """Return the angles beta of a turn, or say what is wrong with the plan."""
+    """Return the angles beta of a turn, rad; refuse a plan without planes or with a wrong step."""
     if not len(planes_rad) or not np.all(np.isfinite(planes_rad)):
         raise UserError('sweep.planes_rad: names no plane; give at least one angle alpha')
     if not 2 * np.pi / 720 <= step_rad <= np.pi / 2 + 1e-9:
@@ -134,26 +176,42 @@ def _turn(planes_rad: Sequence[float], step_rad: float) -> np.ndarray:
     return np.arange(round(2 * np.pi / step_rad) + 1) * step_rad
 
 
-def _whole(angle_rad: float) -> float:
+def _whole_degrees(angle_rad: float) -> float:
     return float(np.radians(np.round(np.degrees(angle_rad))))
 
 
-def _apart(a: Target, b: Target) -> float:
-    return max(abs(a.alpha_rad - b.alpha_rad), abs(a.beta_rad - b.beta_rad))
+def _distance_rad(first: Target, second: Target) -> float:
+    return max(abs(first.alpha_rad - second.alpha_rad), abs(first.beta_rad - second.beta_rad))
 
 
 def nearest(start: Target, targets: list[Target]) -> list[Target]:
-    """Order targets by the nearest neighbour of the one before."""
-    left, way = list(targets), [start]
-    while left:
-        way.append(min(left, key=lambda target: _apart(way[-1], target)))
-        left.remove(way[-1])
-    return way[1:]
+    """
+    Order poses so that each one is the nearest to the pose before.
+
+    Parameters
+    ----------
+    start
+        The pose before the first.
+    targets
+        The poses.
+
+    Returns
+    -------
+    list
+        The poses in that order.
+
+    """
+    remaining, path = list(targets), [start]
+    while remaining:
+        path.append(min(remaining, key=lambda target: _distance_rad(path[-1], target)))
+        remaining.remove(path[-1])
+    return path[1:]
 
 
 def spread(count: int) -> list[Target]:
     """Spread check poses evenly over the sphere by a golden spiral."""
     index = np.arange(count)
-    alpha = np.arccos(0.97 - 1.94 * (index + 0.5) / max(count, 1))
+    alpha = np.arccos(_HIGHEST_COSINE - 2 * _HIGHEST_COSINE * (index + 0.5) / max(count, 1))
     beta = (index * _GOLDEN_RAD) % (2 * np.pi)
-    return [Target(float(a), float(b), True) for a, b in zip(alpha, beta)]
+    return [Target(float(alpha_rad), float(beta_rad), True)
+            for alpha_rad, beta_rad in zip(alpha, beta)]

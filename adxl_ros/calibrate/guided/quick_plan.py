@@ -16,8 +16,8 @@
 The quick plan: the fewest poses that reach a stated tilt error.
 
 Poses are chosen by D-optimality from a grid of 15°, which can be set by hand on a scale, for the
-unit's axes and for its stage. They are visited on a short way, and the tilt error to expect is
-that of this very order, where joints keep their error until they move.
+unit's axes and for its stage. They are visited on a short way. The expected tilt error is that of
+this order, in which joints keep their error until they move.
 """
 
 from __future__ import annotations
@@ -27,14 +27,13 @@ from collections.abc import Sequence
 from adxl_ros.calibrate.fits import d_optimal
 from adxl_ros.calibrate.guided import running_estimate
 from adxl_ros.calibrate.guided.pose_plan import nearest, Target, with_checks
-from adxl_ros.calibrate.poses import Poses
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
-_SPARE = 40
-"""Readings beyond the coefficients: by these the stage's error and disturbed poses are judged."""
-_MOST = 90
-"""Poses after which a plan is no longer quick."""
+_SPARE_READINGS = 40
+"""Readings beyond the coefficients, which show the stage's error and disturbed poses; chosen."""
+_MOST_POSES = 90
+"""Largest number of poses; chosen: above it the plan full takes hardly longer."""
 
 
 def quick(sensor: Sensor, dwell_s: float, tilt_error_rad: float, check_poses: int
@@ -45,13 +44,13 @@ def quick(sensor: Sensor, dwell_s: float, tilt_error_rad: float, check_poses: in
     Parameters
     ----------
     sensor
-        Nominal figures of the unit; its stage resolution is the stated error of the stage.
+        The nominal sensor; its stage resolution is the stated error of the stage.
     dwell_s
         Time that a pose is averaged, s.
     tilt_error_rad
         Rms error of alpha and beta to reach, rad.
     check_poses
-        Poses off the grid after the others.
+        Number of poses off the grid after the others.
 
     Returns
     -------
@@ -59,46 +58,67 @@ def quick(sensor: Sensor, dwell_s: float, tilt_error_rad: float, check_poses: in
         Poses in the order of the visit.
 
     """
-    start = nothing_known(sensor, dwell_s)
-    fewest = -(-(len(start.names) + _SPARE) // len(sensor.axes))
+    start = datasheet_estimate(sensor, dwell_s)
+    fewest = -(-(len(start.names) + _SPARE_READINGS) // len(sensor.axes))
     grid = d_optimal.candidate_poses(start.pose_std_v)
     rows = d_optimal.whitened_jacobian(start.unit, grid, start.names, start.stage)
     chosen = [Target(float(grid.alpha_rad[i]), float(grid.beta_rad[i])) for i in
-              d_optimal.choose_poses(rows, np.diag(1 / start.prior ** 2), max(_MOST, fewest))]
+              d_optimal.choose_poses(rows, np.diag(1 / start.prior ** 2),
+                                     max(_MOST_POSES, fewest))]
     for count in range(fewest, len(chosen) + 1):
         targets = _short_way(chosen[:count])
-        if start.after(targets).tilt_error_rad() <= tilt_error_rad:
+        if start.with_poses(targets).tilt_error_rad() <= tilt_error_rad:
             break
     return with_checks(targets, check_poses)
 
 
-def nothing_known(sensor: Sensor, dwell_s: float) -> running_estimate.Known:
-    """Return what the datasheet alone tells of a unit, with poses of a dwell in s to come."""
-    empty = Poses.without_volts(np.zeros(0), np.zeros(0), np.zeros(len(sensor.axes)))
-    return running_estimate.from_poses(
-        sensor, empty, dwell_s, sensor.stage_resolution_rad / np.sqrt(12))
-
-
-def expected_tilt_error_rad(sensor: Sensor, dwell_s: float, targets: Sequence[Target]) -> float:
+def datasheet_estimate(sensor: Sensor, dwell_s: float) -> running_estimate.RunningEstimate:
     """
-    Return the rms error of alpha and beta to expect after a plan, rad.
+    Return the estimate of a unit before its first pose, by the datasheet alone.
 
     Parameters
     ----------
     sensor
-        Nominal figures of the unit.
+        The nominal sensor.
+    dwell_s
+        Time that a pose is averaged, s.
+
+    Returns
+    -------
+    RunningEstimate
+        The estimate.
+
+    """
+    return running_estimate.from_poses(
+        sensor, running_estimate.no_poses(len(sensor.axes)), dwell_s,
+        sensor.stage_resolution_rad / np.sqrt(12))
+
+
+def expected_tilt_error_rad(sensor: Sensor, dwell_s: float, targets: Sequence[Target]) -> float:
+    """
+    Predict the rms error of alpha and beta after a pose plan.
+
+    Parameters
+    ----------
+    sensor
+        The nominal sensor.
     dwell_s
         Time that a pose is averaged, s.
     targets
-        The plan; check poses do not count.
+        The pose plan; check poses do not count.
+
+    Returns
+    -------
+    float
+        The error, rad; NaN where no pose shows both angles.
 
     """
     fitted = [target for target in targets if not target.check]
-    return nothing_known(sensor, dwell_s).after(fitted).tilt_error_rad()
+    return datasheet_estimate(sensor, dwell_s).with_poses(fitted).tilt_error_rad()
 
 
 def _short_way(targets: list[Target]) -> list[Target]:
-    first = min(targets, key=lambda t: (t.alpha_rad, t.beta_rad))
-    rest = list(targets)
-    rest.remove(first)
-    return [first, *nearest(first, rest)]
+    first = min(targets, key=lambda target: (target.alpha_rad, target.beta_rad))
+    others = list(targets)
+    others.remove(first)
+    return [first, *nearest(first, others)]

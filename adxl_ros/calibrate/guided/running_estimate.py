@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What the poses so far tell of a unit: each coefficient's interval, and the tilt to expect."""
+"""The estimate of a unit after each pose: coefficients, and the tilt error to expect."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ from adxl_ros.calibrate import pose_response
 from adxl_ros.calibrate.fits import full_model
 from adxl_ros.calibrate.fits.linearised import linearised
 from adxl_ros.calibrate.guided.pose_plan import spread, Target
+from adxl_ros.calibrate.guided.screen_contents import CoefficientRow
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.calibrate.stage_error import StageError
 from adxl_ros.model import noise
@@ -36,32 +37,44 @@ from adxl_ros.model.tilt import tilt
 import numpy as np
 
 _ROUNDS = 2
-_JUDGED = 48
-_SHOWN_RAD = np.radians(1.0)
-"""Poses that not even a perfect calibration shows better than this are not judged by."""
+"""Linearised fits after each pose; chosen: the estimate changes little with each pose."""
+_EVALUATION_POSES = 48
+"""Poses over the sphere at which the tilt error is predicted; chosen: enough for 1 % of it."""
+_VISIBLE_RAD = np.radians(1.0)
+"""Poses that a perfect calibration shows worse than this have no part in the tilt error, rad."""
 _LEAST_STD_V = 1e-7
-_LOOKED_RAD, _LONGEST_RAD, _TURNS, _EXPLAINED = np.radians(60.0), 0.3, 25, 3.0
+"""Lower bound of the noise of a mean, V; chosen: below any ADC, so that no weight is infinite."""
+_SEARCH_STD_RAD = np.radians(60.0)
+"""Spread of the angles about a pose in the search of `angles_of`, rad; chosen: a wrong pose."""
+_LONGEST_STEP_RAD = 0.3
+"""Longest step of the search of `angles_of`, rad; chosen: the response is nearly linear in it."""
+_SEARCH_STEPS = 25
+"""Steps of the search of `angles_of`; chosen: several turns at the longest step."""
+_EXPLAINED_STDS = 3.0
+"""Angles explain volts whose residuals are within so many slacks; chosen: three deviations."""
 
 
 @dataclass(frozen=True)
-class Known:
+class RunningEstimate:
     """
-    The unit as the poses so far and the datasheet tell it.
+    The unit by the poses so far and the datasheet.
 
     Attributes
     ----------
     unit
-        With the most likely coefficients, those of the stage's base among them.
-    names, covariance
-        Of those coefficients; the inverse of their Fisher information and the datasheet's.
+        The unit with the most likely coefficients, those of the stage's base among them.
+    names
+        Names of those coefficients, (p,).
+    covariance
+        Their covariance, the inverse of the Fisher information of poses and datasheet, (p, p).
     prior
-        Standard deviation of each by the datasheet alone, (p,).
+        Standard deviation of each coefficient by the datasheet alone, (p,).
     stage
         Levels of the stage's error, by the stated one and by the poses.
     pose_std_v
-        Noise of the mean of one pose, (m,).
+        Standard deviation of the mean of one pose, V, (m,).
     poses
-        How many there are.
+        Number of poses.
 
     """
 
@@ -78,146 +91,225 @@ class Known:
         """Return the standard deviation of each coefficient, (p,)."""
         return np.sqrt(np.diag(self.covariance))
 
-    def reading(self, alpha_rad: float, beta_rad: float) -> tuple[np.ndarray, np.ndarray]:
-        """Predict the volts of a pose and their standard deviations, (m,) each."""
+    def predicted(self, alpha_rad: float, beta_rad: float) -> tuple[np.ndarray, np.ndarray]:
+        """
+        Predict the volts of a pose.
+
+        Parameters
+        ----------
+        alpha_rad, beta_rad
+            Angles of the pose, rad.
+
+        Returns
+        -------
+        volts, std_v
+            The volts and their standard deviations, V, (m,) each.
+
+        """
         pose = Poses.without_volts(np.array([alpha_rad]), np.array([beta_rad]), self.pose_std_v)
         slope = pose_response.coefficient_jacobian(self.unit, pose, self.names)[0]
         covariance = slope @ self.covariance @ slope.T + pose_response.volts_covariance(
             self.unit, pose, self.stage).blocks[0]
         return pose_response.predicted_volts(self.unit, pose)[0], np.sqrt(np.diag(covariance))
 
-    def seen_at(self, alpha_rad: float, beta_rad: float, volts: np.ndarray, slack_v: np.ndarray
-                ) -> tuple[float, float] | None:
+    def angles_of(self, alpha_rad: float, beta_rad: float, volts: np.ndarray, slack_v: np.ndarray
+                  ) -> tuple[float, float] | None:
         """
-        Find the angles near a pose at which volts, (m,), would be read, rad.
+        Find the angles near a pose that explain volts, by damped Gauss-Newton steps.
 
-        Where a pose does not show an angle, it stays. None if no angles explain the volts to
-        within about `slack_v`, (m,).
+        An angle that the volts do not show stays as it is.
+
+        Parameters
+        ----------
+        alpha_rad, beta_rad
+            Angles of the pose, rad.
+        volts
+            The volts that are read, V, (m,).
+        slack_v
+            Their standard deviation about the model, V, (m,).
+
+        Returns
+        -------
+        tuple or None
+            Angles alpha and beta, rad; None if no angles explain the volts.
+
         """
-        step, by = np.zeros(2), 1 / _LOOKED_RAD ** 2
-        for _ in range(_TURNS):
-            pose = Poses.without_volts(np.array([alpha_rad + step[0]]),
-                                       np.array([beta_rad + step[1]]), self.pose_std_v)
-            off = (volts - pose_response.predicted_volts(self.unit, pose)[0]) / slack_v
+        change_rad, damping = np.zeros(2), 1 / _SEARCH_STD_RAD ** 2
+        for _ in range(_SEARCH_STEPS):
+            pose = Poses.without_volts(np.array([alpha_rad + change_rad[0]]),
+                                       np.array([beta_rad + change_rad[1]]), self.pose_std_v)
+            residual = (volts - pose_response.predicted_volts(self.unit, pose)[0]) / slack_v
             slope = pose_response.angle_jacobian(self.unit, pose)[0] / slack_v[:, None]
-            more = np.linalg.solve(slope.T @ slope + by * np.eye(2), slope.T @ off - by * step)
-            step = step + np.clip(more, -_LONGEST_RAD, _LONGEST_RAD)
-        if np.abs(off).max() > _EXPLAINED:
+            step_rad = np.linalg.solve(slope.T @ slope + damping * np.eye(2),
+                                       slope.T @ residual - damping * change_rad)
+            change_rad = change_rad + np.clip(step_rad, -_LONGEST_STEP_RAD, _LONGEST_STEP_RAD)
+        if np.abs(residual).max() > _EXPLAINED_STDS:
             return None
-        return alpha_rad + float(step[0]), beta_rad + float(step[1])
+        return alpha_rad + float(change_rad[0]), beta_rad + float(change_rad[1])
 
-    def after(self, targets: Sequence[Target]) -> Known:
-        """Return what will be known once those poses are taken, too."""
+    def with_poses(self, targets: Sequence[Target]) -> RunningEstimate:
+        """Return the estimate to expect once further poses are taken."""
         if not targets:
             return self
-        poses = Poses.without_volts(np.array([t.alpha_rad for t in targets]),
-                                    np.array([t.beta_rad for t in targets]), self.pose_std_v)
-        nothing = np.zeros(len(self.names))
-        about = linearised(self.unit, poses, self.names, nothing)
-        told = about.solve(about.covariance(self.stage))[1]
-        return replace(self, covariance=np.linalg.inv(np.linalg.inv(self.covariance) + told))
+        alpha_rad = np.array([target.alpha_rad for target in targets])
+        beta_rad = np.array([target.beta_rad for target in targets])
+        poses = Poses.without_volts(alpha_rad, beta_rad, self.pose_std_v)
+        no_prior = np.zeros(len(self.names))
+        model = linearised(self.unit, poses, self.names, no_prior)
+        information = model.solve(model.covariance(self.stage))[1]
+        return replace(self, covariance=np.linalg.inv(
+            np.linalg.inv(self.covariance) + information))
 
     def sensor(self) -> Sensor:
-        """Return the unit with the covariance of its own coefficients."""
-        own = [i for i, name in enumerate(self.names) if not full_model.belongs_to_stage(name)]
-        return replace(self.unit, covariance=self.covariance[np.ix_(own, own)],
-                       covariance_names=tuple(self.names[i] for i in own))
+        """Return the unit with the covariance of its coefficients, without those of the stage."""
+        of_unit = [i for i, name in enumerate(self.names)
+                   if not full_model.belongs_to_stage(name)]
+        return replace(self.unit, covariance=self.covariance[np.ix_(of_unit, of_unit)],
+                       covariance_names=tuple(self.names[i] for i in of_unit))
 
     def tilt_error_rad(self) -> float:
-        """Return the rms error of alpha and beta to expect; see `tilt_error_rad`."""
+        """Return the expected rms error of alpha and beta over the sphere, rad."""
         return tilt_error_rad(self.sensor(), self.pose_std_v)
+
+    def rows(self) -> tuple[CoefficientRow, ...]:
+        """Return the coefficients for the screen."""
+        return coefficient_rows(self.names, get(self.unit, self.names), self.std, self.prior)
 
 
 def from_poses(sensor: Sensor, poses: Poses, dwell_s: float, stage_rad: float,
-               before: Known | None = None) -> Known:
+               previous: RunningEstimate | None = None) -> RunningEstimate:
     """
-    Learn from the poses so far: one linearised fit of the full model, with the datasheet's priors.
+    Estimate a unit by a linearised fit of the full model with the priors of the datasheet.
 
     Parameters
     ----------
     sensor
-        Nominal figures.
+        The nominal sensor.
     poses
-        As many as there are, also none.
+        All poses so far; there may be none.
     dwell_s
         Time that a pose is averaged, s.
     stage_rad
         Stated standard deviation of a joint's error, rad.
-    before
-        What was known before the last of them: the fit begins there.
+    previous
+        The estimate without the newest pose, where the fit begins; None for the datasheet.
+
+    Returns
+    -------
+    RunningEstimate
+        The estimate.
 
     """
     terms = full_model.default_terms(sensor.axes)
     names = full_model.fitted_coefficients(sensor.axes, terms)
-    unit = before.unit if before else with_neutral(sensor, (*terms, 'base_tilt'))
+    unit = previous.unit if previous else with_neutral(sensor, (*terms, 'base_tilt'))
+    stage = previous.stage if previous else StageError(stage_rad)
     prior = np.array([full_model.LEVEL_STD_RAD if full_model.belongs_to_stage(name)
                       else parameter_of(name).scale for name in names])
-    information, stage = np.diag(1 / prior ** 2), before.stage if before else StageError(stage_rad)
+    information = np.diag(1 / prior ** 2)
     poses = replace(poses, std_v=np.maximum(poses.std_v, _LEAST_STD_V))
     for _ in range(_ROUNDS if len(poses) else 0):
-        about = linearised(unit, poses, names, 1 / prior ** 2)
-        stage = about.stage_error(stage_rad, stage)
-        step, information = about.solve(about.covariance(stage))
+        model = linearised(unit, poses, names, 1 / prior ** 2)
+        stage = model.stage_error(stage_rad, stage)
+        step, information = model.solve(model.covariance(stage))
         unit = put(unit, names, get(unit, names) + step)
-    count = noise.effective_samples(round(dwell_s * sensor.rate_hz), 1 / sensor.rate_hz,
-                                    sensor.rc_s)
-    return Known(unit, names, np.linalg.inv(information), prior, stage,
-                 np.maximum(noise.sample_std_v(sensor) / np.sqrt(count), _LEAST_STD_V), len(poses))
+    samples = noise.effective_samples(round(dwell_s * sensor.rate_hz), 1 / sensor.rate_hz,
+                                      sensor.rc_s)
+    pose_std_v = np.maximum(noise.sample_std_v(sensor) / np.sqrt(samples), _LEAST_STD_V)
+    return RunningEstimate(unit, names, np.linalg.inv(information), prior, stage, pose_std_v,
+                           len(poses))
+
+
+def no_poses(axes: int) -> Poses:
+    """Return the poses of a unit before its first pose, for a number of axes."""
+    return Poses.without_volts(np.zeros(0), np.zeros(0), np.zeros(axes))
 
 
 def tilt_error_rad(sensor: Sensor, pose_std_v: np.ndarray) -> float:
     """
-    Return the rms error to expect of alpha and beta over the sphere, rad.
-
-    NaN where no pose shows them, as for a sensor of one axis.
+    Predict the rms error of alpha and beta over the sphere.
 
     Parameters
     ----------
     sensor
-        With the covariance of its coefficients.
+        The unit with the covariance of its coefficients.
     pose_std_v
-        Noise of the readings, V, (m,).
-
-    """
-    alpha, beta = np.array([(t.alpha_rad, t.beta_rad) for t in spread(_JUDGED)]).T
-    force = specific_force(alpha, beta, sensor.local_gravity_mps2)
-
-    def stds(of: Sensor) -> np.ndarray:
-        found = tilt(force, force_covariance(of, force, pose_std_v ** 2), 'z' in of.axes)
-        return np.column_stack([found.alpha_std, found.beta_std])
-
-    perfect = stds(sensor.without_covariance())
-    errors = np.minimum(stds(sensor)[perfect < _SHOWN_RAD], np.pi / 2)
-    return float(np.sqrt(np.mean(errors ** 2))) if errors.size else float('nan')
-
-
-def in_g(sensor: Sensor, volts: np.ndarray) -> np.ndarray:
-    """Return what volts read in g by the figures of a unit, (m,)."""
-    return (volts - sensor.zero_g_v) / sensor.scale_v_per_g
-
-
-def by_term(names: Sequence[Coefficient], values: np.ndarray, std: np.ndarray, prior: np.ndarray
-            ) -> list[tuple[str, list[str], float]]:
-    """
-    Sum coefficients up for a display, term by term.
+        Standard deviation of the readings, V, (m,).
 
     Returns
     -------
-    list
-        Name of the parameter and its unit; its value and half of its 90 % interval, axis by axis;
-        how much of what the datasheet leaves open is determined, 0 to 1, of the worst axis.
+    float
+        The error, rad; NaN where no pose shows both angles, as for a sensor of one axis.
 
     """
-    rows: dict[Coefficient, list[int]] = {}
+    alpha_rad, beta_rad = np.array([(target.alpha_rad, target.beta_rad)
+                                    for target in spread(_EVALUATION_POSES)]).T
+    force_mps2 = specific_force(alpha_rad, beta_rad, sensor.local_gravity_mps2)
+
+    def tilt_stds_rad(unit: Sensor) -> np.ndarray:
+        covariance = force_covariance(unit, force_mps2, pose_std_v ** 2)
+        estimate = tilt(force_mps2, covariance, 'z' in unit.axes)
+        return np.column_stack([estimate.alpha_std, estimate.beta_std])
+
+    is_visible = tilt_stds_rad(sensor.without_covariance()) < _VISIBLE_RAD
+    errors_rad = np.minimum(tilt_stds_rad(sensor)[is_visible], np.pi / 2)
+    return float(np.sqrt(np.mean(errors_rad ** 2))) if errors_rad.size else float('nan')
+
+
+def degrees_or_none(angle_rad: float) -> float | None:
+    """Return an angle in degrees; None for NaN."""
+    return float(np.degrees(angle_rad)) if np.isfinite(angle_rad) else None
+
+
+def in_g(sensor: Sensor, volts: np.ndarray) -> np.ndarray:
+    """
+    Convert volts by zero-g and scale factor of a unit.
+
+    Parameters
+    ----------
+    sensor
+        The unit.
+    volts
+        The volts, (m,).
+
+    Returns
+    -------
+    numpy.ndarray
+        Specific force, g, (m,).
+
+    """
+    return (volts - sensor.zero_g_v) / sensor.scale_v_per_g
+
+
+def coefficient_rows(names: Sequence[Coefficient], values: np.ndarray, std: np.ndarray,
+                     prior: np.ndarray) -> tuple[CoefficientRow, ...]:
+    """
+    Lay out coefficients for the screen, one row for each parameter of the unit.
+
+    Parameters
+    ----------
+    names
+        Names of the coefficients, (p,).
+    values, std, prior
+        Their values, their standard deviations, and those by the datasheet alone, (p,).
+
+    Returns
+    -------
+    tuple
+        The rows.
+
+    """
+    indices: dict[Coefficient, list[int]] = {}
     for i, name in enumerate(names):
-        rows.setdefault(name.without_axis, []).append(i)
-    table = []
-    for term, at in rows.items():
-        if full_model.belongs_to_stage(names[at[0]]):
-            continue
-        unit = parameter_of(names[at[0]]).unit
-        shown = [f'{names[i].axis or names[i].parameter} {values[i]:+.2g} ± '
-                 f'{Z_90 * std[i]:.1g}' for i in at]
-        worst = float(np.min(1 - np.clip(std[at] / prior[at], 0, 1)))
-        table.append((f'{term}, {unit}' if unit else str(term), shown, worst))
-    return table
+        if not full_model.belongs_to_stage(name):
+            indices.setdefault(name.without_axis, []).append(i)
+    return tuple(_row(name, names, values, std, prior, rows) for name, rows in indices.items())
+
+
+def _row(name: Coefficient, names: Sequence[Coefficient], values: np.ndarray, std: np.ndarray,
+         prior: np.ndarray, rows: list[int]) -> CoefficientRow:
+    unit = parameter_of(names[rows[0]]).unit
+    intervals = tuple(f'{names[i].axis or names[i].parameter} {values[i]:+.2g} ± '
+                      f'{Z_90 * std[i]:.1g}' for i in rows)
+    determined = float(np.min(1 - np.clip(std[rows] / prior[rows], 0, 1)))
+    return CoefficientRow(f'{name}, {unit}' if unit else str(name), intervals, determined)

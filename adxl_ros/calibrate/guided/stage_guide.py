@@ -13,84 +13,115 @@
 # limitations under the License.
 
 """
-The guided sweep, free of ROS: samples and encoder angles in, accepted poses out.
+The guide of a sweep on a stage: samples and encoder angles go in, accepted poses come out.
 
-A pose goes through: the stage arrives (or the operator captures), the sensor comes to rest, a
-full dwell at rest is averaged, and nothing speaks against it (`pose_checks`). Motion during the
-dwell begins it anew.
+The stage arrives, or the operator captures. The sensor comes to rest, and a full dwell at rest is
+averaged. Motion begins the dwell again. `pose_checks` can refuse the pose.
 """
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from enum import auto, Enum
 
-from adxl_ros.calibrate.guided import mounting_check, pose_checks, running_estimate
-from adxl_ros.calibrate.guided.capture_settings import Settings, State
+from adxl_ros.calibrate.guided import coverage, mounting_check, pose_checks, running_estimate
+from adxl_ros.calibrate.guided.capture_settings import CaptureSettings, Phase, StageMode, Status
 from adxl_ros.calibrate.guided.dwell import Dwell, RestMean
-from adxl_ros.calibrate.guided.live_window import Surroundings, went_back
-from adxl_ros.calibrate.guided.pose_plan import Target
+from adxl_ros.calibrate.guided.encoder_track import EncoderTrack, SILENT_S
+from adxl_ros.calibrate.guided.guide import NextPose
+from adxl_ros.calibrate.guided.live_window import NewestSamples, Surroundings, went_back
+from adxl_ros.calibrate.guided.pose_plan import MOVE_S, Target
+from adxl_ros.calibrate.guided.screen_contents import Estimate, Progress
 from adxl_ros.calibrate.joint_settings import angle_tolerance_rad, SettingTracker
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.errors import UserError
-from adxl_ros.files.sweep_journal import PoseRecord
+from adxl_ros.files.sweep_journal import JournalEntry, MountingUnchecked, PoseRecord, PoseSkipped
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.signals.rest_detection import Rest
+from adxl_ros.signals.rest_detection import Rest, Stillness
 import numpy as np
 
-_KEPT_ANGLES = 100000
-_OFFSETS, _FEWEST_OFFSETS = 20, 4
-_OLD_S, _SILENT_S = 60.0, 3.0
+_LONGEST_DWELL_S = 60.0
+"""After this and two dwells a moving sensor's samples are forgotten, s; chosen: little memory."""
+_FEWEST_INTERVALS = 3
+"""Poses of this session whose times predict those of the open ones; chosen: a median of two."""
 
 
 class MountingError(UserError):
     """The sensor is not mounted as it was before an interruption."""
 
 
-class Sweep:
+class PoseState(Enum):
+    """State of the attempt to take one pose."""
+
+    APPROACHING = auto()
+    """The stage, or the operator, has not reached the pose."""
+    AVERAGING = auto()
+    """The pose is reached; a dwell at rest is averaged."""
+    DONE = auto()
+    """No pose is open."""
+
+
+@dataclass
+class _Attempt:
     """
-    Walks the targets that are left.
+    The attempt to take the pose at hand.
+
+    Attributes
+    ----------
+    state
+        Its state.
+    dwell
+        The samples since the pose was reached.
+    since_ns
+        Stamp of the samples at its beginning, ns; None before the first sample.
+    refusal
+        Why the pose was refused; '' if it was not.
+
+    """
+
+    state: PoseState
+    dwell: Dwell
+    since_ns: int | None
+    refusal: str = ''
+
+
+class StageGuide:
+    """
+    Leads a stage, or the operator who turns it, through the poses of a plan; a `Guide`.
 
     Parameters
     ----------
     sensor
         The nominal sensor of the stream; its noise decides what is at rest.
     targets
-        The whole plan.
+        The pose plan.
     settings
         How poses are taken.
-    accepted, skipped
-        What an interrupted sweep has left; see `verify`. Its stage may have lost power: the next
-        pose has new settings of both joints, numbered on from the highest of `accepted`.
+    accepted
+        Poses of an interrupted sweep. The stage may have lost power since: the next pose has new
+        settings of both joints, numbered on from the highest.
+    skipped
+        Numbers of the poses that the operator of an interrupted sweep left out.
 
     """
 
-    def __init__(self, sensor: Sensor, targets: Sequence[Target], settings: Settings,
-                 accepted: Sequence[PoseRecord] = (), skipped: Iterable[int] = ()):
-        self.settings, self.targets, self.sensor = settings, targets, sensor
+    def __init__(self, sensor: Sensor, targets: Sequence[Target], settings: CaptureSettings,
+                 accepted: Sequence[PoseRecord] = (), skipped: Iterable[int] = ()) -> None:
+        self.sensor, self.targets, self.settings = sensor, targets, settings
         self.accepted = {record.pose: record for record in accepted}
         self.skipped = set(skipped) - set(self.accepted)
         self.surroundings = Surroundings()
-        self._verify: list[PoseRecord] = []
         self.newest_ns: int | None = None
-        self._angles: deque[tuple[int, float, float]] = deque(maxlen=_KEPT_ANGLES)
-        self._ahead_s: deque[float] = deque(maxlen=_OFFSETS)
-        self._since_ns: int | None = None
-        self._refusal = self._unsaid = ''
-        self._fresh = False
+        self.encoder = EncoderTrack()
+        self._resumed = len(self.accepted)
+        self._to_verify: list[PoseRecord] = []
+        self._new_refusal = ''
         self._tracker = SettingTracker(angle_tolerance_rad(sensor), (
-            self._highest('alpha_setting'), self._highest('beta_setting')))
-        self.known = self._learned(None)
-        self.index = self._next()
-        self._begin()
-        self._command_target()
+            self._highest_setting('alpha'), self._highest_setting('beta')))
+        self.estimate = self._estimated(None)
+        self._go(self._next_open())
         self.verify()
-
-    def verify(self) -> None:
-        """Take poses again before others, to see that the sensor is mounted as it was."""
-        if self.target is not None and self.accepted:
-            self._verify = mounting_check.to_take_again(list(self.accepted.values()))
-            self._go(self._verify[0].pose)
 
     @property
     def target(self) -> Target | None:
@@ -98,345 +129,463 @@ class Sweep:
         return self.targets[self.index] if self.index < len(self.targets) else None
 
     @property
-    def verifying(self) -> bool:
-        """Tell whether a pose is taken again to see that the mounting is as it was."""
-        return bool(self._verify)
+    def moves_itself(self) -> bool:
+        """Return whether the stage turns itself, so that nobody captures."""
+        return self.settings.stage_mode is StageMode.COMMANDED
 
     @property
-    def to_verify(self) -> int:
-        """Count the poses that are still to be taken again for that."""
-        return len(self._verify)
+    def is_over(self) -> bool:
+        """Return whether all poses are taken or left out."""
+        return self.target is None
 
     @property
-    def angles(self) -> tuple[float, float] | None:
-        """Return where the stage is, alpha and beta, rad; None while it is silent."""
-        return self._angles[-1][1:] if self._angles else None
+    def open_poses(self) -> int:
+        """Return the number of poses that are neither taken nor left out."""
+        return len(self.targets) - len(self.accepted.keys() | self.skipped)
+
+    @property
+    def poses_to_verify(self) -> int:
+        """Return how many poses are still to be taken again for the check of the mounting."""
+        return len(self._to_verify)
+
+    @property
+    def pose_number(self) -> int:
+        """Return the number of the pose to go to, from 1."""
+        return self.index + 1
+
+    @property
+    def previous(self) -> int | None:
+        """Return the previous pose, taken or left out, from 0; None where there is none."""
+        if self._to_verify:
+            return None
+        return max((number for number in self.accepted.keys() | self.skipped
+                    if number < self.index), default=None)
+
+    def verify(self) -> None:
+        """Take earlier poses again before others, to check the mounting."""
+        if self.target is not None and self.accepted:
+            self._to_verify = mounting_check.to_take_again(list(self.accepted.values()))
+            self._go(self._to_verify[0].pose)
 
     def capture(self) -> str:
-        """Take the pose in which the operator has put the sensor; return why not, or ''."""
+        """Take the pose in which the operator has put the sensor; return an obstacle or ''."""
         target = self.target
-        if target is not None and self.settings.stage_mode == 'encoder':
-            if self.angles is None or self._silent():
-                return f'{self._silent()}: in stage.mode encoder its angle counts'
-            off = self._clocks() or pose_checks.angles(target, *self.angles,
-                                                       self.settings.near_rad)
-            if off:
-                return f'{off}; turn the stage there and capture again'
-        self._refusal = ''
-        self._dwell = Dwell(self.sensor, (self.newest_ns or 0) + 1)
-        self._captured = True
+        if target is not None and self.settings.stage_mode is StageMode.ENCODER:
+            angles_rad, silence = self.encoder.angles_rad, self._silence()
+            if angles_rad is None or silence:
+                return f'{silence}: in stage.mode encoder its angle counts'
+            fault = self.encoder.clock_fault() or pose_checks.angles(
+                target, *angles_rad, self.settings.near_rad)
+            if fault:
+                return f'{fault}; turn the stage there and capture again'
+        self._attempt.refusal = ''
+        self._restart_dwell(PoseState.AVERAGING)
         return ''
 
+    def skip_entry(self) -> JournalEntry | None:
+        """Return what the journal says of a `skip` now."""
+        if self._to_verify:
+            return MountingUnchecked()
+        return None if self.is_over else PoseSkipped(self.index)
+
     def skip(self) -> str:
-        """Leave the pose out; return what is done, for people."""
-        number = self.index + 1
-        if self._verify:
-            self._verify = []
-            self._go(self._next())
+        """Leave out the pose at hand; return a line for people."""
+        number = self.pose_number
+        if self._to_verify:
+            self._to_verify = []
+            self._go(self._next_open())
             return f'pose {number} is not taken again: the mounting is not checked'
         self.skipped.add(self.index)
         self.accepted.pop(self.index, None)
-        self._go(self._next())
+        self._go(self._next_open())
         return f'pose {number} is left out'
 
-    @property
-    def before(self) -> int | None:
-        """Return the number of the pose before, taken or left out; None where there is none."""
-        if self._verify:
-            return None
-        return max((i for i in self.accepted.keys() | self.skipped if i < self.index),
-                   default=None)
-
     def redo(self) -> str:
-        """Forget the pose before and go back; return what is done, or '' if there is none."""
-        number = self.before
+        """Forget the previous pose and go back; return a line for people, or '' for none."""
+        number = self.previous
         if number is None:
             return ''
         self.accepted.pop(number, None)
         self.skipped.discard(number)
-        # Its earlier reading must not speak against the new one.
-        self.known = self._learned(None)
+        # The earlier reading of the pose must not speak against the new one.
+        self.estimate = self._estimated(None)
         self._go(number)
         return f'pose {number + 1} will be taken again'
 
-    def stage(self, stamp_ns: int, alpha_rad: float, beta_rad: float) -> None:
-        """Take an encoder reading."""
-        if self._angles and went_back(self._angles[-1][0], stamp_ns):
-            # A stage that was started anew may have moved unseen.
-            self._angles.clear()
+    def read_encoder(self, stamp_ns: int, alpha_rad: float, beta_rad: float) -> None:
+        """
+        Take the angles of the stage.
+
+        Parameters
+        ----------
+        stamp_ns
+            Their stamp, ns.
+        alpha_rad, beta_rad
+            The angles, unwrapped, rad.
+
+        """
+        if self.encoder.read(stamp_ns, alpha_rad, beta_rad):
+            # A stage that has started again may have moved unseen.
             self._tracker.lose_track()
-        if self.settings.stage_mode != 'manual':
+        if self._uses_encoder:
             self._tracker.read(stamp_ns, alpha_rad, beta_rad)
-        self._angles.append((stamp_ns, alpha_rad, beta_rad))
-        self._fresh = True
         target = self.target
-        if self.settings.stage_mode != 'commanded' or target is None:
+        if not self.moves_itself or target is None:
             return
-        off_rad = max(abs(alpha_rad - target.alpha_rad), abs(beta_rad - target.beta_rad))
-        arrived = off_rad <= self.settings.tolerance_rad
-        if arrived and not self._captured:
-            self._dwell = Dwell(self.sensor, stamp_ns)
-        self._captured = arrived
+        distance_rad = max(abs(alpha_rad - target.alpha_rad), abs(beta_rad - target.beta_rad))
+        if distance_rad > self.settings.tolerance_rad:
+            self._attempt.state = PoseState.APPROACHING
+        elif self._attempt.state is PoseState.APPROACHING:
+            self._attempt.dwell = Dwell(self.sensor, stamp_ns)
+            self._attempt.state = PoseState.AVERAGING
 
-    def command(self, alpha_rad: float, beta_rad: float) -> None:
+    def read_command(self, alpha_rad: float, beta_rad: float) -> None:
         """
-        Take a command that somebody gave the stage; NaN for a joint that it does not name.
+        Take a command that somebody gave the stage.
 
-        Only in stage mode 'encoder': elsewhere the targets are the commands.
+        It counts in stage mode `encoder`. In the other modes the targets are the commands.
+
+        Parameters
+        ----------
+        alpha_rad, beta_rad
+            The commanded angles, rad; NaN for a joint without one.
+
         """
-        if self.settings.stage_mode == 'encoder':
+        if self.settings.stage_mode is StageMode.ENCODER:
             self._tracker.command(self.newest_ns or 0, alpha_rad, beta_rad)
 
     def feed(self, stamps_ns: np.ndarray, volts: np.ndarray) -> None:
-        """Take samples: stamps, ns, (n,), and volts, (n, m)."""
+        """
+        Take samples.
+
+        Parameters
+        ----------
+        stamps_ns
+            Their stamps, ns, (n,).
+        volts
+            The samples, V, (n, m).
+
+        """
         if not len(stamps_ns):
             return
         if self.newest_ns is not None and went_back(self.newest_ns, stamps_ns[0]):
-            self._unsaid = f'imu/data_raw went back in time by ' \
-                f'{(self.newest_ns - int(stamps_ns[0])) * 1e-9:.0f} s: the pose begins anew'
-            self.verify()
-            self._tracker.lose_track()
-            self._since_ns, self._ahead_s = None, deque(maxlen=_OFFSETS)
-            self._captured, self._dwell = False, Dwell(self.sensor, 0)
+            self._restart_after_clock_change((self.newest_ns - int(stamps_ns[0])) * 1e-9)
         self.newest_ns = int(stamps_ns[-1])
-        if self._fresh:
-            self._ahead_s.append((self._angles[-1][0] - self.newest_ns) * 1e-9)
-            self._fresh = False
-        if self._since_ns is None:
-            self._since_ns = int(stamps_ns[0])
-        if self._captured:
-            self._dwell.feed(stamps_ns, volts)
+        self.encoder.compare_clock(self.newest_ns)
+        if self._attempt.since_ns is None:
+            self._attempt.since_ns = int(stamps_ns[0])
+        if self._attempt.state is PoseState.AVERAGING:
+            self._attempt.dwell.feed(stamps_ns, volts)
 
     def accept(self) -> PoseRecord | None:
         """
-        Return the pose for the journal when a full dwell at rest is there, else None.
+        Return the pose for the journal when a full dwell at rest is complete, else None.
 
         Raises
         ------
         MountingError
-            The pose before the interruption reads something else now: the mounting changed.
+            A pose from before the interruption reads something else now.
 
         """
         target = self.target
-        if target is None or not self._captured or (
-                self.settings.stage_mode != 'manual' and self._clocks()):
+        if target is None or self._attempt.state is not PoseState.AVERAGING or (
+                self._uses_encoder and self.encoder.clock_fault()):
             return None
-        wanted = round(self.settings.dwell_s * self.sensor.rate_hz)
-        rest = next((r for r in self._dwell.rests() if r.stop - r.start >= wanted), None)
+        dwell = self._attempt.dwell
+        samples = round(self.settings.dwell_s * self.sensor.rate_hz)
+        rest = next((r for r in dwell.rests() if r.stop - r.start >= samples), None)
         if rest is None:
-            # What moves for a long time is judged as a whole again and again: forget it.
-            if self._dwell.age_s() > _OLD_S + 2 * self.settings.dwell_s and \
-                    not self._dwell.at_rest():
-                self._dwell = Dwell(self.sensor, (self.newest_ns or 0) + 1)
+            self._forget_long_motion()
             return None
-        mean = self._dwell.mean(rest, wanted)
-        if self.settings.stage_mode != 'manual' and self._angles[-1][0] < mean.stop_ns:
-            # What the stage did to the end of the dwell is still to come, or never will.
-            if self.settings.stage_mode == 'encoder' and (silent := self._silent()):
-                self._refuse(f'{silent}; capture again when it is back')
+        mean = dwell.mean(rest, samples)
+        if not self._encoder_covers(mean):
             return None
-        entry = self._entry(mean, target)
-        why = self._moved_away(rest, entry) or self._wrong(entry, self._dwell.volts(rest))
-        if why:
-            self._refuse(why)
+        record = self._record(mean, target)
+        refusal = self._moved_away(rest, record) or self._fault(record, dwell.volts(rest))
+        if refusal:
+            self._refuse(refusal)
             return None
-        if self._verify:
-            self._check_mounting(entry)
+        if self._to_verify:
+            self._check_mounting(record)
             return None
-        return entry
+        return record
 
-    def take(self, entry: PoseRecord) -> None:
-        """Count a pose that is on disk, and go on to the next that is open."""
-        self.accepted[entry.pose] = entry
-        self.skipped.discard(entry.pose)
-        self._tracker.take(entry.start_ns, entry.stop_ns, entry.alpha_rad, entry.beta_rad)
-        self.known = self._learned(self.known)
-        self._go(self._next())
+    def take(self, record: PoseRecord) -> None:
+        """Count a pose that is on disk, and go on to the next open one."""
+        self.accepted[record.pose] = record
+        self.skipped.discard(record.pose)
+        self._tracker.take(record.start_ns, record.stop_ns, record.alpha_rad, record.beta_rad)
+        self.estimate = self._estimated(self.estimate)
+        self._go(self._next_open())
 
     def retry(self) -> None:
-        """Take the same pose anew."""
+        """Take the pose at hand again, since its record is not on disk."""
         self._go(self.index)
 
-    def results(self) -> list[PoseRecord]:
-        """Return the poses to fit: all that were accepted."""
+    def poses_to_fit(self) -> list[PoseRecord]:
+        """Return the accepted poses, by number."""
         return [self.accepted[number] for number in sorted(self.accepted)]
 
     def tilt_error_rad(self) -> float:
-        """Return the rms error of alpha and beta to expect after the poses so far, rad."""
-        return self.known.tilt_error_rad()
+        """Return the expected rms error of alpha and beta by the poses so far, rad."""
+        return self.estimate.tilt_error_rad()
 
-    def refused(self) -> str:
+    def new_refusal(self) -> str:
         """Return why a pose was refused since the last call, or ''."""
-        text, self._unsaid = self._unsaid, ''
+        text, self._new_refusal = self._new_refusal, ''
         return text
 
-    def dwelt_s(self) -> float:
-        """Return for how long the sensor has been at rest in the pose, s."""
-        return min(self._dwell.at_rest_s(), self.settings.dwell_s) if self._captured else 0.0
+    def stillness(self, newest: NewestSamples) -> Stillness | None:
+        """Return whether the newest samples are at rest; None while they are too few."""
+        return newest.stillness()
 
-    def where(self) -> str:
-        """Name the pose to reach."""
+    def destination(self) -> str:
+        """Name the pose to reach, for people."""
         target = self.target
         if target is None:
             return ''
-        again = ' once more, to see that the mounting is as it was' if self._verify else ''
-        return f'alpha {np.degrees(target.alpha_rad):.1f}°, ' \
-               f'beta {np.degrees(target.beta_rad):.1f}°{again}'
+        purpose = ' once more, to see that the mounting is as it was' if self._to_verify else ''
+        return (f'alpha {np.degrees(target.alpha_rad):.1f}°, '
+                f'beta {np.degrees(target.beta_rad):.1f}°{purpose}')
 
-    def state(self) -> State:
-        """Say what is waited for, and by how much it is off."""
+    def next_pose(self) -> NextPose | None:
+        """Return the pose to announce; None where no pose is open."""
         target = self.target
         if target is None:
-            return State('done', 'all poses are taken', False)
-        waited_s = ((self.newest_ns or 0) - (self._since_ns or 0)) * 1e-9
-        late = waited_s > self.settings.timeout_s
-        since = f' for {waited_s:.0f} s' if late else ''
-        if self.settings.stage_mode != 'manual' and (apart := self._clocks()):
-            return State('stage', apart, True)
-        silent = '' if self.settings.stage_mode == 'manual' else self._silent()
-        if silent and (self._captured or self.settings.stage_mode == 'encoder'):
-            return State('stage', silent, waited_s > _SILENT_S)
-        if self._refusal:
-            return State('refused', self._refusal, True)
-        if not self._captured:
-            if self.settings.stage_mode != 'commanded':
-                waited = f' (waited {waited_s:.0f} s)' if late else ''
-                return State('operator', f'turn the stage to {self.where()}, then capture{waited}',
-                             False)
-            return State('stage', f'the stage has not arrived at {self.where()}{since}: '
-                                  f'{self._off_text(target)}', late)
-        still = self._dwell.stillness()
-        if still is None:
-            return State('rest', f'at {self.where()}: waiting for samples{since}', late)
-        if still.still:
-            return State('dwell', f'at {self.where()}: averaging', late)
-        steady = '; if nothing touches it, sensor.noise_density_g_per_rthz is too low for this ' \
-            'unit' if late and still.statistic == 'rms' else ''
-        return State(
-            'rest', f'at {self.where()}: {still.describe_mps2(self.sensor)}{since}{steady}', late)
+            return None
+        values: dict[str, str | float] = {
+            'pose': str(self.pose_number), 'poses': str(len(self.targets)),
+            'stage_mode': self.settings.stage_mode.value, 'alpha_rad': target.alpha_rad,
+            'beta_rad': target.beta_rad, 'check': 'true' if target.check else 'false'}
+        number = f'pose {self.pose_number} of {len(self.targets)}'
+        if self.moves_itself:
+            return NextPose(f'{number}: {self.destination()}', values,
+                            (target.alpha_rad, target.beta_rad))
+        return NextPose(f'{number}: turn the stage to {self.destination()}, then capture', values,
+                        None)
 
-    def _next(self) -> int:
-        return next((i for i in range(len(self.targets))
-                     if i not in self.accepted and i not in self.skipped), len(self.targets))
+    def status(self) -> Status:
+        """Return what the guide waits for, with the values that matter."""
+        target, attempt = self.target, self._attempt
+        if target is None:
+            return Status(Phase.DONE, 'all poses are taken', False)
+        waited_s = ((self.newest_ns or 0) - (attempt.since_ns or 0)) * 1e-9
+        if self._uses_encoder and (fault := self.encoder.clock_fault()):
+            return Status(Phase.STAGE, fault, True)
+        silence = self._silence() if self._uses_encoder else ''
+        if silence and (attempt.state is PoseState.AVERAGING
+                        or self.settings.stage_mode is StageMode.ENCODER):
+            return Status(Phase.STAGE, silence, waited_s > SILENT_S)
+        if attempt.refusal:
+            return Status(Phase.REFUSED, attempt.refusal, True)
+        if attempt.state is PoseState.AVERAGING:
+            return self._status_at_pose(waited_s)
+        return self._status_on_the_way(target, waited_s)
+
+    def progress(self) -> Progress:
+        """Return how far the sweep is, for the screen."""
+        target, angles_rad, position = self.target, self.encoder.angles_rad, ''
+        if target is not None and angles_rad is not None:
+            alpha_rad, beta_rad = angles_rad
+            position = (f'{_position("alpha", alpha_rad, target.alpha_rad)}, '
+                        f'{_position("beta", beta_rad, target.beta_rad)}')
+        remaining = len(self.targets) - len(self.accepted) - len(self.skipped)
+        averaging = self._attempt.state is PoseState.AVERAGING
+        dwelt_s = min(self._attempt.dwell.at_rest_s(), self.settings.dwell_s) if averaging else 0.0
+        return Progress(
+            number=self.pose_number, destination=self.destination(), position=position,
+            accepted=len(self.accepted), total=len(self.targets), skipped=len(self.skipped),
+            remaining_s=remaining * self._seconds_per_pose(), dwelt_s=dwelt_s,
+            dwell_s=self.settings.dwell_s)
+
+    def estimate_contents(self) -> Estimate:
+        """Return what the poses determine so far, for the screen."""
+        open_targets = [target for number, target in enumerate(self.targets)
+                        if number not in self.accepted and number not in self.skipped
+                        and not target.check]
+        final = self.estimate.with_poses(open_targets)
+        return Estimate(
+            coverage=coverage.by_plane(self.targets, self.accepted), covered_faces='',
+            coefficients=self.estimate.rows(),
+            tilt_error_deg=running_estimate.degrees_or_none(self.tilt_error_rad()),
+            final_tilt_error_deg=running_estimate.degrees_or_none(final.tilt_error_rad()))
+
+    @property
+    def _uses_encoder(self) -> bool:
+        return self.settings.stage_mode is not StageMode.MANUAL
+
+    def _status_on_the_way(self, target: Target, waited_s: float) -> Status:
+        late = waited_s > self.settings.timeout_s
+        if not self.moves_itself:
+            waited = f' (waited {waited_s:.0f} s)' if late else ''
+            return Status(Phase.OPERATOR,
+                          f'turn the stage to {self.destination()}, then capture{waited}', False)
+        return Status(Phase.STAGE, f'the stage has not arrived at {self.destination()}'
+                      f'{self._since(waited_s)}: {self._distance_text(target)}', late)
+
+    def _status_at_pose(self, waited_s: float) -> Status:
+        late = waited_s > self.settings.timeout_s
+        still = self._attempt.dwell.stillness()
+        since = self._since(waited_s)
+        if still is None:
+            return Status(Phase.REST, f'at {self.destination()}: waiting for samples{since}', late)
+        if still.still:
+            return Status(Phase.DWELL, f'at {self.destination()}: averaging', late)
+        advice = '; if nothing touches it, sensor.noise_density_g_per_rthz is too low for this ' \
+            'unit' if late and still.statistic == 'rms' else ''
+        motion = still.describe_mps2(self.sensor)
+        return Status(Phase.REST, f'at {self.destination()}: {motion}{since}{advice}', late)
+
+    def _since(self, waited_s: float) -> str:
+        return f' for {waited_s:.0f} s' if waited_s > self.settings.timeout_s else ''
+
+    def _distance_text(self, target: Target) -> str:
+        silence, angles_rad = self._silence(), self.encoder.angles_rad
+        if silence or angles_rad is None:
+            return silence
+        return pose_checks.angles(target, *angles_rad, self.settings.tolerance_rad) or 'arrived'
+
+    def _silence(self) -> str:
+        return self.encoder.silence(self.newest_ns or 0)
+
+    def _seconds_per_pose(self) -> float:
+        """Return the time that a pose takes, by those of this session, s."""
+        ends_ns = [record.stop_ns for record in list(self.accepted.values())[self._resumed:]]
+        if len(ends_ns) < _FEWEST_INTERVALS:
+            return self.settings.dwell_s + MOVE_S
+        return float(np.median(np.abs(np.diff(ends_ns)))) * 1e-9
+
+    def _next_open(self) -> int:
+        return next((number for number in range(len(self.targets))
+                     if number not in self.accepted and number not in self.skipped),
+                    len(self.targets))
 
     def _go(self, index: int) -> None:
         self.index = index
-        self._since_ns = self.newest_ns
-        self._refusal = ''
-        self._begin()
-        self._command_target()
-
-    def _command_target(self) -> None:
-        """Note the target as a command, where it is one for the stage or for the operator."""
-        if self.target is not None and self.settings.stage_mode != 'encoder':
+        state = PoseState.DONE if self.target is None else PoseState.APPROACHING
+        self._attempt = _Attempt(state, Dwell(self.sensor, self.encoder.newest_ns or 0),
+                                 self.newest_ns)
+        # In stage mode encoder an operator or a program gives the commands.
+        if self.target is not None and self.settings.stage_mode is not StageMode.ENCODER:
             self._tracker.command(self.newest_ns or 0, self.target.alpha_rad,
                                   self.target.beta_rad)
 
-    def _highest(self, name: str) -> int:
-        return max((getattr(record, name) for record in self.accepted.values()
-                    if getattr(record, name) is not None), default=-1)
+    def _restart_dwell(self, state: PoseState) -> None:
+        """Average from the next sample on."""
+        self._attempt.dwell = Dwell(self.sensor, (self.newest_ns or 0) + 1)
+        self._attempt.state = state
 
-    def _begin(self) -> None:
-        self._captured = False
-        self._dwell = Dwell(self.sensor, self._angles[-1][0] if self._angles else 0)
+    def _restart_after_clock_change(self, back_s: float) -> None:
+        """Begin the pose again after stamps that went back: the driver may have restarted."""
+        self._new_refusal = f'imu/data_raw went back in time by {back_s:.0f} s: the pose begins ' \
+            'anew'
+        self.verify()
+        self._tracker.lose_track()
+        self.encoder.forget_clock()
+        self._attempt.since_ns = None
+        self._attempt.dwell = Dwell(self.sensor, 0)
+        if self._attempt.state is PoseState.AVERAGING:
+            self._attempt.state = PoseState.APPROACHING
 
-    def _learned(self, before: running_estimate.Known | None) -> running_estimate.Known:
-        stage_rad = self.sensor.stage_resolution_rad / np.sqrt(12)
-        records = [record for record in self.results() if not record.check]
-        poses = Poses.from_records(records) if records else Poses.without_volts(
-            np.zeros(0), np.zeros(0), np.zeros(len(self.sensor.axes)))
+    def _forget_long_motion(self) -> None:
+        """Forget the samples of a long motion: they would all be looked at again and again."""
+        dwell = self._attempt.dwell
+        if dwell.age_s() > _LONGEST_DWELL_S + 2 * self.settings.dwell_s and not dwell.at_rest():
+            self._restart_dwell(self._attempt.state)
+
+    def _highest_setting(self, joint: str) -> int:
+        numbers = [getattr(record, f'{joint}_setting') for record in self.accepted.values()]
+        return max((number for number in numbers if number is not None), default=-1)
+
+    def _estimated(self, previous: running_estimate.RunningEstimate | None
+                   ) -> running_estimate.RunningEstimate:
+        records = [record for record in self.poses_to_fit() if not record.check]
+        poses = Poses.from_records(records) if records else \
+            running_estimate.no_poses(len(self.sensor.axes))
         return running_estimate.from_poses(
-            self.sensor, poses, self.settings.dwell_s, stage_rad, before)
+            self.sensor, poses, self.settings.dwell_s,
+            self.sensor.stage_resolution_rad / np.sqrt(12), previous)
 
-    def _entry(self, mean: RestMean, target: Target) -> PoseRecord:
+    def _encoder_covers(self, mean: RestMean) -> bool:
+        """Return whether the encoder was heard to the end of a dwell, where it counts."""
+        newest_ns = self.encoder.newest_ns
+        if not self._uses_encoder or (newest_ns is not None and newest_ns >= mean.stop_ns):
+            return True
+        silence = self._silence()
+        if self.settings.stage_mode is StageMode.ENCODER and silence:
+            self._refuse(f'{silence}; capture again when it is back')
+        return False
+
+    def _record(self, mean: RestMean, target: Target) -> PoseRecord:
         span = mean.start_ns, mean.stop_ns
-        alpha, beta = self._angle_between(*span, target)
-        alpha_setting, beta_setting = self._tracker.settings(*span, alpha, beta)
+        alpha_rad, beta_rad = self.encoder.mean_between(*span) if self._uses_encoder else \
+            (target.alpha_rad, target.beta_rad)
+        alpha_setting, beta_setting = self._tracker.settings(*span, alpha_rad, beta_rad)
         return PoseRecord(
-            pose=self.index, alpha_rad=alpha, beta_rad=beta, alpha_setting=alpha_setting,
-            beta_setting=beta_setting, check=target.check, **mean._asdict(),
-            temperature_c=self.surroundings.temperature_c.mean(*span),
+            pose=self.index, alpha_rad=alpha_rad, beta_rad=beta_rad,
+            alpha_setting=alpha_setting, beta_setting=beta_setting, check=target.check,
+            **mean._asdict(), temperature_c=self.surroundings.temperature_c.mean(*span),
             supply_v=self.surroundings.supply_v.mean(*span))
 
-    def _moved_away(self, rest: Rest, entry: PoseRecord) -> str:
-        """Refuse a rest in another pose than the one in which the operator captured."""
-        if self.settings.stage_mode == 'commanded':
+    def _moved_away(self, rest: Rest, record: PoseRecord) -> str:
+        """Refuse a rest in another pose than that in which the operator captured."""
+        if self.settings.stage_mode is StageMode.COMMANDED:
             return ''
-        if self.settings.stage_mode == 'encoder':
-            seen = np.array([(a, b) for stamp, a, b in self._angles
-                             if entry.start_ns <= stamp <= entry.stop_ns]).reshape(-1, 2)
-            alpha, beta = self.angles or (entry.alpha_rad, entry.beta_rad)
-            return (pose_checks.angles(self.targets[self.index], alpha, beta,
-                                       self.settings.near_rad)
-                    or pose_checks.moved('alpha', seen[:, 0], self.settings.tolerance_rad)
-                    or pose_checks.moved('beta', seen[:, 1], self.settings.tolerance_rad))
-        before = self._dwell.volts(self._dwell.rests()[0]).mean(axis=0)
-        off_g = np.abs(np.array(entry.mean_v) - before) / self.sensor.nominal_scale_v_per_g
-        axis = int(off_g.argmax())
-        return '' if off_g[axis] < np.sin(self.settings.near_rad) else (
-            f'the pose changed after the capture: {self.sensor.axes[axis]} moved by '
-            f'{off_g[axis]:.2f} g; hold the stage still until the pose is taken')
+        if self.settings.stage_mode is StageMode.ENCODER:
+            return self._moved_by_encoder(record)
+        dwell = self._attempt.dwell
+        captured_v = dwell.volts(dwell.rests()[0]).mean(axis=0)
+        change_g = np.abs(np.array(record.mean_v) - captured_v) / self.sensor.nominal_scale_v_per_g
+        axis = int(change_g.argmax())
+        if change_g[axis] < np.sin(self.settings.near_rad):
+            return ''
+        return (f'the pose changed after the capture: {self.sensor.axes[axis]} moved by '
+                f'{change_g[axis]:.2f} g; hold the stage still until the pose is taken')
 
-    def _wrong(self, entry: PoseRecord, volts: np.ndarray) -> str:
-        """Say what speaks against a pose with these samples, or ''."""
-        first = next((record.temperature_c for record in self.results()
-                      if np.isfinite(record.temperature_c)), np.nan)
-        why = (pose_checks.saturated(self.sensor, volts)
-               or pose_checks.temperature(first, entry.temperature_c,
-                                          self.settings.temperature_span_c))
-        if why or self.verifying:
-            return why
-        return pose_checks.reading(self.known, Target(entry.alpha_rad, entry.beta_rad),
-                                   np.array(entry.mean_v), self.settings.tolerance_rad)
+    def _moved_by_encoder(self, record: PoseRecord) -> str:
+        readings_rad = self.encoder.between(record.start_ns, record.stop_ns)
+        now_rad = self.encoder.angles_rad or (record.alpha_rad, record.beta_rad)
+        tolerance_rad = self.settings.tolerance_rad
+        return (pose_checks.angles(self.targets[self.index], *now_rad, self.settings.near_rad)
+                or pose_checks.moved('alpha', readings_rad[:, 0], tolerance_rad)
+                or pose_checks.moved('beta', readings_rad[:, 1], tolerance_rad))
 
-    def _refuse(self, why: str) -> None:
-        """Say why, once; what turns itself is looked at again, an operator captures again."""
-        if why != self._refusal:
-            self._unsaid = why
-        self._refusal = why
-        self._dwell = Dwell(self.sensor, (self.newest_ns or 0) + 1)
-        if self.settings.stage_mode != 'commanded':
-            self._captured = False
+    def _fault(self, record: PoseRecord, volts: np.ndarray) -> str:
+        """Return what speaks against a pose with these samples, or ''."""
+        first_c = next((accepted.temperature_c for accepted in self.poses_to_fit()
+                        if np.isfinite(accepted.temperature_c)), np.nan)
+        fault = (pose_checks.saturated(self.sensor, volts)
+                 or pose_checks.temperature(first_c, record.temperature_c,
+                                            self.settings.temperature_span_c))
+        if fault or self._to_verify:
+            return fault
+        return pose_checks.reading(self.estimate, Target(record.alpha_rad, record.beta_rad),
+                                   np.array(record.mean_v), self.settings.tolerance_rad)
 
-    def _check_mounting(self, entry: PoseRecord) -> None:
-        before, stage_rad = self._verify[0], self.sensor.stage_resolution_rad
-        if self.settings.stage_mode == 'manual':
-            stage_rad = max(stage_rad, self.settings.tolerance_rad)
+    def _refuse(self, refusal: str) -> None:
+        """Report a refusal once. A stage that turns itself tries again, an operator captures."""
+        if refusal != self._attempt.refusal:
+            self._new_refusal = refusal
+        self._attempt.refusal = refusal
+        self._restart_dwell(PoseState.AVERAGING if self.moves_itself else PoseState.APPROACHING)
+
+    def _check_mounting(self, record: PoseRecord) -> None:
+        before, tolerance_rad = self._to_verify[0], self.sensor.stage_resolution_rad
+        if self._uses_encoder:
+            # The stage may be elsewhere within its tolerance, and the encoder knows where.
+            tolerance_rad += max(abs(record.alpha_rad - before.alpha_rad),
+                                 abs(record.beta_rad - before.beta_rad))
         else:
-            # The stage is elsewhere within its tolerance: what the encoder knows is allowed for.
-            stage_rad += max(abs(getattr(entry, name) - getattr(before, name))
-                             for name in ('alpha_rad', 'beta_rad'))
-        why = mounting_check.changed(self.sensor, before, entry, stage_rad)
-        if why and self.settings.stage_mode == 'manual':
-            self._refuse(f'{why}; or turn the stage to where it was, and capture again')
+            tolerance_rad = max(tolerance_rad, self.settings.tolerance_rad)
+        change = mounting_check.changed(self.sensor, before, record, tolerance_rad)
+        if change and self.settings.stage_mode is StageMode.MANUAL:
+            self._refuse(f'{change}; or turn the stage to where it was, and capture again')
             return
-        if why:
-            raise MountingError(why)
-        del self._verify[0]
-        self._go(self._verify[0].pose if self._verify else self._next())
+        if change:
+            raise MountingError(change)
+        del self._to_verify[0]
+        self._go(self._to_verify[0].pose if self._to_verify else self._next_open())
 
-    def _clocks(self) -> str:
-        if len(self._ahead_s) < _FEWEST_OFFSETS:
-            return ''
-        return pose_checks.clocks(min(self._ahead_s, key=abs))
 
-    def _silent(self) -> str:
-        """Say that the encoder is silent, and for how long by the samples' time; '' if not."""
-        if self.angles is None:
-            return 'nothing on stage/joint_states'
-        silent_s = ((self.newest_ns or 0) - self._angles[-1][0]) * 1e-9
-        return f'nothing on stage/joint_states for {silent_s:.0f} s' if silent_s > _SILENT_S \
-            else ''
-
-    def _off_text(self, target: Target) -> str:
-        silent = self._silent()
-        if silent or self.angles is None:
-            return silent
-        return pose_checks.angles(target, *self.angles, self.settings.tolerance_rad) or 'arrived'
-
-    def _angle_between(self, first_ns: int, last_ns: int, target: Target) -> tuple[float, float]:
-        if self.settings.stage_mode == 'manual':
-            return target.alpha_rad, target.beta_rad
-        inside = [(a, b) for stamp, a, b in self._angles if first_ns <= stamp <= last_ns]
-        alpha, beta = np.mean(inside or [self._angles[-1][1:]], axis=0)
-        return float(alpha), float(beta)
+def _position(joint: str, now_rad: float, target_rad: float) -> str:
+    return f'{joint} {np.degrees(now_rad):.2f}° ({np.degrees(now_rad - target_rad):+.2f}°)'

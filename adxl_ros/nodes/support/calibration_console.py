@@ -12,67 +12,89 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The terminal of the calibration node: keys to its actions, figures to the screen."""
+"""The terminal of the calibration node: keys go to its controller, contents to the screen."""
 
 from __future__ import annotations
 
-from typing import Any
+from enum import Enum
 
-from adxl_ros.calibrate.guided.display import live, View
+from adxl_ros.calibrate.guided.capture_settings import Phase
+from adxl_ros.calibrate.guided.controller import Answer, Controller, ControllerState, IDLE_TEXT
+from adxl_ros.calibrate.guided.display import live_reading, SessionDisplay
+from adxl_ros.calibrate.guided.screen_contents import LiveReading, ScreenContents
 from adxl_ros.calibrate.guided.session import Session
 from adxl_ros.nodes.terminal.terminal_process import open_terminal, Terminal
 import rclpy
 from rclpy.node import Node
 
-IDLE = 'idle; call ~/start'
-"""What a node says that has not been told to begin."""
+_TURNS_PER_UPDATE = 4
+"""Turns of the node between two updates of the screen: five updates a second."""
 
-_EVERY = 4
-"""The screen is given new figures every so many turns: five times a second."""
-_RUNNING = {'r': 'redo', 's': 'skip', 'f': 'finish', 'a': 'abort', 'q': 'quit'}
-_BY_HAND = {'c': 'capture', **_RUNNING}
-_IDLE = {'b': 'begin', 'q': 'quit'}
-_WAITING = {'a': 'abort', 'q': 'quit'}
-_ASKED = {'y': 'go on', 'n': 'begin anew', 'a': 'abort', 'q': 'quit'}
+
+class Action(Enum):
+    """What a key does; the value stands on the screen."""
+
+    BEGIN = 'begin'
+    CAPTURE = 'capture'
+    REDO = 'redo'
+    SKIP = 'skip'
+    FINISH = 'finish'
+    ABORT = 'abort'
+    GO_ON = 'go on'
+    BEGIN_ANEW = 'begin anew'
+    QUIT = 'quit'
+
+
+_RUNNING = {'r': Action.REDO, 's': Action.SKIP, 'f': Action.FINISH, 'a': Action.ABORT,
+            'q': Action.QUIT}
+_BY_HAND = {'c': Action.CAPTURE, **_RUNNING}
+_IDLE = {'b': Action.BEGIN, 'q': Action.QUIT}
+_WAITING = {'a': Action.ABORT, 'q': Action.QUIT}
+_ASKING = {'y': Action.GO_ON, 'n': Action.BEGIN_ANEW, 'a': Action.ABORT, 'q': Action.QUIT}
 
 
 class Console:
-    """A screen beside the node, as long as there is a terminal that can show one."""
+    """
+    A screen beside the node, as long as there is a terminal that can show one.
 
-    def __init__(self, node: Node) -> None:
-        self._node = node
+    Parameters
+    ----------
+    node
+        The node, whose log gets a line where the screen is missing.
+    controller
+        What keys control and the screen shows.
+
+    """
+
+    def __init__(self, node: Node, controller: Controller) -> None:
+        self._node, self._controller = node, controller
         self._terminal: Terminal | None
-        self._terminal, why_not = open_terminal()
-        if why_not:
-            node.get_logger().info(why_not)
-        self.asks = self._terminal is not None
+        self._terminal, obstacle = open_terminal()
+        if obstacle:
+            node.get_logger().info(obstacle)
+        controller.may_ask = controller.shows_idle_stream = self._terminal is not None
         self._turns = 0
-        self._sure = False
-        self._view: tuple[Session, View] | None = None
+        self._finish_is_confirmed = False
+        self._session: Session | None = None
+        self._display: SessionDisplay | None = None
 
     def turn(self) -> None:
-        """Do what keys say, and show the present figures; both without waiting."""
+        """Carry out pressed keys and update the screen, without waiting."""
         if self._terminal is None:
             return
         if not self._terminal.alive():
-            self._terminal.close()
-            self._terminal, self.asks = None, False
-            self._node.get_logger().warning('the screen has ended; plain lines from here on')
-            if self._node.question:
-                self._node.start(anew=False)
+            self._lose_terminal(self._terminal)
             return
         for key in self._terminal.pressed():
             self._press(key)
         self._turns += 1
-        if self._turns % _EVERY == 0:
-            phase, text, _ = self._node.state()
-            self.show(phase, text.replace(IDLE, 'press b to begin'))
+        if self._turns % _TURNS_PER_UPDATE == 0:
+            status = self._controller.status()
+            self._show(status.phase, status.text.replace(IDLE_TEXT, 'press b to begin'))
 
-    def show(self, phase: str, text: str) -> None:
-        """Show the figures now."""
-        if self._terminal is not None:
-            self._terminal.show({**self._figures(), 'phase': phase, 'text': text,
-                                 'keys': self._keys(), 'outcome': self._node.outcome})
+    def show_fit(self, text: str) -> None:
+        """Show at once that the fit begins, which takes a while."""
+        self._show(Phase.FIT, text)
 
     def close(self) -> None:
         """Give the terminal back as it was."""
@@ -80,49 +102,72 @@ class Console:
             self._terminal.close()
             self._terminal = None
 
-    def _figures(self) -> dict[str, Any]:
-        node = self._node
-        unit, session = node.unit, node.session
-        figures: dict[str, Any] = {'unit': f'{unit.serial} ({unit.axes})' if unit else '',
-                                   'output': str(node.asked.output), 'mode': node.asked.mode}
-        if session is not None:
-            if self._view is None or self._view[0] is not session:
-                self._view = session, View(session)
-            return {**self._view[1].figures(), **figures}
-        self._view = None
-        newest = node.newest()
-        if newest is None:
-            return figures
-        return {**figures, **live(newest, unit, newest.stillness())}
+    def _lose_terminal(self, terminal: Terminal) -> None:
+        terminal.close()
+        self._terminal, self._controller.may_ask = None, False
+        self._node.get_logger().warning('the screen has ended; plain lines from here on')
+        if self._controller.state is ControllerState.ASKING:
+            self._controller.start(start_over=False)
 
-    def _keys(self) -> dict[str, str]:
-        if self._node.question:
-            return _ASKED
-        if self._node.session is None:
-            return _WAITING if self._node.waiting else _IDLE
-        asked = self._node.asked
-        by_hand = asked.mode == 'stage' and asked.settings.stage_mode != 'commanded'
-        return _BY_HAND if by_hand else _RUNNING
+    def _show(self, phase: Phase, text: str) -> None:
+        if self._terminal is None:
+            return
+        controller, unit = self._controller, self._controller.unit
+        display = self._session_display()
+        self._terminal.show(ScreenContents(
+            phase=phase.value, text=text, unit=f'{unit.serial} ({unit.axes})' if unit else '',
+            output=str(controller.settings.output),
+            keys=tuple((key, action.value) for key, action in self._keys().items()),
+            live=self._idle_reading() if display is None else display.live(),
+            progress=None if display is None else display.progress(),
+            estimate=None if display is None else display.estimate(),
+            outcome=controller.outcome))
+
+    def _session_display(self) -> SessionDisplay | None:
+        """Return the display of the running session; None while there is none."""
+        session = self._controller.session
+        if session is not self._session:
+            self._session = session
+            self._display = None if session is None else SessionDisplay(session)
+        return self._display
+
+    def _idle_reading(self) -> LiveReading | None:
+        newest, unit = self._controller.newest, self._controller.unit
+        if newest is None or unit is None:
+            return None
+        return live_reading(newest, unit, newest.stillness())
+
+    def _keys(self) -> dict[str, Action]:
+        controller = self._controller
+        if controller.state is ControllerState.ASKING:
+            return _ASKING
+        if controller.state is ControllerState.WAITING_FOR_SENSOR:
+            return _WAITING
+        if controller.state is ControllerState.IDLE:
+            return _IDLE
+        return _BY_HAND if controller.settings.operator_captures else _RUNNING
 
     def _press(self, key: str) -> None:
-        action = self._keys().get('c' if key == ' ' else key)
-        node = self._node
-        left = node.session.left if node.session is not None else 0
-        if action == 'finish' and left and not self._sure:
-            self._sure = True
-            node.say(f'{left} poses are open; press f again to fit what there is')
+        action, controller = self._keys().get('c' if key == ' ' else key), self._controller
+        open_poses = 0 if controller.session is None else controller.session.guide.open_poses
+        if action is Action.FINISH and open_poses and not self._finish_is_confirmed:
+            self._finish_is_confirmed = True
+            controller.say(f'{open_poses} poses are open; press f again to fit what there is')
             return
-        self._sure = False
-        if action == 'quit':
+        self._finish_is_confirmed = False
+        if action is Action.QUIT:
             rclpy.try_shutdown()
-        elif action == 'begin':
-            self.asks = True
-            self._tell(node.start())
-        elif action in ('go on', 'begin anew'):
-            self._tell(node.start(anew=action == 'begin anew'))
         elif action is not None:
-            self._tell(getattr(node, action)())
+            controller.say(self._carry_out(action).message)
 
-    def _tell(self, answer: tuple[bool, str]) -> None:
-        """Say what came of a key, where the node has not said so itself."""
-        self._node.say(answer[1])
+    def _carry_out(self, action: Action) -> Answer:
+        controller = self._controller
+        if action is Action.BEGIN:
+            controller.may_ask = True
+            return controller.start()
+        if action in (Action.GO_ON, Action.BEGIN_ANEW):
+            return controller.start(start_over=action is Action.BEGIN_ANEW)
+        requests = {Action.CAPTURE: controller.capture, Action.REDO: controller.redo,
+                    Action.SKIP: controller.skip, Action.FINISH: controller.finish,
+                    Action.ABORT: controller.abort}
+        return requests[action]()

@@ -18,7 +18,6 @@ from __future__ import annotations
 
 from collections import deque
 from contextlib import suppress
-import json
 import os
 import re
 import select
@@ -29,38 +28,61 @@ import termios
 import time
 from typing import Any
 
+from adxl_ros.calibrate.guided.screen_contents import ScreenContents
 from adxl_ros.nodes.terminal.draw import draw
 from adxl_ros.nodes.terminal.keys import Keys
 
 _FRAME_S = 0.2
+"""Shortest time between two drawings, s: the node sends contents five times a second."""
 _KEPT_LINES = 1000
+"""Log lines that are kept for the terminal after the screen."""
+_LONGEST_MESSAGE = 1 << 20
+"""Largest message of contents, bytes; chosen: far above any contents."""
 _ESCAPES = re.compile(r'\x1b\[[0-9;]*m')
 
 
 class Log:
-    """Lines that arrive in pieces."""
+    """
+    Lines that arrive in pieces.
+
+    Parameters
+    ----------
+    fd
+        The file descriptor of the pipe.
+
+    """
 
     def __init__(self, fd: int) -> None:
         self.lines: deque[str] = deque(maxlen=_KEPT_LINES)
         self._fd, self._rest = fd, b''
 
     def fileno(self) -> int:
-        """Return what to wait for."""
+        """Return the file descriptor, for `select`."""
         return self._fd
 
     def read(self) -> bool:
-        """Take what is there; return False when nothing will come any more."""
+        """Take the waiting lines; return False at the end of the pipe."""
         with suppress(BlockingIOError):
             data = os.read(self._fd, 65536)
             if not data:
                 return False
-            *whole, self._rest = (self._rest + data).split(b'\n')
-            self.lines.extend(_ESCAPES.sub('', line.decode(errors='replace')) for line in whole)
+            *lines, self._rest = (self._rest + data).split(b'\n')
+            self.lines.extend(_ESCAPES.sub('', line.decode(errors='replace')) for line in lines)
         return True
 
 
 def run(talk: socket.socket, log: Log) -> None:
-    """Draw and read keys until the other side is gone, or a signal comes."""
+    """
+    Draw and read keys until the node has ended, or a signal comes.
+
+    Parameters
+    ----------
+    talk
+        The socket to the node: contents come in, keys go out.
+    log
+        Lines of the node's log.
+
+    """
     from rich.console import Console
     from rich.live import Live
 
@@ -69,7 +91,7 @@ def run(talk: socket.socket, log: Log) -> None:
         signal.signal(number, lambda *_: ended.append(True))
     resized = [True]
     signal.signal(signal.SIGWINCH, lambda *_: resized.append(True))
-    figures: dict[str, Any] = {'phase': 'idle', 'text': 'starting'}
+    contents = ScreenContents('idle', 'starting')
     console = Console()
     drawn_s, keys = 0.0, Keys()
     sources: list[Any] = [talk, log, sys.stdin]
@@ -79,38 +101,39 @@ def run(talk: socket.socket, log: Log) -> None:
             if log in ready and not log.read():
                 sources.remove(log)
             if talk in ready:
-                newest = _newest(talk)
-                if newest is None:
+                data = _newest(talk)
+                if data is None:
                     return
-                figures = newest or figures
+                if data:
+                    contents = ScreenContents.from_bytes(data)
             if sys.stdin in ready and not _pass_keys(talk, keys):
                 return
             if time.monotonic() - drawn_s > _FRAME_S:
                 drawn_s = time.monotonic()
-                live.update(draw(figures, list(log.lines), console.size), refresh=True)
+                live.update(draw(contents, list(log.lines), console.size), refresh=True)
 
 
 def _ready(sources: list[Any]) -> list[Any]:
     return select.select(sources, [], [], _FRAME_S)[0]
 
 
-def _newest(talk: socket.socket) -> dict[str, Any] | None:
-    """Return the newest figures, {} where there are none; None when the other side is gone."""
-    newest = {}
+def _newest(talk: socket.socket) -> bytes | None:
+    """Return the newest message, b'' where there is none; None when the node has ended."""
+    newest = b''
     with suppress(BlockingIOError):
         while True:
             try:
-                data = talk.recv(1 << 20)
+                data = talk.recv(_LONGEST_MESSAGE)
             except ConnectionError:
                 return None
             if not data:
                 return None
-            newest = json.loads(data)
+            newest = data
     return newest
 
 
 def _pass_keys(talk: socket.socket, keys: Keys) -> bool:
-    """Hand on what was pressed; return False when the terminal is gone."""
+    """Send the pressed keys to the node; return False when the terminal has ended."""
     try:
         data = os.read(sys.stdin.fileno(), 64)
     except OSError:
@@ -123,7 +146,7 @@ def _pass_keys(talk: socket.socket, keys: Keys) -> bool:
 
 def main() -> int:
     """Run the process: arguments are the numbers of its socket and of the log's pipe."""
-    # Ctrl-C is for the other process; this one ends when that has.
+    # Ctrl-C is for the node; this process ends when the node has ended.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     talk = socket.socket(fileno=int(sys.argv[1]))
     talk.setblocking(False)

@@ -12,14 +12,23 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What the screen looks like: figures in, lines out, as many as the terminal has."""
+"""What the screen looks like: contents go in, lines come out, as many as the terminal has."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
 import re
 from textwrap import wrap
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING
+
+from adxl_ros.calibrate.guided.screen_contents import (
+    CoefficientRow,
+    Estimate,
+    LiveReading,
+    Progress,
+    RestReading,
+    ScreenContents,
+)
 
 if TYPE_CHECKING:
     from rich.console import ConsoleDimensions, Group
@@ -27,153 +36,192 @@ if TYPE_CHECKING:
 
 _COLOURS = {'dwell': 'green', 'refused': 'red', 'silent': 'red', 'question': 'yellow',
             'rest': 'yellow', 'stage': 'yellow', 'operator': 'bold cyan', 'fit': 'green'}
+"""Styles of rich by phase."""
+_LEVELS = {'WARN': 'yellow', 'ERROR': 'red', 'FATAL': 'red'}
+"""Styles of rich by level of a log line."""
 _PREFIX = re.compile(r'^\[(\w+)\] \[[\d.]+\] \[[^]]*\]: ')
-_LABEL = 10
+"""The beginning of a line of rclpy's log: level, time, and name of the node."""
+_LEAST_WIDTH = 20
+"""A narrower terminal is drawn as if it had this width, columns."""
+_LEAST_LINES = 4
+"""Lines that a low terminal keeps beside log and keys: title, text, pose and angles."""
+_TEXT_LINES = 5
+"""Largest number of lines of the text at the top."""
+_LABEL_WIDTH = 10
+"""Width of the labels, columns: the longest is 'tilt error'."""
+_BAR_WIDTH = 12
+"""Width of a bar, columns."""
+_COEFFICIENT_BAR_WIDTH = 6
+"""Width of the bar of a coefficient, columns."""
+_NARROW_BAR_WIDTH = 3
+"""The same where a row has little room."""
+_LEAST_NAME_WIDTH = 24
+"""Names of coefficients that have less room make the row narrow, columns."""
+_WIDEST_NAME = 36
+"""Largest width of the name of a coefficient, columns."""
+_SHORTEST_NAME = 8
+"""Smallest width of the name of a coefficient, columns."""
 _MESSAGES = 3
-_LEAST_NAME = 24
+"""Log lines that are shown."""
 
 
-def draw(figures: Mapping[str, Any], log: Sequence[str], size: ConsoleDimensions) -> Group:
+def draw(contents: ScreenContents, log: Sequence[str], size: ConsoleDimensions) -> Group:
     """
-    Lay the figures out.
+    Lay the contents out.
 
     Parameters
     ----------
-    figures
-        As `nodes.support.calibration_console` sends them; what is missing is left out.
+    contents
+        What the screen shows.
     log
-        Lines that were logged, newest last.
+        Lines of the log, the newest last.
     size
-        Of the terminal.
+        Size of the terminal.
+
+    Returns
+    -------
+    rich.console.Group
+        The lines of the screen.
 
     """
     from rich.console import Group
 
-    width = max(size.width, 20)
-    top = [*_head(figures, width), *_pose(figures, width), *_reading(figures, width),
-           *_progress(figures, width)]
-    bottom = [*_log(log), _keys(figures)]
+    width = max(size.width, _LEAST_WIDTH)
+    top = [*_head(contents, width), *_pose(contents.progress),
+           *_reading(contents.live, contents.progress),
+           *_progress(contents.progress, contents.estimate, width)]
+    bottom = [*_log(log), _keys(contents.keys)]
+    middle = _outcome(contents.outcome, width) or _coefficients(contents.estimate, width)
     room = size.height - len(top) - len(bottom)
-    middle = _outcome(figures, width) or _learned(figures, width)
     lines = [*top, *middle[:max(room, 0)]]
     lines += [_text('')] * (size.height - len(lines) - len(bottom))
     # In a small terminal the keys and what is to be done stay.
-    return Group(*lines[:max(size.height - len(bottom), 4)], *bottom)
+    return Group(*lines[:max(size.height - len(bottom), _LEAST_LINES)], *bottom)
 
 
-def _head(figures: Mapping[str, Any], width: int) -> list[Text]:
-    unit = figures.get('unit') or 'no sensor yet'
-    title = f' calibration of {unit} into {figures.get("output", "")}'
-    style = _COLOURS.get(figures['phase'], 'bold')
+def _head(contents: ScreenContents, width: int) -> list[Text]:
+    title = f' calibration of {contents.unit or "no sensor yet"} into {contents.output}'
+    style = _COLOURS.get(contents.phase, 'bold')
     return [_text(f'{title:{width}}', 'reverse'),
-            *(_text(line, style) for line in wrap(figures['text'], width - 1)[:5])]
+            *(_text(line, style) for line in wrap(contents.text, width - 1)[:_TEXT_LINES])]
 
 
-def _pose(figures: Mapping[str, Any], width: int) -> list[Text]:
-    if 'where' not in figures:
+def _pose(progress: Progress | None) -> list[Text]:
+    if progress is None:
         return []
-    number, total = figures['number'], figures['total']
-    lines = [_row('pose', f'{number} of {total}: {figures["where"]}'
-                  if figures.get('left_s') is not None else f'{number}: {figures["where"]}')]
-    if figures.get('off') or figures.get('now'):
-        lines.append(_row('now', figures['off'] or figures['now']))
+    total = '' if progress.remaining_s is None else f' of {progress.total}'
+    lines = [_row('pose', f'{progress.number}{total}: {progress.destination}')]
+    if progress.position:
+        lines.append(_row('now', progress.position))
     return lines
 
 
-def _reading(figures: Mapping[str, Any], width: int) -> list[Text]:
-    if not figures.get('live'):
+def _reading(live: LiveReading | None, progress: Progress | None) -> list[Text]:
+    if live is None:
         return []
-    shown = '  '.join(f'{axis} {mean:+.3f} ± {rms:.3f}' for axis, mean, rms in figures['live'])
-    lines = [_row('reads', f'{shown} m/s²  {figures["rate_hz"]:.0f} Hz')]
-    rest = figures.get('rest')
-    if rest:
-        share = rest['value'] / rest['limit'] if rest['limit'] else 1.0
-        what = 'at rest' if rest['still'] else \
-            {'rms': 'moving', 'drift': 'drifting'}[rest['figure']]
-        lines.append(_row('rest', f'{_bar(share, 12)} {what}: {rest["value"]:.2g} m/s² '
-                          f'{rest["figure"]} on {rest["axis"]}, must be below '
-                          f'{rest["limit"]:.2g}', 'green' if rest['still'] else 'yellow'))
-    if figures.get('dwell'):
-        done, wanted = figures['dwell']
-        lines.append(_row('dwell', f'{_bar(done / wanted, 12)} {done:.1f} of {wanted:g} s'))
+    axes = '  '.join(f'{axis.axis} {axis.mean_mps2:+.3f} ± {axis.rms_mps2:.3f}'
+                     for axis in live.axes)
+    lines = [_row('reads', f'{axes} m/s²  {live.rate_hz:.0f} Hz')]
+    if live.rest is not None:
+        lines.append(_rest(live.rest))
+    if progress is not None and progress.dwell_s is not None and progress.dwelt_s is not None:
+        bar = _bar(progress.dwelt_s / progress.dwell_s, _BAR_WIDTH)
+        lines.append(_row('dwell', f'{bar} {progress.dwelt_s:.1f} of {progress.dwell_s:g} s'))
     return lines
 
 
-def _progress(figures: Mapping[str, Any], width: int) -> list[Text]:
-    if 'done' not in figures:
+def _rest(rest: RestReading) -> Text:
+    share = rest.value_mps2 / rest.limit_mps2 if rest.limit_mps2 else 1.0
+    motion = 'at rest' if rest.at_rest else {'rms': 'moving', 'drift': 'drifting'}[rest.quantity]
+    return _row('rest', f'{_bar(share, _BAR_WIDTH)} {motion}: {rest.value_mps2:.2g} m/s² '
+                f'{rest.quantity} on {rest.axis}, must be below {rest.limit_mps2:.2g}',
+                'green' if rest.at_rest else 'yellow')
+
+
+def _progress(progress: Progress | None, estimate: Estimate | None, width: int) -> list[Text]:
+    if progress is None or estimate is None:
         return []
-    done, total, out = figures['done'], figures['total'], figures['skipped']
-    left = max(total - done - out, 0)
-    time = figures.get('left_s')
-    text = f'{_bar((done + out) / total, 12)} {done} done, ' + (
-        f'{out} left out, ' if out else '') + f'{left} left' + (
-        f', about {_span(time)}' if time is not None else ' for a good fit')
-    lines = [_row('poses', text)]
-    covered = ', '.join(f'{name} {n}/{of}' for name, n, of in figures['coverage'])
-    if figures.get('covered'):
-        covered += f' ({figures["covered"]} up)'
+    lines = [_row('poses', _counts(progress))]
+    covered = ', '.join(f'{row.group} {row.accepted}/{row.total}' for row in estimate.coverage)
+    if estimate.covered_faces:
+        covered += f' ({estimate.covered_faces} up)'
     lines += _wrapped('coverage', covered, width)
-    end = figures.get('tilt_end_deg')
-    if figures['tilt_deg'] is None:
+    if estimate.tilt_error_deg is None:
         return [*lines, _row('tilt error', 'no pose shows both angles to one axis')]
-    lines.append(_row('tilt error', f'{_degrees(figures["tilt_deg"])} expected now' + (
-        '' if end is None else f', {_degrees(end)} after all poses'), 'bold'))
-    return lines
+    final = '' if estimate.final_tilt_error_deg is None else \
+        f', {estimate.final_tilt_error_deg:.2g}° after all poses'
+    return [*lines, _row('tilt error', f'{estimate.tilt_error_deg:.2g}° expected now{final}',
+                         'bold')]
 
 
-def _learned(figures: Mapping[str, Any], width: int) -> list[Text]:
-    rows = figures.get('coefficients', ())
-    between, bar, values = '  ', 6, [list(shown) for _, shown, _ in rows]
+def _counts(progress: Progress) -> str:
+    closed = progress.accepted + progress.skipped
+    skipped = f'{progress.skipped} left out, ' if progress.skipped else ''
+    time = ' for a good fit' if progress.remaining_s is None else \
+        f', about {_span(progress.remaining_s)}'
+    return (f'{_bar(closed / progress.total, _BAR_WIDTH)} {progress.accepted} done, {skipped}'
+            f'{max(progress.total - closed, 0)} left{time}')
 
-    def room() -> int:
-        longest = max((len(between.join(shown)) for shown in values), default=0)
-        return min(width - bar - 2 - longest, 36)
 
-    if room() < _LEAST_NAME:
+def _coefficients(estimate: Estimate | None, width: int) -> list[Text]:
+    if estimate is None:
+        return []
+    rows = estimate.coefficients
+    texts = ['  '.join(row.intervals) for row in rows]
+    bar_width = _COEFFICIENT_BAR_WIDTH
+    if _name_room(texts, bar_width, width) < _LEAST_NAME_WIDTH:
         # Of three axes: what is left out is less than the interval of the last.
-        between, bar = ' ', 3
-        values = [[one.replace(' ± ', '±') for one in shown] for shown in values]
-    name_width = max(room(), 8)
-    return [_text(f'{_cut(name, name_width):{name_width}} {_bar(share, bar)} '
-                  f'{between.join(shown)}') for (name, _, share), shown in zip(rows, values)]
+        bar_width = _NARROW_BAR_WIDTH
+        texts = [_narrow(row) for row in rows]
+    name_width = max(_name_room(texts, bar_width, width), _SHORTEST_NAME)
+    return [_text(f'{_cut(row.name, name_width):{name_width}} '
+                  f'{_bar(row.determined, bar_width)} {text}') for row, text in zip(rows, texts)]
+
+
+def _narrow(row: CoefficientRow) -> str:
+    return ' '.join(interval.replace(' ± ', '±') for interval in row.intervals)
+
+
+def _name_room(texts: Sequence[str], bar_width: int, width: int) -> int:
+    longest = max((len(text) for text in texts), default=0)
+    return min(width - bar_width - 2 - longest, _WIDEST_NAME)
 
 
 def _cut(name: str, width: int) -> str:
     return name if len(name) <= width else f'{name[:width - 1]}…'
 
 
-def _outcome(figures: Mapping[str, Any], width: int) -> list[Text]:
-    return [_text(part) for line in figures.get('outcome', ())
+def _outcome(outcome: Sequence[str], width: int) -> list[Text]:
+    return [_text(part) for line in outcome
             for part in (wrap(line, width - 1) if len(line) >= width else [line])]
 
 
 def _log(log: Sequence[str]) -> list[Text]:
     lines = []
     for line in log[-_MESSAGES:]:
-        found = _PREFIX.match(line)
-        level = found[1] if found else 'INFO'
-        style = {'WARN': 'yellow', 'ERROR': 'red', 'FATAL': 'red'}.get(level, 'dim')
-        lines.append(_text(_PREFIX.sub('', line), style))
+        prefix = _PREFIX.match(line)
+        level = prefix[1] if prefix else 'INFO'
+        lines.append(_text(_PREFIX.sub('', line), _LEVELS.get(level, 'dim')))
     return lines
 
 
-def _keys(figures: Mapping[str, Any]) -> Text:
+def _keys(keys: Iterable[tuple[str, str]]) -> Text:
     from rich.text import Text
 
     line = Text(no_wrap=True, overflow='ellipsis')
-    for key, action in figures.get('keys', {}).items():
+    for key, action in keys:
         line.append(f' {key} ', 'reverse')
         line.append(f' {action}  ')
     return line
 
 
 def _row(label: str, text: str, style: str = '') -> Text:
-    return _text(f'{label:{_LABEL}} {text}', style)
+    return _text(f'{label:{_LABEL_WIDTH}} {text}', style)
 
 
 def _wrapped(label: str, text: str, width: int) -> list[Text]:
-    first, *more = wrap(text, max(width - _LABEL - 1, 10)) or ['']
-    return [_row(label, first), *(_row('', line) for line in more[:2])]
+    first, *others = wrap(text, max(width - _LABEL_WIDTH - 1, 10)) or ['']
+    return [_row(label, first), *(_row('', line) for line in others[:2])]
 
 
 def _text(text: str, style: str = '') -> Text:
@@ -185,10 +233,6 @@ def _text(text: str, style: str = '') -> Text:
 def _bar(share: float, width: int) -> str:
     full = round(min(max(share, 0.0), 1.0) * width)
     return '█' * full + '░' * (width - full)
-
-
-def _degrees(value: float) -> str:
-    return f'{value:.2g}°'
 
 
 def _span(seconds: float) -> str:

@@ -12,30 +12,32 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The keys that are pressed, out of the bytes that a terminal sends."""
+"""The pressed keys, from the bytes that a terminal sends."""
 
 from __future__ import annotations
 
 import re
 
 _PLAIN = b'abcdefghijklmnopqrstuvwxyz '
+"""Keys that have an action."""
 _ESCAPED = re.compile(
     rb'\x1b+(\[\[.|\[M...|\[[0-?]*[ -/]*[@-~]|O[0-9;]*[^0-9;]|[^\x1b\[O])', re.S)
-"""Of xterm, with X10's mouse and the function keys of the Linux console; or Alt and a letter."""
+"""A sequence of xterm, of X10's mouse, of the function keys of the Linux console, or with Alt."""
 _BEGUN = re.compile(rb'\x1b+(\[(\[|M.{0,2}|[0-?]*[ -/]*)?|O[0-9;]*)?\Z', re.S)
+"""The beginning of such a sequence at the end of the bytes."""
 _LONELY_S = 1.0
-"""The key Escape takes nothing with it that comes so much later."""
+"""The key Escape does not belong to bytes that come so much later, s."""
 
 
 class Keys:
     """
-    Letters and the space; what comes with an escape, whole or in pieces, is no key of ours.
+    Letters and the space among the bytes; sequences with an escape are left out.
 
     Arrows, the wheel of a mouse and function keys end with a letter: an arrow upwards is no A.
     """
 
     def __init__(self) -> None:
-        self._begun, self._at_s = b'', 0.0
+        self._begun, self._read_s = b'', 0.0
 
     def read(self, data: bytes, now_s: float) -> str:
         """
@@ -44,14 +46,20 @@ class Keys:
         Parameters
         ----------
         data
-            What was read from the terminal.
+            Bytes of the terminal.
         now_s
-            When, s.
+            Time at which they were read, s.
+
+        Returns
+        -------
+        str
+            The keys.
 
         """
-        if self._begun.strip(b'\x1b') or now_s - self._at_s < _LONELY_S:
+        if self._begun.strip(b'\x1b') or now_s - self._read_s < _LONELY_S:
             data = self._begun + data
         begun = _BEGUN.search(data)
-        whole = data[:begun.start()] if begun else data
-        self._begun, self._at_s = data[len(whole):], now_s
-        return bytes(byte for byte in _ESCAPED.sub(b'', whole).lower() if byte in _PLAIN).decode()
+        complete = data[:begun.start()] if begun else data
+        self._begun, self._read_s = data[len(complete):], now_s
+        plain = _ESCAPED.sub(b'', complete).lower()
+        return bytes(byte for byte in plain if byte in _PLAIN).decode()

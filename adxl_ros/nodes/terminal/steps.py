@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The steps of a job in a terminal: what is done, how far it is, how long it has taken."""
+"""The steps of a job in a terminal: name, progress and time."""
 
 from __future__ import annotations
 
@@ -25,9 +25,14 @@ from typing import Any
 
 _BAR_WIDTH = 30
 """Columns of the bar. A line with its bar has 79 columns."""
-_NAME_WIDTH, _TEXT_WIDTH, _LINE_WIDTH = 11, 16, 69
+_NAME_WIDTH = 11
+"""Columns of the name of a step."""
+_TEXT_WIDTH = 16
+"""Columns of the text beside a bar."""
+_LINE_WIDTH = 69
+"""Columns of a line without a bar, before its time."""
 _TENTHS = 10
-"""Where there is no terminal, so many lines show a step from its beginning to its end."""
+"""Lines that show a step where there is no terminal."""
 
 
 @contextmanager
@@ -43,21 +48,26 @@ def step(name: str, text: str, total: int = 0) -> Iterator[Step]:
     name
         Number and name of the step.
     text
-        What it begins with.
+        Text at its beginning.
     total
-        How much there is to do; 0 if that is not known.
+        Amount of work, in any unit; 0 if it is unknown.
+
+    Yields
+    ------
+    Step
+        The step, to show its progress.
 
     """
-    shown = (_InTerminal if drawable() else _AsLines)(name, text, total)
+    shown_step = (_InTerminal if drawable() else _AsLines)(name, text, total)
     try:
-        yield shown
-        shown.end()
+        yield shown_step
+        shown_step.end()
     finally:
-        shown.close()
+        shown_step.close()
 
 
 def drawable() -> bool:
-    """Tell whether stdout is a terminal that can draw, and rich is installed."""
+    """Return whether stdout is a terminal that can draw, and rich is installed."""
     if not sys.stdout.isatty() or os.environ.get('TERM') == 'dumb':
         return False
     try:
@@ -80,9 +90,9 @@ class Step:
         Parameters
         ----------
         text
-            What is done.
+            Text beside the name.
         done
-            How much of the total that is.
+            Share of the total that is done, in its unit.
 
         """
         self._text, self._done = text, done

@@ -13,31 +13,32 @@
 # limitations under the License.
 
 """
-The terminal, from the side of the process whose figures it shows.
+The terminal, from the side of the node whose contents it shows.
 
-A process of its own draws and reads the keys, so that neither costs the samples anything, and so
-that it can give the terminal back even when the other is killed. The two talk over a socket that
-never blocks; what is logged meanwhile goes to the screen, and into the terminal when it is over.
+A process of its own draws and reads the keys: neither delays the samples, and it restores the
+terminal even when the node is killed. Both talk over a socket that never blocks. Log lines go to
+the screen meanwhile, and into the terminal at its end.
 """
 
 from __future__ import annotations
 
 from contextlib import suppress
-import json
 import os
 import socket
 import subprocess
 import sys
 import termios
-from typing import Any
+
+from adxl_ros.calibrate.guided.screen_contents import ScreenContents
 
 _WAIT_S = 5.0
+"""Longest wait for the end of the screen, s; chosen: far above its usual end."""
 RESET = '\x1b[?1049l\x1b[?25h\x1b[0m'
-"""Leaves the alternate screen and shows the cursor."""
+"""Leaves the alternate screen and shows the cursor, by the codes of xterm."""
 
 
 def open_terminal() -> tuple[Terminal | None, str]:
-    """Open a screen where there is a terminal; else None, and what is missing, if anything is."""
+    """Open a screen where there is a terminal; else return None, and what to install or ''."""
     if not all(stream and stream.isatty() for stream in (sys.stdin, sys.stdout)) \
             or os.environ.get('TERM') == 'dumb':
         return None, ''
@@ -63,16 +64,16 @@ class Terminal:
 
     def __init__(self) -> None:
         self._saved = termios.tcgetattr(sys.stdin.fileno())
-        self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._socket, screen_end = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         read, write = os.pipe()
         self._process = subprocess.Popen(
-            [sys.executable, '-m', 'adxl_ros.nodes.terminal', str(theirs.fileno()), str(read)],
-            pass_fds=(theirs.fileno(), read), env={**os.environ, 'PYTHONSAFEPATH': '1'})
-        theirs.close()
+            [sys.executable, '-m', 'adxl_ros.nodes.terminal', str(screen_end.fileno()), str(read)],
+            pass_fds=(screen_end.fileno(), read), env={**os.environ, 'PYTHONSAFEPATH': '1'})
+        screen_end.close()
         os.close(read)
         self._socket.setblocking(False)
         os.set_blocking(write, False)
-        # What logs, from whatever library, would tear the screen.
+        # Lines of any library would tear the screen.
         sys.stdout.flush()
         sys.stderr.flush()
         self._outputs = [(fd, os.dup(fd)) for fd in (1, 2)]
@@ -81,16 +82,16 @@ class Terminal:
         os.close(write)
 
     def alive(self) -> bool:
-        """Tell whether the screen is still there."""
+        """Return whether the process of the screen still runs."""
         return self._process.poll() is None
 
-    def show(self, figures: dict[str, Any]) -> None:
-        """Give the screen new figures; they are left out where it is busy."""
+    def show(self, contents: ScreenContents) -> None:
+        """Give the screen new contents; they are left out while it is busy."""
         with suppress(OSError):
-            self._socket.send(json.dumps(figures).encode())
+            self._socket.send(contents.to_bytes())
 
     def pressed(self) -> list[str]:
-        """Return the keys that were pressed since."""
+        """Return the keys that were pressed since the last call."""
         keys = []
         with suppress(OSError):
             while data := self._socket.recv(64):
@@ -98,7 +99,7 @@ class Terminal:
         return keys
 
     def close(self) -> None:
-        """End the screen, and see that the terminal is as it was."""
+        """End the screen, and restore the terminal if the screen did not."""
         with suppress(OSError):
             sys.stdout.flush()
             sys.stderr.flush()

@@ -17,10 +17,10 @@
 from dataclasses import replace
 
 from adxl_ros.calibrate.guided import pose_checks, running_estimate
-from adxl_ros.calibrate.guided.capture_settings import Settings
-from adxl_ros.calibrate.guided.hand_guide import Tumble
+from adxl_ros.calibrate.guided.capture_settings import CaptureSettings, Phase, StageMode
+from adxl_ros.calibrate.guided.hand_guide import HandGuide
 from adxl_ros.calibrate.guided.pose_plan import guided, spread, Target
-from adxl_ros.calibrate.guided.stage_guide import MountingError, Sweep
+from adxl_ros.calibrate.guided.stage_guide import MountingError, StageGuide
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.calibrate.report import cross_validation
 from adxl_ros.model import signal_chain
@@ -38,15 +38,15 @@ NEXT = Target(np.pi / 2, np.pi / 6)
 def bench(mode='commanded', targets=(UP, NEXT), sensor=None, accepted=(), **settings):
     """Return a stage with a sensor, and poses of 1 s."""
     sensor = sensor or nominal()
-    chosen = Settings(1.0, np.radians(0.2), 20.0, mode, **settings)
-    return Bench(Sweep(nominal(sensor.axes), targets, chosen, accepted), sensor)
+    chosen = CaptureSettings(1.0, np.radians(0.2), 20.0, StageMode(mode), **settings)
+    return Bench(StageGuide(nominal(sensor.axes), targets, chosen, accepted), sensor)
 
 
 def refusal(of):
     """Return what the sweep says of the pose that it does not take."""
-    state = of.sweep.state()
-    assert state.phase == 'refused' and state.late
-    assert state.text == of.sweep.refused()
+    state = of.sweep.status()
+    assert state.phase is Phase.REFUSED and state.late
+    assert state.text == of.sweep.new_refusal()
     return state.text
 
 
@@ -54,7 +54,7 @@ def test_moving_names_axis_figure_and_threshold():
     """The words of the issue, with the axis that moves."""
     shaken = bench()
     assert shaken.run(5, UP.alpha_rad, 0.0, shake_mps2=0.43) is None
-    text = shaken.sweep.state().text
+    text = shaken.sweep.status().text
     assert 'moving: 0.29 m/s² on x, must be below 0.0' in text
 
 
@@ -89,17 +89,17 @@ def test_an_encoder_that_falls_silent_is_told_and_its_last_angle_is_no_pose():
     dead.run(4, np.pi / 2, 0.0, encoder=False)
     words = 'nothing on stage/joint_states for 4 s'
     assert dead.sweep.capture() == f'{words}: in stage.mode encoder its angle counts'
-    state = dead.sweep.state()
+    state = dead.sweep.status()
     assert state.text == words and state.late
     for mode in ('encoder', 'commanded'):
         dead = bench(mode)
         dead.run(0.2, np.pi / 2, 0.0)
         assert dead.sweep.capture() == ''
         assert dead.run(5, np.pi / 2, 0.0, encoder=False) is None
-        state = dead.sweep.state()
+        state = dead.sweep.status()
         assert state.text == 'nothing on stage/joint_states for 5 s' and state.late
         said = f'{words.replace("4", "3")}; capture again when it is back'
-        assert dead.sweep.refused() == (said if mode == 'encoder' else '')
+        assert dead.sweep.new_refusal() == (said if mode == 'encoder' else '')
         dead.run(0.5, np.pi / 2, 0.0)
         dead.sweep.capture()
         assert dead.run(3, np.pi / 2, 0.0)
@@ -173,7 +173,8 @@ def _edge(name, value):
 def test_saturated():
     """A rail of the ADC is no reading."""
     sensor = nominal(nominal_zero_g_v=np.array([4.9, 2.5]))
-    railed = Bench(Sweep(sensor, [UP], Settings(1.0, 0.0035, 20.0, 'commanded')), sensor)
+    settings = CaptureSettings(1.0, 0.0035, 20.0, StageMode.COMMANDED)
+    railed = Bench(StageGuide(sensor, [UP], settings), sensor)
     assert railed.run(4, np.pi / 2, 0.0) is None
     assert refusal(railed).startswith('saturated: x reads +0.10 g (5.000 V), beyond its range of')
 
@@ -198,9 +199,9 @@ def test_clocks_apart(ahead_s, words):
     """A stage by another clock is said to be one: nothing hangs, and nothing wrong is taken."""
     apart = bench()
     for _ in range(80):
-        apart.sweep.stage(int(apart.now_ns + ahead_s * 1e9), np.pi / 2, 0.0)
+        apart.sweep.read_encoder(int(apart.now_ns + ahead_s * 1e9), np.pi / 2, 0.0)
         assert apart.run(0.05, np.pi / 2, 0.0, encoder=False) is None
-    state = apart.sweep.state()
+    state = apart.sweep.status()
     assert state.late and words in state.text and 'use_sim_time' in state.text
 
 
@@ -230,11 +231,12 @@ def test_the_mounting_is_looked_at_after_an_interruption(by_rad, words):
     before = bench()
     entry = before.run(5, np.pi / 2, 0.0)
     after = bench(accepted=[entry])
-    assert after.sweep.verifying and 'once more, to see that the mounting' in after.sweep.where()
+    assert after.sweep.poses_to_verify
+    assert 'once more, to see that the mounting' in after.sweep.destination()
     assert after.sweep.target == UP
     if not words:
         assert after.run(4, np.pi / 2, 0.0) is None
-        assert not after.sweep.verifying and after.sweep.target == NEXT
+        assert not after.sweep.poses_to_verify and after.sweep.target == NEXT
         return
     after.fed = Fed(replace(nominal(), effects=('misalignment',), values={'misalignment': {
         'alpha_rad': np.zeros(2), 'beta_rad': np.full(2, by_rad)}}))
@@ -249,10 +251,10 @@ def test_a_turn_about_the_vertical_shows_in_a_second_pose():
     for target in targets[:2]:
         before.sweep.take(before.run(5, target.alpha_rad, target.beta_rad))
     for off_v, words in ((0.002, ''), (0.008, 'mounting changed: in pose 1 y reads')):
-        after = bench(targets=targets, accepted=before.sweep.results())
-        assert after.sweep.target == targets[1] and after.sweep.to_verify == 2
+        after = bench(targets=targets, accepted=before.sweep.poses_to_fit())
+        assert after.sweep.target == targets[1] and after.sweep.poses_to_verify == 2
         assert after.run(4, np.pi / 2, np.pi / 2) is None
-        assert after.sweep.target == UP and after.sweep.verifying
+        assert after.sweep.target == UP and after.sweep.poses_to_verify
         after.fed = Fed(replace(nominal(), effects=('bias',), values={
             'bias': {'offset_v': np.array([0.0, off_v])}}))
         if words:
@@ -268,17 +270,17 @@ def test_a_clock_that_went_back_has_the_mounting_looked_at():
     again.sweep.take(again.run(5, np.pi / 2, 0.0))
     again.now_ns -= 3600 * 10 ** 9
     again.run(0.5, np.pi / 2, np.pi / 6)
-    assert again.sweep.verifying and again.sweep.target == UP
-    assert again.sweep.refused().startswith('imu/data_raw went back in time by 3600 s')
+    assert again.sweep.poses_to_verify and again.sweep.target == UP
+    assert again.sweep.new_refusal().startswith('imu/data_raw went back in time by 3600 s')
     again.run(3, np.pi / 2, 0.0)
-    assert not again.sweep.verifying and again.sweep.target == NEXT
+    assert not again.sweep.poses_to_verify and again.sweep.target == NEXT
 
 
 def test_what_shakes_for_minutes_is_forgotten_and_taken_when_it_is_still():
     """A long wait costs neither memory nor the pose."""
     shaken = bench()
     assert shaken.run(70, np.pi / 2, 0.0, shake_mps2=0.3) is None
-    assert shaken.sweep._dwell.age_s() < 65
+    assert shaken.sweep._attempt.dwell.age_s() < 65
     assert shaken.run(5, np.pi / 2, 0.0)
 
 
@@ -293,8 +295,8 @@ def test_by_hand_a_last_pose_that_differs_can_be_set_anew():
         after.run(0.2, np.pi / 2, beta)
         after.sweep.capture()
         assert after.run(3, np.pi / 2, beta) is None
-        assert words in after.sweep.state().text
-    assert not after.sweep.verifying and after.sweep.target == NEXT
+        assert words in after.sweep.status().text
+    assert not after.sweep.poses_to_verify and after.sweep.target == NEXT
 
 
 def test_redo_and_skip_walk_the_plan():
@@ -307,23 +309,23 @@ def test_redo_and_skip_walk_the_plan():
     walk.sweep.take(walk.run(5, np.pi / 2, np.pi / 6))
     assert sorted(walk.sweep.accepted) == [0, 1] and walk.sweep.index == 2
     assert walk.sweep.redo() == 'pose 2 will be taken again'
-    assert sorted(walk.sweep.accepted) == [0] and len(walk.sweep.results()) == 1
+    assert sorted(walk.sweep.accepted) == [0] and len(walk.sweep.poses_to_fit()) == 1
     again = walk.run(5, np.pi / 2, np.pi / 6)
     walk.sweep.take(again)
     assert walk.sweep.accepted[1] == again
     assert walk.sweep.skip() == 'pose 3 is left out'
-    assert walk.sweep.target is None and walk.sweep.state().phase == 'done'
+    assert walk.sweep.target is None and walk.sweep.status().phase is Phase.DONE
 
 
 def test_by_hand_directions_are_asked_for_in_words_until_all_are_covered():
     """A sensor turned as asked covers faces, edges and corners, and is well determined."""
     sensor = nominal('xyz')
     truth = drawn(np.random.default_rng(2), sensor, ('bias', 'scale_factor', 'misalignment'))
-    tumble = Tumble(sensor, 3.0)
+    tumble = HandGuide(sensor, 3.0)
     fed = Fed(truth, 4)
     now_ns, asked, errors = 10 ** 18, [], []
     for _ in range(16):
-        asked.append(tumble.where())
+        asked.append(tumble.destination())
         up = _direction(tumble)
         for seconds, shake in ((0.5, 3.0), (2.5, 0.0), (1.6, 3.0)):
             time = np.arange(round(1000 * seconds)) / 1000
@@ -340,7 +342,7 @@ def test_by_hand_directions_are_asked_for_in_words_until_all_are_covered():
     assert len(set(asked)) == 16, 'a direction was asked for twice'
     assert errors[-1] < errors[0] / 20
     assert tumble.redo() == 'rest 16 is forgotten; hold the sensor in that direction again'
-    assert len(tumble.results()) == 15
+    assert len(tumble.poses_to_fit()) == 15
     assert 'is left out' in tumble.skip()
 
 

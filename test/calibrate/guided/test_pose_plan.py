@@ -70,7 +70,7 @@ def test_fits_reach_the_intervals_that_a_plan_promises(axes, kind):
         poses = swept(rng, truth, per_setting=True, targets=targets)
         found = full_model.fit_full(sensor, poses)
         spread = np.sqrt(np.diag(found.fitted.covariance))
-        promised = quick_plan.nothing_known(sensor, 5.0).after(targets)
+        promised = quick_plan.datasheet_estimate(sensor, 5.0).with_poses(targets)
         stds = dict(zip(promised.names, promised.std))
         ratios += [s / stds[name] for s, name in zip(spread, found.fitted.covariance_names)]
     assert np.exp(np.mean(np.log(ratios))) == pytest.approx(1.0, abs=0.15)

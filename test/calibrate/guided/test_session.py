@@ -16,8 +16,9 @@
 
 from dataclasses import replace
 
-from adxl_ros.calibrate.guided.capture_settings import Settings
-from adxl_ros.calibrate.guided.session import Plan, Session
+from adxl_ros.calibrate.guided.capture_settings import CaptureSettings, StageMode
+from adxl_ros.calibrate.guided.session import Session
+from adxl_ros.calibrate.guided.session_settings import SessionSettings
 from adxl_ros.errors import UserError
 from adxl_ros.files import atomic_write, parameter_file, sweep_journal
 from adxl_ros.model import signal_chain
@@ -35,31 +36,32 @@ def begin(tmp_path):
     """Give a function that begins or resumes a calibration of 20 poses and 2 check poses."""
     begun = []
 
-    def begin(anew=False, **changes):
+    def begin(start_over=False, **changes):
         if begun:
             begun[-1].close()
-        settings = Settings(1.0, 0.0035, 20.0, 'manual')
-        asked = replace(Plan(
+        capture = CaptureSettings(1.0, 0.0035, 20.0, StageMode.MANUAL)
+        settings = replace(SessionSettings(
             'stage', 'full', (np.pi / 4, np.pi / 2), np.pi / 2, float(np.radians(0.1)), 2,
-            settings, tmp_path / 'unit.yaml', tmp_path / 'journal', '', ''), **changes)
-        begun.append(Session(UNIT, asked, anew))
+            capture, tmp_path / 'unit.yaml', tmp_path / 'journal', '', ''), **changes)
+        begun.append(Session(UNIT, settings, start_over))
         return begun[-1]
     yield begin
     begun[-1].close()
 
 
 def take(session, count, off_v=0.0):
-    """Take poses, as `Session.accepted` does with those that the stream gives."""
+    """Take poses, as `Session.take_poses` does with those that the stream gives."""
     for _ in range(count):
-        target, walk = session.walk.target, session.walk
+        guide = session.guide
+        target = guide.target
         volts = np.column_stack(signal_chain.static_response(TRUTH)(specific_force(
             np.array([target.alpha_rad]), np.array([target.beta_rad]), 9.80665)))[0] + off_v
         entry = pose_record(
-            walk.index, alpha_rad=target.alpha_rad, beta_rad=target.beta_rad, check=target.check,
-            start_ns=2 * walk.index, stop_ns=2 * walk.index + 1, mean_v=tuple(volts.tolist()),
+            guide.index, alpha_rad=target.alpha_rad, beta_rad=target.beta_rad, check=target.check,
+            start_ns=2 * guide.index, stop_ns=2 * guide.index + 1, mean_v=tuple(volts.tolist()),
             std_v=(5e-5, 5e-5))
         session.journal.append(entry)
-        walk.take(entry)
+        guide.take(entry)
 
 
 def kept(session):
@@ -75,7 +77,7 @@ def test_a_pose_to_be_taken_again_is_in_no_fit_and_not_resumed(begin):
     take(session, 1, 0.3)
     assert session.redo() == 'pose 3 will be taken again'
     assert kept(session) == [0, 1]
-    assert [e.pose for e in session.walk.results()] == [0, 1]
+    assert [e.pose for e in session.guide.poses_to_fit()] == [0, 1]
     session = begin()
     assert session.resumed == 2 and kept(session) == [0, 1]
 
@@ -87,10 +89,10 @@ def test_finished_early_it_goes_on_and_at_its_end_it_is_over(begin):
     assert session.finish().fitted.provenance['poses'] == '12'
     session.end()
     session = begin()
-    assert session.resumed == 12 and session.left == 10
-    session.walk.skip()
+    assert session.resumed == 12 and session.guide.open_poses == 10
+    session.guide.skip()
     take(session, 10)
-    assert session.over and session.finish().fitted.provenance['check_poses'] == '2'
+    assert session.guide.is_over and session.finish().fitted.provenance['check_poses'] == '2'
     session.end()
     assert begin().resumed == 0
 
@@ -103,15 +105,15 @@ def test_a_finish_that_comes_twice_keeps_the_calibration_before(begin, tmp_path,
     with monkeypatch.context() as patch:
         patch.setattr(session.journal, 'append', _full)
         found = session.finish()
-        copy = found.keep(session.asked.store)
+        copy = found.keep(session.settings.store)
         with pytest.raises(UserError, match='unit.yaml is written, but .*make room'):
             session.end()
     again = session.finish()
-    assert again.keep(session.asked.store) == copy and copy.startswith('kept as')
+    assert again.keep(session.settings.store) == copy and copy.startswith('kept as')
     assert (tmp_path / 'unit.yaml.previous').read_text() == 'the one before\n'
     first = (tmp_path / 'unit.yaml').read_text()
     take(session, 1)
-    session.finish().keep(session.asked.store)
+    session.finish().keep(session.settings.store)
     assert (tmp_path / 'unit.yaml.previous').read_text() == first
     assert len(list((tmp_path / 'store' / 'S1').iterdir())) == 2
 
@@ -152,8 +154,8 @@ def test_few_poses_are_fitted_or_refused(begin, count):
     """Never a traceback, whenever an operator has had enough."""
     session = begin()
     take(session, count)
-    session.walk.skipped.update(range(count, 20))
-    session.walk.retry()
+    session.guide.skipped.update(range(count, 20))
+    session.guide.retry()
     try:
         assert session.finish().fitted.provenance['poses'] == f'{count}'
     except UserError as error:
@@ -163,17 +165,16 @@ def test_few_poses_are_fitted_or_refused(begin, count):
 @pytest.mark.parametrize('mode', ['stage', 'gravity'])
 def test_a_calibration_goes_on_only_with_the_figures_and_settings_it_began_with(begin, mode):
     """What changes the poses or the fit is in the head; what was changed is said."""
-    asked, unit = begin().asked, nominal('xyz')
-    asked = replace(asked, mode=mode)
-    changed = [(asked, replace(unit, **{name: np.asarray(getattr(unit, name)) * 2}))
+    settings, unit = replace(begin().settings, mode=mode), nominal('xyz')
+    changed = [(settings, replace(unit, **{name: np.asarray(getattr(unit, name)) * 2}))
                for name in ('noise_density_g_per_rthz', 'rc_capacitance_f', 'adc_vref_v',
                             'range_g', 'local_gravity_mps2', 'stage_resolution_rad')]
     names = ['temperature_span_c'] + ['tolerance_rad', 'near_rad'] * (mode == 'stage')
-    changed += [(replace(asked, settings=replace(asked.settings, **{name: 0.1})), unit)
+    changed += [(replace(settings, capture=replace(settings.capture, **{name: 0.1})), unit)
                 for name in names]
-    before = asked.head(unit)
-    for plan, sensor in changed:
-        assert len([key for key, value in plan.head(sensor).items() if value != before[key]]) == 1
+    before = settings.head(unit)
+    for other, sensor in changed:
+        assert len([key for key, value in other.head(sensor).items() if value != before[key]]) == 1
 
 
 def test_a_mounting_that_was_not_checked_is_said_in_the_file(begin, tmp_path):

@@ -14,10 +14,10 @@
 
 """The guided sweep without ROS: what it waits for, says and accepts."""
 
-from adxl_ros.calibrate.guided.capture_settings import Settings
-from adxl_ros.calibrate.guided.hand_guide import Tumble
+from adxl_ros.calibrate.guided.capture_settings import CaptureSettings, Phase, StageMode
+from adxl_ros.calibrate.guided.hand_guide import HandGuide
 from adxl_ros.calibrate.guided.pose_plan import guided, sweep as plan_sweep, Target, travel_rad
-from adxl_ros.calibrate.guided.stage_guide import Sweep
+from adxl_ros.calibrate.guided.stage_guide import StageGuide
 from adxl_ros.errors import UserError
 from adxl_ros.model.kinematics import specific_force
 import numpy as np
@@ -29,8 +29,9 @@ TARGETS = [Target(np.pi / 2, 0.0), Target(np.pi / 2, np.pi / 6)]
 
 def _bench(mode='commanded', **changes):
     sensor = nominal(**changes)
-    settings = Settings(dwell_s=5.0, tolerance_rad=0.0035, timeout_s=20.0, stage_mode=mode)
-    return Bench(Sweep(sensor, TARGETS, settings), sensor)
+    settings = CaptureSettings(dwell_s=5.0, tolerance_rad=0.0035, timeout_s=20.0,
+                               stage_mode=StageMode(mode))
+    return Bench(StageGuide(sensor, TARGETS, settings), sensor)
 
 
 def test_a_pose_keeps_its_full_dwell():
@@ -47,11 +48,11 @@ def test_nothing_is_accepted_before_arrival_and_the_text_says_how_far_off():
     """A stage 3° off is waited for; after the time-out the state says since when."""
     bench = _bench()
     assert bench.run(3, np.pi / 2, np.radians(3)) is None
-    state = bench.sweep.state()
-    assert (state.phase, state.late) == ('stage', False)
+    state = bench.sweep.status()
+    assert (state.phase, state.late) == (Phase.STAGE, False)
     assert 'beta is 3.0° from the asked 0°' in state.text
     bench.run(20, np.pi / 2, np.radians(3))
-    state = bench.sweep.state()
+    state = bench.sweep.status()
     assert state.late
     assert 'for 23 s' in state.text
 
@@ -60,15 +61,15 @@ def test_without_encoder_it_says_so():
     """No joint states at all: the state names the topic."""
     bench = _bench()
     bench.run(1, np.pi / 2, 0.0, encoder=False)
-    assert 'nothing on stage/joint_states' in bench.sweep.state().text
+    assert 'nothing on stage/joint_states' in bench.sweep.status().text
 
 
 def test_a_sensor_that_shakes_is_not_at_rest():
     """Motion is said with its figure and the limit, and nothing is accepted."""
     bench = _bench()
     assert bench.run(8, np.pi / 2, 0.0, shake_mps2=0.3) is None
-    state = bench.sweep.state()
-    assert state.phase == 'rest'
+    state = bench.sweep.status()
+    assert state.phase is Phase.REST
     assert 'moving: 0.' in state.text and 'm/s² on x, must be below 0.0' in state.text
 
 
@@ -97,7 +98,7 @@ def test_the_operator_captures(mode, beta):
     """With an operator nothing happens before capture; whose angle counts is the mode's."""
     bench = _bench(mode)
     assert bench.run(7, np.pi / 2, 0.02, encoder=mode == 'encoder') is None
-    assert bench.sweep.state().phase == 'operator'
+    assert bench.sweep.status().phase is Phase.OPERATOR
     captured_ns = bench.now_ns
     bench.sweep.capture()
     entry = bench.run(7, np.pi / 2, 0.02, encoder=mode == 'encoder')
@@ -151,10 +152,10 @@ def test_rests_by_hand_are_announced_as_they_end():
     tumble, volts = _tumbled()
     found = _rests(tumble, volts, 10 ** 18)
     assert len(found) == 5
-    results = tumble.results()
+    results = tumble.poses_to_fit()
     assert len(results) == 6
     assert all(2.0 < e.samples / 1000 < 3.1 for e in results)
-    assert '5 rests (5 more at least)' in tumble.state().text
+    assert '5 rests (5 more at least)' in tumble.status().text
 
 
 def test_a_clock_that_goes_back_ends_no_tumble():
@@ -162,9 +163,9 @@ def test_a_clock_that_goes_back_ends_no_tumble():
     tumble, volts = _tumbled()
     assert len(_rests(tumble, volts, 10 ** 18)) == 5
     assert len(_rests(tumble, volts, 10 ** 15)) == 5
-    assert sorted(tumble.accepted) == list(range(10)) and len(tumble.results()) == 11
+    assert sorted(tumble.accepted) == list(range(10)) and len(tumble.poses_to_fit()) == 11
     tumble.drop(tumble.accepted[0])
-    assert len(tumble.results()) == 10
+    assert len(tumble.poses_to_fit()) == 10
     tumble.retry()
     assert len(_rests(tumble, volts, 10 ** 15 + 25 * 10 ** 9)) >= 5
 
@@ -175,7 +176,7 @@ def _tumbled():
     alphas = np.repeat(np.linspace(0, 2.5, 6), 4000) + np.concatenate(
         [np.concatenate([np.zeros(3000), 0.2 * np.sin(np.linspace(0, 40, 1000))])
          for _ in range(6)])
-    return Tumble(sensor, 3.0), Fed(sensor, 2)(specific_force(alphas, 0 * alphas, 9.80665))
+    return HandGuide(sensor, 3.0), Fed(sensor, 2)(specific_force(alphas, 0 * alphas, 9.80665))
 
 
 def _rests(tumble, volts, begin_ns):

@@ -1,0 +1,621 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The guided calibration as a state machine, free of ROS.
+
+Services and keys call its methods, messages go into it, and `poll` makes it go on. What it says
+leaves through `Outputs`, and samples come from a `SampleSource`.
+"""
+
+from __future__ import annotations
+
+from enum import auto, Enum
+from pathlib import Path
+from typing import NamedTuple, Protocol
+
+from adxl_ros.calibrate.calibration import CalibrationResult
+from adxl_ros.calibrate.guided.capture_settings import Phase, Status
+from adxl_ros.calibrate.guided.guide import NextPose
+from adxl_ros.calibrate.guided.live_window import NewestSamples, Readings, STALE_NS
+from adxl_ros.calibrate.guided.session import Session
+from adxl_ros.calibrate.guided.session_settings import SessionSettings
+from adxl_ros.calibrate.guided.stage_guide import MountingError
+from adxl_ros.calibrate.report import report_html
+from adxl_ros.errors import UserError
+from adxl_ros.files.stream_info import StreamInfo
+from adxl_ros.files.stream_unit import unit_of
+from adxl_ros.model.sensor import Sensor
+import numpy as np
+
+IDLE_TEXT = 'idle; call ~/start'
+"""What a controller says that has not been started."""
+_NOT_RUNNING = 'no calibration is running'
+
+
+class ControllerState(Enum):
+    """State of the guided calibration."""
+
+    IDLE = auto()
+    """Nothing is to be done."""
+    WAITING_FOR_SENSOR = auto()
+    """A calibration is to begin once the sensor is known."""
+    ASKING = auto()
+    """The operator is asked what to do with an interrupted calibration."""
+    RUNNING = auto()
+    """A session takes poses."""
+    FIT_FAILED = auto()
+    """All poses of the session are taken, but the fit or its files failed."""
+
+
+class Resume(Enum):
+    """What to do with an interrupted calibration."""
+
+    ASK = 'ask'
+    """Ask the operator if somebody is at a screen; else go on with it."""
+    CONTINUE = 'continue'
+    """Go on with it."""
+    ANEW = 'anew'
+    """Put it aside and begin again."""
+
+
+class Severity(Enum):
+    """Severity of a log line."""
+
+    INFO = auto()
+    WARNING = auto()
+    ERROR = auto()
+
+
+class Answer(NamedTuple):
+    """
+    The answer to a request.
+
+    Attributes
+    ----------
+    success
+        Whether it was carried out.
+    message
+        One line for people.
+
+    """
+
+    success: bool
+    message: str
+
+
+class Report(NamedTuple):
+    """
+    What the diagnostics report.
+
+    Attributes
+    ----------
+    status
+        What the calibration waits for.
+    serial
+        Serial number of the sensor; '' while it is unknown.
+    values
+        Further values by key.
+
+    """
+
+    status: Status
+    serial: str
+    values: dict[str, str | float]
+
+
+class Outputs(Protocol):
+    """Where a controller's lines, answers and announcements go."""
+
+    def log(self, severity: Severity, text: str) -> None:
+        """
+        Log a line.
+
+        Parameters
+        ----------
+        severity
+            Its severity.
+        text
+            The line.
+
+        """
+
+    def answer_captures(self, answer: Answer) -> None:
+        """Answer all who wait for the end of a capture."""
+
+    def announce(self, pose: NextPose) -> None:
+        """Announce the pose to go to, and command a stage that turns itself."""
+
+    def withdraw_pose(self, reason: str) -> None:
+        """Take the announced pose back."""
+
+    def show_fit(self, text: str) -> None:
+        """Show that the fit begins, which takes a while."""
+
+
+class SampleSource(Protocol):
+    """
+    Where samples come from.
+
+    Attributes
+    ----------
+    useless
+        Why the newest samples are of no use, or ''.
+
+    """
+
+    useless: str
+
+    def take(self, unit: Sensor) -> tuple[np.ndarray, np.ndarray]:
+        """Return the samples since the last call: stamps, ns, (n,), and volts, (n, m)."""
+
+    def heard(self) -> None:
+        """Begin to measure the silence of the stream."""
+
+    def silent(self) -> str:
+        """Return for how long nothing has come, or ''."""
+
+    def clear(self) -> None:
+        """Forget the waiting samples."""
+
+    def keep_newest(self) -> None:
+        """Forget the oldest of the waiting samples."""
+
+
+class Controller:
+    """
+    Runs guided calibrations, one after the other.
+
+    Parameters
+    ----------
+    settings
+        What a calibration is to do.
+    sensor
+        The sensor of the parameters, which gives what the stream does not state.
+    resume
+        What to do with an interrupted calibration.
+    samples
+        Where samples come from.
+    outputs
+        Where lines, answers and announcements go.
+
+    Attributes
+    ----------
+    state
+        The state.
+    unit
+        The nominal sensor of the stream; None while it is unknown.
+    session
+        The running calibration; None in the states IDLE, WAITING_FOR_SENSOR and ASKING.
+    question
+        The question to the operator in the state ASKING, else ''.
+    outcome
+        Lines on the calibration that has ended.
+    may_ask
+        Whether somebody is at a screen who can be asked.
+    shows_idle_stream
+        Whether a screen shows the samples while no calibration runs.
+
+    """
+
+    def __init__(self, settings: SessionSettings, sensor: Sensor, resume: Resume,
+                 samples: SampleSource, outputs: Outputs) -> None:
+        self.settings = settings
+        self.state = ControllerState.IDLE
+        self.unit: Sensor | None = None
+        self.session: Session | None = None
+        self.question = ''
+        self.outcome: tuple[str, ...] = ()
+        self.may_ask = self.shows_idle_stream = False
+        self._sensor, self._resume = sensor, resume
+        self._samples, self._outputs = samples, outputs
+        self._starts_over = resume is Resume.ANEW
+        self._idle_samples: NewestSamples | None = None
+        self._outlook = self._last_line = self._last_warning = ''
+        self._sensor_fault = self._sample_fault = self._fit_fault = ''
+        self._misdated: set[str] = set()
+
+    @property
+    def newest(self) -> NewestSamples | None:
+        """Return the newest samples; None before the sensor is known."""
+        return self.session.newest if self.session is not None else self._idle_samples
+
+    def wait_for_sensor(self) -> None:
+        """Begin a calibration as soon as the sensor is known."""
+        self.state = ControllerState.WAITING_FOR_SENSOR
+
+    def start(self, start_over: bool | None = None) -> Answer:
+        """
+        Begin a calibration, or resume an interrupted one.
+
+        Parameters
+        ----------
+        start_over
+            The answer to the question: whether to put an interrupted calibration aside. None for
+            a start that is no answer.
+
+        Returns
+        -------
+        Answer
+            Whether it begins.
+
+        """
+        if self.session is not None:
+            return Answer(False, 'a calibration is running; finish or abort it first')
+        if self.state is ControllerState.ASKING and start_over is None:
+            return Answer(False, self.question)
+        self.state, self.question = ControllerState.WAITING_FOR_SENSOR, ''
+        self._starts_over = self._resume is Resume.ANEW if start_over is None else start_over
+        self._try_to_start()
+        if self.state is ControllerState.ASKING:
+            return Answer(False, self.question)
+        if self.state is ControllerState.WAITING_FOR_SENSOR:
+            return Answer(True, 'starts when sensor_info arrives')
+        return Answer(self.session is not None, self._last_line)
+
+    def capture(self) -> Answer:
+        """Take the pose that the operator has reached; the end of the dwell answers later."""
+        if self.session is None:
+            return Answer(False, _NOT_RUNNING)
+        if self.session.guide.moves_itself:
+            return Answer(False, 'nothing to capture: the stage moves itself, and poses are taken '
+                                 'when it has arrived')
+        if self._sample_fault or self._fit_fault:
+            return Answer(False, self._sample_fault or self._fit_fault)
+        self._take_samples(self.session)
+        obstacle = self.session.guide.capture()
+        if obstacle:
+            self._log_news(Severity.WARNING, obstacle)
+            return Answer(False, obstacle)
+        return Answer(True, 'averaging')
+
+    def redo(self) -> Answer:
+        """Take the previous pose again."""
+        if self.session is None:
+            return Answer(False, _NOT_RUNNING)
+        try:
+            return self._changed_pose(self.session.redo(), 'no pose to take again')
+        except UserError as error:
+            return Answer(False, f'{error}')
+
+    def skip(self) -> Answer:
+        """Leave out the pose at hand."""
+        if self.session is None:
+            return Answer(False, _NOT_RUNNING)
+        try:
+            return self._changed_pose(self.session.skip(), 'no pose to leave out')
+        except UserError as error:
+            return Answer(False, f'{error}')
+
+    def finish(self) -> Answer:
+        """Fit the poses so far and write the files."""
+        if self.session is None:
+            return Answer(False, _NOT_RUNNING)
+        self._take_samples(self.session)
+        return Answer(self._fit(self.session), self._last_line)
+
+    def abort(self) -> Answer:
+        """End without a fit; the poses stay in the journal."""
+        if self.state is ControllerState.IDLE:
+            return Answer(False, _NOT_RUNNING)
+        kept = f'; its poses stay in {self.session.journal.path}' if self.session else ''
+        self._stop(Severity.INFO, f'aborted{kept}')
+        return Answer(True, self._last_line)
+
+    def say(self, text: str) -> None:
+        """Log a line unless it was the last one."""
+        self._log_news(Severity.INFO, text)
+
+    def read_sensor_info(self, info: StreamInfo) -> None:
+        """Take what the stream states about its sensor."""
+        try:
+            unit = unit_of(self._sensor, info)
+        except UserError as error:
+            self._refuse_sensor(f'{error}')
+            return
+        self._sensor_fault = ''
+        if self.session is not None:
+            self._compare_sensor(self.session, unit)
+        self.unit, self._idle_samples = unit, NewestSamples(unit)
+        self._outlook = self.settings.outlook(unit)
+
+    def read_stage(self, stamp_ns: int, alpha_rad: float, beta_rad: float) -> None:
+        """
+        Take the angles of the stage.
+
+        Parameters
+        ----------
+        stamp_ns
+            Their stamp, ns.
+        alpha_rad, beta_rad
+            The angles, rad.
+
+        """
+        if self.session is not None:
+            self.session.guide.read_encoder(stamp_ns, alpha_rad, beta_rad)
+
+    def read_command(self, alpha_rad: float, beta_rad: float) -> None:
+        """
+        Take a command that somebody gave the stage.
+
+        Parameters
+        ----------
+        alpha_rad, beta_rad
+            The commanded angles, rad; NaN for a joint without one.
+
+        """
+        if self.session is not None:
+            self.session.guide.read_command(alpha_rad, beta_rad)
+
+    def read_temperature(self, stamp_ns: int, temperature_c: float) -> None:
+        """
+        Take a temperature.
+
+        Parameters
+        ----------
+        stamp_ns
+            Its stamp, ns; 0 for none.
+        temperature_c
+            The temperature, °C.
+
+        """
+        if self.session is not None:
+            readings = self.session.guide.surroundings.temperature_c
+            self._add_reading(self.session, readings, 'temperature', stamp_ns, temperature_c)
+
+    def read_supply(self, stamp_ns: int, supply_v: float) -> None:
+        """
+        Take a supply voltage.
+
+        Parameters
+        ----------
+        stamp_ns
+            Its stamp, ns; 0 for none.
+        supply_v
+            The voltage, V.
+
+        """
+        if self.session is not None:
+            readings = self.session.guide.surroundings.supply_v
+            self._add_reading(self.session, readings, 'supply', stamp_ns, supply_v)
+
+    def poll(self) -> None:
+        """Take the samples that have come, and go on."""
+        if self.state is ControllerState.WAITING_FOR_SENSOR:
+            self._try_to_start()
+        if self.session is None:
+            self._watch()
+            return
+        self._take_samples(self.session)
+        if self._take_poses(self.session):
+            self._go_on(self.session)
+
+    def status(self) -> Status:
+        """Return what the calibration waits for."""
+        if self.state is ControllerState.ASKING:
+            return Status(Phase.QUESTION, self.question, True)
+        if self.state is ControllerState.WAITING_FOR_SENSOR:
+            if self._sensor_fault:
+                return Status(Phase.REFUSED, self._sensor_fault, True)
+            advice = '; is the driver running?' if self._samples.silent() else ''
+            return Status(Phase.INFO, f'waiting for sensor_info{advice}', True)
+        if self.session is None:
+            idle = f'{IDLE_TEXT}; {self._outlook}' if self._outlook else IDLE_TEXT
+            return Status(Phase.IDLE, self._last_line or idle, False)
+        silence = self._samples.silent()
+        if silence:
+            return Status(Phase.SILENT, silence, True)
+        fault = self._sample_fault or self._fit_fault
+        if fault:
+            return Status(Phase.REFUSED, fault, True)
+        return self.session.guide.status()
+
+    def report(self) -> Report:
+        """Return what the diagnostics report; log an obstacle once for each pose and phase."""
+        status = self.status()
+        if status.late:
+            self._warn_once(status)
+        values: dict[str, str | float] = {
+            'accepted': '0', 'output': str(self.settings.output),
+            'verdict': '; '.join(self.outcome)}
+        if self.session is not None:
+            guide = self.session.guide
+            values |= {'phase': status.phase.value, 'pose': str(guide.pose_number),
+                       'next': guide.destination(), 'accepted': str(self.session.accepted_count)}
+            tilt_rad = guide.tilt_error_rad()
+            if np.isfinite(tilt_rad):
+                values['tilt_error_deg'] = float(np.degrees(tilt_rad))
+        return Report(status, self.unit.serial if self.unit else '', values)
+
+    def close(self) -> None:
+        """Close the journal."""
+        if self.session is not None:
+            self.session.close()
+
+    def _try_to_start(self) -> None:
+        """Begin a session if the sensor is known and there is no question."""
+        if self.unit is None:
+            return
+        try:
+            if self.may_ask:
+                if self._resume is Resume.ASK:
+                    self.question = self.settings.question(self.unit)
+                self.may_ask = False
+            if self.question:
+                self.state = ControllerState.ASKING
+            else:
+                self._begin_session(self.unit)
+        except UserError as error:
+            self._stop(Severity.ERROR, f'{error}')
+
+    def _begin_session(self, unit: Sensor) -> None:
+        self.session = session = Session(unit, self.settings, self._starts_over)
+        self.state, self.outcome = ControllerState.RUNNING, ()
+        self._samples.heard()
+        task = self._outlook or 'rest in 24 or more directions, then call ~/finish'
+        if not session.resumed:
+            self.say(f'calibrating {unit.serial}: {task}')
+            return
+        check = ' (the last one first, to see that the mounting is as it was)' \
+            if session.guide.poses_to_verify else ''
+        self.say(f'calibrating {unit.serial}: {task}, resumed after {session.resumed} poses'
+                 f'{check}; resume:=anew puts them aside')
+
+    def _refuse_sensor(self, fault: str) -> None:
+        """Take and show nothing of a sensor that is not the one of the parameters."""
+        self._sensor_fault = fault
+        self.unit = self._idle_samples = None
+        if self.session is not None:
+            self._stop(Severity.ERROR, f'{fault}; the poses are kept')
+        self._log_news(Severity.ERROR, fault)
+
+    def _compare_sensor(self, session: Session, unit: Sensor) -> None:
+        """End a session whose sensor changed; check the mounting if its driver restarted."""
+        old, new = self.settings.head(session.unit), self.settings.head(unit)
+        changes = ', '.join(f'{key} was {old[key]}, is {new[key]}' for key in old
+                            if old[key] != new[key])
+        if changes:
+            self._stop(Severity.ERROR, f'sensor_info: {changes}: changed during the calibration; '
+                       'put it back and start again, the poses are kept')
+            return
+        session.guide.verify()
+        self._outputs.answer_captures(Answer(False, 'the driver began anew; capture again'))
+
+    def _add_reading(self, session: Session, readings: Readings, quantity: str, stamp_ns: int,
+                     value: float) -> None:
+        """Add a reading; one on another clock counts from its arrival."""
+        newest_ns = session.guide.newest_ns or 0
+        ahead_ns = stamp_ns - newest_ns
+        if stamp_ns and newest_ns and abs(ahead_ns) > STALE_NS:
+            if quantity not in self._misdated:
+                self._misdated.add(quantity)
+                side = 'ahead of' if ahead_ns > 0 else 'behind'
+                self._outputs.log(
+                    Severity.WARNING, f'{quantity} is stamped {abs(ahead_ns) * 1e-9:.0f} s {side} '
+                    'imu/data_raw: it counts from when it arrives; put both on one clock')
+            stamp_ns = 0
+        readings.add(stamp_ns or newest_ns, value)
+
+    def _watch(self) -> None:
+        """Keep the newest samples while no calibration runs."""
+        if self.unit is None and self.state is not ControllerState.IDLE:
+            # A driver that has just begun states its sensor on another topic.
+            self._samples.keep_newest()
+        elif self.unit is not None and self._idle_samples is not None and self.shows_idle_stream:
+            self._idle_samples.feed(*self._samples.take(self.unit))
+        else:
+            self._samples.clear()
+
+    def _take_samples(self, session: Session) -> None:
+        stamps_ns, volts = self._samples.take(self.unit or session.unit)
+        if not len(stamps_ns) and not self._samples.useless:
+            return
+        fault = self._samples.useless or session.feed(stamps_ns, volts)
+        if fault and not self._sample_fault:
+            self._log_news(Severity.ERROR, fault)
+        self._sample_fault = fault
+
+    def _take_poses(self, session: Session) -> bool:
+        """Take the poses that are complete; return whether the session goes on."""
+        try:
+            for text in session.take_poses():
+                self.say(text)
+                self._outputs.answer_captures(Answer(True, text))
+        except MountingError as error:
+            self._stop(Severity.ERROR, f'{error}')
+            return False
+        except UserError as error:
+            self._log_news(Severity.ERROR, f'{error}')
+            self._outputs.answer_captures(Answer(False, f'{error}'))
+        refusal = session.guide.new_refusal()
+        if refusal:
+            self._log_news(Severity.WARNING, refusal)
+            self._outputs.answer_captures(Answer(False, refusal))
+        return True
+
+    def _go_on(self, session: Session) -> None:
+        """Announce the next pose, or fit where none is open."""
+        pose = session.guide.next_pose()
+        if pose is not None:
+            self._outputs.announce(pose)
+        elif self.state is not ControllerState.FIT_FAILED:
+            self._fit(session)
+
+    def _changed_pose(self, text: str, obstacle: str) -> Answer:
+        """Answer a request for another pose, by its line for people or an obstacle."""
+        if not text:
+            return Answer(False, obstacle)
+        self._fit_fault, self.state = '', ControllerState.RUNNING
+        self._outputs.answer_captures(Answer(False, text))
+        self.say(text)
+        return Answer(True, text)
+
+    def _fit(self, session: Session) -> bool:
+        """Fit and write all files; return whether that succeeded."""
+        self.say(f'fitting {session.accepted_count} poses')
+        self._outputs.show_fit(self._last_line)
+        self._fit_fault, self.state = '', ControllerState.RUNNING
+        try:
+            result = session.finish()
+            self._outputs.log(Severity.INFO, result.keep(self.settings.store))
+            self._write_report(result)
+            session.end()
+        except (UserError, OSError) as error:
+            # The poses stay: others, or room on the disk, can still make a calibration of them.
+            text = f'cannot finish: {error}'
+            if session.guide.is_over:
+                text = f'{text}; finish again, redo or abort'
+                self._fit_fault, self.state = text, ControllerState.FIT_FAILED
+            self._log_news(Severity.ERROR, text)
+            return False
+        for line in result.comments():
+            self._outputs.log(Severity.INFO, line)
+        self.outcome = tuple(result.summary_lines)
+        open_poses = session.guide.open_poses
+        advice = f'; {open_poses} poses are open: start again to go on' if open_poses else ''
+        self._stop(Severity.INFO, f'wrote {self.settings.output}{advice}')
+        return True
+
+    def _write_report(self, result: CalibrationResult) -> None:
+        """Write the report; the calibration stands without it."""
+        if not self.settings.report:
+            return
+        try:
+            Path(self.settings.report).mkdir(parents=True, exist_ok=True)
+            report_html.write(self.settings.report, result, self.settings.store)
+        except (UserError, OSError) as error:
+            self._log_news(Severity.ERROR, f'no report: {error}')
+
+    def _stop(self, severity: Severity, text: str) -> None:
+        """End the session, or the wait for one, with a line for people."""
+        if self.session is not None:
+            self.session.close()
+        self.state, self.session, self.question = ControllerState.IDLE, None, ''
+        self._sample_fault = self._fit_fault = ''
+        self._outputs.answer_captures(Answer(False, text))
+        self._outputs.withdraw_pose(text)
+        self._log_news(severity, text)
+
+    def _log_news(self, severity: Severity, text: str) -> None:
+        """Log a line unless it was the last one."""
+        if text != self._last_line:
+            self._outputs.log(severity, text)
+        self._last_line = text
+
+    def _warn_once(self, status: Status) -> None:
+        poses = self.session.accepted_count if self.session is not None else ''
+        key = f'{status.phase.value} {poses}'
+        if key != self._last_warning and status.text != self._last_line:
+            self._outputs.log(Severity.WARNING, status.text)
+        self._last_warning = key

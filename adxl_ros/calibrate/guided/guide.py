@@ -1,0 +1,179 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What a guide is: it leads through the poses of one calibration, with a stage or by hand."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple, Protocol
+
+from adxl_ros.calibrate.guided.capture_settings import Status
+from adxl_ros.calibrate.guided.live_window import NewestSamples, Surroundings
+from adxl_ros.calibrate.guided.screen_contents import Estimate, Progress
+from adxl_ros.files.sweep_journal import JournalEntry, PoseRecord
+from adxl_ros.signals.rest_detection import Stillness
+import numpy as np
+
+
+class NextPose(NamedTuple):
+    """
+    The pose to go to, as it is announced.
+
+    Attributes
+    ----------
+    text
+        One line for people.
+    values
+        Values for programs, by key.
+    command_rad
+        Angles alpha and beta for a stage that turns itself, rad; None for others.
+
+    """
+
+    text: str
+    values: Mapping[str, str | float]
+    command_rad: tuple[float, float] | None
+
+
+class Guide(Protocol):
+    """
+    Leads through the poses of one calibration: samples go in, accepted poses come out.
+
+    Attributes
+    ----------
+    accepted
+        Accepted poses by number.
+    surroundings
+        Temperature and supply over time.
+    newest_ns
+        Stamp of the newest sample, ns; None before the first.
+
+    """
+
+    accepted: dict[int, PoseRecord]
+    surroundings: Surroundings
+    newest_ns: int | None
+
+    @property
+    def moves_itself(self) -> bool:
+        """Return whether a stage turns itself, so that nobody captures."""
+
+    @property
+    def is_over(self) -> bool:
+        """Return whether no pose is open; a hand-held calibration ends by `finish` only."""
+
+    @property
+    def open_poses(self) -> int:
+        """Return the number of open poses; 0 where the number of poses is not fixed."""
+
+    @property
+    def poses_to_verify(self) -> int:
+        """Return how many poses are still to be taken again for the check of the mounting."""
+
+    @property
+    def pose_number(self) -> int:
+        """Return the number of the next pose, from 1."""
+
+    @property
+    def previous(self) -> int | None:
+        """Return the number of the previous pose, from 0; None where there is none."""
+
+    def feed(self, stamps_ns: np.ndarray, volts: np.ndarray) -> None:
+        """
+        Take samples.
+
+        Parameters
+        ----------
+        stamps_ns
+            Their stamps, ns, (n,).
+        volts
+            The samples, V, (n, m).
+
+        """
+
+    def read_encoder(self, stamp_ns: int, alpha_rad: float, beta_rad: float) -> None:
+        """
+        Take the angles of the stage.
+
+        Parameters
+        ----------
+        stamp_ns
+            Their stamp, ns.
+        alpha_rad, beta_rad
+            The angles, unwrapped, rad.
+
+        """
+
+    def read_command(self, alpha_rad: float, beta_rad: float) -> None:
+        """
+        Take a command that somebody gave the stage.
+
+        Parameters
+        ----------
+        alpha_rad, beta_rad
+            The commanded angles, rad; NaN for a joint without one.
+
+        """
+
+    def accept(self) -> PoseRecord | None:
+        """Return the next pose for the journal, if one is complete."""
+
+    def take(self, record: PoseRecord) -> None:
+        """Count a pose that is on disk, and go on to the next one."""
+
+    def retry(self) -> None:
+        """Take the pose at hand again, since its record is not on disk."""
+
+    def capture(self) -> str:
+        """Take the pose in which the operator has put the sensor; return an obstacle or ''."""
+
+    def verify(self) -> None:
+        """Take earlier poses again, to check that the mounting is as it was."""
+
+    def skip_entry(self) -> JournalEntry | None:
+        """Return what the journal says of a `skip` now."""
+
+    def skip(self) -> str:
+        """Leave out the pose at hand; return a line for people."""
+
+    def redo(self) -> str:
+        """Forget the previous pose; return a line for people, or '' where there is none."""
+
+    def poses_to_fit(self) -> list[PoseRecord]:
+        """Return the poses for the fit."""
+
+    def new_refusal(self) -> str:
+        """Return why a pose was refused since the last call, or ''."""
+
+    def status(self) -> Status:
+        """Return what the guide waits for."""
+
+    def destination(self) -> str:
+        """Name the pose to reach, for people."""
+
+    def next_pose(self) -> NextPose | None:
+        """Return the pose to announce; None where no pose is open."""
+
+    def tilt_error_rad(self) -> float:
+        """Return the expected rms error of alpha and beta by the poses so far, rad."""
+
+    def stillness(self, newest: NewestSamples) -> Stillness | None:
+        """Return whether the newest samples are at rest; None while they are too few."""
+
+    def progress(self) -> Progress:
+        """Return how far the calibration is, for the screen."""
+
+    def estimate_contents(self) -> Estimate:
+        """Return what the poses determine so far, for the screen; this costs some time."""

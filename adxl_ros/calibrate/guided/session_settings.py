@@ -1,0 +1,145 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What a guided calibration is to do, whatever the unit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from adxl_ros.calibrate.guided import pose_plan, quick_plan
+from adxl_ros.calibrate.guided.capture_settings import CaptureSettings, StageMode
+from adxl_ros.files.sweep_journal import unfinished
+from adxl_ros.model.sensor import Sensor
+import numpy as np
+
+_UNIT_FIELDS = (
+    'serial', 'axes', 'rate_hz', 'nominal_zero_g_v', 'nominal_scale_v_per_g',
+    'noise_density_g_per_rthz', 'rc_resistance_ohm', 'rc_capacitance_f', 'adc_bits',
+    'adc_vref_v', 'range_g', 'local_gravity_mps2', 'stage_resolution_rad')
+"""Fields of the sensor that must be the same for a calibration to be resumed."""
+
+
+@dataclass(frozen=True)
+class SessionSettings:
+    """
+    What a guided calibration is to do, whatever the unit.
+
+    Attributes
+    ----------
+    mode
+        'stage' or 'gravity'.
+    plan_kind
+        Kind of the pose plan: 'full' or 'quick'.
+    planes_rad
+        Planes alpha of the plan full, rad; empty for those that the axes of the unit need.
+    step_rad
+        Step of beta of the plan full, rad.
+    tilt_error_rad
+        Rms error of the tilt that the plan quick is to reach, rad.
+    check_poses
+        Number of poses that are kept out of the fit.
+    capture
+        How poses are taken.
+    output
+        The parameter file to write.
+    journal
+        The journal of the accepted poses.
+    report
+        Folder of the report, or ''.
+    store
+        Folder of the calibration store, or ''.
+
+    """
+
+    mode: str
+    plan_kind: str
+    planes_rad: tuple[float, ...]
+    step_rad: float
+    tilt_error_rad: float
+    check_poses: int
+    capture: CaptureSettings
+    output: Path
+    journal: Path
+    report: str
+    store: str
+
+    @property
+    def operator_captures(self) -> bool:
+        """Return whether an operator turns a stage and captures."""
+        return self.mode == 'stage' and self.capture.stage_mode is not StageMode.COMMANDED
+
+    def targets(self, unit: Sensor) -> list[pose_plan.Target]:
+        """
+        Return the poses in the order of the visit; none without a stage.
+
+        Raises
+        ------
+        UserError
+            The parameters make no pose plan.
+
+        """
+        if self.mode == 'gravity':
+            return []
+        if self.plan_kind == 'quick':
+            return quick_plan.quick(unit, self.capture.dwell_s, self.tilt_error_rad,
+                                    self.check_poses)
+        planes_rad = self.planes_rad or pose_plan.default_planes_rad(unit.axes)
+        return pose_plan.guided(planes_rad, self.step_rad, self.check_poses)
+
+    def outlook(self, unit: Sensor) -> str:
+        """Return number, duration and expected tilt error of the poses; '' without a stage."""
+        targets = self.targets(unit)
+        if not targets:
+            return ''
+        seconds = len(targets) * (self.capture.dwell_s + pose_plan.MOVE_S)
+        text = (f'plan {self.plan_kind}: {len(targets)} poses, about '
+                f'{max(round(seconds / 60), 1)} min')
+        error_rad = quick_plan.expected_tilt_error_rad(unit, self.capture.dwell_s, targets)
+        if not np.isfinite(error_rad):
+            return text
+        text += f', expected tilt error {np.degrees(error_rad):.2g}°'
+        if self.plan_kind == 'quick' and error_rad > self.tilt_error_rad:
+            text += f' (sweep.tilt_error_deg asks for {np.degrees(self.tilt_error_rad):.2g}°: ' \
+                    'too little for this stage and this dwell)'
+        return text
+
+    def head(self, unit: Sensor) -> dict[str, Any]:
+        """Return what must be the same for a calibration of this unit to be resumed, by key."""
+        unit_fields = {name: np.asarray(getattr(unit, name)).tolist() for name in _UNIT_FIELDS}
+        head = {'mode': self.mode, **unit_fields,
+                'sweep.temperature_span_c': self.capture.temperature_span_c}
+        if self.mode == 'gravity':
+            return head
+        return {**head, 'stage.mode': self.capture.stage_mode.value,
+                'stage.tolerance_rad': self.capture.tolerance_rad,
+                'stage.near_rad': self.capture.near_rad,
+                'sweep.dwell_s': self.capture.dwell_s, 'sweep.plan': self.plan_kind,
+                'sweep.planes_rad': self.planes_rad, 'sweep.step_rad': self.step_rad,
+                'sweep.tilt_error_rad': self.tilt_error_rad,
+                'sweep.check_poses': self.check_poses, 'order': pose_plan.ORDER}
+
+    def question(self, unit: Sensor) -> str:
+        """Return the question what to do with an interrupted calibration; '' without one."""
+        interrupted = unfinished(self.journal, self.head(unit))
+        if interrupted is None:
+            return ''
+        if interrupted.obstacle:
+            return (f'{self.journal} holds {interrupted.poses} poses of an interrupted '
+                    f'calibration, which cannot go on: {interrupted.obstacle}. Begin anew (n; it '
+                    'is kept), or abort (a) and put that back?')
+        return (f'{self.journal} holds {interrupted.poses} poses of an interrupted calibration '
+                'of this unit. Go on with them (y), or begin anew (n; they are kept)?')

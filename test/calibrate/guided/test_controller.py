@@ -1,0 +1,324 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The guided calibration as a state machine, without a graph: requests, states and answers."""
+
+from dataclasses import replace
+
+from adxl_ros.calibrate.guided.capture_settings import CaptureSettings, Phase, StageMode
+from adxl_ros.calibrate.guided.controller import Controller, ControllerState, Resume, Severity
+from adxl_ros.calibrate.guided.display import live_reading, SessionDisplay
+from adxl_ros.calibrate.guided.screen_contents import ScreenContents
+from adxl_ros.calibrate.guided.session_settings import SessionSettings
+from adxl_ros.errors import UserError
+from adxl_ros.files import parameter_file, sweep_journal
+from adxl_ros.files.stream_info import sensor_info, StreamInfo
+from adxl_ros.model.kinematics import specific_force
+import numpy as np
+import pytest
+from units import drawn, Fed, nominal
+
+UNIT = nominal(serial='C1', rate_hz=200.0)
+TRUTH = drawn(np.random.default_rng(3), UNIT)
+
+
+class Rig:
+    """A controller with a sensor on a stage: a source of samples and the end of all outputs."""
+
+    def __init__(self, folder, mode=StageMode.COMMANDED, resume=Resume.ASK, **changes):
+        self.useless = self.silence = ''
+        self.log_lines, self.answers, self.withdrawn = [], [], []
+        self.pose, self.angles_rad = None, (0.0, 0.0)
+        self.now_ns = 1_700_000_000_000_000_000
+        self.fed, self._waiting = Fed(TRUTH, 1), []
+        settings = SessionSettings(
+            'stage', 'full', (np.pi / 4, np.pi / 2), np.pi / 2, 1e-3, 2,
+            CaptureSettings(0.5, np.radians(0.2), 20.0, mode), folder / 'unit.yaml',
+            folder / 'journal', '', '')
+        self.controller = Controller(replace(settings, **changes), UNIT, resume, self, self)
+
+    def log(self, severity, text):
+        """Keep a line of the log."""
+        self.log_lines.append((severity, text))
+
+    def answer_captures(self, answer):
+        """Keep an answer to those who wait for a capture."""
+        self.answers.append(answer)
+
+    def announce(self, pose):
+        """Keep the announced pose."""
+        self.pose = pose
+
+    def withdraw_pose(self, reason):
+        """Forget the announced pose."""
+        self.pose = None
+        self.withdrawn.append(reason)
+
+    def show_fit(self, text):
+        """Check the line of the fit."""
+        assert text.startswith('fitting ')
+
+    def take(self, unit):
+        """Give the waiting samples."""
+        batch, self._waiting = self._waiting, []
+        if not batch:
+            return np.zeros(0, np.int64), np.zeros((0, len(unit.axes)))
+        return tuple(np.concatenate(part) for part in zip(*batch))
+
+    def heard(self):
+        """Begin to measure the silence."""
+        self.silence = ''
+
+    def silent(self):
+        """Give the stated silence."""
+        return self.silence
+
+    def clear(self):
+        """Forget the waiting samples."""
+        self._waiting.clear()
+
+    def keep_newest(self):
+        """Keep all waiting samples, as there are few."""
+
+    def say_info(self, **changes):
+        """State the sensor, as the driver does."""
+        info = {**sensor_info(UNIT), **changes}
+        self.controller.read_sensor_info(StreamInfo(info, 'sensor_info'))
+
+    def turn(self, seconds=0.05, encoder=True):
+        """Go on by a time; a commanded stage is at its pose at once."""
+        for _ in range(round(seconds / 0.05)):
+            if self.pose is not None and self.pose.command_rad is not None:
+                self.angles_rad = self.pose.command_rad
+            if encoder:
+                self.controller.read_stage(self.now_ns, *self.angles_rad)
+            alpha_rad, beta_rad = (np.full(10, angle) for angle in self.angles_rad)
+            stamps_ns = self.now_ns + np.arange(10) * 5_000_000
+            self._waiting.append((stamps_ns, self.fed(specific_force(alpha_rad, beta_rad,
+                                                                     9.80665))))
+            self.now_ns += 50_000_000
+            self.controller.poll()
+
+    def turn_until(self, condition, seconds=60.0):
+        """Go on until something has come."""
+        for _ in range(round(seconds / 0.05)):
+            if condition():
+                return
+            self.turn()
+        pytest.fail(f'{condition} has not come: {self.controller.status()}')
+
+    def lines(self, severity=None):
+        """Return the lines of the log, of one severity or all."""
+        return [text for kind, text in self.log_lines if severity in (None, kind)]
+
+
+@pytest.fixture
+def rig(tmp_path):
+    """Give a function that makes controllers on one journal; each one ends the one before."""
+    made = []
+
+    def make(*args, **changes):
+        if made:
+            made[-1].controller.close()
+        made.append(Rig(tmp_path, *args, **changes))
+        return made[-1]
+    yield make
+    made[-1].controller.close()
+
+
+def test_requests_without_a_calibration_are_refused(rig):
+    """Nothing runs: each request says so, and the state stays."""
+    controller = rig().controller
+    for request in (controller.capture, controller.redo, controller.skip, controller.finish,
+                    controller.abort):
+        assert request() == (False, 'no calibration is running')
+    assert controller.state is ControllerState.IDLE
+    status = controller.status()
+    assert (status.phase, status.text, status.late) == (Phase.IDLE, 'idle; call ~/start', False)
+
+
+def test_a_sweep_goes_from_the_wait_for_its_sensor_to_its_file(rig, tmp_path):
+    """Idle, waiting, running, idle: with the lines, the announcements and the values."""
+    bench = rig()
+    controller = bench.controller
+    assert controller.start() == (True, 'starts when sensor_info arrives')
+    assert controller.state is ControllerState.WAITING_FOR_SENSOR
+    assert controller.status().text == 'waiting for sensor_info'
+    bench.silence = 'nothing on imu/data_raw'
+    assert controller.status().text.endswith('; is the driver running?')
+    bench.turn()
+    assert controller.state is ControllerState.WAITING_FOR_SENSOR
+    bench.say_info()
+    bench.turn()
+    assert controller.state is ControllerState.RUNNING
+    assert bench.lines()[-1].startswith('calibrating C1: plan full: 22 poses')
+    assert controller.start() == (False, 'a calibration is running; finish or abort it first')
+    assert not controller.capture().success
+    bench.turn_until(lambda: controller.session.accepted_count == 2)
+    assert bench.pose.text == 'pose 3 of 22: alpha 90.0°, beta 90.0°'
+    assert bench.pose.values['check'] == 'false' and bench.answers[-1].success
+    report = controller.report()
+    assert report.serial == 'C1' and report.values['accepted'] == '2'
+    assert report.values['phase'] == controller.status().phase.value
+    assert 0 < report.values['tilt_error_deg'] < 90
+    bench.turn_until(lambda: controller.state is ControllerState.IDLE, 120)
+    assert controller.session is None and bench.pose is None
+    assert bench.withdrawn == [f'wrote {tmp_path / "unit.yaml"}']
+    assert controller.outcome and controller.report().values['verdict']
+    assert parameter_file.load(tmp_path / 'unit.yaml').serial == 'C1'
+
+
+def test_an_operator_at_a_screen_is_asked_and_others_go_on(rig, tmp_path):
+    """An interrupted calibration: a question with two answers, or none without a screen."""
+    bench = rig()
+    bench.say_info()
+    assert bench.controller.start().success
+    bench.turn_until(lambda: bench.controller.session.accepted_count == 3)
+    aborted = bench.controller.abort()
+    assert aborted == (True, f'aborted; its poses stay in {tmp_path / "journal"}')
+
+    asking = rig()
+    asking.say_info()
+    asking.controller.may_ask = True
+    answer = asking.controller.start()
+    assert not answer.success and 'holds 3 poses of an interrupted' in answer.message
+    assert asking.controller.state is ControllerState.ASKING
+    assert asking.controller.start() == answer
+    assert asking.controller.status() == (
+        type(asking.controller.status())(Phase.QUESTION, answer.message, True))
+    assert asking.controller.start(start_over=False).success
+    assert asking.controller.session.accepted_count == 3
+    assert 'resumed after 3 poses (the last one first' in asking.lines()[-1]
+    assert asking.controller.abort().success
+
+    continuing = rig()
+    continuing.say_info()
+    assert continuing.controller.start().success
+    assert continuing.controller.session.resumed == 3
+
+    anew = rig(resume=Resume.ANEW)
+    anew.say_info()
+    assert anew.controller.start().success
+    assert anew.controller.session.resumed == 0
+    kept, = tmp_path.glob('journal.2*')
+    assert len(sweep_journal.accepted_poses(sweep_journal.read(kept).entries)) == 3
+
+
+def test_a_fit_that_fails_at_the_end_waits_for_a_decision(rig, tmp_path, monkeypatch):
+    """All poses are taken: redo goes on, and a finish that succeeds ends the session."""
+    bench = rig(planes_rad=(np.pi / 2,), check_poses=0)
+    bench.say_info()
+    bench.controller.start()
+    session = bench.controller.session
+
+    def full_disk():
+        raise UserError('unit.yaml: the disk is full')
+    monkeypatch.setattr(session, 'finish', full_disk)
+    bench.turn_until(lambda: bench.controller.state is ControllerState.FIT_FAILED, 120)
+    status = bench.controller.status()
+    assert status.phase is Phase.REFUSED and status.late
+    assert status.text == 'cannot finish: unit.yaml: the disk is full; finish again, redo or abort'
+    bench.turn(0.5)
+    assert bench.lines(Severity.ERROR) == [status.text], 'tried once, and said once'
+    assert bench.controller.redo() == (True, 'pose 10 will be taken again')
+    assert bench.controller.state is ControllerState.RUNNING
+    bench.turn_until(lambda: bench.controller.state is ControllerState.FIT_FAILED)
+    monkeypatch.undo()
+    answer = bench.controller.finish()
+    assert answer == (True, f'wrote {tmp_path / "unit.yaml"}')
+    assert bench.controller.state is ControllerState.IDLE
+
+
+def test_a_capture_is_answered_when_its_pose_is_on_disk_or_refused(rig):
+    """An operator: the wrong angle, the right one, and a pose that is left out."""
+    bench = rig(StageMode.ENCODER)
+    bench.say_info()
+    bench.controller.start()
+    bench.turn(0.5)
+    assert bench.controller.status().phase is Phase.OPERATOR
+    answer = bench.controller.capture()
+    assert not answer.success and answer.message.startswith('alpha is 45.0° from the asked 45°')
+    assert bench.lines(Severity.WARNING)[-1] == answer.message
+    bench.angles_rad = (np.pi / 4, 0.0)
+    bench.turn(0.5)
+    assert bench.controller.capture() == (True, 'averaging')
+    bench.turn_until(lambda: bench.answers)
+    assert bench.answers == [(True, 'pose 1 is on disk')]
+    bench.controller.capture()
+    assert bench.controller.skip() == (True, 'pose 2 is left out')
+    assert bench.answers[-1] == (False, 'pose 2 is left out')
+    bench.useless = 'this stream is already compensated'
+    bench.turn()
+    assert bench.controller.capture() == (False, bench.useless)
+    assert bench.controller.status().text == bench.useless
+    bench.silence = 'nothing on imu/data_raw for 4 s'
+    assert bench.controller.status().phase is Phase.SILENT
+
+
+def test_another_sensor_ends_the_session_and_a_restarted_driver_checks_the_mounting(rig):
+    """By what the stream states about its sensor."""
+    bench = rig()
+    bench.say_info()
+    bench.controller.start()
+    bench.turn_until(lambda: bench.controller.session.accepted_count == 2)
+    bench.say_info()
+    assert bench.controller.session.guide.poses_to_verify == 2
+    assert bench.answers[-1] == (False, 'the driver began anew; capture again')
+    bench.turn_until(lambda: not bench.controller.session.guide.poses_to_verify)
+    assert 'the sensor is mounted as it was' in bench.lines()
+    bench.say_info(rate_hz='100.0')
+    assert bench.controller.state is ControllerState.IDLE
+    assert 'rate_hz was 200.0, is 100.0: changed during the calibration' in bench.lines()[-1]
+    bench.say_info(serial='C2')
+    assert bench.controller.unit is None and bench.lines(Severity.ERROR)[-1].startswith(
+        'sensor_info: is of the sensor C2')
+    bench.controller.start()
+    assert bench.controller.status().phase is Phase.REFUSED
+
+
+def test_readings_on_another_clock_count_from_their_arrival(rig):
+    """A temperature that is stamped years away is reported once."""
+    bench = rig()
+    bench.say_info()
+    bench.controller.start()
+    bench.turn()
+    for _ in range(3):
+        bench.controller.read_temperature(2_000_000_000_000_000_000, 23.0)
+    bench.controller.read_supply(0, 5.0)
+    assert len([line for line in bench.lines() if line.startswith('temperature is stamped')]) == 1
+    bench.turn_until(lambda: bench.controller.session.accepted_count == 1)
+    record = bench.controller.session.guide.accepted[0]
+    assert (record.temperature_c, record.supply_v) == (23.0, 5.0)
+
+
+def test_the_screen_shows_the_same_after_its_way_to_the_other_process(rig):
+    """Contents of a sweep, complete and equal at the other end."""
+    bench = rig()
+    bench.say_info()
+    bench.controller.shows_idle_stream = True
+    bench.turn(0.5)
+    newest = bench.controller.newest
+    idle = live_reading(newest, UNIT, newest.stillness())
+    assert [axis.axis for axis in idle.axes] == ['x', 'y'] and idle.rate_hz == 200.0
+    bench.controller.start()
+    bench.turn_until(lambda: bench.controller.session.accepted_count == 4)
+    display = SessionDisplay(bench.controller.session)
+    contents = ScreenContents('dwell', 'text', 'C1 (xy)', 'unit.yaml', (('q', 'quit'),),
+                              display.live(), display.progress(), display.estimate())
+    assert ScreenContents.from_bytes(contents.to_bytes()) == contents
+    assert (contents.progress.accepted, contents.progress.total) == (4, 22)
+    assert {row.group: row.accepted for row in contents.estimate.coverage} == {
+        '45°': 2, '90°': 2, 'beta forth': 1, 'beta back': 0, 'check poses': 0}
+    assert display.estimate() is contents.estimate, 'computed once for each pose'
+    assert 0 < contents.estimate.final_tilt_error_deg < contents.estimate.tilt_error_deg
