@@ -176,6 +176,7 @@ class Fitted:
 
 
 JournalEntry: TypeAlias = PoseRecord | PoseDropped | PoseSkipped | MountingUnchecked | Fitted
+"""What a line of a journal after its head may hold."""
 
 
 class JournalContents(NamedTuple):

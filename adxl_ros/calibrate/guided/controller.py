@@ -42,6 +42,7 @@ import numpy as np
 IDLE_TEXT = 'idle; call ~/start'
 """What a controller says that has not been started."""
 _NOT_RUNNING = 'no calibration is running'
+"""The answer to requests that need a session."""
 
 
 class ControllerState(Enum):

@@ -26,8 +26,11 @@ import numpy as np
 _SIDES = {1: 'faces up', 2: 'edges up', 3: 'corners up'}
 """Groups of orientations, by the number of axes that point up."""
 _CHECKS = 'check poses'
+"""Group of the check poses."""
 _FORTH = 'beta forth'
+"""Group of the poses that a rising beta reaches."""
 _BACK = 'beta back'
+"""Group of the poses that a falling beta reaches."""
 
 
 def by_plane(targets: Sequence[Target], accepted: Collection[int]) -> tuple[Coverage, ...]:

@@ -73,8 +73,8 @@ class HandGuide:
     """
     Collects the rests of a hand-held sensor, and asks for the next direction; a `Guide`.
 
-    The noise of the unit is learned from the quietest parts of the stream, so that what counts as
-    a rest can change while the stream runs. Rests are announced as they end. `poses_to_fit` finds
+    The noise of the unit is learned from the quietest parts of the stream. The rests can therefore
+    change while the stream runs. Rests are announced as they end. `poses_to_fit` finds
     the rests of the complete stream once more, as `fit` does with a recording.
 
     Parameters

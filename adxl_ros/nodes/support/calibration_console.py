@@ -47,10 +47,15 @@ class Action(Enum):
 
 _RUNNING = {'r': Action.REDO, 's': Action.SKIP, 'f': Action.FINISH, 'a': Action.ABORT,
             'q': Action.QUIT}
+"""Keys while a session runs."""
 _BY_HAND = {'c': Action.CAPTURE, **_RUNNING}
+"""Keys while a session runs whose poses an operator captures."""
 _IDLE = {'b': Action.BEGIN, 'q': Action.QUIT}
+"""Keys while nothing is to be done."""
 _WAITING = {'a': Action.ABORT, 'q': Action.QUIT}
+"""Keys while the sensor is unknown."""
 _ASKING = {'y': Action.GO_ON, 'n': Action.BEGIN_ANEW, 'a': Action.ABORT, 'q': Action.QUIT}
+"""Keys that answer the question what to do with an interrupted calibration."""
 
 
 class Console:

@@ -39,6 +39,7 @@ _KEPT_LINES = 1000
 _LONGEST_MESSAGE = 1 << 20
 """Largest message of contents, bytes; chosen: far above any contents."""
 _ESCAPES = re.compile(r'\x1b\[[0-9;]*m')
+"""Colours in a line of the log."""
 
 
 class Log:
