@@ -16,8 +16,8 @@
 The quick plan: the fewest poses that reach a stated tilt error.
 
 Poses are chosen by D-optimality for the axes of the unit and for its stage. They come from a grid
-of 15°, which can be set by hand on a scale. They are visited on a short way. The expected tilt error is that of
-this order, in which joints keep their error until they move.
+of 15°, which can be set by hand on a scale. They are visited on a short way. The expected tilt
+error is that of this order, in which joints keep their error until they move.
 """
 
 from __future__ import annotations

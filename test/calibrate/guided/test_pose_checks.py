@@ -156,13 +156,13 @@ def test_units_at_the_edge_of_the_datasheet_are_never_refused():
                                        for e, of in truth.values.items()})
         poses = swept(rng, truth, check_poses=0)
         order = rng.permutation(len(poses))[:12]
-        told = None
+        estimate = None
         for count in range(len(order)):
-            told = running_estimate.from_poses(
-                nominal('xyz'), poses.subset(order[:count]), 5.0, 4.2e-4, told)
+            estimate = running_estimate.from_poses(
+                nominal('xyz'), poses.subset(order[:count]), 5.0, 4.2e-4, estimate)
             i = order[count]
             there = Target(poses.alpha_rad[i], poses.beta_rad[i])
-            assert pose_checks.reading(told, there, poses.volts[i], np.radians(0.2)) == ''
+            assert pose_checks.reading(estimate, there, poses.volts[i], np.radians(0.2)) == ''
 
 
 def _edge(name, value):
@@ -321,34 +321,34 @@ def test_by_hand_directions_are_asked_for_in_words_until_all_are_covered():
     """A sensor turned as asked covers faces, edges and corners, and is well determined."""
     sensor = nominal('xyz')
     truth = drawn(np.random.default_rng(2), sensor, ('bias', 'scale_factor', 'misalignment'))
-    tumble = HandGuide(sensor, 3.0)
+    guide = HandGuide(sensor, 3.0)
     fed = Fed(truth, 4)
     now_ns, asked, errors = 10 ** 18, [], []
     for _ in range(16):
-        asked.append(tumble.destination())
-        up = _direction(tumble)
+        asked.append(guide.destination())
+        up = _direction(guide)
         for seconds, shake in ((0.5, 3.0), (2.5, 0.0), (1.6, 3.0)):
             time = np.arange(round(1000 * seconds)) / 1000
             volts = fed([9.80665 * u + shake * np.sin(40 * time) for u in up])
-            tumble.feed(now_ns + np.arange(len(volts)) * 1_000_000, volts)
+            guide.feed(now_ns + np.arange(len(volts)) * 1_000_000, volts)
             now_ns += len(volts) * 1_000_000
-        while (entry := tumble.accept()) is not None:
-            tumble.take(entry)
-        errors.append(tumble.tilt_error_rad())
-    assert len(tumble.accepted) == 16
+        while (entry := guide.accept()) is not None:
+            guide.take(entry)
+        errors.append(guide.tilt_error_rad())
+    assert len(guide.accepted) == 16
     assert asked[0].startswith('turn it so that +') and 'points up' in asked[0]
     edges = [words for words in asked if ' and ' in words.split(', and hold')[0]]
     assert edges and all(' point up equally' in words for words in edges)
     assert len(set(asked)) == 16, 'a direction was asked for twice'
     assert errors[-1] < errors[0] / 20
-    assert tumble.redo() == 'rest 16 is forgotten; hold the sensor in that direction again'
-    assert len(tumble.poses_to_fit()) == 15
-    assert 'is left out' in tumble.skip()
+    assert guide.redo() == 'rest 16 is forgotten; hold the sensor in that direction again'
+    assert len(guide.poses_to_fit()) == 15
+    assert 'is left out' in guide.skip()
 
 
-def _direction(tumble):
+def _direction(guide):
     from adxl_ros.calibrate.fits.orientations import UP as EACH
-    return EACH[tumble.next_up]
+    return EACH[guide.next_up]
 
 
 def test_a_dead_axis_is_told_at_the_first_pose_that_should_move_it():
@@ -362,16 +362,17 @@ def test_what_is_known_is_what_the_fits_find():
     """The intervals that are shown along the way hold the truth, and the tilt gets better."""
     truth = drawn(np.random.default_rng(11), nominal('xyz'))
     poses = swept(np.random.default_rng(12), truth, check_poses=0)
-    told = running_estimate.from_poses(nominal('xyz'), poses, 5.0,
-                                       truth.stage_resolution_rad / 12 ** 0.5)
-    for name, at, std in zip(told.names, running_estimate.get(told.unit, told.names), told.std):
+    stage_rad = truth.stage_resolution_rad / 12 ** 0.5
+    estimate = running_estimate.from_poses(nominal('xyz'), poses, 5.0, stage_rad)
+    values = running_estimate.get(estimate.unit, estimate.names)
+    for name, at, std in zip(estimate.names, values, estimate.std):
         if name.axis:
             wanted = truth.values.get(name.effect, {}).get(name.parameter, np.zeros(3))[
                 truth.axes.index(name.axis)]
             assert abs(at - wanted) < 5 * std + 1e-6, name
     few = running_estimate.from_poses(nominal('xyz'), poses.subset(np.arange(20)), 5.0, 4e-4)
-    assert told.tilt_error_rad() < 0.05 * few.tilt_error_rad()
-    assert np.degrees(told.tilt_error_rad()) < 0.02
+    assert estimate.tilt_error_rad() < 0.05 * few.tilt_error_rad()
+    assert np.degrees(estimate.tilt_error_rad()) < 0.02
 
 
 def test_the_tilt_to_expect_is_that_of_poses_not_seen():
@@ -382,16 +383,16 @@ def test_the_tilt_to_expect_is_that_of_poses_not_seen():
         truth = drawn(rng, nominal('xyz'))
         half = swept(rng, truth, np.radians([30, 60, 90, 120, 150]), 0).subset(
             np.arange(130) % 26 < 13)
-        told = running_estimate.from_poses(nominal('xyz'), half, 5.0,
-                                           truth.stage_resolution_rad / 12 ** 0.5)
-        promised.append(told.tilt_error_rad())
+        stage_rad = truth.stage_resolution_rad / 12 ** 0.5
+        estimate = running_estimate.from_poses(nominal('xyz'), half, 5.0, stage_rad)
+        promised.append(estimate.tilt_error_rad())
         alpha, beta = np.array([(t.alpha_rad, t.beta_rad) for t in spread(48)]).T
         volts = np.column_stack(
             signal_chain.static_response(truth)(specific_force(alpha, beta, 9.80665)))
-        std_v = np.tile(told.pose_std_v, (48, 1))
+        std_v = np.tile(estimate.pose_std_v, (48, 1))
         unseen = Poses(volts + std_v * rng.normal(size=volts.shape), std_v, alpha, beta,
                        np.zeros((48, 2)), np.zeros(48, bool))
-        off = cross_validation.pose_errors(told.sensor(), unseen)
+        off = cross_validation.pose_errors(estimate.sensor(), unseen)
         found.append(np.nanmean(np.concatenate([off.alpha_rad, off.beta_rad]) ** 2))
     assert np.sqrt(np.mean(found)) == pytest.approx(np.mean(promised), rel=0.4)
 

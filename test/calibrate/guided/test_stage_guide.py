@@ -148,26 +148,26 @@ def test_the_guided_order_saves_travel_and_comes_from_both_sides():
 
 
 def test_rests_by_hand_are_announced_as_they_end():
-    """A tumble counts its rests and names what moves between them."""
-    tumble, volts = _tumbled()
-    found = _rests(tumble, volts, 10 ** 18)
+    """A guide counts its rests and names what moves between them."""
+    guide, volts = _tumbled()
+    found = _rests(guide, volts, 10 ** 18)
     assert len(found) == 5
-    results = tumble.poses_to_fit()
+    results = guide.poses_to_fit()
     assert len(results) == 6
     assert all(2.0 < e.samples / 1000 < 3.1 for e in results)
-    assert '5 rests (5 more at least)' in tumble.status().text
+    assert '5 rests (5 more at least)' in guide.status().text
 
 
 def test_a_clock_that_goes_back_ends_no_tumble():
     """A driver started anew, or NTP's step: rests go on, and those before it stay in the fit."""
-    tumble, volts = _tumbled()
-    assert len(_rests(tumble, volts, 10 ** 18)) == 5
-    assert len(_rests(tumble, volts, 10 ** 15)) == 5
-    assert sorted(tumble.accepted) == list(range(10)) and len(tumble.poses_to_fit()) == 11
-    tumble.drop(tumble.accepted[0])
-    assert len(tumble.poses_to_fit()) == 10
-    tumble.retry()
-    assert len(_rests(tumble, volts, 10 ** 15 + 25 * 10 ** 9)) >= 5
+    guide, volts = _tumbled()
+    assert len(_rests(guide, volts, 10 ** 18)) == 5
+    assert len(_rests(guide, volts, 10 ** 15)) == 5
+    assert sorted(guide.accepted) == list(range(10)) and len(guide.poses_to_fit()) == 11
+    guide.drop(guide.accepted[0])
+    assert len(guide.poses_to_fit()) == 10
+    guide.retry()
+    assert len(_rests(guide, volts, 10 ** 15 + 25 * 10 ** 9)) >= 5
 
 
 def _tumbled():
@@ -179,12 +179,12 @@ def _tumbled():
     return HandGuide(sensor, 3.0), Fed(sensor, 2)(specific_force(alphas, 0 * alphas, 9.80665))
 
 
-def _rests(tumble, volts, begin_ns):
+def _rests(guide, volts, begin_ns):
     """Feed volts of 1 kHz; return the rests that were announced."""
     found = []
     for i in range(0, len(volts), 100):
-        tumble.feed(np.arange(i, i + 100) * 1_000_000 + begin_ns, volts[i:i + 100])
-        while (entry := tumble.accept()) is not None:
+        guide.feed(np.arange(i, i + 100) * 1_000_000 + begin_ns, volts[i:i + 100])
+        while (entry := guide.accept()) is not None:
             found.append(entry)
-            tumble.take(entry)
+            guide.take(entry)
     return found
