@@ -202,7 +202,7 @@ def test_specific_force_of_others_is_felt(run_tool, tmp_path):
     (('rich', '--effect', 'lever_am'), 'did you mean lever_arm?'),
     (('rich', '--effect', 'lever_arm:zm=1'), 'did you mean z_m?'),
     (('rich', '--effect', 'lever_arm:z_m=3'), '3 m is outside -2 to 2 m'),
-    (('rich', '--effect', 'lever_arm:z_m.x=1'), 'one figure without axes'),
+    (('rich', '--effect', 'lever_arm:z_m.x=1'), 'one number without axes'),
     (('rich', '--effect', 'temperature_bias:per_k=0.1mg/K'), 'is in g/K'),
     (('rich', '--effect', 'bias:offset_v=0.1', '--effect', 'bias:offset_v=0.2'), 'stated twice'),
     (('rich', '--rate', '0'), 'outside 0.01 to 100000 Hz'),
