@@ -30,7 +30,7 @@ import numpy as np
 _OUTLIER_STDS = 3.5
 """A reading so many standard deviations from its prediction is refused; chosen: one in 2000."""
 _MODEL_STD_G = 5e-3
-"""Errors of stage and model beyond the predicted ones, g; chosen: units of twice the datasheet."""
+"""Further errors of stage and model, g; chosen: units at twice the datasheet limits are taken."""
 _SAME_READING_G = 0.2
 """Readings within this count as equal when a kind of mistake is named, g; chosen."""
 _WIRING_POSES = 4

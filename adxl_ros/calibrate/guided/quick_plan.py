@@ -33,7 +33,7 @@ import numpy as np
 _SPARE_READINGS = 40
 """Readings beyond the coefficients, which show the stage's error and disturbed poses; chosen."""
 _MOST_POSES = 90
-"""Largest number of poses; chosen: above it the plan full takes hardly longer."""
+"""Largest number of poses; chosen: by hand a longer plan is no longer quick."""
 
 
 def quick(sensor: Sensor, dwell_s: float, tilt_error_rad: float, check_poses: int

@@ -39,7 +39,7 @@ import numpy as np
 _ROUNDS = 2
 """Linearised fits after each pose; chosen: the estimate changes little with each pose."""
 _EVALUATION_POSES = 48
-"""Poses over the sphere at which the tilt error is predicted; chosen: enough for 1 % of it."""
+"""Poses at which the tilt error is predicted; chosen: even over the sphere, and quick."""
 _VISIBLE_RAD = np.radians(1.0)
 """Poses that a perfect calibration shows worse than this have no part in the tilt error, rad."""
 _LEAST_STD_V = 1e-7
