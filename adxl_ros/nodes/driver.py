@@ -23,10 +23,11 @@ from typing import Any
 from adxl_ros.errors import UserError
 from adxl_ros.links.support import base
 from adxl_ros.nodes.support.diagnostics import DiagnosticsReporter, Level, Status
-from adxl_ros.nodes.support.driver_publishers import SampleOutput, Tally
 from adxl_ros.nodes.support.link_reader import LinkReader
 from adxl_ros.nodes.support.parameters import declare
 from adxl_ros.nodes.support.run_node import run
+from adxl_ros.nodes.support.sample_output import SampleOutput
+from adxl_ros.nodes.support.sample_tally import Tally
 from adxl_ros.nodes.support.sensor_parameters import declare_sensor, make_sensor
 from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn

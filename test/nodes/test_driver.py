@@ -20,7 +20,8 @@ import signal
 from adxl_ros.files.stream_info import sensor_info
 from adxl_ros.model import noise
 from adxl_ros.model.sensor import to_nominal_mps2, to_volts
-from adxl_ros.nodes.support.driver_publishers import imu_message, ImuWriter, References
+from adxl_ros.nodes.support.references import References
+from adxl_ros.nodes.support.sample_output import imu_message, ImuWriter
 from diagnostic_msgs.msg import DiagnosticStatus
 from graph import accel, Graph, stamp_ns
 import numpy as np

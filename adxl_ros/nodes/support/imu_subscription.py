@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The samples that the calibration node hears, as volts of its unit."""
+"""The samples of the calibration node, as volts of its unit."""
 
 from __future__ import annotations
 
@@ -26,19 +26,27 @@ from sensor_msgs.msg import Imu
 
 _TOPIC = 'imu/data_raw'
 _SILENT_S = 3.0
+"""Time without samples after which the stream is silent, s; chosen."""
 _QUEUE = 20000
+"""Samples that are kept: 20 s at 1 kHz, longer than a fit takes."""
 _COMPENSATED_RAD2 = 1e5
-"""Variance of a yaw that is not known: a mark of compensation's output."""
+"""Variance of yaw, rad², from which a stream with an orientation is compensation's output, which
+states 1e6; chosen: below that, above every real variance."""
 
 
 class Samples:
     """
-    Takes serialized messages as they come, and decodes them many at a time.
+    Takes serialized messages as they come, and decodes many at once.
+
+    Parameters
+    ----------
+    node
+        The node that subscribes.
 
     Attributes
     ----------
     useless
-        Why the newest samples are of no use, or ''.
+        Why the newest samples cannot be used, or ''.
 
     """
 
@@ -51,19 +59,19 @@ class Samples:
         create_subscription(node, Imu, _TOPIC, self._raw.append, _QUEUE, raw=True)
 
     def heard(self) -> None:
-        """Begin to wait anew."""
+        """Restart the time without samples."""
         self._heard_ns = self._steady.now().nanoseconds
 
     def clear(self) -> None:
-        """Forget what has come so far."""
+        """Forget all samples so far."""
         self._raw.clear()
 
     def keep_newest(self) -> None:
-        """Forget what is older than a queue's length."""
+        """Forget all samples but the newest, as many as the queue holds."""
         del self._raw[:-_QUEUE]
 
     def take(self, unit: Sensor) -> tuple[np.ndarray, np.ndarray]:
-        """Return what has come since: stamps, ns, (n,), and volts, (n, m), finite ones."""
+        """Return the samples since the last call: stamps, ns, (n,), and volts, (n, m), finite."""
         batch = self._raw[:]
         self._raw.clear()
         stamps, accel, yaw_rad2 = np.empty(len(batch), np.int64), np.empty((len(batch), 3)), 0.0
@@ -78,8 +86,8 @@ class Samples:
         finite = np.isfinite(accel)
         if batch:
             self.useless = self._compensated(yaw_rad2) or _no_number(finite, unit)
-        whole = finite.all(axis=1)
-        return stamps[whole], to_volts(accel[whole], unit)
+        complete = finite.all(axis=1)
+        return stamps[complete], to_volts(accel[complete], unit)
 
     def _compensated(self, yaw_rad2: float) -> str:
         return '' if yaw_rad2 < _COMPENSATED_RAD2 else (
@@ -88,13 +96,13 @@ class Samples:
             'driver')
 
     def silent(self) -> str:
-        """Say for how long nothing has come; '' while samples come."""
-        for_s = (self._steady.now().nanoseconds - self._heard_ns) * 1e-9
-        if for_s < _SILENT_S:
+        """Tell for how long no sample has come; '' while samples come."""
+        silent_s = (self._steady.now().nanoseconds - self._heard_ns) * 1e-9
+        if silent_s < _SILENT_S:
             return ''
         topic = self._node.resolve_topic_name(_TOPIC)
-        who = '' if self._node.count_publishers(topic) else ', and nobody publishes it'
-        return f'nothing on {topic} for {for_s:.0f} s{who}'
+        publishers = '' if self._node.count_publishers(topic) else ', and nobody publishes it'
+        return f'nothing on {topic} for {silent_s:.0f} s{publishers}'
 
 
 def _no_number(finite: np.ndarray, unit: Sensor) -> str:

@@ -22,9 +22,10 @@ import time
 
 from adxl_ros.errors import UserError
 from adxl_ros.links.support.base import Level, Link, LinkStatus, StageLink
-from adxl_ros.nodes.support.driver_publishers import References, SampleOutput
 from adxl_ros.nodes.support.rclpy_internals import NotForExecutors, take_messages
 from adxl_ros.nodes.support.receive_thread import PeriodicTurn, RepeatingThread
+from adxl_ros.nodes.support.references import References
+from adxl_ros.nodes.support.sample_output import SampleOutput
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.qos import QoSProfile

@@ -74,10 +74,10 @@ def take_messages(subscription: Subscription, kind: Any, raw: bool, limit: int) 
     """
     with subscription.handle:
         for _ in range(limit):
-            taken = subscription.handle.take_message(kind, raw)
-            if taken is None:
+            message_and_info = subscription.handle.take_message(kind, raw)
+            if message_and_info is None:
                 return
-            yield taken[0]
+            yield message_and_info[0]
 
 
 class MessageWait:
@@ -116,10 +116,10 @@ class MessageWait:
             self._wait_set.add_subscription(handle)
             self._wait_set.wait(_LONGEST_WAIT_NS)
             for _ in range(limit):
-                taken = handle.take_message(kind, True)
-                if taken is None:
+                message_and_info = handle.take_message(kind, True)
+                if message_and_info is None:
                     break
-                callback(taken[0])
+                callback(message_and_info[0])
 
 
 def given_parameters(node: Node) -> Iterable[tuple[str, Any]]:

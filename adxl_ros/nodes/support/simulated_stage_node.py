@@ -23,8 +23,7 @@ from adxl_ros.files.parameter_file import SENSOR_FIELDS
 from adxl_ros.links.support.simulated_stage import JOINTS, SimulatedStage
 from adxl_ros.nodes.support.diagnostics import DiagnosticsReporter, Level, Status
 from adxl_ros.nodes.support.parameters import declare
-from adxl_ros.nodes.support.topics import create_publisher, create_subscription
-from builtin_interfaces.msg import Time
+from adxl_ros.nodes.support.topics import create_publisher, create_subscription, stamp
 import numpy as np
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
@@ -108,8 +107,7 @@ class SimulatedStageNode:
     def _message(self, position: np.ndarray) -> JointState:
         """Make the message of joint positions, rad and m, (3,), at the simulated time."""
         message = JointState(name=JOINTS, position=position, velocity=self._stage.velocity)
-        sec, nanosec = divmod(self._simulated_ns, 10 ** 9)
-        message.header.stamp = Time(sec=sec, nanosec=nanosec)
+        message.header.stamp = stamp(self._simulated_ns)
         return message
 
     def _status(self) -> Status:

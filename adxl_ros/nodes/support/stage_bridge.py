@@ -208,10 +208,10 @@ class StageBridge:
         if not joints or any(joint.angle_rad is None for joint in self._joints.values()):
             return
         self._heard_ns = self._steady.now().nanoseconds
-        shown = JointState(name=list(self._joints),
+        stage = JointState(name=list(self._joints),
                            position=[joint.angle_rad for joint in self._joints.values()])
-        shown.header.stamp = message.header.stamp
-        self._positions.publish(shown)
+        stage.header.stamp = message.header.stamp
+        self._positions.publish(stage)
 
     def _refuse(self, reason: str) -> None:
         if reason != self._refusal:

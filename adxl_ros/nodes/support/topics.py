@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Publishers and subscriptions with the QoS of this package."""
+"""Publishers and subscriptions with the QoS of this package, and stamps."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from collections.abc import Callable
 from typing import Any
 
 from adxl_ros.nodes.support.rclpy_internals import take_messages
+from builtin_interfaces.msg import Time
 from rclpy.callback_groups import CallbackGroup
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -104,3 +105,9 @@ def create_subscription(node: Node, kind: Any, topic: str, callback: Callable[[A
         kind, topic, take_all, qos, raw=raw, callback_group=group,
         qos_overriding_options=QoSOverridingOptions.with_default_policies())
     return subscription
+
+
+def stamp(time_ns: int) -> Time:
+    """Make the stamp of a ROS time, ns."""
+    sec, nanosec = divmod(int(time_ns), 10 ** 9)
+    return Time(sec=sec, nanosec=nanosec)

@@ -1,0 +1,187 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Topics of the driver's samples: acceleration, the values that make it readable, the clock."""
+
+from __future__ import annotations
+
+from adxl_ros.files import cdr
+from adxl_ros.files.stream_info import sensor_info
+from adxl_ros.links.support.base import Samples
+from adxl_ros.model import noise
+from adxl_ros.model.constants import AXES, G0_MPS2
+from adxl_ros.model.covariance import UNMEASURED_VARIANCE
+from adxl_ros.model.sensor import Sensor, to_nominal_mps2
+from adxl_ros.nodes.support.diagnostics import Level, Status, status_message
+from adxl_ros.nodes.support.references import References
+from adxl_ros.nodes.support.sample_tally import Tally
+from adxl_ros.nodes.support.topics import create_publisher, stamp
+from diagnostic_msgs.msg import DiagnosticStatus
+import numpy as np
+from rclpy.node import Node
+from rclpy.serialization import serialize_message
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import Imu
+
+_QUEUE = 5000
+"""Samples that are kept for a slow subscriber: 5 s at 1 kHz."""
+
+
+class ImuWriter:
+    """
+    Makes serialized messages; forty at once take half the time of filling messages.
+
+    Parameters
+    ----------
+    sensor
+        The unit; its nominal values convert volts to acceleration.
+    frame_id
+        Frame of the messages.
+
+    """
+
+    def __init__(self, sensor: Sensor, frame_id: str) -> None:
+        self._sensor = sensor
+        self._axes = [AXES.index(axis) for axis in sensor.axes]
+        self._template = serialize_message(imu_message(sensor, frame_id))
+        self._layout = cdr.imu(self._template)
+
+    def messages(self, stamp_ns: np.ndarray, volts: np.ndarray) -> list[bytes]:
+        """
+        Serialize samples.
+
+        Parameters
+        ----------
+        stamp_ns
+            Stamps, ns, (n,).
+        volts
+            Output by axis, V, (n, m).
+
+        Returns
+        -------
+        list
+            One serialized sensor_msgs/Imu a sample.
+
+        """
+        accel = np.zeros((len(stamp_ns), 3))
+        accel[:, self._axes] = to_nominal_mps2(volts, self._sensor)
+        data = cdr.fill(self._template, self._layout, stamp_ns, {'linear_acceleration': accel})
+        size = len(self._template)
+        return [data[i:i + size] for i in range(0, len(data), size)]
+
+    def saturated(self, volts: np.ndarray) -> np.ndarray:
+        """Tell which samples, (n, m), are at a rail of the ADC or beyond the range, (n,)."""
+        return np.asarray(self._sensor.saturated(volts).any(axis=1))
+
+
+def imu_message(sensor: Sensor, frame_id: str) -> Imu:
+    """
+    Make the message that all samples have in common.
+
+    Parameters
+    ----------
+    sensor
+        The unit; its noise gives the covariance.
+    frame_id
+        Frame of the message.
+
+    Returns
+    -------
+    Imu
+        The message, without stamp and acceleration.
+
+    """
+    message = Imu()
+    message.header.frame_id = frame_id
+    message.orientation_covariance[0] = message.angular_velocity_covariance[0] = -1.0
+    variance = np.full(3, UNMEASURED_VARIANCE)
+    noise_std_g = noise.sample_std_v(sensor) / sensor.nominal_scale_v_per_g
+    variance[:len(sensor.axes)] = (noise_std_g * G0_MPS2) ** 2
+    message.linear_acceleration_covariance = np.diag(variance).ravel()
+    return message
+
+
+class SampleOutput:
+    """
+    Publishes samples, the figures that make them readable, and sensor time.
+
+    Parameters
+    ----------
+    node
+        The node that publishes.
+    sensor
+        Its nominal values convert the samples, until a link states others.
+    frame_id
+        Frame of the samples.
+    delay_ns
+        Delay of the sensor, which is taken out of the stamps, ns.
+    is_clock
+        Whether sensor time is the clock of the graph.
+    tally
+        Counts the samples.
+
+    Attributes
+    ----------
+    sensor, frame_id, is_clock, tally
+        As given; `sensor` may be replaced.
+
+    """
+
+    def __init__(self, node: Node, sensor: Sensor, frame_id: str, delay_ns: int, is_clock: bool,
+                 tally: Tally) -> None:
+        self._node, self._delay_ns = node, delay_ns
+        self.sensor, self.frame_id, self.is_clock, self.tally = sensor, frame_id, is_clock, tally
+        self._writer = ImuWriter(sensor, frame_id)
+        self._data = create_publisher(node, Imu, 'imu/data_raw', _QUEUE)
+        self._info = create_publisher(node, DiagnosticStatus, 'sensor_info', 1, latched=True)
+        self._clock = create_publisher(node, Clock, '/clock', 1) if is_clock else None
+
+    def destroy(self) -> None:
+        """Remove the topics."""
+        for publisher in filter(None, (self._data, self._info, self._clock)):
+            self._node.destroy_publisher(publisher)
+
+    def use(self, sensor: Sensor) -> None:
+        """Convert samples by the nominal values of a sensor, and publish these."""
+        self.sensor = sensor
+        self._writer = ImuWriter(sensor, self.frame_id)
+        self._info.publish(status_message('sensor_info', Status(
+            Level.OK, '', sensor.serial, sensor_info(sensor))))
+
+    def subscribed(self) -> bool:
+        """Tell whether somebody listens to the samples."""
+        return self._data.get_subscription_count() > 0
+
+    def publish(self, samples: Samples, references: References) -> None:
+        """
+        Publish samples and what was recorded beside them.
+
+        Parameters
+        ----------
+        samples
+            What a link has given; samples that are not finite count as missing.
+        references
+            Publishes what was recorded beside the sensor.
+
+        """
+        finite = np.isfinite(samples.volts).all(axis=1)
+        stamps_ns, volts = samples.stamp_ns[finite], samples.volts[finite]
+        references.publish(samples.stamp_ns, samples.references)
+        for message in self._writer.messages(stamps_ns - self._delay_ns, volts):
+            self._data.publish(message)
+        self.tally.count(stamps_ns, int(self._writer.saturated(volts).sum()),
+                         samples.missing + int((~finite).sum()), samples.estimated)
+        self.tally.now_ns = samples.until_ns
+        if self._clock is not None:
+            self._clock.publish(Clock(clock=stamp(samples.until_ns)))

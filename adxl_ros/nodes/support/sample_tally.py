@@ -1,0 +1,123 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Counts of the driver's samples, and of what went wrong with them."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+
+class _Totals(NamedTuple):
+    """Times and counts at one report; the next report is about the differences."""
+
+    steady_ns: int
+    sensor_ns: int
+    samples: int
+    missing: int
+    estimated: int
+    saturated: int
+
+
+class Tally:
+    """
+    Counts samples, and what went wrong with them, between two reports.
+
+    Parameters
+    ----------
+    steady_ns
+        Steady time, ns.
+
+    Attributes
+    ----------
+    now_ns
+        Sensor time up to which samples have been read, ns; None before the first one.
+    samples
+        Published samples.
+    missing
+        Samples that are lost.
+    estimated
+        Those of the missing ones whose number is estimated by time, not counted.
+    saturated
+        Samples at a rail of the ADC or beyond the sensor's range.
+
+    """
+
+    def __init__(self, steady_ns: int) -> None:
+        self.now_ns: int | None = None
+        self.samples = self.missing = self.estimated = self.saturated = 0
+        self._newest_ns: int | None = None
+        self._reported = _Totals(steady_ns, 0, 0, 0, 0, 0)
+
+    def begin(self, now_ns: int) -> None:
+        """Count sensor time from now on, ns."""
+        self._reported = self._reported._replace(sensor_ns=now_ns)
+
+    def count(self, stamps_ns: np.ndarray, saturated: int, missing: int, estimated: int) -> None:
+        """
+        Add samples.
+
+        Parameters
+        ----------
+        stamps_ns
+            Stamps of the published ones, ns, (n,).
+        saturated
+            Number of saturated ones among them.
+        missing
+            Number of lost samples.
+        estimated
+            Number of lost samples that is estimated by time, not counted.
+
+        """
+        self.samples += len(stamps_ns)
+        self.saturated += saturated
+        self.missing += missing
+        self.estimated += estimated
+        if len(stamps_ns):
+            self._newest_ns = int(stamps_ns[-1])
+
+    def report(self, steady_ns: int, sensor_ns: int) -> tuple[dict[str, Any], str]:
+        """
+        Report what has been counted since the last report.
+
+        Parameters
+        ----------
+        steady_ns
+            Steady time, ns.
+        sensor_ns
+            Sensor time, ns; 0 before the first sample.
+
+        Returns
+        -------
+        tuple
+            Values for diagnostics by key, and a warning or ''.
+
+        """
+        totals = _Totals(steady_ns, sensor_ns, self.samples, self.missing, self.estimated,
+                         self.saturated)
+        new = _Totals(*(now - before for now, before in zip(totals, self._reported)))
+        self._reported = totals
+        values = {'rate_hz': round(new.samples / new.sensor_ns * 1e9, 3)
+                  if new.sensor_ns > 0 else 0.0,
+                  'missing': self.missing, 'missing_estimated': self.estimated,
+                  'saturated': self.saturated, 'samples': self.samples,
+                  'speed': round(new.sensor_ns / new.steady_ns, 3) if new.steady_ns > 0 else 0.0}
+        if self._newest_ns is not None:
+            values['age_s'] = round((sensor_ns - self._newest_ns) * 1e-9, 6)
+        estimated = f', {new.estimated} of them estimated' if new.estimated else ''
+        warnings = [f'{new.missing} samples missing{estimated}'] if new.missing else []
+        warnings += [f'{new.saturated} samples saturated'] if new.saturated else []
+        return values, ', '.join(warnings)

@@ -1,0 +1,72 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The reporter of diagnostics: once a second, and at once when a level changes."""
+
+from collections.abc import Iterator
+import threading
+import time
+
+from adxl_ros.nodes.support.diagnostics import DiagnosticsReporter, Level, Status
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from graph import Graph
+import pytest
+
+
+class Reported:
+    """A reporter on the node of a graph, the status of its task, and what it has published."""
+
+    def __init__(self, graph: Graph) -> None:
+        self.graph = graph
+        self.status = Status(Level.OK, 'fine', '17', {'rate_hz': 0.1, 'text': 'a'})
+        self.arrays: list[DiagnosticArray] = graph.listen(DiagnosticArray, '/diagnostics')
+        self.reporter = DiagnosticsReporter(graph.node, {'task': lambda: self.status})
+
+    def wait(self, count: int, timeout_s: float = 5.0) -> DiagnosticStatus:
+        """Wait until so many reports have come; return the newest status."""
+        self.graph.spin_until(lambda: len(self.arrays) >= count, timeout_s, f'{count} reports')
+        return self.arrays[-1].status[0]
+
+
+@pytest.fixture
+def reported(ros_env: dict[str, str]) -> Iterator[Reported]:
+    with Graph() as graph:
+        yield Reported(graph)
+
+
+def test_a_task_is_reported_once_a_second(reported: Reported) -> None:
+    status = reported.wait(3)
+    assert (status.name, status.level) == ('tester: task', DiagnosticStatus.OK)
+    assert (status.message, status.hardware_id) == ('fine', '17')
+    assert {pair.key: pair.value for pair in status.values} == {'rate_hz': '0.1', 'text': 'a'}
+    stamps_s = [array.header.stamp.sec + 1e-9 * array.header.stamp.nanosec
+                for array in reported.arrays]
+    assert stamps_s[2] - stamps_s[0] == pytest.approx(2.0, abs=0.5)
+
+
+def test_a_change_of_level_is_reported_at_once_from_any_thread(reported: Reported) -> None:
+    reported.wait(1)
+    reported.reporter.notice('task', Level.OK)
+    reported.graph.spin(0.3)
+    assert len(reported.arrays) == 1, 'the level is as before'
+    reported.status = Status(Level.ERROR, 'broken', '17', {})
+    began_s = time.monotonic()
+    thread = threading.Thread(target=reported.reporter.notice, args=('task', Level.ERROR))
+    thread.start()
+    assert reported.wait(2).level == DiagnosticStatus.ERROR
+    assert time.monotonic() - began_s < 0.6
+    thread.join()
+    # The next report comes one second after it.
+    assert reported.wait(3).message == 'broken'
+    assert time.monotonic() - began_s > 0.8
