@@ -13,13 +13,13 @@
 # limitations under the License.
 
 """
-Guide a sweep: the driver, the stage and the calibration.
+Start a guided calibration: the driver, the stage and the calibration.
 
     ros2 launch adxl_ros calibrate.launch.py output:=unit_17.yaml
     ros2 launch adxl_ros calibrate.launch.py mode:=gravity output:=unit_17.yaml
 
-The calibration starts by itself and stays up to show its verdict; in mode `gravity` there is no
-stage, and `ros2 service call /calibration/finish std_srvs/srv/Trigger` fits what is there.
+The calibration starts by itself and stays up to show its result. In mode `gravity` there is no
+stage, and `ros2 service call /calibration/finish std_srvs/srv/Trigger` fits the rests so far.
 """
 
 from adxl_ros.files import parameter_file
@@ -43,17 +43,17 @@ def generate_launch_description() -> LaunchDescription:
     params_file = LaunchConfiguration('params_file')
     return LaunchDescription([
         DeclareLaunchArgument('params_file', default_value=params,
-                              description='the sensor and its link, the stage, the sweep'),
+                              description='parameter file of sensor, link, stage and sweep'),
         DeclareLaunchArgument('output', default_value='calibrated.yaml',
-                              description='the parameter file that the calibration writes'),
+                              description='parameter file that the calibration writes'),
         DeclareLaunchArgument('mode', default_value='stage', choices=['stage', 'gravity'],
-                              description='poses of a stage, or rests of a sensor in the hand'),
+                              description='poses of a stage, or rests of a hand-held sensor'),
         DeclareLaunchArgument('namespace', default_value='',
-                              description='of the nodes and their topics'),
+                              description='namespace of the nodes and their topics'),
         DeclareLaunchArgument('frame_id', default_value='imu_link',
-                              description='the frame of the case'),
+                              description='frame of the case'),
         DeclareLaunchArgument('log_level', default_value='info',
-                              description='debug, info, warn, error or fatal'),
+                              description='log level: debug, info, warn, error or fatal'),
         Node(executable='driver',
              parameters=[params_file, {'frame_id': text(LaunchConfiguration('frame_id'))}],
              **common),
@@ -69,5 +69,5 @@ def generate_launch_description() -> LaunchDescription:
 
 
 def text(value: LaunchConfiguration) -> ParameterValue:
-    """Keep an argument that looks like a number a string."""
+    """Return an argument as a string, also where it looks like a number."""
     return ParameterValue(value, value_type=str)

@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-Run a calibrated sensor on a robot: the driver and the compensation.
+Start a calibrated sensor on a robot: the driver and the compensation.
 
     ros2 launch adxl_ros robot.launch.py params_file:=unit_17.yaml namespace:=arm frame_id:=arm_imu
 """
@@ -38,12 +38,12 @@ def generate_launch_description() -> LaunchDescription:
     ]
     return LaunchDescription([
         DeclareLaunchArgument('params_file', default_value=params,
-                              description='the calibrated sensor, and its link'),
+                              description='parameter file of the calibrated sensor and its link'),
         DeclareLaunchArgument('namespace', default_value='',
-                              description='of the nodes and their topics'),
+                              description='namespace of the nodes and their topics'),
         DeclareLaunchArgument('frame_id', default_value='imu_link',
-                              description='the frame of the case'),
+                              description='frame of the case'),
         DeclareLaunchArgument('log_level', default_value='info',
-                              description='debug, info, warn, error or fatal'),
+                              description='log level: debug, info, warn, error or fatal'),
         *nodes,
     ])
