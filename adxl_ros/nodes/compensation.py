@@ -51,7 +51,7 @@ class Compensation(Node):
     def __init__(self) -> None:
         super().__init__('compensation')
         paper = declare(
-            self, 'inverse', 'exact', "of the model: exact, or the paper's approximation",
+            self, 'inverse', 'exact', "inverse of the model: exact, or the paper's approximation",
             choices=('exact', 'paper')) == 'paper'
         self._undo_filter = declare(
             self, 'undo_filter', False, 'take the RC filter out, amplitude and phase; a sample '

@@ -93,7 +93,7 @@ def _keys() -> Iterator[_Key]:
                        Kind.DOUBLE_ARRAY if p.axes else Kind.DOUBLE,
                        f'{p.doc}, by axis' if p.axes else p.doc, p.unit, p.lower, p.upper)
     yield _Key('covariance_names', Kind.STRING_ARRAY, 'coefficients in the covariance')
-    yield _Key('covariance', Kind.DOUBLE_ARRAY, 'of the coefficients, rows flattened')
+    yield _Key('covariance', Kind.DOUBLE_ARRAY, 'covariance of the coefficients, rows flattened')
     for name, description in parameter_file.ENVELOPE.items():
         kind = Kind.DOUBLE_ARRAY if name in parameter_file.ENVELOPE_LISTS else Kind.DOUBLE
         yield _Key(f'envelope.{name}', kind, description)

@@ -62,8 +62,8 @@ class SimulatedStageNode:
     def __init__(self, node: Node) -> None:
         self._node = node
         self._stage = _declare_stage(node)
-        self._delay_ns = round(1e9 * declare(node, 'delay_s', 0.1, 'from a command to its effect',
-                                             's', 0.02, 1.0))
+        self._delay_ns = round(1e9 * declare(node, 'delay_s', 0.1, 'time from a command to its '
+                                             'effect', 's', 0.02, 1.0))
         self._unshown: deque[tuple[int, JointState]] = deque()
         self._simulated_ns = 0
         self._refusal_count = 0
@@ -124,12 +124,14 @@ def _declare_stage(node: Node) -> SimulatedStage:
     about = SENSOR_FIELDS['stage.resolution_rad'].metadata
     resolution_rad = declare(node, 'stage.resolution_rad', _RESOLUTION_RAD, about['doc'],
                              about['unit'], about['lower'], about['upper'])
-    turn_rad_s = declare(node, 'slew_rate_rad_s', 0.5, 'fastest turn', 'rad/s', 1e-6, 100.0)
-    shift_m_s = declare(node, 'slew_rate_m_s', 0.01, 'fastest shift', 'm/s', 1e-9, 10.0)
-    settling_s = declare(node, 'settling_time_s', 0.3, 'of a step, to 1 %', 's', 0.01, 60.0)
+    turn_rad_s = declare(node, 'slew_rate_rad_s', 0.5, 'largest speed of a turn', 'rad/s', 1e-6,
+                         100.0)
+    shift_m_s = declare(node, 'slew_rate_m_s', 0.01, 'largest speed of a shift', 'm/s', 1e-9, 10.0)
+    settling_s = declare(node, 'settling_time_s', 0.3, 'settling time of a step, to 1 %', 's',
+                         0.01, 60.0)
     start = [declare(node, name, 0.0, 'position at the start', unit, -reach, reach)
              for name, unit, reach in _START]
-    seed = declare(node, 'seed', 0, "of where in the encoder's step it comes to rest", '', 0,
+    seed = declare(node, 'seed', 0, "seed of the positions within the encoder's step", '', 0,
                    2 ** 31 - 1)
     return SimulatedStage(np.array(start), np.array([turn_rad_s, turn_rad_s, shift_m_s]),
                           settling_s, np.array([resolution_rad, resolution_rad, 0.0]), seed)

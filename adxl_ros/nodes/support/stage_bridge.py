@@ -125,8 +125,8 @@ class StageBridge:
                                      "topic of the controller's joint states")
         command_topic = declare(node, 'bridge.command', _DEFAULT_COMMANDS[kind],
                                 'topic on which the controller listens')
-        self._speed_rad_s = declare(node, 'bridge.speed_rad_s', 0.3, 'of a trajectory', 'rad/s',
-                                    1e-4, 10.0)
+        self._speed_rad_s = declare(node, 'bridge.speed_rad_s', 0.3, 'speed of a trajectory',
+                                    'rad/s', 1e-4, 10.0)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._goal: dict[str, float] = {}
         self._heard_ns = 0
@@ -263,5 +263,5 @@ def _declare_joint(node: Node, name: str) -> _Joint:
     if sign == 0:
         raise parameter_error(f'bridge.{name}.sign', '0 is not 1 or -1')
     return _Joint(joint, float(sign), declare(
-        node, f'bridge.{name}.offset_rad', 0.0, f"{name} where the controller's joint is at 0",
-        'rad', -100.0, 100.0))
+        node, f'bridge.{name}.offset_rad', 0.0,
+        f"angle {name} where the controller's joint is at 0", 'rad', -100.0, 100.0))
