@@ -17,10 +17,10 @@
 
 class UserError(Exception):
     """
-    Something the user can put right, said in one line.
+    An error that the user can correct, with a message of one line.
 
-    The line names the file, line and column or the topic, the figure that is wrong, and what to
-    do. Tools print it and exit with status 1; nodes log it and show it in diagnostics.
+    The message names the file, line and column, or the topic, the wrong value, and what to do.
+    Tools print it and exit with status 1. Nodes log it and show it in diagnostics.
     """
 
 

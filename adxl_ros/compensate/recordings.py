@@ -138,7 +138,7 @@ class RecordingEstimator:
 
     def _estimate(self, volts: np.ndarray, at_rail: np.ndarray, environment: Environment
                   ) -> Estimates:
-        """Estimate from volts, V, (n, m); nothing is known of samples at a rail, (n,)."""
+        """Estimate from volts, V, (n, m); samples at a rail, (n,), determine no quantity."""
         sensor = self._sensor
         with np.errstate(all='ignore'):  # no force explains some volts
             force = self._inverse(list(volts.T), environment)

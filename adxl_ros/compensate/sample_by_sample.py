@@ -35,8 +35,8 @@ from adxl_ros.model.tilt import angles, roll_pitch_covariance
 import numpy as np
 
 _CELL_MPS2 = 0.5
-"""Width of a cell of the grid of forces, m/s²; chosen: within it the tangent and the covariance by
-the coefficients hardly vary, so that its samples share them."""
+"""Width of a cell of the grid of forces, m/s²; chosen: tangent and covariance hardly vary within
+it, so that its samples share them."""
 
 _MAX_CELLS = 4096
 """Largest number of cells in memory; chosen: the forces of all poses fill about as many."""
@@ -123,8 +123,8 @@ class LiveEstimator:
     Estimates specific force, its covariance and tilt of a live stream, sample by sample.
 
     All calculations are in floats, which are ten times faster than arrays of one sample. The
-    force is that of `signal_chain.inverse`: to 1e-8 m/s² where |f| = g has a solution, and to a
-    few hundredths of its standard deviation at alpha = ±90°, where it may have none.
+    force is that of `signal_chain.inverse` to 1e-8 m/s². Near alpha = ±90°, where |f| = g may
+    have no solution, it differs by a few hundredths of its standard deviation.
 
     Angles, and the z of equation 5, hold at rest only. Motion adds to their variances: the
     variance of the in-plane force over half a second, as far as it exceeds twice that of the

@@ -43,8 +43,8 @@ _RELATIVE_STEP = 1e-3
 and nearly linear in them."""
 
 _ROOT_MEAN = 1.25
-"""Blunts the divisor of derived z where the in-plane force is g: there z² = 2·σ·g·n for normal
-noise n > 0, so that the variance of z is 0.8·σ·g = σ·g/1.25."""
+"""Blunts the divisor of derived z where the in-plane force is g. Derived: there z² = 2·σ·g·n for
+normal noise n > 0, and the variance of z is 0.8·σ·g = σ·g/1.25."""
 
 
 def force_covariance(sensor: Sensor, force: Components,
@@ -168,7 +168,7 @@ def derived_z_covariance(force: Components, measured: tuple[Value, Value, Value]
     Propagate the in-plane covariance to z = √(g² − x² − y²), equation 5.
 
     With x = x₀ + s·z, dz = −(x·dx₀ + y·dy₀)/(z + x·s). Where the divisor vanishes, at alpha =
-    ±90°, the error of z is the root of the noise and not its multiple: its variance is 0.8·σ·g,
+    ±90°, the error of z is the root of the noise and not its multiple. Its variance is 0.8·σ·g,
     and it hardly correlates with dx₀ and dy₀. Near alpha = ±90°, |f|² = g² has a second solution,
     z − 2·divisor/(1 + s²). Where that is upright, too, either may be true, so that half the
     square of their distance is added.

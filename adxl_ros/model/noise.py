@@ -104,8 +104,8 @@ def effective_samples(count: int | np.ndarray, dt_s: float, rc_s: float) -> np.n
     """
     Count the independent samples that make a mean as good as `count` filtered ones.
 
-    Noise behind a first-order filter is an AR(1) sequence, a = exp(−dt/RC), and the variance of
-    the mean of N samples is σ²/N·[1 + 2·Σ (1 − k/N)·aᵏ], exactly. 5000 samples at 1 kHz behind
+    Noise behind a first-order filter is an AR(1) sequence with a = exp(−dt/RC). The variance of
+    the mean of N samples is exactly σ²/N·[1 + 2·Σ (1 − k/N)·aᵏ]. 5000 samples at 1 kHz behind
     32 kΩ and 0.33 µF are 237.
 
     Parameters

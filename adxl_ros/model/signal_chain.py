@@ -40,8 +40,8 @@ _TOLERANCE_MPS2 = 1e-10
 """Newton step below which the inverse has converged, m/s²; chosen: near rounding."""
 
 _UNSOLVED_MPS2 = 1e-6
-"""Last Newton step from which a sample has no solution, m/s²; chosen: near alpha = ±90°, where
-the z of equation 5 is a root of 0, rounding alone moves it by up to this."""
+"""Last Newton step from which a sample has no solution, m/s²; chosen: near alpha = ±90°, the z of
+equation 5 is a root of 0, and rounding moves it by up to this."""
 
 _MAX_ITERATIONS = 60
 """Largest number of iterations of either inverse; chosen: samples with a

@@ -51,15 +51,15 @@ from typing import Any
 import numpy as np
 
 MARGIN_K = 2.0
-"""Distance from the temperatures of the poses that still counts as inside, K; chosen: it is
-0.2 mg by the datasheet, below the noise of a sample, and no thermometer is at the element."""
+"""Distance from the temperatures of the poses that counts as inside, K; chosen: by the datasheet
+it is 0.2 mg, below the noise of a sample. No thermometer is at the element."""
 
 STRETCH = 1.1
 """Factor of the poses' forces at which h_max is taken, too; chosen: see the text above."""
 
 MARGIN_MPS2 = 2.0
-"""Distance from the forces of the poses that still counts as inside, m/s²; chosen: planes from
-30° on leave 1.3 m/s² to level, and nearby forces share one result."""
+"""Distance from the forces of the poses that counts as inside, m/s²; chosen: planes from 30° on
+leave 1.3 m/s² to level, and nearby forces share one result."""
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ Columns = dict[str, np.ndarray]
 """Columns of a recording by canonical name, (n,) each."""
 
 _BLOCK_ROWS = 32768
-"""Samples of a block; chosen: its arrays stay small beside those of the internal grid."""
+"""Samples of a block; chosen: its arrays stay smaller than the internal grid."""
 
 
 def simulate(sensor: Sensor, motion: Motion, seed: int) -> Columns:
@@ -88,7 +88,7 @@ def simulate_blocks(sensor: Sensor, motion: Motion, seed: int, begin_s: float = 
 
 def reference_columns(sensor: Sensor, motion: Motion, time_s: np.ndarray) -> Columns:
     """
-    Return the columns that a recording has beside those of the sensor.
+    Return the columns of a recording that are not those of the sensor.
 
     Parameters
     ----------

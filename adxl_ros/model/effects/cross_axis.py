@@ -12,7 +12,11 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Bias from the other in-plane axis: g(V_c) of (10) and (11), centred and in g; z: from x."""
+"""
+Bias from the other in-plane axis: g(V_c) of equations 10 and 11, centred and in g.
+
+The z axis gets it from x.
+"""
 
 from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre
 from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals

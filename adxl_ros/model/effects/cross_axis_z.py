@@ -12,7 +12,11 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Bias from the out-of-plane axis: h(V_z) of equations 12 and 13, centred, in g; z: from y."""
+"""
+Bias from the out-of-plane axis: h(V_z) of equations 12 and 13, centred and in g.
+
+The z axis gets it from y.
+"""
 
 from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre
 from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals

@@ -77,7 +77,7 @@ EFFECT = Effect(
     place=Place.ADC,
     parameters=(
         Parameter('density_g_per_rthz', 'g/sqrt(Hz)', 0.0, 0.1, 1e-4,
-                  'physics: corner near 1 Hz beside 110 ug/sqrt(Hz)',
+                  'physics: corner near 1 Hz at 110 ug/sqrt(Hz)',
                   'density at 1 Hz; it falls with the root of the frequency'),
     ),
     apply=apply,

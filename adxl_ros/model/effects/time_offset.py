@@ -19,7 +19,7 @@ from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Si
 
 
 def apply(signals: Signals, p: Parameters) -> None:
-    """Take each sample earlier than its stamp says."""
+    """Take each sample earlier than its stamp."""
     signals.time_s = signals.time_s - p['offset_s']
 
 
