@@ -25,10 +25,10 @@ from adxl_ros.calibrate.poses import Poses
 from adxl_ros.calibrate.stage_error import StageError
 from adxl_ros.compensate import filter_inversion
 from adxl_ros.model import noise, signal_chain
-from adxl_ros.model.coefficients import put, with_neutral
+from adxl_ros.model.coefficients import with_neutral
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.covariance import force_covariance
-from adxl_ros.model.effects.base import Coefficient, Components
+from adxl_ros.model.effects.base import Components
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.model.tilt import tilt
 import numpy as np
@@ -200,11 +200,3 @@ def motion_bound_mmps2(nominal: Sensor) -> float:
     impulse = lfilter(b, a, np.eye(1, round(nominal.rate_hz))[0])
     density = nominal.noise_density_g_per_rthz[0] * G0_MPS2
     return float(1e3 * density * np.sqrt(nominal.rate_hz / 2 * np.sum(impulse ** 2)))
-
-
-def with_stated_filter(fitted: Sensor) -> Sensor:
-    """Return the unit with the stated filter resistor: what the paper corrected by."""
-    if 'bandwidth' not in fitted.effects:
-        return fitted
-    names = [Coefficient('bandwidth', 'resistance_ratio', axis) for axis in fitted.axes]
-    return put(fitted, names, np.zeros(len(names)))
