@@ -20,9 +20,9 @@ import pytest
 
 @pytest.mark.kills
 def test_no_kill_loses_a_pose_or_breaks_a_file(ros_env, tmp_path):
-    """Ten kills, each at another moment of a sweep that goes on where it was, to its end."""
-    told = kill(tmp_path, ros_env, 10, 1)
-    assert told.lost == [] and told.broken == []
-    assert told.poses >= 20 and told.sweeps >= 2, 'the kills tell nothing of poses, or of the end'
-    assert told.moments.keys() - {'poses', 'the mounting is checked', 'the end'}, \
+    """Ten kills at different moments of a sweep, which resumes each time until its end."""
+    sweeps = kill(tmp_path, ros_env, 10, 1)
+    assert sweeps.lost == [] and sweeps.broken == []
+    assert sweeps.poses >= 20 and sweeps.sweeps >= 2, 'the kills test neither poses nor the end'
+    assert sweeps.moments.keys() - {'poses', 'the mounting is checked', 'the end'}, \
         'no kill while it was fitted or written'

@@ -22,18 +22,18 @@ from pathlib import Path
 import socket
 import tempfile
 
-DOMAINS = range(1, 102)  # 0 is everybody's; above 101 lie ports that the system hands out
+DOMAINS = range(1, 102)
+"""Domains of tests: 0 is the default, and above 101 lie the ephemeral ports of the system."""
 BY_UDP = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SUBNET', 'FASTRTPS_DEFAULT_PROFILES_FILE':
           str(Path(__file__).with_name('udp_of_this_host.xml'))}
 """
-Variables for the processes of tests that kill one of them. Fast DDS's shared memory that a process
-is killed in stays locked for others, and where rmw_fastrtps keeps to LOCALHOST it takes shared
-memory in any case; the profile keeps them to this host, too.
+Variables for tests that kill a process. The shared memory of Fast DDS stays locked after a kill,
+and rmw_fastrtps always uses it with LOCALHOST. The profile limits the processes to this host.
 """
 
 
 def domain_in_use(domain: int) -> bool:
-    """Say whether somebody has the port to which a domain's participants announce themselves."""
+    """Return whether a process uses the discovery port of a domain."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.bind(('', 7400 + 250 * domain))
@@ -44,7 +44,7 @@ def domain_in_use(domain: int) -> bool:
 
 @contextmanager
 def own_domain() -> Iterator[int]:
-    """Give the number of a domain that is ours as long as the context lasts."""
+    """Give a domain that no other test uses as long as the context lasts."""
     locks = Path(tempfile.gettempdir())
     for domain in DOMAINS:
         with open(locks / f'adxl_ros_{os.getuid()}_domain_{domain}.lock', 'w') as lock:

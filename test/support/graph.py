@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""A node of the tests' own, beside the nodes that they have started."""
+"""The node of a test, in the graph of the nodes that the test has started."""
 
 from collections import defaultdict
 import time
@@ -29,8 +29,8 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
 RELIABLE = ('-p', 'qos_overrides./imu/data_raw.subscription.reliability:=reliable')
-"""A best-effort subscriber loses the first samples, for its publisher knows it before it knows the
-publisher, and at many times real time any others."""
+"""Reliable subscription: a best-effort one loses the first samples, and more at many times real
+time."""
 
 
 def stamp_ns(message):
@@ -51,7 +51,7 @@ def imu_table(raws):
 
 
 class Graph:
-    """Keeps what topics bring, by topic; the newest diagnostics by the name of the node."""
+    """Keeps the messages of topics, and the newest diagnostics by the name of the node."""
 
     def __init__(self):
         self.got = defaultdict(list)
@@ -77,7 +77,7 @@ class Graph:
             self.diagnostics[status.name.split(':')[0]] = status
 
     def listen(self, kind, topic, depth=10000, latched=False, raw=False):
-        """Keep the messages of a topic, or their bytes; returns the list that they go to."""
+        """Keep the messages of a topic, or their bytes; return the list that receives them."""
         qos = QoSProfile(depth=depth)
         if latched:
             qos.durability = DurabilityPolicy.TRANSIENT_LOCAL
@@ -86,30 +86,31 @@ class Graph:
         def keep(first):
             kept.append(first)
             for _ in range(1000):
-                if (more := made.handle.take_message(kind, raw)) is None:
+                message = subscription.handle.take_message(kind, raw)
+                if message is None:
                     break
-                kept.append(more[0])
+                kept.append(message[0])
 
-        made = self.node.create_subscription(kind, topic, keep, qos, raw=raw)
+        subscription = self.node.create_subscription(kind, topic, keep, qos, raw=raw)
         return kept
 
-    def spin_until(self, condition, timeout_s, what):
-        """Listen until a condition holds; fail with `what` after the time."""
-        end = time.monotonic() + timeout_s
+    def spin_until(self, condition, timeout_s, purpose):
+        """Listen until a condition holds; fail with the purpose after the time."""
+        end_s = time.monotonic() + timeout_s
         while not condition():
             self._executor.spin_once(timeout_sec=0.05)
-            if time.monotonic() > end:
-                pytest.fail(f'{what}: not after {timeout_s} s; diagnostics: {self.diagnostics}')
+            if time.monotonic() > end_s:
+                pytest.fail(f'{purpose}: not after {timeout_s} s; diagnostics: {self.diagnostics}')
 
     def spin(self, seconds):
         """Listen for so long."""
-        end = time.monotonic() + seconds
-        while (left := end - time.monotonic()) > 0:
-            self._executor.spin_once(timeout_sec=left)
+        end_s = time.monotonic() + seconds
+        while (remaining_s := end_s - time.monotonic()) > 0:
+            self._executor.spin_once(timeout_sec=remaining_s)
 
     def call(self, kind, service, request, timeout_s=20.0):
         """Call a service and return its answer."""
-        # The answer to a client that is new may come before it can be heard.
+        # A new client may miss the answer, so each service has one client.
         client = self._clients.get(service)
         if client is None:
             client = self._clients[service] = self.node.create_client(kind, service)
@@ -119,12 +120,12 @@ class Graph:
         return future.result()
 
     def change(self, node, transition):
-        """Put a managed node into another state; return whether it went."""
+        """Change the state of a managed node; return whether it succeeded."""
         request = ChangeState.Request(transition=Transition(id=transition))
         return self.call(ChangeState, f'{node}/change_state', request).success
 
     def said(self, node, text):
-        """Tell whether the newest diagnostics of a node hold a text."""
+        """Return whether the newest diagnostics of a node contain a text."""
         return node in self.diagnostics and text in self.diagnostics[node].message
 
     def value(self, node, key):

@@ -13,12 +13,12 @@
 # limitations under the License.
 
 """
-A sweep that is killed again and again, at random moments: no accepted pose is lost.
+A sweep that is killed repeatedly, at random moments: no accepted pose is lost.
 
     make soak ARGS='--minutes 0'     200 kills, a table for docs/guided.md
 
-Of five kills two come within the first two seconds, one while all poses are fitted, one while a
-file is written, and one when the sweep has ended.
+Of five kills, two come within the first two seconds and one during the fit. One comes while a file
+is written, and one when the sweep has ended.
 """
 
 from contextlib import suppress
@@ -41,27 +41,34 @@ SWEEP = ('-p', 'autostart:=true', '-p', 'sweep.planes_rad:=[1.5707963267948966]'
          '-p', 'sweep.step_rad:=1.5707963267948966', '-p', 'sweep.dwell_s:=0.5', '-p',
          'sweep.check_poses:=2', '-p', 'output:=unit.yaml', '-p', 'store:=store', '-p',
          'report:=report', *RELIABLE)
-_LONGEST_S = 90.0
-_POSES_S, _FIT_S, _WRITE_S = 2.0, 1.0, 0.005
+_TIMEOUT_S = 90.0
+"""Longest wait for the moment of a kill, s."""
+_DELAYS_S = {'poses': 2.0, 'fit': 1.0, 'write': 0.005, 'end': 0.0}
+"""Longest random delay of a kill after its moment, s."""
 _MOMENTS = ('poses', 'fit', 'poses', 'write', 'end')
+"""Moments of the kills, in turn."""
 _FILES = ('unit.yaml.previous', 'unit.yaml', 'store', 'report.html', 'calibration.png')
+"""Files during whose writing a kill of the moment `write` comes."""
 
 
 class Sweeps:
     """
-    Runs the calibration node on a simulated stage, kills it, and looks at what it left.
+    Runs the calibration node on a simulated stage, kills it, and checks its files.
 
     Attributes
     ----------
-    kills, sweeps
-        How often it was killed, and how many sweeps came to their end in spite of it.
+    kills
+        Number of kills.
+    sweeps
+        Number of sweeps that came to their end in spite of the kills.
     poses
-        Poses that were acknowledged.
-    lost, broken
-        What went wrong: acknowledged poses or an earlier calibration that were gone or changed,
-        files that were not whole.
+        Number of acknowledged poses.
+    lost
+        Acknowledged poses and earlier calibrations that are missing or changed.
+    broken
+        Incomplete files, and other failures.
     moments
-        Kills by what the node was doing.
+        Number of kills by the activity of the node.
 
     """
 
@@ -73,97 +80,104 @@ class Sweeps:
         base = nominal(serial='K1', rate_hz=200.0)
         parameter_file.save(self.folder / 'truth.yaml', drawn(np.random.default_rng(3), base))
         parameter_file.save(self.folder / 'bare.yaml', base)
-        self._known, self._written, self._stored, self._left = {}, '', set(), set()
+        self._kept_poses, self._written = {}, ''
+        self._stored, self._unfinished_before = set(), set()
         self._others = [self._start('driver', 'truth.yaml', '-p', 'link.speed:=10.0'),
                         self._start('stage', 'bare.yaml', '-p', 'slew_rate_rad_s:=6.0')]
 
-    def _start(self, name, file, *more):
+    def _start(self, name, file, *arguments):
         with open(self.folder / f'{name}.log', 'wb') as log:
             return subprocess.Popen(
-                [executable(name), '--ros-args', '--params-file', self.folder / file, *SIM, *more],
+                [executable(name), '--ros-args', '--params-file', self.folder / file, *SIM,
+                 *arguments],
                 env=self.env, cwd=self.folder, stdin=subprocess.DEVNULL, stdout=log,
                 stderr=subprocess.STDOUT)
 
     def end(self):
-        """End what is still running."""
+        """End driver and stage."""
         for process in self._others:
             process.send_signal(signal.SIGINT)
         for process in self._others:
             process.wait(20)
 
     def kill_once(self):
-        """Let the node go on with the sweep until a moment or the end, kill it, and look."""
+        """Run the sweep until a moment or the end, kill the node, and check its files."""
         moment = _MOMENTS[self.kills % len(_MOMENTS)]
-        after_s = self.rng.uniform() * {'poses': _POSES_S, 'fit': _FIT_S, 'write': _WRITE_S,
-                                        'end': 0.0}[moment]
+        delay_s = self.rng.uniform() * _DELAYS_S[moment]
         file = self.rng.choice(_FILES)
         node = self._start('calibration', 'bare.yaml', *SWEEP)
-        began, log = time.monotonic(), self.folder / 'calibration.log'
+        began_s, log = time.monotonic(), self.folder / 'calibration.log'
         try:
-            while not self._come(moment, file, log.read_text(errors='replace')) \
-                    and time.monotonic() - began < _LONGEST_S:
+            while not self._has_come(moment, file, log.read_text(errors='replace')) \
+                    and time.monotonic() - began_s < _TIMEOUT_S:
                 time.sleep(0.005 if moment != 'write' else 0.001)
-            time.sleep(after_s)
+            time.sleep(delay_s)
         finally:
             os.kill(node.pid, signal.SIGKILL)
             node.wait()
         self.kills += 1
-        self._look(log.read_text(errors='replace'))
+        self._check(log.read_text(errors='replace'))
 
-    def _come(self, moment, file, said):
-        """Tell whether a moment has come, or the end."""
-        return 'wrote unit.yaml' in said or {
-            'poses': 'calibrating' in said, 'fit': 'fitting' in said, 'end': False,
-            'write': 'fitting' in said and file in map(_file, self._unfinished())}[moment]
+    def _has_come(self, moment, file, output):
+        """Return whether a moment, or the end of the sweep, has come."""
+        if 'wrote unit.yaml' in output:
+            return True
+        if moment == 'poses':
+            return 'calibrating' in output
+        if moment == 'fit':
+            return 'fitting' in output
+        return (moment == 'write' and 'fitting' in output
+                and file in map(_file, self._unfinished()))
 
     def _unfinished(self):
         """Return the hidden folders in which files are written."""
         while True:
-            # One that is finished while it is looked into is none any more.
+            # A folder may be finished while the search looks into it.
             with suppress(FileNotFoundError):
                 return {path for pattern in ('.unit*.part', '*/.*.part', 'store/K1/.*.part')
                         for path in self.folder.glob(pattern)}
 
-    def _look(self, said):
-        acknowledged = [int(n) - 1 for n in re.findall(r'pose (\d+) is on disk', said)]
+    def _check(self, output):
+        acknowledged = [int(n) - 1 for n in re.findall(r'pose (\d+) is on disk', output)]
         self.poses += len(acknowledged)
-        left = self._unfinished()
+        unfinished = self._unfinished()
         moment = (
-            'start' if 'calibrating' not in said else
-            'the end' if 'wrote' in said else
-            f'a file is written ({_file(min(left))})' if left else
-            'the fit, or between files' if 'fitting' in said else
-            'the mounting is checked' if not acknowledged and self._known else 'poses')
+            'start' if 'calibrating' not in output else
+            'the end' if 'wrote' in output else
+            f'a file is written ({_file(min(unfinished))})' if unfinished else
+            'the fit, or between files' if 'fitting' in output else
+            'the mounting is checked' if not acknowledged and self._kept_poses else 'poses')
         self.moments[moment] = self.moments.get(moment, 0) + 1
         if moment == 'start':
-            self.broken.append(f'kill {self.kills}: it did not begin: {said[-300:]}')
+            self.broken.append(f'kill {self.kills}: it did not begin: {output[-300:]}')
             return
-        if self._left & left:
-            self.broken.append(f'kill {self.kills}: not cleared: {self._left & left}')
-        self._left = left
+        if self._unfinished_before & unfinished:
+            self.broken.append(
+                f'kill {self.kills}: not cleared: {self._unfinished_before & unfinished}')
+        self._unfinished_before = unfinished
         try:
-            self._look_at_poses(acknowledged)
-            self._look_at_files()
+            self._check_poses(acknowledged)
+            self._check_files()
         except Exception as error:
             self.broken.append(f'kill {self.kills}: {error}')
 
-    def _look_at_poses(self, acknowledged):
+    def _check_poses(self, acknowledged):
         _, entries = sweep_journal.read(self.folder / 'unit.yaml.journal')
         kept = {entry.pose: json.dumps(entry.to_json())
                 for entry in sweep_journal.accepted_poses(entries)}
-        gone = [n for n in {*self._known, *acknowledged} if n not in kept]
-        changed = [n for n in self._known if n in kept and kept[n] != self._known[n]]
-        if gone or changed:
-            self.lost.append(f'kill {self.kills}: gone {gone}, changed {changed}')
-        self._known = kept
+        missing = [n for n in {*self._kept_poses, *acknowledged} if n not in kept]
+        changed = [n for n in self._kept_poses if n in kept and kept[n] != self._kept_poses[n]]
+        if missing or changed:
+            self.lost.append(f'kill {self.kills}: missing {missing}, changed {changed}')
+        self._kept_poses = kept
         if any(isinstance(entry, sweep_journal.Fitted) and entry.done for entry in entries):
             self.sweeps += 1
-            self._known = {}
+            self._kept_poses = {}
             if _data(self.folder / 'unit.yaml') not in map(_data, self._in_store()):
                 self.lost.append(f'kill {self.kills}: the sweep has ended without a copy')
 
-    def _look_at_files(self):
-        """Load all that is there; the calibration before the newest is kept, as the store is."""
+    def _check_files(self):
+        """Load all files; the previous calibration and the calibration store must be kept."""
         now = _data(self.folder / 'unit.yaml')
         before = _data(self.folder / 'unit.yaml.previous')
         if now != self._written and before != self._written:
@@ -183,17 +197,17 @@ class Sweeps:
 
 
 def _data(path):
-    """Return the hash of the poses behind a parameter file; '' where there is none."""
+    """Return the hash of the poses of a parameter file; '' without a file."""
     return parameter_file.load(path).provenance['data_sha256'] if path.exists() else ''
 
 
-def _file(left):
-    """Name what was written in a hidden folder."""
-    return 'store' if 'K1' in left.parts else left.name.removesuffix('.part')[1:-9]
+def _file(folder):
+    """Return the name of the file that was written in a hidden folder."""
+    return 'store' if 'K1' in folder.parts else folder.name.removesuffix('.part')[1:-9]
 
 
 def kill(folder, env, kills, seed):
-    """Kill so often; returns the `Sweeps`."""
+    """Kill a sweep so often; return the `Sweeps`."""
     sweeps = Sweeps(folder, env, seed)
     try:
         while sweeps.kills < kills:

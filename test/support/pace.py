@@ -13,10 +13,10 @@
 # limitations under the License.
 
 """
-Limits of processor time that hold on a slow core, too, and beside other work.
+Limits of processor time that also hold on a slow or busy core.
 
-They are stated for a core that does the standard work in a tenth of a second. What this core does
-is measured beside the work in question, before it and after it.
+A limit is stated for a core that does the standard work in a tenth of a second. The speed of this
+core is measured before and after the work that is limited.
 """
 
 from contextlib import contextmanager
@@ -25,10 +25,11 @@ import time
 import numpy as np
 
 STANDARD_S = 0.1
+"""Processor time of the standard work on the core for which limits are stated, s."""
 
 
 def standard_work():
-    """Do a little of what fits and simulations do; return the processor time that it took, s."""
+    """Do some work of fits and simulations; return its processor time, s."""
     began = time.process_time()
     matrix = np.sin(np.arange(36000.0)).reshape(1200, 30)
     for _ in range(60):
@@ -46,7 +47,7 @@ def standard_work():
 
 @contextmanager
 def within(limit_s):
-    """Fail where the work in this block takes longer than a standard core's limit."""
+    """Fail where the work in this block takes longer than the limit of a standard core, s."""
     before = standard_work()
     began = time.process_time()
     yield

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""A real terminal for a program under test: a pty, and an emulator that knows what it shows."""
+"""A real terminal for a program under test: a pty and a terminal emulator."""
 
 import fcntl
 import os
@@ -29,7 +29,7 @@ import pytest
 
 
 class Terminal:
-    """A program in a terminal of its own, which controls it unless told otherwise."""
+    """A program in a terminal of its own; by default the terminal controls it."""
 
     def __init__(self, command, env, cwd, lines=40, columns=110, controls=True):
         self.screen = pyte.Screen(columns, lines)
@@ -38,7 +38,7 @@ class Terminal:
         self.raw = b''
         self._master, slave = pty.openpty()
         self._size(lines, columns)
-        # The test keeps the other end, to see what is left of its settings.
+        # The test keeps the other end, to compare its settings afterwards.
         self.slave = slave
         self.before = termios.tcgetattr(slave)
         self.popen = subprocess.Popen(
@@ -62,14 +62,14 @@ class Terminal:
                 self._stream.feed(data)
 
     def resize(self, lines, columns):
-        """Give the window another size, as a user's mouse does."""
+        """Change the size of the window, as a user does."""
         with self._lock:
             self.screen.resize(lines, columns)
         self._size(lines, columns)
         os.killpg(os.tcgetpgrp(self._master), signal.SIGWINCH)
 
     def text(self):
-        """Return what is on the screen."""
+        """Return the text of the screen."""
         with self._lock:
             return '\n'.join(line.rstrip() for line in self.screen.display)
 
@@ -79,24 +79,27 @@ class Terminal:
 
     def wait_for(self, *texts, timeout_s=30.0):
         """Wait until the screen shows all of some texts, and return it."""
-        end = time.monotonic() + timeout_s
-        # Lines are folded where the terminal ends.
-        plain = [' '.join(text.split()) for text in texts]
-        while not all(text in ' '.join((shown := self.text()).split()) for text in plain):
-            if time.monotonic() > end:
-                pytest.fail(f'no {texts} on the screen after {timeout_s} s:\n{shown}')
+        end_s = time.monotonic() + timeout_s
+        # The terminal folds long lines.
+        expected = [' '.join(text.split()) for text in texts]
+        while True:
+            screen = self.text()
+            unfolded = ' '.join(screen.split())
+            if all(text in unfolded for text in expected):
+                return screen
+            if time.monotonic() > end_s:
+                pytest.fail(f'no {texts} on the screen after {timeout_s} s:\n{screen}')
             time.sleep(0.05)
-        return shown
 
     def restored(self):
-        """Tell whether settings, screen and cursor are as they were."""
+        """Return whether settings, screen and cursor are as before the program."""
         with self._lock:
-            left = self.raw.count(b'\x1b[?1049h') == self.raw.count(b'\x1b[?1049l')
+            left_alternate = self.raw.count(b'\x1b[?1049h') == self.raw.count(b'\x1b[?1049l')
             hidden = self.screen.cursor.hidden
-        return left and not hidden and termios.tcgetattr(self.slave) == self.before
+        return left_alternate and not hidden and termios.tcgetattr(self.slave) == self.before
 
     def close(self):
-        """End what is still running."""
+        """End the program if it is still running."""
         if self.popen.poll() is None:
             os.killpg(self.popen.pid, signal.SIGKILL)
             self.popen.wait()
