@@ -214,7 +214,7 @@ def _noise_table(report: dict[str, Any]) -> str:
 def _hypothesis_table(report: dict[str, Any]) -> str:
     """Return the most probable hypotheses."""
     return _table(['hypothesis', 'probability'], [
-        [', '.join(h['effects']) or 'no gap', f'{h["probability"]:.4f}']
+        [', '.join(h['effects']) or 'no gap', p_text(h['probability'])]
         for h in report['hypotheses'][:_TABLE_ROWS]])
 
 
@@ -231,7 +231,7 @@ def _candidate_table(report: dict[str, Any]) -> str:
     rows = []
     for c in report['candidates'][:_TABLE_ROWS]:
         parameters = '; '.join(_parameter_text(name, p) for name, p in c['parameters'].items())
-        rows.append([c['effect'], f'{c["probability"]:.3f}', parameters,
+        rows.append([c['effect'], p_text(c['probability']), parameters,
                      ', '.join(c['inseparable_from']), c['cause']])
     return _table(['effect', 'probability', 'parameters (90 % interval)', 'inseparable from',
                    'cause'], rows)

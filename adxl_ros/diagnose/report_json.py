@@ -261,7 +261,7 @@ def terminal_lines(diagnosis: Diagnosis) -> list[str]:
         lines += [f'Closed on held-out blocks: {100 * closure.closed:.1f} % '
                   f'(90 %: {100 * low:.1f} to {100 * high:.1f} %).']
     lines += ['', f'{"hypothesis":44} {"probability":>11}']
-    lines += [f'{", ".join(h["effects"]) or "no gap":44} {h["probability"]:11.3f}'
+    lines += [f'{", ".join(h["effects"]) or "no gap":44} {p_text(h["probability"]):>11}'
               for h in report['hypotheses'][:_SCREEN_ROWS]]
     if report['where']:
         lines += ['', 'where the gap shows most:']
