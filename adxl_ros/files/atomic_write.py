@@ -34,7 +34,7 @@ _SUFFIX = '.part'
 @contextmanager
 def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
     """
-    Yield a path beside `path`; what is written there replaces `path` when the block succeeds.
+    Yield a path next to `path`; a file there replaces `path` if the block succeeds.
 
     The new file or directory is synced to disk before the exchange, so that a power cut leaves
     the old or the new one. It is removed when the block fails.

@@ -36,7 +36,7 @@ from adxl_ros.model.constants import AXES
 import numpy as np
 
 _HOLD_ROWS = 1 << 19
-"""Samples that wait for references to come; later ones are handed on without (chosen: 15 MB)."""
+"""Samples that wait for references to come; later ones are handed on without (chosen: 17 MB)."""
 
 _ABSENT_VARIANCE = 1e5
 """Variance from which an axis counts as absent, (m/s²)²; absent axes are written with 1e6."""

@@ -112,7 +112,7 @@ class BagWriter:
         self._imu = _imu_template(self._types, sensor)
 
     def __enter__(self) -> BagWriter:
-        """Open a new bag beside the one to replace."""
+        """Open a new bag next to the one to replace."""
         with ExitStack() as stack:
             fresh = stack.enter_context(atomic_path(self._path))
             folder = fresh

@@ -35,7 +35,7 @@ from adxl_ros.files.recording_columns import LIMIT, Recording, TIME
 import numpy as np
 
 _CHUNK_BYTES = 1 << 22
-"""Bytes that are read at a time (chosen: bounds the memory to some 50 MB)."""
+"""Bytes that are read at a time (chosen: bounds the memory, and large enough for numpy)."""
 
 _LONGEST_LINE_BYTES = 1 << 20
 """Longer lines are refused, bytes (chosen: no recording has them; a file without newlines must

@@ -56,7 +56,7 @@ class CsvWriter:
         self._names: list[str] = []
 
     def __enter__(self) -> CsvWriter:
-        """Open a new file beside the one to replace."""
+        """Open a new file next to the one to replace."""
         with ExitStack() as stack:
             fresh = stack.enter_context(atomic_path(self._path))
             self._file: TextIO = stack.enter_context(

@@ -39,7 +39,7 @@ h2{break-after:avoid}tr,figure,img,.summary{break-inside:avoid}
 """
 
 _DPI = 100
-"""Resolution of plots, dots per inch (chosen: sharp at the page's width, at a tenth of a MB)."""
+"""Resolution of plots, dots per inch (chosen: sharp at the page's width)."""
 
 
 def document(title: str, parts: Sequence[str]) -> str:

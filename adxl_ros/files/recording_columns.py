@@ -46,7 +46,7 @@ COMMANDS = {'alpha': 'alpha_command_rad', 'beta': 'beta_command_rad'}
 
 LIMIT = 1e6
 """Largest magnitude of a sensor's output or a reference, in the column's unit (chosen: beyond
-every sensor of the package, and far below what damaged bytes decode to)."""
+every sensor, stage and reference of the package)."""
 
 
 class Alignment(NamedTuple):

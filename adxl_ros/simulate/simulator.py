@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from adxl_ros.files.recording_columns import Recording, REFERENCES
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.simulate.motion import Held, Motion
 from adxl_ros.simulate.response import Response
@@ -84,6 +85,39 @@ def simulate_blocks(sensor: Sensor, motion: Motion, seed: int, begin_s: float = 
         yield {'time_s': time_s,
                **{f'{axis}_v': volts[:, d] for d, axis in enumerate(sensor.axes)},
                **reference_columns(sensor, motion, time_s)}
+
+
+def simulate_at_stamps(sensor: Sensor, motion: Motion, recording: Recording, seed: int
+                       ) -> Iterator[Columns]:
+    """
+    Simulate samples at the stamps of a recording, block by block.
+
+    Parameters
+    ----------
+    sensor
+        The unit, sampled at about the rate of the recording.
+    motion
+        The manoeuvre, from the first stamp on.
+    recording
+        The recording, which gives the stamps and the references.
+    seed
+        Seed of all randomness; equal seeds give equal bits.
+
+    Yields
+    ------
+    dict
+        Columns of the next samples by canonical name, (n,) each: `time_s`, volts by axis, and
+        the references of the recording.
+
+    """
+    respond = Response(sensor, motion, seed, float(recording.time_s[0]))
+    references = [name for name in REFERENCES if name in recording.columns]
+    for begin in range(0, len(recording), _BLOCK_ROWS):
+        part = slice(begin, begin + _BLOCK_ROWS)
+        volts = respond(recording.time_s[part])
+        yield {'time_s': recording.time_s[part],
+               **{f'{axis}_v': volts[:, d] for d, axis in enumerate(sensor.axes)},
+               **{name: recording.columns[name][part] for name in references}}
 
 
 def reference_columns(sensor: Sensor, motion: Motion, time_s: np.ndarray) -> Columns:

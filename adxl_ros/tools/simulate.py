@@ -26,21 +26,16 @@ import sys
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file, recording
-from adxl_ros.files.recording_columns import Recording, REFERENCES
+from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.stream_info import sensor_info
 from adxl_ros.links.support import emulated_board
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.simulate import simulator
 from adxl_ros.simulate.from_recording import motion_from_force, motion_from_references
-from adxl_ros.simulate.motion import Motion
-from adxl_ros.simulate.response import Response
 from adxl_ros.simulate.trajectories import TRAJECTORIES
 from adxl_ros.tools.common import progress, report_reading, run
 from adxl_ros.tools.effect_option import SYNTAX, with_effects
 import numpy as np
-
-_BLOCK_ROWS = 32768
-"""Samples that are simulated at a time (chosen: some MB)."""
 
 _MIN_RATE_HZ = 0.01
 """Lowest sample rate, Hz, as in a parameter file."""
@@ -216,20 +211,7 @@ def _simulate_recording(sensor: Sensor, options: argparse.Namespace) -> _Run:
                     simulator.simulate_blocks(sensor, motion, options.seed, begin_s))
     sensor = replace(sensor, rate_hz=read.rate_hz)
     return _Run(sensor, begin_s, duration_s,
-                _at_stamps(sensor, motion, read, options.seed))
-
-
-def _at_stamps(sensor: Sensor, motion: Motion, read: Recording, seed: int
-               ) -> Iterator[simulator.Columns]:
-    """Sample at the stamps of a recording, and yield its own references with the samples."""
-    response = Response(sensor, motion, seed, float(read.time_s[0]))
-    references = [name for name in REFERENCES if name in read.columns]
-    for begin in range(0, len(read), _BLOCK_ROWS):
-        part = slice(begin, begin + _BLOCK_ROWS)
-        volts = response(read.time_s[part])
-        yield {'time_s': read.time_s[part],
-               **{f'{axis}_v': volts[:, d] for d, axis in enumerate(sensor.axes)},
-               **{name: read.columns[name][part] for name in references}}
+                simulator.simulate_at_stamps(sensor, motion, read, options.seed))
 
 
 def main() -> int:
