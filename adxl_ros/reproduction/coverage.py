@@ -13,11 +13,10 @@
 # limitations under the License.
 
 """
-Simulation-based calibration: whether intervals hold the truth as often as they state.
+Simulation-based calibration: whether intervals contain the truth as often as they state.
 
-Units and stages are drawn, swept and fitted; the rank of the truth in its posterior must be
-uniform (Talts et al. 2018, arXiv:1804.06788), and 90 % intervals must hold it in 90 % of the
-draws.
+Units and stages are drawn, swept and fitted. The rank of the truth in its posterior must be
+uniform (Talts et al. 2018, arXiv:1804.06788). 90 % intervals must contain it in 90 % of the draws.
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ from adxl_ros.model.coefficients import get, parameter_of, put, with_neutral
 from adxl_ros.model.constants import Z_90
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import Sensor, with_axes
-from adxl_ros.reproduction import scoring
+from adxl_ros.reproduction import error_statistics
 import numpy as np
 from scipy.special import ndtr
 from scipy.stats import beta, chisquare
@@ -48,15 +47,17 @@ STAGES = ('errors per pose', 'errors per setting', 'eccentric', 'tilted base')
 """Errors of a joint are new with each pose, or with each move; the last two are per setting."""
 AXES = ('xy', 'xyz')
 _RESOLUTION_DEG = (0.01, 0.1)
-"""Steps of the encoders that are drawn, log-uniformly."""
+"""Smallest and largest step of the drawn encoders, deg, log-uniform; chosen."""
 _STATED = (0.5, 2.0)
-"""True error of a stage over the stated one, log-uniformly."""
+"""Range of the true error of a stage over the stated one, log-uniform; chosen."""
 _QUICK_RAD = float(np.radians(0.1))
-"""Tilt error that the plan quick is asked for."""
+"""Required tilt error of the plan `quick`, rad; chosen."""
 _DWELL_S = 5.0
+"""Duration of each dwell, s; the paper's."""
 _HELD_OUT = 8
-"""Poses of each draw that are not fitted."""
+"""Number of held-out poses of each draw; chosen."""
 BINS = 10
+"""Number of bins of the ranks; chosen."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +68,7 @@ class Draw:
     Attributes
     ----------
     stage, axes, plan
-        What was drawn.
+        Kind of the stage, axes and plan.
     names
         Fitted coefficients of the sensor, (p,).
     z
@@ -76,9 +77,9 @@ class Draw:
         Their errors over the Cramér-Rao bound of the true error model, (p,); empty where the fit
         has other terms than were drawn.
     tilt_z, force_z
-        The same as `z` of alpha and beta, and of the measured axes, over held-out poses.
+        As `z`, for alpha and beta, and for the measured axes, over held-out poses.
     converged
-        Whether the fit says so.
+        Whether the fit converged.
 
     """
 
@@ -101,22 +102,27 @@ def draw_all(nominal: Sensor, draws: int, seed: int, show: Callable[[float], Non
     Parameters
     ----------
     nominal
-        Figures that units are drawn about.
+        The nominal sensor.
     draws
-        How many; stages, axes and plans take turns.
+        Number of draws; stages, axes and plans alternate.
     seed
-        Of all randomness.
+        Seed of all random numbers.
     show
-        Takes the fraction that is done.
+        Receives the fraction that is finished.
+
+    Returns
+    -------
+    list of Draw
+        All draws.
 
     """
     kinds = list(product(STAGES, AXES, pose_plan.KINDS))
-    found = []
+    finished = []
     with ProcessPoolExecutor(os.cpu_count()) as pool:
-        for one in pool.map(partial(draw, nominal, kinds=kinds, seed=seed), range(draws)):
-            found.append(one)
-            show(len(found) / draws)
-    return found
+        for result in pool.map(partial(draw, nominal, kinds=kinds, seed=seed), range(draws)):
+            finished.append(result)
+            show(len(finished) / draws)
+    return finished
 
 
 def draw(nominal: Sensor, number: int, kinds: Sequence[tuple[str, str, str]], seed: int) -> Draw:
@@ -126,13 +132,18 @@ def draw(nominal: Sensor, number: int, kinds: Sequence[tuple[str, str, str]], se
     Parameters
     ----------
     nominal
-        Figures that the unit is drawn about.
+        The nominal sensor.
     number
-        Of the draw.
+        Index of the draw.
     kinds
-        Stage, axes and plan, which take turns.
+        Stage, axes and plan, which alternate.
     seed
-        Of all randomness.
+        Seed of all random numbers.
+
+    Returns
+    -------
+    Draw
+        The errors.
 
     """
     stage, axes, kind = kinds[number % len(kinds)]
@@ -144,20 +155,20 @@ def draw(nominal: Sensor, number: int, kinds: Sequence[tuple[str, str, str]], se
     targets = pose_plan.guided(pose_plan.default_planes_rad(axes), pose_plan.STEP_RAD, 0) \
         if kind == 'full' else quick_plan.quick(sensor, _DWELL_S, _QUICK_RAD, 0)
     poses, true_rad = _swept(truth, targets, stage == STAGES[0], step, rng)
-    found, _ = term_selection.fit_selected(sensor, poses)
-    names = found.fitted.covariance_names
-    known = with_neutral(truth, {name.effect for name in names})
-    error = get(found.fitted, names) - get(known, names)
+    fit, _ = term_selection.fit_selected(sensor, poses)
+    names = fit.fitted.covariance_names
+    truth_of_fit = with_neutral(truth, {name.effect for name in names})
+    error = get(fit.fitted, names) - get(truth_of_fit, names)
     sigma = step / np.sqrt(12)
     levels = StageError(0.0, sigma) if stage == STAGES[0] else StageError(sigma)
-    bound = scoring.known_bound(truth, poses, true_rad, levels,
+    bound = error_statistics.sweep_bound(truth, poses, true_rad, levels,
                                 (*full_model.default_terms(axes), *_extra(stage)))
-    anywhere = _anywhere(truth, rng)
-    tilt = scoring.angles(found.fitted, bound, *anywhere)
-    force, force_std = scoring.forces(found.fitted, truth, *anywhere)
-    return Draw(stage, axes, kind, names, error / np.sqrt(np.diag(found.fitted.covariance)),
-                _by_bound(names, error, bound), (tilt.error / tilt.std)[tilt.shown],
-                (force / force_std).ravel(), found.converged)
+    held_out = _random_poses(truth, rng)
+    tilt = error_statistics.angle_errors(fit.fitted, bound, *held_out)
+    force, force_std = error_statistics.force_errors(fit.fitted, truth, *held_out)
+    return Draw(stage, axes, kind, names, error / np.sqrt(np.diag(fit.fitted.covariance)),
+                _by_bound(names, error, bound), (tilt.error / tilt.std)[tilt.determined],
+                (force / force_std).ravel(), fit.converged)
 
 
 def _extra(stage: str) -> tuple[str, ...]:
@@ -188,14 +199,14 @@ def _swept(truth: Sensor, targets: Sequence[pose_plan.Target], per_pose: bool, s
     """Return the poses of a sweep, and where the stage really stood, rad, (k, 2)."""
     read = np.array([[t.alpha_rad, t.beta_rad] for t in targets])
     poses = _resting(truth, read, rng)
-    off = np.empty_like(read)
+    error = np.empty_like(read)
     for joint, setting in enumerate((poses.alpha_setting, poses.beta_setting)):
         number = np.arange(len(read)) if per_pose else setting
-        off[:, joint] = step_rad * rng.uniform(-0.5, 0.5, len(read))[number]
-    return _read(truth, poses, read + off, rng), read + off
+        error[:, joint] = step_rad * rng.uniform(-0.5, 0.5, len(read))[number]
+    return _read(truth, poses, read + error, rng), read + error
 
 
-def _anywhere(truth: Sensor, rng: np.random.Generator) -> tuple[Poses, np.ndarray]:
+def _random_poses(truth: Sensor, rng: np.random.Generator) -> tuple[Poses, np.ndarray]:
     """Return poses drawn evenly over the sphere, and their angles, rad, (k, 2)."""
     angles = np.column_stack([np.arccos(rng.uniform(-1, 1, _HELD_OUT)),
                               rng.uniform(0, 2 * np.pi, _HELD_OUT)])
@@ -216,7 +227,20 @@ def _read(truth: Sensor, poses: Poses, true_rad: np.ndarray, rng: np.random.Gene
 
 
 def interval(inside: int, count: int) -> tuple[float, float]:
-    """Return the 90 % interval of a share by `inside` of `count` (Clopper and Pearson 1934)."""
+    """
+    Return the 90 % interval of a share (Clopper and Pearson 1934).
+
+    Parameters
+    ----------
+    inside, count
+        Number of hits, and of all.
+
+    Returns
+    -------
+    tuple
+        Ends of the interval.
+
+    """
     low = beta.ppf(0.05, inside, count - inside + 1) if inside else 0.0
     high = beta.ppf(0.95, inside + 1, count - inside) if inside < count else 1.0
     return float(low), float(high)
@@ -224,40 +248,45 @@ def interval(inside: int, count: int) -> tuple[float, float]:
 
 def page(draws: Sequence[Draw], made: str) -> str:
     """
-    Lay the result out, Markdown.
+    Return the section about coverage.
 
     Parameters
     ----------
     draws
         From `draw_all`.
     made
-        How it was made: version, date, seed.
+        Version, date and seed.
+
+    Returns
+    -------
+    str
+        Markdown.
 
     """
-    ratio = np.concatenate([one.bound_ratio for one in draws])
-    lines = [f'## Do the intervals hold? {len(draws)} drawn units and stages', '', made, '',
-             'A unit is drawn at datasheet spread, a stage with an encoder of 0.01° to 0.1° whose '
-             'true error is 0.5 to 2 times the stated one. Plans, axes and stages take turns. '
-             'Coverage is the share of 90 % intervals that hold the truth; in brackets its own '
-             '90 % interval, by the binomial distribution, or by bootstrap over draws where one '
+    ratio = np.concatenate([d.bound_ratio for d in draws])
+    lines = [f'## Coverage of the intervals: {len(draws)} drawn units and stages', '', made, '',
+             'A unit is drawn at datasheet spread. Its stage has an encoder of 0.01° to 0.1° and '
+             'a true error of 0.5 to 2 times the stated one. Plans, axes and stages alternate. '
+             'Coverage is the share of 90 % intervals that contain the truth. In brackets is its '
+             '90 % interval: by the binomial distribution, or by bootstrap over draws where one '
              'draw has several values. Ranks are counts of the truth in the ten tenths of its '
              'posterior; p is that of a uniform distribution.', '',
              f'Error over the Cramér-Rao bound of the same error model, rms over {len(ratio)} '
-             f'coefficients of {sum(len(one.bound_ratio) > 0 for one in draws)} fits with the '
+             f'coefficients of {sum(len(d.bound_ratio) > 0 for d in draws)} fits with the '
              f'terms that were drawn: {np.sqrt(np.mean(ratio ** 2)):.3f}. '
-             f'Fits that converged: {sum(one.converged for one in draws)} of {len(draws)}.', '',
+             f'Fits that converged: {sum(d.converged for d in draws)} of {len(draws)}.', '',
              '| | coverage, % | rms of error / stated | ranks | p |', '|---|---|---|---|---|',
-             _several('all coefficients', [one.z for one in draws]),
-             _several('tilt', [one.tilt_z for one in draws]),
-             _several('acceleration', [one.force_z for one in draws])]
+             _several('all coefficients', [d.z for d in draws]),
+             _several('tilt', [d.tilt_z for d in draws]),
+             _several('acceleration', [d.force_z for d in draws])]
     for field in ('stage', 'axes', 'plan'):
-        for value in dict.fromkeys(getattr(one, field) for one in draws):
+        for value in dict.fromkeys(getattr(d, field) for d in draws):
             lines.append(_several(f'{field} {value}: coefficients', [
-                one.z for one in draws if getattr(one, field) == value]))
+                d.z for d in draws if getattr(d, field) == value]))
     lines += ['', '| coefficient | coverage, % | rms of error / stated | ranks | p |',
               '|---|---|---|---|---|']
-    for name in dict.fromkeys(name for one in draws for name in one.names):
-        z = np.array([one.z[one.names.index(name)] for one in draws if name in one.names])
+    for name in dict.fromkeys(name for d in draws for name in d.names):
+        z = np.array([d.z[d.names.index(name)] for d in draws if name in d.names])
         inside = int(np.sum(np.abs(z) < Z_90))
         low, high = interval(inside, len(z))
         lines.append(_row(f'{name} ({len(z)})', inside / len(z), (low, high), z))
@@ -267,14 +296,15 @@ def page(draws: Sequence[Draw], made: str) -> str:
 def _several(label: str, parts: Sequence[np.ndarray]) -> str:
     inside = np.array([[np.sum(np.abs(z) < Z_90), len(z)] for z in parts])
     rng = np.random.default_rng(0)
-    again = inside[rng.integers(0, len(parts), (1000, len(parts)))].sum(axis=1)
-    low, high = np.quantile(again[:, 0] / again[:, 1], [0.05, 0.95])
+    resampled = inside[rng.integers(0, len(parts), (1000, len(parts)))].sum(axis=1)
+    low, high = np.quantile(resampled[:, 0] / resampled[:, 1], [0.05, 0.95])
     total = inside.sum(axis=0)
     return _row(label, total[0] / total[1], (low, high), np.concatenate(parts))
 
 
-def _row(label: str, share: float, ends: tuple[float, float], z: np.ndarray) -> str:
+def _row(label: str, share: float, share_interval: tuple[float, float], z: np.ndarray) -> str:
+    low, high = (100 * end for end in share_interval)
     counts = np.histogram(ndtr(z), BINS, (0, 1))[0]
-    return (f'| {label} | {100 * share:.1f} ({100 * ends[0]:.1f} to {100 * ends[1]:.1f}) | '
+    return (f'| {label} | {100 * share:.1f} ({low:.1f} to {high:.1f}) | '
             f'{np.sqrt(np.mean(z ** 2)):.2f} | {" ".join(map(str, counts))} | '
             f'{chisquare(counts).pvalue:.2f} |')

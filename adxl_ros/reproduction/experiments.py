@@ -13,11 +13,11 @@
 # limitations under the License.
 
 """
-The experiments: a unit is drawn, swept, calibrated and tried, all through the simulator.
+The experiments of the paper: a simulated unit is drawn, swept, calibrated and tested.
 
-Stage, filter, ADC and averaging are the paper's (its section III): an encoder of 5 arcmin within
-whose steps a joint stands anywhere, anew after each move, a base level to 0.1°, 32 kΩ ± 25 % and
-0.33 µF, 16 bits at 1 kHz, means of 5 s.
+Stage, filter, ADC and averaging are those of the paper's section III: an encoder of 5 arcmin, a
+base level to 0.1°, 32 kΩ ± 25 % and 0.33 µF, 16 bits at 1 kHz, means of 5 s. The true angle of a
+joint is uniform within a step of the encoder, and new after each move.
 """
 
 from __future__ import annotations
@@ -43,20 +43,32 @@ import numpy as np
 
 MODELS = {'linear': linear.fit, 'physical': paper_regression.fit, 'full': term_selection.fit}
 DRAWN = full_model.TERMS
-"""Effects of a unit, each coefficient normal with its typical size for standard deviation."""
+"""Effects of a unit. Each coefficient is normal; its typical size is the standard deviation."""
 PLANES_RAD = tuple(np.radians([90.0, 60.0, 30.0, 0.0, 120.0, 150.0, 180.0]).tolist())
+"""Planes alpha of the sweep, rad; the paper's."""
 STEP_RAD = float(np.radians(30.0))
+"""Step of beta, rad; the paper's."""
 RESISTANCE = 0.25
-"""The filter's resistor is anywhere within ± this of the stated one."""
+"""Largest departure of the filter's resistor from the stated one, a share; the paper's."""
 GRAVITY_MPS2 = 9.80131
-"""Where the paper's experiments were done."""
+"""Local gravity of the paper's experiments, m/s²."""
 SETTLED_S = 1.0
-"""A pose's mean begins so long after the stage has stopped."""
+"""Time from the stop of the stage to the start of a pose's mean, s; chosen."""
 
 
 @dataclass(frozen=True)
 class Stage:
-    """How well the stage is known: resolution of the encoder, rad, and of the level, rad."""
+    """
+    Errors of a stage.
+
+    Attributes
+    ----------
+    resolution_rad
+        Step of the encoder, rad.
+    level_rad
+        Standard deviation of the base's tilt, rad.
+
+    """
 
     resolution_rad: float
     level_rad: float
@@ -74,13 +86,13 @@ class Run:
     Attributes
     ----------
     truth
-        What the simulator has, the base's tilt among it.
+        The true unit, with the tilt of the base.
     fitted
-        By model.
+        The calibrated unit by model.
     poses
-        Of the sweep.
+        Poses of the sweep.
     true_rad
-        Where the stage really stood in them, alpha and beta, (k, 2).
+        True alpha and beta of these poses, rad, (k, 2).
 
     """
 
@@ -91,7 +103,24 @@ class Run:
 
 
 def draw(nominal: Sensor, stage: Stage, rng: np.random.Generator) -> Sensor:
-    """Draw a unit at datasheet spread on a base out of level, or take the one that is given."""
+    """
+    Draw a unit at datasheet spread, or take the given one, on a base that is not level.
+
+    Parameters
+    ----------
+    nominal
+        The nominal sensor, or one unit with its effects.
+    stage
+        The stage.
+    rng
+        The random generator.
+
+    Returns
+    -------
+    Sensor
+        The unit.
+
+    """
     unit = replace(nominal, stage_resolution_rad=stage.resolution_rad,
                    local_gravity_mps2=GRAVITY_MPS2)
     if not nominal.effects:
@@ -100,20 +129,20 @@ def draw(nominal: Sensor, stage: Stage, rng: np.random.Generator) -> Sensor:
         ratio = rng.uniform(-RESISTANCE, RESISTANCE, len(unit.axes))
         values['bandwidth'] = {'resistance_ratio': ratio}
         unit = replace(unit, effects=tuple(values), values=values)
-    level = {f'{way}_rad': np.array(stage.level_rad * rng.normal()) for way in 'xy'}
+    level = {f'{axis}_rad': np.array(stage.level_rad * rng.normal()) for axis in 'xy'}
     unit = with_neutral(unit, ['base_tilt'])
     return replace(unit, values={**unit.values, 'base_tilt': level})
 
 
 def bare(truth: Sensor) -> Sensor:
-    """Return what is known of a unit before its calibration."""
+    """Return the unit as it is stated before its calibration."""
     return replace(truth.without_covariance(), effects=(), values={}, model='nominal')
 
 
 def poses_at(truth: Sensor, read_rad: np.ndarray, seed: int
              ) -> tuple[Poses, np.ndarray, Recording]:
     """
-    Rest where the encoder reads given angles, 5 s each, and average.
+    Simulate rests of 5 s at given angles of the encoder, and average.
 
     Parameters
     ----------
@@ -122,12 +151,12 @@ def poses_at(truth: Sensor, read_rad: np.ndarray, seed: int
     read_rad
         Alpha and beta, (k, 2).
     seed
-        Of where the stage stands within its steps, and of the noise.
+        Seed of the stage errors and of the noise.
 
     Returns
     -------
     tuple
-        Poses with the encoder's angles; the true ones, rad, (k, 2); what was recorded.
+        Poses with the encoder's angles; true angles, rad, (k, 2); the recording.
 
     """
     rng = np.random.default_rng([seed, 1])
@@ -152,33 +181,57 @@ def poses_at(truth: Sensor, read_rad: np.ndarray, seed: int
 
 
 def visited(true_rad: np.ndarray) -> tuple[Motion, list[float]]:
-    """Return the motion through poses, and when the dwell in each ends, s."""
+    """Return the motion through poses, (k, 2), rad, and the end of each dwell, s."""
     script = trajectories.Script(*true_rad[0])
-    ends = []
+    dwell_ends_s = []
     for pose in true_rad:
         script.go(*pose)
         script.rest(SETTLED_S + trajectories.DWELL_S)
-        ends.append(script.now)
+        dwell_ends_s.append(script.now)
     alpha, beta = script.joints()
-    return Motion(script.now, alpha, beta), ends
+    return Motion(script.now, alpha, beta), dwell_ends_s
 
 
 def calibrated(truth: Sensor, seed: int, models: Sequence[str] = tuple(MODELS)) -> Run:
-    """Sweep a unit (the paper's experiments 1 and 2) and fit the models to it."""
+    """
+    Sweep a unit (the paper's experiments 1 and 2) and fit the models.
+
+    Parameters
+    ----------
+    truth
+        The unit.
+    seed
+        Seed of all random numbers.
+    models
+        Names of the models.
+
+    Returns
+    -------
+    Run
+        The unit after its sweep.
+
+    """
     targets = sweep(PLANES_RAD, STEP_RAD, 0)
     poses, true, recording = poses_at(
         truth, np.array([[t.alpha_rad, t.beta_rad] for t in targets]), seed)
     nominal = bare(truth)
     fitted = {name: MODELS[name](nominal, poses) for name in models}
     if 'full' in fitted:
-        found = pose_extraction.estimate_filters(recording, nominal, poses)
-        fitted['full'], _ = filter_time_constant.with_filter(fitted['full'], [found])
+        noise = pose_extraction.estimate_filters(recording, nominal, poses)
+        fitted['full'], _ = filter_time_constant.with_filter(fitted['full'], [noise])
     return Run(truth, fitted, poses, true)
 
 
 def shaken(truth: Sensor, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """
     Shake a unit as in the paper's motion experiment.
+
+    Parameters
+    ----------
+    truth
+        The unit.
+    seed
+        Seed of all random numbers.
 
     Returns
     -------
@@ -187,11 +240,13 @@ def shaken(truth: Sensor, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray
 
     """
     rng = np.random.default_rng([seed, 2])
-    asked = trajectories.motion(rng)
-    off = truth.stage_resolution_rad * rng.uniform(-0.5, 0.5, 2)
+    nominal_motion = trajectories.motion(rng)
+    joint_error_rad = truth.stage_resolution_rad * rng.uniform(-0.5, 0.5, 2)
     at_rest = np.zeros(1)
-    motion = replace(asked, alpha=Held(float(asked.alpha(at_rest)[0] + off[0])),
-                     beta=Held(float(asked.beta(at_rest)[0] + off[1])))
+    alpha_rad, beta_rad = (
+        float(joint(at_rest)[0] + error) for joint, error in zip(
+            (nominal_motion.alpha, nominal_motion.beta), joint_error_rad))
+    motion = replace(nominal_motion, alpha=Held(alpha_rad), beta=Held(beta_rad))
     columns = simulate(truth, motion, seed)
     volts = np.column_stack([columns[f'{axis}_v'] for axis in truth.axes])
     return columns['time_s'], volts, motion.shift(columns['time_s'], 2)

@@ -24,28 +24,29 @@ from adxl_ros.files.plot_file import pyplot, write_plot
 from adxl_ros.model import signal_chain
 from adxl_ros.model.constants import G0_MPS2, Z_90
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.reproduction import scoring
-from adxl_ros.reproduction.misalignment import Found
+from adxl_ros.reproduction import error_statistics
+from adxl_ros.reproduction.misalignment import DirectionSearch
 from adxl_ros.reproduction.units import RUNS, Unit
 import numpy as np
 
 _COLOURS = {'linear': 'tab:red', 'physical': 'tab:orange', 'full': 'tab:green'}
 _SHOWN_S = (2.0, 2.5)
+"""Interval of figure 12, s; chosen."""
 
 
-def draw_misalignment(path: str | os.PathLike, found: Found) -> None:
-    """Draw the search for β_x of (18) and where its three ways end, beside figure 9."""
+def draw_misalignment(path: str | os.PathLike, search: DirectionSearch) -> None:
+    """Draw the search for β_x of (18) and the results of its three methods, as figure 9."""
     figure, axis = pyplot().subplots(figsize=(7, 4.5), layout='constrained')
-    turned = np.degrees(found.turned_rad)
-    axis.plot(turned, 1e3 * (found.output_g - found.output_g.max()), 'o', ms=4,
+    turned = np.degrees(search.turned_rad)
+    axis.plot(turned, 1e3 * (search.output_g - search.output_g.max()), 'o', ms=4,
               label='output, means of 5 s')
     for value, colour, label in (
-            (found.truth_rad, 'k', 'truth'), (found.largest_rad, 'tab:red', 'greatest output'),
-            (found.parabola_rad, 'tab:orange', 'parabola through the outputs'),
-            (found.null_rad, 'tab:green', 'null crossings at ±90°')):
+            (search.truth_rad, 'k', 'truth'), (search.largest_rad, 'tab:red', 'largest output'),
+            (search.parabola_rad, 'tab:orange', 'parabola through the outputs'),
+            (search.null_rad, 'tab:green', 'null crossings at ±90°')):
         axis.axvline(-np.degrees(value), color=colour, lw=1,
                      label=f'{label}: β = {np.degrees(value):+.2f}°')
-    axis.set(xlabel='beta of the stage, °', ylabel='x output less its greatest, mg',
+    axis.set(xlabel='beta of the stage, °', ylabel='x output minus its largest, mg',
              title='Direction of the x axis (18): the maximum is flat')
     axis.legend(fontsize=8)
     write_plot(figure, path)
@@ -58,11 +59,12 @@ def draw_tilt(path: str | os.PathLike, unit: Unit) -> None:
         turned = asked_deg[:, 1 if run == 'beta' else 0]
         for row, angle in enumerate(('alpha', 'beta')):
             axis = grid[row, column]
-            for name, judged in unit.models.items():
-                angles = judged.runs[run]
-                error = np.where(angles.shown[:, row], np.degrees(angles.error[:, row]), np.nan)
+            for name, errors in unit.models.items():
+                angles = errors.runs[run]
+                counts = angles.determined[:, row]
+                error = np.where(counts, np.degrees(angles.error[:, row]), np.nan)
                 axis.plot(turned, error, 'o-', ms=4, lw=1, color=_COLOURS[name], label=name)
-            bound = np.where(angles.shown[:, row], np.degrees(angles.bound[:, row]), np.nan)
+            bound = np.where(counts, np.degrees(angles.bound[:, row]), np.nan)
             axis.fill_between(turned, -Z_90 * bound, Z_90 * bound, color='0.8',
                               label='90 % by the bound')
             axis.axhline(0, color='0.5', lw=0.8)
@@ -78,17 +80,17 @@ def draw_tilt(path: str | os.PathLike, unit: Unit) -> None:
 
 def draw_motion(path: str | os.PathLike, fitted: dict[str, Sensor],
                 shaken: tuple[np.ndarray, np.ndarray, np.ndarray]) -> None:
-    """Draw figure 12: the acceleration of the shaken sensor beside the interferometer's."""
+    """Draw figure 12: the acceleration of the shaken sensor and of the interferometer."""
     figure, row = pyplot().subplots(1, len(fitted), figsize=(16, 4.5), layout='constrained',
                                     sharey=True)
     time_s = shaken[0]
     part = (time_s >= _SHOWN_S[0]) & (time_s <= _SHOWN_S[1])
     for axis, (name, unit) in zip(row, fitted.items()):
-        figures, estimate, reference = scoring.motion(unit, *shaken)
+        errors, estimate, reference = error_statistics.motion_errors(unit, *shaken)
         axis.plot(time_s[part], 1e3 * reference[part], ':', color='k', label='interferometer')
         axis.plot(time_s[part], 1e3 * estimate[part], color=_COLOURS[name], label=name)
-        axis.set(xlabel='time, s', title=f'fig. 12, {name}: rmse {figures.rmse_mmps2:.1f} mm/s² '
-                                         f'about an offset of {figures.offset_mmps2:.1f}')
+        axis.set(xlabel='time, s', title=f'fig. 12, {name}: rmse {errors.rmse_mmps2:.1f} mm/s² '
+                                         f'about an offset of {errors.offset_mmps2:.1f}')
         axis.legend(fontsize=8, loc='upper right')
     row[0].set(ylabel='acceleration along x, mm/s²')
     write_plot(figure, path)
@@ -108,17 +110,17 @@ def draw_components(path: str | os.PathLike, truth: Sensor, fitted: Sensor,
              ('+ misalignment (18)', fitted, tuple(fitted.effects)),
              ('actual response', truth, None))
     actual = _volts(truth, None, pose)
-    figure, (whole, apart) = pyplot().subplots(1, 2, figsize=(14, 5), layout='constrained')
+    figure, (response, difference) = pyplot().subplots(1, 2, figsize=(14, 5), layout='constrained')
     for label, unit, effects in steps:
         volts = _volts(unit, effects, pose)
         style: dict[str, Any] = {'color': 'k', 'ls': ':'} if unit is truth else {}
-        whole.plot(reach, volts, label=label, **style)
-        apart.plot(reach, 1e3 * (volts - actual), label=label, **style)
-    whole.set(xlabel='acceleration along x, g', ylabel='x output, V',
+        response.plot(reach, volts, label=label, **style)
+        difference.plot(reach, 1e3 * (volts - actual), label=label, **style)
+    response.set(xlabel='acceleration along x, g', ylabel='x output, V',
               title='fig. 13: response at alpha = 45°, beta = 90°')
-    apart.set(xlabel='acceleration along x, g', ylabel='less the actual response, mV',
-              title='the same, less the actual response')
-    whole.legend(fontsize=8)
+    difference.set(xlabel='acceleration along x, g', ylabel='minus the actual response, mV',
+              title='the same, minus the actual response')
+    response.legend(fontsize=8)
     write_plot(figure, path)
 
 

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The page of a reproduction: Table I and the motion experiment beside the paper and the bound."""
+"""The page of a reproduction: Table I and the motion experiment, with the paper and the bound."""
 
 from __future__ import annotations
 
@@ -21,69 +21,75 @@ from collections.abc import Callable, Sequence
 from adxl_ros.model.constants import Z_90
 from adxl_ros.reproduction import misalignment
 from adxl_ros.reproduction.experiments import MODELS
-from adxl_ros.reproduction.units import Judged, Unit
+from adxl_ros.reproduction.units import ModelErrors, Unit
 import numpy as np
 
 TABLE_I = {('alpha', 'linear'): (2.88, 3.95), ('alpha', 'physical'): (0.32, 0.82),
            ('beta', 'linear'): (1.64, 2.36), ('beta', 'physical'): (0.60, 0.82)}
-"""The paper's rms and greatest error, deg."""
+"""The paper's rms and largest error, deg."""
 MOTION_MMPS2 = {'linear': 299.8, 'physical': 20.8}
+"""The paper's residuals of the motion experiment, mm/s²."""
 _STAGE_WORDS = {
     'perfect': 'perfect stage',
     'paper': "the paper's stage (5 arcmin, a new error with each move of a joint, level 0.1°)"}
 FIGURES = 'reproduction'
-"""Folder of the figures, beside the page."""
+"""Folder of the plots, in the folder of the page."""
 NOTES = """\
 ## What differs from the paper, and why
 
-- **The noise floor.** The paper sets its motion residual, 20.8 mm/s², beside a "rated rms
-  noise" of 16.4 mm/s², which is 110 µg/√Hz times 15.2 Hz: the square root is missing. 110
-  µg/√Hz through the RC filter are 5.25 mm/s², through the 20 Hz Butterworth 5.08. Its residual
-  is four times the floor; here it reaches the floor.
-- **Θy.** For (19), α_y = 0.75° and β_y = 0.5° give θ_yx = −0.0087; the paper prints −0.0029,
-  which would need β_y = 0.17°. And x_ref in (18) is [1 0 0]ᵀ: with [0 0 1]ᵀ the printed Θx does
-  not come out.
-- **Tilt run (b)** turns beta "at alpha = 0", where beta does not show; it must have been 90°,
+- **The noise floor.** The paper compares its motion residual, 20.8 mm/s², with a "rated rms
+  noise" of 16.4 mm/s². That is 110 µg/√Hz times 15.2 Hz: the square root is missing. 110 µg/√Hz
+  are 5.25 mm/s² after the RC filter, and 5.08 after the 20 Hz Butterworth. The residual of the
+  paper is four times this floor; here the residual reaches it.
+- **Θy.** For (19), α_y = 0.75° and β_y = 0.5° give θ_yx = −0.0087. The paper prints −0.0029,
+  which needs β_y = 0.17°. And x_ref in (18) is [1 0 0]ᵀ: with [0 0 1]ᵀ the printed Θx does not
+  result.
+- **Tilt run (b)** turns beta "at alpha = 0", where beta has no effect. It must have been 90°,
   and is here.
-- **p1, q1 and Θ** are the same to first order; the staged fit and the separate search count
-  them twice. Here they are one (docs/calibration.md, "The gauge").
-- **The offset of the motion experiment** is the stage's: 0.1° of level are 17 mm/s². `full` finds
-  the level and keeps it out of the sensor; `linear` and `physical` take it into the sensor, where
-  it cancels on the same base and nowhere else.
-- **The search for the greatest output** cannot give the ±0.2° that the paper states: see the
-  figure. Null crossings can.
-- **±90°.** A two-axis sensor sees alpha there through a root of zero: no bound below 1°, so
-  such poses are scored apart, as are poses near it where |f| = g has two upright solutions.
-- **The paper's figures are of one unit of its time.** Units here are drawn at datasheet spread:
-  each coefficient normal with its typical size, the filter's resistor within ±25 %.
+- **p1, q1 and Θ** are the same to first order. The staged fit and the separate search count them
+  twice. Here they are one (docs/calibration.md, "The gauge").
+- **The offset of the motion experiment** is the stage's: 0.1° of level are 17 mm/s². `full` fits
+  the level and keeps it out of the sensor. `linear` and `physical` include it in the sensor, where
+  it cancels on the same base only.
+- **The search for the largest output** cannot give the ±0.2° that the paper states, as the plot
+  shows. Null crossings can.
+- **±90°.** A two-axis sensor determines alpha there by a root of zero, with no bound below 1°.
+  Such poses do not count. Poses near it do not count where |f| = g has two upright solutions.
+- **The paper's values are of one unit of its time.** Units here are drawn at datasheet spread:
+  each coefficient is normal with its typical size, the filter's resistor within ±25 %.
 """
 
 
-def page(found: dict[str, list[Unit]], bound_mmps2: float, made: str, coverage: str = '') -> str:
+def page(results: dict[str, list[Unit]], bound_mmps2: float, made: str, coverage: str = '') -> str:
     """
     Lay out the page, Markdown.
 
     Parameters
     ----------
-    found
+    results
         Units by stage.
     bound_mmps2
-        The floor of the motion experiment.
+        Noise floor of the motion experiment, mm/s².
     made
-        How it was made: version, date, seed.
+        Version, date and seed.
     coverage
         The section of `coverage.page`; empty for none.
+
+    Returns
+    -------
+    str
+        Markdown.
 
     """
     parts = ["# The paper's experiments, on simulated units", made,
              'W. T. Ang, P. K. Khosla, C. N. Riviere, "Nonlinear Regression Model of a Low-g MEMS '
              'Accelerometer", IEEE Sensors Journal, 2007, doi 10.1109/JSEN.2006.886995. In '
              'brackets: 90 % intervals over units, by bootstrap.']
-    for stage, units in found.items():
+    for stage, units in results.items():
         parts += [f'## {_STAGE_WORDS[stage][0].upper()}{_STAGE_WORDS[stage][1:]}', _tilt(units),
                   _to_reach(units), _motion(units, bound_mmps2)]
     parts += [coverage] if coverage else []
-    parts += ['## Direction of the x axis by (18)', _directions(found['paper']),
+    parts += ['## Direction of the x axis by (18)', _directions(results['paper']),
               '## Figures', _DRAWN, NOTES]
     return '\n\n'.join(part.strip('\n') for part in parts) + '\n'
 
@@ -96,14 +102,14 @@ _DRAWN = '\n\n'.join(f'![{title}]({FIGURES}/{name}.png)' for name, title in (
 
 
 def in_words(angle: str) -> str:
-    """Return the paper's rms and greatest error of an angle by model."""
+    """Return the paper's rms and largest error of an angle by model."""
     return ', '.join(f'{name} {rms} / {largest}°' for (a, name), (rms, largest)
                      in TABLE_I.items() if a == angle)
 
 
 def _tilt(units: Sequence[Unit]) -> str:
-    lines = ['Table I: rms / greatest error of tilt, °, over the three runs of figure 10; poses '
-             'whose bound exceeds 1° apart.', '',
+    lines = ['Table I: rms / largest error of tilt, °, over the three runs of figure 10; poses '
+             'whose bound exceeds 1° do not count.', '',
              *_head('', 'paper', *MODELS, 'Cramér-Rao bound, rms')]
     for row, angle in enumerate(('alpha', 'beta')):
         cells = [f'{np.degrees(_rms(e)):.3f} / {np.degrees(np.abs(e).max()):.3f}'
@@ -114,73 +120,77 @@ def _tilt(units: Sequence[Unit]) -> str:
 
 
 def _errors(units: Sequence[Unit], model: str, row: int) -> np.ndarray:
-    return np.concatenate([a.error[a.shown[:, row], row] for unit in units
+    return np.concatenate([a.error[a.determined[:, row], row] for unit in units
                            for a in unit.models[model].runs.values()])
 
 
 def _bounds(units: Sequence[Unit], row: int) -> np.ndarray:
-    return np.concatenate([a.bound[a.shown[:, row], row] for unit in units
+    return np.concatenate([a.bound[a.determined[:, row], row] for unit in units
                            for a in unit.models['full'].runs.values()])
 
 
 def _to_reach(units: Sequence[Unit]) -> str:
-    def over(function: Callable[[Judged], np.ndarray]) -> list[list[np.ndarray]]:
+    def over(function: Callable[[ModelErrors], np.ndarray]) -> list[list[np.ndarray]]:
         return [[function(unit.models[name]) for unit in units] for name in MODELS]
 
-    def flat(judged: Judged) -> np.ndarray:
-        every = [judged.random, *judged.runs.values()]
-        return np.concatenate([a.error[a.shown[:, 0] & ~a.near_vertical, 0] for a in every])
+    def flat(errors: ModelErrors) -> np.ndarray:
+        every = [errors.random, *errors.runs.values()]
+        return np.concatenate([a.error[a.determined[:, 0] & ~a.near_vertical, 0] for a in every])
 
-    def ratio(alone: bool) -> Callable[[Judged], np.ndarray]:
-        return lambda judged: np.concatenate([
-            a.ratio(alone) for a in (judged.random, *judged.runs.values())])
+    def ratio(pose_only: bool) -> Callable[[ModelErrors], np.ndarray]:
+        return lambda errors: np.concatenate([
+            a.ratio(pose_only) for a in (errors.random, *errors.runs.values())])
 
     lines = _head('random poses and the three runs, none fitted', *MODELS)
-    for alone, text in ((True, 'of the noise of one pose'), (False, 'of pose and calibration')):
+    for pose_only, text in ((True, 'of the noise of one pose'),
+                            (False, 'of pose and calibration')):
         lines.append(f'| tilt error ÷ bound {text}, rms | '
-                     + ' | '.join(_interval(parts) for parts in over(ratio(alone))) + ' |')
+                     + ' | '.join(_interval(parts) for parts in over(ratio(pose_only))) + ' |')
     before = over(flat)[0]
     reduced = [100 * (1 - _rms(np.concatenate(parts)) / _rms(np.concatenate(before)))
                for parts in over(flat)]
-    lines.append('| alpha rms error less than linear, 15° and more from ±90°, % | – | '
+    lines.append('| reduction of the rms error of alpha, 15° and more from ±90°, % | – | '
                  + ' | '.join(f'{r:.2f}' for r in reduced[1:]) + ' |')
-    for text, of in (('acceleration', lambda judged: np.ravel(judged.force_z)),
-                     ('coefficients', lambda judged: judged.coefficient_z)):
+    for text, z_of in (('acceleration', lambda errors: np.ravel(errors.force_z)),
+                     ('coefficients', lambda errors: errors.coefficient_z)):
         cells = []
-        for parts in over(of):
+        for parts in over(z_of):
             z = np.concatenate(parts)
             cells.append(f'{100 * np.mean(np.abs(z) < Z_90):.1f} (of {len(z)})' if len(z)
                          else '–')
         lines.append(f'| coverage of 90 % intervals, {text}, % | ' + ' | '.join(cells) + ' |')
     every = [a for unit in units for a in (unit.models['full'].random,
                                            *unit.models['full'].runs.values())]
-    apart = sum(int((~a.shown[:, 0]).sum()) for a in every)
-    lines += ['', f'Of {sum(len(a.error) for a in every)} poses {apart} show alpha worse than 1° '
-                  'and are scored apart.']
+    undetermined = sum(int((~a.determined[:, 0]).sum()) for a in every)
+    count = sum(len(a.error) for a in every)
+    lines += ['', f'Of {count} poses {undetermined} determine alpha worse than 1° and do not '
+                  'count.']
     return '\n'.join(lines)
 
 
 def _motion(units: Sequence[Unit], bound_mmps2: float) -> str:
-    shaken = {name: [unit.models[name].shaken for unit in units] for name in MODELS}
-    rmse = [_interval([np.array([one.rmse_mmps2]) for one in of]) for of in shaken.values()]
-    offset = [f'{_rms(np.array([one.offset_mmps2 for one in of])):.1f}' for of in shaken.values()]
-    both = [f'{_rms(np.array([np.hypot(one.rmse_mmps2, one.offset_mmps2) for one in of])):.1f}'
-            for of in shaken.values()]
+    rmse = {name: np.array([unit.models[name].motion.rmse_mmps2 for unit in units])
+            for name in MODELS}
+    offset = {name: np.array([unit.models[name].motion.offset_mmps2 for unit in units])
+              for name in MODELS}
+    rmse_cells = [_interval([np.array([value]) for value in values]) for values in rmse.values()]
+    offset_cells = [f'{_rms(values):.1f}' for values in offset.values()]
+    both_cells = [f'{_rms(np.hypot(rmse[name], offset[name])):.1f}' for name in MODELS]
     paper = ', '.join(f'{name} {value}' for name, value in MOTION_MMPS2.items())
-    rows = (('rmse about the offset', '–', *rmse, f'{bound_mmps2:.2f}'),
-            ("offset, rms, the stage's part included", '–', *offset, '–'),
-            ('both together', paper, *both, f'{bound_mmps2:.2f}'))
+    rows = (('rmse about the offset', '–', *rmse_cells, f'{bound_mmps2:.2f}'),
+            ("offset, rms, the stage's part included", '–', *offset_cells, '–'),
+            ('both together', paper, *both_cells, f'{bound_mmps2:.2f}'))
     return '\n'.join([*_head('motion, mm/s²', 'paper', *MODELS, 'bound'), *map(_row, rows)])
 
 
 def _directions(units: Sequence[Unit]) -> str:
     step = np.degrees(misalignment.SEARCH_RAD[1] - misalignment.SEARCH_RAD[0])
     lines = [f'Error of β_x, ° rms over units, base level to 0.1° (steps of {step:g}°):', '',
-             *_head('greatest output', 'parabola through the outputs', 'null crossings')]
-    off = [np.degrees(_rms(np.array([getattr(u.directions, name) - u.directions.truth_rad
+             *_head('largest output', 'parabola through the outputs', 'null crossings')]
+    rms_deg = [np.degrees(_rms(np.array([getattr(u.directions, name) - u.directions.truth_rad
                                      for u in units])))
            for name in ('largest_rad', 'parabola_rad', 'null_rad')]
-    return '\n'.join([*lines, _row([f'{value:.3f}' for value in off])])
+    return '\n'.join([*lines, _row([f'{value:.3f}' for value in rms_deg])])
 
 
 def _head(*names: str) -> list[str]:

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""All experiments over several units: what the page and the figures are made of."""
+"""All experiments on several units."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from adxl_ros.calibrate.fits import full_model
 from adxl_ros.calibrate.stage_error import StageError
 from adxl_ros.model.coefficients import get
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.reproduction import experiments, misalignment, scoring
+from adxl_ros.reproduction import error_statistics, experiments, misalignment
 import numpy as np
 
 RUNS = {
@@ -34,99 +34,133 @@ RUNS = {
     'beta': np.array([(90, a) for a in range(-180, 181, 30)]),
     'both': np.array([(a, a) for a in range(-180, 181, 30)]),
 }
-"""Alpha and beta of figure 10, deg; (b) at alpha 90°, as at 0 beta does not show."""
+"""Alpha and beta of figure 10, deg; (b) at alpha = 90°, as beta has no effect at 0."""
 RANDOM_POSES = 40
+"""Number of poses in random directions; chosen."""
 STAGES = {'perfect': experiments.PERFECT, 'paper': experiments.PAPER}
 
 
 @dataclass(frozen=True)
-class Judged:
+class ModelErrors:
     """
-    One model of one unit against the truth.
+    Errors of one model of one unit.
 
     Attributes
     ----------
     random, runs
-        Angles in random poses, and in each of the paper's tilt experiments.
+        Angle errors in random poses, and in each of the paper's tilt experiments.
     force_z
-        Errors of the measured axes by their promised deviation in the random poses, (k, m).
+        Errors of the measured axes over their standard deviation in the random poses, (k, m).
     coefficient_z
-        Errors of the coefficients by their promised deviation, (p,), where the truth is in the
-        gauge of the fit.
-    shaken
-        The motion experiment.
+        Errors of the coefficients over their standard deviation, (p,). Empty where the truth is
+        not in the gauge of the fit.
+    motion
+        Errors of the motion experiment.
 
     """
 
-    random: scoring.Angles
-    runs: dict[str, scoring.Angles]
+    random: error_statistics.AngleErrors
+    runs: dict[str, error_statistics.AngleErrors]
     force_z: np.ndarray
     coefficient_z: np.ndarray
-    shaken: scoring.Shaken
+    motion: error_statistics.MotionErrors
 
 
 @dataclass(frozen=True)
 class Unit:
-    """One unit on one stage: by model, and the search for its misalignment."""
+    """
+    One unit on one stage.
 
-    models: dict[str, Judged]
-    directions: misalignment.Found
+    Attributes
+    ----------
+    models
+        Errors by model.
+    directions
+        The search for its misalignment.
+
+    """
+
+    models: dict[str, ModelErrors]
+    directions: misalignment.DirectionSearch
 
 
-def judge(nominal: Sensor, stage: experiments.Stage, seed: int) -> Unit:
-    """Draw, sweep, calibrate and try one unit."""
+def evaluate(nominal: Sensor, stage: experiments.Stage, seed: int) -> Unit:
+    """
+    Draw, sweep and calibrate one unit, and run the experiments.
+
+    Parameters
+    ----------
+    nominal
+        The nominal sensor, or one unit with its effects.
+    stage
+        The stage.
+    seed
+        Seed of all random numbers.
+
+    Returns
+    -------
+    Unit
+        The errors.
+
+    """
     rng = np.random.default_rng([seed, 0])
     truth = experiments.draw(nominal, stage, rng)
     run = experiments.calibrated(truth, seed)
-    bound = scoring.known_bound(
+    bound = error_statistics.sweep_bound(
         truth, run.poses, run.true_rad, StageError(truth.stage_resolution_rad / np.sqrt(12)),
         (*full_model.default_terms(truth.axes), *full_model.GAUGE))
-    anywhere = np.column_stack([np.arccos(rng.uniform(-1, 1, RANDOM_POSES)),
+    random_rad = np.column_stack([np.arccos(rng.uniform(-1, 1, RANDOM_POSES)),
                                 rng.uniform(0, 2 * np.pi, RANDOM_POSES)])
-    asked = {'random': anywhere, **{name: np.radians(deg) for name, deg in RUNS.items()}}
-    seen = {name: experiments.poses_at(truth, rad, seed + (i + 1) * 1_000_003)[:2]
-            for i, (name, rad) in enumerate(asked.items())}
-    motion = experiments.shaken(truth, seed)
+    angles_rad = {'random': random_rad, **{name: np.radians(deg) for name, deg in RUNS.items()}}
+    poses_of = {name: experiments.poses_at(truth, rad, seed + (i + 1) * 1_000_003)[:2]
+            for i, (name, rad) in enumerate(angles_rad.items())}
+    shaken = experiments.shaken(truth, seed)
     models = {}
     for name, fitted in run.fitted.items():
-        angles = {key: scoring.angles(fitted, bound, *poses) for key, poses in seen.items()}
-        error, std = scoring.forces(fitted, truth, *seen['random'])
-        models[name] = Judged(angles.pop('random'), angles, error / std,
+        angles = {key: error_statistics.angle_errors(fitted, bound, *poses)
+                  for key, poses in poses_of.items()}
+        error, std = error_statistics.force_errors(fitted, truth, *poses_of['random'])
+        models[name] = ModelErrors(angles.pop('random'), angles, error / std,
                               _coefficients(fitted, truth),
-                              scoring.motion(fitted, *motion)[0])
+                              error_statistics.motion_errors(fitted, *shaken)[0])
     return Unit(models, misalignment.search(truth, seed))
 
 
 def _coefficients(fitted: Sensor, truth: Sensor) -> np.ndarray:
     if not all(name.effect in truth.effects for name in fitted.covariance_names):
         return np.zeros(0)
-    off = get(fitted, fitted.covariance_names) - get(truth, fitted.covariance_names)
-    return off / np.sqrt(np.diag(fitted.covariance))
+    error = get(fitted, fitted.covariance_names) - get(truth, fitted.covariance_names)
+    return error / np.sqrt(np.diag(fitted.covariance))
 
 
-def judge_all(nominal: Sensor, units: int, seed: int, show: Callable[[float], None]
-              ) -> dict[str, list[Unit]]:
+def evaluate_all(nominal: Sensor, units: int, seed: int, show: Callable[[float], None]
+                 ) -> dict[str, list[Unit]]:
     """
-    Judge several units on each stage, over the cores.
+    Evaluate several units on each stage, in parallel.
 
     Parameters
     ----------
     nominal
-        Figures that units are drawn about, or one unit with its effects.
+        The nominal sensor, or one unit with its effects.
     units
-        How many on each stage.
+        Number of units on each stage.
     seed
-        Of all randomness.
+        Seed of all random numbers.
     show
-        Takes the fraction that is done.
+        Receives the fraction that is finished.
+
+    Returns
+    -------
+    dict
+        Units by stage.
 
     """
-    found: dict[str, list[Unit]] = {}
+    results: dict[str, list[Unit]] = {}
     with ProcessPoolExecutor(os.cpu_count()) as pool:
         for i, (name, stage) in enumerate(STAGES.items()):
             seeds: Sequence[int] = [1000 * seed + k for k in range(units)]
-            found[name] = []
-            for unit in pool.map(partial(judge, nominal, stage), seeds):
-                found[name].append(unit)
-                show((i + len(found[name]) / units) / len(STAGES))
-    return found
+            results[name] = []
+            for unit in pool.map(partial(evaluate, nominal, stage), seeds):
+                results[name].append(unit)
+                show((i + len(results[name]) / units) / len(STAGES))
+    return results

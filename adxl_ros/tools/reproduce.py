@@ -29,7 +29,14 @@ from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.atomic_write import write_text
 from adxl_ros.files.stream_unit import recorded_unit
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.reproduction import coverage, experiments, plots, report_page, scoring, units
+from adxl_ros.reproduction import (
+    coverage,
+    error_statistics,
+    experiments,
+    plots,
+    report_page,
+    units,
+)
 from adxl_ros.reproduction.report_page import FIGURES
 from adxl_ros.tools.common import make_folder, progress, report_reading, run
 import numpy as np
@@ -96,7 +103,7 @@ def _simulated(sensor: Sensor, options: argparse.Namespace, folder: Path) -> str
     if not options.units:
         return coverage_part
     with progress('reproduce') as show:
-        results = units.judge_all(sensor, options.units, options.seed, show)
+        results = units.evaluate_all(sensor, options.units, options.seed, show)
     first = 1000 * options.seed
     truth = experiments.draw(sensor, experiments.PAPER, np.random.default_rng([first, 0]))
     unit = experiments.calibrated(truth, first)
@@ -111,7 +118,8 @@ def _simulated(sensor: Sensor, options: argparse.Namespace, folder: Path) -> str
     drawn = 'one unit' if sensor.effects else f'{options.units} units'
     made = (f'adxl_ros {provenance.package_version()}, {date.today()}, {drawn} on each stage, '
             f'seed {options.seed}.')
-    return report_page.page(results, scoring.motion_bound_mmps2(sensor), made, coverage_part)
+    bound_mmps2 = error_statistics.motion_bound_mmps2(sensor)
+    return report_page.page(results, bound_mmps2, made, coverage_part)
 
 
 def _coverage(sensor: Sensor, options: argparse.Namespace) -> str:

@@ -16,7 +16,7 @@
 
 from adxl_ros.files import parameter_file
 from adxl_ros.model.constants import Z_90
-from adxl_ros.reproduction import experiments, scoring, units
+from adxl_ros.reproduction import error_statistics, experiments, units
 import numpy as np
 import pytest
 from units import NOMINAL
@@ -26,9 +26,9 @@ _UNITS = {'perfect': 8, 'paper': 16}
 
 @pytest.fixture(scope='module')
 def found():
-    """Judge units on each stage, more where poses share the errors of a few settings."""
+    """Evaluate units on each stage, more where poses share the errors of a few settings."""
     nominal = parameter_file.load(NOMINAL)
-    return {name: [units.judge(nominal, stage, seed) for seed in range(_UNITS[name])]
+    return {name: [units.evaluate(nominal, stage, seed) for seed in range(_UNITS[name])]
             for name, stage in units.STAGES.items()}
 
 
@@ -51,7 +51,7 @@ def test_tilt_reaches_the_bound(found, stage, alone):
 @pytest.mark.parametrize('stage', ['perfect', 'paper'])
 def test_alpha_gains_on_linear(found, stage):
     """15° and more from ±90°: the paper's 88.9 % by physical, 98 % by full."""
-    off = {model: rms([a.error[a.shown[:, 0] & ~a.near_vertical, 0]
+    off = {model: rms([a.error[a.determined[:, 0] & ~a.near_vertical, 0]
                        for a in every(found[stage], model)]) for model in experiments.MODELS}
     assert 1 - off['physical'] / off['linear'] >= 0.889
     assert 1 - off['full'] / off['linear'] >= 0.98
@@ -60,9 +60,9 @@ def test_alpha_gains_on_linear(found, stage):
 def test_motion_reaches_the_floor(found):
     """RC undone by the resistor that the noise shows: 1.05 of 5.08 mm/s²."""
     nominal = parameter_file.load(NOMINAL)
-    bound = scoring.motion_bound_mmps2(nominal)
+    bound = error_statistics.motion_bound_mmps2(nominal)
     assert bound == pytest.approx(5.08, abs=0.01)
-    off = [unit.models['full'].shaken.rmse_mmps2 for of in found.values() for unit in of]
+    off = [unit.models['full'].motion.rmse_mmps2 for of in found.values() for unit in of]
     assert np.sqrt(np.mean(np.square(off))) < 1.05 * bound
 
 
