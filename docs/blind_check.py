@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Write the tables of a blind check, blind.json, into docs/blind-check.md under a name."""
+"""Write the tables of a blind check, blind.json, into docs/blind-check-log.md."""
 
 import json
 from pathlib import Path
@@ -23,9 +23,9 @@ from adxl_ros.blind import report_html
 
 
 def main() -> None:
-    """Replace what stands between the run's marks."""
+    """Replace the text between the marks of the run."""
     source, run = sys.argv[1:]
-    path = Path(__file__).with_name('blind-check.md')
+    path = Path(__file__).with_name('blind-check-log.md')
     tables = report_html.markdown(json.loads(Path(source).read_text(encoding='utf-8')))
     text, found = re.subn(f'<!-- {run} -->.*<!-- /{run} -->',
                           lambda match: f'<!-- {run} -->\n{tables}\n<!-- /{run} -->',

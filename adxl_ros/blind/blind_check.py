@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""A whole check: sealed, diagnosed, opened, scored."""
+"""A whole check: trials are drawn and committed, diagnosed, and scored."""
 
 from __future__ import annotations
 
@@ -33,32 +33,39 @@ from adxl_ros.blind import (
     negative_controls,
     parallel_io,
     scores,
-    trials as cases,
+    trials,
 )
+from adxl_ros.blind.label_commitment import Setup
 from adxl_ros.blind.scores import Trial
 from adxl_ros.blind.trials import Label
 from adxl_ros.errors import UserError
 
 Show = Callable[[str], Callable[[float], None]]
+"""Receives the name of a stage; returns what receives the fraction that is finished."""
 
 
-def sealed(folder: Path, seed: int | None, trials: int, pool: Executor,
-           show: Callable[[float], None]) -> str:
+def draw(folder: Path, seed: int | None, count: int, pool: Executor,
+         show: Callable[[float], None]) -> str:
     """
-    Draw and seal a check, or go on with the folder's; give the published hash.
+    Draw a check and commit to its labels, or continue the check of the folder.
 
     Parameters
     ----------
     folder
-        Empty, or with a check that was cut short.
+        Empty, or with an interrupted check.
     seed
-        Of the cases; any if None.
-    trials
-        How many, beside those at strength zero.
+        Seed of the trials; None draws one.
+    count
+        Number of trials, without those at strength zero.
     pool
         Draws in parallel.
     show
-        Takes the fraction that is done.
+        Receives the fraction that is finished.
+
+    Returns
+    -------
+    str
+        The published hash.
 
     Raises
     ------
@@ -66,99 +73,108 @@ def sealed(folder: Path, seed: int | None, trials: int, pool: Executor,
         The folder has a check of another seed or size, or something else.
 
     """
-    digest, has = label_commitment.published(folder), label_commitment.begun(folder)
+    digest = label_commitment.published_hash(folder)
     if digest is not None:
-        opened = label_commitment.unseal(folder, leave_open=False)
-        has = opened.seed, opened.trials
-    elif has is None and any(folder.glob('*')):
-        raise UserError(f'{folder}: is not empty and holds no check; choose another folder')
-    seed = (has[0] if has else secrets.randbelow(2 ** 31)) if seed is None else seed
-    if has not in (None, (seed, trials)):
-        raise UserError(f'{folder}: holds a check of another seed or number of trials; say the '
-                        'same again to go on with it, or choose another folder')
+        existing: Setup | None = label_commitment.committed_labels(folder).setup
+    else:
+        existing = label_commitment.interrupted_setup(folder)
+        if existing is None and any(folder.glob('*')):
+            raise UserError(f'{folder}: is not empty and has no check; choose another folder')
+    if seed is None:
+        seed = existing.seed if existing else secrets.randbelow(2 ** 31)
+    setup = Setup(seed, count)
+    if existing not in (None, setup):
+        raise UserError(f'{folder}: has a check of another seed or number of trials; repeat the '
+                        'same options to continue it, or choose another folder')
     if digest is not None:
         return digest
-    return label_commitment.seal(folder, seed, cases.plans(seed, trials), trials, pool, show)
+    return label_commitment.commit(folder, setup, trials.plans(seed, count), pool, show)
 
 
-def scored(folder: Path, command: Sequence[str] | None, pool: Executor,
-           show: Show) -> dict[str, Any]:
+def score(folder: Path, command: Sequence[str] | None, pool: Executor,
+          show: Show) -> dict[str, Any]:
     """
-    Diagnose what is not diagnosed yet, open the labels and score.
+    Diagnose all recordings that have no report yet, read the labels and score.
 
     Parameters
     ----------
     folder
-        Holds a sealed check.
+        Has a committed check.
     command
-        The diagnosis; None for the package's own.
+        The diagnosis; None for that of the package.
     pool
         Works in parallel.
     show
-        Takes the name of a stage; gives what takes the fraction that is done.
+        Receives the name of a stage; returns what receives the fraction that is finished.
 
     Returns
     -------
     dict
-        What blind.json holds.
+        The content of blind.json.
+
+    Raises
+    ------
+    UserError
+        No labels are committed, they were changed, or recordings are missing.
 
     """
-    digest = label_commitment.published(folder)
+    digest = label_commitment.published_hash(folder)
     if digest is None:
-        raise UserError(f'{folder}: nothing is sealed there; use --seal {folder} first')
-    label_commitment.close(folder)
+        raise UserError(f'{folder}: no labels are committed there; use --seal {folder} first')
+    label_commitment.remove_drawn(folder)
+    committed = label_commitment.committed_labels(folder)
     results = diagnosis_runs.diagnose_all(folder, command, pool, show('diagnose'))
     version = (folder / 'reports' / 'version.txt').read_text()
-    opened = label_commitment.unseal(folder)
-    labels = opened.labels
+    labels = committed.labels
     missing = [label.name for label in labels if label.name not in results]
     if missing:
-        raise UserError(f'{folder / "recordings"}: {missing[0]}.csv is missing, of {len(missing)}'
-                        ' that were sealed; a check is of all of them')
-    kept = _held(folder, labels, results, pool, show('held out'))
+        raise UserError(f'{folder / "recordings"}: {missing[0]}.csv is missing, {len(missing)} '
+                        'of the committed recordings in all; a check needs all of them')
+    held_out = _held_out(folder, labels, results, pool, show('held out'))
     answers = [grading.answer(results[label.name]) for label in labels]
-    trials = [Trial(label, given, kept[label.name]) for label, given in zip(labels, answers)]
-    made = scores.scores(trials)
-    tested = negative_controls.controls(folder, labels, answers)
+    graded = [Trial(label, answer, held_out[label.name])
+              for label, answer in zip(labels, answers)]
+    made = scores.scores(graded)
+    controls = negative_controls.controls(folder, labels, answers)
     return {
-        'schema': 1, 'hash': digest, 'seed': opened.seed, 'trials': opened.trials,
-        'cases': len(labels), 'date': str(date.today()),
+        'schema': 1, 'hash': digest, 'seed': committed.setup.seed,
+        'trials': committed.setup.trials, 'cases': len(labels), 'date': str(date.today()),
         'version': diagnosis_runs.package_version(), 'diagnose_code': version,
-        'failed': {label.name: results[label.name]['error'] for label, given
-                   in zip(labels, answers) if given.status == 'failed'},
-        'bars': scores.bars(made), 'controls': tested,
-        'leaks': any(one['leaks'] for one in tested.values()),
-        'scores': made, 'rows': [_row(trial) for trial in trials]}
+        'failed': {label.name: results[label.name]['error'] for label, answer
+                   in zip(labels, answers) if answer.status == 'failed'},
+        'bars': scores.bars(made), 'controls': controls,
+        'leaks': any(control['leaks'] for control in controls.values()),
+        'scores': made, 'rows': [_row(trial) for trial in graded]}
 
 
-def _held(folder: Path, labels: Sequence[Label], results: dict[str, diagnosis_runs.Result],
-          pool: Executor, show: Callable[[float], None]) -> dict[str, dict[str, Any] | None]:
-    done = parallel_io.make(folder / 'labels' / 'held')
+def _held_out(folder: Path, labels: Sequence[Label], results: dict[str, diagnosis_runs.Result],
+              pool: Executor, show: Callable[[float], None]) -> dict[str, dict[str, Any] | None]:
+    done = parallel_io.make_folder(folder / 'labels' / 'held')
 
-    def keep(name: str, found: dict[str, Any] | None) -> None:
-        parallel_io.write(done / f'{name}.json', json.dumps(found).encode())
+    def keep(name: str, gap: dict[str, Any] | None) -> None:
+        parallel_io.write(done / f'{name}.json', json.dumps(gap).encode())
 
     def job(label: Label) -> tuple:
         stated = (folder / 'recordings' / f'{label.name}.yaml').read_text()
         return label, stated, results[label.name]['parameters']
 
     todo = [label for label in labels if not (done / f'{label.name}.json').exists()]
-    parallel_io.each(pool, held_out_gap.judge, [partial(job, label) for label in todo], keep, show,
-                     len(labels) - len(todo))
+    parallel_io.for_each(pool, held_out_gap.evaluate, [partial(job, label) for label in todo],
+                         keep, show, len(labels) - len(todo))
     return {label.name: json.loads((done / f'{label.name}.json').read_bytes())
             for label in labels}
 
 
 def _row(trial: Trial) -> dict[str, Any]:
-    """Tell of one trial what the scores are made of."""
-    label, given = trial.label, trial.given
+    """Return the data of one trial from which the scores follow."""
+    label, answer = trial.label, trial.answer
     return {'name': label.name, 'group': label.group, 'effects': list(label.effects),
-            'strength_mps2': [one['strength_mps2'] for one in label.faults],
-            'power': [one['power'] for one in label.faults],
-            'told': [one['told'] for one in label.faults],
-            'inseparable': [one['inseparable'] for one in label.faults],
+            'strength_mps2': [fault['strength_mps2'] for fault in label.faults],
+            'power': [fault['power'] for fault in label.faults],
+            'told': [fault['told'] for fault in label.faults],
+            'inseparable': [fault['inseparable'] for fault in label.faults],
             'flexible': label.flexible, 'manoeuvre': label.manoeuvre, 'axes': label.axes,
-            'status': given.status, 'top': sorted(given.top), 'named': sorted(given.named),
-            'probability': given.probability,
-            'right': grading.verdict_right(given, label), 'seconds': given.seconds,
-            'held': trial.held}
+            'status': answer.status, 'top': sorted(answer.top), 'named': sorted(answer.named),
+            'probability': answer.probability,
+            'right': grading.verdict_right(answer, label), 'seconds': answer.seconds,
+            'held': trial.held_out}

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The diagnosis of every recording, each in a process that is given no more than that."""
+"""The diagnosis of every recording, each in a process that gets this recording only."""
 
 from __future__ import annotations
 
@@ -37,33 +37,50 @@ from adxl_ros.blind import parallel_io
 from adxl_ros.errors import UserError
 from ament_index_python.packages import get_package_prefix
 
-# What ROS 2 and Python need; nothing of where the check lies or what it is about.
 _ENVIRONMENT = ('PATH', 'LD_LIBRARY_PATH', 'PYTHONPATH', 'AMENT_PREFIX_PATH', 'VIRTUAL_ENV',
                 '_ROS_WHEELS_BOOTSTRAP_COMPLETE', 'ROS_DISTRO', 'LANG', 'SYSTEMROOT')
-_LONGEST_S = 1200.0
+"""Variables that ROS 2 and Python need. None contains the folder of the check."""
+_TIMEOUT_S = 1200.0
+"""Longest time of one diagnosis, s; chosen."""
 Result = dict[str, Any]
+"""What a diagnosis left: `report`, `parameters`, `seconds`, `status` and `error`."""
 
 
 def executable(name: str) -> list[str]:
-    """Say how to run an executable of the package."""
+    """Return the command line of an executable of the package."""
     return [sys.executable, str(Path(get_package_prefix('adxl_ros'), 'lib', 'adxl_ros', name))]
 
 
 def call(command: Sequence[str], folder: Path) -> tuple[int, str]:
-    """Run a command in a folder, with nothing else known to it; give status and stderr."""
+    """
+    Run a command in a folder, with an environment that names no other folder of the user.
+
+    Parameters
+    ----------
+    command
+        The command line.
+    folder
+        Its working directory and home.
+
+    Returns
+    -------
+    tuple
+        Exit status, and the last line of stderr.
+
+    """
     environment = {name: os.environ[name] for name in _ENVIRONMENT if name in os.environ}
-    # One process a core: linear algebra must not take the others.
+    # Each process uses one core: linear algebra must not use the others.
     environment |= {'HOME': str(folder), 'OPENBLAS_NUM_THREADS': '1', 'OMP_NUM_THREADS': '1',
                     'MPLCONFIGDIR': str(folder)}
     with subprocess.Popen(command, cwd=folder, env=environment, stdin=subprocess.DEVNULL,
                           stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
                           start_new_session=True) as process:
         try:
-            error = process.communicate(timeout=_LONGEST_S)[1]
+            error = process.communicate(timeout=_TIMEOUT_S)[1]
             return process.returncode, (error.strip().splitlines() or [''])[-1]
         except subprocess.TimeoutExpired:
             os.killpg(process.pid, signal.SIGKILL)
-            return 1, f'not done after {_LONGEST_S:.0f} s'
+            return 1, f'not finished after {_TIMEOUT_S:.0f} s'
         except BaseException:
             os.killpg(process.pid, signal.SIGKILL)
             raise
@@ -72,48 +89,63 @@ def call(command: Sequence[str], folder: Path) -> tuple[int, str]:
 def diagnose(name: str, recording: bytes, parameters: bytes,
              command: Sequence[str] | None) -> tuple[str, Result]:
     """
-    Diagnose a recording in a folder that holds it and its parameter file alone.
+    Diagnose a recording in a folder that has the recording and its parameter file only.
 
     Parameters
     ----------
     name
-        Neutral, of both files.
+        Neutral name of both files.
     recording, parameters
-        The files' bytes.
+        Content of the files.
     command
-        What to run; the package's own `diagnose` where this runs if None.
+        What to run; None for `diagnose` of the package.
 
     Returns
     -------
     tuple
-        The name, and `report` and `parameters` as they were left, None without; `seconds`,
-        `status`, `error`.
+        The name and the result; `report` and `parameters` are None where they were not written.
 
     """
-    with tempfile.TemporaryDirectory(prefix='diagnose_') as made:
-        folder = Path(made)
+    with tempfile.TemporaryDirectory(prefix='diagnose_') as temporary:
+        folder = Path(temporary)
         csv, yaml, out = folder / f'{name}.csv', folder / f'{name}.yaml', folder / 'out'
         for path, data in ((csv, recording), (yaml, parameters)):
             path.write_bytes(data)
             os.utime(path, (0, 0))
-        words = [*(command or executable('diagnose')), csv.name, '--params', yaml.name,
-                 '-o', out.name, '--json', '--seed', '0']
+        arguments = [*(command or executable('diagnose')), csv.name, '--params', yaml.name,
+                     '-o', out.name, '--json', '--seed', '0']
         start = time.monotonic()
-        status, error = call(words, folder)
+        status, error = call(arguments, folder)
         seconds = time.monotonic() - start
-        report, left = out / 'report.json', out / 'params.yaml'
+        report, params = out / 'report.json', out / 'params.yaml'
         try:
-            found = json.loads(report.read_bytes())
+            content = json.loads(report.read_bytes())
         except (OSError, ValueError) as problem:
-            found, error = None, error or f'no report: {problem}'
-        return name, {'report': found, 'seconds': seconds, 'status': status, 'error': error,
-                      'parameters': left.read_text() if left.exists() else None}
+            content, error = None, error or f'no report: {problem}'
+        return name, {'report': content, 'seconds': seconds, 'status': status, 'error': error,
+                      'parameters': params.read_text() if params.exists() else None}
 
 
 def diagnose_all(folder: Path, command: Sequence[str] | None, pool: Executor,
                  show: Callable[[float], None]) -> dict[str, Result]:
     """
-    Diagnose all recordings of a folder that are not diagnosed yet, and give all results.
+    Diagnose all recordings of a folder that have no report yet.
+
+    Parameters
+    ----------
+    folder
+        Has `recordings`; gets `reports`.
+    command
+        The diagnosis; None for that of the package.
+    pool
+        Works in parallel.
+    show
+        Receives the fraction that is finished.
+
+    Returns
+    -------
+    dict
+        All results by name.
 
     Raises
     ------
@@ -121,12 +153,12 @@ def diagnose_all(folder: Path, command: Sequence[str] | None, pool: Executor,
         Earlier results are of another version of the diagnosis.
 
     """
-    reports, code = parallel_io.make(folder / 'reports'), code_version(command)
+    reports, code = parallel_io.make_folder(folder / 'reports'), code_version(command)
     stamp = reports / 'version.txt'
     if stamp.exists() and stamp.read_text() != code:
         raise UserError(f'{stamp}: earlier reports are of another version of the diagnosis '
-                        f'({stamp.read_text()[:12]}, now {code[:12]}); seal anew into another '
-                        'folder, a check is of one version')
+                        f'({stamp.read_text()[:12]}, now {code[:12]}); draw a new check '
+                        'into another folder')
     parallel_io.write(stamp, code.encode())
     names = sorted(path.stem for path in (folder / 'recordings').glob('*.csv'))
     todo = [name for name in names if not (reports / f'{name}.json').exists()]
@@ -139,16 +171,16 @@ def diagnose_all(folder: Path, command: Sequence[str] | None, pool: Executor,
     def keep(name: str, result: Result) -> None:
         parallel_io.write(reports / f'{name}.json', json.dumps(result).encode())
 
-    parallel_io.each(pool, diagnose, [partial(job, name) for name in todo], keep, show,
-                     len(names) - len(todo))
+    parallel_io.for_each(pool, diagnose, [partial(job, name) for name in todo], keep, show,
+                         len(names) - len(todo))
     if code_version(command) != code:
-        raise UserError('the code of the diagnosis was changed while it ran: seal anew into '
-                        'another folder, and leave the package alone meanwhile')
+        raise UserError('the code of the diagnosis changed while it ran; draw a new check into '
+                        'another folder, and do not change the package meanwhile')
     return {name: json.loads((reports / f'{name}.json').read_bytes()) for name in names}
 
 
 def code_version(command: Sequence[str] | None) -> str:
-    """Hash the code that diagnoses: the package without this check, or the command's files."""
+    """Hash the code of the diagnosis: the package without this check, or the command's files."""
     hashed = hashlib.sha256()
     if command is None:
         root = Path(__file__).parents[1]
@@ -173,7 +205,17 @@ def package_version() -> str:
 @contextmanager
 def workers(scheduler: str | None) -> Iterator[Executor]:
     """
-    Give a pool: a process for each core, or a Dask cluster.
+    Open a pool: a process for each core, or a Dask cluster.
+
+    Parameters
+    ----------
+    scheduler
+        Address of the cluster; None for processes.
+
+    Yields
+    ------
+    Executor
+        The pool.
 
     Raises
     ------
@@ -182,9 +224,9 @@ def workers(scheduler: str | None) -> Iterator[Executor]:
 
     """
     if scheduler is None:
-        # Each takes one core; what is spawned reads this before it loads numpy.
+        # A new process reads this before it loads numpy; each uses one core.
         os.environ['OPENBLAS_NUM_THREADS'] = '1'
-        pool = ProcessPoolExecutor(cores(), get_context('spawn'), _deaf)
+        pool = ProcessPoolExecutor(cores(), get_context('spawn'), _ignore_interrupts)
         try:
             yield pool
         finally:
@@ -202,12 +244,12 @@ def workers(scheduler: str | None) -> Iterator[Executor]:
         yield pool
 
 
-def _deaf() -> None:
-    """Leave Ctrl-C to the parent: it stops giving work, and what is under way ends."""
+def _ignore_interrupts() -> None:
+    """Leave Ctrl-C to the parent, which stops to submit jobs; running jobs finish."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def cores() -> int:
-    """Count the cores that this process may use."""
+    """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else \
         os.cpu_count() or 1

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What the diagnosis answered, what would have been right, and whether it was."""
+"""Grading of answers: what the diagnosis answered, and whether it is right."""
 
 from __future__ import annotations
 
@@ -27,13 +27,39 @@ from adxl_ros.blind.world.unit import G0
 import numpy as np
 
 UNKNOWN = 'unknown'
-# Below this power of the ideal observer an effect is out of sight: not naming it is right, too.
-SEEN, SURE = 0.5, 0.9
+VISIBLE_POWER = 0.5
+"""Power of the ideal observer below which an effect may be missing in a right answer; chosen."""
+CERTAIN_POWER = 0.9
+"""Power of the ideal observer from which scores count an effect; chosen."""
+_NOISE_BAND_HZ = 78.5
+"""Noise bandwidth of the 50 Hz output filter, Hz: π/2 of its corner."""
 
 
 @dataclass(frozen=True)
 class Answer:
-    """A report, read: `certain` effects, `groups` of which one each, and the hypotheses."""
+    """
+    What a report answers.
+
+    Attributes
+    ----------
+    status
+        Status of the verdict; 'failed' without a report.
+    certain
+        Effects that the verdict names for certain.
+    groups
+        Groups of which the verdict names one effect each.
+    probability
+        Probability of the verdict by the report.
+    hypotheses
+        Effects and probability of each hypothesis.
+    parameters
+        Value, and ends of the 90 % interval, by parameter.
+    seconds
+        Run time, s.
+    closed
+        Share of the gap that is closed; None without one.
+
+    """
 
     status: str
     certain: frozenset[str]
@@ -46,31 +72,31 @@ class Answer:
 
     @property
     def named(self) -> frozenset[str]:
-        """Name every effect of the verdict, for certain or as one of a group."""
+        """Return every effect that the verdict names, for certain or in a group."""
         return self.certain.union(*self.groups)
 
     @property
     def top(self) -> frozenset[str]:
-        """Give the most probable hypothesis."""
-        return max(self.hypotheses, key=lambda one: one[1])[0]
+        """Return the effects of the most probable hypothesis."""
+        return max(self.hypotheses, key=lambda hypothesis: hypothesis[1])[0]
 
     @property
     def gap(self) -> bool:
-        """Say whether the answer is that there is something."""
+        """Return whether the answer states a gap."""
         return self.status in ('explained', 'inseparable', 'unknown', 'bad_data')
 
 
 def answer(result: dict[str, Any]) -> Answer:
-    """Read a result; what is no report of the fixed form counts as failed and says nothing."""
+    """Read a result of `diagnosis_runs`; anything but a report of the fixed form is a failure."""
     try:
         report = result['report']
         verdict = report['verdict']
-        hypotheses = tuple((frozenset(one['effects']), float(one['probability']))
-                           for one in report['hypotheses'])
+        hypotheses = tuple((frozenset(row['effects']), float(row['probability']))
+                           for row in report['hypotheses'])
         parameters = {
-            f'{one["effect"]}.{name}': (
+            f'{candidate["effect"]}.{name}': (
                 float(row['value']), float(row['ci'][0]), float(row['ci'][1]))
-            for one in report['candidates'] for name, row in one['parameters'].items()
+            for candidate in report['candidates'] for name, row in candidate['parameters'].items()
             if isinstance(row, dict) and row.get('ci')}
         certain = frozenset(verdict['effects'])
         if verdict['status'] == 'unknown':
@@ -85,101 +111,129 @@ def answer(result: dict[str, Any]) -> Answer:
 
 
 def truth(label: Label) -> frozenset[str]:
-    """Give the answer that is wholly right."""
+    """Return the effects of the true answer."""
     return frozenset({UNKNOWN} if label.group == 'outside' else label.true)
 
 
 def right(label: Label) -> list[frozenset[str]]:
-    """Give every answer that is right: effects out of the ideal observer's sight may miss."""
-    whole = truth(label)
-    power = {UNKNOWN if label.group == 'outside' else one['effect']: one['power']
-             for one in label.faults}
-    hidden = [name for name in whole if power.get(name, 1.0) < SEEN]
-    return [whole - set(some) for k in range(len(hidden) + 1) for some in combinations(hidden, k)]
+    """Return every right answer: effects that the ideal observer does not see may be missing."""
+    true = truth(label)
+    power = {UNKNOWN if label.group == 'outside' else fault['effect']: fault['power']
+             for fault in label.faults}
+    hidden = [name for name in true if power.get(name, 1.0) < VISIBLE_POWER]
+    subsets = [combinations(hidden, k) for k in range(len(hidden) + 1)]
+    return [true - set(missing) for subset in subsets for missing in subset]
 
 
-def verdict_right(given: Answer, label: Label) -> bool:
-    """Say whether a verdict is right: what is certain is true, and each group holds one more."""
-    if given.status in ('failed', 'insufficient', 'bad_data'):
+def verdict_right(answer: Answer, label: Label) -> bool:
+    """
+    Return whether a verdict is right: certain effects are true, and each group has one more.
+
+    Parameters
+    ----------
+    answer, label
+        The answer, and what is true.
+
+    Returns
+    -------
+    bool
+        Whether it is right.
+
+    """
+    if answer.status in ('failed', 'insufficient', 'bad_data'):
         return False
-    return any(_fits(given, wanted) for wanted in right(label))
+    return any(_matches(answer, effects) for effects in right(label))
 
 
-def _fits(given: Answer, wanted: frozenset[str]) -> bool:
-    if not given.certain <= wanted:
+def _matches(answer: Answer, effects: frozenset[str]) -> bool:
+    if not answer.certain <= effects:
         return False
-    rest = wanted - given.certain
-    return len(rest) == len(given.groups) and any(
-        all(name in group for name, group in zip(order, given.groups))
+    rest = effects - answer.certain
+    return len(rest) == len(answer.groups) and any(
+        all(name in group for name, group in zip(order, answer.groups))
         for order in permutations(rest))
 
 
-def sure(label: Label) -> bool:
-    """Say whether the ideal observer both sees every effect and tells it from all others."""
+def separable(label: Label) -> bool:
+    """Return whether the ideal observer detects every effect and separates it from all others."""
     return bool(label.faults) and all(
-        one['power'] * one['told'] >= SURE for one in label.faults)
+        fault['power'] * fault['told'] >= CERTAIN_POWER for fault in label.faults)
 
 
 def visible(label: Label) -> bool:
-    """Say whether the ideal observer sees every effect."""
-    return bool(label.faults) and all(one['power'] >= SURE for one in label.faults)
+    """Return whether the ideal observer detects every effect."""
+    return bool(label.faults) and all(
+        fault['power'] >= CERTAIN_POWER for fault in label.faults)
 
 
-def brier(given: Answer, label: Label) -> float:
-    """Score the probabilities of all hypotheses; those that are right count together."""
-    wanted = right(label)
-    good = sum(p for effects, p in given.hypotheses if effects in wanted)
-    wrong = sum(p * p for effects, p in given.hypotheses if effects not in wanted)
-    return (1 - good) ** 2 + wrong
+def brier(answer: Answer, label: Label) -> float:
+    """
+    Return the Brier score of all hypotheses; right hypotheses count together.
+
+    Parameters
+    ----------
+    answer, label
+        The answer, and what is true.
+
+    Returns
+    -------
+    float
+        The score, 0 for a certain right answer.
+
+    """
+    accepted = right(label)
+    correct = sum(p for effects, p in answer.hypotheses if effects in accepted)
+    wrong = sum(p * p for effects, p in answer.hypotheses if effects not in accepted)
+    return (1 - correct) ** 2 + wrong
 
 
 def true_parameters(label: Label) -> dict[str, float]:
     """
-    Give true figures by the names that reports use, where both worlds mean the same by them.
+    Return the true values of parameters that mean the same in both worlds, by name of the report.
 
-    A coefficient of another functional form has no counterpart and is left out.
+    A coefficient of another functional form has no counterpart.
     """
-    out: dict[str, float] = {}
+    true: dict[str, float] = {}
     unit = trials.scene(label.seed, label.seconds).unit
     stage = unit.stage_rad
-    for one in label.faults:
-        name, size = one['effect'], one['size']
-        w = size * np.asarray(one['shape'].get('w', [0.0]), float)
+    for fault in label.faults:
+        name, size = fault['effect'], fault['size']
+        w = size * np.asarray(fault['shape'].get('w', [0.0]), float)
         by_axis = dict(zip(unit.axes, w))
         scale = dict(zip(unit.axes, unit.scale_v_per_g))
         zero = dict(zip(unit.axes, unit.zero_v))
         noise = dict(zip(unit.axes, zip(unit.noise_g_per_rthz, unit.stated_noise_g_per_rthz)))
         if name == 'bias':
-            out |= {f'bias.offset_v.{d}': zero[d] + v * scale[d] - 2.5
+            true |= {f'bias.offset_v.{d}': zero[d] + v * scale[d] - 2.5
                     for d, v in by_axis.items()}
         elif name == 'scale_factor':
-            out |= {f'scale_factor.offset_v_per_g.{d}': scale[d] * (1 + v) - 1.0
+            true |= {f'scale_factor.offset_v_per_g.{d}': scale[d] * (1 + v) - 1.0
                     for d, v in by_axis.items()}
         elif name == 'noise_excess':
-            out |= {f'noise_excess.ratio.{d}': math.sqrt(
-                noise[d][0] ** 2 + (v / scale[d]) ** 2 / 78.5) / noise[d][1] - 1
+            true |= {f'noise_excess.ratio.{d}': math.sqrt(
+                noise[d][0] ** 2 + (v / scale[d]) ** 2 / _NOISE_BAND_HZ) / noise[d][1] - 1
                 for d, v in by_axis.items()}
         elif name == 'gravity':
-            out['gravity.offset_mps2'] = G0 * w[0]
+            true['gravity.offset_mps2'] = G0 * w[0]
         elif name == 'time_offset':
-            out['time_offset.offset_s'] = w[0]
+            true['time_offset.offset_s'] = w[0]
         elif name == 'lever_arm':
-            out |= {f'lever_arm.{d}_m': v for d, v in zip('xyz', w)}
+            true |= {f'lever_arm.{d}_m': v for d, v in zip('xyz', w)}
         elif name == 'stage_offset':
-            out |= {'stage_offset.alpha_rad': w[0] + stage[0],
+            true |= {'stage_offset.alpha_rad': w[0] + stage[0],
                     'stage_offset.beta_rad': w[1] + stage[3]}
         elif name == 'base_tilt':
-            out |= {'base_tilt.x_rad': -w[1], 'base_tilt.y_rad': w[0]}
+            true |= {'base_tilt.x_rad': -w[1], 'base_tilt.y_rad': w[0]}
         elif name == 'backlash':
-            out |= {'backlash.alpha_rad': abs(w[0]), 'backlash.beta_rad': abs(w[1])}
+            true |= {'backlash.alpha_rad': abs(w[0]), 'backlash.beta_rad': abs(w[1])}
         elif name == 'stage_eccentricity':
-            out |= {f'stage_eccentricity.{part}_rad': v + stage[i] for part, v, i in zip(
+            true |= {f'stage_eccentricity.{part}_rad': v + stage[i] for part, v, i in zip(
                 ('beta_sine', 'beta_cosine', 'alpha_sine', 'alpha_cosine'), w, (4, 5, 1, 2))}
         elif name == 'misalignment':
             # Equations 18 and 19, to first order, of the directions xy, xz, yx, yz, zx, zy.
-            out |= {f'misalignment.{part}_rad.{d}': sign * v for part, d, sign, v in zip(
+            true |= {f'misalignment.{part}_rad.{d}': sign * v for part, d, sign, v in zip(
                 ('beta', 'alpha', 'beta', 'alpha', 'beta', 'alpha'), 'xxyyzz',
                 (1, -1, -1, 1, 1, -1), w)}
         elif name == 'mount_resonance':
-            out['mount_resonance.frequency_hz'] = one['shape']['hertz']
-    return out
+            true['mount_resonance.frequency_hz'] = fault['shape']['hertz']
+    return true

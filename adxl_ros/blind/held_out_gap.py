@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""How far the gap closes on a recording that the diagnosis never saw, beside an oracle."""
+"""The gap on a held-out recording with what the diagnosis found, and with the true faults."""
 
 from __future__ import annotations
 
@@ -26,64 +26,70 @@ from adxl_ros.blind import diagnosis_runs, trials
 from adxl_ros.blind.trials import Label
 from adxl_ros.blind.world import ideal_observer
 from adxl_ros.blind.world.chain import render
-from adxl_ros.blind.world.fault_table import Fault, KINDS
+from adxl_ros.blind.world.fault import Fault
+from adxl_ros.blind.world.fault_table import KINDS
 from adxl_ros.errors import UserError
 import numpy as np
 import yaml
 
-# Noise does not repeat: these effects are left out where a recording is simulated again.
 NOISE_LIKE = frozenset(name for name, kind in KINDS.items() if kind.random and name != 'adc_inl')
-_BLOCK_S, _RESAMPLES = 5.0, 400
+"""Effects that are removed before a recording is simulated again, as noise does not repeat."""
+_BLOCK_S = 5.0
+"""Length of the blocks of the bootstrap, s; chosen."""
+_RESAMPLES = 400
+"""Number of bootstrap samples; chosen."""
 
 
-def judge(label: Label, stated: str, found: str | None) -> tuple[str, dict[str, Any] | None]:
+def evaluate(label: Label, stated: str, fitted: str | None
+             ) -> tuple[str, dict[str, Any] | None]:
     """
-    Simulate a held-out recording of a case, with and without what the diagnosis found.
+    Simulate a held-out recording of a trial, with and without what the diagnosis found.
 
     Parameters
     ----------
     label
-        The case.
-    stated, found
-        Parameter files: the user's, and what the diagnosis left (None for nothing).
+        Label of the trial.
+    stated, fitted
+        Text of parameter files: of the user, and of the diagnosis (None without one).
 
     Returns
     -------
     tuple
-        The case's name, and mean squares `before`, `after`, `oracle` and `floor`, (m/s^2)^2, with
-        the 90 % intervals `gap_ci` of before less floor and `harm_ci` of after less before; None
-        where there is nothing to close and nothing was changed.
+        Name of the trial, and mean squares `before`, `after`, `oracle` and `floor`, (m/s²)², with
+        the 90 % intervals `gap_ci` of before minus floor and `harm_ci` of after minus before. None
+        where the trial has no gap and the diagnosis changed nothing.
 
     """
-    changed = found is not None and _mean_only(found) != _mean_only(stated)
+    changed = fitted is not None and _without_noise(fitted) != _without_noise(stated)
     faults = [fault for fault in trials.faults_of(label) if fault.kind.name not in NOISE_LIKE]
     if not changed and not faults:
         return label.name, None
-    at = trials.scene(label.seed, label.seconds, held_out=True)
-    unit = at.unit
-    eye = ideal_observer.Eye(at)
-    measured = render(unit, at.manoeuvre, trials.faults_of(label), at.seed)
+    held_out = trials.scene(label.seed, label.seconds, held_out=True)
+    unit = held_out.unit
+    observer = ideal_observer.IdealObserver(held_out)
+    measured = render(unit, held_out.manoeuvre, trials.faults_of(label), held_out.seed)
     csv = trials.recording(label, held_out=True)
 
     def squares(simulated: np.ndarray) -> np.ndarray:
-        off = (measured - simulated) * unit.volts_to_mps2
-        return np.mean(ideal_observer.beyond_calibration(unit, off, eye.force) ** 2, axis=0)
+        gap = (measured - simulated) * unit.volts_to_mps2
+        rest = ideal_observer.beyond_calibration(unit, gap, observer.force)
+        return np.mean(rest ** 2, axis=0)
 
-    def clean(some: list[Fault]) -> np.ndarray:
-        return render(unit, at.manoeuvre, some, at.seed, noise=False)
+    def clean(acting: list[Fault]) -> np.ndarray:
+        return render(unit, held_out.manoeuvre, acting, held_out.seed, noise=False)
 
-    plain, nothing = _simulate(csv, stated), clean([])
-    before = squares(plain)
+    baseline, without_faults = _simulate(csv, stated), clean([])
+    before = squares(baseline)
     after, error = before, None
-    if changed and found:
+    if changed and fitted:
         try:
-            after = squares(_simulate(csv, found))
+            after = squares(_simulate(csv, fitted))
         except UserError as problem:
-            # What was found cannot be simulated: it closes nothing.
+            # A parameter file that cannot be simulated closes nothing.
             error = str(problem)
-    # The same simulator, which follows the encoder's rounded angles, with the world's own effect.
-    floor, oracle = (squares(plain + clean(some) - nothing)
-                     for some in (faults, _fitted(label, faults)))
+    # The package's simulator follows the rounded encoder; the world's own effect is added to it.
+    floor, oracle = (squares(baseline + clean(acting) - without_faults)
+                     for acting in (faults, _fitted(label, faults)))
     block = int(_BLOCK_S * unit.rate_hz)
     gap_ci, harm_ci = (_interval(row, block) for row in (before - floor, after - before))
     return label.name, {'before': before.mean(), 'after': after.mean(), 'oracle': oracle.mean(),
@@ -91,23 +97,23 @@ def judge(label: Label, stated: str, found: str | None) -> tuple[str, dict[str, 
                         'error': error}
 
 
-def _mean_only(text: str) -> dict[str, Any]:
-    """Read a parameter file without noise and without what noise-like effects add."""
+def _without_noise(text: str) -> dict[str, Any]:
+    """Read a parameter file without noise and without noise-like effects."""
     keys = yaml.safe_load(text)['/**']['ros__parameters']
     keys['effects'] = [name for name in keys.get('effects', []) if name not in NOISE_LIKE]
     keys['sensor']['noise_density_g_per_rthz'] = [0.0] * len(keys['sensor']['axes'])
-    # Of no use to the simulator, and not of the effects that are left.
+    # The simulator does not use these keys, and they name removed effects.
     return {name: value for name, value in keys.items()
             if name not in (*NOISE_LIKE, 'covariance', 'covariance_names', 'provenance')}
 
 
 def _simulate(csv: str, parameters: str) -> np.ndarray:
-    """Run the package's simulator along a recording; give volts, (axes, n)."""
-    with tempfile.TemporaryDirectory(prefix='simulate_') as made:
-        folder = Path(made)
+    """Run the package's simulator along a recording; return volts, (m, n)."""
+    with tempfile.TemporaryDirectory(prefix='simulate_') as temporary:
+        folder = Path(temporary)
         (folder / 'held.csv').write_text(csv)
         (folder / 'held.yaml').write_text(yaml.safe_dump(
-            {'/**': {'ros__parameters': _mean_only(parameters)}}))
+            {'/**': {'ros__parameters': _without_noise(parameters)}}))
         status, error = diagnosis_runs.call(
             [*diagnosis_runs.executable('simulate'), 'held.csv', '--params', 'held.yaml',
              '-o', 'again.csv'], folder)
@@ -122,21 +128,21 @@ def _simulate(csv: str, parameters: str) -> np.ndarray:
 
 
 def _fitted(label: Label, faults: list[Fault]) -> list[Fault]:
-    """Fit the sizes of the true faults, in their true forms, to the case's own recording."""
+    """Fit the sizes of the true faults, in their true forms, to the recording of the trial."""
     if not faults:
         return []
-    at = trials.scene(label.seed, label.seconds)
-    eye = ideal_observer.Eye(at)
-    volts = render(at.unit, at.manoeuvre, trials.faults_of(label), at.seed)
-    off = (volts - at.unit.stated_zero_v[:, None]) * at.unit.volts_to_mps2 - eye.force
-    columns = np.stack([eye.seen(at.response([fault])) for fault in faults], axis=1)
-    sizes = np.linalg.lstsq(columns, eye.seen(off), rcond=None)[0]
+    drawn = trials.scene(label.seed, label.seconds)
+    observer = ideal_observer.IdealObserver(drawn)
+    volts = render(drawn.unit, drawn.manoeuvre, trials.faults_of(label), drawn.seed)
+    gap = (volts - drawn.unit.stated_zero_v[:, None]) * drawn.unit.volts_to_mps2 - observer.force
+    columns = np.stack([observer.project(drawn.response([fault])) for fault in faults], axis=1)
+    sizes = np.linalg.lstsq(columns, observer.project(gap), rcond=None)[0]
     return [replace(fault, size=fault.size * float(np.clip(size, 0, 2)))
             for fault, size in zip(faults, sizes)]
 
 
 def _interval(values: np.ndarray, block: int) -> list[float]:
-    """Give the 90 % interval of a mean by resampling blocks."""
+    """Return the 90 % interval of a mean by resampling blocks."""
     means = np.array([part.mean() for part in np.array_split(
         values, max(len(values) // block, 2))])
     rng = np.random.default_rng(0)

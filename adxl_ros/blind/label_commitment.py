@@ -13,12 +13,12 @@
 # limitations under the License.
 
 """
-Recordings in one folder, labels in another, sealed by the hash of labels and salt.
+Commitment to labels: recordings in one folder, labels in another, and a published hash.
 
-While the labels are sealed they lie encrypted in DIR/labels; the key is in the user's own state
-folder, not in DIR, so that neither a look around nor a known path gives them away. A program of
-the same user that searches that folder could still find it: who must rule that out seals on one
-machine and diagnoses DIR/recordings on another.
+The hash of salt and labels is published before the diagnosis starts. It proves that the labels
+did not change since. The diagnosis gets neither the folder of the labels nor a path to it: it
+runs in a folder of its own (`diagnosis_runs`). The labels are not encrypted. To keep them from a
+program that searches the disk, diagnose a copy of DIR/recordings on another machine.
 """
 
 from __future__ import annotations
@@ -34,47 +34,91 @@ import os
 from pathlib import Path
 import secrets
 import shutil
-from typing import Any
+from typing import Any, NamedTuple
 
-from adxl_ros.blind import parallel_io, trials as cases
+from adxl_ros.blind import parallel_io, trials
 from adxl_ros.blind.trials import Label, Plan
 from adxl_ros.errors import UserError
 
-Draw = Callable[[Plan], tuple[Label, str, str]]
+
+class Drawn(NamedTuple):
+    """
+    One drawn trial.
+
+    Attributes
+    ----------
+    label
+        Its label.
+    recording, parameters
+        Text of its recording (CSV) and of its parameter file (YAML).
+
+    """
+
+    label: Label
+    recording: str
+    parameters: str
 
 
-@dataclass(frozen=True)
-class Sealed:
-    """What the seal closes over: how the check was drawn, and its labels."""
+class Setup(NamedTuple):
+    """
+    What determines the trials of a check.
+
+    Attributes
+    ----------
+    seed
+        Seed of all random numbers.
+    trials
+        Number of trials, without those at strength zero.
+
+    """
 
     seed: int
     trials: int
+
+
+@dataclass(frozen=True)
+class CommittedLabels:
+    """
+    The content of the label file that the hash covers.
+
+    Attributes
+    ----------
+    setup
+        How the trials were drawn.
+    labels
+        The label of each trial.
+
+    """
+
+    setup: Setup
     labels: list[Label]
 
 
-def draw(plan: Plan) -> tuple[Label, str, str]:
-    """Draw a case: its label, its recording and its parameter file."""
-    label = cases.draw(plan)
-    return label, cases.recording(label), cases.parameter_file(label)
+def draw(plan: Plan) -> Drawn:
+    """Draw a trial: its label, its recording and its parameter file."""
+    label = trials.draw(plan)
+    return Drawn(label, trials.recording(label), trials.parameter_file(label))
 
 
-def seal(folder: Path, seed: int, plans: list[Plan], trials: int, pool: Executor,
-         show: Callable[[float], None], make: Draw = draw) -> str:
+def commit(folder: Path, setup: Setup, plans: list[Plan], pool: Executor,
+           show: Callable[[float], None], make: Callable[[Plan], Drawn] = draw) -> str:
     """
-    Draw cases into a folder and seal their labels; go on where an earlier call was cut short.
+    Draw trials into a folder and publish the hash of their labels.
+
+    An interrupted call continues where it was.
 
     Parameters
     ----------
     folder
         Gets `recordings`, `labels` and `seal.json`.
-    seed, plans, trials
-        Of the check.
+    setup, plans
+        Seed and size of the check, and its trials.
     pool
         Draws in parallel.
     show
-        Takes the fraction that is done.
+        Receives the fraction that is finished.
     make
-        Draws a case.
+        Draws one trial.
 
     Returns
     -------
@@ -82,106 +126,132 @@ def seal(folder: Path, seed: int, plans: list[Plan], trials: int, pool: Executor
         SHA-256 of salt and labels.
 
     """
-    recordings = parallel_io.make(folder / 'recordings')
-    drawn = parallel_io.make(folder / 'labels' / 'drawn')
+    recordings = parallel_io.make_folder(folder / 'recordings')
+    drawn = parallel_io.make_folder(_drawn(folder))
 
     def keep(label: Label, recording: str, parameters: str) -> None:
-        name = label.name
         for suffix, text in (('csv', recording), ('yaml', parameters)):
-            path = recordings / f'{name}.{suffix}'
+            path = recordings / f'{label.name}.{suffix}'
             parallel_io.write(path, text.encode('ascii'))
-            # When it was drawn would tell of the work that its label made.
+            # The time of writing would show how long the label took to draw.
             os.utime(path, (0, 0))
-        row = {'seed': seed, 'trials': trials, 'label': json.loads(cases.as_json([label]))[0]}
-        parallel_io.write(drawn / f'{name}.json', json.dumps(row).encode())
+        row = {**setup._asdict(), 'label': json.loads(trials.as_json([label]))[0]}
+        parallel_io.write(drawn / f'{label.name}.json', json.dumps(row).encode())
 
     todo = [plan for plan in plans if not (drawn / f'{plan.name}.json').exists()]
-    parallel_io.each(pool, make, [partial(_only, plan) for plan in todo], keep, show,
-                     len(plans) - len(todo))
-    rows = [json.loads((drawn / f'{plan.name}.json').read_bytes())['label'] for plan in plans]
-    text = json.dumps({'salt': secrets.token_hex(16), 'seed': seed, 'trials': trials,
-                       'labels': rows}, indent=1).encode()
+    parallel_io.for_each(pool, make, [partial(_arguments, plan) for plan in todo], keep, show,
+                         len(plans) - len(todo))
+    rows = [_read_drawn(drawn / f'{plan.name}.json')['label'] for plan in plans]
+    text = json.dumps({'salt': secrets.token_hex(16), **setup._asdict(), 'labels': rows},
+                      indent=1).encode()
     digest = hashlib.sha256(text).hexdigest()
-    key = secrets.token_bytes(32)
-    key_path = _key_path(digest)
-    parallel_io.make(key_path.parent)
-    parallel_io.write(key_path, key)
-    key_path.chmod(0o600)
-    parallel_io.write(folder / 'labels' / 'labels.sealed', _crypt(text, key))
-    parallel_io.write(folder / 'seal.json', json.dumps({
+    parallel_io.write(_label_file(folder), text)
+    parallel_io.write(_seal(folder), json.dumps({
         'sha256_of_salt_and_labels': digest, 'cases': len(plans), 'date': str(date.today()),
     }, indent=1).encode())
-    close(folder)
+    remove_drawn(folder)
     return digest
 
 
-def close(folder: Path) -> None:
-    """Take away what drawing left beside the sealed labels, also where it was cut short there."""
-    shutil.rmtree(folder / 'labels' / 'drawn', ignore_errors=True)
+def remove_drawn(folder: Path) -> None:
+    """Remove what drawing left beside the labels, also after an interruption."""
+    shutil.rmtree(_drawn(folder), ignore_errors=True)
 
 
-def _only(plan: Plan) -> tuple[Plan]:
-    return (plan,)
+def published_hash(folder: Path) -> str | None:
+    """
+    Return the published hash of a folder's labels; None before it is published.
 
+    Raises
+    ------
+    UserError
+        The file of the hash is damaged.
 
-def published(folder: Path) -> str | None:
-    """Give the hash that a folder's labels are sealed with, None before that."""
-    path = folder / 'seal.json'
+    """
+    path = _seal(folder)
     try:
         return str(json.loads(path.read_bytes())['sha256_of_salt_and_labels'])
     except FileNotFoundError:
         return None
     except (ValueError, KeyError, TypeError):
-        raise UserError(f'{path}: is no seal; seal anew into another folder') from None
+        raise UserError(f'{path}: has no hash; draw a new check into another folder') from None
 
 
-def begun(folder: Path) -> tuple[int, int] | None:
-    """Give seed and trials of a check that was cut short while it was drawn."""
-    for path in (folder / 'labels' / 'drawn').glob('*.json'):
-        row = json.loads(path.read_bytes())
-        return row['seed'], row['trials']
-    return None
-
-
-def unseal(folder: Path, leave_open: bool = True) -> Sealed:
+def interrupted_setup(folder: Path) -> Setup | None:
     """
-    Open the labels, check them against the published hash, and leave them in the open or not.
+    Return seed and number of trials of a check whose drawing was interrupted; None without one.
 
     Raises
     ------
     UserError
-        The key is not here, or the labels are not those that were sealed.
+        A drawn label is damaged, or of an older version.
 
     """
-    digest = published(folder)
+    for path in _drawn(folder).glob('*.json'):
+        row = _read_drawn(path)
+        return Setup(row['seed'], row['trials'])
+    return None
+
+
+def committed_labels(folder: Path) -> CommittedLabels:
+    """
+    Read the labels and compare them with the published hash.
+
+    Raises
+    ------
+    UserError
+        There is no hash, the labels differ from it, or an older version encrypted them.
+
+    """
+    digest = published_hash(folder)
     if digest is None:
-        raise UserError(f'{folder}: nothing is sealed there; use --seal {folder} first')
-    plain, sealed = folder / 'labels' / 'labels.json', folder / 'labels' / 'labels.sealed'
-    if plain.exists():
-        text = plain.read_bytes()
-    else:
-        key = _key_path(digest)
-        try:
-            text = _crypt(sealed.read_bytes(), key.read_bytes())
-        except OSError as error:
-            raise UserError(f'{error.filename}: {error.strerror}; it is needed to open the '
-                            f'labels: copy it from where {folder} was sealed') from None
+        raise UserError(f'{folder}: no labels are committed there; use --seal {folder} first')
+    path = _label_file(folder)
+    try:
+        text = path.read_bytes()
+    except FileNotFoundError:
+        older = path.with_name('labels.sealed')
+        if older.exists():
+            raise UserError(f'{older}: an older version encrypted these labels, which this '
+                            'version cannot read; draw a new check into another folder'
+                            ) from None
+        raise UserError(f'{path}: no such file; copy it from where the check was drawn') from None
     if hashlib.sha256(text).hexdigest() != digest:
-        raise UserError(f'{folder / "labels"}: the labels are not those whose hash {digest} was '
-                        'published; they have been changed since')
-    if leave_open and not plain.exists():
-        parallel_io.write(plain, text)
-    what: dict[str, Any] = json.loads(text)
-    return Sealed(what['seed'], what['trials'], cases.from_json(json.dumps(what['labels'])))
+        raise UserError(f'{path}: these are not the labels whose hash {digest} was published; '
+                        'they were changed since')
+    try:
+        content: dict[str, Any] = json.loads(text)
+        return CommittedLabels(Setup(content['seed'], content['trials']),
+                               trials.from_json(json.dumps(content['labels'])))
+    except (ValueError, KeyError, TypeError):
+        raise _other_form(path) from None
 
 
-def _key_path(digest: str) -> Path:
-    home = os.environ.get('XDG_STATE_HOME') or Path.home() / '.local' / 'state'
-    return Path(home) / 'adxl_ros' / 'blind' / f'{digest}.key'
+def _read_drawn(path: Path) -> dict[str, Any]:
+    try:
+        row = json.loads(path.read_bytes())
+        trials.from_json(json.dumps([row['label']]))
+        return {'seed': int(row['seed']), 'trials': int(row['trials']), 'label': row['label']}
+    except (ValueError, KeyError, TypeError):
+        raise _other_form(path) from None
 
 
-def _crypt(data: bytes, key: bytes) -> bytes:
-    """Encrypt or decrypt: a key is used once, so its SHAKE-256 stream is a one-time pad."""
-    stream = hashlib.shake_256(key).digest(len(data))
-    return (int.from_bytes(data, 'little') ^ int.from_bytes(stream, 'little')).to_bytes(
-        len(data), 'little')
+def _other_form(path: Path) -> UserError:
+    return UserError(f'{path}: is damaged or of another version; draw a new check into another '
+                     'folder')
+
+
+def _drawn(folder: Path) -> Path:
+    return folder / 'labels' / 'drawn'
+
+
+def _label_file(folder: Path) -> Path:
+    return folder / 'labels' / 'labels.json'
+
+
+def _seal(folder: Path) -> Path:
+    return folder / 'seal.json'
+
+
+def _arguments(plan: Plan) -> tuple[Plan]:
+    return (plan,)

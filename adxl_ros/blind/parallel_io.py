@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Small whole files, and work in parallel that can be cut short."""
+"""Small files that are written as a whole, and parallel work that can be interrupted."""
 
 from __future__ import annotations
 
@@ -25,20 +25,36 @@ from typing import Any
 from adxl_ros.errors import UserError
 
 _AHEAD = 32
+"""Largest number of jobs in the pool at once; chosen: each holds its files in memory."""
 
 
 def write(path: Path, data: bytes) -> None:
-    """Write a file whole or not at all."""
-    fresh = path.with_name(f'.{path.name}.{os.getpid()}')
+    """
+    Write a file as a whole or not at all.
+
+    Parameters
+    ----------
+    path
+        The file.
+    data
+        Its content.
+
+    Raises
+    ------
+    UserError
+        It cannot be written.
+
+    """
+    temporary = path.with_name(f'.{path.name}.{os.getpid()}')
     try:
-        fresh.write_bytes(data)
-        os.replace(fresh, path)
+        temporary.write_bytes(data)
+        os.replace(temporary, path)
     except OSError as error:
-        fresh.unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
         raise UserError(f'{path}: cannot be written: {error.strerror}') from None
 
 
-def make(folder: Path) -> Path:
+def make_folder(folder: Path) -> Path:
     """Make a folder and return it."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -47,25 +63,25 @@ def make(folder: Path) -> Path:
     return folder
 
 
-def each(pool: Executor, work: Callable[..., Any], jobs: Iterable[Callable[[], tuple]],
-         keep: Callable[..., None], show: Callable[[float], None], done: int = 0) -> None:
+def for_each(pool: Executor, work: Callable[..., Any], jobs: Iterable[Callable[[], tuple]],
+             keep: Callable[..., None], show: Callable[[float], None], done: int = 0) -> None:
     """
-    Do jobs in parallel and keep each result as it comes.
+    Run jobs in parallel and keep each result as soon as it is there.
 
     Parameters
     ----------
     pool
-        Of threads, of processes or of a Dask cluster.
+        Threads, processes or a Dask cluster.
     work
-        Called with the arguments of a job; returns a tuple.
+        Receives the arguments of a job; returns a tuple.
     jobs
-        Each gives the arguments of one job when its turn comes.
+        Each returns the arguments of one job at its turn.
     keep
-        Called here with what `work` returned.
+        Receives what `work` returned, in this process.
     show
-        Takes the fraction that is done.
+        Receives the fraction that is finished.
     done
-        How many were done before.
+        Number of jobs that were finished before.
 
     """
     waiting: dict[Future, Any] = {}
@@ -73,7 +89,6 @@ def each(pool: Executor, work: Callable[..., Any], jobs: Iterable[Callable[[], t
     total = done + len(todo)
     try:
         while todo or waiting:
-            # Not all at once: each brings its files along.
             while todo and len(waiting) < _AHEAD:
                 job = todo.pop(0)
                 waiting[pool.submit(work, *job())] = None

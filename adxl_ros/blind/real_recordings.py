@@ -13,11 +13,10 @@
 # limitations under the License.
 
 """
-Real sensors: an effect is deleted from calibrated parameters, and should be put back.
+Real sensors: an effect is deleted from calibrated parameters, and the diagnosis should add it.
 
-Where a recording has neither a stage nor another simulator's force beside it, its own calibrated
-force, smoothed, stands for what the sensor felt: noise and motion are real, but what the
-calibration itself lacks cannot show.
+A recording may have neither a stage nor another simulator's force. Then its own calibrated force,
+smoothed, is the reference. Noise and motion are real, but an error of the calibration cannot show.
 """
 
 from __future__ import annotations
@@ -38,11 +37,26 @@ from scipy.signal import butter, sosfiltfilt
 import yaml
 
 _SMOOTH_HZ = 15.0
+"""Corner of the low-pass of the reference, Hz; chosen."""
 
 
 @dataclass(frozen=True)
 class Arm:
-    """A real recording, its unit's calibrated parameters, and the other simulator's force."""
+    """
+    A real recording with the calibrated parameters of its unit.
+
+    Attributes
+    ----------
+    recording
+        The recording.
+    parameters
+        Content of the parameter file.
+    sim
+        Recording of another simulator's force; None without.
+    itself
+        Whether its own smoothed force is the reference.
+
+    """
 
     recording: Path
     parameters: dict[str, Any]
@@ -50,19 +64,19 @@ class Arm:
     itself: bool = False
 
 
-def arm(words: str) -> Arm:
+def read_arm(option: str) -> Arm:
     """
-    Read RECORDING:PARAMS[:SIM].
+    Read the option RECORDING:PARAMS[:SIM].
 
     Raises
     ------
     UserError
-        A file is missing, or the parameters hold no effect to delete.
+        A file is missing, or the parameters have no effect to delete.
 
     """
-    paths = [Path(word) for word in words.split(':')]
+    paths = [Path(word) for word in option.split(':')]
     if len(paths) not in (2, 3):
-        raise UserError(f'--real {words}: RECORDING:PARAMS or RECORDING:PARAMS:SIM is needed')
+        raise UserError(f'--real {option}: RECORDING:PARAMS or RECORDING:PARAMS:SIM is needed')
     for path in paths:
         if not path.exists():
             raise UserError(f'{path}: no such file')
@@ -72,13 +86,13 @@ def arm(words: str) -> Arm:
     except (OSError, UnicodeError, yaml.YAMLError, KeyError, TypeError) as error:
         raise UserError(f'{paths[1]}: no parameter file with effects: {error}') from None
     if not effects:
-        raise UserError(f'{paths[1]}: holds no effect to delete; calibrate the unit first')
+        raise UserError(f'{paths[1]}: has no effect to delete; calibrate the unit first')
     sim = paths[2].resolve() if len(paths) == 3 else None
     return Arm(paths[0].resolve(), keys, sim, sim is None and _without_stage(paths[0]))
 
 
 def _without_stage(recording: Path) -> bool:
-    """Say whether a CSV recording has no angles of a stage."""
+    """Return whether a CSV recording has no angles of a stage."""
     if recording.suffix != '.csv':
         return False
     with open(recording, encoding='utf-8') as lines:
@@ -86,15 +100,15 @@ def _without_stage(recording: Path) -> bool:
     return 'alpha_rad' not in head
 
 
-def _felt(one: Arm, folder: Path) -> Path:
+def _smoothed_force(arm: Arm, folder: Path) -> Path:
     """Calibrate a recording by its full parameters and smooth it, without delay."""
-    (folder / 'full.yaml').write_text(yaml.safe_dump(one.parameters))
+    (folder / 'full.yaml').write_text(yaml.safe_dump(arm.parameters))
     status, error = diagnosis_runs.call(
-        [*diagnosis_runs.executable('apply'), str(one.recording), '--params', 'full.yaml',
-         '-o', 'felt.csv'], folder)
+        [*diagnosis_runs.executable('apply'), str(arm.recording), '--params', 'full.yaml',
+         '-o', 'force.csv'], folder)
     if status:
         raise UserError(error)
-    lines = [line for line in (folder / 'felt.csv').read_text().splitlines()
+    lines = [line for line in (folder / 'force.csv').read_text().splitlines()
              if not line.startswith('#')]
     names = ['time_s', 'ax_mps2', 'ay_mps2', 'az_mps2']
     columns = [lines[0].split(',').index(name) for name in names]
@@ -108,7 +122,22 @@ def _felt(one: Arm, folder: Path) -> Path:
 
 
 def without(parameters: dict[str, Any], effect: str | None) -> dict[str, Any]:
-    """Delete an effect from parameters, with its rows of the covariance."""
+    """
+    Delete an effect from parameters, with its rows of the covariance.
+
+    Parameters
+    ----------
+    parameters
+        Content of the parameter file.
+    effect
+        The effect; None deletes nothing.
+
+    Returns
+    -------
+    dict
+        Content of the new parameter file.
+
+    """
     keys = dict(parameters['/**']['ros__parameters'])
     keys['effects'] = [name for name in keys['effects'] if name != effect]
     keys.pop(effect, None)
@@ -125,7 +154,18 @@ def without(parameters: dict[str, Any], effect: str | None) -> dict[str, Any]:
 def put_back(arms: Sequence[Arm], command: Sequence[str] | None, pool: Executor,
              show: Callable[[float], None]) -> list[dict[str, Any]]:
     """
-    Delete each effect of each arm in turn and diagnose; also with nothing deleted.
+    Delete each effect of each recording's parameters in turn, or none, and diagnose.
+
+    Parameters
+    ----------
+    arms
+        The recordings with their parameters.
+    command
+        The diagnosis; None for that of the package.
+    pool
+        Works in parallel.
+    show
+        Receives the fraction that is finished.
 
     Returns
     -------
@@ -140,27 +180,27 @@ def put_back(arms: Sequence[Arm], command: Sequence[str] | None, pool: Executor,
     def keep(i: int, effect: str | None, result: diagnosis_runs.Result) -> None:
         rows[i, effect] = _row(arms[i], effect, result)
 
-    jobs = [(i, effect) for i, one in enumerate(arms)
-            for effect in (None, *one.parameters['/**']['ros__parameters']['effects'])]
-    parallel_io.each(pool, _diagnose, [partial(_job, arms[i], i, effect, command)
-                                       for i, effect in jobs], keep, show)
+    jobs = [(i, effect) for i, entry in enumerate(arms)
+            for effect in (None, *entry.parameters['/**']['ros__parameters']['effects'])]
+    parallel_io.for_each(pool, _diagnose, [partial(_job, arms[i], i, effect, command)
+                                           for i, effect in jobs], keep, show)
     return [rows[job] for job in jobs]
 
 
-def _job(one: Arm, i: int, effect: str | None, command: Sequence[str] | None) -> tuple:
-    return one, i, effect, command
+def _job(arm: Arm, i: int, effect: str | None, command: Sequence[str] | None) -> tuple:
+    return arm, i, effect, command
 
 
-def _diagnose(one: Arm, i: int, effect: str | None,
+def _diagnose(arm: Arm, i: int, effect: str | None,
               command: Sequence[str] | None) -> tuple[int, str | None, diagnosis_runs.Result]:
-    with tempfile.TemporaryDirectory(prefix='diagnose_') as made:
-        folder = Path(made)
-        (folder / 'unit.yaml').write_text(yaml.safe_dump(without(one.parameters, effect)))
-        sim = _felt(one, folder) if one.itself else one.sim
-        words = [*(command or diagnosis_runs.executable('diagnose')), str(one.recording),
-                 '--params', 'unit.yaml', '-o', 'out', '--seed', '0']
+    with tempfile.TemporaryDirectory(prefix='diagnose_') as temporary:
+        folder = Path(temporary)
+        (folder / 'unit.yaml').write_text(yaml.safe_dump(without(arm.parameters, effect)))
+        sim = _smoothed_force(arm, folder) if arm.itself else arm.sim
+        arguments = [*(command or diagnosis_runs.executable('diagnose')), str(arm.recording),
+                     '--params', 'unit.yaml', '-o', 'out', '--seed', '0']
         status, error = diagnosis_runs.call(
-            [*words, *(['--sim', str(sim)] if sim else [])], folder)
+            [*arguments, *(['--sim', str(sim)] if sim else [])], folder)
         try:
             report = json.loads((folder / 'out' / 'report.json').read_bytes())
         except (OSError, ValueError):
@@ -168,22 +208,22 @@ def _diagnose(one: Arm, i: int, effect: str | None,
         return i, effect, {'report': report, 'seconds': 0.0, 'status': status, 'error': error}
 
 
-def _row(one: Arm, effect: str | None, result: diagnosis_runs.Result) -> dict[str, Any]:
-    given = grading.answer(result)
-    figures: dict[str, Any] = {}
-    keys = one.parameters['/**']['ros__parameters']
+def _row(arm: Arm, effect: str | None, result: diagnosis_runs.Result) -> dict[str, Any]:
+    answer = grading.answer(result)
+    coefficients: dict[str, Any] = {}
+    keys = arm.parameters['/**']['ros__parameters']
     for name, values in (keys.get(effect) or {}).items():
         by_axis = dict(zip(keys['sensor']['axes'], values)) if isinstance(values, list) else {}
         rows = {f'{effect}.{name}.{axis}': value for axis, value in by_axis.items()} or {
             f'{effect}.{name}': values}
-        figures |= {key: {'deleted': value, 'found': given.parameters.get(key)}
+        coefficients |= {key: {'deleted': value, 'found': answer.parameters.get(key)}
                     for key, value in rows.items()}
     report = result['report'] or {}
-    against = 'itself, calibrated and smoothed' if one.itself else \
-        one.sim.name if one.sim else 'the stage'
-    return {'recording': one.recording.name, 'against': against, 'deleted': effect,
-            'status': given.status,
-            'put_back': None if effect is None else effect in given.named,
-            'top': sorted(given.top), 'named': sorted(given.named),
-            'probability': given.probability, 'error': result['error'],
-            'gap_mps2': (report.get('gap') or {}).get('before'), 'parameters': figures}
+    against = 'itself, calibrated and smoothed' if arm.itself else \
+        arm.sim.name if arm.sim else 'the stage'
+    return {'recording': arm.recording.name, 'against': against, 'deleted': effect,
+            'status': answer.status,
+            'put_back': None if effect is None else effect in answer.named,
+            'top': sorted(answer.top), 'named': sorted(answer.named),
+            'probability': answer.probability, 'error': result['error'],
+            'gap_mps2': (report.get('gap') or {}).get('before'), 'parameters': coefficients}

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""A check as one page that opens offline, and as a table for the documentation."""
+"""A check as a page in one file that opens offline, and as tables for the documentation."""
 
 from __future__ import annotations
 
@@ -35,17 +35,18 @@ border-bottom:1px solid #ddd;vertical-align:top}img{max-width:100%}
 .leak{background:#fbeeee;border-color:#c33}@media print{body{margin:0}}
 """
 Table = tuple[list[str], list[list[str]]]
+"""Head and rows."""
 
 
 def summary(made: dict[str, Any]) -> str:
-    """Say in a few lines how the check came out."""
-    rows = [f'{words:52s}{figure:34s}{bar:16s}{met}'
-            for words, figure, bar, met in _bars(made)[1]]
+    """Return the result of the check in a few lines."""
+    rows = [f'{words:52s}{score:34s}{bar:16s}{met}'
+            for words, score, bar, met in _bars(made)[1]]
     return '\n'.join([_drawn(made), '', *rows, '', _leaks(made)])
 
 
 def markdown(made: dict[str, Any]) -> str:
-    """Write all tables for the documentation."""
+    """Return all tables for the documentation."""
     out = [_drawn(made), '', _leaks(made), '']
     for title, (head, rows) in _tables(made).items():
         if rows:
@@ -55,10 +56,25 @@ def markdown(made: dict[str, Any]) -> str:
 
 
 def page(made: dict[str, Any], pyplot: Any) -> str:
-    """Lay out the page; its pictures are drawn with matplotlib's `pyplot`."""
+    """
+    Return the page.
+
+    Parameters
+    ----------
+    made
+        The content of blind.json.
+    pyplot
+        The drawing functions of matplotlib.
+
+    Returns
+    -------
+    str
+        HTML.
+
+    """
     tables = _tables(made)
     pictures = {'Detection against strength': _curves, 'Calibration': _calibration,
-                'What was taken for what': _confusion}
+                'Answers by true effect': _confusion}
     parts = ['<h1>Blind check of diagnose</h1>', f'<p class="said">{escape(_drawn(made))}</p>',
              f'<p class="said{" leak" if made["leaks"] else ""}">{escape(_leaks(made))}</p>']
     for title, draw in pictures.items():
@@ -81,9 +97,10 @@ def _drawn(made: dict[str, Any]) -> str:
 
 
 def _leaks(made: dict[str, Any]) -> str:
-    bad = [name.replace('_', ' ') for name, one in made['controls'].items() if one['leaks']]
+    bad = [name.replace('_', ' ') for name, control in made['controls'].items()
+           if control['leaks']]
     if bad:
-        return f'THE CHECK ITSELF LEAKS: off chance is {", ".join(bad)}. Its scores mean nothing.'
+        return f'THE CHECK ITSELF LEAKS: not at chance: {", ".join(bad)}. Its scores mean nothing.'
     return 'The controls came out at chance.'
 
 
@@ -92,63 +109,63 @@ def _tables(made: dict[str, Any]) -> dict[str, Table]:
     return {'Bars': _bars(made), 'Scores': _scores(scores), 'Strength that is detected':
             _strengths(scores), 'Baselines': _baselines(scores), 'Controls': _controls(made),
             'Effect by effect, where the oracle sees it': _by_effect(scores),
-            'Real sensors: what is deleted, is it put back?': _real(made),
-            'Runs that failed': (['case', 'error'], [
+            'Real sensors: is the deleted effect put back?': _real(made),
+            'Runs that failed': (['trial', 'error'], [
                 [name, str(error)] for name, error in made['failed'].items()])}
 
 
-def _figure(one: dict[str, Any] | None, scale: float = 1.0, unit: str = '') -> str:
-    if one is None or one['value'] is None:
+def _score_text(score: dict[str, Any] | None, scale: float = 1.0, unit: str = '') -> str:
+    if score is None or score['value'] is None:
         return '-'
-    text = f'{scale * one["value"]:.3g}{unit}'
-    if one.get('ci'):
-        ends = ('∞' if end is None else f'{scale * end:.3g}' for end in one['ci'])
-        text += f' ({" to ".join(ends)})'
-    return text + (f', n = {one["count"]}' if 'count' in one else '')
+    text = f'{scale * score["value"]:.3g}{unit}'
+    if score.get('ci'):
+        interval = ('∞' if end is None else f'{scale * end:.3g}' for end in score['ci'])
+        text += f' ({" to ".join(interval)})'
+    return text + (f', n = {score["count"]}' if 'count' in score else '')
 
 
 def _bars(made: dict[str, Any]) -> Table:
     sign = {-1: 'at most ', 1: 'at least ', 0: ''}
-    return ['score', 'figure (90 % interval)', 'bar', 'met'], [
-        [row['words'], _figure(row), sign[row['way']] + ' to '.join(
+    return ['score', 'value (90 % interval)', 'bar', 'met'], [
+        [row['words'], _score_text(row), sign[row['way']] + ' to '.join(
             f'{bar:g}' for bar in row['bar']),
          'no trial' if row['met'] is None else 'yes' if row['met'] else 'NO']
         for row in made['bars']]
 
 
 _WORDS = {
-    'top_1_all_singles': 'top-1, all single effects, seen or not',
+    'top_1_all_singles': 'top-1, all single effects, visible or not',
     'leading': 'true effect within the top hypothesis, where the oracle sees it',
     'set_size': 'effects in the named set', 'inseparable_size':
-    'effects that the recording does not tell apart (fixed by the generator)',
-    'verdict_right': 'verdict wholly right, all cases', 'brier': 'Brier score, all hypotheses',
+    'effects that are inseparable by the recording (fixed by the generator)',
+    'verdict_right': 'verdict right, all trials', 'brier': 'Brier score, all hypotheses',
     'closed': 'gap closed on a held-out recording, median',
     'unknown_recall_all': 'recall of unknown, visible or not',
-    'unknown_wrongly': 'unknown said where the library holds the effect, or there is none',
+    'unknown_wrongly': 'unknown where the library has the effect, or there is none',
     'seconds': 'run time, median, s',
 }
 
 
 def _scores(scores: dict[str, Any]) -> Table:
-    rows = [[words, _figure(scores[name])] for name, words in _WORDS.items()]
-    rows += [[f'pairs: {name.replace("_", " ")}', _figure(one)]
-             for name, one in scores['pairs'].items()]
+    rows = [[words, _score_text(scores[name])] for name, words in _WORDS.items()]
+    rows += [[f'pairs: {name.replace("_", " ")}', _score_text(score)]
+             for name, score in scores['pairs'].items()]
     rows += [['run time, longest, s', f'{scores["longest_s"]:.0f}'],
              ['verdicts', ', '.join(f'{name} {n}' for name, n in scores['status'].items())]]
-    return ['score', 'figure (90 % interval)'], rows
+    return ['score', 'value (90 % interval)'], rows
 
 
 def _strengths(scores: dict[str, Any]) -> Table:
     return ['effects', '50 %, mg rms', '90 %, mg rms'], [
         [name.replace('_', ' '), *(
-            _figure(one.get(level), 1e3 / G0) if one.get(level) else 'not reached'
-            for level in ('at_50', 'at_90'))] for name, one in scores['detection'].items()]
+            _score_text(curve.get(level), 1e3 / G0) if curve.get(level) else 'not reached'
+            for level in ('at_50', 'at_90'))] for name, curve in scores['detection'].items()]
 
 
 def _baselines(scores: dict[str, Any]) -> Table:
-    return ['', 'right, all cases', 'false alarms'], [
-        [name, _figure(one['right']), _figure(one['false_alarms'])]
-        for name, one in scores['baselines'].items()]
+    return ['', 'right, all trials', 'false alarms'], [
+        [name, _score_text(baseline['right']), _score_text(baseline['false_alarms'])]
+        for name, baseline in scores['baselines'].items()]
 
 
 def _controls(made: dict[str, Any]) -> Table:
@@ -156,9 +173,9 @@ def _controls(made: dict[str, Any]) -> Table:
         return '-' if value is None else f'{value:.3f}'
 
     return ['control', 'score', 'at chance', 'p', 'leaks'], [
-        [name.replace('_', ' '), number(one['score']), number(one['chance']),
-         number(one.get('p')), 'YES' if one['leaks'] else 'no']
-        for name, one in made['controls'].items()]
+        [name.replace('_', ' '), number(control['score']), number(control['chance']),
+         number(control.get('p')), 'YES' if control['leaks'] else 'no']
+        for name, control in made['controls'].items()]
 
 
 def _by_effect(scores: dict[str, Any]) -> Table:
@@ -169,14 +186,14 @@ def _by_effect(scores: dict[str, Any]) -> Table:
 
 def _real(made: dict[str, Any]) -> Table:
     rows = []
-    for one in made.get('real', []):
-        figures = '; '.join(
+    for run in made.get('real', []):
+        coefficients = '; '.join(
             f'{name.split(".", 1)[1]}: {row["deleted"]:.3g}' + (
                 f', found {row["found"][0]:.3g} ({row["found"][1]:.3g} to {row["found"][2]:.3g})'
-                if row['found'] else '') for name, row in one['parameters'].items())
-        rows.append([one['recording'], one['against'], one['deleted'] or 'nothing',
-                     {None: '-', True: 'yes', False: 'NO'}[one['put_back']],
-                     ', '.join(one['named']) or one['status'], figures])
+                if row['found'] else '') for name, row in run['parameters'].items())
+        rows.append([run['recording'], run['against'], run['deleted'] or 'nothing',
+                     {None: '-', True: 'yes', False: 'NO'}[run['put_back']],
+                     ', '.join(run['named']) or run['status'], coefficients])
     return ['recording', 'against', 'deleted', 'put back', 'named', 'parameters'], rows
 
 
@@ -190,21 +207,21 @@ def _html(table: Table) -> str:
 
 def _curves(made: dict[str, Any], pyplot: Any) -> Any:
     figure, axis = pyplot.subplots(figsize=(10, 4), layout='constrained')
-    for i, (name, one) in enumerate(made['scores']['detection'].items()):
-        if not one['bins']:
+    for i, (name, curve) in enumerate(made['scores']['detection'].items()):
+        if not curve['bins']:
             continue
-        x = np.array([row['strength'] for row in one['bins']])
-        y = np.array([row['value'] for row in one['bins']])
-        off = np.abs(np.array([row['ci'] for row in one['bins']]).T - y)
-        axis.errorbar(1e3 * x / G0, y, yerr=off, fmt='o', ms=4, lw=0.8, color=f'C{i}',
+        x = np.array([row['strength'] for row in curve['bins']])
+        y = np.array([row['value'] for row in curve['bins']])
+        errors = np.abs(np.array([row['ci'] for row in curve['bins']]).T - y)
+        axis.errorbar(1e3 * x / G0, y, yerr=errors, fmt='o', ms=4, lw=0.8, color=f'C{i}',
                       label=name.replace('_', ' '))
-        if 'middle' in one:
+        if 'middle' in curve:
             fine = np.linspace(np.log(x.min()), np.log(x.max()), 100)
             axis.plot(1e3 * np.exp(fine) / G0, detection(
-                fine, one['middle'], one['width'], one['missed'], one['by_chance']),
+                fine, curve['middle'], curve['width'], curve['missed'], curve['by_chance']),
                 color=f'C{i}')
         if name == 'every':
-            axis.plot(1e3 * x / G0, [row['value'] for row in one['oracle']], 'k--', lw=0.8,
+            axis.plot(1e3 * x / G0, [row['value'] for row in curve['oracle']], 'k--', lw=0.8,
                       label='oracle')
     axis.set(xscale='log', xlabel='strength, mg rms beyond zero-g and scale',
              ylabel='share detected', ylim=(-0.03, 1.03))
@@ -227,8 +244,8 @@ def _confusion(made: dict[str, Any], pyplot: Any) -> Any:
     table = made['scores']['confusion']
     rows = [name for name in ('none', UNKNOWN) if name in table] + [
         name for name in table if name not in ('none', UNKNOWN)]
-    said = {name for row in table.values() for name in row}
-    columns = [name for name in rows if name in said] + sorted(said - set(rows))
+    answers = {name for row in table.values() for name in row}
+    columns = [name for name in rows if name in answers] + sorted(answers - set(rows))
     shares = np.array([[table[row].get(column, 0) / sum(table[row].values())
                         for column in columns] for row in rows]).reshape(len(rows), -1)
     figure, axis = pyplot.subplots(figsize=(11, 10), layout='constrained')
@@ -241,5 +258,5 @@ def _confusion(made: dict[str, Any], pyplot: Any) -> Any:
             if table[row].get(column):
                 axis.text(j, i, table[row][column], ha='center', va='center', fontsize=6,
                           color='white' if shares[i, j] > 0.6 else 'black')
-    axis.set(xlabel='said', ylabel='true (cases)')
+    axis.set(xlabel='answer', ylabel='true (trials)')
     return figure

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Shares and means with their intervals, and the curve of detection against strength."""
+"""Shares and statistics with their intervals, and the curve of detection against strength."""
 
 from __future__ import annotations
 
@@ -25,27 +25,44 @@ from scipy.optimize import minimize
 from scipy.stats import binomtest
 
 LEVEL = 0.9
+"""Probability of all intervals."""
 _RESAMPLES = 1000
+"""Number of bootstrap samples; chosen."""
 
 
 def share(hits: Sequence[bool] | np.ndarray) -> dict[str, Any]:
-    """Give the share of hits with Wilson's interval; all None without trials."""
-    count, found = len(hits), int(np.sum(hits))
+    """Return the share of hits with Wilson's interval; None without trials."""
+    count, true = len(hits), int(np.sum(hits))
     if not count:
         return {'value': None, 'ci': None, 'count': 0}
-    ci = binomtest(found, count).proportion_ci(LEVEL, 'wilson')
-    return {'value': found / count, 'ci': [float(ci.low), float(ci.high)], 'count': count}
+    ci = binomtest(true, count).proportion_ci(LEVEL, 'wilson')
+    return {'value': true / count, 'ci': [float(ci.low), float(ci.high)], 'count': count}
 
 
-def resampled(rows: Sequence[Any], figure: Callable[[list[Any]], float]) -> dict[str, Any]:
-    """Give a figure of rows with the interval over resampled rows."""
+def resampled(rows: Sequence[Any], statistic: Callable[[list[Any]], float]) -> dict[str, Any]:
+    """
+    Return a statistic of rows with its interval over resampled rows.
+
+    Parameters
+    ----------
+    rows
+        One for each trial.
+    statistic
+        Function of rows.
+
+    Returns
+    -------
+    dict
+        `value`, `ci` and `count`.
+
+    """
     if not len(rows):
         return {'value': None, 'ci': None, 'count': 0}
     rng = np.random.default_rng(0)
-    drawn = [figure([rows[i] for i in rng.integers(len(rows), size=len(rows))])
+    drawn = [statistic([rows[i] for i in rng.integers(len(rows), size=len(rows))])
              for _ in range(_RESAMPLES)]
     low, high = np.nanquantile(drawn, ((1 - LEVEL) / 2, (1 + LEVEL) / 2))
-    return {'value': float(figure(list(rows))), 'ci': [float(low), float(high)],
+    return {'value': float(statistic(list(rows))), 'ci': [float(low), float(high)],
             'count': len(rows)}
 
 
@@ -56,11 +73,11 @@ def curve(strength: np.ndarray, detected: np.ndarray, by_chance: float) -> dict[
     Parameters
     ----------
     strength
-        Of each trial, (n,) m/s^2.
+        Strength in each trial, m/s², (n,).
     detected
         Whether each was detected, (n,).
     by_chance
-        Share of false alarms, which the curve begins at.
+        Share of false alarms, at which the curve starts.
 
     Returns
     -------
@@ -77,20 +94,37 @@ def curve(strength: np.ndarray, detected: np.ndarray, by_chance: float) -> dict[
     for _ in range(200):
         take = rng.integers(len(x), size=len(x))
         drawn.append(_logistic(x[take], y[take], by_chance, fitted[:1]))
-    out: dict[str, Any] = {'bins': bins(strength, detected), 'by_chance': by_chance,
+    result: dict[str, Any] = {'bins': bins(strength, detected), 'by_chance': by_chance,
                            'middle': fitted[0], 'width': fitted[1], 'missed': fitted[2]}
     for level in (0.5, 0.9):
         value = _reaches(fitted, by_chance, level)
-        some = [_reaches(one, by_chance, level) for one in drawn]
-        low, high = np.quantile(some, (0.05, 0.95), method='nearest')
-        out[f'at_{round(100 * level)}'] = None if math.isinf(value) else {
+        resampled_levels = [_reaches(fit, by_chance, level) for fit in drawn]
+        low, high = np.quantile(resampled_levels, (0.05, 0.95), method='nearest')
+        result[f'at_{round(100 * level)}'] = None if math.isinf(value) else {
             'value': value, 'ci': [float(low), None if math.isinf(high) else float(high)]}
-    return out
+    return result
 
 
 def detection(x: np.ndarray, middle: float, width: float, missed: float,
               by_chance: float) -> np.ndarray:
-    """Give the fitted chance of detection at log strengths x."""
+    """
+    Return the fitted probability of detection.
+
+    Parameters
+    ----------
+    x
+        Logarithms of the strength, (n,).
+    middle, width, missed
+        The fitted curve: its middle, its width, and the share that it never detects.
+    by_chance
+        Share of false alarms.
+
+    Returns
+    -------
+    numpy.ndarray
+        Probabilities, (n,).
+
+    """
     return by_chance + (1 - by_chance - missed) / (1 + np.exp(-(x - middle) / width))
 
 
@@ -113,23 +147,40 @@ def _reaches(fit: tuple[float, float, float], by_chance: float, level: float) ->
 
 
 def bins(strength: np.ndarray, detected: np.ndarray, count: int = 8) -> list[dict[str, Any]]:
-    """Give the share detected in bins of strength with as many trials each."""
+    """
+    Return the share detected in bins of strength with equal numbers of trials.
+
+    Parameters
+    ----------
+    strength
+        Strength in each trial, m/s², (n,).
+    detected
+        Whether each was detected, (n,).
+    count
+        Largest number of bins.
+
+    Returns
+    -------
+    list of dict
+        Strength and share of each bin.
+
+    """
     order = np.argsort(strength)
     return [{'strength': float(np.median(strength[part])), **share(detected[part])}
             for part in np.array_split(order, min(count, max(len(order) // 3, 1))) if len(part)]
 
 
 def calibration_error(rows: Sequence[tuple[float, bool]]) -> float:
-    """Give the mean distance of confidence and share right, over the bins of `reliability`."""
+    """Return the mean distance of confidence and share right, over the bins of `reliability`."""
     return sum(row['count'] * abs(row['right'] - row['confidence'])
                for row in reliability(rows)) / max(len(rows), 1)
 
 
 def reliability(rows: Sequence[tuple[float, bool]]) -> list[dict[str, Any]]:
-    """Bin (confidence, right) by confidence."""
+    """Return the share right in bins of confidence, from pairs (confidence, right)."""
     table = np.asarray(rows, float).reshape(-1, 2)
     edges = np.array([0.0, 0.5, 0.7, 0.8, 0.9, 0.95, 0.98, 1.0 + 1e-9])
-    which = np.digitize(table[:, 0], edges) - 1
-    return [{'confidence': float(table[which == k, 0].mean()),
-             'right': float(table[which == k, 1].mean()), 'count': int(np.sum(which == k))}
-            for k in range(len(edges) - 1) if np.any(which == k)]
+    index = np.digitize(table[:, 0], edges) - 1
+    return [{'confidence': float(table[index == k, 0].mean()),
+             'right': float(table[index == k, 1].mean()), 'count': int(np.sum(index == k))}
+            for k in range(len(edges) - 1) if np.any(index == k)]

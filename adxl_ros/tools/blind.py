@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Check `diagnose` on data whose effect is withheld, and say how often it is right."""
+"""Check `diagnose` on recordings whose effects are withheld, and count how often it is right."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ import json
 from pathlib import Path
 import sys
 
-from adxl_ros.blind import blind_check, diagnosis_runs as running, real_recordings, report_html
+from adxl_ros.blind import blind_check, diagnosis_runs, real_recordings, report_html
 from adxl_ros.errors import UserError
 from adxl_ros.files.atomic_write import atomic_path
 from adxl_ros.files.plot_file import pyplot
@@ -34,18 +34,19 @@ def parser() -> argparse.ArgumentParser:
     """Describe the command line."""
     parse = argparse.ArgumentParser(prog=PROG, description=__doc__)
     parse.add_argument('--trials', type=int, default=600,
-                       help='how many cases (default 600), and a twelfth at strength zero')
+                       help='number of trials (default 600); a twelfth more has strength zero')
     parse.add_argument('--seed', type=int, default=None,
-                       help='of the cases; drawn if not given, and told when labels are opened')
+                       help='seed of the trials (default: drawn; the report states it)')
     parse.add_argument('--real', metavar='RECORDING:PARAMS[:SIM]', action='append', default=[],
                        help='a real recording with calibrated parameters, whose effects are '
                             'deleted one by one to see whether they are put back; may be repeated')
     parse.add_argument('--scheduler', metavar='ADDRESS', help='of a Dask cluster to run on')
     where = parse.add_mutually_exclusive_group(required=True)
-    where.add_argument('-o', dest='output', metavar='DIR', help='seal, diagnose, open and score')
-    where.add_argument('--seal', metavar='DIR', help='only draw the cases and seal their labels')
+    where.add_argument('-o', dest='output', metavar='DIR', help='draw, diagnose and score')
+    where.add_argument('--seal', metavar='DIR',
+                       help='only draw the trials and publish the hash of their labels')
     where.add_argument('--open', metavar='DIR',
-                       help='diagnose what is not diagnosed yet, open the labels and score')
+                       help='diagnose all recordings without a report, and score')
     return parse
 
 
@@ -55,12 +56,12 @@ def blind(options: argparse.Namespace) -> int:
         raise UserError(f'--trials {options.trials}: at least 1 is needed')
     if options.seed is not None and options.seed < 0:
         raise UserError(f'--seed {options.seed}: must not be negative')
-    arms = [real_recordings.arm(words) for words in options.real]
+    arms = [real_recordings.read_arm(option) for option in options.real]
     folder = Path(options.output or options.seal or options.open)
     try:
         return _check(options, folder, arms)
     except KeyboardInterrupt:
-        print(f'{PROG}: interrupted; the same command goes on where it was', file=sys.stderr)
+        print(f'{PROG}: interrupted; the same command continues', file=sys.stderr)
         return 130
 
 
@@ -68,14 +69,14 @@ def _check(options: argparse.Namespace, folder: Path, arms: list[real_recordings
     draw = pyplot()
     if not options.open:
         make_folder(folder)
-    with running.workers(options.scheduler) as pool:
+    with diagnosis_runs.workers(options.scheduler) as pool:
         if not options.open:
             with progress('draw') as show:
-                digest = blind_check.sealed(folder, options.seed, options.trials, pool, show)
+                digest = blind_check.draw(folder, options.seed, options.trials, pool, show)
             print(f'SHA-256 of salt and labels: {digest}', flush=True)
         if options.seal:
             return 0
-        made = blind_check.scored(folder, None, pool, progress)
+        made = blind_check.score(folder, None, pool, progress)
         if arms:
             with progress('real') as show:
                 made['real'] = real_recordings.put_back(arms, None, pool, show)

@@ -33,8 +33,9 @@ from adxl_ros.blind import (
     scores,
     trials,
 )
+from adxl_ros.blind.label_commitment import Setup
 from adxl_ros.blind.trials import Label
-from adxl_ros.blind.world import chain, fault_table, ideal_observer, motion, unit
+from adxl_ros.blind.world import chain, fault, fault_table, ideal_observer, motion, unit
 from adxl_ros.errors import UserError
 from adxl_ros.files.plot_file import pyplot
 import numpy as np
@@ -59,10 +60,11 @@ out.mkdir()
 """
 NOTHING = "def said(recording, parameters): return 'no_gap', [[[], 0.9], [['bias'], 0.1]]"
 ALWAYS = "def said(recording, parameters): return 'explained', [[['lever_arm'], 1.0]]"
-# Looks about for labels: near its files, in its environment, and where it was told they are.
+# Looks for labels: near its files, in its arguments and environment, and in a given folder.
 CHEAT = """
 def said(recording, parameters):
     places = [Path.cwd(), *Path.cwd().resolve().parents[:-2], Path({folder!r})]
+    places += [Path(word).resolve().parent for word in sys.argv[1:]]
     places += [Path(word) for value in os.environ.values() for word in value.split(':')
                if 'label' in word or 'blind' in word]
     for place in places:
@@ -97,19 +99,11 @@ def pool():
 
 
 @pytest.fixture(scope='module')
-def state(tmp_path_factory):
-    """Keep keys where this user's own are not."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv('XDG_STATE_HOME', str(tmp_path_factory.mktemp('state')))
-        yield
-
-
-@pytest.fixture(scope='module')
-def original(tmp_path_factory, state):
+def original(tmp_path_factory):
     folder = tmp_path_factory.mktemp('check') / 'blind'
     with diagnosis_runs.workers(None) as pool:
-        label_commitment.seal(folder, SEED, trials.plans(SEED, TRIALS, SECONDS), TRIALS, pool,
-                              show(''))
+        label_commitment.commit(folder, Setup(SEED, TRIALS), trials.plans(SEED, TRIALS, SECONDS),
+                                pool, show(''))
     return folder
 
 
@@ -118,8 +112,8 @@ def known_nothing(original, tmp_path_factory, pool):
     """Score a diagnosis that never finds anything, once for all tests that build on it."""
     folder = tmp_path_factory.mktemp('nothing')
     shutil.copytree(original, folder / 'blind')
-    return folder / 'blind', blind_check.scored(folder / 'blind', script(folder, NOTHING), pool,
-                                                show)
+    return folder / 'blind', blind_check.score(folder / 'blind', script(folder, NOTHING), pool,
+                                               show)
 
 
 def copied(original, known_nothing, folder):
@@ -129,7 +123,7 @@ def copied(original, known_nothing, folder):
     return folder / 'blind'
 
 
-def test_a_sealed_check_tells_nothing(original):
+def test_only_the_label_file_tells_of_labels(original):
     names = sorted(path.name for path in (original / 'recordings').iterdir())
     count = TRIALS + 2
     assert names == sorted(f'r{i:04d}.{suffix}' for i in range(count)
@@ -137,7 +131,10 @@ def test_a_sealed_check_tells_nothing(original):
     assert {path.stat().st_mtime for path in (original / 'recordings').iterdir()} == {0}
     effects = [name.encode() for name in fault_table.KINDS if name not in (
         'bias', 'gravity', 'scale_factor', 'supply')]
+    assert [path.name for path in (original / 'labels').iterdir()] == ['labels.json']
     for path in original.rglob('*'):
+        if path.name == 'labels.json':
+            continue
         data = path.read_bytes() if path.is_file() else b''
         assert [name for name in effects if name in data] == [], path
         assert b'"seed"' not in data, path
@@ -149,14 +146,29 @@ def test_labels_are_those_of_the_hash(original, known_nothing, tmp_path, pool):
     digest = json.loads((original / 'seal.json').read_bytes())['sha256_of_salt_and_labels']
     assert hashlib.sha256(text).hexdigest() == digest == made['hash']
     drawn = [trials.draw(plan) for plan in trials.plans(SEED, TRIALS, SECONDS)[:1]]
-    opened = label_commitment.unseal(folder).labels[:1]
+    opened = label_commitment.committed_labels(folder).labels[:1]
     assert [label.effects for label in drawn] == [label.effects for label in opened]
     assert [one['size'] for label in drawn for one in label.faults] == pytest.approx(
         [one['size'] for label in opened for one in label.faults])
     other = copied(original, known_nothing, tmp_path)
     (other / 'labels' / 'labels.json').write_bytes(text.replace(b'"single"', b'"pair"'))
-    with pytest.raises(UserError, match='not those whose hash'):
-        blind_check.scored(other, script(tmp_path, NOTHING), pool, show)
+    with pytest.raises(UserError, match='not the labels whose hash'):
+        blind_check.score(other, script(tmp_path, NOTHING), pool, show)
+
+
+def test_a_folder_of_an_older_version_is_refused_in_one_line(original, tmp_path, pool):
+    """Labels that are encrypted, or drawn labels of another form, name no key that is missing."""
+    shutil.copytree(original, tmp_path / 'encrypted')
+    labels = tmp_path / 'encrypted' / 'labels'
+    (labels / 'labels.json').rename(labels / 'labels.sealed')
+    with pytest.raises(UserError, match='an older version encrypted these labels'):
+        blind_check.score(tmp_path / 'encrypted', None, pool, show)
+    drawn = tmp_path / 'drawn' / 'labels' / 'drawn'
+    drawn.mkdir(parents=True)
+    for text in ('{"seed": 1, "trials": 2}', '[]', '', '{"seed": 1, "trials": 2, "label": {}}'):
+        (drawn / 'r0000.json').write_text(text)
+        with pytest.raises(UserError, match='of another version'):
+            blind_check.draw(tmp_path / 'drawn', 1, 2, pool, show(''))
 
 
 def test_nothing_found_scores_as_it_should(known_nothing):
@@ -172,20 +184,21 @@ def test_nothing_found_scores_as_it_should(known_nothing):
 
 
 def test_a_cheat_finds_no_labels(original, known_nothing, tmp_path, pool):
+    """Its working directory, its arguments and its environment lead to no label."""
     folder = copied(original, known_nothing, tmp_path)
-    cheat = script(tmp_path, CHEAT.format(folder=str(folder)))
-    sealed = blind_check.scored(folder, cheat, pool, show)
-    assert not any(row['named'] for row in sealed['rows'])
-    # The same diagnosis does cheat where labels lie open.
+    blindfolded = blind_check.score(folder, script(tmp_path, CHEAT.format(folder='.')), pool, show)
+    assert not any(row['named'] for row in blindfolded['rows'])
+    # The same diagnosis does cheat where it is told the folder.
     shutil.rmtree(folder / 'reports')
-    opened = blind_check.scored(folder, cheat, pool, show)
+    opened = blind_check.score(folder, script(tmp_path, CHEAT.format(folder=str(folder))), pool,
+                               show)
     assert all(sorted(row['named']) == sorted(row['effects']) for row in opened['rows']
                if row['group'] != 'zero')
 
 
 def test_always_one_effect_scores_as_it_should(original, known_nothing, tmp_path, pool):
     folder = copied(original, known_nothing, tmp_path)
-    made = blind_check.scored(folder, script(tmp_path, ALWAYS), pool, show)
+    made = blind_check.score(folder, script(tmp_path, ALWAYS), pool, show)
     score = made['scores']
     assert score['false_alarms']['value'] == 1
     singles = [row for row in made['rows'] if row['group'] == 'single']
@@ -240,7 +253,7 @@ def test_resumes_where_it_was_cut(original, known_nothing, tmp_path, pool):
         diagnosis_runs.diagnose_all(folder, script(tmp_path, ALWAYS), pool, show(''))
 
 
-def test_drawing_resumes(tmp_path, pool, state):
+def test_drawing_resumes(tmp_path, pool):
     plans = trials.plans(3, 2, SECONDS)
 
     def twice(plan):
@@ -249,11 +262,12 @@ def test_drawing_resumes(tmp_path, pool, state):
         return label_commitment.draw(plan)
 
     with pytest.raises(KeyboardInterrupt):
-        label_commitment.seal(tmp_path / 'blind', 3, plans, 2, pool, show(''), twice)
+        label_commitment.commit(tmp_path / 'blind', Setup(3, 2), plans, pool, show(''), twice)
     (tmp_path / 'again').touch()
-    digest = label_commitment.seal(tmp_path / 'blind', 3, plans, 2, pool, show(''), twice)
-    opened = label_commitment.unseal(tmp_path / 'blind')
-    assert digest == label_commitment.published(tmp_path / 'blind')
+    digest = label_commitment.commit(tmp_path / 'blind', Setup(3, 2), plans, pool, show(''),
+                                     twice)
+    opened = label_commitment.committed_labels(tmp_path / 'blind')
+    assert digest == label_commitment.published_hash(tmp_path / 'blind')
     assert [label.name for label in opened.labels] == ['r0000', 'r0001', 'r0002']
 
 
@@ -280,19 +294,19 @@ def said(recording, parameters):
 
 def test_a_leaky_generator_is_caught(known_nothing, tmp_path, pool):
     """The same cases again, by a generator whose files tell which have an effect."""
-    folder, labels = tmp_path / 'blind', label_commitment.unseal(known_nothing[0]).labels
+    folder, labels = tmp_path / 'blind', label_commitment.committed_labels(known_nothing[0]).labels
     recordings = known_nothing[0] / 'recordings'
 
     def leaking(plan):
         label = next(label for label in labels if label.name == plan.name)
         text, parameters = ((recordings / f'{plan.name}.{suffix}').read_text()
                             for suffix in ('csv', 'yaml'))
-        return label, padded(label, text), parameters
+        return label_commitment.Drawn(label, padded(label, text), parameters)
 
-    label_commitment.seal(folder, SEED, trials.plans(SEED, TRIALS, SECONDS), TRIALS, pool,
-                          show(''), leaking)
+    label_commitment.commit(folder, Setup(SEED, TRIALS), trials.plans(SEED, TRIALS, SECONDS),
+                            pool, show(''), leaking)
     shutil.copytree(known_nothing[0] / 'labels' / 'held', folder / 'labels' / 'held')
-    made = blind_check.scored(folder, script(tmp_path, PADDED), pool, show)
+    made = blind_check.score(folder, script(tmp_path, PADDED), pool, show)
     assert made['controls']['metadata_only']['leaks'] and made['leaks']
     assert 'LEAKS' in report_html.summary(made) and 'LEAKS' in report_html.page(made, pyplot())
 
@@ -382,27 +396,27 @@ def test_every_fault_changes_a_recording(name):
 
     def size(times):
         return ideal_observer.rms(at.response(
-            [fault_table.Fault(kind, times * kind.start, shape)], True))
+            [fault.Fault(kind, times * kind.start, shape)], True))
 
     assert size(0.0) == pytest.approx(0, abs=1e-9)
     assert 0 < size(1.0) < size(2.0)
     assert np.isfinite(size(1.0))
 
 
-def test_ideal_observer(state):
+def test_ideal_observer():
     """What is strong is seen, what is weak is not, and a tilted bench is an offset of alpha."""
     at = ideal_observer.Scene(unit.draw(np.random.default_rng(0)), motion.draw(
         np.random.default_rng(2), (60.0, 62.0), 125.0, 'one_plane'), 1)
-    eye = ideal_observer.Eye(at)
+    observer = ideal_observer.IdealObserver(at)
     kind = fault_table.KINDS['stage_offset']
-    seen = [ideal_observer.power(float(np.sum(eye.seen(at.response([fault_table.Fault(
+    seen = [ideal_observer.power(float(np.sum(observer.project(at.response([fault.Fault(
         kind, size, {'w': [0.0, 1.0]})])) ** 2))) for size in (1e-7, 3e-3)]
     assert seen[0] < 0.05 and seen[1] > 0.99
-    clean = eye.seen(np.zeros_like(eye.force))
+    clean = observer.project(np.zeros_like(observer.force))
     assert np.allclose(clean, 0)
     noise = chain.render(at.unit, at.manoeuvre, [], 3) - chain.render(
         at.unit, at.manoeuvre, [], 3, noise=False)
-    spread = eye.seen(noise * at.unit.volts_to_mps2)
+    spread = observer.project(noise * at.unit.volts_to_mps2)
     # Whitened noise has variance 1: the spectrum that the oracle uses is that of the noise.
     assert np.var(spread) == pytest.approx(1, abs=0.05)
 
@@ -418,7 +432,7 @@ def said(recording, parameters):
     return ('explained', [[missing, 1.0]]) if missing else ('no_gap', [[[], 1.0]])
 """
     csv = original / 'recordings' / 'r0000.csv'
-    rows = real_recordings.put_back([real_recordings.arm(f'{csv}:{tmp_path / "unit.yaml"}')],
+    rows = real_recordings.put_back([real_recordings.read_arm(f'{csv}:{tmp_path / "unit.yaml"}')],
                                     script(tmp_path, body), pool, show(''))
     assert [(row['deleted'], row['put_back']) for row in rows] == [
         (None, None), ('bias', True), ('scale_factor', True)]
@@ -429,7 +443,7 @@ def said(recording, parameters):
     assert left['covariance_names'] == [f'scale_factor.offset_v_per_g.{axis}'
                                         for axis in left['sensor']['axes']]
     with pytest.raises(UserError, match='no such file'):
-        real_recordings.arm(f'{csv}:nowhere.yaml')
+        real_recordings.read_arm(f'{csv}:nowhere.yaml')
 
 
 def test_on_a_cluster(original, known_nothing, tmp_path):
@@ -443,14 +457,14 @@ def test_on_a_cluster(original, known_nothing, tmp_path):
     assert len(found) == TRIALS + 2 and all(one['report'] for one in found.values())
 
 
-def test_through_the_front_door(run_tool, tmp_path, state):
+def test_through_the_front_door(run_tool, tmp_path):
     """Sealed by one call, diagnosed, opened and scored by another."""
     sealed = run_tool('blind', '--seal', 'dir', '--trials', 1, '--seed', 156)
     assert sealed.returncode == 0, sealed.stderr
     digest = json.loads((tmp_path / 'dir' / 'seal.json').read_text())['sha256_of_salt_and_labels']
     assert digest in sealed.stdout
-    assert not list((tmp_path / 'dir' / 'labels').glob('*.json'))
-    opened = run_tool('blind', '--open', 'dir', timeout_s=300)
+    assert not list((tmp_path / 'dir').glob('blind.*'))
+    opened = run_tool('blind', '--open', 'dir')
     assert opened.returncode == 0, opened.stderr
     made = json.loads((tmp_path / 'dir' / 'blind.json').read_text())
     assert (made['hash'], made['seed'], made['trials'], made['cases']) == (digest, 156, 1, 2)

@@ -12,72 +12,41 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The chain of this world: joints to force, element, electronics, clock and ADC."""
+"""The chain of this world, from the joints to the codes of the ADC."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 import math
-from typing import TYPE_CHECKING
-import zlib
 
+from adxl_ros.blind.world.fault import Fault
 from adxl_ros.blind.world.motion import Manoeuvre
-from adxl_ros.blind.world.unit import ADC_BITS, ADC_VREF, G0, Unit
+from adxl_ros.blind.world.run import Place, Run
+from adxl_ros.blind.world.signals import pink_noise
+from adxl_ros.blind.world.unit import ADC_BITS, G0, LSB_V, Unit
 import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.signal import lfilter
 
-if TYPE_CHECKING:
-    from adxl_ros.blind.world.fault_table import Fault
-
-# Steps of the simulation a second, at least; a whole number a sample.
 FINE_HZ = 2000.0
-LSB = ADC_VREF / 2 ** ADC_BITS
-PLACES = ('stage', 'mount', 'element', 'electronics', 'wire', 'samples')
-
-
-@dataclass
-class Run:
-    """
-    A recording in the making; faults change it at their places.
-
-    Joints, `up` and `force` (3, n) m/s^2 in the sensor's frame; `u` (axes, n) in g; `volts`
-    (axes, n), on the fine grid `t` and from place `samples` on one a sample.
-    """
-
-    unit: Unit
-    t: np.ndarray
-    seed: int
-    alpha: np.ndarray
-    beta: np.ndarray
-    shift: np.ndarray
-    temperature: np.ndarray
-    supply: np.ndarray
-    up: np.ndarray = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
-    gravity: float = G0
-    arm: np.ndarray = field(default_factory=lambda: np.zeros(3))
-    late: float = 0.0
-    skew: float = 0.0
-    corner_hz: float = 0.0
-    second_hz: float = math.inf
-    force: np.ndarray = field(default_factory=lambda: np.zeros((3, 0)))
-    directions: np.ndarray = field(default_factory=lambda: np.eye(3))
-    u: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
-    volts: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
-
-    @property
-    def dt(self) -> float:
-        """Step of the fine grid, s."""
-        return float(self.t[1] - self.t[0])
-
-    def random(self, stream: str) -> np.random.Generator:
-        """Give the generator of a stream, the same whatever other faults there are."""
-        return np.random.default_rng([self.seed, zlib.crc32(stream.encode())])
+"""Lowest rate of the simulation, Hz; chosen. Each sample has a whole number of its steps."""
 
 
 def stamps(unit: Unit, manoeuvre: Manoeuvre) -> np.ndarray:
-    """Give the stamps of a recording, s."""
+    """
+    Return the stamps of a recording.
+
+    Parameters
+    ----------
+    unit, manoeuvre
+        The unit and its motion.
+
+    Returns
+    -------
+    numpy.ndarray
+        Stamps, s, (n,).
+
+    """
     return np.arange(int(manoeuvre.seconds * unit.rate_hz)) / unit.rate_hz
 
 
@@ -89,59 +58,75 @@ def render(unit: Unit, manoeuvre: Manoeuvre, faults: Sequence[Fault], seed: int,
     Parameters
     ----------
     unit, manoeuvre
-        What is moved, and how.
+        The unit and its motion.
     faults
-        Of any number; each acts at its place.
+        Any number of faults; each acts at its place.
     seed
-        Of all that is random.
+        Seed of all random numbers.
     noise
-        Without, there is neither noise nor drift nor the rounding of the ADC: for responses.
+        False for responses: no noise, no drift, no stage errors and no rounding by the ADC.
     fine_hz
-        Least rate of the simulation.
+        Lowest rate of the simulation, Hz.
 
     Returns
     -------
     numpy.ndarray
-        (axes, samples) V.
+        Output of the axes, V, (m, n).
 
     """
     sampled = stamps(unit, manoeuvre)
     step = 1 / (unit.rate_hz * math.ceil(fine_hz / unit.rate_hz))
-    # Samples that come late or early must still lie on the grid.
+    # Late and early samples must lie within the grid.
     t = np.arange(-0.5, sampled[-1] + 1.0, step)
     joints = manoeuvre.joints(t)
     run = Run(unit, t, seed, joints['alpha'], joints['beta'], joints['shift'],
               *manoeuvre.climate(t), corner_hz=unit.corner_hz)
 
-    def act(place: str) -> None:
-        for fault in faults:
-            if fault.kind.place == place:
-                fault.kind.act(run, fault.size, fault.shape)
-
     if noise:
         _stage_errors(run)
-    act('stage')
+    _act(faults, Place.STAGE, run)
     run.force = _force(run)
-    act('mount')
-    run.u = (run.directions @ run.force)[unit.which] / G0
-    act('element')
+    _act(faults, Place.MOUNT, run)
+    run.u = (run.directions @ run.force)[unit.axis_indices] / G0
+    _act(faults, Place.ELEMENT, run)
     run.volts = unit.zero_v[:, None] + unit.scale_v_per_g[:, None] * run.u
-    act('electronics')
+    _act(faults, Place.ELECTRONICS, run)
     if noise:
         run.volts += unit.scale_v_per_g[:, None] * _sensor_noise(run)
     run.volts = _low_pass(_low_pass(run.volts, run.corner_hz, step), run.second_hz, step)
-    act('wire')
+    _act(faults, Place.WIRE, run)
     late = run.late + run.skew * (sampled + 8 * np.sin(sampled / 25))
     run.volts = CubicSpline(t, run.volts, axis=1)(np.clip(sampled - late, t[0], t[-1]))
     run.t = sampled
-    act('samples')
+    _act(faults, Place.SAMPLES, run)
     if noise:
-        run.volts = np.clip(np.floor(run.volts / LSB), 0, 2 ** ADC_BITS - 1) * LSB
+        run.volts = np.clip(np.floor(run.volts / LSB_V), 0, 2 ** ADC_BITS - 1) * LSB_V
     return run.volts
 
 
+def _act(faults: Sequence[Fault], place: Place, run: Run) -> None:
+    for fault in faults:
+        if fault.kind.place is place:
+            fault.kind.act(run, fault.size, fault.shape)
+
+
 def references(unit: Unit, manoeuvre: Manoeuvre, seed: int) -> dict[str, np.ndarray]:
-    """Give the other columns of a recording: what encoder, thermometer and voltmeter say."""
+    """
+    Return the other columns of a recording, by encoder, thermometer and voltmeter.
+
+    Parameters
+    ----------
+    unit, manoeuvre
+        The unit and its motion.
+    seed
+        Seed of all random numbers.
+
+    Returns
+    -------
+    dict
+        Columns by name, (n,) each.
+
+    """
     t = stamps(unit, manoeuvre)
     rng = np.random.default_rng([seed, 77])
     joints, (temperature, supply) = manoeuvre.joints(t), manoeuvre.climate(t)
@@ -154,7 +139,7 @@ def references(unit: Unit, manoeuvre: Manoeuvre, seed: int) -> dict[str, np.ndar
 
 
 def _stage_errors(run: Run) -> None:
-    """Add a stage's errors inside its stated resolution, and an encoder's between its lines."""
+    """Add errors of the stage within its resolution, and of the encoder between its lines."""
     step, rng = run.unit.resolution_rad, run.random('encoder')
     for joint, (offset, sine, cosine) in zip((run.alpha, run.beta),
                                              run.unit.stage_rad.reshape(2, 3)):
@@ -162,8 +147,8 @@ def _stage_errors(run: Run) -> None:
             2 * np.pi * joint / (37 * step) + rng.uniform(0, 2 * np.pi))
 
 
-def _turn(run: Run, vector: np.ndarray) -> np.ndarray:
-    """Turn a vector of the base, (3,) or (3, n), into the sensor's frame, (3, n)."""
+def _rotate(run: Run, vector: np.ndarray) -> np.ndarray:
+    """Rotate a vector of the base, (3,) or (3, n), into the sensor's frame, (3, n)."""
     ca, sa, cb, sb = np.cos(run.alpha), np.sin(run.alpha), np.cos(run.beta), np.sin(run.beta)
     x, y, z = vector
     x, z = ca * x + sa * z, -sa * x + ca * z
@@ -171,23 +156,23 @@ def _turn(run: Run, vector: np.ndarray) -> np.ndarray:
 
 
 def _force(run: Run) -> np.ndarray:
-    force = run.gravity * _turn(run, run.up)
-    force[0] += _twice(run.shift, run.dt)
+    force = run.gravity * _rotate(run, run.up)
+    force[0] += _second_derivative(run.shift, run.dt)
     if run.arm.any():
-        # The arm's path in the base, differentiated there: no formula of rotating frames.
+        # The path of the sensor in the base is differentiated twice: no rotating frame is used.
         ca, sa, cb, sb = np.cos(run.alpha), np.sin(run.alpha), np.cos(run.beta), np.sin(run.beta)
         x, y = cb * run.arm[0] - sb * run.arm[1], sb * run.arm[0] + cb * run.arm[1]
         path = np.stack([ca * x - sa * run.arm[2], y, sa * x + ca * run.arm[2]])
-        force += _turn(run, _twice(path, run.dt))
+        force += _rotate(run, _second_derivative(path, run.dt))
     return force
 
 
-def _twice(values: np.ndarray, dt: float) -> np.ndarray:
+def _second_derivative(values: np.ndarray, dt: float) -> np.ndarray:
     return np.gradient(np.gradient(values, dt, axis=-1), dt, axis=-1)
 
 
 def _low_pass(values: np.ndarray, corner_hz: float, dt: float) -> np.ndarray:
-    """Filter by one pole, exactly for inputs that are straight between steps."""
+    """Filter by one pole, exactly for inputs that are linear between steps."""
     if math.isinf(corner_hz):
         return values
     x = 2 * np.pi * corner_hz * dt
@@ -205,16 +190,5 @@ def _sensor_noise(run: Run) -> np.ndarray:
     rng = run.random('drift')
     for row, walk, size in zip(white, unit.walk_g_per_rts, unit.flicker_g):
         drift = walk * math.sqrt(0.1) * np.cumsum(rng.normal(size=len(slow)))
-        row += np.interp(run.t, slow, drift + size * pink(slow, rng))
+        row += np.interp(run.t, slow, drift + size * pink_noise(slow, rng))
     return white
-
-
-def pink(t: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Draw 1/f noise: relaxations at half-decade steps, each of variance 1."""
-    out = np.zeros_like(t)
-    dt = t[1] - t[0]
-    for lag in dt * 10 ** np.arange(0.5, math.log10(2 * (t[-1] - t[0]) / dt), 0.5):
-        keep = math.exp(-dt / lag)
-        out += lfilter([math.sqrt(1 - keep * keep)], [1, -keep], rng.normal(size=len(t)),
-                       zi=[keep * rng.normal()])[0]
-    return out

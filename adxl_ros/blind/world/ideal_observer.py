@@ -12,73 +12,121 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What an ideal observer of this world could see: power, and what cannot be told apart."""
+"""The ideal observer of this world: the power of detection, and what it cannot separate."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 import math
 
-from adxl_ros.blind.world.chain import FINE_HZ, LSB, references, render, stamps
-from adxl_ros.blind.world.fault_table import Fault, Kind, KINDS, KNOWN
+from adxl_ros.blind.world.chain import FINE_HZ, references, render, stamps
+from adxl_ros.blind.world.fault import Fault, FaultKind
+from adxl_ros.blind.world.fault_table import KINDS, KNOWN
 from adxl_ros.blind.world.motion import Manoeuvre
-from adxl_ros.blind.world.unit import G0, SCALE_SD, STAGE_SD, Unit, ZERO_SD_G
+from adxl_ros.blind.world.unit import G0, LSB_V, SCALE_STD, STAGE_STD, Unit, ZERO_G_STD_G
 import numpy as np
 from scipy.optimize import lsq_linear, minimize_scalar
 from scipy.stats import chi2, ncx2, norm
 
-# Of the observer's test of one effect, so that all of the library together err in 5 %.
-LEVEL = 0.05 / len(KNOWN)
-# Rivals whose fit leaves less than three standard deviations of the truth are not told apart.
-LEFT = 9.0
+TEST_LEVEL = 0.05 / len(KNOWN)
+"""Level of the test of one effect, so that the tests of all effects together have 5 %."""
+INSEPARABLE_BELOW = 9.0
+"""A rival is inseparable where its fit leaves less than this of the squared visibility.
+
+These are three standard deviations; chosen.
+"""
 _COARSE_HZ = 400.0
-_NOISE_SD = 0.02
+"""Lowest rate of the simulation of responses, Hz; chosen: eight times the filter's corner."""
+_NOISE_STD = 0.02
+"""Uncertainty of the stated noise density, a share; that of units is 0.015."""
+_FLEXIBLE_LEVEL = 0.001
+"""Level of the test by a flexible model; chosen."""
+_RECOGNISABLE_SAMPLE = 7.0
+"""Squared visibility of one repeated sample; chosen."""
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A unit in a manoeuvre; forces and spectra on the sample grid."""
+    """
+    A unit in a manoeuvre.
+
+    Attributes
+    ----------
+    unit, manoeuvre
+        The unit and its motion.
+    seed
+        Seed of all random numbers.
+
+    """
 
     unit: Unit
     manoeuvre: Manoeuvre
     seed: int
 
     def response(self, faults: list[Fault], coarse: bool = False) -> np.ndarray:
-        """Give what faults change, (axes, n) m/s^2 as the user converts."""
+        """
+        Return the change of the output by faults.
+
+        Parameters
+        ----------
+        faults
+            Faults that act together.
+        coarse
+            Whether a lower rate of the simulation suffices.
+
+        Returns
+        -------
+        numpy.ndarray
+            The change as the user converts it, m/s², (m, n).
+
+        """
         noise = any(fault.kind.random for fault in faults)
         fine = _COARSE_HZ if coarse else FINE_HZ
-        with_faults, without = (render(self.unit, self.manoeuvre, some, self.seed, noise=noise,
-                                       fine_hz=fine) for some in (faults, []))
+        with_faults, without = (render(self.unit, self.manoeuvre, acting, self.seed, noise=noise,
+                                       fine_hz=fine) for acting in (faults, []))
         return (with_faults - without) * self.unit.volts_to_mps2
 
     def force(self) -> np.ndarray:
-        """Give each axis's own specific force without faults, (axes, n) m/s^2."""
+        """Return the specific force along each axis without faults, m/s², (m, n)."""
         volts = render(self.unit, self.manoeuvre, [], self.seed, noise=False)
         return (volts - self.unit.zero_v[:, None]) * self.unit.volts_to_mps2
 
 
 def beyond_calibration(unit: Unit, change: np.ndarray, force: np.ndarray) -> np.ndarray:
     """
-    Take off what zero-g and scale account for within two standard deviations of the file.
+    Remove what zero-g and scale factor explain within two standard deviations of the file.
 
-    Both arrays, and what is returned, are (axes, n) m/s^2.
+    Parameters
+    ----------
+    unit
+        The unit.
+    change
+        Change of the output, m/s², (m, n).
+    force
+        Specific force along the axes, m/s², (m, n).
+
+    Returns
+    -------
+    numpy.ndarray
+        The rest of the change, m/s², (m, n).
+
     """
-    left = np.empty_like(change)
-    for row, own, out in zip(change, force, left):
-        columns = np.stack([np.ones_like(own), own], axis=1)
+    rest = np.empty_like(change)
+    bounds = 2 * np.array([ZERO_G_STD_G * G0, SCALE_STD])
+    for row, along, out in zip(change, force, rest):
+        columns = np.stack([np.ones_like(along), along], axis=1)
         q, r = np.linalg.qr(columns)
-        most = 2 * np.array([ZERO_SD_G * G0, SCALE_SD])
-        out[:] = row - columns @ lsq_linear(r, q.T @ row, (-most, most)).x
-    return left
+        out[:] = row - columns @ lsq_linear(r, q.T @ row, (-bounds, bounds)).x
+    return rest
 
 
 def rms(values: np.ndarray) -> float:
-    """Give the rms over samples and axes."""
+    """Return the rms over samples and axes."""
     return float(np.sqrt(np.mean(values ** 2)))
 
 
 def _spectrum(unit: Unit, count: int) -> np.ndarray:
-    """Give the one-sided spectrum of a fault-free recording, (axes, f) (m/s^2)^2/Hz."""
+    """Return the one-sided spectrum of a recording without faults, (m/s²)²/Hz, (m, f)."""
     rate = unit.rate_hz
     f = np.fft.rfftfreq(count, 1 / rate)
     f[0] = f[1]
@@ -90,18 +138,24 @@ def _spectrum(unit: Unit, count: int) -> np.ndarray:
     power += 2 * (unit.walk_g_per_rts[:, None] / w) ** 2
     lags = 0.1 * 10 ** np.arange(0.5, math.log10(20 * count / rate), 0.5)
     power += unit.flicker_g[:, None] ** 2 * sum(4 * lag / (1 + (w * lag) ** 2) for lag in lags)
-    # An encoder's rounding stays for a pose's length; the ADC's is white.
+    # The rounding of the encoder stays for the length of a pose; that of the ADC is white.
     power += unit.resolution_rad ** 2 / 24 * 4 * 2.0 / (1 + (w * 2.0) ** 2)
-    power += ((LSB / unit.scale_v_per_g) ** 2 / 12 * 2 / rate)[:, None]
+    power += ((LSB_V / unit.scale_v_per_g) ** 2 / 12 * 2 / rate)[:, None]
     return G0 ** 2 * power
 
 
-class Eye:
+class IdealObserver:
     """
-    The ideal observer: knows every form and the noise, and the calibration as far as stated.
+    It knows the form of every effect and the noise, and the calibration as far as it is stated.
 
-    Vectors are whitened responses, axis after axis, with a row for each stated figure, so that
-    sums of squares are log likelihood ratios (twice).
+    Its vectors are whitened responses, axis after axis, with a row for each stated value. Sums of
+    their squares are twice a log likelihood ratio.
+
+    Parameters
+    ----------
+    scene
+        What it observes.
+
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -115,71 +169,71 @@ class Eye:
             prior[2 * self.axes + i] = 1.0
             stated.append(np.concatenate([self.whiten(change), prior]))
         for d in range(self.axes):
-            for what, sd in ((np.ones_like(self.force[d]), ZERO_SD_G * G0),
-                             (self.force[d], SCALE_SD)):
+            for response, std in ((np.ones_like(self.force[d]), ZERO_G_STD_G * G0),
+                                  (self.force[d], SCALE_STD)):
                 rows = np.zeros_like(self.force)
-                rows[d] = what
+                rows[d] = response
                 prior = np.zeros(2 * self.axes + 6)
-                prior[len(stated) - 6] = 1 / sd
+                prior[len(stated) - 6] = 1 / std
                 stated.append(np.concatenate([self.whiten(rows), prior]))
         self.stated = np.linalg.qr(np.stack(stated, axis=1))[0]
 
     def _stage(self) -> list[np.ndarray]:
-        """Give what each error of the stage changes, at its standard deviation."""
+        """Return the response to each error of the stage at its standard deviation."""
         unit = self.scene.unit
-        size = STAGE_SD * unit.resolution_rad
-        sets = [('stage_offset', [0]), ('stage_eccentricity', [2]), ('stage_eccentricity', [3]),
-                ('stage_offset', [1]), ('stage_eccentricity', [0]), ('stage_eccentricity', [1])]
+        size = STAGE_STD * unit.resolution_rad
+        errors = [('stage_offset', [0]), ('stage_eccentricity', [2]), ('stage_eccentricity', [3]),
+                  ('stage_offset', [1]), ('stage_eccentricity', [0]), ('stage_eccentricity', [1])]
         return [self.scene.response([Fault(KINDS[name], size, {
-            'w': np.isin(np.arange(4), which).astype(float)})], coarse=True)
-            for name, which in sets]
+            'w': np.isin(np.arange(4), weights).astype(float)})], coarse=True)
+            for name, weights in errors]
 
     def whiten(self, change: np.ndarray) -> np.ndarray:
-        """Whiten (axes, n) m/s^2 into one vector."""
+        """Whiten a change, m/s², (m, n), into one vector."""
         return np.fft.irfft(np.fft.rfft(change) * self.weight, self.count).ravel()
 
-    def seen(self, change: np.ndarray) -> np.ndarray:
-        """Whiten a change and take off what the stated calibration may account for."""
+    def project(self, change: np.ndarray) -> np.ndarray:
+        """Whiten a change and remove what the uncertainty of the calibration explains."""
         vector = np.concatenate([self.whiten(change), np.zeros(2 * self.axes + 6)])
         return vector - self.stated @ (self.stated.T @ vector)
 
     def responses(self) -> dict[str, list[np.ndarray]]:
-        """Give the responses of every effect of the mean, (axes, n) m/s^2 each."""
-        out = {}
+        """Return the responses of each effect that is not like noise, m/s², (m, n) each."""
+        responses = {}
         for name in KNOWN:
             kind = KINDS[name]
             if not kind.random or name == 'adc_inl':
-                out[name] = [part for shape in kind.spread(self.scene.unit)
-                             for times in kind.sizes
-                             for part in _parts(kind, self.scene.response(
-                                 [Fault(kind, times * kind.start, shape)], coarse=True))]
-        return out
+                faults = [Fault(kind, multiple * kind.start, shape)
+                          for shape in kind.spread(self.scene.unit) for multiple in kind.sizes]
+                responses[name] = [part for fault in faults for part in _parts(
+                    kind, self.scene.response([fault], coarse=True))]
+        return responses
 
     def span(self, responses: list[np.ndarray]) -> np.ndarray:
-        """Span whitened responses by orthonormal columns."""
-        return _orthonormal([self.seen(change) for change in responses], self.stated.shape[0])
+        """Return orthonormal columns that span whitened responses, (v, k)."""
+        return _orthonormal([self.project(change) for change in responses], self.stated.shape[0])
 
-    def plain_choices(self, residual: np.ndarray,
-                      responses: dict[str, list[np.ndarray]]) -> dict[str, str]:
+    def simple_choices(self, residual: np.ndarray,
+                       responses: dict[str, list[np.ndarray]]) -> dict[str, str]:
         """
-        Choose an effect as is often done: by smallest RMSE, and by BIC as if noise were white.
+        Choose an effect by two common methods: smallest RMSE, and BIC with white noise.
 
         Parameters
         ----------
         residual
-            Recording less simulator, (axes, n) m/s^2; zero-g and scale are refitted freely.
+            Recording minus simulator, m/s², (m, n). Zero-g and scale factor are refitted freely.
         responses
-            Of every effect, in this world's own forms: more than a user has.
+            Of every effect in the forms of this world, which is more than a user has.
 
         Returns
         -------
         dict
-            By `rmse` and `bic` the name of an effect; empty for none.
+            Name of an effect for `rmse` and `bic`; empty for none.
 
         """
         axes = range(self.axes)
-        affine = _orthonormal([(what * (np.arange(self.axes) == d)[:, None]).ravel()
-                               for what in (np.ones_like(self.force), self.force)
+        affine = _orthonormal([(response * (np.arange(self.axes) == d)[:, None]).ravel()
+                               for response in (np.ones_like(self.force), self.force)
                                for d in axes], residual.size)
 
         def beyond(rows: np.ndarray) -> np.ndarray:
@@ -187,68 +241,74 @@ class Eye:
 
         rest = beyond(residual)
         total, cost = float(rest @ rest), math.log(rest.size)
-        squares, scores = {}, {'': rest.size * math.log(total)}
+        squares, criterion = {}, {'': rest.size * math.log(total)}
         for name, changes in responses.items():
             columns = _orthonormal([beyond(change) for change in changes], rest.size)
             squares[name] = total - float(np.sum((columns.T @ rest) ** 2))
-            scores[name] = rest.size * math.log(squares[name]) + columns.shape[1] * cost
+            criterion[name] = rest.size * math.log(squares[name]) + columns.shape[1] * cost
         return {'rmse': min(squares, key=squares.__getitem__),
-                'bic': min(scores, key=scores.__getitem__)}
+                'bic': min(criterion, key=criterion.__getitem__)}
 
-    def flexible(self, taken: np.ndarray, vector: np.ndarray) -> float:
+    def flexible_power(self, reserved: np.ndarray, vector: np.ndarray) -> float:
         """
-        Give the power of a flexible model of force, rate, way, temperature and time.
+        Return the power of a flexible model of force, rate, angle, temperature and time.
 
         Parameters
         ----------
-        taken
-            Orthonormal columns that the flexible model may not use.
+        reserved
+            Orthonormal columns that the flexible model may not use, (v, k).
         vector
-            A whitened change.
+            A whitened change, (v,).
+
+        Returns
+        -------
+        float
+            Probability of detection.
 
         """
-        scene, found, used = self.scene, 0.0, 0
-        whole = vector - taken @ (taken.T @ vector)
+        scene, explained, used = self.scene, 0.0, 0
+        rest = vector - reserved @ (reserved.T @ vector)
         hats = _hats(scene, self.force)
         for d in range(self.axes):
             columns = []
             for hat in hats:
                 rows = np.zeros_like(self.force)
                 rows[d] = hat
-                column = self.seen(rows)
-                columns.append(column - taken @ (taken.T @ column))
-            basis = _orthonormal(columns, len(whole))
-            found += float(np.sum((basis.T @ whole) ** 2))
+                column = self.project(rows)
+                columns.append(column - reserved @ (reserved.T @ column))
+            basis = _orthonormal(columns, len(rest))
+            explained += float(np.sum((basis.T @ rest) ** 2))
             used += basis.shape[1]
-        return float(ncx2.sf(chi2.isf(0.001, used), used, found))
+        return float(ncx2.sf(chi2.isf(_FLEXIBLE_LEVEL, used), used, explained))
 
 
-def _parts(kind: Kind, change: np.ndarray) -> list[np.ndarray]:
-    if not kind.each:
+def _parts(kind: FaultKind, change: np.ndarray) -> list[np.ndarray]:
+    if not kind.per_axis:
         return [change]
     return [change * (np.arange(len(change)) == d)[:, None] for d in range(len(change))
             if change[d].any()]
 
 
 def _orthonormal(columns: list[np.ndarray], length: int) -> np.ndarray:
-    """Give an orthonormal basis, (length, k), of what columns of any size span."""
+    """Return an orthonormal basis of the span of columns of any size, (length, k)."""
     sizes = [float(np.linalg.norm(column)) for column in columns]
     kept = [column / size for column, size in zip(columns, sizes) if size > 1e-6]
     if not kept:
         return np.zeros((length, 0))
     stack = np.stack(kept, axis=1)
     values, vectors = np.linalg.eigh(stack.T @ stack)
-    good = values > 1e-8 * values[-1]
-    return stack @ (vectors[:, good] / np.sqrt(values[good]))
+    significant = values > 1e-8 * values[-1]
+    return stack @ (vectors[:, significant] / np.sqrt(values[significant]))
 
 
 def _hats(scene: Scene, force: np.ndarray) -> list[np.ndarray]:
+    """Return the hat functions of the flexible model, (n,) each."""
     t = stamps(scene.unit, scene.manoeuvre)
-    known = references(scene.unit, scene.manoeuvre, scene.seed)
+    measured = references(scene.unit, scene.manoeuvre, scene.seed)
     rates = [np.gradient(scene.manoeuvre.joints(t)[name], t) for name in ('alpha', 'beta')]
-    over = [(own, 7) for own in force] + [(np.tanh(2 * rate), 5) for rate in rates]
-    over += [(np.sin(known['beta_rad']), 5), (np.cos(known['beta_rad']), 5),
-             (known['temperature_c'], 4), (t, 8)]
+    over = [(along, 7) for along in force] + [(np.tanh(2 * rate), 5) for rate in rates]
+    over += [(np.sin(measured['beta_rad']), 5), (np.cos(measured['beta_rad']), 5),
+             (measured['temperature_c'], 4), (t, 8)]
     hats = []
     for values, count in over:
         centres = np.linspace(values.min(), values.max(), count)
@@ -258,35 +318,52 @@ def _hats(scene: Scene, force: np.ndarray) -> list[np.ndarray]:
 
 
 def power(strength: float) -> float:
-    """Give the chance that a change of this squared visibility is detected."""
-    return float(ncx2.sf(chi2.isf(LEVEL, 1), 1, strength))
+    """Return the probability that a change of a squared visibility is detected."""
+    return float(ncx2.sf(chi2.isf(TEST_LEVEL, 1), 1, strength))
 
 
-def told(strength: float) -> float:
-    """Give the chance that the truth beats a rival which leaves this much of it."""
+def separation_probability(strength: float) -> float:
+    """Return the probability that the truth beats a rival that leaves a squared visibility."""
     return float(norm.cdf(0.5 * math.sqrt(max(strength, 0.0))))
 
 
-def noise_visibility(eye: Eye, kind: Kind, change: np.ndarray) -> float:
+def noise_visibility(observer: IdealObserver, kind: FaultKind, change: np.ndarray) -> float:
     """
-    Give the squared visibility of a fault that differs from run to run.
+    Return the squared visibility of a fault that differs from run to run.
 
-    By its spectrum (Whittle), where the stated noise is uncertain by 2 %; spikes also one by
-    one, and repeated or missing codes by their number.
+    It follows from the spectrum (Whittle), with an uncertainty of the stated noise of 2 %. Spikes
+    also show one by one, and repeated or missing codes by their number.
+
+    Parameters
+    ----------
+    observer
+        The ideal observer.
+    kind
+        Kind of the fault.
+    change
+        Change of the output by the fault, m/s², (m, n).
+
+    Returns
+    -------
+    float
+        The squared visibility.
+
     """
     if kind.name in ('mains_hum', 'adc_inl'):
-        return float(np.sum(eye.seen(change) ** 2))
-    white = eye.weight ** 2 * np.abs(np.fft.rfft(change)) ** 2 / eye.count
+        return float(np.sum(observer.project(change) ** 2))
+    white = observer.weight ** 2 * np.abs(np.fft.rfft(change)) ** 2 / observer.count
     excess = np.stack([_smooth(row) for row in white])[:, 1:]
-    out = sum(_whittle(row) for row in excess)
+    visibility = sum(_whittle(row) for row in excess)
     if kind.name == 'spikes':
-        single = (eye.whiten(change)) ** 2
-        out = max(out, float(np.sum(np.clip(single - 2 * math.log(single.size), 0, None))))
+        samples = (observer.whiten(change)) ** 2
+        outstanding = np.clip(samples - 2 * math.log(samples.size), 0, None)
+        visibility = max(visibility, float(np.sum(outstanding)))
     elif kind.name == 'stuck':
-        out = max(out, 7.0 * np.count_nonzero(np.any(np.abs(change) > 0, axis=0)))
-    elif kind.name == 'quantisation' and np.abs(change).max() > 2 * G0 * LSB:
-        out = max(out, float(eye.count))
-    return float(out)
+        repeated = np.count_nonzero(np.any(np.abs(change) > 0, axis=0))
+        visibility = max(visibility, _RECOGNISABLE_SAMPLE * repeated)
+    elif kind.name == 'quantisation' and np.abs(change).max() > 2 * G0 * LSB_V:
+        visibility = max(visibility, float(observer.count))
+    return float(visibility)
 
 
 def _smooth(power: np.ndarray) -> np.ndarray:
@@ -297,7 +374,8 @@ def _smooth(power: np.ndarray) -> np.ndarray:
 
 
 def _whittle(excess: np.ndarray) -> float:
-    def off(level: float) -> float:
+    """Return the squared visibility of an excess of the spectrum by the Whittle likelihood."""
+    def misfit(level: float) -> float:
         ratio = (1 + excess) / (1 + level)
-        return float(2 * np.sum(ratio - 1 - np.log(ratio)) + (level / (2 * _NOISE_SD)) ** 2)
-    return minimize_scalar(off, bounds=(-0.2, 0.2), method='bounded').fun
+        return float(2 * np.sum(ratio - 1 - np.log(ratio)) + (level / (2 * _NOISE_STD)) ** 2)
+    return minimize_scalar(misfit, bounds=(-0.2, 0.2), method='bounded').fun

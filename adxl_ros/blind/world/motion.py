@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Manoeuvres of this world: acts strung together, rich or poor, with temperature and supply."""
+"""Manoeuvres of this world: sequences of moves, rich or poor, with temperature and supply."""
 
 from __future__ import annotations
 
@@ -21,42 +21,95 @@ from dataclasses import dataclass, field
 import numpy as np
 
 POOR = ('one_way', 'crawl', 'few_poses', 'together', 'one_plane')
+"""Kinds of manoeuvres that cannot separate all effects."""
+_FASTEST_HZ = 22.0
+"""Highest frequency of the shaker, Hz; chosen: below the 50 Hz of the filter."""
 
 
 @dataclass
 class Script:
-    """Knots of the joints, swings laid over them, and bursts of the shaker."""
+    """
+    Knots of the joints, with swings and bursts of the shaker added to them.
+
+    Attributes
+    ----------
+    time
+        Instants of the knots, s.
+    alpha, beta
+        Joint angles at the knots, rad.
+    swings
+        Joint, amplitude (rad or m), frequency (Hz), start and end (s) of each swing.
+    fastest_hz
+        Highest frequency of the shaker, Hz.
+
+    """
 
     time: list[float] = field(default_factory=lambda: [0.0])
     alpha: list[float] = field(default_factory=lambda: [np.pi / 2])
     beta: list[float] = field(default_factory=lambda: [0.0])
     swings: list[tuple[str, float, float, float, float]] = field(default_factory=list)
-    fastest_hz: float = 22.0
+    fastest_hz: float = _FASTEST_HZ
 
     @property
     def end(self) -> float:
-        """When the last knot is."""
+        """Return the instant of the last knot, s."""
         return self.time[-1]
 
     def rest(self, seconds: float) -> None:
-        """Stay."""
+        """Stay for some seconds."""
         self.go(self.alpha[-1], self.beta[-1], seconds)
 
     def go(self, alpha: float, beta: float, seconds: float) -> None:
-        """Move within so many seconds, without a jerk at either end."""
+        """
+        Move without a jump of velocity or acceleration at either end.
+
+        Parameters
+        ----------
+        alpha, beta
+            Where to, rad.
+        seconds
+            Duration, s.
+
+        """
         self.time.append(self.end + seconds)
         self.alpha.append(alpha)
         self.beta.append(beta)
 
     def swing(self, joint: str, size: float, hertz: float, seconds: float) -> None:
-        """Swing a joint about where it is (rad, or m of the shaker)."""
+        """
+        Swing a joint about its position.
+
+        Parameters
+        ----------
+        joint
+            'alpha', 'beta' or 'shift'.
+        size
+            Amplitude, rad, or m of the shaker.
+        hertz
+            Frequency, Hz.
+        seconds
+            Duration, s.
+
+        """
         self.swings.append((joint, size, hertz, self.end, self.end + seconds))
         self.rest(seconds)
 
 
 @dataclass(frozen=True)
 class Manoeuvre:
-    """What was done and what it was like; `seconds` long, laws of time as knots."""
+    """
+    One manoeuvre and its environment.
+
+    Attributes
+    ----------
+    kind
+        'rich' or one of `POOR`.
+    script
+        Motion of the joints.
+    temperature, supply
+        Instants, s, and values, °C or V.
+
+    """
 
     kind: str
     script: Script
@@ -65,54 +118,59 @@ class Manoeuvre:
 
     @property
     def seconds(self) -> float:
-        """How long it takes."""
+        """Return the duration, s."""
         return self.script.end
 
     def joints(self, t: np.ndarray) -> dict[str, np.ndarray]:
-        """Give alpha, beta (rad) and shift (m) at times t (s)."""
+        """Return alpha and beta (rad) and shift (m) at instants t (s)."""
         knots = np.asarray(self.script.time)
         i = np.clip(np.searchsorted(knots, t, 'right') - 1, 0, len(knots) - 2)
         x = np.clip((t - knots[i]) / (knots[i + 1] - knots[i]), 0, 1)
         blend = x ** 3 * (10 - 15 * x + 6 * x * x)
-        out = {'shift': np.zeros_like(t)}
+        joints = {'shift': np.zeros_like(t)}
         for name in ('alpha', 'beta'):
-            at = np.asarray(getattr(self.script, name))
-            out[name] = at[i] + (at[i + 1] - at[i]) * blend
+            angles = np.asarray(getattr(self.script, name))
+            joints[name] = angles[i] + (angles[i + 1] - angles[i]) * blend
         for joint, size, hertz, start, stop in self.script.swings:
             a, b = np.searchsorted(t, [start, stop])
             u = (t[a:b] - start) / (stop - start)
-            # Fades in and out over a fifth of its length each, three times differentiable.
+            # Each swing fades in and out over a fifth of its duration, with three derivatives.
             edge = np.clip(np.minimum(u, 1 - u) / 0.2, 0, 1)
             fade = edge ** 4 * (35 - 84 * edge + 70 * edge ** 2 - 20 * edge ** 3)
-            out[joint][a:b] += size * fade * np.sin(2 * np.pi * hertz * (t[a:b] - start))
-        return out
+            joints[joint][a:b] += size * fade * np.sin(2 * np.pi * hertz * (t[a:b] - start))
+        return joints
 
     def climate(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Give temperature (degC) and supply (V) at times t (s)."""
+        """Return temperature (°C) and supply (V) at instants t (s)."""
         return np.interp(t, *self.temperature), np.interp(t, *self.supply)
 
 
 def draw(rng: np.random.Generator, seconds: tuple[float, float], rate_hz: float,
          kind: str | None = None) -> Manoeuvre:
     """
-    Draw a manoeuvre; a quarter are poor.
+    Draw a manoeuvre; a quarter of them are poor.
 
     Parameters
     ----------
     rng
-        Draws.
+        The random generator.
     seconds
-        Shortest and longest.
+        Shortest and longest duration, s.
     rate_hz
-        Of the recording: nothing moves so fast that a period has less than ten samples.
+        Sample rate, Hz; every period of the shaker has at least ten samples.
     kind
-        One of `POOR`, or rich; drawn if None.
+        'rich' or one of `POOR`; drawn if None.
+
+    Returns
+    -------
+    Manoeuvre
+        The manoeuvre.
 
     """
     length = rng.uniform(*seconds)
     if kind is None:
         kind = str(rng.choice(POOR)) if rng.random() < 0.25 else 'rich'
-    script = Script(fastest_hz=min(22.0, rate_hz / 10))
+    script = Script(fastest_hz=min(_FASTEST_HZ, rate_hz / 10))
     script.beta[0] = rng.uniform(-np.pi, np.pi)
     script.rest(rng.uniform(1.5, 3.0))
     {'rich': _rich, 'one_way': _one_way, 'crawl': _crawl, 'few_poses': _few_poses,
@@ -123,12 +181,12 @@ def draw(rng: np.random.Generator, seconds: tuple[float, float], rate_hz: float,
 
 
 def _rich(script: Script, length: float, rng: np.random.Generator) -> None:
-    acts = [_plane, _tilts, _swing_beta, _shake, _plane, _swing_alpha, _dash]
+    moves = [_plane, _tilts, _swing_beta, _shake, _plane, _swing_alpha, _dash]
     while True:
-        for i in rng.permutation(len(acts)):
+        for i in rng.permutation(len(moves)):
             if script.end > length:
                 return
-            acts[i](script, rng)
+            moves[i](script, rng)
 
 
 def _plane(script: Script, rng: np.random.Generator) -> None:
@@ -136,8 +194,8 @@ def _plane(script: Script, rng: np.random.Generator) -> None:
     script.go(alpha, script.beta[-1], rng.uniform(1.0, 2.5))
     step, start = rng.uniform(0.7, 1.5), script.beta[-1]
     count = int(rng.integers(3, 6))
-    for way in [1] * count + [-1] * count:
-        script.go(alpha, script.beta[-1] + way * step, step / rng.uniform(0.6, 2.0))
+    for direction in [1] * count + [-1] * count:
+        script.go(alpha, script.beta[-1] + direction * step, step / rng.uniform(0.6, 2.0))
         script.rest(rng.uniform(0.6, 1.4))
     script.go(alpha, start + rng.normal(0, 0.3), 1.0)
 
@@ -175,7 +233,7 @@ def _dash(script: Script, rng: np.random.Generator) -> None:
 
 
 def _one_way(script: Script, length: float, rng: np.random.Generator) -> None:
-    """One plane, one direction, one speed."""
+    """Turn in one plane, in one direction, at one speed."""
     alpha, step = np.deg2rad(rng.uniform(70, 110)), rng.uniform(0.35, 0.6)
     script.alpha[:] = [alpha] * len(script.alpha)
     while script.end < 0.6 * length:
@@ -184,7 +242,7 @@ def _one_way(script: Script, length: float, rng: np.random.Generator) -> None:
 
 
 def _crawl(script: Script, length: float, rng: np.random.Generator) -> None:
-    """Slow turns, and back."""
+    """Turn slowly between random poses."""
     while script.end < 0.8 * length:
         script.go(np.deg2rad(rng.uniform(30, 150)), script.beta[-1] + rng.uniform(-2, 2),
                   rng.uniform(12, 20))
@@ -192,7 +250,7 @@ def _crawl(script: Script, length: float, rng: np.random.Generator) -> None:
 
 
 def _few_poses(script: Script, length: float, rng: np.random.Generator) -> None:
-    """Five or six poses, each once."""
+    """Visit five or six poses, each once."""
     count = int(rng.integers(5, 7))
     for _ in range(count):
         script.go(np.deg2rad(rng.uniform(20, 160)), rng.uniform(-np.pi, np.pi), 3.0)
@@ -200,12 +258,12 @@ def _few_poses(script: Script, length: float, rng: np.random.Generator) -> None:
 
 
 def _one_plane(script: Script, length: float, rng: np.random.Generator) -> None:
-    """Vertical plane only, forth and back, at one speed."""
+    """Turn in the vertical plane only, forward and backward, at one speed."""
     script.alpha[:] = [np.pi / 2] * len(script.alpha)
     step = rng.uniform(0.5, 0.9)
     while script.end < 0.7 * length:
-        for way in [1] * 7 + [-1] * 7:
-            script.go(np.pi / 2, script.beta[-1] + way * step, step / 0.7)
+        for direction in [1] * 7 + [-1] * 7:
+            script.go(np.pi / 2, script.beta[-1] + direction * step, step / 0.7)
             script.rest(1.0)
 
 
@@ -217,7 +275,7 @@ def _temperature(kind: str, end: float,
         return t, start + rng.uniform(4, 10) * t / end
     if kind != 'rich':
         return t, start + 0.15 * np.sin(2 * np.pi * t / rng.uniform(60, 200))
-    # A heater goes on and off; the plate follows by two lags.
+    # A heater switches on and off; the plate follows with two time constants.
     heat = np.zeros_like(t)
     for _ in range(2):
         on = rng.uniform(0, 0.75) * end

@@ -12,38 +12,47 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Faults that look like noise: of the sensor, of the wire, of the samples."""
+"""Faults that look like noise: of the sensor, of the wire and of the samples."""
 
 from __future__ import annotations
 
+from functools import partial
 import math
-from typing import Any
 
-from adxl_ros.blind.world.chain import LSB, pink, Run
-from adxl_ros.blind.world.fault_shapes import Act, by_axis, column, Draw, ones, Shape, vector
-from adxl_ros.blind.world.unit import ADC_BITS, Unit
+from adxl_ros.blind.world.fault import Act, Draw, FaultKind, Shape
+from adxl_ros.blind.world.fault_shapes import (
+    all_axes,
+    by_axis,
+    column,
+    draw_weights,
+    single_weights,
+)
+from adxl_ros.blind.world.run import Place, Run
+from adxl_ros.blind.world.signals import pink_noise
+from adxl_ros.blind.world.unit import ADC_BITS, LSB_V, Unit
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 from scipy.signal import lfilter
 
-_HEAVY_BITS = 5
+_HIGH_BITS = 5
+"""Number of the bits whose weights are wrong, from the highest; chosen."""
 
 
-def noise_excess(run: Run, size: float, shape: Shape) -> None:
-    """Hiss more: white and heavy-tailed ahead of the filter, `size` g rms within 50 Hz."""
+def _noise_excess(run: Run, size: float, shape: Shape) -> None:
+    """Add white, heavy-tailed noise before the filter; `size` is its rms within 50 Hz, V."""
     hiss = run.random('hiss').laplace(size=run.volts.shape) / math.sqrt(2)
     run.volts += size * column(shape) * math.sqrt(0.5 / run.dt / 78.5) * hiss
 
 
-def flicker(run: Run, size: float, shape: Shape) -> None:
-    """Flicker: relaxations over four decades."""
+def _flicker(run: Run, size: float, shape: Shape) -> None:
+    """Add 1/f noise: relaxations over four decades, V."""
     rng, slow = run.random('flicker'), np.arange(run.t[0], run.t[-1] + 0.05, 0.02)
     run.volts += size * column(shape) * np.stack([
-        np.interp(run.t, slow, pink(slow, rng)) for _ in run.volts])
+        np.interp(run.t, slow, pink_noise(slow, rng)) for _ in run.volts])
 
 
-def bias_walk(run: Run, size: float, shape: Shape) -> None:
-    """Wander: a step every second, rounded off."""
+def _bias_walk(run: Run, size: float, shape: Shape) -> None:
+    """Add a random walk, V: a smoothed step every second."""
     rng, knots = run.random('walk'), np.arange(run.t[0] - 1, run.t[-1] + 2, 0.25)
     steps = rng.normal(size=(len(run.volts), len(knots))) * (np.arange(len(knots)) % 4 == 0)
     walks = gaussian_filter1d(np.cumsum(steps, axis=1), 1.5, axis=1)
@@ -51,8 +60,8 @@ def bias_walk(run: Run, size: float, shape: Shape) -> None:
         np.interp(run.t, knots, walk - walk[0]) for walk in walks])
 
 
-def mains_hum(run: Run, size: float, shape: Shape) -> None:
-    """Hum: a mains whose frequency wanders, with two harmonics that come and go."""
+def _mains_hum(run: Run, size: float, shape: Shape) -> None:
+    """Add mains hum, V: its frequency wanders, and it has two harmonics."""
     rng, slow = run.random('mains'), np.arange(run.t[0], run.t[-1] + 1, 0.5)
     wander = gaussian_filter1d(rng.normal(size=len(slow)), 20)
     hertz = shape['hertz'] + 0.03 * wander / max(np.std(wander), 1e-9)
@@ -61,16 +70,16 @@ def mains_hum(run: Run, size: float, shape: Shape) -> None:
     run.volts += size * column(shape) * (1 + 0.1 * np.sin(run.t / 17)) * hum
 
 
-def spikes(run: Run, size: float, shape: Shape) -> None:
-    """Spike at random, with a tail of a sample or two."""
+def _spikes(run: Run, size: float, shape: Shape) -> None:
+    """Add spikes at random, V, each with a tail of a sample or two."""
     rng = run.random('spikes')
     hits = rng.random(run.volts.shape) < shape['rate'] * run.dt
     heights = rng.choice([-1.0, 1.0], hits.shape) * rng.lognormal(0, 0.4, hits.shape)
     run.volts += size * column(shape) * lfilter([1.0], [1.0, -0.25], hits * heights)
 
 
-def stuck(run: Run, size: float, shape: Shape) -> None:
-    """Repeat a sample of all axes, for `size` s on the average."""
+def _stuck(run: Run, size: float, shape: Shape) -> None:
+    """Repeat a sample of all axes, for `size` s on average."""
     rng = run.random('stuck')
     starts = np.flatnonzero(rng.random(len(run.t)) < shape['rate'] * run.dt)
     lengths = rng.exponential(1.0, len(run.t))[starts] * size / run.dt
@@ -78,43 +87,44 @@ def stuck(run: Run, size: float, shape: Shape) -> None:
         run.volts[:, start:start + 1 + int(length)] = run.volts[:, start:start + 1]
 
 
-def quantisation(run: Run, size: float, shape: Shape) -> None:
-    """Lose the low bits: steps of `size` V, that need not be a power of 2."""
-    if size > LSB:
-        step = size * np.maximum(np.abs(column(shape)), LSB / size)
+def _quantisation(run: Run, size: float, shape: Shape) -> None:
+    """Lose the low bits: steps of `size` V, which need not be a power of 2."""
+    if size > LSB_V:
+        step = size * np.maximum(np.abs(column(shape)), LSB_V / size)
         run.volts = np.floor(run.volts / step) * step + step / 2
 
 
-def adc_inl(run: Run, size: float, shape: Shape) -> None:
-    """Weigh the heavy bits wrongly, as a charge converter with unmatched capacitors does."""
-    code = np.clip(run.volts / LSB, 0, 2 ** ADC_BITS - 1)
-    whole = code.astype(np.int64)
+def _adc_inl(run: Run, size: float, shape: Shape) -> None:
+    """Weigh the high bits wrongly, V, as a charge converter with unmatched capacitors does."""
+    code = np.clip(run.volts / LSB_V, 0, 2 ** ADC_BITS - 1)
+    integer = code.astype(np.int64)
     for i, w in enumerate(shape['w']):
-        run.volts += size * w * 0.7 ** i * ((whole >> (ADC_BITS - 1 - i) & 1) - 0.5)
+        run.volts += size * w * 0.7 ** i * ((integer >> (ADC_BITS - 1 - i) & 1) - 0.5)
 
 
-def _mains(rng: np.random.Generator, unit: Unit) -> Shape:
+def _draw_mains(rng: np.random.Generator, unit: Unit) -> Shape:
     return {**by_axis(rng, unit), 'hertz': float(rng.choice([50.0, 60.0]))}
 
 
-def _at_rate(least: float, most: float) -> Draw:
-    return lambda rng, unit: {**by_axis(rng, unit), 'rate': float(rng.uniform(least, most))}
+def _draw_with_rate(lowest: float, highest: float, rng: np.random.Generator, unit: Unit) -> Shape:
+    return {**by_axis(rng, unit), 'rate': float(rng.uniform(lowest, highest))}
 
 
-def _disorder(act: Act, place: str, start: float, most: float,
-              draw: Draw = by_axis) -> dict[str, Any]:
-    return {'place': place, 'act': act, 'draw': draw, 'spread': ones, 'each': True,
-            'start': start, 'most': most, 'random': True}
+def _noise(name: str, place: Place, act: Act, start: float, largest: float,
+           draw: Draw = by_axis) -> FaultKind:
+    """Return a kind with a weight for each axis that differs from run to run."""
+    return FaultKind(name, place, act, draw, all_axes, start, largest, per_axis=True, random=True)
 
 
-KINDS = {
-    'noise_excess': _disorder(noise_excess, 'electronics', 1e-3, 0.1),
-    'flicker': _disorder(flicker, 'electronics', 3e-4, 0.05),
-    'bias_walk': _disorder(bias_walk, 'electronics', 1e-4, 0.05),
-    'mains_hum': _disorder(mains_hum, 'wire', 1e-3, 0.1, _mains),
-    'spikes': _disorder(spikes, 'samples', 0.05, 1.5, _at_rate(0.05, 0.3)),
-    'stuck': _disorder(stuck, 'samples', 0.05, 1.0, _at_rate(0.03, 0.15)),
-    'quantisation': _disorder(quantisation, 'samples', 1e-3, 0.08),
-    'adc_inl': {'place': 'samples', 'act': adc_inl, **vector(_HEAVY_BITS), 'start': 1e-3,
-                'most': 0.1},
-}
+KINDS = (
+    _noise('noise_excess', Place.ELECTRONICS, _noise_excess, start=1e-3, largest=0.1),
+    _noise('flicker', Place.ELECTRONICS, _flicker, start=3e-4, largest=0.05),
+    _noise('bias_walk', Place.ELECTRONICS, _bias_walk, start=1e-4, largest=0.05),
+    _noise('mains_hum', Place.WIRE, _mains_hum, 1e-3, 0.1, _draw_mains),
+    _noise('spikes', Place.SAMPLES, _spikes, 0.05, 1.5, partial(_draw_with_rate, 0.05, 0.3)),
+    _noise('stuck', Place.SAMPLES, _stuck, 0.05, 1.0, partial(_draw_with_rate, 0.03, 0.15)),
+    _noise('quantisation', Place.SAMPLES, _quantisation, start=1e-3, largest=0.08),
+    FaultKind('adc_inl', Place.SAMPLES, _adc_inl, partial(draw_weights, _HIGH_BITS),
+              partial(single_weights, _HIGH_BITS), start=1e-3, largest=0.1),
+)
+"""The kinds of this file, in the order of the table."""

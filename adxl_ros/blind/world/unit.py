@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""A unit of this world: what is true of it, and what its user's parameter file says."""
+"""A unit of this world: its true values, and those that its user's parameter file states."""
 
 from __future__ import annotations
 
@@ -21,21 +21,47 @@ from dataclasses import dataclass
 import numpy as np
 
 G0 = 9.80665
-ADC_BITS, ADC_VREF = 16, 5.0
-# What a calibration some days old still vouches for (standard deviations).
-ZERO_SD_G, SCALE_SD = 150e-6, 150e-6
-# Errors of the stage by its stated resolution (standard deviation of each).
-STAGE_SD = 0.15
+"""Standard gravity, m/s², exact."""
+ADC_BITS = 16
+"""Resolution of the ADC, bits; chosen: that of the paper."""
+ADC_VREF = 5.0
+"""Range of the ADC, V; chosen: that of the paper."""
+LSB_V = ADC_VREF / 2 ** ADC_BITS
+"""Step of the ADC, V."""
+ZERO_G_STD_G = 150e-6
+"""Standard deviation of zero-g since its calibration some days ago, g; chosen."""
+SCALE_STD = 150e-6
+"""Standard deviation of the scale factor since then, a share; chosen."""
+STAGE_STD = 0.15
+"""Standard deviation of each error of the stage, in its stated resolution; chosen."""
 
 
 @dataclass(frozen=True)
 class Unit:
     """
-    A sensor on its stage; arrays have one entry an axis.
+    A sensor on its stage; m axes. `stated_` values are those that the user knows.
 
-    `zero_v`, `scale_v_per_g`, `noise_g_per_rthz` and `corner_hz` are true on the day of the
-    recording; the `stated_` ones are what the user knows. `stage_rad` is how far the stage's
-    angles are off: of alpha, then of beta, the offset and parts of the angle's sine and cosine.
+    Attributes
+    ----------
+    axes
+        Measured axes, 'xy' or 'xyz'.
+    zero_v, scale_v_per_g
+        Zero-g, V, and scale factor, V/g, on the day of the recording, (m,).
+    stated_zero_v, stated_scale_v_per_g
+        The same by the calibration, (m,).
+    noise_g_per_rthz, stated_noise_g_per_rthz
+        Noise density, g/√Hz, (m,).
+    corner_hz
+        Corner of the output filter, Hz.
+    walk_g_per_rts, flicker_g
+        Random walk, g/√s, and size of the 1/f noise, g, (m,).
+    resolution_rad
+        Stated resolution of the stage, rad.
+    stage_rad
+        Errors of alpha, then of beta, rad, (6,): offset, and parts of sine and cosine.
+    rate_hz
+        Sample rate, Hz.
+
     """
 
     axes: str
@@ -53,18 +79,18 @@ class Unit:
     rate_hz: float
 
     @property
-    def which(self) -> list[int]:
-        """Which of x, y and z the axes are."""
+    def axis_indices(self) -> list[int]:
+        """Return the indices of the measured axes among x, y and z."""
         return ['xyz'.index(axis) for axis in self.axes]
 
     @property
     def volts_to_mps2(self) -> np.ndarray:
-        """Of each axis, as the user converts, (axes, 1)."""
+        """Return the factor from V to m/s² by the stated scale factor, (m, 1)."""
         return (G0 / self.stated_scale_v_per_g)[:, None]
 
 
 def draw(rng: np.random.Generator) -> Unit:
-    """Draw a unit: an ADXL203 and its kind, 50 Hz, calibrated some days before."""
+    """Draw a unit like an ADXL203 with a 50 Hz filter, calibrated some days before."""
     axes = 'xyz' if rng.random() < 0.7 else 'xy'
     n = len(axes)
     zero = 2.5 + 0.1 * np.clip(rng.normal(0, 0.4, n), -1, 1)
@@ -74,17 +100,32 @@ def draw(rng: np.random.Generator) -> Unit:
     resolution = float(np.deg2rad(rng.choice([0.002, 0.005, 0.01])))
     return Unit(
         axes, zero, scale,
-        zero + ZERO_SD_G * scale * rng.normal(size=n),
-        scale * (1 + SCALE_SD * rng.normal(size=n)),
+        zero + ZERO_G_STD_G * scale * rng.normal(size=n),
+        scale * (1 + SCALE_STD * rng.normal(size=n)),
         noise, noise * np.exp(rng.normal(0, 0.015, n)),
         corner,
         10 ** rng.uniform(-6.0, -5.1, n), 10 ** rng.uniform(-5.3, -4.7, n),
-        resolution, STAGE_SD * resolution * np.clip(rng.normal(size=6), -2, 2),
+        resolution, STAGE_STD * resolution * np.clip(rng.normal(size=6), -2, 2),
         float(rng.choice([100.0, 125.0, 200.0, 250.0])))
 
 
 def parameter_file(unit: Unit, serial: str) -> str:
-    """Write the YAML that a user has for the unit; every figure takes the same room."""
+    """
+    Return the parameter file that the user has; every number takes the same space.
+
+    Parameters
+    ----------
+    unit
+        The unit.
+    serial
+        Its serial number.
+
+    Returns
+    -------
+    str
+        YAML text.
+
+    """
     n = len(unit.axes)
 
     def row(values: np.ndarray) -> str:
@@ -92,8 +133,8 @@ def parameter_file(unit: Unit, serial: str) -> str:
 
     names = [f'bias.offset_v.{axis}' for axis in unit.axes] + [
         f'scale_factor.offset_v_per_g.{axis}' for axis in unit.axes]
-    spread = np.concatenate([ZERO_SD_G * unit.stated_scale_v_per_g,
-                             SCALE_SD * unit.stated_scale_v_per_g])
+    spread = np.concatenate([ZERO_G_STD_G * unit.stated_scale_v_per_g,
+                             SCALE_STD * unit.stated_scale_v_per_g])
     resistance = 32e3
     return f"""\
 /**:

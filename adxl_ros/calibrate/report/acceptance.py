@@ -139,8 +139,8 @@ def _outcome(budget: ErrorBudget, limit: float) -> str:
     """Compare the error of a calibration with a limit, both mean squares."""
     if not limit > 0:
         return ''
-    shown = budget.calibration if budget.separable else budget.coefficients
-    if shown > limit:
+    certain = budget.calibration if budget.separable else budget.coefficients
+    if certain > limit:
         return FAIL
     return PASS if budget.calibration_high <= limit else NOT_SHOWN
 
@@ -283,10 +283,10 @@ def headline(assessment: Assessment | None, models: Sequence[HeldOutErrors]) -> 
     for errors in models:
         if errors.model == assessment.model:
             tilt, accel = errors.tilt_deg, errors.accel_mg
-            shown = '' if np.isnan(tilt.rms) else \
+            tilt_text = '' if np.isnan(tilt.rms) else \
                 f'tilt {tilt.rms:.2g}° rms, {tilt.largest:.2g}° max; '
-            lines.append(f'held out: {shown}accel {accel.rms:.2g} mg rms, {accel.largest:.2g} mg '
-                         'max')
+            lines.append(f'held out: {tilt_text}accel {accel.rms:.2g} mg rms, '
+                         f'{accel.largest:.2g} mg max')
     return lines
 
 
@@ -323,8 +323,8 @@ def narrow_table(assessments: Sequence[Assessment], models: Sequence[HeldOutErro
 
 
 def _cell(statistic: ErrorStatistic, datasheet: str, noise: str) -> str:
-    shown = '-' if np.isnan(statistic.rms) else f'{statistic.rms:.3f}/{statistic.largest:.3f}'
-    return f'{shown:>14} {datasheet:9} {noise:9}'
+    cell = '-' if np.isnan(statistic.rms) else f'{statistic.rms:.3f}/{statistic.largest:.3f}'
+    return f'{cell:>14} {datasheet:9} {noise:9}'
 
 
 def gravity_line(assessment: Assessment, leave_one_out_mps2: np.ndarray) -> str:

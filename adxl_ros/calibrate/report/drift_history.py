@@ -101,7 +101,7 @@ class DriftHistory:
     sensors: tuple[Sensor, ...]
 
     @staticmethod
-    def of(newest: Sensor, stored: Sequence[Sensor]) -> DriftHistory:
+    def from_store(newest: Sensor, stored: Sequence[Sensor]) -> DriftHistory:
         """
         Append the newest calibration to the stored ones of other data and the same axes.
 

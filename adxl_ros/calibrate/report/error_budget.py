@@ -159,7 +159,7 @@ class _Covariances(NamedTuple):
     probe: np.ndarray
 
 
-class _KnownParts(NamedTuple):
+class _PredictedParts(NamedTuple):
     """
     Parts of a mean square that covariances predict.
 
@@ -230,31 +230,32 @@ def error_budgets(errors: HeldOutErrors, poses: Poses, stage: Sensor | None = No
     scatter = _scatter(sensor, poses.subset(~poses.check))
     accel = tilt = _NO_BUDGET
     if used.any():
-        known = _KnownParts(*(_axis_variance(covariance, axes, used)
+        predicted = _PredictedParts(*(_axis_variance(covariance, axes, used)
                               for covariance in covariances[:3]))
         accel = _budget((measured.force_mps2 - corrected)[used][:, axes],
-                        float(np.mean(measured.accel_mps2[used] ** 2)), known,
-                        _unexplainable(scatter, 'accel', known))
+                        float(np.mean(measured.accel_mps2[used] ** 2)), predicted,
+                        _unexplainable(scatter, 'accel', predicted))
     if has_tilt.any():
-        known = _KnownParts(*(_tilt_variance(covariance, reference, gravity, has_tilt)
+        predicted = _PredictedParts(*(_tilt_variance(covariance, reference, gravity, has_tilt)
                               for covariance in covariances[:3]))
         tilt = _budget(angle_between(measured.force_mps2, corrected)[has_tilt],
-                       float(np.mean(measured.tilt_rad[has_tilt] ** 2)), known,
-                       _unexplainable(scatter, 'tilt', known))
+                       float(np.mean(measured.tilt_rad[has_tilt] ** 2)), predicted,
+                       _unexplainable(scatter, 'tilt', predicted))
         tilt_per_axis = _tilt_variance(covariances.probe, reference, gravity, has_tilt) \
             / _PROBE_MPS2 ** 2
         tilt = replace(tilt, tilt_per_axis=tilt_per_axis)
     return ErrorBudgets(accel, tilt)
 
 
-def _unexplainable(scatter: _Scatter | None, quantity: str, known: _KnownParts) -> float | None:
+def _unexplainable(scatter: _Scatter | None, quantity: str, predicted: _PredictedParts
+                   ) -> float | None:
     """Return the mean square that no model explains, without noise; None where unknown."""
     if scatter is None:
         return None
-    return getattr(scatter, quantity) - (known.noise if scatter.has_noise else 0.0)
+    return getattr(scatter, quantity) - (predicted.noise if scatter.has_noise else 0.0)
 
 
-def _budget(errors: np.ndarray, measured: float, known: _KnownParts,
+def _budget(errors: np.ndarray, measured: float, predicted: _PredictedParts,
             unexplainable: float | None) -> ErrorBudget:
     """
     Split a mean square of errors against the corrected reference.
@@ -265,7 +266,7 @@ def _budget(errors: np.ndarray, measured: float, known: _KnownParts,
         Errors against the corrected reference, (k,) or (k, m), in the order of the visit.
     measured
         Mean square of the errors against the angles of the stage.
-    known
+    predicted
         The parts that covariances predict.
     unexplainable
         Mean square that no model could explain, without noise; None where it is unknown.
@@ -279,14 +280,15 @@ def _budget(errors: np.ndarray, measured: float, known: _KnownParts,
     mean_square, nu = float(np.mean(errors ** 2)), degrees_of_freedom(errors)
     lower = mean_square * nu / float(chdtri(nu, _CHANCE))
     upper = mean_square * nu / float(chdtri(nu, _UPPER_QUANTILE))
-    largest_stage = known.stated_stage if unexplainable is None else \
-        max(known.stated_stage, unexplainable)
-    explained = known.noise + known.coefficients + largest_stage
+    largest_stage = predicted.stated_stage if unexplainable is None else \
+        max(predicted.stated_stage, unexplainable)
+    explained = predicted.noise + predicted.coefficients + largest_stage
     model = mean_square - explained if lower > explained else 0.0
-    stage = min(max(mean_square - known.noise - known.coefficients, 0.0), largest_stage)
+    stage = min(max(mean_square - predicted.noise - predicted.coefficients, 0.0), largest_stage)
     return ErrorBudget(
-        measured, known.noise, max(measured - mean_square, 0.0) + stage, known.coefficients,
-        model, known.coefficients + max(upper - explained, 0.0), unexplainable is not None)
+        measured, predicted.noise, max(measured - mean_square, 0.0) + stage,
+        predicted.coefficients, model,
+        predicted.coefficients + max(upper - explained, 0.0), unexplainable is not None)
 
 
 def _covariances(errors: HeldOutErrors, held: Poses, reference: np.ndarray) -> _Covariances:

@@ -146,7 +146,7 @@ def _write_page(path: Path, result: CalibrationResult, past: Sequence[Sensor]) -
              _error_table(result),
              '<h2>Residuals over the sphere of poses</h2>', _sphere(result),
              '<h2>Coefficients</h2>', _coefficients(fitted),
-             '<h2>History of this unit</h2>', _history(DriftHistory.of(fitted, past)),
+             '<h2>History of this unit</h2>', _history(DriftHistory.from_store(fitted, past)),
              '<h2>Plots</h2>', *_plots(result),
              '<h2>Details</h2>', _preformatted(result.report_lines),
              '<h2>Provenance</h2>', _provenance(fitted), html_page.script(script)]
@@ -186,8 +186,8 @@ def _summary(result: CalibrationResult) -> str:
     lines.append('Without noise and stage error of the check, the calibration error is '
                  f'{assessment.error_mg:.3g} mg{tilt}. Limited by: {assessment.limited_by}.')
     lines += [f'Beyond the datasheet: {line}.' for line in beyond]
-    shown = ' '.join(outcomes.values())
-    kind = 'bad' if FAIL in shown else 'open' if NOT_SHOWN in shown else 'good'
+    joined = ' '.join(outcomes.values())
+    kind = 'bad' if FAIL in joined else 'open' if NOT_SHOWN in joined else 'good'
     return f'<p class="summary {kind}">' + '<br>'.join(map(escape, lines)) + '</p>'
 
 
@@ -291,13 +291,13 @@ def _absolute_rows(label: str, unit: str, fitted: Sensor, values: Sequence[float
             for axis, value, stated in zip(fitted.axes, values, nominal)]
 
 
-def _against_datasheet(shown: float, typical: float, maximum: float) -> str:
-    """Compare the magnitude that a 90 % interval shows with datasheet values, 0 if not stated."""
+def _against_datasheet(magnitude: float, typical: float, maximum: float) -> str:
+    """Compare the least magnitude of a 90 % interval with datasheet values, 0 if not stated."""
     if not (typical or maximum):
         return ''
-    if maximum and shown > maximum:
+    if maximum and magnitude > maximum:
         return 'beyond the maximum'
-    return 'beyond typical' if typical and shown > typical else 'within'
+    return 'beyond typical' if typical and magnitude > typical else 'within'
 
 
 def _history(history: DriftHistory) -> str:
