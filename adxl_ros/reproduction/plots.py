@@ -35,7 +35,17 @@ _SHOWN_S = (2.0, 2.5)
 
 
 def draw_misalignment(path: str | os.PathLike, search: DirectionSearch) -> None:
-    """Draw the search for β_x of (18) and the results of its three methods, as figure 9."""
+    """
+    Draw the search for β_x of (18) and the results of its three methods, as figure 9.
+
+    Parameters
+    ----------
+    path
+        The PNG file.
+    search
+        The search for the direction.
+
+    """
     figure, axis = pyplot().subplots(figsize=(7, 4.5), layout='constrained')
     turned = np.degrees(search.turned_rad)
     axis.plot(turned, 1e3 * (search.output_g - search.output_g.max()), 'o', ms=4,
@@ -53,7 +63,17 @@ def draw_misalignment(path: str | os.PathLike, search: DirectionSearch) -> None:
 
 
 def draw_tilt(path: str | os.PathLike, unit: Unit) -> None:
-    """Draw figure 10: errors of alpha and beta in the three tilt experiments."""
+    """
+    Draw figure 10: errors of alpha and beta in the three tilt experiments.
+
+    Parameters
+    ----------
+    path
+        The PNG file.
+    unit
+        One unit with its errors by model.
+
+    """
     figure, grid = pyplot().subplots(2, 3, figsize=(16, 8), layout='constrained', sharex=True)
     for column, (run, asked_deg) in enumerate(RUNS.items()):
         turned = asked_deg[:, 1 if run == 'beta' else 0]
@@ -80,7 +100,19 @@ def draw_tilt(path: str | os.PathLike, unit: Unit) -> None:
 
 def draw_motion(path: str | os.PathLike, fitted: dict[str, Sensor],
                 shaken: tuple[np.ndarray, np.ndarray, np.ndarray]) -> None:
-    """Draw figure 12: the acceleration of the shaken sensor and of the interferometer."""
+    """
+    Draw figure 12: the acceleration of the shaken sensor and of the interferometer.
+
+    Parameters
+    ----------
+    path
+        The PNG file.
+    fitted
+        The calibrated unit by model.
+    shaken
+        Stamps, s, (n,); volts, (n, m); acceleration along x, m/s², (n,).
+
+    """
     figure, row = pyplot().subplots(1, len(fitted), figsize=(16, 4.5), layout='constrained',
                                     sharey=True)
     time_s = shaken[0]
@@ -98,7 +130,17 @@ def draw_motion(path: str | os.PathLike, fitted: dict[str, Sensor],
 
 def draw_components(path: str | os.PathLike, truth: Sensor, fitted: Sensor,
                     linear: Sensor) -> None:
-    """Draw figure 13: what each part of the model does to the response at alpha 45°, beta 90°."""
+    """
+    Draw figure 13: what each part of the model does to the response at alpha 45°, beta 90°.
+
+    Parameters
+    ----------
+    path
+        The PNG file.
+    truth, fitted, linear
+        The unit: true, by the physical model, and by the linear model.
+
+    """
     reach = np.linspace(-0.4, 0.4, 81)
     pose = [reach * G0_MPS2, np.full(81, -np.sqrt(0.5) * truth.local_gravity_mps2),
             np.full(81, np.sqrt(0.5) * truth.local_gravity_mps2)]
