@@ -44,7 +44,7 @@ from adxl_ros.files.atomic_write import keep_previous
 from adxl_ros.files.stream_info import NO_UNIT
 from adxl_ros.model import signal_chain
 from adxl_ros.model.coefficients import get
-from adxl_ros.model.constants import G0_MPS2, Z_90
+from adxl_ros.model.constants import AXES, G0_MPS2, Z_90
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import Sensor
@@ -232,7 +232,7 @@ def calibrate(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str | 
         raise UserError(f'{source}: the {model} model is fitted against stage angles (alpha_rad '
                         'and beta_rad), which are missing; leave --model out to calibrate a '
                         'three-axis sensor against gravity')
-    if sensor.axes != 'xyz':
+    if sensor.axes != AXES:
         raise UserError(f'{source}: no stage angles and only the axes {sensor.axes}: the '
                         'magnitude of gravity needs x, y and z; record alpha_rad and beta_rad')
     return _against_gravity(sensor, poses, source, data_sha256)

@@ -32,7 +32,7 @@ from adxl_ros.files.recording_columns import (
     Recording,
 )
 from adxl_ros.files.reference_alignment import Command, seconds, Track
-from adxl_ros.model.constants import AXES
+from adxl_ros.model.constants import AXES, MEASURED_AXES
 import numpy as np
 
 _HOLD_ROWS = 1 << 19
@@ -72,7 +72,7 @@ def blocks(path: str | os.PathLike, rows: int, ideal: bool = False) -> Iterator[
     with open_bag(path) as bag:
         topics = find_ideal(bag) if ideal else find_topics(bag)
         info = read_info(bag, topics.info)
-        samples = _Samples(f'{bag.path}: topic {topics.imu}', 'xyz' if ideal else info.get('axes'))
+        samples = _Samples(f'{bag.path}: topic {topics.imu}', AXES if ideal else info.get('axes'))
         tracks = _tracks(bag, topics)
         commands = {column: Command() for column in COMMANDS.values() if topics.command}
         for batch, is_last in _batches(bag, topics, rows):
@@ -201,7 +201,7 @@ class _Samples:
         if self.axes is None:
             present = variance < _ABSENT_VARIANCE
             self.axes = ''.join(axis for axis, is_there in zip(AXES, present) if is_there)
-        if self.axes not in ('x', 'xy', 'xyz'):
+        if self.axes not in MEASURED_AXES:
             raise UserError(f'{self.where}: linear_acceleration_covariance gives the axes '
                             f'{self.axes or "none"}, expected x, xy or xyz; record sensor_info')
 

@@ -21,6 +21,7 @@ from typing import Any
 
 from adxl_ros.errors import UserError
 from adxl_ros.files.bag_messages import Bag
+from adxl_ros.model.constants import MEASURED_AXES
 
 IMU = 'sensor_msgs/msg/Imu'
 JOINT_STATE = 'sensor_msgs/msg/JointState'
@@ -182,7 +183,7 @@ def read_info(bag: Bag, topic: str | None) -> dict[str, str]:
                 raise UserError(f'{bag.path}: topic {topic}: {key} changes from {info[key]} to '
                                 f'{new.get(key)}; record each sensor by itself')
         info = new
-    if info.get('axes', 'x') not in ('x', 'xy', 'xyz'):
+    if info.get('axes', 'x') not in MEASURED_AXES:
         raise UserError(f"{bag.path}: topic {topic}: axes is {info['axes']!r}, "
                         'expected x, xy or xyz')
     return info

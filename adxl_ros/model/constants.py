@@ -20,6 +20,9 @@ G0_MPS2 = 9.80665
 AXES = 'xyz'
 """Axis letters in the order of every array."""
 
+MEASURED_AXES = ('x', 'xy', 'xyz')
+"""The axes that a sensor may measure."""
+
 Z_90 = 1.6449
 """Half of a 90 % interval in standard deviations: the 95 % quantile of the normal distribution."""
 

@@ -20,7 +20,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from adxl_ros.errors import UserError
-from adxl_ros.model.constants import G0_MPS2
+from adxl_ros.model.constants import G0_MPS2, MEASURED_AXES
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.validity import Envelope
 import numpy as np
@@ -98,7 +98,7 @@ class Sensor:
     """
 
     serial: str = _nominal('sensor.serial', 'serial number; nominal is no unit in particular')
-    axes: str = _nominal('sensor.axes', 'measured axes', choices=('x', 'xy', 'xyz'))
+    axes: str = _nominal('sensor.axes', 'measured axes', choices=MEASURED_AXES)
     nominal_zero_g_v: np.ndarray = _nominal(
         'sensor.nominal_zero_g_v', 'zero-g output by the datasheet, by axis', 'V', -10.0, 10.0)
     nominal_scale_v_per_g: np.ndarray = _nominal(

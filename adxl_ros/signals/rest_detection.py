@@ -29,7 +29,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from adxl_ros.errors import UserError
-from adxl_ros.model.constants import G0_MPS2
+from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.noise import effective_samples
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals.block_statistics import angle_bounds, BlockCutter, Blocks
@@ -117,7 +117,7 @@ class Stillness:
     value: float
     limit: float
 
-    def describe(self, unit: str, scale: float = 1.0, axes: str = 'xyz') -> str:
+    def describe(self, unit: str, scale: float = 1.0, axes: str = AXES) -> str:
         """
         Return one line with the statistic and its limit.
 

@@ -47,6 +47,7 @@ from adxl_ros.calibrate.poses import Poses
 from adxl_ros.calibrate.stage_error import AngleErrors, PoseCovariance, StageError
 from adxl_ros.errors import UserError
 from adxl_ros.model.coefficients import get, names_of, parameter_of, put, with_neutral
+from adxl_ros.model.constants import AXES
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Coefficient, Parameter, Place, Role
 from adxl_ros.model.gauss_newton import gauss_newton, halve_until, Iterate, Solution
@@ -175,7 +176,7 @@ class FullFit:
 
 def default_terms(axes: str) -> tuple[str, ...]:
     """Return the terms of the full model for a unit with these axes."""
-    return TERMS + (_THREE_AXES if axes == 'xyz' else ())
+    return TERMS + (_THREE_AXES if axes == AXES else ())
 
 
 def fit_full(sensor: Sensor, poses: Poses, terms: Sequence[str] | None = None) -> FullFit:

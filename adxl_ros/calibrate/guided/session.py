@@ -41,6 +41,7 @@ from adxl_ros.files.sweep_journal import (
     PoseRecord,
     skipped_poses,
 )
+from adxl_ros.model.constants import AXES
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
@@ -80,7 +81,7 @@ class Session:
         if not os.access(settings.output.parent, os.W_OK):
             raise UserError(f'output: {settings.output}: {settings.output.parent} is not a '
                             'directory that can be written; choose another')
-        if settings.mode == 'gravity' and unit.axes != 'xyz':
+        if settings.mode == 'gravity' and unit.axes != AXES:
             raise UserError(f'mode: gravity needs the axes x, y and z, but the sensor has '
                             f'{unit.axes}; use mode:=stage')
         targets = settings.targets(unit)

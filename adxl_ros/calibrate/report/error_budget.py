@@ -349,7 +349,7 @@ def _scatter(sensor: Sensor, poses: Poses) -> _Scatter | None:
         across = np.cross(force, reference[pairs[:, 0]])[has_tilt] / gravity ** 2
         tilt = np.sum(across ** 2) / max(len(across), 1) / 2
         return _Scatter(float(np.mean(accel ** 2) / 2), float(tilt), has_noise=True)
-    if sensor.axes != 'xyz':
+    if sensor.axes != AXES:
         return None
     # No stage error changes |f|. A model error is as large in |f| as in any other direction.
     magnitude = np.linalg.norm(errors.force_mps2, axis=1) - gravity
