@@ -120,7 +120,7 @@ def _report_effects(block: Recording, sensor: Sensor, undo_filter: bool) -> None
         for name in effect.follows:
             if name != 'time_s' and not np.isfinite(block.columns.get(name, np.nan)).all():
                 print(f'apply: {block.path}: {name} is missing or has gaps: {effect.name} is '
-                      f'undone for {getattr(NOMINAL_ENVIRONMENT, name):g} there',
+                      f'taken at {getattr(NOMINAL_ENVIRONMENT, name):g} there',
                       file=sys.stderr)
 
 
