@@ -16,7 +16,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping
 from dataclasses import dataclass
 import os
 
@@ -45,7 +45,8 @@ _EXACT_NS = 1 << 53
 """Up to here float64 resolves single nanoseconds, ns."""
 
 
-def blocks(path: str | os.PathLike, rows: int, ideal: bool = False) -> Iterator[Recording]:
+def blocks(path: str | os.PathLike, rows: int, ideal: bool = False
+           ) -> Generator[Recording, None, None]:
     """
     Read a bag in blocks of at most `rows` samples.
 

@@ -21,7 +21,7 @@ field, which accepts text and quotes, and finds the line and column to name in a
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 import csv
 from dataclasses import dataclass
 import os
@@ -136,7 +136,7 @@ class _State:
 
 
 def blocks(path: str | os.PathLike, rows: int,
-           needed: tuple[str, ...] | None = None) -> Iterator[Recording]:
+           needed: tuple[str, ...] | None = None) -> Generator[Recording, None, None]:
     """
     Read a CSV recording in blocks of at most `rows` samples.
 

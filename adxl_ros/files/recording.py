@@ -21,7 +21,7 @@ CSV, `.mcap` one bag file, everything else a rosbag2 directory.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import contextmanager
 import os
 from pathlib import Path
@@ -61,7 +61,7 @@ def read(path: str | os.PathLike) -> Recording:
     return recording
 
 
-def blocks(path: str | os.PathLike, rows: int) -> Iterator[Recording]:
+def blocks(path: str | os.PathLike, rows: int) -> Generator[Recording, None, None]:
     """
     Read a recording in blocks; the memory is bounded by a block.
 

@@ -16,7 +16,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Generator
 from dataclasses import dataclass, replace
 
 from adxl_ros.errors import UserError
@@ -95,6 +95,10 @@ class Replay:
 
     live = False
     waits_for_listener = True
+    _block: Recording | None
+    _row: int
+    _stamps: np.ndarray
+    _volts: np.ndarray
 
     def __init__(self, sensor: Sensor, settings: Settings) -> None:
         """
@@ -114,7 +118,7 @@ class Replay:
 
         """
         self._path, self._loop = settings.recording, settings.loop
-        self._blocks: Iterator[Recording] = recording.blocks(self._path, _ROWS)
+        self._blocks: Generator[Recording, None, None] = recording.blocks(self._path, _ROWS)
         first = next(self._blocks)
         self.sensor = _recorded_sensor(sensor, first)
         self.references = tuple(name for name in REFERENCES if name in first.columns)

@@ -244,9 +244,9 @@ class SimulatedSensor:
 
     def _settled_response(self) -> Response:
         """Return the response of a sensor at rest in the stage's pose, with new noise."""
-        joints = [partial(self._joint, joint) for joint in range(len(JOINTS))]
+        alpha, beta, shift = (partial(self._joint, joint) for joint in range(len(JOINTS)))
         self._seed += 1
-        return Response(self.sensor, Motion(inf, *joints), self._seed - 1)
+        return Response(self.sensor, Motion(inf, alpha, beta, shift), self._seed - 1)
 
     def _joint(self, joint: int, time_s: np.ndarray, order: int = 0) -> np.ndarray:
         """

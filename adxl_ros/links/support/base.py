@@ -89,7 +89,7 @@ def option(default: bool | int | float | str | tuple[()], doc: str, unit: str = 
 
 def options(settings: type) -> tuple[Option, ...]:
     """Describe the fields of a link's `Settings`."""
-    return tuple(Option(f.name, f.default, **f.metadata) for f in fields(settings))
+    return tuple(Option(f.name, cast(Any, f.default), **f.metadata) for f in fields(settings))
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass
 import time
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -182,7 +182,7 @@ class ClockMap:
         late = self._late
         if late is not None and late.count > 1 and now_ns - late.first_ns >= _LATER_WAIT_S * 1e9:
             self._resolve(late)
-        if not self.settled and self._open is not None \
+        if not self.settled and self._open is not None and self._first_arrived_ns is not None \
                 and now_ns - self._first_arrived_ns >= self._wait_s * 1e9:
             self.settled = True
             self._wait_s = _LATER_WAIT_S
@@ -216,7 +216,8 @@ class ClockMap:
         self._newest_stamp_ns = int(stamps[-1])
         return stamps
 
-    def _line(self, device_ns: np.ndarray | int) -> np.ndarray | float:
+    def _line(self, device_ns: Any) -> Any:
+        """Map device times, ns, to host times, ns: an array or one number."""
         return self._line_host_ns + (device_ns - self._line_device_ns) * self._slope
 
     def _lateness_ns(self, device_ns: int, arrived_ns: int) -> float:
@@ -274,7 +275,7 @@ class ClockMap:
         The fit is a least-squares line, reweighted so that a window above it counts less, with a
         prior for a drift of 0.
         """
-        windows = [*self._windows] or [self._open]
+        windows = [self._open] if self._open and not self._windows else [*self._windows]
         origin = windows[-1]
         time_s = np.array([w.device_ns - origin.device_ns for w in windows]) * 1e-9
         lag_ns = np.array([w.lag_ns - origin.lag_ns for w in windows], float)

@@ -22,6 +22,7 @@ import os
 from pathlib import Path
 import pty
 import stat
+import termios
 import time
 import tty
 
@@ -244,6 +245,6 @@ def _open_existing(path: Path) -> int:
     try:
         fd = os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
         tty.setraw(fd)
-    except (OSError, tty.error) as error:
+    except (OSError, termios.error) as error:
         raise UserError(f'--port {path}: cannot be opened: {error}') from None
     return fd

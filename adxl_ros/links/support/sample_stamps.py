@@ -185,5 +185,6 @@ class Stamper:
 
     def _gaps(self, device_ns: np.ndarray) -> int:
         """Count the samples that are missing by the device's stamps."""
+        assert self._last_device_ns is not None, 'gaps are counted after a first block'
         periods = np.rint(np.diff(device_ns, prepend=self._last_device_ns) / self.period_ns)
         return int((periods - 1).clip(0).sum())
