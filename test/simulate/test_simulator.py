@@ -259,7 +259,7 @@ def test_apply_takes_temperature_and_supply_out(run_tool, tmp_path):
             for line in (tmp_path / 'soak.csv').read_text().splitlines()]
     (tmp_path / 'bare.csv').write_text('\n'.join(bare) + '\n')
     done = run_tool('apply', 'bare.csv', '--params', 'unit.yaml', '-o', 'out.csv')
-    assert done.returncode == 0 and 'supply_v is missing or has gaps: supply' in done.stderr
+    assert done.returncode == 0 and 'supply is taken at 5' in done.stderr
 
 
 def test_quick_moves_among_slow_ones_are_followed():
