@@ -124,11 +124,11 @@ def test_the_live_tracker_and_a_recording_agree_whatever_comes(monkeypatch):
     for _ in range(300):
         walk = np.cumsum(rng.choice([0] * 30 + [1, -1, 2], 60)) * STEP
         readings = np.where(rng.random(60) < rng.choice([0, 0.3]), NAN, walk).tolist()
-        told = rng.integers(0, 3, 60) * 0.1
-        commands = np.where(rng.random(60) < 0.98, NAN, told).tolist()
-        found = by_rows(readings, commands, RESTS)
-        assert one_by_one(readings, commands, RESTS) == found
-        moves += found[-1]
+        drawn_rad = rng.integers(0, 3, 60) * 0.1
+        commands = np.where(rng.random(60) < 0.98, NAN, drawn_rad).tolist()
+        by_recording = by_rows(readings, commands, RESTS)
+        assert one_by_one(readings, commands, RESTS) == by_recording
+        moves += by_recording[-1]
     assert 200 < moves < 580
 
 
@@ -365,7 +365,7 @@ class Run:
         sent += [bags.joints(t, alpha=a, beta=b) for t, a, b in self.joints]
         sent += [bags.joints(t, '/stage/command', alpha=a, beta=b) for t, a, b in self.commands]
         return bags.bag_of(path, [bags.info(**sensor_info(self.sensor)),
-                                  *sorted(sent, key=lambda one: one.stamp_ns)])
+                                  *sorted(sent, key=lambda message: message.stamp_ns)])
 
 
 def test_sweep_journal_bag_and_csv_give_the_same_settings(tmp_path):

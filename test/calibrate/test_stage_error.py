@@ -40,26 +40,26 @@ def poses():
 def dense(slope, poses, error):
     """Write the covariance out: noise, an error a pose, and an error a setting, joint by joint."""
     count, axes = slope.shape[:2]
-    found = np.diag((poses.std_v ** 2).ravel())
+    matrix = np.diag((poses.std_v ** 2).ravel())
     for joint, setting in enumerate((poses.alpha_setting, poses.beta_setting)):
         angles = error.joints[joint] ** 2 * (
             error.setting_rad ** 2 * (setting[:, None] == setting)
             + error.pose_rad ** 2 * np.eye(count))
         part = np.einsum('km,kl,ln->kmln', slope[:, :, joint], angles, slope[:, :, joint])
-        found += part.reshape(count * axes, count * axes)
-    return found
+        matrix += part.reshape(count * axes, count * axes)
+    return matrix
 
 
 def test_products_and_determinant_are_those_of_the_dense_covariance(poses):
     """Woodbury's formula gives what the inverse of the whole matrix gives."""
     slope = pose_response.angle_jacobian(nominal(), poses)
     columns = np.random.default_rng(1).normal(size=(len(poses), 2, 5))
-    whole = dense(slope, poses, ERROR)
+    matrix = dense(slope, poses, ERROR)
     covariance = PoseCovariance(slope, poses, shared_settings(poses), ERROR)
     flat = columns.reshape(-1, 5)
     np.testing.assert_allclose(covariance.products(columns),
-                               flat.T @ np.linalg.solve(whole, flat), rtol=1e-8)
-    assert covariance.log_determinant() == pytest.approx(np.linalg.slogdet(whole)[1], abs=1e-6)
+                               flat.T @ np.linalg.solve(matrix, flat), rtol=1e-8)
+    assert covariance.log_determinant() == pytest.approx(np.linalg.slogdet(matrix)[1], abs=1e-6)
 
 
 def test_predicted_errors_are_the_best_linear_ones(poses):
@@ -85,10 +85,10 @@ def test_poses_that_do_not_count_change_nothing(poses):
     columns = np.random.default_rng(1).normal(size=(len(poses), 2, 3))
     kept = np.arange(len(poses)) % 7 != 0
     some = PoseCovariance(slope, poses, shared_settings(poses), ERROR, kept)
-    own = poses.subset(kept)
-    alone = PoseCovariance(slope[kept], own, shared_settings(own), ERROR)
-    np.testing.assert_allclose(some.products(columns), alone.products(columns[kept]), rtol=1e-8)
-    assert some.log_determinant() == pytest.approx(alone.log_determinant(), abs=1e-6)
+    part_of_poses = poses.subset(kept)
+    separate = PoseCovariance(slope[kept], part_of_poses, shared_settings(part_of_poses), ERROR)
+    np.testing.assert_allclose(some.products(columns), separate.products(columns[kept]), rtol=1e-8)
+    assert some.log_determinant() == pytest.approx(separate.log_determinant(), abs=1e-6)
 
 
 def test_a_stated_error_counts_where_poses_do_not_tell(poses):
@@ -110,13 +110,13 @@ def test_a_joint_that_is_worse_than_the_other_is_found():
     targets = pose_plan.guided(pose_plan.default_planes_rad('xy'), pose_plan.STEP_RAD, 0)
     poses = swept(rng, truth, targets=targets, noisy=False)
     step = np.radians(5 / 60)
-    off = [factor * step * rng.uniform(-0.5, 0.5, len(poses))[setting]
+    shift_rad = [factor * step * rng.uniform(-0.5, 0.5, len(poses))[setting]
            for factor, setting in ((3, poses.alpha_setting), (1, poses.beta_setting))]
-    volts = pose_response.predicted_volts(truth, replace(poses, alpha_rad=poses.alpha_rad + off[0],
-                                                  beta_rad=poses.beta_rad + off[1]))
-    found = full_model.fit_full(nominal(), replace(
+    volts = pose_response.predicted_volts(truth, replace(
+        poses, alpha_rad=poses.alpha_rad + shift_rad[0], beta_rad=poses.beta_rad + shift_rad[1]))
+    estimate = full_model.fit_full(nominal(), replace(
         poses, volts=volts + poses.std_v * rng.normal(size=volts.shape)))
-    alpha, beta = found.stage.setting_rad * found.stage.joints * np.sqrt(12) / step
+    alpha, beta = estimate.stage.setting_rad * estimate.stage.joints * np.sqrt(12) / step
     assert alpha == pytest.approx(3, rel=0.2) and beta == pytest.approx(1, rel=0.4)
 
 
@@ -124,9 +124,9 @@ def test_settings_without_numbers_follow_the_angles():
     """Each change of the angle is a move, and no setting outlasts its recording."""
     alpha, beta = np.array([0.0, 0.0, 1.0, 0.0]), np.array([0.0, 1.0, 1.0, 1.0])
     nothing = np.zeros((4, 2))
-    one = Poses(nothing, nothing, alpha, beta, nothing, np.zeros(4, bool))
-    assert one.alpha_setting.tolist() == [0, 0, 1, 2]
-    assert one.beta_setting.tolist() == [0, 1, 1, 1]
-    both = join_poses([one, one])
+    single = Poses(nothing, nothing, alpha, beta, nothing, np.zeros(4, bool))
+    assert single.alpha_setting.tolist() == [0, 0, 1, 2]
+    assert single.beta_setting.tolist() == [0, 1, 1, 1]
+    both = join_poses([single, single])
     assert both.alpha_setting.tolist() == [0, 0, 1, 2, 3, 3, 4, 5]
     assert both.subset(np.array([3, 4])).beta_setting.tolist() == [1, 2]

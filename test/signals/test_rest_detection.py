@@ -49,11 +49,11 @@ def tumbled(rng, rate_hz, rest_s, turn_s=1.0, sigma=SIGMA):
     """
     poses = directions(rng, len(rest_s) + 1)
     parts, bounds, row = [], [], 0
-    for here, there, length_s in zip(poses, poses[1:], rest_s):
+    for pose, there, length_s in zip(poses, poses[1:], rest_s):
         rest, turn = round(length_s * rate_hz), round(turn_s * rate_hz)
         share = np.linspace(0, 1, turn, endpoint=False)[:, None]
         shake = 0.3 * np.sin(2 * np.pi * 3.1 * turn_s * share) * np.sin(np.pi * share)
-        parts += [np.tile(here, (rest, 1)), here + share * (there - here) + shake]
+        parts += [np.tile(pose, (rest, 1)), pose + share * (there - pose) + shake]
         bounds.append((row, row + rest))
         row += rest + turn
     samples = np.concatenate(parts)
@@ -71,10 +71,10 @@ def filtered(rng, count, sigma, rate_hz=1000.0, tau_s=TAU_S):
 def matched(rests, bounds):
     """Assert that each rest is inside that of `bounds`, and return what is lost of it."""
     assert len(rests) == len(bounds)
-    found = np.array([(rest.start, rest.stop) for rest in rests])
-    assert (found[:, 0] >= bounds[:, 0]).all()
-    assert (found[:, 1] <= bounds[:, 1]).all()
-    return np.diff(bounds, axis=1)[:, 0] - np.diff(found, axis=1)[:, 0]
+    detected = np.array([(rest.start, rest.stop) for rest in rests])
+    assert (detected[:, 0] >= bounds[:, 0]).all()
+    assert (detected[:, 1] <= bounds[:, 1]).all()
+    return np.diff(bounds, axis=1)[:, 0] - np.diff(detected, axis=1)[:, 0]
 
 
 @pytest.mark.parametrize('rate_hz', [25.0, 100.0, 285.71, 1000.0, 10000.0])
@@ -127,14 +127,14 @@ def damaged(rng, time_s, samples):
 @given(strategies.integers(0, 2**32 - 1), strategies.integers(1, 3),
        strategies.sampled_from([1.0, 20.0, 100.0, 400.0]), strategies.booleans(),
        strategies.booleans())
-def test_live_equals_offline(seed, axes, rate_hz, known, staged):
+def test_live_equals_offline(seed, axes, rate_hz, is_stated, staged):
     """However a stream is portioned, the rests and their means are the same to the last bit."""
     rng = np.random.default_rng(seed)
     scale_s = 1.0 if rate_hz > 10 else 30.0
     time_s, samples, _, _ = tumbled(rng, rate_hz, scale_s * rng.uniform(1, 8, 12), scale_s)
     time_s, samples = damaged(rng, time_s, samples)
     samples = samples[:, :axes]
-    noise = Noise(np.full(axes, SIGMA), 0.01) if known else None
+    noise = Noise(np.full(axes, SIGMA), 0.01) if is_stated else None
     tolerance = 1e-3 if staged else None
     angles = np.round(samples[:, [0, 0]] / 3) if staged else None
     offline = find_rests(time_s, samples, rate_hz, angles, noise, angle_tolerance_rad=tolerance)
@@ -173,8 +173,8 @@ def test_figures_of_a_rest_do_not_depend_on_others():
     rests = find_rests(time_s, samples, 100.0)
     together = rest_means(time_s, samples, rests, 100.0)
     for k, rest in enumerate(rests):
-        for alone, of_all in zip(rest_means(time_s, samples, [rest], 100.0), together):
-            assert (alone[0] == of_all[k]).all()
+        for single, of_all in zip(rest_means(time_s, samples, [rest], 100.0), together):
+            assert (single[0] == of_all[k]).all()
 
 
 @pytest.mark.parametrize('rate_dps', [0.2, 0.5, 2.0])
@@ -188,11 +188,11 @@ def test_slow_rotation_is_no_rest(rate_dps):
     samples += SIGMA * rng.normal(size=samples.shape)
     rests = find_rests(np.arange(len(samples)) / 100, samples, 100.0, min_rest_s=0.6)
     assert len(rests) == 2
-    for found, wanted in zip(rests, ((0, rest), (rest + turn, 2 * rest + turn))):
+    for detected, wanted in zip(rests, ((0, rest), (rest + turn, 2 * rest + turn))):
         # Of the turn at most half a degree.
-        assert found.start > wanted[0] - 100 * 0.5 / rate_dps
-        assert found.stop < wanted[1] + 100 * 0.5 / rate_dps
-        assert found.stop - found.start > 0.6 * rest
+        assert detected.start > wanted[0] - 100 * 0.5 / rate_dps
+        assert detected.stop < wanted[1] + 100 * 0.5 / rate_dps
+        assert detected.stop - detected.start > 0.6 * rest
 
 
 def test_a_stream_that_only_turns_slowly_has_no_rest():
@@ -301,8 +301,8 @@ def test_known_noise_behind_its_filter():
         lengths = np.array([rest.time_stop_s - rest.time_start_s for rest in rests])
         assert np.median(lengths) > 4.6
         mean, error = rest_means(time_s, volts, rests, 1000.0, ADXL)
-        off = (mean - 2.5 - poses[:-1]) / error
-        assert 0.75 < np.sqrt((off ** 2).mean()) < 1.15
+        deviation = (mean - 2.5 - poses[:-1]) / error
+        assert 0.75 < np.sqrt((deviation ** 2).mean()) < 1.15
         # 5 s at 1 kHz count for 237 samples.
         assert np.median(error) == pytest.approx(0.535e-3 / np.sqrt(237), rel=0.15)
 
@@ -428,14 +428,14 @@ def test_speed():
     assert len(rests) == 500
 
 
-@pytest.mark.parametrize('name, fewest, most', [
+@pytest.mark.parametrize('name, fewest, largest', [
     ('mpu9150_0', 22, 24), ('mpu9150_1', 22, 24), ('mpu9150_2', 22, 24),
     ('xsens_multiposition', 37, 39), ('two_axis_stand', 23, 25)])
-def test_real_streams(shared_dir, name, fewest, most):
+def test_real_streams(shared_dir, name, fewest, largest):
     """As many rests as their authors made, but for stops of a second; the same for all files."""
     path = shared_dir / 'real' / f'{name}.csv'
     if not path.exists():
         pytest.skip(f'no {path}')
     stream = recording.read(path)
     samples = np.column_stack([stream.columns[f'a{a}_mps2'] for a in 'xyz'])
-    assert fewest <= len(find_rests(stream.time_s, samples, 100.0)) <= most
+    assert fewest <= len(find_rests(stream.time_s, samples, 100.0)) <= largest

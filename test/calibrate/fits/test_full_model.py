@@ -42,12 +42,12 @@ def swept_unit(seed, axes='xy', stage_deg=5 / 60, **options):
     return sensor, truth, poses
 
 
-def errors(found, truth):
+def errors(fit, truth):
     """Errors of the coefficients and their promised deviations, (p,) each."""
-    names = found.fitted.covariance_names
+    names = fit.fitted.covariance_names
     truth = with_neutral(truth, {name.effect for name in names})
-    return (get(found.fitted, names) - get(truth, names),
-            np.sqrt(np.diag(found.fitted.covariance)))
+    return (get(fit.fitted, names) - get(truth, names),
+            np.sqrt(np.diag(fit.fitted.covariance)))
 
 
 @pytest.mark.parametrize('axes, units, per_setting', [
@@ -83,35 +83,35 @@ def test_an_eccentric_stage_is_found_and_a_sound_one_is_not_blamed(eccentric):
         truth = drawn(rng, nominal(), (*TERMS, 'stage_eccentricity'))
         names = full_model.fitted_coefficients('xy', ('stage_eccentricity',))[2:]
         truth = put(truth, names, eccentric * 1e-3 * rng.choice([-1, 1], len(names)))
-        found, _ = term_selection.fit_selected(nominal(), swept(rng, truth, per_setting=True))
-        assert any('eccentricity' in name.effect for name in found.names) == eccentric
-        off, std = errors(found, truth)
-        assert np.sqrt(np.mean((off / std) ** 2)) < 2
+        fit, _ = term_selection.fit_selected(nominal(), swept(rng, truth, per_setting=True))
+        assert any('eccentricity' in name.effect for name in fit.names) == eccentric
+        error, std = errors(fit, truth)
+        assert np.sqrt(np.mean((error / std) ** 2)) < 2
 
 
 def test_each_axis_of_a_three_axis_unit_bends():
     """A z that bends like x and y is fitted to the noise, and the stage is not blamed for it."""
     sensor, truth, poses = swept_unit(4, 'xyz', 0.0, check_poses=0,
                                       planes_rad=np.radians(np.arange(0, 181, 30)))
-    found, _ = term_selection.fit_selected(sensor, poses)
+    fit, _ = term_selection.fit_selected(sensor, poses)
     bent = truth.values['cross_axis']['quadratic_per_g'][2]
     assert abs(bent) > 1e-3
-    assert found.fitted.values['cross_axis']['quadratic_per_g'][2] == pytest.approx(bent, abs=2e-4)
-    assert np.degrees(found.stage_std_rad) < 2e-3
-    off, std = errors(found, truth)
-    assert np.sqrt(np.mean((off / std) ** 2)) < 1.4
+    assert fit.fitted.values['cross_axis']['quadratic_per_g'][2] == pytest.approx(bent, abs=2e-4)
+    assert np.degrees(fit.stage_std_rad) < 2e-3
+    error, std = errors(fit, truth)
+    assert np.sqrt(np.mean((error / std) ** 2)) < 1.4
 
 
 def test_a_fit_that_does_not_converge_says_so(monkeypatch):
     """It says so in its words; one that converges does not."""
     sensor, _, poses = swept_unit(2)
-    found, judged = term_selection.fit_selected(sensor, poses)
-    assert found.converged
-    assert full_fit_text.NOT_CONVERGED not in full_fit_text.report_lines(found, poses, judged)
+    fit, terms = term_selection.fit_selected(sensor, poses)
+    assert fit.converged
+    assert full_fit_text.NOT_CONVERGED not in full_fit_text.report_lines(fit, poses, terms)
     monkeypatch.setattr(full_model, '_MAX_ROUNDS', 1)
-    found, judged = term_selection.fit_selected(sensor, poses)
-    assert not found.converged
-    assert full_fit_text.NOT_CONVERGED in full_fit_text.report_lines(found, poses, judged)
+    fit, terms = term_selection.fit_selected(sensor, poses)
+    assert not fit.converged
+    assert full_fit_text.NOT_CONVERGED in full_fit_text.report_lines(fit, poses, terms)
 
 
 def test_a_term_that_is_not_convex_is_found_from_several_starts():
@@ -121,16 +121,16 @@ def test_a_term_that_is_not_convex_is_found_from_several_starts():
     values = {**truth.values['adc_inl'], 'amplitude_v': np.array(1e-3), 'cycles': np.array(17.3)}
     truth = replace(truth, values={**truth.values, 'adc_inl': values})
     poses = swept(np.random.default_rng(1), truth, check_poses=0)
-    found = full_model.fit_full(sensor, poses, (*TERMS, 'adc_inl')).unit.values['adc_inl']
-    assert found['cycles'] == pytest.approx(17.3, rel=0.01)
-    assert found['amplitude_v'] == pytest.approx(1e-3, rel=0.15)
+    fit = full_model.fit_full(sensor, poses, (*TERMS, 'adc_inl')).unit.values['adc_inl']
+    assert fit['cycles'] == pytest.approx(17.3, rel=0.01)
+    assert fit['amplitude_v'] == pytest.approx(1e-3, rel=0.15)
 
 
 def test_one_axis():
     """A sensor of one axis is fitted, too."""
     sensor, truth, poses = swept_unit(1, 'x')
-    off, std = errors(full_model.fit_full(sensor, poses), truth)
-    assert np.abs(off / std).max() < 4
+    error, std = errors(full_model.fit_full(sensor, poses), truth)
+    assert np.abs(error / std).max() < 4
 
 
 def test_the_gauge_is_fixed_where_only_the_sum_shows():
@@ -141,11 +141,11 @@ def test_the_gauge_is_fixed_where_only_the_sum_shows():
     truth = put(truth, [Coefficient('cross_axis', 'linear', 'x'),
                         Coefficient('cross_axis_z', 'linear', 'y')], [0.012, -0.02])
     poses = swept(rng, truth)
-    found, _ = term_selection.fit_selected(nominal(), poses)
+    fit, _ = term_selection.fit_selected(nominal(), poses)
     assert not set(full_model.GAUGE) & {full_model.term_of(name)
-                                        for name in found.fitted.covariance_names}
-    assert found.fitted.values['cross_axis']['linear'].tolist() == [0, 0]
-    turned = found.fitted.values['misalignment']['beta_rad'][0]
+                                        for name in fit.fitted.covariance_names}
+    assert fit.fitted.values['cross_axis']['linear'].tolist() == [0, 0]
+    turned = fit.fitted.values['misalignment']['beta_rad'][0]
     assert turned == pytest.approx(
         truth.values['misalignment']['beta_rad'][0] + 0.012, abs=4e-4)
 
@@ -164,11 +164,11 @@ def test_the_gauge_is_freed_where_products_show_the_parts():
     force = specific_force(*held.T, truth.local_gravity_mps2)
     volts = signal_chain.static_response(truth)(force)
     worst = {}
-    for name, found in (('fixed', full_model.fit_full(nominal(), poses)),
+    for name, fit in (('fixed', full_model.fit_full(nominal(), poses)),
                         ('judged', term_selection.fit_selected(nominal(), poses)[0])):
         up = np.where(np.cos(held[:, 0]) < 0, -1, 1)
-        off = np.subtract(signal_chain.inverse(found.fitted, up)(volts), force)[:2]
-        worst[name] = np.abs(off).max()
+        error = np.subtract(signal_chain.inverse(fit.fitted, up)(volts), force)[:2]
+        worst[name] = np.abs(error).max()
     assert worst['judged'] < 3e-4 and worst['fixed'] > 2 * worst['judged']
 
 
@@ -178,67 +178,67 @@ def test_knocked_poses_are_named_and_left_out():
     bad = [7, 40, 90]
     volts = poses.volts.copy()
     volts[bad] += [[0.01, 0.0], [0.0, -0.02], [0.03, 0.01]]
-    found, judged = term_selection.fit_selected(sensor, replace(poses, volts=volts))
-    assert found.outliers == tuple(bad)
-    off, std = errors(found, truth)
-    assert np.sqrt(np.mean((off / std) ** 2)) < 1.6
+    fit, terms = term_selection.fit_selected(sensor, replace(poses, volts=volts))
+    assert fit.outliers == tuple(bad)
+    error, std = errors(fit, truth)
+    assert np.sqrt(np.mean((error / std) ** 2)) < 1.6
     assert any('left out, disturbed: pose 8 (alpha' in line
-               for line in full_fit_text.report_lines(found, poses, judged))
+               for line in full_fit_text.report_lines(fit, poses, terms))
 
 
 @pytest.mark.parametrize('stage_deg', [1.0, 3.0])
 def test_a_bad_stage_is_found_and_the_sensor_is_not_blamed(stage_deg):
     """The stage's error is estimated, and zero-g is as good as the magnitude of gravity tells."""
     sensor, truth, poses = swept_unit(6, 'xyz', stage_deg * np.sqrt(12))
-    found, judged = term_selection.fit_selected(sensor, poses)
-    assert np.degrees(found.stage_std_rad) == pytest.approx(stage_deg, rel=0.15)
-    off, std = errors(found, truth)
-    assert np.sqrt(np.mean((off / std) ** 2)) < 1.6
-    zero_g = [name.effect == 'bias' for name in found.fitted.covariance_names]
-    assert np.abs(off[zero_g]).max() < 1e-4
+    fit, terms = term_selection.fit_selected(sensor, poses)
+    assert np.degrees(fit.stage_std_rad) == pytest.approx(stage_deg, rel=0.15)
+    error, std = errors(fit, truth)
+    assert np.sqrt(np.mean((error / std) ** 2)) < 1.6
+    zero_g = [name.effect == 'bias' for name in fit.fitted.covariance_names]
+    assert np.abs(error[zero_g]).max() < 1e-4
     assert any('the reference is worse than stated' in line
-               for line in full_fit_text.report_lines(found, poses, judged))
+               for line in full_fit_text.report_lines(fit, poses, terms))
 
 
 def test_terms_that_are_not_there_do_not_earn_their_place():
     """A unit of zero-g, scale and misalignment alone: nothing else gains on poses held out."""
     rng = np.random.default_rng(8)
     truth = drawn(rng, nominal(), ('bias', 'scale_factor', 'misalignment'))
-    judged = term_selection.fit_selected(nominal(), swept(rng, truth))[1]
-    assert [term.name for term in judged if term.is_supported] == ['misalignment']
+    terms = term_selection.fit_selected(nominal(), swept(rng, truth))[1]
+    assert [term.name for term in terms if term.is_supported] == ['misalignment']
 
 
 def test_the_next_poses_help_more_than_others():
     """Poses that the fit asks for shrink the joint interval more than as many of the sweep."""
     sensor, _, poses = swept_unit(9, check_poses=0)
-    found = full_model.fit_full(sensor, poses)
-    asked = full_model.next_poses(found.unit, poses, found.names, found.stage)
+    fit = full_model.fit_full(sensor, poses)
+    suggested = full_model.next_poses(fit.unit, poses, fit.names, fit.stage)
 
     def volume(angles_rad):
-        more, alone = poses.subset(np.arange(len(angles_rad))), np.arange(len(angles_rad))
-        more = replace(more, alpha_rad=angles_rad[:, 0], beta_rad=angles_rad[:, 1],
-                       alpha_setting=alone, beta_setting=alone)
-        known = found.information + full_model.fisher_information(
-            found.unit, more, found.names, found.stage) - np.diag(
-            full_model.prior_precision(found.names))
-        return -np.linalg.slogdet(known)[1]
+        added, settings = poses.subset(np.arange(len(angles_rad))), np.arange(len(angles_rad))
+        added = replace(added, alpha_rad=angles_rad[:, 0], beta_rad=angles_rad[:, 1],
+                       alpha_setting=settings, beta_setting=settings)
+        information = fit.information + full_model.fisher_information(
+            fit.unit, added, fit.names, fit.stage) - np.diag(
+            full_model.prior_precision(fit.names))
+        return -np.linalg.slogdet(information)[1]
 
     others = np.column_stack([poses.alpha_rad, poses.beta_rad])[[5, 30, 60, 100]]
-    assert volume(np.array(asked)) < volume(others)
+    assert volume(np.array(suggested)) < volume(others)
 
 
 def test_temperature_that_moved_is_said_and_fitted():
     """15 degC of warming during the sweep: the verdict says so, or the term takes it."""
     sensor, truth, poses = swept_unit(10, check_poses=0)
     warm = replace(poses, temperature_c=np.linspace(20, 35, len(poses)))
-    found, judged = term_selection.fit_selected(sensor, warm)
-    words = full_fit_text.report_lines(found, warm, judged)
+    fit, terms = term_selection.fit_selected(sensor, warm)
+    words = full_fit_text.report_lines(fit, warm, terms)
     assert any('temperature moved by 15.0 degC' in line for line in words)
     drift = 1e-3 * truth.scale_v_per_g * (warm.temperature_c[:, None] - 25)
-    found, judged = term_selection.fit_selected(sensor, replace(warm, volts=warm.volts + drift))
-    assert found.fitted.values['temperature_bias']['per_k'] == pytest.approx([1e-3] * 2, rel=0.1)
+    fit, terms = term_selection.fit_selected(sensor, replace(warm, volts=warm.volts + drift))
+    assert fit.fitted.values['temperature_bias']['per_k'] == pytest.approx([1e-3] * 2, rel=0.1)
     assert not any('temperature moved' in line
-                   for line in full_fit_text.report_lines(found, warm, judged))
+                   for line in full_fit_text.report_lines(fit, warm, terms))
 
 
 @pytest.mark.parametrize('planes_deg, lost', [
@@ -254,10 +254,10 @@ def test_poses_of_too_few_planes_are_refused(planes_deg, lost):
 def test_what_is_not_determined_falls_back_and_says_so():
     """Without a choice the richest model that the poses determine is fitted."""
     sensor, _, poses = swept_unit(1, planes_rad=PLANES_RAD[2:3], check_poses=0)
-    found = calibration.calibrate(sensor, [calibration.RecordedPoses('made', poses)])
-    assert found.fitted.model == 'linear'
-    assert found.report_lines[0].startswith('not full: the full model is not determined')
-    assert found.report_lines[1].startswith('not physical: ')
+    fit = calibration.calibrate(sensor, [calibration.RecordedPoses('made', poses)])
+    assert fit.fitted.model == 'linear'
+    assert fit.report_lines[0].startswith('not full: the full model is not determined')
+    assert fit.report_lines[1].startswith('not physical: ')
 
 
 def test_several_recordings_of_one_unit():
@@ -266,9 +266,9 @@ def test_several_recordings_of_one_unit():
     truth = drawn(rng, nominal(), TERMS)
     parts = [swept(rng, truth, check_poses=0) for _ in range(2)]
     parts = [calibration.RecordedPoses(name, part) for name, part in zip('ab', parts)]
-    one = calibration.calibrate(nominal(), parts[:1], 'full')
+    single = calibration.calibrate(nominal(), parts[:1], 'full')
     both = calibration.calibrate(nominal(), parts, 'full')
-    assert np.trace(both.fitted.covariance) < 0.7 * np.trace(one.fitted.covariance)
+    assert np.trace(both.fitted.covariance) < 0.7 * np.trace(single.fitted.covariance)
 
 
 @pytest.mark.parametrize('change, words', [
@@ -294,8 +294,8 @@ def test_six_hundred_poses_of_three_axes_take_two_seconds():
     sensor, _, poses = swept_unit(2, 'xyz', planes_rad=np.radians(np.linspace(0, 180, 23)))
     assert len(poses) > 600
     with within(2.0):
-        found, _ = term_selection.fit_selected(sensor, poses)
-    assert len(found.names) >= 20
+        fit, _ = term_selection.fit_selected(sensor, poses)
+    assert len(fit.names) >= 20
 
 
 def test_the_filter_is_found_in_the_noise(run_tool, tmp_path):

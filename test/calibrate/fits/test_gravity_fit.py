@@ -95,10 +95,10 @@ def test_exact_without_noise(seed):
 
 def test_jacobian_against_differences():
     rng = np.random.default_rng(1)
-    mean, found = directions(rng, 20) * 1.05, rng.normal(0, 0.05, 9)
+    mean, estimate = directions(rng, 20) * 1.05, rng.normal(0, 0.05, 9)
     step = 1e-6
-    for k, column in enumerate(gravity_model.magnitude_jacobian(mean, found).T):
-        up, down = found.copy(), found.copy()
+    for k, column in enumerate(gravity_model.magnitude_jacobian(mean, estimate).T):
+        up, down = estimate.copy(), estimate.copy()
         up[k] += step
         down[k] -= step
         wanted = (gravity_model.magnitude(mean, up)
@@ -118,8 +118,8 @@ def test_covariance_is_honest(count, error_v, excess_g):
         poses = np.concatenate([SIX, directions(rng, count - 6)])
         means, errors = rested(rng, sensor, poses, error_v, excess_g)
         fit = fit_gravity(means, errors, bare(sensor))
-        off = np.abs(parameters(fit) - truth) / np.sqrt(np.diag(fit.covariance))
-        inside.append(off < 1.645)
+        error = np.abs(parameters(fit) - truth) / np.sqrt(np.diag(fit.covariance))
+        inside.append(error < 1.645)
         false += len(fit.outliers)
     assert 0.85 < np.mean(inside) < 0.96
     assert false <= 3
@@ -130,13 +130,13 @@ def test_covariance_in_other_units():
     rng = np.random.default_rng(3)
     sensor, _ = unit(rng)
     means, errors = rested(rng, sensor, directions(rng, 24))
-    one = fit_gravity(means, errors, bare(sensor))
+    first = fit_gravity(means, errors, bare(sensor))
     half = replace(bare(sensor), nominal_zero_g_v=sensor.nominal_zero_g_v / 2,
                    nominal_scale_v_per_g=sensor.nominal_scale_v_per_g / 2)
     other = fit_gravity(means / 2, errors / 2, half)
     units = np.array([0.5] * 6 + [1.0] * 3)
-    assert parameters(other) == pytest.approx(parameters(one) * units, abs=1e-9)
-    assert other.covariance == pytest.approx(one.covariance * np.outer(units, units), rel=1e-6)
+    assert parameters(other) == pytest.approx(parameters(first) * units, abs=1e-9)
+    assert other.covariance == pytest.approx(first.covariance * np.outer(units, units), rel=1e-6)
 
 
 def test_order_does_not_matter():
@@ -144,19 +144,19 @@ def test_order_does_not_matter():
     sensor, _ = unit(rng)
     means, errors = rested(rng, sensor, directions(rng, 24), 5e-5, 1e-4)
     order = rng.permutation(24)
-    one, other = (fit_gravity(means[o], errors[o], bare(sensor)) for o in (np.arange(24), order))
-    assert parameters(other) == pytest.approx(parameters(one), abs=1e-7)
-    assert other.leave_one_out_mps2 == pytest.approx(one.leave_one_out_mps2[order], abs=1e-6)
+    first, other = (fit_gravity(means[o], errors[o], bare(sensor)) for o in (np.arange(24), order))
+    assert parameters(other) == pytest.approx(parameters(first), abs=1e-7)
+    assert other.leave_one_out_mps2 == pytest.approx(first.leave_one_out_mps2[order], abs=1e-6)
 
 
 def test_excess_is_what_the_means_do_not_explain():
     rng = np.random.default_rng(5)
-    found = []
+    estimate = []
     for _ in range(20):
         sensor, _ = unit(rng)
         fit = fit_gravity(*rested(rng, sensor, directions(rng, 30), 2e-5, 3e-4), bare(sensor))
-        found.append(fit.excess_mps2 * MG)
-    assert np.mean(found) == pytest.approx(0.3, rel=0.15)
+        estimate.append(fit.excess_mps2 * MG)
+    assert np.mean(estimate) == pytest.approx(0.3, rel=0.15)
 
 
 def test_leave_one_out_is_that():
@@ -169,9 +169,9 @@ def test_leave_one_out_is_that():
         without = replace(sensor, values=fit_gravity(means[others], errors[others],
                                                      bare(sensor)).values)
         force = np.array(signal_chain.inverse(without)(list(means[i:i + 1].T)))
-        off = np.linalg.norm(force) - sensor.local_gravity_mps2
+        error = np.linalg.norm(force) - sensor.local_gravity_mps2
         # The excess is estimated anew without the rest, the weights change a little.
-        assert fit.leave_one_out_mps2[i] == pytest.approx(off, abs=2e-4)
+        assert fit.leave_one_out_mps2[i] == pytest.approx(error, abs=2e-4)
 
 
 @pytest.mark.parametrize('count, knocks, size_g', [
@@ -263,15 +263,15 @@ def plain(means, errors, sensor):
     out = []
     for i in range(len(means)):
         rows = np.arange(len(means)) != i
-        found = least_squares(lambda p, rows=rows: magnitudes(p, rows) - wanted, everything).x
-        out.append(magnitudes(found, [i])[0] - wanted)
+        estimate = least_squares(lambda p, rows=rows: magnitudes(p, rows) - wanted, everything).x
+        out.append(magnitudes(estimate, [i])[0] - wanted)
     return G0_MPS2 * (magnitudes(everything) - wanted), G0_MPS2 * np.array(out)
 
 
 def test_no_worse_than_plain_least_squares():
     """Rests from 1 to 60 s: the weights tell, in what other rests then read."""
     rng = np.random.default_rng(10)
-    ours, theirs = [], []
+    ours, reference = [], []
     for _ in range(15):
         sensor, _ = unit(rng)
         poses = directions(rng, 24)
@@ -279,8 +279,8 @@ def test_no_worse_than_plain_least_squares():
         means, _ = rested(rng, sensor, poses, 0.0)
         means = means + errors * rng.normal(size=means.shape)
         ours.append(fit_gravity(means, errors, bare(sensor)).leave_one_out_mps2)
-        theirs.append(plain(means, errors, sensor)[1])
-    assert rms(ours) < rms(theirs)
+        reference.append(plain(means, errors, sensor)[1])
+    assert rms(ours) < rms(reference)
 
 
 def real(shared_dir, name, local_gravity_mps2=G0_MPS2):
@@ -311,8 +311,8 @@ def test_real_units(shared_dir, name, local, before, within, without):
     assert MG * rms(fit.residual_mps2) < within
     assert MG * rms(fit.leave_one_out_mps2) < without
     assert len(fit.outliers) == 0
-    _, theirs = plain(means, errors, sensor)
-    assert rms(fit.leave_one_out_mps2) < 1.05 * rms(theirs)
+    _, reference = plain(means, errors, sensor)
+    assert rms(fit.leave_one_out_mps2) < 1.05 * rms(reference)
 
 
 def test_real_unit_on_rests_kept_out(shared_dir):
@@ -337,8 +337,8 @@ def test_three_real_units_turn_alike(shared_dir):
             :, [rests.index(same[k]) for same in common]]
         along = force / np.linalg.norm(force, axis=0)
         turned.append(np.degrees(np.arccos((along[:, 1:] * along[:, :-1]).sum(axis=0))))
-    for one, other in ((0, 1), (0, 2), (1, 2)):
-        assert rms(turned[one] - turned[other]) < 0.06
+    for first, other in ((0, 1), (0, 2), (1, 2)):
+        assert rms(turned[first] - turned[other]) < 0.06
 
 
 def test_too_few_rests_are_said_in_one_line(run_tool, shared_dir):

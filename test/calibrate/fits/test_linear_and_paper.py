@@ -162,7 +162,7 @@ def test_verdict_without_check_poses_holds_out_folds():
     """A recording without check poses is judged by fits that leave a fifth out."""
     rng = np.random.default_rng(6)
     poses = swept(rng, drawn(rng, nominal()), check_poses=0)
-    found = calibration.calibrate(nominal(), [calibration.RecordedPoses('made', poses)])
-    assert found.fitted.model == 'full'
-    first_words = [line.split()[0] for line in found.report_lines[:5]]
+    result = calibration.calibrate(nominal(), [calibration.RecordedPoses('made', poses)])
+    assert result.fitted.model == 'full'
+    first_words = [line.split()[0] for line in result.report_lines[:5]]
     assert first_words == ['held', 'nominal', 'linear', 'physical', 'full']
