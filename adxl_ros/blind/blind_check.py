@@ -122,9 +122,11 @@ def score(folder: Path, command: Sequence[str] | None, pool: Executor,
     if digest is None:
         raise UserError(f'{folder}: no labels are committed there; use --seal {folder} first')
     label_commitment.remove_drawn(folder)
-    committed = label_commitment.committed_labels(folder)
+    label_commitment.refuse_encrypted(folder)
+    # Labels may be on another machine: the diagnosis does not need them.
     results = diagnosis_runs.diagnose_all(folder, command, pool, show('diagnose'))
     version = (folder / 'reports' / 'version.txt').read_text()
+    committed = label_commitment.committed_labels(folder)
     labels = committed.labels
     missing = [label.name for label in labels if label.name not in results]
     if missing:

@@ -210,11 +210,7 @@ def committed_labels(folder: Path) -> CommittedLabels:
     try:
         text = path.read_bytes()
     except FileNotFoundError:
-        older = path.with_name('labels.sealed')
-        if older.exists():
-            raise UserError(f'{older}: an older version encrypted these labels, which this '
-                            'version cannot read; draw a new check into another folder'
-                            ) from None
+        refuse_encrypted(folder)
         raise UserError(f'{path}: no such file; copy it from where the check was drawn') from None
     if hashlib.sha256(text).hexdigest() != digest:
         raise UserError(f'{path}: these are not the labels whose hash {digest} was published; '
@@ -225,6 +221,22 @@ def committed_labels(folder: Path) -> CommittedLabels:
                                trials.from_json(json.dumps(content['labels'])))
     except (ValueError, KeyError, TypeError):
         raise _other_form(path) from None
+
+
+def refuse_encrypted(folder: Path) -> None:
+    """
+    Refuse a folder whose labels an older version encrypted.
+
+    Raises
+    ------
+    UserError
+        There are encrypted labels and no others.
+
+    """
+    older = _label_file(folder).with_name('labels.sealed')
+    if older.exists() and not _label_file(folder).exists():
+        raise UserError(f'{older}: an older version encrypted these labels, which this version '
+                        'cannot read; draw a new check into another folder')
 
 
 def _read_drawn(path: Path) -> dict[str, Any]:
