@@ -24,10 +24,10 @@ import time
 from typing import NamedTuple
 
 from adxl_ros.links.support.base import Level, LinkStatus, option, PacedSettings, Samples
-from adxl_ros.links.support.simulated_stage import JOINTS
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.simulate.motion import Motion
 from adxl_ros.simulate.response import Response
+from adxl_ros.simulate.simulated_stage import JOINTS
 import numpy as np
 import scipy.signal  # noqa: F401 (the simulator loads it at its first sample, which is late)
 

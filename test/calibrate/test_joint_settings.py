@@ -26,9 +26,9 @@ from adxl_ros.files import recording
 from adxl_ros.files.recording_columns import COMMANDS, Recording
 from adxl_ros.files.stream_info import sensor_info
 from adxl_ros.files.stream_unit import recorded_unit
-from adxl_ros.links.support.simulated_stage import SimulatedStage
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.sensor import to_nominal_mps2
+from adxl_ros.simulate.simulated_stage import SimulatedStage
 import numpy as np
 import pytest
 from setting_checks import (

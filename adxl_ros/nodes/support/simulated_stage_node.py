@@ -20,10 +20,10 @@ from collections import deque
 
 from adxl_ros.errors import UserError
 from adxl_ros.files.parameter_file import SENSOR_FIELDS
-from adxl_ros.links.support.simulated_stage import JOINTS, SimulatedStage
 from adxl_ros.nodes.support.diagnostics import DiagnosticsReporter, Level, Status
 from adxl_ros.nodes.support.parameters import declare
 from adxl_ros.nodes.support.topics import create_publisher, create_subscription, stamp
+from adxl_ros.simulate.simulated_stage import JOINTS, SimulatedStage
 import numpy as np
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
