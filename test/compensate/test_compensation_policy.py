@@ -68,7 +68,8 @@ def test_the_source_is_named_in_one_line() -> None:
     ('serial', '18', 'is of the sensor 18, but the parameters are of 17'),
     ('axes', 'xyz', 'axes xyz, but the parameters of 17 are for xy'),
     ('nominal_zero_g_v', '1.65, 1.65', 'nominal_zero_g_v is [1.65, 1.65], but [2.5, 2.5]'),
-    ('format', '99', 'format version 99'),
+    ('nominal_scale_v_per_g', '0.3, 0.3', 'nominal_scale_v_per_g is [0.3, 0.3], but [1.0, 1.0]'),
+    ('format', '99', 'format version 99, but this package reads version 1'),
     ('rate_hz', 'nan', "rate_hz is 'nan', expected samples a second"),
     ('rate_hz', '-1', "rate_hz is '-1', expected samples a second"),
 ])

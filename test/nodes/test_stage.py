@@ -14,6 +14,7 @@
 
 """The stage over DDS, alone and in lockstep with the driver's simulated sensor."""
 
+from functools import partial
 import os
 import signal
 
@@ -78,23 +79,30 @@ def test_it_goes_where_it_is_told_and_shows_its_encoder(start):
     assert 1e-6 < np.abs(off).max() <= STEP / 2 + 1e-9
 
 
-@pytest.mark.parametrize('names, positions, why', [
-    (['alpha'], [np.nan], 'alpha = nan'), (['gamma'], [0.1], "no joint 'gamma'"),
-    (['alpha', 'beta'], [0.1], '2 names, but 1'), (['beta'], [1e38], 'out of reach')])
-def test_a_command_that_makes_no_sense_is_refused(start, names, positions, why):
+BAD_COMMANDS = {
+    'alpha = nan': JointState(name=['alpha'], position=[np.nan]),
+    "no joint 'gamma'": JointState(name=['gamma'], position=[0.1]),
+    '2 names, but 1': JointState(name=['alpha', 'beta'], position=[0.1]),
+    'out of reach': JointState(name=['beta'], position=[1e38]),
+}
+
+
+def test_a_command_without_meaning_is_refused(start):
     stage = start('stage')
     with Commander() as graph:
         graph.spin_until(lambda: graph.shown, 20, 'the stage')
         graph.spin(1)
-        graph.command.publish(JointState(name=names, position=positions))
-        graph.spin_until(lambda: graph.said('stage', why), 20, 'the refusal')
-        assert graph.diagnostics['stage'].level == DiagnosticStatus.WARN
-        assert '/stage/command' in graph.diagnostics['stage'].message
-        assert not np.abs(graph.shown[-1].position).max() > STEP
-        graph.spin_until(lambda: graph.said('stage', 'at rest'), 20, 'that all is well again')
+        for reason, command in BAD_COMMANDS.items():
+            graph.command.publish(command)
+            graph.spin_until(partial(graph.said, 'stage', reason), 20, f'refusal: {reason}')
+            assert graph.diagnostics['stage'].level == DiagnosticStatus.WARN
+            assert '/stage/command' in graph.diagnostics['stage'].message
+            assert not np.abs(graph.shown[-1].position).max() > STEP
+            graph.spin_until(lambda: graph.said('stage', 'at rest'), 20, 'recovery')
     assert stage.stop() == 0
-    assert len(stage.output().splitlines()) == 1
-    assert why in stage.output()
+    lines = stage.output().splitlines()
+    assert len(lines) == len(BAD_COMMANDS)
+    assert all(reason in line for reason, line in zip(BAD_COMMANDS, lines))
 
 
 @pytest.mark.parametrize('speed', [1.0, 5.0])
