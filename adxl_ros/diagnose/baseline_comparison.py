@@ -27,7 +27,7 @@ from adxl_ros.model.effects.base import ActsOn
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals.rest_detection import find_rests
 from adxl_ros.simulate.from_recording import environment_paths, motion_from_references
-from adxl_ros.simulate.motion import Motion, Path
+from adxl_ros.simulate.motion import INTERNAL_RATE_HZ, Motion, Path
 from adxl_ros.simulate.response import Response
 import numpy as np
 
@@ -37,12 +37,12 @@ are left out, never averaged, so that aliases of faster signals remain."""
 SEARCH_SAMPLES = 80_000
 """Largest number of samples of a recording in the search. Chosen: some ten minutes at 125 Hz, and
 less than 1 GB of memory."""
-_INTERNAL_RATE_HZ = 250.0
-"""Lowest internal rate of the simulator, Hz. Chosen: twice the rate of the search."""
-_HIGHEST_INTERNAL_RATE_HZ = 1000.0
-"""Highest internal rate of the simulator, Hz, its default elsewhere."""
+_LOWEST_INTERNAL_RATE_HZ = 250.0
+"""Lowest internal rate of the simulator where something moves, Hz. Chosen: twice the rate of the
+search."""
 _REST_INTERNAL_RATE_HZ = 1e-3
-"""Internal rate where nothing moves, Hz, so that the rate of the samples is enough."""
+"""Lowest internal rate where nothing moves, Hz. Chosen: so low that the simulator runs at the rate
+of the samples."""
 _CACHED_VALUES = 3_000_000
 """Number of values of one path that are kept in memory. Chosen: 24 MB."""
 _SMALLEST_TURN_RAD = 2e-3
@@ -197,7 +197,7 @@ class CachedPath:
             while sum(map(len, self._values.values())) > _CACHED_VALUES \
                     and len(self._values) > 1:
                 del self._values[next(iter(self._values))]
-        # The dictionary is in the order of use: the oldest use goes first.
+        # The entry moves to the end, so that the one that was not used for longest is deleted.
         self._values[key] = self._values.pop(key)
         return self._values[key]
 
@@ -248,7 +248,7 @@ def compare(recording: Recording, sensor: Sensor, sim: Motion | None = None
     motion, reference = _motion(recording, sensor, volts, sim)
     if reference is not Reference.NONE:
         motion = replace(motion, internal_rate_hz=min(
-            max(_INTERNAL_RATE_HZ, sensor.rate_hz), _HIGHEST_INTERNAL_RATE_HZ))
+            max(_LOWEST_INTERNAL_RATE_HZ, sensor.rate_hz), INTERNAL_RATE_HZ))
     motion = _cached(motion, reference)
     return BaselineComparison(
         recording.path, recording.time_s, volts, motion, sensor, reference,
@@ -262,7 +262,7 @@ def at_search_rate(comparison: BaselineComparison) -> BaselineComparison:
     every = max(1, round(comparison.sensor.rate_hz / rate_wanted_hz))
     part, motion = slice(None, None, every), comparison.motion
     if comparison.reference is not Reference.NONE:
-        motion = replace(motion, internal_rate_hz=_INTERNAL_RATE_HZ)
+        motion = replace(motion, internal_rate_hz=_LOWEST_INTERNAL_RATE_HZ)
     return replace(
         comparison, time_s=comparison.time_s[part], volts=comparison.volts[part],
         motion=_cached(motion, comparison.reference),
@@ -291,6 +291,7 @@ def _motion(recording: Recording, sensor: Sensor, volts: np.ndarray, sim: Motion
 def _stage_moves(recording: Recording) -> bool:
     """Determine whether both angles were sampled and a joint moves."""
     def span(name: str) -> float:
+        """Return the range of a column, NaN where it has no samples."""
         values = recording.columns.get(name, np.array([np.nan]))
         return float(np.nanmax(values) - np.nanmin(values)) if np.isfinite(values).any() \
             else np.nan

@@ -42,8 +42,10 @@ the noise of an ADXL203."""
 _LARGEST_UNEXPLAINED_MOTION_G = 0.3
 """Range of the output, g, that drift and noise cannot explain without a reference. Chosen: 17°
 of tilt."""
+_RANGE_QUANTILES = (0.02, 0.98)
+"""Quantiles of the output between which that range lies. Chosen: they ignore outliers."""
 _CORRELATED = 0.9
-"""Correlation from which two signals are the same one. Chosen: noise of 0.4 times the signal."""
+"""Correlation from which two signals are the same one. Chosen: noise of half the signal."""
 _SWAPPED_CORRELATION = 0.7
 """An axis is swapped only if its correlation with its own reference is smaller. Chosen: halfway
 between two signals that are the same and two that have nothing in common."""
@@ -79,7 +81,7 @@ _UNIT_RATIOS = {
     1e-3: 'kV instead of V',
     1 / 9.80665: 'm/s² instead of g',
 }
-"""Gains of an output in the wrong unit, and what was taken for what."""
+"""Gain of an output in the wrong unit, and which unit it has instead of which."""
 
 
 @dataclass(frozen=True)
@@ -129,7 +131,7 @@ class CheckedRecording:
 
 def check_recording(comparison: BaselineComparison) -> CheckedRecording | DataFault:
     """
-    Check a recording, and mark the samples that do not count.
+    Check a recording, and mark the samples that are not used.
 
     Where the codes of the ADC are coarser than stated, the baseline gets their true number of
     bits.
@@ -202,7 +204,8 @@ def _unexplained_motion(comparison: BaselineComparison, finite: np.ndarray) -> D
     """Find a sensor that moves although no reference describes the motion."""
     force_g = comparison.volts[finite] / comparison.sensor.scale_v_per_g
     step_g = np.std(np.diff(force_g, axis=0), axis=0)
-    range_g = np.quantile(force_g, 0.98, axis=0) - np.quantile(force_g, 0.02, axis=0)
+    low_g, high_g = np.quantile(force_g, _RANGE_QUANTILES, axis=0)
+    range_g = high_g - low_g
     worst = int(np.argmax(range_g))
     if range_g[worst] < _LARGEST_UNEXPLAINED_MOTION_G or step_g[worst] > range_g[worst]:
         return None
@@ -292,8 +295,8 @@ def _reference_fault(correlation: float) -> DataFault | None:
     if correlation >= _UNCORRELATED:
         return None
     return DataFault('reference', 'bad_data', 'the output does not follow the reference '
-                     f'(correlation {correlation:.2f}): they belong to different recordings, or '
-                     'they are more than 30 s apart in time')
+                     f'(correlation {correlation:.2f}); check that both belong to one recording, '
+                     f'with clocks that differ by less than {_LARGEST_DELAY_S:g} s')
 
 
 def _delay_fault(simulated_g: np.ndarray, measured_g: np.ndarray, rate_hz: float
@@ -313,8 +316,9 @@ def _delay_fault(simulated_g: np.ndarray, measured_g: np.ndarray, rate_hz: float
     delay_s = best_lag / rate_hz
     if best > _CORRELATED and best - undelayed > _CORRELATION_GAIN \
             and abs(delay_s) > _SEARCHED_DELAY_S:
-        return DataFault('time_misaligned', 'bad_data', f'the sensor is {delay_s:+.2f} s late of '
-                         'the reference, but the search covers 1 s; shift its stamps')
+        return DataFault('time_misaligned', 'bad_data', f'the sensor is {abs(delay_s):.2f} s '
+                         f'{"later" if delay_s > 0 else "earlier"} than the reference, but the '
+                         f'search covers {_SEARCHED_DELAY_S:g} s; shift its stamps')
     return None
 
 

@@ -46,34 +46,37 @@ PRIOR_UNKNOWN = 0.02
 EVIDENCE_EXPONENT = 0.5
 """Factor of the log evidence (tempering). Samples of an inexact model are not independent."""
 VISIBLE_SHARE_OF_NOISE = 0.03
-"""Smallest rms of an effect, by the noise."""
+"""Smallest rms of an effect, divided by that of the noise."""
 SMALLEST_SHARE = 0.02
-"""Smallest share of an effect in the summed squares of all effects of its hypothesis."""
+"""Smallest mean square of an effect, divided by the sum over those effects of its hypothesis whose
+form is not exact."""
 SMALLEST_DRIFT_SHARE = 0.1
-"""Smallest such share of a drift. The residual of an inexact form comes and goes like a drift."""
+"""The same limit for a drift. The residual of an inexact form comes and goes like a drift."""
 SMALLEST_REDUCTION = 0.006
-"""Smallest reduction of the residual's mean square by an effect, by that of the hypothesis."""
+"""Smallest reduction of the residual's mean square by one effect, divided by the reduction by its
+whole hypothesis."""
 BESIDE_DRIFT_LOG_BAYES_FACTOR = 25.0
-"""Smallest log Bayes factor of an effect beside a drift: no drift has exactly the model's spectrum
-at its slowest."""
+"""Smallest log Bayes factor of an effect beside a drift. No drift has exactly the spectrum of the
+model at the lowest frequencies."""
 RIVAL_RATIO = 0.05
-"""Smallest probability of an inseparable rival, by that of the best hypothesis. Chosen:
+"""Smallest probability of an inseparable rival, divided by that of the best hypothesis. Chosen:
 odds of 20 to 1."""
 CERTAIN = 0.5
 """Probability of unknown above which the verdict is unknown. Chosen: more likely than not."""
 UNKNOWN_SHARE_OF_EXPLAINED = 0.3
-"""Smallest rms of a flexible term, by the explained rms."""
+"""Smallest rms of a flexible term, divided by the explained rms."""
 UNKNOWN_SHARE_OF_NOISE = 0.05
-"""Smallest rms of a flexible term, by the noise."""
+"""Smallest rms of a flexible term, divided by that of the noise."""
 FORM_SHARE_OF_EXPLAINED = 0.2
-"""Largest unexplained rms, by the explained rms, that is an error of the form of an effect."""
+"""Largest unexplained rms, divided by the explained rms, that the inexact form of an effect
+causes."""
 WALK_LOG_BAYES_FACTOR = 30.0
 """Log Bayes factor of octaves with another power than a random walk's, above which the drift is
 unknown. No sensor walks exactly as the model."""
 UNEXPLAINED_SHARE_OF_EXPLAINED = 0.7
-"""Unexplained rms, by the explained rms, above which the verdict is unknown."""
+"""Unexplained rms, divided by the explained rms, above which the verdict is unknown."""
 UNEXPLAINED_SHARE_OF_NOISE = 0.5
-"""Unexplained rms, by the noise, above which the verdict is unknown."""
+"""Unexplained rms, divided by that of the noise, above which the verdict is unknown."""
 HIDDEN_EFFECT_WITHOUT_GAP = 0.22
 """Probability of an effect that is too weak to show, where no effect shows. It is rounded from 17
 of 72 recordings of working seeds 9406 and 9407 of the blind check. It presumes the mix of that
@@ -148,9 +151,11 @@ class Findings:
     discrepancy
         Flexible term beside the best hypothesis.
     instead_of_drift
-        Flexible term in place of its drift; None where the drift is more probable.
+        Flexible term in place of the best hypothesis's drift; None where the drift is more
+        probable.
     walk_log_bayes_factor
-        Log Bayes factor against its random walk, by the power in octaves; 0 without one.
+        Log Bayes factor against the best hypothesis's random walk, by the power in octaves; 0
+        without a random walk.
     detections
         Noise-like effects that show.
     noise_mps2
@@ -158,10 +163,10 @@ class Findings:
     explained_mps2
         Rms that the best hypothesis explains, m/s².
     unexplained_mps2
-        Rms that neither it nor noise explains, m/s².
+        Rms that neither the best hypothesis nor noise explains, m/s².
     code_step_mps2
-        Standard deviation of the ADC's rounding, m/s². Where codes are coarser than the noise, it
-        follows the signal.
+        Standard deviation of the ADC's rounding, m/s². Where codes are coarser than the noise, the
+        rounding follows the signal.
 
     """
 
@@ -180,7 +185,7 @@ class Findings:
 def material_hypotheses(sized: Sequence[SizedHypothesis], library_size: int, noise_mps2: float,
                         smallest_angle_rad: float) -> list[Hypothesis]:
     """
-    Keep the hypotheses of which each effect is material, the most probable first.
+    Keep the hypotheses whose effects are all material, the most probable first.
 
     Parameters
     ----------
@@ -216,29 +221,30 @@ def _is_material(sized: SizedHypothesis, effect: str,
     """
     Determine whether one effect of a hypothesis is material.
 
-    Its reduction of the residual is compared with the hypothesis of the other effects. The
+    The effect must be visible, and must reduce the residual of the hypothesis without it. The
     residual of a large effect always resembles some other effect a little, because its form is
     not exact.
     """
     hints = effect_named(effect).diagnosis
-    contributed = sized.contributions_mps2[effect] ** 2
-    contributed_by_all = sum(
+    rms_mps2 = sized.contributions_mps2[effect]
+    inexact_squares = sum(
         rms * rms for other, rms in sized.contributions_mps2.items()
         if not effect_named(other).exact)
-    # Of two orders of the same effects, the less probable one counts.
-    residual = by_effects[frozenset(sized.hypothesis.effects)].residual_mean_square
-    closed = min(by_effects[frozenset()].residual_mean_square - residual, contributed_by_all)
+    # Two hypotheses may have the same effects in another order; the less probable one is used.
+    residual_square = by_effects[frozenset(sized.hypothesis.effects)].residual_mean_square
+    explained_square = min(by_effects[frozenset()].residual_mean_square - residual_square,
+                           inexact_squares)
     smallest_mps2 = _smallest_visible_mps2(effect, noise_mps2, smallest_angle_rad)
     others = frozenset(sized.hypothesis.effects) - {effect}
-    reduction = contributed
+    reduction = rms_mps2 ** 2
     if others in by_effects and not hints.drift and not hints.absorbed:
-        reduction = by_effects[others].residual_mean_square - residual
-    share = SMALLEST_DRIFT_SHARE if hints.drift else SMALLEST_SHARE
-    if sized.contributions_mps2[effect] < smallest_mps2 \
-            or contributed < share * contributed_by_all \
-            or reduction < SMALLEST_REDUCTION * closed:
+        reduction = by_effects[others].residual_mean_square - residual_square
+    smallest_share = SMALLEST_DRIFT_SHARE if hints.drift else SMALLEST_SHARE
+    if rms_mps2 < smallest_mps2 \
+            or rms_mps2 ** 2 < smallest_share * inexact_squares \
+            or reduction < SMALLEST_REDUCTION * explained_square:
         return False
-    # An effect alone stands beside no other form that could be inexact.
+    # Beside other effects, the errors of their form reduce the residual, too.
     if others and reduction < smallest_mps2 ** 2:
         return False
     if others not in by_effects or hints.drift or not drifts_among(others):
@@ -248,7 +254,11 @@ def _is_material(sized: SizedHypothesis, effect: str,
 
 
 def _smallest_visible_mps2(effect: str, noise_mps2: float, smallest_angle_rad: float) -> float:
-    """Return the smallest rms of a visible effect: of an angle at least the encoder's, m/s²."""
+    """
+    Return the smallest rms of a visible effect, m/s².
+
+    An effect of angles must exceed the encoder's step.
+    """
     visible_mps2 = VISIBLE_SHARE_OF_NOISE * noise_mps2
     if not any(p.unit == 'rad' for p in effect_named(effect).parameters if p.is_size):
         return visible_mps2
@@ -266,25 +276,14 @@ def _log_weights(hypotheses: Sequence[Hypothesis], library_size: int) -> np.ndar
 
 
 def decide(findings: Findings) -> Verdict:
-    """Weigh the hypotheses, and what is unknown, to a verdict."""
+    """Compute the probabilities of the hypotheses and of unknown, and return the verdict."""
     hypotheses, best = findings.hypotheses, findings.hypotheses[0]
     unknown, where = _unknown(findings)
     log_weights = _log_weights(hypotheses, findings.library_size)
     weights = np.exp(log_weights - log_weights[0])
     probabilities = weights / weights.sum() * (1 - unknown)
     detected = tuple(d.effect for d in findings.detections if d.effect != UNKNOWN)
-    hidden = HIDDEN_EFFECT_BESIDE_EFFECTS if best.effects or detected \
-        else HIDDEN_EFFECT_WITHOUT_GAP
-    weighted = [WeightedHypothesis(tuple(sorted((*h.effects, *detected))), float(p * (1 - hidden)))
-                for h, p in zip(hypotheses, probabilities)]
-    with_hidden = float(probabilities.sum()) * hidden
-    if best.effects or detected:
-        weighted.append(WeightedHypothesis(tuple(sorted((*best.effects, *detected, UNKNOWN))),
-                                           with_hidden))
-    else:
-        unknown += with_hidden
-    weighted.append(WeightedHypothesis((UNKNOWN,), float(unknown)))
-    weighted.sort(key=lambda w: -w.probability)
+    weighted, unknown = _with_hidden_effects(hypotheses, probabilities, detected, unknown)
     if unknown > CERTAIN:
         return Verdict('unknown', (), (), float(unknown), tuple(weighted), best, where)
     rivals = _rivals(hypotheses, probabilities)
@@ -299,6 +298,28 @@ def decide(findings: Findings) -> Verdict:
                    tuple(weighted), best)
 
 
+def _with_hidden_effects(hypotheses: Sequence[Hypothesis], probabilities: np.ndarray,
+                         detected: tuple[str, ...], unknown: float
+                         ) -> tuple[list[WeightedHypothesis], float]:
+    """
+    Give a part of each probability to an effect that is too weak to show.
+
+    Return the hypotheses with all effects by falling probability, and the probability of unknown
+    alone. The weak effect stands beside the best hypothesis as 'unknown'.
+    """
+    best_effects = (*hypotheses[0].effects, *detected)
+    hidden = HIDDEN_EFFECT_BESIDE_EFFECTS if best_effects else HIDDEN_EFFECT_WITHOUT_GAP
+    weighted = [WeightedHypothesis(tuple(sorted((*h.effects, *detected))), float(p * (1 - hidden)))
+                for h, p in zip(hypotheses, probabilities)]
+    with_hidden = float(probabilities.sum()) * hidden
+    if best_effects:
+        weighted.append(WeightedHypothesis(tuple(sorted((*best_effects, UNKNOWN))), with_hidden))
+    else:
+        unknown += with_hidden
+    weighted.append(WeightedHypothesis((UNKNOWN,), float(unknown)))
+    return sorted(weighted, key=lambda w: -w.probability), unknown
+
+
 def _unknown(findings: Findings) -> tuple[float, tuple[str, ...]]:
     """Return the probability of unknown, and the dimensions in which it shows."""
     drifts = drifts_among(findings.hypotheses[0].effects)
@@ -309,7 +330,7 @@ def _unknown(findings: Findings) -> tuple[float, tuple[str, ...]]:
         shows, where = True, _dimensions(instead)
     if drifts and findings.walk_log_bayes_factor > WALK_LOG_BAYES_FACTOR:
         shows, where = True, list(dict.fromkeys((*where, 'time_s')))
-    # A drift leaves no residual beside that by which it is known.
+    # With a drift, the residual is the drift itself, so that its rms shows nothing unknown.
     if not drifts and findings.unexplained_mps2 > max(
             UNEXPLAINED_SHARE_OF_NOISE * findings.noise_mps2,
             UNEXPLAINED_SHARE_OF_EXPLAINED * findings.explained_mps2, findings.code_step_mps2):

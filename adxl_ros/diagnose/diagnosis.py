@@ -15,7 +15,7 @@
 """
 The diagnosis as one library call, in stages.
 
-The stages are checks, comparison, linear model, search and decision; then what the report adds.
+The stages are comparison, checks, linear model, search and decision. What the report adds follows.
 """
 
 from __future__ import annotations
@@ -90,8 +90,8 @@ class Diagnosis:
     single_effect_tests
         Tests of each effect alone.
     noise_before, noise_after
-        Recorded by simulated noise of each recording, for the baseline and for the baseline with
-        the effects that were found.
+        Recorded noise relative to simulated noise, recording by recording: with the baseline, and
+        with the baseline and the effects that were found.
     sensor
         The baseline with the effects of the verdict, ready for `simulate`.
 
@@ -131,12 +131,12 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
     seed
         Seed of bootstraps and of simulated noise.
     show_progress
-        Takes the fraction that is done.
+        Called with the fraction that is done, 0 to 1.
 
     Returns
     -------
     Diagnosis
-        The verdict and what it rests on, or a fault of a recording.
+        The verdict with its evidence, or a fault of a recording.
 
     Raises
     ------
@@ -187,7 +187,7 @@ class _Explanation:
     sensor
         The baseline with the best hypothesis and the detections.
     noise_before, noise_after
-        Recorded by simulated noise, for the baseline and for `sensor`.
+        Recorded noise relative to simulated noise, with the baseline and with `sensor`.
 
     """
 
@@ -230,22 +230,32 @@ def _decide(linear_model: LinearModel, explanation: _Explanation) -> Verdict:
         [n.simulated_std_mps2 ** 2 for n in explanation.noise_after])))
     walk = walk_log_bayes_factor(list(residual_channels(linear_model, best))) \
         if drifts_among(best.effects) else 0.0
+    explained_square = max(closure.before_mps2 ** 2 - closure.fitted_rms_mps2 ** 2, 0.0)
     verdict = decision.decide(Findings(
-        explanation.hypotheses, linear_model.library_size, discrepancy(linear_model, best),
-        discrepancy_instead_of_drift(linear_model, explanation.hypotheses), walk,
-        explanation.detections, explanation.noise_mps2,
-        float(np.sqrt(max(closure.before_mps2 ** 2 - closure.fitted_rms_mps2 ** 2, 0.0))),
-        gap_closure.unexplained_mps2(linear_model, best, closure, simulated_noise_mps2),
-        max(float(c.sensor.lsb_v / np.min(c.scale_v_per_mps2)) / 12 ** 0.5
-            for c in linear_model.comparisons)))
+        hypotheses=explanation.hypotheses,
+        library_size=linear_model.library_size,
+        discrepancy=discrepancy(linear_model, best),
+        instead_of_drift=discrepancy_instead_of_drift(linear_model, explanation.hypotheses),
+        walk_log_bayes_factor=walk,
+        detections=explanation.detections,
+        noise_mps2=explanation.noise_mps2,
+        explained_mps2=float(np.sqrt(explained_square)),
+        unexplained_mps2=gap_closure.unexplained_mps2(linear_model, best, closure,
+                                                      simulated_noise_mps2),
+        code_step_mps2=max(map(_rounding_std_mps2, linear_model.comparisons))))
     if verdict.status == 'no_gap' and not any(map(_could_show, linear_model.comparisons)):
         return replace(verdict, status='insufficient')
     return verdict
 
 
+def _rounding_std_mps2(comparison: BaselineComparison) -> float:
+    """Return the standard deviation of the ADC's rounding on its coarsest axis, m/s²."""
+    return float(comparison.sensor.lsb_v / np.min(comparison.scale_v_per_mps2)) / 12 ** 0.5
+
+
 def _with_report(linear_model: LinearModel, explanation: _Explanation, verdict: Verdict,
                  sensor: Sensor, seed: int) -> Diagnosis:
-    """Add to a verdict what the report shows beside it."""
+    """Add to a verdict the other parts of the report."""
     comparisons, best = linear_model.comparisons, verdict.best
     floor, lacking = explanation.noise_floor, not_covered(comparisons)
     contributions_mps2 = {
@@ -253,24 +263,33 @@ def _with_report(linear_model: LinearModel, explanation: _Explanation, verdict: 
         for effect in best.effects}
     named = verdict.status not in ('no_gap', 'unknown', 'insufficient')
     return Diagnosis(
-        None, comparisons, floor, verdict, tuple(explanation.hypotheses),
-        tuple(explanation.detections), explanation.closure,
-        tuple(residual_map(comparisons[0], floor.rms_mps2, seed)), tuple(lacking),
-        propose_next_experiment(verdict, lacking, seed), contributions_mps2,
-        single_effect_tests(linear_model, seed), explanation.noise_before,
-        explanation.noise_after, explanation.sensor if named else sensor)
+        data_fault=None,
+        comparisons=comparisons,
+        noise_floor=floor,
+        verdict=verdict,
+        hypotheses=tuple(explanation.hypotheses),
+        detections=tuple(explanation.detections),
+        gap_closure=explanation.closure,
+        residual_cells=tuple(residual_map(comparisons[0], floor.rms_mps2, seed)),
+        not_covered=tuple(lacking),
+        next_experiment=propose_next_experiment(verdict, lacking, seed),
+        contributions_mps2=contributions_mps2,
+        single_effect_tests=single_effect_tests(linear_model, seed),
+        noise_before=explanation.noise_before,
+        noise_after=explanation.noise_after,
+        sensor=explanation.sensor if named else sensor)
 
 
 def _confirmed(linear_model: LinearModel, comparisons: Sequence[BaselineComparison],
                hypotheses: Sequence[Hypothesis], baseline_residual: HeldOutResidual,
                floor_mps2: float, seed: int) -> tuple[list[Hypothesis], GapClosure]:
     """
-    Remove the first hypotheses until the best one holds on held-out blocks.
+    Remove the most probable hypotheses until the first one holds on held-out blocks.
 
-    It must make the held-out samples more probable and their residual not larger. Nuisance
-    parameters follow the recording in any case, and the scale factor imitates gravity, so that
-    these effects need not. A drift may only take up what the form of the effects beside it lacks,
-    so that it must predict more than they do.
+    A hypothesis holds if it makes the held-out samples more probable and their residual not
+    larger. Effects that nuisance parameters absorb need not make the samples more probable. A
+    hypothesis with a drift must predict more than the same effects without it, because a drift
+    also follows what the form of these effects lacks.
     """
     closures: dict[frozenset[str], GapClosure] = {}
 
@@ -281,18 +300,19 @@ def _confirmed(linear_model: LinearModel, comparisons: Sequence[BaselineComparis
                 linear_model, comparisons, hypothesis, baseline_residual, floor_mps2, seed)
         return closures[effects]
 
-    remaining = list(hypotheses)
-    while remaining[0].effects:
-        best, closure = remaining[0], closure_of(remaining[0])
-        without_drift = frozenset(best.effects) - frozenset(drifts_among(best.effects))
-        steady = [h for h in remaining[1:] if 0 < len(h.effects) < len(best.effects)
-                  and frozenset(h.effects) == without_drift]
+    def holds(best: Hypothesis, others: Sequence[Hypothesis]) -> bool:
+        closure = closure_of(best)
         absorbed = all(effect_named(e).diagnosis.absorbed for e in best.effects)
-        predicts = closure.log_likelihood_gain > 0 or absorbed
-        if not closure.harm and predicts and all(
-                closure.log_likelihood_gain - closure_of(h).log_likelihood_gain
-                >= WORTH_LOG_BAYES_FACTOR for h in steady):
-            break
+        if closure.harm or not (closure.log_likelihood_gain > 0 or absorbed):
+            return False
+        without_drift = frozenset(best.effects) - frozenset(drifts_among(best.effects))
+        steady = [h for h in others if 0 < len(h.effects) < len(best.effects)
+                  and frozenset(h.effects) == without_drift]
+        return all(closure.log_likelihood_gain - closure_of(h).log_likelihood_gain
+                   >= WORTH_LOG_BAYES_FACTOR for h in steady)
+
+    remaining = list(hypotheses)
+    while remaining[0].effects and not holds(remaining[0], remaining[1:]):
         remaining = remaining[1:]
     return remaining, closure_of(remaining[0])
 
@@ -313,15 +333,16 @@ def _detections(checked: Sequence[CheckedRecording], best: Hypothesis) -> list[D
                                                                         sensor):
             detections.append(spikes)
         detections += noise_detectors.residual_detections(NoiseSamples(
-            comparison.time_s, bridged(residual_v, used), residual_v,
-            comparison.simulated_noise_v(sensor, 0), comparison.at_rest & used, used), sensor)
+            time_s=comparison.time_s, residual_v=bridged(residual_v, used),
+            raw_residual_v=residual_v, simulated_v=comparison.simulated_noise_v(sensor, 0),
+            at_rest=comparison.at_rest & used, used=used), sensor)
     ranked = sorted(detections, key=lambda d: d.log_bayes_factor)
     return list({d.effect: d for d in ranked}.values())
 
 
 def _noise_comparisons(comparisons: Sequence[BaselineComparison], mean_sensor: Sensor,
                        noise_sensor: Sensor, seed: int) -> tuple[NoiseComparison, ...]:
-    """Compare the residual about the mean of one sensor with the noise of another."""
+    """Compare the residual after one sensor's mean output with the noise of another sensor."""
     return tuple(compare_noise(bridged(c.residual_v(mean_sensor), c.used),
                                c.simulated_noise_v(noise_sensor, seed), c.sensor.rate_hz,
                                c.scale_v_per_mps2) for c in comparisons)
@@ -346,19 +367,23 @@ def _with_detections(best: Hypothesis, detections: Sequence[Detection], baseline
     """
     Return the sensor of a hypothesis with the noise-like effects, at the baseline's rate.
 
-    Filter and latency within their tolerance are not worth an effect. Where no effect of the mean
-    is named, zero-g and scale factor stay those of the file, too. A zero-g that drifted says
-    nothing about the next recording.
+    Nuisance parameters that are not effects of the hypothesis have these values:
+
+    - Filter and latency stay those of the parameter file.
+    - Zero-g and scale factor are fitted if the hypothesis has an effect on the mean, otherwise
+      those of the file.
+    - A zero-g that drifts stays that of the file, because it does not predict the next recording.
     """
-    by_mean = any(effect_named(effect).acts_on is ActsOn.MEAN for effect in best.effects)
+    has_mean_effect = any(effect_named(effect).acts_on is ActsOn.MEAN for effect in best.effects)
     drifts = bool(drifts_among(best.effects))
 
     def stays_as_filed(effect: str) -> bool:
         hints = effect_named(effect).diagnosis
         if effect in best.effects:
             return False
-        return (hints.straight_line is StraightLine.ZERO_G and drifts) if by_mean \
-            else hints.nuisance
+        if has_mean_effect:
+            return drifts and hints.straight_line is StraightLine.ZERO_G
+        return hints.nuisance
 
     effects = [e for e in best.sensor.effects
                if e in (*baseline.effects, *best.effects)

@@ -15,9 +15,9 @@
 """
 Checks of a drift: whether the noise is the same all the time, and has the spectrum of the drift.
 
-The evidence takes any slow change for a drift. A drift has the same power in all blocks, and a
-random walk has its expected power in every octave. A warm draught or a floor that sways has most
-of its power in a few octaves.
+The evidence alone cannot distinguish a drift from other slow changes. A drift has the same power
+in all blocks, and a random walk has its expected power in every octave. A warm draught or a floor
+that sways has most of its power in a few octaves.
 """
 
 from __future__ import annotations
@@ -34,17 +34,20 @@ from scipy.optimize import minimize_scalar
 from scipy.signal import sosfreqz
 
 _OCTAVE_RATIO = 4.0
-"""Ratio of the power in octaves to the walk's, above or below which they are not part of it.
-Tuned by hand on simulated recordings of the working seeds of the blind check."""
+"""Power in a run of octaves, divided by that of the random walk, differs too much above this ratio
+or below its inverse. Tuned by hand on simulated recordings of the working seeds of the blind
+check."""
 _INDEPENDENT_SHARE = 0.6
 """Share of neighbouring frequencies under a Hann window that are independent (Harris 1978)."""
 _CORRELATION_S = 0.1
 """Time over which strong noise of another colour than the filter's stays correlated, s. Tuned by
 hand on simulated flicker noise of another form than the library's."""
 _LOG_LEVEL_RANGE = 3.0
-"""Range of the logarithm of a walk's power by that of its filter. Chosen: wider than the grid."""
+"""Largest magnitude of the logarithm of a walk's power, relative to that of its filter. Chosen:
+wider than the grid."""
 _BAND_OCTAVES = 4
-"""Highest frequency of that fit, by the highest at which the walk dominates. Chosen: 2 octaves."""
+"""Highest frequency of the fit of a walk's power, divided by the highest one at which the walk
+dominates. Chosen: two octaves more."""
 
 
 @dataclass(frozen=True)
@@ -129,7 +132,11 @@ def walk_log_bayes_factor(channels: Sequence[ResidualChannel]) -> float:
 
 
 def _octaves(channel: ResidualChannel) -> tuple[np.ndarray, np.ndarray]:
-    """Return by octave of the walk the number of frequencies, and power by expected power."""
+    """
+    Return the number of frequencies in each octave, and their power divided by the expected one.
+
+    The octaves reach up to the frequency where the walk no longer dominates.
+    """
     white = channel.whitened_v()
     taper = np.sqrt(8 / 3) * np.hanning(len(white))
     power = np.abs(np.fft.rfft(white * taper)) ** 2 \
@@ -147,7 +154,7 @@ def _octaves(channel: ResidualChannel) -> tuple[np.ndarray, np.ndarray]:
         mean = share[band] + np.exp(log_level) * (1 - share[band])
         return float(np.sum(np.log(mean) + power[band] / mean))
 
-    # The grid of filters is coarse, so that the level of the walk is fitted.
+    # The grid of filters is coarse, so that the power of the walk is fitted.
     level = np.exp(minimize_scalar(negative_log_likelihood, method='bounded',
                                    bounds=(-_LOG_LEVEL_RANGE, _LOG_LEVEL_RANGE)).x)
     power = power / (share + level * (1 - share))

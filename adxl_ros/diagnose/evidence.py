@@ -35,8 +35,8 @@ BLOCKS = 48
 """Number of blocks of a recording, of which some are held out. Chosen: a multiple of the folds,
 and blocks of a few seconds in a short recording."""
 AMPLITUDES = 10.0 ** np.arange(0, -2.5, -0.5)
-"""Amplitudes of an effect by its typical one, equally probable: a log-uniform prior over two
-decades, in five steps."""
+"""Amplitudes of an effect, divided by that of its given prior. They are equally probable: a
+log-uniform prior over two decades, in five steps."""
 _ITERATIONS = 3
 """Iterations over coefficients and noise. Chosen: the filters no longer change then."""
 _SMALLEST_SQUARES_V2 = 1e-300
@@ -209,28 +209,25 @@ def fit_columns(channels: Sequence[WhitenedChannel], column_ids: Sequence[int],
     """
     ids = np.array(sorted(column_ids), int)
     selected = [_selected(channel, ids, blocks) for channel in channels]
-    counts = [s.count for s in selected]
     log_priors = [_filter_log_priors(channel, drifts) for channel in channels]
     filters = list(start.filter_indices) if start else [int(np.argmax(p)) for p in log_priors]
-    variance = np.array([s.grams[f, 0, 0] / s.count for s, f in zip(selected, filters)])
-    prior_precision, bound = prior_std[ids] ** -2.0, bounds[ids]
+    variance_v2 = np.array([s.grams[f, 0, 0] / s.count for s, f in zip(selected, filters)])
+    prior_precision = prior_std[ids] ** -2.0
     for _ in range(_ITERATIONS):
-        precision, information = np.diag(prior_precision), np.zeros(len(ids))
-        for s, f, v in zip(selected, filters, variance):
-            precision[np.ix_(s.places, s.places)] += s.grams[f, 1:, 1:] / v
-            information[s.places] += s.grams[f, 1:, 0] / v
+        precision, information = _normal_equations(selected, filters, variance_v2,
+                                                   prior_precision)
         values, at_bound, covariance, half_log_det = _bounded_solution(precision, information,
-                                                                       bound)
-        squares = [_residual_squares(s.grams, values[s.places]) for s in selected]
-        filters = [int(np.argmax(-n / 2 * np.log(np.maximum(r, _SMALLEST_SQUARES_V2)) + p))
-                   for r, n, p in zip(squares, counts, log_priors)]
-        variance = np.array([max(r[f], _SMALLEST_SQUARES_V2) / n
-                             for r, f, n in zip(squares, filters, counts)])
+                                                                       bounds[ids])
+        for i, s in enumerate(selected):
+            squares_v2 = np.maximum(_residual_squares(s.grams, values[s.places]),
+                                    _SMALLEST_SQUARES_V2)
+            filters[i] = int(np.argmax(-s.count / 2 * np.log(squares_v2) + log_priors[i]))
+            variance_v2[i] = squares_v2[filters[i]] / s.count
     log_evidence = -0.5 * float(np.sum(prior_precision * values ** 2)) \
         - half_log_det + 0.5 * float(np.log(prior_precision[~at_bound]).sum())
-    for n, v, f, channel in zip(counts, variance, filters, channels):
-        log_evidence += float(-n / 2 * (np.log(v) + 1) + channel.log_priors[f])
-    return LinearFit(ids, values, covariance, at_bound, log_evidence, tuple(filters), variance)
+    for s, variance, f, channel in zip(selected, variance_v2, filters, channels):
+        log_evidence += float(-s.count / 2 * (np.log(variance) + 1) + channel.log_priors[f])
+    return LinearFit(ids, values, covariance, at_bound, log_evidence, tuple(filters), variance_v2)
 
 
 @dataclass(frozen=True)
@@ -240,6 +237,17 @@ class _SelectedColumns:
     places: np.ndarray
     grams: np.ndarray
     count: float
+
+
+def _normal_equations(selected: Sequence[_SelectedColumns], filters: Sequence[int],
+                      variance_v2: np.ndarray, prior_precision: np.ndarray
+                      ) -> tuple[np.ndarray, np.ndarray]:
+    """Return the posterior precision, (k, k), and the information vector, (k,)."""
+    precision, information = np.diag(prior_precision), np.zeros(len(prior_precision))
+    for s, f, variance in zip(selected, filters, variance_v2):
+        precision[np.ix_(s.places, s.places)] += s.grams[f, 1:, 1:] / variance
+        information[s.places] += s.grams[f, 1:, 0] / variance
+    return precision, information
 
 
 def _selected(channel: WhitenedChannel, ids: np.ndarray, blocks: np.ndarray | None
@@ -256,7 +264,11 @@ def _selected(channel: WhitenedChannel, ids: np.ndarray, blocks: np.ndarray | No
 
 
 def _filter_log_priors(channel: WhitenedChannel, drifts: Sequence[str]) -> np.ndarray:
-    """Return log priors of the filters, −inf where they need another drift, (filters,)."""
+    """
+    Return log priors of the filters, (filters,).
+
+    The prior of a filter for a drift that is not given is −inf, unless no filter remains.
+    """
     allowed = np.isin(channel.drift_effects, ('', *drifts))
     return np.where(allowed | ~allowed.any(), channel.log_priors, -np.inf)
 
@@ -307,7 +319,7 @@ def log_bayes_factor_by_amplitude(mean: np.ndarray, covariance: np.ndarray,
         Log Bayes factors, (amplitudes,).
 
     """
-    # In units of the prior volts and radians have similar sizes.
+    # Divided by their prior deviations, coefficients in V and in rad have similar sizes.
     precision = np.linalg.inv(covariance / prior_std[:, None] / prior_std)
     information = precision @ (mean / prior_std)
     quadratic = float(information @ (mean / prior_std))
@@ -326,9 +338,9 @@ def _bounded_solution(precision: np.ndarray, information: np.ndarray, bound: np.
     """
     Solve precision · values = information within bounds.
 
-    Returns the values, which are at a bound, the covariance of the others, and half the logarithm
-    of the determinant of their precision. The columns are scaled, so that those of different
-    sizes and those that are nearly equal are no obstacle.
+    Return the values, whether each is at a bound, the covariance of the values that are not, and
+    half the logarithm of the determinant of their precision. The columns are scaled, so that
+    columns of different sizes or nearly equal columns cause no rounding errors.
     """
     size = 1 / np.sqrt(np.diag(precision))
     scaled = precision * size[:, None] * size + _RIDGE * np.eye(len(size))
@@ -360,8 +372,9 @@ def robust_std(channels: Sequence[WhitenedChannel], fit: LinearFit, prior_std: n
     """
     Return standard deviations that also hold where the model is not exact.
 
-    They are the larger of the model's and of the sandwich estimate (White 1982, Econometrica 50).
-    The sandwich is from the scores of blocks, because samples may be correlated.
+    Each is the larger of the model's deviation and of the sandwich estimate (White 1982,
+    Econometrica 50). The sandwich sums gradients of the log likelihood over blocks, because
+    samples may be correlated.
 
     Parameters
     ----------
@@ -378,14 +391,14 @@ def robust_std(channels: Sequence[WhitenedChannel], fit: LinearFit, prior_std: n
         Standard deviations of the coefficients, (k,).
 
     """
-    scores = np.zeros((BLOCKS, len(fit.column_ids)))
+    gradients = np.zeros((BLOCKS, len(fit.column_ids)))
     for c, f, v in zip(channels, fit.filter_indices, fit.innovation_variance_v2):
         columns = np.flatnonzero(np.isin(c.column_ids, fit.column_ids))
         places = np.searchsorted(fit.column_ids, c.column_ids[columns])
         rows = c.block_grams[f][:, 1 + columns]
-        scores[:, places] += (rows[:, :, 0] - rows[:, :, 1 + columns] @ fit.values[places]) / v
-    scores = scores - scores.mean(axis=0)
-    sandwich = fit.covariance @ (scores.T @ scores) @ fit.covariance * BLOCKS / (BLOCKS - 1)
+        gradients[:, places] += (rows[:, :, 0] - rows[:, :, 1 + columns] @ fit.values[places]) / v
+    gradients = gradients - gradients.mean(axis=0)
+    sandwich = fit.covariance @ (gradients.T @ gradients) @ fit.covariance * BLOCKS / (BLOCKS - 1)
     return np.sqrt(np.maximum(np.diag(fit.covariance),
                               np.minimum(np.diag(sandwich), prior_std[fit.column_ids] ** 2)))
 

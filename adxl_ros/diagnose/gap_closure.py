@@ -15,8 +15,9 @@
 """
 How large the gap is, what each effect contributes, and how far a hypothesis closes the gap.
 
-Blocks are held out in turn, and the blocks next to them are not fitted. The gap is the rms over
-held-out samples and axes, with zero-g and scale factor at their posterior from the other blocks.
+Blocks are held out in turn, and the blocks next to them are not fitted. The gap is the rms of the
+residual over held-out samples and axes. Zero-g and scale factor have their posterior mean from the
+fitted blocks.
 """
 
 from __future__ import annotations
@@ -46,13 +47,15 @@ _RUN_BLOCKS = 2
 """Number of neighbouring blocks that are held out together. Chosen: most slow effects change
 within two blocks."""
 _HARM_RATIO = 1.005
-"""Mean square after the hypothesis, by that before, from which the hypothesis does harm. Chosen:
-above the change by refitting."""
+"""Held-out mean square with the hypothesis, divided by that of the baseline, above which the
+hypothesis does harm. Chosen: above the change by refitting."""
 _BOOTSTRAP_DRAWS = 400
 """Number of draws of the interval. Chosen: the 5 % quantile has 20 draws below it."""
+_RATE_TOLERANCE = 1e-3
+"""Largest relative difference of the sample rates of two repeats. Chosen: 20 ms in 20 s."""
 _DRIFT_QUANTILE = 2.0
-"""Mean square of a random walk about its mean, by its expected value, in the 90 % quantile of
-recordings. Derived from the random walk."""
+"""90 % quantile of the mean square of a random walk about its mean, divided by its expected value.
+Derived from the random walk."""
 
 
 @dataclass(frozen=True)
@@ -134,16 +137,16 @@ def estimate_noise_floor(comparisons: Sequence[BaselineComparison]) -> NoiseFloo
     """
     Estimate the noise floor from rests, else from repeats, else from the parameter file.
 
-    The noise at rest is that about the mean of each second. To the noise the steps of the stage's
-    encoder are added.
+    The noise at rest is that about the mean of each second. The mean square of the encoder's steps
+    is added.
     """
     baseline = comparisons[0].sensor
-    nothing = SquareSum(np.zeros(len(baseline.axes)), 0)
+    no_samples = SquareSum(np.zeros(len(baseline.axes)), 0)
     total = sum((noise_floor.squares_at_rest(c.volts, c.at_rest & c.used, c.sensor)
-                 for c in comparisons), nothing)
+                 for c in comparisons), no_samples)
     source = 'still'
     if total.count < FEWEST_SAMPLES:
-        total, source = sum(_repeat_squares(comparisons), nothing), 'repeats'
+        total, source = sum(_repeat_squares(comparisons), no_samples), 'repeats'
     if total.count < FEWEST_SAMPLES:
         noise_v, source = noise.sample_std_v(baseline), 'assumed'
     else:
@@ -162,7 +165,7 @@ def _repeat_squares(comparisons: Sequence[BaselineComparison]) -> list[SquareSum
     for i, first in enumerate(staged):
         for j, second in enumerate(staged[i:], i):
             rate_hz = first.sensor.rate_hz
-            if abs(rate_hz / second.sensor.rate_hz - 1) > 1e-3:
+            if abs(rate_hz / second.sensor.rate_hz - 1) > _RATE_TOLERANCE:
                 continue
             repeat = noise_floor.find_repeat(directions[i], directions[j], rate_hz,
                                              first.sensor.stage_resolution_rad, i == j)
@@ -222,7 +225,8 @@ def contribution_mps2(linear_model: LinearModel, hypothesis: Hypothesis, effect:
     Returns
     -------
     float
-        Rms over samples and axes about the mean, of zero-g and scale factor about zero, m/s².
+        Rms over samples and axes, m/s²: about zero for zero-g and scale factor, about the mean for
+        other effects.
 
     """
     library_effect = effect_named(effect)
@@ -386,15 +390,18 @@ def gap_closure(linear_model: LinearModel, comparisons: Sequence[BaselineCompari
     floor = floor_mps2 ** 2
     before_square, after_square = before.sum() / counts.sum(), after.sum() / counts.sum()
     # The rms after can be below the floor by chance.
-    closed = (before_square - after_square) / (before_square - min(floor, after_square)) \
+    lowest_square = min(floor, after_square)
+    closed = (before_square - after_square) / (before_square - lowest_square) \
         if before_square > floor else float('nan')
     return GapClosure(
-        float(np.sqrt(before_square)), float(np.sqrt(after_square)), floor_mps2,
-        float(min(closed, 1.0)), _closed_interval(before, after, counts,
-                                                  min(floor, after_square), seed),
-        bool(after_square > before_square * _HARM_RATIO),
-        float(np.sqrt(fitted_squares / counts.sum())),
-        residual.log_likelihood - baseline_residual.log_likelihood)
+        before_mps2=float(np.sqrt(before_square)),
+        after_mps2=float(np.sqrt(after_square)),
+        floor_mps2=floor_mps2,
+        closed=float(min(closed, 1.0)),
+        closed_ci=_closed_interval(before, after, counts, lowest_square, seed),
+        harm=bool(after_square > before_square * _HARM_RATIO),
+        fitted_rms_mps2=float(np.sqrt(fitted_squares / counts.sum())),
+        log_likelihood_gain=residual.log_likelihood - baseline_residual.log_likelihood)
 
 
 def _closed_interval(before: np.ndarray, after: np.ndarray, counts: np.ndarray, floor: float,
@@ -414,8 +421,8 @@ def _squares_by_block(comparison: BaselineComparison, sensor: Sensor, fitted: np
     """
     Return the sum over samples of the mean square over axes, by block, (m/s²)², (blocks,).
 
-    The zero-g drifts, so that its level comes from the fitted blocks, within its tolerance. Where
-    the zero-g is an effect, its level has no bound.
+    The zero-g may drift, so that the mean residual of the fitted blocks is subtracted. It shrinks
+    towards zero by the tolerance of the zero-g, unless the zero-g is an effect of the hypothesis.
     """
     residual_v = comparison.residual_v(sensor)
     edges = evidence.block_edges(len(comparison))

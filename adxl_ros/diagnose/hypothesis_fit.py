@@ -43,8 +43,8 @@ import numpy as np
 _SMOOTH_EVALUATIONS = 10
 """Largest number of simulations of a hypothesis of smooth effects. Chosen: most need five."""
 _ROUGH_EVALUATIONS = 5
-"""The same of other hypotheses. Chosen: their derivatives are those of wide steps, and more steps
-do not improve them."""
+"""The same for other hypotheses. Chosen: their derivatives are from wide steps, and more
+iterations do not improve the fit."""
 _HALVINGS = 2
 """How often a step that lowers the log evidence is halved. Chosen: a quarter of a step is
 enough for the library."""
@@ -55,14 +55,15 @@ _SMALLEST_STEP = 1e-3
 _SMALLEST_GAIN = 0.05
 """Gain of log evidence below which the fit has converged. Chosen: far below one unit."""
 _SMALLEST_GAIN_SHARE = 1e-4
-"""The same by the gain of all steps. Chosen: a large effect needs no more digits."""
+"""The same limit, divided by the gain of all steps. Chosen: a large effect needs no more
+digits."""
 _FORM_ERROR = 0.03
-"""Relative standard deviation of a coefficient by the form of its effect, which only geometry and
-clocks have exactly. Tuned by hand on simulated recordings of the working seeds of the blind
-check."""
+"""Relative standard deviation of a coefficient because the form of its effect is not exact. Only
+geometry and clocks have exact forms. Tuned by hand on simulated recordings of the working seeds of
+the blind check."""
 _UNDETERMINED_PRIOR_SHARE = 0.5
-"""A posterior standard deviation above this share of the prior's is not determined.
-Chosen: the samples then say less than the prior."""
+"""A coefficient is not determined if its posterior standard deviation exceeds this share of the
+prior's. Chosen: the samples then determine it hardly better than the prior."""
 _UNDETERMINED_RATIO = 3.0
 """Some blocks do not determine a coefficient if their standard deviation exceeds that of all
 blocks by this factor. Chosen: a quarter of the blocks is held out."""
@@ -107,9 +108,10 @@ class Hypothesis:
 @dataclass(frozen=True)
 class LinearisedHypothesis:
     """
-    A hypothesis linearised at values of its k coefficients; the first j are of the effects.
+    A hypothesis linearised at values of its k coefficients.
 
-    Nuisance parameters stay near the baseline and are linearised there.
+    The first j coefficients are those of the effects. The others are nuisance parameters, which
+    stay near the baseline and are linearised there.
 
     Attributes
     ----------
@@ -126,7 +128,7 @@ class LinearisedHypothesis:
     values
         Values of the coefficients of the effects, (j,).
     channels
-        Whitened residuals, as they would be at the prior mean, and columns.
+        Whitened columns, and whitened residuals at the prior mean by the linear model.
 
     """
 
@@ -145,7 +147,7 @@ class LinearisedHypothesis:
 
     @property
     def bounds(self) -> np.ndarray:
-        """Largest deviation from the prior mean: a healthy unit keeps its tolerance, (k,)."""
+        """Largest deviation from the prior mean, (k,); infinite for coefficients of effects."""
         of_effects = np.arange(len(self.names)) < len(self.values)
         return np.where(of_effects, np.inf, TOLERANCE_STDS * self.prior_std)
 
@@ -174,8 +176,8 @@ class LinearisedHypothesis:
         """
         Return the sensor with the effects at their values.
 
-        The nuisance parameters are at their posterior mean given these values. Their mean by the
-        fit itself may differ much, along what they and the effects have in common.
+        The nuisance parameters are at their posterior mean given these values. Their mean in the
+        fit itself may differ much, because there the effects have other values.
         """
         of_effects = np.arange(len(self.values))
         departures = np.clip(
@@ -209,9 +211,9 @@ class LinearisedHypothesis:
         """
         Return the departures from the prior mean after a fit.
 
-        A limit or a shape that the samples do not determine stays, because its prior mean is no
-        better guess. The same holds where only the blocks outside the fit determine it. A shape
-        changes by a factor of two at most.
+        A limit or a shape keeps its value if the samples do not determine it, because its prior
+        mean is no better guess. It also keeps its value if only the held-out blocks determine
+        it. A shape changes by a factor of two at most.
 
         Parameters
         ----------
@@ -342,7 +344,7 @@ def _prior(sensor: Sensor, names: Sequence[Coefficient]) -> tuple[np.ndarray, li
 
 def _output_beside_sensor_effects(linear_model: LinearModel, number: int, sensor: Sensor,
                                   start: Sensor, effects: Sequence[str]) -> np.ndarray:
-    """Simulate a recording without the effects that a calibration takes up, V, (n, m)."""
+    """Simulate a recording without the effects whose straight line is calibrated, V, (n, m)."""
     taken_up = [effect for effect in effects if calibration_takes_up(effect)]
     if len(taken_up) == len(effects):
         return linear_model.baseline_v[number]
@@ -439,7 +441,7 @@ def _first_values(sensor: Sensor, names: Sequence[Coefficient], start: Mapping[C
 
 def _has_converged(first: _HypothesisIterate, previous: _HypothesisIterate | None,
                    present: _HypothesisIterate) -> bool:
-    """Determine whether another step would gain nothing."""
+    """Determine whether the last step gained too little, or the next one would."""
     if previous is not None and present.log_evidence - previous.log_evidence < _SMALLEST_GAIN:
         return True
     smallest = max(_SMALLEST_GAIN,
@@ -467,27 +469,28 @@ def _with_drift_densities(linear_model: LinearModel, effects: Sequence[str], sen
 
 
 def _encoder_std(linear_model: LinearModel, names: Sequence[Coefficient]) -> np.ndarray:
-    """Return standard deviations of angles by the step of the encoder, (k,)."""
+    """Return standard deviations by the encoder's step: rad for angles, 0 for others, (k,)."""
     return np.where([parameter_of(n).unit == 'rad' for n in names],
                     linear_model.smallest_angle_rad(), 0.0)
 
 
 def _form_std(linearised: LinearisedHypothesis, fit: LinearFit) -> np.ndarray:
-    """Return standard deviations of coefficients by the form of their effects, (j,)."""
+    """Return standard deviations because forms are not exact, (j,); 0 for exact forms."""
     names = linearised.effect_names
     size = np.where([parameter_of(n).is_size for n in names], fit.values[:len(names)],
                     linearised.values)
     exact = [effect_named(n.effect).exact for n in names]
-    return np.where(exact, 0.0, _FORM_ERROR * size)
+    return np.where(exact, 0.0, _FORM_ERROR * np.abs(size))
 
 
 def _sparsity_log_bayes_factor(linearised: LinearisedHypothesis, fit: LinearFit) -> float:
     """
     Return what the log evidence gains because an effect need not show in all coefficients.
 
-    Every set of an effect's coefficients is equally probable beforehand, and its amplitude is
-    log-uniform. Omitting a coefficient gains the ratio of its posterior and prior densities at
-    zero (Dickey 1971). They are omitted one by one; at least one of an effect stays.
+    The prior gives every set of an effect's coefficients the same probability, and a log-uniform
+    amplitude. Omitting a coefficient multiplies the evidence by the ratio of its posterior and
+    prior densities at zero (Dickey 1971). Coefficients are omitted one by one while the evidence
+    gains; at least one coefficient of each effect stays.
     """
     mean, covariance = fit.values.copy(), fit.covariance.copy()
     gain = 0.0

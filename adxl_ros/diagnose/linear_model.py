@@ -17,12 +17,13 @@ The linear model of all recordings about the baseline: sensitivities to the whol
 
 Some coefficients of a healthy unit differ from the parameter file. Zero-g and scale factor age,
 the parts of the RC filter have tolerances, and stamps have a latency. These nuisance parameters
-are free in every hypothesis, within the tolerance of a healthy unit. They are named only beyond
-it.
+are free in every hypothesis, within the tolerance of a healthy unit. An effect is named only if
+its parameters exceed this tolerance.
 
-A calibration has taken up an unknown share of the straight line in the output of a sensor effect.
-Beside such an effect, zero-g and scale factor are as free as that straight line. An effect of the
-stage or of the specific force is no part of the calibrated sensor and leaves them as they are.
+The output of an effect of the sensor has a part that is a straight line over the specific force.
+Zero-g and scale factor of the calibration contain an unknown share of this line. In a hypothesis
+with such an effect, they may therefore change by as much as the line. An effect of the stage or of
+the specific force is no part of the calibrated sensor and leaves their tolerance as it is.
 """
 
 from __future__ import annotations
@@ -43,8 +44,8 @@ from adxl_ros.model.sensor import Sensor
 import numpy as np
 
 _DRIFTED_STD_G = 0.02
-"""Prior standard deviation of the zero-g where it drifts, g: it has drifted before the recording,
-too. Tuned by hand on simulated recordings of the working seeds of the blind check."""
+"""Prior standard deviation of a zero-g that drifts, g. It has also drifted between calibration and
+recording. Tuned by hand on simulated recordings of the working seeds of the blind check."""
 TOLERANCE_STDS = 4.0
 """Largest deviation of a healthy unit, in standard deviations. Chosen: beyond it an effect is more
 probable than chance."""
@@ -61,7 +62,9 @@ def hints_of(name: Coefficient) -> DiagnosisHints:
 @dataclass(frozen=True)
 class LinearModel:
     """
-    Recordings of one unit, and the sensitivities at their baseline; a channel is one axis of one.
+    Recordings of one unit, and the sensitivities at their baseline.
+
+    A channel is one axis of one recording.
 
     Attributes
     ----------
@@ -84,7 +87,8 @@ class LinearModel:
     nuisance_columns
         By channel: nuisance parameters and their sensitivities, V per unit, (n,).
     straight_line_parts
-        By coefficient of zero-g or scale factor: its amount in a unit of each column, (columns,).
+        For each coefficient of zero-g and scale factor: how much of it one unit of each column
+        contains, (columns,).
 
     """
 
@@ -132,7 +136,8 @@ class LinearModel:
         Parameters
         ----------
         chosen
-            Numbers of the variants of the hypothesis, which alone exceed their tolerance.
+            Numbers of the variants of the hypothesis. Only their effects may exceed the tolerance
+            of a healthy unit.
         drifts
             Effects by which the zero-g drifts.
 
@@ -153,7 +158,7 @@ class LinearModel:
             parts = self.straight_line_parts.get(name, np.zeros(len(prior_std)))[columns] \
                 * prior_std[columns]
             prior_std[i] = np.hypot(self.tolerance(name, drifts), np.sqrt(np.sum(parts ** 2)))
-            # The size of the chosen effects is unknown, and so is that of their straight part.
+            # A chosen effect may have any size, and so may its straight-line part.
             bounds[i] = np.inf if np.any(parts) else TOLERANCE_STDS * prior_std[i]
         return prior_std, bounds
 
@@ -214,7 +219,7 @@ class LinearModel:
         Returns
         -------
         LinearFit
-            The fit; its log evidence has the log-uniform prior over amplitudes.
+            The fit; its log evidence is that with the log-uniform prior over amplitudes.
 
         """
         drifts = (*drifts, *drifts_among(self.baseline.effects))
@@ -232,7 +237,7 @@ class LinearModel:
 
 
 def calibration_takes_up(effect: str) -> bool:
-    """Determine whether a calibration takes up the straight line in the output of an effect."""
+    """Determine whether a calibration contains the straight-line part of an effect."""
     return effect_named(effect).place not in (Place.STAGE, Place.FORCE)
 
 
@@ -248,7 +253,7 @@ def build_linear_model(comparisons: Sequence[BaselineComparison],
     comparisons
         Recordings of one unit, with one baseline.
     show_progress
-        Takes the fraction that is done.
+        Called with the fraction that is done, 0 to 1.
     filter_indices
         Number of the whitening filter of each channel, where the noise is known.
     only
@@ -351,21 +356,22 @@ def straight_line_parts(lines: Sequence[dict[int, np.ndarray]],
                         columns: Sequence[Sequence[NumberedColumn]], count: int
                         ) -> dict[int, np.ndarray]:
     """
-    Fit straight lines between force and volts to columns, by least squares.
+    Fit the columns of zero-g and scale factor to other columns, by least squares.
 
     Parameters
     ----------
     lines
-        By channel: columns of zero-g and scale factor by number, V per unit, (n,).
+        For each channel: columns of zero-g and scale factor by number, V per unit, (n,).
     columns
-        By channel: numbers, below `count`, and columns, V per unit, (n,).
+        For each channel: the other columns, V per unit, (n,), with their numbers below `count`.
     count
-        Number of the columns.
+        Number of the other columns.
 
     Returns
     -------
     dict
-        By number of a line's column: its amount in a unit of each column, (count,).
+        By number of a column of zero-g or scale factor: how much of it one unit of each other
+        column contains, (count,).
 
     """
     grams: dict[tuple[int, ...], np.ndarray] = {}

@@ -16,9 +16,9 @@
 The model discrepancy: a flexible term beside the best hypothesis, for what the library lacks.
 
 The term has splines and products over force, rate, direction, temperature, supply and time, by
-axis, with a prior of their own. The sensitivities of the hypothesis are fitted beside them, so
-that the term only takes what the hypothesis cannot. It is never offered first, because a flexible
-term would take what an effect explains.
+axis, with a prior of their own. The coefficients of the hypothesis are fitted together with them,
+so that the term only explains what the hypothesis cannot. The term is never fitted before the
+search, because it would also explain what an effect explains.
 """
 
 from __future__ import annotations
@@ -40,17 +40,18 @@ import numpy as np
 from scipy.interpolate import BSpline
 
 _CREEP_S = (2.0, 10.0, 50.0)
-"""Time constants of force that acts late, s. Chosen: about half a decade apart."""
+"""Time constants of low-pass filtered force (creep), s. Chosen: a factor of five apart."""
 _RELAXATION_S = (1, 4, 16)
 """Time constants of relaxation after a move, s. Chosen: a factor of four apart."""
 _SPLINES = 12
-"""Splines over an angle or a component of the force. Chosen: a tenth of the range each."""
+"""Number of splines over an angle or a component of the force. Chosen: a tenth of the range
+each."""
 _SURROUNDING_SPLINES = 5
-"""Splines over temperature or supply. Chosen: smooth laws."""
+"""Number of splines over temperature or supply. Chosen: smooth laws."""
 _HARMONICS = 8
-"""Harmonics of beta. Chosen: periods of 45° and more."""
+"""Number of harmonics of beta. Chosen: periods of 45° and more."""
 _TIME_STEPS = 24
-"""Steps over time. Chosen: half of the blocks."""
+"""Number of steps over time. Chosen: half of the blocks."""
 _PRODUCT_DEGREE = 4
 """Highest degree of the products of force. Chosen: the library ends at the third."""
 _SMALLEST_RATE_RAD_S = 1e-3
@@ -65,10 +66,12 @@ UNKNOWN_LOG_BAYES_FACTOR = 15.0
 """Log Bayes factor from which a flexible term shows something unknown. Tuned by hand on simulated
 recordings of the working seeds of the blind check."""
 _SHIFT_SHARE = 0.382
-"""Share of the recording by which a term is moved to follow nothing (circular-shift null).
+"""Share of the recording by which a term is shifted in time, so that it follows nothing there
+(circular-shift null).
 Chosen: the golden section, far from any period of the manoeuvre."""
 _SHIFTED_GAIN_FACTOR = 2.0
-"""Gain by chance beside a drift, by that of the shifted term. Tuned as the limit above."""
+"""Gain of a term by chance beside a drift, divided by the gain of the shifted term. Tuned as the
+limit above."""
 
 Basis = dict[str, np.ndarray]
 """Basis functions of one recording by dimension, of size about 1, (n, k) each."""
@@ -100,8 +103,8 @@ def discrepancy(linear_model: LinearModel, hypothesis: Hypothesis) -> Discrepanc
     Fit the flexible term beside a hypothesis.
 
     The spectrum of a strong drift is not exactly that of its model, and slow basis functions gain
-    whatever they follow. The gain of the same term at other times, where it follows nothing, is
-    subtracted.
+    by chance. The gain of the same term, shifted in time so that it follows nothing, estimates
+    this chance; a multiple of it is subtracted.
 
     Parameters
     ----------
@@ -127,14 +130,14 @@ def discrepancy(linear_model: LinearModel, hypothesis: Hypothesis) -> Discrepanc
 
 
 def _shifted(basis: Basis) -> Basis:
-    """Return basis functions at other times, in a circle."""
+    """Return basis functions shifted in time; what leaves at the end comes in at the beginning."""
     return {dimension: np.roll(values, round(_SHIFT_SHARE * len(values)), axis=0)
             for dimension, values in basis.items()}
 
 
 def _fitted(linear_model: LinearModel, hypothesis: Hypothesis, bases: Sequence[Basis]
             ) -> Discrepancy:
-    """Fit the dimensions that gain, each of its most probable amplitude."""
+    """Fit each dimension alone; then fit those that gain together, with their best amplitudes."""
     linearised = linearise(linear_model, hypothesis.effects, hypothesis.sensor,
                            [np.column_stack(list(basis.values())) for basis in bases],
                            hypothesis.fit.filter_indices)
@@ -189,8 +192,8 @@ def discrepancy_instead_of_drift(linear_model: LinearModel, hypotheses: Sequence
     """
     Return the flexible term in place of a drift, where the term is more probable.
 
-    An unknown law of force or direction looks like a drift to the evidence, but a drift follows
-    nothing.
+    By the evidence, an unknown law of force or direction may look like a drift. A drift, however,
+    follows neither.
 
     Parameters
     ----------
@@ -272,7 +275,7 @@ def _stage_basis(time_s: np.ndarray, alpha_rad: np.ndarray, beta_rad: np.ndarray
                                           for factor in (np.ones_like(direction), *f)])
     since_s = time_since_move_s(time_s, rates_rad_s)
     dt_s = float(np.median(np.diff(time_s)))
-    # Creep follows the force late, by one time constant or another.
+    # Creep follows the force with a delay, by one of several time constants.
     late = [low_pass(component, tau_s, dt_s, {}) - component
             for tau_s in _CREEP_S for component in f]
     basis['since_move_s'] = np.column_stack([

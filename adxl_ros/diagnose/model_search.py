@@ -16,7 +16,8 @@
 The search for hypotheses: single effects, pairs and triples.
 
 The linear model ranks hundreds of hypotheses within a second. The best are fitted by
-re-simulation, shapes included, because a delay of 7 ms under a 40 Hz shaker is not linear.
+re-simulation, shapes included, because large effects are not linear. An example is a delay of 7 ms
+at a shaker of 40 Hz.
 """
 
 from __future__ import annotations
@@ -44,7 +45,8 @@ from adxl_ros.model.effects.base import Coefficient
 import numpy as np
 
 LARGEST_SET = 3
-"""Largest number of effects in a hypothesis. Chosen: more are not separable in one recording."""
+"""Largest number of effects in a hypothesis. Chosen: more effects are inseparable in one
+recording."""
 _SINGLES = 8
 """Number of single effects that are fitted, and whose pairs are tried. Chosen: run time."""
 _FURTHER = 4
@@ -81,7 +83,7 @@ def search(linear_model: LinearModel, show_progress: Callable[[float], None]
     linear_model
         The recordings and their sensitivities.
     show_progress
-        Takes the fraction that is done.
+        Called with the fraction that is done, 0 to 1.
 
     Returns
     -------
@@ -94,8 +96,8 @@ def search(linear_model: LinearModel, show_progress: Callable[[float], None]
     singles = _ranked(linear_model, [(i,) for i in _identifiable(linear_model)], null_fit)
     _fit_best(linear_model, singles[:_SINGLES], null_fit, hypotheses)
     show_progress(0.3)
-    # A nominal parameter file has neither zero-g nor scale factor of the unit, and their sum may
-    # look like neither.
+    # A nominal parameter file may be wrong in zero-g and scale factor, and the sum of both errors
+    # may look like neither of them.
     straight = [i for i in _identifiable(linear_model)
                 if effect_named(linear_model.variants[i].effect).diagnosis.straight_line]
     _fit_best(linear_model, _ranked(linear_model, list(combinations(straight, 2)), null_fit),
@@ -132,7 +134,7 @@ def _best(hypotheses: Hypotheses) -> Hypothesis:
 
 
 def _drift_shows(linear_model: LinearModel, best: Hypothesis) -> bool:
-    """Determine whether the residual of a hypothesis is more probable with a drift."""
+    """Determine whether a drift makes the residual of a hypothesis much more probable."""
     linearised = linearise(linear_model, best.effects, best.sensor)
     return linearised.fit(drifts=drift_effects()).log_evidence \
         - linearised.fit().log_evidence > WORTH_LOG_BAYES_FACTOR
@@ -165,8 +167,8 @@ def _model_about(linear_model: LinearModel, best: Hypothesis) -> LinearModel:
     """
     Return the linear model about a hypothesis: residuals and sensitivities at its fit.
 
-    Nuisance parameters that are no straight line stay at the parameter file, so that they are as
-    free as before.
+    Filter and latency stay those of the parameter file, unless they are effects of the hypothesis,
+    so that their tolerance is the same as before.
     """
     file_values = with_neutral(linear_model.baseline, best.sensor.effects).values
 
@@ -183,7 +185,7 @@ def _model_about(linear_model: LinearModel, best: Hypothesis) -> LinearModel:
 
 
 def _add_effect(linear_model: LinearModel, best: Hypothesis, hypotheses: Hypotheses) -> None:
-    """Add one effect to a hypothesis: on the linear model about it, then in full."""
+    """Add one effect to a hypothesis: rank on the linear model, then fit the best in full."""
     about = _model_about(linear_model, best)
     of_best = [i for i, v in enumerate(about.variants) if v.effect in best.effects]
     drifts = drifts_among(best.effects)
@@ -210,7 +212,7 @@ def _add_effect(linear_model: LinearModel, best: Hypothesis, hypotheses: Hypothe
 
 def _remove_each_effect(linear_model: LinearModel, best: Hypothesis, hypotheses: Hypotheses
                         ) -> None:
-    """Remove each effect of a hypothesis once: the first one may stand in for two others."""
+    """Fit a hypothesis without each of its effects; two effects may replace an earlier one."""
     start = dict(zip(best.names, best.values))
     present = {frozenset(effects) for effects in hypotheses}
     for effect in best.effects:
@@ -236,7 +238,7 @@ def _ranked(linear_model: LinearModel, sets: Sequence[tuple[int, ...]], null_fit
 
 def _fit_best(linear_model: LinearModel, ranked: Iterable[_RankedSet], null_fit: LinearFit,
               hypotheses: Hypotheses, drifts: tuple[str, ...] = ()) -> None:
-    """Fit the ranked sets in full, with drifts beside them, that gain enough."""
+    """Fit in full, together with drifts, those ranked sets that gain enough."""
     for gain, chosen, fit in ranked:
         variants = [linear_model.variants[i] for i in chosen]
         effects = (*(v.effect for v in variants), *drifts)

@@ -13,10 +13,11 @@
 # limitations under the License.
 
 """
-The next experiment: the manoeuvre that separates what the recordings could not.
+The next experiment: the manoeuvre that separates effects that the recordings cannot separate.
 
-Each manoeuvre is simulated with the best hypothesis, noise included, and its rivals are fitted to
-the result. Its worth is the log Bayes factor of the truth over the nearest rival, per minute.
+Each manoeuvre is simulated with the best hypothesis, noise included, and the inseparable effects
+are fitted to the simulation. The worth of a manoeuvre is the log Bayes factor of the best effect
+over the second one, per minute.
 """
 
 from __future__ import annotations
@@ -153,7 +154,7 @@ def propose_next_experiment(verdict: Verdict, not_covered: Sequence[str], seed: 
     if verdict.status == 'no_gap' and not not_covered:
         return None
     if verdict.status == 'unknown':
-        why = 'what is unknown shows elsewhere, too'
+        why = 'to show what the unknown part of the gap depends on'
     elif not_covered:
         why = f'this recording has no {", no ".join(not_covered)}'
     else:

@@ -15,8 +15,8 @@
 """
 Recorded noise compared with simulated noise: power by band, Allan deviation, likelihood.
 
-The rms of a gap is blind to noise-like effects. Here the residual is compared with noise that the
-simulator draws, for the baseline and for the verdict's sensor.
+The rms of a gap does not show noise-like effects. The residual is therefore compared with noise
+that the simulator draws.
 """
 
 from __future__ import annotations
@@ -30,32 +30,34 @@ from scipy.signal import periodogram, welch
 _BANDS = 5
 """Number of bands of frequency. Chosen: some half a decade each."""
 _LOWEST_EDGE_HZ = 0.05
-"""Upper edge of the lowest band is at least this, Hz. Chosen: 20 s."""
+"""Smallest frequency from which the edges of the bands are spaced, Hz. Chosen: a period of 20 s.
+The lowest band begins at 0."""
 _TIMES_S = (0.1, 1.0, 10.0)
-"""Averaging times of the Allan deviation, s. Chosen: one a decade."""
+"""Averaging times of the Allan deviation, s. Chosen: one for each decade."""
 _SEGMENT_S = 16.0
-"""Segment of the simulated spectrum, s. Chosen: some ten segments in three minutes."""
+"""Length of a segment of the simulated spectrum, s. Chosen: some ten segments in three minutes."""
 _LOWEST_POWER = 1e-6
-"""Smallest power of the simulated spectrum, by its largest. Chosen: above rounding errors."""
+"""Smallest power of the simulated spectrum, divided by its largest. Chosen: above rounding
+errors."""
 
 
 @dataclass(frozen=True)
 class NoiseComparison:
     """
-    Recorded noise by simulated noise, all axes together.
+    Recorded noise relative to simulated noise, all axes together.
 
     Attributes
     ----------
     band_edges_hz
         Edges of the k bands of frequency, Hz, (k + 1,).
     power_ratio
-        Recorded by simulated power of each band, (k,).
+        Recorded power divided by simulated power, for each band, (k,).
     averaging_times_s
         Averaging times of the Allan deviation, s, (j,).
     allan_ratio
-        Recorded by simulated Allan deviation, (j,).
+        Recorded Allan deviation divided by the simulated one, (j,).
     log_likelihood
-        Of the recorded spectrum under the simulated one (Whittle 1953).
+        Log likelihood of the recorded spectrum under the simulated one (Whittle 1953).
     simulated_std_mps2
         Rms of the simulated noise over samples and axes, m/s².
 
@@ -106,12 +108,14 @@ def compare_noise(residual_v: np.ndarray, simulated_v: np.ndarray, rate_hz: floa
     times_s = [t for t in _TIMES_S
                if t * rate_hz >= 2 and t * 10 < len(recorded) / rate_hz]
     return NoiseComparison(
-        tuple(edges_hz.tolist()),
-        tuple(float(power[band].sum() / simulated_power[band].sum()) for band in bands),
-        tuple(times_s),
-        tuple(_allan_ratio(recorded, simulated, round(t * rate_hz)) for t in times_s),
-        -float(np.sum(power[1:] / expected + np.log(expected))),
-        float(np.sqrt(np.mean(simulated ** 2))))
+        band_edges_hz=tuple(edges_hz.tolist()),
+        power_ratio=tuple(float(power[band].sum() / simulated_power[band].sum())
+                          for band in bands),
+        averaging_times_s=tuple(times_s),
+        allan_ratio=tuple(_allan_ratio(recorded, simulated, round(t * rate_hz))
+                          for t in times_s),
+        log_likelihood=-float(np.sum(power[1:] / expected + np.log(expected))),
+        simulated_std_mps2=float(np.sqrt(np.mean(simulated ** 2))))
 
 
 def _allan_ratio(recorded: np.ndarray, simulated: np.ndarray, count: int) -> float:

@@ -15,8 +15,7 @@
 """
 Effects that show in the statistics of the noise and not in the mean, each with its detector.
 
-An effect names its detector in its own file. What a detector estimates are the effect's
-parameters.
+An effect names its detector in its own file. A detector estimates the parameters of its effect.
 """
 
 from __future__ import annotations
@@ -43,8 +42,8 @@ _LINE_FEWEST_ORDINATES = 64
 """Fewest ordinates of a periodogram in which a line is looked for. Chosen: their level needs
 some."""
 _LINE_LOG_EXCESS = 14.0
-"""Log likelihood ratio of a line beyond the largest of all ordinates by chance. Chosen: exp(−14)
-is one in a million."""
+"""Log likelihood ratio of a line, above that of the largest ordinate by chance, from which it is a
+line. Chosen: exp(−14) is one in a million."""
 _LOCAL_ORDINATES = 201
 """Ordinates over which the local level of a periodogram is taken. Chosen: much wider than a
 line."""
@@ -63,25 +62,33 @@ _SPIKE_LOCAL_FEWEST = 9
 _SPIKE_LOG_BAYES_FACTOR = 10.0
 """Log Bayes factor of one isolated sample, rough: it only ranks detections."""
 _MAD_PER_STD = 0.6745
-"""Median absolute deviation of normal noise by its standard deviation."""
+"""Median absolute deviation of normal noise, divided by its standard deviation."""
 _NOISE_EXCESS = 1.2
-"""Noise by the stated noise from which it is excessive. Chosen: units differ by less."""
+"""Noise, divided by the stated noise, from which it is excessive. Chosen: units differ by less."""
 _COARSE_STEPS = 1.6
 """Distance of codes, in stated steps, from which codes are coarse. Chosen: between 1 and 2."""
+_SMALLEST_CODE_STEPS = 0.3
+"""Distance of two values, in stated steps, below which they are one code. Chosen: below half a
+step."""
+_NEAREST_CODES_RATIO = 1.5
+"""Distance of codes, divided by the smallest one, up to which no code lies between them. Chosen:
+between 1 and 2."""
 _COARSE_LOG_BAYES_FACTOR = 1e3
 """Log Bayes factor of coarse codes, rough: there is no other explanation."""
 _CODES_FEWEST = 8
 """Fewest distances between codes from which their step is estimated. Chosen: a median."""
 _RESTING_FEWEST = 500
-"""Fewest resting samples from which the level of the noise is estimated. Chosen: 3 %."""
+"""Fewest resting samples from which the level of the noise is estimated. Chosen: its standard
+deviation is then 3 %."""
 _LINE_REST_S = 10.0
-"""Shortest total rest in which a line that is no mains must show, s. Chosen: 0.1 Hz resolution."""
+"""Shortest total rest that can show a line of another frequency than the mains, s. Chosen: a
+resolution of 0.1 Hz."""
 _LEVEL_CELL = 0.02
-"""Width of a cell of levels, in parts of the range, in which spikes are counted. Chosen:
+"""Width of a level, as a share of the range of the output. Spikes are counted by level. Chosen:
 wider than the noise in a slow motion."""
 _LEVEL_RARITY = 4.0
-"""Spikes cluster at some levels, where these hold less than one by this of all samples. Tuned by
-hand on simulated recordings of the working seeds of the blind check."""
+"""Spikes cluster if the levels at which they occur hold less than 1/4, the inverse of this, of all
+samples. Tuned by hand on simulated recordings of the working seeds of the blind check."""
 _LEVEL_FEWEST = 10
 """Fewest spikes of which the levels are compared. Chosen: fewer say little."""
 _REPEAT_CHANCE = 1e-4
@@ -89,6 +96,13 @@ _REPEAT_CHANCE = 1e-4
 recordings."""
 _REPEAT_SHORTEST = 3
 """Shortest run of equal samples, samples. Chosen: two may be equal by rounding."""
+_REPEAT_PROBABILITY_ONE_AXIS = 0.05
+"""Smallest assumed probability that a sample of one axis equals the last one. Chosen: in
+10⁵ samples, chance then explains runs of up to 7."""
+_REPEAT_PROBABILITY_MORE_AXES = 1e-3
+"""The same for all of several axes. Chosen: in 10⁵ samples, runs of up to 3."""
+_REPEAT_LARGEST_PROBABILITY = 0.5
+"""Largest assumed probability of the same. Chosen: in 10⁵ samples, runs of up to 30."""
 _REPEAT_LOG_BAYES_FACTOR = 5.0
 """Log Bayes factor of one run of equal samples, rough: it only ranks detections."""
 
@@ -147,9 +161,11 @@ def repeated_samples(volts: np.ndarray, time_s: np.ndarray, used: np.ndarray, se
     same = np.concatenate([[False], (np.diff(volts, axis=0) == 0).all(axis=1)])
     # Neighbours are correlated, so that the root of the independent probability is safe.
     probability = float(np.sqrt(np.prod([np.mean(np.diff(v) == 0) for v in volts.T])))
-    probability = max(probability, 1e-3 if len(sensor.axes) > 1 else 0.05)
-    shortest = max(_REPEAT_SHORTEST, int(np.ceil(np.log(_REPEAT_CHANCE / len(volts))
-                                                 / np.log(min(probability, 0.5)))))
+    smallest = _REPEAT_PROBABILITY_MORE_AXES if len(sensor.axes) > 1 \
+        else _REPEAT_PROBABILITY_ONE_AXIS
+    probability = min(max(probability, smallest), _REPEAT_LARGEST_PROBABILITY)
+    by_chance = int(np.ceil(np.log(_REPEAT_CHANCE / len(volts)) / np.log(probability)))
+    shortest = max(_REPEAT_SHORTEST, by_chance)
     repeated = np.zeros(len(volts), bool)
     for begin, end in true_runs(same):
         if end - begin >= shortest:
@@ -163,13 +179,13 @@ def repeated_samples(volts: np.ndarray, time_s: np.ndarray, used: np.ndarray, se
         'rate_hz': np.array(len(repeats) / float(time_s[-1] - time_s[0])),
         'duration_s': np.array(max(duration_s + 1 / sensor.rate_hz, 1 / sensor.rate_hz))},
         _REPEAT_LOG_BAYES_FACTOR * len(repeats),
-        f'{len(repeats)} times the samples repeat, {duration_s:.3g} s long')]
+        f'samples repeat {len(repeats)} times, for {duration_s:.3g} s (median)')]
 
 
 def isolated_samples(volts: np.ndarray, time_s: np.ndarray, used: np.ndarray, sensor: Sensor
                      ) -> tuple[np.ndarray, Detection | None]:
     """
-    Find samples that leave the line between their neighbours and come back.
+    Find single samples that deviate from the straight line between their neighbours.
 
     Parameters
     ----------
@@ -196,7 +212,7 @@ def isolated_samples(volts: np.ndarray, time_s: np.ndarray, used: np.ndarray, se
     return used & ~spikes.any(axis=1), Detection(
         detected_effect(Detector.ISOLATED_SAMPLES),
         {'rate_hz': np.array(rate_hz), 'amplitude_v': size_v}, _SPIKE_LOG_BAYES_FACTOR * count,
-        f'{count} samples stand alone, by {size_v.max() * 1e3:.3g} mV')
+        f'{count} single samples deviate, by up to {size_v.max() * 1e3:.3g} mV (median by axis)')
 
 
 def residual_shows_spikes(spikes: Detection, residual_v: np.ndarray, used: np.ndarray,
@@ -204,7 +220,7 @@ def residual_shows_spikes(spikes: Detection, residual_v: np.ndarray, used: np.nd
     """
     Determine whether the residual of the best hypothesis shows the spikes of the recording.
 
-    Without this check the sensor's own motion may look like spikes.
+    Without this check, motion of the sensor may look like spikes.
 
     Parameters
     ----------
@@ -234,11 +250,11 @@ def _spikes(volts: np.ndarray, used: np.ndarray, sensor: Sensor
     near = _SPIKE_NEIGHBOUR
     deviation_v = volts - (np.roll(volts, near, 0) + np.roll(volts, -near, 0)) / 2
     isolated, size_v = np.zeros(volts.shape, bool), np.zeros(volts.shape[1])
-    # A return after repeated or missing samples is no spike.
+    # The first samples after repeated or missing ones may step, which is no spike.
     undisturbed = np.convolve(used, np.ones(4 * near + 1), 'same') > 4 * near
     for d, deviation in enumerate(deviation_v.T):
         std_v = np.nanmedian(np.abs(deviation[used])) / _MAD_PER_STD
-        # Motion deviates from the line, too, so that the scale around a sample counts as well.
+        # Motion also deviates from the line, so that a spike must exceed its surroundings, too.
         local_v = _local_std(np.nan_to_num(deviation),
                              round(max(sensor.rate_hz * _SPIKE_LOCAL_S, _SPIKE_LOCAL_FEWEST)))
         outside = (np.abs(deviation)
@@ -267,7 +283,7 @@ def _at_few_levels(volts: np.ndarray, spikes: np.ndarray) -> bool:
 
 
 def _local_std(values: np.ndarray, width: int) -> np.ndarray:
-    """Return a robust standard deviation of the values around each, by blocks, interpolated."""
+    """Return a robust standard deviation around each value, interpolated between blocks."""
     count = max(len(values) // width, 1)
     blocks = np.abs(values[:count * width]).reshape(count, -1)
     std = np.median(blocks, axis=1) / _MAD_PER_STD
@@ -296,10 +312,11 @@ def coarse_codes(volts: np.ndarray, sensor: Sensor) -> Detection | None:
     lost_bits = []
     for v in volts.T:
         distance_v = np.diff(np.unique(v[np.isfinite(v)]))
-        distance_v = distance_v[distance_v > sensor.lsb_v * 0.3]
+        distance_v = distance_v[distance_v > sensor.lsb_v * _SMALLEST_CODE_STEPS]
         if len(distance_v) < _CODES_FEWEST:
             return None
-        step_v = float(np.median(distance_v[distance_v < 1.5 * distance_v.min()]))
+        step_v = float(np.median(
+            distance_v[distance_v < _NEAREST_CODES_RATIO * distance_v.min()]))
         lost_bits.append(np.log2(step_v / sensor.lsb_v))
     bits = float(np.median(lost_bits))
     if bits < np.log2(_COARSE_STEPS):
@@ -355,7 +372,7 @@ def residual_detections(samples: NoiseSamples, sensor: Sensor) -> list[Detection
         A line, a level of noise, both or none.
 
     """
-    # The first differences take out a zero-g that drifts.
+    # First differences remove a zero-g that drifts.
     white = np.diff(_before_filter(samples.residual_v, sensor), axis=0)
     at_rest = samples.at_rest[2:]
     detections = [_line(white, at_rest, samples, sensor), _excess(white, at_rest, samples, sensor)]
@@ -374,7 +391,7 @@ def _excess(white: np.ndarray, at_rest: np.ndarray, samples: NoiseSamples, senso
     """Find noise above the level of drawn noise."""
     simulated = np.diff(_before_filter(samples.simulated_v, sensor), axis=0)
     enough_rest = at_rest.sum() > _RESTING_FEWEST
-    # In motion, effects that are not modelled would pass for noise.
+    # In motion, effects that are not modelled would look like noise, so that rests are preferred.
     chosen = at_rest if enough_rest else samples.used[2:]
     ratio = np.median(np.abs(white[chosen]), axis=0) \
         / np.median(np.abs(simulated[chosen]), axis=0)
@@ -390,7 +407,7 @@ def _excess(white: np.ndarray, at_rest: np.ndarray, samples: NoiseSamples, senso
         return None
     return Detection(detected_effect(Detector.NOISE_LEVEL), {'ratio': ratio - 1},
                      (len(white) + 1) * float(np.log(largest) ** 2),
-                     f'white noise is {largest:.2f} of what is stated')
+                     f'white noise is {largest:.2f} times the stated noise')
 
 
 def _spectral_level(white: np.ndarray, rate_hz: float) -> np.ndarray:
@@ -401,7 +418,11 @@ def _spectral_level(white: np.ndarray, rate_hz: float) -> np.ndarray:
 
 def _line(white: np.ndarray, at_rest: np.ndarray, samples: NoiseSamples, sensor: Sensor
           ) -> Detection | None:
-    """Find a line in the spectrum; one that is no mains frequency must show at rest, too."""
+    """
+    Find a line in the spectrum, None where chance explains it.
+
+    A line of another frequency than the mains must also show at rest.
+    """
     line = _strongest_line(white, samples, sensor)
     if line is None or line.effect != UNKNOWN:
         return line
@@ -429,13 +450,14 @@ def _strongest_line(white: np.ndarray, samples: NoiseSamples, sensor: Sensor
     mains_hz = _mains_frequency_hz(line_hz, sensor.rate_hz)
     if mains_hz is None:
         return Detection(UNKNOWN, {}, log_excess,
-                         f'a line at {line_hz:.2f} Hz, which is no mains frequency')
+                         f'the spectrum has a line at {line_hz:.2f} Hz, which is no mains '
+                         'frequency')
     turn = np.exp(-2j * np.pi * line_hz * samples.time_s)
     amplitude_v = 2 * np.abs(np.nanmean(samples.raw_residual_v * turn[:, None], axis=0))
     return Detection(detected_effect(Detector.MAINS_LINE), {
         'amplitude_v': amplitude_v, 'frequency_hz': np.array(mains_hz),
         'phase_rad': np.array(0.0)}, log_excess,
-        f'a line at {line_hz:.2f} Hz, {amplitude_v.max() * 1e3:.3g} mV')
+        f'the spectrum has a line at {line_hz:.2f} Hz, {amplitude_v.max() * 1e3:.3g} mV')
 
 
 def _mains_frequency_hz(line_hz: float, rate_hz: float) -> float | None:
@@ -449,7 +471,7 @@ def _mains_frequency_hz(line_hz: float, rate_hz: float) -> float | None:
 
 
 def _local_level(power: np.ndarray) -> np.ndarray:
-    """Return the mean of the ordinates around each, from their median."""
+    """Return the mean of the ordinates around each ordinate, estimated by their median."""
     width = _LOCAL_ORDINATES
     count = max(len(power) // width, 1)
     blocks = power[:count * width].reshape(count, -1) if len(power) >= width else power[None]

@@ -34,13 +34,14 @@ _REPEAT_DELAY_S = 10.0
 """Smallest delay of a repeat in the same recording, s. Chosen: beyond the correlation of a move
 with itself."""
 _REPEAT_STEPS = 5.0
-"""Rms deviation between repeats, in steps of the encoder. Chosen: several times the
-rounding of both."""
+"""Largest rms angle between the directions of two repeats, in steps of the encoder. Chosen:
+several times the rounding of both."""
 _SMALLEST_RESOLUTION_RAD = 1e-5
 """Smallest step of the encoder that is assumed for repeats, rad. Chosen: rounding errors of
 stated angles."""
 _REPEAT_MOTION = 0.05
-"""Standard deviation of the direction of gravity in a repeat, rad. Chosen: it must move."""
+"""Smallest standard deviation of the direction of gravity in a repeat, rad. Chosen: above the
+changes of a rest."""
 
 
 @dataclass(frozen=True)

@@ -20,10 +20,10 @@ random walk it is y = n + w + d. Here n is an AR(1) sequence with a = exp(−dt/
 d is the walk. Then (1 − aL)(1 − L)·y is an MA(2). Its factor follows from its spectrum (Brockwell
 and Davis 1991, section 3.2).
 
-Poles and zeros in turn, one pair a decade, whiten 1/f noise below the corner where it meets the
-white noise (Corsini and Saletti 1988, IEEE Trans. Instrum. Meas. 37). The variance of the
-innovations is fitted. The filter then only depends on the ratio of drift and noise, which is
-searched on a grid.
+Alternating poles and zeros, one pair a decade, whiten 1/f noise below its corner, where its
+density equals that of the white noise (Corsini and Saletti 1988, IEEE Trans. Instrum. Meas. 37).
+The variance of the innovations is fitted. The filter then depends only on the ratio of drift and
+noise, which is searched on a grid.
 """
 
 from __future__ import annotations
@@ -49,11 +49,12 @@ USUAL_DENSITY = 1e-5
 _DENSITY_DECADES = 1.0
 """Prior standard deviation of the logarithm of the density, decades. Chosen: a factor of ten."""
 _LOWEST_NOISE_V = 1e-7
-"""Smallest standard deviation of the noise, V: whitening needs some. Chosen: below any ADC."""
+"""Smallest standard deviation of the noise, V, because whitening needs noise. Chosen: below that
+of any ADC."""
 _TOP_OF_RATE = 0.25
-"""Highest frequency of the corner of 1/f noise, by the sample rate. Chosen: half of Nyquist."""
+"""Highest corner frequency of 1/f noise, divided by the sample rate. Chosen: half of Nyquist."""
 _UNFILTERED_TOP_OF_RATE = 0.4
-"""Highest pole of 1/f noise that bypasses the RC filter, by the sample rate. Chosen: below
+"""Highest pole of 1/f noise that bypasses the RC filter, divided by the sample rate. Chosen: below
 Nyquist."""
 
 
@@ -63,7 +64,7 @@ def drift_effects() -> tuple[str, ...]:
 
 
 def drifts_among(effects: Iterable[str]) -> tuple[str, ...]:
-    """Return the effects, of those given, that let the zero-g drift."""
+    """Return those of the given effects that let the zero-g drift."""
     return tuple(e for e in effects if effect_named(e).diagnosis.drift)
 
 
@@ -139,7 +140,7 @@ def whiteners(sensor: Sensor, d: int, dt_s: float, span_s: float) -> list[Whiten
     step_std_v = sensor.lsb_v / np.sqrt(12)
     scale = float(sensor.scale_v_per_g[d])
     walks = _walk_whiteners(a, std_v, step_std_v, scale, dt_s)
-    # The MA(1) of noise and steps without drift.
+    # Noise and ADC steps without drift are an ARMA(1, 1) sequence; this is the zero of its MA.
     healthy_zero = -_spectral_factor(
         std_v ** 2 * (1 - a * a) * _power(np.ones(1), 1)
         + step_std_v ** 2 * _power(np.array([1, -a]), 1), 1)[1]
@@ -156,8 +157,8 @@ def whiteners(sensor: Sensor, d: int, dt_s: float, span_s: float) -> list[Whiten
         if corner_hz > top_hz:
             break
     if a:
-        # 1/f noise that bypasses the RC filter covers all other noise where it exceeds it at the
-        # filter's corner.
+        # 1/f noise that bypasses the RC filter is the largest noise at all frequencies if it is
+        # the largest at the filter's corner.
         zeros, poles = _flicker_zeros_and_poles(_UNFILTERED_TOP_OF_RATE / dt_s,
                                                 int(np.ceil(np.log10(span_s / dt_s))), dt_s)
         lowest = np.sqrt(white_v2_per_hz / (2 * np.pi * rc_s)) / scale
@@ -184,7 +185,11 @@ def _walk_whiteners(a: float, std_v: float, step_std_v: float, scale_v_per_g: fl
 
 def _flicker_zeros_and_poles(top_hz: float, decades: int, dt_s: float
                              ) -> tuple[np.ndarray, np.ndarray]:
-    """Return zeros and poles, one pair a decade, that rise as the root of frequency to the top."""
+    """
+    Return zeros and poles, one pair a decade from `top_hz` down, of a filter for 1/f noise.
+
+    Its gain rises with the root of the frequency.
+    """
     corners_hz = top_hz * 10.0 ** -np.arange(decades)
     return (np.exp(-2 * np.pi * dt_s * corners_hz * 10 ** -0.5),
             np.exp(-2 * np.pi * dt_s * corners_hz))
@@ -215,8 +220,8 @@ def fitted_density(whitener: Whitener, variance_v2: float, dt_s: float, scale_v_
     Returns
     -------
     float
-        Density of the grid for a random walk, g/√s. Root of the one-sided density at 1 Hz for 1/f
-        noise, g/√Hz.
+        For a random walk the density of the grid, g/√s. For 1/f noise the root of the fitted
+        one-sided density at 1 Hz, g/√Hz.
 
     """
     if whitener.spectrum is DriftSpectrum.RANDOM_WALK:
@@ -275,7 +280,7 @@ def neighbouring_filters(filters: Sequence[Whitener], best: int) -> list[Whitene
 
 
 def _power(polynomial: np.ndarray, order: int) -> np.ndarray:
-    """Return |p(L)|² by powers of L from −order to order."""
+    """Return the coefficients of |p(L)|², of the powers of L from −order to order."""
     square = np.convolve(polynomial, polynomial[::-1])
     return np.pad(square, order - (len(polynomial) - 1))
 

@@ -15,9 +15,9 @@
 """
 Where the gap lies: mean and variance of the residual over axis and dimension, tested together.
 
-The largest of all statistics under random signs of whole blocks decides (max-T; Westfall and Young
-1993). Otherwise 200 cells would give ten false ones. The power in bands of frequency is compared
-with that of the stated noise.
+Each statistic is compared with the largest of all statistics under random signs of whole blocks
+(max-T; Westfall and Young 1993). Separate tests at 5 % would report ten of 200 cells by chance.
+The power in bands of frequency is compared with that of the stated noise.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _DRAWS = 500
 _BLOCK_S = 2.0
 """Length of the blocks that change sign together, s. Chosen: beyond the correlation of noise."""
 _FEWEST_BLOCKS = 3
-"""Fewest blocks of a cell that is tested. Chosen: signs of fewer have four patterns."""
+"""Fewest blocks of a cell that is tested. Chosen: the signs of two blocks have four patterns."""
 SIGNIFICANT_P = 0.05
 """Family-wise probability below which a cell is reported. Chosen: the usual level."""
 _BANDS_HZ = (0.0, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 500.0)
@@ -84,9 +84,9 @@ class ResidualCell:
     low, high
         Range of the dimension, in its unit.
     mean_mps2
-        Mean residual; of variance and power the root of the excess, m/s².
+        Mean residual, m/s². For variance and power: root of the excess, m/s².
     floor_units
-        The same by the noise floor.
+        `mean_mps2` divided by the noise floor.
     share
         Share of the squares of the residual.
     p
@@ -118,7 +118,7 @@ class _Candidate(NamedTuple):
 
 
 def dimensions(comparison: BaselineComparison) -> dict[str, np.ndarray]:
-    """Return what the residual is mapped over by name, (n,) each, without what is constant."""
+    """Return the dimensions of the map by name, (n,) each, without constant ones."""
     time_s, motion = comparison.time_s, comparison.motion
     values = {'time_s': time_s - time_s[0]}
     if comparison.reference is Reference.STAGE:
@@ -142,7 +142,7 @@ def dimensions(comparison: BaselineComparison) -> dict[str, np.ndarray]:
 
 
 def not_covered(comparisons: Sequence[BaselineComparison]) -> list[str]:
-    """Name what no recording covers."""
+    """Name, for people, the dimensions that no recording covers."""
     covered: set[str] = set()
     for comparison in comparisons:
         covered |= set(dimensions(comparison))
@@ -220,11 +220,11 @@ def _cells_over_dimensions(comparison: BaselineComparison, residual: np.ndarray,
     p = (1 + (drawn.max(axis=0)[None] >= statistic[:, None]).sum(axis=1)) / (_DRAWS + 1)
     total = float(np.sum(residual ** 2))
     for i, c in enumerate(candidates):
-        of_mean = c.statistic == 'mean'
-        if not enough[i] or (not of_mean and mean[i] <= 0):
+        is_mean = c.statistic == 'mean'
+        if not enough[i] or (not is_mean and mean[i] <= 0):
             continue
-        square = mean[i] ** 2 if of_mean else mean[i]
-        size_mps2 = mean[i] if of_mean else np.sqrt(mean[i])
+        square = mean[i] ** 2 if is_mean else mean[i]
+        size_mps2 = mean[i] if is_mean else np.sqrt(mean[i])
         yield ResidualCell(c.axis, c.dimension, c.statistic, c.low, c.high, float(size_mps2),
                            float(size_mps2 / floor_mps2),
                            float(min(square * size[i] / total, 1.0)), float(p[i]))

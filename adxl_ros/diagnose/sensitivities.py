@@ -28,23 +28,24 @@ from adxl_ros.model.sensor import Sensor
 import numpy as np
 
 PRIOR_WIDTH = 5.0
-"""Prior standard deviation of a coefficient by its typical size. Chosen: faults are larger than
-typical values. Smaller amplitudes have a prior of their own (`evidence.AMPLITUDES`)."""
+"""Prior standard deviation of a coefficient, divided by its typical size. Chosen: faults are
+larger than typical values. `evidence.AMPLITUDES` adds smaller amplitudes to the prior."""
 _SHAPE_FACTORS = (0.2, 1.0, 5.0)
-"""Values of a shape parameter that are tried, by the typical value. Chosen: fits reach the values
-between."""
+"""Values of a shape parameter that are tried, divided by its typical value. Chosen: fits reach the
+values between."""
 _SMOOTH_STEP = 0.2
-"""Step of a smooth parameter by its typical size. Chosen: small for a fault."""
+"""Step of a smooth parameter, divided by its typical size. Chosen: smaller than most faults."""
 _ROUGH_STEPS = (1.0, 4.0, 16.0)
-"""Steps of a parameter that is not smooth, by its typical size. Chosen: the derivative at a play
-of 1 mrad says little about one of 15 mrad."""
+"""Steps of a parameter that is not smooth, divided by its typical size. Chosen: the derivative at
+a play of 1 mrad does not predict a play of 15 mrad."""
 _CLIPPED_SHARES = (0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.3)
-"""Shares of the samples that a limit clips where it is tried. Chosen: factors of 1.5
-to 2.5."""
+"""Shares of the samples that are clipped by the limits that are tried. Chosen: neighbours differ
+by factors of 1.5 to 2.5."""
 _FIT_STEP = 0.02
-"""Step of a smooth parameter at its fitted value, by its typical size. Chosen: a derivative."""
+"""Step of a smooth parameter at its fitted value, divided by its typical size. Chosen: small
+enough for a derivative."""
 _ROUGH_FIT_STEP = 0.3
-"""The same of a parameter that is not smooth. Chosen: wider than the noise of its derivative."""
+"""The same for a parameter that is not smooth. Chosen: wide enough for a steady derivative."""
 _SMALLEST_V = 1e-9
 """Change of the output, V, that is a rounding error."""
 
@@ -73,7 +74,8 @@ class Variant:
         By axis: numbers of the coefficients that it follows, and the sensitivities, V per unit,
         (n, numbers).
     limit_start
-        Where the fit of a limit starts, by coefficient; its columns are the change by that limit.
+        Only for an effect with a limit: first values of its fit, by coefficient. The columns are
+        then the change of the output by these values, V.
 
     """
 
@@ -112,7 +114,7 @@ def variants(simulate: Simulate, sensor: Sensor, effect: Effect, baseline_v: np.
     baseline_v
         Simulated output of the baseline, V, (n, m).
     pose_known
-        Whether the recording has a reference; if not, the means mean nothing.
+        Whether the recording has a reference. Without one, only changes of the output count.
 
     Yields
     ------
@@ -125,7 +127,8 @@ def variants(simulate: Simulate, sensor: Sensor, effect: Effect, baseline_v: np.
         if not modelled:
             yield from _limit_variants(simulate, sensor, effect, limits(effect)[0], baseline_v)
         return
-    # An effect with a shape is linear beside the shape; one of the baseline keeps its shape.
+    # An effect with a shape parameter is nearly linear in its sizes. An effect of the baseline
+    # keeps its shape.
     rough = not effect.smooth and not any(p.role is Role.SHAPE for p in effect.parameters)
     for shape in [{}] if modelled else shapes(effect):
         for step in _ROUGH_STEPS if rough else (_SMOOTH_STEP,):
@@ -139,7 +142,7 @@ def variants(simulate: Simulate, sensor: Sensor, effect: Effect, baseline_v: np.
 
 def _limit_variants(simulate: Simulate, sensor: Sensor, effect: Effect, limit: Parameter,
                     baseline_v: np.ndarray) -> Iterator[Variant]:
-    """Try a limit where it clips small parts of the samples: by axis, and one for all axes."""
+    """Try limits that clip small shares of the samples, by axis and for all axes together."""
     axes = sensor.axes
     with_effect = with_neutral(sensor, [effect.name])
     names = names_of(replace(effect, parameters=(limit,)), axes)
@@ -248,7 +251,7 @@ def sensitivities_at(simulate: Simulate, sensor: Sensor, names: Sequence[Coeffic
     """
     Differentiate the output by p coefficients at their values.
 
-    Coefficients of one parameter change together, for an axis follows its own alone.
+    Coefficients of one parameter change together, because each axis only follows its own one.
 
     Parameters
     ----------

@@ -15,10 +15,11 @@
 """
 Tests of each effect alone: gain of evidence, its probability without a gap, and visibility.
 
-They use the linear model at the baseline, with the noise of the null hypothesis. Chi-square is
-wrong for the best of many effects, and where a width or a frequency means nothing at zero. A
-parametric bootstrap gives the probability instead: the largest gain of all candidates in drawn
-recordings without a gap. For linear columns only their products with the noise are drawn.
+They use the linear model at the baseline, with the noise of the null hypothesis. A chi-square test
+does not hold for the best of many effects, or where a shape parameter is undefined without the
+effect. A parametric bootstrap gives the probability instead, from the largest gain of all
+candidates in drawn recordings without a gap. In a linear model, drawing the products of columns
+and noise is enough.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ class SingleEffectTest:
     p
         Probability that any effect gains as much without a gap.
     visibility
-        Share of the whitened signal that nuisance parameters cannot imitate, 0 to 1.
+        Share of the effect's whitened signal that nuisance parameters cannot imitate, 0 to 1.
 
     """
 
@@ -101,8 +102,8 @@ def _marginal_products(linear_model: LinearModel) -> tuple[np.ndarray, np.ndarra
     """
     Return products of the whitened columns with the noise of the null hypothesis.
 
-    They are the Gram matrix of the columns, the same with the nuisance parameters eliminated, and
-    the products with the residual, nuisance parameters eliminated.
+    Return the Gram matrix of the columns, this matrix with the nuisance parameters eliminated, and
+    the products of the columns and the residual with the nuisance parameters eliminated.
     """
     prior_std, bounds = linear_model.prior(())
     nuisances = np.array(linear_model.nuisance_ids())

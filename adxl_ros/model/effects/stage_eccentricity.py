@@ -37,8 +37,8 @@ EFFECT = Effect(
     place=Place.STAGE,
     parameters=tuple(
         Parameter(f'{joint}_{wave}_rad', 'rad', -0.2, 0.2, 1e-3,
-                  'physics: a disc of 20 mm that is 20 um off its axis',
-                  f'true {joint} minus the encoder, part of the {wave}', '')
+                  'physics: a disc of radius 20 mm, 20 um off its axis',
+                  f'true {joint} minus the encoder, amplitude of the {wave}', '')
         for joint in ('alpha', 'beta') for wave in ('sine', 'cosine')),
     apply=apply,
     needs=(Need.STAGE,),
