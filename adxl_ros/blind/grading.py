@@ -205,10 +205,10 @@ def true_parameters(label: Label) -> dict[str, float]:
         noise = dict(zip(unit.axes, zip(unit.noise_g_per_rthz, unit.stated_noise_g_per_rthz)))
         if name == 'bias':
             true |= {f'bias.offset_v.{d}': zero[d] + v * scale[d] - 2.5
-                    for d, v in by_axis.items()}
+                     for d, v in by_axis.items()}
         elif name == 'scale_factor':
             true |= {f'scale_factor.offset_v_per_g.{d}': scale[d] * (1 + v) - 1.0
-                    for d, v in by_axis.items()}
+                     for d, v in by_axis.items()}
         elif name == 'noise_excess':
             true |= {f'noise_excess.ratio.{d}': math.sqrt(
                 noise[d][0] ** 2 + (v / scale[d]) ** 2 / _NOISE_BAND_HZ) / noise[d][1] - 1
@@ -221,7 +221,7 @@ def true_parameters(label: Label) -> dict[str, float]:
             true |= {f'lever_arm.{d}_m': v for d, v in zip('xyz', w)}
         elif name == 'stage_offset':
             true |= {'stage_offset.alpha_rad': w[0] + stage[0],
-                    'stage_offset.beta_rad': w[1] + stage[3]}
+                     'stage_offset.beta_rad': w[1] + stage[3]}
         elif name == 'base_tilt':
             true |= {'base_tilt.x_rad': -w[1], 'base_tilt.y_rad': w[0]}
         elif name == 'backlash':

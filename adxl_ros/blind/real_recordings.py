@@ -121,13 +121,13 @@ def _smoothed_force(arm: Arm, folder: Path) -> Path:
     return path
 
 
-def without(parameters: dict[str, Any], effect: str | None) -> dict[str, Any]:
+def without(content: dict[str, Any], effect: str | None) -> dict[str, Any]:
     """
     Delete an effect from parameters, with its rows of the covariance.
 
     Parameters
     ----------
-    parameters
+    content
         Content of the parameter file.
     effect
         The effect; None deletes nothing.
@@ -138,7 +138,7 @@ def without(parameters: dict[str, Any], effect: str | None) -> dict[str, Any]:
         Content of the new parameter file.
 
     """
-    keys = dict(parameters['/**']['ros__parameters'])
+    keys = dict(content['/**']['ros__parameters'])
     keys['effects'] = [name for name in keys['effects'] if name != effect]
     keys.pop(effect, None)
     names = keys.get('covariance_names', [])
@@ -217,7 +217,7 @@ def _row(arm: Arm, effect: str | None, result: diagnosis_runs.Result) -> dict[st
         rows = {f'{effect}.{name}.{axis}': value for axis, value in by_axis.items()} or {
             f'{effect}.{name}': values}
         coefficients |= {key: {'deleted': value, 'found': answer.parameters.get(key)}
-                    for key, value in rows.items()}
+                         for key, value in rows.items()}
     report = result['report'] or {}
     against = 'itself, calibrated and smoothed' if arm.itself else \
         arm.sim.name if arm.sim else 'the stage'

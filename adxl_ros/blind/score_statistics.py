@@ -95,7 +95,7 @@ def curve(strength: np.ndarray, detected: np.ndarray, by_chance: float) -> dict[
         take = rng.integers(len(x), size=len(x))
         drawn.append(_logistic(x[take], y[take], by_chance, fitted[:1]))
     result: dict[str, Any] = {'bins': bins(strength, detected), 'by_chance': by_chance,
-                           'middle': fitted[0], 'width': fitted[1], 'missed': fitted[2]}
+                              'middle': fitted[0], 'width': fitted[1], 'missed': fitted[2]}
     for level in (0.5, 0.9):
         value = _reaches(fitted, by_chance, level)
         resampled_levels = [_reaches(fit, by_chance, level) for fit in drawn]

@@ -162,7 +162,7 @@ def draw(nominal: Sensor, number: int, kinds: Sequence[tuple[str, str, str]], se
     sigma = step / np.sqrt(12)
     levels = StageError(0.0, sigma) if stage == STAGES[0] else StageError(sigma)
     bound = error_statistics.sweep_bound(truth, poses, true_rad, levels,
-                                (*full_model.default_terms(axes), *_extra(stage)))
+                                         (*full_model.default_terms(axes), *_extra(stage)))
     held_out = _random_poses(truth, rng)
     tilt = error_statistics.angle_errors(fit.fitted, bound, *held_out)
     force, force_std = error_statistics.force_errors(fit.fitted, truth, *held_out)

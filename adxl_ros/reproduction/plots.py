@@ -159,9 +159,9 @@ def draw_components(path: str | os.PathLike, truth: Sensor, fitted: Sensor,
         response.plot(reach, volts, label=label, **style)
         difference.plot(reach, 1e3 * (volts - actual), label=label, **style)
     response.set(xlabel='acceleration along x, g', ylabel='x output, V',
-              title='fig. 13: response at alpha = 45°, beta = 90°')
+                 title='fig. 13: response at alpha = 45°, beta = 90°')
     difference.set(xlabel='acceleration along x, g', ylabel='minus the actual response, mV',
-              title='the same, minus the actual response')
+                   title='the same, minus the actual response')
     response.legend(fontsize=8)
     write_plot(figure, path)
 

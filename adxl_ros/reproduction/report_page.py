@@ -152,7 +152,7 @@ def _to_reach(units: Sequence[Unit]) -> str:
     lines.append('| reduction of the rms error of alpha, 15° and more from ±90°, % | – | '
                  + ' | '.join(f'{r:.2f}' for r in reduced[1:]) + ' |')
     for text, z_of in (('acceleration', lambda errors: np.ravel(errors.force_z)),
-                     ('coefficients', lambda errors: errors.coefficient_z)):
+                       ('coefficients', lambda errors: errors.coefficient_z)):
         cells = []
         for parts in over(z_of):
             z = np.concatenate(parts)
@@ -188,8 +188,8 @@ def _directions(units: Sequence[Unit]) -> str:
     lines = [f'Error of β_x, ° rms over units, base level to 0.1° (steps of {step:g}°):', '',
              *_head('largest output', 'parabola through the outputs', 'null crossings')]
     rms_deg = [np.degrees(_rms(np.array([getattr(u.directions, name) - u.directions.truth_rad
-                                     for u in units])))
-           for name in ('largest_rad', 'parabola_rad', 'null_rad')]
+               for u in units])))
+               for name in ('largest_rad', 'parabola_rad', 'null_rad')]
     return '\n'.join([*lines, _row([f'{value:.3f}' for value in rms_deg])])
 
 

@@ -110,10 +110,10 @@ def evaluate(nominal: Sensor, stage: experiments.Stage, seed: int) -> Unit:
         truth, run.poses, run.true_rad, StageError(truth.stage_resolution_rad / np.sqrt(12)),
         (*full_model.default_terms(truth.axes), *full_model.GAUGE))
     random_rad = np.column_stack([np.arccos(rng.uniform(-1, 1, RANDOM_POSES)),
-                                rng.uniform(0, 2 * np.pi, RANDOM_POSES)])
+                                 rng.uniform(0, 2 * np.pi, RANDOM_POSES)])
     angles_rad = {'random': random_rad, **{name: np.radians(deg) for name, deg in RUNS.items()}}
     poses_of = {name: experiments.poses_at(truth, rad, seed + (i + 1) * 1_000_003)[:2]
-            for i, (name, rad) in enumerate(angles_rad.items())}
+                for i, (name, rad) in enumerate(angles_rad.items())}
     shaken = experiments.shaken(truth, seed)
     models = {}
     for name, fitted in run.fitted.items():
@@ -121,8 +121,8 @@ def evaluate(nominal: Sensor, stage: experiments.Stage, seed: int) -> Unit:
                   for key, poses in poses_of.items()}
         error, std = error_statistics.force_errors(fitted, truth, *poses_of['random'])
         models[name] = ModelErrors(angles.pop('random'), angles, error / std,
-                              _coefficients(fitted, truth),
-                              error_statistics.motion_errors(fitted, *shaken)[0])
+                                   _coefficients(fitted, truth),
+                                   error_statistics.motion_errors(fitted, *shaken)[0])
     return Unit(models, misalignment.search(truth, seed))
 
 

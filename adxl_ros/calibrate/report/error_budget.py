@@ -231,13 +231,13 @@ def error_budgets(errors: HeldOutErrors, poses: Poses, stage: Sensor | None = No
     accel = tilt = _NO_BUDGET
     if used.any():
         predicted = _PredictedParts(*(_axis_variance(covariance, axes, used)
-                              for covariance in covariances[:3]))
+                                    for covariance in covariances[:3]))
         accel = _budget((measured.force_mps2 - corrected)[used][:, axes],
                         float(np.mean(measured.accel_mps2[used] ** 2)), predicted,
                         _unexplainable(scatter, 'accel', predicted))
     if has_tilt.any():
         predicted = _PredictedParts(*(_tilt_variance(covariance, reference, gravity, has_tilt)
-                              for covariance in covariances[:3]))
+                                    for covariance in covariances[:3]))
         tilt = _budget(angle_between(measured.force_mps2, corrected)[has_tilt],
                        float(np.mean(measured.tilt_rad[has_tilt] ** 2)), predicted,
                        _unexplainable(scatter, 'tilt', predicted))
