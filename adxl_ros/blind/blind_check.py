@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
+from contextlib import AbstractContextManager
 from datetime import date
 from functools import partial
 import json
@@ -40,8 +41,8 @@ from adxl_ros.blind.scores import Trial
 from adxl_ros.blind.trials import Label
 from adxl_ros.errors import UserError
 
-Show = Callable[[str], Callable[[float], None]]
-"""Receives the name of a stage; returns what receives the fraction that is finished."""
+Show = Callable[[str], AbstractContextManager[Callable[[float], None]]]
+"""Receives the name of a stage; gives a context with what receives the finished fraction."""
 
 
 def draw(folder: Path, seed: int | None, count: int, pool: Executor,
@@ -105,7 +106,7 @@ def score(folder: Path, command: Sequence[str] | None, pool: Executor,
     pool
         Works in parallel.
     show
-        Receives the name of a stage; returns what receives the fraction that is finished.
+        Receives the name of a stage; gives a context with what receives the finished fraction.
 
     Returns
     -------
@@ -124,7 +125,8 @@ def score(folder: Path, command: Sequence[str] | None, pool: Executor,
     label_commitment.remove_drawn(folder)
     label_commitment.refuse_encrypted(folder)
     # Labels may be on another machine: the diagnosis does not need them.
-    results = diagnosis_runs.diagnose_all(folder, command, pool, show('diagnose'))
+    with show('diagnose') as advance:
+        results = diagnosis_runs.diagnose_all(folder, command, pool, advance)
     version = (folder / 'reports' / 'version.txt').read_text()
     committed = label_commitment.committed_labels(folder)
     labels = committed.labels
@@ -132,7 +134,8 @@ def score(folder: Path, command: Sequence[str] | None, pool: Executor,
     if missing:
         raise UserError(f'{folder / "recordings"}: {missing[0]}.csv is missing, {len(missing)} '
                         'of the committed recordings in all; a check needs all of them')
-    held_out = _held_out(folder, labels, results, pool, show('held out'))
+    with show('held out') as advance:
+        held_out = _held_out(folder, labels, results, pool, advance)
     answers = [grading.answer(results[label.name]) for label in labels]
     graded = [Trial(label, answer, held_out[label.name])
               for label, answer in zip(labels, answers)]

@@ -52,7 +52,7 @@ class Answer:
         Probability of the verdict by the report.
     hypotheses
         Effects and probability of each hypothesis.
-    parameters
+    parameters : dict
         Value, and ends of the 90 % interval, by parameter.
     seconds
         Run time, s.

@@ -49,7 +49,7 @@ class Arm:
     ----------
     recording
         The recording.
-    parameters
+    parameters : dict
         Content of the parameter file.
     sim
         Recording of another simulator's force; None without.

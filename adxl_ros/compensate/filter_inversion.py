@@ -90,7 +90,7 @@ def undo(volts: np.ndarray, time_s: np.ndarray, rc_s: np.ndarray, rate_hz: float
 
 
 def undo_blocks(blocks: Iterable[tuple[Token, np.ndarray, np.ndarray]], rc_s: np.ndarray,
-                  rate_hz: float) -> Iterator[tuple[Token, np.ndarray]]:
+                rate_hz: float) -> Iterator[tuple[Token, np.ndarray]]:
     """
     Undo the filter block by block, with the result of `undo` for the whole.
 

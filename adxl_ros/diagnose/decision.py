@@ -344,8 +344,8 @@ def _discrepancy_is_unknown(findings: Findings) -> bool:
     """Determine whether the flexible term shows more than an error of the form of an effect."""
     best, term = findings.hypotheses[0], findings.discrepancy
     large = term.rms_mps2 > max(UNKNOWN_SHARE_OF_NOISE * findings.noise_mps2,
-                                 UNKNOWN_SHARE_OF_EXPLAINED * findings.explained_mps2,
-                                 findings.code_step_mps2)
+                                UNKNOWN_SHARE_OF_EXPLAINED * findings.explained_mps2,
+                                findings.code_step_mps2)
     form_error = bool(best.effects) and not drifts_among(best.effects) and \
         findings.unexplained_mps2 <= FORM_SHARE_OF_EXPLAINED * findings.explained_mps2
     return term.log_bayes_factor > UNKNOWN_LOG_BAYES_FACTOR and large and not form_error

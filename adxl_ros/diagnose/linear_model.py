@@ -105,7 +105,7 @@ class LinearModel:
 
     @property
     def baseline(self) -> Sensor:
-        """The baseline of the first recording."""
+        """Return the baseline of the first recording."""
         return self.comparisons[0].sensor
 
     @property
@@ -115,7 +115,7 @@ class LinearModel:
 
     @property
     def library_size(self) -> int:
-        """Number of effects that have something to act on."""
+        """Return the number of effects that have something to act on."""
         return len({v.effect for v in self.variants})
 
     def nuisance_ids(self) -> list[int]:

@@ -127,7 +127,7 @@ class Recording:
 
     @property
     def stream_info(self) -> StreamInfo:
-        """What the recording states about its sensor."""
+        """Return what the recording states about its sensor."""
         return StreamInfo(self.info, self.path)
 
     @property

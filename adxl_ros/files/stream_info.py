@@ -55,13 +55,13 @@ class StreamInfo:
     where: str
 
     @property
-    def format(self) -> str:
-        """Version of the recording format."""
+    def format_version(self) -> str:
+        """Return the version of the recording format."""
         return self.texts.get('format', FORMAT)
 
     @property
     def serial(self) -> str:
-        """Serial number of the unit; `NO_UNIT` where none is stated."""
+        """Return the serial number of the unit; `NO_UNIT` where none is stated."""
         return self.texts.get('serial', NO_UNIT)
 
     @property

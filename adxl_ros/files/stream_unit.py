@@ -47,9 +47,9 @@ def check_unit(info: StreamInfo, axes: str, sensor: Sensor) -> None:
         The format version is unknown, or the serial number, the axes or a nominal value differs.
 
     """
-    if info.format != FORMAT:
-        raise UserError(f'{info.where}: format version {info.format}, but this package reads '
-                        f'version {FORMAT}; update the package')
+    if info.format_version != FORMAT:
+        raise UserError(f'{info.where}: format version {info.format_version}, but this package '
+                        f'reads version {FORMAT}; update the package')
     _check_serial(info, sensor)
     if axes != sensor.axes:
         raise UserError(f'{info.where}: samples of the axes {axes}, but the parameters of '

@@ -223,7 +223,7 @@ class IioLink:
         level, text = self._condition()
         clock = self._stamper.statistics()
         return LinkStatus(level, text, (Statistics(self._connections, self._repeated), clock),
-                      clock_events(clock))
+                          clock_events(clock))
 
     def close(self) -> None:
         """Close the device."""

@@ -142,7 +142,7 @@ class Statistics:
 
     frames: int
     bad_frames: int
-    bytes: int
+    bytes: int  # noqa: A003
     skipped_bytes: int
     held_back: int
     repeated: int

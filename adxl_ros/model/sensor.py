@@ -117,7 +117,7 @@ class Sensor:
     adc_vref_v: float = _nominal('sensor.adc_vref_v', 'full scale of the ADC', 'V', 0.1, 100.0)
     rate_hz: float = _nominal('sensor.rate_hz', 'sample rate', 'Hz', 0.01, 100000.0)
     range_g: float = _nominal('sensor.range_g', 'measuring range by the datasheet', 'g',
-                             0.1, 1000.0)
+                              0.1, 1000.0)
     local_gravity_mps2: float = _nominal(
         'sensor.local_gravity_mps2', 'gravity where the sensor is', 'm/s^2', 9.7, 9.9)
     z_sign: int = _nominal(

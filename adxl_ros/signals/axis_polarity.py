@@ -80,7 +80,7 @@ def find_polarity_fault(correlation: np.ndarray, references: list[int],
     correlation
         Correlation of m measured axes with r reference axes, (m, r). NaN where an axis is
         constant.
-    references
+    references : list of int
         Index of the reference of each measured axis, (m,). An axis whose own correlation is NaN
         is skipped.
     swap_limit

@@ -92,7 +92,7 @@ class FilterNoise:
 
 
 def estimate_filter(rests: Iterable[np.ndarray], rate_hz: float, rc_s: float, lsb_v: float
-             ) -> FilterNoise | None:
+                    ) -> FilterNoise | None:
     """
     Estimate the time constant of one axis.
 

@@ -144,7 +144,7 @@ class NoiseLimits:
     def larger(self, other: NoiseLimits) -> NoiseLimits:
         """Return the larger of each limit."""
         return NoiseLimits(np.maximum(self.variance, other.variance),
-                      np.maximum(self.drift, other.drift), np.maximum(self.step, other.step))
+                           np.maximum(self.drift, other.drift), np.maximum(self.step, other.step))
 
     @property
     def flicker(self) -> np.ndarray:

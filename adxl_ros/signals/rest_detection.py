@@ -348,8 +348,8 @@ class RestFinder:
         """Return whether the mean before a disturbance differs from that after it."""
         reach = self._spans.longest // 2
         return limits.differ(means[max(before[0], before[1] - reach):before[1]],
-                                  means[after[0]:min(after[1], after[0] + reach)],
-                                  self._spans, END_SIGMAS)
+                             means[after[0]:min(after[1], after[0] + reach)],
+                             self._spans, END_SIGMAS)
 
 
 def find_rests(time_s: np.ndarray, samples: np.ndarray, rate_hz: float,

@@ -15,6 +15,7 @@
 """`blind`: the machinery, on small seeded checks with diagnoses that cheat or know nothing."""
 
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import replace
 import hashlib
 import json
@@ -81,8 +82,14 @@ def said(recording, parameters):
 """
 
 
+def no_progress(fraction):
+    """Receive the fraction that is finished."""
+
+
+@contextmanager
 def show(stage):
-    return lambda done: None
+    """Give what receives the progress of a stage."""
+    yield no_progress
 
 
 def script(folder, body):
@@ -103,7 +110,7 @@ def original(tmp_path_factory):
     folder = tmp_path_factory.mktemp('check') / 'blind'
     with diagnosis_runs.workers(None) as pool:
         label_commitment.commit(folder, Setup(SEED, TRIALS), trials.plans(SEED, TRIALS, SECONDS),
-                                pool, show(''))
+                                pool, no_progress)
     return folder
 
 
@@ -168,7 +175,7 @@ def test_a_folder_of_an_older_version_is_refused_in_one_line(original, tmp_path,
     for text in ('{"seed": 1, "trials": 2}', '[]', '', '{"seed": 1, "trials": 2, "label": {}}'):
         (drawn / 'r0000.json').write_text(text)
         with pytest.raises(UserError, match='of another version'):
-            blind_check.draw(tmp_path / 'drawn', 1, 2, pool, show(''))
+            blind_check.draw(tmp_path / 'drawn', 1, 2, pool, no_progress)
 
 
 def test_nothing_found_scores_as_it_should(known_nothing):
@@ -247,10 +254,10 @@ def test_resumes_where_it_was_cut(original, known_nothing, tmp_path, pool):
         diagnosis_runs.diagnose_all(folder, command, pool, cut)
     before = {path: path.stat().st_mtime_ns for path in (folder / 'reports').glob('r*.json')}
     assert 0 < len(before) < TRIALS
-    assert len(diagnosis_runs.diagnose_all(folder, command, pool, show(''))) == TRIALS + 2
+    assert len(diagnosis_runs.diagnose_all(folder, command, pool, no_progress)) == TRIALS + 2
     assert all(path.stat().st_mtime_ns == time for path, time in before.items())
     with pytest.raises(UserError, match='another version'):
-        diagnosis_runs.diagnose_all(folder, script(tmp_path, ALWAYS), pool, show(''))
+        diagnosis_runs.diagnose_all(folder, script(tmp_path, ALWAYS), pool, no_progress)
 
 
 def test_drawing_resumes(tmp_path, pool):
@@ -262,9 +269,9 @@ def test_drawing_resumes(tmp_path, pool):
         return label_commitment.draw(plan)
 
     with pytest.raises(KeyboardInterrupt):
-        label_commitment.commit(tmp_path / 'blind', Setup(3, 2), plans, pool, show(''), twice)
+        label_commitment.commit(tmp_path / 'blind', Setup(3, 2), plans, pool, no_progress, twice)
     (tmp_path / 'again').touch()
-    digest = label_commitment.commit(tmp_path / 'blind', Setup(3, 2), plans, pool, show(''),
+    digest = label_commitment.commit(tmp_path / 'blind', Setup(3, 2), plans, pool, no_progress,
                                      twice)
     opened = label_commitment.committed_labels(tmp_path / 'blind')
     assert digest == label_commitment.published_hash(tmp_path / 'blind')
@@ -304,7 +311,7 @@ def test_a_leaky_generator_is_caught(known_nothing, tmp_path, pool):
         return label_commitment.Drawn(label, padded(label, text), parameters)
 
     label_commitment.commit(folder, Setup(SEED, TRIALS), trials.plans(SEED, TRIALS, SECONDS),
-                            pool, show(''), leaking)
+                            pool, no_progress, leaking)
     shutil.copytree(known_nothing[0] / 'labels' / 'held', folder / 'labels' / 'held')
     made = blind_check.score(folder, script(tmp_path, PADDED), pool, show)
     assert made['controls']['metadata_only']['leaks'] and made['leaks']
@@ -433,7 +440,7 @@ def said(recording, parameters):
 """
     csv = original / 'recordings' / 'r0000.csv'
     rows = real_recordings.put_back([real_recordings.read_arm(f'{csv}:{tmp_path / "unit.yaml"}')],
-                                    script(tmp_path, body), pool, show(''))
+                                    script(tmp_path, body), pool, no_progress)
     assert [(row['deleted'], row['put_back']) for row in rows] == [
         (None, None), ('bias', True), ('scale_factor', True)]
     left = real_recordings.without(keys, 'bias')['/**']['ros__parameters']
@@ -453,7 +460,7 @@ def test_on_a_cluster(original, known_nothing, tmp_path):
     with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None,
                                   local_directory=str(tmp_path)) as cluster, \
             diagnosis_runs.workers(cluster.scheduler_address) as pool:
-        found = diagnosis_runs.diagnose_all(folder, script(tmp_path, NOTHING), pool, show(''))
+        found = diagnosis_runs.diagnose_all(folder, script(tmp_path, NOTHING), pool, no_progress)
     assert len(found) == TRIALS + 2 and all(one['report'] for one in found.values())
 
 

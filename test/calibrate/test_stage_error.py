@@ -111,7 +111,7 @@ def test_a_joint_that_is_worse_than_the_other_is_found():
     poses = swept(rng, truth, targets=targets, noisy=False)
     step = np.radians(5 / 60)
     shift_rad = [factor * step * rng.uniform(-0.5, 0.5, len(poses))[setting]
-           for factor, setting in ((3, poses.alpha_setting), (1, poses.beta_setting))]
+                 for factor, setting in ((3, poses.alpha_setting), (1, poses.beta_setting))]
     volts = pose_response.predicted_volts(truth, replace(
         poses, alpha_rad=poses.alpha_rad + shift_rad[0], beta_rad=poses.beta_rad + shift_rad[1]))
     estimate = full_model.fit_full(nominal(), replace(

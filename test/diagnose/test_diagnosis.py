@@ -91,7 +91,7 @@ def test_no_gap():
     report, _ = diagnosed(unit(), 'bias_walk:density_g_per_rts=2e-5')
     probability = report['verdict'].pop('probability')
     assert report['verdict'] == {'status': 'no_gap', 'effects': [], 'groups': [],
-                               'data_fault': None}
+                                 'data_fault': None}
     assert 0.5 < probability <= 1
     assert report['gap']['floor_source'] == 'still'
     assert report['gap']['before'] == pytest.approx(5.3e-3, rel=0.1)
@@ -390,7 +390,7 @@ def test_a_poor_manoeuvre_makes_no_wrong_verdict(effect):
     script = turning([np.pi / 2], [0.7] * 3, 4.0)
     alpha, beta = script.joints()
     diagnosis = diagnose([record(sensor, Motion(script.now, alpha, beta),
-                               [effect] if effect else [])], sensor)
+                                 [effect] if effect else [])], sensor)
     if effect is None:
         assert diagnosis.verdict.status == 'no_gap'
     else:
@@ -445,7 +445,7 @@ def test_next_experiment_separates_most():
 def test_temperature_is_named_in_a_climatic_chamber(run_tool, tmp_path, shared_dir):
     """A real recording at rest has the slopes of its README: 0.16, -0.15 and -0.43 mg/degC."""
     run = run_tool('diagnose', shared_dir / 'real' / 'thermal_chamber.csv', '-o', tmp_path,
-                    '--json')
+                   '--json')
     report = json.loads(run.stdout)
     assert 'temperature_bias' in report['verdict']['effects']
     candidate = next(c for c in report['candidates'] if c['effect'] == 'temperature_bias')
@@ -463,7 +463,7 @@ def test_temperature_is_named_in_a_climatic_chamber(run_tool, tmp_path, shared_d
 def test_another_simulator_takes_the_place_of_the_stage(run_tool, tmp_path, shared_dir):
     """Optical tracking does not simulate an IMU. The gap is unknown, and no effect is named."""
     run = run_tool('diagnose', shared_dir / 'real' / 'broad_02_real.csv', '--sim',
-                    shared_dir / 'real' / 'broad_02_sim.csv', '-o', tmp_path, '--json')
+                   shared_dir / 'real' / 'broad_02_sim.csv', '-o', tmp_path, '--json')
     report = json.loads(run.stdout)
     assert (report['verdict']['status'], report['verdict']['effects']) == ('unknown', [])
     assert any(c['dimension'] == 'frequency_hz' for c in report['where'])
@@ -482,7 +482,7 @@ def test_samples_of_another_generator(run_tool, tmp_path, shared_dir, name):
     folder = shared_dir / 'samples' / name
     run_tool('fit', folder / 'cal.csv', '--model', 'linear', '-o', tmp_path / 'unit.yaml')
     run = run_tool('diagnose', folder / 'run.csv', '--params', tmp_path / 'unit.yaml', '-o',
-                    tmp_path / 'out', '--json')
+                   tmp_path / 'out', '--json')
     verdict = json.loads(run.stdout)['verdict']
     assert verdict['effects'] == ([] if name == 'no_gap' else [name])
     assert verdict['status'] == ('no_gap' if name == 'no_gap' else 'explained')

@@ -34,6 +34,7 @@ from units import nominal
 HEADER = 'time_s,x_v,y_v,alpha_rad,beta_rad'
 GOOD = '0.0,2.5,2.6,1.5,0.1\n0.001,2.51,2.61,,\n0.002,2.52,2.62,1.6,0.2\n'
 
+
 def written(tmp_path: Path, text: str | bytes, name: str = 'run.csv') -> Path:
     path = tmp_path / name
     path.write_bytes(text if isinstance(text, bytes) else text.encode())

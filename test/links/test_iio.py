@@ -73,7 +73,7 @@ FORMATS = ['le:u16/16>>0', 'be:u16/16>>0', 'le:u12/16>>4', 'be:s12/16>>4', 'le:s
 def test_every_format_gives_the_volts_of_its_codes(served, form):
     scale, offset = 0.05, -3
     adc = {'channels': [{'id': 'voltage0', 'format': form, 'scale': scale, 'offset': offset},
-                            {'id': 'voltage1', 'format': form, 'scale': scale}]}
+                        {'id': 'voltage1', 'format': form, 'scale': scale}]}
     _, link = served(adc=adc)
     volts = np.concatenate([part.volts for part in read_samples(link, 200)])
     assert len(volts) >= 200

@@ -165,7 +165,7 @@ def test_missing_samples_are_counted_across_the_wrap():
 
 def test_repeated_and_late_frames_are_not_accepted():
     counter, accepted = counted(data(0), data(10), data(10), data(0), data(20), data(50), data(30),
-                          data(60))
+                                data(60))
     assert [i for i, *_ in accepted] == [0, 10, 20, 50, 60]
     assert [lost for _, lost, _ in accepted] == [None, 0, 0, 20, 0]
     assert counter.repeated == 30
@@ -176,7 +176,7 @@ def test_a_reset_begins_a_new_count_with_and_without_its_flag():
     assert accepted == [(500, None, False), (510, 0, False), (0, None, False), (10, 0, False)]
     _, accepted = counted(data(500), data(510), data(30, 30100), data(50, 50100), data(60, 60100))
     assert accepted == [(500, None, False), (510, 0, False), (30, None, False), (50, 10, False),
-                     (60, 0, False)]
+                        (60, 0, False)]
 
 
 def test_a_board_that_repeats_itself_after_its_reset_is_accepted_again():
@@ -207,7 +207,7 @@ def test_a_count_continues_across_a_closed_port_if_the_clocks_agree(index, away_
 
 def test_overruns_of_the_device_are_counted_across_the_wrap():
     counter, _ = counted(data(0, overruns=65530), data(20, overruns=4), data(30, overruns=4),
-                      data(0, 50, AFTER_RESET, overruns=0), data(20, 20050, overruns=10))
+                         data(0, 50, AFTER_RESET, overruns=0), data(20, 20050, overruns=10))
     assert counter.overruns == 10 + 10
 
 

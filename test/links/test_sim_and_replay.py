@@ -112,8 +112,8 @@ def test_sim_senses_the_true_motion_at_its_samples():
     t = (samples.stamp_ns - START) * 1e-9
     position, rate = turning(t)
     growth = {'alpha': -3.6 * np.sin(3 * t), 'beta': 2 * np.cos(t), 'shift': -0.64 * np.sin(8 * t)}
-    truth = np.column_stack(specific_force_in_motion(*(Joint(position[j], rate[j], growth[j])
-                                   for j in ('alpha', 'beta', 'shift')), 9.80665))
+    joints = [Joint(position[j], rate[j], growth[j]) for j in ('alpha', 'beta', 'shift')]
+    truth = np.column_stack(specific_force_in_motion(*joints, 9.80665))
     error = np.abs(to_nominal_mps2(samples.volts, ideal()) - truth)[1:]
     assert error.max() < 1e-3, 'second derivatives are those of the interpolation'
     assert error[:, 2].max() < 1e-4
@@ -173,7 +173,7 @@ def test_sim_counts_the_samples_that_a_jump_of_the_clock_skips():
 
 def a_stage(**changes):
     settings = {'pose': np.zeros(3), 'slew': np.array([0.5, 0.5, 0.01]), 'settling_s': 0.3,
-               'resolution': np.array([1.5e-3, 1.5e-3, 0.0]), 'seed': 3} | changes
+                'resolution': np.array([1.5e-3, 1.5e-3, 0.0]), 'seed': 3} | changes
     return SimulatedStage(**settings)
 
 

@@ -119,7 +119,7 @@ class _Estimate(NamedTuple):
 
     Attributes
     ----------
-    parameters
+    parameters : ndarray
         The nine parameters, (9,).
     excess_g2
         Variance of the magnitudes beyond the noise of the means, g².

@@ -120,7 +120,7 @@ def effect_values(parameters: np.ndarray, sensor: Sensor) -> EffectValues:
 
     Parameters
     ----------
-    parameters
+    parameters : ndarray
         The nine parameters, (9,).
     sensor
         Nominal values of the unit.
@@ -157,7 +157,7 @@ def force_g(mean: np.ndarray, parameters: np.ndarray) -> np.ndarray:
     ----------
     mean
         Means by nominal values, g, (k, 3).
-    parameters
+    parameters : ndarray
         The nine parameters, (9,).
 
     Returns
@@ -231,7 +231,7 @@ def magnitude_variance(rests: NominalRests, parameters: np.ndarray) -> np.ndarra
     ----------
     rests
         k rests.
-    parameters
+    parameters : ndarray
         The nine parameters, (9,).
 
     Returns
@@ -289,7 +289,7 @@ def fisher_information(rests: NominalRests, parameters: np.ndarray, excess_g2: f
     ----------
     rests
         k rests, which may be none.
-    parameters
+    parameters : ndarray
         The nine parameters, (9,).
     excess_g2
         Variance of the magnitudes beyond the noise of the means, g².

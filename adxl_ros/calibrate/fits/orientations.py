@@ -66,7 +66,7 @@ def information_gain(information: np.ndarray, parameters: np.ndarray, gravity_g:
     ----------
     information
         Information of the rests so far, (9, 9).
-    parameters
+    parameters : ndarray
         The nine parameters of `gravity_model`, (9,).
     gravity_g
         Local gravity, g.
@@ -95,7 +95,7 @@ def rests_to_add(count: int, information: np.ndarray, parameters: np.ndarray, gr
         Smallest count of rests.
     information
         Information of the rests so far, (9, 9).
-    parameters
+    parameters : ndarray
         The nine parameters of `gravity_model`, (9,).
     gravity_g
         Local gravity, g.

@@ -97,7 +97,7 @@ class Block:
         Device time, ns, (n,) int64, ascending.
     volts
         Output of the sensor by axis, V, (n, m).
-    references
+    references : Mapping
         References by column, (n,) each.
 
     """
@@ -189,7 +189,7 @@ class PeriodMeans:
         ----------
         host_ns
             Times of the samples, ns, (n,), ascending from call to call.
-        references
+        references : Mapping
             References by column, (n,) each.
 
         Returns

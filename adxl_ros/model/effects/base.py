@@ -318,7 +318,7 @@ class Effect:
         Name, which is unique in the library.
     place
         Place in the chain.
-    parameters
+    parameters : tuple of Parameter
         Its parameters.
     apply
         Its function, for arrays, and for floats where it is invertible.

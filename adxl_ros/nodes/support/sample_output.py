@@ -171,7 +171,7 @@ class SampleOutput:
         ----------
         samples
             What a link has given; samples that are not finite count as missing.
-        references
+        references : References
             Publishes what was recorded beside the sensor.
 
         """

@@ -165,7 +165,7 @@ def test_the_gauge_is_freed_where_products_show_the_parts():
     volts = signal_chain.static_response(truth)(force)
     worst = {}
     for name, fit in (('fixed', full_model.fit_full(nominal(), poses)),
-                        ('judged', term_selection.fit_selected(nominal(), poses)[0])):
+                      ('judged', term_selection.fit_selected(nominal(), poses)[0])):
         up = np.where(np.cos(held[:, 0]) < 0, -1, 1)
         error = np.subtract(signal_chain.inverse(fit.fitted, up)(volts), force)[:2]
         worst[name] = np.abs(error).max()
@@ -217,7 +217,7 @@ def test_the_next_poses_help_more_than_others():
     def volume(angles_rad):
         added, settings = poses.subset(np.arange(len(angles_rad))), np.arange(len(angles_rad))
         added = replace(added, alpha_rad=angles_rad[:, 0], beta_rad=angles_rad[:, 1],
-                       alpha_setting=settings, beta_setting=settings)
+                        alpha_setting=settings, beta_setting=settings)
         information = fit.information + full_model.fisher_information(
             fit.unit, added, fit.names, fit.stage) - np.diag(
             full_model.prior_precision(fit.names))

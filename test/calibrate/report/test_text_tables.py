@@ -168,7 +168,7 @@ def test_table_of_the_truth_has_room() -> None:
 
 def test_table_of_errors() -> None:
     errors = cross_validation.PoseErrors(*np.zeros((2, 3)), np.full((3, 2), 0.45),
-                                     np.radians(np.full(3, 7.2)), np.zeros((3, 3)))
+                                         np.radians(np.full(3, 7.2)), np.zeros((3, 3)))
     fitted = replace(errors, accel_mps2=errors.accel_mps2 / 100, tilt_rad=np.full(3, np.nan))
     models = [cross_validation.summarise('nominal', errors),
               cross_validation.summarise('full', fitted)]
