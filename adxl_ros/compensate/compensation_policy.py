@@ -32,7 +32,7 @@ from adxl_ros.model.effects.base import NOMINAL_ENVIRONMENT
 from adxl_ros.model.sensor import Sensor
 
 _STALE_S = 60.0
-"""Age at which a temperature or supply is not known any more, s; chosen: a room warms by less than
+"""Age from which a temperature or supply counts as unknown, s; chosen: a room warms by less than
 0.1 K in that time."""
 _CLOCK_TOLERANCE_DAYS = 0.01
 """Largest difference of two clocks, days; chosen: a quarter of an hour. A calibration that is
@@ -209,7 +209,7 @@ class CompensationPolicy:
         return f'compensating by {source}: {model}'
 
     def assess(self) -> bool:
-        """Find out whether the sensor corrects the stream; tell whether `refusal` has changed."""
+        """Update `refusal` by the sensor and the stream; return whether it has changed."""
         before, self.refusal = self.refusal, ''
         try:
             self.check(self.sensor)
@@ -218,7 +218,7 @@ class CompensationPolicy:
         return self.refusal != before
 
     def is_named(self, calibration: str) -> bool:
-        """Tell whether a user named the calibration; `calibration` is the parameter's value."""
+        """Return whether a user named the calibration; `calibration` is the parameter's value."""
         return calibration != self.stored_path if calibration else bool(self.sensor.effects)
 
     def choose(self, calibration: str) -> tuple[str, list[str]]:
@@ -296,7 +296,7 @@ class CompensationPolicy:
         if unknown:
             return Status(State.SURROUNDINGS_UNKNOWN, unknown)
         if not self.sensor.effects:
-            return Status(State.NOT_CALIBRATED, 'not calibrated: the nominal figures apply')
+            return Status(State.NOT_CALIBRATED, 'not calibrated: the datasheet values apply')
         if counts.get('outside'):
             return Status(State.OUTSIDE, (
                 f'{counts["outside"]} samples outside of what was calibrated, their covariance '
@@ -351,7 +351,7 @@ class CompensationPolicy:
             **{f'provenance.{key}': value for key, value in sensor.provenance.items()}}
 
     def _validity(self, interval: Interval, age_days: float | None) -> str:
-        """Tell in words whether the calibration holds for what the stream has shown."""
+        """Describe whether the calibration is valid for the samples of the interval."""
         sensor = self.sensor
         if not sensor.effects:
             return 'not calibrated'

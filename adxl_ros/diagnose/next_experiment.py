@@ -156,9 +156,9 @@ def propose_next_experiment(verdict: Verdict, not_covered: Sequence[str], seed: 
     if verdict.status == 'unknown':
         why = 'to show what the unknown part of the gap depends on'
     elif not_covered:
-        why = f'this recording has no {", no ".join(not_covered)}'
+        why = f'because the recordings have no {", no ".join(not_covered)}'
     else:
-        why = 'to confirm it on another recording'
+        why = 'to confirm the verdict on another recording'
     return _experiment(_revealing_manoeuvre(verdict, bool(not_covered)), why)
 
 

@@ -25,7 +25,7 @@ from typing import Any
 
 from adxl_ros.diagnose.diagnosis import Diagnosis
 from adxl_ros.diagnose.hypothesis_fit import Hypothesis
-from adxl_ros.diagnose.report_json import as_json, p_text, shares_of_gap, summary
+from adxl_ros.diagnose.report_json import as_json, p_text, shares_of_gap, summary, unit_text
 from adxl_ros.diagnose.residual_map import RANGES, SIGNIFICANT_P
 from adxl_ros.files.plot_file import pyplot
 from adxl_ros.model.constants import G0_MPS2
@@ -73,12 +73,12 @@ def page(diagnosis: Diagnosis, title: str) -> str:
         parts += ['<h2>How far the gap closes</h2>', _image(_bar_plot(diagnosis)),
                   '<h2>Recording minus simulation, before and after</h2>',
                   _image(_residual_plot(diagnosis)),
-                  '<h2>Recorded noise by simulated noise</h2>', _noise_table(report),
+                  '<h2>Recorded noise divided by simulated noise</h2>', _noise_table(report),
                   '<h2>Where the gap lies</h2>', _image(_map_plot(diagnosis)),
                   _cell_table(report), _not_covered(report['not_covered']),
                   '<h2>Which effects cause it</h2>', _hypothesis_table(report),
                   _convergence(diagnosis.verdict.best), _candidate_table(report),
-                  '<h2>What is not separable, and what to record next</h2>',
+                  '<h2>What to record next</h2>',
                   _next_experiment(report)]
     return (f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{escape(title)}'
             f'</title><style>{_STYLE}</style></head><body>{"".join(parts)}</body></html>\n')
@@ -151,7 +151,7 @@ def _residual_plot(diagnosis: Diagnosis) -> Any:
 
 
 def _map_plot(diagnosis: Diagnosis) -> Any:
-    """Draw the mean residual of all cells; significant cells have a ring."""
+    """Draw the mean residual of all cells; significant cells have a frame."""
     cells = [c for c in diagnosis.residual_cells if c.statistic == 'mean']
     rows = sorted({(c.dimension, c.axis) for c in cells})
     largest_mg = _mg(max((abs(c.mean_mps2) for c in cells), default=G0_MPS2 / 1e3))
@@ -166,7 +166,7 @@ def _map_plot(diagnosis: Diagnosis) -> Any:
         axis.text(RANGES, i, f'{in_row[0].low:.4g} to {in_row[-1].high:.4g}', fontsize=8,
                   va='center')
     axis.set(yticks=range(len(rows)), xticks=[], xlim=(-0.5, RANGES + 2),
-             xlabel=f'lowest to highest range; ring: family-wise p < {SIGNIFICANT_P:g}')
+             xlabel=f'parts of the range, ascending; frame: family-wise p < {SIGNIFICANT_P:g}')
     axis.set_yticklabels([f'{dimension}  {name}' for dimension, name in rows], fontsize=8)
     if drawn is not None:
         plot.colorbar(drawn, label='mean residual, mg', shrink=0.6)
@@ -174,7 +174,7 @@ def _map_plot(diagnosis: Diagnosis) -> Any:
 
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Return a table, or a word where it has no rows."""
+    """Return a table, or "None." where it has no rows."""
     if not rows:
         return '<p>None.</p>'
     top = ''.join(f'<th>{escape(h)}</th>' for h in head)
@@ -194,7 +194,7 @@ def _cell_table(report: dict[str, Any]) -> str:
         rows.append([c['axis'], c['dimension'], c['statistic'], f'{low:.4g} to {high:.4g}',
                      f'{_mg(c["mean"]):+.2f}', f'{c["floor_units"]:+.1f}',
                      f'{100 * c["share"]:.1f} %', p_text(c['p'])])
-    return _table(['axis', 'dimension', 'statistic', 'range', 'mg', 'by the noise floor',
+    return _table(['axis', 'dimension', 'statistic', 'range', 'size, mg', 'size / noise floor',
                    'share of the squares', 'family-wise p'], rows)
 
 
@@ -208,7 +208,7 @@ def _noise_table(report: dict[str, Any]) -> str:
                          for when in ('before', 'after'))
         rows += [[name, f'{b:.2f}', f'{a:.2f}'] for name, b, a in zip(names, before, after)]
         rows.append(['gain of log likelihood', '', f'{noise["log_likelihood_gain"]:.0f}'])
-    return _table(['power or Allan deviation, recorded by simulated', 'before', 'after'], rows)
+    return _table(['quantity, recorded divided by simulated', 'before', 'after'], rows)
 
 
 def _hypothesis_table(report: dict[str, Any]) -> str:
@@ -242,7 +242,7 @@ def _parameter_text(name: str, parameter: dict[str, Any]) -> str:
     if 'ci' not in parameter:
         return f'{name} = {parameter["value"]}'
     low, high = parameter['ci']
-    return f'{name} = {parameter["value"]:.4g} ({low:.3g} to {high:.3g}) {parameter["unit"]}'
+    return f'{name} = {parameter["value"]:.4g} ({low:.3g} to {high:.3g}) {unit_text(parameter)}'
 
 
 def _not_covered(names: Sequence[str]) -> str:
@@ -261,5 +261,5 @@ def _next_experiment(report: dict[str, Any]) -> str:
         ['manoeuvre', 'minutes', 'log Bayes factor per minute'], [
             [m['manoeuvre'], f'{m["minutes"]:.1f}', f'{m["nats_per_minute"]:.1f}']
             for m in proposal['menu']])
-    return (f'{groups}<p>{escape(proposal["manoeuvre"])}: {escape(proposal["why"])}.</p>'
+    return (f'{groups}<p>{escape(proposal["manoeuvre"])}, {escape(proposal["why"])}.</p>'
             f'<p><code>{escape(proposal["command"])}</code></p>{menu}')

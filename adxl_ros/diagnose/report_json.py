@@ -41,6 +41,9 @@ _SCREEN_ROWS = 6
 """Rows of each table on the terminal. Chosen: all of it fits on one screen."""
 _SCREEN_CANDIDATES = 3
 """Candidates on the terminal. Chosen: a verdict names three effects at most."""
+_CELL_HEAD = (f'{"axis":4} {"dimension":15} {"range":>20} {"statistic":9} {"mg":>7} {"share":>7} '
+              f'{"p":>8}')
+"""Head of the table of cells on the terminal, with the columns of `_cell_line`."""
 _SCREEN_PROBABILITY = 0.05
 """Smallest probability of a candidate on the terminal. Chosen: that of a rival."""
 
@@ -145,11 +148,10 @@ def _summing_to_one(hypotheses: Sequence[WeightedHypothesis]) -> list[WeightedHy
 
 
 def _candidates(diagnosis: Diagnosis) -> list[dict[str, Any]]:
-    """Return every effect that was weighed, the most probable first."""
-    assert diagnosis.verdict is not None and diagnosis.gap_closure is not None
-    verdict = diagnosis.verdict
+    """Return the effects of all hypotheses and detections, the most probable first."""
+    assert diagnosis.verdict is not None
     probability: dict[str, float] = {}
-    for weighted in verdict.hypotheses:
+    for weighted in diagnosis.verdict.hypotheses:
         for effect in weighted.effects:
             probability[effect] = probability.get(effect, 0.0) + weighted.probability
     best_with: dict[str, Hypothesis] = {}
@@ -157,25 +159,34 @@ def _candidates(diagnosis: Diagnosis) -> list[dict[str, Any]]:
         for effect in h.effects:
             best_with.setdefault(effect, h)
     shares = shares_of_gap(diagnosis)
-    candidates = []
-    for name in library():
-        if name not in probability and name not in best_with:
-            continue
-        test = diagnosis.single_effect_tests.get(name)
-        detection = next((d for d in diagnosis.detections if d.effect == name), None)
-        chance = float(np.exp(-detection.log_bayes_factor)) if detection else None
-        candidates.append({
-            'effect': name, 'probability': _rounded(min(probability.get(name, 0.0), 1.0)),
-            'closed': _rounded(diagnosis.gap_closure.closed)
-            if name in verdict.best.effects and not detection else None,
-            'p': _rounded(test.p) if test else chance,
-            'parameters': _parameters(best_with.get(name), name) if detection is None
-            else {parameter: {'value': np.asarray(value).tolist()}
-                  for parameter, value in detection.values.items()},
-            'share': _rounded(shares[name]) if name in shares else None,
-            'visibility': _rounded(test.visibility) if test else 1.0,
-            'inseparable_from': _rivals(name, verdict), 'cause': effect_named(name).cause})
+    candidates = [_candidate(diagnosis, name, probability.get(name, 0.0), best_with.get(name),
+                             shares.get(name))
+                  for name in library() if name in probability or name in best_with]
     return sorted(candidates, key=lambda c: (-(c['probability'] or 0.0), c['effect']))
+
+
+def _candidate(diagnosis: Diagnosis, effect: str, probability: float,
+               best_with: Hypothesis | None, share: float | None) -> dict[str, Any]:
+    """Return one effect, with its parameters in the best hypothesis that has it."""
+    assert diagnosis.verdict is not None and diagnosis.gap_closure is not None
+    verdict, closed = diagnosis.verdict, None
+    test = diagnosis.single_effect_tests.get(effect)
+    detection = next((d for d in diagnosis.detections if d.effect == effect), None)
+    p = _rounded(test.p) if test else None
+    if detection is None:
+        parameters = _parameters(best_with, effect)
+        if effect in verdict.best.effects:
+            closed = _rounded(diagnosis.gap_closure.closed)
+    else:
+        parameters = {parameter: {'value': np.asarray(value).tolist()}
+                      for parameter, value in detection.values.items()}
+        if test is None:
+            p = float(np.exp(-detection.log_bayes_factor))
+    return {'effect': effect, 'probability': _rounded(min(probability, 1.0)), 'closed': closed,
+            'p': p, 'parameters': parameters,
+            'share': None if share is None else _rounded(share),
+            'visibility': _rounded(test.visibility) if test else 1.0,
+            'inseparable_from': _rivals(effect, verdict), 'cause': effect_named(effect).cause}
 
 
 def _rivals(effect: str, verdict: Verdict) -> list[str]:
@@ -213,18 +224,20 @@ def summary(diagnosis: Diagnosis) -> str:
         return (f'No gap: the recording differs from the simulator by {before_mg:.2f} mg rms, '
                 f'and the noise floor is {floor_mg:.2f} mg {probability}.')
     if verdict.status == 'insufficient':
-        return 'Insufficient: nothing moves or warms, so that no effect can show.'
+        return ('Insufficient: neither motion nor temperature nor supply changes, so that no '
+                'effect can show.')
     if verdict.status == 'unknown':
-        where = f' over {", ".join(verdict.unknown_where[:3])}' if verdict.unknown_where else ''
+        where = f'; the unknown part shows over {", ".join(verdict.unknown_where[:3])}' \
+            if verdict.unknown_where else ''
         return (f'Unknown: no effect of the library explains the gap of {before_mg:.2f} mg rms '
-                f'above a noise floor of {floor_mg:.2f} mg; it shows{where} {probability}.')
+                f'(noise floor {floor_mg:.2f} mg){where} {probability}.')
     return f'{_named_effects(verdict)} {probability}{_closed_text(closure)}.'
 
 
 def _named_effects(verdict: Verdict) -> str:
     """Return the effects of a verdict, and its groups, as text."""
-    return ' and '.join([*verdict.effects, *(f'one of {", ".join(group)}'
-                                             for group in verdict.groups)])
+    *first, last = [*verdict.effects, *(f'one of {", ".join(group)}' for group in verdict.groups)]
+    return f'{", ".join(first)} and {last}' if first else last
 
 
 def _closed_text(closure: GapClosure) -> str:
@@ -232,8 +245,8 @@ def _closed_text(closure: GapClosure) -> str:
     if not np.isfinite(closure.closed):
         return ''
     return (f': the gap falls from {_mg(closure.before_mps2):.2f} to '
-            f'{_mg(closure.after_mps2):.2f} mg rms above a noise floor of '
-            f'{_mg(closure.floor_mps2):.2f} mg ({100 * closure.closed:.0f} % closed)')
+            f'{_mg(closure.after_mps2):.2f} mg rms ({100 * closure.closed:.0f} % closed, '
+            f'noise floor {_mg(closure.floor_mps2):.2f} mg)')
 
 
 def _mg(value_mps2: float) -> float:
@@ -244,6 +257,11 @@ def _mg(value_mps2: float) -> float:
 def p_text(p: float) -> str:
     """Return a probability as text."""
     return '< 0.001' if p < 1e-3 else f'{p:.3f}'
+
+
+def unit_text(parameter: dict[str, Any]) -> str:
+    """Return the unit of a parameter of the report as text; '' for a pure number."""
+    return '' if parameter['unit'] == '1' else parameter['unit']
 
 
 def terminal_lines(diagnosis: Diagnosis) -> list[str]:
@@ -260,11 +278,12 @@ def terminal_lines(diagnosis: Diagnosis) -> list[str]:
         low, high = closure.closed_ci
         lines += [f'Closed on held-out blocks: {100 * closure.closed:.1f} % '
                   f'(90 %: {100 * low:.1f} to {100 * high:.1f} %).']
-    lines += ['', f'{"hypothesis":44} {"probability":>11}']
-    lines += [f'{", ".join(h["effects"]) or "no gap":44} {p_text(h["probability"]):>11}'
-              for h in report['hypotheses'][:_SCREEN_ROWS]]
+    lines += ['', 'probability  hypothesis']
+    for h in report['hypotheses'][:_SCREEN_ROWS]:
+        lines += wrap(f'{p_text(h["probability"]):>11}  {", ".join(h["effects"]) or "no gap"}',
+                      _SCREEN_COLUMNS, subsequent_indent=13 * ' ')
     if report['where']:
-        lines += ['', 'where the gap shows most:']
+        lines += ['', 'where the gap shows most:', _CELL_HEAD]
         lines += [_cell_line(cell) for cell in report['where'][:_SCREEN_ROWS]]
     for candidate in report['candidates'][:_SCREEN_CANDIDATES]:
         if (candidate['probability'] or 0) >= _SCREEN_PROBABILITY:
@@ -279,8 +298,9 @@ def terminal_lines(diagnosis: Diagnosis) -> list[str]:
 def _cell_line(cell: dict[str, Any]) -> str:
     """Return one line for a cell of the residual map."""
     low, high = cell['range']
-    return (f'  {cell["axis"]}  {cell["dimension"]:16} {low:9.4g} to {high:9.4g}  '
-            f'{_mg(cell["mean"]):+8.2f} mg  {100 * cell["share"]:5.1f} %  p {p_text(cell["p"])}')
+    return (f'{cell["axis"]:4} {cell["dimension"]:15} {low:8.4g} to {high:8.4g} '
+            f'{cell["statistic"]:9} {_mg(cell["mean"]):+7.2f} {100 * cell["share"]:5.1f} % '
+            f'{p_text(cell["p"]):>8}')
 
 
 def _candidate_lines(candidate: dict[str, Any]) -> list[str]:
@@ -289,5 +309,6 @@ def _candidate_lines(candidate: dict[str, Any]) -> list[str]:
     for name, p in candidate['parameters'].items():
         if 'ci' in p:
             low, high = p['ci']
-            lines.append(f'  {name:32} {p["value"]:.5g} ({low:.4g} to {high:.4g}) {p["unit"]}')
+            value = f'{p["value"]:.5g} ({low:.4g} to {high:.4g}) {unit_text(p)}'
+            lines.append(f'  {name:32} {value}'.rstrip())
     return lines

@@ -43,8 +43,8 @@ _RELATIVE_STEP = 1e-3
 and nearly linear in them."""
 
 _ROOT_MEAN = 1.25
-"""Blunts the divisor of derived z where the in-plane force is g. Derived: there z² = 2·σ·g·n for
-normal noise n > 0, and the variance of z is 0.8·σ·g = σ·g/1.25."""
+"""Factor of the term that keeps the divisor of derived z from 0 where the in-plane force is g.
+Derived: there z² = 2·σ·g·n for normal noise n > 0, and the variance of z is 0.8·σ·g = σ·g/1.25."""
 
 
 def force_covariance(sensor: Sensor, force: Components,

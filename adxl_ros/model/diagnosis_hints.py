@@ -21,7 +21,7 @@ from enum import auto, Enum
 
 
 class StraightLine(Enum):
-    """Part of the straight line between specific force and volts that an effect changes."""
+    """Coefficient of the straight line from specific force to volts that an effect changes."""
 
     ZERO_G = auto()
     SCALE_FACTOR = auto()
@@ -41,11 +41,12 @@ class DriftSpectrum(Enum):
 
 class Detector(Enum):
     """
-    Statistic of the noise that shows an effect; an effect has all parameters that it estimates.
+    Statistic of the noise that shows an effect.
 
-    REPEATED_SAMPLES estimates `rate_hz` and `duration_s`, ISOLATED_SAMPLES `rate_hz` and
-    `amplitude_v`, COARSE_CODES `lost_bits`, MAINS_LINE `amplitude_v`, `frequency_hz` and
-    `phase_rad`, NOISE_LEVEL `ratio`.
+    An effect with a detector has all parameters that the detector estimates. REPEATED_SAMPLES
+    estimates `rate_hz` and `duration_s`, ISOLATED_SAMPLES `rate_hz` and `amplitude_v`,
+    COARSE_CODES `lost_bits`, MAINS_LINE `amplitude_v`, `frequency_hz` and `phase_rad`, NOISE_LEVEL
+    `ratio`.
     """
 
     REPEATED_SAMPLES = auto()
@@ -74,11 +75,12 @@ class DiagnosisHints:
     Attributes
     ----------
     straight_line
-        Part of the straight line that the effect is; None for all other effects.
+        Coefficient of the straight line that the effect is; None for all other effects.
     healthy_std
-        Standard deviation from day to day of a healthy unit's coefficients, beside the covariance
-        of the parameter file. The unit is the parameter's, with g in place of V. An effect with a
-        value is a nuisance parameter of every hypothesis.
+        Day-to-day standard deviation of a healthy unit's coefficients, in addition to the
+        covariance of the parameter file. The unit is that of the parameter, but g for the zero-g
+        and 1 for the scale factor. An effect with this value is a nuisance parameter of every
+        hypothesis.
     imitated
         Whether zero-g and scale factor together imitate the effect completely.
     drift
@@ -90,7 +92,8 @@ class DiagnosisHints:
     revealed_by
         Manoeuvre that shows the effect best.
     half_turn
-        Parameter, rad, that changes by π where the sensor is remounted turned about its z axis.
+        Name of the parameter, rad, that changes by π when the sensor is remounted by half a turn
+        about its z axis; empty for other effects.
 
     """
 
@@ -110,5 +113,5 @@ class DiagnosisHints:
 
     @property
     def absorbed(self) -> bool:
-        """Whether the nuisance parameters of a hypothesis without the effect take it up."""
+        """Whether nuisance parameters can imitate the effect in a hypothesis without it."""
         return self.nuisance or self.imitated

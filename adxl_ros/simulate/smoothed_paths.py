@@ -43,10 +43,10 @@ _PROBES = 12
 """Windows that the strength of the penalty is matched to; chosen: enough for a median."""
 
 _MIN_MOVING = 100
-"""Fewest readings in motion that determine a strength; chosen."""
+"""Fewest readings in motion that determine a strength; chosen: their rms is then within 7 %."""
 
 _MAX_ROUNDS = 16
-"""Largest number of rounds that soften the penalty; chosen: see `_SOFTER`."""
+"""Largest number of rounds that soften the penalty; chosen: it is then nearly 0, see `_SOFTER`."""
 
 _SOFTER = 0.2
 """Factor of the penalty where the readings deviate too much; chosen: 16 rounds give 7e-12."""
@@ -69,7 +69,8 @@ _STRENGTHS = (10.0 ** np.arange(-12, 13, 0.5)).tolist()
 """Strengths of the penalty that are tried; chosen: half a decade hardly changes a spline."""
 
 _REST_GAP = 8
-"""Gap between changes of a reading, in median gaps and in samples, from which it rests; chosen."""
+"""Gap between changes of a reading, in median gaps and in samples, above which it rests; chosen:
+above the gaps of a slow move."""
 
 _THIRD_DIFFERENCE = np.array([-1.0, 3.0, -3.0, 1.0])
 """Weights of four coefficients in a third difference."""

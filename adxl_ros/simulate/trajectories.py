@@ -36,7 +36,7 @@ _JERK_PEAK = 1.875
 """Peak velocity of the motion of minimum jerk, divided by its mean: 15/8."""
 
 _RUN_UP_S = 1.0
-"""Time in which a joint reaches a constant velocity, s; chosen."""
+"""Time in which a joint reaches a constant velocity, s; chosen: 60° per second squared at most."""
 
 _SHAKE_LOW_HZ = 2.0
 """Lowest frequency of the shaker, Hz; chosen: its stroke is 13 mm."""
@@ -48,7 +48,7 @@ _SHAKE_MPS2 = 1.0
 """Amplitude of the shaker, m/s²; chosen: a tenth of gravity."""
 
 _SHAKE_S = 40.0
-"""Duration of the shaker, s; chosen."""
+"""Duration of the shaker, s; chosen: some 9 s for each octave."""
 
 _FADE_S = 2.0
 """Time over which the shaker fades in and out, s; chosen: four periods of its lowest

@@ -28,7 +28,7 @@ EFFECT = Effect(
     place=Place.CLOCK,
     parameters=(
         Parameter('offset_s', 's', -1.0, 1.0, 5e-3, 'physics: buffers between ADC and host',
-                  'how late the data come', ''),
+                  'delay of the stamps behind the samples', ''),
     ),
     apply=apply,
     exact=True,
