@@ -39,12 +39,12 @@ HALF = 8
 """Samples of the central difference each way; chosen: within 1 % up to a third of the rate."""
 
 MAX_GAP = 1.5
-"""Distance of neighbours in sample periods from which they count as a gap; chosen: it is between
-that of one and of two samples."""
+"""Distance of neighbours, in sample periods, from which there is a gap between them; chosen:
+between one and two periods."""
 
 
 def derivative_weights(half: int) -> np.ndarray:
-    """Weights of the samples −half … half in a derivative by the sample number, (2·half + 1,)."""
+    """Return the weights of the samples −half … half in a derivative by index, (2·half + 1,)."""
     one_side = [-(-1) ** k * factorial(half) ** 2
                 / (k * factorial(half - k) * factorial(half + k)) for k in range(1, half + 1)]
     return np.array([*(-w for w in reversed(one_side)), 0.0, *one_side])
@@ -52,9 +52,9 @@ def derivative_weights(half: int) -> np.ndarray:
 
 def undo(volts: np.ndarray, time_s: np.ndarray, rc_s: np.ndarray, rate_hz: float) -> np.ndarray:
     """
-    Undo the filter of a stretch.
+    Undo the filter of consecutive samples.
 
-    Near the ends of the stretch, and near gaps, the difference uses as many neighbours as both
+    Near the ends of the series, and near gaps, the difference uses as many neighbours as both
     sides have. A sample without a neighbour on one side stays as it is.
 
     Parameters

@@ -140,7 +140,7 @@ class RecordingEstimator:
                   ) -> Estimates:
         """Estimate from volts, V, (n, m); samples at a rail, (n,), determine no quantity."""
         sensor = self._sensor
-        with np.errstate(all='ignore'):  # no force explains some volts
+        with np.errstate(all='ignore'):  # some volts have no solution
             force = self._inverse(list(volts.T), environment)
             covariance = force_covariance(sensor, force, self._variance_v2, environment)
             outside = np.isfinite(force[0]) & sensor.envelope.is_outside(
@@ -170,7 +170,7 @@ def effects_left(sensor: Sensor, undo_filter: bool) -> list[Effect]:
     Returns
     -------
     list
-        Effects of the mean, of the sensor or its place, but not of stage and clock.
+        Effects on the mean of the output, without those of stage and clock.
 
     """
     effects = [effect_named(name) for name in sensor.effects]

@@ -221,7 +221,7 @@ class LiveEstimator:
         motion = self._motion_variance(force, time_s) + unknown
         cell = self._cell(force)
         covariance = self._covariance(force, cell, unknown, motion)
-        # For the angles gravity is the signal, and motion adds to the noise of each axis.
+        # The angles are those of gravity, so that motion adds to the variance of each axis.
         moved = (covariance[0] + motion, covariance[1], covariance[2], covariance[3] + motion,
                  covariance[4], covariance[5] if self._derives_z else covariance[5] + motion)
         roll, pitch, inclination, _ = angles(force, moved, FLOATS)
@@ -255,7 +255,7 @@ class LiveEstimator:
         self._last_volts = self._respond(self._force, self._environment)
 
     def _use(self, sensor: Sensor) -> None:
-        """Take covariance and validity range from the unit, with its temperatures or without."""
+        """Take covariance and validity range from the unit, with or without temperature range."""
         self._measured_covariance = measured_covariance(sensor, self._variance_v2)
         self._leverage, self._envelope = leverage(sensor), sensor.envelope
         self._knows_temperature = sensor is self.sensor
@@ -311,13 +311,17 @@ class LiveEstimator:
         self._mean, self._squares = [0.0, 0.0], [0.0, 0.0]
 
     def _excess(self) -> float:
-        """Return the variance of this interval beyond that of the noise, (m/s²)²."""
+        """Return the variance of this interval beyond a multiple of that of the noise, (m/s²)²."""
         return max(0.0, *(squares / self._count - _NOISE_FACTOR * variance
                           for squares, variance in zip(self._squares, self._noise_variance)))
 
     def _covariance(self, force: Components, cell: _Cell, unknown: float, motion: float
                     ) -> tuple[float, ...]:
-        """Return the covariance of a force, with a variance that each axis gets, (m/s²)²."""
+        """
+        Return the covariance of a force: xx, xy, xz, yy, yz, zz, (m/s²)².
+
+        Each axis gets the variance `unknown`; a derived z also gets that of noise and motion.
+        """
         if not self._derives_z:
             xx, xy, xz, yy, yz, zz = cell.covariance
             return xx + unknown, xy, xz, yy + unknown, yz, zz + unknown

@@ -27,7 +27,6 @@ from adxl_ros.diagnose.linear_model import (
     calibration_takes_up,
     hints_of,
     LinearModel,
-    NumberedColumn,
     straight_line_parts,
     TOLERANCE_STDS,
 )
@@ -285,9 +284,8 @@ def linearise(linear_model: LinearModel, effects: Sequence[str], sensor: Sensor,
     sensor = put(start, names, values)
     all_names = [*names, *nuisances]
     channels: list[WhitenedChannel] = []
-    lines: list[dict[int, np.ndarray]] = []
-    changes: list[list[NumberedColumn]] = []
-    count = len(all_names)
+    changes_v: list[np.ndarray] = []
+    next_id = len(all_names)
     for number, comparison in enumerate(linear_model.comparisons):
         extra = extra_columns[number] if extra_columns else np.zeros((len(comparison), 0))
         at_rate = replace(sensor, rate_hz=comparison.sensor.rate_hz)
@@ -295,34 +293,49 @@ def linearise(linear_model: LinearModel, effects: Sequence[str], sensor: Sensor,
         columns = sensitivities_at(comparison.simulated_v, at_rate, names, values, output_v)
         change_v = output_v - _output_beside_sensor_effects(linear_model, number, at_rate, start,
                                                             effects)
-        for d in range(len(start.axes)):
-            places = [i for i, n in enumerate(names) if n.axis in ('', start.axes[d])]
-            own_nuisances = linear_model.nuisance_columns[len(channels)]
-            free = [n for n in nuisances if n in own_nuisances]
-            lines.append({all_names.index(n): column for n, column in own_nuisances.items()
-                          if hints_of(n).straight_line})
-            changes.append([(0, change_v[:, d])])
+        for d, axis in enumerate(start.axes):
+            places = [i for i, n in enumerate(names) if n.axis in ('', axis)]
             design = columns[:, d, places]
             residual_v = comparison.volts[:, d] - output_v[:, d] \
                 + design @ (values - prior_mean)[places]
+            on_channel = linear_model.nuisance_columns[len(channels)]
+            nuisance_columns = {all_names.index(n): on_channel[n]
+                                for n in nuisances if n in on_channel}
+            extra_ids = range(next_id, next_id + extra.shape[1])
+            next_id = extra_ids.stop
             filters = linear_model.filters[len(channels)]
             if filter_indices is not None:
                 filters = neighbouring_filters(filters, filter_indices[len(channels)])
+            changes_v.append(change_v[:, d])
             channels.append(evidence.whiten_channel(
-                residual_v, np.column_stack([design, *(own_nuisances[n] for n in free), extra]),
-                np.array([*places, *(all_names.index(n) for n in free),
-                          *range(count, count + extra.shape[1])], int),
-                comparison.used, filters))
-            count += extra.shape[1]
-    parts = straight_line_parts(lines, changes, 1)
-    drifts = drifts_among(effects)
-    prior_std += [float(np.hypot(linear_model.tolerance(n, drifts),
-                                 parts[i][0] if i in parts else 0.0))
-                  for i, n in enumerate(nuisances, len(names))]
+                residual_v, np.column_stack([design, *nuisance_columns.values(), extra]),
+                np.array([*places, *nuisance_columns, *extra_ids], int), comparison.used,
+                filters))
+    nuisance_std = _nuisance_std(linear_model, effects, all_names, nuisances, changes_v)
     return LinearisedHypothesis(
-        tuple(effects), sensor, tuple(all_names),
-        np.concatenate([prior_mean, get(start, nuisances)]), np.array(prior_std), values,
-        channels)
+        effects=tuple(effects), sensor=sensor, names=tuple(all_names),
+        prior_mean=np.concatenate([prior_mean, get(start, nuisances)]),
+        prior_std=np.array([*prior_std, *nuisance_std]), values=values, channels=channels)
+
+
+def _nuisance_std(linear_model: LinearModel, effects: Sequence[str], names: list[Coefficient],
+                  nuisances: Sequence[Coefficient], changes_v: Sequence[np.ndarray]
+                  ) -> list[float]:
+    """
+    Return prior standard deviations of nuisance parameters in a hypothesis with some effects.
+
+    The square of each is that of a healthy unit's tolerance plus that of the straight-line part of
+    the effects. `changes_v` are the outputs of the effects by channel, V, (n,); `names` are all
+    coefficients.
+    """
+    lines = [{names.index(n): column for n, column in columns.items() if hints_of(n).straight_line}
+             for columns in linear_model.nuisance_columns]
+    parts = straight_line_parts(lines, [[(0, change_v)] for change_v in changes_v], 1)
+    drifts, std = drifts_among(effects), []
+    for name in nuisances:
+        part = parts.get(names.index(name), np.zeros(1))
+        std.append(float(np.hypot(linear_model.tolerance(name, drifts), part[0])))
+    return std
 
 
 def _fitted_names(linear_model: LinearModel, effects: Sequence[str]

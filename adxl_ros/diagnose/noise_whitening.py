@@ -113,7 +113,7 @@ class Whitener:
         return sosfilt(self.sections, values)
 
 
-def whiteners(sensor: Sensor, d: int, dt_s: float, span_s: float) -> list[Whitener]:
+def whiteners(sensor: Sensor, axis: int, dt_s: float, span_s: float) -> list[Whitener]:
     """
     Return the filters that are tried for the noise of one axis of a recording.
 
@@ -121,8 +121,8 @@ def whiteners(sensor: Sensor, d: int, dt_s: float, span_s: float) -> list[Whiten
     ----------
     sensor
         The baseline.
-    d
-        Number of the axis.
+    axis
+        Index of the measured axis.
     dt_s
         Time between samples, s.
     span_s
@@ -134,11 +134,11 @@ def whiteners(sensor: Sensor, d: int, dt_s: float, span_s: float) -> list[Whiten
         Random walks first, ascending, then 1/f noise.
 
     """
-    rc_s = float(noise.electronics(sensor).rc_s[d])
+    rc_s = float(noise.electronics(sensor).rc_s[axis])
     a = float(np.exp(-dt_s / rc_s)) if rc_s else 0.0
-    std_v = max(float(noise.analog_std_v(sensor)[d]), _LOWEST_NOISE_V)
+    std_v = max(float(noise.analog_std_v(sensor)[axis]), _LOWEST_NOISE_V)
     step_std_v = sensor.lsb_v / np.sqrt(12)
-    scale = float(sensor.scale_v_per_g[d])
+    scale = float(sensor.scale_v_per_g[axis])
     walks = _walk_whiteners(a, std_v, step_std_v, scale, dt_s)
     # Noise and ADC steps without drift are an ARMA(1, 1) sequence; this is the zero of its MA.
     healthy_zero = -_spectral_factor(

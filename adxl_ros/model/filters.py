@@ -162,7 +162,7 @@ def first_order_recursion(gain: float, decay: complex, inputs: np.ndarray, previ
 
 @lru_cache(maxsize=64)
 def _weights(z: complex) -> np.ndarray:
-    """Weights of the newest inputs, newest first: ∫ exp(z·(1 − s))·Lⱼ(s) ds over 0 to 1."""
+    """Return weights of the newest inputs, newest first: ∫ exp(z·(1 − s))·Lⱼ(s) ds, 0 to 1."""
     nodes = 1.0 - np.arange(ORDER)
     lagrange = [np.poly(np.delete(nodes, j)) / np.prod(nodes[j] - np.delete(nodes, j))
                 for j in range(ORDER)]
@@ -171,7 +171,7 @@ def _weights(z: complex) -> np.ndarray:
         s, weight = (s + 1) / 2, weight / 2
         growth = weight * np.exp(z * (1 - s))
         return np.array([np.sum(growth * np.polyval(c, s)) for c in lagrange])
-    # The integrals of s^k by parts.
+    # Integrals of exp(z·(1 − s))·s^k, by parts.
     moments = [(np.exp(z) - 1) / z]
     for k in range(1, ORDER):
         moments.append((k * moments[-1] - 1) / z)

@@ -48,9 +48,12 @@ _POINTS = 6
 _ALIGNED_STEPS = 1e-4
 """Largest distance of a sample on a step from it, in steps; chosen: far above rounding."""
 
+_ROUNDING = 1e-9
+"""Rounding error of a ratio of two rates."""
+
 _NOISE_MEMORY = 50
-"""Time constants of the filter over which missing samples count for the noise; chosen: a state
-has decayed to e⁻⁵⁰."""
+"""Time constants of the filter over which the noise of missing samples is drawn; chosen: the state
+of the filter has then decayed to e⁻⁵⁰."""
 
 
 class Response:
@@ -89,8 +92,8 @@ class Response:
         self._effects = {place: [_EffectState(name, signal_chain.parameters(sensor, name), seed)
                                  for name in sensor.effects
                                  if effect_named(name).place is place] for place in Place}
-        self._step_s = 1 / (sensor.rate_hz * ceil(motion.internal_rate_hz / sensor.rate_hz
-                                                  - 1e-9))
+        steps_per_sample = ceil(motion.internal_rate_hz / sensor.rate_hz - _ROUNDING)
+        self._step_s = 1 / (sensor.rate_hz * steps_per_sample)
         # Rate of the instants by stamps; rounding evens out the steps of float64 times.
         instants_s = self._instants(np.array([0.0, 1.0]))
         self._dt_s = self._step_s * round(float(instants_s[1] - instants_s[0]), 12)
@@ -221,7 +224,7 @@ class Response:
         """
         Draw the noise behind the filter, V, (n, m): an exactly sampled AR(1) sequence.
 
-        Missing samples are drawn, too, as far as the filter remembers them.
+        Noise of missing samples is drawn, too, as far back as the filter remembers.
         """
         rc_s, rate_hz = np.array(signals.rc_s), self.sensor.rate_hz
         std_v = noise.analog_std_v(self.sensor)
@@ -255,7 +258,7 @@ class _EffectState:
 
 
 def _lagrange(position: np.ndarray) -> np.ndarray:
-    """Weights of `_POINTS` steps for interpolation at positions among them, (n, points)."""
+    """Return the weights of `_POINTS` steps for interpolation at positions, (n, points)."""
     nodes = np.arange(_POINTS)
     return np.column_stack([
         np.prod([(position - k) / (j - k) for k in nodes if k != j], axis=0) for j in nodes])

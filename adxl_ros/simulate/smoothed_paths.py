@@ -62,8 +62,8 @@ _MAX_RATIO = 1.7
 scatter of a mean over `_LOCAL_S`."""
 
 _RIDGE = 1e-12
-"""Weight of the normal matrix' largest element on its diagonal; chosen: it only determines
-coefficients without samples and penalty."""
+"""Addition to the diagonal of the normal matrix, divided by its largest element; chosen: it
+matters only for coefficients without samples and penalty."""
 
 _STRENGTHS = (10.0 ** np.arange(-12, 13, 0.5)).tolist()
 """Strengths of the penalty that are tried; chosen: half a decade hardly changes a spline."""
@@ -276,7 +276,7 @@ def _third_differences(weights: np.ndarray) -> np.ndarray:
 
 
 def _moving(reading: np.ndarray) -> np.ndarray:
-    """Return which readings lie between changes that follow each other, (n,): not the rests."""
+    """Return which readings are in motion, (n,): between two changes that are close in time."""
     edges = np.zeros(len(reading) + 1, int)
     changes = np.flatnonzero(np.diff(reading))
     gaps = np.diff(changes)

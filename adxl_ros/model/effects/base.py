@@ -321,22 +321,23 @@ class Effect:
     parameters : tuple of Parameter
         Its parameters.
     apply
-        Its function, for arrays, and for floats where it is invertible.
+        The function of the effect. It takes arrays, and floats too if the effect is invertible.
     cause
         Sentence for a report: the cause, and what to do about it.
     smooth
         Whether the output is differentiable by the parameters.
     exact
-        Whether its form is certain, as that of geometry or of a clock.
+        Whether the form of the effect is certain, as that of geometry or of a clock.
     acts_on
-        Property of the output in which it shows; the text 'mean' or 'noise' is accepted, too.
+        Property of the output in which the effect shows; the texts 'mean' and 'noise' are
+        accepted, too.
     invertible
-        Whether it is a smooth function of force and environment of one sample, which the inverse
-        undoes. Effects of the stage, with a memory or with noise are not.
+        Whether the inverse undoes the effect. The effect then is a smooth function of force and
+        environment of one sample. Effects of the stage, with a memory or with noise are not.
     needs
-        Parts of the chain that it acts on; their names as text are accepted, too.
+        Parts of the chain that the effect acts on; their names as text are accepted, too.
     follows
-        Names of the fields of `Environment` that it depends on.
+        Names of the fields of `Environment` that the effect depends on.
     diagnosis
         Properties that only the diagnosis uses.
 
