@@ -73,6 +73,10 @@ Chosen: a sensor at rest has an extreme value seldom."""
 _SMALLEST_RANGE_V = 0.05
 """Range of the output, V, below which an extreme value is not the end of the range.
 Chosen: 50 mg, a sensor that hardly moves."""
+_SMALLEST_STEP_V = 1e-9
+"""Step of an ADC, V, that stands for none. Chosen: above rounding errors."""
+_SMALLEST_NORM = 1e-12
+"""Smallest product of the norms of two signals: it keeps the divisor from 0."""
 _UNIT_TOLERANCE = 0.1
 """Relative deviation of a gain from the ratio of two units. Chosen: above any scale error."""
 _UNIT_RATIOS = {
@@ -232,11 +236,11 @@ def _clock_fault(time_s: np.ndarray) -> DataFault | None:
 
 
 def _share_at_rail(volts: np.ndarray, lsb_v: float) -> float:
-    """Return the share of samples at an extreme value of their axis that many samples have."""
+    """Return the largest share of an axis's samples at an extreme value; 0 below `_RAIL_SHARE`."""
     largest = 0.0
     for axis_v in volts.T:
         for rail_v in (axis_v.max(), axis_v.min()):
-            share = float(np.mean(np.abs(axis_v - rail_v) < max(lsb_v, 1e-9) / 2))
+            share = float(np.mean(np.abs(axis_v - rail_v) < max(lsb_v, _SMALLEST_STEP_V) / 2))
             if share > _RAIL_SHARE and np.ptp(axis_v) > _SMALLEST_RANGE_V:
                 largest = max(largest, share)
     return largest
@@ -305,10 +309,12 @@ def _delay_fault(simulated_g: np.ndarray, measured_g: np.ndarray, rate_hz: float
     largest_lag = min(round(_LARGEST_DELAY_S * rate_hz), len(simulated_g) // 3)
     best, best_lag, undelayed = 0.0, 0, 0.0
     for simulated, measured in zip(simulated_g.T, measured_g.T):
+        # Twice the length, so that the circular correlation has no overlap.
         size = 2 ** int(np.ceil(np.log2(2 * len(simulated))))
         products = np.fft.irfft(np.fft.rfft(measured, size)
                                 * np.conj(np.fft.rfft(simulated, size)), size)
-        norm = np.sqrt(np.sum(simulated * simulated) * np.sum(measured * measured)) + 1e-12
+        norm = np.sqrt(np.sum(simulated * simulated) * np.sum(measured * measured)) \
+            + _SMALLEST_NORM
         lags = np.concatenate([products[-largest_lag:], products[:largest_lag + 1]]) / norm
         if lags.max() > best:
             best, best_lag = float(lags.max()), int(np.argmax(lags)) - largest_lag

@@ -146,6 +146,7 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
     """
     if not sensor.effects:
         sensor = with_axes(sensor, recordings[0].axes)
+    # The fractions of the progress are shares of the usual run time.
     checked: list[CheckedRecording] = []
     for recording in recordings:
         check_unit(recording.stream_info, recording.axes, sensor)

@@ -27,6 +27,7 @@ from adxl_ros.diagnose.linear_model import (
     calibration_takes_up,
     hints_of,
     LinearModel,
+    NumberedColumn,
     straight_line_parts,
     TOLERANCE_STDS,
 )
@@ -330,7 +331,8 @@ def _nuisance_std(linear_model: LinearModel, effects: Sequence[str], names: list
     """
     lines = [{names.index(n): column for n, column in columns.items() if hints_of(n).straight_line}
              for columns in linear_model.nuisance_columns]
-    parts = straight_line_parts(lines, [[(0, change_v)] for change_v in changes_v], 1)
+    changes = [[NumberedColumn(0, change_v)] for change_v in changes_v]
+    parts = straight_line_parts(lines, changes, 1)
     drifts, std = drifts_among(effects), []
     for name in nuisances:
         part = parts.get(names.index(name), np.zeros(1))

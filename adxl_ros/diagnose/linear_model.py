@@ -31,6 +31,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
+from typing import NamedTuple
 
 from adxl_ros.diagnose import evidence, noise_whitening
 from adxl_ros.diagnose.baseline_comparison import BaselineComparison, Reference
@@ -50,8 +51,22 @@ TOLERANCE_STDS = 4.0
 """Largest deviation of a healthy unit, in standard deviations. Chosen: beyond it an effect is more
 probable than chance."""
 
-NumberedColumn = tuple[int, np.ndarray]
-"""Number of a column and its sensitivity, V per unit, (n,)."""
+
+class NumberedColumn(NamedTuple):
+    """
+    One column of the linear model on one channel.
+
+    Attributes
+    ----------
+    number
+        Number of the column.
+    values
+        Sensitivity of the samples to the coefficient, V per unit, (n,).
+
+    """
+
+    number: int
+    values: np.ndarray
 
 
 def hints_of(name: Coefficient) -> DiagnosisHints:
@@ -279,9 +294,9 @@ def build_linear_model(comparisons: Sequence[BaselineComparison],
                     numbers[name] = len(names)
                     names.append(name)
                     prior_std.append(float(std))
-            for d, (places, values) in enumerate(variant.columns):
-                columns[i][d] += [(numbers[variant.names[j]], values[:, c])
-                                  for c, j in enumerate(places)]
+            for d, axis in enumerate(variant.columns):
+                columns[i][d] += [NumberedColumn(numbers[variant.names[j]], column)
+                                  for j, column in zip(axis.numbers, axis.values.T)]
         ids = list(numbers.values())
         kept.append(replace(next(iter(by_recording.values())), names=tuple(numbers),
                             prior_std=np.array([prior_std[j] for j in ids])))

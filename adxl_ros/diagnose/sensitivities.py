@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 from adxl_ros.errors import UserError
 from adxl_ros.model.coefficients import names_of, parameter_of, put, with_neutral
@@ -53,6 +54,23 @@ Simulate = Callable[[Sensor], np.ndarray]
 """Mean output of a sensor in one recording, V, (n, m)."""
 
 
+class AxisColumns(NamedTuple):
+    """
+    Sensitivities of one axis to the k coefficients that it follows.
+
+    Attributes
+    ----------
+    numbers
+        Numbers of the coefficients in their variant, (k,).
+    values
+        Sensitivities, V per unit of the coefficient, (n, k).
+
+    """
+
+    numbers: np.ndarray
+    values: np.ndarray
+
+
 @dataclass(frozen=True)
 class Variant:
     """
@@ -71,8 +89,7 @@ class Variant:
     prior_std
         Their prior standard deviations, (p,).
     columns
-        By axis: numbers of the coefficients that it follows, and the sensitivities, V per unit,
-        (n, numbers).
+        Sensitivities of each axis.
     limit_start
         Only for an effect with a limit: first values of its fit, by coefficient. The columns are
         then the change of the output by these values, V.
@@ -84,7 +101,7 @@ class Variant:
     step: float
     names: tuple[Coefficient, ...]
     prior_std: np.ndarray
-    columns: tuple[tuple[np.ndarray, np.ndarray], ...]
+    columns: tuple[AxisColumns, ...]
     limit_start: dict[Coefficient, float] = field(default_factory=dict)
 
 
@@ -164,12 +181,10 @@ def _limit_variants(simulate: Simulate, sensor: Sensor, effect: Effect, limit: P
                           dict(zip(names, values)) | start)
 
 
-def _limit_columns(change_v: np.ndarray, clipped: list[int]
-                   ) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
-    """Return by axis the number of its limit, if it clips, and the change, V, (n, 0 or 1)."""
-    return tuple((np.array([clipped.index(d)] if d in clipped else [], int),
-                  change_v[:, [d]] if d in clipped else np.zeros((len(change_v), 0)))
-                 for d in range(change_v.shape[1]))
+def _limit_columns(change_v: np.ndarray, clipped: list[int]) -> tuple[AxisColumns, ...]:
+    """Return the change by its limit for each axis, V; no column where the limit does not clip."""
+    return tuple(_stacked([(clipped.index(d), change_v[:, d])] if d in clipped else [],
+                          len(change_v)) for d in range(change_v.shape[1]))
 
 
 def shapes(effect: Effect) -> list[dict[str, float]]:
@@ -214,12 +229,12 @@ def _variant(simulate: Simulate, sensor: Sensor, effect: Effect, shape: dict[str
         _stacked(axis_columns, len(baseline_v)) for axis_columns in columns))
 
 
-def _stacked(columns: list[tuple[int, np.ndarray]], count: int
-             ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the numbers of columns, and the columns side by side, (count, numbers)."""
+def _stacked(columns: list[tuple[int, np.ndarray]], count: int) -> AxisColumns:
+    """Put numbered columns of `count` samples side by side."""
     if not columns:
-        return np.zeros(0, int), np.zeros((count, 0))
-    return np.array([i for i, _ in columns], int), np.column_stack([c for _, c in columns])
+        return AxisColumns(np.zeros(0, int), np.zeros((count, 0)))
+    return AxisColumns(np.array([i for i, _ in columns], int),
+                       np.column_stack([column for _, column in columns]))
 
 
 def _step_within(parameter: Parameter, values: np.ndarray, step: float) -> float:
