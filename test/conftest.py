@@ -13,10 +13,10 @@
 # limitations under the License.
 
 """
-What the tests share: a ROS domain of their own, the installed executables, the shared files.
+Fixtures that the tests share: a private ROS domain, the installed executables, the shared files.
 
-The executables are found through the ament index, as `ros2 run` does, and talk over DDS on the
-loopback interface in a domain that no other run of these tests and no other graph uses.
+The ament index locates the executables, as for `ros2 run`. They communicate over DDS on the
+loopback interface, in a domain that no other test run and no other graph uses.
 """
 
 from __future__ import annotations
@@ -37,22 +37,22 @@ from hypothesis import settings
 from processes import executable, REPO, Started
 import pytest
 
-# The same examples in each run; to look for new ones: make test ARGS='--hypothesis-profile search'
+# Each run has the same examples. New ones: make test ARGS='--hypothesis-profile search'
 settings.register_profile('same', deadline=None, derandomize=True)
 settings.register_profile('search', deadline=None, max_examples=2000)
 settings.load_profile('same')
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    # A run that is told to end stops the processes it has started, as after Ctrl-C.
+    # After SIGTERM a run stops the processes that it has started, as after Ctrl-C.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    # A shell's background job ignores Ctrl-C, and so would the processes of the tests.
+    # A background job of a shell ignores SIGINT, and its processes would inherit this.
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark tests of a graph; keep what a module makes once in one worker, which xdist reads."""
+    """Mark tests of a graph; keep the shared results of a module in one worker of xdist."""
     for item in items:
         fixtures = set(getattr(item, 'fixturenames', ()))
         if 'ros_env' in fixtures:
@@ -62,7 +62,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """End with one line: how many tests were skipped, and what is missing."""
+    """End with one line: the number of skipped tests, and the missing packages."""
     reasons = Counter(report.longrepr[2].removeprefix('Skipped: ')
                       for report in terminalreporter.stats.get('skipped', ()))
     if reasons:
@@ -71,14 +71,14 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
 
 
 @pytest.fixture(autouse=True)
-def store_of_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Keep the store of calibrations, and whatever else is the user's, out of the tests."""
+def private_store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Keep the calibration store and other files of the user out of the tests."""
     monkeypatch.setenv('ROS_HOME', str(tmp_path / 'ros_home'))
 
 
 @pytest.fixture
 def ros_env(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[dict[str, str]]:
-    """Set the environment of a graph of this test's own, and return that of its processes."""
+    """Set the environment of a private graph, and give the environment of its processes."""
     with own_domain() as domain, pytest.MonkeyPatch.context() as patch:
         patch.setenv('ROS_DOMAIN_ID', str(domain))
         patch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
@@ -90,11 +90,10 @@ def ros_env(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[dict[str
 @pytest.fixture
 def start(ros_env: dict[str, str], tmp_path: Path) -> Iterator[Callable[..., Started]]:
     """
-    Give a function of a name and arguments that starts an executable in this test's graph.
+    Give a function of a name and arguments that starts an executable in the graph of the test.
 
-    It returns a `Started` at once; all of them are stopped when the test ends. The files of what
-    they printed are `tmp_path / '<number>_<name>.log'`, and what a failing test's processes
-    printed is in its report.
+    It returns a `Started` at once. All processes are stopped when the test ends. Their output is
+    in `tmp_path / '<number>_<name>.log'`, and in the report of a failing test.
     """
     started: list[Started] = []
 
@@ -142,7 +141,7 @@ def run_tool(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
 @pytest.fixture(scope='session')
 def shared_dir() -> Path:
-    """Name the folder of real recordings and samples beside the repository."""
+    """Return the folder of real recordings and samples beside the repository."""
     path = REPO.parent / 'shared'
     if not path.is_dir():
         pytest.skip(f'no recordings in {path}')

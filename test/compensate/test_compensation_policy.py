@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Which calibration corrects a stream, whether it may, and in which state the stream is."""
+"""The choice of the calibration of a stream, its refusal, and the state of the stream."""
 
 from dataclasses import replace
 from datetime import datetime, timedelta, timezone
@@ -41,7 +41,7 @@ def unit(serial: str = '17', axes: str = 'xy', seed: int = 1) -> Sensor:
 
 def policy_for(sensor: Sensor, store: Path | str = '', paper: bool = False,
                **info: str) -> CompensationPolicy:
-    """Return the policy of a stream of this sensor, but for some keys of what it states."""
+    """Return the policy of a stream of this sensor; `changes` replaces keys of its info."""
     policy = CompensationPolicy(paper, str(store), TOPICS)
     policy.use(sensor, 'a file')
     policy.info = StreamInfo({**sensor_info(sensor), **info}, '/sensor_info')
@@ -57,7 +57,7 @@ def stored(folder: Path, sensor: Sensor, days_old: float) -> Path:
     return path
 
 
-def test_the_source_is_named_in_one_line() -> None:
+def test_the_source_of_a_calibration_is_stated_in_one_line() -> None:
     policy = CompensationPolicy(False, '', TOPICS)
     assert policy.use(nominal(), 'the file') == \
         'compensating by the file: nominal, which is not calibrated'
@@ -73,8 +73,8 @@ def test_the_source_is_named_in_one_line() -> None:
     ('rate_hz', 'nan', "rate_hz is 'nan', expected samples a second"),
     ('rate_hz', '-1', "rate_hz is '-1', expected samples a second"),
 ])
-def test_another_stream_is_refused_until_it_is_that_of_the_unit(key: str, value: str,
-                                                                reason: str) -> None:
+def test_a_stream_is_refused_until_it_belongs_to_the_unit(key: str, value: str,
+                                                          reason: str) -> None:
     policy = policy_for(unit(), **{key: value})
     assert reason in policy.refusal
     assert policy.refusal.startswith('/sensor_info: ')
@@ -94,7 +94,7 @@ def test_the_papers_inverse_needs_two_axes() -> None:
     policy_for(unit(axes='xyz'), paper=True).check(nominal('xyz'))
 
 
-def test_the_rate_is_the_streams_else_the_calibrations() -> None:
+def test_the_rate_of_the_stream_precedes_that_of_the_calibration() -> None:
     assert policy_for(unit(), rate_hz='250.0').rate_hz == 250.0
     assert policy_for(unit(), rate_hz='none').rate_hz == 1000.0
     policy = CompensationPolicy(False, '', TOPICS)
@@ -119,7 +119,7 @@ def test_the_newest_calibration_of_the_unit_is_chosen(tmp_path: Path) -> None:
     assert policy.choose(path) == (str(fresh), [])
 
 
-def test_a_named_calibration_stands(tmp_path: Path) -> None:
+def test_a_named_calibration_is_not_replaced(tmp_path: Path) -> None:
     stored(tmp_path, unit(seed=2), 0.0)
     named = policy_for(nominal(serial='17'), tmp_path)
     assert named.is_named('/a/file.yaml')
@@ -165,7 +165,7 @@ def test_states_of_the_samples(counts: dict[str, int], state: State, text: str) 
     assert text in status.text
 
 
-def test_a_short_interval_is_no_silence() -> None:
+def test_a_short_interval_does_not_count_as_silence() -> None:
     interval = replace(QUIET, counts={'received': 0}, duration_s=0.01)
     assert policy_for(unit()).status(interval, None, '').state is State.COMPENSATING
 
@@ -180,7 +180,7 @@ def test_states_of_the_stream() -> None:
     assert policy_for(nominal()).values(QUIET, None)['validity'] == 'not calibrated'
 
 
-def test_surroundings_that_an_effect_follows_must_be_heard() -> None:
+def test_missing_temperature_or_supply_is_reported() -> None:
     policy = policy_for(with_neutral(unit(), ['supply']))
     assert policy.status(QUIET, None, '') == (
         State.SURROUNDINGS_UNKNOWN, 'supply is taken at 5: nothing on /supply')

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The RC filter undone, and the paper's approximate inverse beside the exact one."""
+"""The inversion of the RC filter, and the paper's approximate inverse with the exact one."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -40,14 +40,14 @@ RATE_HZ = 1000.0
 
 
 def filtered(inputs, rate_hz=RATE_HZ, fine=16):
-    """Filter functions of time finely, exactly enough, and sample them: stamps and volts."""
+    """Filter functions of time on a fine grid and sample them; return stamps and volts."""
     time_s = np.arange(int(2 * rate_hz * fine)) / (rate_hz * fine)
     out = [low_pass(f(time_s), rc, 1 / (rate_hz * fine), {}) for f, rc in zip(inputs, RC_S)]
     return time_s[::fine], np.column_stack(out)[::fine]
 
 
-def test_amplitude_and_phase_come_back():
-    """10, 60 and 150 Hz behind 15 Hz filters come back to a thousandth, without delay."""
+def test_amplitude_and_phase_are_restored():
+    """10, 60 and 150 Hz behind 15 Hz filters are restored to a thousandth, without delay."""
     def felt(t):
         return np.sin(62.8 * t) + 0.5 * np.cos(377 * t) + 0.2 * np.sin(942 * t)
 
@@ -57,34 +57,34 @@ def test_amplitude_and_phase_come_back():
     assert np.abs(back - expected).max() < 2e-3
 
 
-def test_a_gap_is_not_bridged():
-    """Samples beside a gap are undone from their own side, and never from across."""
+def test_the_inverse_does_not_bridge_a_gap():
+    """Samples beside a gap use only samples of their side."""
     time_s, volts = filtered([np.sin, np.cos])
     kept = np.ones(len(time_s), bool)
     kept[900:1400] = False
     back = filter_inversion.undo(volts[kept], time_s[kept], RC_S, RATE_HZ)
-    whole = filter_inversion.undo(volts, time_s, RC_S, RATE_HZ)[kept]
-    assert np.abs(back - whole)[500:].max() < 0.03
+    without_gap = filter_inversion.undo(volts, time_s, RC_S, RATE_HZ)[kept]
+    assert np.abs(back - without_gap)[500:].max() < 0.03
     np.testing.assert_array_equal(back[900], volts[kept][900])
 
 
 @pytest.mark.parametrize('sizes', [[2000], [700, 3, 1297], [16] * 125])
-def test_blocks_give_what_the_whole_gives(sizes):
-    """How a recording is cut makes no difference but beside blocks shorter than the filter."""
+def test_the_inverse_does_not_depend_on_blocks(sizes):
+    """Blocks change the result only beside blocks that are shorter than the filter."""
     time_s, volts = filtered([np.sin, np.cos])
     cuts = np.cumsum([0, *sizes])
     blocks = [(i, time_s[a:b], volts[a:b]) for i, (a, b) in enumerate(pairwise(cuts))]
     parts = list(filter_inversion.undo_blocks(blocks, RC_S, RATE_HZ))
     assert [token for token, _ in parts] == list(range(len(sizes)))
     back = np.concatenate([part for _, part in parts])
-    whole = filter_inversion.undo(volts, time_s, RC_S, RATE_HZ)
+    at_once = filter_inversion.undo(volts, time_s, RC_S, RATE_HZ)
     if min(sizes) >= filter_inversion.HALF:
-        np.testing.assert_allclose(back, whole, atol=1e-12)
-    assert np.abs(back - whole)[50:].max() < 1e-3
+        np.testing.assert_allclose(back, at_once, atol=1e-12)
+    assert np.abs(back - at_once)[50:].max() < 1e-3
 
 
-def test_a_stream_gives_the_same_eight_samples_later():
-    """Delayed is the zero-phase inverse, sample by sample, with the samples' own stamps."""
+def test_a_stream_gives_the_same_samples_with_a_delay_of_eight():
+    """The zero-phase inverse is delayed sample by sample, and keeps the stamps of the samples."""
     time_s, volts = filtered([np.sin, np.cos])
     kept = np.r_[0:500, 700:1200]
     delayed = filter_inversion.DelayedInversion(RC_S, RATE_HZ)
@@ -103,8 +103,8 @@ def test_a_stream_gives_the_same_eight_samples_later():
     assert sorted(late)[len(late) // 2] == filter_inversion.HALF
 
 
-def test_the_variance_is_that_of_the_noise_that_comes_back():
-    """Noise of a simulated sensor at rest behind the inverse, against `noise_variance_v2`."""
+def test_the_predicted_variance_of_restored_noise_is_right():
+    """The inverse of simulated noise at rest has the variance `noise_variance_v2`."""
     sensor = put(with_neutral(nominal(), ['bandwidth']),
                  [Coefficient('bandwidth', 'resistance_ratio', 'x')], [-0.2])
     time_s = np.arange(200_000) / sensor.rate_hz
@@ -114,8 +114,8 @@ def test_the_variance_is_that_of_the_noise_that_comes_back():
         filter_inversion.noise_variance_v2(sensor), rel=0.02)
 
 
-def test_motion_through_apply(run_tool, tmp_path):
-    """10 Hz of 0.118 m/s² come back whole with --undo-filter, and as 0.83 of it without."""
+def test_apply_restores_the_amplitude_of_a_motion(run_tool, tmp_path):
+    """10 Hz of 0.118 m/s² have their amplitude with --undo-filter, and 0.83 of it without."""
     sensor = replace(nominal(), noise_density_g_per_rthz=np.zeros(2))
     motion = Motion(4.0, Held(np.pi / 4), Held(np.pi / 2), Sine(30e-6, 10.0))
     time_s = np.arange(4000) / 1000
@@ -123,36 +123,36 @@ def test_motion_through_apply(run_tool, tmp_path):
     parameter_file.save(tmp_path / 'unit.yaml', sensor)
     recording.write(tmp_path / 'made.csv', Recording(
         'made', time_s, dict(zip(('x_v', 'y_v'), volts.T)), sensor_info(sensor)), sensor)
-    reach = {}
-    for more in ((), ('--undo-filter',)):
-        run_tool('apply', tmp_path / 'made.csv', '--params', tmp_path / 'unit.yaml', *more,
+    amplitude = {}
+    for options in ((), ('--undo-filter',)):
+        run_tool('apply', tmp_path / 'made.csv', '--params', tmp_path / 'unit.yaml', *options,
                  '-o', tmp_path / 'out.csv')
         table = np.genfromtxt(tmp_path / 'out.csv', delimiter=',', names=True)
         phase = 2 * np.pi * 10 * time_s[1000:3000]
         ax = table['ax_mps2'][1000:3000]
-        reach[more] = 2 * np.mean(ax * np.exp(-1j * phase)) / -1j
+        amplitude[options] = 2 * np.mean(ax * np.exp(-1j * phase)) / -1j
     # -0.118 m/s² is the acceleration of +30 µm·sin.
-    asked = -30e-6 * (2 * np.pi * 10) ** 2
-    assert abs(reach['--undo-filter',] / asked - 1) < 5e-3
-    assert abs(reach[()] / asked) == pytest.approx(0.833, abs=5e-3)
-    assert np.degrees(np.angle(reach[()] / asked)) == pytest.approx(-33.6, abs=0.5)
+    true_mps2 = -30e-6 * (2 * np.pi * 10) ** 2
+    assert abs(amplitude['--undo-filter',] / true_mps2 - 1) < 5e-3
+    assert abs(amplitude[()] / true_mps2) == pytest.approx(0.833, abs=5e-3)
+    assert np.degrees(np.angle(amplitude[()] / true_mps2)) == pytest.approx(-33.6, abs=0.5)
 
 
-def unit(rng, **more):
+def unit(rng, **options):
     """Draw a unit of the paper's terms."""
-    return drawn(rng, nominal(**more))
+    return drawn(rng, nominal(**options))
 
 
 def poses(count=200):
-    """Draw poses upright, off the plane where z is a root of zero."""
+    """Draw upright poses, away from the plane in which z is the root of zero."""
     rng = np.random.default_rng(0)
     alpha = rng.uniform(0, np.radians(70), count)
     return specific_force(alpha, rng.uniform(0, 2 * np.pi, count), 9.80665)
 
 
 @pytest.mark.parametrize('axes', ['xy', 'xyz'])
-def test_the_papers_inverse_is_near_and_the_exact_one_exact(axes):
-    """(14) to (21) are off by second order: more than 1e-6, less than some mg; exact: 1e-9."""
+def test_the_papers_inverse_is_approximate_and_the_other_exact(axes):
+    """(14) to (21) have errors of second order: above 1e-6, below some mg. The other has 1e-9."""
     sensor = unit(np.random.default_rng(2), axes=axes)
     force = poses()
     volts = signal_chain.static_response(sensor)(force)
@@ -163,24 +163,24 @@ def test_the_papers_inverse_is_near_and_the_exact_one_exact(axes):
 
 
 def test_the_papers_inverse_is_exact_for_a_linear_unit():
-    """Without cross-axis terms nothing is approximate."""
+    """Without cross-axis terms the inverse has no approximation."""
     sensor = drawn(np.random.default_rng(2), nominal(), ('bias', 'scale_factor'))
     force = poses()
     back = paper_inverse.inverse(sensor)(signal_chain.static_response(sensor)(force))
     np.testing.assert_allclose(back, force, atol=1e-9)
 
 
-def test_the_papers_inverse_live_is_that_of_arrays():
-    """Sample by sample in floats as in arrays."""
+def test_the_papers_inverse_is_equal_for_floats_and_arrays():
+    """Single samples as floats have the results of arrays."""
     sensor = unit(np.random.default_rng(4))
     volts = signal_chain.static_response(sensor)(poses(5))
-    whole = np.transpose(paper_inverse.inverse(sensor)(volts))
+    force = np.transpose(paper_inverse.inverse(sensor)(volts))
     single = paper_inverse.inverse(sensor, maths=FLOATS)
     live = LiveEstimator(sensor, paper=True)
-    for i, expected in enumerate(whole):
-        one = [float(v[i]) for v in volts]
-        np.testing.assert_allclose(single(one), expected, atol=1e-12)
-        np.testing.assert_allclose(live.from_volts(one, float(i)).force, expected, atol=1e-12)
+    for i, expected in enumerate(force):
+        sample_v = [float(v[i]) for v in volts]
+        np.testing.assert_allclose(single(sample_v), expected, atol=1e-12)
+        np.testing.assert_allclose(live.from_volts(sample_v, float(i)).force, expected, atol=1e-12)
 
 
 def test_the_papers_inverse_needs_two_axes(run_tool, tmp_path):

@@ -34,7 +34,7 @@ G = 9.80665
 
 
 class Stream(LiveStream):
-    """A stream whose results are kept."""
+    """A stream that keeps its results."""
 
     def __init__(self, sensor: Sensor, undo_filter: bool = False, period_ns: int = 2 * 10 ** 9
                  ) -> None:
@@ -76,14 +76,14 @@ def test_samples_are_corrected_and_counted() -> None:
     assert (stream.counts['received'], stream.counts['published']) == (1, 1)
 
 
-def test_a_refused_stream_is_counted_only() -> None:
+def test_samples_of_a_refused_stream_are_only_counted() -> None:
     stream = Stream(unit())
     stream.refused = True
     stream.send(unit(), 0.7, -1.2)
     assert (stream.counts['received'], stream.data) == (1, [])
 
 
-def test_what_is_no_sample_is_dropped() -> None:
+def test_invalid_messages_are_dropped() -> None:
     stream = Stream(unit())
     stream(b'too short')
     stream(serialize_message(Imu())[:-8])
@@ -93,7 +93,7 @@ def test_what_is_no_sample_is_dropped() -> None:
     assert (stream.counts['dropped'], stream.data) == (3, [])
 
 
-def test_coefficients_are_replaced_as_a_whole() -> None:
+def test_coefficients_are_replaced_completely() -> None:
     stream = Stream(unit(1))
     stream.send(unit(1), 0.7, 0.4)
     stream.use(unit(2), 1000.0)
@@ -101,7 +101,7 @@ def test_coefficients_are_replaced_as_a_whole() -> None:
     np.testing.assert_allclose(stream.force(), specific_force(0.7, 0.4, G), atol=1e-7)
 
 
-def test_surroundings_are_used_from_the_next_sample_on() -> None:
+def test_temperature_and_supply_apply_from_the_next_sample_on() -> None:
     sensor = put(with_neutral(unit(), ['temperature_bias']),
                  [Coefficient('temperature_bias', 'per_k', 'x')], [1e-3])
     warm = NOMINAL_ENVIRONMENT._replace(temperature_c=35.0)
@@ -111,13 +111,13 @@ def test_surroundings_are_used_from_the_next_sample_on() -> None:
     stream.send(sensor, 0.7, 0.4, warm)
     assert stream.surroundings == {'temperature_c': 35.0}
     np.testing.assert_allclose(stream.force(), specific_force(0.7, 0.4, G), atol=1e-6)
-    # A new sensor knows them, too.
+    # A new sensor uses them as well.
     stream.use(sensor, 1000.0)
     stream.send(sensor, 0.6, 0.4, warm)
     np.testing.assert_allclose(stream.force(), specific_force(0.6, 0.4, G), atol=1e-6)
 
 
-def test_an_angle_that_is_not_shown_keeps_its_value() -> None:
+def test_an_unobservable_angle_keeps_its_value() -> None:
     """With x upright, roll is not observable."""
     sensor = unit(axes='xyz')
     stream = Stream(sensor)
@@ -131,7 +131,7 @@ def test_an_angle_that_is_not_shown_keeps_its_value() -> None:
     assert 0 < covariance[1, 1] < 1e-5
 
 
-def test_with_the_filter_undone_samples_come_late() -> None:
+def test_inversion_of_the_filter_delays_samples() -> None:
     sensor = replace(unit(), rc_capacitance_f=1e-7)
     stream = Stream(sensor, undo_filter=True, period_ns=1_000_000)
     for _ in range(20):
@@ -140,4 +140,4 @@ def test_with_the_filter_undone_samples_come_late() -> None:
     stream.restart_filter(500.0)
     for _ in range(filter_inversion.HALF):
         stream.send(sensor, 0.7, 0.4)
-    assert len(stream.data) == 20 - filter_inversion.HALF, 'the samples that waited are forgotten'
+    assert len(stream.data) == 20 - filter_inversion.HALF, 'the waiting samples are dropped'

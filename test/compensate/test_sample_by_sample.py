@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Sample by sample the same as block by block, and the bytes that carry it."""
+"""Compensation sample by sample equals that of blocks, and its messages are right."""
 
 from dataclasses import replace
 
@@ -46,7 +46,7 @@ def unit(axes: str) -> Sensor:
 
 
 def samples(sensor: Sensor, force: list[np.ndarray]) -> list[list[float]]:
-    """Let the sensor feel a force at its rate; return nominal acceleration, (n, 3)."""
+    """Apply a force to the sensor at its rate; return nominal acceleration, (n, 3)."""
     volts = Fed(sensor, 2)(force)
     accel = np.zeros((len(volts), 3))
     accel[:, :len(sensor.axes)] = to_nominal_mps2(volts, sensor)
@@ -67,49 +67,49 @@ def test_agrees_with_blocks(axes: str) -> None:
     sensor = unit(axes)
     accel = samples(sensor, turning(2.0))
     follow = LiveEstimator(sensor)
-    found = [follow(a, i / 1000) for i, a in enumerate(accel)]
+    outputs = [follow(a, i / 1000) for i, a in enumerate(accel)]
     volts = sensor.nominal_zero_g_v + np.array(accel)[:, :len(axes)] / G * \
         sensor.nominal_scale_v_per_g
     force = signal_chain.inverse(sensor)(list(volts.T))
-    np.testing.assert_allclose([f.force for f in found], np.array(force).T, rtol=0, atol=2e-8)
+    np.testing.assert_allclose([f.force for f in outputs], np.array(force).T, rtol=0, atol=2e-8)
     covariance = force_covariance(sensor, force)
     measured = np.sqrt(covariance[[0, 0], [0, 0]] if axes == 'x' else
                        covariance[[0, 1], [0, 1]]).T
-    std = np.sqrt([[f.covariance[0], f.covariance[0 if axes == 'x' else 3]] for f in found])
+    std = np.sqrt([[f.covariance[0], f.covariance[0 if axes == 'x' else 3]] for f in outputs])
     np.testing.assert_allclose(std, measured, rtol=0.05)
     angles = tilt(force, covariance, 'z' in axes)
-    shown = np.isfinite(angles.roll)
-    np.testing.assert_allclose(np.array([f.roll[0] for f in found])[shown], angles.roll[shown],
+    finite = np.isfinite(angles.roll)
+    np.testing.assert_allclose(np.array([f.roll[0] for f in outputs])[finite], angles.roll[finite],
                                rtol=0, atol=1e-7)
-    np.testing.assert_allclose([f.inclination[0] for f in found if axes != 'x'],
-                               angles.inclination[np.full(len(found), axes != 'x')],
+    np.testing.assert_allclose([f.inclination[0] for f in outputs if axes != 'x'],
+                               angles.inclination[np.full(len(outputs), axes != 'x')],
                                rtol=0, atol=1e-7)
 
 
-def test_at_rest_z_gets_the_noise_of_a_measured_axis() -> None:
+def test_at_rest_z_has_the_noise_of_a_measured_axis() -> None:
     sensor = unit('xy')
     accel = samples(sensor, at_rest(0.6, 1.0, 3000))
     follow = LiveEstimator(sensor)
-    found = [follow(a, i / 1000) for i, a in enumerate(accel)]
-    zz = force_covariance(sensor, [np.array([v]) for v in found[-1].force])[2, 2, 0]
+    outputs = [follow(a, i / 1000) for i, a in enumerate(accel)]
+    zz = force_covariance(sensor, [np.array([v]) for v in outputs[-1].force])[2, 2, 0]
     noise = (sample_std_v(sensor)[0] / sensor.scale_v_per_g[0] * G) ** 2
-    assert found[-1].covariance[5] == pytest.approx(zz + noise, rel=0.1)
-    assert max(f.covariance[5] for f in found) < 2 * (zz + noise)
+    assert outputs[-1].covariance[5] == pytest.approx(zz + noise, rel=0.1)
+    assert max(f.covariance[5] for f in outputs) < 2 * (zz + noise)
 
 
-def test_motion_widens_z_and_the_angles_and_passes() -> None:
-    """Shaken by 2 m/s² rms along x, z and tilt are as unsure as that; afterwards they are not."""
+def test_motion_raises_the_variance_of_z_and_angles_while_it_lasts() -> None:
+    """A vibration of 2 m/s² rms along x raises the variances of z and tilt while it lasts."""
     sensor = unit('xy')
     force = at_rest(0.6, 1.0, 9000)
     shaken = slice(2000, 5000)
     force[0][shaken] += 2 * 2 ** 0.5 * np.sin(2 * np.pi * 3 * np.arange(3000) / 1000)
     follow = LiveEstimator(sensor)
-    found = [follow(a, i / 1000) for i, a in enumerate(samples(sensor, force))]
-    std = np.sqrt([f.covariance[5] for f in found])
+    outputs = [follow(a, i / 1000) for i, a in enumerate(samples(sensor, force))]
+    std = np.sqrt([f.covariance[5] for f in outputs])
     assert 1.5 < np.median(std[3500:5000]) < 3
-    assert np.sqrt(np.median([f.pitch[1] for f in found[3500:5000]])) > 0.15
-    # The x axis itself is measured, moving or not.
-    assert max(f.covariance[0] for f in found) < 1.1 * found[0].covariance[0]
+    assert np.sqrt(np.median([f.pitch[1] for f in outputs[3500:5000]])) > 0.15
+    # The x axis is measured also in motion.
+    assert max(f.covariance[0] for f in outputs) < 1.1 * outputs[0].covariance[0]
     assert std[-1] < 1.1 * std[1900]
     three_axes = LiveEstimator(unit('xyz'))
     for i, a in enumerate(samples(unit('xyz'), force)[:4000]):
@@ -118,7 +118,7 @@ def test_motion_widens_z_and_the_angles_and_passes() -> None:
     assert np.sqrt(last.pitch[1]) > 0.15
 
 
-def test_a_pause_or_a_clock_set_back_is_no_motion() -> None:
+def test_a_pause_or_a_clock_set_back_does_not_count_as_motion() -> None:
     sensor = nominal('xyz')
     follow = LiveEstimator(sensor)
     for i in range(1000):
@@ -128,22 +128,22 @@ def test_a_pause_or_a_clock_set_back_is_no_motion() -> None:
         follow([0.0, 0.0, G], time_s + 2)
 
 
-def test_at_the_vertical_it_differs_by_less_than_its_uncertainty() -> None:
+def test_difference_to_blocks_at_the_vertical_is_below_its_uncertainty() -> None:
     sensor = unit('xy')
     accel = samples(sensor, at_rest(np.pi / 2, 0.4, 2000))
     follow = LiveEstimator(sensor)
-    found = [follow(a, i / 1000) for i, a in enumerate(accel)]
+    outputs = [follow(a, i / 1000) for i, a in enumerate(accel)]
     volts = sensor.nominal_zero_g_v + np.array(accel)[:, :2] / G * sensor.nominal_scale_v_per_g
     force = np.array(signal_chain.inverse(sensor)(list(volts.T)))
-    off = np.abs(np.array([f.force for f in found]) - force.T)
-    std = np.sqrt([[f.covariance[0], f.covariance[3], f.covariance[5]] for f in found])
-    assert np.isfinite(off).all()
-    assert np.max(off / std) < 0.1
+    difference_mps2 = np.abs(np.array([f.force for f in outputs]) - force.T)
+    std = np.sqrt([[f.covariance[0], f.covariance[3], f.covariance[5]] for f in outputs])
+    assert np.isfinite(difference_mps2).all()
+    assert np.max(difference_mps2 / std) < 0.1
 
 
 @pytest.mark.parametrize('bad', [float('nan'), float('inf'), -1e300])
 @pytest.mark.parametrize('axes', ['x', 'xy', 'xyz'])
-def test_what_no_force_explains_is_none_and_spoils_nothing(axes: str, bad: float) -> None:
+def test_a_sample_without_a_solution_is_none_and_changes_no_other(axes: str, bad: float) -> None:
     sensor = unit(axes)
     accel = samples(sensor, at_rest(0.6, 1.0, 40))
     follow, again = LiveEstimator(sensor), LiveEstimator(sensor)
@@ -153,16 +153,16 @@ def test_what_no_force_explains_is_none_and_spoils_nothing(axes: str, bad: float
         assert follow(a, i / 1000) == again(a, i / 1000)
 
 
-def test_at_a_rail_nothing_is_sure() -> None:
+def test_at_a_rail_all_variances_are_large() -> None:
     sensor = nominal('xyz')
     follow = LiveEstimator(sensor)
     rail = (5.0 - sensor.lsb_v - 2.5) * G
     for _ in range(2):
         assert not follow([0.0, 0.0, G], 0.0).saturated
-        found = follow([0.1, rail, 0.0], 0.001)
-        assert found.saturated
-        assert min(found.covariance[i] for i in (0, 3, 5)) >= UNMEASURED_VARIANCE
-        assert min(found.roll[1], found.pitch[1], found.inclination[1]) > 1
+        output = follow([0.1, rail, 0.0], 0.001)
+        assert output.saturated
+        assert min(output.covariance[i] for i in (0, 3, 5)) >= UNMEASURED_VARIANCE
+        assert min(output.roll[1], output.pitch[1], output.inclination[1]) > 1
     assert not follow([0.1, rail + 1.0, 0.0], 0.002).saturated
 
 
@@ -196,8 +196,8 @@ def big_endian(raw: bytes) -> bytes:
 
 @pytest.mark.parametrize('frame_id', ['', 'a', 'abc', 'imu_link', 'arm/imu_of_the_left_hand'])
 @pytest.mark.parametrize('order', ['little', 'big'])
-def test_bytes_are_the_messages(frame_id: str, order: str) -> None:
-    """What is put into the bytes is what rclpy reads from them, in both byte orders."""
+def test_written_bytes_equal_the_serialized_messages(frame_id: str, order: str) -> None:
+    """Rclpy reads the written values from the bytes, in both byte orders."""
     message = imu(frame_id)
     raw = serialize_message(message)
     if order == 'big':
@@ -216,7 +216,7 @@ def test_bytes_are_the_messages(frame_id: str, order: str) -> None:
     v = expected.vector
     v.x, v.y, v.z = 0.1, 0.2, 0.3
     assert deserialize_message(tilted, Vector3Stamped) == expected
-    if order == 'little' and frame_id == 'abc':  # no padding, whose bytes are anything
+    if order == 'little' and frame_id == 'abc':  # without padding, whose bytes are arbitrary
         assert made == serialize_message(message)
         assert tilted == serialize_message(expected)
 
@@ -224,7 +224,7 @@ def test_bytes_are_the_messages(frame_id: str, order: str) -> None:
 @pytest.mark.parametrize('spoil', [lambda raw: raw[:-1], lambda raw: raw[:10], lambda raw: b'',
                                    lambda raw: b'\x00\x03' + raw[2:],
                                    lambda raw: raw[:12] + b'\xff\xff\xff\x7f' + raw[16:]])
-def test_bytes_that_are_no_imu(spoil: object) -> None:
+def test_bytes_of_other_messages_are_refused(spoil: object) -> None:
     raw = serialize_message(imu('imu_link'))
     imu_message.read(raw)
     with pytest.raises(CdrError):

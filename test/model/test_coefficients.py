@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Names of coefficients, and what an effect states about its parameters."""
+"""Names of coefficients, and the statements of an effect about its parameters."""
 
 from dataclasses import replace
 import json
@@ -28,7 +28,7 @@ from units import nominal
 @pytest.mark.parametrize(('text', 'coefficient'), [
     ('bias.offset_v.x', Coefficient('bias', 'offset_v', 'x')),
     ('time_offset.offset_s', Coefficient('time_offset', 'offset_s'))])
-def test_text_and_name_are_one(text: str, coefficient: Coefficient) -> None:
+def test_text_and_name_are_equivalent(text: str, coefficient: Coefficient) -> None:
     assert Coefficient.parse(text) == coefficient
     assert str(coefficient) == f'{coefficient}' == text
     with pytest.raises(TypeError):
@@ -52,7 +52,7 @@ def test_put_changes_a_copy() -> None:
     assert changed.zero_g_v.tolist() == [2.5, 2.6]
 
 
-def test_a_covariance_is_removed_as_a_whole() -> None:
+def test_a_covariance_is_removed_completely() -> None:
     sensor = replace(nominal('x'), covariance=np.eye(1),
                      covariance_names=(Coefficient('bias', 'offset_v', 'x'),))
     bare = sensor.without_covariance()

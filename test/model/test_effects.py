@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Each effect: neutral is identity, blocks join, tangents agree, closed forms hold."""
+"""Each effect: neutral values change nothing, blocks join, tangents agree, closed forms hold."""
 
 from dataclasses import replace
 
@@ -50,8 +50,8 @@ MOTION = Motion(12.0, Knots([0, 1, 3, 5, 7, 12], [0.5, 0.5, 1.2, 0.9, 2.0, 2.0])
                 supply_v=Steps(5.0, ((4.0, 4.8),), 0.5))
 
 
-def having(name, sensor=None, **changes):
-    """Return a sensor with one effect, typical but for the changes."""
+def with_effect(name, sensor=None, **changes):
+    """Return a sensor with one effect at its typical values, except for the changes."""
     sensor = sensor or nominal('xyz', **CLEAN)
     values = {**typical(library()[name], sensor.axes), **{k: np.asarray(v, float)
                                                           for k, v in changes.items()}}
@@ -59,19 +59,19 @@ def having(name, sensor=None, **changes):
 
 
 def volts(sensor, motion=MOTION, seed=1):
-    """Simulate; volts, (n, m)."""
+    """Simulate a motion; return volts, (n, m)."""
     columns = simulate(sensor, motion, seed)
     return np.column_stack([columns[f'{axis}_v'] for axis in sensor.axes])
 
 
 @pytest.fixture(scope='module')
 def plain():
-    """Return what a sensor without effects says, with noise and ADC."""
+    """Return the volts of a sensor without effects, with noise and ADC."""
     return volts(nominal('xyz'))
 
 
-def test_the_library_is_that_of_the_interfaces():
-    """All names that other software relies on are there."""
+def test_the_library_has_the_documented_effects():
+    """The library contains all effects on which other software relies."""
     names = ('bias scale_factor cross_axis scale_factor_z cross_axis_z misalignment '
              'nonlinearity quadratic hysteresis bandwidth mount_resonance temperature_bias '
              'temperature_scale warm_up bias_walk supply saturation quantisation adc_inl '
@@ -88,37 +88,37 @@ def test_neutral_is_identity_to_the_bit(name, plain):
 
 
 @pytest.mark.parametrize('name', NAMES)
-def test_typical_values_show_and_join(name, plain):
-    """A typical effect changes something, the same in one block and in many."""
-    sensor = having(name, nominal('xyz'))
+def test_typical_values_change_a_recording_and_blocks_join(name, plain):
+    """A typical effect changes the volts, equally in one block and in many."""
+    sensor = with_effect(name, nominal('xyz'))
     if name == 'saturation':
         sensor = put(sensor, [Coefficient('saturation', 'limit_g', 'z')], [0.3])
     if name == 'spikes' or name == 'stuck':
         sensor = put(sensor, [Coefficient(name, 'rate_hz')], [3.0])
-    whole = volts(sensor)
-    assert np.abs(whole - plain).max() > 5e-5
-    respond, stamps = Response(sensor, MOTION, 1), np.arange(len(whole)) / sensor.rate_hz
+    all_at_once_v = volts(sensor)
+    assert np.abs(all_at_once_v - plain).max() > 5e-5
+    respond, stamps = Response(sensor, MOTION, 1), np.arange(len(all_at_once_v)) / sensor.rate_hz
     parts = [respond(stamps[i:i + 777]) for i in range(0, len(stamps), 777)]
-    np.testing.assert_array_equal(np.vstack(parts), whole)
+    np.testing.assert_array_equal(np.vstack(parts), all_at_once_v)
 
 
 @pytest.mark.parametrize('name', [n for n in NAMES if library()[n].smooth
                                   and library()[n].acts_on is ActsOn.MEAN])
 def test_tangents_do_not_depend_on_the_step(name):
-    """Smooth effects: differences by two steps agree, so that fits can use them."""
-    sensor = having(name)
+    """Finite differences of smooth effects with two steps agree."""
+    sensor = with_effect(name)
     for coefficient in names_of(library()[name], 'xyz'):
-        at, scale = get(sensor, [coefficient])[0], parameter_of(coefficient).scale
-        slopes = [(volts(put(sensor, [coefficient], [at + step]))
-                   - volts(put(sensor, [coefficient], [at - step]))) / (2 * step)
+        value, scale = get(sensor, [coefficient])[0], parameter_of(coefficient).scale
+        slopes = [(volts(put(sensor, [coefficient], [value + step]))
+                   - volts(put(sensor, [coefficient], [value - step]))) / (2 * step)
                   for step in (1e-3 * scale, 2e-4 * scale)]
         size = np.abs(slopes[0]).max()
         assert np.abs(slopes[0] - slopes[1]).max() <= 2e-3 * size + 1e-9 / scale
 
 
 @pytest.mark.parametrize('name', NAMES)
-def test_says_what_it_is(name):
-    """Bounds hold the neutral and the typical value; unit, source and cause are stated."""
+def test_bounds_contain_neutral_and_typical_values(name):
+    """Every parameter states its unit and source, every effect its cause."""
     effect = library()[name]
     assert effect.cause.endswith('.')
     for p in effect.parameters:
@@ -128,7 +128,7 @@ def test_says_what_it_is(name):
 
 
 def test_filter_at_10_hz():
-    """The RC of the paper at 10 Hz: 0.833, −33.6°."""
+    """The RC filter of the paper has the gain 0.833 and the phase −33.6° at 10 Hz."""
     time_s = np.arange(4000) / 1000
     out = low_pass(np.sin(20 * np.pi * time_s), 32e3 * 0.33e-6, 1e-3, {})
     wave = 2j * (out * np.exp(-20j * np.pi * time_s))[2000:].mean()
@@ -137,7 +137,7 @@ def test_filter_at_10_hz():
 
 
 def test_resonance():
-    """At its natural frequency a resonator gives 1/(2·ζ), a quarter turn late."""
+    """At its natural frequency a resonator has the gain 1/(2·ζ) and a phase of −90°."""
     time_s = np.arange(20000) / 4000
     out = resonator(np.sin(2 * np.pi * 80 * time_s), 80.0, 0.05, 1 / 4000, {})
     wave = 2j * (out * np.exp(-2j * np.pi * 80 * time_s))[10000:].mean()
@@ -145,7 +145,7 @@ def test_resonance():
     assert np.degrees(np.angle(wave)) == pytest.approx(-90.0, abs=0.01)
 
 
-def test_play_s_loop():
+def test_area_of_the_loop_of_play():
     """A cycle of amplitude A through a dead band 2·r encloses 4·r·(A − r)."""
     x = np.tile(np.concatenate([np.linspace(-1, 1, 4001), np.linspace(1, -1, 4001)]), 2)
     y = play(x, 0.3, {})
@@ -154,23 +154,23 @@ def test_play_s_loop():
     assert area == pytest.approx(4 * 0.3 * (1 - 0.3), rel=1e-3)
 
 
-def test_play_is_its_recursion():
-    """Turning points give what yₙ = max(xₙ − r, min(xₙ + r, yₙ₋₁)) gives, to the bit."""
+def test_play_equals_its_recursion():
+    """The algorithm by turning points equals yₙ = max(xₙ − r, min(xₙ + r, yₙ₋₁)) to the bit."""
     x = np.round(np.cumsum(np.random.default_rng(0).normal(size=5000)), 1)
-    at, expected = x[0], []
-    for value in x:
-        at = max(value - 2, min(value + 2, at))
-        expected.append(at)
+    output, expected = x[0], []
+    for position in x:
+        output = max(position - 2, min(position + 2, output))
+        expected.append(output)
     memory = {}
     parts = [play(x[i:i + 61], 2, memory) for i in range(0, len(x), 61)]
     np.testing.assert_array_equal(np.concatenate(parts), expected)
 
 
 def test_hysteresis_lags_by_its_half_width():
-    """Far from a reversal the output is half a loop behind, on either side."""
+    """Far from a reversal the output lags by half the width of the loop, in both directions."""
     sweep = np.concatenate([np.linspace(-1, 1, 3000), np.linspace(1, -1, 3000)])
-    sensor = having('hysteresis', nominal('x', rc_capacitance_f=0.0, adc_bits=0,
-                                          noise_density_g_per_rthz=np.zeros(1)))
+    sensor = with_effect('hysteresis', nominal('x', rc_capacitance_f=0.0, adc_bits=0,
+                                               noise_density_g_per_rthz=np.zeros(1)))
     out = Fed(sensor)([sweep * G, 0.0, 0.0])[:, 0] - 2.5
     up, down = np.interp(0.0, sweep[:3000], out[:3000]), np.interp(0.0, sweep[:2999:-1],
                                                                    out[:2999:-1])
@@ -178,41 +178,43 @@ def test_hysteresis_lags_by_its_half_width():
 
 
 def test_backlash_lags_by_half_of_its_width():
-    """A turning joint is half of the dead band behind its encoder."""
+    """A turning joint lags its encoder by half of the dead band."""
     swing = Motion(8.0, Held(np.pi / 2), Knots([0, 3, 4, 7, 8], [0, 2, 2, 0, 0]))
-    off = volts(having('backlash', beta_rad=4e-3), swing) - volts(nominal('xyz', **CLEAN), swing)
+    difference_v = (volts(with_effect('backlash', beta_rad=4e-3), swing)
+                    - volts(nominal('xyz', **CLEAN), swing))
     # At beta = 2 and at beta = 0 of alpha 90°: df_x = −sin(beta)·d beta·g.
-    assert off[3900, 0] == pytest.approx(-np.sin(2.0) * -2e-3, rel=2e-3)
-    assert off[-1, 1] == pytest.approx(-2e-3, rel=1e-3)
+    assert difference_v[3900, 0] == pytest.approx(-np.sin(2.0) * -2e-3, rel=2e-3)
+    assert difference_v[-1, 1] == pytest.approx(-2e-3, rel=1e-3)
 
 
 def test_lever_arm_is_centripetal_and_tangential():
-    """ω²·r towards the axis at constant speed, ω̇·r across it while it grows."""
+    """The force is ω²·r towards the axis, and ω̇·r across it while the speed grows."""
     spin = Motion(9.0, Held(0.0), Knots([0, 2, 8, 9], [0, 3, 21, 22.5], [0, 3, 3, 0]))
-    off = (volts(having('lever_arm', x_m=0.1, y_m=0.0, z_m=0.0), spin)
-           - volts(nominal('xyz', **CLEAN), spin)) * G
-    assert off[5000] == pytest.approx([-0.9, 0.0, 0.0], abs=1e-6)
+    difference_mps2 = (volts(with_effect('lever_arm', x_m=0.1, y_m=0.0, z_m=0.0), spin)
+                       - volts(nominal('xyz', **CLEAN), spin)) * G
+    assert difference_mps2[5000] == pytest.approx([-0.9, 0.0, 0.0], abs=1e-6)
     growth = spin.beta(np.array([1.0]), 2)[0]
     assert growth > 1.0
-    slow = having('lever_arm', nominal('xyz', **{**CLEAN, 'rc_capacitance_f': 0.0}),
-                  x_m=0.1, y_m=0.0, z_m=0.0)
-    off = (volts(slow, spin) - volts(nominal('xyz', **CLEAN, rc_capacitance_f=0.0), spin)) * G
-    assert off[1000, 1] == pytest.approx(0.1 * growth, rel=1e-6)
+    slow = with_effect('lever_arm', nominal('xyz', **{**CLEAN, 'rc_capacitance_f': 0.0}),
+                       x_m=0.1, y_m=0.0, z_m=0.0)
+    difference_mps2 = (volts(slow, spin)
+                       - volts(nominal('xyz', **CLEAN, rc_capacitance_f=0.0), spin)) * G
+    assert difference_mps2[1000, 1] == pytest.approx(0.1 * growth, rel=1e-6)
 
 
-def test_supply_is_not_quite_ratiometric():
+def test_supply_effect_has_the_values_of_the_datasheet():
     """The ADXL203 gives 560 mV/g and 1.5 V at 3 V."""
-    respond = signal_chain.static_response(having('supply'))
+    respond = signal_chain.static_response(with_effect('supply'))
     around = NOMINAL_ENVIRONMENT._replace(supply_v=3.0)
-    zero, one = (respond([f, 0.0, 0.0], around)[0] for f in (0.0, G))
-    assert zero == pytest.approx(1.5, abs=1e-12)
-    assert one - zero == pytest.approx(0.560, abs=2e-4)
+    at_zero_v, at_1_g_v = (respond([f, 0.0, 0.0], around)[0] for f in (0.0, G))
+    assert at_zero_v == pytest.approx(1.5, abs=1e-12)
+    assert at_1_g_v - at_zero_v == pytest.approx(0.560, abs=2e-4)
 
 
 def test_temperature_moves_zero_g_and_scale():
-    """0.1 mg/K from 25 °C on, and the scale factor by its part."""
+    """Zero-g changes by 0.1 mg/K from 25 °C on, and the scale factor by its coefficient."""
     around = NOMINAL_ENVIRONMENT._replace(temperature_c=35.0)
-    bias, scale = (signal_chain.static_response(having(name))
+    bias, scale = (signal_chain.static_response(with_effect(name))
                    for name in ('temperature_bias', 'temperature_scale'))
     assert bias([0.0, 0.0, 0.0], around)[0] == pytest.approx(2.501, abs=1e-12)
     assert scale([G, 0.0, 0.0], around)[0] == pytest.approx(3.501, abs=1e-12)
@@ -221,31 +223,32 @@ def test_temperature_moves_zero_g_and_scale():
 def test_vibration_shifts_by_its_mean_square():
     """A vibration of 1 m/s² at 40 Hz shifts the zero-g by k·a²/2."""
     shake = Motion(12.0, Held(np.pi / 2), Held(np.pi / 2), Sine(1 / (80 * np.pi) ** 2, 40.0))
-    off = volts(having('vibration_rectification'), shake) - volts(nominal('xyz', **CLEAN), shake)
-    assert off[-4000:, 0].mean() == pytest.approx(0.05 * (1 / G) ** 2 / 2, rel=1e-3)
+    difference_v = (volts(with_effect('vibration_rectification'), shake)
+                    - volts(nominal('xyz', **CLEAN), shake))
+    assert difference_v[-4000:, 0].mean() == pytest.approx(0.05 * (1 / G) ** 2 / 2, rel=1e-3)
 
 
-def test_quantisation_s_variance_is_its_step_s():
-    """Rounding a slow ramp leaves LSB²/12, by as many bits as are left."""
+def test_variance_of_quantisation_follows_from_its_step():
+    """Rounding a slow ramp has the variance LSB²/12 of the remaining bits."""
     sensor = nominal('x', noise_density_g_per_rthz=np.zeros(1))
     ramp = [np.linspace(0, 1, 60000) * G, 0.0, 0.0]
     exact = Fed(replace(sensor, adc_bits=0))(ramp)
     for lost in (0, 3):
-        coarse = Fed(having('quantisation', sensor, lost_bits=lost))(ramp)
+        coarse = Fed(with_effect('quantisation', sensor, lost_bits=lost))(ramp)
         lsb = sensor.lsb_v * 2 ** lost
         assert np.var(coarse - exact) == pytest.approx(lsb ** 2 / 12, rel=0.01)
 
 
 def test_flicker_is_one_over_f():
-    """Its density is k²/f within 2 % up to a fifth of the rate, and so is the drawn noise."""
+    """The density is k²/f within 2 % up to a fifth of the rate, in theory and in a simulation."""
     rest = Motion(4000.0, internal_rate_hz=10.0)
-    found = []
+    densities = []
     for seed in range(3):
-        sensor = having('flicker', nominal('xyz', **CLEAN, rate_hz=100.0))
+        sensor = with_effect('flicker', nominal('xyz', **CLEAN, rate_hz=100.0))
         data = volts(sensor, rest, seed)
         f, density = welch(data, 100.0, nperseg=2 ** 16, axis=0, detrend=False)
-        found.append(density.mean(axis=1))
-    shape = np.mean(found, axis=0) * f / 1e-8
+        densities.append(density.mean(axis=1))
+    shape = np.mean(densities, axis=0) * f / 1e-8
     for low, tolerance in ((0.03, 0.15), (0.3, 0.05), (2.0, 0.03), (6.0, 0.03)):
         assert shape[(f > low) & (f < 2 * low)].mean() == pytest.approx(1.0, abs=tolerance)
     corners = np.array([0.001, 0.02, 0.1, 0.7, 3.0, 9.0, 19.0])
@@ -253,7 +256,7 @@ def test_flicker_is_one_over_f():
 
 
 def flicker_theory(f, rate_hz):
-    """Return the sum of the processes' sampled densities times f, k = 1."""
+    """Return f times the sum of the densities of the sampled processes, for k = 1."""
     from adxl_ros.model.effects.flicker import corners_hz
     a = np.exp(-2 * np.pi * corners_hz(rate_hz) / rate_hz)[:, None]
     step = np.log(10) / 2
@@ -262,26 +265,26 @@ def flicker_theory(f, rate_hz):
 
 
 def test_bias_walks_with_the_root_of_time():
-    """After t its variance over units is k²·t."""
-    sensor = having('bias_walk', nominal('xyz', **CLEAN, rate_hz=100.0))
-    ends = [volts(sensor, Motion(50.0, internal_rate_hz=10.0), seed)[-1] - [2.5, 2.5, 3.5]
-            for seed in range(150)]
-    assert np.std(ends) == pytest.approx(2e-5 * np.sqrt(50), rel=0.1)
+    """After the time t the variance over units is k²·t."""
+    sensor = with_effect('bias_walk', nominal('xyz', **CLEAN, rate_hz=100.0))
+    final_v = [volts(sensor, Motion(50.0, internal_rate_hz=10.0), seed)[-1] - [2.5, 2.5, 3.5]
+               for seed in range(150)]
+    assert np.std(final_v) == pytest.approx(2e-5 * np.sqrt(50), rel=0.1)
 
 
-def test_stamps_of_late_data():
-    """Positive offset and skew: a sample holds what was before its stamp."""
+def test_time_offset_and_clock_skew_shift_the_samples():
+    """With a positive offset and skew, a sample was taken before its stamp."""
     ramp = Motion(20.0, Held(np.pi / 2), Knots([0, 1, 19, 20], [0, .05, 1.85, 1.9],
                                                [0, 0.1, 0.1, 0]))
     clean = volts(nominal('xyz', **CLEAN), ramp)[:, 1]
-    late = volts(having('time_offset', offset_s=0.02), ramp)[:, 1]
+    late = volts(with_effect('time_offset', offset_s=0.02), ramp)[:, 1]
     np.testing.assert_allclose(late[3020:15000], clean[3000:14980], atol=1e-12)
-    skewed = volts(having('clock_skew', ratio=1e-3), ramp)[:, 1]
+    skewed = volts(with_effect('clock_skew', ratio=1e-3), ramp)[:, 1]
     assert skewed[10000] == pytest.approx(clean[9990], abs=1e-7)
 
 
-def test_inverse_by_surroundings():
-    """With temperature, supply and time since power on known, the inverse is exact."""
+def test_inverse_uses_temperature_supply_and_time():
+    """Given temperature, supply and time since power-on, the inverse is exact."""
     names = [n for n in NAMES if library()[n].invertible and Need.STAGE not in library()[n].needs]
     sensor = with_neutral(nominal('xyz'), names)
     sensor = replace(sensor, values={n: typical(library()[n], 'xyz') for n in names})
@@ -289,18 +292,18 @@ def test_inverse_by_surroundings():
     around = signal_chain.Environment(rng.uniform(0, 900, 400), rng.uniform(-20, 60, 400),
                                       rng.uniform(4.5, 5.5, 400))
     truth = rng.normal(size=(3, 400)) * 5
-    found = signal_chain.inverse(sensor)(
+    force = signal_chain.inverse(sensor)(
         signal_chain.static_response(sensor)(list(truth), around), around)
-    np.testing.assert_allclose(np.array(found), truth, atol=1e-9 * G)
+    np.testing.assert_allclose(np.array(force), truth, atol=1e-9 * G)
 
 
 def test_local_gravity_is_used_by_equation_5():
-    """A two-axis sensor takes its z from the corrected gravity."""
-    sensor = having('gravity', nominal('xy'))
+    """A two-axis sensor computes z from the corrected gravity."""
+    sensor = with_effect('gravity', nominal('xy'))
     force = specific_force(0.6, 0.3, signal_chain.gravity_mps2(sensor))
-    found = signal_chain.inverse(sensor)(
+    recovered = signal_chain.inverse(sensor)(
         signal_chain.static_response(sensor)([float(f) for f in force]))
-    assert found == pytest.approx([float(f) for f in force], abs=1e-9)
+    assert recovered == pytest.approx([float(f) for f in force], abs=1e-9)
 
 
 @pytest.mark.parametrize('name, changes, motion', [
@@ -308,13 +311,13 @@ def test_local_gravity_is_used_by_equation_5():
     ('quantisation', {'adc_bits': 0}, MOTION),
     ('noise_excess', {'noise_density_g_per_rthz': np.zeros(3)}, MOTION),
     ('backlash', {}, Motion(1.0, force=lambda at_s: [0 * at_s] * 3))])
-def test_nothing_to_act_on_is_said(name, changes, motion):
-    """An effect without filter, ADC, noise or stage is refused by name."""
+def test_an_effect_without_its_stage_of_the_chain_is_refused(name, changes, motion):
+    """The message names the effect if the sensor has no filter, ADC, noise or stage."""
     with pytest.raises(UserError, match=f'^{name} acts on the '):
-        Response(replace(having(name, nominal('xyz')), **changes), motion, 0)
+        Response(replace(with_effect(name, nominal('xyz')), **changes), motion, 0)
 
 
 def test_neutral_values_are_stated_by_axis():
-    """Values have an entry an axis, or none."""
+    """Values have one entry for each axis, or no axes."""
     values = neutral(library()['mount_resonance'], 'xy')
     assert values['gain'].tolist() == [0.0, 0.0] and values['frequency_hz'].shape == ()

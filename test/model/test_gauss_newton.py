@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Gauss-Newton: certified results of NIST, honest about convergence, halves steps that lose."""
+"""Gauss-Newton: certified results of NIST, convergence, steps that would raise the cost."""
 
 from collections.abc import Callable
 

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The model beside figures that others gave: the paper, the datasheet, closed forms."""
+"""The model compared with values of the paper, of the datasheet and of closed forms."""
 
 from adxl_ros.model import noise, signal_chain
 from adxl_ros.model.coefficients import with_neutral
@@ -24,8 +24,8 @@ import pytest
 from units import Fed, nominal
 
 
-def test_directions_of_the_paper():
-    """Equation 18 with the paper's angles gives its Θx; (19) by hand, as its Θy is a slip."""
+def test_matrix_of_misalignment_equals_equations_18_and_19():
+    """Equation 18 gives Θx of the paper. (19) is computed by hand, as Θy is misprinted there."""
     x = direction(0, np.radians(0.75), np.radians(-0.33))
     assert np.round(x, 4).tolist() == [0.9999, -0.0058, -0.0131]
     y = direction(1, np.radians(0.75), np.radians(0.5))
@@ -46,8 +46,8 @@ def test_effective_samples_of_a_dwell():
     assert noise.effective_samples(5000, 1e-3, 0.0) == 5000
 
 
-def test_mean_of_simulated_noise_scatters_as_promised():
-    """Means over 5 s of simulated noise scatter by σ/√237."""
+def test_means_of_simulated_noise_have_the_predicted_deviation():
+    """Means over 5 s of simulated noise have a standard deviation of σ/√237."""
     sensor = nominal(adc_bits=0)
     fed = Fed(sensor, 5)
     volts = np.vstack([fed([np.zeros(50000), np.zeros(50000), np.full(50000, 9.8)])
@@ -72,18 +72,18 @@ def test_filter_at_10_hz():
     assert np.degrees(np.angle(ratio)) == pytest.approx(-33.6, abs=0.05)
 
 
-def test_blocks_join_to_one_run():
-    """The chain gives the same samples whether it runs in one block or in many."""
+def test_samples_do_not_depend_on_the_blocks():
+    """The chain gives the same samples in one block and in many."""
     sensor = nominal()
     force = specific_force(np.linspace(0, 1, 1000), np.linspace(0, 2, 1000), 9.8)
-    whole, parts = Fed(sensor, 3)(force), Fed(sensor, 3)
+    at_once, parts = Fed(sensor, 3)(force), Fed(sensor, 3)
     parts = [parts([f[i:i + 77] for f in force]) for i in range(0, 1000, 77)]
-    np.testing.assert_array_equal(whole, np.vstack(parts))
+    np.testing.assert_array_equal(at_once, np.vstack(parts))
 
 
 @pytest.mark.parametrize('name', sorted(library()))
 def test_neutral_effect_is_identity(name):
-    """An effect whose parameters are neutral changes no bit."""
+    """An effect with neutral parameters changes no bit."""
     plain = nominal('xyz')
     neutral = with_neutral(plain, [name])
     force = specific_force(np.linspace(-3, 3, 50), np.linspace(-2, 4, 50), 9.8)
@@ -93,7 +93,7 @@ def test_neutral_effect_is_identity(name):
 
 
 def test_stage_frames():
-    """The stage's frames: x up at alpha 90°, beta 0; y down at beta 90°; z up at alpha 0."""
+    """X is up at alpha 90°, beta 0; y is down at beta 90°; z is up at alpha 0."""
     quarter = np.pi / 2
     np.testing.assert_allclose(specific_force(quarter, 0.0, 9.8), [9.8, 0, 0], atol=1e-12)
     np.testing.assert_allclose(specific_force(quarter, quarter, 9.8), [0, -9.8, 0], atol=1e-12)

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The page about effects of one's own: its package, installed as written, works everywhere."""
+"""The package of the page about effects of other packages works as documented."""
 
 import os
 import re
@@ -27,8 +27,8 @@ from units import nominal
 PAGE = REPO / 'docs' / 'own_effect.md'
 
 
-def test_the_page_s_package_works(tmp_path, monkeypatch):
-    """Its module and entry point, found by simulate, by parameter files and by apply."""
+def test_the_documented_package_works(tmp_path, monkeypatch):
+    """Its effect is available to `simulate`, to parameter files and to `apply`."""
     blocks = re.findall(r'`([a-z_.]+)`:\n\n```\w+\n(.*?)```', PAGE.read_text(), re.DOTALL)
     assert {name for name, _ in blocks} == {'pyproject.toml', 'crane_effects.py'}
     package = tmp_path / 'package'
@@ -52,7 +52,7 @@ def test_the_page_s_package_works(tmp_path, monkeypatch):
                            cwd=tmp_path)
     assert plain.returncode == 0, plain.stderr
     read = [recording.read(tmp_path / name).columns['x_v'] for name in ('a.csv', 'b.csv')]
-    # 2 Ohm · 0.7 mA; its growth with the output averages out over a whole turn.
+    # 2 Ohm · 0.7 mA. The growth with the output averages out over a complete turn.
     assert abs(np.mean(read[0] - read[1]) - 1.4e-3) < 2e-5
     path = tmp_path / 'unit.yaml'
     parameter_file.save(path, nominal('xy'))

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The inverse undoes the chain, and what it says of its own uncertainty is so."""
+"""The inverse undoes the chain, and its stated uncertainty is right."""
 
 from dataclasses import replace
 
@@ -54,7 +54,7 @@ def coefficients(sensor: Sensor) -> tuple[Coefficient, ...]:
     return tuple(n for name in sensor.effects for n in names_of(library()[name], sensor.axes))
 
 
-def one_of(axes: str, seed: int) -> Sensor:
+def drawn_sensor(axes: str, seed: int) -> Sensor:
     """Draw a unit at datasheet spread with a covariance of its coefficients."""
     rng = np.random.default_rng(seed)
     sensor = with_neutral(nominal(axes), INVERTIBLE)
@@ -70,18 +70,18 @@ def direction(draw: st.DrawFn) -> np.ndarray:
     return vector / np.linalg.norm(vector)
 
 
-def bits_off_v(sensor: Sensor) -> float:
-    """Return by how much the wrong weights of bits can move volts, V."""
+def bit_error_v(sensor: Sensor) -> float:
+    """Return the largest effect of the wrong bit weights, V."""
     return float(sum(abs(value) for name, value in sensor.values['adc_inl'].items()
                      if name.endswith('bit_v')))
 
 
-def at_a_step(sensor: Sensor, force: np.ndarray) -> bool:
-    """Tell whether the ADC's input is so near a step that another input may give its volts."""
+def near_a_step(sensor: Sensor, force: np.ndarray) -> bool:
+    """Return whether the input of the ADC is so near a step that another input has its code."""
     input_v = np.array(signal_chain.analog_response(sensor)([float(f) for f in force]))
     step_v = sensor.adc_vref_v / 64
     off_v = np.abs(input_v - np.rint(input_v / step_v) * step_v)
-    return bool((off_v <= 2 * bits_off_v(sensor)).any())
+    return bool((off_v <= 2 * bit_error_v(sensor)).any())
 
 
 @given(st.data(), st.sampled_from(AXES))
@@ -92,15 +92,15 @@ def test_inverse_undoes_the_chain(data: st.DataObject, axes: str) -> None:
     if axes == 'x':
         force[1:] = 0
     if axes == 'xy':
-        # Nearer to the plane, another z with the same volts may be the upper one.
+        # Nearer to the plane, another z with the same volts may be the upper solution.
         force[2] = abs(force[2]) + 0.4 * G
         force *= G / np.linalg.norm(force)
     volts = signal_chain.static_response(sensor)([float(f) for f in force])
-    found = signal_chain.inverse(sensor)(volts)
-    apart_mps2 = 4 * bits_off_v(sensor) * G if at_a_step(sensor, force) else 0.0
-    np.testing.assert_allclose(found, force, rtol=0, atol=1e-9 + apart_mps2)
+    recovered = signal_chain.inverse(sensor)(volts)
+    apart_mps2 = 4 * bit_error_v(sensor) * G if near_a_step(sensor, force) else 0.0
+    np.testing.assert_allclose(recovered, force, rtol=0, atol=1e-9 + apart_mps2)
     many = signal_chain.inverse(sensor)([np.full(3, v) for v in volts])
-    np.testing.assert_array_equal(np.array(many), np.array(found)[:, None] * np.ones(3))
+    np.testing.assert_array_equal(np.array(many), np.array(recovered)[:, None] * np.ones(3))
 
 
 @given(st.data(), st.floats(-1, 1), st.floats(-np.pi, np.pi), st.floats(-3, 3))
@@ -114,41 +114,43 @@ def test_inverse_holds_at_the_vertical(data: st.DataObject, tilted: float, beta:
     volts = [v + sigmas * 1e-3 for v in volts]
     force = signal_chain.inverse(sensor)(volts)
     assert np.isfinite(force).all()
-    # Between two codes whose bits are off lies a gap that no force reaches.
+    # Between two codes with wrong bit weights lies a gap that no force reaches.
     np.testing.assert_allclose(signal_chain.static_response(sensor)(force), volts, rtol=0,
-                               atol=1e-6 + (bits_off_v(sensor) if sigmas else 0))
-    # |f| is g; where noise puts more into the plane, it is the least that the volts allow.
+                               atol=1e-6 + (bit_error_v(sensor) if sigmas else 0))
+    # |f| is g. Where noise makes the force in the plane larger, |f| is the smallest possible one.
     assert np.linalg.norm(force) > G - 1e-5
 
 
-@pytest.mark.parametrize('bad', [np.nan, np.inf, 1e38, -1e300])
+@pytest.mark.parametrize('invalid_v', [np.nan, np.inf, 1e38, -1e300])
 @pytest.mark.parametrize('axes', AXES)
-def test_what_no_force_explains_is_nan_and_spoils_nothing(axes: str, bad: float) -> None:
-    sensor = one_of(axes, 1)
-    good = signal_chain.static_response(sensor)([1.0, 0.0, 0.0])
-    volts = [np.array([v, bad, v]) for v in good]
+def test_volts_without_a_solution_are_nan_and_change_no_other_sample(axes: str, invalid_v: float
+                                                                     ) -> None:
+    sensor = drawn_sensor(axes, 1)
+    valid_v = signal_chain.static_response(sensor)([1.0, 0.0, 0.0])
+    volts = [np.array([v, invalid_v, v]) for v in valid_v]
     force = np.array(signal_chain.inverse(sensor)(volts))
-    assert np.isnan(force[:, 1]).all() or not np.isfinite(bad) or np.abs(force[:, 1]).max() > 1e3
-    alone = np.array(signal_chain.inverse(sensor)(good))
-    np.testing.assert_array_equal(force[:, 0], alone)
-    np.testing.assert_array_equal(force[:, 2], alone)
+    assert (np.isnan(force[:, 1]).all() or not np.isfinite(invalid_v)
+            or np.abs(force[:, 1]).max() > 1e3)
+    single = np.array(signal_chain.inverse(sensor)(valid_v))
+    np.testing.assert_array_equal(force[:, 0], single)
+    np.testing.assert_array_equal(force[:, 2], single)
 
 
 def test_z_sign_by_sample() -> None:
-    sensor = one_of('xy', 2)
+    sensor = drawn_sensor('xy', 2)
     alpha, beta = np.array([0.5, np.pi - 0.5]), np.array([1.0, 1.0])
     force = specific_force(alpha, beta, G)
     volts = signal_chain.static_response(sensor)(force)
-    found = signal_chain.inverse(sensor, np.array([1, -1]))(volts)
-    np.testing.assert_allclose(found, force, rtol=0, atol=1e-9)
+    recovered = signal_chain.inverse(sensor, np.array([1, -1]))(volts)
+    np.testing.assert_allclose(recovered, force, rtol=0, atol=1e-9)
     upside_down = signal_chain.inverse(replace(sensor, z_sign=-1))([float(v[1]) for v in volts])
     np.testing.assert_allclose(upside_down, [f[1] for f in force], rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize('axes', ['xy', 'xyz'])
-def test_intervals_cover_what_they_promise(axes: str) -> None:
-    """90 % intervals hold the truth in 88 to 92 % of units drawn from a calibration."""
-    sensor = one_of(axes, 3)
+def test_intervals_have_their_stated_coverage(axes: str) -> None:
+    """90 % intervals contain the truth in 88 to 92 % of units drawn from a calibration."""
+    sensor = drawn_sensor(axes, 3)
     rng = np.random.default_rng(4)
     beta = np.radians([-150, -60, 20, 80])
     force = np.array(specific_force(np.radians([35, 60, 25, 50]), beta, G))
@@ -162,23 +164,23 @@ def test_intervals_cover_what_they_promise(axes: str) -> None:
     volts = np.array(volts) + noise.sample_std_v(sensor)[:, None] * rng.normal(
         size=(draws, len(axes), len(beta)))
     volts = np.moveaxis(volts, 1, 0).reshape(len(axes), -1)
-    found = signal_chain.inverse(sensor)(list(volts))
-    covariance = force_covariance(sensor, found)
+    recovered = signal_chain.inverse(sensor)(list(volts))
+    covariance = force_covariance(sensor, recovered)
     truth = np.tile(force, draws)
     for d in range(3):
-        covered(found[d] - truth[d], np.sqrt(covariance[d, d]))
-    shown = tilt(found, covariance, 'z' in axes)
+        assert_coverage(recovered[d] - truth[d], np.sqrt(covariance[d, d]))
+    angles = tilt(recovered, covariance, 'z' in axes)
     exact = tilt(list(truth), np.zeros((3, 3, truth.shape[1])))
     for name in ('roll', 'pitch', 'inclination', 'alpha', 'beta'):
-        error = getattr(shown, name) - getattr(exact, name)
-        covered((error + np.pi) % (2 * np.pi) - np.pi, getattr(shown, f'{name}_std'))
+        error = getattr(angles, name) - getattr(exact, name)
+        assert_coverage((error + np.pi) % (2 * np.pi) - np.pi, getattr(angles, f'{name}_std'))
 
 
-def covered(error: np.ndarray, std: np.ndarray) -> None:
+def assert_coverage(error: np.ndarray, std: np.ndarray) -> None:
     assert 0.88 < np.mean(np.abs(error) < 1.6449 * std) < 0.92
 
 
-def test_coefficient_tangent_is_the_paper_s() -> None:
+def test_coefficient_tangent_equals_the_paper() -> None:
     """∂V/∂B = 1, ∂V/∂SF = A of equation 3."""
     sensor = replace(nominal(), effects=('bias', 'scale_factor'), values={
         'bias': {'offset_v': np.array([0.1, 0.0])},
@@ -186,12 +188,12 @@ def test_coefficient_tangent_is_the_paper_s() -> None:
         covariance=np.eye(2) * 1e-6,
         covariance_names=(Coefficient('bias', 'offset_v', 'x'),
                           Coefficient('scale_factor', 'offset_v_per_g', 'x')))
-    found = coefficient_tangent(sensor)([np.array([G / 2]), np.array([1.0]), np.array([0.0])])
-    np.testing.assert_allclose(found[:, :, 0], [[1, 0.5], [0, 0]], atol=1e-9)
+    tangent = coefficient_tangent(sensor)([np.array([G / 2]), np.array([1.0]), np.array([0.0])])
+    np.testing.assert_allclose(tangent[:, :, 0], [[1, 0.5], [0, 0]], atol=1e-9)
 
 
-def test_vertical_z_scatters_as_promised() -> None:
-    """At alpha = 90° z is the root of noise: √(0.8·σ·g), not infinite, and not zero."""
+def test_vertical_z_has_the_predicted_deviation() -> None:
+    """At alpha = 90° the deviation of z is √(0.8·σ·g), neither infinite nor zero."""
     sensor = nominal(adc_bits=0)
     rng = np.random.default_rng(6)
     volts = 2.5 + np.array([[1.0], [0.0]]) + rng.normal(size=(2, 50000)) * \
@@ -202,30 +204,30 @@ def test_vertical_z_scatters_as_promised() -> None:
 
 
 def test_angles_of_known_poses() -> None:
-    """REP-103 frames: pitched up by 30° x reads +g/2's opposite; rolled by 90° y reads g."""
+    """In frames of REP 103, x reads −g/2 at a pitch of 30°, and y reads g at a roll of 90°."""
     half, root = G / 2, G * 3 ** 0.5 / 2
     force = np.array([[-half, 0, root], [0, G, 0], [0, half, root], [half, -root, 0]]).T
-    found = tilt(list(force), np.full((3, 3, 4), 1e-12) * np.eye(3)[:, :, None])
-    np.testing.assert_allclose(np.degrees(found.pitch), [30, 0, 0, -30], atol=1e-9)
-    np.testing.assert_allclose(np.degrees(found.roll), [0, 90, 30, -90], atol=1e-9)
-    np.testing.assert_allclose(np.degrees(found.inclination), [30, 90, 30, 90], atol=1e-9)
-    np.testing.assert_allclose(np.degrees(found.beta), [180, -90, -90, 60], atol=1e-9)
+    angles = tilt(list(force), np.full((3, 3, 4), 1e-12) * np.eye(3)[:, :, None])
+    np.testing.assert_allclose(np.degrees(angles.pitch), [30, 0, 0, -30], atol=1e-9)
+    np.testing.assert_allclose(np.degrees(angles.roll), [0, 90, 30, -90], atol=1e-9)
+    np.testing.assert_allclose(np.degrees(angles.inclination), [30, 90, 30, 90], atol=1e-9)
+    np.testing.assert_allclose(np.degrees(angles.beta), [180, -90, -90, 60], atol=1e-9)
 
 
-def test_what_a_pose_does_not_show() -> None:
-    """Neither beta at alpha = 0, nor roll with x upright, nor anything in free fall."""
+def test_unobservable_angles_are_nan() -> None:
+    """Beta at alpha = 0, roll with x upright, and all angles in free fall are unobservable."""
     spread = 1e-4 * np.eye(3)[:, :, None] * np.ones(3)
-    found = tilt([np.array(c) for c in ([1e-3, G, 0.0], [0.0, 1e-3, 0.0], [G, 0.0, 0.0])], spread)
-    for name, shown in (('beta', [False, True, False]), ('roll', [True, False, False]),
-                        ('pitch', [True, True, False]), ('inclination', [True, True, False])):
-        assert np.isfinite(getattr(found, name)).tolist() == shown
-        assert np.isfinite(getattr(found, f'{name}_std')).tolist() == shown
+    angles = tilt([np.array(c) for c in ([1e-3, G, 0.0], [0.0, 1e-3, 0.0], [G, 0.0, 0.0])], spread)
+    for name, observable in (('beta', [False, True, False]), ('roll', [True, False, False]),
+                             ('pitch', [True, True, False]), ('inclination', [True, True, False])):
+        assert np.isfinite(getattr(angles, name)).tolist() == observable
+        assert np.isfinite(getattr(angles, f'{name}_std')).tolist() == observable
     two_axes = tilt([np.array([3.0]), np.array([0.0]), np.array([-9.0])], spread[:, :, :1], False)
     assert two_axes.alpha == pytest.approx(np.arctan2(3, 9))
 
 
 def test_floats_and_arrays_agree() -> None:
-    """One formula serves a live sample and a recording."""
+    """The formulas give the same result for a live sample and for a recording."""
     rng = np.random.default_rng(7)
     force = rng.normal(size=(3, 200)) * 6
     mixed = rng.normal(size=(200, 3, 3)) * 0.1
@@ -238,7 +240,7 @@ def test_floats_and_arrays_agree() -> None:
         np.testing.assert_allclose(floats, arrays[:, i], rtol=1e-12)
 
 
-def test_roll_and_pitch_covary_as_by_differences() -> None:
+def test_covariance_of_roll_and_pitch_equals_finite_differences() -> None:
     force = np.array([3.0, -4.0, 8.0])
     spread = np.array([[4, 1, 2], [1, 5, -1], [2, -1, 6]]) * 1e-4
 
@@ -259,7 +261,7 @@ def test_axes_of_a_nominal_sensor() -> None:
     assert with_axes(nominal(), 'xyz').nominal_zero_g_v.tolist() == [2.5, 2.5, 2.5]
     assert with_axes(nominal(), 'x').noise_density_g_per_rthz.shape == (1,)
     with pytest.raises(UserError, match='calibrated for the axes xy, not xyz'):
-        with_axes(one_of('xy', 1), 'xyz')
+        with_axes(drawn_sensor('xy', 1), 'xyz')
     uneven = nominal(nominal_scale_v_per_g=np.array([1.0, 0.9]))
     with pytest.raises(UserError, match=r'\[1.0, 0.9\] for xy does not determine'):
         with_axes(uneven, 'xyz')

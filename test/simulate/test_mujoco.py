@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Another simulator's ideal reading through our chain, beside our own kinematics."""
+"""The ideal reading of MuJoCo through the signal chain, compared with the kinematics."""
 
 import subprocess
 import sys
@@ -26,21 +26,21 @@ from units import nominal
 SCRIPT = REPO / 'docs' / 'examples' / 'mujoco_arm.py'
 
 
-def test_mujoco_s_accelerometer_agrees_to_a_tenth_of_a_mg(run_tool, tmp_path):
-    """A swinging arm: MuJoCo's specific force and our stage with a lever arm, noise off."""
+def test_the_accelerometer_of_mujoco_agrees_to_a_tenth_of_a_mg(run_tool, tmp_path):
+    """Specific force of a swinging arm by MuJoCo and by a stage with a lever arm agree."""
     pytest.importorskip('mujoco', reason='mujoco is not installed: pip install mujoco')
     ideal, joints = tmp_path / 'ideal.csv', tmp_path / 'joints.csv'
     subprocess.run([sys.executable, str(SCRIPT), str(ideal), str(joints)], check=True)
     parameter_file.save(tmp_path / 'exact.yaml', nominal(
         'xyz', noise_density_g_per_rthz=np.zeros(3), adc_bits=0, stage_resolution_rad=0.0))
-    found = []
+    volts = []
     for args in (('imu', '--force', ideal),
                  (joints, '--effect', 'lever_arm:x_m=0.05,y_m=-0.03,z_m=0.1')):
         out = tmp_path / 'out.csv'
         done = run_tool('simulate', *args, '--params', tmp_path / 'exact.yaml', '-o', out)
         assert done.returncode == 0, done.stderr
-        found.append(recording.read(out).volts(nominal('xyz')))
-    by_mujoco, by_joints = found
+        volts.append(recording.read(out).volts(nominal('xyz')))
+    by_mujoco, by_joints = volts
     assert np.ptp(by_mujoco, axis=0).min() > 0.5, 'the arm must move the sensor'
-    off_mg = 1e3 * (by_mujoco[:len(by_joints)] - by_joints)[50:-50]
-    assert np.abs(off_mg).max() < 0.1
+    difference_mg = 1e3 * (by_mujoco[:len(by_joints)] - by_joints)[50:-50]
+    assert np.abs(difference_mg).max() < 0.1

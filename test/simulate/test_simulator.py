@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The simulator through its command line, and against theory: rate, noise, motion, recordings."""
+"""The simulator by its command line and against theory: rate, noise, motion, recordings."""
 
 from dataclasses import replace
 
@@ -38,15 +38,15 @@ CLEAN = {'noise_density_g_per_rthz': np.zeros(3), 'adc_bits': 0}
 
 
 def with_all(sensor, acts_on=tuple(ActsOn)):
-    """Give a sensor every effect of the library, typical."""
+    """Return a sensor with every effect of the library at its typical values."""
     names = [name for name, e in library().items() if e.acts_on in acts_on]
     values = {name: typical(library()[name], sensor.axes) for name in names}
     return replace(sensor, effects=tuple(names), values=values)
 
 
 @pytest.mark.parametrize('everything', [False, True])
-def test_rich_at_250_hz_is_rich_at_16_khz(everything):
-    """Noise off, the rates differ by less than 5 µg rms, with every effect in the mean, too."""
+def test_rich_at_250_hz_equals_rich_at_16_khz(everything):
+    """Without noise the volts at both rates differ by less than 1 µV rms."""
     sensor = nominal('xyz', **CLEAN)
     if everything:
         sensor = with_all(sensor, (ActsOn.MEAN,))
@@ -57,13 +57,13 @@ def test_rich_at_250_hz_is_rich_at_16_khz(everything):
         motion = replace(motion, duration_s=150.0)
     slow, fast = (simulate(replace(sensor, rate_hz=rate), motion, 0) for rate in (250.0, 16000.0))
     for name in ('x_v', 'y_v', 'z_v'):
-        off = slow[name] - fast[name][::64][:len(slow[name])]
-        assert np.sqrt(np.mean(off ** 2)) < 1e-6
+        difference_v = slow[name] - fast[name][::64][:len(slow[name])]
+        assert np.sqrt(np.mean(difference_v ** 2)) < 1e-6
 
 
 @pytest.mark.parametrize('name', sorted(TRAJECTORIES))
-def test_joints_have_their_own_derivatives(name):
-    """Velocity and acceleration are those of the position, and all ends at rest."""
+def test_velocity_and_acceleration_are_derivatives_of_the_position(name):
+    """All manoeuvres but `motion` also begin and end at rest."""
     motion = TRAJECTORIES[name](np.random.default_rng(0))
     time_s = np.linspace(0, min(motion.duration_s, 300.0), 300001)
     for joint in (motion.alpha, motion.beta, motion.shift):
@@ -77,8 +77,8 @@ def test_joints_have_their_own_derivatives(name):
 
 
 @pytest.mark.perf
-def test_ten_minutes_of_everything_take_seconds():
-    """10 min at 1 kHz, three axes, all effects: at most 3 s of processor time (the aim)."""
+def test_ten_minutes_with_all_effects_take_seconds():
+    """10 min of three axes at 1 kHz with all effects need at most 3 s of processor time."""
     sensor, motion = with_all(nominal('xyz')), rich(np.random.default_rng(0))
     with within(3.0 * motion.duration_s / 600):
         simulate(sensor, motion, 0)
@@ -102,21 +102,22 @@ def test_noise_has_the_stated_spectrum_and_allan_deviation():
     assert np.sqrt(density[(f > 0.3) & (f < 2)].mean()) == pytest.approx(110e-6, rel=0.03)
     for length in (10, 100, 1000):
         means = data[:len(data) // length * length].reshape(-1, length, data.shape[1]).mean(axis=1)
-        found = np.sqrt(np.mean(np.diff(means, axis=0) ** 2) / 2)
-        assert found == pytest.approx(np.sqrt(allan_variance(variance, decay, length)), rel=0.03)
+        deviation_v = np.sqrt(np.mean(np.diff(means, axis=0) ** 2) / 2)
+        expected_v = np.sqrt(allan_variance(variance, decay, length))
+        assert deviation_v == pytest.approx(expected_v, rel=0.03)
 
 
 def allan_variance(variance, decay, length):
-    """Return that of an AR(1) sequence for means of so many samples, from its correlations."""
+    """Return the Allan variance of an AR(1) sequence for means of `length` samples."""
     lag = np.arange(1 - length, length)
     weight = length - np.abs(lag)
     same = np.sum(weight * decay ** np.abs(lag))
-    next_one = np.sum(weight * decay ** np.abs(lag + length))
-    return variance * (same - next_one) / length ** 2
+    adjacent = np.sum(weight * decay ** np.abs(lag + length))
+    return variance * (same - adjacent) / length ** 2
 
 
-def test_codes_are_as_frequent_as_the_noise_says():
-    """At rest each code has the probability of the noise within its step, within 3 %."""
+def test_frequencies_of_codes_follow_from_the_noise():
+    """At rest the frequency of each code is the probability of its step, within 3 %."""
     sensor = nominal('x', noise_density_g_per_rthz=np.full(1, 30e-6))
     codes = np.rint(simulate(replace(sensor, rate_hz=50.0), Motion(
         20000.0, internal_rate_hz=50.0), 0)['x_v'] / sensor.lsb_v)
@@ -128,34 +129,34 @@ def test_codes_are_as_frequent_as_the_noise_says():
             assert np.mean(codes == code) == pytest.approx(expected, rel=0.03)
 
 
-def test_stamps_that_jitter_and_gaps_are_followed():
-    """Samples between steps of the grid are as right as those on it."""
+def test_samples_at_irregular_stamps_are_exact():
+    """Samples between the steps of the grid, and after gaps, equal those at 16 kHz."""
     sensor, motion = nominal('xyz', **CLEAN), rich(np.random.default_rng(0))
     rng = np.random.default_rng(1)
     stamps = np.arange(60000) / 1000 + rng.uniform(-3e-4, 3e-4, 60000)
     stamps = np.delete(stamps - stamps[0], slice(20000, 31000))
-    found = Response(sensor, motion, 0)(stamps)
+    volts = Response(sensor, motion, 0)(stamps)
     dense = simulate(replace(sensor, rate_hz=16000.0), replace(motion, duration_s=60.0), 0)
     for d, axis in enumerate('xyz'):
-        there = np.interp(stamps, dense['time_s'], dense[f'{axis}_v'])
-        assert np.abs(found[:, d] - there)[:-20].max() < 2e-6
+        dense_v = np.interp(stamps, dense['time_s'], dense[f'{axis}_v'])
+        assert np.abs(volts[:, d] - dense_v)[:-20].max() < 2e-6
 
 
 def test_joints_behind_an_encoder_are_smoothed():
-    """Re-followed through 5 arcmin, the acceleration is known to 5 %; exact if the encoder is."""
+    """The smoothed path has the right acceleration, exactly if the encoder is exact."""
     motion = sweep(np.random.default_rng(0))
     time_s = np.arange(100000) / 250
     for step, tolerance in ((1.4544e-3, 0.06), (1e-5, 0.01), (0.0, 1e-3)):
         reading = motion.beta(time_s)
         reading = np.rint(reading / step) * step if step else reading
-        found, true = SmoothedPath(time_s, reading, step)(time_s, 2), motion.beta(time_s, 2)
-        assert np.sqrt(np.mean((found - true) ** 2)) < tolerance * np.sqrt(np.mean(true ** 2))
+        smoothed, true = SmoothedPath(time_s, reading, step)(time_s, 2), motion.beta(time_s, 2)
+        assert np.sqrt(np.mean((smoothed - true) ** 2)) < tolerance * np.sqrt(np.mean(true ** 2))
         position = SmoothedPath(time_s, reading, step)(time_s)
         assert np.abs(position - motion.beta(time_s)).max() < step + 1e-9
 
 
 def test_a_seed_repeats_to_the_bit(run_tool, tmp_path):
-    """The same seed writes the same file, another one another."""
+    """The same seed writes the same file, and another seed another file."""
     for name, seed in (('a', 3), ('b', 3), ('c', 4)):
         done = run_tool('simulate', 'tilt_alpha', '--rate', '50', '--seed', str(seed), '--effect',
                         'flicker', '--effect', 'hysteresis', '-o', str(tmp_path / f'{name}.csv'))
@@ -164,24 +165,24 @@ def test_a_seed_repeats_to_the_bit(run_tool, tmp_path):
     assert a == b != c
 
 
-def test_a_recording_is_followed_again(run_tool, tmp_path):
-    """Its angles through the chain again: its own stamps and references, the same volts."""
+def test_a_recording_is_simulated_again(run_tool, tmp_path):
+    """A simulation of a recording has its stamps, its references and its volts."""
     first, second = tmp_path / 'first.csv', tmp_path / 'second.mcap'
     for args in (('rich', '--rate', '100', '--effect', 'lever_arm:z_m=0.05', '-o', str(first)),
                  (str(first), '--effect', 'lever_arm:z_m=0.05', '--seed', '1', '-o',
                   str(second))):
         done = run_tool('simulate', *args)
         assert done.returncode == 0, done.stderr
-    one, two = recording.read(first), recording.read(second)
-    np.testing.assert_array_equal(one.columns['alpha_rad'], two.columns['alpha_rad'])
-    np.testing.assert_allclose(one.time_s, two.time_s, atol=1e-9)
-    volts = [r.volts(nominal('xy')) for r in (one, two)]
+    original, repeated = recording.read(first), recording.read(second)
+    np.testing.assert_array_equal(original.columns['alpha_rad'], repeated.columns['alpha_rad'])
+    np.testing.assert_allclose(original.time_s, repeated.time_s, atol=1e-9)
+    volts = [r.volts(nominal('xy')) for r in (original, repeated)]
     # Noise of both, and the encoder's step of 1.45 mrad: 0.42 mg.
     assert np.sqrt(np.mean((volts[0] - volts[1]) ** 2)) < 1.1e-3
 
 
-def test_specific_force_of_others_is_felt(run_tool, tmp_path):
-    """The trajectory imu runs a force through the chain, at its rate and at another."""
+def test_a_recorded_specific_force_passes_through_the_chain(run_tool, tmp_path):
+    """The trajectory `imu` uses a recorded force, at its rate and at another."""
     time_s = np.arange(4000) / 200
     force = np.column_stack([np.sin(time_s), np.cos(3 * time_s), np.full(4000, G)])
     lines = ['time_s,ax_mps2,ay_mps2,az_mps2'] + [
@@ -198,7 +199,7 @@ def test_specific_force_of_others_is_felt(run_tool, tmp_path):
         assert np.sqrt(np.mean((read.columns['x_v'] - expected)[500:] ** 2)) < 0.6e-3
 
 
-@pytest.mark.parametrize('args, said', [
+@pytest.mark.parametrize('args, message', [
     (('rich', '--effect', 'lever_am'), 'did you mean lever_arm?'),
     (('rich', '--effect', 'lever_arm:zm=1'), 'did you mean z_m?'),
     (('rich', '--effect', 'lever_arm:z_m=3'), '3 m is outside -2 to 2 m'),
@@ -207,16 +208,16 @@ def test_specific_force_of_others_is_felt(run_tool, tmp_path):
     (('rich', '--effect', 'bias:offset_v=0.1', '--effect', 'bias:offset_v=0.2'), 'stated twice'),
     (('rich', '--rate', '0'), 'outside 0.01 to 100000 Hz'),
     (('imu',), '--force RECORDING')])
-def test_bad_input_is_one_line_and_no_file(run_tool, tmp_path, args, said):
-    """Exit status 1, one line that says what to do, nothing written."""
+def test_bad_input_is_one_line_and_no_file(run_tool, tmp_path, args, message):
+    """The exit status is 1, one line states what to do, and no file is written."""
     out = tmp_path / 'out.csv'
     done = run_tool('simulate', *args, '-o', str(out))
-    assert done.returncode == 1 and said in done.stderr
+    assert done.returncode == 1 and message in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1 and not out.exists()
 
 
 def test_a_stage_cannot_jump(run_tool, tmp_path):
-    """A recording whose angle jumps is refused with the time and the figure."""
+    """A recording with a jump of its angle is refused with the time and the size."""
     path = tmp_path / 'jump.csv'
     rows = [f'{i / 100!r},2.5,2.5,{0.0 if i < 50 else 3.0!r},0.0' for i in range(100)]
     path.write_text('time_s,x_v,y_v,alpha_rad,beta_rad\n' + '\n'.join(rows) + '\n')
@@ -224,8 +225,8 @@ def test_a_stage_cannot_jump(run_tool, tmp_path):
     assert done.returncode == 1 and 'alpha_rad jumps by 3 rad' in done.stderr
 
 
-def test_effects_of_a_stage_need_one(run_tool, tmp_path):
-    """Backlash on a recorded force is a conflict that is named."""
+def test_effects_of_a_stage_need_a_stage(run_tool, tmp_path):
+    """Backlash on a recorded force is refused by name."""
     path = tmp_path / 'ideal.csv'
     path.write_text('time_s,ax_mps2,ay_mps2,az_mps2\n' + '\n'.join(
         f'{i / 100!r},0.0,0.0,9.8' for i in range(100)) + '\n')
@@ -234,16 +235,16 @@ def test_effects_of_a_stage_need_one(run_tool, tmp_path):
     assert done.returncode == 1 and 'backlash acts on the stage' in done.stderr
 
 
-def test_neutral_effects_of_a_file_stay(tmp_path):
-    """What a parameter file lists neutral leaves a simulated sensor as it is."""
+def test_neutral_effects_of_a_file_change_nothing(tmp_path):
+    """Effects with neutral values do not change a simulated sensor."""
     sensor = nominal('xyz')
     force = [np.linspace(0, G, 500), 0.0, G]
     np.testing.assert_array_equal(Fed(sensor)(force), Fed(with_neutral(sensor, [
         n for n, e in library().items() if Need.STAGE not in e.needs]))(force))
 
 
-def test_apply_takes_temperature_and_supply_out(run_tool, tmp_path):
-    """A soak with drifts: corrected by what it recorded beside the sensor, and said without."""
+def test_apply_corrects_for_temperature_and_supply(run_tool, tmp_path):
+    """`apply` uses the recorded values, and reports a missing supply."""
     effects = ('--effect', 'supply', '--effect', 'temperature_bias:per_k=1e-3')
     made = run_tool('simulate', 'soak', '--rate', '2', *effects, '-o', 'soak.csv')
     assert made.returncode == 0, made.stderr
@@ -262,15 +263,15 @@ def test_apply_takes_temperature_and_supply_out(run_tool, tmp_path):
     assert done.returncode == 0 and 'supply is taken at 5' in done.stderr
 
 
-def test_quick_moves_among_slow_ones_are_followed():
-    """A stage that mostly creeps and then leaps: no reading is off by much more than a step."""
+def test_a_smoothed_path_follows_quick_moves_among_slow_ones():
+    """On a slow stage with a few quick moves, no position has an error above two steps."""
     step = np.radians(0.01)
     moves = Knots([0, 40, 41, 41.6, 60, 60.5, 61, 90], [0, 1, 1, 2, 2, 3, 2.5, 3.2])
     time_s = np.arange(0, 90, 0.008)
     true = moves(time_s)
     path = SmoothedPath(time_s, np.rint(true / step) * step, step)
-    off = path(time_s) - true
-    assert np.abs(off).max() < 2 * step
-    assert np.sqrt(np.mean(off ** 2)) < 0.3 * step
+    error_rad = path(time_s) - true
+    assert np.abs(error_rad).max() < 2 * step
+    assert np.sqrt(np.mean(error_rad ** 2)) < 0.3 * step
     worst = np.abs(path(time_s, 2) - moves(time_s, 2))
     assert np.sqrt(np.mean(worst ** 2)) < 0.1 * np.abs(moves(time_s, 2)).max()

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Bags made message by message, by the library rosbags alone."""
+"""Bags that the library rosbags writes message by message."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -34,7 +34,7 @@ EPOCH_NS = 1_750_000_000_000_000_000
 
 @dataclass
 class Sent:
-    """A message of a made bag; `raw` stands for a message that no type describes."""
+    """A message of a bag; `raw` holds the bytes of a message without a type."""
 
     topic: str
     kind: str

@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-The faults of devices: each is injected, and the driver must then have published the right samples.
+Faults of devices. After each injected fault, the driver must have published the right samples.
 
     make faults     all faults for longer than in the tests, as a table
 """
@@ -59,7 +59,7 @@ class Fault:
 @dataclass(frozen=True)
 class Outcome:
     """
-    What came of a fault.
+    The samples during and after a fault.
 
     Attributes
     ----------

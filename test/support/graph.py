@@ -29,7 +29,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
 RELIABLE = ('-p', 'qos_overrides./imu/data_raw.subscription.reliability:=reliable')
-"""Reliable subscription: a best-effort one loses the first samples, and more at many times real
+"""Reliable subscription. A best-effort one loses the first samples, and others at many times real
 time."""
 
 
@@ -51,7 +51,7 @@ def imu_table(raws):
 
 
 class Graph:
-    """Keeps the messages of topics, and the newest diagnostics by the name of the node."""
+    """The messages of topics, and the newest diagnostics by the name of the node."""
 
     def __init__(self):
         self.got = defaultdict(list)
@@ -103,7 +103,7 @@ class Graph:
                 pytest.fail(f'{purpose}: not after {timeout_s} s; diagnostics: {self.diagnostics}')
 
     def spin(self, seconds):
-        """Listen for so long."""
+        """Listen for some seconds."""
         end_s = time.monotonic() + seconds
         while (remaining_s := end_s - time.monotonic()) > 0:
             self._executor.spin_once(timeout_sec=remaining_s)

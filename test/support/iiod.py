@@ -252,13 +252,13 @@ class Client(socketserver.StreamRequestHandler):
 
 
 class Server(socketserver.ThreadingTCPServer):
-    """The server; it takes a port that was just in use."""
+    """The server; it may bind a port that was just in use."""
 
     allow_reuse_address = True
     daemon_threads = True
 
     def handle_error(self, request, client_address):
-        """Print nothing: clients leave without a word."""
+        """Print nothing, because clients disconnect without notice."""
 
 
 def main():

@@ -207,7 +207,7 @@ def _file(folder):
 
 
 def kill(folder, env, kills, seed):
-    """Kill a sweep so often; return the `Sweeps`."""
+    """Kill a sweep a number of times; return the `Sweeps`."""
     sweeps = Sweeps(folder, env, seed)
     try:
         while sweeps.kills < kills:

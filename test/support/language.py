@@ -13,9 +13,9 @@
 # limitations under the License.
 
 """
-The rules of language that a program can check: docstrings, names of values, sentences in docs.
+Rules of language that a program can check: docstrings, names of values, sentences in docs.
 
-Each function returns what breaks a rule, as lines `file:line: what`.
+Each function returns the violations of a rule, as lines `file:line: violation`.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ BANNED_NAMES = frozenset((
     'less', 'beside', 'off', 'fewer', 'least', 'taken', 'whole', 'thin', 'good', 'loud', 'alone',
     'far', 'ends', 'came', 'gone', 'mine', 'theirs', 'this', 'that', 'what', 'who', 'shown',
     'alike', 'so', 'much', 'more'))
-"""Words that say nothing about a quantity."""
+"""Words that do not describe a quantity."""
 
 SENTENCE_WORDS = 25
-"""Most words of a sentence in the documentation."""
+"""Largest number of words of a sentence in the documentation."""
 
 LINE_COLUMNS = 120
-"""Most columns of a line of prose in the documentation; tables and code may be wider."""
+"""Largest number of columns of a line of prose; tables and code may be wider."""
 
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 
@@ -51,9 +51,8 @@ def undocumented(path: Path) -> list[str]:
     """
     Find public functions of two or more arguments whose docstring does not describe them.
 
-    A docstring in the numpydoc format describes every parameter, and what the function returns
-    or yields. The function `apply` of an effect is
-    described once, by `model.effects.base.Apply`.
+    A docstring in the numpydoc format describes every parameter and the returned or yielded
+    value. `model.effects.base.Apply` describes the function `apply` of all effects.
     """
     return [f'{path}:{function.lineno}: {function.name}: {fault}'
             for function, in_class in _public_functions(ast.parse(path.read_text('utf-8')))
@@ -97,13 +96,13 @@ def _star_names(arguments: ast.arguments) -> set[str]:
 
 
 def _returns(function: Function) -> bool:
-    """Tell by the annotation whether a function returns something."""
+    """Return whether the annotation of a function states a returned value."""
     return function.returns is not None and ast.unparse(function.returns) not in (
         'None', "'None'", 'NoReturn')
 
 
 def banned_names(path: Path) -> list[str]:
-    """Find variables, parameters and attributes that are called by a banned name."""
+    """Find variables, parameters and attributes that have a banned name."""
     return [f'{path}:{line}: {name}: a banned name'
             for name, line in _named(ast.parse(path.read_text('utf-8')))
             if name.strip('_') in BANNED_NAMES]
@@ -120,7 +119,7 @@ def _named(tree: ast.AST) -> Iterator[tuple[str, int]]:
 
 
 def long_sentences(path: Path) -> list[str]:
-    """Find the sentences of a Markdown page that have too many words."""
+    """Find sentences of a Markdown page that have too many words."""
     return [f'{path}:{line}: {len(words)} words: {sentence[:60]} ...'
             for line, text in _prose(MarkdownIt().enable('table').parse(path.read_text('utf-8')))
             for sentence in re.split(r'(?<=[.!?])\s+(?=[A-Z`*\[(])|(?<=[^\d]):\s*$', text)
@@ -128,7 +127,7 @@ def long_sentences(path: Path) -> list[str]:
 
 
 def _prose(tokens: list[Token]) -> Iterator[tuple[int, str]]:
-    """Give the text of paragraphs and list items with their lines; tables and code have none."""
+    """Yield the text of paragraphs and list items with their lines, without tables and code."""
     in_table = False
     for token in tokens:
         in_table = (in_table or token.type == 'table_open') and token.type != 'table_close'

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Installed executables as processes of a test, and waiting for what they do."""
+"""Installed executables as processes of a test, and waits for their actions."""
 
 from __future__ import annotations
 
@@ -32,45 +32,45 @@ REPO = Path(__file__).resolve().parents[2]
 """The root of the repository."""
 
 
-def wait_until(condition: Callable[[], object], timeout_s: float, what: str) -> None:
-    """Poll `condition` until it holds, and fail with `what` after `timeout_s` seconds."""
+def wait_until(condition: Callable[[], object], timeout_s: float, purpose: str) -> None:
+    """Poll `condition` until it holds, and fail with `purpose` after `timeout_s` seconds."""
     end = time.monotonic() + timeout_s
     while not condition():
         if time.monotonic() > end:
-            pytest.fail(f'{what}: not after {timeout_s} s')
+            pytest.fail(f'{purpose}: not after {timeout_s} s')
         time.sleep(0.02)
 
 
 @dataclass(frozen=True)
 class Started:
-    """A process that runs an installed executable, and the file that takes what it prints."""
+    """A process that runs an installed executable, and the file of its output."""
 
     name: str
     popen: subprocess.Popen
     log: Path
 
     def output(self) -> str:
-        """Read what it has printed so far, on stdout and stderr."""
+        """Read the output on stdout and stderr so far."""
         return self.log.read_text(encoding='utf-8', errors='replace')
 
     def wait_for(self, text: str, timeout_s: float = 20.0) -> None:
-        """Wait until it has printed `text`; fail when it ends without, or after the time."""
+        """Wait until the process has printed `text`; fail after its end or after the time."""
         def seen() -> bool:
             ended = self.popen.poll() is not None
-            found = text in self.output()
-            if ended and not found:
+            printed = text in self.output()
+            if ended and not printed:
                 pytest.fail(f'{self.name} ended with {self.popen.returncode} and without '
                             f'printing {text!r}:\n{self.output()}')
-            return found
+            return printed
         wait_until(seen, timeout_s, f'{self.name} printing {text!r}')
 
     def wait(self, timeout_s: float = 20.0) -> int:
-        """Wait until it ends by itself and return its exit status."""
+        """Wait until the process ends by itself and return its exit status."""
         wait_until(lambda: self.popen.poll() is not None, timeout_s, f'{self.name} ending')
         return self.popen.returncode
 
     def stop(self) -> int:
-        """End it with its children, kindly first, and return its exit status."""
+        """End the process and its children, first by SIGINT, and return its exit status."""
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
             if self.popen.poll() is None:
                 os.killpg(self.popen.pid, number)
@@ -87,6 +87,6 @@ def executable(name: str) -> Path:
 
 
 def run_executable(name: str, *args: object, **options: object) -> subprocess.CompletedProcess:
-    """Run an installed executable to its end and capture what it prints."""
+    """Run an installed executable to its end and capture its output."""
     return subprocess.run([executable(name), *map(str, args)], text=True, capture_output=True,
                           stdin=subprocess.DEVNULL, **{'timeout': 120, **options})

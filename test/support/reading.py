@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What reading a recording takes, and how it is refused."""
+"""Memory that reading a recording needs, and the messages of its refusals."""
 
 import os
 from pathlib import Path
@@ -35,7 +35,7 @@ print(peaks_kb[-1] - peaks_kb[len(peaks_kb) // 4])
 
 
 def refusal(path: Path) -> str:
-    """Return what the user is told, which is one line and begins with the file."""
+    """Return the message to the user, which is one line and begins with the file."""
     with pytest.raises(UserError) as raised:
         recording.read(path)
     text = str(raised.value)
@@ -45,7 +45,7 @@ def refusal(path: Path) -> str:
 
 
 def growth_mb(path: Path) -> float:
-    """Return by how much memory grows while all but the first blocks of a recording are read."""
+    """Return the growth of memory after the first blocks of a recording, MB."""
     done = subprocess.run([sys.executable, '-c', GROWTH, path], text=True, check=True,
                           capture_output=True, env={**os.environ,
                                                     'PYTHONPATH': os.pathsep.join(sys.path)})

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Recording and journal of one sweep number the settings of its joints alike."""
+"""Recording and journal of one sweep number the settings of its joints equally."""
 
 from dataclasses import replace
 import json
@@ -32,14 +32,14 @@ def without_settings(records):
     return [replace(record, alpha_setting=None, beta_setting=None) for record in records]
 
 
-def same_partition(some, others):
-    """Tell whether two lists of numbers put the same poses together."""
-    pairs = set(zip(some, others))
-    return len(pairs) == len(set(some)) == len(set(others))
+def same_partition(first, second):
+    """Return whether two lists of numbers put the same poses together."""
+    pairs = set(zip(first, second))
+    return len(pairs) == len(set(first)) == len(set(second))
 
 
 def by_rests(read, unit, entries):
-    """Find the rests without a journal; return the settings of those of a journal's poses."""
+    """Find the rests without a journal; return the settings of the poses of a journal."""
     poses = pose_extraction.extract_poses(read, unit)
     begin, end = (read.epoch_ns + np.rint(poses.time_s * 1e9).astype(np.int64)).T
     middle = [(e.start_ns + e.stop_ns) // 2 for e in entries]
@@ -55,6 +55,6 @@ def check_all_agree(read, unit, entries):
     assert (by_journal.alpha_setting == alpha).all() and (by_journal.beta_setting == beta).all()
     bare = without_settings(entries)
     named = pose_extraction.extract_poses(read, unit, bare)
-    for found in ((named.alpha_setting, named.beta_setting), by_rests(read, unit, entries)):
-        assert same_partition(found[0].tolist(), alpha.tolist())
-        assert same_partition(found[1].tolist(), beta.tolist())
+    for settings in ((named.alpha_setting, named.beta_setting), by_rests(read, unit, entries)):
+        assert same_partition(settings[0].tolist(), alpha.tolist())
+        assert same_partition(settings[1].tolist(), beta.tolist())

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Made units and sweeps that the tests share."""
+"""Simulated units and sweeps that the tests share."""
 
 from dataclasses import replace
 
@@ -35,7 +35,7 @@ PLANES_RAD = np.radians([30, 60, 90, 120, 150])
 
 
 def nominal(axes='xy', **changes):
-    """Return the nominal ADXL203, with that many axes."""
+    """Return the nominal ADXL203 with the given axes."""
     sensor = parameter_file.load(NOMINAL)
     count = len(axes)
     arrays = {name: np.full(count, getattr(sensor, name)[0]) for name in (
@@ -59,9 +59,9 @@ def drawn(rng, sensor, effects=EFFECTS):
 def swept(rng, truth, planes_rad=PLANES_RAD, check_poses=16, noisy=True, per_setting=False,
           targets=None):
     """
-    Sweep a unit: poses with the noise of 5 s means and a stage with an error within a step.
+    Sweep a unit: poses with the noise of 5 s means, on a stage with an error within a step.
 
-    A joint has a new error in each pose, or only after each move.
+    A joint draws its error in each pose, or with `per_setting` only after each move.
     """
     targets = targets or sweep(planes_rad, np.radians(30), check_poses)
     alpha, beta = (np.array([getattr(t, name) for t in targets])
@@ -72,8 +72,8 @@ def swept(rng, truth, planes_rad=PLANES_RAD, check_poses=16, noisy=True, per_set
         drawn = slack * rng.uniform(-0.5, 0.5, len(angle))
         setting = np.cumsum(np.abs(np.diff(angle, prepend=angle[0])) > 1e-9)
         return drawn[setting] if per_setting else drawn
-    off = error(alpha), error(beta)
-    force = pose_response.stage_force(truth, alpha + off[0], beta + off[1])
+    joint_error = error(alpha), error(beta)
+    force = pose_response.stage_force(truth, alpha + joint_error[0], beta + joint_error[1])
     volts = np.column_stack(signal_chain.static_response(truth)(force))
     count = noise.effective_samples(5000, 1e-3, truth.rc_s)
     std = np.broadcast_to(noise.sample_std_v(truth) / np.sqrt(count), volts.shape)
@@ -83,7 +83,7 @@ def swept(rng, truth, planes_rad=PLANES_RAD, check_poses=16, noisy=True, per_set
 
 
 class Fed:
-    """A sensor that is given its specific force sample by sample, and gives its volts."""
+    """A simulated sensor: specific force sample by sample in, volts out."""
 
     def __init__(self, sensor, seed=0):
         self.rate_hz, self.count = sensor.rate_hz, 0
@@ -91,7 +91,7 @@ class Fed:
                                                internal_rate_hz=sensor.rate_hz), seed)
 
     def __call__(self, force):
-        """Feel three components, m/s^2, each (n,)."""
+        """Return the volts at a specific force of three components, m/s², each (n,)."""
         count = max(np.size(f) for f in force)
         self.force = [np.broadcast_to(np.asarray(f, float), count) for f in force]
         stamps_s = (self.count + np.arange(count)) / self.rate_hz
@@ -100,7 +100,7 @@ class Fed:
 
 
 def pose_record(pose, **changes):
-    """Return a pose of a journal, that of a level sensor by default."""
+    """Return a pose record of a journal; by default the sensor is level."""
     return PoseRecord(**{'pose': pose, 'alpha_rad': 0.0, 'beta_rad': 0.0, 'start_ns': pose,
                          'stop_ns': pose, 'samples': 1000, 'mean_v': (2.5, 2.5),
                          'std_v': (1e-4, 1e-4), **changes})
@@ -116,7 +116,7 @@ class Bench:
         self.fed = Fed(sensor, seed)
 
     def run(self, seconds, alpha, beta, encoder=True, shake_mps2=0.0):
-        """Hold the angles (floats, or functions of time) for so long; stop at an entry."""
+        """Hold the angles, rad, for some seconds; return the first accepted pose."""
         for _ in range(round(seconds / 0.05)):
             time = np.arange(50) / 1000
             force = specific_force(np.full(50, alpha), np.full(50, beta), 9.80665,

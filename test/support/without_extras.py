@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""A Python that finds none of the extras: importing them fails as where they are not installed."""
+"""A Python process in which the import of every extra fails, as without an installation."""
 
 from importlib.metadata import requires
 import json
@@ -20,7 +20,7 @@ import re
 import subprocess
 import sys
 
-# Imported under other names than they are installed by, or not asked for by setup.py.
+# Packages with an import name that differs from the distribution, or without an entry in setup.py.
 OTHERS = ('PIL', 'arch', 'cobs', 'iio', 'jinja2', 'mcap', 'numba', 'pandas', 'rosbag2_py',
           'ruamel', 'serial', 'tqdm')
 
@@ -38,13 +38,13 @@ sys.meta_path.insert(0, Blocker())
 
 
 def extras() -> set[str]:
-    """Name the distributions that setup.py lists as extras."""
+    """Return the names of the distributions that setup.py lists as extras."""
     lines = [line for line in requires('adxl_ros') or () if 'extra ==' in line]
     return {re.match(r'[\w.-]+', line)[0].replace('-', '_') for line in lines}
 
 
 def run_without_extras(code: str, *args: str) -> subprocess.CompletedProcess:
-    """Run `code` in a Python that finds none of the extras."""
+    """Run `code` in a Python process that cannot import the extras."""
     blocked = json.dumps(sorted(extras().union(OTHERS)))
     return subprocess.run([sys.executable, '-c', BLOCK + code, blocked, *args], text=True,
                           capture_output=True, timeout=60)
