@@ -57,7 +57,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         fixtures = set(getattr(item, 'fixturenames', ()))
         if 'ros_env' in fixtures:
             item.add_marker(pytest.mark.live)
-        if {'original', 'found', 'reported'} & fixtures:
+        if {'committed_check', 'evaluations', 'report_folder'} & fixtures:
             item.add_marker(pytest.mark.xdist_group(item.path.stem))
 
 

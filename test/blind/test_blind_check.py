@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""`blind`: the machinery, on small seeded checks with diagnoses that cheat or know nothing."""
+"""`blind` on small checks, with diagnoses that cheat or name no effect."""
 
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -44,14 +44,14 @@ import pytest
 import yaml
 
 SEED, TRIALS, SECONDS = 5, 20, (20.0, 24.0)
-# A diagnosis that is a script: `said(recording, parameters)` gives status and hypotheses.
+# A diagnosis as a script: `answer(recording, parameters)` returns status and hypotheses.
 SCRIPT = """
 import json, os, sys
 from pathlib import Path
 {body}
 recording, parameters, out = sys.argv[1], sys.argv[3], Path(sys.argv[5])
-status, hypotheses = said(Path(recording), Path(parameters))
-best = max(hypotheses, key=lambda one: one[1])
+status, hypotheses = answer(Path(recording), Path(parameters))
+best = max(hypotheses, key=lambda hypothesis: hypothesis[1])
 out.mkdir()
 (out / 'report.json').write_text(json.dumps({{
     'verdict': {{'status': status, 'effects': [] if 'unknown' in best[0] else best[0],
@@ -59,11 +59,11 @@ out.mkdir()
     'hypotheses': [{{'effects': e, 'probability': p}} for e, p in hypotheses],
     'gap': {{'closed': None, 'before': 0.01}}, 'candidates': []}}))
 """
-NOTHING = "def said(recording, parameters): return 'no_gap', [[[], 0.9], [['bias'], 0.1]]"
-ALWAYS = "def said(recording, parameters): return 'explained', [[['lever_arm'], 1.0]]"
-# Looks for labels: near its files, in its arguments and environment, and in a given folder.
+NOTHING = "def answer(recording, parameters): return 'no_gap', [[[], 0.9], [['bias'], 0.1]]"
+ALWAYS = "def answer(recording, parameters): return 'explained', [[['lever_arm'], 1.0]]"
+# Searches labels near its files, in its arguments and environment, and in a given folder.
 CHEAT = """
-def said(recording, parameters):
+def answer(recording, parameters):
     places = [Path.cwd(), *Path.cwd().resolve().parents[:-2], Path({folder!r})]
     places += [Path(word).resolve().parent for word in sys.argv[1:]]
     places += [Path(word) for value in os.environ.values() for word in value.split(':')
@@ -93,7 +93,7 @@ def show(stage):
 
 
 def script(folder, body):
-    """Write a diagnosis and say how to run it."""
+    """Write a diagnosis and return its command."""
     path = folder / 'diagnosis.py'
     path.write_text(SCRIPT.format(body=body))
     return [sys.executable, str(path)]
@@ -106,7 +106,7 @@ def pool():
 
 
 @pytest.fixture(scope='module')
-def original(tmp_path_factory):
+def committed_check(tmp_path_factory):
     folder = tmp_path_factory.mktemp('check') / 'blind'
     with diagnosis_runs.workers(None) as pool:
         label_commitment.commit(folder, Setup(SEED, TRIALS), trials.plans(SEED, TRIALS, SECONDS),
@@ -115,31 +115,31 @@ def original(tmp_path_factory):
 
 
 @pytest.fixture(scope='module')
-def known_nothing(original, tmp_path_factory, pool):
-    """Score a diagnosis that never finds anything, once for all tests that build on it."""
+def null_check(committed_check, tmp_path_factory, pool):
+    """Score a diagnosis that names no effect, once for all tests that use it."""
     folder = tmp_path_factory.mktemp('nothing')
-    shutil.copytree(original, folder / 'blind')
+    shutil.copytree(committed_check, folder / 'blind')
     return folder / 'blind', blind_check.score(folder / 'blind', script(folder, NOTHING), pool,
                                                show)
 
 
-def copied(original, known_nothing, folder):
-    """Copy the sealed check, with the held-out simulations, which those tests do not change."""
-    shutil.copytree(original, folder / 'blind')
-    shutil.copytree(known_nothing[0] / 'labels' / 'held', folder / 'blind' / 'labels' / 'held')
+def copied(committed_check, null_check, folder):
+    """Copy the committed check with its held-out simulations, which the tests do not change."""
+    shutil.copytree(committed_check, folder / 'blind')
+    shutil.copytree(null_check[0] / 'labels' / 'held', folder / 'blind' / 'labels' / 'held')
     return folder / 'blind'
 
 
-def test_only_the_label_file_tells_of_labels(original):
-    names = sorted(path.name for path in (original / 'recordings').iterdir())
+def test_only_the_label_file_contains_labels(committed_check):
+    names = sorted(path.name for path in (committed_check / 'recordings').iterdir())
     count = TRIALS + 2
     assert names == sorted(f'r{i:04d}.{suffix}' for i in range(count)
                            for suffix in ('csv', 'yaml'))
-    assert {path.stat().st_mtime for path in (original / 'recordings').iterdir()} == {0}
+    assert {path.stat().st_mtime for path in (committed_check / 'recordings').iterdir()} == {0}
     effects = [name.encode() for name in fault_table.KINDS if name not in (
         'bias', 'gravity', 'scale_factor', 'supply')]
-    assert [path.name for path in (original / 'labels').iterdir()] == ['labels.json']
-    for path in original.rglob('*'):
+    assert [path.name for path in (committed_check / 'labels').iterdir()] == ['labels.json']
+    for path in committed_check.rglob('*'):
         if path.name == 'labels.json':
             continue
         data = path.read_bytes() if path.is_file() else b''
@@ -147,25 +147,25 @@ def test_only_the_label_file_tells_of_labels(original):
         assert b'"seed"' not in data, path
 
 
-def test_labels_are_those_of_the_hash(original, known_nothing, tmp_path, pool):
-    folder, made = known_nothing
+def test_labels_have_the_committed_hash(committed_check, null_check, tmp_path, pool):
+    folder, made = null_check
     text = (folder / 'labels' / 'labels.json').read_bytes()
-    digest = json.loads((original / 'seal.json').read_bytes())['sha256_of_salt_and_labels']
+    digest = json.loads((committed_check / 'seal.json').read_bytes())['sha256_of_salt_and_labels']
     assert hashlib.sha256(text).hexdigest() == digest == made['hash']
     drawn = [trials.draw(plan) for plan in trials.plans(SEED, TRIALS, SECONDS)[:1]]
     opened = label_commitment.committed_labels(folder).labels[:1]
     assert [label.effects for label in drawn] == [label.effects for label in opened]
-    assert [one['size'] for label in drawn for one in label.faults] == pytest.approx(
-        [one['size'] for label in opened for one in label.faults])
-    other = copied(original, known_nothing, tmp_path)
+    assert [fault['size'] for label in drawn for fault in label.faults] == pytest.approx(
+        [fault['size'] for label in opened for fault in label.faults])
+    other = copied(committed_check, null_check, tmp_path)
     (other / 'labels' / 'labels.json').write_bytes(text.replace(b'"single"', b'"pair"'))
     with pytest.raises(UserError, match='not the labels whose hash'):
         blind_check.score(other, script(tmp_path, NOTHING), pool, show)
 
 
-def test_a_folder_of_an_older_version_is_refused_in_one_line(original, tmp_path, pool):
-    """Labels that are encrypted, or drawn labels of another form, name no key that is missing."""
-    shutil.copytree(original, tmp_path / 'encrypted')
+def test_a_folder_of_an_older_version_is_refused_in_one_line(committed_check, tmp_path, pool):
+    """Encrypted labels, and labels of an earlier form, do not cause a message about a key."""
+    shutil.copytree(committed_check, tmp_path / 'encrypted')
     labels = tmp_path / 'encrypted' / 'labels'
     (labels / 'labels.json').rename(labels / 'labels.sealed')
     with pytest.raises(UserError, match='an older version encrypted these labels'):
@@ -178,8 +178,8 @@ def test_a_folder_of_an_older_version_is_refused_in_one_line(original, tmp_path,
             blind_check.draw(tmp_path / 'drawn', 1, 2, pool, no_progress)
 
 
-def test_nothing_found_scores_as_it_should(known_nothing):
-    made = known_nothing[1]
+def test_scores_of_a_diagnosis_without_effects(null_check):
+    made = null_check[1]
     assert made['scores']['false_alarms']['value'] == 0
     for score in ('top_1', 'set_recall', 'unknown_recall_all', 'harm'):
         assert made['scores'][score]['value'] == 0
@@ -190,12 +190,12 @@ def test_nothing_found_scores_as_it_should(known_nothing):
         5, 4, 4, 7, 2]
 
 
-def test_a_cheat_finds_no_labels(original, known_nothing, tmp_path, pool):
-    """Its working directory, its arguments and its environment lead to no label."""
-    folder = copied(original, known_nothing, tmp_path)
+def test_a_diagnosis_cannot_reach_the_labels(committed_check, null_check, tmp_path, pool):
+    """Working directory, arguments and environment of a diagnosis do not lead to a label."""
+    folder = copied(committed_check, null_check, tmp_path)
     blindfolded = blind_check.score(folder, script(tmp_path, CHEAT.format(folder='.')), pool, show)
     assert not any(row['named'] for row in blindfolded['rows'])
-    # The same diagnosis does cheat where it is told the folder.
+    # The same diagnosis names the labels if it has the folder.
     shutil.rmtree(folder / 'reports')
     opened = blind_check.score(folder, script(tmp_path, CHEAT.format(folder=str(folder))), pool,
                                show)
@@ -203,14 +203,14 @@ def test_a_cheat_finds_no_labels(original, known_nothing, tmp_path, pool):
                if row['group'] != 'zero')
 
 
-def test_always_one_effect_scores_as_it_should(original, known_nothing, tmp_path, pool):
-    folder = copied(original, known_nothing, tmp_path)
+def test_scores_of_a_diagnosis_with_a_constant_effect(committed_check, null_check, tmp_path, pool):
+    folder = copied(committed_check, null_check, tmp_path)
     made = blind_check.score(folder, script(tmp_path, ALWAYS), pool, show)
     score = made['scores']
     assert score['false_alarms']['value'] == 1
     singles = [row for row in made['rows'] if row['group'] == 'single']
-    own = [row['effects'] == ['lever_arm'] for row in singles]
-    assert score['top_1_all_singles']['value'] == sum(own) / len(own)
+    right = [row['effects'] == ['lever_arm'] for row in singles]
+    assert score['top_1_all_singles']['value'] == sum(right) / len(right)
     assert {name for row in score['confusion'].values() for name in row} == {'lever_arm'}
     assert score['set_size']['value'] == 1
     assert score['calibration_error']['value'] == pytest.approx(
@@ -225,22 +225,22 @@ def test_always_one_effect_scores_as_it_should(original, known_nothing, tmp_path
     assert '| false alarms | 1 (' in report_html.markdown(made)
 
 
-def test_a_process_is_given_its_recording_and_no_more(original, tmp_path):
+def test_a_process_has_only_its_recording(committed_check, tmp_path):
     body = """
-def said(recording, parameters):
+def answer(recording, parameters):
     seen = [sorted(path.name for path in Path.cwd().iterdir()), dict(os.environ)]
     return 'no_gap', [[[], 1.0], [[json.dumps(seen)], 0.0]]
 """
-    csv = original / 'recordings' / 'r0000.csv'
+    csv = committed_check / 'recordings' / 'r0000.csv'
     name, result = diagnosis_runs.diagnose('r0000', csv.read_bytes(), b'', script(tmp_path, body))
     files, environment = json.loads(result['report']['hypotheses'][1]['effects'][0])
     assert name == 'r0000' and files == ['r0000.csv', 'r0000.yaml']
-    assert not any(str(original.parent) in value for value in environment.values())
+    assert not any(str(committed_check.parent) in value for value in environment.values())
     assert environment['HOME'] != str(Path.home())
 
 
-def test_resumes_where_it_was_cut(original, known_nothing, tmp_path, pool):
-    folder = copied(original, known_nothing, tmp_path)
+def test_an_interrupted_check_resumes(committed_check, null_check, tmp_path, pool):
+    folder = copied(committed_check, null_check, tmp_path)
     command = script(tmp_path, NOTHING)
 
     class Cut(Exception):
@@ -278,7 +278,7 @@ def test_drawing_resumes(tmp_path, pool):
     assert [label.name for label in opened.labels] == ['r0000', 'r0001', 'r0002']
 
 
-def test_a_failed_diagnosis_counts_as_such(tmp_path):
+def test_a_failed_diagnosis_is_counted(tmp_path):
     command = [sys.executable, '-c', 'import sys; sys.exit("no such thing")']
     result = diagnosis_runs.diagnose('r0', b'time_s,x_v\n', b'', command)[1]
     given = grading.answer(result)
@@ -288,21 +288,21 @@ def test_a_failed_diagnosis_counts_as_such(tmp_path):
 
 
 def padded(label, recording):
-    """Make a recording longer where its label has an effect, at strength zero, too."""
+    """Make a recording longer if its label has an effect, even at strength zero."""
     return '# ' + 'x' * 5000 + '\n' + recording if label.effects else recording
 
 
 PADDED = """
-def said(recording, parameters):
+def answer(recording, parameters):
     found = recording.read_text().startswith('#')
     return ('explained', [[['bias'], 1.0]]) if found else ('no_gap', [[[], 1.0]])
 """
 
 
-def test_a_leaky_generator_is_caught(known_nothing, tmp_path, pool):
-    """The same cases again, by a generator whose files tell which have an effect."""
-    folder, labels = tmp_path / 'blind', label_commitment.committed_labels(known_nothing[0]).labels
-    recordings = known_nothing[0] / 'recordings'
+def test_a_generator_that_leaks_labels_is_detected(null_check, tmp_path, pool):
+    """The length of the recordings reveals which trials have an effect."""
+    folder, labels = tmp_path / 'blind', label_commitment.committed_labels(null_check[0]).labels
+    recordings = null_check[0] / 'recordings'
 
     def leaking(plan):
         label = next(label for label in labels if label.name == plan.name)
@@ -312,14 +312,14 @@ def test_a_leaky_generator_is_caught(known_nothing, tmp_path, pool):
 
     label_commitment.commit(folder, Setup(SEED, TRIALS), trials.plans(SEED, TRIALS, SECONDS),
                             pool, no_progress, leaking)
-    shutil.copytree(known_nothing[0] / 'labels' / 'held', folder / 'labels' / 'held')
+    shutil.copytree(null_check[0] / 'labels' / 'held', folder / 'labels' / 'held')
     made = blind_check.score(folder, script(tmp_path, PADDED), pool, show)
     assert made['controls']['metadata_only']['leaks'] and made['leaks']
     assert 'LEAKS' in report_html.summary(made) and 'LEAKS' in report_html.page(made, pyplot())
 
 
-def test_an_effect_at_strength_zero_must_not_show(tmp_path):
-    """What only the generator's own marks tell of shows at strength zero."""
+def test_an_answer_at_strength_zero_is_a_leak(tmp_path):
+    """A diagnosis that uses marks of the generator names effects of strength zero."""
     labels, answers = drawn_labels(), []
     for label in labels:
         text = padded(label, 'time_s,x_v\n0.0,2.5\n')
@@ -329,23 +329,23 @@ def test_an_effect_at_strength_zero_must_not_show(tmp_path):
 
 
 def drawn_labels():
-    """Return labels of a fair mix, without their recordings."""
-    at = {'manoeuvre': 'rich', 'axes': 'xyz', 'floor_mps2': 0.01}
+    """Return labels of the usual mix, without their recordings."""
+    common = {'manoeuvre': 'rich', 'axes': 'xyz', 'floor_mps2': 0.01}
     rows = []
     for plan in trials.plans(1, 60):
         faults = [{'effect': name, 'size': 1.0, 'shape': {'w': [0.0] * 6, 'hertz': 9.0},
                    'strength_mps2': 0.01 * (i + 1), 'power': 1.0, 'told': 1.0, 'inseparable': []}
                   for i, name in enumerate(plan.effects)]
-        rows.append(Label(plan.name, plan.group, plan.effects, plan.seed, plan.seconds, **at,
+        rows.append(Label(plan.name, plan.group, plan.effects, plan.seed, plan.seconds, **common,
                           faults=faults, flexible=1.0, plain={'rmse': 'bias', 'bic': ''}))
     return rows
 
 
 def answered(label, wrong=False):
-    """Answer rightly, or with an effect that is not there."""
-    said = frozenset({'bias', 'gravity'}) if wrong else grading.truth(label)
-    status = 'no_gap' if not said else 'unknown' if 'unknown' in said else 'explained'
-    return grading.Answer(status, said, (), 0.95, ((said, 0.95),
+    """Return the right answer, or an answer with effects that the trial does not have."""
+    effects = frozenset({'bias', 'gravity'}) if wrong else grading.truth(label)
+    status = 'no_gap' if not effects else 'unknown' if 'unknown' in effects else 'explained'
+    return grading.Answer(status, effects, (), 0.95, ((effects, 0.95),
                           (frozenset({'x'}), 0.05)), {}, 1.0)
 
 
@@ -365,44 +365,44 @@ def test_perfect_and_wrong_answers():
     assert {row['name'] for row in scores.bars(wrong) if row['met']} == {'harm'}
 
 
-def test_groups_hold_the_truth_or_not():
+def test_a_verdict_with_groups_is_right_if_they_contain_the_truth():
     label = next(label for label in drawn_labels() if label.group == 'pair')
-    one, two = label.effects
+    first, second = label.effects
     given = answered(label)
 
-    def says(certain, *groups):
+    def verdict(certain, *groups):
         return replace(given, status='inseparable', certain=frozenset(certain),
                        groups=tuple(frozenset(group) for group in groups))
 
-    assert grading.verdict_right(says([one], [two, 'a']), label)
-    assert grading.verdict_right(says([], [two, 'a'], [one, 'b']), label)
-    assert not grading.verdict_right(says([one], ['a', 'b']), label)
-    assert not grading.verdict_right(says([], [one, two]), label)
-    assert not grading.verdict_right(says([one, two], ['a', 'b']), label)
+    assert grading.verdict_right(verdict([first], [second, 'a']), label)
+    assert grading.verdict_right(verdict([], [second, 'a'], [first, 'b']), label)
+    assert not grading.verdict_right(verdict([first], ['a', 'b']), label)
+    assert not grading.verdict_right(verdict([], [first, second]), label)
+    assert not grading.verdict_right(verdict([first, second], ['a', 'b']), label)
     label.faults[0]['power'] = 0.1
-    assert grading.verdict_right(says([two]), label)
-    assert not grading.verdict_right(says([one]), label)
+    assert grading.verdict_right(verdict([second]), label)
+    assert not grading.verdict_right(verdict([first]), label)
 
 
-def test_the_curve_finds_the_strength():
+def test_the_detection_curve_contains_the_true_strength():
     rng = np.random.default_rng(0)
     strength = np.exp(rng.uniform(-7, -1, 600))
     seen = rng.random(600) < 1 / (1 + np.exp(-(np.log(strength) + 4) / 0.5))
-    found = scores.score_statistics.curve(strength, seen, 0.0)
-    assert found['at_50']['ci'][0] < np.exp(-4) < found['at_50']['ci'][1]
-    assert found['at_90']['ci'][0] < np.exp(-4 + 0.5 * np.log(9)) < found['at_90']['ci'][1]
+    curve = scores.score_statistics.curve(strength, seen, 0.0)
+    assert curve['at_50']['ci'][0] < np.exp(-4) < curve['at_50']['ci'][1]
+    assert curve['at_90']['ci'][0] < np.exp(-4 + 0.5 * np.log(9)) < curve['at_90']['ci'][1]
 
 
 @pytest.mark.parametrize('name', fault_table.KINDS)
 def test_every_fault_changes_a_recording(name):
-    """In proportion to its size or more, and not at all at size zero; one rich manoeuvre."""
-    at = ideal_observer.Scene(unit.draw(np.random.default_rng(0)), motion.draw(
+    """The change grows with the size, and is zero at size zero."""
+    scene = ideal_observer.Scene(unit.draw(np.random.default_rng(0)), motion.draw(
         np.random.default_rng(2), (60.0, 62.0), 125.0, 'rich'), 1)
     kind = fault_table.KINDS[name]
-    shape = kind.draw(np.random.default_rng(1), at.unit)
+    shape = kind.draw(np.random.default_rng(1), scene.unit)
 
     def size(times):
-        return ideal_observer.rms(at.response(
+        return ideal_observer.rms(scene.response(
             [fault.Fault(kind, times * kind.start, shape)], True))
 
     assert size(0.0) == pytest.approx(0, abs=1e-9)
@@ -411,61 +411,61 @@ def test_every_fault_changes_a_recording(name):
 
 
 def test_ideal_observer():
-    """What is strong is seen, what is weak is not, and a tilted bench is an offset of alpha."""
-    at = ideal_observer.Scene(unit.draw(np.random.default_rng(0)), motion.draw(
+    """The observer detects a strong offset of alpha, and not a weak one."""
+    scene = ideal_observer.Scene(unit.draw(np.random.default_rng(0)), motion.draw(
         np.random.default_rng(2), (60.0, 62.0), 125.0, 'one_plane'), 1)
-    observer = ideal_observer.IdealObserver(at)
+    observer = ideal_observer.IdealObserver(scene)
     kind = fault_table.KINDS['stage_offset']
-    seen = [ideal_observer.power(float(np.sum(observer.project(at.response([fault.Fault(
+    seen = [ideal_observer.power(float(np.sum(observer.project(scene.response([fault.Fault(
         kind, size, {'w': [0.0, 1.0]})])) ** 2))) for size in (1e-7, 3e-3)]
     assert seen[0] < 0.05 and seen[1] > 0.99
     clean = observer.project(np.zeros_like(observer.force))
     assert np.allclose(clean, 0)
-    noise = chain.render(at.unit, at.manoeuvre, [], 3) - chain.render(
-        at.unit, at.manoeuvre, [], 3, noise=False)
-    spread = observer.project(noise * at.unit.volts_to_mps2)
-    # Whitened noise has variance 1: the spectrum that the oracle uses is that of the noise.
+    noise = chain.render(scene.unit, scene.manoeuvre, [], 3) - chain.render(
+        scene.unit, scene.manoeuvre, [], 3, noise=False)
+    spread = observer.project(noise * scene.unit.volts_to_mps2)
+    # Whitened noise has variance 1, because the oracle uses the spectrum of the noise.
     assert np.var(spread) == pytest.approx(1, abs=0.05)
 
 
-def test_real_arm_puts_back(original, tmp_path, pool):
-    """A diagnosis that names what its parameters lack."""
-    keys = yaml.safe_load((original / 'recordings' / 'r0000.yaml').read_text())
+def test_a_removed_effect_of_a_real_sensor_is_named(committed_check, tmp_path, pool):
+    """A diagnosis names the effect that its parameters do not contain."""
+    keys = yaml.safe_load((committed_check / 'recordings' / 'r0000.yaml').read_text())
     (tmp_path / 'unit.yaml').write_text(yaml.safe_dump(keys))
     body = """
-def said(recording, parameters):
+def answer(recording, parameters):
     missing = [name for name in ('bias', 'scale_factor') if name + ':' not in
                parameters.read_text()]
     return ('explained', [[missing, 1.0]]) if missing else ('no_gap', [[[], 1.0]])
 """
-    csv = original / 'recordings' / 'r0000.csv'
+    csv = committed_check / 'recordings' / 'r0000.csv'
     rows = real_recordings.put_back([real_recordings.read_arm(f'{csv}:{tmp_path / "unit.yaml"}')],
                                     script(tmp_path, body), pool, no_progress)
     assert [(row['deleted'], row['put_back']) for row in rows] == [
         (None, None), ('bias', True), ('scale_factor', True)]
-    left = real_recordings.without(keys, 'bias')['/**']['ros__parameters']
-    count = len(left['sensor']['axes'])
-    assert left['effects'] == ['scale_factor'] and 'bias' not in left
-    assert len(left['covariance']) == count ** 2
-    assert left['covariance_names'] == [f'scale_factor.offset_v_per_g.{axis}'
-                                        for axis in left['sensor']['axes']]
+    remaining = real_recordings.without(keys, 'bias')['/**']['ros__parameters']
+    count = len(remaining['sensor']['axes'])
+    assert remaining['effects'] == ['scale_factor'] and 'bias' not in remaining
+    assert len(remaining['covariance']) == count ** 2
+    assert remaining['covariance_names'] == [f'scale_factor.offset_v_per_g.{axis}'
+                                             for axis in remaining['sensor']['axes']]
     with pytest.raises(UserError, match='no such file'):
         real_recordings.read_arm(f'{csv}:nowhere.yaml')
 
 
-def test_on_a_cluster(original, known_nothing, tmp_path):
+def test_on_a_cluster(committed_check, null_check, tmp_path):
     distributed = pytest.importorskip(
         'distributed', reason='distributed is not installed: pip install distributed')
-    folder = copied(original, known_nothing, tmp_path)
+    folder = copied(committed_check, null_check, tmp_path)
     with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None,
                                   local_directory=str(tmp_path)) as cluster, \
             diagnosis_runs.workers(cluster.scheduler_address) as pool:
-        found = diagnosis_runs.diagnose_all(folder, script(tmp_path, NOTHING), pool, no_progress)
-    assert len(found) == TRIALS + 2 and all(one['report'] for one in found.values())
+        results = diagnosis_runs.diagnose_all(folder, script(tmp_path, NOTHING), pool, no_progress)
+    assert len(results) == TRIALS + 2 and all(result['report'] for result in results.values())
 
 
-def test_through_the_front_door(run_tool, tmp_path):
-    """Sealed by one call, diagnosed, opened and scored by another."""
+def test_the_command_commits_and_scores(run_tool, tmp_path):
+    """One call commits the labels. Another call diagnoses, opens and scores."""
     sealed = run_tool('blind', '--seal', 'dir', '--trials', 1, '--seed', 156)
     assert sealed.returncode == 0, sealed.stderr
     digest = json.loads((tmp_path / 'dir' / 'seal.json').read_text())['sha256_of_salt_and_labels']

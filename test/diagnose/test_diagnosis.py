@@ -55,7 +55,7 @@ def unit(axes='xyz', rate_hz=125.0):
                 'scale_factor': {'offset_v_per_g': rng.normal(size=count) * 0.02}})
 
 
-def turned():
+def turning_motion():
     """Turn beta in two planes at two speeds, with rests, and warm up by 12 degC."""
     script = trajectories.Script(np.pi / 2, 0.0)
     for alpha in (np.pi / 2, np.pi / 4, 2.0):
@@ -69,26 +69,26 @@ def turned():
     return Motion(script.now, alpha, beta, temperature_c=warm)
 
 
-def made(sensor, effects=(), seed=3, change=None):
-    """Simulate a recording with effects."""
-    columns = simulate(with_effects(sensor, list(effects)), turned(), seed)
+def simulated(sensor, effects=(), seed=3, change=None):
+    """Simulate a recording with effects of the library."""
+    columns = simulate(with_effects(sensor, list(effects)), turning_motion(), seed)
     if change is not None:
         columns = change(columns)
     time_s = columns.pop('time_s')
     return Recording('made', time_s, columns, sensor_info(sensor))
 
 
-def diagnosed(sensor, *effects, change=None):
+def diagnosis_of(sensor, *effects, change=None):
     """Diagnose such a recording by the library call."""
-    diagnosis = diagnose([made(sensor, effects, change=change)], sensor)
+    diagnosis = diagnose([simulated(sensor, effects, change=change)], sensor)
     report = report_json.as_json(diagnosis)
     assert set(report) >= KEYS
     return report, diagnosis
 
 
 def test_no_gap():
-    """A unit as in its file, with the drift of a healthy unit."""
-    report, _ = diagnosed(unit(), 'bias_walk:density_g_per_rts=2e-5')
+    """A unit as in its file, with the usual drift, has no gap."""
+    report, _ = diagnosis_of(unit(), 'bias_walk:density_g_per_rts=2e-5')
     probability = report['verdict'].pop('probability')
     assert report['verdict'] == {'status': 'no_gap', 'effects': [], 'groups': [],
                                  'data_fault': None}
@@ -101,14 +101,14 @@ def test_no_gap():
     ('temperature_bias:per_k=4e-4', 'per_k.x', 4e-4),
     ('backlash:alpha_rad=0.004,beta_rad=0.004', 'beta_rad', 0.004),
     ('misalignment:alpha_rad=0.003,beta_rad=-0.002', 'alpha_rad.y', 0.003),
-    # Nothing but a straight line, which zero-g and scale factor could take up.
+    # The signal is a straight line, which zero-g and scale factor can imitate.
     ('gravity:offset_mps2=0.02', 'offset_mps2', 0.02),
-    # As in the parameter file: with what the baseline has of it.
+    # As in the parameter file: the estimate plus the value of the baseline.
     ('bias:offset_v=0.04', 'offset_v.y', 0.04)])
 def test_one_effect_is_named_and_the_gap_closed(option, parameter, value):
     """The verdict names the effect, and its parameter closes nearly all of the gap."""
     name = option.split(':')[0]
-    report, _ = diagnosed(unit(), option)
+    report, _ = diagnosis_of(unit(), option)
     assert (report['verdict']['status'], report['verdict']['effects']) == ('explained', [name])
     candidate = next(c for c in report['candidates'] if c['effect'] == name)
     assert candidate['parameters'][parameter]['value'] == pytest.approx(value, rel=0.1)
@@ -124,7 +124,7 @@ def test_an_effect_outside_the_library_is_unknown():
                 4 * columns['beta_rad'] + phase)
         return columns
 
-    report, _ = diagnosed(unit(), change=change)
+    report, _ = diagnosis_of(unit(), change=change)
     assert report['verdict']['status'] == 'unknown'
     likeliest = report['hypotheses'][0]
     assert likeliest['effects'] == ['unknown']
@@ -140,20 +140,20 @@ def test_a_nominal_file_lacks_zero_g_and_scale_factor():
             columns[f'{axis}_v'] = columns[f'{axis}_v'] + zero_v + scale * g
         return columns
 
-    report, _ = diagnosed(unit(), change=change)
+    report, _ = diagnosis_of(unit(), change=change)
     assert report['verdict']['effects'] == ['bias', 'scale_factor']
     assert report['gap']['closed'] > 0.95
 
 
 @pytest.mark.parametrize('amplitude_v, tau_s', [(0.01, 20.0), (0.002, 43.0)])
-def test_a_shape_far_from_the_typical_is_found_and_the_zero_g_fits_it(amplitude_v, tau_s):
+def test_a_shape_far_from_the_typical_is_estimated_with_its_zero_g(amplitude_v, tau_s):
     """A board settles in a tenth of the usual time. It was calibrated half warm."""
     def change(columns):
         settled = 1 - np.exp(-np.arange(len(columns['z_v'])) / 125.0 / tau_s)
         columns['z_v'] = columns['z_v'] + amplitude_v * (settled - 0.42)
         return columns
 
-    recording = made(unit(), change=change)
+    recording = simulated(unit(), change=change)
     diagnosis = diagnose([recording], unit())
     report = report_json.as_json(diagnosis)
     assert report['verdict']['effects'] == ['warm_up']
@@ -174,7 +174,7 @@ def test_the_straight_part_of_an_effect_may_be_in_the_scale_factor():
             columns[f'{axis}_v'] = columns[f'{axis}_v'] + 0.02 * (g ** 3 - g)
         return columns
 
-    report, _ = diagnosed(unit(), change=change)
+    report, _ = diagnosis_of(unit(), change=change)
     assert (report['verdict']['status'], report['verdict']['effects']) == (
         'explained', ['nonlinearity'])
     assert report['gap']['closed'] > 0.95
@@ -185,10 +185,10 @@ def test_the_straight_part_of_an_effect_may_be_in_the_scale_factor():
     ('bias_walk:density_g_per_rts=6e-4', 'bias_walk')])
 def test_spectrum_separates_the_drifts(option, effect):
     """The spectrum separates 1/f noise from a random walk."""
-    assert named(diagnosed(unit(), option)[1]) == {effect}
+    assert named(diagnosis_of(unit(), option)[1]) == {effect}
 
 
-def test_strong_flicker_of_another_colour_is_flicker():
+def test_strong_flicker_of_another_spectrum_is_flicker():
     """Relaxations of 0.3 s to minutes with a hundred times the power of the noise are flicker."""
     def drifting(seed):
         def change(columns):
@@ -200,7 +200,7 @@ def test_strong_flicker_of_another_colour_is_flicker():
                     total += lfilter([np.sqrt(1 - a * a)], [1, -a], rng.normal(size=len(total)))
                 columns[f'{axis}_v'] = columns[f'{axis}_v'] + 0.01 * total / total.std()
             return columns
-        return named(diagnosed(unit(), change=change)[1])
+        return named(diagnosis_of(unit(), change=change)[1])
 
     # A drift of 10 mg looks like a second effect in some recordings, here in the first.
     named_effects = [drifting(seed) for seed in (8, 9)]
@@ -208,10 +208,10 @@ def test_strong_flicker_of_another_colour_is_flicker():
     assert {'flicker'} in named_effects
 
 
-def test_a_weak_effect_shows_in_long_recordings():
+def test_a_weak_effect_is_named_in_long_recordings():
     """An effect of a twentieth of the noise shows, although latency imitates most of it."""
     sensor = unit()
-    recordings = [made(sensor, ['clock_skew:ratio=1.4e-6'], seed) for seed in (3, 4, 5, 6)]
+    recordings = [simulated(sensor, ['clock_skew:ratio=1.4e-6'], seed) for seed in (3, 4, 5, 6)]
     diagnosis = diagnose(recordings, sensor)
     assert (diagnosis.verdict.status, named(diagnosis)) == ('explained', {'clock_skew'})
 
@@ -227,7 +227,7 @@ def test_a_drift_smoother_than_the_library_is_unknown():
             columns[f'{axis}_v'] = columns[f'{axis}_v'] + 4e-3 * wander / wander.std()
         return columns
 
-    report, _ = diagnosed(unit(), change=change)
+    report, _ = diagnosis_of(unit(), change=change)
     assert report['verdict']['status'] == 'unknown'
     assert 'time_s' in report['unknown_where']
 
@@ -241,7 +241,7 @@ def test_a_soft_clip_is_saturation():
         return columns | {'y_v': sensor.zero_g_v[1] + np.where(
             np.abs(g) < 0.9, g, np.sign(g) * (0.9 + 0.1 * np.tanh((np.abs(g) - 0.9) / 0.1)))}
 
-    report, _ = diagnosed(sensor, change=change)
+    report, _ = diagnosis_of(sensor, change=change)
     assert report['verdict']['status'] == 'explained'
     assert report['verdict']['effects'] == ['saturation']
 
@@ -271,12 +271,12 @@ def test_a_limit_that_one_block_reaches_keeps_its_value():
     assert held_out.max() < 1.3 * np.median(held_out)
 
 
-def test_an_effect_of_turning_alone_is_no_drift():
+def test_an_effect_of_turning_is_not_a_drift():
     """A ripple of the gears with 40 periods in a turn is unknown."""
     def change(columns):
         return columns | {'x_v': columns['x_v'] + 3e-3 * np.sin(40 * columns['beta_rad'])}
 
-    assert diagnosed(unit(), change=change)[0]['verdict']['status'] == 'unknown'
+    assert diagnosis_of(unit(), change=change)[0]['verdict']['status'] == 'unknown'
 
 
 def test_samples_without_numbers_are_ignored():
@@ -285,7 +285,7 @@ def test_samples_without_numbers_are_ignored():
         late = (columns['time_s'] > 20) & (columns['time_s'] < 35)
         return columns | {'y_v': np.where(late, np.nan, columns['y_v'])}
 
-    report, _ = diagnosed(unit(), 'misalignment:alpha_rad=0.003,beta_rad=-0.002', change=change)
+    report, _ = diagnosis_of(unit(), 'misalignment:alpha_rad=0.003,beta_rad=-0.002', change=change)
     assert report['verdict']['effects'] == ['misalignment']
 
 
@@ -297,7 +297,7 @@ def test_samples_without_numbers_are_ignored():
     ('quantisation:lost_bits=4', 'quantisation')])
 def test_noise_like_effects_are_named(option, effect):
     """Lines, level, isolated samples, repeated samples and coarse codes have detectors."""
-    verdict = diagnosed(unit(), option)[0]['verdict']
+    verdict = diagnosis_of(unit(), option)[0]['verdict']
     assert (verdict['status'], verdict['effects']) == ('explained', [effect])
 
 
@@ -312,22 +312,22 @@ def test_noise_like_effects_are_named(option, effect):
     (lambda c: c | {'x_v': np.clip(c['x_v'], 2.4, 2.6)}, 'saturated')])
 def test_faults_of_the_recording_are_named(change, fault):
     """The verdict names the fault and no effect."""
-    report, diagnosis = diagnosed(unit(), change=change)
+    report, diagnosis = diagnosis_of(unit(), change=change)
     assert (report['verdict']['status'], report['verdict']['data_fault']) == ('bad_data', fault)
     assert report['verdict']['effects'] == [] and diagnosis.sensor is None
 
 
 def test_too_short_is_insufficient():
     """A recording of ten seconds has no verdict."""
-    report, _ = diagnosed(unit(), change=lambda c: {k: v[:1250] for k, v in c.items()})
+    report, _ = diagnosis_of(unit(), change=lambda c: {k: v[:1250] for k, v in c.items()})
     assert report['verdict']['status'] == 'insufficient'
     assert 'too short' in report['summary']
 
 
-def test_the_command_leaves_report_page_and_parameters(run_tool, tmp_path):
+def test_the_command_writes_report_page_and_parameters(run_tool, tmp_path):
     """Two runs are equal to the byte. With the written parameters there is no gap."""
     sensor = unit('xy')
-    recorded_run = made(sensor, ['temperature_bias:per_k=4e-4'])
+    recorded_run = simulated(sensor, ['temperature_bias:per_k=4e-4'])
     recording.write(tmp_path / 'run.csv', recorded_run, sensor)
     parameter_file.save(tmp_path / 'unit.yaml', sensor)
     files = []
@@ -349,7 +349,7 @@ def test_several_recordings_and_bags(run_tool, tmp_path):
     sensor = unit('xy')
     parameter_file.save(tmp_path / 'unit.yaml', sensor)
     for name, seed in (('a.csv', 3), ('b.mcap', 4)):
-        recording.write(tmp_path / name, made(sensor, ['time_offset:offset_s=0.004'], seed),
+        recording.write(tmp_path / name, simulated(sensor, ['time_offset:offset_s=0.004'], seed),
                         sensor)
     run = run_tool('diagnose', 'a.csv', 'b.mcap', '--params', 'unit.yaml', '-o', 'out', '--json')
     report = json.loads(run.stdout)
@@ -384,7 +384,7 @@ def named(diagnosis):
 
 
 @pytest.mark.parametrize('effect', ['backlash:beta_rad=0.003', 'time_offset:offset_s=0.005', None])
-def test_a_poor_manoeuvre_makes_no_wrong_verdict(effect):
+def test_a_poor_manoeuvre_causes_no_wrong_verdict(effect):
     """A minute on one plane at one speed names the truth, alone or in a group."""
     sensor = unit('xy')
     script = turning([np.pi / 2], [0.7] * 3, 4.0)
@@ -406,7 +406,7 @@ def test_a_recording_at_rest_is_insufficient():
     assert 'motion' in report['not_covered'] and report['next_experiment']
 
 
-def test_repeats_determine_the_noise_floor_where_nothing_rests():
+def test_repeats_determine_the_noise_floor_without_rests():
     """The difference of two runs of one trajectory is the noise floor."""
     sensor = replace(unit('xy'), stage_resolution_rad=1e-5)
     time_s = np.arange(0.0, 70.0, 0.5)
@@ -420,9 +420,9 @@ def test_repeats_determine_the_noise_floor_where_nothing_rests():
     assert report['gap']['floor'] == pytest.approx(5.3e-3, rel=0.1)
 
 
-def test_noise_is_compared_where_the_mean_is_blind():
-    """Twice the noise has four times the power, until the simulator has it, too."""
-    report, _ = diagnosed(unit(), 'noise_excess:ratio=1.0')
+def test_noise_is_compared_with_the_simulated_noise():
+    """Twice the noise has four times the power, until the simulator has it as well."""
+    report, _ = diagnosis_of(unit(), 'noise_excess:ratio=1.0')
     noise = report['gap']['noise'][0]
     assert noise['power_ratio_before'][-1] == pytest.approx(4.0, rel=0.1)
     assert noise['power_ratio_after'][-1] == pytest.approx(1.0, rel=0.1)
@@ -449,7 +449,7 @@ def test_temperature_is_named_in_a_climatic_chamber(run_tool, tmp_path, shared_d
     report = json.loads(run.stdout)
     assert 'temperature_bias' in report['verdict']['effects']
     candidate = next(c for c in report['candidates'] if c['effect'] == 'temperature_bias')
-    # The README's are those of straight lines, through what is a parabola about 25 degC.
+    # The slopes of the README are those of straight lines, but the data are a parabola at 25 degC.
     warm_k = recording.read(shared_dir / 'real' / 'thermal_chamber.csv').columns[
         'temperature_c'] - 25
     slopes = []
@@ -470,7 +470,7 @@ def test_another_simulator_takes_the_place_of_the_stage(run_tool, tmp_path, shar
 
 
 def test_a_sensor_that_moves_without_a_reference_gets_no_verdict(run_tool, tmp_path, shared_dir):
-    """A sensor turned by hand has no reference, which one line says."""
+    """A sensor turned by hand has no reference, and one line reports this."""
     run = run_tool('diagnose', shared_dir / 'real' / 'mpu9150_0.csv', '-o', tmp_path, '--json')
     verdict = json.loads(run.stdout)['verdict']
     assert (verdict['status'], verdict['data_fault']) == ('bad_data', 'reference')
@@ -478,7 +478,7 @@ def test_a_sensor_that_moves_without_a_reference_gets_no_verdict(run_tool, tmp_p
 
 @pytest.mark.parametrize('name', ['no_gap', 'temperature_bias', 'time_offset'])
 def test_samples_of_another_generator(run_tool, tmp_path, shared_dir, name):
-    """The shared samples have the right verdict after `fit --model linear`."""
+    """The shared samples have the right verdict after a linear fit."""
     folder = shared_dir / 'samples' / name
     run_tool('fit', folder / 'cal.csv', '--model', 'linear', '-o', tmp_path / 'unit.yaml')
     run = run_tool('diagnose', folder / 'run.csv', '--params', tmp_path / 'unit.yaml', '-o',

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Recordings as bags: round trips, what ros2 bag writes, references, cuts, bad bags, memory."""
+"""Recordings as bags: round trips, bags of ros2 bag, references, cuts, invalid bags, memory."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -35,8 +35,8 @@ EPOCH_NS, IMU, INFO, JOINTS, STORE, STRING, TYPES = (
     bags.EPOCH_NS, bags.IMU, bags.INFO, bags.JOINTS, bags.STORE, bags.STRING, bags.TYPES)
 
 
-def made(count: int = 3000, axes: str = 'xyz') -> Recording:
-    """Make a recording with references of every kind at every sample."""
+def recorded(count: int = 3000, axes: str = 'xyz') -> Recording:
+    """Return a recording with references of every kind at every sample."""
     rng = np.random.default_rng(1)
     columns = {f'{axis}_v': rng.normal(2.5, 0.5, count) for axis in axes}
     columns.update({name: rng.normal(size=count) for name in REFERENCES})
@@ -50,9 +50,9 @@ def made(count: int = 3000, axes: str = 'xyz') -> Recording:
 @pytest.mark.parametrize('name', ['run', 'run.v2', 'run.mcap'])
 @pytest.mark.parametrize('axes', ['x', 'xy', 'xyz'])
 def test_round_trip_to_the_bit(tmp_path: Path, name: str, axes: str) -> None:
-    sent = made(axes=axes)
+    sent = recorded(axes=axes)
     sensor = nominal(axes)
-    for _ in range(2):  # the second one replaces the first
+    for _ in range(2):  # the second file replaces the first
         recording.write(tmp_path / name, sent, sensor)
     assert [path.name for path in tmp_path.iterdir()] == [name]
     got = recording.read(tmp_path / name)
@@ -70,21 +70,21 @@ def test_round_trip_to_the_bit(tmp_path: Path, name: str, axes: str) -> None:
     assert all((last.columns[k] == v).all() for k, v in got.columns.items())
 
 
-def test_bag_and_csv_say_the_same(tmp_path: Path) -> None:
+def test_bag_and_csv_have_the_same_contents(tmp_path: Path) -> None:
     sensor = nominal('xyz')
-    sent = replace(made(), epoch_ns=0)
+    sent = replace(recorded(), epoch_ns=0)
     recording.write(tmp_path / 'run.mcap', sent, sensor)
     recording.write(tmp_path / 'run.csv', recording.read(tmp_path / 'run.mcap'), sensor)
-    one, other = (recording.read(tmp_path / name) for name in ('run.mcap', 'run.csv'))
-    assert (one.time_s == sent.time_s).all()
-    assert (one.time_s == other.time_s).all()
-    assert all((other.columns[k] == v).all() for k, v in one.columns.items())
-    assert one.info == other.info
+    from_bag, from_csv = (recording.read(tmp_path / name) for name in ('run.mcap', 'run.csv'))
+    assert (from_bag.time_s == sent.time_s).all()
+    assert (from_bag.time_s == from_csv.time_s).all()
+    assert all((from_csv.columns[k] == v).all() for k, v in from_bag.columns.items())
+    assert from_bag.info == from_csv.info
 
 
-def test_what_is_written_is_what_others_read(tmp_path: Path) -> None:
+def test_a_written_bag_is_readable_by_other_software(tmp_path: Path) -> None:
     sensor = nominal('xy')
-    sent = made(50, 'xy')
+    sent = recorded(50, 'xy')
     recording.write(tmp_path / 'run', sent, sensor)
     accel = sent.accel_mps2(sensor)
     count: dict[str, int] = {}
@@ -118,7 +118,7 @@ def test_what_is_written_is_what_others_read(tmp_path: Path) -> None:
 
 
 def converted(source: Path, target: Path, storage: str, mode: str) -> None:
-    """Copy a bag into another storage and compression, beside topics of others."""
+    """Copy a bag into another storage and compression, with topics of another robot."""
     with rosbag2.Reader(source) as reader:
         writer = rosbag2.Writer(target, version=9,
                                 storage_plugin=rosbag2.StoragePlugin[storage])
@@ -139,7 +139,7 @@ def converted(source: Path, target: Path, storage: str, mode: str) -> None:
     ('MCAP', 'NONE'), ('MCAP', 'STORAGE'), ('MCAP', 'FILE'), ('MCAP', 'MESSAGE'),
     ('SQLITE3', 'NONE'), ('SQLITE3', 'FILE'), ('SQLITE3', 'MESSAGE')])
 def test_every_storage_and_compression(tmp_path: Path, storage: str, mode: str) -> None:
-    recording.write(tmp_path / 'plain', made(), nominal('xyz'))
+    recording.write(tmp_path / 'plain', recorded(), nominal('xyz'))
     plain = recording.read(tmp_path / 'plain')
     target = tmp_path / 'recorded'
     converted(tmp_path / 'plain', target, storage, mode)
@@ -198,7 +198,7 @@ def test_layouts_are_those_of_an_independent_decoder() -> None:
             assert (back.linear_acceleration.y, back.header.stamp.nanosec) == (2.0, 5)
 
 
-def test_joints_may_come_one_by_one(tmp_path: Path) -> None:
+def test_joints_may_have_messages_of_their_own(tmp_path: Path) -> None:
     times = stamps(100)
     messages = [imu(t) for t in times]
     for i, t in enumerate(times):
@@ -226,7 +226,7 @@ def test_references_at_another_rate_are_interpolated(tmp_path: Path) -> None:
     assert (np.isnan(got.columns['alpha_rad']) == ~near).all()
     assert (got.columns['alpha_rad'][near & (times < there[0])] == alpha[0]).all()
     error = np.abs(got.columns['beta_rad'] - np.sin(2 * np.pi * s))[inside].max()
-    # Twice the spacing misses four times as much, and its rms is 1/√2 of its largest.
+    # Twice the spacing has four times the error, whose rms is 1/√2 of its largest value.
     assert error < got.alignments['beta_rad'].residual < 4.5 * error
     assert got.alignments['alpha_rad'].residual < 1e-9
     assert 0.019 < got.alignments['alpha_rad'].gap_s <= 0.02
@@ -240,12 +240,12 @@ def test_references_at_another_rate_are_interpolated(tmp_path: Path) -> None:
 
 
 def test_a_command_is_in_force_until_the_next_one(tmp_path: Path) -> None:
-    """By its stamp, or where it has none from when it was recorded; no sample waits for it."""
+    """Its stamp counts, or the time of its record without a stamp. No sample waits for it."""
     times = stamps(1000)
     messages = [m for i, t in enumerate(times) for m in (
         imu(t), *([joints(t, alpha=0.0, beta=0.0)] if i % 10 == 0 else []))]
 
-    def at(row: int) -> int:
+    def index_after(row: int) -> int:
         return next(i for i, m in enumerate(messages) if m.message.header == imu(times[row])
                     .message.header and m.kind == IMU) + 1
 
@@ -253,7 +253,8 @@ def test_a_command_is_in_force_until_the_next_one(tmp_path: Path) -> None:
             (100, 500_000, {'alpha': 1.0}), (200, 0, {'beta': 2.0, 'other': 5.0}),
             (300, -times[300], {'alpha': 3.0, 'beta': np.nan}), (400, 0, {'alpha': np.inf}),
             (500, 0, {}), (600, -3_000_000, {'alpha': 1e7, 'beta': 4.0})):
-        messages.insert(at(row), joints(times[row] + late_ns, '/stage/command', **positions))
+        command = joints(times[row] + late_ns, '/stage/command', **positions)
+        messages.insert(index_after(row), command)
     path = bags.bag_of(tmp_path / 'run', messages)
     got = recording.read(path)
     nan = np.nan
@@ -267,13 +268,13 @@ def test_a_command_is_in_force_until_the_next_one(tmp_path: Path) -> None:
         assert max(map(len, blocks)) <= rows
         for name in ('alpha_command_rad', 'beta_command_rad'):
             joined = np.concatenate([b.columns[name] for b in blocks])
-            # One that is recorded 3 ms late may miss the samples before it.
+            # A command that is recorded 3 ms late may not apply to the samples before it.
             assert np.count_nonzero(~((joined == got.columns[name]) | np.isnan(joined))) <= 3
             assert (np.isnan(joined) == np.isnan(got.columns[name])).all()
 
 
 def test_commands_are_those_of_the_stage_and_of_the_right_type(tmp_path: Path) -> None:
-    """Others use the name, too: that is no error, and no column."""
+    """Topics of that name with another type are neither an error nor a column."""
     commands = [joints(T[0], '/b/stage/command', alpha=1.0),
                 joints(T[0], '/a/stage/command', alpha=2.0)]
     stage = [joints(t, '/b/stage/joint_states', alpha=0.0) for t in T]
@@ -290,7 +291,7 @@ def test_commands_are_those_of_the_stage_and_of_the_right_type(tmp_path: Path) -
         ': topic /stage/command: a message is damaged')
 
 
-def test_a_stage_that_dies_does_not_hold_up_the_samples(
+def test_samples_continue_after_the_last_message_of_the_stage(
         tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bag_reader, '_HOLD_ROWS', 500)
     messages = [m for t in stamps(3000) for m in (imu(t), joints(t, alpha=1.0))
@@ -306,18 +307,18 @@ def test_a_stage_that_dies_does_not_hold_up_the_samples(
 @pytest.mark.parametrize('name', ['run', 'run.mcap'])
 def test_a_cut_file_is_read_up_to_the_cut(tmp_path: Path, name: str) -> None:
     sensor = nominal('xyz')
-    recording.write(tmp_path / name, made(9000), sensor)
+    recording.write(tmp_path / name, recorded(9000), sensor)
     file = tmp_path / name if name == 'run.mcap' else tmp_path / name / 'run.mcap'
-    whole = recording.read(tmp_path / name)
+    complete = recording.read(tmp_path / name)
     data = file.read_bytes()
     counts = []
     for size in (len(data) - 1, len(data) * 2 // 3, len(data) // 3, 100_000):
         file.write_bytes(data[:size])
         got = recording.read(tmp_path / name)
         counts.append(len(got))
-        assert (got.stamp_ns == whole.stamp_ns[:len(got)]).all()
-        assert (got.columns['ay_mps2'] == whole.columns['ay_mps2'][:len(got)]).all()
-        assert got.info == whole.info
+        assert (got.stamp_ns == complete.stamp_ns[:len(got)]).all()
+        assert (got.columns['ay_mps2'] == complete.columns['ay_mps2'][:len(got)]).all()
+        assert got.info == complete.info
         assert f'{file}: cut off' in got.cut
         assert f'of {size}; the last sample read is at 1750000' in got.cut
         assert list(recording.blocks(tmp_path / name, 100))[-1].cut
@@ -332,12 +333,12 @@ def test_a_cut_file_is_read_up_to_the_cut(tmp_path: Path, name: str) -> None:
 
 
 def test_damaged_files_are_refused(tmp_path: Path) -> None:
-    recording.write(tmp_path / 'run.mcap', made(), nominal('xyz'))
+    recording.write(tmp_path / 'run.mcap', recorded(), nominal('xyz'))
     data = bytearray((tmp_path / 'run.mcap').read_bytes())
     data[-30] ^= 0xFF  # in the footer
     (tmp_path / 'footer.mcap').write_bytes(data)
     assert ': cannot read it as a rosbag2 recording: ' in refusal(tmp_path / 'footer.mcap')
-    recording.write(tmp_path / 'plain', made(), nominal('xyz'))
+    recording.write(tmp_path / 'plain', recorded(), nominal('xyz'))
     converted(tmp_path / 'plain', tmp_path / 'sql', 'SQLITE3', 'NONE')
     file = tmp_path / 'sql' / 'sql.db3'
     file.write_bytes(file.read_bytes()[:100_000])
@@ -356,7 +357,7 @@ T = stamps(3)
 CUT_IMU = bytes(STORE.serialize_cdr(imu(T[1]).message, IMU))[:100]
 
 
-@pytest.mark.parametrize(('messages', 'told'), [
+@pytest.mark.parametrize(('messages', 'message'), [
     ([Sent('/imu/data_raw', STRING, 0, TYPES[STRING](data=''))],
      f': topic /imu/data_raw is of type {STRING}, expected {IMU}'),
     ([imu(T[0], topic='/imu')],
@@ -398,9 +399,9 @@ CUT_IMU = bytes(STORE.serialize_cdr(imu(T[1]).message, IMU))[:100]
     ([imu(T[0]), Sent('/sensor_info', INFO, 0, raw=b'\0\1\0\0\7')],
      ': topic /sensor_info: damaged message: '),
 ])
-def test_what_is_wrong_is_said_in_one_line(
-        tmp_path: Path, messages: list[Sent], told: str) -> None:
-    assert refusal(bags.bag_of(tmp_path / 'run', messages)).startswith(told)
+def test_invalid_bags_are_refused_in_one_line(
+        tmp_path: Path, messages: list[Sent], message: str) -> None:
+    assert refusal(bags.bag_of(tmp_path / 'run', messages)).startswith(message)
 
 
 def test_the_sensors_own_namespace_comes_first(tmp_path: Path) -> None:
@@ -429,13 +430,13 @@ def test_writing_is_all_or_nothing(tmp_path: Path) -> None:
     sensor = nominal('xyz')
     for name in ('run', 'run.mcap', 'run.csv'):
         with pytest.raises(KeyboardInterrupt), recording.writer(tmp_path / name, sensor) as append:
-            append(made(50))
+            append(recorded(50))
             raise KeyboardInterrupt
-    early = replace(made(50), epoch_ns=-10**12)
+    early = replace(recorded(50), epoch_ns=-10**12)
     with pytest.raises(UserError, match='cannot be stamps of ROS messages'):
         recording.write(tmp_path / 'run', early, sensor)
     with pytest.raises(UserError, match='has the axes xy, but the sensor'):
-        recording.write(tmp_path / 'run', made(50, 'xy'), sensor)
+        recording.write(tmp_path / 'run', recorded(50, 'xy'), sensor)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -445,7 +446,7 @@ def test_without_rosbags(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     with pytest.raises(UserError, match='pip install "rosbags'):
         recording.read(tmp_path / 'run')
     with pytest.raises(UserError, match='pip install "rosbags'):
-        recording.write(tmp_path / 'run', made(5), nominal('xyz'))
+        recording.write(tmp_path / 'run', recorded(5), nominal('xyz'))
 
 
 def test_real_file_through_a_bag(shared_dir: Path, tmp_path: Path) -> None:
@@ -458,7 +459,7 @@ def test_real_file_through_a_bag(shared_dir: Path, tmp_path: Path) -> None:
 
 
 def test_memory_is_bounded(tmp_path: Path) -> None:
-    part = made(6_000, 'xy')
+    part = recorded(6_000, 'xy')
     del part.columns['temperature_c'], part.columns['supply_v']
     span_ns = int(part.stamp_ns[-1] - part.stamp_ns[0]) + 10**6
     with recording.writer(tmp_path / 'run', nominal('xy')) as append:

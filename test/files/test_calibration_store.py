@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Provenance and the store, through `fit`: copies by serial and date, the previous file kept."""
+"""Provenance and calibration store by `fit`: copies by serial number and date, earlier files."""
 
 from dataclasses import replace
 import hashlib
@@ -31,7 +31,7 @@ DATED = {'date': '2026-01-02T03:04:05+00:00', 'data_sha256': 'ab' * 32}
 
 @pytest.fixture(scope='module')
 def swept_csv(tmp_path_factory):
-    """Give a swept recording of the unit U/7, warm, with its supply; and its nominal file."""
+    """Return a folder with a sweep of the unit U/7, its temperature, supply and nominal file."""
     folder = tmp_path_factory.mktemp('swept')
     (folder / 'u7.yaml').write_text(
         NOMINAL.read_text().replace('serial: nominal', 'serial: U/7'))
@@ -52,23 +52,24 @@ def swept_csv(tmp_path_factory):
 
 
 def test_provenance_store_and_the_previous_file(run_tool, swept_csv, tmp_path):
-    """What the YAML says of its calibration; a second one keeps the first; both are stored."""
+    """The file states its provenance. A second fit keeps the first file, and both are stored."""
     shutil.copytree(swept_csv, tmp_path, dirs_exist_ok=True)
     done = run_tool('fit', 'sweep.csv', '--params', 'u7.yaml', '--model', 'physical', '-o',
                     'u.yaml')
     assert done.returncode == 0, done.stderr
     first = (tmp_path / 'u.yaml').read_text()
     sensor = parameter_file.load(tmp_path / 'u.yaml')
-    said = sensor.provenance
+    provenance = sensor.provenance
     raw = (tmp_path / 'sweep.csv').read_bytes()
-    assert said['data_sha256'] == hashlib.sha256(raw).hexdigest()
-    assert said['temperature_c'] == '22.50'
-    assert said['supply_v'] == '4.9500'
-    assert said['sweep'] == ('125 poses: alpha 30, 60, 90, 120, 150 deg; beta 0 to 360 deg, steps '
-                             'of 30, both directions')
-    assert said['package_version'] and said['date'] and said['residual_mg']
-    assert float(said['held_out_tilt_rms_deg']) > 0
-    assert said['id'].startswith('U/7-20') and said['id'].endswith(said['data_sha256'][:8])
+    assert provenance['data_sha256'] == hashlib.sha256(raw).hexdigest()
+    assert provenance['temperature_c'] == '22.50'
+    assert provenance['supply_v'] == '4.9500'
+    assert provenance['sweep'] == ('125 poses: alpha 30, 60, 90, 120, 150 deg; beta 0 to 360 deg, '
+                                   'steps of 30, both directions')
+    assert provenance['package_version'] and provenance['date'] and provenance['residual_mg']
+    assert float(provenance['held_out_tilt_rms_deg']) > 0
+    assert provenance['id'].startswith('U/7-20')
+    assert provenance['id'].endswith(provenance['data_sha256'][:8])
     assert sensor.envelope.temperature_c == pytest.approx((22.0, 23.0), abs=0.05)
     assert sensor.envelope.leverage > 0
     assert (sensor.serial, sensor.model) == ('U/7', 'physical')
@@ -84,13 +85,13 @@ def test_provenance_store_and_the_previous_file(run_tool, swept_csv, tmp_path):
     assert (tmp_path / 'u.yaml.previous').read_text() == first
     assert len(list((tmp_path / 'elsewhere').rglob('*.yaml'))) == 1
     assert len(list(folder.iterdir())) == 1
-    # What it leaves is a set of parameters that nodes and tools load.
+    # Nodes and tools load the written parameters.
     done = run_tool('apply', 'sweep.csv', '--params', 'u.yaml', '-o', 'out.csv')
     assert done.returncode == 0, done.stderr
 
 
-def test_a_store_that_cannot_be_written_loses_nothing(run_tool, swept_csv, tmp_path):
-    """The file is there, and one line says why there is no copy."""
+def test_a_store_that_cannot_be_written_is_reported(run_tool, swept_csv, tmp_path):
+    """The file is written, and one line states the reason for the missing copy."""
     shutil.copytree(swept_csv, tmp_path, dirs_exist_ok=True)
     (tmp_path / 'file').write_text('')
     done = run_tool('fit', 'sweep.csv', '--params', 'u7.yaml', '--model', 'linear', '-o', 'u.yaml',
@@ -101,16 +102,16 @@ def test_a_store_that_cannot_be_written_loses_nothing(run_tool, swept_csv, tmp_p
     assert done.stderr.count('\n') == 1
 
 
-def test_no_unit_in_particular_is_not_stored(run_tool, tmp_path):
-    """Serial `nominal`: the copy would be of nobody."""
+def test_a_calibration_without_a_unit_is_not_stored(run_tool, tmp_path):
+    """The serial number `nominal` is that of no unit."""
     run_tool('simulate', 'sweep', '--rate', '100', '-o', 'a.csv')
     done = run_tool('fit', 'a.csv', '--model', 'linear', '-o', 'u.yaml')
     assert done.returncode == 0 and 'names no unit' in done.stderr
     assert not (tmp_path / 'ros_home').exists()
 
 
-def test_apply_says_what_lies_outside(run_tool, swept_csv, tmp_path):
-    """And raises its standard deviations as much as `compensation` does."""
+def test_apply_reports_samples_outside_of_the_validity_range(run_tool, swept_csv, tmp_path):
+    """Their standard deviations grow as those of the node `compensation`."""
     shutil.copytree(swept_csv, tmp_path, dirs_exist_ok=True)
     run_tool('fit', 'sweep.csv', '--params', 'u7.yaml', '--model', 'linear', '-o', 'u.yaml')
     head = (tmp_path / 'sweep.csv').read_text().split('\ntime_s')[0]
@@ -127,7 +128,7 @@ def test_apply_says_what_lies_outside(run_tool, swept_csv, tmp_path):
 
 
 def test_the_file_holds_envelope_and_datasheet(tmp_path):
-    """They round-trip; an older file without them loads, and says that nothing is known."""
+    """Both are equal after a round trip. An older file without them loads with empty values."""
     sensor = replace(drawn(np.random.default_rng(1), nominal(serial='17')), model='full',
                      envelope=Envelope((20.5, 23.25), 1e-4, 3e-5, 2e-7, 1e-3, (-9.0, -9.5, 0.5),
                                        (9.0, 9.5, 8.0)))
@@ -143,33 +144,33 @@ def test_the_file_holds_envelope_and_datasheet(tmp_path):
 
 
 @pytest.mark.parametrize('serial', ['17', 'A/B', '..', 'ä €', '-x', 'ä' * 200])
-def test_any_serial_has_a_folder_of_its_own(tmp_path, serial):
-    """Inside the store, whatever the serial number is."""
+def test_each_serial_number_has_its_folder(tmp_path, serial):
+    """The folder is inside the store for every serial number."""
     sensor = replace(drawn(np.random.default_rng(1), nominal(serial=serial)), provenance=DATED)
     path = calibration_store.put(tmp_path / 'store', sensor)
     assert path.parent.parent == tmp_path / 'store'
     assert calibration_store.newer(tmp_path / 'store', sensor) is None
     old = replace(sensor, provenance={'date': '2025-01-02T03:04:05+00:00'})
     assert calibration_store.newer(tmp_path / 'store', old) == path
-    (found, again), = calibration_store.history(tmp_path / 'store', serial).calibrations
-    assert found == path and again.serial == serial
+    (stored, again), = calibration_store.history(tmp_path / 'store', serial).calibrations
+    assert stored == path and again.serial == serial
 
 
-def test_history_is_by_date_and_tells_what_it_cannot_read(tmp_path):
-    """A file that is half or of another unit does not hide the others."""
+def test_history_is_ordered_by_date_and_names_unreadable_files(tmp_path):
+    """An incomplete file or one of another unit does not hide the others."""
     sensor = drawn(np.random.default_rng(1), nominal(serial='17'))
     dates = ['2026-03-01T00:00:00+00:00', '2025-12-24T00:00:00+00:00', '2026-02-01T00:00:00']
     for date in dates:
         calibration_store.put(tmp_path, replace(sensor, provenance={'date': date}))
     parameter_file.save(tmp_path / '17' / 'other.yaml', replace(sensor, serial='18'))
     (tmp_path / '17' / 'half.yaml').write_text('/**:\n  ros__par')
-    found, refused = calibration_store.history(tmp_path, '17')
-    assert [s.provenance['date'] for _, s in found] == [dates[1], dates[2], dates[0]]
+    calibrations, refused = calibration_store.history(tmp_path, '17')
+    assert [s.provenance['date'] for _, s in calibrations] == [dates[1], dates[2], dates[0]]
     assert len(refused) == 2 and 'half.yaml:' in refused[0] and 'unit 18' in refused[1]
 
 
 def test_a_file_that_was_named_by_hand_counts_by_its_date(tmp_path):
-    """A copy is not newer than itself, nor is an old backup whose name sorts last."""
+    """Neither a copy nor an old backup whose name sorts last counts as newer."""
     sensor = replace(drawn(np.random.default_rng(1), nominal(serial='17')), provenance=DATED)
     path = calibration_store.put(tmp_path, sensor)
     shutil.copy(path, tmp_path / '17' / 'unit_17.yaml')
@@ -185,7 +186,7 @@ def test_a_file_that_was_named_by_hand_counts_by_its_date(tmp_path):
 
 
 def test_a_full_disk_keeps_the_old_file(swept_csv, tmp_path):
-    """No file can grow beyond a kilobyte: the old one stands to the byte, and nothing is left."""
+    """If no file can exceed a kilobyte, the old file is kept and no other file remains."""
     shutil.copytree(swept_csv, tmp_path, dirs_exist_ok=True)
     (tmp_path / 'u.yaml').write_text('old')
     there = {path.name for path in tmp_path.iterdir()}

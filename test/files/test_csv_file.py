@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Recordings as CSV: round trips, the real files, what is wrong with bad ones, memory, speed."""
+"""Recordings as CSV: round trips, real files, invalid files, memory, speed."""
 
 from dataclasses import replace
 import os
@@ -41,8 +41,8 @@ def written(tmp_path: Path, text: str | bytes, name: str = 'run.csv') -> Path:
     return path
 
 
-def made(rng: np.random.Generator, count: int = 3000, axes: str = 'xyz') -> Recording:
-    """Make a recording of full-precision numbers, with references of every kind."""
+def recorded(rng: np.random.Generator, count: int = 3000, axes: str = 'xyz') -> Recording:
+    """Return a recording of full-precision numbers, with references of every kind."""
     columns = {f'{axis}_v': rng.normal(2.5, 0.5, count) for axis in axes}
     for name in ('alpha_rad', 'beta_rad', 'shift_m', 'temperature_c', 'supply_v'):
         columns[name] = np.where(rng.random(count) < 0.3, np.nan, rng.normal(size=count))
@@ -50,14 +50,14 @@ def made(rng: np.random.Generator, count: int = 3000, axes: str = 'xyz') -> Reco
     return Recording('made', time_s, columns, sensor_info(nominal(axes)))
 
 
-def same_bits(one: np.ndarray, other: np.ndarray) -> bool:
-    """Tell whether two float64 arrays are the same, NaN being NaN."""
-    return np.array_equal(one, other, equal_nan=True) and np.array_equal(
-        np.signbit(one[~np.isnan(one)]), np.signbit(other[~np.isnan(other)]))
+def same_bits(first: np.ndarray, second: np.ndarray) -> bool:
+    """Return whether two float64 arrays are equal, with NaN equal to NaN."""
+    return np.array_equal(first, second, equal_nan=True) and np.array_equal(
+        np.signbit(first[~np.isnan(first)]), np.signbit(second[~np.isnan(second)]))
 
 
 def test_round_trip_to_the_bit(tmp_path: Path) -> None:
-    sent = made(np.random.default_rng(1))
+    sent = recorded(np.random.default_rng(1))
     sent.columns['x_v'][:6] = [0.1, -0.0, 5e-324, 1 / 3, -123456.789e-9, 2.0 ** 0.5]
     sent.columns['other'] = np.where(sent.time_s > 0.5, np.inf, 1e300)
     path = tmp_path / 'run.csv'
@@ -82,14 +82,14 @@ def test_stamps_since_1970_keep_their_nanoseconds(tmp_path: Path) -> None:
     assert got.epoch_ns == epoch_ns
 
 
-def test_blocks_are_the_whole(tmp_path: Path) -> None:
+def test_blocks_join_to_the_complete_recording(tmp_path: Path) -> None:
     path = tmp_path / 'run.csv'
-    recording.write(path, made(np.random.default_rng(3), 5000), nominal('xyz'))
-    whole = recording.read(path)
+    recording.write(path, recorded(np.random.default_rng(3), 5000), nominal('xyz'))
+    complete = recording.read(path)
     blocks = list(recording.blocks(path, 700))
     assert max(len(block) for block in blocks) <= 700
     assert same_bits(np.concatenate([b.columns['beta_rad'] for b in blocks]),
-                     whole.columns['beta_rad'])
+                     complete.columns['beta_rad'])
 
 
 def test_writing_is_all_or_nothing(tmp_path: Path) -> None:
@@ -100,20 +100,20 @@ def test_writing_is_all_or_nothing(tmp_path: Path) -> None:
     assert path.read_text() == 'before'
     assert os.listdir(tmp_path) == ['run.csv']
     with pytest.raises(UserError, match='nowhere'):
-        recording.write(tmp_path / 'nowhere' / 'run.csv', made(np.random.default_rng(4), 5),
+        recording.write(tmp_path / 'nowhere' / 'run.csv', recorded(np.random.default_rng(4), 5),
                         nominal('xyz'))
 
 
-def test_nominal_conversion_uses_the_figures_of_the_recording() -> None:
-    own = nominal('xy', nominal_zero_g_v=np.array([2.4, 2.6]))
+def test_nominal_conversion_uses_the_datasheet_values_of_the_recording() -> None:
+    stated = nominal('xy', nominal_zero_g_v=np.array([2.4, 2.6]))
     sensor = nominal('xy')
     volts = np.array([[2.4, 2.6], [3.4, 1.6]])
-    accel = (volts - own.nominal_zero_g_v) * G0_MPS2
+    accel = (volts - stated.nominal_zero_g_v) * G0_MPS2
     columns = {name: accel[:, i] for i, name in enumerate(ACCEL[:2])}
-    carried = Recording('made', np.arange(2.0), columns, sensor_info(own))
+    carried = Recording('made', np.arange(2.0), columns, sensor_info(stated))
     np.testing.assert_allclose(carried.volts(sensor), volts, rtol=1e-15)
     np.testing.assert_allclose(carried.accel_mps2(sensor), (volts - 2.5) * G0_MPS2, atol=1e-14)
-    assert (carried.accel_mps2(own) == accel).all()
+    assert (carried.accel_mps2(stated) == accel).all()
     bare = replace(carried, info={})
     np.testing.assert_allclose(bare.volts(sensor), volts + [0.1, -0.1], rtol=1e-15)
     bare.info['nominal_zero_g_v'] = '2.5'
@@ -122,7 +122,7 @@ def test_nominal_conversion_uses_the_figures_of_the_recording() -> None:
 
 
 def test_another_unit_is_refused() -> None:
-    carried = made(np.random.default_rng(5), 5)
+    carried = recorded(np.random.default_rng(5), 5)
     carried.info['serial'] = 'A17'
     check_unit(carried.stream_info, carried.axes, nominal('xyz'))
     check_unit(carried.stream_info, carried.axes, nominal('xyz', serial='A17'))
@@ -169,7 +169,7 @@ def test_a_gap_in_time_is_kept(tmp_path: Path) -> None:
     assert got.time_s.tolist() == [0.0, 0.001, 9.0]
 
 
-@pytest.mark.parametrize(('text', 'told'), [
+@pytest.mark.parametrize(('text', 'message'), [
     ('', ': is empty'),
     ('# serial: A17\n', ': is empty'),
     (f'{HEADER}\n', ': has a header, but no samples'),
@@ -219,8 +219,9 @@ def test_a_gap_in_time_is_kept(tmp_path: Path) -> None:
     (b'\x89MCAP0\r\n', ': is a bag; rename it so that it ends in .mcap'),
     (b'\x28\xb5\x2f\xfd', ': is compressed; name the directory with its metadata.yaml'),
 ])
-def test_what_is_wrong_is_said_in_one_line(tmp_path: Path, text: str | bytes, told: str) -> None:
-    assert refusal(written(tmp_path, text)).startswith(told)
+def test_invalid_files_are_refused_in_one_line(tmp_path: Path, text: str | bytes, message: str
+                                               ) -> None:
+    assert refusal(written(tmp_path, text)).startswith(message)
 
 
 def test_paths_that_cannot_be_read(tmp_path: Path) -> None:
@@ -233,7 +234,7 @@ def test_paths_that_cannot_be_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize('place', [0, 1600, 2999])
-def test_faults_far_down_are_found(
+def test_faults_in_late_lines_are_reported(
         tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: int) -> None:
     monkeypatch.setattr(csv_file, '_CHUNK_BYTES', 10_000)
     lines = [f'{i / 1000!r},2.5,2.5,{i % 7},0.1' for i in range(3000)]
@@ -247,19 +248,19 @@ def test_faults_far_down_are_found(
 
 
 @pytest.mark.parametrize('size', [1, 7, 200])
-def test_where_the_file_is_cut_into_blocks_does_not_matter(
+def test_the_result_does_not_depend_on_the_blocks(
         tmp_path: Path, monkeypatch: pytest.MonkeyPatch, size: int) -> None:
     rows = GOOD.replace('\n', '\r\n')
     path = written(tmp_path, f'\ufeff# serial: A17\r\n{HEADER}\n{rows}# end: 1\n0.1,1,2,3,4')
-    whole = recording.read(path)
+    complete = recording.read(path)
     monkeypatch.setattr(csv_file, '_CHUNK_BYTES', size)
     cut = recording.read(path)
-    assert cut.info == whole.info == {'serial': 'A17', 'end': '1'}
-    assert cut.time_s.tolist() == whole.time_s.tolist() == [0.0, 0.001, 0.002, 0.1]
-    assert all(same_bits(cut.columns[name], whole.columns[name]) for name in whole.columns)
+    assert cut.info == complete.info == {'serial': 'A17', 'end': '1'}
+    assert cut.time_s.tolist() == complete.time_s.tolist() == [0.0, 0.001, 0.002, 0.1]
+    assert all(same_bits(cut.columns[name], complete.columns[name]) for name in complete.columns)
 
 
-def test_a_column_that_turns_to_text_is_left_out(
+def test_a_column_that_changes_to_text_is_ignored(
         tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(csv_file, '_CHUNK_BYTES', 10_000)
     lines = [f'{i / 1000!r},2.5,{i}' for i in range(3000)]
@@ -269,7 +270,7 @@ def test_a_column_that_turns_to_text_is_left_out(
     assert 'state' in next(recording.blocks(path, 1000)).columns
 
 
-def test_text_columns_are_passed_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_text_columns_are_ignored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(csv_file, '_CHUNK_BYTES', 10_000)
     text = ['far out', '', '"q"', 'ä', '7', '"a,b"']
     lines = [f'{text[i % 5]},{text[i // 5 % 5]}, {i / 1000!r} ,{text[i % 3]},{1 / (i + 1)!r},,'
@@ -309,7 +310,7 @@ def test_real_files_are_read(shared_dir: Path, tmp_path: Path) -> None:
 
 @pytest.fixture
 def long_csv(tmp_path: Path) -> Path:
-    """Write a tenth of 3 million rows, for which reading may take 15 s."""
+    """Write a tenth of 3 million rows, which may need 15 s for reading."""
     path = tmp_path / 'long.csv'
     rng = np.random.default_rng(6)
     with CsvWriter(path) as file:

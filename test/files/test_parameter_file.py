@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The parameter file: it round-trips, and what is wrong with it is said with its place."""
+"""The parameter file: round trips, and messages that name the place of a fault."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -146,7 +146,7 @@ def test_bad_file_is_refused_with_its_place(tmp_path: Path, name: str) -> None:
 @pytest.mark.parametrize('content', [
     b'', b'# nothing\n', b'- 1\n', b'\xff\xfe\x00', b'a: &a [*a]\n', b'--- 1\n--- 2\n',
     b'/**:\n  ros__parameters: &a\n    b: *a\n'])
-def test_what_is_no_parameter_file(tmp_path: Path, content: bytes) -> None:
+def test_other_files_are_refused(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / 'unit.yaml'
     path.write_bytes(content)
     refusal(path)
@@ -162,9 +162,9 @@ def test_calibrated_file_is_read() -> None:
     assert parameter_file.load(path).serial == 'nominal'
 
 
-def equal(one: Sensor, other: Sensor) -> None:
-    assert parameter_file.to_flat(one) == parameter_file.to_flat(other)
-    np.testing.assert_array_equal(one.covariance, other.covariance)
+def assert_equal(first: Sensor, second: Sensor) -> None:
+    assert parameter_file.to_flat(first) == parameter_file.to_flat(second)
+    np.testing.assert_array_equal(first.covariance, second.covariance)
 
 
 def test_round_trip(tmp_path: Path) -> None:
@@ -176,11 +176,11 @@ def test_round_trip(tmp_path: Path) -> None:
              replace(sensor, serial='007', provenance={'source': 'a: b # c', 'poses': '12'})]
     for unit in units:
         parameter_file.save(tmp_path / 'saved.yaml', unit, ['words: for', '/** people'])
-        equal(parameter_file.load(tmp_path / 'saved.yaml'), unit)
+        assert_equal(parameter_file.load(tmp_path / 'saved.yaml'), unit)
 
 
 def test_saved_numbers_are_doubles_for_ros(tmp_path: Path) -> None:
-    """What rcl reads as text or as an integer, 1e-06 and 1, is not written so."""
+    """Numbers such as 1e-06 and 1, which rcl reads as text or integer, have another form."""
     unit = nominal(rc_capacitance_f=1e-6, rate_hz=1.0, adc_vref_v=1e2)
     parameter_file.save(tmp_path / 'saved.yaml', unit)
     text = (tmp_path / 'saved.yaml').read_text(encoding='utf-8')

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The journal: on disk before it is acknowledged, whole after any crash."""
+"""The journal: an acknowledged pose is on disk, and a crash leaves no invalid journal."""
 
 import errno
 import json
@@ -40,7 +40,7 @@ HEAD = {'serial': 'A1', 'mode': 'stage'}
 
 
 def test_an_interrupted_calibration_resumes(tmp_path):
-    """Entries that were appended come back, and a line that a crash cut does not."""
+    """Appended entries are read again, except for a line that a crash has cut."""
     path = tmp_path / 'j'
     journal = Journal(path, HEAD)
     journal.append(POSE)
@@ -55,7 +55,7 @@ def test_an_interrupted_calibration_resumes(tmp_path):
     assert [entry.pose for entry in read(path)[1]] == [0, 1, 2]
 
 
-def test_another_unit_is_refused_and_says_what_changed(tmp_path):
+def test_another_unit_is_refused_with_the_difference(tmp_path):
     """A journal of another unit is not continued."""
     path = tmp_path / 'j'
     journal = Journal(path, HEAD)
@@ -66,8 +66,8 @@ def test_another_unit_is_refused_and_says_what_changed(tmp_path):
     assert len(read(path)[1]) == 1
 
 
-def test_two_at_once_are_refused(tmp_path):
-    """The second calibration of one journal is told so."""
+def test_two_calibrations_of_one_journal_are_refused(tmp_path):
+    """The second calibration is refused."""
     first = Journal(tmp_path / 'j', HEAD)
     with pytest.raises(UserError, match='another calibration is writing this journal'):
         Journal(tmp_path / 'j', HEAD)
@@ -75,7 +75,7 @@ def test_two_at_once_are_refused(tmp_path):
     Journal(tmp_path / 'j', HEAD).close()
 
 
-def test_a_finished_one_is_kept_beside_the_new(tmp_path):
+def test_a_finished_journal_is_kept_beside_the_new_one(tmp_path):
     """After a finished calibration a new one begins, and the old journal is kept."""
     path = tmp_path / 'j'
     journal = Journal(path, HEAD)
@@ -91,8 +91,8 @@ def test_a_finished_one_is_kept_beside_the_new(tmp_path):
 @pytest.mark.parametrize('text, words', [
     ('', 'empty journal'), ('hello\n', ':1: not a journal'), ('{"format": 9}\n', 'format 9'),
     ('[1]\n', 'not an object')])
-def test_what_is_no_journal(tmp_path, text, words):
-    """Files that are no journal are refused by their line."""
+def test_other_files_are_refused(tmp_path, text, words):
+    """The message names the line of the fault."""
     path = tmp_path / 'j'
     path.write_text(text)
     with pytest.raises(UserError, match=words):
@@ -102,8 +102,8 @@ def test_what_is_no_journal(tmp_path, text, words):
 @pytest.mark.parametrize('text, poses', [
     (b'%s\n%r\n{"po#e": \xff}\n%r\n', 1), (b'%s\n%r\n{"pose": 1, "mean_v": [2.5]}\n', 1),
     (b'a list of mine', 0)])
-def test_a_damaged_one_is_said_and_begun_anew_only_if_told(tmp_path, text, poses):
-    """Nothing is cut from it, and it is no dead end."""
+def test_a_damaged_journal_is_replaced_only_on_request(tmp_path, text, poses):
+    """The file is not changed, and a start with `resume:=anew` keeps a copy of it."""
     path, head = tmp_path / 'j', json.dumps({'format': 1, **HEAD}).encode()
     text = text.replace(b'%s', head).replace(b'%r', json.dumps(POSE.to_json()).encode())
     path.write_bytes(text)
@@ -111,30 +111,30 @@ def test_a_damaged_one_is_said_and_begun_anew_only_if_told(tmp_path, text, poses
                        'name another journal, or begin anew with resume:=anew'):
         Journal(path, HEAD)
     assert path.read_bytes() == text
-    found, why = unfinished(path, HEAD)
-    assert found == poses and 'is not of a journal' in why
+    accepted, reason = unfinished(path, HEAD)
+    assert accepted == poses and 'is not of a journal' in reason
     Journal(path, HEAD, start_over=True).close()
     assert read(path) == ({'format': 1, **HEAD}, [])
     kept, = tmp_path.glob('j.2*')
     assert kept.read_bytes() == text
 
 
-def test_a_head_that_a_crash_cut_is_written_anew(tmp_path):
-    """It held no pose: nothing to ask about."""
+def test_an_incomplete_head_is_written_again(tmp_path):
+    """Without a pose there is no question to the operator."""
     for text in (b'{"form', bytes(40)):
         (tmp_path / 'j').write_bytes(text)
         Journal(tmp_path / 'j', HEAD).close()
         assert read(tmp_path / 'j')[0]['serial'] == 'A1'
 
 
-def test_unwritable(tmp_path):
-    """A journal in a folder that is not there is refused."""
+def test_a_journal_in_a_missing_folder_is_refused(tmp_path):
+    """The message names the missing folder."""
     with pytest.raises(UserError, match='cannot write the journal'):
         Journal(tmp_path / 'none' / 'j', HEAD)
 
 
-def test_a_pose_taken_again_replaces_the_first():
-    """`redo` appends the pose anew."""
+def test_a_repeated_pose_replaces_the_first():
+    """`redo` appends the pose again."""
     first, other, again = pose_record(0), pose_record(1), pose_record(0, samples=3)
     entries = [first, other, again, Fitted(None, True)]
     assert accepted_poses(entries) == [again, other]
@@ -142,14 +142,14 @@ def test_a_pose_taken_again_replaces_the_first():
 
 def test_lines_of_every_version_are_read(tmp_path):
     """Keys and their order are those of all journals; a rest by hand has no angles."""
-    taken = {'pose': 1, 'alpha_rad': 0.5, 'beta_rad': 0.25, 'alpha_setting': 0, 'beta_setting': 1,
-             'check': False, 'start_ns': 1, 'stop_ns': 2, 'samples': 5, 'mean_v': [2.5, 2.6],
-             'std_v': [0.1, 0.2], 'temperature_c': 23.0}
-    by_hand = {key: taken[key] for key in ('pose', 'start_ns', 'stop_ns', 'samples', 'mean_v',
-                                           'std_v')}
-    earlier = {key: value for key, value in taken.items() if not key.endswith('_setting')}
-    lines = [taken, by_hand, earlier, {'drop': 1}, {'skip': 3, 'drop': 3},
-             {'mounting': 'not checked'}, {'rests': [taken, by_hand], 'done': False}]
+    record = {'pose': 1, 'alpha_rad': 0.5, 'beta_rad': 0.25, 'alpha_setting': 0, 'beta_setting': 1,
+              'check': False, 'start_ns': 1, 'stop_ns': 2, 'samples': 5, 'mean_v': [2.5, 2.6],
+              'std_v': [0.1, 0.2], 'temperature_c': 23.0}
+    by_hand = {key: record[key] for key in ('pose', 'start_ns', 'stop_ns', 'samples', 'mean_v',
+                                            'std_v')}
+    earlier = {key: value for key, value in record.items() if not key.endswith('_setting')}
+    lines = [record, by_hand, earlier, {'drop': 1}, {'skip': 3, 'drop': 3},
+             {'mounting': 'not checked'}, {'rests': [record, by_hand], 'done': False}]
     path = tmp_path / 'j'
     path.write_text(''.join(f'{json.dumps(line)}\n' for line in (
         {'format': 1, **HEAD}, *lines, {'note': 'of another version'}, {'done': True})))
@@ -161,7 +161,7 @@ def test_lines_of_every_version_are_read(tmp_path):
 
 
 def test_a_pose_is_synced_before_it_is_acknowledged(tmp_path, monkeypatch):
-    """What a power cut after `append` leaves is what fsync was called for, the entry in it."""
+    """The file contains the entry when `append` calls fsync."""
     path, synced = tmp_path / 'j', []
     journal = Journal(path, HEAD)
     sync = os.fsync
@@ -178,8 +178,8 @@ def _no_room(_):
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
-def test_one_that_was_fitted_early_goes_on_and_is_in_nobodys_way(tmp_path):
-    """With poses left open it is offered again; to another unit it is a finished one."""
+def test_an_early_fit_can_continue_and_does_not_block_another_unit(tmp_path):
+    """With open poses the calibration can resume. For another unit the journal is finished."""
     path = tmp_path / 'j'
     journal = Journal(path, HEAD)
     journal.append(POSE)
@@ -198,8 +198,8 @@ def test_one_that_was_fitted_early_goes_on_and_is_in_nobodys_way(tmp_path):
     assert accepted_poses(read(kept)[1]) == [POSE]
 
 
-def test_fit_takes_the_rests_that_were_fitted_unless_the_sweep_went_on(tmp_path):
-    """`fit --journal` has all poses that the sweep ended with."""
+def test_fit_uses_the_fitted_rests_unless_the_sweep_has_continued(tmp_path):
+    """`fit --journal` uses all poses of the end of the sweep."""
     path = tmp_path / 'j'
     journal = Journal(path, HEAD)
     journal.append(POSE)
@@ -210,8 +210,8 @@ def test_fit_takes_the_rests_that_were_fitted_unless_the_sweep_went_on(tmp_path)
     assert fit._records(path) == [POSE, pose_record(1)]
 
 
-def test_anew_keeps_the_interrupted_one(tmp_path):
-    """Poses of an interrupted calibration are put aside, not away."""
+def test_a_new_start_keeps_the_interrupted_journal(tmp_path):
+    """The poses of an interrupted calibration are kept in another file."""
     path = tmp_path / 'j'
     journal = Journal(path, HEAD)
     journal.append(POSE)
@@ -226,16 +226,16 @@ def test_anew_keeps_the_interrupted_one(tmp_path):
     assert unfinished(path, HEAD) is None
 
 
-def test_poses_that_were_dropped_or_left_out():
-    """A rest that is forgotten counts no more; a pose that is left out is known as such."""
+def test_dropped_and_skipped_poses():
+    """A dropped pose does not count, and a skipped pose is listed."""
     entries = [POSE, pose_record(1), PoseDropped(1), PoseSkipped(4), pose_record(2),
                PoseSkipped(5), PoseDropped(5)]
     assert accepted_poses(entries) == [POSE, pose_record(2)]
-    assert skipped_poses(entries) == {4}, 'what is taken again after all is not left out'
+    assert skipped_poses(entries) == {4}, 'a pose that is taken after all is not skipped'
 
 
-def test_what_a_power_cut_leaves_at_the_end_is_no_pose(tmp_path):
-    """A file system may have given the file its length, but not yet its bytes."""
+def test_zero_bytes_after_a_power_cut_are_ignored(tmp_path):
+    """A file system may have stored the length of the file before its bytes."""
     path = tmp_path / 'j'
     journal = Journal(path, HEAD)
     journal.append(POSE)

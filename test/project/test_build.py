@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What `colcon build` installed, and ./run."""
+"""The package that `colcon build` has installed, and the script `run`."""
 
 from importlib.metadata import distribution, EntryPoint
 import os
@@ -31,7 +31,7 @@ LAUNCH_FILES = ('calibrate.launch.py', 'robot.launch.py')
 
 
 def run(*args: str, **options: object) -> subprocess.CompletedProcess:
-    """Run ./run of this tree, when it is this tree that is under test."""
+    """Run the script `run` of this tree; skip if another build is under test."""
     if Path(get_package_prefix('adxl_ros')) != REPO / 'install' / 'adxl_ros':
         pytest.skip('the package under test was not built by make build')
     command = [options.pop('path', REPO / 'run'), *args]
@@ -56,7 +56,7 @@ def test_share(path: str) -> None:
     assert (Path(get_package_share_directory('adxl_ros')) / path).is_file()
 
 
-def test_run_names_what_there_is() -> None:
+def test_run_lists_its_commands() -> None:
     for args in ((), ('no_such_tool',), ('../adxl_ros/fit',)):
         done = run(*args)
         assert done.returncode == 2

@@ -13,10 +13,9 @@
 # limitations under the License.
 
 """
-The nodes and a CSV fit need no extra: rclpy, the common interfaces, numpy, scipy and PyYAML do.
+The nodes and a fit of a CSV file need no extra beside rclpy, interfaces, numpy, scipy and PyYAML.
 
-The environment without extras is made by a subprocess whose import of them fails, as it does
-where they are not installed.
+A subprocess in which the import of every extra fails stands for an environment without them.
 """
 
 import json
@@ -55,7 +54,7 @@ def test_every_core_module_imports() -> None:
     assert result['blocked'] == []
 
 
-def test_a_real_link_says_what_to_install() -> None:
+def test_a_link_without_its_extra_names_the_package_to_install() -> None:
     code = """
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
@@ -76,7 +75,7 @@ for name, settings in (('serial', {'port': '/dev/null'}), ('iio', {})):
 
 
 def test_a_csv_is_fitted(tmp_path: Path) -> None:
-    """`simulate` and `fit` on CSV need numpy and scipy alone; a plot says what to install."""
+    """`simulate` and `fit` on CSV need only numpy and scipy. A plot names the missing package."""
     run = 'from adxl_ros.tools.{0} import main\nsys.argv[0] = {0!r}\nsys.exit(main())'
     sweep, output = str(tmp_path / 'sweep.csv'), str(tmp_path / 'unit.yaml')
     done = run_without_extras(run.format('simulate'), 'sweep', '--rate', '100', '-o', sweep)

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Arrows point down only, and what is not core is imported where it is used."""
+"""Imports follow the layers, and extras are imported in the functions that use them."""
 
 import ast
 from pathlib import Path
@@ -35,20 +35,20 @@ def test_contracts(capsys: pytest.CaptureFixture) -> None:
 
 
 def imported_at_once(path: Path) -> set[str]:
-    """Name the packages that importing the module at `path` imports, type checking aside."""
-    found: set[str] = set()
+    """Return the packages that the import of a module imports, without those for types only."""
+    packages: set[str] = set()
     todo: list[ast.AST] = [ast.parse(path.read_text(encoding='utf-8'))]
     while todo:
         node = todo.pop()
         if isinstance(node, ast.Import):
-            found.update(alias.name.partition('.')[0] for alias in node.names)
+            packages.update(alias.name.partition('.')[0] for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
-            found.add('adxl_ros' if node.level else str(node.module).partition('.')[0])
+            packages.add('adxl_ros' if node.level else str(node.module).partition('.')[0])
         elif isinstance(node, ast.If) and 'TYPE_CHECKING' in ast.unparse(node.test):
             todo.extend(node.orelse)
         elif not isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda)):
             todo.extend(ast.iter_child_nodes(node))
-    return found
+    return packages
 
 
 @pytest.mark.parametrize('path', sorted(PACKAGE.rglob('*.py')),

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Style, types and manifest; ament's own linters where they are installed."""
+"""Style, types and manifest, with the linters of ament where they are installed."""
 
 import importlib.util
 import re
@@ -26,7 +26,7 @@ PYTHON_SOURCES = ('adxl_ros', 'launch', 'test', 'setup.py')
 
 
 def run_module(name: str, *args: str) -> None:
-    """Run `python -m name` over the sources; show what it found."""
+    """Run `python -m name` on the sources; assert that it has no findings."""
     package = name.partition('.')[0]
     if importlib.util.find_spec(package) is None:
         pytest.skip(f'{package} is not installed: pip install -r requirements/test.txt, or '

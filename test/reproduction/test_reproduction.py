@@ -25,68 +25,71 @@ _UNITS = {'perfect': 8, 'paper': 16}
 
 
 @pytest.fixture(scope='module')
-def found():
-    """Evaluate units on each stage, more where poses share the errors of a few settings."""
+def evaluations():
+    """Evaluate units on each stage; their number is larger where poses share stage errors."""
     nominal = parameter_file.load(NOMINAL)
     return {name: [units.evaluate(nominal, stage, seed) for seed in range(_UNITS[name])]
             for name, stage in units.STAGES.items()}
 
 
-def every(of, model):
+def angles_of(evaluated, model):
     """Return the angles of all experiments of all units."""
-    return [a for unit in of for a in (unit.models[model].random,
-                                       *unit.models[model].runs.values())]
+    return [a for unit in evaluated for a in (unit.models[model].random,
+                                              *unit.models[model].runs.values())]
 
 
 def rms(parts):
     return np.sqrt(np.mean(np.concatenate(parts) ** 2))
 
 
-@pytest.mark.parametrize('stage, alone', [('perfect', True), ('paper', False)])
-def test_tilt_reaches_the_bound(found, stage, alone):
-    """Full: 1.10 of the bound of one pose's noise; with the stage, of pose and calibration."""
-    assert rms([a.ratio(alone) for a in every(found[stage], 'full')]) < 1.10
+@pytest.mark.parametrize('stage, without_stage', [('perfect', True), ('paper', False)])
+def test_tilt_error_reaches_its_bound(evaluations, stage, without_stage):
+    """The error is at most 1.10 of the bound by noise, or by noise, stage and calibration."""
+    assert rms([a.ratio(without_stage) for a in angles_of(evaluations[stage], 'full')]) < 1.10
 
 
 @pytest.mark.parametrize('stage', ['perfect', 'paper'])
-def test_alpha_gains_on_linear(found, stage):
-    """15° and more from ±90°: the paper's 88.9 % by physical, 98 % by full."""
-    off = {model: rms([a.error[a.determined[:, 0] & ~a.near_vertical, 0]
-                       for a in every(found[stage], model)]) for model in experiments.MODELS}
-    assert 1 - off['physical'] / off['linear'] >= 0.889
-    assert 1 - off['full'] / off['linear'] >= 0.98
+def test_alpha_errors_are_below_those_of_the_linear_model(evaluations, stage):
+    """15° or more from ±90° the error falls by 88.9 % (physical) and 98 % (full)."""
+    error_rad = {model: rms([a.error[a.determined[:, 0] & ~a.near_vertical, 0]
+                             for a in angles_of(evaluations[stage], model)])
+                 for model in experiments.MODELS}
+    assert 1 - error_rad['physical'] / error_rad['linear'] >= 0.889
+    assert 1 - error_rad['full'] / error_rad['linear'] >= 0.98
 
 
-def test_motion_reaches_the_floor(found):
-    """RC undone by the resistor that the noise shows: 1.05 of 5.08 mm/s²."""
+def test_motion_error_reaches_the_noise_floor(evaluations):
+    """With the filter time constant of the noise the error is at most 1.05 of 5.08 mm/s²."""
     nominal = parameter_file.load(NOMINAL)
     bound = error_statistics.motion_bound_mmps2(nominal)
     assert bound == pytest.approx(5.08, abs=0.01)
-    off = [unit.models['full'].motion.rmse_mmps2 for of in found.values() for unit in of]
-    assert np.sqrt(np.mean(np.square(off))) < 1.05 * bound
+    error_mmps2 = [unit.models['full'].motion.rmse_mmps2
+                   for evaluated in evaluations.values() for unit in evaluated]
+    assert np.sqrt(np.mean(np.square(error_mmps2))) < 1.05 * bound
 
 
 @pytest.mark.parametrize('stage', ['perfect', 'paper'])
-def test_promised_deviations_hold(found, stage):
-    """90 % intervals of the acceleration in poses that were not fitted."""
-    # Poses of one unit share the errors of its few settings of alpha: units are independent.
+def test_intervals_have_their_stated_coverage(evaluations, stage):
+    """90 % intervals of the acceleration contain 90 % of the held-out poses."""
+    # Poses of one unit share the errors of its few settings of alpha. Units are independent.
     inside = np.array([np.mean(np.abs(unit.models['full'].force_z) < Z_90)
-                       for unit in found[stage]])
+                       for unit in evaluations[stage]])
     assert abs(inside.mean() - 0.9) < 0.02 + 2.5 * inside.std() / np.sqrt(len(inside))
-    spread = np.sqrt(np.mean([np.mean(unit.models['full'].force_z ** 2) for unit in found[stage]]))
+    spread = np.sqrt(np.mean([np.mean(unit.models['full'].force_z ** 2)
+                              for unit in evaluations[stage]]))
     assert 0.7 < spread < 1.4
 
 
-def test_null_crossings_beat_the_flat_maximum(found):
-    """Direction of the x axis, on a perfect stage, to hundredths of a degree."""
-    off = {name: np.degrees(rms([[getattr(u.directions, name) - u.directions.truth_rad]
-                                 for u in found['perfect']]))
-           for name in ('largest_rad', 'null_rad')}
-    assert off['null_rad'] < 0.1 < off['largest_rad']
+def test_null_crossings_are_more_exact_than_the_maximum(evaluations):
+    """On a perfect stage null crossings give the direction of the x axis to 0.1°."""
+    error_deg = {name: np.degrees(rms([[getattr(u.directions, name) - u.directions.truth_rad]
+                                       for u in evaluations['perfect']]))
+                 for name in ('largest_rad', 'null_rad')}
+    assert error_deg['null_rad'] < 0.1 < error_deg['largest_rad']
 
 
-def test_the_command(run_tool, tmp_path):
-    """`reproduce` leaves the page with its figures, and the same again for the same seed."""
+def test_the_command_is_reproducible(run_tool, tmp_path):
+    """`reproduce` writes the page and its plots, which are equal for the same seed."""
     pages = []
     for name in ('one', 'two'):
         done = run_tool('reproduce', '--units', '2', '--seed', '5', '-o', tmp_path / name)
@@ -100,7 +103,7 @@ def test_the_command(run_tool, tmp_path):
 
 
 def test_the_command_on_a_recording(run_tool, tmp_path):
-    """A recorded sweep is calibrated and set beside the paper's figures."""
+    """A recorded sweep is calibrated and compared with the results of the paper."""
     run_tool('simulate', 'sweep', '--params', NOMINAL, '--effect', 'cross_axis_z', '--effect',
              'misalignment', '-o', tmp_path / 'sweep.csv')
     done = run_tool('reproduce', tmp_path / 'sweep.csv', '-o', tmp_path / 'out')
@@ -110,8 +113,8 @@ def test_the_command_on_a_recording(run_tool, tmp_path):
 
 @pytest.mark.parametrize('option, words', [
     (('--units', '0'), 'at least 1'), (('--seed', '-1'), 'must not be negative')])
-def test_wrong_options_in_one_line(run_tool, tmp_path, option, words):
-    """What cannot be done is said, and nothing is made."""
+def test_wrong_options_are_refused_in_one_line(run_tool, tmp_path, option, words):
+    """The reason is reported, and no file is written."""
     done = run_tool('reproduce', *option, '-o', tmp_path / 'out')
     assert done.returncode == 1 and words in done.stderr
     assert not (tmp_path / 'out').exists()

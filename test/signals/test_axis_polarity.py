@@ -27,11 +27,11 @@ import pytest
     ([[0.8, 0.95], [0.1, 1.0]], None),
     ([[np.nan, 0.95], [0.1, -0.99]], PolarityFault(1, 1, -0.99))])
 def test_polarity_fault(correlation, fault):
-    """The first fault counts; an axis that follows its own reference well enough has none."""
+    """The first fault counts. An axis that correlates with its reference has none."""
     assert find_polarity_fault(np.array(correlation), [0, 1], 0.7) == fault
 
 
-def test_words_of_a_polarity_fault():
+def test_text_of_a_polarity_fault():
     assert 'x reads against its reference' in PolarityFault(0, 0, -0.99).describe('x', 'x')
     assert 'x moves against the reference of y' in PolarityFault(0, 1, -0.95).describe('x', 'y')
 

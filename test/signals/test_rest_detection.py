@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Rests in made streams whose motion is known, in real ones, and live against offline."""
+"""Rests in simulated and real streams, and equality of live and offline detection."""
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import recording
@@ -36,24 +36,24 @@ def directions(rng, count):
     return G0_MPS2 * drawn / np.linalg.norm(drawn, axis=1, keepdims=True)
 
 
-def tumbled(rng, rate_hz, rest_s, turn_s=1.0, sigma=SIGMA):
+def handled_stream(rng, rate_hz, rest_s, turn_s=1.0, sigma=SIGMA):
     """
     Make a stream of rests with turns between them.
 
     Returns
     -------
     time_s, samples, bounds, poses
-        Times (n,), samples (n, 3), rows at which each rest begins and ends (k, 2), and what the
-        sensor reads in it (k, 3).
+        Times (n,), samples (n, 3), first and last rows of the rests (k, 2), and their true means
+        (k, 3).
 
     """
     poses = directions(rng, len(rest_s) + 1)
     parts, bounds, row = [], [], 0
-    for pose, there, length_s in zip(poses, poses[1:], rest_s):
+    for pose, next_pose, length_s in zip(poses, poses[1:], rest_s):
         rest, turn = round(length_s * rate_hz), round(turn_s * rate_hz)
         share = np.linspace(0, 1, turn, endpoint=False)[:, None]
         shake = 0.3 * np.sin(2 * np.pi * 3.1 * turn_s * share) * np.sin(np.pi * share)
-        parts += [np.tile(pose, (rest, 1)), pose + share * (there - pose) + shake]
+        parts += [np.tile(pose, (rest, 1)), pose + share * (next_pose - pose) + shake]
         bounds.append((row, row + rest))
         row += rest + turn
     samples = np.concatenate(parts)
@@ -61,31 +61,31 @@ def tumbled(rng, rate_hz, rest_s, turn_s=1.0, sigma=SIGMA):
     return np.arange(len(samples)) / rate_hz, samples, np.array(bounds), poses[:-1]
 
 
-def filtered(rng, count, sigma, rate_hz=1000.0, tau_s=TAU_S):
+def filtered_noise(rng, count, sigma, rate_hz=1000.0, tau_s=TAU_S):
     """Make the noise of an RC filter, (count, 3)."""
     a = np.exp(-1 / (rate_hz * tau_s))
     white = rng.normal(size=(count + 200, 3)) * np.sqrt(1 - a * a)
     return sigma * lfilter([1.0], [1.0, -a], white, axis=0)[200:]
 
 
-def matched(rests, bounds):
-    """Assert that each rest is inside that of `bounds`, and return what is lost of it."""
+def lost_rows(rests, bounds):
+    """Assert that each rest is inside that of `bounds`, and return the number of lost rows."""
     assert len(rests) == len(bounds)
-    detected = np.array([(rest.start, rest.stop) for rest in rests])
-    assert (detected[:, 0] >= bounds[:, 0]).all()
-    assert (detected[:, 1] <= bounds[:, 1]).all()
-    return np.diff(bounds, axis=1)[:, 0] - np.diff(detected, axis=1)[:, 0]
+    rows = np.array([(rest.start, rest.stop) for rest in rests])
+    assert (rows[:, 0] >= bounds[:, 0]).all()
+    assert (rows[:, 1] <= bounds[:, 1]).all()
+    return np.diff(bounds, axis=1)[:, 0] - np.diff(rows, axis=1)[:, 0]
 
 
 @pytest.mark.parametrize('rate_hz', [25.0, 100.0, 285.71, 1000.0, 10000.0])
 def test_rests_of_1_s_to_60_s(rate_hz):
     rng = np.random.default_rng(1)
     lengths = [1.0, 2.0, 5.0, 1.2, 60.0, 3.0, 10.0, 1.5]
-    time_s, samples, bounds, poses = tumbled(rng, rate_hz, lengths)
+    time_s, samples, bounds, poses = handled_stream(rng, rate_hz, lengths)
     rests = find_rests(time_s, samples, rate_hz, min_rest_s=0.6)
-    # The row in which a turn begins is hardly moved: one block may reach beyond it.
+    # The first row of a turn hardly moves, so that one block may reach beyond it.
     slack = np.array([-1, 1]) * round(0.06 * rate_hz + 1)
-    lost = matched(rests, bounds + slack)
+    lost = lost_rows(rests, bounds + slack)
     assert (lost < (0.7 + 0.2 * np.array(lengths)) * rate_hz + 4).all()
     assert np.median(lost) < 0.5 * rate_hz + 4
     mean, error = rest_means(time_s, samples, rests, rate_hz)
@@ -97,23 +97,23 @@ def test_rests_of_1_s_to_60_s(rate_hz):
 @pytest.mark.parametrize('rate_hz', [1.0, 2.0, 5.0])
 def test_slow_streams(rate_hz):
     rng = np.random.default_rng(2)
-    time_s, samples, bounds, poses = tumbled(rng, rate_hz, [60.0] * 8, turn_s=10.0)
+    time_s, samples, bounds, poses = handled_stream(rng, rate_hz, [60.0] * 8, turn_s=10.0)
     rests = find_rests(time_s, samples, rate_hz)
-    lost = matched(rests, bounds + np.array([-1, 2]))
+    lost = lost_rows(rests, bounds + np.array([-1, 2]))
     assert (lost <= 20).all() and np.median(lost) <= 12
     mean, error = rest_means(time_s, samples, rests, rate_hz)
     assert np.abs((mean - poses) / error).max() < 7
 
 
-def test_by_hand_a_pause_of_1_s_is_no_rest():
+def test_a_pause_of_1_s_by_hand_does_not_count_as_rest():
     rng = np.random.default_rng(3)
-    time_s, samples, _, _ = tumbled(rng, 100.0, [5.0, 1.0, 5.0, 1.0, 5.0])
+    time_s, samples, _, _ = handled_stream(rng, 100.0, [5.0, 1.0, 5.0, 1.0, 5.0])
     assert len(find_rests(time_s, samples, 100.0)) == 3
     assert len(find_rests(time_s, samples, 100.0, min_rest_s=0.6)) == 5
 
 
 def damaged(rng, time_s, samples):
-    """Put NaN, gaps, a step back in time and absurd spikes into a stream."""
+    """Put NaN, gaps, a step back in time and very large spikes into a stream."""
     samples = samples.copy()
     samples[rng.integers(len(samples), size=20)] = np.nan
     samples[rng.integers(len(samples), size=2), 0] = (1e38, -np.inf)
@@ -127,16 +127,16 @@ def damaged(rng, time_s, samples):
 @given(strategies.integers(0, 2**32 - 1), strategies.integers(1, 3),
        strategies.sampled_from([1.0, 20.0, 100.0, 400.0]), strategies.booleans(),
        strategies.booleans())
-def test_live_equals_offline(seed, axes, rate_hz, is_stated, staged):
-    """However a stream is portioned, the rests and their means are the same to the last bit."""
+def test_live_equals_offline(seed, axes, rate_hz, known_noise, with_stage):
+    """The rests and their means do not depend on the portions of a stream, to the last bit."""
     rng = np.random.default_rng(seed)
     scale_s = 1.0 if rate_hz > 10 else 30.0
-    time_s, samples, _, _ = tumbled(rng, rate_hz, scale_s * rng.uniform(1, 8, 12), scale_s)
+    time_s, samples, _, _ = handled_stream(rng, rate_hz, scale_s * rng.uniform(1, 8, 12), scale_s)
     time_s, samples = damaged(rng, time_s, samples)
     samples = samples[:, :axes]
-    noise = Noise(np.full(axes, SIGMA), 0.01) if is_stated else None
-    tolerance = 1e-3 if staged else None
-    angles = np.round(samples[:, [0, 0]] / 3) if staged else None
+    noise = Noise(np.full(axes, SIGMA), 0.01) if known_noise else None
+    tolerance = 1e-3 if with_stage else None
+    angles = np.round(samples[:, [0, 0]] / 3) if with_stage else None
     offline = find_rests(time_s, samples, rate_hz, angles, noise, angle_tolerance_rad=tolerance)
     live = RestFinder(rate_hz, axes, noise, angle_tolerance_rad=tolerance)
     cuts = np.sort(rng.integers(0, len(samples), rng.integers(1, 300)))
@@ -154,7 +154,7 @@ def test_live_equals_offline(seed, axes, rate_hz, is_stated, staged):
 
 def test_rests_appear_while_the_stream_runs():
     rng = np.random.default_rng(4)
-    time_s, samples, _, _ = tumbled(rng, 100.0, [5.0] * 6)
+    time_s, samples, _, _ = handled_stream(rng, 100.0, [5.0] * 6)
     finder, counts, still = RestFinder(100.0, 3), [], []
     for row in range(0, len(samples), 50):
         finder.feed(time_s[row:row + 50], samples[row:row + 50])
@@ -163,23 +163,23 @@ def test_rests_appear_while_the_stream_runs():
         still.append(judged is not None and judged.still)
     assert counts[-1] == 6
     assert counts[36] >= 2
-    # Half a second into a rest the newest second still holds the turn; at its end it does not.
+    # Half a second into a rest the newest second still contains the turn; at its end it does not.
     assert still[9] and not still[11] and still[21]
 
 
-def test_figures_of_a_rest_do_not_depend_on_others():
+def test_means_of_a_rest_do_not_depend_on_other_rests():
     rng = np.random.default_rng(5)
-    time_s, samples, _, _ = tumbled(rng, 100.0, [5.0] * 6)
+    time_s, samples, _, _ = handled_stream(rng, 100.0, [5.0] * 6)
     rests = find_rests(time_s, samples, 100.0)
     together = rest_means(time_s, samples, rests, 100.0)
     for k, rest in enumerate(rests):
-        for single, of_all in zip(rest_means(time_s, samples, [rest], 100.0), together):
-            assert (single[0] == of_all[k]).all()
+        for single, shared in zip(rest_means(time_s, samples, [rest], 100.0), together):
+            assert (single[0] == shared[k]).all()
 
 
 @pytest.mark.parametrize('rate_dps', [0.2, 0.5, 2.0])
-def test_slow_rotation_is_no_rest(rate_dps):
-    """Rest, turn by 10° so slowly that no window sees it, rest."""
+def test_slow_rotation_does_not_count_as_rest(rate_dps):
+    """A turn by 10° separates two rests, also if no window shows its motion."""
     rng = np.random.default_rng(6)
     rest, turn = 1000, round(10 / rate_dps * 100)
     angle = np.radians(np.concatenate([np.zeros(rest), np.linspace(0, 10, turn),
@@ -188,10 +188,10 @@ def test_slow_rotation_is_no_rest(rate_dps):
     samples += SIGMA * rng.normal(size=samples.shape)
     rests = find_rests(np.arange(len(samples)) / 100, samples, 100.0, min_rest_s=0.6)
     assert len(rests) == 2
-    for detected, wanted in zip(rests, ((0, rest), (rest + turn, 2 * rest + turn))):
-        # Of the turn at most half a degree.
-        assert detected.start > wanted[0] - 100 * 0.5 / rate_dps
-        assert detected.stop < wanted[1] + 100 * 0.5 / rate_dps
+    for detected, (start, stop) in zip(rests, ((0, rest), (rest + turn, 2 * rest + turn))):
+        # A rest contains half a degree of the turn at most.
+        assert detected.start > start - 100 * 0.5 / rate_dps
+        assert detected.stop < stop + 100 * 0.5 / rate_dps
         assert detected.stop - detected.start > 0.6 * rest
 
 
@@ -204,7 +204,7 @@ def test_a_stream_that_only_turns_slowly_has_no_rest():
 
 
 def test_a_slip_splits_a_rest():
-    """The pose gives way by 0.5°, without a jolt."""
+    """A slow change of the pose by 0.5° separates two rests."""
     rng = np.random.default_rng(8)
     samples = np.tile([0.0, 0.0, G0_MPS2], (2000, 1)) + SIGMA * rng.normal(size=(2000, 3))
     samples[1000:, 0] += G0_MPS2 * np.radians(0.5)
@@ -255,7 +255,7 @@ def test_gaps_end_rests_and_nan_does_not():
 
 @pytest.mark.parametrize('samples', [
     np.empty((0, 3)), np.zeros((3, 3)), np.full((5000, 3), np.nan), np.full((5000, 3), np.inf)])
-def test_nothing_to_find(samples):
+def test_streams_without_a_rest(samples):
     time_s = np.arange(len(samples)) / 100
     assert find_rests(time_s, samples, 100.0) == []
     assert RestFinder(100.0, 3).stillness() is None
@@ -263,36 +263,37 @@ def test_nothing_to_find(samples):
 
 @pytest.mark.parametrize('noise', [0.02, 0.1, 0.3])
 def test_noise_below_the_step_of_the_adc(noise):
-    """Codes that hold still, and others that flicker, are the same rest."""
+    """Constant codes and alternating codes are part of one rest."""
     rng = np.random.default_rng(12)
     step = 0.04
-    time_s, samples, bounds, poses = tumbled(rng, 100.0, [6.0] * 20, sigma=noise * step)
+    time_s, samples, bounds, poses = handled_stream(rng, 100.0, [6.0] * 20, sigma=noise * step)
     samples = np.round(samples / step) * step
     rests = find_rests(time_s, samples, 100.0)
-    matched(rests, bounds + np.array([-8, 8]))
+    lost_rows(rests, bounds + np.array([-8, 8]))
     mean, error = rest_means(time_s, samples, rests, 100.0)
     assert (np.abs(mean - poses) < 0.5 * step + 3 * error).all()
-    # Rounding without noise errs by up to half a step, by 1/√12 of it in the rms.
+    # Rounding without noise has an error of up to half a step, and 1/√12 of a step rms.
     if noise < 0.1:
         assert np.median(error) == pytest.approx(step / np.sqrt(12), rel=1e-3)
         assert (error > 0.99 * step / np.sqrt(12)).all()
 
 
 def test_a_stream_without_noise():
-    time_s, samples, bounds, poses = tumbled(np.random.default_rng(13), 100.0, [4.0] * 5, sigma=0)
+    time_s, samples, bounds, poses = handled_stream(np.random.default_rng(13), 100.0, [4.0] * 5,
+                                                    sigma=0)
     rests = find_rests(time_s, samples, 100.0)
-    matched(rests, bounds + np.array([-8, 8]))
+    lost_rows(rests, bounds + np.array([-8, 8]))
     assert rest_means(time_s, samples, rests, 100.0)[0] == pytest.approx(poses, abs=1e-4)
 
 
 def test_known_noise_behind_its_filter():
-    """Five seconds at rest every six: all found, none cut, by the noise of the datasheet."""
+    """With the noise of the datasheet, all rests of 5 s in every 6 s are found in full length."""
     rng = np.random.default_rng(14)
     poses = directions(rng, 61) / G0_MPS2
     volts = 2.5 + np.repeat(poses[:-1], 6000, axis=0)
     ramp = np.clip((np.arange(len(volts)) % 6000 - 5000) / 1000, 0, 1)[:, None]
     volts += ramp * np.repeat(np.diff(poses, axis=0), 6000, axis=0)
-    volts += filtered(rng, len(volts), 0.535e-3)
+    volts += filtered_noise(rng, len(volts), 0.535e-3)
     volts = np.round(volts / (5 / 2**16)) * 5 / 2**16
     time_s = np.arange(len(volts)) / 1000
     for learn in (False, True):
@@ -301,18 +302,18 @@ def test_known_noise_behind_its_filter():
         lengths = np.array([rest.time_stop_s - rest.time_start_s for rest in rests])
         assert np.median(lengths) > 4.6
         mean, error = rest_means(time_s, volts, rests, 1000.0, ADXL)
-        deviation = (mean - 2.5 - poses[:-1]) / error
-        assert 0.75 < np.sqrt((deviation ** 2).mean()) < 1.15
+        normalized = (mean - 2.5 - poses[:-1]) / error
+        assert 0.75 < np.sqrt((normalized ** 2).mean()) < 1.15
         # 5 s at 1 kHz count for 237 samples.
         assert np.median(error) == pytest.approx(0.535e-3 / np.sqrt(237), rel=0.15)
 
 
-def test_says_what_moves():
+def test_the_reason_for_motion_is_stated():
     rng = np.random.default_rng(15)
     scale = G0_MPS2
     finder = RestFinder(1000.0, 3, ADXL)
     time_s = np.arange(3000) / 1000
-    volts = 2.5 + filtered(rng, 3000, 0.535e-3)
+    volts = 2.5 + filtered_noise(rng, 3000, 0.535e-3)
     finder.feed(time_s[:1000], volts[:1000])
     still = finder.stillness()
     assert still.still and still.describe('m/s²', scale).startswith('at rest: ')
@@ -322,11 +323,11 @@ def test_says_what_moves():
     assert not moving.still
     assert (moving.axis, moving.statistic) == (1, 'rms')
     assert moving.value * scale == pytest.approx(0.3, rel=0.1)
-    # 0.535 mg rms, and what chi-squared allows the variance of 0.25 s.
+    # 0.535 mg rms, times the quantile of chi-squared for the variance of 0.25 s.
     assert 1.5 * 0.00525 < moving.limit * scale < 2 * 0.00525
     assert moving.describe('m/s²', scale) == 'moving: 0.3 m/s² on y, must be below ' + \
         f'{moving.limit * scale:.2g}'
-    volts[2000:] = 2.5 + filtered(rng, 1000, 0.535e-3)
+    volts[2000:] = 2.5 + filtered_noise(rng, 1000, 0.535e-3)
     volts[2000:, 2] += np.radians(0.5) * (time_s[2000:] - 2)
     finder.feed(time_s[2000:], volts[2000:])
     drifting = finder.stillness()
@@ -336,20 +337,20 @@ def test_says_what_moves():
 
 def test_a_unit_noisier_than_its_file():
     rng = np.random.default_rng(16)
-    time_s, samples, bounds, _ = tumbled(rng, 200.0, [4.0] * 8, sigma=2.5 * SIGMA)
+    time_s, samples, bounds, _ = handled_stream(rng, 200.0, [4.0] * 8, sigma=2.5 * SIGMA)
     stated = Noise(np.full(3, SIGMA))
     assert find_rests(time_s, samples, 200.0, noise=stated) == []
     rests = find_rests(time_s, samples, 200.0, noise=stated, learn=True)
-    matched(rests, bounds + np.array([-15, 15]))
+    lost_rows(rests, bounds + np.array([-15, 15]))
 
 
 @pytest.mark.parametrize('tau_s, amplitude', [(0.1, 0.2), (0.5, 0.02), (1.0, 0.01)])
-def test_settling_is_left_out(tau_s, amplitude):
-    """What is left of the settling biases the mean by not much more than its standard error."""
+def test_settling_is_excluded_from_a_rest(tau_s, amplitude):
+    """The remaining settling biases the mean by little more than its standard error."""
     rng = np.random.default_rng(17)
     worst = []
     for _ in range(10):
-        volts = 2.5 + filtered(rng, 10000, 0.535e-3)
+        volts = 2.5 + filtered_noise(rng, 10000, 0.535e-3)
         time_s = np.arange(10000) / 1000
         tail = amplitude * np.exp(-time_s / tau_s)
         volts[:, 0] += tail
@@ -359,18 +360,18 @@ def test_settling_is_left_out(tau_s, amplitude):
     assert np.median(worst) < 2.5 * 0.535e-3 / np.sqrt(237)
 
 
-def staged(rng, angles, volts_at):
+def stage_stream(rng, angles, volts_at):
     """Make a stream of a stage at the angles (n, 2) of each row."""
-    volts = volts_at(angles) + filtered(rng, len(angles), 0.535e-3)
+    volts = volts_at(angles) + filtered_noise(rng, len(angles), 0.535e-3)
     return np.arange(len(angles)) / 1000, volts
 
 
-def test_the_stage_turns_where_the_sensor_feels_nothing():
-    """At alpha = 0 beta cannot be felt: only the encoder ends the rests."""
+def test_the_encoder_ends_a_rest_where_the_sensor_does_not_respond():
+    """At alpha = 0 the sensor does not respond to beta: only the encoder ends the rests."""
     rng = np.random.default_rng(18)
     beta = np.clip(np.arange(24000) % 6000 / 500 - 10, 0, 1) + np.arange(24000) // 6000
     angles = np.column_stack([np.zeros(24000), np.radians(30) * beta])
-    time_s, volts = staged(rng, angles, lambda a: 2.5 + np.zeros((len(a), 3)))
+    time_s, volts = stage_stream(rng, angles, lambda a: 2.5 + np.zeros((len(a), 3)))
     encoder = np.round(angles / 1.45e-3) * 1.45e-3
     encoder[np.arange(24000) % 20 != 3] = np.nan  # read at 50 Hz
     rests = find_rests(time_s, volts, 1000.0, encoder, ADXL, angle_tolerance_rad=1.45e-3)
@@ -378,14 +379,14 @@ def test_the_stage_turns_where_the_sensor_feels_nothing():
     for k, rest in enumerate(rests):
         assert np.ptp(angles[rest.start:rest.stop, 1]) < 2 * 1.45e-3
         assert rest.stop - rest.start > 4600
-        # The filter's tail is left out as well.
+        # The settling of the filter is excluded as well.
         assert k == 0 or rest.start >= 6000 * k - 500 + 8000 * TAU_S
 
 
 def test_an_encoder_that_flickers_between_two_codes_is_at_rest():
     rng = np.random.default_rng(19)
     angles = 1.45e-3 * rng.integers(0, 2, (5000, 2))
-    time_s, volts = staged(rng, angles, lambda a: 2.5 + np.zeros((len(a), 3)))
+    time_s, volts = stage_stream(rng, angles, lambda a: 2.5 + np.zeros((len(a), 3)))
     rest, = find_rests(time_s, volts, 1000.0, angles, ADXL, angle_tolerance_rad=1.45e-3)
     assert rest.stop - rest.start > 4800
 
@@ -393,14 +394,14 @@ def test_an_encoder_that_flickers_between_two_codes_is_at_rest():
 def test_a_sensor_that_moves_under_a_still_stage():
     rng = np.random.default_rng(20)
     angles = np.zeros((12000, 2))
-    time_s, volts = staged(rng, angles, lambda a: 2.5 + np.zeros((len(a), 3)))
+    time_s, volts = stage_stream(rng, angles, lambda a: 2.5 + np.zeros((len(a), 3)))
     volts[5000:7000, 0] += 0.01 * np.sin(2 * np.pi * 7 * time_s[5000:7000])
     rests = find_rests(time_s, volts, 1000.0, angles, ADXL, angle_tolerance_rad=1.45e-3)
     assert [round(rest.time_start_s) for rest in rests] == [0, 7]
 
 
-def test_errors_of_means_are_honest():
-    """Noise of unknown spectrum: white, filtered, and what an anti-alias filter overshoots."""
+def test_standard_errors_of_means_are_right():
+    """The spectrum is unknown: white, filtered, or that of an anti-alias filter with overshoot."""
     rng = np.random.default_rng(21)
     for shape in ([1.0], [0.2, 0.3, 0.3, 0.2], np.exp(-np.arange(40) / 8), [1.0, 0.4, -0.2]):
         white = rng.normal(size=(150000, 3))
@@ -419,7 +420,7 @@ def test_a_rest_without_samples_is_refused():
 def test_speed():
     """Three million samples of three axes in two seconds."""
     rng = np.random.default_rng(22)
-    _, samples, _, _ = tumbled(rng, 1000.0, [5.0] * 100)
+    _, samples, _, _ = handled_stream(rng, 1000.0, [5.0] * 100)
     time_s = np.arange(5 * len(samples)) / 1000
     samples = np.tile(samples, (5, 1))
     assert len(samples) == 3_000_000
@@ -428,14 +429,14 @@ def test_speed():
     assert len(rests) == 500
 
 
-@pytest.mark.parametrize('name, fewest, largest', [
+@pytest.mark.parametrize('name, min_rests, max_rests', [
     ('mpu9150_0', 22, 24), ('mpu9150_1', 22, 24), ('mpu9150_2', 22, 24),
     ('xsens_multiposition', 37, 39), ('two_axis_stand', 23, 25)])
-def test_real_streams(shared_dir, name, fewest, largest):
-    """As many rests as their authors made, but for stops of a second; the same for all files."""
+def test_rests_of_real_recordings(shared_dir, name, min_rests, max_rests):
+    """Real recordings have the number of rests that is documented, except for stops of 1 s."""
     path = shared_dir / 'real' / f'{name}.csv'
     if not path.exists():
         pytest.skip(f'no {path}')
     stream = recording.read(path)
     samples = np.column_stack([stream.columns[f'a{a}_mps2'] for a in 'xyz'])
-    assert fewest <= len(find_rests(stream.time_s, samples, 100.0)) <= largest
+    assert min_rests <= len(find_rests(stream.time_s, samples, 100.0)) <= max_rests

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The tool apply: the columns, the numbers, and what it refuses."""
+"""The tool `apply`: its columns, its numbers, and its refusals."""
 
 from collections.abc import Callable
 import csv
@@ -62,7 +62,7 @@ def record(folder: Path, sensor: Sensor, volts: np.ndarray, info: dict[str, str]
     return folder / 'made.csv'
 
 
-def felt(sensor: Sensor, alpha: np.ndarray = ALPHA, beta: np.ndarray = BETA) -> np.ndarray:
+def volts_of(sensor: Sensor, alpha: np.ndarray = ALPHA, beta: np.ndarray = BETA) -> np.ndarray:
     return np.column_stack(signal_chain.static_response(sensor)(specific_force(alpha, beta, G)))
 
 
@@ -86,8 +86,8 @@ def numbers(table: dict, *names: str) -> np.ndarray:
 def test_force_and_angles_are_recovered(run_tool: RunTool, tmp_path: Path, axes: str,
                                         units: str) -> None:
     sensor = unit(axes)
-    table, said = applied(run_tool, record(tmp_path, sensor, felt(sensor), units=units))
-    assert said == ''
+    table, messages = applied(run_tool, record(tmp_path, sensor, volts_of(sensor), units=units))
+    assert messages == ''
     force = np.array(specific_force(ALPHA, BETA, G))
     np.testing.assert_allclose(numbers(table, 'ax_mps2', 'ay_mps2', 'az_mps2'), force, atol=1e-9)
     np.testing.assert_allclose(numbers(table, 'alpha_rad', 'beta_rad'), [ALPHA, BETA], atol=1e-9)
@@ -102,24 +102,24 @@ def test_force_and_angles_are_recovered(run_tool: RunTool, tmp_path: Path, axes:
 
 
 def test_z_sign_and_the_range_of_alpha(run_tool: RunTool, tmp_path: Path) -> None:
-    """Without z, alpha is in [0, π/2], though z_sign says that it hangs upside down."""
+    """Without z, alpha is in [0, π/2], even if z_sign states that the sensor is upside down."""
     sensor = replace(unit(), z_sign=-1)
-    path = record(tmp_path, sensor, felt(sensor, np.pi - ALPHA))
+    path = record(tmp_path, sensor, volts_of(sensor, np.pi - ALPHA))
     table, _ = applied(run_tool, path)
     np.testing.assert_allclose(numbers(table, 'az_mps2')[0], -G * np.cos(ALPHA), atol=1e-9)
     np.testing.assert_allclose(numbers(table, 'alpha_rad')[0], ALPHA, atol=1e-9)
     np.testing.assert_allclose(numbers(table, 'inclination_rad')[0], np.pi - ALPHA, atol=1e-9)
 
 
-def test_what_is_not_shown_is_empty(run_tool: RunTool, tmp_path: Path) -> None:
+def test_unobservable_angles_are_empty_cells(run_tool: RunTool, tmp_path: Path) -> None:
     sensor = unit()
-    table, _ = applied(run_tool, record(tmp_path, sensor, felt(
+    table, _ = applied(run_tool, record(tmp_path, sensor, volts_of(
         sensor, np.array([0.0, np.pi / 2, np.pi / 2]), np.array([1.0, 0.0, np.pi]))))
     assert [text == '' for text in table['beta_rad']] == [True, False, False]
     assert [text == 'inf' for text in table['beta_std_rad']] == [True, False, False]
     assert table['roll_rad'][1:] == ['', '']
     assert table['roll_std_rad'][1:] == ['inf', 'inf']
-    # In (−π, π].
+    # Angles are in (−π, π].
     assert numbers(table, 'beta_rad')[0, 2] == pytest.approx(np.pi, abs=1e-3)
 
 
@@ -134,8 +134,8 @@ def test_one_axis(run_tool: RunTool, tmp_path: Path) -> None:
 def test_samples_without_a_solution_are_kept_and_counted(run_tool: RunTool,
                                                          tmp_path: Path) -> None:
     sensor = unit()
-    volts = np.vstack([felt(sensor), [[20.0, 2.0]], [[0.0, 2.5]], felt(sensor)])
-    table, said = applied(run_tool, record(tmp_path, sensor, volts))
+    volts = np.vstack([volts_of(sensor), [[20.0, 2.0]], [[0.0, 2.5]], volts_of(sensor)])
+    table, messages = applied(run_tool, record(tmp_path, sensor, volts))
     assert len(table['time_s']) == 10
     lost, rail = ({name: table[name][i] for name in COLUMNS} for i in (4, 5))
     for row in (lost, rail):
@@ -143,29 +143,29 @@ def test_samples_without_a_solution_are_kept_and_counted(run_tool: RunTool,
         assert row['pitch_rad'] == row['alpha_rad'] == ''
     assert lost['ax_mps2'] == lost['az_mps2'] == ''
     assert float(rail['ax_mps2']) < -20
-    assert said == ('apply: 1 of 10 samples have no solution: their cells are empty\n'
-                    'apply: 1 of 10 samples have the ADC at its rail: their standard deviations '
-                    'are inf\n')
+    assert messages == ('apply: 1 of 10 samples have no solution: their cells are empty\n'
+                        'apply: 1 of 10 samples have the ADC at its rail: their standard '
+                        'deviations are inf\n')
     assert table['ax_mps2'][:4] == table['ax_mps2'][6:]
 
 
 def test_a_nominal_file_fits_any_axes_and_unit(run_tool: RunTool, tmp_path: Path) -> None:
     made = nominal('xyz', serial='mpu')
-    path = record(tmp_path, made, felt(made), units='mps2')
+    path = record(tmp_path, made, volts_of(made), units='mps2')
     parameter_file.save(tmp_path / 'nominal.yaml', nominal('xy'))
     table, _ = applied(run_tool, path, tmp_path / 'nominal.yaml')
     np.testing.assert_allclose(numbers(table, 'az_mps2')[0], G * np.cos(ALPHA), atol=1e-9)
 
 
-def test_a_recording_that_says_nothing_of_its_unit(run_tool: RunTool, tmp_path: Path) -> None:
+def test_a_recording_without_a_statement_of_its_unit(run_tool: RunTool, tmp_path: Path) -> None:
     sensor = unit()
-    applied(run_tool, record(tmp_path, sensor, felt(sensor), info={}))
+    applied(run_tool, record(tmp_path, sensor, volts_of(sensor), info={}))
 
 
-def refused(run_tool: RunTool, path: Path, *more: object) -> str:
-    """Run apply, expecting one line on stderr, status 1, and nothing written or left behind."""
+def refused(run_tool: RunTool, path: Path, *options: object) -> str:
+    """Assert that `apply` has status 1, one line on stderr and no output; return the line."""
     before = {p: p.read_bytes() for p in path.parent.iterdir() if p.is_file()}
-    done = run_tool('apply', path, *(more or (
+    done = run_tool('apply', path, *(options or (
         '--params', path.with_name('unit.yaml'), '-o', path.with_name('out.csv'))))
     assert done.returncode == 1
     assert done.stdout == ''
@@ -185,23 +185,23 @@ def refused(run_tool: RunTool, path: Path, *more: object) -> str:
 def test_another_unit_is_refused(run_tool: RunTool, tmp_path: Path, key: str, value: str,
                                  message: str) -> None:
     sensor = unit()
-    path = record(tmp_path, sensor, felt(sensor), {**sensor_info(sensor), key: value})
-    said = refused(run_tool, path)
-    assert message in said
-    assert str(path) in said
+    path = record(tmp_path, sensor, volts_of(sensor), {**sensor_info(sensor), key: value})
+    reason = refused(run_tool, path)
+    assert message in reason
+    assert str(path) in reason
 
 
 def test_other_axes_are_refused(run_tool: RunTool, tmp_path: Path) -> None:
     made = unit('xyz')
-    path = record(tmp_path, made, felt(made))
+    path = record(tmp_path, made, volts_of(made))
     parameter_file.save(tmp_path / 'unit.yaml', unit('xy'))
-    said = refused(run_tool, path)
-    assert 'calibrated for the axes xy, not xyz' in said or 'are for xy' in said
+    reason = refused(run_tool, path)
+    assert 'calibrated for the axes xy, not xyz' in reason or 'are for xy' in reason
 
 
 def test_bad_input_leaves_the_earlier_output(run_tool: RunTool, tmp_path: Path) -> None:
     sensor = unit()
-    path = record(tmp_path, sensor, felt(sensor))
+    path = record(tmp_path, sensor, volts_of(sensor))
     (tmp_path / 'out.csv').write_text('earlier')
     text = path.read_text(encoding='utf-8')
     path.write_text(text + '10.004,nan,2.5\n', encoding='utf-8')
@@ -212,32 +212,32 @@ def test_bad_input_leaves_the_earlier_output(run_tool: RunTool, tmp_path: Path) 
     assert f'{tmp_path}/unit.yaml:3:5: ' in refused(run_tool, path)
 
 
-def test_where_it_cannot_write(run_tool: RunTool, tmp_path: Path) -> None:
+def test_an_output_that_cannot_be_written_is_refused(run_tool: RunTool, tmp_path: Path) -> None:
     sensor = unit()
-    path = record(tmp_path, sensor, felt(sensor))
+    path = record(tmp_path, sensor, volts_of(sensor))
     parameters = tmp_path / 'unit.yaml'
-    said = refused(run_tool, path, '--params', parameters, '-o', tmp_path / 'none' / 'out.csv')
-    assert 'out.csv: cannot write' in said
-    said = refused(run_tool, path, '--params', parameters, '-o', path)
-    assert 'is the recording itself' in said
+    reason = refused(run_tool, path, '--params', parameters, '-o', tmp_path / 'none' / 'out.csv')
+    assert 'out.csv: cannot write' in reason
+    reason = refused(run_tool, path, '--params', parameters, '-o', path)
+    assert 'is the recording itself' in reason
     assert 'cannot read' in refused(run_tool, tmp_path / 'none.csv', '--params', parameters,
                                     '-o', tmp_path / 'out.csv')
 
 
 @pytest.mark.parametrize(('number', 'status'), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_interrupted_it_leaves_nothing(tmp_path: Path, number: int, status: int) -> None:
+def test_an_interruption_leaves_no_output(tmp_path: Path, number: int, status: int) -> None:
     sensor = unit()
-    path = record(tmp_path, sensor, felt(sensor, *np.full((2, 500000), 0.5)))
+    path = record(tmp_path, sensor, volts_of(sensor, *np.full((2, 500000), 0.5)))
     process = subprocess.Popen(
         [executable('apply'), path, '--params', tmp_path / 'unit.yaml', '-o',
          tmp_path / 'out.csv'], stderr=subprocess.PIPE, text=True)
     wait_until(lambda: [p for p in tmp_path.iterdir() if p.name.startswith('.out')], 20.0,
                'output begun')
     process.send_signal(number)
-    _, said = process.communicate(timeout=20)
+    _, messages = process.communicate(timeout=20)
     assert process.returncode == status
-    assert said.count('\n') <= 1
-    assert 'Traceback' not in said
+    assert messages.count('\n') <= 1
+    assert 'Traceback' not in messages
     assert sorted(p.name for p in tmp_path.iterdir()) == ['made.csv', 'unit.yaml']
 
 
@@ -246,20 +246,20 @@ def test_wrong_usage(run_tool: RunTool, tmp_path: Path) -> None:
     assert run_tool('apply', 'a.csv').returncode == 2
 
 
-def test_many_blocks_are_as_one(run_tool: RunTool, tmp_path: Path) -> None:
-    """Rows beyond a block, in the order of the recording."""
+def test_the_output_does_not_depend_on_blocks(run_tool: RunTool, tmp_path: Path) -> None:
+    """Rows beyond one block are in the order of the recording."""
     sensor = unit()
     count = 40000
     alpha, beta = np.linspace(0.3, 1.3, count), np.linspace(-3, 3, count)
-    path = record(tmp_path, sensor, felt(sensor, alpha, beta))
+    path = record(tmp_path, sensor, volts_of(sensor, alpha, beta))
     table, _ = applied(run_tool, path)
     np.testing.assert_allclose(numbers(table, 'alpha_rad', 'beta_rad'), [alpha, beta], atol=1e-8)
 
 
-def test_bag_gives_the_same(run_tool: RunTool, tmp_path: Path) -> None:
+def test_a_bag_has_the_same_result(run_tool: RunTool, tmp_path: Path) -> None:
     pytest.importorskip('rosbags', reason='rosbags is not installed: pip install rosbags')
     sensor = unit()
-    path = record(tmp_path, sensor, felt(sensor))
+    path = record(tmp_path, sensor, volts_of(sensor))
     from_csv, _ = applied(run_tool, path)
     recording.write(tmp_path / 'bag', recording.read(path), sensor)
     from_bag, _ = applied(run_tool, tmp_path / 'bag', tmp_path / 'unit.yaml')

@@ -53,7 +53,7 @@ def test_a_recording_is_simulated_and_fitted(tmp_path) -> None:
     assert (tmp_path / 'unit.yaml').is_file()
 
 
-def test_a_reader_that_closes_the_pipe_is_no_traceback(tmp_path) -> None:
+def test_a_reader_that_closes_the_pipe_causes_no_traceback(tmp_path) -> None:
     code = f'{executable("simulate")} --help | {sys.executable} -c pass'
     piped = subprocess.run(['sh', '-c', code], text=True, capture_output=True, cwd=tmp_path,
                            env=os.environ, timeout=60)

@@ -34,20 +34,20 @@ def test_simulate_fit_and_apply_make_one_path(run_tool, tmp_path):
 
 
 def test_several_recordings_of_one_unit_are_fitted_together(run_tool, tmp_path):
-    """Two sweeps determine the unit better than one, and the file says so."""
+    """Two sweeps determine the unit better than one, and the file names both."""
     for seed in (1, 2):
         run_tool('simulate', 'sweep', '--rate', 100, '--seed', seed, '-o', f'{seed}.csv')
     run_tool('fit', '1.csv', '-o', 'one.yaml')
     done = run_tool('fit', '1.csv', '2.csv', '-o', 'both.yaml')
     assert done.returncode == 0, done.stderr
-    one, both = parameter_file.load(
+    single, both = parameter_file.load(
         tmp_path / 'one.yaml'), parameter_file.load(tmp_path / 'both.yaml')
-    assert np.mean(np.diag(both.covariance) / np.diag(one.covariance)) < 0.8
+    assert np.mean(np.diag(both.covariance) / np.diag(single.covariance)) < 0.8
     assert both.provenance['source'] == '1.csv, 2.csv'
 
 
 def test_the_same_seed_gives_the_same_bytes(run_tool, tmp_path):
-    """Recordings repeat to the bit by their seed, and differ without."""
+    """Recordings of one seed are equal to the bit, and those of different seeds differ."""
     for name, seed in (('a', 4), ('b', 4), ('c', 5)):
         run_tool('simulate', 'tilt_beta', '--rate', 100, '--seed', seed, '-o', f'{name}.csv')
     a, b, c = ((tmp_path / f'{name}.csv').read_bytes() for name in 'abc')
@@ -62,8 +62,8 @@ def test_the_same_seed_gives_the_same_bytes(run_tool, tmp_path):
     (['--effect', 'cross_axis:linear.z=0.1'], "no axis 'z' to act on"),
     (['--rate', '-3'], '--rate -3: outside'),
     (['--params', 'none.yaml'], 'none.yaml: cannot be read')])
-def test_simulate_refuses(run_tool, tmp_path, arguments, words):
-    """What simulate cannot do it says in one line, and writes nothing."""
+def test_bad_arguments_of_simulate_are_refused(run_tool, tmp_path, arguments, words):
+    """`simulate` reports the reason in one line, and writes no file."""
     done = run_tool('simulate', 'tilt_beta', *arguments, '-o', 'out.csv')
     assert done.returncode == 1
     assert words in done.stderr and done.stderr.count('\n') == 1
@@ -83,7 +83,7 @@ def test_simulate_refuses(run_tool, tmp_path, arguments, words):
     ('time_s,x_v,y_v\n' + ''.join(f'{i / 100},2.5,2.5\n' for i in range(500)),
      'no stage angles')])
 def test_fit_refuses_a_bad_recording(run_tool, tmp_path, text, words):
-    """One line with file, line and column; status 1; the earlier output stays."""
+    """The message is one line with file, line and column, and the earlier output is kept."""
     (tmp_path / 'bad.csv').write_text(text)
     (tmp_path / 'unit.yaml').write_text('before')
     done = run_tool('fit', 'bad.csv', '-o', 'unit.yaml')
@@ -116,9 +116,9 @@ def test_wrong_usage(run_tool):
 @pytest.mark.parametrize('name, in_sample, left_out', [
     ('mpu9150_0', 0.26, 0.33), ('mpu9150_1', 0.26, 0.33), ('mpu9150_2', 0.26, 0.33),
     ('xsens_multiposition', 0.10, 0.16), ('two_axis_stand', 0.12, 0.14)])
-def test_real_recordings_reach_what_a_plain_fit_does(run_tool, tmp_path, shared_dir, name,
-                                                     in_sample, left_out):
-    """The magnitude of gravity over the rests of real sensors, rms in mg."""
+def test_real_recordings_have_the_residual_of_a_plain_fit(run_tool, tmp_path, shared_dir, name,
+                                                          in_sample, left_out):
+    """The rms residual of the magnitude of gravity over the rests is at most that of the table."""
     done = run_tool('fit', shared_dir / 'real' / f'{name}.csv', '-o', 'unit.yaml')
     assert done.returncode == 0, done.stderr
     provenance = parameter_file.load(tmp_path / 'unit.yaml').provenance
@@ -128,7 +128,7 @@ def test_real_recordings_reach_what_a_plain_fit_does(run_tool, tmp_path, shared_
 
 @pytest.mark.parametrize('name', ['no_gap', 'temperature_bias', 'time_offset'])
 def test_sweeps_of_another_generator(run_tool, tmp_path, shared_dir, name):
-    """The linear fit of a sample's sweep leaves held-out poses within 0.1 mg."""
+    """The linear fit of the sweep predicts held-out poses to 0.1 mg."""
     done = run_tool('fit', shared_dir / 'samples' / name / 'cal.csv', '--model', 'linear',
                     '-o', 'unit.yaml')
     assert done.returncode == 0, done.stderr
