@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Settings of a joint: the rule, and the same numbers from sweep, journal, bag and CSV."""
+"""Settings of a joint: the rule, and equal numbers from sweep, journal, bag and CSV."""
 
 from dataclasses import replace
 
@@ -52,15 +52,15 @@ def by_rows(readings, commands, rests):
                              TOLERANCE).tolist()
 
 
-def one_by_one(readings, commands, rests):
-    """Return the settings as in a live sweep: readings and commands come one by one."""
+def by_tracker(readings, commands, rests):
+    """Return the settings of a live sweep, whose readings and commands come one by one."""
     tracker = SettingTracker(TOLERANCE)
     numbers = []
     for row, (reading, command) in enumerate(zip(readings, commands)):
         tracker.read(row, reading, NAN)
         tracker.command(row, command, NAN)
         for start, stop in rests:
-            # A pose is taken some time after its end.
+            # The sweep takes a pose some time after its end.
             if row == stop + 3:
                 seen = [a for a in readings[start:stop] if np.isfinite(a)]
                 pose = start, stop - 1, np.mean(seen) if seen else NAN, NAN
@@ -70,7 +70,7 @@ def one_by_one(readings, commands, rests):
 
 
 def changed(**parts):
-    """Return 60 values of 0, but for rows `from_to=value`, named r20_30 for rows 20 to 30."""
+    """Return 60 values of 0, except for rows such as `r20_30=value` for rows 20 to 30."""
     values = [0.0] * 60
     for rows, value in parts.items():
         first, stop = map(int, rows[1:].split('_'))
@@ -78,7 +78,7 @@ def changed(**parts):
     return values
 
 
-@pytest.mark.parametrize('number', [by_rows, one_by_one])
+@pytest.mark.parametrize('number', [by_rows, by_tracker])
 @pytest.mark.parametrize(('readings', 'commands', 'settings'), [
     (changed(), changed(), [0, 0, 0]),
     # The encoder.
@@ -88,10 +88,10 @@ def changed(**parts):
     (changed(r15_60=STEP), changed(), [0, 0, 0]),
     (changed(r15_60=2 * STEP), changed(), [0, 1, 1]),
     (changed(r15_35=0.3), changed(), [0, 1, 2]),
-    # The end of a rest that is found in a recording may hold the beginning of the next move.
+    # The end of a rest in a recording may contain the beginning of the next move.
     (changed(r29_60=2 * STEP), changed(), [0, 0, 1]),
     (changed(r14_22=-2 * STEP), changed(), [0, 1, 1]),
-    # Where it is not sampled.
+    # Rows without a reading.
     (changed(r11_19=NAN), changed(), [0, 0, 0]),
     (changed(r11_40=NAN), changed(), [0, 0, 0]),
     (changed(r11_40=NAN, r40_60=0.3), changed(), [0, 0, 1]),
@@ -101,7 +101,7 @@ def changed(**parts):
     (changed(), changed(r15_60=0.3), [0, 1, 1]),
     (changed(), changed(r12_14=0.3), [0, 1, 1]),
     (changed(), changed(r12_14=2e-9), [0, 1, 1]),
-    # A controller takes its time: a rest goes on after the next command.
+    # A controller reacts late, so that a rest continues after the next command.
     (changed(), changed(r22_60=0.3), [0, 0, 1]),
     (changed(), changed(r12_14=1e-10), [0, 0, 0]),
     (changed(), changed(r0_12=0.1, r12_20=NAN, r20_60=0.1), [0, 0, 0]),
@@ -111,13 +111,13 @@ def changed(**parts):
     (changed(), changed(r0_32=NAN), [0, 0, 1]),
     (changed(r0_60=NAN), changed(r15_30=0.1), [0, 1, 2]),
 ])
-def test_a_joint_has_moved_when_its_encoder_or_its_command_has(
+def test_a_joint_moves_with_its_encoder_or_its_command(
         number, readings, commands, settings):
     assert number(readings, commands, RESTS) == settings
 
 
-def test_the_live_tracker_and_a_recording_agree_whatever_comes(monkeypatch):
-    """Random walks of encoder and command, with gaps; the tracker remembers few readings."""
+def test_the_live_tracker_and_a_recording_agree(monkeypatch):
+    """Both agree on random walks of encoder and command, with few readings in the tracker."""
     monkeypatch.setattr(joint_settings, '_MAX_READINGS', 12)
     rng = np.random.default_rng(5)
     moves = 0
@@ -127,7 +127,7 @@ def test_the_live_tracker_and_a_recording_agree_whatever_comes(monkeypatch):
         drawn_rad = rng.integers(0, 3, 60) * 0.1
         commands = np.where(rng.random(60) < 0.98, NAN, drawn_rad).tolist()
         by_recording = by_rows(readings, commands, RESTS)
-        assert one_by_one(readings, commands, RESTS) == by_recording
+        assert by_tracker(readings, commands, RESTS) == by_recording
         moves += by_recording[-1]
     assert 200 < moves < 580
 
@@ -158,14 +158,14 @@ def bench(mode='commanded', targets=PLAN, accepted=(), **settings):
 
 
 def take(on, alpha=None, beta=None):
-    """Rest where the sweep wants it, or a little beside; return the entry of the pose."""
+    """Rest at the target of the sweep or at other angles; return the entry of the pose."""
     target = on.sweep.target
     alpha, beta = (wanted if given is None else given for wanted, given in (
         (target.alpha_rad, alpha), (target.beta_rad, beta)))
     on.run(0.2, alpha, beta)
     on.sweep.capture()
     entry = on.run(5, alpha, beta)
-    # As it is in a journal.
+    # The entry as it is in a journal.
     entry = as_read(entry)
     on.sweep.take(entry)
     return entry
@@ -179,15 +179,15 @@ def numbers(entries):
 
 @pytest.mark.parametrize('mode', ['commanded', 'encoder', 'manual'])
 def test_a_sweep_numbers_its_settings(mode):
-    """A joint that the next target leaves where it is keeps its setting."""
+    """A joint keeps its setting if the next target does not move it."""
     on = bench(mode)
     entries = [take(on) for _ in PLAN]
     assert numbers(entries) == ([0, 0, 1, 1, 1], [0, 1, 1, 1, 2])
     assert on.sweep.target is None
 
 
-def test_what_the_operator_turns_by_the_way_has_moved():
-    """With an encoder a turn away and back is seen, and flicker is none."""
+def test_a_joint_that_the_operator_turns_has_moved():
+    """With an encoder a turn away and back is a move, and flicker is not."""
     step = nominal().stage_resolution_rad
     on = bench('encoder', [Target(ALPHA, 0.0)] * 4)
     entries = [take(on)]
@@ -200,8 +200,8 @@ def test_what_the_operator_turns_by_the_way_has_moved():
     assert numbers(entries) == ([0, 1, 1, 1], [0, 0, 0, 1])
 
 
-def test_a_command_that_the_encoder_does_not_show_is_a_move():
-    """A stage draws a new error: below a step of the encoder, and after a way there and back."""
+def test_a_command_below_the_encoder_step_is_a_move():
+    """A stage has a new error after a command below the encoder step, or away and back."""
     tiny = nominal().stage_resolution_rad / 10
     on = bench('commanded', [Target(ALPHA, 0.0), Target(ALPHA, tiny), Target(ALPHA, tiny)])
     assert numbers([take(on, beta=0.0) for _ in range(3)]) == ([0, 0, 0], [0, 1, 1])
@@ -216,8 +216,8 @@ def test_a_command_that_the_encoder_does_not_show_is_a_move():
 
 
 @pytest.mark.parametrize('mode', ['commanded', 'manual'])
-def test_a_target_that_is_left_again_was_a_command(mode):
-    """Skip and redo send the stage, or the operator, away and back."""
+def test_a_skipped_target_counts_as_a_command(mode):
+    """Skip and redo move the stage, or the operator, away and back."""
     on = bench(mode)
     entries = [take(on)]
     on.sweep.skip()
@@ -225,15 +225,15 @@ def test_a_target_that_is_left_again_was_a_command(mode):
     on.sweep.skip()
     entries.append(take(on))
     assert numbers(entries) == ([0, 1], [0, 1])
-    # The pose before is taken again: its own joints have gone to the last target and back.
+    # The pose before is repeated: its joints have moved to the last target and back.
     on.sweep.redo()
     entries.append(take(on))
     entries.append(take(on))
     assert numbers(entries) == ([0, 1, 1, 1], [0, 1, 2, 3])
 
 
-def test_a_refused_pose_and_readings_after_the_dwell_move_nothing():
-    """What is taken counts; a stage that goes on early moves for the next pose."""
+def test_a_refused_pose_and_readings_after_the_dwell_are_no_moves():
+    """Only taken poses count. An early move of the stage belongs to the next pose."""
     on = bench('encoder', [Target(ALPHA, 0.0)] * 3, temperature_span_c=1.0)
     on.sweep.surroundings.temperature_c.add(on.now_ns, 20.0)
     entries = [take(on)]
@@ -254,7 +254,7 @@ def test_a_refused_pose_and_readings_after_the_dwell_move_nothing():
 
 
 def test_after_an_interruption_both_joints_have_moved():
-    """The stage may have lost power. Numbers go on; the mounting check counts as a way."""
+    """The stage may have lost power. Numbers continue, and the mounting check counts as a move."""
     on = bench(targets=[Target(ALPHA, 0.0), *[Target(ALPHA, BETA)] * 5])
     before = [take(on) for _ in range(3)]
     assert numbers(before) == ([0, 0, 0], [0, 1, 1])
@@ -267,7 +267,7 @@ def test_after_an_interruption_both_joints_have_moved():
     assert numbers(after) == ([1, 1, 1], [2, 2, 2])
     poses = Poses.from_records([*after, *before])
     assert poses.alpha_setting.tolist() == [1, 1, 1, 0, 0, 0]
-    # A driver that was started anew: the way to the check and back is by command.
+    # After a restart of the driver, commands move the stage to the check and back.
     on = bench(targets=on.sweep.targets, accepted=())
     entries = [take(on) for _ in range(2)]
     on.sweep.verify()
@@ -280,8 +280,8 @@ def test_after_an_interruption_both_joints_have_moved():
 
 @pytest.mark.parametrize('back_s', [5, 86400])
 @pytest.mark.parametrize('mode', ['commanded', 'encoder', 'manual'])
-def test_a_clock_that_goes_back_leaves_open_whether_the_stage_has_moved(mode, back_s):
-    """Both joints count as moved, and later poses are numbered as before."""
+def test_after_a_clock_step_both_joints_count_as_moved(mode, back_s):
+    """The numbers of later poses follow the usual rule."""
     on = bench(mode, [Target(ALPHA, 0.0), *[Target(ALPHA, BETA)] * 5])
     entries = [take(on) for _ in range(3)]
     on.now_ns -= back_s * 10 ** 9
@@ -296,7 +296,7 @@ def test_a_clock_that_goes_back_leaves_open_whether_the_stage_has_moved(mode, ba
 
 
 def test_journals_of_earlier_versions_are_numbered_by_their_angles():
-    """In the order of time, whatever the order of the entries; beside new ones, too."""
+    """The order of time counts, not that of the entries, also with new entries."""
     entries = [pose_record(i, mean_v=(2.5,), std_v=(1e-5,), alpha_rad=alpha, beta_rad=beta,
                            start_ns=10 * i, stop_ns=10 * i + 5)
                for i, (alpha, beta) in enumerate([(1, 0), (1, 1), (1, 0), (2, 0)])]
@@ -314,7 +314,7 @@ def test_journals_of_earlier_versions_are_numbered_by_their_angles():
 
 
 class Run:
-    """A commanded sweep on the simulated stage, recorded as a bag would be."""
+    """A commanded sweep on the simulated stage, with the messages of a bag."""
 
     def __init__(self, targets, seed=2, rate_hz=200.0):
         self.sensor = nominal(serial='S1', rate_hz=rate_hz)
@@ -328,7 +328,7 @@ class Run:
         self.samples, self.joints, self.commands, self.entries = [], [], [], []
 
     def turn(self):
-        """Go on by 10 ms."""
+        """Advance the time by 10 ms."""
         target = self.sweep.target
         if target != self.commanded or self.now_ns % 500_000_000 == 0:
             self.commanded = target
@@ -352,13 +352,13 @@ class Run:
             self.sweep.take(entry)
 
     def pose(self):
-        """Go on until a pose is taken."""
+        """Advance the time until a pose is taken."""
         done = len(self.entries)
         while len(self.entries) == done:
             self.turn()
 
     def bag(self, path):
-        """Write what came to a bag, in the order of arrival."""
+        """Write the messages to a bag, in the order of arrival."""
         bags = pytest.importorskip('bags', reason='rosbags is not installed: pip install rosbags')
         sent = [bags.imu(t, [*to_nominal_mps2(v[None], self.sensor)[0], 0.0])
                 for t, v in self.samples]
@@ -369,7 +369,7 @@ class Run:
 
 
 def test_sweep_journal_bag_and_csv_give_the_same_settings(tmp_path):
-    """With poses taken again and left out, and commands that the encoder does not show."""
+    """The sweep has repeated and skipped poses, and commands below the encoder step."""
     tiny = nominal().stage_resolution_rad / 10
     targets = [Target(a, b) for a in (0.5, 1.0) for b in (0.0, 0.8, 1.6)]
     targets += [Target(1.3, 1.6 + tiny), Target(1.0, 1.6 + tiny), Target(1.0, 1.6 + tiny),
@@ -377,7 +377,7 @@ def test_sweep_journal_bag_and_csv_give_the_same_settings(tmp_path):
     run = Run(targets)
     for _ in range(3):
         run.pose()
-    # The stage is on its way to the next pose when the one before is to be taken again.
+    # The stage moves to the next pose when the operator repeats the previous one.
     for _ in range(20):
         run.turn()
     run.sweep.redo()
@@ -398,28 +398,28 @@ def test_sweep_journal_bag_and_csv_give_the_same_settings(tmp_path):
     recording.write(tmp_path / 'run.csv', read, unit)
     of_csv = recording.read(tmp_path / 'run.csv')
     check_all_agree(of_csv, unit, entries)
-    # By way of a CSV into a bag again.
+    # The CSV is converted to a bag again.
     recording.write(tmp_path / 'again.mcap', of_csv, unit)
     again = recording.read(tmp_path / 'again.mcap')
     check_all_agree(again, unit, entries)
     for name in COMMANDS.values():
         assert np.array_equal(again.columns[name], read.columns[name], equal_nan=True)
-    # Without commands, the encoder tells of all moves that it shows.
+    # Without commands, only the encoder shows moves.
     for name in COMMANDS.values():
         del read.columns[name]
     poses = pose_extraction.extract_poses(
         read, unit, [replace(e, alpha_setting=-1) for e in entries])
-    assert (poses.alpha_setting == -1).all(), 'the numbers of a journal stand'
+    assert (poses.alpha_setting == -1).all(), 'the numbers of a journal are kept'
     _, beta = by_rests(read, unit, entries)
     assert same_partition(beta.tolist(), [0, 1, 3, 4, 5, 5, 5, 5, 7])
 
 
 def test_a_sweep_with_a_journal_of_an_earlier_version_is_numbered_by_the_recording(tmp_path):
-    """Its entries tell the rests, and the samples tell what has moved."""
+    """The entries determine the rests, and the samples determine the moves."""
     run = Run([Target(0.5, 0.0), Target(0.5, 0.8), Target(0.5, 0.8)])
     for _ in range(2):
         run.pose()
-    # Something turns beta away and back.
+    # Beta turns away and back.
     run.stage.position[1] += 0.1
     run.pose()
     read = recording.read(run.bag(tmp_path / 'bag'))

@@ -13,7 +13,7 @@
 # limitations under the License.
 
 
-"""The covariance of all poses against its closed form, and the levels of the stage's error."""
+"""The covariance of all poses against its closed form, and the levels of the stage error."""
 
 from dataclasses import replace
 
@@ -32,13 +32,13 @@ ERROR = StageError(4e-4, 2e-4, 1.3)
 
 @pytest.fixture(scope='module')
 def poses():
-    """Return a sweep whose joints keep their errors."""
+    """Return a sweep with errors by setting."""
     rng = np.random.default_rng(3)
     return swept(rng, drawn(rng, nominal()), per_setting=True, check_poses=4)
 
 
 def dense(slope, poses, error):
-    """Write the covariance out: noise, an error a pose, and an error a setting, joint by joint."""
+    """Compute the dense covariance: noise, and errors by pose and by setting of each joint."""
     count, axes = slope.shape[:2]
     matrix = np.diag((poses.std_v ** 2).ravel())
     for joint, setting in enumerate((poses.alpha_setting, poses.beta_setting)):
@@ -51,7 +51,7 @@ def dense(slope, poses, error):
 
 
 def test_products_and_determinant_are_those_of_the_dense_covariance(poses):
-    """Woodbury's formula gives what the inverse of the whole matrix gives."""
+    """Woodbury's formula equals the inverse of the dense matrix."""
     slope = pose_response.angle_jacobian(nominal(), poses)
     columns = np.random.default_rng(1).normal(size=(len(poses), 2, 5))
     matrix = dense(slope, poses, ERROR)
@@ -62,7 +62,7 @@ def test_products_and_determinant_are_those_of_the_dense_covariance(poses):
     assert covariance.log_determinant() == pytest.approx(np.linalg.slogdet(matrix)[1], abs=1e-6)
 
 
-def test_predicted_errors_are_the_best_linear_ones(poses):
+def test_predicted_errors_are_the_best_linear_estimates(poses):
     """Errors of setting and pose are those of the conditional normal distribution."""
     slope = pose_response.angle_jacobian(nominal(), poses)
     residual = np.random.default_rng(2).normal(size=poses.volts.shape) * 1e-4
@@ -79,8 +79,8 @@ def test_predicted_errors_are_the_best_linear_ones(poses):
                                rtol=1e-7, atol=1e-15)
 
 
-def test_poses_that_do_not_count_change_nothing(poses):
-    """Products of some poses are those of these alone."""
+def test_excluded_poses_change_nothing(poses):
+    """Products of some poses equal those of a covariance of these poses."""
     slope = pose_response.angle_jacobian(nominal(), poses)
     columns = np.random.default_rng(1).normal(size=(len(poses), 2, 3))
     kept = np.arange(len(poses)) % 7 != 0
@@ -91,8 +91,8 @@ def test_poses_that_do_not_count_change_nothing(poses):
     assert some.log_determinant() == pytest.approx(separate.log_determinant(), abs=1e-6)
 
 
-def test_a_stated_error_counts_where_poses_do_not_tell(poses):
-    """Few poses leave the level at the stated one; many decide it themselves."""
+def test_the_stated_error_counts_where_poses_do_not_determine_it(poses):
+    """With few poses the level is the stated one, and many poses determine it."""
     unit = with_neutral(nominal(), ('bias', 'scale_factor', 'base_tilt'))
     names = full_model.fitted_coefficients('xy', ('bias', 'scale_factor'))
     precision = full_model.prior_precision(names)
@@ -103,8 +103,8 @@ def test_a_stated_error_counts_where_poses_do_not_tell(poses):
     assert many.stage_error(1e-3).total_rad < 1e-4
 
 
-def test_a_joint_that_is_worse_than_the_other_is_found():
-    """Alpha with nine times the variance of beta, where the sweep moves both often."""
+def test_different_errors_of_the_joints_are_estimated():
+    """Alpha has nine times the variance of beta, and the sweep moves both often."""
     rng = np.random.default_rng(5)
     truth = drawn(rng, nominal())
     targets = pose_plan.guided(pose_plan.default_planes_rad('xy'), pose_plan.STEP_RAD, 0)
@@ -121,7 +121,7 @@ def test_a_joint_that_is_worse_than_the_other_is_found():
 
 
 def test_settings_without_numbers_follow_the_angles():
-    """Each change of the angle is a move, and no setting outlasts its recording."""
+    """Each change of the angle is a move, and a setting ends with its recording."""
     alpha, beta = np.array([0.0, 0.0, 1.0, 0.0]), np.array([0.0, 1.0, 1.0, 1.0])
     nothing = np.zeros((4, 2))
     single = Poses(nothing, nothing, alpha, beta, nothing, np.zeros(4, bool))

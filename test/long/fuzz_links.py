@@ -13,10 +13,10 @@
 # limitations under the License.
 
 """
-Hostile bytes for the decoder and the serial link, for two minutes.
+Arbitrary bytes for the decoder and the serial link, for two minutes.
 
     make fuzz                       guided by coverage where atheris is installed, else random
-    make fuzz ARGS='10'             for so many seconds
+    make fuzz ARGS='10'             for 10 s
 
 Some inputs are put into frames with a right CRC. Others are the fields of frames with samples,
 which a faulty board with a right CRC can send.
@@ -50,16 +50,16 @@ SETTINGS = serial.Settings(port='/dev/null')
 SENSOR = nominal()
 """Sensor of the link."""
 MAX_INPUT = 1000
-"""Most bytes of an input."""
+"""Largest number of bytes of an input."""
 MAX_CHUNKS = 50
-"""Most chunks of an input."""
+"""Largest number of chunks of an input."""
 MAX_POOL = 500
-"""Most inputs that are kept for mutation."""
+"""Largest number of inputs that are kept for mutation."""
 counts = Counter()
 
 
 class ScriptedPort:
-    """A port that delivers chunks, then nothing; None stands for a port that was closed."""
+    """A port that delivers chunks, then no bytes; None stands for a port that was closed."""
 
     error = ''
     received_bytes = connections = 0

@@ -16,7 +16,7 @@
 A long recording through `apply` in bounded memory: `make long ARGS='--hours 8'`.
 
 Writes a recording of three axes at 1 kHz, applies a parameter file to it, and prints rows, time
-and the greatest memory of each step. Then the same is interrupted half-way.
+and the largest memory of each step. Then it interrupts the same run half-way.
 """
 
 import argparse
@@ -39,7 +39,7 @@ RATE_HZ = 1000.0
 
 
 def write(path: Path, hours: float) -> int:
-    """Write a made recording; return its rows."""
+    """Write a simulated recording; return its rows."""
     sensor = nominal('xyz')
     rng = np.random.default_rng(0)
     rows = round(hours * 3600 * RATE_HZ)
@@ -60,7 +60,7 @@ def main() -> None:
     parse.add_argument('--hours', type=float, default=8.0)
     parse.add_argument('--folder', type=Path, default=None, help='for some 8 GB')
     options = parse.parse_args()
-    # A shell's background job ignores Ctrl-C, and so would all that it starts.
+    # A background job of a shell ignores SIGINT, and its processes would inherit this.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     with tempfile.TemporaryDirectory(dir=options.folder) as folder:
         unit = Path(folder) / 'unit.yaml'
@@ -75,18 +75,19 @@ def main() -> None:
             written = time.monotonic() - began
             began = time.monotonic()
             command = ['apply', str(path), '--params', str(unit), '-o', str(out)]
-            found = subprocess.run([sys.executable, '-c', MEASURE, *command], text=True,
-                                   check=True, capture_output=True).stdout
+            done = subprocess.run([sys.executable, '-c', MEASURE, *command], text=True,
+                                  check=True, capture_output=True).stdout
             took = time.monotonic() - began
-            print(f'| {name} | {rows} | {written:.0f} | {took:.0f} | {int(found) / 1e3:.0f} |',
+            print(f'| {name} | {rows} | {written:.0f} | {took:.0f} | {int(done) / 1e3:.0f} |',
                   flush=True)
             out.unlink()
             again = subprocess.Popen(['apply', *command[1:]])
             time.sleep(took / 2)
             again.send_signal(signal.SIGINT)
             again.wait()
-            left = [p.name for p in Path(folder).iterdir() if p.name not in (name, 'unit.yaml')]
-            assert again.returncode == 130 and not left, (again.returncode, left)
+            remaining = [p.name for p in Path(folder).iterdir()
+                         if p.name not in (name, 'unit.yaml')]
+            assert again.returncode == 130 and not remaining, (again.returncode, remaining)
             path.unlink()
         print('\nInterrupted half-way, neither left a file.')
 

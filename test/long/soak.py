@@ -111,7 +111,7 @@ def failed(fault, report):
 
 
 def check_sweep(options):
-    """Kill a sweep again and again and print a table; return what went wrong."""
+    """Kill a sweep repeatedly and print a table; return the failures."""
     with tempfile.TemporaryDirectory() as folder, private_graph():
         sweeps = kill(folder, os.environ | BY_UDP, options.kills, options.seed)
     print_origin(options, f'{sweeps.kills} kills')

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The gravity fit against two other methods on the same rests of real sensors."""
+"""The gravity fit compared with two other methods on the same rests of real sensors."""
 
 from adxl_ros.calibrate import pose_extraction
 from adxl_ros.calibrate.fits import gravity_fit
@@ -29,7 +29,7 @@ FILES = ('mpu9150_0', 'mpu9150_1', 'mpu9150_2', 'xsens_multiposition', 'two_axis
 
 @pytest.fixture(params=FILES)
 def rests(request, shared_dir):
-    """Give the gravity fit of a recording, mean accelerations of its rests, m/s², and gravity."""
+    """Return the fit of a recording, mean accelerations of its rests, m/s², and gravity."""
     stream = recording.read(shared_dir / 'real' / f'{request.param}.csv')
     unit = recorded_unit(parameter_file.load(NOMINAL), stream)
     poses = pose_extraction.extract_poses(stream, unit)
@@ -72,7 +72,7 @@ def ferraris_magnitude(accel, gravity_mps2, six):
 
 
 def test_is_as_good_as_least_squares(rests):
-    """In-sample, where nothing is better, and leave-one-out."""
+    """The residuals are compared in-sample, where least squares is optimal, and leave-one-out."""
     residual, leave_one_out, accel, g = rests
     assert rms_mg(residual) <= 1.03 * rms_mg(least_squares_magnitude(accel, g)(accel) - g)
     held_out = [least_squares_magnitude(np.delete(accel, i, 0), g)(accel[[i]])[0] - g
@@ -81,7 +81,7 @@ def test_is_as_good_as_least_squares(rests):
 
 
 def test_is_better_than_six_positions_on_the_other_rests(rests):
-    """Rests that imucal has not used, which the gravity fit leaves out one by one."""
+    """The comparison uses rests that imucal has not used, and leave-one-out residuals."""
     _, leave_one_out, accel, g = rests
     six = [int(np.argmax(sign * accel[:, axis])) for axis in range(3) for sign in (1, -1)]
     other = np.setdiff1d(np.arange(len(accel)), six)

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The full model: intervals that hold, the gauge, bad poses, bad stages, contradictions."""
+"""The full model: coverage of intervals, gauge, outliers, stage errors, contradictions."""
 
 from dataclasses import replace
 
@@ -34,7 +34,7 @@ TERMS = full_model.TERMS
 
 
 def swept_unit(seed, axes='xy', stage_deg=5 / 60, **options):
-    """Draw a unit of all terms and sweep it; return nominal figures, the unit, its poses."""
+    """Draw a unit with all terms and sweep it; return nominal sensor, unit and poses."""
     rng = np.random.default_rng(seed)
     sensor = nominal(axes)
     truth = drawn(rng, sensor, full_model.default_terms(axes))
@@ -43,7 +43,7 @@ def swept_unit(seed, axes='xy', stage_deg=5 / 60, **options):
 
 
 def errors(fit, truth):
-    """Errors of the coefficients and their promised deviations, (p,) each."""
+    """Return errors of the coefficients and their standard deviations, (p,) each."""
     names = fit.fitted.covariance_names
     truth = with_neutral(truth, {name.effect for name in names})
     return (get(fit.fitted, names) - get(truth, names),
@@ -53,7 +53,7 @@ def errors(fit, truth):
 @pytest.mark.parametrize('axes, units, per_setting', [
     ('xy', 70, False), ('xy', 70, True), ('xyz', 40, True)])
 def test_ninety_percent_intervals_cover_ninety_percent(axes, units, per_setting):
-    """Over more than a thousand intervals of drawn units, whatever the stage's errors."""
+    """The coverage is right over more than a thousand intervals, for all kinds of stage errors."""
     z = np.concatenate([np.divide(*errors(full_model.fit_full(sensor, poses), truth))
                         for sensor, truth, poses in (
                             swept_unit(k, axes, per_setting=per_setting) for k in range(units))])
@@ -62,8 +62,8 @@ def test_ninety_percent_intervals_cover_ninety_percent(axes, units, per_setting)
 
 
 @pytest.mark.parametrize('per_setting', [True, False])
-def test_the_kind_of_the_stages_error_is_found(per_setting):
-    """Errors per setting and errors per pose are told apart, and their level is right."""
+def test_the_kind_of_the_stage_error_is_identifiable(per_setting):
+    """Errors by setting and by pose are separated, and their level is right."""
     levels = []
     for k in range(8):
         sensor, _, poses = swept_unit(k, per_setting=per_setting)
@@ -76,8 +76,8 @@ def test_the_kind_of_the_stages_error_is_found(per_setting):
 
 
 @pytest.mark.parametrize('eccentric', [False, True])
-def test_an_eccentric_stage_is_found_and_a_sound_one_is_not_blamed(eccentric):
-    """Discs that are 20 um off their axis are found, and nowhere else."""
+def test_an_eccentric_stage_is_identified_and_a_sound_one_has_no_such_term(eccentric):
+    """An eccentricity of 20 µm is identified, and no other."""
     for seed in range(8):
         rng = np.random.default_rng(seed)
         truth = drawn(rng, nominal(), (*TERMS, 'stage_eccentricity'))
@@ -89,8 +89,8 @@ def test_an_eccentric_stage_is_found_and_a_sound_one_is_not_blamed(eccentric):
         assert np.sqrt(np.mean((error / std) ** 2)) < 2
 
 
-def test_each_axis_of_a_three_axis_unit_bends():
-    """A z that bends like x and y is fitted to the noise, and the stage is not blamed for it."""
+def test_each_axis_of_a_three_axis_unit_has_its_cross_axis_terms():
+    """A quadratic term of z is fitted to the noise, and does not appear as stage error."""
     sensor, truth, poses = swept_unit(4, 'xyz', 0.0, check_poses=0,
                                       planes_rad=np.radians(np.arange(0, 181, 30)))
     fit, _ = term_selection.fit_selected(sensor, poses)
@@ -102,8 +102,8 @@ def test_each_axis_of_a_three_axis_unit_bends():
     assert np.sqrt(np.mean((error / std) ** 2)) < 1.4
 
 
-def test_a_fit_that_does_not_converge_says_so(monkeypatch):
-    """It says so in its words; one that converges does not."""
+def test_a_fit_that_does_not_converge_is_reported(monkeypatch):
+    """The text of the fit contains the warning only if the fit does not converge."""
     sensor, _, poses = swept_unit(2)
     fit, terms = term_selection.fit_selected(sensor, poses)
     assert fit.converged
@@ -114,8 +114,8 @@ def test_a_fit_that_does_not_converge_says_so(monkeypatch):
     assert full_fit_text.NOT_CONVERGED in full_fit_text.report_lines(fit, poses, terms)
 
 
-def test_a_term_that_is_not_convex_is_found_from_several_starts():
-    """The curve of an ADC has the right number of periods, far from the typical one."""
+def test_a_term_that_is_not_convex_is_fitted_from_several_starts():
+    """The periods of an ADC's nonlinearity are right, far from the typical value."""
     sensor, truth, _ = swept_unit(3)
     truth = with_neutral(truth, ['adc_inl'])
     values = {**truth.values['adc_inl'], 'amplitude_v': np.array(1e-3), 'cycles': np.array(17.3)}
@@ -127,14 +127,14 @@ def test_a_term_that_is_not_convex_is_found_from_several_starts():
 
 
 def test_one_axis():
-    """A sensor of one axis is fitted, too."""
+    """A sensor of one axis is fitted as well."""
     sensor, truth, poses = swept_unit(1, 'x')
     error, std = errors(full_model.fit_full(sensor, poses), truth)
     assert np.abs(error / std).max() < 4
 
 
-def test_the_gauge_is_fixed_where_only_the_sum_shows():
-    """Linear cross-axis terms alone are a misalignment, and cross_axis.linear stays 0."""
+def test_the_gauge_is_fixed_where_only_the_sum_is_identifiable():
+    """Linear cross-axis terms only are a misalignment, and cross_axis.linear stays 0."""
     rng = np.random.default_rng(3)
     truth = drawn(rng, nominal(), ('bias', 'scale_factor', 'misalignment'))
     truth = with_neutral(truth, ['cross_axis', 'cross_axis_z'])
@@ -150,8 +150,8 @@ def test_the_gauge_is_fixed_where_only_the_sum_shows():
         truth.values['misalignment']['beta_rad'][0] + 0.012, abs=4e-4)
 
 
-def test_the_gauge_is_freed_where_products_show_the_parts():
-    """With a scale factor that depends on z the same terms are fitted, to the noise."""
+def test_the_gauge_is_free_where_products_make_the_parts_identifiable():
+    """If the scale factor depends on z, the same terms are fitted to the noise."""
     rng = np.random.default_rng(3)
     truth = drawn(rng, nominal(), TERMS)
     truth = put(truth, [Coefficient('cross_axis', 'linear', 'x'),
@@ -172,8 +172,8 @@ def test_the_gauge_is_freed_where_products_show_the_parts():
     assert worst['judged'] < 3e-4 and worst['fixed'] > 2 * worst['judged']
 
 
-def test_knocked_poses_are_named_and_left_out():
-    """Three poses in which somebody knocked do not move the coefficients."""
+def test_outliers_are_named_and_excluded():
+    """Three poses with a knock do not change the coefficients."""
     sensor, truth, poses = swept_unit(5, check_poses=0)
     bad = [7, 40, 90]
     volts = poses.volts.copy()
@@ -187,8 +187,8 @@ def test_knocked_poses_are_named_and_left_out():
 
 
 @pytest.mark.parametrize('stage_deg', [1.0, 3.0])
-def test_a_bad_stage_is_found_and_the_sensor_is_not_blamed(stage_deg):
-    """The stage's error is estimated, and zero-g is as good as the magnitude of gravity tells."""
+def test_a_large_stage_error_is_not_attributed_to_the_sensor(stage_deg):
+    """The stage error is estimated, and the magnitude of gravity determines zero-g."""
     sensor, truth, poses = swept_unit(6, 'xyz', stage_deg * np.sqrt(12))
     fit, terms = term_selection.fit_selected(sensor, poses)
     assert np.degrees(fit.stage_std_rad) == pytest.approx(stage_deg, rel=0.15)
@@ -200,16 +200,16 @@ def test_a_bad_stage_is_found_and_the_sensor_is_not_blamed(stage_deg):
                for line in full_fit_text.report_lines(fit, poses, terms))
 
 
-def test_terms_that_are_not_there_do_not_earn_their_place():
-    """A unit of zero-g, scale and misalignment alone: nothing else gains on poses held out."""
+def test_terms_that_the_unit_lacks_are_not_selected():
+    """For a unit with zero-g, scale factor and misalignment, no other term is supported."""
     rng = np.random.default_rng(8)
     truth = drawn(rng, nominal(), ('bias', 'scale_factor', 'misalignment'))
     terms = term_selection.fit_selected(nominal(), swept(rng, truth))[1]
     assert [term.name for term in terms if term.is_supported] == ['misalignment']
 
 
-def test_the_next_poses_help_more_than_others():
-    """Poses that the fit asks for shrink the joint interval more than as many of the sweep."""
+def test_suggested_poses_determine_more_than_others():
+    """Suggested poses reduce the covariance more than an equal number of poses of the sweep."""
     sensor, _, poses = swept_unit(9, check_poses=0)
     fit = full_model.fit_full(sensor, poses)
     suggested = full_model.next_poses(fit.unit, poses, fit.names, fit.stage)
@@ -227,8 +227,8 @@ def test_the_next_poses_help_more_than_others():
     assert volume(np.array(suggested)) < volume(others)
 
 
-def test_temperature_that_moved_is_said_and_fitted():
-    """15 degC of warming during the sweep: the verdict says so, or the term takes it."""
+def test_a_change_of_temperature_is_reported_and_fitted():
+    """A change by 15 °C during the sweep is reported, or fitted by its term."""
     sensor, truth, poses = swept_unit(10, check_poses=0)
     warm = replace(poses, temperature_c=np.linspace(20, 35, len(poses)))
     fit, terms = term_selection.fit_selected(sensor, warm)
@@ -244,15 +244,15 @@ def test_temperature_that_moved_is_said_and_fitted():
 @pytest.mark.parametrize('planes_deg, lost', [
     ([90], 'cross_axis_z.quadratic_per_g'), ([90, 60], 'scale_factor_z')])
 def test_poses_of_too_few_planes_are_refused(planes_deg, lost):
-    """The message names what is open and which poses to add."""
+    """The message names the undetermined terms and the poses to add."""
     sensor, _, poses = swept_unit(1, planes_rad=np.radians(planes_deg), check_poses=0)
     with pytest.raises(UserError,
                        match=rf'do not determine .*{lost}.*add poses \(alpha, beta\) = '):
         full_model.fit_full(sensor, poses)
 
 
-def test_what_is_not_determined_falls_back_and_says_so():
-    """Without a choice the richest model that the poses determine is fitted."""
+def test_a_simpler_model_is_fitted_if_the_full_one_is_not_determined():
+    """Without a chosen model, `calibrate` fits the richest model that the poses determine."""
     sensor, _, poses = swept_unit(1, planes_rad=PLANES_RAD[2:3], check_poses=0)
     fit = calibration.calibrate(sensor, [calibration.RecordedPoses('made', poses)])
     assert fit.fitted.model == 'linear'
@@ -260,8 +260,8 @@ def test_what_is_not_determined_falls_back_and_says_so():
     assert fit.report_lines[1].startswith('not physical: ')
 
 
-def test_several_recordings_of_one_unit():
-    """Two sweeps are fitted together, and tell more than one."""
+def test_recordings_of_one_unit_are_fitted_together():
+    """Two sweeps together determine the coefficients better than one."""
     rng = np.random.default_rng(12)
     truth = drawn(rng, nominal(), TERMS)
     parts = [swept(rng, truth, check_poses=0) for _ in range(2)]
@@ -278,7 +278,7 @@ def test_several_recordings_of_one_unit():
     (lambda truth: put(truth, [Coefficient('bias', 'offset_v', 'x')],
                        truth.values['bias']['offset_v'][:1] + 0.08), 'zero-g of x is shifted by')])
 def test_recordings_that_contradict_each_other_are_refused(change, words):
-    """Another mounting or another unit: the message has the figure and its significance."""
+    """The message has the difference and its significance for another mounting or unit."""
     rng = np.random.default_rng(13)
     truth = drawn(rng, nominal(), TERMS)
     parts = [swept(rng, unit, check_poses=0) for unit in (truth, truth, change(truth))]
@@ -290,7 +290,7 @@ def test_recordings_that_contradict_each_other_are_refused(change, words):
 
 @pytest.mark.perf
 def test_six_hundred_poses_of_three_axes_take_two_seconds():
-    """With errors of the stage and the comparison of terms."""
+    """The time includes stage errors and the selection of terms."""
     sensor, _, poses = swept_unit(2, 'xyz', planes_rad=np.radians(np.linspace(0, 180, 23)))
     assert len(poses) > 600
     with within(2.0):
@@ -298,8 +298,8 @@ def test_six_hundred_poses_of_three_axes_take_two_seconds():
     assert len(fit.names) >= 20
 
 
-def test_the_filter_is_found_in_the_noise(run_tool, tmp_path):
-    """`fit` on a simulated sweep gives the filter's resistor, and keeps it in the file."""
+def test_the_noise_determines_the_filter_time_constant(run_tool, tmp_path):
+    """`fit` on a simulated sweep estimates the resistor of the filter, and writes it."""
     run_tool('simulate', 'sweep', '--params', NOMINAL, '--effect',
              'bandwidth:resistance_ratio.x=0.2,resistance_ratio.y=-0.15', '--effect',
              'misalignment', '-o', tmp_path / 'sweep.csv')
@@ -313,8 +313,8 @@ def test_the_filter_is_found_in_the_noise(run_tool, tmp_path):
     assert np.abs((ratio - [0.2, -0.15]) / std).max() < 4
 
 
-def test_an_effect_more_on_the_command_line(run_tool, tmp_path):
-    """--effect adds a term; one that rests cannot tell is refused by name."""
+def test_an_additional_effect_on_the_command_line(run_tool, tmp_path):
+    """--effect adds a term. A term that poses at rest cannot determine is refused by name."""
     run_tool('simulate', 'sweep', '--params', NOMINAL, '-o', tmp_path / 'sweep.csv')
     run_tool('fit', tmp_path / 'sweep.csv', '--effect', 'stage_eccentricity', '-o',
              tmp_path / 'unit.yaml')

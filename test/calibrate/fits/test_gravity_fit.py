@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Nine parameters from gravity: made units with known truth, refusals, and real recordings."""
+"""Nine parameters from gravity: simulated units, refusals, and real recordings."""
 
 from dataclasses import replace
 
@@ -60,7 +60,7 @@ def directions(rng, count):
 
 
 def rested(rng, sensor, poses, error_v=5e-5, excess_g=0.0):
-    """Make the rests of a unit in `poses`: means and standard errors, V, through the chain."""
+    """Simulate the rests of a unit in `poses`: means and standard errors, V."""
     force = poses * (sensor.local_gravity_mps2
                      + G0_MPS2 * excess_g * rng.normal(size=(len(poses), 1)))
     volts = np.column_stack(signal_chain.static_response(sensor)(list(force.T)))
@@ -73,7 +73,7 @@ def bare(sensor):
 
 
 def parameters(fit):
-    """Put the fitted values in the order of NAMES."""
+    """Return the fitted values in the order of NAMES."""
     return np.array([fit.values[name.effect][name.parameter]['xyz'.index(name.axis)]
                      for name in NAMES])
 
@@ -81,7 +81,7 @@ def parameters(fit):
 @settings(max_examples=30)
 @given(strategies.integers(0, 2**32 - 1))
 def test_exact_without_noise(seed):
-    """The chain's own response is inverted, for any unit, scale and gravity."""
+    """The fit recovers any unit, scale factor and gravity from exact volts."""
     rng = np.random.default_rng(seed)
     sensor, truth = unit(rng, 2.0, nominal_scale_v_per_g=rng.uniform(0.3, 2, 3),
                          nominal_zero_g_v=rng.uniform(1, 3, 3),
@@ -109,8 +109,8 @@ def test_jacobian_against_differences():
 @pytest.mark.parametrize('count, error_v, excess_g', [
     (12, 1e-4, 0.0), (18, 1e-4, 0.0), (30, 1e-4, 0.0), (24, 1e-6, 0.0), (24, 2e-5, 2e-4),
     (16, 2e-5, 2e-4), (24, 1e-4, 1e-4)])
-def test_covariance_is_honest(count, error_v, excess_g):
-    """90 % intervals hold the truth in 85 to 95 % of the units; without excess in no fewer."""
+def test_covariance_has_the_stated_coverage(count, error_v, excess_g):
+    """90 % intervals contain the truth in 85 to 95 % of the units; without excess also in more."""
     rng = np.random.default_rng(2)
     inside, false = [], 0
     for _ in range(40):
@@ -126,7 +126,7 @@ def test_covariance_is_honest(count, error_v, excess_g):
 
 
 def test_covariance_in_other_units():
-    """Half the scale factor halves volts: the figures in g are the same."""
+    """With half the scale factor the parameters in g are equal."""
     rng = np.random.default_rng(3)
     sensor, _ = unit(rng)
     means, errors = rested(rng, sensor, directions(rng, 24))
@@ -139,7 +139,7 @@ def test_covariance_in_other_units():
     assert other.covariance == pytest.approx(first.covariance * np.outer(units, units), rel=1e-6)
 
 
-def test_order_does_not_matter():
+def test_the_result_does_not_depend_on_the_order_of_rests():
     rng = np.random.default_rng(4)
     sensor, _ = unit(rng)
     means, errors = rested(rng, sensor, directions(rng, 24), 5e-5, 1e-4)
@@ -149,7 +149,7 @@ def test_order_does_not_matter():
     assert other.leave_one_out_mps2 == pytest.approx(first.leave_one_out_mps2[order], abs=1e-6)
 
 
-def test_excess_is_what_the_means_do_not_explain():
+def test_excess_is_the_scatter_beyond_the_standard_errors():
     rng = np.random.default_rng(5)
     estimate = []
     for _ in range(20):
@@ -159,7 +159,7 @@ def test_excess_is_what_the_means_do_not_explain():
     assert np.mean(estimate) == pytest.approx(0.3, rel=0.15)
 
 
-def test_leave_one_out_is_that():
+def test_leave_one_out_equals_fits_without_the_rest():
     rng = np.random.default_rng(6)
     sensor, _ = unit(rng)
     means, errors = rested(rng, sensor, directions(rng, 16), 5e-5)
@@ -170,14 +170,14 @@ def test_leave_one_out_is_that():
                                                      bare(sensor)).values)
         force = np.array(signal_chain.inverse(without)(list(means[i:i + 1].T)))
         error = np.linalg.norm(force) - sensor.local_gravity_mps2
-        # The excess is estimated anew without the rest, the weights change a little.
+        # Without the rest the excess and thus the weights change a little.
         assert fit.leave_one_out_mps2[i] == pytest.approx(error, abs=2e-4)
 
 
 @pytest.mark.parametrize('count, knocks, size_g', [
     (14, 1, 0.02), (18, 2, 0.02), (24, 1, 0.002), (24, 3, 0.02), (24, 3, 0.2), (40, 5, 0.005)])
-def test_knocks_are_named(count, knocks, size_g):
-    """Rests that were none do not spoil the fit, and hide neither themselves nor one another."""
+def test_outliers_are_named(count, knocks, size_g):
+    """Disturbed rests do not change the fit, and all of them are named."""
     rng = np.random.default_rng(7)
     right, worst = 0, []
     for _ in range(20):
@@ -204,7 +204,7 @@ def test_knocks_are_named(count, knocks, size_g):
      'bias.offset_v.z, scale_factor.offset_v_per_g.z, misalignment.alpha_rad.z, '
      'misalignment.beta_rad.z', 'z up'),
 ])
-def test_refuses_what_the_rests_leave_open(poses, names, advice):
+def test_undetermined_parameters_are_refused(poses, names, advice):
     rng = np.random.default_rng(8)
     sensor, _ = unit(rng)
     means, errors = rested(rng, sensor, poses)
@@ -217,7 +217,7 @@ def test_refuses_what_the_rests_leave_open(poses, names, advice):
     assert '\n' not in text
 
 
-def test_refuses_what_is_not_gravity():
+def test_magnitudes_far_from_gravity_are_refused():
     rng = np.random.default_rng(12)
     sensor, _ = unit(rng)
     means, errors = rested(rng, sensor, directions(rng, 24))
@@ -226,8 +226,8 @@ def test_refuses_what_is_not_gravity():
         fit_gravity(means, errors, wrong)
 
 
-def test_the_advice_is_enough():
-    """The poses that a refusal names make the fit possible."""
+def test_the_advised_poses_are_sufficient():
+    """With the poses that a refusal names the fit succeeds."""
     rng = np.random.default_rng(9)
     sensor, truth = unit(rng)
     few = directions(rng, 24) * [1, 1, 0.02]
@@ -247,8 +247,8 @@ def test_the_advice_is_enough():
         assert np.abs(parameters(fit) - truth).max() < 0.02
 
 
-def plain(means, errors, sensor):
-    """Fit offsets and a lower triangular matrix by unweighted least squares, from nominal."""
+def unweighted_fit(means, errors, sensor):
+    """Fit offsets and a lower triangular matrix by unweighted least squares."""
     scaled = (means - sensor.nominal_zero_g_v) / sensor.nominal_scale_v_per_g
     lower = np.tril_indices(3)
 
@@ -257,19 +257,19 @@ def plain(means, errors, sensor):
         matrix[lower] = p[3:]
         return np.linalg.norm((scaled[rows] - p[:3]) @ matrix.T, axis=1)
 
-    wanted = sensor.local_gravity_mps2 / G0_MPS2
+    gravity = sensor.local_gravity_mps2 / G0_MPS2
     start = np.concatenate([np.zeros(3), np.eye(3)[lower]])
-    everything = least_squares(lambda p: magnitudes(p) - wanted, start).x
+    all_rows = least_squares(lambda p: magnitudes(p) - gravity, start).x
     out = []
     for i in range(len(means)):
         rows = np.arange(len(means)) != i
-        estimate = least_squares(lambda p, rows=rows: magnitudes(p, rows) - wanted, everything).x
-        out.append(magnitudes(estimate, [i])[0] - wanted)
-    return G0_MPS2 * (magnitudes(everything) - wanted), G0_MPS2 * np.array(out)
+        estimate = least_squares(lambda p, rows=rows: magnitudes(p, rows) - gravity, all_rows).x
+        out.append(magnitudes(estimate, [i])[0] - gravity)
+    return G0_MPS2 * (magnitudes(all_rows) - gravity), G0_MPS2 * np.array(out)
 
 
-def test_no_worse_than_plain_least_squares():
-    """Rests from 1 to 60 s: the weights tell, in what other rests then read."""
+def test_residuals_are_below_those_of_unweighted_least_squares():
+    """For rests from 1 to 60 s the weights improve the prediction of other rests."""
     rng = np.random.default_rng(10)
     ours, reference = [], []
     for _ in range(15):
@@ -279,12 +279,12 @@ def test_no_worse_than_plain_least_squares():
         means, _ = rested(rng, sensor, poses, 0.0)
         means = means + errors * rng.normal(size=means.shape)
         ours.append(fit_gravity(means, errors, bare(sensor)).leave_one_out_mps2)
-        reference.append(plain(means, errors, sensor)[1])
+        reference.append(unweighted_fit(means, errors, sensor)[1])
     assert rms(ours) < rms(reference)
 
 
 def real(shared_dir, name, local_gravity_mps2=G0_MPS2):
-    """Read a recording, find its rests and average them, all as by default."""
+    """Read a recording, detect its rests and average them with default settings."""
     path = shared_dir / 'real' / f'{name}.csv'
     if not path.exists():
         pytest.skip(f'no {path}')
@@ -303,20 +303,20 @@ XSENS_MPS2 = 9.81744
     ('mpu9150_2', G0_MPS2, (8, 24), 0.26, 0.33),
     ('xsens_multiposition', XSENS_MPS2, (100, 150), 0.104, 0.16),
     ('two_axis_stand', G0_MPS2, (60, 64), 0.12, 0.145)])
-def test_real_units(shared_dir, name, local, before, within, without):
-    """What others reached on these recordings, rms over the rests in mg, with one set of rules."""
+def test_residuals_of_real_recordings(shared_dir, name, local, before, within, without):
+    """The rms residuals over the rests, mg, are those of published methods or better."""
     sensor, _, means, errors = real(shared_dir, name, local)
     fit = fit_gravity(means, errors, sensor)
     assert before[0] < MG * rms(fit.before_mps2) < before[1]
     assert MG * rms(fit.residual_mps2) < within
     assert MG * rms(fit.leave_one_out_mps2) < without
     assert len(fit.outliers) == 0
-    _, reference = plain(means, errors, sensor)
+    _, reference = unweighted_fit(means, errors, sensor)
     assert rms(fit.leave_one_out_mps2) < 1.05 * rms(reference)
 
 
-def test_real_unit_on_rests_kept_out(shared_dir):
-    """Fitted on 24 rests, the others read gravity to 0.12 mg."""
+def test_held_out_rests_of_a_real_recording(shared_dir):
+    """After a fit of 24 rests, the other rests have the magnitude of gravity to 0.12 mg."""
     sensor, _, means, errors = real(shared_dir, 'xsens_multiposition', XSENS_MPS2)
     fit = fit_gravity(means[:24], errors[:24], sensor)
     fitted = replace(sensor, effects=EFFECTS, values=fit.values)
@@ -324,8 +324,8 @@ def test_real_unit_on_rests_kept_out(shared_dir):
     assert MG * rms(np.linalg.norm(force, axis=0) - XSENS_MPS2) < 0.125
 
 
-def test_three_real_units_turn_alike(shared_dir):
-    """Three sensors on one body: the change of tilt between rests agrees to 0.04° or so."""
+def test_three_real_units_agree_in_their_change_of_tilt(shared_dir):
+    """On one body the changes of tilt between rests agree to about 0.04°."""
     units = [real(shared_dir, f'mpu9150_{k}') for k in range(3)]
     common = [(a, b, c) for a in units[0][1] for b in units[1][1] for c in units[2][1]
               if min(a.stop, b.stop, c.stop) - max(a.start, b.start, c.start) > 100]
@@ -341,8 +341,8 @@ def test_three_real_units_turn_alike(shared_dir):
         assert rms(turned[first] - turned[other]) < 0.06
 
 
-def test_too_few_rests_are_said_in_one_line(run_tool, shared_dir):
-    """Moved by hand all the time, behind no filter: which poses are missing, no traceback."""
+def test_too_few_rests_are_refused_in_one_line(run_tool, shared_dir):
+    """A sensor in permanent motion by hand: the message names the missing poses."""
     done = run_tool('fit', shared_dir / 'real' / 'broad_02_real.csv', '-o', 'unit.yaml')
     assert done.returncode == 1
     assert done.stderr.startswith('fit: gravity: ') and done.stderr.count('\n') == 1

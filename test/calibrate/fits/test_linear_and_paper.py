@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Linear and physical fits: equations 1 to 19 on made and drawn units."""
+"""Linear and physical fits: equations 1 to 19 on simulated units."""
 
 from dataclasses import replace
 
@@ -33,8 +33,8 @@ def _made(volts, alpha_deg, beta_deg):
                  np.radians(beta_deg), np.zeros((count, 2)), np.zeros(count, bool))
 
 
-def test_equations_1_to_3_on_made_volts():
-    """±1 g poses give SF = (V₊ − V₋)/2 and B = (V₊ + V₋)/2 whatever the other poses read."""
+def test_equations_1_to_3():
+    """Poses at ±1 g give SF = (V₊ − V₋)/2 and B = (V₊ + V₋)/2, independent of other poses."""
     poses = _made([[3.52, 2.51], [1.50, 2.53], [2.44, 1.49], [2.60, 3.55], [2.9, 2.9]],
                   [90, 90, 90, 90, 30], [0, 180, 90, 270, 45])
     fitted = linear.fit(nominal(), poses)
@@ -42,15 +42,15 @@ def test_equations_1_to_3_on_made_volts():
     assert fitted.zero_g_v == pytest.approx([2.51, 2.52], abs=1e-12)
 
 
-def test_linear_takes_local_gravity():
-    """Where g is 9.78 m/s² the same volts mean a larger V/g of standard g."""
+def test_linear_uses_local_gravity():
+    """At a gravity of 9.78 m/s² the same volts give a larger scale factor in V/g."""
     poses = _made([[3.5, 2.5], [1.5, 2.5], [2.5, 1.5], [2.5, 3.5]], [90] * 4, [0, 180, 90, 270])
     fitted = linear.fit(nominal(local_gravity_mps2=9.78), poses)
     assert fitted.scale_v_per_g == pytest.approx([9.80665 / 9.78] * 2)
 
 
 def test_linear_without_upright_poses_uses_all():
-    """A sweep that never stands an axis upright is fitted by least squares over all poses."""
+    """A sweep without poses at ±1 g is fitted by least squares over all poses."""
     rng = np.random.default_rng(0)
     truth = drawn(rng, nominal(), ('bias', 'scale_factor'))
     fitted = linear.fit(nominal(), swept(rng, truth, np.radians([20, 40]), 0, noisy=False))
@@ -59,7 +59,7 @@ def test_linear_without_upright_poses_uses_all():
 
 
 def test_linear_refuses_an_axis_that_was_not_turned():
-    """A plane near the horizontal tells no scale factor, and the message says of which axis."""
+    """A plane near the horizontal determines no scale factor. The message names the axis."""
     rng = np.random.default_rng(0)
     poses = swept(rng, nominal(), np.radians([1.0]), 0)
     with pytest.raises(UserError, match=r'^x: its reference spans 0.03 g'):
@@ -67,15 +67,15 @@ def test_linear_refuses_an_axis_that_was_not_turned():
 
 
 @pytest.mark.parametrize('axes', ['xy', 'xyz'])
-def test_physical_finds_the_unit(axes):
-    """Coefficients come out within their intervals, tilt to 0.1° on average, on a real stage."""
+def test_physical_recovers_the_unit(axes):
+    """Coefficients are within their intervals, and tilt is right to 0.1° on average."""
     rng = np.random.default_rng(7)
     sensor = nominal(axes)
     inside, alpha_deg = [], []
     for _ in range(12):
         truth = drawn(rng, sensor)
         for effect in ('cross_axis', 'cross_axis_z', 'scale_factor_z'):
-            # The paper has no model of a z axis.
+            # The paper does not model a z axis.
             for values in truth.values[effect].values():
                 values[2:] = 0.0
         poses = swept(rng, truth, per_setting=True)
@@ -108,7 +108,7 @@ def test_physical_reduces_the_tilt_error_as_the_paper_does():
 
 
 def test_physical_is_exact_without_noise():
-    """With a perfect stage and no noise what is left is the staged fit's own approximation."""
+    """Without noise and stage error, only the approximation of the staged fit remains."""
     rng = np.random.default_rng(3)
     truth = drawn(rng, nominal())
     poses = swept(rng, truth, noisy=False)
@@ -119,7 +119,7 @@ def test_physical_is_exact_without_noise():
 
 @pytest.mark.perf
 def test_physical_takes_less_than_a_second():
-    """The fit with its uncertainties is quick."""
+    """The time includes the uncertainties."""
     rng = np.random.default_rng(1)
     poses = swept(rng, drawn(rng, nominal()))
     with within(1.0):
@@ -129,8 +129,8 @@ def test_physical_takes_less_than_a_second():
 @pytest.mark.parametrize('planes_deg, missing', [
     ([30, 60], 'alpha = 90 deg'), ([90], 'planes alpha = 30, 60, 120 and 150'),
     ([90, 60], 'planes alpha = 30, 60, 120 and 150')])
-def test_physical_says_which_planes_are_missing(planes_deg, missing):
-    """A sweep of too few planes is refused by naming those to add."""
+def test_physical_names_the_missing_planes(planes_deg, missing):
+    """A sweep of too few planes is refused, and the message names the planes to add."""
     rng = np.random.default_rng(1)
     poses = swept(rng, drawn(rng, nominal()), np.radians(planes_deg), 0)
     with pytest.raises(UserError, match=missing):
@@ -138,7 +138,7 @@ def test_physical_says_which_planes_are_missing(planes_deg, missing):
 
 
 def test_z_dependence_and_hysteresis_like_paths():
-    """Figure 2: forth and back give the same path, and x at ±beta differ by the cross-axis."""
+    """As in Figure 2, both directions agree, and x at ±beta differs by the cross-axis terms."""
     rng = np.random.default_rng(2)
     truth = drawn(rng, nominal())
     poses = swept(rng, truth, PLANES_RAD[2:3], 0, noisy=False)
@@ -150,7 +150,7 @@ def test_z_dependence_and_hysteresis_like_paths():
     (lambda v: v * [-1, 1] + [5, 0], 'x reads against its reference'),
     (lambda v: v[:, ::-1], 'axes are swapped')])
 def test_wrong_polarity_is_named(change, words):
-    """An inverted or swapped axis is named before anything is fitted."""
+    """An inverted or swapped axis is named before the fit."""
     rng = np.random.default_rng(4)
     poses = swept(rng, nominal())
     with pytest.raises(UserError, match=words):
@@ -158,8 +158,8 @@ def test_wrong_polarity_is_named(change, words):
             'made', replace(poses, volts=change(poses.volts)))])
 
 
-def test_verdict_without_check_poses_holds_out_folds():
-    """A recording without check poses is judged by fits that leave a fifth out."""
+def test_without_check_poses_folds_are_held_out():
+    """Without check poses the held-out errors are those of fits without a fifth of the poses."""
     rng = np.random.default_rng(6)
     poses = swept(rng, drawn(rng, nominal()), check_poses=0)
     result = calibration.calibrate(nominal(), [calibration.RecordedPoses('made', poses)])

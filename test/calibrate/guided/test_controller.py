@@ -61,7 +61,7 @@ class Rig:
         self.pose = pose
 
     def withdraw_pose(self, reason):
-        """Forget the announced pose."""
+        """Withdraw the announced pose."""
         self.pose = None
         self.withdrawn.append(reason)
 
@@ -70,7 +70,7 @@ class Rig:
         assert text.startswith('fitting ')
 
     def take(self, unit):
-        """Give the waiting samples."""
+        """Pass the waiting samples."""
         batch, self._waiting = self._waiting, []
         if not batch:
             return np.zeros(0, np.int64), np.zeros((0, len(unit.axes)))
@@ -81,11 +81,11 @@ class Rig:
         self.silence = ''
 
     def silent(self):
-        """Give the stated silence."""
+        """Return the stated silence, s."""
         return self.silence
 
     def clear(self):
-        """Forget the waiting samples."""
+        """Drop the waiting samples."""
         self._waiting.clear()
 
     def keep_newest(self):
@@ -97,7 +97,7 @@ class Rig:
         self.controller.read_sensor_info(StreamInfo(info, 'sensor_info'))
 
     def turn(self, seconds=0.05, encoder=True):
-        """Go on by a time; a commanded stage is at its pose at once."""
+        """Advance the time; a commanded stage reaches its pose at once."""
         for _ in range(round(seconds / 0.05)):
             if self.pose is not None and self.pose.command_rad is not None:
                 self.angles_rad = self.pose.command_rad
@@ -111,7 +111,7 @@ class Rig:
             self.controller.poll()
 
     def turn_until(self, condition, seconds=60.0):
-        """Go on until something has come."""
+        """Advance the time until a condition holds."""
         for _ in range(round(seconds / 0.05)):
             if condition():
                 return
@@ -138,7 +138,7 @@ def rig(tmp_path):
 
 
 def test_requests_without_a_calibration_are_refused(rig):
-    """Nothing runs: each request says so, and the state stays."""
+    """Each request states that no calibration runs, and the state does not change."""
     controller = rig().controller
     for request in (controller.capture, controller.redo, controller.skip, controller.finish,
                     controller.abort):
@@ -149,7 +149,7 @@ def test_requests_without_a_calibration_are_refused(rig):
 
 
 def test_a_sweep_goes_from_the_wait_for_its_sensor_to_its_file(rig, tmp_path):
-    """Idle, waiting, running, idle: with the lines, the announcements and the values."""
+    """The states are idle, waiting, running, idle, with their log, announcements and values."""
     bench = rig()
     controller = bench.controller
     assert controller.start() == (True, 'starts when sensor_info arrives')
@@ -179,8 +179,8 @@ def test_a_sweep_goes_from_the_wait_for_its_sensor_to_its_file(rig, tmp_path):
     assert parameter_file.load(tmp_path / 'unit.yaml').serial == 'C1'
 
 
-def test_an_operator_at_a_screen_is_asked_and_others_go_on(rig, tmp_path):
-    """An interrupted calibration: a question with two answers, or none without a screen."""
+def test_an_operator_at_a_screen_has_a_choice_and_others_resume(rig, tmp_path):
+    """An interrupted calibration asks a question at a screen, and resumes without a screen."""
     bench = rig()
     bench.say_info()
     assert bench.controller.start().success
@@ -216,7 +216,7 @@ def test_an_operator_at_a_screen_is_asked_and_others_go_on(rig, tmp_path):
 
 
 def test_a_fit_that_fails_at_the_end_waits_for_a_decision(rig, tmp_path, monkeypatch):
-    """All poses are taken: redo goes on, and a finish that succeeds ends the session."""
+    """After all poses, redo continues, and a successful finish ends the session."""
     bench = rig(planes_rad=(np.pi / 2,), check_poses=0)
     bench.say_info()
     bench.controller.start()
@@ -230,7 +230,7 @@ def test_a_fit_that_fails_at_the_end_waits_for_a_decision(rig, tmp_path, monkeyp
     assert status.phase is Phase.REFUSED and status.late
     assert status.text == 'cannot finish: unit.yaml: the disk is full; finish again, redo or abort'
     bench.turn(0.5)
-    assert bench.lines(Severity.ERROR) == [status.text], 'tried once, and said once'
+    assert bench.lines(Severity.ERROR) == [status.text], 'one attempt has one report'
     assert bench.controller.redo() == (True, 'pose 10 will be taken again')
     assert bench.controller.state is ControllerState.RUNNING
     bench.turn_until(lambda: bench.controller.state is ControllerState.FIT_FAILED)
@@ -240,8 +240,8 @@ def test_a_fit_that_fails_at_the_end_waits_for_a_decision(rig, tmp_path, monkeyp
     assert bench.controller.state is ControllerState.IDLE
 
 
-def test_a_capture_is_answered_when_its_pose_is_on_disk_or_refused(rig):
-    """An operator: the wrong angle, the right one, and a pose that is left out."""
+def test_a_capture_has_its_answer_when_its_pose_is_on_disk_or_refused(rig):
+    """An operator captures at a wrong angle, at the right one, and skips a pose."""
     bench = rig(StageMode.ENCODER)
     bench.say_info()
     bench.controller.start()
@@ -267,7 +267,7 @@ def test_a_capture_is_answered_when_its_pose_is_on_disk_or_refused(rig):
 
 
 def test_another_sensor_ends_the_session_and_a_restarted_driver_checks_the_mounting(rig):
-    """By what the stream states about its sensor."""
+    """The info of the stream decides."""
     bench = rig()
     bench.say_info()
     bench.controller.start()
@@ -288,7 +288,7 @@ def test_another_sensor_ends_the_session_and_a_restarted_driver_checks_the_mount
 
 
 def test_readings_on_another_clock_count_from_their_arrival(rig):
-    """A temperature that is stamped years away is reported once."""
+    """A temperature with a stamp years away is reported once."""
     bench = rig()
     bench.say_info()
     bench.controller.start()
@@ -302,8 +302,8 @@ def test_readings_on_another_clock_count_from_their_arrival(rig):
     assert (record.temperature_c, record.supply_v) == (23.0, 5.0)
 
 
-def test_the_screen_shows_the_same_after_its_way_to_the_other_process(rig):
-    """Contents of a sweep, complete and equal at the other end."""
+def test_contents_of_the_screen_are_equal_in_the_other_process(rig):
+    """The contents of a sweep are equal after serialization."""
     bench = rig()
     bench.say_info()
     bench.controller.shows_idle_stream = True

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Every refusal of a pose: with the figure, the axis or joint, and what it must be."""
+"""Every refusal of a pose names the value, the axis or joint, and the expected value."""
 
 from dataclasses import replace
 
@@ -42,24 +42,24 @@ def bench(mode='commanded', targets=(UP, NEXT), sensor=None, accepted=(), **sett
     return Bench(StageGuide(nominal(sensor.axes), targets, chosen, accepted), sensor)
 
 
-def refusal(of):
-    """Return what the sweep says of the pose that it does not take."""
-    state = of.sweep.status()
+def refusal(rig):
+    """Return the reason for which the sweep refuses a pose."""
+    state = rig.sweep.status()
     assert state.phase is Phase.REFUSED and state.late
-    assert state.text == of.sweep.new_refusal()
+    assert state.text == rig.sweep.new_refusal()
     return state.text
 
 
-def test_moving_names_axis_figure_and_threshold():
-    """The words of the issue, with the axis that moves."""
+def test_motion_names_axis_value_and_limit():
+    """The message names the axis that moves."""
     shaken = bench()
     assert shaken.run(5, UP.alpha_rad, 0.0, shake_mps2=0.43) is None
     text = shaken.sweep.status().text
     assert 'moving: 0.29 m/s² on x, must be below 0.0' in text
 
 
-def test_a_stage_turned_by_hand_is_captured_where_it_was_asked():
-    """3.2° off is refused at once; 1° off is taken as the encoder has it."""
+def test_a_stage_turned_by_hand_is_captured_near_its_target():
+    """An error of 3.2° is refused at once. With 1° the angle of the encoder counts."""
     by_hand = bench('encoder', [Target(np.pi / 2, np.radians(30))])
     by_hand.run(0.5, np.pi / 2, np.radians(33.2))
     assert by_hand.sweep.capture() == \
@@ -69,8 +69,8 @@ def test_a_stage_turned_by_hand_is_captured_where_it_was_asked():
     assert by_hand.run(4, np.pi / 2, np.radians(31)).beta_rad == pytest.approx(np.radians(31))
 
 
-def test_a_stage_that_is_turned_during_the_dwell_is_told():
-    """The operator goes on to the next pose too early: captured is what stays."""
+def test_a_turn_of_the_stage_during_the_dwell_is_refused():
+    """The operator turns the stage too early: the pose is refused and can be repeated."""
     slow = bench('encoder')
     slow.run(0.2, np.pi / 2, 0.0)
     assert slow.sweep.capture() == ''
@@ -82,8 +82,8 @@ def test_a_stage_that_is_turned_during_the_dwell_is_told():
     assert slow.run(3, np.pi / 2, 0.0)
 
 
-def test_an_encoder_that_falls_silent_is_told_and_its_last_angle_is_no_pose():
-    """Before the capture, and during the dwell: nothing is taken until it is heard again."""
+def test_a_silent_encoder_is_reported_and_gives_no_pose():
+    """Before the capture and during the dwell, no pose is taken without the encoder."""
     dead = bench('encoder')
     dead.run(0.5, np.pi / 2, 0.0)
     dead.run(4, np.pi / 2, 0.0, encoder=False)
@@ -98,15 +98,15 @@ def test_an_encoder_that_falls_silent_is_told_and_its_last_angle_is_no_pose():
         assert dead.run(5, np.pi / 2, 0.0, encoder=False) is None
         state = dead.sweep.status()
         assert state.text == 'nothing on stage/joint_states for 5 s' and state.late
-        said = f'{words.replace("4", "3")}; capture again when it is back'
-        assert dead.sweep.new_refusal() == (said if mode == 'encoder' else '')
+        message = f'{words.replace("4", "3")}; capture again when it is back'
+        assert dead.sweep.new_refusal() == (message if mode == 'encoder' else '')
         dead.run(0.5, np.pi / 2, 0.0)
         dead.sweep.capture()
         assert dead.run(3, np.pi / 2, 0.0)
 
 
-def test_by_hand_without_encoder_the_sensor_tells_that_the_pose_changed():
-    """In mode manual only the sensor can tell that the operator went on too early."""
+def test_without_an_encoder_the_sensor_shows_a_change_of_pose():
+    """In mode manual only the sensor shows that the operator turned the stage too early."""
     blind = bench('manual')
     blind.run(0.2, np.pi / 2, 0.0, encoder=False)
     blind.sweep.capture()
@@ -119,8 +119,8 @@ def test_by_hand_without_encoder_the_sensor_tells_that_the_pose_changed():
     (np.pi, 'x reads −1.00 g where +1.00 g was expected: axis inverted or swapped'),
     (-np.pi / 2, 'y reads +1.00 g where +0.00 g was expected: axis inverted or swapped'),
     (0.5, 'by the sensor, beta is 28.6° from the asked 0°')])
-def test_the_first_pose_tells_axes_that_are_inverted_or_swapped(turned, words):
-    """The stage is where it was asked to be, but the sensor feels something else."""
+def test_the_first_pose_shows_inverted_or_swapped_axes(turned, words):
+    """The stage is at its target, but the sensor measures another direction."""
     wrong = bench('manual', [Target(np.pi / 2, 0.0)])
     wrong.run(0.2, np.pi / 2, turned, encoder=False)
     wrong.sweep.capture()
@@ -128,32 +128,33 @@ def test_the_first_pose_tells_axes_that_are_inverted_or_swapped(turned, words):
     assert words in refusal(wrong)
 
 
-def test_a_wrong_pose_is_told_once_the_unit_is_known():
-    """After a plane, 3° off are 52 mg, and known to be the pose: the wiring was right so far."""
+def test_a_wrong_pose_is_refused_once_the_unit_is_estimated():
+    """After one plane an error of 3°, 52 mg, is attributed to the pose, not to the wiring."""
     sensor = drawn(np.random.default_rng(5), nominal())
     targets = guided([np.pi / 2], np.radians(30), 0)
     poses = swept(np.random.default_rng(1), sensor, [np.pi / 2], 0)
-    taken = [pose_record(i, alpha_rad=np.pi / 2, beta_rad=poses.beta_rad[i],
-                         mean_v=tuple(poses.volts[i]), std_v=tuple(poses.std_v[i]))
-             for i in range(8)]
-    hand = bench('manual', targets, sensor, taken)
+    accepted = [pose_record(i, alpha_rad=np.pi / 2, beta_rad=poses.beta_rad[i],
+                            mean_v=tuple(poses.volts[i]), std_v=tuple(poses.std_v[i]))
+                for i in range(8)]
+    hand = bench('manual', targets, sensor, accepted)
     hand.sweep.skip()  # the check of the mounting
-    asked = hand.sweep.target
-    hand.run(0.2, asked.alpha_rad, asked.beta_rad + np.radians(3), encoder=False)
+    target = hand.sweep.target
+    hand.run(0.2, target.alpha_rad, target.beta_rad + np.radians(3), encoder=False)
     hand.sweep.capture()
-    assert hand.run(4, asked.alpha_rad, asked.beta_rad + np.radians(3), encoder=False) is None
-    assert f'beta is 3.0° from the asked {np.degrees(asked.beta_rad):.0f}°' in refusal(hand)
+    assert hand.run(4, target.alpha_rad, target.beta_rad + np.radians(3), encoder=False) is None
+    assert f'beta is 3.0° from the asked {np.degrees(target.beta_rad):.0f}°' in refusal(hand)
     hand.sweep.capture()
-    assert hand.run(4, asked.alpha_rad, asked.beta_rad, encoder=False)
+    assert hand.run(4, target.alpha_rad, target.beta_rad, encoder=False)
 
 
 def test_units_at_the_edge_of_the_datasheet_are_never_refused():
-    """Of 15 units with departures up to twice the datasheet's limits, no pose is refused."""
+    """No pose of 15 units with departures up to twice the datasheet's limits is refused."""
     rng = np.random.default_rng(7)
     for _ in range(15):
         truth = drawn(rng, nominal('xyz'))
-        truth = replace(truth, values={e: {p: _edge(Coefficient(e, p), v) for p, v in of.items()}
-                                       for e, of in truth.values.items()})
+        truth = replace(truth, values={e: {p: _edge(Coefficient(e, p), v)
+                                           for p, v in parameters.items()}
+                                       for e, parameters in truth.values.items()})
         poses = swept(rng, truth, check_poses=0)
         order = rng.permutation(len(poses))[:12]
         estimate = None
@@ -161,8 +162,8 @@ def test_units_at_the_edge_of_the_datasheet_are_never_refused():
             estimate = running_estimate.from_poses(
                 nominal('xyz'), poses.subset(order[:count]), 5.0, 4.2e-4, estimate)
             i = order[count]
-            there = Target(poses.alpha_rad[i], poses.beta_rad[i])
-            assert pose_checks.reading(estimate, there, poses.volts[i], np.radians(0.2)) == ''
+            target = Target(poses.alpha_rad[i], poses.beta_rad[i])
+            assert pose_checks.reading(estimate, target, poses.volts[i], np.radians(0.2)) == ''
 
 
 def _edge(name, value):
@@ -170,8 +171,8 @@ def _edge(name, value):
     return np.clip(4 * value, -limit, limit)
 
 
-def test_saturated():
-    """A rail of the ADC is no reading."""
+def test_a_saturated_pose_is_refused():
+    """A pose at a rail of the ADC is refused."""
     sensor = nominal(nominal_zero_g_v=np.array([4.9, 2.5]))
     settings = CaptureSettings(1.0, 0.0035, 20.0, StageMode.COMMANDED)
     railed = Bench(StageGuide(sensor, [UP], settings), sensor)
@@ -179,8 +180,8 @@ def test_saturated():
     assert refusal(railed).startswith('saturated: x reads +0.10 g (5.000 V), beyond its range of')
 
 
-def test_temperature():
-    """4 °C more than at the first pose is refused, and taken again when it is back."""
+def test_a_change_of_temperature_is_refused():
+    """4 °C above the first pose is refused, and accepted after the temperature is back."""
     warm = bench()
     warm.sweep.surroundings.temperature_c.add(warm.now_ns, 23.0)
     first = warm.run(5, np.pi / 2, 0.0)
@@ -195,8 +196,8 @@ def test_temperature():
 
 @pytest.mark.parametrize('ahead_s, words', [
     (-40.0, 'stamped 40.0 s behind imu/data_raw'), (7200.0, 'stamped 2 h ahead of imu/data_raw')])
-def test_clocks_apart(ahead_s, words):
-    """A stage by another clock is said to be one: nothing hangs, and nothing wrong is taken."""
+def test_a_stage_on_another_clock_is_reported(ahead_s, words):
+    """The message names the clock, and no pose is taken."""
     apart = bench()
     for _ in range(80):
         apart.sweep.read_encoder(int(apart.now_ns + ahead_s * 1e9), np.pi / 2, 0.0)
@@ -205,15 +206,15 @@ def test_clocks_apart(ahead_s, words):
     assert state.late and words in state.text and 'use_sim_time' in state.text
 
 
-def test_rate():
-    """Samples at another rate than sensor_info states."""
+def test_a_wrong_sample_rate_is_refused():
+    """Samples at another rate than that of sensor_info are refused."""
     assert pose_checks.rate(999.0, 1000.0) == pose_checks.rate(float('nan'), 1000.0) == ''
     assert 'samples are 500 a second by their stamps, but sensor_info states rate_hz 1000' in \
         pose_checks.rate(500.0, 1000.0)
 
 
-def test_time_that_runs_backwards_begins_the_pose_anew():
-    """A driver that is started anew, with a clock of its own, is followed."""
+def test_a_step_back_in_time_restarts_the_pose():
+    """A driver that has started again with another clock is accepted."""
     again = bench('manual')
     again.run(0.5, np.pi / 2, 0.0, encoder=False)
     again.sweep.capture()
@@ -226,8 +227,8 @@ def test_time_that_runs_backwards_begins_the_pose_anew():
 
 @pytest.mark.parametrize('by_rad, words', [
     (0.0, ''), (np.radians(3), 'mounting changed: in pose 1 y reads')])
-def test_the_mounting_is_looked_at_after_an_interruption(by_rad, words):
-    """The last pose is taken again first; another reading there stops the calibration."""
+def test_the_mounting_is_verified_after_an_interruption(by_rad, words):
+    """The last pose is repeated first, and a different reading stops the calibration."""
     before = bench()
     entry = before.run(5, np.pi / 2, 0.0)
     after = bench(accepted=[entry])
@@ -244,8 +245,8 @@ def test_the_mounting_is_looked_at_after_an_interruption(by_rad, words):
         after.run(4, np.pi / 2, 0.0)
 
 
-def test_a_turn_about_the_vertical_shows_in_a_second_pose():
-    """One level axis reads the same; the pose a quarter turn away tells, to 3 mg."""
+def test_a_turn_about_the_vertical_is_observable_in_a_second_pose():
+    """A level axis does not change, but the pose a quarter turn away does, above 3 mg."""
     targets = (UP, Target(np.pi / 2, np.pi / 2), NEXT)
     before = bench(targets=targets)
     for target in targets[:2]:
@@ -264,8 +265,8 @@ def test_a_turn_about_the_vertical_shows_in_a_second_pose():
             assert after.run(4, np.pi / 2, 0.0) is None and after.sweep.target == NEXT
 
 
-def test_a_clock_that_went_back_has_the_mounting_looked_at():
-    """The driver was started anew: perhaps somebody had the sensor in his hands."""
+def test_a_clock_that_went_back_requires_a_mounting_check():
+    """The driver has started again, so that the sensor may have been moved."""
     again = bench()
     again.sweep.take(again.run(5, np.pi / 2, 0.0))
     again.now_ns -= 3600 * 10 ** 9
@@ -276,16 +277,16 @@ def test_a_clock_that_went_back_has_the_mounting_looked_at():
     assert not again.sweep.poses_to_verify and again.sweep.target == NEXT
 
 
-def test_what_shakes_for_minutes_is_forgotten_and_taken_when_it_is_still():
-    """A long wait costs neither memory nor the pose."""
+def test_a_long_vibration_is_dropped_and_the_pose_is_taken_at_rest():
+    """A long wait needs no memory, and the pose is taken afterwards."""
     shaken = bench()
     assert shaken.run(70, np.pi / 2, 0.0, shake_mps2=0.3) is None
     assert shaken.sweep._attempt.dwell.age_s() < 65
     assert shaken.run(5, np.pi / 2, 0.0)
 
 
-def test_by_hand_a_last_pose_that_differs_can_be_set_anew():
-    """Without an encoder it may be the operator who missed the pose: nothing is stopped."""
+def test_by_hand_a_last_pose_that_differs_can_be_repeated():
+    """Without an encoder the operator may have missed the pose, and the calibration continues."""
     before = bench('manual')
     before.run(0.2, np.pi / 2, 0.0)
     before.sweep.capture()
@@ -299,8 +300,8 @@ def test_by_hand_a_last_pose_that_differs_can_be_set_anew():
     assert not after.sweep.poses_to_verify and after.sweep.target == NEXT
 
 
-def test_redo_and_skip_walk_the_plan():
-    """A pose that is left out is not asked for again, one that is taken again replaces."""
+def test_redo_and_skip_move_within_the_plan():
+    """A skipped pose is not requested again, and a repeated pose replaces the first."""
     walk = bench(targets=(UP, NEXT, Target(np.pi / 2, np.pi / 3)))
     walk.sweep.take(walk.run(5, np.pi / 2, 0.0))
     assert walk.sweep.skip() == 'pose 2 is left out'
@@ -317,15 +318,15 @@ def test_redo_and_skip_walk_the_plan():
     assert walk.sweep.target is None and walk.sweep.status().phase is Phase.DONE
 
 
-def test_by_hand_directions_are_asked_for_in_words_until_all_are_covered():
-    """A sensor turned as asked covers faces, edges and corners, and is well determined."""
+def test_by_hand_directions_are_requested_until_all_are_covered():
+    """The requested directions cover faces, edges and corners, and determine the sensor."""
     sensor = nominal('xyz')
     truth = drawn(np.random.default_rng(2), sensor, ('bias', 'scale_factor', 'misalignment'))
     guide = HandGuide(sensor, 3.0)
     fed = Fed(truth, 4)
-    now_ns, asked, errors = 10 ** 18, [], []
+    now_ns, requests, errors = 10 ** 18, [], []
     for _ in range(16):
-        asked.append(guide.destination())
+        requests.append(guide.destination())
         up = _direction(guide)
         for seconds, shake in ((0.5, 3.0), (2.5, 0.0), (1.6, 3.0)):
             time = np.arange(round(1000 * seconds)) / 1000
@@ -336,10 +337,10 @@ def test_by_hand_directions_are_asked_for_in_words_until_all_are_covered():
             guide.take(entry)
         errors.append(guide.tilt_error_rad())
     assert len(guide.accepted) == 16
-    assert asked[0].startswith('turn it so that +') and 'points up' in asked[0]
-    edges = [words for words in asked if ' and ' in words.split(', and hold')[0]]
+    assert requests[0].startswith('turn it so that +') and 'points up' in requests[0]
+    edges = [words for words in requests if ' and ' in words.split(', and hold')[0]]
     assert edges and all(' point up equally' in words for words in edges)
-    assert len(set(asked)) == 16, 'a direction was asked for twice'
+    assert len(set(requests)) == 16, 'a direction was requested twice'
     assert errors[-1] < errors[0] / 20
     assert guide.redo() == 'rest 16 is forgotten; hold the sensor in that direction again'
     assert len(guide.poses_to_fit()) == 15
@@ -351,33 +352,33 @@ def _direction(guide):
     return EACH[guide.next_up]
 
 
-def test_a_dead_axis_is_told_at_the_first_pose_that_should_move_it():
-    """A wire that is off reads zero-g for ever."""
+def test_a_dead_axis_is_reported_at_the_first_pose_that_should_change_it():
+    """A disconnected axis always reads zero-g."""
     dead = bench(sensor=nominal(nominal_scale_v_per_g=np.array([1e-3, 1.0])))
     assert dead.run(4, np.pi / 2, 0.0) is None
     assert 'x reads +0.00 g where +1.00 g was expected' in refusal(dead)
 
 
-def test_what_is_known_is_what_the_fits_find():
-    """The intervals that are shown along the way hold the truth, and the tilt gets better."""
+def test_the_running_estimate_agrees_with_the_truth():
+    """The running intervals contain the truth, and the tilt error decreases."""
     truth = drawn(np.random.default_rng(11), nominal('xyz'))
     poses = swept(np.random.default_rng(12), truth, check_poses=0)
     stage_rad = truth.stage_resolution_rad / 12 ** 0.5
     estimate = running_estimate.from_poses(nominal('xyz'), poses, 5.0, stage_rad)
     values = running_estimate.get(estimate.unit, estimate.names)
-    for name, at, std in zip(estimate.names, values, estimate.std):
+    for name, value, std in zip(estimate.names, values, estimate.std):
         if name.axis:
             wanted = truth.values.get(name.effect, {}).get(name.parameter, np.zeros(3))[
                 truth.axes.index(name.axis)]
-            assert abs(at - wanted) < 5 * std + 1e-6, name
+            assert abs(value - wanted) < 5 * std + 1e-6, name
     few = running_estimate.from_poses(nominal('xyz'), poses.subset(np.arange(20)), 5.0, 4e-4)
     assert estimate.tilt_error_rad() < 0.05 * few.tilt_error_rad()
     assert np.degrees(estimate.tilt_error_rad()) < 0.02
 
 
-def test_the_tilt_to_expect_is_that_of_poses_not_seen():
-    """After half of the sweep, errors over the sphere are what the screen has promised."""
-    promised, found = [], []
+def test_the_expected_tilt_error_is_that_of_held_out_poses():
+    """After half of the sweep, the errors over the sphere have the expected rms."""
+    expected_rad, squared_error = [], []
     for seed in range(6):
         rng = np.random.default_rng(seed)
         truth = drawn(rng, nominal('xyz'))
@@ -385,20 +386,21 @@ def test_the_tilt_to_expect_is_that_of_poses_not_seen():
             np.arange(130) % 26 < 13)
         stage_rad = truth.stage_resolution_rad / 12 ** 0.5
         estimate = running_estimate.from_poses(nominal('xyz'), half, 5.0, stage_rad)
-        promised.append(estimate.tilt_error_rad())
+        expected_rad.append(estimate.tilt_error_rad())
         alpha, beta = np.array([(t.alpha_rad, t.beta_rad) for t in spread(48)]).T
         volts = np.column_stack(
             signal_chain.static_response(truth)(specific_force(alpha, beta, 9.80665)))
         std_v = np.tile(estimate.pose_std_v, (48, 1))
         unseen = Poses(volts + std_v * rng.normal(size=volts.shape), std_v, alpha, beta,
                        np.zeros((48, 2)), np.zeros(48, bool))
-        off = cross_validation.pose_errors(estimate.sensor(), unseen)
-        found.append(np.nanmean(np.concatenate([off.alpha_rad, off.beta_rad]) ** 2))
-    assert np.sqrt(np.mean(found)) == pytest.approx(np.mean(promised), rel=0.4)
+        held_out = cross_validation.pose_errors(estimate.sensor(), unseen)
+        error_rad = np.concatenate([held_out.alpha_rad, held_out.beta_rad])
+        squared_error.append(np.nanmean(error_rad ** 2))
+    assert np.sqrt(np.mean(squared_error)) == pytest.approx(np.mean(expected_rad), rel=0.4)
 
 
 def test_stage_vectors_agree_with_directions():
-    """What points up is the direction of the specific force."""
+    """The direction that points up is that of the specific force."""
     force = np.array(specific_force(np.pi / 2, 0.0, 1.0))
     from adxl_ros.calibrate.fits.orientations import name_nearest
     assert name_nearest(force) == '+x'

@@ -13,7 +13,7 @@
 # limitations under the License.
 
 
-"""Plans of a sweep: what they cost, what they promise, and that they keep it."""
+"""Pose plans: their travel, and their expected and actual errors."""
 
 from adxl_ros.calibrate.fits import full_model
 from adxl_ros.calibrate.guided import pose_plan, quick_plan
@@ -24,42 +24,42 @@ from units import drawn, nominal, swept
 STEP = np.radians(30)
 
 
-def promised_deg(axes, targets, resolution_deg=5 / 60):
-    """Return the tilt error to expect, deg."""
+def expected_error_deg(axes, targets, resolution_deg=5 / 60):
+    """Return the expected tilt error, deg."""
     sensor = nominal(axes, stage_resolution_rad=np.radians(resolution_deg))
     return np.degrees(quick_plan.expected_tilt_error_rad(sensor, 5.0, targets))
 
 
 @pytest.mark.parametrize('axes', ['xy', 'xyz'])
-def test_the_guided_order_beats_the_papers_on_a_stage_that_keeps_its_errors(axes):
-    """The same poses promise at most half of the tilt error, on a way that is no longer."""
+def test_the_guided_order_has_smaller_errors_on_a_stage_with_errors_by_setting(axes):
+    """The guided order halves the expected tilt error, and its travel is not longer."""
     planes = pose_plan.default_planes_rad('xy')
     guided, paper = pose_plan.guided(planes, STEP, 0), pose_plan.sweep(planes, STEP, 0)
     assert sorted(map(str, guided)) == sorted(map(str, paper))
-    assert promised_deg(axes, guided) < 0.5 * promised_deg(axes, paper)
+    assert expected_error_deg(axes, guided) < 0.5 * expected_error_deg(axes, paper)
     assert pose_plan.travel_rad(guided) < 1.05 * pose_plan.travel_rad(paper)
 
 
-@pytest.mark.parametrize('axes, fewest', [('xy', 30), ('xyz', 24)])
-def test_the_quick_plan_reaches_its_tilt_error(axes, fewest):
-    """About 30 poses on a usual stage, more where more is asked, whole steps of 15°."""
+@pytest.mark.parametrize('axes, expected_count', [('xy', 30), ('xyz', 24)])
+def test_the_quick_plan_reaches_its_tilt_error(axes, expected_count):
+    """A plan has about 30 poses in steps of 15°, and more poses for a smaller error."""
     sensor = nominal(axes)
     targets = quick_plan.quick(sensor, 5.0, np.radians(0.1), 8)
     fitted = [t for t in targets if not t.check]
-    assert len(fitted) == fewest and len(targets) == fewest + 8
-    assert promised_deg(axes, fitted) <= 0.1
+    assert len(fitted) == expected_count and len(targets) == expected_count + 8
+    assert expected_error_deg(axes, fitted) <= 0.1
     angles = np.degrees([(t.alpha_rad, t.beta_rad) for t in fitted])
     np.testing.assert_allclose(angles / 15, np.rint(angles / 15), atol=1e-9)
-    finer = np.radians(0.95 * promised_deg(axes, fitted))
-    more = quick_plan.quick(sensor, 5.0, finer, 0)
-    assert len(more) > fewest
-    assert np.radians(promised_deg(axes, more)) <= finer
+    finer = np.radians(0.95 * expected_error_deg(axes, fitted))
+    finer_plan = quick_plan.quick(sensor, 5.0, finer, 0)
+    assert len(finer_plan) > expected_count
+    assert np.radians(expected_error_deg(axes, finer_plan)) <= finer
 
 
 @pytest.mark.parametrize('axes', ['xy', 'xyz'])
 @pytest.mark.parametrize('kind', pose_plan.KINDS)
-def test_fits_reach_the_intervals_that_a_plan_promises(axes, kind):
-    """The standard deviations of the coefficients are the promised ones, on average."""
+def test_fits_have_the_standard_deviations_that_a_plan_predicts(axes, kind):
+    """On average the standard deviations of the coefficients are the predicted ones."""
     sensor = nominal(axes)
     targets = pose_plan.guided(pose_plan.default_planes_rad(axes), STEP, 0) \
         if kind == 'full' else quick_plan.quick(sensor, 5.0, np.radians(0.1), 0)
@@ -68,16 +68,16 @@ def test_fits_reach_the_intervals_that_a_plan_promises(axes, kind):
         rng = np.random.default_rng(seed)
         truth = drawn(rng, sensor, full_model.default_terms(axes))
         poses = swept(rng, truth, per_setting=True, targets=targets)
-        found = full_model.fit_full(sensor, poses)
-        spread = np.sqrt(np.diag(found.fitted.covariance))
+        fit = full_model.fit_full(sensor, poses)
+        spread = np.sqrt(np.diag(fit.fitted.covariance))
         promised = quick_plan.datasheet_estimate(sensor, 5.0).with_poses(targets)
         stds = dict(zip(promised.names, promised.std))
-        ratios += [s / stds[name] for s, name in zip(spread, found.fitted.covariance_names)]
+        ratios += [s / stds[name] for s, name in zip(spread, fit.fitted.covariance_names)]
     assert np.exp(np.mean(np.log(ratios))) == pytest.approx(1.0, abs=0.15)
 
 
-def test_planes_of_a_z_axis_are_level_too():
-    """A three-axis unit sees 1 g on each axis; in level planes beta makes quarter turns."""
+def test_a_z_axis_requires_level_planes():
+    """A three-axis unit measures 1 g on each axis. In level planes beta makes quarter turns."""
     planes = pose_plan.default_planes_rad('xyz')
     assert np.degrees(planes[0]) == 0 and np.degrees(planes[-1]) == pytest.approx(180)
     targets = pose_plan.guided(planes, STEP, 0)

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""A calibration from its poses to its file, without ROS: what ends in the fit and on the disk."""
+"""A session from its poses to its file, without ROS."""
 
 from dataclasses import replace
 
@@ -50,7 +50,7 @@ def begin(tmp_path):
 
 
 def take(session, count, off_v=0.0):
-    """Take poses, as `Session.take_poses` does with those that the stream gives."""
+    """Take poses as `Session.take_poses` does."""
     for _ in range(count):
         guide = session.guide
         target = guide.target
@@ -64,26 +64,26 @@ def take(session, count, off_v=0.0):
         guide.take(entry)
 
 
-def kept(session):
+def poses_on_disk(session):
     """Return the numbers of the poses on disk."""
     return [e.pose for e in sweep_journal.accepted_poses(
         sweep_journal.read(session.journal.path)[1])]
 
 
-def test_a_pose_to_be_taken_again_is_in_no_fit_and_not_resumed(begin):
-    """`redo` and then a finish or a kill: the pose that was bad is gone."""
+def test_a_pose_to_be_repeated_is_neither_fitted_nor_resumed(begin):
+    """After `redo` the pose is neither in the fit nor in a resumed session."""
     session = begin()
     take(session, 2)
     take(session, 1, 0.3)
     assert session.redo() == 'pose 3 will be taken again'
-    assert kept(session) == [0, 1]
+    assert poses_on_disk(session) == [0, 1]
     assert [e.pose for e in session.guide.poses_to_fit()] == [0, 1]
     session = begin()
-    assert session.resumed == 2 and kept(session) == [0, 1]
+    assert session.resumed == 2 and poses_on_disk(session) == [0, 1]
 
 
-def test_finished_early_it_goes_on_and_at_its_end_it_is_over(begin):
-    """The file is of the poses so far; the next start has them, and ends with all."""
+def test_an_early_fit_can_continue_to_the_end_of_the_plan(begin):
+    """The file contains the poses so far. The next start resumes with them."""
     session = begin()
     take(session, 12)
     assert session.finish().fitted.provenance['poses'] == '12'
@@ -97,15 +97,15 @@ def test_finished_early_it_goes_on_and_at_its_end_it_is_over(begin):
     assert begin().resumed == 0
 
 
-def test_a_finish_that_comes_twice_keeps_the_calibration_before(begin, tmp_path, monkeypatch):
-    """The journal took no `done`: the same fit again is no other calibration."""
+def test_a_repeated_finish_keeps_the_previous_calibration(begin, tmp_path, monkeypatch):
+    """If the journal does not accept `done`, an equal fit does not replace the file."""
     (tmp_path / 'unit.yaml').write_text('the one before\n')
     session = begin(store=str(tmp_path / 'store'))
     take(session, 12)
     with monkeypatch.context() as patch:
         patch.setattr(session.journal, 'append', _full)
-        found = session.finish()
-        copy = found.keep(session.settings.store)
+        result = session.finish()
+        copy = result.keep(session.settings.store)
         with pytest.raises(UserError, match='unit.yaml is written, but .*make room'):
             session.end()
     again = session.finish()
@@ -122,8 +122,8 @@ def _full(_):
     raise UserError('journal: cannot write the journal: the disk is full; make room and try again')
 
 
-def test_what_a_killed_writer_left_is_cleared_and_what_is_being_written_stays(begin, tmp_path):
-    """Hidden folders of a write that was killed go at the next start."""
+def test_incomplete_files_of_a_killed_process_are_removed(begin, tmp_path):
+    """Hidden folders of a killed write are removed at the next start, those in use are kept."""
     for name in ('unit.yaml', 'unit.yaml.previous', 'journal.previous'):
         (tmp_path / f'.{name}.abcd1234.part').mkdir()
         (tmp_path / f'.{name}.abcd1234.part' / name).write_text('half')
@@ -138,20 +138,20 @@ def test_what_a_killed_writer_left_is_cleared_and_what_is_being_written_stays(be
     assert {p.name for p in tmp_path.glob('.*')} == {'.unit.yaml.mine'}
 
 
-def test_check_poses_alone_are_no_calibration(begin):
-    """They judge a fit: without poses to fit it is refused, and what was taken stays."""
+def test_check_poses_only_are_refused(begin):
+    """Without poses to fit a finish is refused, and the taken poses are kept."""
     session = begin()
     for _ in range(20):
         session.skip()
     take(session, 1)
     with pytest.raises(UserError, match='only check poses are taken'):
         session.finish()
-    assert kept(session) == [20]
+    assert poses_on_disk(session) == [20]
 
 
 @pytest.mark.parametrize('count', [1, 2, 3, 5, 8])
 def test_few_poses_are_fitted_or_refused(begin, count):
-    """Never a traceback, whenever an operator has had enough."""
+    """An early finish never causes a traceback."""
     session = begin()
     take(session, count)
     session.guide.skipped.update(range(count, 20))
@@ -163,8 +163,8 @@ def test_few_poses_are_fitted_or_refused(begin, count):
 
 
 @pytest.mark.parametrize('mode', ['stage', 'gravity'])
-def test_a_calibration_goes_on_only_with_the_figures_and_settings_it_began_with(begin, mode):
-    """What changes the poses or the fit is in the head; what was changed is said."""
+def test_a_calibration_resumes_only_with_equal_values_and_settings(begin, mode):
+    """The head contains all that changes poses or fit, and the message names the difference."""
     settings, unit = replace(begin().settings, mode=mode), nominal('xyz')
     changed = [(settings, replace(unit, **{name: np.asarray(getattr(unit, name)) * 2}))
                for name in ('noise_density_g_per_rthz', 'rc_capacitance_f', 'adc_vref_v',
@@ -177,8 +177,8 @@ def test_a_calibration_goes_on_only_with_the_figures_and_settings_it_began_with(
         assert len([key for key, value in other.head(sensor).items() if value != before[key]]) == 1
 
 
-def test_a_mounting_that_was_not_checked_is_said_in_the_file(begin, tmp_path):
-    """`skip` goes on without the check, and who uses the calibration can see it."""
+def test_a_skipped_mounting_check_is_stated_in_the_file(begin, tmp_path):
+    """`skip` continues without the check, and the provenance states this."""
     take(begin(), 12)
     session = begin()
     assert session.skip() == 'pose 12 is not taken again: the mounting is not checked'

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The guided sweep without ROS: what it waits for, says and accepts."""
+"""The guided sweep without ROS: its waits, its messages and its accepted poses."""
 
 from adxl_ros.calibrate.guided.capture_settings import CaptureSettings, Phase, StageMode
 from adxl_ros.calibrate.guided.hand_guide import HandGuide
@@ -44,8 +44,8 @@ def test_a_pose_keeps_its_full_dwell():
     assert entry.mean_v[0] == pytest.approx(3.5, abs=3e-4)
 
 
-def test_nothing_is_accepted_before_arrival_and_the_text_says_how_far_off():
-    """A stage 3° off is waited for; after the time-out the state says since when."""
+def test_no_pose_is_accepted_before_arrival_and_the_distance_is_stated():
+    """The guide waits for a stage with an error of 3°, and states the time after the time-out."""
     bench = _bench()
     assert bench.run(3, np.pi / 2, np.radians(3)) is None
     state = bench.sweep.status()
@@ -57,15 +57,15 @@ def test_nothing_is_accepted_before_arrival_and_the_text_says_how_far_off():
     assert 'for 23 s' in state.text
 
 
-def test_without_encoder_it_says_so():
-    """No joint states at all: the state names the topic."""
+def test_a_missing_encoder_is_reported():
+    """Without joint states the text names the topic."""
     bench = _bench()
     bench.run(1, np.pi / 2, 0.0, encoder=False)
     assert 'nothing on stage/joint_states' in bench.sweep.status().text
 
 
-def test_a_sensor_that_shakes_is_not_at_rest():
-    """Motion is said with its figure and the limit, and nothing is accepted."""
+def test_a_vibrating_sensor_is_not_at_rest():
+    """Motion is reported with its value and limit, and no pose is accepted."""
     bench = _bench()
     assert bench.run(8, np.pi / 2, 0.0, shake_mps2=0.3) is None
     state = bench.sweep.status()
@@ -73,8 +73,8 @@ def test_a_sensor_that_shakes_is_not_at_rest():
     assert 'moving: 0.' in state.text and 'm/s² on x, must be below 0.0' in state.text
 
 
-def test_motion_during_the_dwell_begins_it_anew():
-    """A knock after 3 s costs those 3 s, not the quality of the pose."""
+def test_motion_during_the_dwell_restarts_it():
+    """After a knock at 3 s the dwell begins again."""
     bench = _bench()
     assert bench.run(3, np.pi / 2, 0.0) is None
     assert bench.run(0.2, np.pi / 2, 0.0, shake_mps2=1.0) is None
@@ -83,8 +83,8 @@ def test_motion_during_the_dwell_begins_it_anew():
     assert entry.start_ns >= knocked_ns
 
 
-def test_a_stage_that_leaves_and_returns_begins_anew():
-    """Samples of a first arrival do not count after the stage has moved."""
+def test_a_stage_that_leaves_and_returns_restarts_the_dwell():
+    """Samples before a motion of the stage do not count."""
     bench = _bench()
     bench.run(4, np.pi / 2, 0.0)
     bench.run(1, np.pi / 2, 0.05)
@@ -94,8 +94,8 @@ def test_a_stage_that_leaves_and_returns_begins_anew():
 
 
 @pytest.mark.parametrize('mode, beta', [('encoder', 0.02), ('manual', 0.0)])
-def test_the_operator_captures(mode, beta):
-    """With an operator nothing happens before capture; whose angle counts is the mode's."""
+def test_a_pose_is_taken_after_the_capture_of_the_operator(mode, beta):
+    """No pose is taken before the capture. The mode decides which angle counts."""
     bench = _bench(mode)
     assert bench.run(7, np.pi / 2, 0.02, encoder=mode == 'encoder') is None
     assert bench.sweep.status().phase is Phase.OPERATOR
@@ -106,8 +106,8 @@ def test_the_operator_captures(mode, beta):
     assert entry.beta_rad == pytest.approx(beta)
 
 
-def test_the_plan_is_the_papers_and_refuses_nonsense():
-    """Planes forth and back by 30°, then check poses off the grid."""
+def test_the_plan_of_the_paper_and_refused_settings():
+    """Planes have steps of 30° in both directions, and check poses are beside the grid."""
     targets = plan_sweep([np.pi / 2, 0.5], np.radians(30), 8)
     assert len(targets) == 2 * 26 + 8
     beta = np.degrees([t.beta_rad for t in targets[:26]])
@@ -119,48 +119,48 @@ def test_the_plan_is_the_papers_and_refuses_nonsense():
         plan_sweep([1.0], 0.0, 0)
 
 
-def test_the_guided_order_saves_travel_and_comes_from_both_sides():
-    """The same poses as the paper's, less way, and each in both directions of both joints."""
+def test_the_guided_order_saves_travel_and_reaches_angles_from_both_sides():
+    """The poses are those of the paper, with less travel and both directions of each joint."""
     planes = np.radians([90, 30, 150, 60, 120])
     targets = guided(planes, np.radians(30), 16)
     paper = plan_sweep(sorted(planes), np.radians(30), 16)
 
-    def poses(of):
-        return sorted((t.check, t.alpha_rad, t.beta_rad) for t in of)
-    # Check poses are in whole degrees, as an operator without an encoder is asked for them.
-    off = np.abs(np.degrees(np.array(poses(targets)) - poses(paper)))
-    assert off[:130].max() < 1e-9 and 0.1 < off[130:].max() <= 0.5
+    def poses(plan):
+        return sorted((t.check, t.alpha_rad, t.beta_rad) for t in plan)
+    # Check poses are in whole degrees, because an operator without an encoder sets them.
+    difference_deg = np.abs(np.degrees(np.array(poses(targets)) - poses(paper)))
+    assert difference_deg[:130].max() < 1e-9 and 0.1 < difference_deg[130:].max() <= 0.5
     checks = np.degrees([(t.alpha_rad, t.beta_rad) for t in targets if t.check])
     np.testing.assert_allclose(checks, np.round(checks), atol=1e-9)
     assert travel_rad(targets) < 0.75 * travel_rad(paper)
     grid = [t for t in targets if not t.check]
     for joint, count in (('alpha_rad', 5), ('beta_rad', 13)):
-        came = {}
+        sides = {}
         now, side = getattr(grid[0], joint), 0.0
         for target in grid[1:]:
             side = np.sign(getattr(target, joint) - now) or side
             now = getattr(target, joint)
-            came.setdefault(round(now, 6), set()).add(side)
-        assert len(came) == count
-        inner = sorted(came)[1:-1]
-        assert all(came[angle] == {1.0, -1.0} for angle in inner), joint
+            sides.setdefault(round(now, 6), set()).add(side)
+        assert len(sides) == count
+        inner = sorted(sides)[1:-1]
+        assert all(sides[angle] == {1.0, -1.0} for angle in inner), joint
     assert {round(t.alpha_rad, 6) for t in grid[:65]} == set(np.round(planes, 6))
 
 
 def test_rests_by_hand_are_announced_as_they_end():
-    """A guide counts its rests and names what moves between them."""
-    guide, volts = _tumbled()
-    found = _rests(guide, volts, 10 ** 18)
-    assert len(found) == 5
+    """The guide counts its rests."""
+    guide, volts = _hand_calibration()
+    rests = _rests(guide, volts, 10 ** 18)
+    assert len(rests) == 5
     results = guide.poses_to_fit()
     assert len(results) == 6
     assert all(2.0 < e.samples / 1000 < 3.1 for e in results)
     assert '5 rests (5 more at least)' in guide.status().text
 
 
-def test_a_clock_that_goes_back_ends_no_tumble():
-    """A driver started anew, or NTP's step: rests go on, and those before it stay in the fit."""
-    guide, volts = _tumbled()
+def test_a_clock_that_goes_back_does_not_end_a_calibration_by_hand():
+    """After a restart of the driver or a step of NTP, earlier rests stay in the fit."""
+    guide, volts = _hand_calibration()
     assert len(_rests(guide, volts, 10 ** 18)) == 5
     assert len(_rests(guide, volts, 10 ** 15)) == 5
     assert sorted(guide.accepted) == list(range(10)) and len(guide.poses_to_fit()) == 11
@@ -170,8 +170,8 @@ def test_a_clock_that_goes_back_ends_no_tumble():
     assert len(_rests(guide, volts, 10 ** 15 + 25 * 10 ** 9)) >= 5
 
 
-def _tumbled():
-    """Return a tumble, and the volts of six rests of 3 s with motion between."""
+def _hand_calibration():
+    """Return a guide by hand, and the volts of six rests of 3 s with motion between them."""
     sensor = nominal('xyz', noise_density_g_per_rthz=np.full(3, 300e-6))
     alphas = np.repeat(np.linspace(0, 2.5, 6), 4000) + np.concatenate(
         [np.concatenate([np.zeros(3000), 0.2 * np.sin(np.linspace(0, 40, 1000))])
@@ -180,11 +180,11 @@ def _tumbled():
 
 
 def _rests(guide, volts, begin_ns):
-    """Feed volts of 1 kHz; return the rests that were announced."""
-    found = []
+    """Feed volts at 1 kHz; return the accepted rests."""
+    rests = []
     for i in range(0, len(volts), 100):
         guide.feed(np.arange(i, i + 100) * 1_000_000 + begin_ns, volts[i:i + 100])
         while (entry := guide.accept()) is not None:
-            found.append(entry)
+            rests.append(entry)
             guide.take(entry)
-    return found
+    return rests

@@ -40,38 +40,38 @@ def calibrated(seed, model=None, axes='xy', check=16, stage_rad=None, effects=TE
         sensor, [calibration.RecordedPoses('made', poses)], model)
 
 
-def true_errors(truth, found):
+def true_errors(truth, result):
     """Return the errors of the fitted units without noise and stage error, mg and deg rms."""
-    held_out = found.held_out[-1]
-    poses = found.poses.subset(found.inliers).subset(held_out.pose_index)
+    held_out = result.held_out[-1]
+    poses = result.poses.subset(result.inliers).subset(held_out.pose_index)
     force = np.column_stack(specific_force(poses.alpha_rad, poses.beta_rad,
                                            truth.local_gravity_mps2))
     volts = np.column_stack(signal_chain.static_response(truth)(list(force.T)))
     got = np.empty_like(force)
     for number, unit in enumerate(held_out.fitted):
-        own = held_out.fold == number
-        up = np.where(force[own, 2] < 0, -1, 1)
-        got[own] = np.column_stack(signal_chain.inverse(unit, up)(list(volts[own].T)))
-    shown = np.isfinite(held_out.errors.tilt_rad)
-    mg = (got - force)[shown, :len(truth.axes)] / G0_MPS2 * 1e3
+        in_fold = held_out.fold == number
+        up = np.where(force[in_fold, 2] < 0, -1, 1)
+        got[in_fold] = np.column_stack(signal_chain.inverse(unit, up)(list(volts[in_fold].T)))
+    finite = np.isfinite(held_out.errors.tilt_rad)
+    mg = (got - force)[finite, :len(truth.axes)] / G0_MPS2 * 1e3
     return (np.sqrt(np.mean(mg ** 2)),
-            np.degrees(np.sqrt(np.mean(cross_validation.angle_between(got, force)[shown] ** 2))))
+            np.degrees(np.sqrt(np.mean(cross_validation.angle_between(got, force)[finite] ** 2))))
 
 
 @pytest.mark.parametrize(('check', 'units', 'within'), [(16, 4, 0.35), (0, 2, 0.5)],
                          ids=['check poses', 'folds'])
-def test_the_error_that_is_stated_is_true(check, units, within):
-    """Without noise and stage error, rms over units; the measured errors are larger."""
+def test_the_stated_calibration_error_is_right(check, units, within):
+    """The stated error is the rms over units without noise and stage error."""
     estimated, true, measured = [], [], []
     for seed in range(units):
-        truth, found = calibrated(seed, 'full', check=check)
-        assessment = found.assessments[-1]
+        truth, result = calibrated(seed, 'full', check=check)
+        assessment = result.assessments[-1]
         estimated.append((assessment.error_mg, assessment.error_deg))
-        true.append(true_errors(truth, found))
-        measured.append(found.held_out[-1].accel_mg.rms)
+        true.append(true_errors(truth, result))
+        measured.append(result.held_out[-1].accel_mg.rms)
         assert assessment.limited_by == 'stage'
         assert (assessment.accel_datasheet, assessment.accel_noise) == ('PASS', 'PASS')
-        entries = found.fitted.provenance
+        entries = result.fitted.provenance
         assert float(entries['own_accel_mg']) == pytest.approx(assessment.error_mg, rel=1e-3)
         assert float(entries['held_out_accel_rms_mg']) == pytest.approx(measured[-1], rel=1e-3)
     estimated, true = (np.sqrt(np.mean(np.square(errors), axis=0))
@@ -92,55 +92,55 @@ CASES = {
 
 
 @pytest.mark.parametrize('name', CASES)
-def test_what_limits_it_is_named(name):
-    """For one of two units at least: chance changes an outcome once in a hundred."""
+def test_the_limiting_part_of_the_error_is_named(name):
+    """Chance changes one outcome in a hundred, so that one of two units must have the name."""
     limit, settings = CASES[name]
     named = [calibrated(seed, **settings)[1].assessments[-1].limited_by for seed in range(2)]
     assert limit in named, named
 
 
-def test_a_linear_model_fails_and_says_why():
-    """Where the unit has the paper's terms; the full model of the same poses passes."""
-    _, found = calibrated(1)
+def test_a_linear_model_fails_because_of_its_model():
+    """The unit has the terms of the paper, and the full model of the same poses passes."""
+    _, result = calibrated(1)
     outcomes = {row.model: (row.accel_datasheet, row.accel_noise, row.limited_by)
-                for row in found.assessments}
+                for row in result.assessments}
     assert outcomes['linear'] == ('FAIL', 'FAIL', 'model')
     assert outcomes['full'][:2] == ('PASS', 'PASS')
     limit = outcomes['full'][2]
-    lines = '\n'.join(found.comments())
+    lines = '\n'.join(result.comments())
     assert 'limit by the datasheet 3.4 mg' in lines
     assert 'unit within ADXL203' in lines
-    # A screen shows the acceptance first, and a line per model, within 80 columns.
-    assert found.summary_lines[0] == f'full: datasheet PASS, noise PASS; limited by the {limit}'
-    assert found.summary_lines[1].startswith('held out: tilt 0.')
-    models = [line for line in found.summary_lines if line.split()[0] in outcomes]
+    # A screen has the acceptance first, then one line for each model, within 80 columns.
+    assert result.summary_lines[0] == f'full: datasheet PASS, noise PASS; limited by the {limit}'
+    assert result.summary_lines[1].startswith('held out: tilt 0.')
+    models = [line for line in result.summary_lines if line.split()[0] in outcomes]
     assert [line.split()[2] for line in models] == ['FAIL', 'PASS', 'PASS']
-    assert max(map(len, [*found.summary_lines[:2], *models])) < 80
+    assert max(map(len, [*result.summary_lines[:2], *models])) < 80
 
 
 def test_a_unit_beyond_the_datasheet_is_named():
-    """By the whole of its interval; the greatest zero-g is 100 mV from nominal."""
-    _, found = calibrated(2, effects=())
-    assert acceptance.beyond_datasheet(found.fitted) == []
-    off = replace(found.fitted, values={**found.fitted.values, 'bias': {
+    """The complete interval is beyond the largest zero-g offset, 100 mV."""
+    _, result = calibrated(2, effects=())
+    assert acceptance.beyond_datasheet(result.fitted) == []
+    changed = replace(result.fitted, values={**result.fitted.values, 'bias': {
         'offset_v': np.array([0.02, -0.11])}})
-    said, = acceptance.beyond_datasheet(off)
-    assert said.startswith('bias.offset_v.y is -0.11')
+    message, = acceptance.beyond_datasheet(changed)
+    assert message.startswith('bias.offset_v.y is -0.11')
 
 
 def test_without_a_datasheet_there_is_no_limit():
     """The datasheet values of the ADXL203 are no limits of another sensor."""
-    _, found = calibrated(3, datasheet={}, datasheet_name='')
-    assert {row.accel_datasheet for row in found.assessments} == {''}
-    assert 'no limit by a datasheet' in '\n'.join(found.report_lines)
+    _, result = calibrated(3, datasheet={}, datasheet_name='')
+    assert {row.accel_datasheet for row in result.assessments} == {''}
+    assert 'no limit by a datasheet' in '\n'.join(result.report_lines)
 
 
 @pytest.mark.parametrize(('parts', 'outcome'), [
     ((1.0, 0.0, 0.9, 0.1, 0.0, 0.2), 'PASS'), ((9.0, 0.0, 8.9, 0.1, 0.0, 2.0), 'NOT SHOWN'),
     ((9.0, 0.0, 0.1, 0.1, 8.8, 12.0), 'FAIL'), ((9.0, 0.0, 0.1, 0.1, 8.8, 12.0, False),
                                                 'NOT SHOWN')])
-def test_pass_fail_and_not_shown(parts, outcome):
-    """The limit is 1: an error below it, one that may be below it, and one beyond it."""
+def test_outcomes_of_the_acceptance(parts, outcome):
+    """At a limit of 1, an error is below it, possibly below it, or above it."""
     sensor = replace(nominal(), datasheet={Coefficient('nonlinearity', 'cubic_per_g2'): (
         1 / G0_MPS2 / nominal().range_g ** 3, 0.0)})
     budget = ErrorBudget(*parts)
@@ -156,9 +156,9 @@ def test_pass_fail_and_not_shown(parts, outcome):
         assert assessment.limited_by == ('model' if outcome == 'FAIL' else 'stage')
 
 
-@pytest.mark.parametrize(('together', 'least'), [(0.0, 0.82), (0.9, 0.7)])
-def test_intervals_hold_for_errors_that_go_together(together, least):
-    """Of 130 errors that follow each other; an interval for independent ones covers 35 %."""
+@pytest.mark.parametrize(('correlation', 'min_coverage'), [(0.0, 0.82), (0.9, 0.7)])
+def test_intervals_have_their_coverage_for_correlated_errors(correlation, min_coverage):
+    """For 130 correlated errors an interval for independent errors has a coverage of 35 %."""
     rng = np.random.default_rng(82)
     covered = naive = 0
     for _ in range(400):
@@ -166,10 +166,10 @@ def test_intervals_hold_for_errors_that_go_together(together, least):
         errors = np.empty(230)
         errors[0] = noise[0]
         for k in range(1, 230):
-            errors[k] = together * errors[k - 1] + np.sqrt(1 - together ** 2) * noise[k]
+            errors[k] = correlation * errors[k - 1] + np.sqrt(1 - correlation ** 2) * noise[k]
         errors = errors[100:]
         low, high = cross_validation.rms_interval(errors)
         covered += low < 1 < high
         naive += 1 / 1.11 < np.sqrt(np.mean(errors ** 2)) < 1.11
-    assert least < covered / 400 < 0.97
-    assert together == 0 or naive < 0.6 * covered
+    assert min_coverage < covered / 400 < 0.97
+    assert correlation == 0 or naive < 0.6 * covered

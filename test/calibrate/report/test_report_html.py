@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The report of a calibration in a browser: it opens offline, says nothing wrong, and turns."""
+"""The report of a calibration in a browser: it opens offline, without errors, and turns."""
 
 from dataclasses import replace
 from itertools import product
@@ -33,7 +33,7 @@ pytestmark = pytest.mark.skipif(CHROMIUM is None, reason='no Chromium: apt insta
 
 @pytest.fixture(scope='module')
 def browser():
-    """Give a headless Chromium."""
+    """Yield a headless Chromium."""
     driver = pytest.importorskip(
         'playwright.sync_api', reason='playwright is not installed: pip install playwright')
     with driver.sync_playwright() as playwright:
@@ -44,19 +44,19 @@ def browser():
 
 @pytest.fixture
 def opened(browser):
-    """Give a function that opens a file as a laptop does, and what the browser says to it."""
+    """Give a function that opens a file, and returns the page and messages of the browser."""
     pages = []
 
     def begin(path):
         page = browser.new_page(viewport={'width': 1366, 'height': 768})
         pages.append(page)
-        said = []
-        page.on('console', lambda message: said.append(f'{message.type}: {message.text}'))
-        page.on('pageerror', lambda error: said.append(f'error: {error}'))
-        page.on('request', lambda request: said.append(f'loads {request.url}')
+        messages = []
+        page.on('console', lambda message: messages.append(f'{message.type}: {message.text}'))
+        page.on('pageerror', lambda error: messages.append(f'error: {error}'))
+        page.on('request', lambda request: messages.append(f'loads {request.url}')
                 if not request.url.startswith(('data:', f'file://{path}')) else None)
         page.goto(f'file://{path}')
-        return page, said
+        return page, messages
 
     yield begin
     for page in pages:
@@ -64,8 +64,8 @@ def opened(browser):
 
 
 @pytest.fixture(scope='module')
-def reported(tmp_path_factory):
-    """Give the folder of a report of a unit that has drifted since its last calibration."""
+def report_folder(tmp_path_factory):
+    """Return the folder of a report of a unit that has drifted since its last calibration."""
     folder = tmp_path_factory.mktemp('reported')
     text = NOMINAL.read_text().replace('serial: nominal', "serial: '<U&7>'")
     (folder / 'u7.yaml').write_text(text)
@@ -90,21 +90,21 @@ def reported(tmp_path_factory):
     return folder
 
 
-def test_the_browser_tells_what_is_wrong(opened, tmp_path):
-    """A page with faults of each kind: without this the tests below could not fail."""
+def test_the_browser_reports_faults_of_a_page(opened, tmp_path):
+    """The messages contain faults of each kind, so that the other tests can fail."""
     path = tmp_path / 'bad.html'
     path.write_text('<script>console.error("ouch"); nowhere();</script><img src="gone.png">')
-    page, said = opened(path)
+    page, messages = opened(path)
     page.wait_for_timeout(200)
-    text = '\n'.join(said)
+    text = '\n'.join(messages)
     assert 'error: ouch' in text and 'nowhere is not defined' in text
     assert 'gone.png' in text
 
 
-def test_the_report_holds_what_it_should(opened, reported):
-    """Verdict by model, coefficients beside the datasheet, drift, figures; nothing is loaded."""
-    page, said = opened(reported / 'report' / 'report.html')
-    assert said == []
+def test_the_report_has_its_contents(opened, report_folder):
+    """It has acceptance by model, coefficients with the datasheet, drift and plots, offline."""
+    page, messages = opened(report_folder / 'report' / 'report.html')
+    assert messages == []
     text = page.locator('body').inner_text()
     assert 'Calibration of <U&7>' in text
     rows = page.locator('table').nth(0).locator('tbody tr')
@@ -112,7 +112,7 @@ def test_the_report_holds_what_it_should(opened, reported):
         'nominal', 'linear', 'physical', 'full']
     assert 'PASS' in rows.nth(3).inner_text() and 'FAIL' in rows.nth(1).inner_text()
     coefficients = page.locator('table').nth(1).inner_text()
-    sensor = parameter_file.load(reported / 'unit.yaml')
+    sensor = parameter_file.load(report_folder / 'unit.yaml')
     assert all(str(name) in coefficients for name in sensor.covariance_names)
     line = next(line for line in coefficients.splitlines()
                 if line.startswith('nonlinearity.cubic_per_g2.x'))
@@ -121,15 +121,15 @@ def test_the_report_holds_what_it_should(opened, reported):
     assert 'zero-g of y' not in text
     assert page.locator('img').count() == 5
     assert page.evaluate('[...document.images].every(i => i.complete && i.naturalWidth > 500)')
-    # Nothing sticks out of a laptop's window.
+    # The page fits in the window of a laptop.
     assert page.evaluate('document.documentElement.scrollWidth <= innerWidth')
     for value in (sensor.provenance['id'], sensor.provenance['data_sha256']):
         assert value in text
 
 
-def test_the_sphere_turns(opened, reported):
-    """By mouse, wheel and keys; it says the pose under the pointer, and shows other figures."""
-    page, said = opened(reported / 'report' / 'report.html')
+def test_the_sphere_turns(opened, report_folder):
+    """Mouse, wheel and keys turn it. A text names the pose below the pointer."""
+    page, messages = opened(report_folder / 'report' / 'report.html')
     sphere = page.locator('#sphere')
     sphere.scroll_into_view_if_needed()
     box = sphere.bounding_box()
@@ -158,38 +158,39 @@ def test_the_sphere_turns(opened, reported):
     assert changed()
     page.select_option('#sphere-quantity', label='error of x, mg')
     assert changed()
-    found = page.locator('#sphere-about')
+    pose_text = page.locator('#sphere-about')
     sphere.scroll_into_view_if_needed()
     box = sphere.bounding_box()
     for x, y in product(range(300, 520, 10), range(180, 360, 10)):
         page.mouse.move(box['x'] + x, box['y'] + y)
-        if found.inner_text().startswith('pose'):
+        if pose_text.inner_text().startswith('pose'):
             break
     assert re.match(r'pose \d+, alpha [\d.]+, beta [\d.]+ deg: -?[\d.]+(e-\d)? mg',
-                    found.inner_text())
-    assert said == []
+                    pose_text.inner_text())
+    assert messages == []
 
 
-def test_the_report_prints(opened, reported, tmp_path):
-    """All of it, on A4, the sphere too; the boxes to choose from stay on the screen."""
-    page, said = opened(reported / 'report' / 'report.html')
+def test_the_report_is_printable(opened, report_folder, tmp_path):
+    """The print on A4 contains the sphere, without its selection boxes."""
+    page, messages = opened(report_folder / 'report' / 'report.html')
     page.emulate_media(media='print')
     assert not page.locator('#sphere-model').is_visible()
     assert page.locator('#sphere').is_visible()
     page.pdf(path=tmp_path / 'page.pdf', format='A4')
     pages = (tmp_path / 'page.pdf').read_bytes().count(b'/Type /Page\n')
     assert 4 <= pages <= 12
-    assert said == []
+    assert messages == []
 
 
-def test_a_first_calibration_and_one_by_hand(opened, reported, run_tool, shared_dir, tmp_path):
-    """Without history, and without a stage."""
-    page, said = opened(reported / 'first' / 'report.html')
+def test_reports_without_history_and_without_a_stage(opened, report_folder, run_tool, shared_dir,
+                                                     tmp_path):
+    """The page names a missing history, and the report by hand has its plots."""
+    page, messages = opened(report_folder / 'first' / 'report.html')
     assert 'No earlier calibration of this unit' in page.locator('body').inner_text()
     done = run_tool('fit', shared_dir / 'real' / 'mpu9150_0.csv', '-o', 'u.yaml', '--report',
                     'by_hand')
     assert done.returncode == 0, done.stderr
-    by_hand, said_by_hand = opened(tmp_path / 'by_hand' / 'report.html')
+    by_hand, messages_by_hand = opened(tmp_path / 'by_hand' / 'report.html')
     text = by_hand.locator('body').inner_text()
     assert 'magnitude minus gravity, mg' in text and 'magnitude of gravity over 23 rests' in text
-    assert said == said_by_hand == []
+    assert messages == messages_by_hand == []

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Fitted coefficients beside the true ones, and the results as tables of a terminal."""
+"""Fitted coefficients compared with the true ones, and results as tables of a terminal."""
 
 from dataclasses import replace
 import re
@@ -42,11 +42,11 @@ LINEAR = (Coefficient('cross_axis', 'linear'), Coefficient('cross_axis_z', 'line
 STD = 1e-3
 
 
-def fitted_of(truth, names, off=0.0):
-    """Return the unit as a fit of some coefficients finds it, each off by so much."""
+def fitted_of(truth, names, error=0.0):
+    """Return the unit as a fit of some coefficients, each with the same error."""
     unit = with_neutral(truth, [name.effect for name in names])
-    return replace(put(unit, names, get(unit, names) + off), model='full', covariance_names=names,
-                   covariance=STD ** 2 * np.eye(len(names)))
+    return replace(put(unit, names, get(unit, names) + error), model='full',
+                   covariance_names=names, covariance=STD ** 2 * np.eye(len(names)))
 
 
 def names_for(axes, terms=TERMS, without=()):
@@ -54,51 +54,51 @@ def names_for(axes, terms=TERMS, without=()):
                  if name.without_axis not in without)
 
 
-def made(off=0.0, axes='xy', without=LINEAR):
+def fitted_and_truth(error=0.0, axes='xy', without=LINEAR):
     truth = drawn(np.random.default_rng(1), nominal(axes))
-    return fitted_of(truth, names_for(axes, without=without), off), truth
+    return fitted_of(truth, names_for(axes, without=without), error), truth
 
 
-def named(compared, name, axis):
-    return next(one for one in compared if (one.name, one.axis) == (name, axis))
+def coefficient_of(compared, name, axis):
+    return next(row for row in compared if (row.name, row.axis) == (name, axis))
 
 
 def test_each_fitted_coefficient_is_compared() -> None:
-    fitted, truth = made()
+    fitted, truth = fitted_and_truth()
     compared = compare(fitted, truth)
-    assert [f'{one.name}.{one.axis}' for one in compared] == \
+    assert [f'{row.name}.{row.axis}' for row in compared] == \
         list(map(str, fitted.covariance_names))
-    assert all(one.fitted == pytest.approx(one.truth, abs=1e-9) and one.inside for one in compared)
-    zero_g = named(compared, 'bias.offset_v', 'y')
+    assert all(row.fitted == pytest.approx(row.truth, abs=1e-9) and row.inside for row in compared)
+    zero_g = coefficient_of(compared, 'bias.offset_v', 'y')
     assert (zero_g.label, zero_g.unit) == ('zero-g', 'V')
     assert zero_g.truth == pytest.approx(truth.zero_g_v[1])
     assert zero_g.half_width == pytest.approx(1.6449 * STD)
-    scale = named(compared, 'scale_factor.offset_v_per_g', 'x')
+    scale = coefficient_of(compared, 'scale_factor.offset_v_per_g', 'x')
     assert scale.truth == pytest.approx(truth.scale_v_per_g[0])
-    alpha = named(compared, 'misalignment.alpha_rad', 'x')
+    alpha = coefficient_of(compared, 'misalignment.alpha_rad', 'x')
     assert (alpha.unit, alpha.half_width) == ('°', pytest.approx(np.degrees(1.6449 * STD)))
     assert alpha.truth == pytest.approx(np.degrees(truth.values['misalignment']['alpha_rad'][0]))
-    assert named(compared, 'cross_axis.quadratic_per_g', 'x').label == 'bias, y²'
-    assert named(compared, 'cross_axis.quadratic_per_g', 'y').label == 'bias, x²'
-    assert named(compared, 'scale_factor_z.quadratic_per_g2', 'y').label == 'scale, z²'
-    # Which the unit does not have.
-    assert named(compared, 'nonlinearity.cubic_per_g2', 'x').truth == 0
+    assert coefficient_of(compared, 'cross_axis.quadratic_per_g', 'x').label == 'bias, y²'
+    assert coefficient_of(compared, 'cross_axis.quadratic_per_g', 'y').label == 'bias, x²'
+    assert coefficient_of(compared, 'scale_factor_z.quadratic_per_g2', 'y').label == 'scale, z²'
+    # The unit does not have this effect.
+    assert coefficient_of(compared, 'nonlinearity.cubic_per_g2', 'x').truth == 0
 
 
-@pytest.mark.parametrize(('off', 'inside'), [(1.6 * STD, True), (-1.6 * STD, True),
-                                             (1.7 * STD, False), (-1.7 * STD, False)])
-def test_an_interval_is_90_percent(off: float, inside: bool) -> None:
-    assert {one.inside for one in compare(*made(off))} == {inside}
+@pytest.mark.parametrize(('error', 'inside'), [(1.6 * STD, True), (-1.6 * STD, True),
+                                               (1.7 * STD, False), (-1.7 * STD, False)])
+def test_an_interval_is_90_percent(error: float, inside: bool) -> None:
+    assert {row.inside for row in compare(*fitted_and_truth(error))} == {inside}
 
 
 def test_other_axes_are_refused() -> None:
     with pytest.raises(UserError, match='axes xy, the true unit has xyz'):
-        compare(made()[0], made(axes='xyz')[1])
+        compare(fitted_and_truth()[0], fitted_and_truth(axes='xyz')[1])
 
 
 @pytest.mark.parametrize('axes', ['xy', 'xyz'])
 def test_linear_terms_that_the_fit_lacks_are_misalignment(axes: str) -> None:
-    """The unit with what is compared for coefficients responds as the true one."""
+    """A unit with the compared true coefficients responds as the true unit."""
     rng = np.random.default_rng(2)
     truth = drawn(rng, nominal(axes), ('bias', 'scale_factor', 'misalignment'))
     linear = [name for name in names_for(axes, ('cross_axis', 'cross_axis_z'))
@@ -108,8 +108,8 @@ def test_linear_terms_that_the_fit_lacks_are_misalignment(axes: str) -> None:
     fitted = fitted_of(truth, names_for(axes, ('bias', 'scale_factor', 'misalignment')))
     compared = compare(fitted, truth)
     nominal_of = {'bias.offset_v': 2.5, 'scale_factor.offset_v_per_g': 1.0}
-    values = [np.radians(one.truth) if one.unit == '°' else
-              one.truth - nominal_of[one.name] for one in compared]
+    values = [np.radians(row.truth) if row.unit == '°' else
+              row.truth - nominal_of[row.name] for row in compared]
     bare = put(fitted, linear, np.zeros(len(linear)))
     same = put(bare, fitted.covariance_names, values)
     force = specific_force(rng.uniform(0, np.pi, 50), rng.uniform(0, 2 * np.pi, 50), 9.80665)
@@ -121,9 +121,9 @@ def test_linear_terms_that_the_fit_has_are_compared() -> None:
     truth = drawn(np.random.default_rng(3), nominal())
     truth = put(truth, [Coefficient('cross_axis', 'linear', 'x')], [0.02])
     compared = compare(fitted_of(truth, names_for('xy')), truth)
-    linear = named(compared, 'cross_axis.linear', 'x')
+    linear = coefficient_of(compared, 'cross_axis.linear', 'x')
     assert (linear.label, linear.truth, linear.inside) == ('bias, y', 0.02, True)
-    beta = named(compared, 'misalignment.beta_rad', 'x')
+    beta = coefficient_of(compared, 'misalignment.beta_rad', 'x')
     assert beta.truth == pytest.approx(np.degrees(truth.values['misalignment']['beta_rad'][0]))
 
 
@@ -137,7 +137,7 @@ def test_terms_that_the_unit_lacks_are_named() -> None:
 
 
 def test_table_of_the_truth() -> None:
-    fitted, truth = made(without=())
+    fitted, truth = fitted_and_truth(without=())
     fitted = put(fitted, [Coefficient('scale_factor_z', 'quadratic_per_g2', 'x')], [
         truth.values['scale_factor_z']['quadratic_per_g2'][0] + 0.002])
     lines = truth_table(compare(fitted, truth))
@@ -153,8 +153,8 @@ def test_table_of_the_truth() -> None:
 
 
 def test_table_of_the_truth_has_room() -> None:
-    """Also for what has no name in words, a large interval, and a small one."""
-    fitted, truth = made()
+    """The columns also fit an effect without a label, a large interval and a small one."""
+    fitted, truth = fitted_and_truth()
     compared = compare(fitted, truth)
     wide = replace(compared[0], name='vibration_rectification.per_g2', axis='x',
                    label='vibration_rectification.per_g2', unit='g/K²', fitted=-12345.678,
@@ -188,12 +188,12 @@ def test_table_of_errors() -> None:
     ('PASS', 'NOT SHOWN', [' NOT SHOWN  calibration error 0.20 mg', 'too few']),
 ])
 def test_acceptance(accel: str, tilt: str, begin: list[str]) -> None:
-    said = {'own_accel_mg': '0.201', 'own_tilt_deg': '0.3251', 'verdict_datasheet': accel,
-            'verdict_tilt_datasheet': tilt}
-    lines = acceptance_lines(replace(made()[0], provenance=said))
+    provenance = {'own_accel_mg': '0.201', 'own_tilt_deg': '0.3251', 'verdict_datasheet': accel,
+                  'verdict_tilt_datasheet': tilt}
+    lines = acceptance_lines(replace(fitted_and_truth()[0], provenance=provenance))
     assert len(lines) == len(begin) and max(map(len, lines)) <= 79
     assert all(text in line for text, line in zip(begin, lines))
-    assert acceptance_lines(made()[0])[0].startswith(f' {acceptance.NOT_SHOWN}')
+    assert acceptance_lines(fitted_and_truth()[0])[0].startswith(f' {acceptance.NOT_SHOWN}')
 
 
 def test_table_of_gravity() -> None:
