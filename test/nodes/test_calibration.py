@@ -20,7 +20,7 @@ from units import drawn, nominal
 
 FAST = ('-p', 'use_sim_time:=true')
 # At many times real time a best-effort subscriber, or one with a short queue, loses samples on a
-# busy machine: this one is 25 s long.
+# busy machine. This queue holds 25 s.
 QUEUE = 100000
 LOSSLESS = (*RELIABLE, '-p', f'qos_overrides./imu/data_raw.subscription.depth:={QUEUE}',
             '-p', 'qos_overrides./stage/command.publisher.depth:=1000')
@@ -48,20 +48,20 @@ def _record(graph, kind, topic):
 
     def keep(raw):
         kept.append((time.monotonic_ns(), raw))
-        while (more := made.handle.take_message(kind, True)) is not None:
-            kept.append((time.monotonic_ns(), more[0]))
+        while (waiting := made.handle.take_message(kind, True)) is not None:
+            kept.append((time.monotonic_ns(), waiting[0]))
 
     made = graph.node.create_subscription(kind, topic, keep, qos, raw=True)
     return kept
 
 
-def _sweep(start, truth, bare, *more):
+def _sweep(start, truth, bare, *options):
     """Return the processes of driver and calibration."""
     driver = start('driver', '--ros-args', '--params-file', truth, '-p', 'link.speed:=4.0', *FAST,
                    *KEPT)
     start('stage', '--ros-args', '--params-file', bare, *FAST)
     return driver, start('calibration', '--ros-args', '--params-file', bare, *FAST, *LOSSLESS,
-                         *QUICK, *more)
+                         *QUICK, *options)
 
 
 def test_a_sweep_ends_with_a_file_and_fit_agrees_on_its_bag(start, run_tool, tmp_path):
@@ -79,17 +79,17 @@ def test_a_sweep_ends_with_a_file_and_fit_agrees_on_its_bag(start, run_tool, tmp
                          60, 'all topics')
         assert graph.call(Trigger, 'calibration/start', Trigger.Request()).success
         graph.spin_until((tmp_path / 'unit.yaml').exists, 120, 'the parameter file')
-        # 4000 samples a second would take the report's time from it.
+        # 4000 samples a second would need the processor time of the report.
         driver.stop()
         node.wait_for('wrote unit.yaml', 120)
-    found = parameter_file.load(tmp_path / 'unit.yaml')
-    want = parameter_file.load(truth)
-    assert (found.model, found.serial) == ('full', 'T1')
-    np.testing.assert_allclose(found.zero_g_v, want.zero_g_v, atol=1e-3)
-    np.testing.assert_allclose(found.scale_v_per_g, want.scale_v_per_g, atol=1e-3)
+    live = parameter_file.load(tmp_path / 'unit.yaml')
+    truth_sensor = parameter_file.load(truth)
+    assert (live.model, live.serial) == ('full', 'T1')
+    np.testing.assert_allclose(live.zero_g_v, truth_sensor.zero_g_v, atol=1e-3)
+    np.testing.assert_allclose(live.scale_v_per_g, truth_sensor.scale_v_per_g, atol=1e-3)
     copy, = (tmp_path / 'ros_home' / 'adxl_ros' / 'calibrations' / 'T1').iterdir()
     assert copy.read_text() == (tmp_path / 'unit.yaml').read_text()
-    assert copy.stem == found.provenance['id']
+    assert copy.stem == live.provenance['id']
     assert 'held out' in (tmp_path / 'report' / 'report.html').read_text()
     head = (tmp_path / 'unit.yaml').read_text().split('/**')[0]
     assert all(f'# {model}' in head for model in ('linear', 'physical', 'full'))
@@ -97,28 +97,29 @@ def test_a_sweep_ends_with_a_file_and_fit_agrees_on_its_bag(start, run_tool, tmp
     sent = []
     for topic, kind in (('/imu/data_raw', rosbags.IMU), ('/stage/joint_states', rosbags.JOINTS),
                         ('/sensor_info', rosbags.INFO), ('/stage/command', rosbags.JOINTS)):
-        sent += [rosbags.Sent(topic, kind, at, raw=raw) for at, raw in kept[topic]]
-    bag = rosbags.bag_of(tmp_path / 'bag', sorted(sent, key=lambda one: one.stamp_ns))
+        sent += [rosbags.Sent(topic, kind, arrival_ns, raw=raw)
+                 for arrival_ns, raw in kept[topic]]
+    bag = rosbags.bag_of(tmp_path / 'bag', sorted(sent, key=lambda message: message.stamp_ns))
     done = run_tool('fit', bag, '--params', bare, '--journal', 'unit.yaml.journal',
                     '-o', 'offline.yaml')
     assert done.returncode == 0, done.stderr
     offline = parameter_file.load(tmp_path / 'offline.yaml')
-    for effect, values in found.values.items():
+    for effect, values in live.values.items():
         for name, value in values.items():
             np.testing.assert_allclose(offline.values[effect][name], value, rtol=0, atol=1e-9)
-    # From the samples `fit` also knows the filter, whose rows are the last.
-    both = len(found.covariance)
-    assert offline.covariance_names[:both] == found.covariance_names
-    np.testing.assert_allclose(offline.covariance[:both, :both], found.covariance, rtol=1e-5)
+    # From the samples `fit` also estimates the filter, whose rows are the last.
+    both = len(live.covariance)
+    assert offline.covariance_names[:both] == live.covariance_names
+    np.testing.assert_allclose(offline.covariance[:both, :both], live.covariance, rtol=1e-5)
 
     _, entries = sweep_journal.read(tmp_path / 'unit.yaml.journal')
     assert entries[-1].done
     assert sum(entry.check for entry in entries[-1].rests) == 6
     assert all(entry.samples == 1000 for entry in entries[-1].rests)
 
-    # The bag and its CSV number the settings of the joints as the sweep did.
+    # The bag and its CSV number the settings of the joints as the sweep does.
     read = recording.read(bag)
-    recording.write(tmp_path / 'bag.csv', read, want)
+    recording.write(tmp_path / 'bag.csv', read, truth_sensor)
     for path in (bag, tmp_path / 'bag.csv'):
         read = recording.read(path)
         check_all_agree(read, recorded_unit(nominal(serial='T1'), read),
@@ -129,7 +130,7 @@ def test_a_sweep_ends_with_a_file_and_fit_agrees_on_its_bag(start, run_tool, tmp
 
 
 def test_services_and_refusals(start, tmp_path):
-    """Two sweeps at once, a finish without poses and an abort are answered in words."""
+    """Two sweeps at once, a finish without poses and an abort have an answer with a text."""
     truth, bare = _files(tmp_path)
     with Graph() as graph:
         def ask(name):
@@ -137,8 +138,8 @@ def test_services_and_refusals(start, tmp_path):
             return answer.success, answer.message
 
         _sweep(start, truth, bare)
-        graph.spin_until(lambda: graph.said('driver', ''), 30, 'the driver')
-        graph.spin_until(lambda: graph.said('calibration', 'call ~/start'), 30, 'idle')
+        graph.spin_until(lambda: graph.reports('driver', ''), 30, 'the driver')
+        graph.spin_until(lambda: graph.reports('calibration', 'call ~/start'), 30, 'idle')
         assert ask('finish') == (False, 'no calibration is running')
         assert ask('abort')[0] is False
         assert ask('start')[0]
@@ -163,14 +164,14 @@ def test_services_and_refusals(start, tmp_path):
         assert fitted.model in ('linear', 'physical')
 
 
-def test_a_stage_that_never_arrives_is_said(start, tmp_path):
-    """Without a stage the node stays up and says in diagnostics what it waits for."""
+def test_a_stage_that_never_arrives_is_reported(start, tmp_path):
+    """Without a stage the node continues, and its diagnostics state what is missing."""
     truth, bare = _files(tmp_path)
     with Graph() as graph:
         start('driver', '--ros-args', '--params-file', truth)
         node = start('calibration', '--ros-args', '--params-file', bare, *QUICK,
                      '-p', 'autostart:=true', '-p', 'stage.timeout_s:=2.0')
-        graph.spin_until(lambda: graph.said('calibration', 'nothing on stage/joint_states')
+        graph.spin_until(lambda: graph.reports('calibration', 'nothing on stage/joint_states')
                          and graph.diagnostics['calibration'].level == DiagnosticStatus.WARN,
                          30, 'the warning')
         graph.spin(3)
@@ -179,11 +180,11 @@ def test_a_stage_that_never_arrives_is_said(start, tmp_path):
 
 
 def test_an_output_that_cannot_be_written_is_refused_at_the_start(start, tmp_path):
-    """Nobody walks a sweep whose result has no place to go."""
+    """The start of a sweep checks the folder of its output."""
     truth, bare = _files(tmp_path)
     with Graph() as graph:
         _sweep(start, truth, bare, '-p', 'autostart:=true', '-p', 'output:=none/unit.yaml')
-        graph.spin_until(lambda: graph.said('calibration', 'output: none/unit.yaml'), 30, 'why')
+        graph.spin_until(lambda: graph.reports('calibration', 'output: none/unit.yaml'), 30, 'why')
 
 
 @pytest.mark.parametrize('setting, words', [
@@ -206,11 +207,11 @@ def test_a_real_sensor_through_the_live_graph(start, run_tool, tmp_path, shared_
     with Graph() as graph:
         start('calibration', '--ros-args', *FAST, *LOSSLESS, '-p', 'mode:=gravity',
               '-p', 'autostart:=true', '-p', 'output:=live.yaml')
-        graph.spin_until(lambda: graph.said('calibration', 'waiting for sensor_info'), 30, 'up')
+        graph.spin_until(lambda: graph.reports('calibration', 'waiting for sensor_info'), 30, 'up')
         start('driver', '--ros-args', *FAST, '-p', 'link.type:=replay', '-p',
               f'link.recording:={source}', '-p', 'link.speed:=30.0', '-p', 'autostart:=false',
               *KEPT)
-        # The two have found each other before the first sample, and stalls are bridged.
+        # The nodes are connected before the first sample, and the queue is long.
         assert graph.change('driver', Transition.TRANSITION_CONFIGURE)
         graph.spin_until(lambda: graph.node.count_publishers('imu/data_raw'), 30, 'a publisher')
         assert graph.change('driver', Transition.TRANSITION_ACTIVATE)
@@ -228,8 +229,8 @@ def test_a_real_sensor_through_the_live_graph(start, run_tool, tmp_path, shared_
             np.testing.assert_allclose(offline.values[effect][parameter], value, atol=1e-9)
 
 
-def test_what_came_before_the_driver_said_what_it_is_counts(start, tmp_path):
-    """Topics find each other in any order: the first rest is not lost by it."""
+def test_rests_before_the_info_of_the_driver_count(start, tmp_path):
+    """Topics connect in any order, and the first rest is not lost."""
     base = nominal('xyz', serial='T5')
     parameter_file.save(tmp_path / 'bare.yaml', base)
     rng = np.random.default_rng(1)
@@ -239,7 +240,7 @@ def test_what_came_before_the_driver_said_what_it_is_counts(start, tmp_path):
             depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL))
         start('calibration', '--ros-args', '--params-file', tmp_path / 'bare.yaml', *LOSSLESS,
               '-p', 'mode:=gravity', '-p', 'autostart:=true', '-p', 'output:=unit.yaml')
-        graph.spin_until(lambda: raw.get_subscription_count() and graph.said(
+        graph.spin_until(lambda: raw.get_subscription_count() and graph.reports(
             'calibration', 'waiting for sensor_info'), 30, 'up')
         rests = [np.tile(G0_MPS2 * np.eye(3)[d], (3000, 1)) for d in (2, 0)]
         moving = 5 * rng.standard_normal((1500, 3))
@@ -247,21 +248,21 @@ def test_what_came_before_the_driver_said_what_it_is_counts(start, tmp_path):
             message = Imu()
             message.header.stamp.sec, ms = divmod(100_000 + i, 1000)
             message.header.stamp.nanosec = ms * 1_000_000
-            at = message.linear_acceleration
-            at.x, at.y, at.z = (a + 0.005 * rng.standard_normal(3)).tolist()
+            accel = message.linear_acceleration
+            accel.x, accel.y, accel.z = (a + 0.005 * rng.standard_normal(3)).tolist()
             raw.publish(message)
-        # Heard, not only sent.
+        # The node has received the samples.
         graph.spin(1.0)
         info.publish(DiagnosticStatus(values=[
             KeyValue(key=k, value=v) for k, v in sensor_info(base).items()]))
         graph.spin_until(lambda: graph.value('calibration', 'accepted') == '2', 30, 'both rests')
     _, entries = sweep_journal.read(tmp_path / 'unit.yaml.journal')
-    # The ends of a rest are left out.
+    # The ends of a rest are excluded.
     assert min(entry.samples for entry in sweep_journal.accepted_poses(entries)) > 2500
 
 
-def test_an_operator_captures(start, tmp_path):
-    """Without a motor nothing is taken before ~/capture, which answers when it is on disk."""
+def test_a_pose_is_taken_after_the_capture_of_an_operator(start, tmp_path):
+    """Without a motor no pose is taken before ~/capture, which answers when it is on disk."""
     truth, bare = _files(tmp_path, axes='x')
     with Graph() as graph:
         announced = graph.listen(DiagnosticStatus, 'calibration/next_pose', latched=True)
@@ -269,18 +270,18 @@ def test_an_operator_captures(start, tmp_path):
               '-p', 'link.alpha_rad:=0.785', '-p', 'link.beta_rad:=0.0')
         start('calibration', '--ros-args', '--params-file', bare, *FAST, *QUICK,
               '-p', 'autostart:=true', '-p', 'stage.mode:=manual')
-        graph.spin_until(lambda: graph.said('calibration', 'then capture'), 30, 'the request')
+        graph.spin_until(lambda: graph.reports('calibration', 'then capture'), 30, 'the request')
         answer = graph.call(Trigger, 'calibration/capture', Trigger.Request(), 30)
         assert answer.success and 'pose 1 is on disk' in answer.message
         _, entries = sweep_journal.read(tmp_path / 'calibration.yaml.journal')
         assert entries[0].alpha_rad == 0.785
-        # One axis shows no tilt: there is no figure, and it is not NaN.
+        # One axis determines no tilt: the value is absent, and not NaN.
         graph.spin_until(lambda: graph.value('calibration', 'accepted') == '1', 10, 'the pose')
         values = {p.key: p.value for p in graph.diagnostics['calibration'].values}
         assert 'tilt_error_deg' not in values and 'nan' not in values.values()
         wait_until(lambda: graph.call(Trigger, 'calibration/redo', Trigger.Request()).success,
                    10, 'redo')
-        # What was announced is taken back, for those, too, who listen later.
+        # The announcement is withdrawn, also for later subscribers.
         graph.spin_until(lambda: announced[-1].message.startswith('pose 1 of'), 10, 'pose 1')
         assert graph.call(Trigger, 'calibration/abort', Trigger.Request()).success
         late = graph.listen(DiagnosticStatus, '/calibration/next_pose', latched=True)

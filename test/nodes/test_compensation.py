@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The compensation over DDS: what it publishes, what it refuses, and coefficients set live."""
+"""The compensation over DDS: its outputs, its refusals, and coefficients set live."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -59,13 +59,13 @@ def unit(serial: str = '17', axes: str = 'xy', seed: int = 1) -> Sensor:
 
 
 class Robot:
-    """A driver's topics, and what the compensation makes of them."""
+    """The topics of a driver, and the outputs of the compensation."""
 
     def __init__(self, graph: Graph) -> None:
         self.graph = graph
         self.data = graph.listen(Imu, 'imu/data')
         self.tilt = graph.listen(Vector3Stamped, 'tilt')
-        self._told = graph.listen(DiagnosticArray, '/diagnostics')
+        self._diagnostics = graph.listen(DiagnosticArray, '/diagnostics')
         self._raw = graph.node.create_publisher(Imu, 'imu/data_raw', 100)
         self._info = graph.node.create_publisher(DiagnosticStatus, 'sensor_info', QoSProfile(
             depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL))
@@ -79,7 +79,7 @@ class Robot:
             KeyValue(key=k, value=v) for k, v in {**sensor_info(sensor), **changes}.items()]))
 
     def connected(self, timeout_s: float = 20.0) -> None:
-        """Wait until the compensation hears and is heard, and knows what it was told."""
+        """Wait until all topics are connected, and the compensation has its info."""
         self.graph.spin_until(
             lambda: self._raw.get_subscription_count()
             and self.graph.node.count_publishers('tilt')
@@ -99,7 +99,7 @@ class Robot:
         self._raw.publish(message)
 
     def answer(self, values: list[float]) -> Imu:
-        """Publish one sample and return what the compensation makes of it."""
+        """Publish one sample and return the corrected sample."""
         count, tilts = len(self.data), len(self.tilt)
         self.send(values)
         self.graph.spin_until(lambda: len(self.data) > count and len(self.tilt) > tilts, 10.0,
@@ -123,16 +123,17 @@ class Robot:
         return [parameter_value_to_python(value) for value in values]
 
     def level(self, level: bytes, text: str) -> None:
-        """Wait for diagnostics."""
+        """Wait for diagnostics of a level with a text."""
         self.graph.spin_until(
-            lambda: self.graph.said(NODE, text)
+            lambda: self.graph.reports(NODE, text)
             and self.graph.diagnostics[NODE].level == level, 10.0, f'{level!r} {text}')
 
-    def warned(self, of: str, count: int) -> None:
-        """Wait until so many samples were warned of; each message counts one second."""
+    def warned(self, text: str, count: int) -> None:
+        """Wait until warnings have counted a number of samples; a message covers one second."""
         self.graph.spin_until(lambda: count == sum(
-            int(status.message.split()[0]) for array in self._told for status in array.status
-            if status.level == DiagnosticStatus.WARN and of in status.message), 10.0, of)
+            int(status.message.split()[0])
+            for array in self._diagnostics for status in array.status
+            if status.level == DiagnosticStatus.WARN and text in status.message), 10.0, text)
 
 
 @pytest.fixture
@@ -146,12 +147,12 @@ def _saved(folder: Path, sensor: Sensor) -> Path:
     return folder / 'unit.yaml'
 
 
-def started(start: Start, tmp_path: Path, sensor: Sensor, *more: object) -> Started:
-    return start(NODE, '--ros-args', '--params-file', _saved(tmp_path, sensor), *RELIABLE, *more)
+def started(start: Start, tmp_path: Path, sensor: Sensor, *args: object) -> Started:
+    return start(NODE, '--ros-args', '--params-file', _saved(tmp_path, sensor), *RELIABLE, *args)
 
 
-def felt(sensor: Sensor, force: list[float]) -> list[float]:
-    """Return the nominal acceleration of a sensor that feels a force, m/s², three floats."""
+def output_of(sensor: Sensor, force: list[float]) -> list[float]:
+    """Return the nominal acceleration of a sensor at a force, m/s², three floats."""
     volts = np.array([signal_chain.static_response(sensor)(force)])
     return [*to_nominal_mps2(volts, sensor)[0].tolist(), 0.0][:3]
 
@@ -166,17 +167,17 @@ def test_corrected_stream(robot: Robot, start: Start, tmp_path: Path) -> None:
     robot.inform(sensor)
     robot.connected()
     force = pose(0.7, -1.2)
-    message = robot.answer(felt(sensor, force))
+    message = robot.answer(output_of(sensor, force))
     np.testing.assert_allclose(accel(message), force, atol=1e-7)
     assert message.header.frame_id == 'arm_imu'
     assert message.angular_velocity_covariance[0] == -1
     covariance = force_covariance(sensor, force)[:, :, 0]
-    found = message.linear_acceleration_covariance.reshape(3, 3)
-    np.testing.assert_array_equal(found, found.T)
-    # The message says by its variance that z is not measured.
-    noise = found[2, 2] - covariance[2, 2]
+    measured = message.linear_acceleration_covariance.reshape(3, 3)
+    np.testing.assert_array_equal(measured, measured.T)
+    # The variance of z states that z is not measured.
+    noise = measured[2, 2] - covariance[2, 2]
     assert noise == pytest.approx((5.3e-3) ** 2, rel=0.2)
-    np.testing.assert_allclose(found - np.diag([0, 0, noise]), covariance, rtol=0.05, atol=2e-7)
+    np.testing.assert_allclose(measured - np.diag([0, 0, noise]), covariance, rtol=0.05, atol=2e-7)
     roll, pitch = np.arctan2(force[1], force[2]), np.arctan2(-force[0], np.hypot(*force[1:]))
     q = message.orientation
     np.testing.assert_allclose(
@@ -192,7 +193,7 @@ def test_corrected_stream(robot: Robot, start: Start, tmp_path: Path) -> None:
     np.testing.assert_allclose([tilt.vector.x, tilt.vector.y, tilt.vector.z], [roll, pitch, 0.7],
                                atol=1e-7)
     for beta in np.linspace(0, 1, 20):
-        robot.answer(felt(sensor, pose(0.7, beta)))
+        robot.answer(output_of(sensor, pose(0.7, beta)))
     robot.level(DiagnosticStatus.OK, 'compensating')
     status = robot.graph.diagnostics[NODE]
     assert status.hardware_id == '17'
@@ -205,8 +206,8 @@ def test_corrected_stream(robot: Robot, start: Start, tmp_path: Path) -> None:
     assert stamp_ns(message) == 10 ** 9
 
 
-def test_supply_and_temperature_are_taken_out(robot: Robot, start: Start, tmp_path: Path) -> None:
-    """What `supply` and `temperature` say reaches the inverse; what is not said is named."""
+def test_supply_and_temperature_are_corrected(robot: Robot, start: Start, tmp_path: Path) -> None:
+    """The inverse uses `supply` and `temperature`, and diagnostics name missing values."""
     sensor = with_neutral(unit(), ['supply', 'temperature_bias'])
     sensor = put(sensor, [Coefficient('temperature_bias', 'per_k', 'x'), *(
         Coefficient('supply', f'{figure}_exponent', axis) for figure in ('zero_g', 'scale')
@@ -220,14 +221,14 @@ def test_supply_and_temperature_are_taken_out(robot: Robot, start: Start, tmp_pa
     temperature = node.create_publisher(Temperature, 'temperature', 1)
     force, around = pose(0.7, 0.4), NOMINAL_ENVIRONMENT._replace(temperature_c=35.0, supply_v=4.8)
     volts = np.array([signal_chain.static_response(sensor)(force, around)])
-    shown = [*to_nominal_mps2(volts, sensor)[0].tolist(), 0.0]
-    robot.answer(shown)
+    nominal_accel = [*to_nominal_mps2(volts, sensor)[0].tolist(), 0.0]
+    robot.answer(nominal_accel)
     robot.level(DiagnosticStatus.WARN, 'supply is taken at 5: nothing on /supply')
 
     def corrected() -> bool:
         supply.publish(BatteryState(voltage=4.8))
         temperature.publish(Temperature(temperature=35.0))
-        return bool(np.abs(np.array(accel(robot.answer(shown))) - force).max() < 1e-5)
+        return bool(np.abs(np.array(accel(robot.answer(nominal_accel))) - force).max() < 1e-5)
 
     robot.graph.spin_until(corrected, 10.0, 'corrected for the surroundings')
     robot.level(DiagnosticStatus.OK, 'compensating')
@@ -235,15 +236,15 @@ def test_supply_and_temperature_are_taken_out(robot: Robot, start: Start, tmp_pa
     def old() -> bool:
         clock.publish(Clock(clock=Time(sec=3600)))
         temperature.publish(Temperature(temperature=35.0))
-        robot.answer(shown)
-        return robot.graph.said(NODE, 'supply is taken at 4.8: nothing on /supply for 3600 s')
-    # What was true an hour ago is not known any more.
+        robot.answer(nominal_accel)
+        return robot.graph.reports(NODE, 'supply is taken at 4.8: nothing on /supply for 3600 s')
+    # A value of an hour ago does not count.
     robot.graph.spin_until(old, 10.0, 'an hour later')
     assert robot.graph.diagnostics[NODE].level == DiagnosticStatus.WARN
 
 
 def stored(folder: Path, sensor: Sensor, days_old: float) -> Path:
-    """Put a calibration of some age into a store."""
+    """Put a calibration of a certain age into a store."""
     made = datetime.now(timezone.utc) - timedelta(days=days_old)
     path = calibration_store.put(folder, replace(sensor, provenance={
         'date': made.isoformat(timespec='seconds'), 'data_sha256': f'{days_old:064.3f}'}))
@@ -253,7 +254,7 @@ def stored(folder: Path, sensor: Sensor, days_old: float) -> Path:
 
 def test_the_newest_calibration_of_the_unit_is_taken(robot: Robot, start: Start, tmp_path: Path
                                                      ) -> None:
-    """By serial and date; what does not fit is passed over, and a newer one is announced."""
+    """Serial number and date decide. Other files are ignored, and a newer file is announced."""
     folder = tmp_path / 'calibrations'
     old, newest = unit(seed=1), unit(seed=2)
     stored(folder, old, 30.0)
@@ -270,7 +271,7 @@ def test_the_newest_calibration_of_the_unit_is_taken(robot: Robot, start: Start,
     assert f'passed over: {three}: ' in process.output()
     assert '17-29990101T000000Z-0.yaml:1:1: ' in process.output()
     force = pose(0.7, -1.2)
-    np.testing.assert_allclose(accel(robot.answer(felt(newest, force))), force, atol=1e-7)
+    np.testing.assert_allclose(accel(robot.answer(output_of(newest, force))), force, atol=1e-7)
     robot.graph.spin_until(lambda: robot.graph.value(NODE, 'validity')
                            == 'valid, temperature not known', 10, 'validity')
     assert robot.graph.value(NODE, 'calibration_id') == path.stem
@@ -279,37 +280,37 @@ def test_the_newest_calibration_of_the_unit_is_taken(robot: Robot, start: Start,
     fresh = stored(folder, unit(seed=5), 0.0)
 
     def announced() -> bool:
-        robot.send(felt(newest, force))
-        return robot.graph.said(NODE, f'a newer calibration is in the store: {fresh}')
+        robot.send(output_of(newest, force))
+        return robot.graph.reports(NODE, f'a newer calibration is in the store: {fresh}')
     robot.graph.spin_until(announced, 10, 'the newer one')
-    # It is not taken in the middle of a run, but when the driver starts again.
-    np.testing.assert_allclose(accel(robot.answer(felt(newest, force))), force, atol=1e-7)
+    # The node loads it when the driver starts again, not during a run.
+    np.testing.assert_allclose(accel(robot.answer(output_of(newest, force))), force, atol=1e-7)
     robot.inform(newest)
     process.wait_for(f'compensating by {fresh}')
 
 
-def test_a_named_calibration_stands(robot: Robot, start: Start, tmp_path: Path) -> None:
-    """Whatever the store has; without one it is the store's default folder that is asked."""
+def test_a_named_calibration_is_not_replaced(robot: Robot, start: Start, tmp_path: Path) -> None:
+    """The store does not replace it. Without a name the default store counts."""
     sensor = unit(seed=1)
     stored(calibration_store.default_folder(), unit(seed=2), 0.0)
     process = started(start, tmp_path, sensor)
     robot.inform(sensor)
     robot.connected()
     force = pose(0.7, -1.2)
-    np.testing.assert_allclose(accel(robot.answer(felt(sensor, force))), force, atol=1e-7)
+    np.testing.assert_allclose(accel(robot.answer(output_of(sensor, force))), force, atol=1e-7)
     robot.level(DiagnosticStatus.OK, 'compensating')
     assert process.output().count('compensating by') == 1
     nominal_file = tmp_path / 'nominal.yaml'
     parameter_file.save(nominal_file, nominal(serial='17'))
     process.stop()
-    # Figures without coefficients name no calibration.
+    # Datasheet values without coefficients are not a calibration.
     other = start(NODE, '--ros-args', '--params-file', nominal_file, '-r', '__node:=other')
     other.wait_for(f'compensating by {calibration_store.default_folder()}')
 
 
-def test_outside_of_what_was_calibrated_the_covariance_is_raised(
+def test_the_covariance_is_raised_outside_of_the_validity_range(
         robot: Robot, start: Start, tmp_path: Path) -> None:
-    """By temperature and by pose, as much as the documentation says, and diagnostics say so."""
+    """Temperature and pose raise it as documented, and diagnostics report it."""
     sensor = unit(axes='xyz')
     sensor = replace(sensor, covariance_names=tuple(
         Coefficient(effect, parameter, axis) for effect, parameter in (
@@ -319,22 +320,22 @@ def test_outside_of_what_was_calibrated_the_covariance_is_raised(
     nothing = np.zeros((9, 3))
     poses = Poses(nothing, nothing, nothing[:, 0], nothing[:, 0], nothing[:, :2],
                   nothing[:, 0] > 0, np.linspace(20, 25, 9))
-    # The sensor of the poses sees no more than 30°; a small force tells less of the scale.
+    # The poses reach 30° at most. A small force determines the scale factor less.
     sensor = replace(sensor, envelope=envelope(sensor, force, poses, 0.02))
     started(start, tmp_path, sensor)
     robot.inform(sensor)
     robot.connected()
     temperature = robot.graph.node.create_publisher(Temperature, 'temperature', 1)
-    inside = felt(sensor, pose(0.4, 0.4))
+    inside = output_of(sensor, pose(0.4, 0.4))
 
-    def variances(shown: list[float], at_c: float, said: str) -> np.ndarray:
-        """Return those of a sample at a temperature, once diagnostics say what they must."""
+    def variances(nominal_accel: list[float], at_c: float, validity: str) -> np.ndarray:
+        """Return the variances of a sample at a temperature, once the validity is reported."""
         def there() -> bool:
             temperature.publish(Temperature(temperature=at_c))
-            robot.answer(shown)
-            found = robot.graph.value(NODE, 'validity')
-            return found == said or (said != 'valid' and found.startswith(said))
-        robot.graph.spin_until(there, 15, f'{at_c} degC: {said}')
+            robot.answer(nominal_accel)
+            value = robot.graph.value(NODE, 'validity')
+            return value == validity or (validity != 'valid' and value.startswith(validity))
+        robot.graph.spin_until(there, 15, f'{at_c} degC: {validity}')
         return np.array(robot.data[-1].linear_acceleration_covariance).reshape(3, 3).diagonal()
 
     robot.answer(inside)
@@ -347,11 +348,11 @@ def test_outside_of_what_was_calibrated_the_covariance_is_raised(
     # By the datasheet 0.1 mg/K and 3e-5/K of the force, over the 13 K beyond 25 + 2 degC.
     added = (13 * 1e-4 * G) ** 2 + (13 * 3e-5 * np.array(pose(0.4, 0.4))) ** 2
     np.testing.assert_allclose(warm - before, added, rtol=0.1)
-    tilted = variances(felt(sensor, [2 * G, 0.0, 0.0]), 23.0,
+    tilted = variances(output_of(sensor, [2 * G, 0.0, 0.0]), 23.0,
                        'outside: force near 19.5, 0.0, 0.0 m/s^2')
     assert tilted[0] > before[0] + 0.02 ** 2 * 0.5
-    # Nor was 85 deg visited, however little the force along x alone would tell of it.
-    variances(felt(sensor, pose(1.48, 0.4)), 23.0, 'outside: force near')
+    # No pose is near 85 deg either, although the force along x is in the range.
+    variances(output_of(sensor, pose(1.48, 0.4)), 23.0, 'outside: force near')
     assert float(robot.graph.value(NODE, 'outside')) >= 3
     np.testing.assert_allclose(variances(inside, 23.0, 'valid'), before)
 
@@ -369,14 +370,14 @@ def test_without_a_file_the_nominal_sensor_applies(robot: Robot, start: Start) -
     robot.level(DiagnosticStatus.WARN, 'no samples on /imu/data_raw')
 
 
-def test_what_is_not_shown_stands(robot: Robot, start: Start, tmp_path: Path) -> None:
-    """With x upright roll is not seen: the last one stands, its variance is very large."""
+def test_an_unobservable_angle_keeps_its_value(robot: Robot, start: Start, tmp_path: Path) -> None:
+    """With x upright, roll keeps its last value with a very large variance."""
     sensor = unit(axes='xyz')
     started(start, tmp_path, sensor)
     robot.connected()
-    robot.answer(felt(sensor, pose(0.7, -1.2)))
+    robot.answer(output_of(sensor, pose(0.7, -1.2)))
     roll = robot.tilt[-1].vector.x
-    message = robot.answer(felt(sensor, [G, 0.0, 0.0]))
+    message = robot.answer(output_of(sensor, [G, 0.0, 0.0]))
     vector = robot.tilt[-1].vector
     assert vector.x == roll
     assert vector.y == pytest.approx(-np.pi / 2, abs=1e-3)
@@ -386,20 +387,20 @@ def test_what_is_not_shown_stands(robot: Robot, start: Start, tmp_path: Path) ->
     assert 0 < about[1, 1] < 1e-5
 
 
-def test_nan_never_leaves(robot: Robot, start: Start, tmp_path: Path) -> None:
+def test_invalid_samples_are_not_published(robot: Robot, start: Start, tmp_path: Path) -> None:
     sensor = unit()
     started(start, tmp_path, sensor)
     robot.inform(sensor)
     robot.connected()
-    good = felt(sensor, pose(0.5, 0.5))
-    before = accel(robot.answer(good))
-    for bad in (float('nan'), float('inf'), 1e38, -1e300, 5e3):
-        robot.send([bad, good[1], 0.0])
-    np.testing.assert_array_equal(accel(robot.answer(good)), before)
+    valid = output_of(sensor, pose(0.5, 0.5))
+    before = accel(robot.answer(valid))
+    for invalid in (float('nan'), float('inf'), 1e38, -1e300, 5e3):
+        robot.send([invalid, valid[1], 0.0])
+    np.testing.assert_array_equal(accel(robot.answer(valid)), before)
     assert len(robot.data) == len(robot.tilt) == 2
     robot.warned('samples dropped', 5)
     assert robot.graph.value(NODE, 'dropped') == '5'
-    robot.answer([-2.5 * G, good[1], 0.0])
+    robot.answer([-2.5 * G, valid[1], 0.0])
     robot.warned('samples with the ADC at its rail', 1)
 
 
@@ -411,13 +412,13 @@ def test_another_unit_is_refused(robot: Robot, start: Start, tmp_path: Path) -> 
     robot.connected()
     robot.level(DiagnosticStatus.ERROR, 'is of the sensor 18, but the parameters are of 17')
     for _ in range(3):
-        robot.send(felt(sensor, pose(0.5, 0.5)))
+        robot.send(output_of(sensor, pose(0.5, 0.5)))
     robot.graph.spin_until(lambda: robot.graph.value(NODE, 'received') == '3', 10.0, 'received')
     assert not robot.data
     assert not robot.tilt
     robot.inform(sensor)
     process.wait_for('publishing again')
-    robot.answer(felt(sensor, pose(0.5, 0.5)))
+    robot.answer(output_of(sensor, pose(0.5, 0.5)))
     robot.level(DiagnosticStatus.OK, 'compensating')
     assert process.output().count('publishing nothing') == 1
 
@@ -452,7 +453,7 @@ def test_coefficients_are_set_all_or_none(robot: Robot, start: Start, tmp_path: 
         assert reason in robot.assign(**values)
         assert robot.get(*names[:3]) == held
         assert accel(robot.answer([1.0, 2.0, 0.0]))[0] == after
-    # Effects that the file does not list come with all that they need.
+    # Effects that the file does not list have all their parameters.
     assert not robot.assign(
         effects=['bias', 'misalignment'], misalignment__alpha_rad=[0.0, 0.0],
         misalignment__beta_rad=[0.0, 0.02], covariance=[1e-4],
@@ -462,8 +463,8 @@ def test_coefficients_are_set_all_or_none(robot: Robot, start: Start, tmp_path: 
     assert message.linear_acceleration_covariance[0] == pytest.approx(1e-4 * G * G, rel=0.01)
 
 
-def test_calibration_loads_a_whole_file_or_nothing(robot: Robot, start: Start,
-                                                   tmp_path: Path) -> None:
+def test_calibration_loads_a_complete_file_or_nothing(robot: Robot, start: Start,
+                                                      tmp_path: Path) -> None:
     first, second = unit(seed=1), replace(unit(seed=2), noise_density_g_per_rthz=np.full(2, 1e-3))
     second = replace(second, effects=('bias',), values={'bias': second.values['bias']},
                      provenance={'date': '2026-02-03'})
@@ -476,18 +477,18 @@ def test_calibration_loads_a_whole_file_or_nothing(robot: Robot, start: Start,
     robot.inform(first)
     robot.connected()
     force = pose(0.6, 0.3)
-    np.testing.assert_allclose(accel(robot.answer(felt(first, force))), force, atol=1e-7)
+    np.testing.assert_allclose(accel(robot.answer(output_of(first, force))), force, atol=1e-7)
     assert 'is of the sensor 17, but the parameters are of 18' in robot.assign(
         calibration=str(tmp_path / 'foreign.yaml'))
     reason = robot.assign(calibration=str(broken))
     assert f'{broken}:' in reason
     assert 'sensor.rate_hz: 1000 is not a floating-point number' in reason
-    np.testing.assert_allclose(accel(robot.answer(felt(first, force))), force, atol=1e-7)
+    np.testing.assert_allclose(accel(robot.answer(output_of(first, force))), force, atol=1e-7)
     assert robot.assign(calibration=str(other)) == ''
-    np.testing.assert_allclose(accel(robot.answer(felt(second, force))), force, atol=1e-7)
+    np.testing.assert_allclose(accel(robot.answer(output_of(second, force))), force, atol=1e-7)
     flat = parameter_file.to_flat(second)
-    found = robot.get('calibration', *flat)
-    assert found == [str(other), *flat.values()]
+    values = robot.get('calibration', *flat)
+    assert values == [str(other), *flat.values()]
     assert robot.get('misalignment.alpha_rad', 'provenance.source') == [[], '']
     robot.graph.spin_until(lambda: robot.graph.value(NODE, 'calibration') == str(other), 10.0,
                            'calibration in diagnostics')
@@ -501,20 +502,20 @@ def test_parameters_are_described(robot: Robot, start: Start, tmp_path: Path) ->
     start(NODE, '--ros-args', '-p', f'calibration:={_saved(tmp_path, unit())}')
     robot.connected()
     names = ['sensor.serial', 'bias.offset_v', 'calibration', 'sensor.rate_hz', 'effects']
-    found = robot.graph.call(DescribeParameters, f'{NODE}/describe_parameters',
-                             DescribeParameters.Request(names=names)).descriptors
-    assert all(d.description and not d.read_only for d in found)
-    assert found[1].additional_constraints == '-2 to 2'
-    assert found[3].floating_point_range[0].to_value == 1e5
+    descriptors = robot.graph.call(DescribeParameters, f'{NODE}/describe_parameters',
+                                   DescribeParameters.Request(names=names)).descriptors
+    assert all(d.description and not d.read_only for d in descriptors)
+    assert descriptors[1].additional_constraints == '-2 to 2'
+    assert descriptors[3].floating_point_range[0].to_value == 1e5
     assert robot.get('sensor.serial', 'sensor.axes') == ['17', 'xy']
 
 
-def test_best_effort_publishers_are_heard(robot: Robot, start: Start, tmp_path: Path) -> None:
+def test_best_effort_publishers_are_received(robot: Robot, start: Start, tmp_path: Path) -> None:
     start(NODE, '--ros-args', '--params-file', _saved(tmp_path, unit()))
     robot._raw = robot.graph.node.create_publisher(Imu, 'imu/data_raw', QoSProfile(
         depth=10, reliability=ReliabilityPolicy.BEST_EFFORT))
     robot.connected()
-    robot.answer(felt(unit(), pose(0.5, 0.5)))
+    robot.answer(output_of(unit(), pose(0.5, 0.5)))
 
 
 @pytest.mark.parametrize(('right', 'wrong', 'message'), [
@@ -539,9 +540,9 @@ def test_a_bad_file_ends_it_with_one_line(start: Start, tmp_path: Path, right: s
         assert message in process.output()
 
 
-def test_the_filter_is_undone_late_and_with_own_stamps(robot: Robot, start: Start,
-                                                       tmp_path: Path) -> None:
-    """undo_filter: what comes out is the zero-phase inverse, eight samples later."""
+def test_the_inverse_of_the_filter_keeps_the_stamps(robot: Robot, start: Start,
+                                                    tmp_path: Path) -> None:
+    """With undo_filter the output is the zero-phase inverse, eight samples later."""
     sensor = replace(unit().without_covariance(), rate_hz=1.0, rc_capacitance_f=3e-5)
     started(start, tmp_path, sensor, '-p', 'undo_filter:=true')
     robot.inform(sensor)
@@ -560,13 +561,13 @@ def test_the_filter_is_undone_late_and_with_own_stamps(robot: Robot, start: Star
     np.testing.assert_allclose(got[8:, :2], expected[8:, :2], atol=1e-5)
 
 
-def test_the_papers_inverse_by_choice(robot: Robot, start: Start, tmp_path: Path) -> None:
-    """inverse:=paper gives equations 14 to 21; another word is refused at the start."""
+def test_the_papers_inverse_is_an_option(robot: Robot, start: Start, tmp_path: Path) -> None:
+    """inverse:=paper gives equations 14 to 21, and another value is refused at the start."""
     sensor = unit()
     started(start, tmp_path, sensor, '-p', 'inverse:=paper')
     robot.inform(sensor)
     robot.connected()
-    values = felt(sensor, pose(0.7, 0.4))
+    values = output_of(sensor, pose(0.7, 0.4))
     volts = [v[0] for v in signal_chain.static_response(
         sensor)([np.array([f]) for f in pose(0.7, 0.4)])]
     expected = paper_inverse.inverse(sensor, maths=FLOATS)([float(v) for v in volts])

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The demonstration: its titles, its steps, and all of it live."""
+"""The demonstration: its titles, its steps, and a live run."""
 
 import io
 import re
@@ -52,27 +52,27 @@ def test_steps_without_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_live(ros_env, tmp_path) -> None:
-    """In a terminal of 80 columns: steps, tables, verdict and files, and no line that wraps."""
+    """In a terminal of 80 columns no line of steps, tables, acceptance and files wraps."""
     terminal = Terminal([executable('demo')], ros_env, tmp_path, lines=60, columns=80)
     try:
         terminal.wait_for('1/3 sweep', 'of 146 poses', '━', timeout_s=60.0)
-        shown = terminal.wait_for('Next  your own sensor:', timeout_s=600.0)
+        screen = terminal.wait_for('Next  your own sensor:', timeout_s=600.0)
         assert terminal.popen.wait(30.0) == 0
         restored = terminal.restored()
     finally:
         terminal.close()
-    lines = shown.splitlines()
+    lines = screen.splitlines()
     assert max(map(len, lines)) <= 79 and restored
     assert lines[0].endswith('coefficients are known   (2 min)')
-    assert re.search(r'1/3 sweep +146 of 146 poses +━+ +100 %', shown)
-    assert re.search(r'2/3 fit +130 poses, full model', shown)
-    assert re.search(r'3/3 check +16 poses that the fit has not seen', shown)
+    assert re.search(r'1/3 sweep +146 of 146 poses +━+ +100 %', screen)
+    assert re.search(r'2/3 fit +130 poses, full model', screen)
+    assert re.search(r'3/3 check +16 poses that the fit has not seen', screen)
     for model in ('datasheet values', 'linear calibration', 'full calibration'):
-        assert re.search(rf'{model} +[\d.]+ +° +[\d.]+ +mg', shown)
+        assert re.search(rf'{model} +[\d.]+ +° +[\d.]+ +mg', screen)
     rows = [line for line in lines if line.endswith(('  ok', '  MISSED'))]
     assert len(rows) >= 18 and all('±' in row for row in rows)
-    assert f'of {len(rows)} inside their 90 % intervals' in shown
-    assert re.search(r' PASS  calibration error 0\.\d+ mg; the datasheet allows 3\.4 mg', shown)
+    assert f'of {len(rows)} inside their 90 % intervals' in screen
+    assert re.search(r' PASS  calibration error 0\.\d+ mg; the datasheet allows 3\.4 mg', screen)
     assert '\x1b[32mPASS' in terminal.raw.decode()
     for name in ('sweep/report.html', 'adxl203_demo.yaml'):
-        assert f' demo_output/{name}' in shown and (tmp_path / 'demo_output' / name).is_file()
+        assert f' demo_output/{name}' in screen and (tmp_path / 'demo_output' / name).is_file()

@@ -34,39 +34,39 @@ class Reported:
         self.reporter = DiagnosticsReporter(graph.node, {'task': lambda: self.status})
 
     def wait(self, count: int, timeout_s: float = 5.0) -> DiagnosticStatus:
-        """Wait until so many reports have come; return the newest status."""
+        """Wait for a number of reports; return the newest status."""
         self.graph.spin_until(lambda: len(self.arrays) >= count, timeout_s, f'{count} reports')
         return self.arrays[-1].status[0]
 
 
 @pytest.fixture
-def reported(ros_env: dict[str, str]) -> Iterator[Reported]:
+def reporter_rig(ros_env: dict[str, str]) -> Iterator[Reported]:
     with Graph() as graph:
         yield Reported(graph)
 
 
-def test_a_task_is_reported_once_a_second(reported: Reported) -> None:
-    status = reported.wait(3)
+def test_a_task_is_published_once_a_second(reporter_rig: Reported) -> None:
+    status = reporter_rig.wait(3)
     assert (status.name, status.level) == ('tester: task', DiagnosticStatus.OK)
     assert (status.message, status.hardware_id) == ('fine', '17')
     assert {pair.key: pair.value for pair in status.values} == {'rate_hz': '0.1', 'text': 'a'}
     stamps_s = [array.header.stamp.sec + 1e-9 * array.header.stamp.nanosec
-                for array in reported.arrays]
+                for array in reporter_rig.arrays]
     assert stamps_s[2] - stamps_s[0] == pytest.approx(2.0, abs=0.5)
 
 
-def test_a_change_of_level_is_reported_at_once_from_any_thread(reported: Reported) -> None:
-    reported.wait(1)
-    reported.reporter.notice('task', Level.OK)
-    reported.graph.spin(0.3)
-    assert len(reported.arrays) == 1, 'the level is as before'
-    reported.status = Status(Level.ERROR, 'broken', '17', {})
+def test_a_change_of_level_is_reported_at_once_from_any_thread(reporter_rig: Reported) -> None:
+    reporter_rig.wait(1)
+    reporter_rig.reporter.notice('task', Level.OK)
+    reporter_rig.graph.spin(0.3)
+    assert len(reporter_rig.arrays) == 1, 'the level is as before'
+    reporter_rig.status = Status(Level.ERROR, 'broken', '17', {})
     began_s = time.monotonic()
-    thread = threading.Thread(target=reported.reporter.notice, args=('task', Level.ERROR))
+    thread = threading.Thread(target=reporter_rig.reporter.notice, args=('task', Level.ERROR))
     thread.start()
-    assert reported.wait(2).level == DiagnosticStatus.ERROR
+    assert reporter_rig.wait(2).level == DiagnosticStatus.ERROR
     assert time.monotonic() - began_s < 0.6
     thread.join()
-    # The next report comes one second after it.
-    assert reported.wait(3).message == 'broken'
+    # The next report comes one second after the change.
+    assert reporter_rig.wait(3).message == 'broken'
     assert time.monotonic() - began_s > 0.8

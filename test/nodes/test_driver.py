@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The driver over DDS: what it publishes, and how it takes what is wrong."""
+"""The driver over DDS: its outputs, and its messages about faults."""
 
 import os
 import signal
@@ -60,13 +60,13 @@ def test_serialized_samples_are_what_rclpy_serializes(axes):
             int, divmod(stamp, 10 ** 9))
         for axis, value in zip('xyz', [*map(float, a), 0.0, 0.0]):
             setattr(template.linear_acceleration, axis, value)
-        # What stands in the 3 bytes of padding behind the frame is left to chance.
+        # The 3 bytes of padding after the frame have arbitrary values.
         expected = serialize_message(template)
         assert (message[:25], message[28:]) == (expected[:25], expected[28:])
         assert deserialize_message(message, Imu) == template
 
 
-def test_saturation_is_seen_at_the_rails_and_beyond_the_range():
+def test_saturation_is_reported_at_the_rails_and_beyond_the_range():
     volts = np.array([[2.5, 2.5], [0.0, 2.5], [2.5, 5 * (1 - 2 ** -16)], [2.5, 4.3], [4.1, 0.9]])
     writer = ImuWriter(nominal(), 'imu_link')
     assert writer.saturated(volts).tolist() == [False, True, True, True, False]
@@ -74,7 +74,7 @@ def test_saturation_is_seen_at_the_rails_and_beyond_the_range():
     assert not digital.saturated(volts).any()
 
 
-def test_sim_publishes_every_sample_as_the_interfaces_say(start):
+def test_sim_publishes_every_sample_as_documented(start):
     driver = start('driver', ROS, '-p', 'link.alpha_rad:=1.5707963267948966', '-p',
                    'frame_id:=case', '-p', 'sensor.serial:=A7')
     sensor = nominal()
@@ -82,7 +82,7 @@ def test_sim_publishes_every_sample_as_the_interfaces_say(start):
         samples = graph.listen(Imu, 'imu/data_raw')
         info = graph.listen(DiagnosticStatus, 'sensor_info', latched=True)
         graph.spin_until(lambda: len(samples) >= 3000 and info, 30, '3000 samples')
-        # A machine that is busy may keep the driver from a second's samples, not for long.
+        # On a busy machine the driver may miss the samples of a second, but recovers.
         graph.spin_until(lambda: 'driver' in graph.diagnostics and abs(
             float(graph.value('driver', 'rate_hz')) - 1000) < 100, 15, 'the rate')
         status = graph.diagnostics['driver']
@@ -98,8 +98,8 @@ def test_sim_publishes_every_sample_as_the_interfaces_say(start):
     variance = first.linear_acceleration_covariance.reshape(3, 3)
     sigma = noise.sample_std_v(sensor) * 9.80665
     assert variance == pytest.approx(np.diag([*sigma ** 2, 1e6]))
-    told = {pair.key: pair.value for pair in info[0].values}
-    assert told == sensor_info(sensor) | {'serial': 'A7'}
+    published = {pair.key: pair.value for pair in info[0].values}
+    assert published == sensor_info(sensor) | {'serial': 'A7'}
     a = np.array([accel(message) for message in samples])
     assert not a[:, 2].any()
     assert a[:, :2].mean(0) == pytest.approx([9.80665, 0], abs=0.05)
@@ -109,7 +109,7 @@ def test_sim_publishes_every_sample_as_the_interfaces_say(start):
     assert 'Traceback' not in driver.output()
 
 
-def test_replay_passes_a_recording_on_faster_than_real_time(start, tmp_path):
+def test_replay_publishes_a_recording_faster_than_real_time(start, tmp_path):
     columns = ('ax_mps2', 'ay_mps2', 'az_mps2', 'alpha_rad', 'beta_rad', 'temperature_c',
                'supply_v')
     data = written(tmp_path / 'r.csv', 1000, columns)
@@ -121,7 +121,7 @@ def test_replay_passes_a_recording_on_faster_than_real_time(start, tmp_path):
         clock = graph.listen(Clock, '/clock')
         start('driver', ROS, '-p', 'link.type:=replay', '-p', 'link.recording:=r.csv', '-p',
               'link.speed:=4.0')
-        graph.spin_until(lambda: graph.said('driver', 'ended'), 30, 'the end')
+        graph.spin_until(lambda: graph.reports('driver', 'ended'), 30, 'the end')
         assert graph.value('driver', 'link_state') == 'ended'
     assert len(samples) == 1000
     stamps = np.array([stamp_ns(message) for message in samples])
@@ -152,7 +152,7 @@ def test_replay_in_real_time_is_stamped_now(start, tmp_path):
     assert np.diff(stamps) == pytest.approx(5e6, abs=2)
 
 
-def test_references_that_stay_are_published_seldom(ros_env):
+def test_constant_references_are_published_at_a_low_rate(ros_env):
     with Graph() as graph:
         sent = []
         references = References(graph.node, 'imu_link', ('alpha_rad', 'temperature_c'))
@@ -162,7 +162,8 @@ def test_references_that_stay_are_published_seldom(ros_env):
         columns = {'alpha_rad': np.full(3000, 0.5), 'temperature_c': np.full(3000, 20.0)}
         columns['alpha_rad'][1:10] = np.nan
         for part in np.split(np.arange(3000), 30):
-            references.publish(stamps[part], {k: of[part] for k, of in columns.items()})
+            references.publish(stamps[part],
+                               {name: values[part] for name, values in columns.items()})
     joints = [m for m in sent if isinstance(m, JointState)]
     assert len(joints) == 300
     assert all(np.isfinite(m.position).all() for m in joints)
@@ -171,13 +172,13 @@ def test_references_that_stay_are_published_seldom(ros_env):
 
 @pytest.mark.parametrize('text, why', [
     (None, 'No such file'), ('', 'empty'), ('time_s,x_v\n0.0,1.0\n0.1,two\n', "x_v is 'two'")])
-def test_a_bad_recording_leaves_the_node_up_to_say_so(start, tmp_path, text, why):
+def test_an_invalid_recording_is_reported_while_the_node_continues(start, tmp_path, text, why):
     if text is not None:
         (tmp_path / 'bad.csv').write_text(text)
     with Graph() as graph:
         graph.listen(Imu, 'imu/data_raw')
         driver = start('driver', ROS, '-p', 'link.type:=replay', '-p', 'link.recording:=bad.csv')
-        graph.spin_until(lambda: graph.said('driver', why), 20, 'the reason')
+        graph.spin_until(lambda: graph.reports('driver', why), 20, 'the reason')
         assert graph.diagnostics['driver'].level == DiagnosticStatus.ERROR
         graph.spin(1.5)
     assert driver.popen.poll() is None
@@ -188,7 +189,7 @@ def test_a_bad_recording_leaves_the_node_up_to_say_so(start, tmp_path, text, why
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_it_quietly(start, number):
+def test_a_signal_ends_the_driver_without_messages(start, number):
     driver = start('driver')
     with Graph() as graph:
         samples = graph.listen(Imu, 'imu/data_raw')
@@ -205,7 +206,7 @@ def test_a_signal_ends_it_quietly(start, number):
     (('axes: xy', 'axes: [xy'), False, 'not YAML'),
     (('range_g: 1.7', 'range_g: -1.0'), True, '-1'),
     (('model: nominal', 'model: nominal\n    effects: [bias]'), False, 'bias.offset_v: missing')])
-def test_a_bad_parameter_file_is_refused_with_the_place(start, tmp_path, change, placed, why):
+def test_an_invalid_parameter_file_is_refused_with_the_place(start, tmp_path, change, placed, why):
     path = tmp_path / 'bad.yaml'
     text = NOMINAL.read_text()
     path.write_text(text.replace(*change))
@@ -221,24 +222,24 @@ def test_a_bad_parameter_file_is_refused_with_the_place(start, tmp_path, change,
 @pytest.mark.parametrize('arguments, status', [
     ((ROS, '-p', 'link.type:=carrier_pigeon'), 1), ((ROS, '-p', 'link.speed:=0.0'), 1),
     ((ROS, '--params-file', 'nowhere.yaml'), 1), (('--speed', '3'), 2), ((ROS, '--sped', '3'), 2)])
-def test_a_bad_start_ends_with_one_line(start, arguments, status):
+def test_an_invalid_start_ends_with_one_line(start, arguments, status):
     driver = start('driver', *arguments)
     assert driver.wait() == status
     assert 'Traceback' not in driver.output()
     assert arguments[-1].split(':=')[-1] in driver.output()
 
 
-def test_parameters_say_what_they_are_and_cannot_be_set(start):
+def test_parameters_have_descriptions_and_are_read_only(start):
     start('driver', ROS, '--params-file', NOMINAL)
     with Graph() as graph:
         names = graph.call(ListParameters, 'driver/list_parameters',
                            ListParameters.Request()).result.names
-        own = [n for n in names if not n.startswith(('qos_overrides', 'use_sim', 'start_type'))]
-        assert {'sensor.rate_hz', 'link.type', 'link.speed', 'frame_id'} <= set(own)
-        about = graph.call(DescribeParameters, 'driver/describe_parameters',
-                           DescribeParameters.Request(names=own)).descriptors
-        assert all(d.description and d.read_only for d in about)
-        rate = next(d for d in about if d.name == 'sensor.rate_hz').floating_point_range[0]
+        stated = [n for n in names if not n.startswith(('qos_overrides', 'use_sim', 'start_type'))]
+        assert {'sensor.rate_hz', 'link.type', 'link.speed', 'frame_id'} <= set(stated)
+        descriptors = graph.call(DescribeParameters, 'driver/describe_parameters',
+                                 DescribeParameters.Request(names=stated)).descriptors
+        assert all(d.description and d.read_only for d in descriptors)
+        rate = next(d for d in descriptors if d.name == 'sensor.rate_hz').floating_point_range[0]
         assert (rate.from_value, rate.to_value) == (0.01, 100000)
         value = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=500.0)
         answer = graph.call(SetParameters, 'driver/set_parameters', SetParameters.Request(

@@ -88,7 +88,7 @@ def test_every_fault_of_a_board_is_counted_exactly(start, tmp_path):
         outcome = run_fault(by_name['reset, away for 0.5 s'], rig, driver.popen.pid, 1.0)
         report = outcome.report
         assert report.wrong == 0
-        # A board that was reset has lost its count: the host's time gives it, to a read's delay.
+        # After its reset the board has no count. The host's time gives it, to the delay of a read.
         assert report.counted == report.estimated == pytest.approx(report.missing, rel=0.02)
         assert 450 < report.missing < 700
         assert outcome.recovery_ms < 1000
@@ -127,16 +127,16 @@ def test_a_late_device_is_opened_and_each_state_is_logged_once(start, tmp_path):
     with Graph() as graph:
         driver = start('driver', ROS, '-p', 'link.type:=serial', '-p',
                        f'link.port:={tmp_path / "board"}')
-        graph.spin_until(lambda: graph.said('driver', 'No such file'), 20, 'the reason')
+        graph.spin_until(lambda: graph.reports('driver', 'No such file'), 20, 'the reason')
         assert graph.diagnostics['driver'].level == DiagnosticStatus.ERROR
         graph.spin(1.5)
         rig = SerialRig(graph, tmp_path)
         began_s = time.monotonic()
         rig.wait_for_samples(100, 20)
         assert time.monotonic() - began_s < 2
-        graph.spin_until(lambda: graph.said('driver', 'streaming'), 5, 'streaming')
+        graph.spin_until(lambda: graph.reports('driver', 'streaming'), 5, 'streaming')
         rig.end()
-        graph.spin_until(lambda: graph.said('driver', 'No such file'), 5, 'the end of the board')
+        graph.spin_until(lambda: graph.reports('driver', 'No such file'), 5, 'the lost board')
     assert driver.stop() == 0
     messages = [re.sub(r'^\[(\w+)\] \[[\d.]+\] \[driver\]: ', r'\1 ', line)
                 for line in lines(driver)]
@@ -153,12 +153,12 @@ def test_two_drivers_cannot_have_one_port(start, tmp_path):
         rig.begin_report()
         second = start('driver', ROS, *rig.driver_parameters(), '-r', '__node:=second')
         graph = rig.graph
-        graph.spin_until(lambda: graph.said('second', 'in use'), 20, 'the refusal')
+        graph.spin_until(lambda: graph.reports('second', 'in use'), 20, 'the refusal')
         graph.spin(1.0)
         report = rig.report()
         assert (report.wrong, report.missing, report.counted) == (0, 0, 0)
         first.stop()
-        graph.spin_until(lambda: graph.said('second', 'streaming'), 10, 'taking over')
+        graph.spin_until(lambda: graph.reports('second', 'streaming'), 10, 'taking over')
     assert second.popen.poll() is None
 
 
@@ -245,7 +245,7 @@ def test_a_system_manager_changes_the_state_of_the_driver(start, tmp_path):
             rig.collect()
             before = len(rig.numbers)
             graph.diagnostics.clear()
-            graph.spin_until(lambda: graph.said('driver', 'inactive'), 5, 'inactive')
+            graph.spin_until(lambda: graph.reports('driver', 'inactive'), 5, 'inactive')
             rig.collect()
             assert len(rig.numbers) == before, 'an inactive driver reads nothing'
             held = [os.readlink(f) for f in Path(f'/proc/{driver.popen.pid}/fd').iterdir()

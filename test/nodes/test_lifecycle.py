@@ -41,7 +41,7 @@ def port() -> Iterator[str]:
 
 
 class HalfOpen:
-    """A serial link whose port is open, and which cannot state what it measures."""
+    """A serial link with an open port, which cannot state what it measures."""
 
     def __init__(self, link: serial_link.SerialLink, failure: Exception | None) -> None:
         self._link, self._failure = link, failure
@@ -75,7 +75,7 @@ def make_driver(ros_env: dict[str, str], port: str, monkeypatch: pytest.MonkeyPa
 
 
 def is_free(port: str) -> bool:
-    """Tell whether nobody holds a port."""
+    """Return whether no process holds a port."""
     try:
         serial.Serial(port, exclusive=True).close()
     except serial.SerialException:
@@ -93,7 +93,7 @@ def test_a_failed_activation_leaves_no_link_open(make_driver: SimpleNamespace, p
     make_driver.failure = failure
     assert driver.trigger_activate() == result
     assert is_free(port)
-    # What has failed once can be tried again, after an error from the beginning.
+    # After a failure the activation can be repeated, after an error from the beginning.
     make_driver.failure = None
     if result == TransitionCallbackReturn.ERROR:
         assert driver.trigger_configure() == TransitionCallbackReturn.SUCCESS

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Full disks, drivers that are started anew, other units and settings: no pose is lost."""
+"""Full disks, restarted drivers, other units and settings: no pose is lost."""
 
 import os
 import resource
@@ -45,9 +45,9 @@ def _stage(start, tmp_path):
                  'slew_rate_rad_s:=3.0')
 
 
-def _calibration(start, tmp_path, *more):
+def _calibration(start, tmp_path, *options):
     return start('calibration', '--ros-args', '--params-file', tmp_path / 'bare.yaml', *FAST,
-                 *PLAN, *more)
+                 *PLAN, *options)
 
 
 def _accepted(graph):
@@ -67,12 +67,12 @@ def _begun(graph, start, tmp_path, poses):
     return driver, node
 
 
-def test_a_full_disk_is_said_and_waited_for(start, tmp_path):
-    """What the disk does not take is not acknowledged; with room again the sweep goes on."""
+def test_a_full_disk_is_reported_and_the_sweep_continues_with_room(start, tmp_path):
+    """A pose that is not on disk is not acknowledged. With room the sweep continues."""
     with Graph() as graph:
         _, node = _begun(graph, start, tmp_path, 2)
         size = (tmp_path / 'unit.yaml.journal').stat().st_size
-        # Files cannot grow: what a full disk does to the journal, without being root.
+        # A limit of the file size acts on the journal as a full disk, without root.
         unlimited = resource.prlimit(node.popen.pid, resource.RLIMIT_FSIZE)
         resource.prlimit(node.popen.pid, resource.RLIMIT_FSIZE, (size + 100, unlimited[1]))
         node.wait_for('cannot write the journal: the disk is full; make room and try again')
@@ -85,13 +85,14 @@ def test_a_full_disk_is_said_and_waited_for(start, tmp_path):
     assert [entry.pose for entry in _on_disk(tmp_path)][:full + 3] == list(range(full + 3))
 
 
-def test_a_driver_that_is_started_anew_is_followed_and_another_unit_is_not(start, tmp_path):
-    """The clock of a new driver may be behind; the pose at hand begins anew, the rest stays."""
+def test_a_restarted_driver_is_accepted_and_another_unit_is_not(start, tmp_path):
+    """The clock of a new driver may be behind. The present pose restarts, the others are kept."""
     with Graph() as graph:
         driver, node = _begun(graph, start, tmp_path, 2)
         driver.stop()
         before = _on_disk(tmp_path)
-        graph.spin_until(lambda: graph.said('calibration', 'nothing on /imu/data_raw'), 20, 'why')
+        graph.spin_until(lambda: graph.reports('calibration', 'nothing on /imu/data_raw'), 20,
+                         'the reason')
         assert 'and nobody publishes it' in graph.diagnostics['calibration'].message
         driver = _driver(start, tmp_path)
         graph.spin_until(lambda: _accepted(graph) >= len(before) + 3, 60, 'more poses')
@@ -102,8 +103,8 @@ def test_a_driver_that_is_started_anew_is_followed_and_another_unit_is_not(start
     assert len(_on_disk(tmp_path)) >= len(before) + 3
 
 
-def test_a_fit_that_fails_at_the_end_waits_and_another_unit_ends_the_session(start, tmp_path):
-    """No dead end: redo, finish and abort are still there; no pose of 18 in the journal of 17."""
+def test_a_failed_fit_waits_for_a_decision_and_another_unit_ends_the_session(start, tmp_path):
+    """Redo, finish and abort are possible. The journal has no pose of the other unit."""
     base = nominal(serial='N1')
     parameter_file.save(tmp_path / 'bare.yaml', base)
     capture = CaptureSettings(0.5, np.radians(0.2), 60.0, StageMode.MANUAL, np.radians(2))
@@ -114,7 +115,7 @@ def test_a_fit_that_fails_at_the_end_waits_and_another_unit_ends_the_session(sta
     for i, target in enumerate(settings.targets(base)):
         interrupted.append(pose_record(
             i, alpha_rad=target.alpha_rad, beta_rad=target.beta_rad, samples=500,
-            # Inverted: a unit that no fit takes.
+            # No fit accepts an inverted unit.
             mean_v=(2.5 - np.cos(target.beta_rad), 2.5 - np.sin(target.beta_rad))))
     interrupted.close()
     with Graph() as graph:
@@ -124,8 +125,8 @@ def test_a_fit_that_fails_at_the_end_waits_and_another_unit_ends_the_session(sta
             'output:=unit.yaml', '-p', 'autostart:=true', '-p', 'stage.mode:=manual', '-p',
             f'sweep.planes_rad:=[{np.pi / 2}]', '-p', f'sweep.step_rad:={np.pi / 2}', '-p',
             'sweep.dwell_s:=0.5', '-p', 'sweep.check_poses:=0')
-        graph.spin_until(lambda: graph.said('calibration', 'cannot finish: '), 60, 'why')
-        assert graph.said('calibration', '; finish again, redo or abort')
+        graph.spin_until(lambda: graph.reports('calibration', 'cannot finish: '), 60, 'why')
+        assert graph.reports('calibration', '; finish again, redo or abort')
         assert node.output().count('fitting 10 poses') == 1
         answer = graph.call(Trigger, 'calibration/redo', Trigger.Request())
         assert answer.success and answer.message == 'pose 10 will be taken again'
@@ -140,8 +141,8 @@ def test_a_fit_that_fails_at_the_end_waits_and_another_unit_ends_the_session(sta
 
 
 @pytest.mark.kills
-def test_a_new_start_resumes_or_says_what_changed_or_begins_anew(start, tmp_path):
-    """Without a terminal: it goes on by itself, refuses other settings, and obeys resume:=anew."""
+def test_a_new_start_resumes_or_names_the_change_or_starts_over(start, tmp_path):
+    """Without a terminal it resumes, refuses other settings, and starts over with resume:=anew."""
     with Graph() as graph:
         _, first = _begun(graph, start, tmp_path, 3)
         os.kill(first.popen.pid, 9)
@@ -171,7 +172,7 @@ def test_a_new_start_resumes_or_says_what_changed_or_begins_anew(start, tmp_path
 
 @pytest.mark.kills
 def test_another_mounting_stops_before_a_pose_is_taken(start, tmp_path):
-    """The sensor was taken off and put back 2° turned: the last pose tells, with figures."""
+    """The sensor is mounted again with a turn of 2°, and the last pose shows it."""
     with Graph() as graph:
         driver = _driver(start, tmp_path)
         _stage(start, tmp_path)

@@ -23,7 +23,7 @@ from graph import Graph
 import pytest
 
 POLICY = os.path.join(get_package_share_directory('adxl_ros'), 'security', 'adxl_ros.policy.xml')
-# Topics that depend on parameters: use_sim_time, link.speed, the references of a replay.
+# Topics that depend on the parameters use_sim_time and link.speed, or on a replay.
 SOMETIMES = {'/clock', '/stage/joint_states'}
 
 

@@ -14,7 +14,7 @@ def test_interrupted_twice_a_node_ends_cleanly(start, name):
         node = start(name)
         graph.spin_until(lambda: name in graph.diagnostics, 30, 'up')
     node.popen.send_signal(signal.SIGINT)
-    # Until it has ended, as often as possible.
+    # Signals repeat until the process has ended.
     while node.popen.poll() is None:
         node.popen.send_signal(signal.SIGINT)
         time.sleep(0.002)

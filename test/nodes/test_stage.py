@@ -36,47 +36,47 @@ IDEAL = ('-p', 'sensor.noise_density_g_per_rthz:=[0.0,0.0,0.0]', '-p', 'sensor.a
 
 
 class Commander(Graph):
-    """Tells the stage where to go, and keeps where it says it is."""
+    """A client that commands the stage and keeps its joint states."""
 
     def __enter__(self):
         super().__enter__()
-        self.shown = self.listen(JointState, 'stage/joint_states')
+        self.states = self.listen(JointState, 'stage/joint_states')
         self.true = self.listen(JointState, 'stage/true_joint_states')
         self.command = self.node.create_publisher(JointState, 'stage/command', 10)
         return self
 
     def go(self, **joints):
-        """Command until the stage has arrived; a command that nobody hears yet is lost."""
+        """Command until the stage has arrived, because the first commands may be lost."""
         def arrived():
             self.command.publish(JointState(name=list(joints), position=list(joints.values())))
             self.spin(0.2)
-            last = dict(zip(self.shown[-1].name, self.shown[-1].position)) if self.shown else {}
-            return last and np.abs(self.shown[-1].velocity).max() < 1e-4 and all(
+            last = dict(zip(self.states[-1].name, self.states[-1].position)) if self.states else {}
+            return last and np.abs(self.states[-1].velocity).max() < 1e-4 and all(
                 abs(last[j] - angle) <= STEP / 2 + 1e-9 for j, angle in joints.items())
 
         self.spin_until(arrived, 60, 'arrival')
 
 
-def test_it_goes_where_it_is_told_and_shows_its_encoder(start):
+def test_the_stage_reaches_its_command_and_publishes_its_encoder(start):
     start('stage', ROS, '-p', 'slew_rate_rad_s:=1.0', '-p', 'beta_rad:=0.2')
     with Commander() as graph:
-        graph.spin_until(lambda: graph.shown, 20, 'joint states')
-        assert list(graph.shown[0].name) == ['alpha', 'beta', 'shift']
-        assert graph.shown[0].position[1] == pytest.approx(0.2, abs=STEP / 2)
+        graph.spin_until(lambda: graph.states, 20, 'joint states')
+        assert list(graph.states[0].name) == ['alpha', 'beta', 'shift']
+        assert graph.states[0].position[1] == pytest.approx(0.2, abs=STEP / 2)
         graph.go(alpha=0.5, beta=-0.3)
         graph.spin(0.3)
         now = graph.node.get_clock().now().nanoseconds
-    stamps = np.array([stamp_ns(m) for m in graph.shown])
+    stamps = np.array([stamp_ns(m) for m in graph.states])
     assert (np.diff(stamps) == 10_000_000).all()
     assert stamps[-1] <= now
-    shown = np.array([m.position for m in graph.shown])
-    steps = shown[:, :2] / STEP
+    positions = np.array([m.position for m in graph.states])
+    steps = positions[:, :2] / STEP
     assert np.abs(steps - np.rint(steps)).max() < 1e-6
-    assert max(np.abs(m.velocity).max() for m in graph.shown) == pytest.approx(1, rel=0.01)
+    assert max(np.abs(m.velocity).max() for m in graph.states) == pytest.approx(1, rel=0.01)
     true = {stamp_ns(m): m.position for m in graph.true}
     assert max(true) > stamps[-1], 'the true motion is known ahead'
-    off = np.array([true[s][:2] - p[:2] for s, p in zip(stamps, shown) if s in true])
-    assert 1e-6 < np.abs(off).max() <= STEP / 2 + 1e-9
+    error_rad = np.array([true[s][:2] - p[:2] for s, p in zip(stamps, positions) if s in true])
+    assert 1e-6 < np.abs(error_rad).max() <= STEP / 2 + 1e-9
 
 
 BAD_COMMANDS = {
@@ -90,15 +90,15 @@ BAD_COMMANDS = {
 def test_a_command_without_meaning_is_refused(start):
     stage = start('stage')
     with Commander() as graph:
-        graph.spin_until(lambda: graph.shown, 20, 'the stage')
+        graph.spin_until(lambda: graph.states, 20, 'the stage')
         graph.spin(1)
         for reason, command in BAD_COMMANDS.items():
             graph.command.publish(command)
-            graph.spin_until(partial(graph.said, 'stage', reason), 20, f'refusal: {reason}')
+            graph.spin_until(partial(graph.reports, 'stage', reason), 20, f'refusal: {reason}')
             assert graph.diagnostics['stage'].level == DiagnosticStatus.WARN
             assert '/stage/command' in graph.diagnostics['stage'].message
-            assert not np.abs(graph.shown[-1].position).max() > STEP
-            graph.spin_until(lambda: graph.said('stage', 'at rest'), 20, 'recovery')
+            assert not np.abs(graph.states[-1].position).max() > STEP
+            graph.spin_until(lambda: graph.reports('stage', 'at rest'), 20, 'recovery')
     assert stage.stop() == 0
     lines = stage.output().splitlines()
     assert len(lines) == len(BAD_COMMANDS)
@@ -106,14 +106,15 @@ def test_a_command_without_meaning_is_refused(start):
 
 
 @pytest.mark.parametrize('speed', [1.0, 5.0])
-def test_the_simulated_sensor_feels_the_true_angles(start, speed):
+def test_the_simulated_sensor_senses_the_true_angles(start, speed):
     clock = SIM_TIME if speed != 1 else (ROS,)
     start('stage', *clock)
     start('driver', *clock, '-p', f'link.speed:={speed}', *IDEAL)
     with Commander() as graph:
         samples = graph.listen(Imu, 'imu/data_raw', raw=True)
-        graph.spin_until(lambda: graph.said('driver', 'on the stage') and graph.true, 20, 'both')
-        # The driver knows the stage from its first message on, not from its discovery.
+        graph.spin_until(lambda: graph.reports('driver', 'on the stage') and graph.true, 20,
+                         'driver and stage')
+        # The driver uses the stage from its first message on, not from its discovery.
         graph.spin_until(lambda: len(samples) > 500 and len(graph.true) > 50, 20, 'a while')
         del samples[:]
         graph.go(alpha=0.8, beta=-0.5)
@@ -132,23 +133,23 @@ def test_the_simulated_sensor_feels_the_true_angles(start, speed):
 
 
 @pytest.mark.kills
-def test_sensor_time_goes_on_without_the_stage_and_waits_for_it_again(start):
+def test_sensor_time_continues_without_the_stage_and_waits_for_it_again(start):
     start('driver', *SIM_TIME, '-p', 'link.speed:=5.0', *IDEAL)
     with Commander() as graph:
         samples = graph.listen(Imu, 'imu/data_raw', raw=True)
         clock = graph.listen(Clock, '/clock')
         graph.spin_until(lambda: len(samples) > 100, 20, 'samples without a stage')
-        assert graph.said('driver', 'no stage') or 'driver' not in graph.diagnostics
+        assert graph.reports('driver', 'no stage') or 'driver' not in graph.diagnostics
         stage = start('stage', *SIM_TIME, '-p', 'alpha_rad:=0.5')
-        graph.spin_until(lambda: graph.said('driver', 'on the stage'), 20, 'the stage')
+        graph.spin_until(lambda: graph.reports('driver', 'on the stage'), 20, 'the stage')
         os.kill(stage.popen.pid, signal.SIGKILL)
-        graph.spin_until(lambda: graph.said('driver', 'stage lost'), 20, 'the loss')
+        graph.spin_until(lambda: graph.reports('driver', 'stage lost'), 20, 'the loss')
         assert graph.diagnostics['driver'].level == DiagnosticStatus.WARN
         count = len(samples)
         graph.spin_until(lambda: len(samples) > count + 1000, 20, 'samples after the loss')
         assert imu_table(samples[-1:])[1][0, 2] == pytest.approx(9.80665 * np.cos(0.5), abs=0.01)
         start('stage', *SIM_TIME, '-p', 'alpha_rad:=1.0')
-        graph.spin_until(lambda: graph.said('driver', 'on the stage'), 20, 'the new stage')
+        graph.spin_until(lambda: graph.reports('driver', 'on the stage'), 20, 'the new stage')
         count = len(samples)
         graph.spin_until(lambda: len(samples) > count + 1000, 20, 'samples on the new stage')
         assert imu_table(samples[-1:])[1][0, 2] == pytest.approx(9.80665 * np.cos(1.0), abs=0.02)
@@ -158,19 +159,19 @@ def test_sensor_time_goes_on_without_the_stage_and_waits_for_it_again(start):
     assert ticks == sorted(ticks)
 
 
-def test_a_stage_by_another_clock_is_told(start):
+def test_a_stage_on_another_clock_is_reported(start):
     start('stage', ROS, '-p', 'alpha_rad:=0.5')
     start('driver', ROS, '-p', 'link.speed:=30.0')
     with Commander() as graph:
-        graph.spin_until(lambda: graph.said('driver', 'another clock') or
-                         graph.said('driver', 'on the stage'), 20, 'the driver')
+        graph.spin_until(lambda: graph.reports('driver', 'another clock') or
+                         graph.reports('driver', 'on the stage'), 20, 'the driver')
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_it_quietly(start, number):
+def test_a_signal_ends_the_stage_without_messages(start, number):
     stage = start('stage')
     with Commander() as graph:
-        graph.spin_until(lambda: graph.shown, 20, 'joint states')
+        graph.spin_until(lambda: graph.states, 20, 'joint states')
     os.kill(stage.popen.pid, number)
     assert stage.wait() == 0
     assert stage.output() == ''

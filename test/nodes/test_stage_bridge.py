@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The bridge to a real stage, before a controller that the test plays."""
+"""The bridge to a real stage, with a controller that the test simulates."""
 
 import math
 
@@ -34,72 +34,74 @@ class Controller(Graph):
         super().__init__()
         self.kind = kind
         self.angles = {'gripper': 0.2, 'turn': 0.0, 'tilt': 0.0}
-        self.told = []
+        self.commands = []
 
     def __enter__(self):
         super().__enter__()
         make = self.node.create_publisher
         self.states = make(JointState, '/joint_states', 10)
         self.command = make(JointState, 'stage/command', 10)
-        self.shown = self.listen(JointState, 'stage/joint_states')
+        self.stage_states = self.listen(JointState, 'stage/joint_states')
         if self.kind == 'trajectory':
             self.node.create_subscription(
-                JointTrajectory, '/joint_trajectory_controller/joint_trajectory', self.told.append,
-                10)
+                JointTrajectory, '/joint_trajectory_controller/joint_trajectory',
+                self.commands.append, 10)
         else:
-            self.node.create_subscription(JointState, '/joint_commands', self.told.append, 10)
+            self.node.create_subscription(JointState, '/joint_commands', self.commands.append, 10)
         self.node.create_timer(0.02, self.publish)
         return self
 
     def publish(self):
-        """Say where the joints are."""
+        """Publish the states of the joints."""
         message = JointState(name=list(self.angles), position=[
             math.remainder(angle, 2 * math.pi) for angle in self.angles.values()])
         message.header.stamp = self.node.get_clock().now().to_msg()
         self.states.publish(message)
 
     def goal(self):
-        """Return the joints' angles of the newest command."""
-        newest = self.told[-1]
+        """Return the angles of the newest command by joint."""
+        newest = self.commands[-1]
         return dict(zip(newest.joint_names, newest.points[0].positions)) \
             if self.kind == 'trajectory' else dict(zip(newest.name, newest.position))
 
-    def ask(self, alpha, beta):
-        """Ask the stage to go somewhere."""
+    def send_command(self, alpha, beta):
+        """Command the stage to angles, rad."""
         self.command.publish(JointState(name=['alpha', 'beta'], position=[alpha, beta]))
 
     def at(self):
-        """Return where the stage says it is."""
-        return dict(zip(self.shown[-1].name, self.shown[-1].position)) if self.shown else {}
+        """Return the newest published angles of the stage, rad, by joint."""
+        if not self.stage_states:
+            return {}
+        return dict(zip(self.stage_states[-1].name, self.stage_states[-1].position))
 
 
 @pytest.mark.parametrize('kind', ['trajectory', 'joint_state'])
 def test_commands_and_states_pass_with_names_signs_and_offsets(start, kind):
-    """What is asked of the stage reaches the controller's joints, and their states come back."""
+    """Commands reach the joints of the controller, and their states return."""
     with Controller(kind) as graph:
         start('stage', '--ros-args', '-p', f'stage.type:={kind}', *NAMES, *MOUNTED)
         graph.spin_until(graph.at, 30, 'the stage')
         assert graph.at() == {'alpha': 0.5, 'beta': 0.0}
-        graph.ask(0.7, 0.3)
-        graph.spin_until(lambda: graph.told, 10, 'a command')
+        graph.send_command(0.7, 0.3)
+        graph.spin_until(lambda: graph.commands, 10, 'a command')
         assert graph.goal() == pytest.approx({'tilt': 0.2, 'turn': -0.3})
         if kind == 'trajectory':
-            point = graph.told[0].points[0]
+            point = graph.commands[0].points[0]
             seconds = point.time_from_start.sec + point.time_from_start.nanosec * 1e-9
             assert seconds == pytest.approx(0.3 / 0.3)  # the longer way at 0.3 rad/s
-            assert graph.told[0].header.stamp.sec == 0  # at once
+            assert graph.commands[0].header.stamp.sec == 0  # at once
         graph.angles.update(graph.goal())
         graph.spin_until(lambda: graph.at()['beta'] > 0.29, 10, 'the new place')
         assert graph.at() == pytest.approx({'alpha': 0.7, 'beta': 0.3})
-        count = len(graph.told)
+        count = len(graph.commands)
         for _ in range(10):
-            graph.ask(0.7, 0.3)
+            graph.send_command(0.7, 0.3)
             graph.spin(0.1)
-        assert len(graph.told) == count, 'a command that is followed was sent again'
+        assert len(graph.commands) == count, 'a command that is followed was sent again'
 
 
-def test_a_turn_beyond_half_is_unwrapped(start):
-    """A controller that counts to pi and on from -pi is followed through a whole turn."""
+def test_a_turn_beyond_half_a_turn_is_unwrapped(start):
+    """A controller that counts in (-pi, pi] is tracked through a complete turn."""
     with Controller('trajectory') as graph:
         start('stage', '--ros-args', '-p', 'stage.type:=trajectory', *NAMES)
         for beta in np.arange(0, 6.5, 0.5):
@@ -109,13 +111,13 @@ def test_a_turn_beyond_half_is_unwrapped(start):
 
 
 def test_a_stage_that_begins_beyond_half_a_turn_arrives(start):
-    """330 deg is -30 deg to a controller that counts to pi: it does not move, and is there."""
+    """330 deg is -30 deg of the controller, so that the stage arrives without motion."""
     with Controller('trajectory') as graph:
         graph.angles['turn'] = np.radians(330)
         start('stage', '--ros-args', '-p', 'stage.type:=trajectory', *NAMES, '-p',
               'bridge.speed_rad_s:=10.0')
         graph.spin_until(graph.at, 30, 'the stage')
-        graph.ask(0.0, np.radians(330))
+        graph.send_command(0.0, np.radians(330))
         graph.spin_until(lambda: graph.at()['beta'] == pytest.approx(np.radians(330)), 20,
                          'beta 330')
         graph.angles['turn'] = np.radians(300)
@@ -124,38 +126,39 @@ def test_a_stage_that_begins_beyond_half_a_turn_arrives(start):
 
 
 def test_a_command_that_is_lost_is_sent_again(start):
-    """A controller that starts later, or ignores a goal, is told again after a while."""
+    """A controller that starts later or ignores a goal receives the command again."""
     with Controller('trajectory') as graph:
         start('stage', '--ros-args', '-p', 'stage.type:=trajectory', *NAMES, '-p',
               'bridge.speed_rad_s:=10.0')
         graph.spin_until(graph.at, 30, 'the stage')
 
-        def told_twice():
-            graph.ask(0.4, 0.0)
-            return len(graph.told) >= 2
-        graph.spin_until(told_twice, 20, 'a second time')
-        graph.spin_until(lambda: graph.said('stage', 'the controller has not followed for ')
-                         and graph.said('stage', ' s: alpha is at 0.0° of 22.9°, beta is'), 20,
+        def commanded_twice():
+            graph.send_command(0.4, 0.0)
+            return len(graph.commands) >= 2
+        graph.spin_until(commanded_twice, 20, 'a second time')
+        graph.spin_until(lambda: graph.reports('stage', 'the controller has not followed for ')
+                         and graph.reports('stage', ' s: alpha is at 0.0° of 22.9°, beta is'), 20,
                          'the warning')
         assert graph.diagnostics['stage'].level == DiagnosticStatus.WARN
 
 
-def test_wrong_names_are_told(start):
-    """A joint that the controller does not have is named, with those that it has."""
+def test_wrong_names_are_reported(start):
+    """The message names the missing joint and the joints of the controller."""
     with Controller('trajectory') as graph:
         start('stage', '--ros-args', '-p', 'stage.type:=trajectory', '-p',
               'bridge.alpha.joint:=tilt', '-p', 'bridge.beta.joint:=spin')
-        graph.spin_until(lambda: graph.said('stage', 'no joint spin; it has gripper, tilt, turn'),
-                         30, 'the names')
+        graph.spin_until(
+            lambda: graph.reports('stage', 'no joint spin; it has gripper, tilt, turn'), 30,
+            'the names')
         assert graph.diagnostics['stage'].level == DiagnosticStatus.ERROR
-        assert not graph.shown
+        assert not graph.stage_states
 
 
-@pytest.mark.parametrize('more, words', [
+@pytest.mark.parametrize('options, words', [
     (('-p', 'bridge.alpha.joint:=tilt'), 'bridge.beta.joint: is not set'),
     ((*NAMES, '-p', 'bridge.beta.sign:=0'), 'bridge.beta.sign: 0 is not 1 or -1')])
-def test_what_is_missing_ends_the_node(start, more, words):
-    """Without the joints' names nothing could work: one line says which is missing."""
-    stage = start('stage', '--ros-args', '-p', 'stage.type:=joint_state', *more)
+def test_missing_names_end_the_node(start, options, words):
+    """One line names the parameter that is missing."""
+    stage = start('stage', '--ros-args', '-p', 'stage.type:=joint_state', *options)
     assert stage.wait() == 1
     assert words in stage.output() and 'Traceback' not in stage.output()

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The terminal screen, in a real terminal: what it shows, its keys, and that it leaves."""
+"""The screen in a real terminal: its contents, its keys, and its end."""
 
 import os
 from pathlib import Path
@@ -47,24 +47,24 @@ def terminal(ros_env, tmp_path):
     parameter_file.save(tmp_path / 'truth.yaml', drawn(np.random.default_rng(3), base))
     parameter_file.save(tmp_path / 'bare.yaml', base)
 
-    def begin(*more, **size):
+    def begin(*options, **size):
         opened.append(Terminal(
             [executable('calibration'), '--ros-args', '--params-file', tmp_path / 'bare.yaml',
-             *PLAN, *more], ros_env, tmp_path, **size))
+             *PLAN, *options], ros_env, tmp_path, **size))
         return opened[-1]
 
     yield begin
-    for one in opened:
-        print(one.text())
-        one.close()
+    for program in opened:
+        print(program.text())
+        program.close()
 
 
 class Hands(Graph):
-    """Somebody who turns the stage."""
+    """An operator who turns the stage."""
 
     def __enter__(self):
         super().__enter__()
-        self.shown = self.listen(JointState, 'stage/joint_states')
+        self.stage_states = self.listen(JointState, 'stage/joint_states')
         self.command = self.node.create_publisher(JointState, 'stage/command', 10)
         return self
 
@@ -74,7 +74,7 @@ class Hands(Graph):
             self.command.publish(JointState(name=['alpha', 'beta'], position=[
                 np.radians(alpha_deg), np.radians(beta_deg)]))
             self.spin(0.1)
-            last = self.shown[-1] if self.shown else None
+            last = self.stage_states[-1] if self.stage_states else None
             return last and np.abs(last.velocity).max() < 1e-4 and np.allclose(
                 np.degrees(last.position[:2]), [alpha_deg, beta_deg], atol=0.1)
         self.spin_until(there, 30, f'the stage at {alpha_deg}, {beta_deg}')
@@ -88,8 +88,8 @@ def bench(start, tmp_path):
           'slew_rate_rad_s:=3.0')
 
 
-def test_an_operator_is_led_through_a_sweep_by_the_screen(start, terminal, tmp_path):
-    """Begin, a mistake, poses, a skip, a redo, the end: all by keys, all to be seen."""
+def test_the_screen_guides_an_operator_through_a_sweep(start, terminal, tmp_path):
+    """Keys begin, capture, skip, redo and finish, and the screen shows each result."""
     bench(start, tmp_path)
     (tmp_path / 'unit.yaml').write_text('the earlier one\n')
     with Hands() as hands:
@@ -97,23 +97,23 @@ def test_an_operator_is_led_through_a_sweep_by_the_screen(start, terminal, tmp_p
         seen.wait_for('press b to begin; plan full: 22 poses, about 2 min, expected tilt error',
                       'calibration of T1 (xyz) into unit.yaml', '1000 Hz')
         seen.press('b')
-        shown = seen.wait_for('turn the stage to alpha 45.0°, beta 0.0°, then capture',
-                              'alpha 0.00° (-45.00°)', '0 done, 22 left', 'tilt error',
-                              'must be below', 'misalignment.beta_rad', '45° 0/10', 'c  capture')
-        assert 'check poses 0/2' in ' '.join(shown.split())
-        # Arrows, a wheel and function keys are none of the keys; c comes after them.
+        screen = seen.wait_for('turn the stage to alpha 45.0°, beta 0.0°, then capture',
+                               'alpha 0.00° (-45.00°)', '0 done, 22 left', 'tilt error',
+                               'must be below', 'misalignment.beta_rad', '45° 0/10', 'c  capture')
+        assert 'check poses 0/2' in ' '.join(screen.split())
+        # Arrows, a wheel and function keys have no effect. The key c follows them.
         seen.press(OTHERS)
         seen.press('c')
         seen.wait_for('alpha is 45.0° from the asked 45°')
-        before = _tilt(shown)
+        before = _tilt(screen)
         for number, (alpha, beta) in enumerate(((45, 0), (90, 0), (90, 90), (45, 90)), 1):
             hands.turn(alpha, beta)
             seen.wait_for(f'{number} of 22', f'alpha {alpha:.2f}° (+0.00°)',
                           f'beta {beta:.2f}° (+0.00°)')
             seen.press('c')
             seen.wait_for(f'{number} done', timeout_s=40)
-        shown = seen.wait_for('45° 2/10', 'beta forth 1/4', 'at rest')
-        assert _tilt(shown) < before / 2
+        screen = seen.wait_for('45° 2/10', 'beta forth 1/4', 'at rest')
+        assert _tilt(screen) < before / 2
         seen.press('s')
         seen.wait_for('1 left out', 'alpha 90.0°, beta 180.0°')
         seen.press('r')
@@ -135,20 +135,20 @@ def test_an_operator_is_led_through_a_sweep_by_the_screen(start, terminal, tmp_p
         seen.press('c')
         seen.wait_for('5 done')
         seen.resize(24, 80)
-        shown = seen.wait_for('5 done', 'c  capture')
-        # Each axis with its interval, whole.
-        assert re.search(r'(?m)^bias.* x \S+±\S+ y \S+±\S+ z \S+±\d\S*$', shown), shown
+        screen = seen.wait_for('5 done', 'c  capture')
+        # The line is complete: each axis with its interval.
+        assert re.search(r'(?m)^bias.* x \S+±\S+ y \S+±\S+ z \S+±\d\S*$', screen), screen
         seen.press('f')
         seen.wait_for('16 poses are open; press f again')
         assert not (tmp_path / 'unit.yaml.previous').exists()
         seen.press('f')
-        # The verdict first, and no line of its table is folded.
-        shown = seen.wait_for('wrote unit.yaml', 'held out: tilt')
+        # The acceptance comes first, and no line of its table is folded.
+        screen = seen.wait_for('wrote unit.yaml', 'held out: tilt')
         assert re.search(r'(?m)^linear: datasheet (PASS|FAIL|NOT SHOWN), noise (PASS|FAIL|NOT '
                          r'SHOWN); limited by the \w+\nheld out: tilt \S+° rms, \S+° max; accel '
-                         r'\S+ mg rms, \S+ mg max$', shown), shown
+                         r'\S+ mg rms, \S+ mg max$', screen), screen
         assert re.search(r'(?m)^linear +[\d.]+/[\d.]+( +(PASS|FAIL|NOT SHOWN)){2} +[\d.]+/[\d.]+'
-                         r'( +(PASS|FAIL|NOT SHOWN)){2}$', shown), shown
+                         r'( +(PASS|FAIL|NOT SHOWN)){2}$', screen), screen
         seen.press('b')
         seen.wait_for('unit.yaml.journal holds 5 poses of an interrupted calibration', 'y  go on')
         seen.press('q')
@@ -160,12 +160,12 @@ def test_an_operator_is_led_through_a_sweep_by_the_screen(start, terminal, tmp_p
     _, entries = sweep_journal.read(tmp_path / 'unit.yaml.journal')
     poses = sweep_journal.accepted_poses(entries)
     assert len(poses) == 5 and sweep_journal.skipped_poses(entries) == {4}
-    # The screen costs no samples: every pose is gapless.
+    # The screen causes no loss: every pose has all samples.
     assert all(e.stop_ns - e.start_ns == 1_000_000 * (e.samples - 1) for e in poses)
 
 
-def _tilt(shown):
-    line = next(line for line in shown.splitlines() if line.startswith('tilt error'))
+def _tilt(screen):
+    line = next(line for line in screen.splitlines() if line.startswith('tilt error'))
     return float(line.split()[2].rstrip('°'))
 
 
@@ -177,8 +177,8 @@ def children(pid):
 
 @pytest.mark.kills
 @pytest.mark.parametrize('how', ['ctrl-c', 'term', 'kill', 'kill of the screen'])
-def test_the_terminal_is_given_back(terminal, how):
-    """However the node ends, settings, screen and cursor are as they were."""
+def test_the_terminal_is_restored(terminal, how):
+    """After each kind of end, settings, screen and cursor are as before."""
     seen = terminal()
     seen.wait_for('press b to begin')
     screen, = children(seen.popen.pid)
@@ -197,11 +197,11 @@ def test_the_terminal_is_given_back(terminal, how):
                          'the terminal as it was')
 
 
-def test_a_terminal_of_another_process_has_a_screen_too(terminal):
-    """As in a container or below an IDE: a terminal that does not control the node."""
+def test_a_terminal_of_another_process_has_a_screen(terminal):
+    """The screen also works in a terminal that does not control the node, as in a container."""
     seen = terminal(controls=False)
     seen.wait_for('press b to begin', 'q  quit')
-    # No driver is there: what was begun can be taken back.
+    # Without a driver the start can be aborted.
     seen.press('b')
     seen.wait_for('waiting for sensor_info', 'a  abort')
     seen.press('a')
@@ -211,8 +211,8 @@ def test_a_terminal_of_another_process_has_a_screen_too(terminal):
     assert seen.restored()
 
 
-def test_what_changed_is_said_and_asked_about(start, terminal, tmp_path):
-    """An interrupted calibration of other settings: what differs, and anew only if told."""
+def test_a_change_of_settings_is_reported_with_a_question(start, terminal, tmp_path):
+    """The question names the difference. Only the key for it starts over."""
     old = sweep_journal.Journal(tmp_path / 'unit.yaml.journal', {'mode': 'stage', 'serial': 'T0'})
     old.append(pose_record(0))
     old.close()
@@ -221,7 +221,7 @@ def test_what_changed_is_said_and_asked_about(start, terminal, tmp_path):
     seen.wait_for('holds 1 poses of an interrupted calibration, which cannot go on',
                   'serial was "T0", is "T1"', 'n  begin anew')
     with Graph() as graph:
-        # Who calls the service is told that somebody at the screen is asked.
+        # The answer of the service states that the operator at the screen decides.
         answer = graph.call(Trigger, 'calibration/start', Trigger.Request())
         assert not answer.success and 'which cannot go on' in answer.message
     seen.press('n')
@@ -231,8 +231,8 @@ def test_what_changed_is_said_and_asked_about(start, terminal, tmp_path):
 
 
 @pytest.mark.parametrize('length', [1, 2, 3, 100])
-def test_what_comes_with_an_escape_is_no_key(length):
-    """However the terminal's bytes are cut, of which the letters of a mouse are any."""
+def test_escape_sequences_are_not_keys(length):
+    """Mouse sequences are not keys, independent of the portions of the bytes."""
     keys, sent = Keys(), f'C{OTHERS}\xe4r{OTHERS} '.encode()
     assert ''.join(keys.read(sent[i:i + length], i * 1e-3)
                    for i in range(0, len(sent), length)) == 'cr '
@@ -240,7 +240,7 @@ def test_what_comes_with_an_escape_is_no_key(length):
 
 
 def test_without_rich_there_are_plain_lines():
-    """The screen is an extra: one line says what it needs."""
+    """The screen is an extra, and one line names its missing package."""
     done = run_without_extras("""
 import os
 from adxl_ros.nodes.terminal.terminal_process import open_terminal

@@ -124,7 +124,7 @@ class Graph:
         request = ChangeState.Request(transition=Transition(id=transition))
         return self.call(ChangeState, f'{node}/change_state', request).success
 
-    def said(self, node, text):
+    def reports(self, node, text):
         """Return whether the newest diagnostics of a node contain a text."""
         return node in self.diagnostics and text in self.diagnostics[node].message
 
