@@ -94,7 +94,7 @@ class BaselineComparison:
     at_rest
         Samples at which nothing moves, (n,) bool.
     used
-        Samples that count, (n,) bool; the others are missing, repeated or outliers.
+        Samples that are used, (n,) bool; the others are missing, repeated or outliers.
 
     """
 
@@ -235,7 +235,7 @@ def compare(recording: Recording, sensor: Sensor, sim: Motion | None = None
     Returns
     -------
     BaselineComparison
-        The comparison; all samples count.
+        The comparison; all samples are used.
 
     Raises
     ------

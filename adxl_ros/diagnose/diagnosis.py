@@ -39,7 +39,12 @@ from adxl_ros.diagnose.noise_comparison import compare_noise, NoiseComparison
 from adxl_ros.diagnose.noise_detectors import Detection, NoiseSamples, UNKNOWN
 from adxl_ros.diagnose.noise_floor import NoiseFloor
 from adxl_ros.diagnose.noise_whitening import drifts_among
-from adxl_ros.diagnose.residual_map import not_covered, residual_map, ResidualCell
+from adxl_ros.diagnose.residual_map import (
+    not_covered,
+    residual_map,
+    ResidualCell,
+    SMALLEST_WARMING_C,
+)
 from adxl_ros.diagnose.single_effect_tests import single_effect_tests, SingleEffectTest
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.stream_unit import check_unit
@@ -50,9 +55,6 @@ from adxl_ros.model.sensor import Sensor, with_axes
 from adxl_ros.simulate.motion import Motion
 import numpy as np
 
-_SMALLEST_WARMING_C = 1.0
-"""Range of the temperature, °C, below which nothing warms. Chosen: 0.1 mg of a typical
-sensor."""
 _SMALLEST_SUPPLY_CHANGE_V = 0.02
 """Range of the supply, V, below which it does not change. Chosen: twice the ripple of a
 regulator."""
@@ -357,7 +359,7 @@ def _could_show(comparison: BaselineComparison) -> bool:
         return True
     motion, time_s = comparison.motion, comparison.time_s
     warms = motion.temperature_c is not None \
-        and np.ptp(motion.temperature_c(time_s)) > _SMALLEST_WARMING_C
+        and np.ptp(motion.temperature_c(time_s)) > SMALLEST_WARMING_C
     supply_changes = motion.supply_v is not None \
         and np.ptp(motion.supply_v(time_s)) > _SMALLEST_SUPPLY_CHANGE_V
     return bool(warms or supply_changes)

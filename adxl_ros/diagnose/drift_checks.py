@@ -58,9 +58,9 @@ class ResidualChannel:
     Attributes
     ----------
     residual_v
-        Residual, bridged over samples that do not count, V, (n,).
+        Residual, bridged over samples that are not used, V, (n,).
     used
-        Samples that count, (n,) bool.
+        Samples that are used, (n,) bool.
     rate_hz
         Sample rate, Hz.
     whitener
@@ -80,7 +80,7 @@ class ResidualChannel:
     innovation_variance_v2: float
 
     def whitened_v(self) -> np.ndarray:
-        """Return the whitened residual, V, (n,), zero where samples do not count."""
+        """Return the whitened residual, V, (n,), zero where samples are not used."""
         white = self.whitener(self.residual_v[None])[0] * self.used
         # The first sample is a step from zero.
         white[0] = 0.0

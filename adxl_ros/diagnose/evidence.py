@@ -91,7 +91,7 @@ def whiten_channel(residual_v: np.ndarray, columns: np.ndarray, column_ids: np.n
     column_ids
         Numbers of the columns, (k,).
     used
-        Samples that count, (n,) bool; the others are bridged by straight lines.
+        Samples that are used, (n,) bool; the others are bridged by straight lines.
     filters
         Whitening filters to choose from.
 
@@ -124,14 +124,14 @@ def block_edges(count: int) -> np.ndarray:
 
 def bridged(data: np.ndarray, used: np.ndarray) -> np.ndarray:
     """
-    Replace rows that do not count by straight lines between those that do.
+    Replace rows that are not used by straight lines between those that are.
 
     Parameters
     ----------
     data
         Series, (n, k).
     used
-        Rows that count, (n,) bool.
+        Rows that are used, (n,) bool.
 
     Returns
     -------
@@ -195,7 +195,7 @@ def fit_columns(channels: Sequence[WhitenedChannel], column_ids: Sequence[int],
     bounds
         Largest magnitude of every column's coefficient, by number.
     blocks
-        Blocks that count, (blocks,) bool; None for all.
+        Blocks that are used, (blocks,) bool; None for all.
     start
         A fit whose noise is close to that of this fit.
     drifts

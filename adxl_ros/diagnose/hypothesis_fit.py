@@ -158,7 +158,7 @@ class LinearisedHypothesis:
         Parameters
         ----------
         blocks
-            Blocks that count, (blocks,) bool; None for all.
+            Blocks that are used, (blocks,) bool; None for all.
         drifts
             Effects by which the zero-g drifts, beside those of the sensor.
 

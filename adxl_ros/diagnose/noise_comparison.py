@@ -79,7 +79,7 @@ def compare_noise(residual_v: np.ndarray, simulated_v: np.ndarray, rate_hz: floa
     Parameters
     ----------
     residual_v
-        Residual, bridged over samples that do not count, V, (n, m).
+        Residual, bridged over samples that are not used, V, (n, m).
     simulated_v
         Drawn noise, V, (n, m).
     rate_hz

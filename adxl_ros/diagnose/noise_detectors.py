@@ -148,14 +148,14 @@ def repeated_samples(volts: np.ndarray, time_s: np.ndarray, used: np.ndarray, se
     time_s
         Stamps, s, (n,).
     used
-        Samples that count so far, (n,) bool.
+        Samples that are used so far, (n,) bool.
     sensor
         The baseline.
 
     Returns
     -------
     tuple
-        The samples that count, (n,) bool, and the detection or none.
+        The samples that are used, (n,) bool, and the detection or none.
 
     """
     same = np.concatenate([[False], (np.diff(volts, axis=0) == 0).all(axis=1)])
@@ -194,14 +194,14 @@ def isolated_samples(volts: np.ndarray, time_s: np.ndarray, used: np.ndarray, se
     time_s
         Stamps, s, (n,).
     used
-        Samples that count so far, (n,) bool.
+        Samples that are used so far, (n,) bool.
     sensor
         The baseline.
 
     Returns
     -------
     tuple
-        The samples that count, (n,) bool, and the detection or None.
+        The samples that are used, (n,) bool, and the detection or None.
 
     """
     spikes, size_v = _spikes(volts, used, sensor)
@@ -229,7 +229,7 @@ def residual_shows_spikes(spikes: Detection, residual_v: np.ndarray, used: np.nd
     residual_v
         Residual, V, (n, m).
     used
-        Samples that count, (n,) bool; spikes are not among them.
+        Samples that are used, (n,) bool; spikes are not among them.
     sensor
         Sensor of the hypothesis, at the rate of the recording.
 
@@ -335,15 +335,15 @@ class NoiseSamples:
     time_s
         Stamps, s, (n,).
     residual_v
-        Residual, bridged over samples that do not count, V, (n, m).
+        Residual, bridged over samples that are not used, V, (n, m).
     raw_residual_v
         Residual as it is, V, (n, m).
     simulated_v
         Noise that the simulator draws, V, (n, m).
     at_rest
-        Samples that rest and count, (n,) bool.
+        Samples that rest and are used, (n,) bool.
     used
-        Samples that count, (n,) bool.
+        Samples that are used, (n,) bool.
 
     """
 

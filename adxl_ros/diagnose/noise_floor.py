@@ -96,7 +96,7 @@ def squares_at_rest(volts: np.ndarray, at_rest: np.ndarray, sensor: Sensor) -> S
     volts
         Output, V, (n, m).
     at_rest
-        Samples that rest and count, (n,) bool.
+        Samples that rest and are used, (n,) bool.
     sensor
         The baseline at the rate of the samples.
 

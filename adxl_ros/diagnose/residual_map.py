@@ -52,9 +52,9 @@ _BANDS_HZ = (0.0, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 500.0)
 _SMALLEST_RANGE = 1e-3
 """Range of a dimension, in its unit, below which it is constant. Chosen: steps of an
 encoder."""
-_SMALLEST_WARMING_C = 1.0
-"""Range of the temperature below which other temperatures are missing, °C. Chosen: 0.1 mg
-of a typical sensor."""
+SMALLEST_WARMING_C = 1.0
+"""Range of the temperature, °C, below which it counts as constant. Chosen: 0.1 mg of a typical
+sensor."""
 _LONGEST_SINCE_MOVE_S = 60.0
 """Longest time since the last move that is mapped, s. Chosen: creep has ended."""
 _COVERAGE = {
@@ -148,7 +148,7 @@ def not_covered(comparisons: Sequence[BaselineComparison]) -> list[str]:
         covered |= set(dimensions(comparison))
         temperature = comparison.motion.temperature_c
         if temperature is not None \
-                and np.ptp(temperature(comparison.time_s)) < _SMALLEST_WARMING_C:
+                and np.ptp(temperature(comparison.time_s)) < SMALLEST_WARMING_C:
             covered -= {'temperature_c'}
     return [text for name, text in _COVERAGE.items() if name not in covered]
 
