@@ -321,7 +321,7 @@ class Journal:
             if not start_over:
                 raise UserError(
                     f'{error}; {len(accepted_poses(error.entries))} poses before it can be read; '
-                    'name another journal, or begin anew with resume:=anew (this file is kept)'
+                    'name another journal, or begin again with resume:=anew (this file is kept)'
                 ) from None
             self._put_aside(None)
             contents = None
@@ -335,7 +335,7 @@ class Journal:
             return []
         if changed := differences(contents.head, head):
             raise UserError(f'{self.path}: holds an unfinished calibration of another kind: '
-                            f'{changed}; go back, or begin anew with resume:=anew (it is kept)')
+                            f'{changed}; go back, or begin again with resume:=anew (it is kept)')
         self._file.truncate(size)
         return contents.entries
 

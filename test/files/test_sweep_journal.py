@@ -108,7 +108,7 @@ def test_a_damaged_journal_is_replaced_only_on_request(tmp_path, text, poses):
     text = text.replace(b'%s', head).replace(b'%r', json.dumps(POSE.to_json()).encode())
     path.write_bytes(text)
     with pytest.raises(UserError, match=f'not a journal: .*; {poses} poses before it can be read; '
-                       'name another journal, or begin anew with resume:=anew'):
+                       'name another journal, or begin again with resume:=anew'):
         Journal(path, HEAD)
     assert path.read_bytes() == text
     accepted, reason = unfinished(path, HEAD)

@@ -51,7 +51,7 @@ class Operator(Graph):
     def has_request(self):
         """Return whether the newest diagnostics request a pose, or state its error."""
         return (self.reports('calibration', 'then capture')
-                or self.reports('calibration', 'from the asked'))
+                or self.reports('calibration', 'from the target'))
 
     def command(self, alpha, beta, shift=0.0):
         """Command the stage without waiting for its arrival."""
@@ -104,12 +104,12 @@ def test_a_calibration_with_mistakes_of_the_operator_is_right(start, tmp_path):
         operator.turn(alpha, np.radians(3.2))
         operator.spin_until(operator.has_request, 20, 'an angle in the calibration')
         assert operator.ask() == (
-            False, 'beta is 3.2° from the asked 0°; turn the stage there and capture again')
+            False, 'beta is 3.2° from the target 0°; turn the stage there and capture again')
         # Too early: the stage is still turning.
         operator.turn(alpha, 4 * np.pi)
         operator.command(alpha, beta)
         early, answer = operator.ask()
-        assert not early and 'from the asked 0°' in answer
+        assert not early and 'from the target 0°' in answer
         operator.turn(alpha, beta)
         # A knock during the dwell restarts the average of the pose.
         done, answer = operator.ask(meanwhile=lambda: (operator.command(alpha, beta, 0.02),
@@ -121,7 +121,7 @@ def test_a_calibration_with_mistakes_of_the_operator_is_right(start, tmp_path):
         assert number == 2
         operator.turn(alpha, beta)
         done, answer = operator.ask(meanwhile=lambda: operator.turn(alpha, beta + np.pi / 4))
-        assert not done and f'beta is 45.0° from the asked {np.degrees(beta):.4g}°' in answer
+        assert not done and f'beta is 45.0° from the target {np.degrees(beta):.4g}°' in answer
         # A pause: the calibration continues and repeats its request.
         operator.turn(alpha, beta)
         operator.spin_until(operator.has_request, 20, 'what is waited for')

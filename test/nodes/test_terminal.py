@@ -104,7 +104,7 @@ def test_the_screen_guides_an_operator_through_a_sweep(start, terminal, tmp_path
         # Arrows, a wheel and function keys have no effect. The key c follows them.
         seen.press(OTHERS)
         seen.press('c')
-        seen.wait_for('alpha is 45.0° from the asked 45°')
+        seen.wait_for('alpha is 45.0° from the target 45°')
         before = _tilt(screen)
         for number, (alpha, beta) in enumerate(((45, 0), (90, 0), (90, 90), (45, 90)), 1):
             hands.turn(alpha, beta)
@@ -219,7 +219,7 @@ def test_a_change_of_settings_is_reported_with_a_question(start, terminal, tmp_p
     bench(start, tmp_path)
     seen = terminal(*FAST, '-p', 'autostart:=true')
     seen.wait_for('holds 1 poses of an interrupted calibration, which cannot go on',
-                  'serial was "T0", is "T1"', 'n  begin anew')
+                  'serial was "T0", is "T1"', 'n  begin again')
     with Graph() as graph:
         # The answer of the service states that the operator at the screen decides.
         answer = graph.call(Trigger, 'calibration/start', Trigger.Request())

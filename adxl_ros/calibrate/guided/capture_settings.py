@@ -41,13 +41,15 @@ class CaptureSettings:
     dwell_s
         Time at rest for each pose, s.
     tolerance_rad
-        A stage that turns itself has arrived within this of the pose, rad.
+        Largest distance of a joint from the pose at which a stage that turns itself has arrived,
+        rad.
     timeout_s
-        A pose that takes longer is reported as late, s.
+        Time after which an open pose is reported as late, s.
     stage_mode
         Who turns the stage.
     near_rad
-        A stage that is turned by hand is captured within this of the pose, rad.
+        Largest distance of a joint from the pose at which a capture by hand is accepted, rad.
+        The default is 2°.
     temperature_span_c
         Largest difference of the temperature from that of the first pose, °C.
 

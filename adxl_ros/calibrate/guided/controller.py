@@ -15,8 +15,8 @@
 """
 The guided calibration as a state machine, free of ROS.
 
-Services and keys call its methods, messages go into it, and `poll` makes it go on. What it says
-leaves through `Outputs`, and samples come from a `SampleSource`.
+Services, keys and messages call its methods, and `poll` advances it. Samples come from a
+`SampleSource`. Lines, answers and poses go to `Outputs`.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from adxl_ros.model.sensor import Sensor
 import numpy as np
 
 IDLE_TEXT = 'idle; call ~/start'
-"""What a controller says that has not been started."""
+"""Status of a controller that has not been started."""
 _NOT_RUNNING = 'no calibration is running'
 """The answer to requests that need a session."""
 
@@ -49,9 +49,9 @@ class ControllerState(Enum):
     """State of the guided calibration."""
 
     IDLE = auto()
-    """Nothing is to be done."""
+    """No calibration runs or waits."""
     WAITING_FOR_SENSOR = auto()
-    """A calibration is to begin once the sensor is known."""
+    """A calibration begins once the sensor is known."""
     ASKING = auto()
     """The operator is asked what to do with an interrupted calibration."""
     RUNNING = auto()
@@ -64,11 +64,11 @@ class Resume(Enum):
     """What to do with an interrupted calibration."""
 
     ASK = 'ask'
-    """Ask the operator if somebody is at a screen; else go on with it."""
+    """Ask the operator if somebody is at a screen; else resume it."""
     CONTINUE = 'continue'
-    """Go on with it."""
+    """Resume it."""
     ANEW = 'anew'
-    """Put it aside and begin again."""
+    """Put its journal aside and begin a new calibration."""
 
 
 class Severity(Enum):
@@ -86,7 +86,7 @@ class Answer(NamedTuple):
     Attributes
     ----------
     success
-        Whether it was carried out.
+        Whether the request was carried out.
     message
         One line for people.
 
@@ -126,14 +126,14 @@ class Outputs(Protocol):
         Parameters
         ----------
         severity
-            Its severity.
+            Severity of the line.
         text
             The line.
 
         """
 
     def answer_captures(self, answer: Answer) -> None:
-        """Answer all who wait for the end of a capture."""
+        """Answer all callers that wait for the end of a capture."""
 
     def announce(self, pose: NextPose) -> None:
         """Announce the pose to go to, and command a stage that turns itself."""
@@ -151,21 +151,21 @@ class SampleSource(Protocol):
 
     Attributes
     ----------
-    useless
+    fault
         Why the newest samples are of no use, or ''.
 
     """
 
-    useless: str
+    fault: str
 
     def take(self, unit: Sensor) -> tuple[np.ndarray, np.ndarray]:
         """Return the samples since the last call: stamps, ns, (n,), and volts, (n, m)."""
 
-    def heard(self) -> None:
-        """Begin to measure the silence of the stream."""
+    def restart_silence(self) -> None:
+        """Measure the time without samples from now on."""
 
-    def silent(self) -> str:
-        """Return for how long nothing has come, or ''."""
+    def silence(self) -> str:
+        """Return one line on the time without samples; '' while samples come."""
 
     def clear(self) -> None:
         """Forget the waiting samples."""
@@ -194,7 +194,7 @@ class Controller:
     Attributes
     ----------
     state
-        The state.
+        The present state.
     unit
         The nominal sensor of the stream; None while it is unknown.
     session
@@ -202,7 +202,7 @@ class Controller:
     question
         The question to the operator in the state ASKING, else ''.
     outcome
-        Lines on the calibration that has ended.
+        Lines on the calibration that ended last.
     may_ask
         Whether somebody is at a screen who can be asked.
     shows_idle_stream
@@ -277,7 +277,7 @@ class Controller:
         self._take_samples(self.session)
         obstacle = self.session.guide.capture()
         if obstacle:
-            self._log_news(Severity.WARNING, obstacle)
+            self._log_unless_repeated(Severity.WARNING, obstacle)
             return Answer(False, obstacle)
         return Answer(True, 'averaging')
 
@@ -286,16 +286,16 @@ class Controller:
         if self.session is None:
             return Answer(False, _NOT_RUNNING)
         try:
-            return self._changed_pose(self.session.redo(), 'no pose to take again')
+            return self._answer_pose_change(self.session.redo(), 'no pose to take again')
         except UserError as error:
             return Answer(False, f'{error}')
 
     def skip(self) -> Answer:
-        """Leave out the pose at hand."""
+        """Leave out the open pose."""
         if self.session is None:
             return Answer(False, _NOT_RUNNING)
         try:
-            return self._changed_pose(self.session.skip(), 'no pose to leave out')
+            return self._answer_pose_change(self.session.skip(), 'no pose to leave out')
         except UserError as error:
             return Answer(False, f'{error}')
 
@@ -316,7 +316,7 @@ class Controller:
 
     def say(self, text: str) -> None:
         """Log a line unless it was the last one."""
-        self._log_news(Severity.INFO, text)
+        self._log_unless_repeated(Severity.INFO, text)
 
     def read_sensor_info(self, info: StreamInfo) -> None:
         """Take what the stream states about its sensor."""
@@ -392,7 +392,7 @@ class Controller:
             self._add_reading(self.session, readings, 'supply', stamp_ns, supply_v)
 
     def poll(self) -> None:
-        """Take the samples that have come, and go on."""
+        """Take the samples and poses since the last call; announce the next pose or fit."""
         if self.state is ControllerState.WAITING_FOR_SENSOR:
             self._try_to_start()
         if self.session is None:
@@ -400,7 +400,7 @@ class Controller:
             return
         self._take_samples(self.session)
         if self._take_poses(self.session):
-            self._go_on(self.session)
+            self._announce_or_fit(self.session)
 
     def status(self) -> Status:
         """Return what the calibration waits for."""
@@ -409,12 +409,12 @@ class Controller:
         if self.state is ControllerState.WAITING_FOR_SENSOR:
             if self._sensor_fault:
                 return Status(Phase.REFUSED, self._sensor_fault, True)
-            advice = '; is the driver running?' if self._samples.silent() else ''
+            advice = '; is the driver running?' if self._samples.silence() else ''
             return Status(Phase.INFO, f'waiting for sensor_info{advice}', True)
         if self.session is None:
             idle = f'{IDLE_TEXT}; {self._outlook}' if self._outlook else IDLE_TEXT
             return Status(Phase.IDLE, self._last_line or idle, False)
-        silence = self._samples.silent()
+        silence = self._samples.silence()
         if silence:
             return Status(Phase.SILENT, silence, True)
         fault = self._sample_fault or self._fit_fault
@@ -445,7 +445,7 @@ class Controller:
             self.session.close()
 
     def _try_to_start(self) -> None:
-        """Begin a session if the sensor is known and there is no question."""
+        """Begin a session if the sensor is known and the operator has nothing to answer."""
         if self.unit is None:
             return
         try:
@@ -463,7 +463,7 @@ class Controller:
     def _begin_session(self, unit: Sensor) -> None:
         self.session = session = Session(unit, self.settings, self._starts_over)
         self.state, self.outcome = ControllerState.RUNNING, ()
-        self._samples.heard()
+        self._samples.restart_silence()
         task = self._outlook or 'rest in 24 or more directions, then call ~/finish'
         if not session.resumed:
             self.say(f'calibrating {unit.serial}: {task}')
@@ -474,12 +474,12 @@ class Controller:
                  f'{check}; resume:=anew puts them aside')
 
     def _refuse_sensor(self, fault: str) -> None:
-        """Take and show nothing of a sensor that is not the one of the parameters."""
+        """End the session of a stream whose sensor is not the one of the parameters."""
         self._sensor_fault = fault
         self.unit = self._idle_samples = None
         if self.session is not None:
             self._stop(Severity.ERROR, f'{fault}; the poses are kept')
-        self._log_news(Severity.ERROR, fault)
+        self._log_unless_repeated(Severity.ERROR, fault)
 
     def _compare_sensor(self, session: Session, unit: Sensor) -> None:
         """End a session whose sensor changed; check the mounting if its driver restarted."""
@@ -491,11 +491,11 @@ class Controller:
                        'put it back and start again, the poses are kept')
             return
         session.guide.verify()
-        self._outputs.answer_captures(Answer(False, 'the driver began anew; capture again'))
+        self._outputs.answer_captures(Answer(False, 'the driver started again; capture again'))
 
     def _add_reading(self, session: Session, readings: Readings, quantity: str, stamp_ns: int,
                      value: float) -> None:
-        """Add a reading; one on another clock counts from its arrival."""
+        """Add a reading; a reading on another clock gets the stamp of the newest sample."""
         newest_ns = session.guide.newest_ns or 0
         ahead_ns = stamp_ns - newest_ns
         if stamp_ns and newest_ns and abs(ahead_ns) > STALE_NS:
@@ -504,7 +504,7 @@ class Controller:
                 side = 'ahead of' if ahead_ns > 0 else 'behind'
                 self._outputs.log(
                     Severity.WARNING, f'{quantity} is stamped {abs(ahead_ns) * 1e-9:.0f} s {side} '
-                    'imu/data_raw: it counts from when it arrives; put both on one clock')
+                    'imu/data_raw: its time of arrival counts; put both on one clock')
             stamp_ns = 0
         readings.add(stamp_ns or newest_ns, value)
 
@@ -520,11 +520,11 @@ class Controller:
 
     def _take_samples(self, session: Session) -> None:
         stamps_ns, volts = self._samples.take(self.unit or session.unit)
-        if not len(stamps_ns) and not self._samples.useless:
+        if not len(stamps_ns) and not self._samples.fault:
             return
-        fault = self._samples.useless or session.feed(stamps_ns, volts)
+        fault = self._samples.fault or session.feed(stamps_ns, volts)
         if fault and not self._sample_fault:
-            self._log_news(Severity.ERROR, fault)
+            self._log_unless_repeated(Severity.ERROR, fault)
         self._sample_fault = fault
 
     def _take_poses(self, session: Session) -> bool:
@@ -537,24 +537,24 @@ class Controller:
             self._stop(Severity.ERROR, f'{error}')
             return False
         except UserError as error:
-            self._log_news(Severity.ERROR, f'{error}')
+            self._log_unless_repeated(Severity.ERROR, f'{error}')
             self._outputs.answer_captures(Answer(False, f'{error}'))
         refusal = session.guide.new_refusal()
         if refusal:
-            self._log_news(Severity.WARNING, refusal)
+            self._log_unless_repeated(Severity.WARNING, refusal)
             self._outputs.answer_captures(Answer(False, refusal))
         return True
 
-    def _go_on(self, session: Session) -> None:
-        """Announce the next pose, or fit where none is open."""
+    def _announce_or_fit(self, session: Session) -> None:
+        """Announce the next pose; fit if no pose is open."""
         pose = session.guide.next_pose()
         if pose is not None:
             self._outputs.announce(pose)
         elif self.state is not ControllerState.FIT_FAILED:
             self._fit(session)
 
-    def _changed_pose(self, text: str, obstacle: str) -> Answer:
-        """Answer a request for another pose, by its line for people or an obstacle."""
+    def _answer_pose_change(self, text: str, obstacle: str) -> Answer:
+        """Answer a request for another pose by its line, or by the obstacle if it has none."""
         if not text:
             return Answer(False, obstacle)
         self._fit_fault, self.state = '', ControllerState.RUNNING
@@ -573,12 +573,12 @@ class Controller:
             self._write_report(result)
             session.end()
         except (UserError, OSError) as error:
-            # The poses stay: others, or room on the disk, can still make a calibration of them.
+            # The poses stay: further poses, or room on the disk, can still lead to a fit.
             text = f'cannot finish: {error}'
             if session.guide.is_over:
                 text = f'{text}; finish again, redo or abort'
                 self._fit_fault, self.state = text, ControllerState.FIT_FAILED
-            self._log_news(Severity.ERROR, text)
+            self._log_unless_repeated(Severity.ERROR, text)
             return False
         for line in result.comments():
             self._outputs.log(Severity.INFO, line)
@@ -589,14 +589,14 @@ class Controller:
         return True
 
     def _write_report(self, result: CalibrationResult) -> None:
-        """Write the report; the calibration stands without it."""
+        """Write the report; without it the calibration is still valid."""
         if not self.settings.report:
             return
         try:
             Path(self.settings.report).mkdir(parents=True, exist_ok=True)
             report_html.write(self.settings.report, result, self.settings.store)
         except (UserError, OSError) as error:
-            self._log_news(Severity.ERROR, f'no report: {error}')
+            self._log_unless_repeated(Severity.ERROR, f'no report: {error}')
 
     def _stop(self, severity: Severity, text: str) -> None:
         """End the session, or the wait for one, with a line for people."""
@@ -606,15 +606,16 @@ class Controller:
         self._sample_fault = self._fit_fault = ''
         self._outputs.answer_captures(Answer(False, text))
         self._outputs.withdraw_pose(text)
-        self._log_news(severity, text)
+        self._log_unless_repeated(severity, text)
 
-    def _log_news(self, severity: Severity, text: str) -> None:
+    def _log_unless_repeated(self, severity: Severity, text: str) -> None:
         """Log a line unless it was the last one."""
         if text != self._last_line:
             self._outputs.log(severity, text)
         self._last_line = text
 
     def _warn_once(self, status: Status) -> None:
+        """Log a warning once for each phase and pose, although its times change."""
         poses = self.session.accepted_count if self.session is not None else ''
         key = f'{status.phase.value} {poses}'
         if key != self._last_warning and status.text != self._last_line:

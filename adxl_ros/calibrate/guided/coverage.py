@@ -76,6 +76,7 @@ def faces(covered: np.ndarray) -> str:
 
 
 def _groups(target: Target, previous: Target | None) -> list[str]:
+    """Return the groups of a target: its plane and its direction of travel, or the checks."""
     if target.check:
         return [_CHECKS]
     plane = f'{np.degrees(target.alpha_rad):.0f}°'

@@ -32,7 +32,7 @@ from adxl_ros.signals.rest_detection import Stillness
 
 class SessionDisplay:
     """
-    The displayed values of one session; the slow ones are computed only once for each pose.
+    The displayed values of one session; the slow estimate is computed only once for each pose.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ class SessionDisplay:
     def __init__(self, session: Session) -> None:
         self._session = session
         self._estimate: Estimate | None = None
-        self._poses_of_estimate = (0, 0)
+        self._estimate_key = (0, 0)
 
     def live(self) -> LiveReading | None:
         """Return what the sensor reads at present; None without samples."""
@@ -52,16 +52,17 @@ class SessionDisplay:
         return live_reading(newest, self._session.unit, self._session.guide.stillness(newest))
 
     def progress(self) -> Progress:
-        """Return how far the calibration is."""
+        """Return the progress of the calibration."""
         return self._session.guide.progress()
 
     def estimate(self) -> Estimate:
         """Return what the poses determine so far."""
         guide = self._session.guide
         newest_ns = max((record.stop_ns for record in guide.accepted.values()), default=0)
-        poses = len(guide.accepted), newest_ns
-        if self._estimate is None or poses != self._poses_of_estimate:
-            self._estimate, self._poses_of_estimate = guide.estimate_contents(), poses
+        # A pose that is taken again changes the stamp only.
+        key = len(guide.accepted), newest_ns
+        if self._estimate is None or key != self._estimate_key:
+            self._estimate, self._estimate_key = guide.estimate_contents(), key
         return self._estimate
 
 

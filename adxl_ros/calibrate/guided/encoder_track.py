@@ -27,7 +27,7 @@ _KEPT_READINGS = 100_000
 _KEPT_OFFSETS = 20
 """Offsets of the two clocks that stay in memory; chosen: a second of messages at 20 Hz."""
 _FEWEST_OFFSETS = 4
-"""Offsets of the two clocks that a comparison needs; chosen: one late message is no offset."""
+"""Offsets of the two clocks that a comparison needs; chosen: one message alone may be late."""
 SILENT_S = 3.0
 """The encoder counts as silent after this, s; chosen: several of its longest usual periods."""
 
@@ -88,10 +88,11 @@ class EncoderTrack:
         """Return what is wrong with the clock of the encoder, or ''."""
         if len(self._offsets_s) < _FEWEST_OFFSETS:
             return ''
-        return pose_checks.clocks(min(self._offsets_s, key=abs))
+        # The smallest offset is that of the message with the least delay.
+        return pose_checks.clock_fault(min(self._offsets_s, key=abs))
 
     def silence(self, sample_ns: int) -> str:
-        """Return for how long nothing has come, by the newest stamp of the samples, or ''."""
+        """Return one line on the time without readings up to a stamp, ns; '' if it is short."""
         if not self._readings:
             return 'nothing on stage/joint_states'
         silent_s = (sample_ns - self._readings[-1][0]) * 1e-9

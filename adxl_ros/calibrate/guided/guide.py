@@ -134,7 +134,7 @@ class Guide(Protocol):
         """Count a pose that is on disk, and go on to the next one."""
 
     def retry(self) -> None:
-        """Take the pose at hand again, since its record is not on disk."""
+        """Take the same pose again, since its record is not on disk."""
 
     def capture(self) -> str:
         """Take the pose in which the operator has put the sensor; return an obstacle or ''."""
@@ -143,10 +143,10 @@ class Guide(Protocol):
         """Take earlier poses again, to check that the mounting is as it was."""
 
     def skip_entry(self) -> JournalEntry | None:
-        """Return what the journal says of a `skip` now."""
+        """Return the entry that the journal needs before `skip`; None for none."""
 
     def skip(self) -> str:
-        """Leave out the pose at hand; return a line for people."""
+        """Leave out the open pose; return a line for people."""
 
     def redo(self) -> str:
         """Forget the previous pose; return a line for people, or '' where there is none."""
@@ -173,7 +173,7 @@ class Guide(Protocol):
         """Return whether the newest samples are at rest; None while they are too few."""
 
     def progress(self) -> Progress:
-        """Return how far the calibration is, for the screen."""
+        """Return the progress of the calibration, for the screen."""
 
     def estimate_contents(self) -> Estimate:
         """Return what the poses determine so far, for the screen; this costs some time."""

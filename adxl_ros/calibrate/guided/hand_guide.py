@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The guide of a hand-held sensor: samples go in, rests come out; there is no stage."""
+"""The guide of a hand-held sensor: samples go in, accepted rests come out."""
 
 from __future__ import annotations
 
@@ -55,6 +55,8 @@ _MOST_SATURATED = 0.01
 """Largest share of a rest's samples at a rail; chosen: a knock does not spoil the mean."""
 _UP_SAMPLES = 20
 """Samples whose mean shows what points up at present; chosen: quick and still steady."""
+_MIN_FORCE_G = 1e-9
+"""Lower bound of the measured force, g, so that a sensor without signal has a direction."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +102,7 @@ class HandGuide:
         self.surroundings = Surroundings()
         self.newest_ns: int | None = None
         self._span_c = temperature_span_c
-        self._passed = np.zeros(len(orientations.UP), bool)
+        self._skipped = np.zeros(len(orientations.UP), bool)
         self._new_refusal = ''
         self._begin_stream()
         self._update_estimate()
@@ -215,9 +217,9 @@ class HandGuide:
         """Ask for another direction; return a line for people."""
         if self.next_up is None:
             return 'there is no direction left to skip'
-        self._passed[self.next_up] = True
+        self._skipped[self.next_up] = True
         skipped = orientations.name_up(self.next_up)
-        self._choose()
+        self._choose_next_up()
         return f'{skipped} up is left out'
 
     def redo(self) -> str:
@@ -266,7 +268,7 @@ class HandGuide:
         mean_v = self._newest.volts[-_UP_SAMPLES:].mean(axis=0, keepdims=True)
         rests = nominal_rests(mean_v, 0 * mean_v, self.sensor)
         force = force_g(rests.mean, self._coefficients)[0]
-        return force / max(float(np.linalg.norm(force)), 1e-9)
+        return force / max(float(np.linalg.norm(force)), _MIN_FORCE_G)
 
     def destination(self) -> str:
         """Name the direction to turn to, for people."""
@@ -285,18 +287,23 @@ class HandGuide:
 
     def status(self) -> Status:
         """Return what the guide waits for, with the values that matter."""
-        count = len(self.accepted)
-        advice = f'{max(MIN_RESTS - count, 0)} more at least' if count < MIN_RESTS else \
-            'call finish when done' if count >= ENOUGH_RESTS else 'more make it better'
+        rests = f'{len(self.accepted)} rests ({self._advice()})'
         still = self._finder.stillness()
-        phase = Phase.DWELL if still is not None and still.still else Phase.REST
         if still is None:
-            return Status(phase, f'{count} rests ({advice}); waiting for samples', False)
-        return Status(phase, f'{count} rests ({advice}); {still.describe_mps2(self.sensor)}; '
+            return Status(Phase.REST, f'{rests}; waiting for samples', False)
+        phase = Phase.DWELL if still.still else Phase.REST
+        return Status(phase, f'{rests}; {still.describe_mps2(self.sensor)}; '
                       f'{self.destination()}', False)
 
+    def _advice(self) -> str:
+        """Return how many rests are still needed, for people."""
+        count = len(self.accepted)
+        if count < MIN_RESTS:
+            return f'{MIN_RESTS - count} more at least'
+        return 'more make it better' if count < ENOUGH_RESTS else 'call finish when done'
+
     def progress(self) -> Progress:
-        """Return how far the calibration is, for the screen."""
+        """Return the progress of the calibration, for the screen."""
         up = self.up()
         position = '' if up is None else \
             f'{orientations.points_up(orientations.name_nearest(up))} now'
@@ -339,15 +346,16 @@ class HandGuide:
         force = force_g(rests.mean, self._coefficients)
         self._covered = orientations.covered(force / np.linalg.norm(force, axis=1, keepdims=True))
         self._gain = orientations.information_gain(information, self._coefficients,
-                                                   rests.gravity_g)[0]
-        self._choose()
+                                                   rests.gravity_g).gain
+        self._choose_next_up()
 
-    def _choose(self) -> None:
+    def _choose_next_up(self) -> None:
         """Choose the orientation to ask for."""
-        self.next_up = orientations.next_up(self._gain, ~self._covered & ~self._passed, self.up())
+        available = ~self._covered & ~self._skipped
+        self.next_up = orientations.next_up(self._gain, available, self.up())
 
     def _fault(self, record: PoseRecord) -> str:
-        """Return what speaks against a rest, or ''."""
+        """Return why a rest is refused, or ''."""
         saturated = (bisect_right(self._saturated_ns, record.stop_ns)
                      - bisect_left(self._saturated_ns, record.start_ns))
         if saturated > _MOST_SATURATED * record.samples:
@@ -355,10 +363,10 @@ class HandGuide:
                     f'±{self.sensor.range_g:g} g or at a rail of the ADC; check supply and wiring')
         first_c = next((accepted.temperature_c for accepted in self.accepted.values()
                         if np.isfinite(accepted.temperature_c)), np.nan)
-        return pose_checks.temperature(first_c, record.temperature_c, self._span_c)
+        return pose_checks.temperature_fault(first_c, record.temperature_c, self._span_c)
 
     def _time_s(self, stamps_ns: np.ndarray) -> np.ndarray:
-        # From the first stamp: float64 seconds since 1970 resolve only 0.2 µs.
+        """Return times since the first stamp, s: since 1970 they would resolve only 0.2 µs."""
         return (stamps_ns - self._stamps[0][0]) * 1e-9
 
     def _all_stamps(self) -> np.ndarray:

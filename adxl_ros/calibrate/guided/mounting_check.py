@@ -24,11 +24,11 @@ from adxl_ros.model.sensor import Sensor
 import numpy as np
 
 _CHANGE_G = 0.003
-"""Largest change of a pose that is taken again, beside noise and stage, g; chosen: 0.17°."""
+"""Largest change of a repeated pose beyond noise and stage error, g; chosen: a turn of 0.17°."""
 _NOISE_STDS = 3.0
-"""Standard deviations of the noise that are permitted beside; chosen: one in 400."""
+"""Standard deviations of the noise in the limit of a change; chosen: exceeded once in 400."""
 _ACROSS_COSINE = 0.94
-"""Cosine of 20°: poses whose verticals are closer show the same turns of the mounting."""
+"""Cosine of 20°: two poses whose verticals are closer do not show each turn of the mounting."""
 
 
 def to_take_again(records: Sequence[PoseRecord]) -> list[PoseRecord]:
@@ -45,7 +45,7 @@ def to_take_again(records: Sequence[PoseRecord]) -> list[PoseRecord]:
 
 def changed(sensor: Sensor, before: PoseRecord, now: PoseRecord, tolerance_rad: float) -> str:
     """
-    Refuse to go on where an earlier pose reads something else now.
+    Compare two readings of the same pose, before and after an interruption.
 
     Parameters
     ----------
@@ -65,6 +65,7 @@ def changed(sensor: Sensor, before: PoseRecord, now: PoseRecord, tolerance_rad: 
     before_v, now_v = np.array(before.mean_v), np.array(now.mean_v)
     change_g = np.abs(now_v - before_v) / sensor.nominal_scale_v_per_g
     noise_g = np.hypot(before.std_v, now.std_v) / sensor.nominal_scale_v_per_g
+    # The stage may be off by its tolerance both times.
     limit_g = _CHANGE_G + _NOISE_STDS * noise_g + 2 * tolerance_rad
     axis = int((change_g - limit_g).argmax())
     if change_g[axis] <= limit_g[axis]:
@@ -72,7 +73,7 @@ def changed(sensor: Sensor, before: PoseRecord, now: PoseRecord, tolerance_rad: 
     return (f'mounting changed: in pose {before.pose + 1} {sensor.axes[axis]} reads '
             f'{now_v[axis]:.4f} V, but read {before_v[axis]:.4f} V before the interruption '
             f'({change_g[axis] * 1e3:.1f} mg apart, {limit_g[axis] * 1e3:.1f} mg are allowed); '
-            'put the sensor back as it was, or begin anew with resume:=anew')
+            'put the sensor back as it was, or begin again with resume:=anew')
 
 
 def _alignment(first: PoseRecord, second: PoseRecord) -> float:

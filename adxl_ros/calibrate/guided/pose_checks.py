@@ -28,20 +28,22 @@ from adxl_ros.model.sensor import Sensor
 import numpy as np
 
 _OUTLIER_STDS = 3.5
-"""A reading so many standard deviations from its prediction is refused; chosen: one in 2000."""
+"""Residual from which a pose is refused, standard deviations; chosen: one of 2000 by chance."""
 _MODEL_STD_G = 5e-3
-"""Further errors of stage and model, g; chosen: units at twice the datasheet limits are taken."""
+"""Standard deviation of further model errors, g; chosen: it accepts twice the datasheet limits."""
 _SAME_READING_G = 0.2
-"""Readings within this count as equal when a kind of mistake is named, g; chosen."""
+"""Largest difference of readings that count as equal when a mistake is named, g; chosen."""
 _WIRING_POSES = 4
-"""Poses after which the wiring of the axes is taken as right; chosen: all axes have moved."""
+"""Poses after which the wiring of the axes counts as right; chosen: all axes have moved."""
 _CLOCK_OFFSET_S = 2.0
 """Largest offset of the clocks of stage and sensor, s; chosen: above any delay of messages."""
 _RATE_ERROR = 0.05
 """Largest relative error of the sample rate; chosen: above the error of any oscillator."""
+_LONGEST_IN_S = 600
+"""Longest time that is stated in seconds; a longer time is stated in hours."""
 
 
-def angles(target: Target, alpha_rad: float, beta_rad: float, tolerance_rad: float) -> str:
+def angle_fault(target: Target, alpha_rad: float, beta_rad: float, tolerance_rad: float) -> str:
     """
     Refuse a stage that is not at the pose.
 
@@ -61,13 +63,13 @@ def angles(target: Target, alpha_rad: float, beta_rad: float, tolerance_rad: flo
 
     """
     return ', '.join(
-        f'{name} is {degrees(now - wanted)} from the asked {np.degrees(wanted):.4g}°'
+        f'{name} is {degrees_text(now - wanted)} from the target {np.degrees(wanted):.4g}°'
         for name, now, wanted in (('alpha', alpha_rad, target.alpha_rad),
                                   ('beta', beta_rad, target.beta_rad))
         if abs(now - wanted) > tolerance_rad)
 
 
-def moved(name: str, angles_rad: np.ndarray, tolerance_rad: float) -> str:
+def motion_fault(name: str, angles_rad: np.ndarray, tolerance_rad: float) -> str:
     """
     Refuse a joint that turned while the pose was averaged.
 
@@ -89,10 +91,11 @@ def moved(name: str, angles_rad: np.ndarray, tolerance_rad: float) -> str:
     range_rad = float(np.ptp(angles_rad)) if len(angles_rad) else 0.0
     if range_rad <= tolerance_rad:
         return ''
-    return f'{name} moved {degrees(range_rad)} while the pose was averaged; hold the stage still'
+    return (f'{name} moved {degrees_text(range_rad)} while the pose was averaged; hold the stage '
+            'still')
 
 
-def saturated(sensor: Sensor, volts: np.ndarray) -> str:
+def saturation_fault(sensor: Sensor, volts: np.ndarray) -> str:
     """
     Refuse volts at a rail of the ADC or beyond the range of the sensor.
 
@@ -115,14 +118,14 @@ def saturated(sensor: Sensor, volts: np.ndarray) -> str:
     axis = int(columns[0])
     reading_v = volts[rows[0], axis]
     reading_g = (reading_v - sensor.nominal_zero_g_v[axis]) / sensor.nominal_scale_v_per_g[axis]
-    return (f'saturated: {sensor.axes[axis]} reads {signed(reading_g)} g ({reading_v:.3f} V), '
-            f'beyond its range of ±{sensor.range_g:g} g or at a rail of the ADC; check supply and '
-            'wiring')
+    return (f'saturated: {sensor.axes[axis]} reads {signed_text(reading_g)} g '
+            f'({reading_v:.3f} V), beyond its range of ±{sensor.range_g:g} g or at a rail of the '
+            'ADC; check supply and wiring')
 
 
-def temperature(first_c: float, now_c: float, span_c: float) -> str:
+def temperature_fault(first_c: float, now_c: float, span_c: float) -> str:
     """
-    Refuse a pose at another temperature than that of the first pose.
+    Refuse a pose whose temperature differs from that of the first pose.
 
     Parameters
     ----------
@@ -140,13 +143,13 @@ def temperature(first_c: float, now_c: float, span_c: float) -> str:
     if not abs(now_c - first_c) > span_c:
         return ''
     return (f'temperature moved {abs(now_c - first_c):.1f} °C since the first pose '
-            f'({first_c:.1f} to {now_c:.1f} °C), must stay within {span_c:g} °C: wait until it '
+            f'({first_c:.1f} to {now_c:.1f} °C), must stay within {span_c:g} °C; wait until it '
             'is back, or finish with the poses so far')
 
 
-def rate(measured_hz: float, stated_hz: float) -> str:
+def rate_fault(measured_hz: float, stated_hz: float) -> str:
     """
-    Refuse samples at another rate than the stated one.
+    Refuse samples whose rate differs from the stated one.
 
     Parameters
     ----------
@@ -164,21 +167,21 @@ def rate(measured_hz: float, stated_hz: float) -> str:
     if not abs(measured_hz / stated_hz - 1) > _RATE_ERROR:
         return ''
     return (f'samples are {measured_hz:.4g} a second by their stamps, but sensor_info states '
-            f'rate_hz {stated_hz:.4g}; put the rate of the driver right')
+            f'rate_hz {stated_hz:.4g}; correct the rate of the driver')
 
 
-def clocks(stage_ahead_s: float) -> str:
-    """Refuse a stage on another clock than the samples, by its offset, s."""
+def clock_fault(stage_ahead_s: float) -> str:
+    """Refuse a stage whose clock differs from that of the samples, by the offset, s."""
     if not abs(stage_ahead_s) > _CLOCK_OFFSET_S:
         return ''
     side = 'ahead of' if stage_ahead_s > 0 else 'behind'
-    return (f'stage/joint_states is stamped {_span(abs(stage_ahead_s))} {side} imu/data_raw: '
-            'stage and sensor must share one clock (use_sim_time for both or for none, or '
-            'synchronise their computers)')
+    return (f'stage/joint_states is stamped {_duration_text(abs(stage_ahead_s))} {side} '
+            'imu/data_raw: stage and sensor must share one clock (use_sim_time for both or for '
+            'none, or synchronise their computers)')
 
 
-def reading(estimate: RunningEstimate, target: Target, volts: np.ndarray, tolerance_rad: float
-            ) -> str:
+def reading_fault(estimate: RunningEstimate, target: Target, volts: np.ndarray,
+                  tolerance_rad: float) -> str:
     """
     Refuse a pose whose mean is an outlier to the prediction from the poses so far.
 
@@ -207,27 +210,27 @@ def reading(estimate: RunningEstimate, target: Target, volts: np.ndarray, tolera
         return ''
     axis = int(residual_stds.argmax())
     measured_g, expected_g = in_g(sensor, volts), in_g(sensor, expected_v)
-    finding = (f'{sensor.axes[axis]} reads {signed(measured_g[axis])} g where '
-               f'{signed(expected_g[axis])} g was expected')
-    # Wiring that has read some poses right does not change, but an operator may be mistaken.
+    finding = (f'{sensor.axes[axis]} reads {signed_text(measured_g[axis])} g where '
+               f'{signed_text(expected_g[axis])} g was expected')
+    # After some good poses the wiring is right, but the operator may still be wrong.
     is_wiring_unproven = estimate.poses < _WIRING_POSES
     if is_wiring_unproven and _is_crossed(measured_g, expected_g):
         return f'{finding}: axis inverted or swapped; check wiring, mounting and pose'
     advice = ', or take the pose before again' if estimate.poses and is_wiring_unproven else ''
     angles_rad = estimate.angles_of(target.alpha_rad, target.beta_rad, volts, slack_v)
-    distance = angles(target, *angles_rad, tolerance_rad) if angles_rad else ''
+    distance = angle_fault(target, *angles_rad, tolerance_rad) if angles_rad else ''
     if distance:
         return f'{finding}: by the sensor, {distance}; check the pose and the mounting{advice}'
     return f'{finding}; check the pose, the mounting and the wiring{advice}'
 
 
-def degrees(angle_rad: float) -> str:
+def degrees_text(angle_rad: float) -> str:
     """Return the size of an angle as text, in degrees."""
     size = abs(float(np.degrees(angle_rad)))
     return f'{size:.2f}°' if size < 1 else f'{size:.1f}°'
 
 
-def signed(value: float) -> str:
+def signed_text(value: float) -> str:
     """Return a value as text, with its sign."""
     return f'{value:+.2f}'.replace('-', '−')
 
@@ -244,5 +247,5 @@ def _is_crossed(measured_g: np.ndarray, expected_g: np.ndarray) -> bool:
     return any(is_expected(np.array(sign) * order) for sign, order in product(signs, orders))
 
 
-def _span(seconds: float) -> str:
-    return f'{seconds:.1f} s' if seconds < 600 else f'{seconds / 3600:.3g} h'
+def _duration_text(seconds: float) -> str:
+    return f'{seconds:.1f} s' if seconds < _LONGEST_IN_S else f'{seconds / 3600:.3g} h'

@@ -24,19 +24,21 @@ from adxl_ros.errors import UserError
 import numpy as np
 
 ORDER = 3
-"""Version of the order of `guided`: an interrupted sweep is resumed in the same order only."""
+"""Version of the order of `guided`; an interrupted sweep resumes only in the same order."""
 KINDS = ('full', 'quick')
 """Kinds of plans: planes as in the paper, or the fewest poses that reach a tilt error."""
 STEP_RAD = float(np.radians(30.0))
 """Step of beta, rad, as in the paper."""
 MOVE_S = 5.0
-"""Time of a move and of the settling, s; chosen: it counts until poses show the real one."""
+"""Time of a move with settling, s; chosen: it is used until poses show the real time."""
 _FLAT = 0.2
-"""Planes with |sin α| below this hardly show beta; equation (15) of the paper excludes them."""
+"""Lower bound of |sin α| of the planes that show beta well, as in equation (15) of the paper."""
+_ROUNDING = 1e-6
+"""Largest rounding error of the sine of a multiple of a quarter turn."""
 _GOLDEN_RAD = np.pi * (3 - np.sqrt(5))
 """The golden angle, rad."""
 _HIGHEST_COSINE = 0.97
-"""Cosine of alpha at the ends of the spiral of `spread`; chosen: not level, so that beta shows."""
+"""Cosine of alpha at the ends of the spiral of `spread`; chosen: inclined poses show beta."""
 
 
 @dataclass(frozen=True)
@@ -134,8 +136,8 @@ def guided(planes_rad: Sequence[float], step_rad: float, check_poses: int) -> li
     inclined = np.abs(np.sin(planes)) >= _FLAT
     grid = []
     for i, beta in enumerate((*forth, *forth[::-1])):
-        quarter = abs(np.sin(2 * beta)) < 1e-6
-        visited = planes if quarter or not inclined.any() else planes[inclined]
+        is_quarter_turn = abs(np.sin(2 * beta)) < _ROUNDING
+        visited = planes if is_quarter_turn or not inclined.any() else planes[inclined]
         grid += [Target(float(alpha), float(beta)) for alpha in visited[::-1 if i % 2 else 1]]
     return with_checks(grid, check_poses)
 

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The estimate of a unit after each pose: coefficients, and the tilt error to expect."""
+"""The estimate of a unit after each pose: coefficients and expected tilt error."""
 
 from __future__ import annotations
 
@@ -41,17 +41,17 @@ _ROUNDS = 2
 _EVALUATION_POSES = 48
 """Poses at which the tilt error is predicted; chosen: even over the sphere, and quick."""
 _VISIBLE_RAD = np.radians(1.0)
-"""Poses that a perfect calibration shows worse than this have no part in the tilt error, rad."""
+"""Largest standard deviation of an angle by noise alone, rad, at which a pose counts."""
 _LEAST_STD_V = 1e-7
 """Lower bound of the noise of a mean, V; chosen: below any ADC, so that no weight is infinite."""
 _SEARCH_STD_RAD = np.radians(60.0)
-"""Spread of the angles about a pose in the search of `angles_of`, rad; chosen: a wrong pose."""
+"""Prior standard deviation of the angles in `angles_of`, rad; chosen: a wrong pose is likely."""
 _LONGEST_STEP_RAD = 0.3
 """Longest step of the search of `angles_of`, rad; chosen: the response is nearly linear in it."""
 _SEARCH_STEPS = 25
 """Steps of the search of `angles_of`; chosen: several turns at the longest step."""
 _EXPLAINED_STDS = 3.0
-"""Angles explain volts whose residuals are within so many slacks; chosen: three deviations."""
+"""Largest residual of angles that explain volts, standard deviations; chosen: the usual 3."""
 
 
 @dataclass(frozen=True)
@@ -148,7 +148,7 @@ class RunningEstimate:
         return alpha_rad + float(change_rad[0]), beta_rad + float(change_rad[1])
 
     def with_poses(self, targets: Sequence[Target]) -> RunningEstimate:
-        """Return the estimate to expect once further poses are taken."""
+        """Predict the covariance of the estimate after further poses."""
         if not targets:
             return self
         alpha_rad = np.array([target.alpha_rad for target in targets])

@@ -88,7 +88,7 @@ class LiveReading:
 @dataclass(frozen=True)
 class Progress:
     """
-    How far a calibration is.
+    Progress of a calibration.
 
     Attributes
     ----------
@@ -103,7 +103,7 @@ class Progress:
     remaining_s
         Time that the open poses take, s; None where the number of poses is not fixed.
     dwelt_s, dwell_s
-        Time at rest in the pose so far and in all, s; None without a fixed dwell.
+        Time at rest in the pose so far, and the required time, s; None without a fixed dwell.
 
     """
 
@@ -149,7 +149,7 @@ class CoefficientRow:
     intervals
         Most likely value and half of the 90 % interval of each axis, as text.
     determined
-        Share of the datasheet's spread that is gone, of the worst axis, 0 to 1.
+        Relative reduction of the datasheet's standard deviation, of the worst axis, 0 to 1.
 
     """
 
@@ -188,7 +188,7 @@ class Estimate:
 @dataclass(frozen=True)
 class ScreenContents:
     """
-    All that the screen shows beside the log.
+    Everything that the screen shows, except the log.
 
     Attributes
     ----------
@@ -205,7 +205,7 @@ class ScreenContents:
     live
         What the sensor reads; None without samples.
     progress, estimate
-        Of the running calibration; None while there is none.
+        Progress and estimate of the running calibration; None while no calibration runs.
     outcome
         Lines on the calibration that has ended.
 

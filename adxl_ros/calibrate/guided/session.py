@@ -121,7 +121,7 @@ class Session:
 
         """
         self.newest.feed(stamps_ns, volts)
-        fault = pose_checks.rate(self.newest.rate_hz(), self.unit.rate_hz)
+        fault = pose_checks.rate_fault(self.newest.rate_hz(), self.unit.rate_hz)
         if not fault:
             self.guide.feed(stamps_ns, volts)
         return fault
@@ -153,11 +153,11 @@ class Session:
             self.guide.take(record)
             yield f'pose {record.pose + 1} is on disk'
         if unverified > self.guide.poses_to_verify:
-            yield 'this pose reads what it did before; one more shows the mounting as a whole' \
+            yield 'this pose reads the same as before; one more pose checks the mounting' \
                 if self.guide.poses_to_verify else 'the sensor is mounted as it was'
 
     def skip(self) -> str:
-        """Leave out the pose at hand; return a line for people, or '' where none is open."""
+        """Leave out the open pose; return a line for people, or '' where none is open."""
         if self.guide.is_over:
             return ''
         entry = self.guide.skip_entry()
@@ -171,7 +171,7 @@ class Session:
         """Take the previous pose again; return a line for people, or '' where there is none."""
         number = self.guide.previous
         if number is not None:
-            # The pose is bad, and no part of a fit even if it is not taken again.
+            # The fit must not use the pose, even if it is not taken again.
             self.journal.append(PoseDropped(number))
         return self.guide.redo()
 
@@ -179,7 +179,7 @@ class Session:
         """
         Fit the poses so far and write the parameter file.
 
-        `end` is due when the report and the copy in the store are written, too.
+        Call `end` once the report and the copy in the store are written, too.
 
         Returns
         -------
@@ -196,8 +196,8 @@ class Session:
         if not records:
             raise UserError('no pose is taken yet')
         if all(record.check for record in records):
-            raise UserError('only check poses are taken, which judge a fit and are no part of '
-                            'it; take poses of the planes, too')
+            raise UserError('only check poses are taken, which the fit does not use; take other '
+                            'poses, too')
         result = calibration.calibrate(self.unit, [calibration.RecordedPoses(
             self.journal.path.name, Poses.from_records(records))])
         if self._is_mounting_unchecked:
@@ -212,7 +212,7 @@ class Session:
         """
         Note in the journal that the fit is written; a sweep with open poses can be resumed.
 
-        Without this note the next start fits and writes once more.
+        Without this note the next start fits and writes the files again.
 
         Raises
         ------

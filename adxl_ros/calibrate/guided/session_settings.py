@@ -45,11 +45,11 @@ class SessionSettings:
     plan_kind
         Kind of the pose plan: 'full' or 'quick'.
     planes_rad
-        Planes alpha of the plan full, rad; empty for those that the axes of the unit need.
+        Planes alpha of the plan `full`, rad; empty for those that the axes of the unit need.
     step_rad
-        Step of beta of the plan full, rad.
+        Step of beta of the plan `full`, rad.
     tilt_error_rad
-        Rms error of the tilt that the plan quick is to reach, rad.
+        Rms error of the tilt that the plan `quick` is to reach, rad.
     check_poses
         Number of poses that are kept out of the fit.
     capture
@@ -113,12 +113,12 @@ class SessionSettings:
             return text
         text += f', expected tilt error {np.degrees(error_rad):.2g}°'
         if self.plan_kind == 'quick' and error_rad > self.tilt_error_rad:
-            text += f' (sweep.tilt_error_deg asks for {np.degrees(self.tilt_error_rad):.2g}°: ' \
-                    'too little for this stage and this dwell)'
+            text += f' (sweep.tilt_error_deg is {np.degrees(self.tilt_error_rad):.2g}°, ' \
+                    'which this stage and this dwell cannot reach)'
         return text
 
     def head(self, unit: Sensor) -> dict[str, Any]:
-        """Return what must be the same for a calibration of this unit to be resumed, by key."""
+        """Return the settings and values, by key, that an interrupted calibration must share."""
         unit_fields = {name: np.asarray(getattr(unit, name)).tolist() for name in _UNIT_FIELDS}
         head = {'mode': self.mode, **unit_fields,
                 'sweep.temperature_span_c': self.capture.temperature_span_c}
@@ -139,7 +139,7 @@ class SessionSettings:
             return ''
         if interrupted.obstacle:
             return (f'{self.journal} holds {interrupted.poses} poses of an interrupted '
-                    f'calibration, which cannot go on: {interrupted.obstacle}. Begin anew (n; it '
-                    'is kept), or abort (a) and put that back?')
+                    f'calibration, which cannot go on: {interrupted.obstacle}. Begin again (n; '
+                    'the file is kept), or abort (a) and restore the old setting?')
         return (f'{self.journal} holds {interrupted.poses} poses of an interrupted calibration '
-                'of this unit. Go on with them (y), or begin anew (n; they are kept)?')
+                'of this unit. Go on with them (y), or begin again (n; they are kept)?')

@@ -42,7 +42,10 @@ from adxl_ros.signals.rest_detection import Rest, Stillness
 import numpy as np
 
 _LONGEST_DWELL_S = 60.0
-"""After this and two dwells a moving sensor's samples are forgotten, s; chosen: little memory."""
+"""Time beyond two dwells after which a moving sensor's samples are dropped, s.
+
+Chosen: it bounds the memory and the time of the rest detection.
+"""
 _FEWEST_INTERVALS = 3
 """Poses of this session whose times predict those of the open ones; chosen: a median of two."""
 
@@ -65,16 +68,16 @@ class PoseState(Enum):
 @dataclass
 class _Attempt:
     """
-    The attempt to take the pose at hand.
+    The attempt to take the open pose.
 
     Attributes
     ----------
     state
-        Its state.
+        State of the attempt.
     dwell
         The samples since the pose was reached.
     since_ns
-        Stamp of the samples at its beginning, ns; None before the first sample.
+        Newest stamp of the samples when the attempt began, ns; None before the first sample.
     refusal
         Why the pose was refused; '' if it was not.
 
@@ -174,7 +177,7 @@ class StageGuide:
             angles_rad, silence = self.encoder.angles_rad, self._silence()
             if angles_rad is None or silence:
                 return f'{silence}: in stage.mode encoder its angle counts'
-            fault = self.encoder.clock_fault() or pose_checks.angles(
+            fault = self.encoder.clock_fault() or pose_checks.angle_fault(
                 target, *angles_rad, self.settings.near_rad)
             if fault:
                 return f'{fault}; turn the stage there and capture again'
@@ -183,13 +186,13 @@ class StageGuide:
         return ''
 
     def skip_entry(self) -> JournalEntry | None:
-        """Return what the journal says of a `skip` now."""
+        """Return the entry that the journal needs before `skip`; None for none."""
         if self._to_verify:
             return MountingUnchecked()
         return None if self.is_over else PoseSkipped(self.index)
 
     def skip(self) -> str:
-        """Leave out the pose at hand; return a line for people."""
+        """Leave out the open pose; return a line for people."""
         number = self.pose_number
         if self._to_verify:
             self._to_verify = []
@@ -207,7 +210,7 @@ class StageGuide:
             return ''
         self.accepted.pop(number, None)
         self.skipped.discard(number)
-        # The earlier reading of the pose must not speak against the new one.
+        # The rejected reading must not influence the prediction for the new one.
         self.estimate = self._estimated(None)
         self._go(number)
         return f'pose {number + 1} will be taken again'
@@ -225,7 +228,7 @@ class StageGuide:
 
         """
         if self.encoder.read(stamp_ns, alpha_rad, beta_rad):
-            # A stage that has started again may have moved unseen.
+            # A stage that has restarted may have moved in between.
             self._tracker.lose_track()
         if self._uses_encoder:
             self._tracker.read(stamp_ns, alpha_rad, beta_rad)
@@ -319,7 +322,7 @@ class StageGuide:
         self._go(self._next_open())
 
     def retry(self) -> None:
-        """Take the pose at hand again, since its record is not on disk."""
+        """Take the same pose again, since its record is not on disk."""
         self._go(self.index)
 
     def poses_to_fit(self) -> list[PoseRecord]:
@@ -383,7 +386,7 @@ class StageGuide:
         return self._status_on_the_way(target, waited_s)
 
     def progress(self) -> Progress:
-        """Return how far the sweep is, for the screen."""
+        """Return the progress of the sweep, for the screen."""
         target, angles_rad, position = self.target, self.encoder.angles_rad, ''
         if target is not None and angles_rad is not None:
             alpha_rad, beta_rad = angles_rad
@@ -443,7 +446,8 @@ class StageGuide:
         silence, angles_rad = self._silence(), self.encoder.angles_rad
         if silence or angles_rad is None:
             return silence
-        return pose_checks.angles(target, *angles_rad, self.settings.tolerance_rad) or 'arrived'
+        fault = pose_checks.angle_fault(target, *angles_rad, self.settings.tolerance_rad)
+        return fault or 'arrived'
 
     def _silence(self) -> str:
         return self.encoder.silence(self.newest_ns or 0)
@@ -456,6 +460,7 @@ class StageGuide:
         return float(np.median(np.abs(np.diff(ends_ns)))) * 1e-9
 
     def _next_open(self) -> int:
+        """Return the number of the first open pose, from 0; the number of poses if none is."""
         return next((number for number in range(len(self.targets))
                      if number not in self.accepted and number not in self.skipped),
                     len(self.targets))
@@ -478,7 +483,7 @@ class StageGuide:
     def _restart_after_clock_change(self, back_s: float) -> None:
         """Begin the pose again after stamps that went back: the driver may have restarted."""
         self._new_refusal = f'imu/data_raw went back in time by {back_s:.0f} s: the pose begins ' \
-            'anew'
+            'again'
         self.verify()
         self._tracker.lose_track()
         self.encoder.forget_clock()
@@ -488,7 +493,7 @@ class StageGuide:
             self._attempt.state = PoseState.APPROACHING
 
     def _forget_long_motion(self) -> None:
-        """Forget the samples of a long motion: they would all be looked at again and again."""
+        """Forget the samples of a long motion, so that the rest detection stays quick."""
         dwell = self._attempt.dwell
         if dwell.age_s() > _LONGEST_DWELL_S + 2 * self.settings.dwell_s and not dwell.at_rest():
             self._restart_dwell(self._attempt.state)
@@ -499,6 +504,7 @@ class StageGuide:
 
     def _estimated(self, previous: running_estimate.RunningEstimate | None
                    ) -> running_estimate.RunningEstimate:
+        """Estimate the unit from the accepted poses, starting from the previous estimate."""
         records = [record for record in self.poses_to_fit() if not record.check]
         poses = Poses.from_records(records) if records else \
             running_estimate.no_poses(len(self.sensor.axes))
@@ -507,7 +513,7 @@ class StageGuide:
             self.sensor.stage_resolution_rad / np.sqrt(12), previous)
 
     def _encoder_covers(self, mean: RestMean) -> bool:
-        """Return whether the encoder was heard to the end of a dwell, where it counts."""
+        """Return whether the readings of the encoder reach to the end of a dwell."""
         newest_ns = self.encoder.newest_ns
         if not self._uses_encoder or (newest_ns is not None and newest_ns >= mean.stop_ns):
             return True
@@ -517,6 +523,7 @@ class StageGuide:
         return False
 
     def _record(self, mean: RestMean, target: Target) -> PoseRecord:
+        """Return the record of a dwell, with the angles that count in this stage mode."""
         span = mean.start_ns, mean.stop_ns
         alpha_rad, beta_rad = self.encoder.mean_between(*span) if self._uses_encoder else \
             (target.alpha_rad, target.beta_rad)
@@ -546,33 +553,34 @@ class StageGuide:
         readings_rad = self.encoder.between(record.start_ns, record.stop_ns)
         now_rad = self.encoder.angles_rad or (record.alpha_rad, record.beta_rad)
         tolerance_rad = self.settings.tolerance_rad
-        return (pose_checks.angles(self.targets[self.index], *now_rad, self.settings.near_rad)
-                or pose_checks.moved('alpha', readings_rad[:, 0], tolerance_rad)
-                or pose_checks.moved('beta', readings_rad[:, 1], tolerance_rad))
+        return (pose_checks.angle_fault(self.targets[self.index], *now_rad, self.settings.near_rad)
+                or pose_checks.motion_fault('alpha', readings_rad[:, 0], tolerance_rad)
+                or pose_checks.motion_fault('beta', readings_rad[:, 1], tolerance_rad))
 
     def _fault(self, record: PoseRecord, volts: np.ndarray) -> str:
-        """Return what speaks against a pose with these samples, or ''."""
+        """Return why a pose with these samples is refused, or ''."""
         first_c = next((accepted.temperature_c for accepted in self.poses_to_fit()
                         if np.isfinite(accepted.temperature_c)), np.nan)
-        fault = (pose_checks.saturated(self.sensor, volts)
-                 or pose_checks.temperature(first_c, record.temperature_c,
+        fault = (pose_checks.saturation_fault(self.sensor, volts)
+                 or pose_checks.temperature_fault(first_c, record.temperature_c,
                                             self.settings.temperature_span_c))
         if fault or self._to_verify:
             return fault
-        return pose_checks.reading(self.estimate, Target(record.alpha_rad, record.beta_rad),
+        return pose_checks.reading_fault(self.estimate, Target(record.alpha_rad, record.beta_rad),
                                    np.array(record.mean_v), self.settings.tolerance_rad)
 
     def _refuse(self, refusal: str) -> None:
-        """Report a refusal once. A stage that turns itself tries again, an operator captures."""
+        """Report a refusal once. A commanded stage averages again, an operator captures again."""
         if refusal != self._attempt.refusal:
             self._new_refusal = refusal
         self._attempt.refusal = refusal
         self._restart_dwell(PoseState.AVERAGING if self.moves_itself else PoseState.APPROACHING)
 
     def _check_mounting(self, record: PoseRecord) -> None:
+        """Compare a pose that is taken again with its first record, and go to the next pose."""
         before, tolerance_rad = self._to_verify[0], self.sensor.stage_resolution_rad
         if self._uses_encoder:
-            # The stage may be elsewhere within its tolerance, and the encoder knows where.
+            # The encoder shows how far the stage is from the earlier angles.
             tolerance_rad += max(abs(record.alpha_rad - before.alpha_rad),
                                  abs(record.beta_rad - before.beta_rad))
         else:

@@ -41,7 +41,7 @@ class Action(Enum):
     FINISH = 'finish'
     ABORT = 'abort'
     GO_ON = 'go on'
-    BEGIN_ANEW = 'begin anew'
+    BEGIN_AGAIN = 'begin again'
     QUIT = 'quit'
 
 
@@ -54,7 +54,7 @@ _IDLE = {'b': Action.BEGIN, 'q': Action.QUIT}
 """Keys while nothing is to be done."""
 _WAITING = {'a': Action.ABORT, 'q': Action.QUIT}
 """Keys while the sensor is unknown."""
-_ASKING = {'y': Action.GO_ON, 'n': Action.BEGIN_ANEW, 'a': Action.ABORT, 'q': Action.QUIT}
+_ASKING = {'y': Action.GO_ON, 'n': Action.BEGIN_AGAIN, 'a': Action.ABORT, 'q': Action.QUIT}
 """Keys that answer the question what to do with an interrupted calibration."""
 
 
@@ -170,8 +170,8 @@ class Console:
         if action is Action.BEGIN:
             controller.may_ask = True
             return controller.start()
-        if action in (Action.GO_ON, Action.BEGIN_ANEW):
-            return controller.start(start_over=action is Action.BEGIN_ANEW)
+        if action in (Action.GO_ON, Action.BEGIN_AGAIN):
+            return controller.start(start_over=action is Action.BEGIN_AGAIN)
         requests = {Action.CAPTURE: controller.capture, Action.REDO: controller.redo,
                     Action.SKIP: controller.skip, Action.FINISH: controller.finish,
                     Action.ABORT: controller.abort}

@@ -45,7 +45,7 @@ class Samples:
 
     Attributes
     ----------
-    useless
+    fault
         Why the newest samples cannot be used, or ''.
 
     """
@@ -54,11 +54,11 @@ class Samples:
         self._node = node
         self._raw: list[bytes] = []
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.useless = ''
-        self.heard()
+        self.fault = ''
+        self.restart_silence()
         create_subscription(node, Imu, _TOPIC, self._raw.append, _QUEUE, raw=True)
 
-    def heard(self) -> None:
+    def restart_silence(self) -> None:
         """Restart the time without samples."""
         self._heard_ns = self._steady.now().nanoseconds
 
@@ -81,11 +81,11 @@ class Samples:
             variances = table.numbers('orientation_covariance')
             yaw_rad2 = max(yaw_rad2, float(np.max(variances[:, 8] * (variances[:, 0] >= 0))))
         if batch:
-            self.heard()
+            self.restart_silence()
         accel = accel[:, :len(unit.axes)]
         finite = np.isfinite(accel)
         if batch:
-            self.useless = self._compensated(yaw_rad2) or _no_number(finite, unit)
+            self.fault = self._compensated(yaw_rad2) or _no_number(finite, unit)
         complete = finite.all(axis=1)
         return stamps[complete], to_volts(accel[complete], unit)
 
@@ -95,7 +95,7 @@ class Samples:
             '(it carries an orientation, as imu/data does); remap it to imu/data_raw of the '
             'driver')
 
-    def silent(self) -> str:
+    def silence(self) -> str:
         """Tell for how long no sample has come; '' while samples come."""
         silent_s = (self._steady.now().nanoseconds - self._heard_ns) * 1e-9
         if silent_s < _SILENT_S:

@@ -37,7 +37,7 @@ class Rig:
     """A controller with a sensor on a stage: a source of samples and the end of all outputs."""
 
     def __init__(self, folder, mode=StageMode.COMMANDED, resume=Resume.ASK, **changes):
-        self.useless = self.silence = ''
+        self.fault = self.silence_text = ''
         self.log_lines, self.answers, self.withdrawn = [], [], []
         self.pose, self.angles_rad = None, (0.0, 0.0)
         self.now_ns = 1_700_000_000_000_000_000
@@ -76,13 +76,13 @@ class Rig:
             return np.zeros(0, np.int64), np.zeros((0, len(unit.axes)))
         return tuple(np.concatenate(part) for part in zip(*batch))
 
-    def heard(self):
+    def restart_silence(self):
         """Begin to measure the silence."""
-        self.silence = ''
+        self.silence_text = ''
 
-    def silent(self):
+    def silence(self):
         """Return the stated silence, s."""
-        return self.silence
+        return self.silence_text
 
     def clear(self):
         """Drop the waiting samples."""
@@ -155,7 +155,7 @@ def test_a_sweep_goes_from_the_wait_for_its_sensor_to_its_file(rig, tmp_path):
     assert controller.start() == (True, 'starts when sensor_info arrives')
     assert controller.state is ControllerState.WAITING_FOR_SENSOR
     assert controller.status().text == 'waiting for sensor_info'
-    bench.silence = 'nothing on imu/data_raw'
+    bench.silence_text = 'nothing on imu/data_raw'
     assert controller.status().text.endswith('; is the driver running?')
     bench.turn()
     assert controller.state is ControllerState.WAITING_FOR_SENSOR
@@ -248,7 +248,7 @@ def test_a_capture_has_its_answer_when_its_pose_is_on_disk_or_refused(rig):
     bench.turn(0.5)
     assert bench.controller.status().phase is Phase.OPERATOR
     answer = bench.controller.capture()
-    assert not answer.success and answer.message.startswith('alpha is 45.0° from the asked 45°')
+    assert not answer.success and answer.message.startswith('alpha is 45.0° from the target 45°')
     assert bench.lines(Severity.WARNING)[-1] == answer.message
     bench.angles_rad = (np.pi / 4, 0.0)
     bench.turn(0.5)
@@ -258,11 +258,11 @@ def test_a_capture_has_its_answer_when_its_pose_is_on_disk_or_refused(rig):
     bench.controller.capture()
     assert bench.controller.skip() == (True, 'pose 2 is left out')
     assert bench.answers[-1] == (False, 'pose 2 is left out')
-    bench.useless = 'this stream is already compensated'
+    bench.fault = 'this stream is already compensated'
     bench.turn()
-    assert bench.controller.capture() == (False, bench.useless)
-    assert bench.controller.status().text == bench.useless
-    bench.silence = 'nothing on imu/data_raw for 4 s'
+    assert bench.controller.capture() == (False, bench.fault)
+    assert bench.controller.status().text == bench.fault
+    bench.silence_text = 'nothing on imu/data_raw for 4 s'
     assert bench.controller.status().phase is Phase.SILENT
 
 
@@ -274,7 +274,7 @@ def test_another_sensor_ends_the_session_and_a_restarted_driver_checks_the_mount
     bench.turn_until(lambda: bench.controller.session.accepted_count == 2)
     bench.say_info()
     assert bench.controller.session.guide.poses_to_verify == 2
-    assert bench.answers[-1] == (False, 'the driver began anew; capture again')
+    assert bench.answers[-1] == (False, 'the driver started again; capture again')
     bench.turn_until(lambda: not bench.controller.session.guide.poses_to_verify)
     assert 'the sensor is mounted as it was' in bench.lines()
     bench.say_info(rate_hz='100.0')

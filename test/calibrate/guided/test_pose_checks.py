@@ -63,7 +63,7 @@ def test_a_stage_turned_by_hand_is_captured_near_its_target():
     by_hand = bench('encoder', [Target(np.pi / 2, np.radians(30))])
     by_hand.run(0.5, np.pi / 2, np.radians(33.2))
     assert by_hand.sweep.capture() == \
-        'beta is 3.2° from the asked 30°; turn the stage there and capture again'
+        'beta is 3.2° from the target 30°; turn the stage there and capture again'
     by_hand.run(0.5, np.pi / 2, np.radians(31))
     assert by_hand.sweep.capture() == ''
     assert by_hand.run(4, np.pi / 2, np.radians(31)).beta_rad == pytest.approx(np.radians(31))
@@ -76,7 +76,7 @@ def test_a_turn_of_the_stage_during_the_dwell_is_refused():
     assert slow.sweep.capture() == ''
     assert slow.run(0.6, np.pi / 2, 0.0) is None
     assert slow.run(3, np.pi / 2, np.pi / 6) is None
-    assert 'beta is 30.0° from the asked 0°' in refusal(slow)
+    assert 'beta is 30.0° from the target 0°' in refusal(slow)
     assert slow.run(3, np.pi / 2, 0.0) is None
     assert slow.sweep.capture() == ''
     assert slow.run(3, np.pi / 2, 0.0)
@@ -118,7 +118,7 @@ def test_without_an_encoder_the_sensor_shows_a_change_of_pose():
 @pytest.mark.parametrize('turned, words', [
     (np.pi, 'x reads −1.00 g where +1.00 g was expected: axis inverted or swapped'),
     (-np.pi / 2, 'y reads +1.00 g where +0.00 g was expected: axis inverted or swapped'),
-    (0.5, 'by the sensor, beta is 28.6° from the asked 0°')])
+    (0.5, 'by the sensor, beta is 28.6° from the target 0°')])
 def test_the_first_pose_shows_inverted_or_swapped_axes(turned, words):
     """The stage is at its target, but the sensor measures another direction."""
     wrong = bench('manual', [Target(np.pi / 2, 0.0)])
@@ -142,7 +142,7 @@ def test_a_wrong_pose_is_refused_once_the_unit_is_estimated():
     hand.run(0.2, target.alpha_rad, target.beta_rad + np.radians(3), encoder=False)
     hand.sweep.capture()
     assert hand.run(4, target.alpha_rad, target.beta_rad + np.radians(3), encoder=False) is None
-    assert f'beta is 3.0° from the asked {np.degrees(target.beta_rad):.0f}°' in refusal(hand)
+    assert f'beta is 3.0° from the target {np.degrees(target.beta_rad):.0f}°' in refusal(hand)
     hand.sweep.capture()
     assert hand.run(4, target.alpha_rad, target.beta_rad, encoder=False)
 
@@ -163,7 +163,7 @@ def test_units_at_the_edge_of_the_datasheet_are_never_refused():
                 nominal('xyz'), poses.subset(order[:count]), 5.0, 4.2e-4, estimate)
             i = order[count]
             target = Target(poses.alpha_rad[i], poses.beta_rad[i])
-            assert pose_checks.reading(estimate, target, poses.volts[i], np.radians(0.2)) == ''
+            assert pose_checks.reading_fault(estimate, target, poses.volts[i], np.radians(0.2)) == ''
 
 
 def _edge(name, value):
@@ -208,9 +208,9 @@ def test_a_stage_on_another_clock_is_reported(ahead_s, words):
 
 def test_a_wrong_sample_rate_is_refused():
     """Samples at another rate than that of sensor_info are refused."""
-    assert pose_checks.rate(999.0, 1000.0) == pose_checks.rate(float('nan'), 1000.0) == ''
+    assert pose_checks.rate_fault(999.0, 1000.0) == pose_checks.rate_fault(float('nan'), 1000.0) == ''
     assert 'samples are 500 a second by their stamps, but sensor_info states rate_hz 1000' in \
-        pose_checks.rate(500.0, 1000.0)
+        pose_checks.rate_fault(500.0, 1000.0)
 
 
 def test_a_step_back_in_time_restarts_the_pose():

@@ -50,7 +50,7 @@ def test_no_pose_is_accepted_before_arrival_and_the_distance_is_stated():
     assert bench.run(3, np.pi / 2, np.radians(3)) is None
     state = bench.sweep.status()
     assert (state.phase, state.late) == (Phase.STAGE, False)
-    assert 'beta is 3.0° from the asked 0°' in state.text
+    assert 'beta is 3.0° from the target 0°' in state.text
     bench.run(20, np.pi / 2, np.radians(3))
     state = bench.sweep.status()
     assert state.late
