@@ -37,21 +37,21 @@ from adxl_ros.model.sensor import Sensor
 import numpy as np
 
 PASS = 'PASS'
-"""The whole 90 % interval of the error keeps the limit."""
+"""Outcome: the whole 90 % interval of the error is within the limit."""
 FAIL = 'FAIL'
-"""The error exceeds the limit."""
+"""Outcome: the error exceeds the limit."""
 NOT_SHOWN = 'NOT SHOWN'
-"""The error keeps the limit, but its 90 % interval does not."""
+"""Outcome: the error is within the limit, but its 90 % interval is not."""
 _CHANCE_SHARE = 0.2
-"""Largest difference of measured and expected mean square that needs no comment; chosen."""
+"""Largest relative difference of expected and measured mean square without a comment; chosen."""
 _NONLINEARITY = Coefficient('nonlinearity', 'cubic_per_g2')
-"""Parameter whose typical datasheet value is the limit of acceleration."""
+"""Parameter whose typical datasheet value limits the error of acceleration."""
 
 
 @dataclass(frozen=True)
 class Assessment:
     """
-    One model against its limits. Outcomes are PASS, FAIL, NOT SHOWN, or '' without a limit.
+    The outcomes of one model: PASS, FAIL or NOT SHOWN against each limit, '' without a limit.
 
     Attributes
     ----------
@@ -86,7 +86,7 @@ class Assessment:
 
     @property
     def limited_by(self) -> str:
-        """Return 'noise', 'stage', 'model' or 'stage or model'."""
+        """Return the largest cause of the acceleration error, as `ErrorBudget.limited_by`."""
         return self.accel.limited_by
 
     @property
@@ -106,19 +106,18 @@ def _worse(*outcomes: str) -> str:
 
 def assess(model: str, budgets: ErrorBudgets, sensor: Sensor) -> Assessment:
     """
-    Assess the error of one model itself, without noise and stage error of the check.
+    Compare the calibration error of one model, without noise and stage error, with its limits.
 
     The limit by the datasheet is the typical nonlinearity at full scale, the only error that the
-    manufacturer's own calibration leaves. The limit by the noise is that of one sample, rms over
-    the axes. The limits of tilt follow from such errors on each axis. NOT SHOWN is an error whose
-    90 % interval exceeds the limit.
+    manufacturer's own calibration leaves. The limit by the noise is the noise of one sample, rms
+    over the axes. The limits of tilt are the tilt errors that such errors of each axis cause.
 
     Parameters
     ----------
     model
         Name of the model.
     budgets
-        From `error_budget`.
+        From `error_budget.error_budgets`.
     sensor
         The unit with its datasheet values and noise.
 
@@ -139,8 +138,9 @@ def _outcome(budget: ErrorBudget, limit: float) -> str:
     """Compare the error of a calibration with a limit, both mean squares."""
     if not limit > 0:
         return ''
-    certain = budget.calibration if budget.separable else budget.coefficients
-    if certain > limit:
+    # Where stage and model are inseparable, the model part may be an error of the stage.
+    certain_error = budget.calibration if budget.separable else budget.coefficients
+    if certain_error > limit:
         return FAIL
     return PASS if budget.calibration_high <= limit else NOT_SHOWN
 
@@ -172,9 +172,9 @@ def table(assessments: Sequence[Assessment], models: Sequence[HeldOutErrors]) ->
     Parameters
     ----------
     assessments
-        One for each row.
+        Assessments of the models, one row each.
     models
-        Held-out errors of the same models, and of others.
+        Held-out errors of the same models, and possibly of others.
 
     Returns
     -------
@@ -196,12 +196,12 @@ def table(assessments: Sequence[Assessment], models: Sequence[HeldOutErrors]) ->
 
 def explanation(assessment: Assessment, sensor: Sensor) -> list[str]:
     """
-    State the limits, and the parts of the error of the model that was taken.
+    State the limits, and the parts of the error of the saved model.
 
     Parameters
     ----------
     assessment
-        Of that model.
+        Assessment of that model.
     sensor
         The unit with its datasheet values and noise.
 
@@ -222,11 +222,11 @@ def explanation(assessment: Assessment, sensor: Sensor) -> list[str]:
     part = {name: f'{name} {rms_mg(getattr(accel, name)):.3f}'
             for name in ('noise', 'stage', 'coefficients', 'model')}
     if assessment.model == 'gravity':
-        # The part of the coefficients is of all directions; the measured error is of a magnitude.
+        # The coefficients' part holds for a direction, the measured error for a magnitude.
         lines.append(f'gravity: {part["noise"]} mg, {part["model"]} mg; {part["coefficients"]} mg '
                      'in each direction')
     else:
-        # The covariance of the coefficients may predict more, or less, than these poses show.
+        # The covariance predicts the mean over many fits, of which this is one.
         by_chance = abs(accel.expected - accel.measured) >= _CHANCE_SHARE * accel.measured
         lines.append(f'expected {rms_mg(accel.expected):.3f} mg = {", ".join(part.values())} '
                      f'(squares add); measured {rms_mg(accel.measured):.3f} mg'
@@ -258,12 +258,12 @@ def unit_line(sensor: Sensor) -> list[str]:
 
 def headline(assessment: Assessment | None, models: Sequence[HeldOutErrors]) -> list[str]:
     """
-    State outcomes and held-out errors of the model that was taken, in a line each.
+    State outcomes and held-out errors of the saved model, in a line each.
 
     Parameters
     ----------
     assessment
-        Of that model; None where no pose was held out.
+        Assessment of that model; None where no pose was held out.
     models
         Held-out errors of all models.
 
@@ -298,7 +298,7 @@ def narrow_table(assessments: Sequence[Assessment], models: Sequence[HeldOutErro
     Parameters
     ----------
     assessments
-        Of some of the models.
+        Assessments of some of the models.
     models
         Held-out errors, one row each.
 
@@ -334,7 +334,7 @@ def gravity_line(assessment: Assessment, leave_one_out_mps2: np.ndarray) -> str:
     Parameters
     ----------
     assessment
-        Of that calibration.
+        Assessment of that calibration.
     leave_one_out_mps2
         Error of the magnitude of gravity at each rest by the fit to all others, m/s², (k,).
 
@@ -354,12 +354,12 @@ def gravity_line(assessment: Assessment, leave_one_out_mps2: np.ndarray) -> str:
 def provenance_entries(assessment: Assessment | None, models: Sequence[HeldOutErrors]
                        ) -> dict[str, str]:
     """
-    Return the entries of the provenance about the model that was taken, without NaN.
+    Return the entries of the provenance about the saved model, without NaN.
 
     Parameters
     ----------
     assessment
-        Of that model; None gives no entries.
+        Assessment of that model; None gives no entries.
     models
         Held-out errors of all models.
 

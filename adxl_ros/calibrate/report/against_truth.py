@@ -39,10 +39,10 @@ _LABELS = {
     'scale_factor.offset_v_per_g': 'scale factor',
     'misalignment.alpha_rad': 'misalignment alpha',
     'misalignment.beta_rad': 'misalignment beta',
-    'cross_axis.linear': 'bias, {other}',
-    'cross_axis.quadratic_per_g': 'bias, {other}²',
-    'cross_axis_z.linear': 'bias, {other}',
-    'cross_axis_z.quadratic_per_g': 'bias, {other}²',
+    'cross_axis.linear': 'zero-g, {other}',
+    'cross_axis.quadratic_per_g': 'zero-g, {other}²',
+    'cross_axis_z.linear': 'zero-g, {other}',
+    'cross_axis_z.quadratic_per_g': 'zero-g, {other}²',
     'scale_factor_cross.linear_per_g': 'scale, {other}',
     'scale_factor_z.linear_per_g': 'scale, {other}',
     'scale_factor_z.quadratic_per_g2': 'scale, {other}²',
@@ -55,7 +55,7 @@ _OTHER = {effect.EFFECT.name: effect.OTHER
 _ANGLES = (Coefficient('misalignment', 'alpha_rad'), Coefficient('misalignment', 'beta_rad'))
 """Parameters of the direction of an axis."""
 _LINEAR = (Coefficient('cross_axis', 'linear'), Coefficient('cross_axis_z', 'linear'))
-"""Parameters that a misalignment equals to first order."""
+"""Parameters that act as a misalignment does, to first order."""
 
 
 @dataclass(frozen=True)
@@ -151,6 +151,7 @@ def added_effects(fitted: Sensor, truth: Sensor) -> list[str]:
 
 
 def _compared(name: Coefficient, fitted: float, half_width: float, truth: float) -> Comparison:
+    """Compare one coefficient, with its label in words and angles in degrees."""
     key = str(name.without_axis)
     acts = name.axis and name.effect in _OTHER
     other = AXES[_OTHER[name.effect][AXES.index(name.axis)]] if acts else ''
@@ -173,7 +174,7 @@ def _absolute(sensor: Sensor, names: tuple[Coefficient, ...]) -> np.ndarray:
 
 
 def _in_gauge_of_fit(truth: Sensor, names: tuple[Coefficient, ...]) -> Sensor:
-    """Return the true unit with all effects of the fit, and without linear terms it lacks."""
+    """Return the true unit with the terms of the fit, other linear terms as misalignment."""
     effects = [name.effect for name in (*names, *_LINEAR, *_ANGLES, _SCALE)]
     equivalent = truth = with_neutral(truth, effects)
     for axis in truth.axes:

@@ -31,28 +31,28 @@ import numpy as np
 from scipy.special import chdtri
 
 Fit = Callable[[Sensor, Poses], Sensor]
-"""A function that fits a nominal sensor to poses."""
+"""A function that fits a nominal sensor to poses and returns the fitted unit."""
 
 _FOLDS = 5
 """Number of folds where no pose is marked as a check pose; chosen: the usual number."""
 _MAX_ANGLE_STD_RAD = np.radians(1.0)
-"""Largest standard deviation of an angle, rad, at which its error counts; chosen.
+"""Largest standard deviation of an angle, rad, at which its error counts.
 
-Without z, alpha is poorly determined near ±90°.
+Chosen: it leaves out poses near ±90°, which determine alpha poorly without z.
 """
 
 
 @dataclass(frozen=True)
 class PoseErrors:
     """
-    Errors of a calibrated sensor, pose by pose.
+    Errors of a calibrated sensor, measured minus reference, pose by pose.
 
     Attributes
     ----------
     alpha_rad, beta_rad
-        Measured minus reference, rad, (k,). NaN where the pose does not determine the angle.
+        Errors of the angles, rad, (k,). NaN where the pose does not determine the angle.
     accel_mps2
-        Along the measured axes, m/s², (k, m).
+        Errors along the measured axes, m/s², (k, m).
     tilt_rad
         Angle between the measured and the reference vertical, rad, (k,). NaN where the pose does
         not determine alpha.
@@ -138,8 +138,9 @@ def pose_errors(sensor: Sensor, poses: Poses, stage: Sensor | None = None) -> Po
     """
     Compare a calibrated sensor with the stage, pose by pose.
 
-    f(−α, β + π) = f(α, β): angle errors refer to the equivalent pose nearest the reference. A
-    sensor without z cannot distinguish α from π − α. The stage gives the sign of its z.
+    As f(−α, β + π) = f(α, β), the angles of the reference are those with 0 ≤ α ≤ π. A sensor
+    without z cannot distinguish α from π − α: its alpha is at most π/2, and the reference gives
+    the sign of its z.
 
     Parameters
     ----------
@@ -159,8 +160,8 @@ def pose_errors(sensor: Sensor, poses: Poses, stage: Sensor | None = None) -> Po
     """
     reference = reference_force(poses, sensor.local_gravity_mps2) if stage is None else \
         stage_force(stage, poses.alpha_rad, poses.beta_rad)
-    up = np.where(reference[2] < 0, -1, 1)
-    force = signal_chain.inverse(sensor, up)(list(poses.volts.T), poses.environment)
+    z_sign = np.where(reference[2] < 0, -1, 1)
+    force = signal_chain.inverse(sensor, z_sign)(list(poses.volts.T), poses.environment)
     covariance = force_covariance(sensor, force, np.mean(poses.std_v, axis=0) ** 2,
                                   poses.environment)
     measures_z = 'z' in sensor.axes
@@ -287,9 +288,9 @@ def cross_validate(fits: dict[str, Fit], sensor: Sensor, poses: Poses,
     """
     Return the errors of models on poses that are held out of their fit.
 
-    Poses marked `check` are held out of a fit to all others. Without check poses, each fold of
-    every fifth pose is held out of a fit to the rest. A fold whose rest does not determine a model
-    does not count for that model.
+    Poses marked `check` are held out of a fit to all others. Without check poses, every pose
+    belongs to one of five folds, and each fold is held out of a fit to the others. A fold is
+    skipped for a model whose fit fails.
 
     Parameters
     ----------
@@ -335,6 +336,7 @@ def _joined(model: str, parts: list[PoseErrors], pose_index: list[np.ndarray],
 
 
 def _folds(poses: Poses) -> list[np.ndarray]:
+    """Return a mask of the held-out poses for each fold, (k,) bool each."""
     if poses.check.any():
         return [poses.check]
     return [np.arange(len(poses)) % _FOLDS == fold for fold in range(min(_FOLDS, len(poses)))]

@@ -121,7 +121,7 @@ class DriftHistory:
         data = newest.provenance.get('data_sha256')
         by_data: dict[str, Sensor] = {}
         for sensor in stored:
-            # Two fits of the same data show no drift: the last one represents them.
+            # Two fits of the same data show no drift: only the last one counts.
             if sensor.axes == newest.axes and (
                     data is None or sensor.provenance.get('data_sha256') != data):
                 by_data[sensor.provenance.get('data_sha256')
@@ -136,15 +136,15 @@ class DriftHistory:
         return head, [_row(*pair) for pair in zip((None, *self.sensors), self.sensors)]
 
     def changes(self) -> list[str]:
-        """Return lines that state what has changed beyond the 90 % interval of the change."""
+        """Return lines on the changes since the calibration before that exceed their intervals."""
         before, now = self.sensors[-2:]
         changes = []
         for quantity in _QUANTITIES:
             change, std = _change(before, now, quantity)
-            for axis, by, half_width in zip(now.axes, change, Z_90 * std):
-                if abs(by) > half_width:
-                    changes.append(f'{quantity.label} of {axis} by {by:+.2f} +- {half_width:.2f} '
-                                   f'{quantity.unit}')
+            for axis, difference, half_width in zip(now.axes, change, Z_90 * std):
+                if abs(difference) > half_width:
+                    changes.append(f'{quantity.label} of {axis} changed by {difference:+.2f} +- '
+                                   f'{half_width:.2f} {quantity.unit}')
         days = _days(before, now)
         identity = calibration_store.calibration_id(before)
         since = f'In {days:.1f} days since {identity}' if days is not None else \
@@ -154,8 +154,9 @@ class DriftHistory:
         warming = _temperature_c(now) - _temperature_c(before)
         if abs(warming) > _MIN_WARMING_C and changes:
             slope, _ = now.datasheet.get(_TEMPERATURE_SLOPE, (_TYPICAL_SLOPE_PER_K, 0.0))
-            lines.append(f"The temperature differs by {warming:+.1f} °C. The datasheet's typical "
-                         f'slope makes {1e3 * slope * abs(warming):.2f} mg of zero-g from it.')
+            lines.append(f"The temperature differs by {warming:+.1f} °C. With the datasheet's "
+                         'typical slope, zero-g changes by '
+                         f'{1e3 * slope * abs(warming):.2f} mg from that.')
         return lines
 
     def series(self) -> DriftSeries:
@@ -171,6 +172,7 @@ class DriftHistory:
 
 
 def _row(before: Sensor | None, now: Sensor) -> list[str]:
+    """Return one calibration as cells of a table, with its change from the one before."""
     cells = []
     for quantity in _QUANTITIES:
         for d in range(len(now.axes)):
@@ -182,13 +184,14 @@ def _row(before: Sensor | None, now: Sensor) -> list[str]:
 
 
 def _values(sensor: Sensor, quantity: _Quantity) -> np.ndarray:
+    """Return a quantity of each axis, V or V/g, (m,)."""
     return sensor.zero_g_v if quantity is _ZERO_G else sensor.scale_v_per_g
 
 
 def _change(before: Sensor, now: Sensor, quantity: _Quantity) -> tuple[np.ndarray, np.ndarray]:
     """Return the change of a quantity and its standard deviation, mg or permille, (m,)."""
-    by = (_values(now, quantity) - _values(before, quantity)) / now.scale_v_per_g * 1e3
-    return by, np.hypot(_std(before, quantity), _std(now, quantity))
+    change = (_values(now, quantity) - _values(before, quantity)) / now.scale_v_per_g * 1e3
+    return change, np.hypot(_std(before, quantity), _std(now, quantity))
 
 
 def _std(sensor: Sensor, quantity: _Quantity) -> np.ndarray:

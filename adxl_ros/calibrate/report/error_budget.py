@@ -19,14 +19,15 @@ The mean runs over axes and over the poses that determine alpha. Squares add:
 
     measured = noise + stage + coefficients + model
 
-- noise: noise of the pose's mean, by the tangent of the inverse.
-- stage: a random error of each joint, up to the stated σ = step/√12, and what visits of the same
-  pose scatter by beyond that. The level and the form of the stage that the full model fitted are
-  part of the reference.
+- noise: the noise of the pose's mean, propagated through the linearised inverse.
+- stage: the random error of each joint. It is at most the stated σ = step/√12, or the scatter
+  between visits of the same pose if that is larger. The level of the base and the eccentricity
+  that the full model fits are corrected in the reference.
 - coefficients: the covariance of the calibration, which noise and stage error cause.
-- model: the rest. It counts where it exceeds what chance makes once in a hundred (with the degrees
-  of freedom of correlated poses) and the scatter between visits of the same pose. Where no pose
-  was visited twice, a sensor with z separates stage and model by |f|, which no stage can change.
+- model: the remainder. It counts if chance explains it less than once in a hundred, by the degrees
+  of freedom of correlated poses. The scatter between visits of the same pose is no part of it.
+  Where no pose was visited twice, a sensor with z separates stage and model by |f|, which no
+  stage can change.
 
 The error of the calibration itself is √(coefficients + model).
 """
@@ -59,9 +60,9 @@ _SAME_POSE_RAD = np.radians(0.5)
 _MIN_PAIRS = 6
 """Smallest number of pairs of visits that show the scatter between visits; chosen."""
 _PROBE_MPS2 = 1e-3 * G0_MPS2
-"""Error of each axis, m/s², by which the tilt error that it causes is computed: 1 mg."""
+"""Error of each axis, m/s², for which the resulting tilt error is computed: 1 mg."""
 _CHANCE = 0.01
-"""Chance that errors without a model part are said to have one; chosen."""
+"""Probability of a model part by chance, if the errors have none; chosen."""
 _UPPER_QUANTILE = 0.95
 """Probability of the upper end of a 90 % interval."""
 
@@ -108,7 +109,7 @@ class ErrorBudget:
 
     @property
     def limited_by(self) -> str:
-        """Return 'noise', 'stage', 'model' or 'stage or model': the cause of the largest part."""
+        """Return the cause of the largest part: noise, stage, model, or 'stage or model'."""
         if not self.separable and \
                 max(self.model, self.coefficients) > max(self.noise, self.stage):
             return 'stage or model'
@@ -130,9 +131,9 @@ class ErrorBudgets(NamedTuple):
     Attributes
     ----------
     accel
-        Of acceleration, (m/s²)² per axis.
+        Budget of acceleration, (m/s²)² per axis.
     tilt
-        Of tilt, rad².
+        Budget of tilt, rad².
 
     """
 
@@ -147,9 +148,9 @@ class _Covariances(NamedTuple):
     Attributes
     ----------
     noise, coefficients, stage
-        Of the mean's noise, of the calibration, and of the stated stage error.
+        Covariance by the noise of the mean, by the calibration, and by the stated stage error.
     probe
-        Of an independent error `_PROBE_MPS2` on each measured axis.
+        Covariance by an independent error `_PROBE_MPS2` on each measured axis.
 
     """
 
@@ -168,7 +169,7 @@ class _PredictedParts(NamedTuple):
     noise, coefficients
         As in `ErrorBudget`.
     stated_stage
-        Of the stage error that the parameter file states.
+        Part of the stage error that the parameter file states.
 
     """
 
@@ -184,9 +185,9 @@ class _Scatter(NamedTuple):
     Attributes
     ----------
     accel, tilt
-        Of acceleration, (m/s²)² per axis, and of tilt, rad².
+        Mean square of acceleration, (m/s²)² per axis, and of tilt, rad².
     has_noise
-        Whether the noise of the means is in it.
+        Whether it includes the noise of the means.
 
     """
 
@@ -224,7 +225,7 @@ def error_budgets(errors: HeldOutErrors, poses: Poses, stage: Sensor | None = No
         stage_force(stage, held.alpha_rad, held.beta_rad))
     has_tilt = np.isfinite(measured.tilt_rad)
     axes = [AXES.index(axis) for axis in sensor.axes]
-    # Where equation 5 has two roots, the wrong z shifts x and y, which is none of the parts.
+    # Without z, a wrong root of equation (5) shifts x and y, an error that no part describes.
     used = has_tilt if has_tilt.any() else np.isfinite(measured.force_mps2).all(axis=1)
     covariances = _covariances(errors, held, reference)
     scatter = _scatter(sensor, poses.subset(~poses.check))
@@ -343,6 +344,7 @@ def _scatter(sensor: Sensor, poses: Poses) -> _Scatter | None:
     errors = pose_errors(sensor, poses)
     reference = np.column_stack(reference_force(poses, gravity))
     if len(pairs) >= _MIN_PAIRS:
+        # The difference of two visits has twice the mean square of one visit.
         accel = np.diff(errors.accel_mps2[pairs], axis=1)[:, 0]
         force = np.diff((errors.force_mps2 - reference)[pairs], axis=1)[:, 0]
         has_tilt = np.isfinite(errors.tilt_rad[pairs]).all(axis=1)
@@ -389,7 +391,7 @@ def gravity_error_budgets(fit: GravityFit, fitted: Sensor, force: np.ndarray, ke
     upper = max(measured * nu / float(chdtri(nu, _UPPER_QUANTILE)) - by_noise, excess)
     accel = _axis_variance(covariance, [0, 1, 2], used)
     tilt = _tilt_variance(covariance, force[kept], gravity, used)
-    # Three axes have a magnitude's error each; two of the three turn the vertical.
+    # Each of three axes has the error of a magnitude; two of the three turn the vertical.
     return ErrorBudgets(
         ErrorBudget(measured, by_noise, 0.0, accel, excess, accel + upper),
         ErrorBudget(3 * measured / gravity ** 2, 2 * by_noise / gravity ** 2, 0.0, tilt,

@@ -35,7 +35,7 @@ import numpy as np
 _FINE_G = np.linspace(-1, 1, 201)
 """Specific force at which curves are drawn, g."""
 _VERTICAL = np.sin(np.radians(89))
-"""Smallest sine of alpha in the plane alpha = 90°; chosen: encoders are better than 1°."""
+"""Smallest sine of alpha in the plane alpha = 90°; chosen: stages are better than 1°."""
 _MARKERS = 'os^D'
 """Markers of models and axes, in order."""
 
@@ -48,7 +48,7 @@ class _AxisData:
     Attributes
     ----------
     d
-        Index of the axis, 0 for x or 1 for y.
+        Index of the axis: 0 for x, 1 for y.
     force_g
         Reference along the measured axes, g, (k, m).
     poses
@@ -139,7 +139,7 @@ def sweep(sensor: Sensor, fitted: Sensor, poses: Poses, panels: Sequence[int] = 
 
 def gravity_rests(name: str, fit: GravityFit) -> Any:
     """
-    Draw the error of the magnitude of gravity over the rests, before and after the fit.
+    Draw the error of the magnitude of gravity in each rest, before and after the fit.
 
     Parameters
     ----------
@@ -221,15 +221,15 @@ def drift(series: DriftSeries) -> Any:
 
 
 def _vertical_paths(axis: Any, data: _AxisData) -> None:
-    _paths(axis, data, data.vertical, 2)
+    _paths(axis, data, data.vertical, paper_figure=2)
 
 
 def _all_paths(axis: Any, data: _AxisData) -> None:
-    _paths(axis, data, np.ones(len(data.poses), bool), 3)
+    _paths(axis, data, np.ones(len(data.poses), bool), paper_figure=3)
 
 
-def _paths(axis: Any, data: _AxisData, chosen: np.ndarray, number: int) -> None:
-    """Draw the deviation over the reference, plane by plane, up and down in beta."""
+def _paths(axis: Any, data: _AxisData, chosen: np.ndarray, paper_figure: int) -> None:
+    """Draw the deviation against the reference, plane by plane, beta forth and back."""
     alpha_deg = np.degrees(data.poses.alpha_rad)
     backward = np.gradient(data.poses.beta_rad) < 0
     force_g, deviation_mv = data.force_g[:, data.d], data.deviation_mv
@@ -243,10 +243,11 @@ def _paths(axis: Any, data: _AxisData, chosen: np.ndarray, number: int) -> None:
                   mfc='none')
     axis.legend(title='alpha', fontsize=7)
     axis.set(xlabel=f'{data.name} reference, g', ylabel=f'{data.name} output minus linear, mV',
-             title=f'fig. {number}: paths, forth ● and back ◁')
+             title=f'fig. {paper_figure}: paths, forth ● and back ◁')
 
 
 def _across(axis: Any, data: _AxisData) -> None:
+    """Draw the deviation against the other axis in the plane alpha = 90°, with its quadratic."""
     vertical = data.vertical
     axis.plot(data.force_g[vertical, 1 - data.d], data.deviation_mv[vertical], 'o', ms=4,
               label='measured (10)')
@@ -258,6 +259,7 @@ def _across(axis: Any, data: _AxisData) -> None:
 
 
 def _modelled(axis: Any, data: _AxisData) -> None:
+    """Draw the measured and the modelled deviation against the reference, plane by plane."""
     alpha_rad, force_g = data.poses.alpha_rad, data.force_g[:, data.d]
     for plane in paper_regression.planes(alpha_rad):
         index = np.sort(plane)
@@ -272,8 +274,8 @@ def _modelled(axis: Any, data: _AxisData) -> None:
 def _bias_along_z(axis: Any, data: _AxisData) -> None:
     regression = data.regression
     _along_z(axis, regression.plane_az_g, 1e3 * regression.plane_bias_v, 1e3 * regression.q)
-    axis.set(xlabel='z reference, g', ylabel=f'{data.name} bias minus bias at 90°, mV',
-             title='fig. 6: bias against z (12, 13)')
+    axis.set(xlabel='z reference, g', ylabel=f'{data.name} zero-g minus that at 90°, mV',
+             title='fig. 6: zero-g against z (12, 13)')
 
 
 def _scale_along_z(axis: Any, data: _AxisData) -> None:
@@ -284,6 +286,7 @@ def _scale_along_z(axis: Any, data: _AxisData) -> None:
 
 
 def _along_z(axis: Any, az_g: np.ndarray, values: np.ndarray, polynomial: np.ndarray) -> None:
+    """Draw values of the planes against their force along z, with a polynomial."""
     fine_g = np.linspace(az_g.min(), az_g.max(), 101)
     axis.plot(az_g, values, 'o', ms=4)
     axis.plot(fine_g, np.polynomial.polynomial.polyval(fine_g, polynomial))

@@ -72,7 +72,7 @@ class _SphereData(NamedTuple):
     quantities
         Label and unit of each quantity.
     errors
-        One (k, q) for each model.
+        Errors of each model by pose and quantity, (k, q) each.
     force
         Specific force in the case, m/s², (k, 3).
     labels
@@ -110,7 +110,7 @@ def write(folder: str | os.PathLike, result: CalibrationResult,
     past = calibration_store.history(store, result.fitted.serial).calibrations \
         if str(store) else []
     _write_page(Path(folder) / 'report.html', result, [sensor for _, sensor in past])
-    # Where the poses do not suffice for the figures of the paper, the page states why.
+    # If the poses do not suffice for the figures of the paper, the page states the reason.
     with suppress(UserError):
         draw(Path(folder) / 'calibration.png', result)
 
@@ -160,7 +160,7 @@ def _preformatted(lines: Sequence[str]) -> str:
 
 
 def _summary(result: CalibrationResult) -> str:
-    """State whether the calibration is accepted, its errors, and what limits it."""
+    """Return the outcomes, the errors and the largest cause of error, as a paragraph."""
     fitted = result.fitted
     assessment = next((row for row in result.assessments if row.model == fitted.model), None)
     if assessment is None:
@@ -292,7 +292,7 @@ def _absolute_rows(label: str, unit: str, fitted: Sensor, values: Sequence[float
 
 
 def _against_datasheet(magnitude: float, typical: float, maximum: float) -> str:
-    """Compare the least magnitude of a 90 % interval with datasheet values, 0 if not stated."""
+    """Compare the lower end of a magnitude's interval with datasheet values, 0 if not stated."""
     if not (typical or maximum):
         return ''
     if maximum and magnitude > maximum:

@@ -68,7 +68,7 @@ def truth_table(comparisons: Sequence[Comparison]) -> list[str]:
 
 
 def _truth_row(row: Comparison, width: int) -> str:
-    """Lay out one coefficient, whose label has a width."""
+    """Lay out one coefficient, with a label of the given width."""
     decimals = _decimals(row.half_width)
     fitted, half_width, truth = (f'{round(value, decimals) + 0.0:.{decimals}f}'
                                  for value in (row.fitted, row.half_width, row.truth))
@@ -78,7 +78,7 @@ def _truth_row(row: Comparison, width: int) -> str:
 
 
 def _decimals(half_width: float) -> int:
-    """Return how many decimals show two digits of an interval."""
+    """Return the number of decimals that shows two digits of an interval."""
     if not half_width > 0:
         return _UNKNOWN_DECIMALS
     exponent = int(f'{half_width:.1e}'.partition('e')[2])
@@ -86,7 +86,7 @@ def _decimals(half_width: float) -> int:
 
 
 def acceptance_lines(fitted: Sensor) -> list[str]:
-    """Tell whether the calibration is as good as the datasheet: value, limit and meaning."""
+    """Return whether the calibration error is within the datasheet's limit, as lines."""
     provenance = fitted.provenance
     if 'own_accel_mg' not in provenance:
         return [f' {acceptance.NOT_SHOWN}  no pose was kept out of the fit to assess it']
@@ -103,12 +103,12 @@ def acceptance_lines(fitted: Sensor) -> list[str]:
                 '       The sensor is worse than its datasheet states: do not use this file.']
     if acceptance.NOT_SHOWN in (accel, tilt):
         return [f' {acceptance.NOT_SHOWN}  {result}',
-                '            The check poses are too few to show that the limit is kept.']
+                '            The check poses are too few to show that the error is within it.']
     return [f' {acceptance.PASS}  {result}']
 
 
 def added_effect_lines(effects: Sequence[str]) -> list[str]:
-    """Name each effect that the fit has and the simulated unit has not."""
+    """Name each effect that the fit has and the simulated unit does not have."""
     return [f'       The fit has the term {effect}, which this unit does not have.'
             for effect in effects]
 

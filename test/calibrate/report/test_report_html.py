@@ -117,7 +117,8 @@ def test_the_report_has_its_contents(opened, report_folder):
     line = next(line for line in coefficients.splitlines()
                 if line.startswith('nonlinearity.cubic_per_g2.x'))
     assert '\t0.00069\t0.0043\t' in line
-    assert re.search(r'In [\d.]+ days since last-year: zero-g of x by \+[34]\.\d+', text), text
+    change = re.search(r'In [\d.]+ days since last-year: zero-g of x changed by \+[34]\.\d+', text)
+    assert change, text
     assert 'zero-g of y' not in text
     assert page.locator('img').count() == 5
     assert page.evaluate('[...document.images].every(i => i.complete && i.naturalWidth > 500)')

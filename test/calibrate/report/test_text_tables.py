@@ -78,8 +78,8 @@ def test_each_fitted_coefficient_is_compared() -> None:
     alpha = coefficient_of(compared, 'misalignment.alpha_rad', 'x')
     assert (alpha.unit, alpha.half_width) == ('°', pytest.approx(np.degrees(1.6449 * STD)))
     assert alpha.truth == pytest.approx(np.degrees(truth.values['misalignment']['alpha_rad'][0]))
-    assert coefficient_of(compared, 'cross_axis.quadratic_per_g', 'x').label == 'bias, y²'
-    assert coefficient_of(compared, 'cross_axis.quadratic_per_g', 'y').label == 'bias, x²'
+    assert coefficient_of(compared, 'cross_axis.quadratic_per_g', 'x').label == 'zero-g, y²'
+    assert coefficient_of(compared, 'cross_axis.quadratic_per_g', 'y').label == 'zero-g, x²'
     assert coefficient_of(compared, 'scale_factor_z.quadratic_per_g2', 'y').label == 'scale, z²'
     # The unit does not have this effect.
     assert coefficient_of(compared, 'nonlinearity.cubic_per_g2', 'x').truth == 0
@@ -122,7 +122,7 @@ def test_linear_terms_that_the_fit_has_are_compared() -> None:
     truth = put(truth, [Coefficient('cross_axis', 'linear', 'x')], [0.02])
     compared = compare(fitted_of(truth, names_for('xy')), truth)
     linear = coefficient_of(compared, 'cross_axis.linear', 'x')
-    assert (linear.label, linear.truth, linear.inside) == ('bias, y', 0.02, True)
+    assert (linear.label, linear.truth, linear.inside) == ('zero-g, y', 0.02, True)
     beta = coefficient_of(compared, 'misalignment.beta_rad', 'x')
     assert beta.truth == pytest.approx(np.degrees(truth.values['misalignment']['beta_rad'][0]))
 
