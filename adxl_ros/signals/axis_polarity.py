@@ -35,7 +35,7 @@ class PolarityFault:
     axis
         Index of the measured axis.
     follows
-        Index of the reference axis that it follows; its own where it is inverted.
+        Index of the reference axis that it follows: its own reference if it is inverted.
     correlation
         Correlation with that reference, −1 to 1.
 
@@ -47,7 +47,7 @@ class PolarityFault:
 
     def describe(self, axis: str, reference: str) -> str:
         """
-        Say what is wrong and what to correct.
+        Return the fault and its remedy as one line.
 
         Parameters
         ----------

@@ -23,15 +23,15 @@ import numpy as np
 BLOCK_S = 0.05
 """Length of a block, s. Chosen: well below a rest, and above the sample period of most sensors."""
 GAP_S = 0.1
-"""Time without a sample that ends a block and a rest, s."""
+"""Smallest time without a sample that ends a block and a rest, s. Chosen: two blocks."""
 _GAP_PERIODS = 5
-"""Sample periods without a sample that are needed as well to end a block."""
+"""Smallest gap in sample periods. Chosen: at low rates a few lost samples are no gap."""
 _CHUNK = 1 << 13
-"""Rows processed at once. Chosen: they fit a cache, and long recordings need no memory."""
+"""Rows processed at once. Chosen: they fit into the cache, whatever the length of a recording."""
 
 
 def block_samples(rate_hz: float) -> int:
-    """Count the samples in a block at `rate_hz`."""
+    """Return the number of samples in a block at a sample rate, Hz."""
     return max(1, round(BLOCK_S * rate_hz))
 
 
@@ -47,16 +47,16 @@ class Blocks:
     time_s
         Time of the first and last row, s, (k, 2).
     run
-        Number of the gapless run that the block is a part of, (k,).
+        Number of the gapless run that the block belongs to, (k,).
     count
-        Rows without NaN, (k,); 0 where that is less than half.
+        Number of rows without NaN, (k,); 0 if these are at most half of the rows.
     mean
-        Mean of those by axis, (k, m); where there are none, that of the block before.
+        Mean of these rows by axis, (k, m); without such rows the mean of the block before.
     squares
         Sum of the squared deviations from the mean, (k, m).
     step
-        Smallest change between consecutive rows that is not 0, (k, m). It is the step of the ADC
-        if the noise reaches it; inf if nothing changes.
+        Smallest change between consecutive rows that is not 0, (k, m); inf if nothing changes. It
+        is the step of the ADC if the noise exceeds that step.
     angle
         Lowest and highest encoder angle, rad, (k, 2, a); NaN where none was sampled.
 
@@ -72,11 +72,11 @@ class Blocks:
     angle: np.ndarray
 
     def __len__(self) -> int:
-        """Count the blocks."""
+        """Return the number of blocks."""
         return len(self.start)
 
     def __getitem__(self, part: slice | np.ndarray) -> Blocks:
-        """Take the blocks of `part`."""
+        """Return the blocks that a slice or an index array selects."""
         return Blocks(*(getattr(self, f.name)[part] for f in fields(self)))
 
     @staticmethod
@@ -88,10 +88,10 @@ class Blocks:
 
 class BlockCutter:
     """
-    Cuts a stream into blocks, which do not depend on how the stream is fed in portions.
+    Cuts a stream into blocks; the portions in which it is fed do not change the blocks.
 
     A gap in time, or time that runs backwards, begins a new run. The incomplete block before it
-    is not used.
+    is dropped.
 
     Parameters
     ----------
@@ -106,7 +106,7 @@ class BlockCutter:
         self.size = block_samples(rate_hz)
         self._axes = axes
         self._gap_s = max(GAP_S, _GAP_PERIODS / rate_hz)
-        self._rest = np.empty((1 + axes + angles, 0))
+        self._leftover = np.empty((1 + axes + angles, 0))
         self._mean = np.zeros((axes, 1))
         self._row = 0
         self._run = -1
@@ -138,12 +138,12 @@ class BlockCutter:
             for i in range(0, len(time_s), _CHUNK)])
 
     def none(self) -> Blocks:
-        """Return no blocks, of the right shape."""
-        return self._summed(self._rest, np.empty(0, int), np.empty(0, int))
+        """Return an empty sequence of blocks, of the right shape."""
+        return self._summed(self._leftover, np.empty(0, int), np.empty(0, int))
 
     def _cut(self, columns: np.ndarray) -> Blocks:
-        """Cut the rows that are left over from before, and these, (1 + m + a, n)."""
-        columns = np.concatenate([self._rest, columns], axis=1)
+        """Cut the leftover rows and further rows, (1 + m + a, n), into blocks."""
+        columns = np.concatenate([self._leftover, columns], axis=1)
         count = columns.shape[1]
         step_s = np.diff(columns[0], prepend=self._last_time_s)
         begins = np.flatnonzero(~((step_s >= 0) & (step_s <= self._gap_s)))
@@ -153,13 +153,13 @@ class BlockCutter:
         start += self.size * np.arange(len(start))
         blocks = self._summed(columns, start,
                               self._run + np.searchsorted(begins, start, side='right'))
-        # Gaps within the rows that are kept are counted later, with the same time before them.
-        kept = int(edges[-2] + self.size * complete[-1])
-        self._run += int(np.searchsorted(begins, kept))
-        self._row += kept
-        if kept:
-            self._last_time_s = columns[0, kept - 1]
-        self._rest = columns[:, kept:]
+        # The next call counts a gap within the leftover rows.
+        used = int(edges[-2] + self.size * complete[-1])
+        self._run += int(np.searchsorted(begins, used))
+        self._row += used
+        if used:
+            self._last_time_s = columns[0, used - 1]
+        self._leftover = columns[:, used:]
         return blocks
 
     def _summed(self, columns: np.ndarray, start: np.ndarray, run: np.ndarray) -> Blocks:
@@ -177,6 +177,7 @@ class BlockCutter:
         with np.errstate(over='ignore', invalid='ignore'):
             mean = np.where(finite, samples, 0).sum(axis=2) / np.maximum(count, 1)
             squares = (np.where(finite, samples - mean[..., None], 0) ** 2).sum(axis=2)
+        # A block without samples takes the mean of the newest block before it.
         mean = np.concatenate([self._mean, mean], axis=1)
         mean = mean[:, np.maximum.accumulate(np.where(count, np.arange(1, len(count) + 1), 0))]
         if len(count):
@@ -188,10 +189,11 @@ class BlockCutter:
 
 def angle_bounds(blocks: Blocks) -> np.ndarray:
     """
-    Return the negative lowest angle and the highest angle of each block, (k, 2, a).
+    Return the bounds of the encoder angles of each block as (−lowest, highest), rad, (k, 2, a).
 
-    An encoder that is read less often than the sensor has blocks without a reading, and it may
-    turn between two readings. The readings before and after a block count too.
+    With this sign the bounds of several blocks are the maximum of their bounds. The readings
+    before and after a block count too: an encoder that is read less often than the sensor may turn
+    between two readings.
     """
     bounds = blocks.angle * np.array([[-1.0], [1.0]])
     has_angle = np.isfinite(bounds).all(axis=(1, 2))

@@ -15,10 +15,11 @@
 """
 Time constant of the output filter, from the spectrum of the noise at rest.
 
-White noise behind a first-order filter is an AR(1) sequence, a = exp(−dt/RC), plus the white
-rounding noise of the ADC. Three parameters are fitted to the mean periodogram of all rests by the
-debiased Whittle likelihood (Sykulski et al. 2019, doi 10.1093/biomet/asy071). It compares each
-ordinate with its exact expectation behind window and sampling.
+White noise behind a first-order filter is an AR(1) sequence with a = exp(−dt/RC). The ADC adds
+white rounding noise. The variance of the noise, RC and the variance of the rounding noise are
+fitted to the mean periodogram of all rests by the debiased Whittle likelihood (Sykulski et al.
+2019, doi 10.1093/biomet/asy071). It compares each ordinate with its exact expectation for the
+window and the sampling.
 """
 
 from __future__ import annotations
@@ -34,11 +35,11 @@ from scipy.linalg import block_diag
 from scipy.optimize import minimize
 
 _SEGMENT_S = 1.0
-"""Length of a segment of the periodogram, s."""
+"""Length of a segment of the periodogram, s. Chosen: several fit into a rest."""
 _MIN_SEGMENT_SAMPLES = 16
-"""Smallest count of samples in a segment."""
+"""Smallest number of samples in a segment. Chosen: fewer ordinates do not show a filter."""
 _LOWEST_BINS = 2
-"""Highest bin that is left out: mean, drift and flicker dominate there."""
+"""Highest bin that is left out: mean, drift and flicker dominate in bins 0 to 2."""
 _INDEPENDENT_SEGMENTS = 0.95
 """Independent periodograms per segment, for a Hann window that overlaps by half."""
 _CORRELATED_ORDINATES = 35 / 18
@@ -47,22 +48,27 @@ _ADC_NOISE_PRIOR_STD = 0.7
 """Prior standard deviation of the logarithm of the ADC's noise variance about LSB²/12. Chosen:
 a factor of two."""
 _LINE_STD = 6.0
-"""An ordinate this many standard deviations above the others is a line (hum), no noise."""
+"""Excess from which an ordinate is a line (hum), standard deviations of the ordinates."""
 _FIT_ROUNDS = 2
-"""Fits, with the lines that the one before has shown left out."""
+"""Number of fits: the second one leaves out the lines that the first one shows."""
 _MIN_VARIANCE_V2 = 1e-18
-"""Smallest variance of the noise to begin with, V²."""
+"""Lower bound of the start value of the noise variance, V²."""
 _MIN_LSB_V = 1e-9
-"""Smallest step of the ADC, V."""
+"""Lower bound of the ADC's step, V, for samples without rounding."""
 _LOG_STEP = 1e-4
-"""Step of the central differences by the logarithm of a parameter."""
+"""Step of the central differences, in the logarithm of a parameter."""
+_MAX_LOG = 80.0
+"""Largest magnitude of a parameter's logarithm, so that its exponential stays finite."""
+_MIN_EXPECTED_V2 = 1e-300
+"""Lower bound of an expected ordinate, V², so that its logarithm is finite."""
 _MAX_CONDITION = 1e12
-"""Largest condition number of the information."""
+"""Largest condition number of the information matrix that can be inverted."""
 _MAX_RATIO_STD = 0.1
 """Largest relative standard deviation of a credible estimate. Chosen: well below the ±25 % of the
 datasheet."""
 _MAX_SCATTER = 2.0
-"""Largest scatter of the ordinates, relative to that of filtered white noise."""
+"""Largest scatter of the ordinates, relative to that of filtered white noise. Chosen: flicker and
+hum exceed it."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +83,7 @@ class FilterNoise:
     ratio_std
         Relative standard deviation of the time constant.
     scatter
-        Mean square of the periodogram's deviations over its expectation: 1 for filtered noise.
+        Mean square of the ordinates' deviations, relative to that of filtered white noise.
 
     """
 
@@ -126,12 +132,13 @@ def estimate_filter(rests: Iterable[np.ndarray], rate_hz: float, rc_s: float, ls
     used = np.arange(len(power)) > _LOWEST_BINS
     start = np.log([max(float(np.mean(power[used])) / size, lsb_v ** 2, _MIN_VARIANCE_V2),
                     rc_s * rate_hz, max(lsb_v, _MIN_LSB_V) ** 2 / 12])
-    white = float(start[2])
+    log_adc_variance = float(start[2])
 
     def cost(x: np.ndarray) -> float:
-        expected = np.maximum(_expected(x, lags)[used], 1e-300)
-        return float(np.sum(power[used] / expected + np.log(expected))
-                     + ((x[2] - white) / _ADC_NOISE_PRIOR_STD) ** 2 / (2 * weight))
+        """Return the negative log posterior for the parameters of `_expected`."""
+        expected = np.maximum(_expected(x, lags)[used], _MIN_EXPECTED_V2)
+        prior = ((x[2] - log_adc_variance) / _ADC_NOISE_PRIOR_STD) ** 2
+        return float(np.sum(power[used] / expected + np.log(expected)) + prior / (2 * weight))
 
     for _ in range(_FIT_ROUNDS):
         fit = minimize(cost, start, method='Nelder-Mead',
@@ -152,7 +159,7 @@ def estimate_filter(rests: Iterable[np.ndarray], rate_hz: float, rc_s: float, ls
 
 
 def _mean_periodogram(rests: Iterable[np.ndarray], window: np.ndarray) -> tuple[np.ndarray, int]:
-    """Return the mean periodogram of all segments, and their count."""
+    """Return the mean periodogram of all segments, V², and their number."""
     size = len(window)
     total, count = np.zeros(size // 2 + 1), 0
     for volts in rests:
@@ -164,10 +171,10 @@ def _mean_periodogram(rests: Iterable[np.ndarray], window: np.ndarray) -> tuple[
 
 
 def _expected(x: np.ndarray, lags: np.ndarray) -> np.ndarray:
-    """Return the expected periodogram for ln of σ², RC in samples and the ADC's σ²."""
-    sigma2, rc, white = np.exp(np.clip(x, -80, 80))
-    covariance = sigma2 * np.exp(-np.arange(len(lags)) / rc)
-    covariance[0] += white
+    """Return the expected periodogram, V², for the logarithms of σ², RC/dt and the ADC's σ²."""
+    variance_v2, rc_samples, adc_variance_v2 = np.exp(np.clip(x, -_MAX_LOG, _MAX_LOG))
+    covariance = variance_v2 * np.exp(-np.arange(len(lags)) / rc_samples)
+    covariance[0] += adc_variance_v2
     terms = covariance * lags
     return 2 * np.fft.rfft(terms).real - terms[0]
 
@@ -195,22 +202,21 @@ def with_filter(fitted: Sensor, estimates: Sequence[Sequence[FilterNoise | None]
     Returns
     -------
     tuple
-        The unit, unchanged if the noise of an axis does not show the filter, and lines that give
-        the reason.
+        The unit, and the reasons if it is unchanged: one line for an axis whose noise does not
+        show the filter.
 
     """
     if not fitted.rc_s or not estimates:
         return fitted, []
     ratios, variances = [], []
-    for axis, of_axis in zip(fitted.axes, zip(*estimates)):
-        credible = [estimate for estimate in of_axis
+    for axis, axis_estimates in zip(fitted.axes, zip(*estimates)):
+        credible = [estimate for estimate in axis_estimates
                     if estimate is not None and estimate.credible]
         if not credible:
             return fitted, [f'{axis}: the noise at rest does not fit white noise behind the '
                             'stated filter; the fit keeps the stated resistor']
         weights = np.array([estimate.ratio_std ** -2 for estimate in credible])
-        rc_s = np.sum(weights * np.array([estimate.rc_s for estimate in credible])) \
-            / weights.sum()
+        rc_s = np.average([estimate.rc_s for estimate in credible], weights=weights)
         ratios.append(rc_s / fitted.rc_s - 1)
         variances.append((rc_s / fitted.rc_s) ** 2 / weights.sum())
     names = names_of(effect_named('bandwidth'), fitted.axes)

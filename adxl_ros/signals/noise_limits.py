@@ -26,13 +26,13 @@ from numpy.lib.stride_tricks import sliding_window_view
 from scipy.special import chdtri
 
 _WINDOW_S = 0.25
-"""Length of the window of a variance, s."""
+"""Length of the window of a variance, s. Chosen: under half of the shortest rest."""
 _WINDOW_SAMPLES = 8
-"""Smallest count of samples in that window."""
+"""Smallest number of samples in that window. Chosen: fewer do not show a variance."""
 _HALF_S = 0.5
-"""Length of the shortest neighbouring halves whose means are compared, s."""
+"""Shortest length of the neighbouring halves whose means are compared, s. Chosen: two windows."""
 DRIFT_OCTAVES = 4
-"""Octaves of that length: 0.5, 1, 2 and 4 s. Chosen: beyond, a sensor's flicker dominates."""
+"""Number of lengths of halves: 0.5, 1, 2 and 4 s. Chosen: beyond, a sensor's flicker dominates."""
 _MIN_VARIANCE_RATIO = 2.25
 """Smallest limit of a variance, relative to that of the noise: 1.5 times its rms."""
 _MAX_VARIANCE_RATIO = 9.0
@@ -40,21 +40,23 @@ _MAX_VARIANCE_RATIO = 9.0
 _FALSE_ALARM = 1e-6
 """Probability that the variance of noise exceeds its limit."""
 _QUIETEST_SHARE = 0.05
-"""Share of the windows at whose greatest variance the search for the noise begins."""
+"""Quantile of the windows' variances at which the search for the variance of noise begins."""
 _QUIET_RATIO = 3.0
-"""Windows up to this many times the noise's variance are quiet ones."""
+"""Largest variance of a quiet window, relative to that of the noise."""
 _QUIET_STEPS = 50
-"""Largest count of steps of that search."""
+"""Largest number of steps of that search."""
 _QUIET_DEVIATIONS = 5.0
-"""The limit is this many standard deviations of ln(variance) above the noise."""
+"""Distance of a variance's limit from the noise, standard deviations of ln(variance)."""
 _MAD_TO_STD = 1.4826
-"""Standard deviation of a normal deviate by the median of its magnitude."""
+"""Standard deviation of a normal deviate, relative to the median of its magnitude."""
 _QUARTILE_TO_STD = 0.3186
-"""Quartile of a normal deviate's magnitude, by its standard deviation."""
+"""First quartile of a normal deviate's magnitude, relative to its standard deviation."""
 _ROUNDING = 1e-9
 """Relative rounding error of samples without noise."""
+_TINY_VARIANCE = 1e-300
+"""Lower bound of a variance, in squares of any unit, so that its logarithm is finite."""
 END_SIGMAS = 3.5
-"""The ends of a rest are cut if they differ from its middle by more standard deviations."""
+"""Difference of an end of a rest from its middle beyond which it is cut, standard deviations."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +104,7 @@ class Spans:
     half: int
 
     @staticmethod
-    def at(rate_hz: float) -> Spans:
+    def for_rate(rate_hz: float) -> Spans:
         """Return the lengths for a sample rate, Hz."""
         size = block_samples(rate_hz)
         block_s = size / rate_hz
@@ -111,12 +113,12 @@ class Spans:
 
     @property
     def block_s(self) -> float:
-        """Return the time of a block, s."""
+        """Return the length of a block, s."""
         return self.size * self.dt_s
 
     @property
     def longest(self) -> int:
-        """Return the count of blocks of both longest halves."""
+        """Return the number of blocks in both longest halves together."""
         return self.half << DRIFT_OCTAVES
 
 
@@ -148,7 +150,8 @@ class NoiseLimits:
 
     @property
     def flicker(self) -> np.ndarray:
-        """Return the noise of the difference of two very long means, (m,)."""
+        """Return the standard deviation of the difference of two very long means, (m,)."""
+        # The longest halves have 2^(DRIFT_OCTAVES − 1) times the length of the shortest.
         white = self.drift[0] ** 2 / (1 << DRIFT_OCTAVES - 1)
         return np.sqrt(np.maximum(self.drift[-1] ** 2 - white, 0))
 
@@ -172,7 +175,7 @@ class NoiseLimits:
         Returns
         -------
         bool
-            True if the means of an axis differ by more.
+            Whether the means of an axis differ by more.
 
         """
         white = self.block_noise(spans) ** 2 * (1 / len(before) + 1 / len(after))
@@ -182,10 +185,10 @@ class NoiseLimits:
 
 def stated_limits(noise: Noise, step: np.ndarray, spans: Spans) -> NoiseLimits:
     """
-    Return the limits for a given noise. A variance of samples is chi-squared.
+    Return the limits for a given noise, whose sample variance is chi-squared.
 
     A first-order filter correlates neighbours by a = exp(−dt/τ). The variance of n such samples
-    scatters as that of n·(1 − a²)/(1 + a²) independent ones.
+    scatters as the variance of n·(1 − a²)/(1 + a²) independent samples.
 
     Parameters
     ----------
@@ -214,7 +217,7 @@ def stated_limits(noise: Noise, step: np.ndarray, spans: Spans) -> NoiseLimits:
 def learned_limits(blocks: Blocks, windows: np.ndarray, step: np.ndarray,
                    spans: Spans) -> NoiseLimits | None:
     """
-    Learn the limits from the quietest windows, at least those of the ADC's step.
+    Learn the limits from the quietest windows; they are at least the limits of the ADC's step.
 
     Parameters
     ----------
@@ -248,21 +251,21 @@ def learned_limits(blocks: Blocks, windows: np.ndarray, step: np.ndarray,
     return NoiseLimits(limit, drift, undithered(step, np.sqrt(variance)))
 
 
-def _drift_noise(moved: np.ndarray, valid: np.ndarray, half: int) -> np.ndarray | None:
+def _drift_noise(differences: np.ndarray, valid: np.ndarray, half: int) -> np.ndarray | None:
     """
-    Learn the standard deviation of the differences of halves, (m,); None if there are none.
+    Learn the standard deviation of the valid differences of halves, (m,); None if none is valid.
 
-    A steady turn changes all of them by the same, which differences of differences remove. The
-    quartile of the magnitude is valid even if most quiet blocks are no rest.
+    A steady turn adds the same to all differences. Differences of two differences remove it. The
+    first quartile of the magnitude is right even if most quiet blocks are no rest.
     """
     both = valid[:-2 * half] & valid[2 * half:]
     if both.any():
-        differences = (moved[2 * half:] - moved[:-2 * half])[both] / np.sqrt(2)
+        noise = (differences[2 * half:] - differences[:-2 * half])[both] / np.sqrt(2)
     elif valid.any():
-        differences = moved[valid]
+        noise = differences[valid]
     else:
         return None
-    return np.quantile(np.abs(differences), 0.25, axis=0) / _QUARTILE_TO_STD
+    return np.quantile(np.abs(noise), 0.25, axis=0) / _QUARTILE_TO_STD
 
 
 def quiet_variance(blocks: Blocks, windows: np.ndarray,
@@ -270,8 +273,8 @@ def quiet_variance(blocks: Blocks, windows: np.ndarray,
     """
     Learn the variance that the quietest windows have in common, and its limit.
 
-    Noise below the ADC's step shows as two neighbouring codes in equal parts at most. Samples
-    without any noise still have a rounding error.
+    Noise below the ADC's step makes at most two neighbouring codes equally frequent: a variance
+    of a quarter of the squared step. Samples without any noise still have a rounding error.
 
     Parameters
     ----------
@@ -287,7 +290,7 @@ def quiet_variance(blocks: Blocks, windows: np.ndarray,
 
     """
     middle = np.median(np.abs(blocks.mean), axis=0)
-    smallest = step ** 2 / 4 + (_ROUNDING * middle) ** 2 + 1e-300
+    smallest = step ** 2 / 4 + (_ROUNDING * middle) ** 2 + _TINY_VARIANCE
     variance, ratio = np.array([_quietest(variances, limit)
                                 for variances, limit in zip(windows.T, smallest)]).T
     return variance, ratio * variance
@@ -297,8 +300,8 @@ def _quietest(variances: np.ndarray, smallest: float) -> tuple[float, float]:
     """
     Return the variance that the quiet windows have in common, and the ratio of its limit.
 
-    The search begins at the 5 % of lowest variance. It moves to the median of all variances
-    below three times the present one: motion spreads over decades, noise does not.
+    The search begins at the 5 % quantile. Each step goes to the median of all variances below
+    three times the present one. Variances of motion spread over decades, those of noise do not.
     """
     values = np.sort(np.maximum(variances[np.isfinite(variances)], smallest))
     if not len(values):
@@ -327,11 +330,11 @@ def adc_step(blocks: Blocks) -> np.ndarray:
 
 def undithered(step: np.ndarray, sigma: np.ndarray) -> np.ndarray:
     """
-    Return the error of a mean by rounding that noise does not average out.
+    Return the rounding error of a mean that noise does not average out.
 
-    Noise reduces the first harmonic of the rounding error to exp(−2π²σ²/step²) of itself
-    (Widrow's quantisation theorem). A scatter of up to half a step does not show the noise: the
-    codes may flicker between two values without any.
+    Noise multiplies the first harmonic of the rounding error by exp(−2π²σ²/step²) (Widrow's
+    quantisation theorem). A scatter of up to half a step is no evidence of noise: without noise
+    the codes may alternate between two values.
 
     Parameters
     ----------
@@ -343,7 +346,7 @@ def undithered(step: np.ndarray, sigma: np.ndarray) -> np.ndarray:
     Returns
     -------
     ndarray
-        Error, (m,).
+        Error in the unit of the samples, (m,).
 
     """
     noise = np.maximum(sigma ** 2 - step ** 2 / 4, 0)
@@ -386,7 +389,7 @@ def window_variance(blocks: Blocks, spans: Spans) -> np.ndarray:
 def quiet_blocks(blocks: Blocks, windows: np.ndarray, limit: np.ndarray,
                  window: int) -> np.ndarray:
     """
-    Mark the blocks whose surroundings have the variance of noise.
+    Mark the blocks in whose window the variance is that of noise.
 
     Parameters
     ----------
@@ -400,13 +403,13 @@ def quiet_blocks(blocks: Blocks, windows: np.ndarray, limit: np.ndarray,
     Returns
     -------
     ndarray
-        True where the window around a block is within the limit, (k,) bool.
+        Whether the window around each block is within the limit, (k,) bool.
 
     """
     quiet: np.ndarray = np.all(windows <= limit, axis=1)
     if not len(quiet):
         return np.zeros(len(blocks), bool)
-    # At the ends of a run the outermost window counts, which is not centred.
+    # A block near an end of its run takes the outermost window, which is not centred on it.
     begin = np.searchsorted(blocks.run, blocks.run, side='left')
     end = np.searchsorted(blocks.run, blocks.run, side='right')
     first = np.clip(np.arange(len(blocks)) - window // 2, begin, np.maximum(end - window, begin))
@@ -437,47 +440,50 @@ def half_differences(blocks: Blocks, usable: np.ndarray,
     places = len(blocks) - 2 * half + 1
     if places < 1:
         return np.empty((0, blocks.mean.shape[1])), np.zeros(0, bool)
-    # Only usable blocks are summed: a spike of 1e38 would erase all that is added to it.
+    # Only usable blocks are summed: a spike of 1e38 would absorb all later terms.
     centre = np.median(blocks.mean[usable], axis=0) if usable.any() else 0.0
     total = np.zeros((len(blocks) + 1, blocks.mean.shape[1]))
     np.cumsum(np.where(usable[:, None], blocks.mean - centre, 0), axis=0, out=total[1:])
-    moved = (total[2 * half:] - 2 * total[half:-half] + total[:-2 * half]) / half
-    bad = np.concatenate([[0], np.cumsum(~usable)])
+    differences = (total[2 * half:] - 2 * total[half:-half] + total[:-2 * half]) / half
+    unusable = np.concatenate([[0], np.cumsum(~usable)])
     gapless = blocks.run[2 * half - 1:] == blocks.run[:places]
-    return moved, gapless & (bad[2 * half:] == bad[:-2 * half])
+    return differences, gapless & (unusable[2 * half:] == unusable[:-2 * half])
 
 
-def unlike_beginning(means: np.ndarray, longest: int, white: np.ndarray, flicker: np.ndarray,
-                     step: np.ndarray) -> int:
+def differing_start(means: np.ndarray, longest: int, white: np.ndarray, flicker: np.ndarray,
+                    step: np.ndarray) -> int:
     """
-    Count the blocks at the beginning that differ from what follows.
+    Count the blocks at the start of a rest whose mean differs from the mean of the others.
+
+    Starts of 1, 2, 4, … blocks are compared with the remainder of the rest. A start that differs
+    is cut, and the search begins again after it.
 
     Parameters
     ----------
     means
         Means of the blocks of a rest, (k, m).
     longest
-        Largest count of blocks to cut.
+        Largest number of blocks to cut.
     white, flicker, step
-        Standard deviation of a block's mean, of the difference of very long means, and largest
-        change by the ADC, (m,).
+        Standard deviation of a block's mean, the same of the difference of very long means, and
+        largest change by rounding of the ADC, (m,) each.
 
     Returns
     -------
     int
-        Count of blocks.
+        Number of blocks to cut.
 
     """
     total = np.cumsum(means, axis=0)
     lengths = 1 << np.arange(max(longest, 1).bit_length())
     cut = 0
     while (lengths := lengths[cut + lengths <= longest]).size:
-        after = len(means) - cut - lengths
-        upto = total[cut + lengths - 1]
-        begin = (upto - (total[cut - 1] if cut else 0.0)) / lengths[:, None]
-        bulk = (total[-1] - upto) / after[:, None]
-        noise = np.sqrt(white ** 2 * (1 / lengths + 1 / after)[:, None] + flicker ** 2)
-        differs = (np.abs(begin - bulk) > END_SIGMAS * noise + step).any(axis=1)
+        remaining = len(means) - cut - lengths
+        start_total = total[cut + lengths - 1]
+        start_mean = (start_total - (total[cut - 1] if cut else 0.0)) / lengths[:, None]
+        remaining_mean = (total[-1] - start_total) / remaining[:, None]
+        noise = np.sqrt(white ** 2 * (1 / lengths + 1 / remaining)[:, None] + flicker ** 2)
+        differs = (np.abs(start_mean - remaining_mean) > END_SIGMAS * noise + step).any(axis=1)
         if not differs.any():
             break
         cut += int(lengths[differs.argmax()])

@@ -15,13 +15,13 @@
 """
 Rest detection: the intervals of a stream in which the sensor does not move.
 
-One search serves recordings and live streams. It works on the statistics of short blocks, so that
-the rests do not depend on how the stream is fed in portions. A block is quiet if the variance
-around it is that of the noise. A sequence of quiet blocks is a rest if its mean is constant as
-well: over 0.5 s to 4 s anywhere in it, and at its ends, where a filter or a stage settles. A knock
-that does not change the mean does not end a rest, and is left out of the mean. On a live stage,
-which uses the datasheet noise only, a knock begins the dwell again. The noise is that of the
-datasheet, learned from the quietest parts of the stream, or the larger of both.
+One search serves recordings and live streams. It uses the statistics of short blocks, so that the
+portions in which a stream is fed do not change the rests. A block is quiet if the variance around
+it is that of the noise. A sequence of quiet blocks is a rest if its mean is constant as well. The
+mean is compared over 0.5 s to 4 s anywhere in it, and at its ends, where a filter or a stage
+settles. A knock that does not change the mean does not end a rest, and is left out of the mean. On
+a live stage, which uses the datasheet noise only, a knock begins the dwell again. The noise is
+that of the datasheet, learned from the quietest parts of the stream, or the larger of both.
 """
 
 from __future__ import annotations
@@ -36,6 +36,7 @@ from adxl_ros.signals.block_statistics import angle_bounds, BlockCutter, Blocks
 from adxl_ros.signals.noise_limits import (
     adc_step,
     batch_scatter,
+    differing_start,
     DRIFT_OCTAVES,
     END_SIGMAS,
     half_differences,
@@ -47,7 +48,6 @@ from adxl_ros.signals.noise_limits import (
     Spans,
     stated_limits,
     undithered,
-    unlike_beginning,
     window_variance,
 )
 from adxl_ros.signals.runs import true_runs
@@ -57,15 +57,16 @@ _HAND_HELD_S = 1.4
 """Shortest rest of a hand-held sensor, s, without its margins of 0.3 s. Chosen: shorter rests are
 pauses of the hand."""
 _STAGE_S = 0.6
-"""Shortest rest on a stage, s, without its margins of 0.3 s."""
+"""Shortest rest on a stage, s, without its margins of 0.3 s. Chosen: stages dwell for longer."""
 _KNOCK_S = 1.0
-"""Longest disturbance within a rest, s."""
+"""Longest disturbance within a rest, s. Chosen: a knock decays within a second."""
 _BATCHES = 20
-"""Largest count of parts of a rest whose scatter shows the error of its mean."""
+"""Largest number of batches of a rest whose scatter shows the error of its mean. Chosen: the usual
+number of batch means."""
 _MIN_BATCH_BLOCKS = 2
-"""Smallest length of such a part: 0.1 s."""
+"""Smallest length of such a batch, blocks: 0.1 s."""
 _DRIFT_SIGMAS = 5.0
-"""A drift counts above this many standard deviations. Chosen: one false alarm in hours."""
+"""Smallest drift that counts, standard deviations. Chosen: one false alarm in hours."""
 _SETTLE_TAUS = 8.0
 """Settling time after a motion, in time constants of the filter. Chosen: the remainder of a step,
 0.03 %, is below the noise of a rest's mean."""
@@ -81,7 +82,7 @@ class Rest:
     Attributes
     ----------
     start, stop
-        First row and row after the last.
+        First row of the rest and the row after its last.
     time_start_s, time_stop_s
         Times of the first and the last row, s.
 
@@ -100,7 +101,7 @@ class Stillness:
 
     Attributes
     ----------
-    still
+    at_rest
         Whether all statistics are within their limits.
     axis
         Index of the axis with the largest motion.
@@ -111,7 +112,7 @@ class Stillness:
 
     """
 
-    still: bool
+    at_rest: bool
     axis: int
     statistic: str
     value: float
@@ -124,9 +125,9 @@ class Stillness:
         Parameters
         ----------
         unit
-            Name of a unit.
+            Name of the unit of the line.
         scale
-            Units for one unit of the samples.
+            Value in that unit of 1 in the unit of the samples.
         axes
             Letters of the axes.
 
@@ -136,12 +137,13 @@ class Stillness:
             For example 'moving: 0.2 m/s² on x, must be below 0.1'.
 
         """
-        how = 'at rest' if self.still else {'rms': 'moving', 'drift': 'drifting'}[self.statistic]
-        return (f'{how}: {self.value * scale:.2g} {unit} on {axes[self.axis]}, '
+        state = 'at rest' if self.at_rest else \
+            {'rms': 'moving', 'drift': 'drifting'}[self.statistic]
+        return (f'{state}: {self.value * scale:.2g} {unit} on {axes[self.axis]}, '
                 f'must be below {self.limit * scale:.2g}')
 
     def describe_mps2(self, sensor: Sensor) -> str:
-        """Return that line in m/s², for samples that are volts of a sensor."""
+        """Return the line of `describe` in m/s², for samples that are volts of a sensor."""
         scale = G0_MPS2 / float(sensor.nominal_scale_v_per_g[self.axis])
         return self.describe('m/s²', scale, sensor.axes)
 
@@ -159,11 +161,11 @@ class RestFinder:
     noise
         Noise of a sample; None learns it.
     learn
-        Learn the noise, which is at least the given one. This is for recordings of a unit that
-        may be noisier than its parameter file. A live stage needs no time to learn.
+        Whether to learn the noise, with `noise` as its lower bound. A unit in a recording may be
+        noisier than its parameter file states. A live stage has no time to learn.
     angle_tolerance_rad
-        The stream has two encoder angles, and a rest ends where one of them is farther than this
-        from its middle, rad. None for a stream without angles.
+        Largest distance of each of two encoder angles from the middle of its values in a rest,
+        rad. None for a stream without angles.
     min_rest_s
         Shortest rest, s. By default 1.4 s where noise is learned and there are no angles, else
         0.6 s.
@@ -175,10 +177,10 @@ class RestFinder:
                  min_rest_s: float | None = None):
         self.noise = noise
         self.learn = noise is None if learn is None else learn
-        staged = not self.learn or angle_tolerance_rad is not None
+        on_stage = not self.learn or angle_tolerance_rad is not None
         self.angle_tolerance_rad = angle_tolerance_rad
-        self._spans = Spans.at(rate_hz)
-        shortest_s = (_STAGE_S if staged else _HAND_HELD_S) if min_rest_s is None else min_rest_s
+        self._spans = Spans.for_rate(rate_hz)
+        shortest_s = (_STAGE_S if on_stage else _HAND_HELD_S) if min_rest_s is None else min_rest_s
         self._min_blocks = max(round(shortest_s / self._spans.block_s), self._spans.window)
         # A motion that has decayed below the limits may still be in the first block.
         settle_s = _SETTLE_TAUS * noise.tau_s if noise is not None else 0.0
@@ -211,7 +213,7 @@ class RestFinder:
         return self._parts[0]
 
     def rests(self) -> list[Rest]:
-        """List the rests so far; the last may still go on."""
+        """Return the rests so far; the last rest may not have ended yet."""
         return list(self._detect()[1])
 
     def means(self, rests: list[Rest]) -> tuple[np.ndarray, np.ndarray]:
@@ -239,7 +241,7 @@ class RestFinder:
                          float(values[worst]), float(allowed[worst]))
 
     def _detect(self) -> tuple[NoiseLimits | None, list[Rest]]:
-        """Find limits and rests of the stream so far, once for every new block."""
+        """Find limits and rests of the stream so far; search again only after a new block."""
         blocks = self.blocks()
         if self._result is None or self._result[0] != len(blocks):
             windows = window_variance(blocks, self._spans)
@@ -260,31 +262,32 @@ class RestFinder:
         quiet = quiet_blocks(blocks, windows, limits.variance, self._spans.window)
         still = quiet & ~self._drifting(blocks, quiet, limits)
         bounds = None if self.angle_tolerance_rad is None else angle_bounds(blocks)
-        posed = [part for run in true_runs(still, blocks.run)
-                 for part in self._turned(bounds, *run)]
-        parts = [self._without_ends(blocks.mean, first + self._settle, stop, limits)
-                 for first, stop in posed]
-        parts = [part for part in parts if part[1] - part[0] >= self._spans.window]
+        parts = []
+        for run in true_runs(still, blocks.run):
+            for first, stop in self._split_by_angle(bounds, *run):
+                first, stop = self._without_ends(blocks.mean, first + self._settle, stop, limits)
+                if stop - first >= self._spans.window:
+                    parts.append((first, stop))
+        if self.learn:
+            parts = self._join_across_knocks(blocks, bounds, parts, limits)
         return [Rest(int(blocks.start[first]), int(blocks.start[stop - 1]) + self._spans.size,
                      float(blocks.time_s[first, 0]), float(blocks.time_s[stop - 1, 1]))
-                for first, stop in (self._joined(blocks, bounds, parts, limits)
-                                    if self.learn else parts)
-                if stop - first >= self._min_blocks]
+                for first, stop in parts if stop - first >= self._min_blocks]
 
     def _drifting(self, blocks: Blocks, quiet: np.ndarray, limits: NoiseLimits) -> np.ndarray:
         """
         Mark the blocks where the mean moves, (k,) bool, by comparing neighbouring halves.
 
-        Short halves come first, and longer halves compare only the blocks that these have not
-        marked. A slip thus marks its surroundings only; a slower drift marks more. Blocks between
-        two marked parts are marked as well, unless they are enough for the longest halves.
+        Short halves come first, and longer halves compare only the blocks that are not marked yet.
+        A slip thus marks only half a length on either side; a slower drift marks more. Blocks
+        between two marked parts are marked as well, unless they are enough for the longest halves.
         """
         drifting = np.zeros(len(blocks), bool)
         for octave in range(DRIFT_OCTAVES):
             half = self._spans.half << octave
-            moved, valid = half_differences(blocks, quiet & ~drifting, half)
+            differences, valid = half_differences(blocks, quiet & ~drifting, half)
             allowed = _DRIFT_SIGMAS * limits.drift[octave] + limits.step
-            places = half + np.flatnonzero(valid & (np.abs(moved) > allowed).any(axis=1))
+            places = half + np.flatnonzero(valid & (np.abs(differences) > allowed).any(axis=1))
             marks = np.zeros(len(blocks) + 1)
             np.add.at(marks, places - half // 2, 1)
             np.add.at(marks, places + half // 2, -1)
@@ -301,11 +304,12 @@ class RestFinder:
         longest = min((stop - first) // 4, self._spans.longest // 2)
         if longest > 0:
             noise = limits.block_noise(self._spans), limits.flicker, limits.step
-            first += unlike_beginning(means[first:stop], longest, *noise)
-            stop -= unlike_beginning(means[first:stop][::-1], longest, *noise)
+            first += differing_start(means[first:stop], longest, *noise)
+            stop -= differing_start(means[first:stop][::-1], longest, *noise)
         return first, stop
 
-    def _turned(self, bounds: np.ndarray | None, first: int, stop: int) -> list[tuple[int, int]]:
+    def _split_by_angle(self, bounds: np.ndarray | None, first: int, stop: int
+                        ) -> list[tuple[int, int]]:
         """Split blocks `first` to `stop` where an encoder angle leaves its tolerance."""
         if bounds is None:
             return [(first, stop)]
@@ -313,38 +317,39 @@ class RestFinder:
         changed = (bounds[first + 1:stop] != bounds[first:stop - 1]).any(axis=(1, 2))
         for i in first + 1 + np.flatnonzero(changed):
             widest = np.fmax(widest, bounds[i])
-            if not self._constant(widest):
+            if not self._is_one_pose(widest):
                 parts.append((begin, int(i)))
                 begin, widest = int(i), bounds[i]
         return [*parts, (begin, stop)]
 
-    def _constant(self, bounds: np.ndarray) -> bool:
-        """Return whether the angles within `bounds`, (2, a), are those of one pose."""
+    def _is_one_pose(self, bounds: np.ndarray) -> bool:
+        """Return whether the angles within (−lowest, highest), (2, a), are those of one pose."""
         assert self.angle_tolerance_rad is not None
         allowed = 2 * self.angle_tolerance_rad * (1 + _ROUNDING)
         return not (bounds.sum(axis=0) > allowed).any()
 
-    def _joined(self, blocks: Blocks, bounds: np.ndarray | None, parts: list[tuple[int, int]],
-                limits: NoiseLimits) -> list[tuple[int, int]]:
+    def _join_across_knocks(self, blocks: Blocks, bounds: np.ndarray | None,
+                            parts: list[tuple[int, int]], limits: NoiseLimits
+                            ) -> list[tuple[int, int]]:
         """Join parts if the disturbance between them has not changed mean and angles."""
         joined: list[tuple[int, int]] = []
         for first, stop in parts:
             begin, end = joined[-1] if joined else (0, 0)
-            if (joined and self._near(blocks, end, first)
-                    and (bounds is None or self._constant(np.fmax.reduce(bounds[begin:stop])))
-                    and not self._moved(blocks.mean, (begin, end), (first, stop), limits)):
+            if (joined and self._is_soon_after(blocks, end, first)
+                    and (bounds is None or self._is_one_pose(np.fmax.reduce(bounds[begin:stop])))
+                    and not self._mean_changed(blocks.mean, (begin, end), (first, stop), limits)):
                 joined[-1] = begin, stop
             else:
                 joined.append((first, stop))
         return joined
 
-    def _near(self, blocks: Blocks, end: int, first: int) -> bool:
-        """Return whether block `first` follows shortly on the part that stops at `end`."""
+    def _is_soon_after(self, blocks: Blocks, end: int, first: int) -> bool:
+        """Return whether block `first` follows the part before block `end` within a knock."""
         longest = max(_KNOCK_S / self._spans.block_s, self._spans.window)
         return first - end <= longest and bool(blocks.run[end - 1] == blocks.run[first])
 
-    def _moved(self, means: np.ndarray, before: tuple[int, int], after: tuple[int, int],
-               limits: NoiseLimits) -> bool:
+    def _mean_changed(self, means: np.ndarray, before: tuple[int, int], after: tuple[int, int],
+                      limits: NoiseLimits) -> bool:
         """Return whether the mean before a disturbance differs from that after it."""
         reach = self._spans.longest // 2
         return limits.differ(means[max(before[0], before[1] - reach):before[1]],
@@ -410,13 +415,13 @@ def rest_means(time_s: np.ndarray, samples: np.ndarray, rests: list[Rest], rate_
         if not part.count.sum():
             raise UserError(f'the rest from {rest.time_start_s:.3f} s to {rest.time_stop_s:.3f} '
                             's holds no samples: name rests of this recording')
-    return _means(parts, Spans.at(rate_hz), noise)
+    return _means(parts, Spans.for_rate(rate_hz), noise)
 
 
 def _means(parts: list[Blocks], spans: Spans,
            noise: Noise | None) -> tuple[np.ndarray, np.ndarray]:
     """Average the blocks of each rest; mean and standard deviation, (k, m) each."""
-    # All rests have one ADC. Its step does not show in a rest where the codes are constant.
+    # The step is that of all rests: a rest with constant codes does not show it.
     step = adc_step(Blocks.join(parts)) if parts else np.empty(0)
     pairs = [_mean(_without_knocks(part, step, spans), step, spans, noise) for part in parts]
     mean, error = zip(*pairs) if pairs else ((), ())
@@ -428,8 +433,8 @@ def _mean(part: Blocks, step: np.ndarray, spans: Spans,
     """
     Average the blocks of a rest; mean and standard deviation, (m,) each.
 
-    The noise may have any spectrum. Means of up to twenty batches of the rest are nearly
-    independent, and scatter by its long-run variance (batch means; Law and Kelton 2000).
+    The noise may have any spectrum. The means of up to twenty batches of the rest are nearly
+    independent, and their scatter is the long-run variance (batch means; Law and Kelton 2000).
     """
     mean = part.count @ part.mean / part.count.sum()
     white = part.squares.sum(axis=0) / max((part.count - 1).sum(), 1)

@@ -160,7 +160,7 @@ def test_rests_appear_while_the_stream_runs():
         finder.feed(time_s[row:row + 50], samples[row:row + 50])
         counts.append(len(finder.rests()))
         judged = finder.stillness()
-        still.append(judged is not None and judged.still)
+        still.append(judged is not None and judged.at_rest)
     assert counts[-1] == 6
     assert counts[36] >= 2
     # Half a second into a rest the newest second still contains the turn; at its end it does not.
@@ -316,11 +316,11 @@ def test_the_reason_for_motion_is_stated():
     volts = 2.5 + filtered_noise(rng, 3000, 0.535e-3)
     finder.feed(time_s[:1000], volts[:1000])
     still = finder.stillness()
-    assert still.still and still.describe('m/s²', scale).startswith('at rest: ')
+    assert still.at_rest and still.describe('m/s²', scale).startswith('at rest: ')
     volts[1000:, 1] += 0.3 / scale * np.sqrt(2) * np.sin(2 * np.pi * 40 * time_s[1000:])
     finder.feed(time_s[1000:2000], volts[1000:2000])
     moving = finder.stillness()
-    assert not moving.still
+    assert not moving.at_rest
     assert (moving.axis, moving.statistic) == (1, 'rms')
     assert moving.value * scale == pytest.approx(0.3, rel=0.1)
     # 0.535 mg rms, times the quantile of chi-squared for the variance of 0.25 s.
@@ -331,7 +331,7 @@ def test_the_reason_for_motion_is_stated():
     volts[2000:, 2] += np.radians(0.5) * (time_s[2000:] - 2)
     finder.feed(time_s[2000:], volts[2000:])
     drifting = finder.stillness()
-    assert not drifting.still and (drifting.axis, drifting.statistic) == (2, 'drift')
+    assert not drifting.at_rest and (drifting.axis, drifting.statistic) == (2, 'drift')
     assert drifting.value == pytest.approx(np.radians(0.25), rel=0.2)
 
 

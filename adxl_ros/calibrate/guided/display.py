@@ -66,7 +66,7 @@ class SessionDisplay:
         return self._estimate
 
 
-def live_reading(newest: NewestSamples, unit: Sensor, still: Stillness | None
+def live_reading(newest: NewestSamples, unit: Sensor, stillness: Stillness | None
                  ) -> LiveReading | None:
     """
     Return what the sensor reads at present.
@@ -77,7 +77,7 @@ def live_reading(newest: NewestSamples, unit: Sensor, still: Stillness | None
         The newest samples.
     unit
         The nominal sensor of the stream.
-    still
+    stillness
         Whether it is at rest; None while the samples are too few.
 
     Returns
@@ -90,10 +90,11 @@ def live_reading(newest: NewestSamples, unit: Sensor, still: Stillness | None
         return None
     axes = tuple(AxisReading(axis, mean_mps2, rms_mps2) for axis, mean_mps2, rms_mps2 in zip(
         unit.axes, newest.mean_mps2(), newest.rms_mps2()))
-    return LiveReading(axes, newest.rate_hz(), None if still is None else _rest(still, unit))
+    rest = None if stillness is None else _rest(stillness, unit)
+    return LiveReading(axes, newest.rate_hz(), rest)
 
 
-def _rest(still: Stillness, unit: Sensor) -> RestReading:
-    mps2_per_v = G0_MPS2 / float(unit.nominal_scale_v_per_g[still.axis])
-    return RestReading(bool(still.still), unit.axes[still.axis], still.statistic,
-                       float(still.value) * mps2_per_v, float(still.limit) * mps2_per_v)
+def _rest(stillness: Stillness, unit: Sensor) -> RestReading:
+    mps2_per_v = G0_MPS2 / float(unit.nominal_scale_v_per_g[stillness.axis])
+    return RestReading(bool(stillness.at_rest), unit.axes[stillness.axis], stillness.statistic,
+                       float(stillness.value) * mps2_per_v, float(stillness.limit) * mps2_per_v)

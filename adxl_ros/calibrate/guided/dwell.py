@@ -100,8 +100,8 @@ class Dwell:
 
     def at_rest(self) -> bool:
         """Return whether the newest samples are known to be at rest."""
-        still = self.stillness()
-        return still is not None and still.still
+        stillness = self.stillness()
+        return stillness is not None and stillness.at_rest
 
     def age_s(self) -> float:
         """Return for how long there have been samples, s."""

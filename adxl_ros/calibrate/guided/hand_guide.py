@@ -288,11 +288,11 @@ class HandGuide:
     def status(self) -> Status:
         """Return what the guide waits for, with the values that matter."""
         rests = f'{len(self.accepted)} rests ({self._advice()})'
-        still = self._finder.stillness()
-        if still is None:
+        stillness = self._finder.stillness()
+        if stillness is None:
             return Status(Phase.REST, f'{rests}; waiting for samples', False)
-        phase = Phase.DWELL if still.still else Phase.REST
-        return Status(phase, f'{rests}; {still.describe_mps2(self.sensor)}; '
+        phase = Phase.DWELL if stillness.at_rest else Phase.REST
+        return Status(phase, f'{rests}; {stillness.describe_mps2(self.sensor)}; '
                       f'{self.destination()}', False)
 
     def _advice(self) -> str:

@@ -428,15 +428,15 @@ class StageGuide:
 
     def _status_at_pose(self, waited_s: float) -> Status:
         late = waited_s > self.settings.timeout_s
-        still = self._attempt.dwell.stillness()
+        stillness = self._attempt.dwell.stillness()
         since = self._since(waited_s)
-        if still is None:
+        if stillness is None:
             return Status(Phase.REST, f'at {self.destination()}: waiting for samples{since}', late)
-        if still.still:
+        if stillness.at_rest:
             return Status(Phase.DWELL, f'at {self.destination()}: averaging', late)
         advice = '; if nothing touches it, sensor.noise_density_g_per_rthz is too low for this ' \
-            'unit' if late and still.statistic == 'rms' else ''
-        motion = still.describe_mps2(self.sensor)
+            'unit' if late and stillness.statistic == 'rms' else ''
+        motion = stillness.describe_mps2(self.sensor)
         return Status(Phase.REST, f'at {self.destination()}: {motion}{since}{advice}', late)
 
     def _since(self, waited_s: float) -> str:
