@@ -561,13 +561,13 @@ class StageGuide:
         """Return why a pose with these samples is refused, or ''."""
         first_c = next((accepted.temperature_c for accepted in self.poses_to_fit()
                         if np.isfinite(accepted.temperature_c)), np.nan)
-        fault = (pose_checks.saturation_fault(self.sensor, volts)
-                 or pose_checks.temperature_fault(first_c, record.temperature_c,
-                                            self.settings.temperature_span_c))
+        fault = pose_checks.saturation_fault(self.sensor, volts) or pose_checks.temperature_fault(
+            first_c, record.temperature_c, self.settings.temperature_span_c)
         if fault or self._to_verify:
             return fault
-        return pose_checks.reading_fault(self.estimate, Target(record.alpha_rad, record.beta_rad),
-                                   np.array(record.mean_v), self.settings.tolerance_rad)
+        return pose_checks.reading_fault(
+            self.estimate, Target(record.alpha_rad, record.beta_rad), np.array(record.mean_v),
+            self.settings.tolerance_rad)
 
     def _refuse(self, refusal: str) -> None:
         """Report a refusal once. A commanded stage averages again, an operator captures again."""
