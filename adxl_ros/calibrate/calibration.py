@@ -54,7 +54,7 @@ import numpy as np
 STAGE_FITS = {'linear': linear.fit, 'physical': paper_regression.fit, 'full': term_selection.fit}
 """Models that are fitted against the stage, simplest first."""
 _SAME_FIT_TOLERANCE = 1e-6
-"""Relative difference up to which coefficients are those of the same fit: rounding in a file."""
+"""Largest relative difference of coefficients of the same fit: the rounding in a file."""
 
 
 @dataclass(frozen=True)
@@ -88,9 +88,9 @@ class CalibrationResult:
     nominal, fitted
         The unit before and after the fit.
     report_lines
-        Assessment as text.
+        Errors, acceptance and fit as text: the head of the parameter file.
     summary_lines
-        Assessment as text for a terminal of 80 columns, the most important lines first.
+        The same for a terminal of 80 columns, the most important lines first.
     poses
         k poses, check poses among them.
     assessments
@@ -133,7 +133,7 @@ class CalibrationResult:
             The file cannot be written. The previous file is unchanged.
 
         """
-        # A session that ends twice must not replace the previous calibration by its own.
+        # A session that saves the same fit twice must not replace the previous calibration.
         if not self._is_in(path):
             keep_previous(path)
         parameter_file.save(path, self.fitted, self.comments())
@@ -163,7 +163,7 @@ class CalibrationResult:
         except UserError as error:
             return f'no copy in the store: {error}'
         return f'kept as {path}' if path else \
-            f'not kept in {folder}: the serial number {NO_UNIT} names no unit'
+            f'not kept in {folder}: the serial number is {NO_UNIT}; set sensor.serial'
 
     def _is_in(self, path: str | os.PathLike) -> bool:
         """Return whether a file holds this fit: the same data, model and coefficients."""
@@ -184,7 +184,7 @@ class CalibrationResult:
 
     @property
     def inliers(self) -> np.ndarray:
-        """Mark the poses that are no outliers, which `held_out` counts, (k,) bool."""
+        """Mark the poses that are no outliers, (k,) bool; only these are in `held_out`."""
         return ~np.isin(np.arange(len(self.poses)), self.outliers)
 
     @property
@@ -252,9 +252,9 @@ class _StageFit:
     report_lines
         Report of a full fit.
     refusals
-        Why richer models are not fitted.
+        Reasons why richer models are not fitted.
     full
-        The full fit, where it is one.
+        The full fit; None for other models.
 
     """
 
@@ -274,7 +274,7 @@ def _against_stage(sensor: Sensor, recordings: Sequence[RecordedPoses], model: s
     fitting = np.flatnonzero(~poses.check)
     outliers = tuple(fitting[list(full.outliers)].tolist()) if full else ()
     inliers = poses.subset(~np.isin(np.arange(len(poses)), outliers))
-    # Fitted errors of the stage are no errors of the sensor, for any model.
+    # The reference of all models is the stage with its fitted errors.
     stage = full.unit if full else None
     models = list(STAGE_FITS)
     simpler = {name: STAGE_FITS[name] for name in models[:models.index(fitted.model)]}
@@ -330,7 +330,7 @@ def _richest_fit(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str
 
 def _fit(model: str, sensor: Sensor, recordings: Sequence[RecordedPoses], effects: Sequence[str]
          ) -> _StageFit:
-    """Fit one model to all poses but the check poses."""
+    """Fit one model to all poses except the check poses."""
     poses = join_poses([recording.poses for recording in recordings])
     poses = poses.subset(~poses.check)
     if model != 'full':
@@ -386,7 +386,7 @@ def _gravity_fit_lines(fit: gravity.GravityFit, poses: Poses) -> list[str]:
     lines = [] if fit.converged else [full_fit_text.NOT_CONVERGED]
     if fit.outliers:
         rests = ', '.join(f'{i + 1} (from {poses.time_s[i, 0]:.1f} s)' for i in fit.outliers)
-        lines.append(f'left out, disturbed: rest {rests}')
+        lines.append(f'outliers, left out: rest {rests}')
     return lines
 
 

@@ -43,12 +43,12 @@ from adxl_ros.model.sensor import Sensor
 import numpy as np
 
 ENCODER_STEPS = 1.5
-"""An encoder has moved beyond this many of its steps. Chosen: it flickers by one step at the edge
-of a step."""
+"""Largest change of an encoder at rest, in its steps. Chosen: it may flicker by one step."""
 COMMAND_RAD = 1e-9
 """Commands that differ by less are equal, rad. Chosen: above the rounding of a message."""
 _MAX_READINGS = 20_000
-"""Largest count of the newest readings in memory; of older readings the extremes remain."""
+"""Largest number of readings in memory; older readings are reduced to their extremes. Chosen:
+200 s at 100 Hz."""
 
 
 def angle_tolerance_rad(sensor: Sensor) -> float:
@@ -154,7 +154,7 @@ def _in_force(commands: np.ndarray, rows: np.ndarray) -> np.ndarray:
 
 
 def _last_finite(values: np.ndarray) -> np.ndarray:
-    """Put the last finite value before it in the place of each NaN; NaN before the first one."""
+    """Replace each NaN by the last finite value before it; NaN stays where there is none."""
     last = np.maximum.accumulate(np.where(np.isfinite(values), np.arange(len(values)), -1))
     return np.where(last < 0, np.nan, values[last])
 
@@ -169,8 +169,8 @@ class SettingTracker:
     """
     Numbers the settings of alpha and beta while a sweep runs.
 
-    Memory is bounded: of the time since the last pose, readings beyond the newest 20 000 are
-    kept as their extremes.
+    Memory is bounded: since the last pose, readings older than the newest 20 000 are reduced to
+    their extremes.
 
     Parameters
     ----------
@@ -224,7 +224,7 @@ class SettingTracker:
         """
         Count both joints as moved before the next pose: the stage may have moved unseen.
 
-        Stamps that come next need not follow on those before: a clock may have been set.
+        Later stamps may be smaller than the former ones, since a clock may have been set.
         """
         self._unseen = True
         for window in (self._readings, self._commands):
@@ -282,9 +282,9 @@ class _Window:
     Attributes
     ----------
     before
-        The angles that came last before that, rad; NaN where there were none.
+        The last angles up to that pose, rad; NaN without any.
     newest
-        The angles that came last, rad.
+        The newest angles, rad.
 
     """
 
@@ -326,6 +326,6 @@ class _Window:
         self._older = np.full((2, 2), np.nan)
 
     def _count(self, stamp_ns: int) -> int:
-        """Count the angles kept, up to the last one that came with no later stamp."""
+        """Count the stored angles up to the last one whose stamp is not later."""
         later = takewhile(lambda kept: kept[0] > stamp_ns, reversed(self._recent))
         return len(self._recent) - sum(1 for _ in later)

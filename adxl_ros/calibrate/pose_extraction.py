@@ -30,7 +30,7 @@ from adxl_ros.signals.rest_detection import find_rests, Rest, rest_means
 import numpy as np
 
 _MAX_PERIODS = 1.5
-"""Neighbouring samples are at most this many sample periods apart."""
+"""Largest distance of neighbouring samples in a rest without gaps, sample periods."""
 _MIN_SAMPLES = 0.9
 """Smallest share of the samples of a pose in the journal that its recording must have."""
 
@@ -65,7 +65,7 @@ def named_rests(recording: Recording, records: Sequence[PoseRecord]) -> list[Res
         if stop - start < _MIN_SAMPLES * record.samples:
             raise UserError(f'{recording.path}: has {stop - start} samples between the stamps of '
                             f'pose {number} of the journal, which has {record.samples}; give '
-                            'the recording of that very run')
+                            'the recording of the same run')
         rests.append(Rest(start, stop, float(recording.time_s[start]),
                           float(recording.time_s[stop - 1])))
     return rests
@@ -129,7 +129,8 @@ def _settings(recording: Recording, sensor: Sensor, rests: Sequence[Rest], joint
     """
     Return the settings of a joint, (k,), by the journal, else by its encoder and commands.
 
-    None stands for no encoder and no commands; `Poses` then numbers the settings by the angles.
+    Without encoder and commands the result is None, and `Poses` numbers the settings by the
+    angles.
     """
     name = f'{joint}_setting'
     if records is not None and all(getattr(record, name) is not None for record in records):

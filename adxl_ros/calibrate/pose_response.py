@@ -35,11 +35,11 @@ from adxl_ros.model.sensor import Sensor
 import numpy as np
 
 _ANGLE_STEP_RAD = 1e-4
-"""Step of the central differences by an angle, rad. Chosen: the chain
-is smooth, so that the error of the slope, of order step², is far below the noise."""
+"""Step of the central differences by an angle, rad. Chosen: the chain is smooth, so that the error
+of the slope, of order step², is far below the noise."""
 _COEFFICIENT_STEP = 1e-3
-"""Step of the central differences by a coefficient, by its typical size. Chosen: the chain is
-nearly linear over a thousandth of a typical size."""
+"""Step of the central differences by a coefficient, in typical sizes. Chosen: the chain is nearly
+linear over a thousandth of a typical size."""
 
 
 def predicted_volts(unit: Sensor, poses: Poses, shift_rad: tuple[float, float] = (0.0, 0.0)
@@ -54,7 +54,7 @@ def predicted_volts(unit: Sensor, poses: Poses, shift_rad: tuple[float, float] =
     poses
         k poses with angles, temperature and supply.
     shift_rad
-        Added to alpha and beta of all poses, rad.
+        Angles that are added to alpha and beta of all poses, rad.
 
     Returns
     -------

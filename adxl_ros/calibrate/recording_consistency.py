@@ -33,16 +33,16 @@ _MAX_ZERO_G_SHIFT_G = 0.02
 """Largest shift of the zero-g between recordings, g. Chosen: a healthy unit may shift by so much
 between two days."""
 _MIN_DEVIATIONS = 6.0
-"""A turn or shift counts beyond this many of its standard deviations."""
+"""Smallest turn or shift that counts, in its standard deviations. Chosen: never by chance."""
 _MIN_EIGENVALUE_RATIO = 1e-10
-"""Directions of a smaller relative eigenvalue are not determined by a recording."""
+"""Smallest relative eigenvalue of the information whose direction counts as determined."""
 _MIN_VARIANCE = 1e-30
-"""Smallest variance of a turn, rad², or shift, g², as a divisor."""
+"""Lower bound of the variance of a turn, rad², or shift, g², so that it can be a divisor."""
 
 
 def require_one_mounting(full: FullFit, parts: Sequence[Poses], names: Sequence[str]) -> None:
     """
-    Refuse recordings of which one has another mounting or another zero-g than the others.
+    Refuse recordings if the mounting or the zero-g of one of them differs.
 
     A turn of the case and a shift of the zero-g of each axis are fitted by least squares to the
     residuals of each recording about the common fit.

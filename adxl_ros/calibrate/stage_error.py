@@ -50,11 +50,11 @@ class StageError:
     Attributes
     ----------
     setting_rad
-        Of the part that is common to the poses of one setting of the joint, σ_s, rad.
+        Standard deviation of the part that the poses of one setting share, σ_s, rad.
     pose_rad
-        Of the part that is new with each pose, σ_p, rad.
+        Standard deviation of the part that is new with each pose, σ_p, rad.
     ratio
-        Standard deviations of alpha over their geometric mean with those of beta, r.
+        Standard deviation of alpha over the geometric mean of those of alpha and beta, r.
 
     """
 
@@ -82,7 +82,7 @@ class SharedSettings(NamedTuple):
     number
         Column of the setting of each joint, (k, 2); −1 where no other pose shares it.
     columns
-        Count of shared settings, q.
+        Number of shared settings, q.
 
     """
 
@@ -114,7 +114,7 @@ class PoseCovariance:
     Parameters
     ----------
     jacobian
-        Volts by alpha and beta, V/rad, (k, m, 2).
+        Derivatives of the volts by alpha and beta, V/rad, (k, m, 2).
     poses
         The poses; `std_v` is used.
     shared
@@ -132,7 +132,7 @@ class PoseCovariance:
         self._jacobian, self._error = jacobian * error.joints, error
         self._kept = np.ones(len(poses), bool) if kept is None else kept
         self._number, self._shared = shared
-        # The error of a setting that has one pose only is an error of the pose.
+        # The error of a setting with only one pose is an error of that pose.
         self._pose_rad2 = error.pose_rad ** 2 + np.where(
             self._number < 0, error.setting_rad ** 2, 0.0)
         noise = poses.std_v[:, :, None] ** 2 * np.eye(jacobian.shape[1])
@@ -165,7 +165,7 @@ class PoseCovariance:
         return solve_triangular(self._settings_root, products, lower=True)
 
     def whiten_by_pose(self, columns: np.ndarray) -> np.ndarray:
-        """Whiten columns by the blocks only, (k, m, c) to (k·m, c); 0 where a pose is left out."""
+        """Whiten columns by the blocks only, (k, m, c) to (k·m, c); 0 for poses without weight."""
         white = self._whitening @ columns
         white[~self._kept] = 0.0
         return white.reshape(np.prod(white.shape[:2]), white.shape[2])
@@ -264,7 +264,7 @@ class AngleErrors:
 
     @classmethod
     def zeros(cls, count: int) -> AngleErrors:
-        """Return no errors in `count` poses."""
+        """Return errors of 0 in a number of poses."""
         return cls(np.zeros((count, 2)), np.zeros((count, 2)), np.zeros(count), 0.0)
 
     @property

@@ -43,7 +43,7 @@ def choose_poses(rows: np.ndarray, information: np.ndarray, count: int) -> list[
     information
         Information before the first choice, (p, p), of full rank.
     count
-        How many to choose; a candidate may be chosen again.
+        Number of poses to choose; a candidate may be chosen again.
 
     Returns
     -------
@@ -63,7 +63,7 @@ def choose_poses(rows: np.ndarray, information: np.ndarray, count: int) -> list[
 
 def candidate_poses(std_v: np.ndarray) -> Poses:
     """
-    Lay candidates over the sphere by `GRID_RAD`, each a new setting of both joints.
+    Return candidates on a grid of `GRID_RAD` over the sphere, each a new setting of both joints.
 
     Alpha covers 0 to π and beta covers 0 to 2π. `std_v` is the noise of the mean of a pose, V,
     (m,).

@@ -31,7 +31,7 @@ NOT_CONVERGED = ('the fit did not converge: coefficients and intervals are those
                  'step; add poses, or leave out terms')
 """Line of a fit that did not converge."""
 _MAX_WARMING_K = 3.0
-"""Change of temperature from which the report warns, K: 0.3 mg by the datasheet's 0.1 mg/°C."""
+"""Range of temperature beyond which the report warns, K: 0.3 mg by the datasheet's 0.1 mg/°C."""
 _TYPICAL_DRIFT_MG_PER_K = 0.1
 """Typical drift of the zero-g, mg/°C (ADXL203 datasheet)."""
 _MIN_POSE_SHARE = 0.1
@@ -55,8 +55,8 @@ class WeakestDirection(NamedTuple):
     Attributes
     ----------
     condition_number
-        Of the information, each coefficient in units of its typical size; square root of the
-        ratio of the extreme eigenvalues.
+        Square root of the ratio of the extreme eigenvalues of the covariance, with each
+        coefficient in units of its typical size.
     std
         Standard deviation along the direction, in typical sizes.
     parts
@@ -115,12 +115,12 @@ def report_lines(full: full_model.FullFit, poses: Poses, terms: Sequence[Term]) 
 
 
 def _stage_lines(full: full_model.FullFit) -> list[str]:
-    setting, pose = (np.degrees(std_rad * full.stage.joints) for std_rad in (
-        full.stage.setting_rad, full.stage.pose_rad))
-    by_pose = f'; {pose[0]:.2g} and {pose[1]:.2g} deg rms by pose' \
-        if pose[0] > _MIN_POSE_SHARE * setting[0] else ''
-    lines = [f'stage error: alpha {setting[0]:.2g}, beta {setting[1]:.2g} deg rms by setting'
-             f'{by_pose} (stated {np.degrees(full.stated_std_rad):.2g} deg)']
+    setting_deg = np.degrees(full.stage.setting_rad * full.stage.joints)
+    pose_deg = np.degrees(full.stage.pose_rad * full.stage.joints)
+    by_pose = f'; {pose_deg[0]:.2g} and {pose_deg[1]:.2g} deg rms by pose' \
+        if pose_deg[0] > _MIN_POSE_SHARE * setting_deg[0] else ''
+    lines = [f'stage error: alpha {setting_deg[0]:.2g}, beta {setting_deg[1]:.2g} deg rms by '
+             f'setting{by_pose} (stated {np.degrees(full.stated_std_rad):.2g} deg)']
     std = np.sqrt(np.diag(np.linalg.inv(full.information)))
     values = [f'{name} {value:.2g} +- {Z_90 * value_std:.1g} {parameter_of(name).unit}'
               for name, value, value_std in zip(full.names, get(full.unit, full.names), std)
@@ -139,8 +139,9 @@ def _outlier_lines(full: full_model.FullFit, poses: Poses) -> list[str]:
              f'{np.degrees(poses.beta_rad[i]):.1f} deg, from {poses.time_s[i, 0]:.1f} s, '
              f'{np.sqrt(full.squared_distances[i]):.0f} sigma)'
              for i in full.outliers[:_MAX_OUTLIERS_NAMED]]
-    rest = len(full.outliers) - len(named)
-    return [f'left out, disturbed: pose {", ".join(named)}{f" and {rest} others" if rest else ""}']
+    unnamed = len(full.outliers) - len(named)
+    return [f'outliers, left out: pose {", ".join(named)}'
+            f'{f" and {unnamed} others" if unnamed else ""}']
 
 
 def _temperature_lines(full: full_model.FullFit, poses: Poses) -> list[str]:

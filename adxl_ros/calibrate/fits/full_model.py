@@ -17,11 +17,11 @@ The full model: one maximum-likelihood fit of all poses and axes, with the error
 
 The volts of a pose are V = h(f(α + δα, β + δβ; tilt); θ) + noise of the mean: the stage has not
 quite reached the angles of the encoder. A joint has one error for each of its settings, and may
-have another for each pose (`stage_error`). The errors are integrated out: poses weigh by the
-inverse of their common covariance S (errors in variables; Fuller 1987, section 3.2). S is taken at
-the most likely angles, so that the model is linear there even if the stage is degrees off. The
-stage error maximises the restricted likelihood (`linearised`). The tilt of the base is a nuisance
-parameter with a prior.
+have another for each pose (`stage_error`). The errors are integrated out: the weight of the poses
+is the inverse of their common covariance S (errors in variables; Fuller 1987, section 3.2). S is
+taken at the most likely angles, so that the model is linear there even if the stage is degrees
+off. The stage error maximises the restricted likelihood (`linearised`). The tilt of the base is a
+nuisance parameter with a prior.
 
 Gauge: p0, q0 of (11) and (13) belong to the zero-g and r0 of (15) to the scale factor. p1 and q1
 are the misalignment to first order, so that `cross_axis.linear` and `cross_axis_z.linear` stay 0.
@@ -70,21 +70,21 @@ _BASE_TILT = (Coefficient('base_tilt', 'x_rad'), Coefficient('base_tilt', 'y_rad
 LEVEL_STD_RAD = np.radians(0.1)
 """Prior standard deviation of the level of the base, rad: the paper's 0.1°."""
 _SENSOR_PRIOR_SIZES = 5.0
-"""Prior standard deviation of a coefficient of the sensor, by its typical size. Chosen: wider
-than any healthy unit, so that it has no weight where the poses have any."""
+"""Prior standard deviation of a coefficient of the sensor, in typical sizes. Chosen: wider than
+any healthy unit, so that the prior matters only where the poses determine nothing."""
 _STAGE_PRIOR_SIZES = 3.0
-"""Prior standard deviation of a coefficient of the stage, by its typical size. Chosen: as for the
-sensor."""
+"""Prior standard deviation of a coefficient of the stage, in typical sizes. Chosen: wider than any
+stage that is in order."""
 _GAUGE_PRIOR_SIZES = 1.0
-"""Prior standard deviation of a term of `GAUGE`, by its typical size: the datasheet's 1.5 %."""
+"""Prior standard deviation of a term of `GAUGE`, in typical sizes: the datasheet's 1.5 %."""
 _REGULARISATION = 1e-6
-"""Added to the information in units of typical sizes, so that it can be inverted."""
+"""Term added to the information in typical sizes, so that it can be inverted."""
 
 _MAX_ROUNDS = 16
 """Largest count of rounds of stage error, coefficients and angles; a fit that needs more is
 reported as not converged."""
 _FIRST_ROUND_LEVELS = 3
-"""Estimates of the stage error in the first round, where it is not known yet."""
+"""Number of estimates of the stage error in the first round, which starts from the stated one."""
 _START_STEPS = 12
 """Gauss-Newton steps before the first round."""
 _ROUND_STEPS = 2
@@ -92,17 +92,17 @@ _ROUND_STEPS = 2
 _MAX_HALVINGS = 7
 """How often the step of a round is halved."""
 _MAX_STEP_SIZES = 3.0
-"""Longest step of a coefficient, by its typical size."""
+"""Longest step of a coefficient, in typical sizes."""
 _LAST_STEP_STD = 1e-4
-"""A step shorter than this is the last, in standard deviations of each coefficient."""
+"""A shorter step is the last one, in standard deviations of each coefficient."""
 _SETTLED_STD = 1e-2
-"""Coefficients have converged if a round moves them by less, in their standard deviations."""
+"""Coefficients have converged if a round moves them by less, in standard deviations of each."""
 _SETTLED_DEVIANCE = 1e-2
 """The stage error has converged if a round changes the deviance by less."""
 _CURVATURE_SHRINK = 0.2
-"""Share of the curvature of the angles that a round leaves."""
+"""Share of the curvature by angle errors that remains after a round."""
 _MAX_CURVATURE = 0.1
-"""Curvature that may remain when a round is assessed, by the noise of a mean."""
+"""Largest curvature at which convergence is checked, relative to the noise of a mean."""
 
 _OUTLIER_CHANCE = 1e-6
 """A pose less likely than this is an outlier."""
@@ -112,11 +112,11 @@ _MAX_OUTLIERS = 0.2
 _SHAPE_STEP = 1.05
 """Ratio of neighbouring trial values of a shape parameter."""
 _SHAPE_STEPS = 60
-"""Trial values on each side of the typical one: up to 19 times as large and as small."""
+"""Number of trial values on each side of the typical one: from 1/19 to 19 times that value."""
 _FINE_SHAPES = 15
-"""Trial values between the neighbours of the likeliest."""
+"""Number of trial values between the neighbours of the likeliest value."""
 _SHAPE_STARTS = 3
-"""Starts of the fit for a shape parameter."""
+"""Number of starts of the fit for a shape parameter."""
 
 
 @dataclass(frozen=True)
@@ -229,12 +229,12 @@ def fit_full(sensor: Sensor, poses: Poses, terms: Sequence[str] | None = None) -
 @dataclass(frozen=True)
 class _Problem:
     """
-    What is fitted to what.
+    Poses, coefficients and stated stage error of one fit.
 
     Attributes
     ----------
     poses
-        As measured, at the angles of the encoder.
+        The measured poses, at the angles of the encoder.
     names
         Coefficients to fit, (p,).
     stated
@@ -278,8 +278,8 @@ def _starts(unit: Sensor, problem: _Problem, effects: Sequence[str]) -> list[Sen
     """
     Return the units from which a fit begins.
 
-    The volts are nearly linear in all coefficients but shape parameters (periods, time
-    constants). Those are searched over their range, and the likeliest few are the starts.
+    The volts are nearly linear in all coefficients except shape parameters (periods, time
+    constants). Shape parameters are searched over their range; the likeliest values are starts.
     """
     starts = [unit]
     for effect in effects:
@@ -308,6 +308,7 @@ def _likeliest(unit: Sensor, problem: _Problem, shape: tuple[str, Parameter],
 
 
 def _with_shape(unit: Sensor, shape: tuple[str, Parameter], value: float) -> Sensor:
+    """Return the unit with a value of a shape parameter, given by effect and parameter."""
     effect, parameter = shape
     values = unit.values[effect]
     changed = {**values, parameter.name: np.full(np.shape(values[parameter.name]), value)}
@@ -368,7 +369,7 @@ def _fit_from(unit: Sensor, problem: _Problem) -> FullFit:
 
 
 def _round(state: _State, problem: _Problem, number: int) -> tuple[_State, float]:
-    """Estimate the stage error, then the coefficients and angles; see `_step` for the length."""
+    """Estimate stage error, coefficients and angles; also return the step length of `_step`."""
     stage, curvature_v = state.stage, state.curvature_v
     for _ in range(1 if number else _FIRST_ROUND_LEVELS):
         std_v = np.hypot(problem.poses.std_v, curvature_v)
@@ -392,6 +393,7 @@ def _inliers(about: Linearised, stage: StageError) -> np.ndarray:
 
 
 def _result(state: _State, problem: _Problem, converged: bool) -> FullFit:
+    """Return the fit of the last state, with the covariance of the sensor's coefficients."""
     about = problem.linearised(state.unit, state.poses, state.kept)
     covariance = about.covariance(state.stage)
     _, information = about.solve(covariance)
@@ -503,7 +505,7 @@ class _Iterate(Iterate):
 
 def _solved(unit: Sensor, problem: _Problem, poses: Poses, stage: StageError, kept: np.ndarray,
             steps: int) -> Solution[_Iterate]:
-    """Take Gauss-Newton steps; the chain is nearly linear in its coefficients."""
+    """Take Gauss-Newton steps without step control: the chain is nearly linear in them."""
     sizes = np.array([parameter_of(name).scale for name in problem.names])
 
     def linearise(values: np.ndarray) -> _Iterate:
@@ -605,7 +607,7 @@ def require_determined(unit: Sensor, poses: Poses, names: Sequence[Coefficient],
     scale = np.array([parameter_of(name).scale for name in names])
     required = [not belongs_to_stage(name) and term_of(name) not in (*GAUGE, *_PRIOR_SUFFICES)
                 for name in names]
-    # Without its prior a required coefficient must be determined by the poses.
+    # The poses must determine a required coefficient without its prior.
     information = fisher_information(unit, poses, names, stage) - np.diag(
         prior_precision(names) * required)
     variances = np.diag(np.linalg.inv(
@@ -642,7 +644,7 @@ def next_poses(unit: Sensor, poses: Poses, names: Sequence[Coefficient], stage: 
     stage
         Standard deviations of the stage's error.
     count
-        How many to choose.
+        Number of poses to choose.
 
     Returns
     -------

@@ -17,8 +17,8 @@ Fit of nine parameters of a three-axis sensor to the magnitude of gravity over i
 
 At rest the specific force has the magnitude of local gravity in every pose. Zero-g, scale factor
 and three angles between the sensing axes are fitted: V = zero-g + scale·(Θ·f/g₀) with Θ of
-equations 18 and 19. The magnitude does not show how the case turns with the axes, which is three
-angles. The gauge holds Θx on the case's x and Θy in its x-y plane.
+equations 18 and 19. A common turn of all three axes, which has three angles, does not change the
+magnitude. The gauge therefore holds Θx on the case's x and Θy in its x-y plane.
 """
 
 from __future__ import annotations
@@ -58,19 +58,22 @@ _EXCESS_TOLERANCE = 1e-6
 """The excess variance has converged if it changes by less, relative to the variance."""
 
 _OUTLIER_CHANCE = 0.01
-"""Probability that a fit without outliers takes any of its rests for one."""
+"""Probability of a false outlier among all rests of a fit without outliers."""
 _MAX_OUTLIERS = 0.25
-"""Largest share of outliers."""
+"""Largest share of outliers. Chosen: more of them are a fault of the recording."""
 _OUTLIER_RANGE_G = 0.03
 """Range of the magnitude of an outlier, g. Chosen: the size of a knock or of a hand's motion."""
 _LTS_STARTS = 20
-"""Starts of the least trimmed squares, with ten rests each: one of them is free of outliers."""
+"""Number of starts of the least trimmed squares, with ten rests each. Chosen: one of them is
+likely to be free of outliers."""
 _LTS_FIRST_STEPS = 4
 """Gauss-Newton steps with the rests of a start."""
 _LTS_STEPS = 11
 """Gauss-Newton steps with the rests that fit best."""
 _LTS_MAX_DEVIATIONS = 5.0
-"""Standard deviations up to which a rest belongs to the best fit of most rests."""
+"""Largest residual of a rest that belongs to the best fit of most rests, standard deviations."""
+_MIN_REMAINDER = 1e-9
+"""Lower bound of 1 − leverage, as a divisor."""
 _MIN_GRAVITY_RATIO = 0.5
 """Smallest ratio of the measured magnitude to local gravity; a smaller one is a wrong unit."""
 _MAX_GRAVITY_RATIO = 2.0
@@ -87,14 +90,14 @@ class GravityFit:
     values
         Parameters of effects by axis, as `Sensor.values` has them.
     covariance
-        Of the coefficients NAMES, in their units, (9, 9).
+        Covariance of the coefficients NAMES, in their units, (9, 9).
     before_mps2, residual_mps2, leave_one_out_mps2
         Magnitude minus local gravity, m/s², (k,): by nominal values, by the fit, and by the fit to
         all other rests.
     expected_mps2
         Standard deviation of a rest's magnitude, m/s², (k,): noise of the mean and excess.
     excess_mps2
-        The part of it that the noise of the means does not explain, m/s².
+        Part of `expected_mps2` that the noise of the means does not explain, m/s².
     outliers
         Indices of the rests that were left out as disturbed.
     converged
@@ -124,7 +127,7 @@ class _Estimate(NamedTuple):
     excess_g2
         Variance of the magnitudes beyond the noise of the means, g².
     converged
-        Whether both have converged.
+        Whether parameters and excess have converged.
 
     """
 
@@ -164,11 +167,11 @@ def fit_gravity(mean_v: np.ndarray, std_v: np.ndarray, sensor: Sensor) -> Gravit
     nominal = np.zeros(len(NAMES))
     _require_determined(rests, nominal, 0.0)
     kept = _inliers(rests, nominal)
-    parameters, excess, converged = _fit(rests[kept], nominal)
-    _require_determined(rests[kept], parameters, excess)
-    variance = magnitude_variance(rests, parameters) + excess
-    covariance = np.linalg.inv(fisher_information(rests[kept], parameters, excess))
-    covariance *= _t_factor(excess, variance[kept])
+    parameters, excess_g2, converged = _fit(rests[kept], nominal)
+    _require_determined(rests[kept], parameters, excess_g2)
+    variance = magnitude_variance(rests, parameters) + excess_g2
+    covariance = np.linalg.inv(fisher_information(rests[kept], parameters, excess_g2))
+    covariance *= _t_factor(excess_g2, variance[kept])
     effects = effect_values(parameters, sensor)
     residual = _residual(rests, parameters)
     return GravityFit(
@@ -178,7 +181,7 @@ def fit_gravity(mean_v: np.ndarray, std_v: np.ndarray, sensor: Sensor) -> Gravit
         residual_mps2=G0_MPS2 * residual,
         leave_one_out_mps2=G0_MPS2 * _leave_one_out(rests, kept, parameters, variance, residual),
         expected_mps2=G0_MPS2 * np.sqrt(variance),
-        excess_mps2=G0_MPS2 * float(np.sqrt(excess)),
+        excess_mps2=G0_MPS2 * float(np.sqrt(excess_g2)),
         outliers=tuple(int(i) for i in np.flatnonzero(~kept)),
         converged=converged)
 
@@ -200,31 +203,32 @@ def _solve(rests: NominalRests, start: np.ndarray, variance: np.ndarray
 
 def _fit(rests: NominalRests, start: np.ndarray) -> _Estimate:
     """Fit the parameters, and the excess variance that makes χ² equal its degrees of freedom."""
-    parameters, excess = start, 0.0
+    parameters, excess_g2 = start, 0.0
     freedom = len(rests.mean) - len(NAMES)
     for _ in range(_MAX_ROUNDS):
         variance = magnitude_variance(rests, parameters)
-        parameters, solved = _solve(rests, parameters, variance + excess)
-        before, excess = excess, _excess(_residual(rests, parameters) ** 2, variance, freedom)
-        if abs(excess - before) <= _EXCESS_TOLERANCE * (excess + variance.min()):
-            return _Estimate(parameters, excess, solved)
-    return _Estimate(parameters, excess, False)
+        parameters, solved = _solve(rests, parameters, variance + excess_g2)
+        squares = _residual(rests, parameters) ** 2
+        before_g2, excess_g2 = excess_g2, _excess(squares, variance, freedom)
+        if abs(excess_g2 - before_g2) <= _EXCESS_TOLERANCE * (excess_g2 + variance.min()):
+            return _Estimate(parameters, excess_g2, solved)
+    return _Estimate(parameters, excess_g2, False)
 
 
 def _excess(squares: np.ndarray, variance: np.ndarray, freedom: int) -> float:
     """Solve Σ r²/(v + excess) = freedom."""
-    def surplus(excess: float) -> float:
-        return float((squares / (variance + excess)).sum()) - freedom
+    def surplus(excess_g2: float) -> float:
+        return float((squares / (variance + excess_g2)).sum()) - freedom
     if surplus(0.0) <= 0:
         return 0.0
     return float(brentq(surplus, 0.0, squares.sum() / freedom, rtol=1e-9, xtol=1e-30))
 
 
-def _t_factor(excess: float, variance: np.ndarray) -> float:
+def _t_factor(excess_g2: float, variance: np.ndarray) -> float:
     """Return the factor of the covariance for an excess that ν rests determine: ν/(ν − 2)."""
-    # The share of the variance that the noise of the means explains needs no such allowance.
+    # The factor applies only to the share of the excess in the variance.
     freedom = len(variance) - len(NAMES)
-    return 1 + excess / variance.mean() * 2 / max(freedom - 2, 1)
+    return 1 + excess_g2 / variance.mean() * 2 / max(freedom - 2, 1)
 
 
 def _inliers(rests: NominalRests, start: np.ndarray) -> np.ndarray:
@@ -232,8 +236,8 @@ def _inliers(rests: NominalRests, start: np.ndarray) -> np.ndarray:
     Mark the rests that fit the others, (k,) bool.
 
     Rests leave or return, one at a time, by their studentised distance from the fit to the
-    others. This begins once with all rests, and once with the best fit to most of them, where
-    several outliers cannot hide one another. The result with the greater likelihood counts.
+    others. One search begins with all rests. Another begins with the best fit to most rests,
+    where outliers cannot mask one another. The result with the greater likelihood counts.
     """
     count = len(rests.mean)
     max_outliers = min(int(_MAX_OUTLIERS * count), count - MIN_RESTS)
@@ -266,8 +270,8 @@ def _exchanged(rests: NominalRests, kept: np.ndarray, start: np.ndarray, max_out
 
 def _negative_log_likelihood(rests: NominalRests, kept: np.ndarray, start: np.ndarray) -> float:
     """Return −ln of the residual likelihood; outliers are uniform within `_OUTLIER_RANGE_G`."""
-    parameters, excess, _ = _fit(rests[kept], start)
-    variance = magnitude_variance(rests[kept], parameters).mean() + excess
+    parameters, excess_g2, _ = _fit(rests[kept], start)
+    variance = magnitude_variance(rests[kept], parameters).mean() + excess_g2
     count, outliers = len(kept), (~kept).sum()
     log_choices = gammaln(count + 1) - gammaln(outliers + 1) - gammaln(count - outliers + 1)
     return float((kept.sum() - len(NAMES)) / 2 * np.log(variance * 2 * np.pi * np.e)
@@ -303,17 +307,17 @@ def _robust_inliers(rests: NominalRests, start: np.ndarray, max_outliers: int) -
 
 def _studentised(rests: NominalRests, kept: np.ndarray, start: np.ndarray) -> np.ndarray:
     """Return the distance of each rest from the fit to the others by its std, (k,)."""
-    parameters, excess, _ = _fit(rests[kept], start)
-    variance = magnitude_variance(rests, parameters) + excess
-    covariance = np.linalg.inv(posterior_information(rests[kept], parameters, excess))
+    parameters, excess_g2, _ = _fit(rests[kept], start)
+    variance = magnitude_variance(rests, parameters) + excess_g2
+    covariance = np.linalg.inv(posterior_information(rests[kept], parameters, excess_g2))
     jacobian = magnitude_jacobian(rests.mean, parameters)
     leverage = np.einsum('ki,ij,kj->k', jacobian, covariance, jacobian) / variance
     distance = np.abs(_residual(rests, parameters)) / np.sqrt(variance)
-    inside = distance / np.sqrt(np.maximum(1 - leverage, 1e-9))
-    # χ² per degree of freedom without the rest itself, at least that of the means' noise.
+    inside = distance / np.sqrt(np.maximum(1 - leverage, _MIN_REMAINDER))
+    # χ² per degree of freedom of the other rests, at least that of the noise of the means.
     freedom = kept.sum() - len(NAMES)
     others = (max((distance[kept] ** 2).sum(), freedom) - inside ** 2) / max(freedom - 1, 1)
-    inside = inside / np.sqrt(np.maximum(others, np.median(1 - excess / variance)))
+    inside = inside / np.sqrt(np.maximum(others, np.median(1 - excess_g2 / variance)))
     return np.where(kept, inside, distance / np.sqrt(1 + leverage))
 
 
@@ -329,7 +333,7 @@ def _leave_one_out(rests: NominalRests, kept: np.ndarray, parameters: np.ndarray
     return errors
 
 
-def _require_determined(rests: NominalRests, parameters: np.ndarray, excess: float) -> None:
+def _require_determined(rests: NominalRests, parameters: np.ndarray, excess_g2: float) -> None:
     """Refuse rests that do not determine a coefficient, or that do not read gravity."""
     count = len(rests.mean)
     measured = np.median(magnitude(rests.mean, parameters)) if count else rests.gravity_g
@@ -337,15 +341,15 @@ def _require_determined(rests: NominalRests, parameters: np.ndarray, excess: flo
         raise UserError(f'gravity: the rests read {measured * G0_MPS2:.3g} m/s², not '
                         f'{rests.gravity_g * G0_MPS2:.3g}: correct nominal_zero_g_v, '
                         'nominal_scale_v_per_g or local_gravity_mps2')
-    information = posterior_information(rests, parameters, excess)
+    information = posterior_information(rests, parameters, excess_g2)
     missing = undetermined(information)
     if count >= MIN_RESTS and not missing:
         return
     names = 'all nine coefficients' if len(missing) == len(NAMES) else \
         ', '.join(map(str, missing))
     reason = f'do not determine {names}' if missing else f'are too few, at least {MIN_RESTS}'
-    scatter = f' and scatter by {1e3 * np.sqrt(excess):.2g} mg' if excess else ''
+    scatter = f' and scatter by {1e3 * np.sqrt(excess_g2):.2g} mg' if excess_g2 else ''
     rests_needed = rests_to_add(max(MIN_RESTS - count, 0), information, parameters,
-                                rests.gravity_g, TRIAL_STD_G ** 2 + excess)
+                                rests.gravity_g, TRIAL_STD_G ** 2 + excess_g2)
     raise UserError(f'gravity: the {count} rests {reason}{scatter}; add rests with '
                     f'{", ".join(rests_needed)}')

@@ -34,18 +34,18 @@ NAMES = (*(Coefficient('bias', 'offset_v', axis) for axis in AXES),
 """The nine coefficients. In the fits of gravity they are zero-g shifts in g, relative changes of
 the scale factor and angles in rad: the "parameters" below, (9,)."""
 PRIOR_STD = 0.1
-"""Prior standard deviation of each parameter. Chosen: ten times what datasheets promise."""
+"""Prior standard deviation of each parameter. Chosen: ten times the tolerances of datasheets."""
 DETERMINED_STD = 0.01
-"""A parameter is determined below this standard deviation: 10 mg, 1 %, 0.6°, what datasheets
-promise."""
+"""Standard deviation below which a parameter counts as determined: 10 mg, 1 % or 0.6°, the usual
+tolerances of datasheets."""
 TRIAL_STD_G = 1e-4
 """Standard deviation of a rest's magnitude before the excess is estimated, g."""
 _ROUNDING_STD_G = 1e-9
-"""Standard deviation of a mean without noise, g."""
+"""Standard deviation of a mean by rounding alone, g, so that no weight is infinite."""
 _MAX_VALUE = 0.5
 """Largest magnitude of a parameter in an iteration. Chosen: five prior standard deviations."""
 _MIN_STEP = 1e-12
-"""A Gauss-Newton step with no larger component is not taken."""
+"""The iteration ends at a step whose largest component is smaller."""
 _PRIOR_INFORMATION = np.eye(len(NAMES)) / PRIOR_STD ** 2
 """Inverse covariance of the prior about 0, (9, 9)."""
 
@@ -106,7 +106,7 @@ class EffectValues(NamedTuple):
     values
         Parameters of effects, (3,) each, as `Sensor.values` has them.
     units
-        Unit of each of NAMES by that of the parameter, (9,).
+        Factor from each parameter to the coefficient in NAMES, (9,).
 
     """
 
@@ -142,7 +142,11 @@ def effect_values(parameters: np.ndarray, sensor: Sensor) -> EffectValues:
 
 
 def sensing_axes(parameters: np.ndarray) -> np.ndarray:
-    """Return the directions of the sensing axes in the gauge, rows Θx, Θy, Θz, (3, 3)."""
+    """
+    Return the directions of the sensing axes in the gauge, rows Θx, Θy, Θz, (3, 3).
+
+    The angles are the last three parameters: beta of y, alpha of z and beta of z.
+    """
     sy, cy = np.sin(parameters[6]), np.cos(parameters[6])
     sa, ca = np.sin(parameters[7]), np.cos(parameters[7])
     sb, cb = np.sin(parameters[8]), np.cos(parameters[8])

@@ -27,10 +27,10 @@ from adxl_ros.model.sensor import Sensor
 import numpy as np
 
 _UPRIGHT_COS = np.cos(np.radians(0.5))
-"""Within 0.5° of the vertical an axis counts as at ±1 g: the error of the cosine is 40 µg."""
+"""Smallest cosine of an axis at ±1 g: it is within 0.5° of the vertical, an error of 40 µg."""
 _MIN_SPAN_G = 0.2
-"""Smallest span of the reference that determines a scale factor, g. Chosen: a line through less
-has a scale factor that cross-axis terms dominate."""
+"""Smallest span of the reference that determines a scale factor, g. Chosen: over a smaller span
+cross-axis terms dominate the slope."""
 
 
 class _Line(NamedTuple):
@@ -44,7 +44,7 @@ class _Line(NamedTuple):
     scale_v_per_g
         Volts per g.
     covariance
-        Of both, (2, 2).
+        Covariance of both, (2, 2).
 
     """
 

@@ -47,10 +47,11 @@ _MIN_TOTAL_RAD = 1e-7
 _MAX_TOTAL_RAD = 0.3
 """Largest standard deviation of an angle error, rad. Chosen: no stage is as bad."""
 _TOTAL_PRIOR_STD = 1.0
-"""Standard deviation of ln(total/stated): within a factor of 2.7. Chosen: the prior decides only
+"""Prior standard deviation of ln(total/stated): a factor of 2.7. Chosen: the prior decides only
 where the poses do not."""
 _RATIO_PRIOR_STD = 0.35
-"""Standard deviation of ln(ratio). Chosen: joints of a stage are alike to within a factor of 2."""
+"""Prior standard deviation of ln(ratio). Chosen: the errors of two joints agree within a factor of
+two."""
 _MAX_LOG_RATIO = 1.5
 """Largest |ln(ratio)|. Chosen: a joint is at most twenty times as good as the other."""
 _SEARCH_UNIT = 0.05
@@ -59,7 +60,8 @@ hundred poses determine them."""
 _SEARCH_OPTIONS = {'eps': 1e-3, 'ftol': 1e-8, 'gtol': 0.5, 'maxiter': 20, 'maxls': 5}
 """Options of L-BFGS-B. Chosen: the deviance is found to 0.1, where χ² has the unit 1."""
 _HUBER_CHANCE = 1e-3
-"""Poses less likely than this count with the root of their distance (Huber 1964)."""
+"""Poses less likely than this have less weight: their squared distance grows linearly (Huber
+1964)."""
 
 
 @dataclass(frozen=True)
@@ -72,9 +74,9 @@ class Linearised:
     poses
         Poses with their noise, angles and settings.
     angle_jacobian
-        Volts by alpha and beta, V/rad, (k, m, 2).
+        Derivatives of the volts by alpha and beta, V/rad, (k, m, 2).
     design
-        Volts by coefficients, V per unit of the coefficient, (k, m, p).
+        Derivatives of the volts by coefficients, V per unit of the coefficient, (k, m, p).
     residual
         Measured volts minus predicted volts, V, (k, m).
     values
@@ -130,9 +132,9 @@ class Linearised:
         """
         Return −2 times the logarithm of the restricted likelihood, up to a constant.
 
-        Coefficients are integrated over their prior, so that models with other coefficients
-        compare by it too: half of the difference is the log Bayes factor. Outliers must not pass
-        for a bad stage: beyond a bound, the distance of a pose counts as its root.
+        Coefficients are integrated over their prior. Half of the difference of two models is
+        therefore their log Bayes factor. Outliers must not enlarge the stage error: beyond a
+        bound the squared distance of a pose grows linearly with the distance.
         """
         covariance = self.covariance(error)
         step, information = self.solve(covariance)
@@ -190,7 +192,7 @@ def _from_search(x: np.ndarray) -> StageError:
 
 @cache
 def _huber_bound(axes: int) -> float:
-    """Return the squared distance beyond which a pose counts with its root."""
+    """Return the squared distance beyond which a pose has less weight."""
     return float(chdtri(axes, _HUBER_CHANCE))
 
 

@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-The paper's staged fit of its nonlinear regression model: equations 4 to 19.
+The paper's sequential fit of its nonlinear regression model: equations 4 to 19.
 
 The paper fits bias, g(V_c), h(V_z), SF(V_z) and misalignment one after another. As printed these
 overlap, so the gauge is fixed here. p0 and q0 belong to the zero-g B, and r0 is the scale factor
@@ -53,11 +53,11 @@ _MIN_PLANE_SIN = 0.2
 _MIN_PLANE_SPAN_G = 0.1
 """Smallest span of the reference in a plane that determines a scale factor, g."""
 _MIN_INPUTS = 3
-"""Smallest count of distinct inputs of a quadratic."""
+"""Smallest number of distinct inputs that determine a quadratic."""
 _MIN_INPUT_SPAN_G = 0.3
-"""Smallest span of the inputs of a quadratic, g."""
+"""Smallest span of the inputs that determine a quadratic, g."""
 _SAME_PLANE_RAD = np.radians(1.0)
-"""Angles alpha that differ by less are of one plane, rad."""
+"""Largest difference of neighbouring angles alpha in one plane, rad."""
 _REPLICAS = 200
 """Sweeps of the parametric bootstrap: the standard deviations are known to 5 %."""
 
@@ -70,7 +70,7 @@ class AxisRegression:
     Attributes
     ----------
     zero_g_v, scale_v_per_g
-        Of the linear model, V and V/g.
+        Zero-g and scale factor of the linear model, V and V/g.
     p, q
         Coefficients of 1, a, a² in g(V_c) (11) and h(V_z) (13): V, V/g, V/g², (3,).
     r
@@ -158,8 +158,7 @@ def _regress_axis(d: int, start: Sensor, poses: Poses) -> AxisRegression:
     force = np.column_stack(reference_force(poses, start.local_gravity_mps2)) / G0_MPS2
     zero, scale = start.zero_g_v[d], start.scale_v_per_g[d]
     along, az, volts = force[:, d], force[:, 2], poses.volts[:, d]
-    # The reference of the other axis, not its measured value: the latter has a misalignment of its
-    # own, which would change q1 and q2.
+    # The measured value of the other axis would add its misalignment to q1 and q2.
     across = force[:, 1 - d]
     vertical = np.abs(np.sin(poses.alpha_rad)) > _VERTICAL_SIN
     residual = volts - zero - scale * along                                  # (10)
@@ -181,7 +180,7 @@ def _regress_axis(d: int, start: Sensor, poses: Poses) -> AxisRegression:
 
 def _regress_plane(along_g: np.ndarray, az_g: np.ndarray, volts: np.ndarray,
                    alpha_rad: np.ndarray, scale_v_per_g: float) -> tuple[float, float, float]:
-    """Return z, g, bias, V, and scale factor, V/g, of a plane; NaN if it does not show that."""
+    """Return z in g, bias in V and scale factor in V/g (NaN if undetermined) of a plane."""
     inclined = np.abs(np.sin(alpha_rad).mean()) >= _MIN_PLANE_SIN
     if inclined and np.ptp(along_g) > _MIN_PLANE_SPAN_G:
         scale, bias = np.polyfit(along_g, volts, 1)
@@ -192,7 +191,8 @@ def _regress_plane(along_g: np.ndarray, az_g: np.ndarray, volts: np.ndarray,
 
 def _quadratic(a: np.ndarray, values: np.ndarray, where: str, missing: str,
                growth: np.ndarray | float = 1.0) -> np.ndarray:
-    """Fit the coefficients of 1, a·growth, a², (3,), or name what the data lack."""
+    """Fit the coefficients of 1, a·growth, a², (3,), for inputs a, g; refuse too few inputs."""
+    # Inputs within 0.017 g are one, as angles within 1° are one plane.
     if len(planes(a)) < _MIN_INPUTS or np.ptp(a) < _MIN_INPUT_SPAN_G:
         raise UserError(f'the physical model is not determined: {len(planes(a))} distinct '
                         f'inputs in {where}, at least {_MIN_INPUTS} are needed; add {missing}, '
@@ -255,9 +255,10 @@ def _fit_z_axis(sensor: Sensor, poses: Poses) -> _ZAxis:
 
 def _covariance(sensor: Sensor, fitted: Sensor, poses: Poses) -> np.ndarray:
     """
-    Return the covariance of the staged estimates by parametric bootstrap, (p, p).
+    Return the covariance of the sequential estimates by parametric bootstrap, (p, p).
 
-    The stages weigh the poses in their own way, so that no least-squares formula holds. Sweeps
+    Each step of the fit weights the poses differently, so that no formula of least squares
+    holds. Sweeps
     are drawn from the fitted model and fitted again, with the noise of the means and an encoder
     error uniform within its step for each setting of a joint. Deviations are widened where the
     residuals exceed noise and encoder step (effects that the model does not hold).

@@ -56,7 +56,7 @@ class _AxisData:
     deviation_mv, model_mv
         Measured and modelled output minus the linear model, mV, (k,).
     regression
-        Coefficients of the staged regression.
+        Coefficients of the sequential regression.
     vertical
         Whether the pose is in the plane alpha = 90°, (k,).
 

@@ -182,7 +182,7 @@ def test_outliers_are_named_and_excluded():
     assert fit.outliers == tuple(bad)
     error, std = errors(fit, truth)
     assert np.sqrt(np.mean((error / std) ** 2)) < 1.6
-    assert any('left out, disturbed: pose 8 (alpha' in line
+    assert any('outliers, left out: pose 8 (alpha' in line
                for line in full_fit_text.report_lines(fit, poses, terms))
 
 
