@@ -146,6 +146,11 @@ class Sensor:
         return self.nominal_scale_v_per_g + self._value('scale_factor', 'offset_v_per_g')
 
     @property
+    def stage_std_rad(self) -> float:
+        """Stated standard deviation of a joint's error, rad: uniform within a step, step/√12."""
+        return self.stage_resolution_rad / np.sqrt(12)
+
+    @property
     def rc_s(self) -> float:
         """Time constant of the output filter, s."""
         return self.rc_resistance_ohm * self.rc_capacitance_f

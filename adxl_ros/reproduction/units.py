@@ -107,7 +107,7 @@ def evaluate(nominal: Sensor, stage: experiments.Stage, seed: int) -> Unit:
     truth = experiments.draw(nominal, stage, rng)
     run = experiments.calibrated(truth, seed)
     bound = error_statistics.sweep_bound(
-        truth, run.poses, run.true_rad, StageError(truth.stage_resolution_rad / np.sqrt(12)),
+        truth, run.poses, run.true_rad, StageError(truth.stage_std_rad),
         (*full_model.default_terms(truth.axes), *full_model.GAUGE))
     random_rad = np.column_stack([np.arccos(rng.uniform(-1, 1, RANDOM_POSES)),
                                  rng.uniform(0, 2 * np.pi, RANDOM_POSES)])

@@ -212,7 +212,7 @@ def fit_full(sensor: Sensor, poses: Poses, terms: Sequence[str] | None = None) -
     unit = with_neutral(linear.fit(sensor, poses).without_covariance(), effects)
     unit = with_neutral(unit, ['base_tilt'])
     problem = _Problem(poses, fitted_coefficients(unit.axes, terms),
-                       StageError(sensor.stage_resolution_rad / np.sqrt(12)))
+                       StageError(sensor.stage_std_rad))
     fits, failure = [], None
     for start in _starts(unit, problem, effects):
         try:

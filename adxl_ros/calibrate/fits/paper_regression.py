@@ -293,4 +293,4 @@ def _pose_variance(fitted: Sensor, poses: Poses) -> np.ndarray:
     """
     slope_v_per_rad = angle_jacobian(fitted, poses)
     return poses.std_v ** 2 + np.sum(
-        slope_v_per_rad ** 2 * fitted.stage_resolution_rad ** 2 / 12, axis=2)
+        slope_v_per_rad ** 2 * fitted.stage_std_rad ** 2, axis=2)

@@ -92,7 +92,7 @@ def datasheet_estimate(sensor: Sensor, dwell_s: float) -> running_estimate.Runni
     """
     return running_estimate.from_poses(
         sensor, running_estimate.no_poses(len(sensor.axes)), dwell_s,
-        sensor.stage_resolution_rad / np.sqrt(12))
+        sensor.stage_std_rad)
 
 
 def expected_tilt_error_rad(sensor: Sensor, dwell_s: float, targets: Sequence[Target]) -> float:

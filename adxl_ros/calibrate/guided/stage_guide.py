@@ -510,7 +510,7 @@ class StageGuide:
             running_estimate.no_poses(len(self.sensor.axes))
         return running_estimate.from_poses(
             self.sensor, poses, self.settings.dwell_s,
-            self.sensor.stage_resolution_rad / np.sqrt(12), previous)
+            self.sensor.stage_std_rad, previous)
 
     def _encoder_covers(self, mean: RestMean) -> bool:
         """Return whether the readings of the encoder reach to the end of a dwell."""
