@@ -12,4 +12,4 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""From poses to coefficients: rests, plans, fits and the verdict."""
+"""From rests to coefficients: poses, fits, guided calibration and report."""

@@ -247,8 +247,8 @@ class _StageFit:
     ----------
     fitted
         The fitted unit.
-    fit
-        The fit as a function, for cross-validation.
+    refit
+        Function that makes the same fit to other poses, for cross-validation.
     report_lines
         Report of a full fit.
     refusals
@@ -259,7 +259,7 @@ class _StageFit:
     """
 
     fitted: Sensor
-    fit: cross_validation.Fit
+    refit: cross_validation.Fit
     report_lines: Sequence[str] = ()
     refusals: Sequence[str] = ()
     full: FullFit | None = None
@@ -274,16 +274,7 @@ def _against_stage(sensor: Sensor, recordings: Sequence[RecordedPoses], model: s
     fitting = np.flatnonzero(~poses.check)
     outliers = tuple(fitting[list(full.outliers)].tolist()) if full else ()
     inliers = poses.subset(~np.isin(np.arange(len(poses)), outliers))
-    # The reference of all models is the stage with its fitted errors.
-    stage = full.unit if full else None
-    models = list(STAGE_FITS)
-    simpler = {name: STAGE_FITS[name] for name in models[:models.index(fitted.model)]}
-    held_out = cross_validation.cross_validate(
-        {'nominal': lambda sensor, _: sensor, **simpler, fitted.model: fit.fit},
-        sensor, inliers, stage)
-    assessments = tuple(
-        acceptance.assess(errors.model, error_budget.error_budgets(errors, inliers, stage), sensor)
-        for errors in held_out if errors.model != 'nominal')
+    held_out, assessments = _assessed(sensor, inliers, fit)
     assessment = next((row for row in assessments if row.model == fitted.model), None)
     residual_mg = _rms_residual_mg(fitted, poses.subset(fitting))
     fit_lines = list(fit.report_lines)
@@ -303,13 +294,29 @@ def _against_stage(sensor: Sensor, recordings: Sequence[RecordedPoses], model: s
     unit_lines = acceptance.unit_line(fitted)
     return CalibrationResult(
         nominal=sensor, fitted=fitted, poses=poses, assessments=assessments,
-        held_out=tuple(held_out), outliers=outliers,
+        held_out=held_out, outliers=outliers,
         report_lines=[*fit.refusals, *cross_validation.table(held_out),
                       *acceptance.table(assessments, held_out), *explanation, *unit_lines,
                       *fit_lines],
         summary_lines=[*acceptance.headline(assessment, held_out), *unit_lines,
                        *acceptance.narrow_table(assessments, held_out), *explanation,
                        *fit_lines, *fit.refusals])
+
+
+def _assessed(sensor: Sensor, inliers: Poses, fit: _StageFit
+              ) -> tuple[tuple[HeldOutErrors, ...], tuple[Assessment, ...]]:
+    """Return held-out errors and acceptance of the fit and of all simpler models."""
+    # The reference of all models is the stage with its fitted errors.
+    stage = fit.full.unit if fit.full else None
+    models = list(STAGE_FITS)
+    simpler = {name: STAGE_FITS[name] for name in models[:models.index(fit.fitted.model)]}
+    held_out = cross_validation.cross_validate(
+        {'nominal': lambda sensor, _: sensor, **simpler, fit.fitted.model: fit.refit},
+        sensor, inliers, stage)
+    assessments = tuple(
+        acceptance.assess(errors.model, error_budget.error_budgets(errors, inliers, stage), sensor)
+        for errors in held_out if errors.model != 'nominal')
+    return tuple(held_out), assessments
 
 
 def _richest_fit(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str | None,

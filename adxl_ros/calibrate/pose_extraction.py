@@ -180,8 +180,14 @@ def estimate_filters(recording: Recording, sensor: Sensor, poses: Poses
     """
     volts = recording.volts(sensor)
     first, last = np.searchsorted(recording.time_s, poses.time_s.T)
-    rests = [volts[a:b + 1] for a, b in zip(first, last) if b > a and np.diff(
-        recording.time_s[a:b + 1]).max() * sensor.rate_hz < _MAX_PERIODS]
-    return [filter_time_constant.estimate_filter(
-        [rest[:, d] for rest in rests], sensor.rate_hz, sensor.rc_s, sensor.lsb_v)
-        for d in range(len(sensor.axes))]
+    gapless = []
+    for begin, end in zip(first, last):
+        steps_s = np.diff(recording.time_s[begin:end + 1])
+        if steps_s.size and steps_s.max() * sensor.rate_hz < _MAX_PERIODS:
+            gapless.append(volts[begin:end + 1])
+    filters = []
+    for d in range(len(sensor.axes)):
+        rests = [rest[:, d] for rest in gapless]
+        filters.append(filter_time_constant.estimate_filter(
+            rests, sensor.rate_hz, sensor.rc_s, sensor.lsb_v))
+    return filters

@@ -162,13 +162,16 @@ class DriftHistory:
     def series(self) -> DriftSeries:
         """Return the drift relative to the newest calibration."""
         newest = self.sensors[-1]
+
+        def changes(quantity: _Quantity) -> np.ndarray:
+            return np.array([_change(newest, sensor, quantity)[0] for sensor in self.sensors])
+
+        def stds(quantity: _Quantity) -> np.ndarray:
+            return np.array([_std(sensor, quantity) for sensor in self.sensors])
+
         dates = [_date(sensor, f'no. {i}') for i, sensor in enumerate(self.sensors, 1)]
-        change = {quantity: np.array([_change(newest, sensor, quantity)[0]
-                                      for sensor in self.sensors]) for quantity in _QUANTITIES}
-        std = {quantity: np.array([_std(sensor, quantity) for sensor in self.sensors])
-               for quantity in _QUANTITIES}
-        return DriftSeries(dates, newest.axes, change[_ZERO_G], change[_SCALE_FACTOR],
-                           std[_ZERO_G], std[_SCALE_FACTOR])
+        return DriftSeries(dates, newest.axes, changes(_ZERO_G), changes(_SCALE_FACTOR),
+                           stds(_ZERO_G), stds(_SCALE_FACTOR))
 
 
 def _row(before: Sensor | None, now: Sensor) -> list[str]:

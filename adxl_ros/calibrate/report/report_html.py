@@ -227,12 +227,15 @@ def _outcome_cells(row: Assessment) -> list[str]:
 def _sphere(result: CalibrationResult) -> str:
     data = _stage_sphere(result) if result.gravity_fit is None else _gravity_sphere(result)
     up = data.force / np.linalg.norm(data.force, axis=1, keepdims=True)
-    poses = [{'u': [round(float(c), 5) for c in up[i]], 'label': label,
-              'held_out': bool(result.poses.check[i]),
-              'values': [list(map(_number, errors[i])) for errors in data.errors]}
-             for i, label in enumerate(data.labels)]
+
+    def point(i: int) -> dict[str, Any]:
+        return {'u': [round(float(c), 5) for c in up[i]], 'label': data.labels[i],
+                'held_out': bool(result.poses.check[i]),
+                'values': [list(map(_number, errors[i])) for errors in data.errors]}
+
     return html_page.data('sphere-data', {
-        'models': data.models, 'quantities': data.quantities, 'poses': poses}) + _SPHERE
+        'models': data.models, 'quantities': data.quantities,
+        'poses': [point(i) for i in range(len(data.labels))]}) + _SPHERE
 
 
 def _gravity_sphere(result: CalibrationResult) -> _SphereData:
