@@ -163,7 +163,8 @@ class CalibrationResult:
         except UserError as error:
             return f'no copy in the store: {error}'
         return f'kept as {path}' if path else \
-            f'not kept in {folder}: the serial number is {NO_UNIT}; set sensor.serial'
+            f'not kept in {folder}: the serial number {NO_UNIT} names no unit; set ' \
+            'sensor.serial'
 
     def _is_in(self, path: str | os.PathLike) -> bool:
         """Return whether a file holds this fit: the same data, model and coefficients."""
