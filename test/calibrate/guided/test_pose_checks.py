@@ -163,7 +163,8 @@ def test_units_at_the_edge_of_the_datasheet_are_never_refused():
                 nominal('xyz'), poses.subset(order[:count]), 5.0, 4.2e-4, estimate)
             i = order[count]
             target = Target(poses.alpha_rad[i], poses.beta_rad[i])
-            assert pose_checks.reading_fault(estimate, target, poses.volts[i], np.radians(0.2)) == ''
+            assert not pose_checks.reading_fault(
+                estimate, target, poses.volts[i], np.radians(0.2))
 
 
 def _edge(name, value):
@@ -208,7 +209,8 @@ def test_a_stage_on_another_clock_is_reported(ahead_s, words):
 
 def test_a_wrong_sample_rate_is_refused():
     """Samples at another rate than that of sensor_info are refused."""
-    assert pose_checks.rate_fault(999.0, 1000.0) == pose_checks.rate_fault(float('nan'), 1000.0) == ''
+    assert pose_checks.rate_fault(999.0, 1000.0) == ''
+    assert pose_checks.rate_fault(float('nan'), 1000.0) == ''
     assert 'samples are 500 a second by their stamps, but sensor_info states rate_hz 1000' in \
         pose_checks.rate_fault(500.0, 1000.0)
 
