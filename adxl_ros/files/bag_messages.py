@@ -39,6 +39,7 @@ _ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
 """First bytes of data that zstd compressed (RFC 8878, section 3.1.1)."""
 
 _ENDINGS = ('.mcap', '.db3', '.mcap.zstd', '.db3.zstd')
+"""Ends of the names of files in a recording's directory."""
 
 
 class Part(Protocol):
@@ -157,6 +158,7 @@ class _RosbagsPart:
 
 
 def _unreadable(path: Path, error: Exception) -> UserError:
+    """Return the error of a file that rosbags cannot read."""
     reason = ' '.join(str(error).split()) or f'damaged ({type(error).__name__})'
     return UserError(f'{path}: cannot read it as a rosbag2 recording: {reason}')
 
@@ -205,6 +207,7 @@ def open_bag(path: str | os.PathLike) -> Iterator[Bag]:
 
 
 def _opened(stack: ExitStack, rosbag2: Any, name: Path, file: Path) -> Part:
+    """Open a file; `name` is its packed form, for messages. `stack` closes it."""
     is_mcap = file.suffix == '.mcap'
     if is_mcap and not mcap_recovery.is_whole(file):
         return stack.enter_context(mcap_recovery.open_scan(file))
@@ -265,6 +268,6 @@ def _listed_files(path: Path) -> list[Path] | None:
 
 
 def _file_number(path: Path) -> tuple[int, str]:
-    """Sort name_10.mcap behind name_9.mcap, as ros2 bag numbers them."""
+    """Return a key that sorts name_10.mcap behind name_9.mcap, as ros2 bag numbers files."""
     number = re.search(r'_(\d+)\.(mcap|db3)', path.name)
     return (int(number[1]) if number else 0, path.name)

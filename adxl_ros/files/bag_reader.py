@@ -36,13 +36,13 @@ from adxl_ros.model.constants import AXES, MEASURED_AXES
 import numpy as np
 
 _HOLD_ROWS = 1 << 19
-"""Samples that wait for references to come; later ones are handed on without (chosen: 17 MB)."""
+"""Samples that wait for references; more samples go on without them (chosen: 17 MB)."""
 
 _ABSENT_VARIANCE = 1e5
 """Variance from which an axis counts as absent, (m/s²)²; absent axes are written with 1e6."""
 
 _EXACT_NS = 1 << 53
-"""Up to here float64 resolves single nanoseconds, ns."""
+"""Largest time, ns, that float64 resolves to single nanoseconds."""
 
 
 def blocks(path: str | os.PathLike, rows: int, ideal: bool = False
@@ -235,6 +235,7 @@ class _Samples:
 
 def _tables(where: str, raws: list[bytes],
             find: Callable[[bytes], cdr.Layout]) -> Iterator[cdr.Table]:
+    """Group messages by layout; a damaged one is an error that names file and topic."""
     try:
         yield from cdr.tables(raws, find)
     except cdr.CdrError as error:
@@ -251,6 +252,7 @@ def _tracks(bag: Bag, topics: Topics) -> dict[str, Track]:
 
 def _add_references(bag: Bag, topics: Topics, tracks: dict[str, Track],
                     messages: dict[str, list[bytes]]) -> None:
+    """Decode the messages of references, by topic, and add them to the tracks of their columns."""
     for topic, raws in messages.items():
         where = f'{bag.path}: topic {topic}'
         if topic == topics.joints:
@@ -281,6 +283,7 @@ def _add_commands(where: str, commands: dict[str, Command], raws: list[bytes],
 
 def _scalar(where: str, raws: list[bytes], find: Callable[[bytes], cdr.Layout],
             name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return stamps, ns, (k,), and the values of one field, (k,)."""
     stamp_ns, value = np.empty(len(raws), np.int64), np.empty(len(raws))
     for table in _tables(where, raws, find):
         stamp_ns[table.rows] = table.stamp_ns()
@@ -307,6 +310,7 @@ def _joints(where: str, raws: list[bytes], names: Mapping[str, str]
 
 def _block(bag: Bag, samples: _Samples, tracks: dict[str, Track], commands: dict[str, Command],
            info: dict[str, str], part: slice) -> Recording:
+    """Make a block of waiting samples, with references and commands at their stamps."""
     stamp_ns = samples.stamp_ns[part]
     accel = samples.accel[part]
     columns = {name: np.ascontiguousarray(accel[:, i])

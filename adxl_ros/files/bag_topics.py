@@ -24,10 +24,19 @@ from adxl_ros.files.bag_messages import Bag
 from adxl_ros.model.constants import MEASURED_AXES
 
 IMU = 'sensor_msgs/msg/Imu'
+"""Type of the sensor's output."""
+
 JOINT_STATE = 'sensor_msgs/msg/JointState'
+"""Type of the positions and commands of the stage."""
+
 DIAGNOSTIC_STATUS = 'diagnostic_msgs/msg/DiagnosticStatus'
+"""Type of `sensor_info`."""
+
 TEMPERATURE = 'sensor_msgs/msg/Temperature'
+"""Type of the temperature."""
+
 BATTERY_STATE = 'sensor_msgs/msg/BatteryState'
+"""Type of the supply."""
 
 _IDENTITY = ('serial', 'axes', 'nominal_zero_g_v', 'nominal_scale_v_per_g')
 """Keys of sensor_info that must not change within a recording."""
@@ -114,6 +123,7 @@ def find_ideal(bag: Bag) -> Topics:
 
 
 def _typed(bag: Bag, topic: str, kind: str) -> str | None:
+    """Return a topic if the bag holds it with this type, else None."""
     return topic if (topic, kind) in bag.types else None
 
 
@@ -135,6 +145,7 @@ def _only(bag: Bag, name: str, kind: str) -> str | None:
 
 
 def _contents(bag: Bag) -> str:
+    """Return topics and types of a bag, and its cut, for messages."""
     listed = ', '.join(f'{topic} ({kind})' for topic, kind in sorted(bag.types))
     return (listed or 'no messages') + (f'; {bag.cut}' if bag.cut else '')
 

@@ -38,6 +38,7 @@ from adxl_ros.files.bag_topics import (
 from adxl_ros.files.recording_columns import COMMANDS, JOINTS, Recording
 from adxl_ros.files.stream_info import converted_info
 from adxl_ros.model.constants import G0_MPS2
+from adxl_ros.model.covariance import UNMEASURED_VARIANCE
 from adxl_ros.model.noise import sample_std_v
 from adxl_ros.model.sensor import Sensor
 import numpy as np
@@ -45,14 +46,20 @@ import numpy as np
 _FRAME = 'imu_link'
 """Frame of the sensor's messages (REP-145)."""
 
-_ABSENT_VARIANCE = 1e6
-"""Variance of an axis that the sensor does not have, (m/s²)² (chosen: no consumer weighs it)."""
-
 _ROWS_AT_ONCE = 65536
 """Samples that are made into messages at a time (chosen: some 20 MB)."""
 
-_LAST_STAMP_NS = (1 << 31) * 1_000_000_000
+_END_OF_TIME_NS = (1 << 31) * 1_000_000_000
 """First stamp that is too late, ns: builtin_interfaces/Time has 32 bits of signed seconds."""
+
+_LONGEST_NS = (1 << 63) - 1
+"""Largest duration of ROS, ns: a QoS without a deadline."""
+
+_LATCHED_DEPTH = 1
+"""Messages that a latched topic keeps for late subscribers."""
+
+_DEPTH = 10
+"""Messages that any other topic keeps, the default depth of ROS."""
 
 
 class _Batch(NamedTuple):
@@ -84,7 +91,7 @@ class BagWriter:
     Each sample becomes a message of `imu/data_raw`. Sampled references become messages of
     `stage/joint_states`, `temperature` and `supply` with the same stamp; the voltage of
     sensor_msgs/BatteryState is float32. A command becomes a message of `stage/command` where it
-    changes, and once every 65536 samples. Columns that are none of the package's are left out.
+    changes, and once every 65536 samples. Columns with other names are left out.
     """
 
     def __init__(self, path: str | os.PathLike, sensor: Sensor) -> None:
@@ -141,7 +148,7 @@ class BagWriter:
 
         """
         stamp_ns = recording.stamp_ns
-        if stamp_ns[0] < 0 or stamp_ns[-1] >= _LAST_STAMP_NS:
+        if stamp_ns[0] < 0 or stamp_ns[-1] >= _END_OF_TIME_NS:
             raise UserError(f'{self._path}: times from {stamp_ns[0] / 1e9:g} to '
                             f'{stamp_ns[-1] / 1e9:g} s cannot be stamps of ROS messages, '
                             'which go from 0 to 2^31 s')
@@ -284,12 +291,14 @@ def _qos(is_latched: bool) -> Any:
         QosTime,
     )
     durability = QosDurability.TRANSIENT_LOCAL if is_latched else QosDurability.VOLATILE
-    forever = QosTime(9223372036, 854775807)
-    return Qos(QosHistory.KEEP_LAST, 1 if is_latched else 10, QosReliability.RELIABLE, durability,
-               forever, forever, QosLiveliness.AUTOMATIC, forever, False)
+    forever = QosTime(*divmod(_LONGEST_NS, 1_000_000_000))
+    return Qos(QosHistory.KEEP_LAST, _LATCHED_DEPTH if is_latched else _DEPTH,
+               QosReliability.RELIABLE, durability, forever, forever, QosLiveliness.AUTOMATIC,
+               forever, False)
 
 
 def _header(types: Any, frame: str) -> Any:
+    """Return a header with the stamp 0."""
     time = types.types['builtin_interfaces/msg/Time'](sec=0, nanosec=0)
     return types.types['std_msgs/msg/Header'](stamp=time, frame_id=frame)
 
@@ -298,7 +307,7 @@ def _imu_template(types: Any, sensor: Sensor) -> bytes:
     """Return an Imu without orientation and angular velocity, with the noise of one sample."""
     absent = np.zeros(9)
     absent[0] = -1.0
-    variance = np.full(3, _ABSENT_VARIANCE)
+    variance = np.full(3, UNMEASURED_VARIANCE)
     noise = sample_std_v(sensor) / sensor.nominal_scale_v_per_g * G0_MPS2
     variance[:len(sensor.axes)] = noise ** 2
     vector = types.types['geometry_msgs/msg/Vector3'](x=0.0, y=0.0, z=0.0)
@@ -312,6 +321,7 @@ def _imu_template(types: Any, sensor: Sensor) -> bytes:
 
 
 def _joint_template(types: Any, names: list[str]) -> bytes:
+    """Return a JointState with the positions of some joints."""
     none = np.zeros(0)
     message = types.types[JOINT_STATE](
         header=_header(types, ''), name=names, position=np.zeros(len(names)),
@@ -320,6 +330,7 @@ def _joint_template(types: Any, names: list[str]) -> bytes:
 
 
 def _temperature_template(types: Any) -> bytes:
+    """Return a Temperature of unknown variance."""
     message = types.types[TEMPERATURE](
         header=_header(types, _FRAME), temperature=0.0, variance=0.0)
     return bytes(types.serialize_cdr(message, TEMPERATURE))

@@ -90,6 +90,7 @@ class _Lines:
 
 
 def _split(path: str, line: bytes, number: int) -> list[str]:
+    """Return the fields of the line with a number."""
     try:
         return next(csv.reader([_decode(path, line, number)]))
     except csv.Error as error:
@@ -171,6 +172,7 @@ def blocks(path: str | os.PathLike, rows: int,
 
 def _blocks(path: str, file: BinaryIO, rows: int,
             needed: tuple[str, ...] | None) -> Iterator[Recording]:
+    """Yield the blocks of an open file; the arguments are those of `blocks`."""
     info: dict[str, str] = {}
     state = None
     count = 0
@@ -202,6 +204,7 @@ def _begin(path: str, lines: _Lines, info: dict[str, str],
 
 
 def _epoch_ns(path: str, info: dict[str, str]) -> int:
+    """Return the origin of the times, ns, that the comments state; else 0."""
     text = info.get('epoch_ns', '0')
     if not re.fullmatch(r'-?\d{1,19}', text) or abs(int(text)) >= 1 << 63:
         raise UserError(f'{path}: epoch_ns is {text!r}, expected whole nanoseconds')
@@ -228,6 +231,7 @@ def _chunks(path: str, file: BinaryIO, info: dict[str, str]) -> Iterator[_Lines]
 
 
 def _whole_lines(path: str, file: BinaryIO) -> Iterator[bytes]:
+    """Yield the bytes of a file in parts that end with a line."""
     rest = b''
     while data := file.read(_CHUNK_BYTES):
         data = rest + data
@@ -255,6 +259,7 @@ def _has_other_lines(data: bytes) -> bool:
 
 
 def _drop_other_lines(path: str, lines: _Lines, info: dict[str, str]) -> None:
+    """Remove comments and empty lines; keys and values of comments go to `info`."""
     kept, numbers = [], []
     for line, number in zip(lines.data.split(b'\n'), lines.numbers):
         text = line.strip()
@@ -375,6 +380,7 @@ def _refuse_field_count(state: _State, lines: _Lines, row: int, count: int) -> N
 
 
 def _cut_hint(lines: _Lines, row: int) -> str:
+    """Return what to do about the last line of a file that is cut off, else ''."""
     if lines.is_open_ended and row == len(lines.numbers) - 1:
         return '; the file ends in the middle of this line: delete it'
     return ''
@@ -400,6 +406,7 @@ def _limit(name: str) -> float:
 
 
 def _refuse_value(state: _State, lines: _Lines, row: int, name: str, value: float) -> None:
+    """Raise the error of a number that is empty, not finite or too large."""
     index = state.header.index(name)
     text = lines.fields(state.path, row)[index].strip()
     where = lines.where(state.path, row, index)
@@ -412,6 +419,7 @@ def _refuse_value(state: _State, lines: _Lines, row: int, name: str, value: floa
 
 
 def _check_time(state: _State, lines: _Lines, time_s: np.ndarray) -> None:
+    """Refuse times, s, (n,), that do not increase; remember the last one."""
     earlier = np.concatenate([[state.last_time_s], time_s[:-1]])
     wrong = ~(time_s > earlier)
     if wrong.any():

@@ -95,16 +95,19 @@ class CsvWriter:
 
 
 def _exactly(columns: list[np.ndarray]) -> str:
+    """Return rows with all digits of the columns, (n,) each."""
     return '\n'.join(map(','.join, zip(*map(_fields, columns)))) + '\n'
 
 
 def _rounded(columns: list[np.ndarray], digits: int) -> str:
+    """Return rows with all digits of the first column, and some digits of the others."""
     row = ','.join(['%r', *[f'%.{digits}g'] * (len(columns) - 1)]) + '\n'
     rows = (row * len(columns[0])) % tuple(np.column_stack(columns).ravel().tolist())
     return rows.replace('nan', '')
 
 
 def _fields(values: np.ndarray) -> list[str]:
+    """Return numbers as text; NaN is empty."""
     text = list(map(repr, values.tolist()))
     for i in np.flatnonzero(np.isnan(values)):
         text[i] = ''

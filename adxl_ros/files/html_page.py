@@ -37,6 +37,7 @@ table,pre{font-size:9px}td,th{padding:.15em .4em}
 h2{break-after:avoid}tr,figure,img,.summary{break-inside:avoid}
 *{-webkit-print-color-adjust:exact;print-color-adjust:exact}.screen{display:none}}
 """
+"""Style sheet of all pages, on screen and on paper."""
 
 _DPI = 100
 """Resolution of plots, dots per inch (chosen: sharp at the page's width)."""

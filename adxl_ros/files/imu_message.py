@@ -31,6 +31,9 @@ from adxl_ros.files import cdr
 _STAMP_OFFSET = 4
 """Offset of the header's stamp, bytes."""
 
+_FRAME_LENGTH = slice(12, 16)
+"""Bytes with the length of the frame's name, which follows the stamp."""
+
 _COVARIANCE_BYTES = 72
 """Size of a covariance: nine float64."""
 
@@ -69,6 +72,7 @@ class _Layout(NamedTuple):
 
 
 _layouts: dict[bytes, _Layout] = {}
+"""Known layouts, by byte order and length of the frame's name."""
 
 
 def read(raw: bytes) -> tuple[float, Sequence[float]]:
@@ -136,7 +140,7 @@ def vector3_stamped(raw: bytes, vector: Sequence[float]) -> bytes:
 
 def _layout(raw: bytes) -> _Layout:
     """Return the layout of a message; byte order and length of the frame's name determine it."""
-    head = raw[:2] + raw[12:16]
+    head = raw[:2] + raw[_FRAME_LENGTH]
     layout = _layouts.get(head)
     if layout is None or len(raw) < layout.size:
         layout = _find_layout(raw)

@@ -251,16 +251,18 @@ def _chunk(content: bytes, is_whole: bool) -> Generator[Record, None, bool]:
 
 
 def _is_record(code: int, size: int) -> bool:
-    """Return whether a record can begin so; damaged bytes rarely look like one."""
+    """Return whether a record may have this code and size; damaged bytes rarely look like it."""
     is_known = 0 < code <= _LAST_CODE or code >= _FIRST_PRIVATE_CODE
     return is_known and size >= _SMALLEST_BYTES.get(code, 0)
 
 
 def _u16(data: bytes, offset: int) -> int:
+    """Return the 16-bit number at an offset."""
     return data[offset] | data[offset + 1] << 8
 
 
 def _text(data: bytes, offset: int) -> str:
+    """Return the string at an offset: its length in 4 bytes, then its bytes."""
     start = offset + 4
     stop = start + int.from_bytes(data[offset:start], 'little')
     return data[start:stop].decode(errors='replace')

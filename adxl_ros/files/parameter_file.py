@@ -217,34 +217,57 @@ def _represent_float(dumper: yaml.SafeDumper, value: float) -> yaml.Node:
 _Dumper.add_representer(float, _represent_float)
 
 
+def compose(path: str | os.PathLike) -> yaml.Node | None:
+    """
+    Read a YAML file as a tree of nodes, which know their places; None for an empty file.
+
+    Raises
+    ------
+    UserError
+        The file cannot be read, or is not YAML. The message names line and column.
+
+    """
+    try:
+        return yaml.compose(Path(path).read_text(encoding='utf-8'), Loader=yaml.SafeLoader)
+    except OSError as error:
+        raise UserError(f'{path}: cannot be read: {error.strerror}') from None
+    except UnicodeDecodeError:
+        raise UserError(f'{path}: cannot be read: not UTF-8 text') from None
+    except yaml.YAMLError as error:
+        raise _yaml_error(path, error) from None
+
+
+def _yaml_error(path: str | os.PathLike, error: yaml.YAMLError) -> UserError:
+    """Return the error of a file that is not YAML, with its place where the parser names one."""
+    problem, mark = str(error), None
+    if isinstance(error, yaml.MarkedYAMLError):
+        problem, mark = str(error.problem), error.problem_mark
+    return UserError(f'{_where(path, mark)}: not YAML: {" ".join(problem.split())}')
+
+
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return values and places by dotted key, from below `/**: ros__parameters:`."""
-    try:
-        text = path.read_text(encoding='utf-8')
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, 'strerror', None) or 'not UTF-8 text'
-        raise UserError(f'{path}: cannot be read: {reason}') from None
     flat: dict[str, Any] = {}
     try:
-        parameters: Any = yaml.compose(text, Loader=yaml.SafeLoader)
+        parameters: Any = compose(path)
         for key in ('/**', 'ros__parameters'):
             parameters = _child(parameters, key, path)
         marks = {'': parameters.start_mark}
         _flatten(parameters, '', flat, marks, path)
     except yaml.YAMLError as error:
-        problem = ' '.join(str(getattr(error, 'problem', error)).split())
-        raise UserError(f'{_where(path, getattr(error, "problem_mark", None))}: not YAML: '
-                        f'{problem}') from None
+        raise _yaml_error(path, error) from None
     except RecursionError:
         raise UserError(f'{path}: a node contains itself') from None
     return flat, marks
 
 
 def _where(path: str | os.PathLike, mark: Any) -> str:
+    """Return file:line:column of a mark of yaml; the file alone without a mark."""
     return f'{path}:{mark.line + 1}:{mark.column + 1}' if mark else f'{path}'
 
 
 def _child(node: Any, key: str, path: Path) -> Any:
+    """Return the mapping below a key; `UserError` where there is none."""
     if isinstance(node, yaml.MappingNode):
         for name, value in node.value:
             if name.value == key and isinstance(value, yaml.MappingNode):
@@ -255,6 +278,7 @@ def _child(node: Any, key: str, path: Path) -> Any:
 
 def _flatten(node: yaml.MappingNode, prefix: str, flat: dict[str, Any], marks: dict[str, Any],
              path: Path) -> None:
+    """Add the values and places below a node to `flat` and `marks`, by dotted key."""
     for name, value in node.value:
         key = f'{prefix}{name.value}'
         if key in marks:
@@ -275,6 +299,7 @@ class _FlatReader:
     make_error: MakeError
 
     def sensor(self) -> Sensor:
+        """Make the sensor; every value is checked."""
         values = {field.name: self._field(field) for field in SENSOR_FIELDS.values()}
         axes = values['axes']
         for key, field in SENSOR_FIELDS.items():
@@ -360,6 +385,7 @@ class _FlatReader:
         return values
 
     def _values(self, effect: Effect, parameter: Parameter, axes: str) -> np.ndarray:
+        """Return the value of a parameter by axis, (m,), or () where it has no axes."""
         key = str(Coefficient(effect.name, parameter.name))
         if key not in self.flat and parameter.role is Role.OPTIONAL:
             return neutral(effect, axes)[parameter.name]
@@ -385,8 +411,9 @@ class _FlatReader:
                     ) -> tuple[np.ndarray, tuple[Coefficient, ...]]:
         """Return the covariance, (k, k), and the names of its k coefficients."""
         names = self._names('covariance_names')
-        coefficients = {str(name): name for effect in effects
-                        for name in names_of(effect_named(effect), axes)}
+        coefficients: dict[str, Coefficient] = {}
+        for effect in effects:
+            coefficients |= {str(name): name for name in names_of(effect_named(effect), axes)}
         for name in names:
             if name not in coefficients:
                 raise self.make_error('covariance_names',
@@ -405,6 +432,7 @@ class _FlatReader:
         return matrix, tuple(coefficients[name] for name in names)
 
     def _check_covariance(self, matrix: np.ndarray, names: Sequence[str]) -> None:
+        """Refuse a matrix that is not symmetric and positive."""
         for name, variance in zip(names, np.diag(matrix)):
             if variance < 0:
                 raise self.make_error(
@@ -419,6 +447,7 @@ class _FlatReader:
                                   f'{smallest:.3g} in units of the variances')
 
     def _envelope(self) -> Envelope:
+        """Return the validity range, as far as the file states it."""
         values_by_name: dict[str, Any] = {}
         for name, meaning in ENVELOPE.items():
             key = f'envelope.{name}'
@@ -447,6 +476,7 @@ class _FlatReader:
         return dict(zip(map(Coefficient.parse, names), zip(typical, maximum)))
 
     def _departures(self, name: str, count: int) -> list[float]:
+        """Return a list of `count` departures by the datasheet, all of 0 or more."""
         key = f'datasheet.{name}'
         if key not in self.flat:
             raise self.make_error(key, f'missing; {count} names stand in datasheet.figures')

@@ -31,6 +31,8 @@ NO_UNIT = 'nominal'
 """Serial number that stands for no particular unit."""
 
 _NOMINAL_KEYS = ('nominal_zero_g_v', 'nominal_scale_v_per_g')
+"""Keys of the nominal values, V and V/g; each is a field of `Sensor`, too."""
+
 _HIGHEST_RATE_HZ = 1e6
 """Sample rates from here on are refused, Hz (chosen: ten times the limit of a parameter file)."""
 
@@ -143,6 +145,7 @@ def sensor_info(sensor: Sensor) -> dict[str, str]:
 
 
 def _listed(values: np.ndarray) -> str:
+    """Return numbers as text, each with all its digits."""
     return ', '.join(map(repr, np.asarray(values, dtype=float).tolist()))
 
 

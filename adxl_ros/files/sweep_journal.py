@@ -80,7 +80,7 @@ class PoseRecord:
     def to_json(self) -> dict[str, Any]:
         """Return the keys and values of the record's line; NaN and None have no key."""
         line = {key: value for key, value in asdict(self).items()
-                if value is not None and value == value}
+                if value is not None and not _is_nan(value)}
         if 'alpha_rad' not in line:
             del line['check']
         return line
@@ -108,7 +108,7 @@ class PoseRecord:
 @dataclass(frozen=True)
 class PoseDropped:
     """
-    A pose that counts no more, because it is to be taken again.
+    A pose that does not count any more, because it is taken again.
 
     Attributes
     ----------
@@ -145,7 +145,7 @@ class PoseSkipped:
 
 @dataclass(frozen=True)
 class MountingUnchecked:
-    """A note that the operator left out the check of the mounting."""
+    """A note that the operator skipped the check of the mounting."""
 
     def to_json(self) -> dict[str, Any]:
         """Return the keys and values of the line."""
@@ -315,6 +315,7 @@ class Journal:
                             'room and try again') from None
 
     def _resume(self, head: dict[str, Any], start_over: bool) -> list[JournalEntry]:
+        """Return the entries of an interrupted calibration, or begin a new file with the head."""
         try:
             contents, size = _parse(self.path)
         except NotJournalError as error:
@@ -491,6 +492,7 @@ def _parse(path: Path) -> tuple[JournalContents | None, int]:
 
 
 def _head(path: Path, raw: bytes) -> dict[str, Any]:
+    """Read the first line; raises `NotJournalError` for another format."""
     try:
         head = _object(raw)
     except ValueError as error:
@@ -502,6 +504,7 @@ def _head(path: Path, raw: bytes) -> dict[str, Any]:
 
 
 def _object(raw: bytes) -> dict[str, Any]:
+    """Read a line as a JSON object; raises `ValueError` for any other line."""
     line = json.loads(raw)
     if not isinstance(line, dict):
         raise ValueError('not an object')
@@ -530,6 +533,11 @@ def _as_read(head: Mapping[str, Any]) -> dict[str, Any]:
     return json.loads(json.dumps({'format': FORMAT, **head}))
 
 
+def _is_nan(value: object) -> bool:
+    return isinstance(value, float) and math.isnan(value)
+
+
 def _short(value: Any) -> str:
+    """Return a value as text that fits into a message."""
     text = json.dumps(value)
     return text if len(text) < _LONGEST_VALUE else f'{text[:_LONGEST_VALUE - 3]}...'

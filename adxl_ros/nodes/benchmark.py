@@ -47,6 +47,11 @@ _FIRST_MESSAGES = 50
 _WARM_UP_S = 2.0
 """Time between the begin of a stream and its measurement, s; chosen."""
 _READ_BYTES = 65536
+"""Most bytes of one read of the bare reader, as the serial link reads them."""
+_QUEUE = 1000
+"""Messages that the listener keeps while it is busy; chosen: 1 s."""
+_BARE_QUEUE = 10
+"""Messages that a bare node keeps, the usual depth of ROS examples."""
 
 
 class Listener(Node):
@@ -67,7 +72,7 @@ class Listener(Node):
         self.raw: list[bytes] = []
         self.arrived_ns: list[int] = []
         self.create_subscription(Imu, topic, self._on_message,
-                                 QoSProfile(depth=1000,
+                                 QoSProfile(depth=_QUEUE,
                                             reliability=qos_profile_sensor_data.reliability),
                                  raw=True)
         self._executor = SingleThreadedExecutor()
@@ -112,7 +117,7 @@ class BarePublisher(Node):
     def __init__(self) -> None:
         super().__init__('bare_publisher')
         self._message = Imu()
-        self._publisher = self.create_publisher(Imu, 'bare', 10)
+        self._publisher = self.create_publisher(Imu, 'bare', _BARE_QUEUE)
         self.create_timer(1 / _RATE_HZ, self._publish)
 
     def _publish(self) -> None:
@@ -125,11 +130,12 @@ class BareRelay(Node):
 
     def __init__(self) -> None:
         super().__init__('bare_relay')
-        publisher = self.create_publisher(Imu, 'relayed', 10)
+        publisher = self.create_publisher(Imu, 'relayed', _BARE_QUEUE)
         self.create_subscription(Imu, 'bare', publisher.publish, qos_profile_sensor_data)
 
 
 _BARE_NODES = {'publisher': BarePublisher, 'relay': BareRelay}
+"""Bare nodes by the value of the hidden option `--bare`, which runs one in its own process."""
 
 
 def main() -> int:
@@ -162,6 +168,7 @@ def main() -> int:
 
 
 def _run_bare_node(make: Callable[[], Node]) -> int:
+    """Spin a node until a signal ends it."""
     rclpy.init()
     executor = SingleThreadedExecutor()
     executor.add_node(make())
@@ -179,8 +186,9 @@ def _run_bare_reader(port: str) -> int:
 
 
 def _measure_nodes(seconds: float) -> None:
-    """Print the rows of the nodes beside those of bare ones, of a duration each, s."""
-    print(f'{"1 kHz for " + format(seconds, "g") + " s":36} {"rate Hz":>8} '
+    """Print the rows of bare nodes and of the package's nodes, each measured for a time, s."""
+    title = f'1 kHz for {seconds:g} s'
+    print(f'{title:36} {"rate Hz":>8} '
           f'{"missing":>8} {"p50 ms":>7} {"p99 ms":>7}   CPU of a core')
     bare = [[sys.executable, sys.argv[0], '--bare', kind] for kind in _BARE_NODES]
     driver, compensation = [executable('driver')], [executable('compensation')]
@@ -203,14 +211,16 @@ def _measure_serial(seconds: float) -> None:
 
 
 def _wait_for_port(port: str) -> None:
+    """Wait until the emulated board has made its pseudo-terminal."""
     end_s = time.monotonic() + _START_S
     while not Path(port).exists():
         if time.monotonic() > end_s:
-            raise UserError('the board does not begin')
+            raise UserError(f'{port}: the emulated board has not begun after {_START_S:g} s')
         time.sleep(0.05)
 
 
 def _measure_bare_reader(port: str, seconds: float) -> None:
+    """Print the CPU load of a process that reads the bytes of a port for a time, s."""
     with running([[sys.executable, sys.argv[0], '--read', port]]) as (reader,):
         time.sleep(_WARM_UP_S)
         before_s = cpu_time_s(reader.pid)
@@ -223,7 +233,7 @@ def _measure_bare_reader(port: str, seconds: float) -> None:
 def _measure_iio(iiod: str, seconds: float) -> None:
     """Print the row of the driver on an IIOD, a Python file that prints its port."""
     with subprocess.Popen([sys.executable, iiod], stdout=subprocess.PIPE, text=True) as server:
-        assert server.stdout is not None, 'a pipe was asked for'
+        assert server.stdout is not None, 'Popen makes the pipe'
         try:
             uri = f'ip:127.0.0.1:{server.stdout.readline().strip()}'
             _measure_stream('driver, iio, 2 axes and supply', 'imu/data_raw', [[

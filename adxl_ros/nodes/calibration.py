@@ -41,15 +41,19 @@ from sensor_msgs.msg import BatteryState, JointState, Temperature
 from std_srvs.srv import Trigger
 
 _POLL_S = 0.05
-"""Time between two looks at the samples, s; chosen: short beside a dwell, long beside a turn."""
+"""Time between two steps of the controller, s; chosen: short beside a dwell of seconds."""
 _QUEUE = 100
 """Messages that wait while the node fits; chosen: some seconds of slow topics."""
 _STAGE_QUEUE = 1000
-"""The same for the angles of the stage, which come faster."""
+"""Messages of the stage that wait meanwhile; more, because its angles come faster."""
 
 
 class Calibration(Node):
-    """The node of the guided calibration: wiring around a `Controller`."""
+    """
+    The node of the guided calibration.
+
+    It connects topics, services and the terminal to a `Controller`, which does the work.
+    """
 
     def __init__(self) -> None:
         super().__init__('calibration')
@@ -115,6 +119,7 @@ class Calibration(Node):
             self._console.close()
 
     def _connect(self) -> None:
+        """Make diagnostics, subscriptions, services and the timer."""
         self._diagnostics = DiagnosticsReporter(self, {'calibration': self._status})
         create_subscription(self, DiagnosticStatus, 'sensor_info', self._on_info, 1, latched=True)
         create_subscription(self, JointState, 'stage/joint_states', self._on_stage, _STAGE_QUEUE)
@@ -124,7 +129,7 @@ class Calibration(Node):
         for request in (self._controller.start, self._controller.redo, self._controller.skip,
                         self._controller.finish, self._controller.abort):
             self.create_service(Trigger, f'~/{request.__name__}', _service(request))
-        # It answers when the pose is on disk: samples must go on coming meanwhile.
+        # The answer comes when the pose is on disk. Until then the node must take samples.
         self.create_service(Trigger, '~/capture', self._on_capture,
                             callback_group=ReentrantCallbackGroup())
         self.create_timer(_POLL_S, self._poll, clock=Clock(clock_type=ClockType.STEADY_TIME))
@@ -170,6 +175,7 @@ class Calibration(Node):
 
 
 def _service(request: Callable[[], Answer]) -> Callable[..., Trigger.Response]:
+    """Make the callback of a service that calls a request of the controller."""
     def respond(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         response.success, response.message = request()
         return response

@@ -46,7 +46,12 @@ _LEVELS = {State.REFUSED: Level.ERROR, State.COMPENSATING: Level.OK}
 
 
 class Compensation(Node):
-    """The node; `compensate` corrects the samples and decides by which calibration."""
+    """
+    The node of the compensation.
+
+    It connects topics and parameters to the package `compensate`, which corrects the samples and
+    decides which calibration applies.
+    """
 
     def __init__(self) -> None:
         super().__init__('compensation')
@@ -68,8 +73,11 @@ class Compensation(Node):
         data = create_publisher(self, Imu, 'imu/data', _DEPTH)
         tilt = create_publisher(self, Vector3Stamped, 'tilt', _DEPTH)
         self._stream = LiveStream(paper, self._undo_filter, data.publish, tilt.publish)
-        self._policy = CompensationPolicy(paper, store, Topics(*map(self.resolve_topic_name, (
-            'imu/data_raw', 'sensor_info', 'temperature', 'supply'))))
+        self._policy = CompensationPolicy(paper, store, Topics(
+            data_raw=self.resolve_topic_name('imu/data_raw'),
+            sensor_info=self.resolve_topic_name('sensor_info'),
+            temperature=self.resolve_topic_name('temperature'),
+            supply=self.resolve_topic_name('supply')))
         ExchangeableSensor(self, self._policy.check, self._use)
         create_subscription(self, DiagnosticStatus, 'sensor_info', self._on_info, 1, latched=True)
         create_subscription(self, Temperature, 'temperature', self._on_temperature, 1)
@@ -82,7 +90,7 @@ class Compensation(Node):
         self._thread.close()
 
     def _use(self, sensor: Sensor, source: str) -> None:
-        """Correct by a sensor from the next sample on."""
+        """Correct samples by a sensor from the next one on; `source` says where it is from."""
         text = self._policy.use(sensor, source)
         self._stream.use(sensor, self._policy.rate_hz)
         self.get_logger().info(text)
@@ -108,6 +116,7 @@ class Compensation(Node):
             self.get_logger().warning(text)
 
     def _calibration(self) -> str:
+        """Return the path of the parameter `calibration`, '' without one."""
         return self.get_parameter('calibration').value
 
     def _assess(self) -> None:
@@ -124,12 +133,13 @@ class Compensation(Node):
         self._diagnostics.notice('compensation', Level.ERROR if refusal else Level.OK)
 
     def _on_temperature(self, message: Temperature) -> None:
-        self._surround('temperature_c', message.temperature)
+        self._set_surroundings('temperature_c', message.temperature)
 
     def _on_supply(self, message: BatteryState) -> None:
-        self._surround('supply_v', message.voltage)
+        self._set_surroundings('supply_v', message.voltage)
 
-    def _surround(self, name: str, value: float) -> None:
+    def _set_surroundings(self, name: str, value: float) -> None:
+        """Use a temperature, °C, or supply, V, from the next sample on; ignore NaN."""
         if isfinite(value):
             self._stream.surround(name, value)
             self._heard_ns[name] = self.get_clock().now().nanoseconds
@@ -152,10 +162,11 @@ class Compensation(Node):
         steady_ns, ros_ns = self._steady.now().nanoseconds, self.get_clock().now().nanoseconds
         counts = Counter({name: self._stream.counts[name] for name in COUNTS})
         interval = Interval(
-            (steady_ns - self._reported_ns) * 1e-9,
-            {name: counts[name] - self._reported[name] for name in COUNTS}, self._stream.outside,
-            self._stream.surroundings.copy(),
-            {name: (ros_ns - ns) * 1e-9 for name, ns in self._heard_ns.items()})
+            duration_s=(steady_ns - self._reported_ns) * 1e-9,
+            counts={name: counts[name] - self._reported[name] for name in COUNTS},
+            outside=self._stream.outside,
+            surroundings=self._stream.surroundings.copy(),
+            ages_s={name: (ros_ns - ns) * 1e-9 for name, ns in self._heard_ns.items()})
         self._reported, self._reported_ns = counts, steady_ns
         return interval
 

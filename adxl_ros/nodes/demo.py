@@ -51,10 +51,10 @@ _SWEEP_S = 1060.0
 """Sensor time of the sweep, s; measured."""
 _OVERHEAD_S = 7.0
 """Real time of start, fit and report, s; measured."""
-_PLANES_RAD = tuple(float(np.radians(alpha)) for alpha in (30, 60, 90, 120, 150))
-"""Planes alpha of the sweep."""
+_PLANES_RAD = tuple(np.radians([30.0, 60.0, 90.0, 120.0, 150.0]).tolist())
+"""Planes alpha of the sweep, rad."""
 _STEP_RAD = float(np.radians(30))
-"""Step of beta in each plane."""
+"""Step of beta in each plane, rad."""
 _CHECK_POSES = 16
 """Number of poses that are kept out of the fit."""
 _UNIT_SEED = 203
@@ -62,12 +62,19 @@ _UNIT_SEED = 203
 _UNIT_EFFECTS = {'bias': 0.5, 'scale_factor': 0.5, 'misalignment': 0.7, 'cross_axis': 0.7,
                  'cross_axis_z': 1.0, 'scale_factor_z': 0.7}
 """Effects of the demonstrated unit, in multiples of their typical values; chosen."""
+_SPREAD = (0.5, 1.5)
+"""Range of the random factor of each coefficient of the demonstrated unit; chosen."""
 _SIM_TIME = ('-p', 'use_sim_time:=true')
+"""Arguments of a node that follows the driver's clock."""
 _UNATTENDED = ('-p', 'autostart:=true', '-p', 'screen:=false')
+"""Arguments of a calibration that nobody controls."""
 _LOSSLESS = ('-p', 'qos_overrides./imu/data_raw.subscription.reliability:=reliable')
-"""At many times real time a best-effort subscriber loses samples on a busy machine."""
+"""Arguments of a calibration that loses no sample: at many times real time, a best-effort
+subscriber loses samples on a busy machine."""
 _COLOURS = {acceptance.PASS: '\x1b[32m', acceptance.FAIL: '\x1b[31m'}
+"""Green and red by the word that they colour, as codes of xterm."""
 _NO_COLOUR = '\x1b[0m'
+"""Code of xterm that ends a colour."""
 NEXT_PAGE = 'docs/guided.md'
 """Page that a user reads next."""
 
@@ -135,7 +142,7 @@ def _draw_unit(sensor: Sensor) -> Sensor:
         values[name] = {}
         for p in effect_named(name).parameters:
             values[name][p.name] = np.array([
-                multiple * p.scale * rng.choice((-1, 1)) * rng.uniform(0.5, 1.5)
+                multiple * p.scale * rng.choice((-1, 1)) * rng.uniform(*_SPREAD)
                 if axis in p.axes else 0.0 for axis in sensor.axes])
     return replace(sensor, effects=tuple(_UNIT_EFFECTS), values=values)
 
@@ -237,7 +244,7 @@ def title(text: str, seconds: float) -> str:
 
 
 def file_lines(values: dict[str, object]) -> list[str]:
-    """Lay out the files that are written, and what to do next."""
+    """Return one line for each value, with its name before it."""
     return [f' {name:12} {value}' for name, value in values.items()]
 
 
@@ -251,12 +258,14 @@ def _print(*lines: str) -> None:
 
 
 def _plan_arguments() -> tuple[str, ...]:
+    """Return the arguments of the node for the pose plan."""
     planes = ', '.join(str(alpha) for alpha in _PLANES_RAD)
     return ('-p', f'sweep.planes_rad:=[{planes}]', '-p', f'sweep.step_rad:={_STEP_RAD}',
             '-p', f'sweep.check_poses:={_CHECK_POSES}')
 
 
 def _output_arguments(output: Path, report: Path) -> tuple[str, ...]:
+    """Return the arguments of the node for its files, the calibration store among them."""
     return ('-p', f'output:={output}', '-p', f'report:={report}',
             '-p', f'store:={output.parent / "calibrations"}')
 
@@ -268,6 +277,7 @@ def _remove_results(output: Path) -> None:
 
 
 def _journal(output: Path) -> Path:
+    """Return the journal of the calibration that writes a parameter file."""
     return output.with_name(f'{output.name}.journal')
 
 
@@ -283,8 +293,8 @@ def _fitted_poses(journal: Path) -> list[sweep_journal.PoseRecord]:
 
 
 def _entries(journal: Path) -> list[sweep_journal.JournalEntry]:
+    """Return the entries of a journal; none while it has no head."""
     try:
         return sweep_journal.read(journal).entries
     except UserError:
-        # Its head is not written yet.
         return []

@@ -35,10 +35,10 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 
 class Driver(LifecycleNode):
     """
-    The node; `links` has the sources of samples, free of ROS.
+    The node of the driver.
 
-    Configured it has its topics; active it reads the link. It configures and activates itself
-    unless `autostart` is false.
+    It publishes the samples of a link of the package `links`. The configured node has its topics,
+    the active node reads the link. It configures and activates itself unless `autostart` is false.
     """
 
     def __init__(self) -> None:
@@ -57,7 +57,7 @@ class Driver(LifecycleNode):
             'does')
         paced = isinstance(self._settings, base.PacedSettings)
         self._speed = self._settings.speed if paced else 1.0
-        # Sensor time that is not real time must be everybody's: then this node is the clock.
+        # All nodes must share a sensor time that is not real time: this node then publishes it.
         self._is_clock = self._speed != 1 or (paced and self.get_parameter('use_sim_time').value)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._wall = Clock(clock_type=ClockType.SYSTEM_TIME)

@@ -40,7 +40,7 @@ _BLOCK_ROWS = 16384
 """Samples that are corrected at a time (chosen: some MB)."""
 
 _DIGITS = 12
-"""Significant digits of an estimate (chosen: a millionth of the noise, or finer)."""
+"""Significant digits of an estimate (chosen: rounding is below a millionth of the noise)."""
 
 
 def parser() -> argparse.ArgumentParser:
@@ -106,6 +106,7 @@ def _of_unit(block: Recording, sensor: Sensor) -> Sensor:
 
 
 def _report(count: int, rows: int, statement: str) -> None:
+    """Print a statement about a number of samples; nothing where there are none."""
     if count:
         print(f'apply: {count} of {rows} samples {statement}', file=sys.stderr)
 

@@ -23,11 +23,12 @@ import sys
 
 from adxl_ros.blind import blind_check, diagnosis_runs, real_recordings, report_html
 from adxl_ros.errors import UserError
-from adxl_ros.files.atomic_write import atomic_path
+from adxl_ros.files.atomic_write import write_text
 from adxl_ros.files.plot_file import pyplot
 from adxl_ros.tools.common import make_folder, progress, run
 
 PROG = 'blind'
+"""Name of the command, for messages."""
 
 
 def parser() -> argparse.ArgumentParser:
@@ -66,6 +67,7 @@ def blind(options: argparse.Namespace) -> int:
 
 
 def _check(options: argparse.Namespace, folder: Path, arms: list[real_recordings.Arm]) -> int:
+    """Draw and seal the trials, diagnose and score them, and write the report."""
     draw = pyplot()
     if not options.open:
         make_folder(folder)
@@ -80,11 +82,9 @@ def _check(options: argparse.Namespace, folder: Path, arms: list[real_recordings
         if arms:
             with progress('real') as show:
                 made['real'] = real_recordings.put_back(arms, None, pool, show)
-    for name, text in (('blind.json', json.dumps(made, indent=1, allow_nan=False) + '\n'),
-                       ('blind.md', report_html.markdown(made)),
-                       ('blind.html', report_html.page(made, draw))):
-        with atomic_path(folder / name) as fresh:
-            fresh.write_text(text, encoding='utf-8')
+    write_text(folder / 'blind.json', json.dumps(made, indent=1, allow_nan=False) + '\n')
+    write_text(folder / 'blind.md', report_html.markdown(made))
+    write_text(folder / 'blind.html', report_html.page(made, draw))
     print(report_html.summary(made))
     print(f'\n{folder / "blind.html"} is written')
     return 0

@@ -28,6 +28,9 @@ from types import FrameType
 from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import Recording
 
+_UNITS = {'rad': 'rad', 'm': 'm', 'c': 'degC', 'v': 'V'}
+"""Units of references by the end of their columns' names."""
+
 
 def run(parser: argparse.ArgumentParser, command: Callable[[argparse.Namespace], int]) -> int:
     """
@@ -102,7 +105,7 @@ def report_reading(tool: str, recording: Recording) -> None:
     for name, alignment in recording.alignments.items():
         # References with the stamps of the samples need no alignment.
         if alignment.gap_s:
-            unit = {'rad': 'rad', 'm': 'm', 'c': 'degC', 'v': 'V'}[name.rsplit('_', 1)[1]]
+            unit = _UNITS[name.rsplit('_', 1)[1]]
             print(f'{tool}: {recording.path}: {name} aligned by its stamps: residual '
                   f'{alignment.residual:.3g} {unit} rms, nearest message at most '
                   f'{alignment.gap_s:.3g} s away', file=sys.stderr)

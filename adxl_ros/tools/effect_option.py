@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Effects of the command line: NAME[:key=value,...]."""
+"""The option `--effect` of a command line: NAME[:key=value,...]."""
 
 from __future__ import annotations
 
@@ -30,6 +30,10 @@ import numpy as np
 SYNTAX = ('NAME alone has typical values,\nKEY=VALUE sets a parameter for all its axes, '
           'KEY.AXIS=VALUE for one;\nparameters without a value are neutral')
 """What an option may be, for help texts."""
+
+
+_SIMILARITY = 0.4
+"""Smallest similarity of a suggested name, as `difflib` counts it; chosen."""
 
 
 def with_effects(sensor: Sensor, texts: Sequence[str]) -> Sensor:
@@ -81,6 +85,7 @@ def _effect(name: str, text: str) -> Effect:
 
 
 def _with_values(sensor: Sensor, effect: Effect, values: dict[str, np.ndarray]) -> Sensor:
+    """Return the sensor with an effect that has these values by parameter."""
     effects = sensor.effects if effect.name in sensor.effects else (*sensor.effects, effect.name)
     return replace(sensor, effects=effects, values={**sensor.values, effect.name: values})
 
@@ -108,13 +113,14 @@ def _with_value(sensor: Sensor, effect: Effect, key: str, number: str, text: str
 def _parameter(effect: Effect, name: str, text: str) -> Parameter:
     by_name = {p.name: p for p in effect.parameters}
     if name not in by_name:
-        near = get_close_matches(name, by_name, 1, 0.4) or list(by_name)
+        near = get_close_matches(name, by_name, 1, _SIMILARITY) or list(by_name)
         raise UserError(f'--effect {text}: {effect.name} has no parameter {name!r}; did you mean '
                         f'{near[0]}?')
     return by_name[name]
 
 
 def _number(parameter: Parameter, number: str, text: str) -> float:
+    """Read the value of a parameter, within its bounds; `text` is the option, for messages."""
     try:
         value = float(number)
     except ValueError:

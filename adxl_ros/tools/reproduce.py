@@ -80,6 +80,7 @@ def reproduce(options: argparse.Namespace) -> int:
 
 
 def _of_recordings(sensor: Sensor, paths: Sequence[str], folder: Path) -> str:
+    """Calibrate from recordings; return the page."""
     unit, recordings = sensor, []
     for path in paths:
         read = recording.read(path)
@@ -97,6 +98,7 @@ def _of_recordings(sensor: Sensor, paths: Sequence[str], folder: Path) -> str:
 
 
 def _simulated(sensor: Sensor, options: argparse.Namespace, folder: Path) -> str:
+    """Repeat the experiments on simulated units and draw the figures; return the page."""
     if not sensor.axes.startswith('xy'):
         raise UserError(f'the paper has a sensor of the axes x and y, not {sensor.axes}')
     coverage_part = _coverage(sensor, options) if options.draws else ''
@@ -123,6 +125,7 @@ def _simulated(sensor: Sensor, options: argparse.Namespace, folder: Path) -> str
 
 
 def _coverage(sensor: Sensor, options: argparse.Namespace) -> str:
+    """Return the part of the page on how often the intervals hold the truth."""
     with progress('coverage') as show:
         draws = coverage.draw_all(replace(sensor, effects=(), values={}), options.draws,
                                   options.seed, show)

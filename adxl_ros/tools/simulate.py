@@ -46,6 +46,9 @@ _MAX_RATE_HZ = 1e5
 _MIN_INTERNAL_RATE_HZ = 1000.0
 """Lowest rate of the simulation before the sampling, Hz: slow samples still see the motion."""
 
+_SHORTEST_S = 1e-9
+"""Shorter durations count as this in the progress, s, so that one sample divides nothing by 0."""
+
 Output = Callable[[simulator.Columns], None]
 """Takes a block of simulated samples."""
 
@@ -121,7 +124,7 @@ def simulate(options: argparse.Namespace) -> int:
             for output in outputs:
                 output(columns)
             elapsed_s = columns['time_s'][-1] - simulation.begin_s
-            show(min(elapsed_s / max(simulation.duration_s, 1e-9), 1.0))
+            show(min(elapsed_s / max(simulation.duration_s, _SHORTEST_S), 1.0))
     return 0
 
 
@@ -178,6 +181,7 @@ class _BoardOutput:
 
 
 def _run(sensor: Sensor, options: argparse.Namespace) -> _Run:
+    """Prepare the simulation of the trajectory that the options name."""
     if options.trajectory == 'imu':
         return _simulate_force(sensor, options)
     if options.trajectory in TRAJECTORIES:

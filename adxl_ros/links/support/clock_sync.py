@@ -30,7 +30,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 # Limits and time constants without a source are chosen for links of 0.1 to 5 ms of jitter at
-# 1 kHz; test_link_parts states what they achieve.
+# 1 kHz; test_link_support measures their accuracy.
 _WINDOW_S = 0.5
 """Length of a window, s, of which only the earliest arrival counts."""
 _MIN_ARRIVALS = 25

@@ -38,8 +38,10 @@ _FILE_KEYS = {'format', 'units', *parameter_file.SENSOR_FIELDS,
 """Parameters that belong to a file and change with it alone."""
 _EFFECT_OF = {str(Coefficient(effect.name, p.name)): effect.name
               for effect in library().values() for p in effect.parameters}
+"""Effect by the name of a parameter."""
 _NEUTRAL = {str(Coefficient(effect.name, p.name)): p.neutral
             for effect in library().values() for p in effect.parameters}
+"""Neutral value by the name of a parameter."""
 _COEFFICIENT_KEYS = {'effects', 'covariance_names', 'covariance', *_EFFECT_OF}
 """Parameters that can be set one by one, or several at once."""
 _CHANGED = ', with coefficients set since'
@@ -82,8 +84,9 @@ class ExchangeableSensor:
         path = declare(
             node, 'calibration', '', 'parameter file to use; setting it loads the whole file or '
             'nothing of it', live=True)
-        # The file of the set that is under way, or why it cannot be loaded.
-        self._file: dict[str, Any] | UserError | None = None
+        # A set of `calibration` that is under way: what its file holds, or why it is refused.
+        self._file: dict[str, Any] | None = None
+        self._file_error: UserError | None = None
         self._declaring = False
         node.add_pre_set_parameters_callback(self._add_file)
         node.add_on_set_parameters_callback(self._check)
@@ -106,7 +109,7 @@ class ExchangeableSensor:
 
     def _add_file(self, parameters: list[Parameter]) -> list[Parameter]:
         """Add everything that the file of `calibration` holds to a set."""
-        self._file = None
+        self._file = self._file_error = None
         if not any(p.name == 'calibration' and p.value for p in parameters):
             return parameters
         try:
@@ -115,13 +118,14 @@ class ExchangeableSensor:
                                 'file holds all of them')
             self._file = parameter_file.to_flat(parameter_file.load(parameters[0].value))
         except UserError as error:
-            self._file = error
+            self._file_error = error
             return parameters
         names = [*_FILE_KEYS, *_COEFFICIENT_KEYS,
                  *(name for name in self._flat if name.startswith('provenance.'))]
         return parameters + [self._parameter(name, self._file.get(name)) for name in names]
 
     def _parameter(self, name: str, value: Any) -> Parameter:
+        """Return a parameter with its declared type; None becomes the empty value of the type."""
         kind = Parameter.Type(self._node.describe_parameter(name).type)
         # A number cannot be empty; that of an effect which is not listed has no meaning.
         empty: Any = {Parameter.Type.STRING: '', Parameter.Type.DOUBLE: _NEUTRAL.get(name, 0.0)}
@@ -132,8 +136,8 @@ class ExchangeableSensor:
         if self._declaring:
             return SetParametersResult(successful=True)
         try:
-            if isinstance(self._file, UserError):
-                raise self._file
+            if self._file_error is not None:
+                raise self._file_error
             changes = _changes(parameters)
             if self._file is None:
                 _refuse_others(changes, self._flat | changes)
@@ -149,7 +153,7 @@ class ExchangeableSensor:
         if self._declaring or not changes:
             return
         self._flat |= changes
-        if isinstance(self._file, dict):
+        if self._file is not None:
             self._source = self._node.get_parameter('calibration').value
             self._declare_provenance(self._file.items())
         else:

@@ -25,6 +25,9 @@ from rclpy.node import Node
 from sensor_msgs.msg import Imu
 
 _TOPIC = 'imu/data_raw'
+"""Topic of the samples, relative to the namespace of the node."""
+_YAW_VARIANCE = 8
+"""Place of the variance of yaw in an orientation's covariance of 9 numbers, from 0."""
 _SILENT_S = 3.0
 """Time without samples after which the stream is silent, s; chosen."""
 _QUEUE = 20000
@@ -78,25 +81,28 @@ class Samples:
         for table in cdr.tables(batch, cdr.imu):
             stamps[table.rows] = table.stamp_ns()
             accel[table.rows] = table.numbers('linear_acceleration')
-            variances = table.numbers('orientation_covariance')
-            yaw_rad2 = max(yaw_rad2, float(np.max(variances[:, 8] * (variances[:, 0] >= 0))))
+            covariance = table.numbers('orientation_covariance')
+            # -1 in the first place means that a message has no orientation.
+            variances_rad2 = np.where(covariance[:, 0] >= 0, covariance[:, _YAW_VARIANCE], 0.0)
+            yaw_rad2 = max(yaw_rad2, float(np.max(variances_rad2)))
         if batch:
             self.restart_silence()
         accel = accel[:, :len(unit.axes)]
         finite = np.isfinite(accel)
         if batch:
-            self.fault = self._compensated(yaw_rad2) or _no_number(finite, unit)
+            self.fault = self._why_compensated(yaw_rad2) or _why_not_finite(finite, unit)
         complete = finite.all(axis=1)
         return stamps[complete], to_volts(accel[complete], unit)
 
-    def _compensated(self, yaw_rad2: float) -> str:
+    def _why_compensated(self, yaw_rad2: float) -> str:
+        """Return that a stream with this variance of yaw is compensated, or ''."""
         return '' if yaw_rad2 < _COMPENSATED_RAD2 else (
             f'{self._node.resolve_topic_name(_TOPIC)}: this stream is already compensated '
             '(it carries an orientation, as imu/data does); remap it to imu/data_raw of the '
             'driver')
 
     def silence(self) -> str:
-        """Tell for how long no sample has come; '' while samples come."""
+        """Return in words for how long no sample has come; '' while samples come."""
         silent_s = (self._steady.now().nanoseconds - self._heard_ns) * 1e-9
         if silent_s < _SILENT_S:
             return ''
@@ -105,8 +111,8 @@ class Samples:
         return f'nothing on {topic} for {silent_s:.0f} s{publishers}'
 
 
-def _no_number(finite: np.ndarray, unit: Sensor) -> str:
-    """Name the axes that make all samples useless, (n, m), or return ''."""
+def _why_not_finite(finite: np.ndarray, unit: Sensor) -> str:
+    """Return which axes are never finite, if no sample is complete, else ''; (n, m) of bool."""
     if finite.all(axis=1).any():
         return ''
     dead = ' and '.join(axis for axis, ever in zip(unit.axes, np.asarray(finite.any(axis=0)))

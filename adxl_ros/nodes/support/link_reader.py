@@ -87,6 +87,7 @@ class LinkReader:
             self._on_close = on_close.pop_all()
 
     def _start(self, on_close: ExitStack) -> None:
+        """Make the topics and the thread; `on_close` gets what ends them."""
         node, link = self._node, self._link
         if link.live and node.get_parameter('use_sim_time').value:
             node.get_logger().warning('use_sim_time: a real device lives in real time; its '
@@ -123,14 +124,15 @@ class LinkReader:
 
     def _live_turn(self) -> None:
         """Publish what a device sends; the link waits for it."""
+        if self._failed:
+            time.sleep(_PERIOD_S)
+            return
         try:
             samples = self._link.read(time.time_ns())
         except UserError as error:
             self._fail(error)
-        if not self._node.context.ok():
             return
-        if self._failed:
-            time.sleep(_PERIOD_S)
+        if not self._node.context.ok():
             return
         sensor = self._link.sensor
         if sensor is not None and sensor is not self._output.sensor:
@@ -171,7 +173,7 @@ class LinkReader:
             self._on_level(Level.WARN)
 
     def _may_begin(self, step_ns: int) -> bool:
-        """Tell whether somebody receives the first sample of a link that waits for that."""
+        """Return whether the link may begin: some links wait for a subscriber."""
         self._subscribed_ns = self._subscribed_ns + step_ns if self._output.subscribed() else 0
         return not self._link.waits_for_listener or self._subscribed_ns >= _DISCOVERY_NS
 
@@ -205,6 +207,7 @@ class LinkReader:
                                      dict(zip(message.name, message.velocity)))
 
     def _fail(self, error: UserError) -> None:
+        """Read no more, and report why."""
         self._failed = True
         self._on_error(error)
 

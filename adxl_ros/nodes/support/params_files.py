@@ -16,10 +16,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 import sys
 
 from adxl_ros.errors import UserError
+from adxl_ros.files.parameter_file import compose
 import yaml
 
 
@@ -36,7 +36,7 @@ def check_params_files() -> None:
 
     """
     for path in _paths():
-        _check_lists(path, _compose(path))
+        _check_lists(path, compose(path))
 
 
 def place_of(key: str) -> str:
@@ -44,25 +44,13 @@ def place_of(key: str) -> str:
     paths = _paths()
     if not paths:
         return ''
-    mark = _find_value(_compose(paths[-1]), key)
+    mark = _find_value(compose(paths[-1]), key)
     return f'{paths[-1]}:{mark.line + 1}:{mark.column + 1}: ' if mark else f'{paths[-1]}: '
 
 
 def _paths() -> list[str]:
+    """Return the files of `--params-file` in the order of the command line."""
     return [path for flag, path in zip(sys.argv, sys.argv[1:]) if flag == '--params-file']
-
-
-def _compose(path: str) -> yaml.Node | None:
-    """Read a file as a tree of YAML nodes, which know their places."""
-    try:
-        return yaml.compose(Path(path).read_text(encoding='utf-8'), yaml.SafeLoader)
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, 'strerror', None) or 'not UTF-8 text'
-        raise UserError(f'{path}: cannot be read: {reason}') from None
-    except yaml.YAMLError as error:
-        mark = getattr(error, 'problem_mark', None)
-        place = f':{mark.line + 1}:{mark.column + 1}' if mark else ''
-        raise UserError(f'{path}{place}: not YAML: {getattr(error, "problem", error)}') from None
 
 
 def _check_lists(path: str, node: yaml.Node | None) -> None:

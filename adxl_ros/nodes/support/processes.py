@@ -26,14 +26,18 @@ import sys
 
 _END_S = 10.0
 """Longest time that a process may take to end, s; chosen: a node ends within 1 s."""
-_FIRST_DOMAIN, _DOMAINS = 60, 40
-"""ROS domains of jobs; chosen: beyond those that robots use, below the last safe one, 101."""
-_USER_TIME, _SYSTEM_TIME = 11, 12
-"""Fields of /proc/PID/stat behind the name of the command, counted from 0 (man 5 proc)."""
+_FIRST_DOMAIN = 60
+"""First ROS domain of jobs; chosen: beyond those that robots use."""
+_DOMAINS = 40
+"""Number of ROS domains of jobs; chosen: the last one is below 101, the last safe one."""
+_USER_TIME = 11
+"""Place of the user time in /proc/PID/stat, from 0, behind the command's name (man 5 proc)."""
+_SYSTEM_TIME = 12
+"""Place of the system time, counted in the same way."""
 
 
 def use_own_graph() -> None:
-    """Keep the nodes of this job apart from other graphs: they must move no robot."""
+    """Give this job a ROS graph of its own on this machine, so that it cannot move a robot."""
     os.environ.setdefault('ROS_DOMAIN_ID', str(_FIRST_DOMAIN + os.getpid() % _DOMAINS))
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 
@@ -45,7 +49,7 @@ def executable(name: str) -> str:
 
 @contextmanager
 def running(commands: Sequence[Sequence[str]]) -> Iterator[list[subprocess.Popen]]:
-    """Run commands without their error output, and stop them at the end; yields processes."""
+    """Yield the processes of commands, without their error output, and stop them at the end."""
     processes = [subprocess.Popen(command, stderr=subprocess.DEVNULL) for command in commands]
     try:
         yield processes

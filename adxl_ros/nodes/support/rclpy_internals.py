@@ -129,15 +129,14 @@ def given_parameters(node: Node) -> Iterable[tuple[str, Any]]:
     rclpy shows a given parameter only once it is declared. The keys of a provenance are free, so
     that no declaration can know their names.
     """
-    return ((name, getattr(given, 'value', given))
-            for name, given in node._parameter_overrides.items())
+    return ((name, parameter.value) for name, parameter in node._parameter_overrides.items())
 
 
 def is_rclpy_error(error: BaseException) -> bool:
-    """Tell whether an error is one of rclpy's own, which have no common base class."""
+    """Return whether an error is one of rclpy's own, which have no common base class."""
     return type(error).__module__.startswith('rclpy')
 
 
 def is_usage_error(error: BaseException) -> bool:
-    """Tell whether rclpy refuses the ROS arguments; the class is in its C++ module alone."""
+    """Return whether rclpy refuses the ROS arguments; the class is in its C++ module alone."""
     return 'ROSArgs' in type(error).__name__

@@ -21,6 +21,7 @@ from collections.abc import Callable
 from pathlib import Path
 import signal
 import sys
+from typing import Protocol, runtime_checkable
 
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.nodes.support import rclpy_internals
@@ -31,6 +32,15 @@ from rclpy.node import Node
 from rclpy.utilities import remove_ros_args
 
 _USAGE = '%(prog)s [--ros-args -p NAME:=VALUE ... --params-file FILE -r FROM:=TO ...]'
+"""Usage that `--help` prints."""
+
+
+@runtime_checkable
+class Closable(Protocol):
+    """A node that holds something open."""
+
+    def close(self) -> None:
+        """Close it."""
 
 
 def run(make_node: Callable[[], Node], description: str | None) -> int:
@@ -40,7 +50,7 @@ def run(make_node: Callable[[], Node], description: str | None) -> int:
     Parameters
     ----------
     make_node
-        Creates the node; it may raise `UserError`, and the node may have a method `close()`.
+        Creates the node; it may raise `UserError`. The node may be `Closable`.
     description
         Text that `--help` prints.
 
@@ -68,10 +78,11 @@ def run(make_node: Callable[[], Node], description: str | None) -> int:
     try:
         _spin(node)
     finally:
-        getattr(node, 'close', lambda: None)()
+        if isinstance(node, Closable):
+            node.close()
         rclpy.try_shutdown()
-        # A launch passes Ctrl-C on, which the terminal has sent, too: the second one may come
-        # when Python has already put its handlers away.
+        # A launch passes Ctrl-C on, although the terminal has sent it too. The second signal may
+        # come after Python has removed its handlers.
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, signal.SIG_IGN)
     return 0

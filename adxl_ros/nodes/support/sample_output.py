@@ -81,7 +81,7 @@ class ImuWriter:
         return [data[i:i + size] for i in range(0, len(data), size)]
 
     def saturated(self, volts: np.ndarray) -> np.ndarray:
-        """Tell which samples, (n, m), are at a rail of the ADC or beyond the range, (n,)."""
+        """Return which samples, V, (n, m), are at a rail of the ADC or beyond the range, (n,)."""
         return np.asarray(self._sensor.saturated(volts).any(axis=1))
 
 
@@ -114,7 +114,7 @@ def imu_message(sensor: Sensor, frame_id: str) -> Imu:
 
 class SampleOutput:
     """
-    Publishes samples, the figures that make them readable, and sensor time.
+    Publishes samples, the values that make them readable, and sensor time.
 
     Parameters
     ----------
@@ -160,7 +160,7 @@ class SampleOutput:
             Level.OK, '', sensor.serial, sensor_info(sensor))))
 
     def subscribed(self) -> bool:
-        """Tell whether somebody listens to the samples."""
+        """Return whether the samples have a subscriber."""
         return self._data.get_subscription_count() > 0
 
     def publish(self, samples: Samples, references: References) -> None:

@@ -29,6 +29,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 Kind = Parameter.Type
+"""Types of ROS parameters."""
 
 _FIELD_KINDS = {'np.ndarray': Kind.DOUBLE_ARRAY, 'float': Kind.DOUBLE, 'int': Kind.INTEGER,
                 'str': Kind.STRING}
@@ -125,7 +126,9 @@ def make_sensor(flat: Mapping[str, Any],
 
     """
     listed = flat.get('effects', [])
-    unused = {str(Coefficient(effect.name, p.name)) for effect in library().values()
-              if effect.name not in listed for p in effect.parameters}
-    return parameter_file.from_flat(
-        {key: value for key, value in flat.items() if key not in unused}, make_error)
+    used = dict(flat)
+    for effect in library().values():
+        if effect.name not in listed:
+            for p in effect.parameters:
+                used.pop(str(Coefficient(effect.name, p.name)), None)
+    return parameter_file.from_flat(used, make_error)

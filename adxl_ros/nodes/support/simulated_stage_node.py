@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The simulated stage as topics: it follows commands and shows its encoders."""
+"""The simulated stage as topics: it follows commands and publishes its encoders."""
 
 from __future__ import annotations
 
@@ -34,6 +34,8 @@ _JUMP_NS = 1_000_000_000
 """Smallest jump of ROS time after which the motion goes on from there, ns; chosen."""
 _QUEUE = 1000
 """Poses that are kept for a slow subscriber: 10 s of ROS time."""
+_COMMAND_QUEUE = 10
+"""Commands that are kept while the node is busy; chosen."""
 _RESOLUTION_RAD = float(5 / 60 * np.pi / 180)
 """Default resolution of the encoders, rad: 5 minutes of arc, as on the paper's stage."""
 _START = (('alpha_rad', 'rad', 100.0), ('beta_rad', 'rad', 100.0), ('shift_m', 'm', 10.0))
@@ -42,10 +44,10 @@ _START = (('alpha_rad', 'rad', 100.0), ('beta_rad', 'rad', 100.0), ('shift_m', '
 
 class SimulatedStageNode:
     """
-    The simulated stage: 100 poses a second of ROS time, on `stage/joint_states`, by its encoders.
+    The simulated stage: its encoders' readings on `stage/joint_states`, at 100 Hz of ROS time.
 
     A command takes effect after the delay of the controller. The true motion is thus known before
-    it happens: `stage/true_joint_states` has it ahead of time, for a simulated sensor to feel.
+    it happens: `stage/true_joint_states` has it ahead of time, for a simulated sensor.
 
     Parameters
     ----------
@@ -71,8 +73,9 @@ class SimulatedStageNode:
         self._encoders = create_publisher(node, JointState, 'stage/joint_states', _QUEUE)
         self._true = create_publisher(node, JointState, 'stage/true_joint_states', _QUEUE)
         self._diagnostics = DiagnosticsReporter(node, {'stage': self._status})
-        create_subscription(node, JointState, 'stage/command', self._on_command, 10)
-        # On ROS time: a clock that runs faster wakes the node with each of its messages.
+        create_subscription(node, JointState, 'stage/command', self._on_command,
+                            _COMMAND_QUEUE)
+        # The timer runs on ROS time: each message of a faster clock wakes the node.
         node.create_timer(_STEP_NS * 1e-9, self._tick)
 
     def _on_command(self, message: JointState) -> None:

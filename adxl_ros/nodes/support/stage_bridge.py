@@ -47,6 +47,13 @@ _ARRIVED_RAD = 0.01
 _SHORTEST_S = 0.2
 """Shortest duration of a trajectory, s; chosen."""
 _TURN_RAD = 2 * np.pi
+"""One turn, rad."""
+_QUEUE = 100
+"""Positions that are kept for a slow subscriber; chosen: 1 s of a usual controller."""
+_COMMAND_QUEUE = 10
+"""Commands that are kept, of the calibration and for the controller; chosen."""
+_STATES_QUEUE = 1000
+"""Joint states of the controller that are kept: 1 s of the fastest controllers."""
 _DEFAULT_COMMANDS = {'trajectory': '/joint_trajectory_controller/joint_trajectory',
                      'joint_state': '/joint_commands'}
 """Usual topics of the controllers' commands, by kind."""
@@ -135,12 +142,15 @@ class StageBridge:
         self._late_ns = 0
         self._controller_joints: set[str] = set()
         self._refusal = ''
-        self._positions = create_publisher(node, JointState, 'stage/joint_states', 100)
+        self._positions = create_publisher(node, JointState, 'stage/joint_states', _QUEUE)
         self._commands = create_publisher(
-            node, JointTrajectory if kind == 'trajectory' else JointState, command_topic, 10)
+            node, JointTrajectory if kind == 'trajectory' else JointState, command_topic,
+            _COMMAND_QUEUE)
         self._diagnostics = DiagnosticsReporter(node, {'stage': self._status})
-        create_subscription(node, JointState, 'stage/command', self._on_command, 10)
-        create_subscription(node, JointState, self._states_topic, self._on_states, 1000)
+        create_subscription(node, JointState, 'stage/command', self._on_command,
+                            _COMMAND_QUEUE)
+        create_subscription(node, JointState, self._states_topic, self._on_states,
+                            _STATES_QUEUE)
 
     def _on_command(self, message: JointState) -> None:
         positions = dict(zip(message.name, message.position))
@@ -167,6 +177,7 @@ class StageBridge:
         self._send(duration_s)
 
     def _send(self, duration_s: float) -> None:
+        """Send the goal to the controller, as a motion of a duration, s."""
         names = [joint.name for joint in self._joints.values()]
         positions = [float(joint.to_controller(self._goal[name]))
                      for name, joint in self._joints.items()]
@@ -175,7 +186,7 @@ class StageBridge:
             message.header.stamp = self._node.get_clock().now().to_msg()
         else:
             sec, nanosec = divmod(round(duration_s * 1e9), 10 ** 9)
-            # A stamp of 0 begins it at once.
+            # A trajectory with the stamp 0 begins at once.
             message = JointTrajectory(joint_names=names, points=[JointTrajectoryPoint(
                 positions=positions, time_from_start=Duration(sec=sec, nanosec=nanosec))])
         self._commands.publish(message)
@@ -187,6 +198,7 @@ class StageBridge:
         return max(max(ways_rad, default=np.pi) / self._speed_rad_s, _SHORTEST_S)
 
     def _late(self) -> bool:
+        """Return whether the stage has not reached its goal in time."""
         return bool(self._goal) and self._steady.now().nanoseconds > self._late_ns \
             and not self._arrived()
 
@@ -214,6 +226,7 @@ class StageBridge:
         self._positions.publish(stage)
 
     def _refuse(self, reason: str) -> None:
+        """Report why a command is refused."""
         if reason != self._refusal:
             self._node.get_logger().warning(reason)
         self._refusal = reason

@@ -38,6 +38,14 @@ _KEPT_LINES = 1000
 """Log lines that are kept for the terminal after the screen."""
 _LONGEST_MESSAGE = 1 << 20
 """Largest message of contents, bytes; chosen: far above any contents."""
+_LOG_BYTES = 65536
+"""Most bytes of one read of the log, those of a pipe."""
+_KEY_BYTES = 64
+"""Most bytes of one read of the keys; chosen: many keys."""
+_LOCAL_MODES = 3
+"""Place of the local modes (echo, line by line) in the attributes of `termios`."""
+_CONTROL_CHARACTERS = 6
+"""Place of the control characters in the attributes of `termios`."""
 _ESCAPES = re.compile(r'\x1b\[[0-9;]*m')
 """Colours in a line of the log."""
 
@@ -64,7 +72,7 @@ class Log:
     def read(self) -> bool:
         """Take the waiting lines; return False at the end of the pipe."""
         with suppress(BlockingIOError):
-            data = os.read(self._fd, 65536)
+            data = os.read(self._fd, _LOG_BYTES)
             if not data:
                 return False
             *lines, self._rest = (self._rest + data).split(b'\n')
@@ -87,11 +95,9 @@ def run(talk: socket.socket, log: Log) -> None:
     from rich.console import Console
     from rich.live import Live
 
-    ended = []
+    ended: list[bool] = []
     for number in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, lambda *_: ended.append(True))
-    resized = [True]
-    signal.signal(signal.SIGWINCH, lambda *_: resized.append(True))
     contents = ScreenContents('idle', 'starting')
     console = Console()
     drawn_s, keys = 0.0, Keys()
@@ -136,13 +142,23 @@ def _newest(talk: socket.socket) -> bytes | None:
 def _pass_keys(talk: socket.socket, keys: Keys) -> bool:
     """Send the pressed keys to the node; return False when the terminal has ended."""
     try:
-        data = os.read(sys.stdin.fileno(), 64)
+        data = os.read(sys.stdin.fileno(), _KEY_BYTES)
     except OSError:
         return False
     for key in keys.read(data, time.monotonic()):
         with suppress(OSError):
             talk.send(key.encode())
     return bool(data)
+
+
+def _read_single_keys(terminal: int) -> None:
+    """Let a terminal pass on each key at once, without an echo and without stop and quit."""
+    attributes = termios.tcgetattr(terminal)
+    attributes[_LOCAL_MODES] &= ~(termios.ICANON | termios.ECHO)
+    # These keys would stop the node in the middle of a sweep and leave the screen behind.
+    for name in (termios.VSUSP, termios.VQUIT):
+        attributes[_CONTROL_CHARACTERS][name] = b'\0'
+    termios.tcsetattr(terminal, termios.TCSANOW, attributes)
 
 
 def main() -> int:
@@ -155,12 +171,7 @@ def main() -> int:
     os.set_blocking(log.fileno(), False)
     terminal = sys.stdin.fileno()
     saved = termios.tcgetattr(terminal)
-    keys = termios.tcgetattr(terminal)
-    keys[3] &= ~(termios.ICANON | termios.ECHO)
-    # A sweep that is stopped in the middle would leave the screen behind.
-    for name in (termios.VSUSP, termios.VQUIT):
-        keys[6][name] = b'\0'
-    termios.tcsetattr(terminal, termios.TCSANOW, keys)
+    _read_single_keys(terminal)
     try:
         run(talk, log)
     finally:

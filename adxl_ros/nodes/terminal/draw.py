@@ -54,7 +54,7 @@ _BAR_WIDTH = 12
 _COEFFICIENT_BAR_WIDTH = 6
 """Width of the bar of a coefficient, columns."""
 _NARROW_BAR_WIDTH = 3
-"""The same where a row has little room."""
+"""Width of the bar of a coefficient where a row has little room, columns."""
 _LEAST_NAME_WIDTH = 24
 """Names of coefficients that have less room make the row narrow, columns."""
 _WIDEST_NAME = 36
@@ -63,6 +63,14 @@ _SHORTEST_NAME = 8
 """Smallest width of the name of a coefficient, columns."""
 _MESSAGES = 3
 """Log lines that are shown."""
+_LABELLED_LINES = 3
+"""Largest number of lines of a text with a label."""
+_LEAST_TEXT_WIDTH = 10
+"""Smallest width of a text with a label, columns."""
+_LONGEST_IN_S = 90
+"""Times below this are shown in seconds, s."""
+_LONGEST_IN_MIN_S = 5400
+"""Times below this are shown in minutes, s."""
 
 
 def draw(contents: ScreenContents, log: Sequence[str], size: ConsoleDimensions) -> Group:
@@ -95,7 +103,7 @@ def draw(contents: ScreenContents, log: Sequence[str], size: ConsoleDimensions) 
     room = size.height - len(top) - len(bottom)
     lines = [*top, *middle[:max(room, 0)]]
     lines += [_text('')] * (size.height - len(lines) - len(bottom))
-    # In a small terminal the keys and what is to be done stay.
+    # A small terminal keeps the keys and the first lines, which say what to do.
     return Group(*lines[:max(size.height - len(bottom), _LEAST_LINES)], *bottom)
 
 
@@ -164,13 +172,14 @@ def _counts(progress: Progress) -> str:
 
 
 def _coefficients(estimate: Estimate | None, width: int) -> list[Text]:
+    """Return a row for each coefficient: name, bar and intervals, shortened to the width."""
     if estimate is None:
         return []
     rows = estimate.coefficients
     texts = ['  '.join(row.intervals) for row in rows]
     bar_width = _COEFFICIENT_BAR_WIDTH
     if _name_room(texts, bar_width, width) < _LEAST_NAME_WIDTH:
-        # Of three axes: what is left out is less than the interval of the last.
+        # Intervals of three axes are long.
         bar_width = _NARROW_BAR_WIDTH
         texts = [_narrow(row) for row in rows]
     name_width = max(_name_room(texts, bar_width, width), _SHORTEST_NAME)
@@ -179,21 +188,27 @@ def _coefficients(estimate: Estimate | None, width: int) -> list[Text]:
 
 
 def _narrow(row: CoefficientRow) -> str:
+    """Return the intervals of a coefficient with few spaces."""
     return ' '.join(interval.replace(' ± ', '±') for interval in row.intervals)
 
 
 def _name_room(texts: Sequence[str], bar_width: int, width: int) -> int:
+    """Return the columns that the names have beside bars and texts in rows of a width."""
     longest = max((len(text) for text in texts), default=0)
     return min(width - bar_width - 2 - longest, _WIDEST_NAME)
 
 
 def _cut(name: str, width: int) -> str:
+    """Return a name in at most a number of columns; an ellipsis stands for the cut part."""
     return name if len(name) <= width else f'{name[:width - 1]}…'
 
 
 def _outcome(outcome: Sequence[str], width: int) -> list[Text]:
-    return [_text(part) for line in outcome
-            for part in (wrap(line, width - 1) if len(line) >= width else [line])]
+    lines: list[str] = []
+    for line in outcome:
+        # A line that fits keeps its spaces.
+        lines += [line] if len(line) < width else wrap(line, width - 1)
+    return [_text(line) for line in lines]
 
 
 def _log(log: Sequence[str]) -> list[Text]:
@@ -220,8 +235,9 @@ def _row(label: str, text: str, style: str = '') -> Text:
 
 
 def _wrapped(label: str, text: str, width: int) -> list[Text]:
-    first, *others = wrap(text, max(width - _LABEL_WIDTH - 1, 10)) or ['']
-    return [_row(label, first), *(_row('', line) for line in others[:2])]
+    """Return the first lines of a text beside its label."""
+    first, *others = wrap(text, max(width - _LABEL_WIDTH - 1, _LEAST_TEXT_WIDTH)) or ['']
+    return [_row(label, first), *(_row('', line) for line in others[:_LABELLED_LINES - 1])]
 
 
 def _text(text: str, style: str = '') -> Text:
@@ -231,11 +247,15 @@ def _text(text: str, style: str = '') -> Text:
 
 
 def _bar(share: float, width: int) -> str:
+    """Return a bar of a width in columns, of which a share from 0 to 1 is full."""
     full = round(min(max(share, 0.0), 1.0) * width)
     return '█' * full + '░' * (width - full)
 
 
 def _span(seconds: float) -> str:
-    if seconds < 90:
+    """Return a duration, s, in seconds, minutes or hours."""
+    if seconds < _LONGEST_IN_S:
         return f'{seconds:.0f} s'
-    return f'{seconds / 60:.0f} min' if seconds < 5400 else f'{seconds / 3600:.1f} h'
+    if seconds < _LONGEST_IN_MIN_S:
+        return f'{seconds / 60:.0f} min'
+    return f'{seconds / 3600:.1f} h'
