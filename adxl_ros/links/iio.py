@@ -232,6 +232,7 @@ class IioLink:
             self._stream = None
 
     def _condition(self) -> tuple[Level, str]:
+        """Return level and text of the status."""
         uri, stream = self._settings.uri, self._stream
         if self._error:
             return Level.ERROR, f'{uri}: {self._error}'
@@ -246,6 +247,7 @@ class IioLink:
         return Level.OK, f'streaming at {rate_hz:g} Hz{difference}'
 
     def _open(self) -> None:
+        """Try to open the device; a new ADC begins a new clock."""
         try:
             stream = open_stream(self._settings, self._entries, self._declared)
         except (ReadError, UserError) as error:
@@ -640,6 +642,7 @@ def _find_channel(device: Any, name: str) -> Any:
 
 
 def _label(channel: Any) -> str:
+    """Return the label of a channel; '' without one."""
     with suppress(OSError, KeyError):
         return channel.attrs['label'].value.strip()
     return ''
@@ -744,8 +747,9 @@ def _set_rate(context: Any, device: Any, columns: Sequence[_Column], rate_hz: fl
 
 def _reason(error: OSError | ValueError) -> str:
     """Return in one line why libiio failed; its error numbers may be negative."""
-    code = getattr(error, 'errno', None)
-    return os.strerror(abs(code)) if code else ' '.join(str(error).split())
+    if isinstance(error, OSError) and error.errno:
+        return os.strerror(abs(error.errno))
+    return ' '.join(str(error).split())
 
 
 def import_libiio() -> Any:

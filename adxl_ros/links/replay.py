@@ -165,6 +165,7 @@ class Replay:
         self._blocks.close()
 
     def _load(self, block: Recording | None) -> None:
+        """Make a block the present one; None after the last one."""
         self._block, self._row = block, 0
         if block is not None:
             self._stamps, self._volts = block.stamp_ns, block.volts(self.sensor)

@@ -276,6 +276,7 @@ class SerialLink:
         self._port.close()
 
     def _condition(self) -> tuple[Level, str]:
+        """Return level and text of the status: the first fault of port, frames and channels."""
         if self._port.error:
             return Level.ERROR, self._port.error
         if self._version_error:
@@ -298,6 +299,7 @@ class SerialLink:
         return Level.OK, self._streaming(self._info)
 
     def _streaming(self, info: BoardInfo) -> str:
+        """Return the text of a working link, with the axes that it does not use."""
         unused = [axis for axis in AXES[:info.channels] if axis not in self._declared.axes]
         if self._stated_roles or not unused:
             return 'streaming'
@@ -358,6 +360,7 @@ class SerialLink:
             time.sleep(min(self._busy_until_s - now_s, _MAX_PAUSE_S))
 
     def _on_info(self, info: BoardInfo) -> None:
+        """Take the description of the board, where it is new or follows a reset."""
         changed = info != self._info
         if not changed and not info.flags & AFTER_RESET:
             return
@@ -388,6 +391,7 @@ class SerialLink:
         return ''
 
     def _on_samples(self, frame: SampleFrame, arrived_ns: int) -> None:
+        """Check, count and stamp the samples of a frame."""
         info = self._info
         rate_hz = info.rate_hz if info else _UNSTATED_RATE_HZ
         self._longest_frame_s = len(frame.codes) / rate_hz

@@ -211,6 +211,7 @@ class SimulatedSensor:
         """Do nothing: the link holds nothing open."""
 
     def _skipped(self, now_ns: int) -> int:
+        """Return how many samples a jump of time to `now_ns` skips."""
         gap_s = (now_ns - self._until_ns) * 1e-9
         return round(gap_s * self.sensor.rate_hz) if self._until_ns and gap_s > 0 else 0
 

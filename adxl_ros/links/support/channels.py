@@ -161,12 +161,13 @@ class _RunningMean:
     count: int = 0
 
     def add(self, values: np.ndarray) -> None:
+        """Add the finite values of an array, (n,)."""
         finite = values[np.isfinite(values)]
         self.total += float(finite.sum())
         self.count += len(finite)
 
     def take(self) -> float:
-        """Return the mean, NaN without a value, and begin again."""
+        """Return the mean, NaN without a value, and begin a new mean."""
         mean = self.total / self.count if self.count else np.nan
         self.total, self.count = 0.0, 0
         return mean

@@ -45,7 +45,7 @@ _FIRST_WAIT_S = 0.15
 """Time for which the samples of the first clock wait for their stamps, s. Of some arrivals one is
 early."""
 _LATER_WAIT_S = 0.06
-"""The same for a later clock, s: it is short because a robot is in motion."""
+"""Time for which the samples of a later clock wait, s: it is short because a robot moves."""
 _FIRST_HORIZON_S = 0.3
 """Shortest time in which the stamps of a new clock follow an earlier arrival, s."""
 _HORIZON_S = 2.0
@@ -74,6 +74,10 @@ _MAX_STEEP_BEND = 0.5
 """Largest change of slope for a difference beyond `_SMOOTH_NS`."""
 _MIN_SLOPE = 1e-3
 """Smallest slope of the stamps: they go forward whatever a faulty device sends."""
+_SHIFT_TOLERANCE_NS = _SHIFT_NS / 4
+"""Largest difference between two windows that are late by the same amount, ns."""
+_SHIFT_WINDOWS = 3
+"""Windows that a backward step needs: one before it and two after it."""
 
 
 class _Window(NamedTuple):
@@ -334,7 +338,7 @@ class ClockMap:
         return True
 
     def _resolve(self, late: _LateArrivals) -> None:
-        """Begin a new clock, unless the samples come faster than they were taken."""
+        """Begin a new clock if the late samples come at the pace of time: the clock stopped."""
         self._late = None
         taken_ns = late.last_device_ns - late.first_device_ns
         if taken_ns > _CATCH_UP_RATIO * (late.last_ns - late.first_ns):
@@ -347,10 +351,11 @@ class ClockMap:
 
     def _is_shifted(self, lag_ns: int) -> bool:
         """Return whether the last two windows are late by the same amount: a backward step."""
-        if len(self._windows) < 3 or lag_ns - self._windows[-1].lag_ns < -_SHIFT_NS / 4:
+        if len(self._windows) < _SHIFT_WINDOWS \
+                or lag_ns - self._windows[-1].lag_ns < -_SHIFT_TOLERANCE_NS:
             return False
-        before, first, second = (self._windows[i].lag_ns for i in (-3, -2, -1))
-        return first - before > _SHIFT_NS and abs(second - first) < _SHIFT_NS / 4
+        before_ns, first_ns, second_ns = (self._windows[i].lag_ns for i in (-3, -2, -1))
+        return first_ns - before_ns > _SHIFT_NS and abs(second_ns - first_ns) < _SHIFT_TOLERANCE_NS
 
 
 class IdentityMap:
@@ -447,7 +452,7 @@ class SystemClockMap:
                 time.monotonic_ns(), time.time_ns(), time.monotonic_ns())
             readings.append(_OffsetReading(after_ns - before_ns,
                                            system_ns - (before_ns + after_ns) // 2))
-        return min(readings)
+        return min(readings, key=lambda reading: reading.uncertainty_ns)
 
 
 class _OffsetReading(NamedTuple):

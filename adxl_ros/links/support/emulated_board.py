@@ -110,6 +110,7 @@ class Board:
             self._index += len(block)
 
     def _codes(self, columns: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Return the ADC codes of all channels, (n, m)."""
         volts = np.column_stack([_volts(role, columns) for role in self._roles])
         codes = np.rint(volts / self._sensor.lsb_v)
         return codes.clip(0, 2 ** self._sensor.adc_bits - 1).astype(np.uint16)
@@ -242,6 +243,7 @@ def open_terminal(port: str) -> Iterator[int]:
 
 
 def _open_existing(path: Path) -> int:
+    """Open a terminal device for raw bytes; return its file descriptor, which does not block."""
     try:
         fd = os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
         tty.setraw(fd)

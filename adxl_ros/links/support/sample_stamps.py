@@ -168,6 +168,7 @@ class Stamper:
             round(clock.jitter_ns * 1e-3, 1), clock.steps, self._system_clock.steps)
 
     def _stamp(self) -> None:
+        """Stamp the waiting samples, with the number of samples that are missing before them."""
         self._system_clock.update()
         for block in self._unstamped:
             host_ns = self.clock.host_ns(block.device_ns)

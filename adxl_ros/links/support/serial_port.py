@@ -119,6 +119,7 @@ class SerialPort:
             self._port = None
 
     def _open(self) -> None:
+        """Try to open the port; `error` has the reason of a failure."""
         try:
             self._port = self._pyserial.serial_for_url(self._name, self._baud, timeout=0,
                                                        exclusive=True)
@@ -138,6 +139,7 @@ class SerialPort:
             self._port.timeout = _WAIT_MS * 1e-3
 
     def _read(self) -> bytes:
+        """Wait for bytes; raises `OSError` where the device or the other side is gone."""
         if self._poll is None:
             first = self._port.read(1)
             if not first:
@@ -155,6 +157,7 @@ class SerialPort:
         return chunk
 
     def _lose(self, reason: str) -> None:
+        """Close the port for a reason; the next `read` opens it again."""
         self.error = f'{self._name}: {reason}'
         self.close()
         self._backoff.fail()
@@ -179,8 +182,8 @@ class SerialPort:
 
 
 def _reason(error: Exception) -> str:
-    """Return in stable words why a port does not open."""
-    code = getattr(error, 'errno', None)
+    """Return why a port does not open, in words that are the same at each attempt."""
+    code = error.errno if isinstance(error, OSError) else None
     if code in (errno.EAGAIN, errno.EBUSY):  # EAGAIN is the answer of the lock
         return 'in use: another process has locked it'
     if code:

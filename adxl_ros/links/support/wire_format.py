@@ -69,6 +69,8 @@ _MAX_VREF_V = 100.0
 """Largest reference voltage, V, as `sensor.adc_vref_v` permits."""
 _MAX_BITS = 16
 """Largest resolution of the ADC, bit: codes are u16."""
+_PRINTABLE = range(32, 127)
+"""Codes of the printable ASCII characters."""
 
 
 class WireError(Exception):
@@ -198,6 +200,7 @@ class Encoder:
         return encode_payload(head + codes.astype('<u2').tobytes())
 
     def _next_sequence(self) -> int:
+        """Return the number of the next frame."""
         self._sequence += 1
         return (self._sequence - 1) % 2 ** 32
 
@@ -255,7 +258,7 @@ def _decode_info(payload: bytes) -> BoardInfo:
     if not (isfinite(rate_hz) and _MIN_RATE_HZ <= rate_hz <= _MAX_RATE_HZ
             and 1 <= bits <= _MAX_BITS and 1 <= channels <= MAX_CHANNELS
             and isfinite(vref_v) and _MIN_VREF_V <= vref_v <= _MAX_VREF_V
-            and all(32 <= byte < 127 for byte in name)):
+            and all(byte in _PRINTABLE for byte in name)):
         raise WireError(f'an info frame with {rate_hz:g} Hz, {bits} bits, {channels} channels, '
                         f'{vref_v:g} V, {name!r}')
     return BoardInfo(rate_hz, bits, channels, vref_v, name.decode('ascii').strip(), flags)

@@ -28,7 +28,7 @@ import rclpy
 from rclpy.node import Node
 
 _TURNS_PER_UPDATE = 4
-"""Turns of the node between two updates of the screen: five updates a second."""
+"""Calls of `Console.turn` from one update of the screen to the next: five updates a second."""
 
 
 class Action(Enum):
@@ -51,7 +51,7 @@ _RUNNING = {'r': Action.REDO, 's': Action.SKIP, 'f': Action.FINISH, 'a': Action.
 _BY_HAND = {'c': Action.CAPTURE, **_RUNNING}
 """Keys while a session runs whose poses an operator captures."""
 _IDLE = {'b': Action.BEGIN, 'q': Action.QUIT}
-"""Keys while nothing is to be done."""
+"""Keys while no session runs."""
 _WAITING = {'a': Action.ABORT, 'q': Action.QUIT}
 """Keys while the sensor is unknown."""
 _ASKING = {'y': Action.GO_ON, 'n': Action.BEGIN_AGAIN, 'a': Action.ABORT, 'q': Action.QUIT}
@@ -108,6 +108,7 @@ class Console:
             self._terminal = None
 
     def _lose_terminal(self, terminal: Terminal) -> None:
+        """Go on without the screen, whose process has ended."""
         terminal.close()
         self._terminal, self._controller.may_ask = None, False
         self._node.get_logger().warning('the screen has ended; plain lines from here on')
@@ -115,6 +116,7 @@ class Console:
             self._controller.start(start_over=False)
 
     def _show(self, phase: Phase, text: str) -> None:
+        """Give the screen its contents."""
         if self._terminal is None:
             return
         controller, unit = self._controller, self._controller.unit
@@ -137,12 +139,14 @@ class Console:
         return self._display
 
     def _idle_reading(self) -> LiveReading | None:
+        """Return what the sensor reads while no session runs; None before the first samples."""
         newest, unit = self._controller.newest, self._controller.unit
         if newest is None or unit is None:
             return None
         return live_reading(newest, unit, newest.stillness())
 
     def _keys(self) -> dict[str, Action]:
+        """Return the keys that have an action now."""
         controller = self._controller
         if controller.state is ControllerState.ASKING:
             return _ASKING
@@ -153,6 +157,7 @@ class Console:
         return _BY_HAND if controller.settings.operator_captures else _RUNNING
 
     def _press(self, key: str) -> None:
+        """Carry out a key; the space captures, and `finish` with open poses needs a second key."""
         action, controller = self._keys().get('c' if key == ' ' else key), self._controller
         open_poses = 0 if controller.session is None else controller.session.guide.open_poses
         if action is Action.FINISH and open_poses and not self._finish_is_confirmed:
@@ -166,6 +171,7 @@ class Console:
             controller.say(self._carry_out(action).message)
 
     def _carry_out(self, action: Action) -> Answer:
+        """Pass an action to the controller and return its answer."""
         controller = self._controller
         if action is Action.BEGIN:
             controller.may_ask = True

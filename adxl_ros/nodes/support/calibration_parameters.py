@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The parameters of the calibration node that say what a calibration is to do."""
+"""The parameters of the calibration node that describe a calibration."""
 
 from __future__ import annotations
 
@@ -89,6 +89,7 @@ def declare_settings(node: Node) -> SessionSettings:
 
 
 def _declare_capture(node: Node) -> CaptureSettings:
+    """Declare the parameters of the stage and the poses."""
     return CaptureSettings(
         dwell_s=declare(node, 'sweep.dwell_s', 5.0, 'time at rest a pose', 's', 0.5, 3600.0),
         tolerance_rad=declare(node, 'stage.tolerance_rad', _TOLERANCE_RAD, 'arrived within this',
@@ -106,6 +107,7 @@ def _declare_capture(node: Node) -> CaptureSettings:
 
 
 def _declare_plan(node: Node, by_hand: bool) -> _PosePlan:
+    """Declare the parameters of the pose plan; `by_hand` where an operator turns the stage."""
     kind = declare(node, 'sweep.plan', 'auto', 'poses: full (planes), quick (the fewest for '
                    'sweep.tilt_error_deg), or auto: quick where the stage is turned by hand and '
                    'no planes are given', choices=('auto', *pose_plan.KINDS))

@@ -31,7 +31,7 @@ from rclpy.node import Node
 from std_srvs.srv import Trigger
 
 FIT_S = 600.0
-"""Longest time of a fit, s; chosen: a fit takes seconds, also on a busy machine."""
+"""Longest time of a fit, s; chosen: far above the seconds that a fit takes."""
 _POLL_S = 0.2
 """Time between two looks at the progress, s."""
 _SILENT_S = 60.0
@@ -92,7 +92,7 @@ class DemoGraph:
     Attributes
     ----------
     watcher
-        Hears what they report.
+        Receives what they report.
 
     """
 
@@ -158,7 +158,7 @@ class DemoGraph:
                                 f'{message or "nothing"}; see {self._log}')
 
     def _check_nodes(self) -> str:
-        """Refuse to go on without a node or a fit; return what the calibration reports."""
+        """Return what the calibration reports; refuse a node that has ended or a failed fit."""
         message = self.watcher.report_of('calibration').get('message', '')
         ended = [name for name, process in self._processes.items() if process.poll() is not None]
         if ended:
@@ -170,7 +170,7 @@ class DemoGraph:
 
 @contextmanager
 def open_graph(log: Path) -> Iterator[DemoGraph]:
-    """Make a graph without nodes, and end its nodes at the end; yields the graph."""
+    """Yield a graph without nodes, and end the nodes that were started in it."""
     log.unlink(missing_ok=True)
     rclpy.init(args=[])
     graph = DemoGraph(log)

@@ -36,8 +36,9 @@ class Announcer:
     """
     Announces the next pose.
 
-    `~/next_pose` has it for people and programs, latched. `stage/command` commands a stage that
-    turns itself, again and again: a stage that starts later or lost a message goes there, too.
+    `~/next_pose` has the pose for people and programs, latched. `stage/command` has the command
+    for a stage that turns itself. It is repeated, so that a stage that starts later or loses a
+    message gets it, too.
 
     Parameters
     ----------

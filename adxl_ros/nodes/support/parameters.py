@@ -67,8 +67,9 @@ def declare(node: Node, name: str, default: Any, description: str, unit: str = '
     text_or_list = isinstance(default, tuple)
     if text_or_list:
         default = ''
-    constraint = f'one of {", ".join(choices)}' if choices else \
-        '' if lower is None else f'{lower:g} to {upper:g}'
+    constraint = '' if lower is None else f'{lower:g} to {upper:g}'
+    if choices:
+        constraint = f'one of {", ".join(choices)}'
     descriptor = ParameterDescriptor(
         description=', '.join(filter(None, (description, unit))), read_only=not live,
         dynamic_typing=text_or_list, additional_constraints=constraint)
@@ -84,7 +85,7 @@ def declare(node: Node, name: str, default: Any, description: str, unit: str = '
 
 
 def _set_range(descriptor: ParameterDescriptor, default: Any, lower: float, upper: float) -> None:
-    """Give the descriptor of a single number its range; one of a list can have none."""
+    """Give the descriptor of a single number its range; ROS has no range for lists."""
     kind = default if isinstance(default, Parameter.Type) else \
         Parameter.Type.from_parameter_value(default)
     if kind == Parameter.Type.DOUBLE:

@@ -32,6 +32,8 @@ controller sends."""
 _SCALAR_PERIOD_NS = 1_000_000_000
 """Longest time between two messages with the same temperature or supply, ns; chosen."""
 
+_STAGE = 'stage'
+"""Key of the publisher of the stage angles, which have several columns."""
 _KINDS = {'temperature_c': (Temperature, 'temperature'), 'supply_v': (BatteryState, 'supply')}
 """Message type and topic of what has one value a sample, by the column of a recording."""
 
@@ -57,7 +59,7 @@ class References:
         self._joints = {column: joint for joint, column in JOINTS.items() if column in columns}
         self._publishers = {}
         if self._joints:
-            self._publishers['stage'] = create_publisher(node, JointState, 'stage/joint_states',
+            self._publishers[_STAGE] = create_publisher(node, JointState, 'stage/joint_states',
                                                          _REFERENCE_QUEUE)
         for column, (kind, topic) in _KINDS.items():
             if column in columns:
@@ -83,7 +85,7 @@ class References:
         if not len(stamps_ns):
             return
         for name, publisher in self._publishers.items():
-            if name == 'stage':
+            if name == _STAGE:
                 values = np.column_stack([columns[column] for column in self._joints])
                 for i in self._new_rows(name, stamps_ns, values, _STAGE_PERIOD_NS):
                     publisher.publish(self._joint_state(stamps_ns[i], values[i]))
@@ -94,7 +96,7 @@ class References:
 
     def _new_rows(self, name: str, stamps_ns: np.ndarray, values: np.ndarray, period_ns: int
                   ) -> np.ndarray:
-        """Find the rows of (n, k) that differ from the row before, or begin a period."""
+        """Return the rows of values, (n, k), that differ from the row before or begin a period."""
         rows = np.flatnonzero(np.isfinite(values).any(axis=1))
         if not len(rows):
             return rows
@@ -113,6 +115,7 @@ class References:
         return message
 
     def _scalar(self, name: str, stamp_ns: int, value: float) -> Temperature | BatteryState:
+        """Make the message of a temperature, °C, or supply, V, by the column of a recording."""
         message = Temperature(temperature=value) if name == 'temperature_c' else \
             BatteryState(voltage=value, present=True)
         message.header.stamp, message.header.frame_id = stamp(stamp_ns), self._frame_id

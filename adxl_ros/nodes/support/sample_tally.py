@@ -50,7 +50,7 @@ class Tally:
     missing
         Samples that are lost.
     estimated
-        Those of the missing ones whose number is estimated by time, not counted.
+        Part of `missing` that is estimated by time, not counted.
     saturated
         Samples at a rail of the ADC or beyond the sensor's range.
 
@@ -63,7 +63,7 @@ class Tally:
         self._reported = _Totals(steady_ns, 0, 0, 0, 0, 0)
 
     def begin(self, now_ns: int) -> None:
-        """Count sensor time from now on, ns."""
+        """Let the next report count sensor time from `now_ns`, ns."""
         self._reported = self._reported._replace(sensor_ns=now_ns)
 
     def count(self, stamps_ns: np.ndarray, saturated: int, missing: int, estimated: int) -> None:
@@ -79,7 +79,7 @@ class Tally:
         missing
             Number of lost samples.
         estimated
-            Number of lost samples that is estimated by time, not counted.
+            Part of `missing` that is estimated by time, not counted.
 
         """
         self.samples += len(stamps_ns)

@@ -32,7 +32,7 @@ _TEXT_WIDTH = 16
 _LINE_WIDTH = 69
 """Columns of a line without a bar, before its time."""
 _TENTHS = 10
-"""Lines that show a step where there is no terminal."""
+"""Largest number of lines of a step where there is no terminal."""
 
 
 @contextmanager
@@ -92,7 +92,7 @@ class Step:
         text
             Text beside the name.
         done
-            Share of the total that is done, in its unit.
+            Amount of work that is done, in the unit of the total.
 
         """
         self._text, self._done = text, done
@@ -104,6 +104,7 @@ class Step:
         """Stop drawing, whether it has succeeded or not."""
 
     def _line(self) -> str:
+        """Return name and text of the step, with spaces up to the bar or the time."""
         width = _TEXT_WIDTH if self._total else _LINE_WIDTH - _NAME_WIDTH - 2
         return f' {self._name:{_NAME_WIDTH}} {self._text:{width}}'
 
@@ -131,7 +132,7 @@ class _AsLines(Step):
 
 
 class _InTerminal(Step):
-    """Draws a line anew ten times a second, also while the caller waits."""
+    """Draws a line again ten times a second, also while the caller waits."""
 
     def __init__(self, name: str, text: str, total: int) -> None:
         from rich.console import Console

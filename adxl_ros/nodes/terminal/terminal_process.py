@@ -38,11 +38,9 @@ RESET = '\x1b[?1049l\x1b[?25h\x1b[0m'
 
 
 def open_terminal() -> tuple[Terminal | None, str]:
-    """Open a screen where there is a terminal; else return None, and what to install or ''."""
-    if not all(stream and stream.isatty() for stream in (sys.stdin, sys.stdout)) \
-            or os.environ.get('TERM') == 'dumb':
-        return None, ''
-    if _in_background():
+    """Return a screen and '', or None and what must be installed, '' if there is no terminal."""
+    is_terminal = all(stream and stream.isatty() for stream in (sys.stdin, sys.stdout))
+    if not is_terminal or os.environ.get('TERM') == 'dumb' or _in_background():
         return None, ''
     try:
         import rich  # noqa: F401
@@ -52,6 +50,7 @@ def open_terminal() -> tuple[Terminal | None, str]:
 
 
 def _in_background() -> bool:
+    """Return whether this process is a background job of its terminal."""
     try:
         return os.tcgetpgrp(sys.stdin.fileno()) != os.getpgrp()
     except OSError:
@@ -86,7 +85,7 @@ class Terminal:
         return self._process.poll() is None
 
     def show(self, contents: ScreenContents) -> None:
-        """Give the screen new contents; they are left out while it is busy."""
+        """Send new contents to the screen; a busy screen misses them."""
         with suppress(OSError):
             self._socket.send(contents.to_bytes())
 
