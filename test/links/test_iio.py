@@ -19,6 +19,7 @@ import time
 
 from adxl_ros.errors import UserError
 from adxl_ros.links import iio
+from adxl_ros.links.support import iio_stream
 from adxl_ros.links.support.base import Level
 import iiod
 import numpy as np
@@ -30,7 +31,7 @@ from units import nominal
 @pytest.fixture(scope='module', autouse=True)
 def library():
     try:
-        iio.import_libiio()
+        iio_stream.import_libiio()
     except UserError as error:
         pytest.skip(str(error))
 
