@@ -112,10 +112,10 @@ class Samples:
 
 
 def _why_not_finite(finite: np.ndarray, unit: Sensor) -> str:
-    """Return which axes are never finite, if no sample is complete, else ''; (n, m) of bool."""
+    """Return why no sample is complete, by which values are finite, (n, m); '' if one is."""
     if finite.all(axis=1).any():
         return ''
-    dead = ' and '.join(axis for axis, ever in zip(unit.axes, np.asarray(finite.any(axis=0)))
-                        if not ever)
+    axis_lives = np.asarray(finite.any(axis=0))
+    dead = ' and '.join(axis for axis, lives in zip(unit.axes, axis_lives) if not lives)
     return f'{dead or "one axis or another"} is not a number in all samples; check its wiring ' \
            'and the driver'

@@ -59,8 +59,8 @@ class References:
         self._joints = {column: joint for joint, column in JOINTS.items() if column in columns}
         self._publishers = {}
         if self._joints:
-            self._publishers[_STAGE] = create_publisher(node, JointState, 'stage/joint_states',
-                                                       _REFERENCE_QUEUE)
+            self._publishers[_STAGE] = create_publisher(
+                node, JointState, 'stage/joint_states', _REFERENCE_QUEUE)
         for column, (kind, topic) in _KINDS.items():
             if column in columns:
                 self._publishers[column] = create_publisher(node, kind, topic, _REFERENCE_QUEUE)
