@@ -106,7 +106,7 @@ perf: build
 	$(pytest) -m perf $(ARGS)
 
 lint: build
-	$(pytest) project/test_linters.py project/test_layering.py
+	$(pytest) project/test_linters.py project/test_layering.py project/test_language.py
 
 bench: build
 	./run bench --iiod test/support/iiod.py $(ARGS)

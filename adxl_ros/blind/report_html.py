@@ -19,6 +19,7 @@ from __future__ import annotations
 from base64 import b64encode
 from html import escape
 from io import BytesIO
+import textwrap
 from typing import Any
 
 from adxl_ros.blind.grading import UNKNOWN
@@ -47,7 +48,7 @@ def summary(made: dict[str, Any]) -> str:
 
 def markdown(made: dict[str, Any]) -> str:
     """Return all tables for the documentation."""
-    out = [_drawn(made), '', _leaks(made), '']
+    out = [textwrap.fill(_drawn(made), 99, break_on_hyphens=False), '', _leaks(made), '']
     for title, (head, rows) in _tables(made).items():
         if rows:
             out += [f'### {title}', '', f'| {" | ".join(head)} |', '|' + '---|' * len(head)]

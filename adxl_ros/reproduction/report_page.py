@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+import textwrap
 
 from adxl_ros.model.constants import Z_90
 from adxl_ros.reproduction import misalignment
@@ -213,3 +214,11 @@ def _interval(parts: Sequence[np.ndarray]) -> str:
 
 def _rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(values ** 2)))
+
+
+def wrap_prose(markdown: str) -> str:
+    """Wrap the lines of prose of a Markdown page; tables, headings and lists stay as they are."""
+    return '\n'.join(
+        line if line.startswith(('|', '#', '!', '-', ' ', '`'))
+        else textwrap.fill(line, 99, break_on_hyphens=False, break_long_words=False)
+        for line in markdown.split('\n'))

@@ -103,7 +103,7 @@ def _simulated(sensor: Sensor, options: argparse.Namespace, folder: Path) -> str
         raise UserError(f'the paper has a sensor of the axes x and y, not {sensor.axes}')
     coverage_part = _coverage(sensor, options) if options.draws else ''
     if not options.units:
-        return coverage_part
+        return report_page.wrap_prose(coverage_part)
     with progress('reproduce') as show:
         results = units.evaluate_all(sensor, options.units, options.seed, show)
     first = 1000 * options.seed
@@ -121,7 +121,7 @@ def _simulated(sensor: Sensor, options: argparse.Namespace, folder: Path) -> str
     made = (f'adxl_ros {provenance.package_version()}, {date.today()}, {drawn} on each stage, '
             f'seed {options.seed}.')
     bound_mmps2 = error_statistics.motion_bound_mmps2(sensor)
-    return report_page.page(results, bound_mmps2, made, coverage_part)
+    return report_page.wrap_prose(report_page.page(results, bound_mmps2, made, coverage_part))
 
 
 def _coverage(sensor: Sensor, options: argparse.Namespace) -> str:

@@ -122,7 +122,7 @@ def long_sentences(path: Path) -> list[str]:
     """Find sentences of a Markdown page that have too many words."""
     return [f'{path}:{line}: {len(words)} words: {sentence[:60]} ...'
             for line, text in _prose(MarkdownIt().enable('table').parse(path.read_text('utf-8')))
-            for sentence in re.split(r'(?<=[.!?])\s+(?=[A-Z`*\[(])|(?<=[^\d]):\s*$', text)
+            for sentence in re.split(r'(?<=[.!?])\s+(?=[^a-z\s])|:\s*$', text)
             if len(words := re.findall(r'\w[\w\'’.,-]*', sentence)) > SENTENCE_WORDS]
 
 
