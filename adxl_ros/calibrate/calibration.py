@@ -100,7 +100,7 @@ class CalibrationResult:
     gravity_fit
         The fit of a calibration against gravity.
     outliers
-        Indices of the poses that were left out as disturbed.
+        Indices of the outliers, which the fit leaves out.
 
     """
 

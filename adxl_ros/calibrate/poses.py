@@ -79,7 +79,7 @@ class Poses:
                     getattr(self, f'{joint}_rad'), self.time_s[:, 0]))
 
     def __len__(self) -> int:
-        """Count the poses."""
+        """Return the number of poses."""
         return len(self.volts)
 
     @classmethod

@@ -137,7 +137,7 @@ class FullFit:
     stated_std_rad
         Stated standard deviation of a joint's error: step/√12, rad.
     outliers
-        Indices of the poses that were left out as disturbed.
+        Indices of the outliers, which the fit leaves out.
     information
         Inverse covariance of `names`, priors included, (p, p).
     squared_distances

@@ -99,7 +99,7 @@ class GravityFit:
     excess_mps2
         Part of `expected_mps2` that the noise of the means does not explain, m/s².
     outliers
-        Indices of the rests that were left out as disturbed.
+        Indices of the outliers, which the fit leaves out.
     converged
         Whether parameters and excess variance have converged.
 

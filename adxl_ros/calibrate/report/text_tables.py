@@ -125,5 +125,5 @@ def gravity_lines(fit: GravityFit) -> list[str]:
              f'(on held-out rests {held_out.strip()} mg)    <- saved']
     if fit.outliers:
         count = len(fit.outliers)
-        lines.append(f' {count} disturbed {"rest was" if count == 1 else "rests were"} left out')
+        lines.append(f' {count} {"outlier was" if count == 1 else "outliers were"} left out')
     return lines
