@@ -43,6 +43,8 @@ import numpy as np
 import pytest
 import yaml
 
+pytestmark = pytest.mark.long
+
 SEED, TRIALS, SECONDS = 5, 20, (20.0, 24.0)
 # A diagnosis as a script: `answer(recording, parameters)` returns status and hypotheses.
 SCRIPT = """

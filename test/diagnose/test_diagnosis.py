@@ -38,6 +38,8 @@ import pytest
 from scipy.signal import lfilter
 from units import nominal
 
+pytestmark = pytest.mark.long
+
 KEYS = {'schema', 'verdict', 'hypotheses', 'gap', 'where', 'candidates', 'next_experiment'}
 
 

@@ -26,6 +26,8 @@ from processes import executable
 import pytest
 from units import drawn, NOMINAL, nominal
 
+pytestmark = pytest.mark.long
+
 DATED = {'date': '2026-01-02T03:04:05+00:00', 'data_sha256': 'ab' * 32}
 
 

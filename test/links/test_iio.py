@@ -27,6 +27,8 @@ import pytest
 from rig import ScriptProcess
 from units import nominal
 
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture(scope='module', autouse=True)
 def library():

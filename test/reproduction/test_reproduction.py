@@ -21,6 +21,8 @@ import numpy as np
 import pytest
 from units import NOMINAL
 
+pytestmark = pytest.mark.long
+
 _UNITS = {'perfect': 8, 'paper': 16}
 
 

@@ -33,6 +33,8 @@ from scipy.signal import welch
 from scipy.special import ndtr
 from units import Fed, nominal
 
+pytestmark = pytest.mark.long
+
 G = 9.80665
 CLEAN = {'noise_density_g_per_rthz': np.zeros(3), 'adc_bits': 0}
 

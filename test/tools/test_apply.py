@@ -33,6 +33,8 @@ from processes import executable, wait_until
 import pytest
 from units import drawn, nominal
 
+pytestmark = pytest.mark.long
+
 G = 9.80665
 COLUMNS = [
     'time_s', 'ax_mps2', 'ay_mps2', 'az_mps2', 'ax_std_mps2', 'ay_std_mps2', 'az_std_mps2',

@@ -5,6 +5,8 @@ import numpy as np
 import pytest
 from units import drawn, NOMINAL, nominal
 
+pytestmark = pytest.mark.long
+
 HEAD = 'time_s,x_v,y_v,alpha_rad,beta_rad\n'
 
 

@@ -30,6 +30,8 @@ from pace import within
 import pytest
 from units import drawn, NOMINAL, nominal, PLANES_RAD, swept
 
+pytestmark = pytest.mark.long
+
 TERMS = full_model.TERMS
 
 

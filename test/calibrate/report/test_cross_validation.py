@@ -28,6 +28,8 @@ import numpy as np
 import pytest
 from units import drawn, nominal, swept
 
+pytestmark = pytest.mark.long
+
 
 def calibrated(seed, model=None, axes='xy', check=16, stage_rad=None, effects=TERMS, **figures):
     """Calibrate a drawn unit on a stage whose true step may differ from the stated one."""

@@ -28,7 +28,8 @@ from units import NOMINAL
 
 CHROMIUM = next(filter(None, map(shutil.which, (
     'chromium', 'chromium-browser', 'google-chrome'))), None)
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason='no Chromium: apt install chromium')
+pytestmark = [pytest.mark.long, pytest.mark.skipif(
+    CHROMIUM is None, reason='no Chromium: apt install chromium')]
 
 
 @pytest.fixture(scope='module')
