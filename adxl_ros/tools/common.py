@@ -52,8 +52,10 @@ def run(parser: argparse.ArgumentParser, command: Callable[[argparse.Namespace],
     """
     signal.signal(signal.SIGTERM, _terminated)
     try:
-        status = command(parser.parse_args())
-        sys.stdout.flush()
+        try:
+            status = command(parser.parse_args())
+        finally:
+            sys.stdout.flush()
     except UserError as error:
         print(f'{parser.prog}: {" ".join(str(error).split())}', file=sys.stderr)
         return 1
