@@ -142,7 +142,7 @@ def _residual_plot(diagnosis: Diagnosis) -> Any:
             frequency_hz, power = welch(np.nan_to_num(mg), comparison.sensor.rate_hz,
                                         nperseg=min(_SPECTRUM_SAMPLES, len(mg)))
             spectrum.loglog(frequency_hz[1:], np.sqrt(power[1:]), lw=1, color=colour)
-        over_time.set(ylabel=f'{axes[d]}: recording minus simulation, mg')
+        over_time.set(ylabel=f'{axes[d]}, mg')
         spectrum.set(ylabel='mg/√Hz')
     grid[0, 0].legend(loc='upper right', fontsize=8)
     grid[-1, 0].set(xlabel='time, s')
