@@ -1,7 +1,7 @@
 # make build    ROS 2 Jazzy (the sourced one, else its wheels in .venv) and the package in install/
 # make demo     the main job on a simulated sensor: a table, and plots in demo_output/
 # make check    linters, types and unit tests: what a change needs, in two minutes
-# make test     every test, in ten minutes        (make test ARGS='-k fit')
+# make test     every test, in twelve minutes        (make test ARGS='-k fit')
 # make perf     limits of processor time, for a quiet machine
 # make bench    rate, missing samples, latency and CPU of the live nodes
 # make gallery  docs/effects.md and its plots, from the library of effects
