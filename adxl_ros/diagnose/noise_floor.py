@@ -223,5 +223,5 @@ def encoder_mean_square(alpha_rad: np.ndarray, beta_rad: np.ndarray, sensor: Sen
                          -np.cos(alpha_rad) * np.sin(beta_rad), -np.sin(alpha_rad)])[:measured]
     by_beta = np.array([-np.sin(alpha_rad) * np.sin(beta_rad),
                         -np.sin(alpha_rad) * np.cos(beta_rad), 0 * alpha_rad])[:measured]
-    return float(sensor.local_gravity_mps2 ** 2 * sensor.stage_resolution_rad ** 2 / 12
+    return float(sensor.local_gravity_mps2 ** 2 * sensor.stage_std_rad ** 2
                  * np.mean(by_alpha ** 2 + by_beta ** 2))

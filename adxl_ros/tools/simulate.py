@@ -32,19 +32,11 @@ from adxl_ros.links.support import emulated_board
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.simulate import simulator
 from adxl_ros.simulate.from_recording import motion_from_force, motion_from_references
+from adxl_ros.simulate.motion import INTERNAL_RATE_HZ
 from adxl_ros.simulate.trajectories import TRAJECTORIES
 from adxl_ros.tools.common import progress, report_reading, run
 from adxl_ros.tools.effect_option import SYNTAX, with_effects
 import numpy as np
-
-_MIN_RATE_HZ = 0.01
-"""Lowest sample rate, Hz, as in a parameter file."""
-
-_MAX_RATE_HZ = 1e5
-"""Highest sample rate, Hz, as in a parameter file."""
-
-_MIN_INTERNAL_RATE_HZ = 1000.0
-"""Lowest rate of the simulation before the sampling, Hz: slow samples still see the motion."""
 
 _SHORTEST_S = 1e-9
 """Shorter durations count as this in the progress, s, so that one sample divides nothing by 0."""
@@ -137,9 +129,10 @@ def _check(options: argparse.Namespace) -> None:
                        f'{", ".join(TRAJECTORIES)}, imu')
     if not options.output and not options.port:
         parser().error('the following arguments are required: -o, or --port')
-    if options.rate is not None and not _MIN_RATE_HZ <= options.rate <= _MAX_RATE_HZ:
-        raise UserError(f'--rate {options.rate:g}: outside {_MIN_RATE_HZ:g} to '
-                        f'{_MAX_RATE_HZ:g} Hz')
+    bounds = parameter_file.SENSOR_FIELDS['sensor.rate_hz'].metadata
+    if options.rate is not None and not bounds['lower'] <= options.rate <= bounds['upper']:
+        raise UserError(f'--rate {options.rate:g}: outside {bounds["lower"]:g} to '
+                        f'{bounds["upper"]:g} Hz')
     if options.seed < 0:
         raise UserError(f'--seed {options.seed}: must be 0 or more')
     for path in filter(None, (options.trajectory, options.force)):
@@ -196,8 +189,7 @@ def _simulate_force(sensor: Sensor, options: argparse.Namespace) -> _Run:
     motion, begin_s = motion_from_force(options.force, options.rate is None)
     if options.rate is None:
         sensor = replace(sensor, rate_hz=motion.internal_rate_hz)
-        motion = replace(motion,
-                         internal_rate_hz=max(sensor.rate_hz, _MIN_INTERNAL_RATE_HZ))
+        motion = replace(motion, internal_rate_hz=max(sensor.rate_hz, INTERNAL_RATE_HZ))
     return _Run(sensor, begin_s, motion.duration_s,
                 simulator.simulate_blocks(sensor, motion, options.seed, begin_s))
 
