@@ -44,6 +44,8 @@ _PLOTTED_SAMPLES = 20_000
 """Largest number of samples in a plot. Chosen: the page stays small."""
 _SPECTRUM_SAMPLES = 2048
 """Samples in a segment of a spectrum. Chosen: 0.06 Hz at 125 Hz."""
+_LEGEND_COLUMNS = 4
+"""Columns of a legend below a plot. Chosen: four names of effects fit beside each other."""
 _TABLE_ROWS = 10
 """Rows of the tables of hypotheses and candidates. Chosen: others are improbable."""
 _CELL_ROWS = 12
@@ -108,18 +110,19 @@ def _bar_plot(diagnosis: Diagnosis) -> Any:
         effect: share * (before - floor) for effect, share in shares_of_gap(diagnosis).items()}
     if sum(widths.values()) < before:
         widths['not explained'] = before - sum(widths.values())
-    plot, axis = pyplot().subplots(figsize=(10, 1.8), layout='constrained')
+    plot, axis = pyplot().subplots(figsize=(10, 2.4), layout='constrained')
     begin = 0.0
     for i, (label, width) in enumerate(widths.items()):
         axis.barh(0, width, left=begin, color='#999' if label == 'noise floor' else f'C{i + 1}',
                   label=f'{label}: {width:.3g} mg²')
         begin += width
-    for label, square in (('after', after), ('before', before)):
+    for label, square, side, offset in (('after', after, 'right', -3),
+                                        ('before', before, 'left', 3)):
         axis.axvline(square, color='k', lw=0.8)
-        axis.annotate(f'{label} {np.sqrt(square):.3g} mg', (square, 0.45), rotation=30,
-                      fontsize=8, annotation_clip=False)
+        axis.annotate(f'{label} {np.sqrt(square):.3g} mg', (square, 0.6), ha=side, fontsize=8,
+                      xytext=(offset, 0), textcoords='offset points')
     axis.set(yticks=[], ylim=(-0.4, 1.0), xlabel='mean square on held-out blocks, mg²')
-    axis.legend(fontsize=8, ncols=len(widths), loc='upper right', frameon=False)
+    plot.legend(fontsize=8, ncols=_LEGEND_COLUMNS, loc='outside lower center', frameon=False)
     axis.spines[['top', 'right', 'left']].set_visible(False)
     return plot
 
