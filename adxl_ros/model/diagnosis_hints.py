@@ -67,6 +67,40 @@ class Manoeuvre(Enum):
     SUPPLY = auto()
 
 
+class FormDimension(Enum):
+    """
+    Quantity over which the form of an effect differs between sensors of one type.
+
+    A real sensor has a curve of its own over the quantity, near that of the effect's function.
+    The values are the names of the flexible dimensions of the diagnosis.
+    """
+
+    FORCE = 'force'
+    """Specific force along the axis."""
+    CROSS_FORCE = 'cross_force'
+    """Specific force across the axis."""
+    DIRECTION = 'direction'
+    """Direction of the last change of joints and force: the branch of a loop."""
+    RATE = 'rate'
+    """Rates of the joints."""
+    ALPHA = 'alpha_rad'
+    """Angle alpha."""
+    BETA = 'beta_rad'
+    """Angle beta."""
+    TEMPERATURE = 'temperature_c'
+    """Temperature of the sensor."""
+    SUPPLY = 'supply_v'
+    """Supply voltage."""
+    TIME = 'time_s'
+    """Time."""
+    SINCE_MOVE = 'since_move_s'
+    """Time since the last move."""
+    CODE = 'code'
+    """Code of the ADC."""
+    LAG = 'lag'
+    """Recent history of the specific force along the axis."""
+
+
 @dataclass(frozen=True)
 class DiagnosisHints:
     """
@@ -94,6 +128,9 @@ class DiagnosisHints:
     half_turn
         Name of the parameter, rad, that changes by π when the sensor is remounted by half a turn
         about its z axis; empty for other effects.
+    form : tuple of FormDimension
+        Dimensions along which the form differs between real sensors. Empty where the form is
+        exact, as of geometry, of a clock and of a straight line, and for effects of the noise.
 
     """
 
@@ -105,6 +142,7 @@ class DiagnosisHints:
     detector: Detector | None = None
     revealed_by: Manoeuvre | None = None
     half_turn: str = ''
+    form: tuple[FormDimension, ...] = ()
 
     @property
     def nuisance(self) -> bool:

@@ -20,8 +20,15 @@ from pathlib import Path
 
 from adxl_ros import diagnose
 from adxl_ros.diagnose.next_experiment import MENU
-from adxl_ros.model.diagnosis_hints import Detector, DriftSpectrum, Manoeuvre, StraightLine
+from adxl_ros.model.diagnosis_hints import (
+    Detector,
+    DriftSpectrum,
+    FormDimension,
+    Manoeuvre,
+    StraightLine,
+)
 from adxl_ros.model.effects import library
+from adxl_ros.model.effects.base import ActsOn, Need, Place
 import pytest
 
 MODULES = sorted(Path(diagnose.__file__).parent.glob('*.py'))
@@ -59,3 +66,25 @@ def test_effects_of_detectors_have_the_parameters_that_are_estimated():
 def test_menu_holds_every_manoeuvre():
     """An effect may name any manoeuvre."""
     assert set(MENU) == set(Manoeuvre)
+
+
+@pytest.mark.parametrize('effect', library().values(), ids=lambda effect: effect.name)
+def test_a_form_is_tolerant_unless_it_is_exact(effect):
+    """An effect of the mean states over what its form differs; geometry and noise do not."""
+    form = effect.diagnosis.form
+    exact = effect.exact or effect.acts_on is ActsOn.NOISE
+    assert bool(form) is not exact
+    assert len(set(form)) == len(form)
+    assert all(isinstance(dimension, FormDimension) for dimension in form)
+
+
+@pytest.mark.parametrize('effect', library().values(), ids=lambda effect: effect.name)
+def test_a_form_differs_over_what_the_effect_follows(effect):
+    """An effect of the surroundings differs over these; only the stage differs over angles."""
+    form = {dimension.value for dimension in effect.diagnosis.form}
+    assert set(effect.follows) <= form
+    assert not form & {'temperature_c', 'supply_v', 'time_s'} - set(effect.follows)
+    if Need.STAGE not in effect.needs:
+        assert not form & {'alpha_rad', 'beta_rad', 'rate', 'since_move_s'}
+    if effect.place is Place.ADC and form:
+        assert form == {'code'}

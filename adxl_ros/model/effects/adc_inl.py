@@ -14,7 +14,7 @@
 
 """Integral nonlinearity of the ADC: one curve over its codes for all channels."""
 
-from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre
+from adxl_ros.model.diagnosis_hints import DiagnosisHints, FormDimension, Manoeuvre
 from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Role, Signals
 import numpy as np
 
@@ -58,5 +58,5 @@ EFFECT = Effect(
     apply=apply,
     invertible=True,
     cause='The ADC is nonlinear; calibrate it with a voltage source, or choose another.',
-    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.REMOUNT),
+    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.REMOUNT, form=(FormDimension.CODE,)),
 )

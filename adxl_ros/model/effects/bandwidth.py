@@ -14,7 +14,7 @@
 
 """Bandwidth of the RC filter: the on-chip resistor has a tolerance of 25 %."""
 
-from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre
+from adxl_ros.model.diagnosis_hints import DiagnosisHints, FormDimension, Manoeuvre
 from adxl_ros.model.effects.base import Effect, Need, Parameter, Parameters, Place, Signals
 
 
@@ -37,5 +37,6 @@ EFFECT = Effect(
     cause='The output filter is not the stated one; measure its resistor and capacitor.',
     # The RC product of a healthy unit is within some 2 % of the measured one (chosen: resistors
     # and capacitors of 1 %, and their temperature).
-    diagnosis=DiagnosisHints(healthy_std=0.02, revealed_by=Manoeuvre.SHAKE),
+    diagnosis=DiagnosisHints(healthy_std=0.02, revealed_by=Manoeuvre.SHAKE,
+                             form=(FormDimension.LAG,)),
 )

@@ -14,7 +14,7 @@
 
 """Hysteresis of the sensing element: a Prandtl-Ishlinskii operator of the acceleration."""
 
-from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre
+from adxl_ros.model.diagnosis_hints import DiagnosisHints, FormDimension, Manoeuvre
 from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Role, Signals
 from adxl_ros.model.play_operator import play
 
@@ -55,5 +55,7 @@ EFFECT = Effect(
     smooth=False,
     cause='The reading depends on the direction of the last change; approach poses from both '
           'sides and average, or relieve the package of mounting stress.',
-    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.SPEEDS),
+    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.SPEEDS,
+                             form=(FormDimension.FORCE, FormDimension.DIRECTION,
+                                   FormDimension.LAG)),
 )

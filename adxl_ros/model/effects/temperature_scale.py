@@ -15,7 +15,7 @@
 """Scale factor that changes with temperature."""
 
 from adxl_ros.model.constants import NOMINAL_TEMPERATURE_C
-from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre
+from adxl_ros.model.diagnosis_hints import DiagnosisHints, FormDimension, Manoeuvre
 from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
 
 
@@ -38,5 +38,5 @@ EFFECT = Effect(
     invertible=True,
     follows=('temperature_c',),
     cause='The scale factor follows the temperature; measure it and correct, or keep it steady.',
-    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.HEAT),
+    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.HEAT, form=(FormDimension.TEMPERATURE,)),
 )
