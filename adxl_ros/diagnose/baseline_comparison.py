@@ -94,7 +94,10 @@ class BaselineComparison:
     at_rest
         Samples at which nothing moves, (n,) bool.
     used
-        Samples that are used, (n,) bool; the others are missing, repeated or outliers.
+        Samples that are used, (n,) bool; the others are missing, repeated or outliers, or their
+        reference is not known.
+    notes
+        What was corrected or left out before the comparison, one line each, for people.
 
     """
 
@@ -107,6 +110,7 @@ class BaselineComparison:
     has_stage_angles: bool
     at_rest: np.ndarray
     used: np.ndarray
+    notes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         """Return the number of samples."""

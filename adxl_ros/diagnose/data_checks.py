@@ -20,6 +20,7 @@ They are axes, units, clocks, the range, the reference, and missing samples.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from adxl_ros.diagnose.baseline_comparison import at_search_rate, BaselineComparison, Reference
@@ -33,7 +34,8 @@ from adxl_ros.signals.axis_polarity import find_polarity_fault
 import numpy as np
 
 SHORTEST_S = 30.0
-"""Shortest recording of a moving sensor, s. Chosen: a few turns of the stage."""
+"""Shortest time, s, that the recordings of a moving sensor last together. Chosen: a few turns of
+the stage."""
 _FEWEST_SAMPLES = 50
 """Fewest samples of any recording. Chosen: one for each of 48 blocks."""
 _SMALLEST_MOTION_G = 0.05
@@ -152,7 +154,7 @@ def check_recording(comparison: BaselineComparison) -> CheckedRecording | DataFa
         comparison, search_comparison = (
             replace(c, sensor=replace(c.sensor, adc_bits=bits))
             for c in (comparison, search_comparison))
-    used = np.isfinite(comparison.volts).all(axis=1)
+    used = comparison.used & np.isfinite(comparison.volts).all(axis=1)
     # Coarse codes repeat by themselves.
     if coarse is None:
         used, repeated = repeated_samples(comparison.volts, comparison.time_s, used,
@@ -163,6 +165,15 @@ def check_recording(comparison: BaselineComparison) -> CheckedRecording | DataFa
     return CheckedRecording(replace(comparison, used=used),
                             replace(search_comparison, used=used[::every]),
                             tuple(detections), spikes)
+
+
+def find_length_fault(comparisons: Sequence[BaselineComparison]) -> DataFault | None:
+    """Find recordings that are too short together; one at rest may have any length."""
+    span_s = sum(c.span_s for c in comparisons)
+    if span_s >= SHORTEST_S or all(c.reference is Reference.NONE for c in comparisons):
+        return None
+    return DataFault('too_short', 'insufficient', f'{span_s:.3g} s in all are too short for a '
+                     'verdict; record at least one minute')
 
 
 def find_data_fault(comparison: BaselineComparison, search_comparison: BaselineComparison
@@ -183,11 +194,9 @@ def find_data_fault(comparison: BaselineComparison, search_comparison: BaselineC
         The first fault that was found.
 
     """
-    span_s = comparison.span_s
-    if (span_s < SHORTEST_S and comparison.reference is not Reference.NONE) \
-            or len(comparison) < _FEWEST_SAMPLES:
-        return DataFault('too_short', 'insufficient', f'{span_s:.3g} s are too short for a '
-                         'verdict; record at least one minute')
+    if len(comparison) < _FEWEST_SAMPLES:
+        return DataFault('too_short', 'insufficient', f'{len(comparison)} samples are too few; '
+                         f'a recording needs {_FEWEST_SAMPLES}')
     finite = np.isfinite(comparison.volts).all(axis=1)
     if finite.mean() < 1 - _LARGEST_MISSING_SHARE:
         return DataFault('missing', 'bad_data', f'{100 * (1 - finite.mean()):.0f} % of the '

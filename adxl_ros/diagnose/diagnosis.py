@@ -149,10 +149,15 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
     if not sensor.effects:
         sensor = with_axes(sensor, recordings[0].axes)
     # The fractions of the progress are shares of the usual run time.
-    checked: list[CheckedRecording] = []
+    compared: list[BaselineComparison] = []
     for recording in recordings:
         check_unit(recording.stream_info, recording.axes, sensor)
-        comparison = compare(recording, sensor, sim)
+        compared.append(compare(recording, sensor, sim))
+    short = data_checks.find_length_fault(compared)
+    if short is not None:
+        return Diagnosis(short, compared)
+    checked: list[CheckedRecording] = []
+    for comparison in compared:
         result = data_checks.check_recording(comparison)
         if isinstance(result, DataFault):
             return Diagnosis(result, [comparison])

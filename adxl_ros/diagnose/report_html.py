@@ -25,7 +25,14 @@ from typing import Any
 
 from adxl_ros.diagnose.diagnosis import Diagnosis
 from adxl_ros.diagnose.hypothesis_fit import Hypothesis
-from adxl_ros.diagnose.report_json import as_json, p_text, shares_of_gap, summary, unit_text
+from adxl_ros.diagnose.report_json import (
+    as_json,
+    notes,
+    p_text,
+    shares_of_gap,
+    summary,
+    unit_text,
+)
 from adxl_ros.diagnose.residual_map import RANGES, SIGNIFICANT_P
 from adxl_ros.files.plot_file import pyplot
 from adxl_ros.model.constants import G0_MPS2
@@ -69,7 +76,8 @@ def page(diagnosis: Diagnosis, title: str) -> str:
         The page, HTML.
 
     """
-    parts = [f'<h1>{escape(title)}</h1>', f'<p class="verdict">{escape(summary(diagnosis))}</p>']
+    parts = [f'<h1>{escape(title)}</h1>', f'<p class="verdict">{escape(summary(diagnosis))}</p>',
+             *(f'<p>{escape(note)}</p>' for note in notes(diagnosis))]
     if diagnosis.data_fault is None and diagnosis.verdict is not None:
         report = as_json(diagnosis)
         parts += ['<h2>How far the gap closes</h2>', _image(_bar_plot(diagnosis)),

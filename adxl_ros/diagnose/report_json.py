@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from textwrap import wrap
 from typing import Any
 
@@ -56,7 +57,7 @@ def as_json(diagnosis: Diagnosis) -> dict[str, Any]:
             'status': fault.status, 'effects': [], 'groups': [],
             'data_fault': fault.name if fault.status == 'bad_data' else None,
             'probability': 1.0}, 'hypotheses': [], 'gap': None, 'where': [], 'candidates': [],
-            'next_experiment': None, 'summary': fault.message}
+            'notes': notes(diagnosis), 'next_experiment': None, 'summary': fault.message}
     assert diagnosis.verdict is not None
     verdict = diagnosis.verdict
     return {
@@ -69,12 +70,20 @@ def as_json(diagnosis: Diagnosis) -> dict[str, Any]:
         'gap': _gap(diagnosis),
         'where': [_cell(c) for c in diagnosis.residual_cells if c.p < SIGNIFICANT_P][:_MOST_CELLS],
         'not_covered': list(diagnosis.not_covered),
+        'notes': notes(diagnosis),
         'unknown_where': list(verdict.unknown_where),
         'candidates': _candidates(diagnosis),
         'noise_like': [{'effect': d.effect, 'words': d.message,
                         'nats': _rounded(d.log_bayes_factor)} for d in diagnosis.detections],
         'next_experiment': _next_experiment(diagnosis.next_experiment),
         'summary': summary(diagnosis)}
+
+
+def notes(diagnosis: Diagnosis) -> list[str]:
+    """Return what was corrected or left out, with the file where there are several."""
+    several = len(diagnosis.comparisons) > 1
+    return [f'{Path(c.name).name}: {note}' if several else note
+            for c in diagnosis.comparisons for note in c.notes]
 
 
 def _gap(diagnosis: Diagnosis) -> dict[str, Any]:
@@ -267,6 +276,8 @@ def unit_text(parameter: dict[str, Any]) -> str:
 def terminal_lines(diagnosis: Diagnosis) -> list[str]:
     """Return the diagnosis as lines for a terminal."""
     lines = wrap(summary(diagnosis), _SCREEN_COLUMNS)
+    for note in notes(diagnosis):
+        lines += wrap(f'note: {note}', _SCREEN_COLUMNS, subsequent_indent='      ')
     if diagnosis.data_fault is not None or diagnosis.verdict is None:
         return lines
     assert diagnosis.gap_closure is not None and diagnosis.noise_floor is not None

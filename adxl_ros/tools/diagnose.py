@@ -19,6 +19,7 @@ from __future__ import annotations
 import argparse
 import json
 from pathlib import Path
+import sys
 
 from adxl_ros.diagnose import report_html, report_json
 from adxl_ros.diagnose.diagnosis import diagnose as diagnose_recordings
@@ -28,10 +29,15 @@ from adxl_ros.files.atomic_write import write_text
 from adxl_ros.simulate.from_recording import motion_from_force
 from adxl_ros.tools.common import make_folder, progress, report_reading, run
 
+_NO_VERDICT = ('bad_data', 'insufficient')
+"""Statuses of the report that hold no verdict: the exit status is then 1."""
+
 
 def parser() -> argparse.ArgumentParser:
     """Describe the command line."""
-    parse = argparse.ArgumentParser(prog='diagnose', description=__doc__)
+    parse = argparse.ArgumentParser(prog='diagnose', description=__doc__, epilog=(
+        'Exit status: 0 with a verdict, 1 where none was possible (the report then names the '
+        'fault of the recording, or what it lacks), 2 after wrong usage.'))
     parse.add_argument('recording', nargs='+',
                        help='rosbag2 directory, .mcap or CSV, all of one unit')
     parse.add_argument('--params', metavar='FILE', default=None,
@@ -62,7 +68,8 @@ def diagnose(options: argparse.Namespace) -> int:
         diagnosis = diagnose_recordings(recordings, sensor, sim, options.seed, show)
     folder = Path(options.output)
     make_folder(folder)
-    text = json.dumps(report_json.as_json(diagnosis), indent=1, allow_nan=False) + '\n'
+    report = report_json.as_json(diagnosis)
+    text = json.dumps(report, indent=1, allow_nan=False) + '\n'
     write_text(folder / 'report.json', text)
     write_text(folder / 'report.html', report_html.page(diagnosis, ', '.join(
         Path(path).name for path in options.recording)))
@@ -70,7 +77,12 @@ def diagnose(options: argparse.Namespace) -> int:
     if diagnosis.sensor is not None:
         parameter_file.save(folder / 'params.yaml', diagnosis.sensor, lines)
     print(text if options.json else '\n'.join(lines))
-    return 0
+    if report['verdict']['status'] not in _NO_VERDICT:
+        return 0
+    reason = report['verdict']['data_fault'] or report['verdict']['status']
+    print(f'diagnose: {", ".join(options.recording)}: no verdict ({reason}); the reason is in '
+          f'{folder / "report.json"}', file=sys.stderr)
+    return 1
 
 
 def main() -> int:
