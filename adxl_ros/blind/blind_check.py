@@ -36,11 +36,14 @@ from adxl_ros.blind import (
     scores,
     trials,
 )
+from adxl_ros.blind.grading import Answer
 from adxl_ros.blind.label_commitment import Setup
 from adxl_ros.blind.scores import Trial
 from adxl_ros.blind.trials import Label
 from adxl_ros.errors import UserError
 
+OtherMethod = Callable[[Path], dict[str, Answer]]
+"""Receives the folder of recordings and parameter files; returns answers by the names of files."""
 Show = Callable[[str], AbstractContextManager[Callable[[float], None]]]
 """Receives the name of a stage; gives a context with what receives the finished fraction."""
 
@@ -92,8 +95,8 @@ def draw(folder: Path, seed: int | None, count: int, pool: Executor,
     return label_commitment.commit(folder, setup, trials.plans(seed, count), pool, show)
 
 
-def score(folder: Path, command: Sequence[str] | None, pool: Executor,
-          show: Show) -> dict[str, Any]:
+def score(folder: Path, command: Sequence[str] | None, pool: Executor, show: Show,
+          others: dict[str, OtherMethod] | None = None) -> dict[str, Any]:
     """
     Diagnose all recordings that have no report yet, read the labels and score.
 
@@ -107,6 +110,8 @@ def score(folder: Path, command: Sequence[str] | None, pool: Executor,
         Works in parallel.
     show
         Receives the name of a stage; gives a context with what receives the finished fraction.
+    others
+        Other methods to compare with, by name.
 
     Returns
     -------
@@ -127,6 +132,7 @@ def score(folder: Path, command: Sequence[str] | None, pool: Executor,
     # Labels may be on another machine: the diagnosis does not need them.
     with show('diagnose') as advance:
         results = diagnosis_runs.diagnose_all(folder, command, pool, advance)
+    compared = {name: method(folder / 'recordings') for name, method in (others or {}).items()}
     version = (folder / 'reports' / 'version.txt').read_text()
     committed = label_commitment.committed_labels(folder)
     labels = committed.labels
@@ -139,7 +145,8 @@ def score(folder: Path, command: Sequence[str] | None, pool: Executor,
     answers = [grading.answer(results[label.name]) for label in labels]
     graded = [Trial(label, answer, held_out[label.name])
               for label, answer in zip(labels, answers)]
-    made = scores.scores(graded)
+    made = scores.scores(graded, {name: [given[label.name] for label in labels]
+                                  for name, given in compared.items()})
     controls = negative_controls.controls(folder, labels, answers)
     return {
         'schema': 1, 'hash': digest, 'seed': committed.setup.seed,
@@ -182,4 +189,5 @@ def _row(trial: Trial) -> dict[str, Any]:
             'status': answer.status, 'top': sorted(answer.top), 'named': sorted(answer.named),
             'probability': answer.probability,
             'right': grading.verdict_right(answer, label), 'seconds': answer.seconds,
+            'ranks': grading.ranks(answer, label),
             'held': trial.held_out}

@@ -25,6 +25,7 @@ from adxl_ros.blind import trials
 from adxl_ros.blind.trials import Label
 from adxl_ros.blind.world.unit import G0
 import numpy as np
+from scipy.stats import norm
 
 UNKNOWN = 'unknown'
 VISIBLE_POWER = 0.5
@@ -33,6 +34,9 @@ CERTAIN_POWER = 0.9
 """Power of the ideal observer from which scores count an effect; chosen."""
 _NOISE_BAND_HZ = 78.5
 """Noise bandwidth of the 50 Hz output filter, Hz: π/2 of its corner."""
+
+_SMALLEST_WIDTH = 1e-30
+"""Smallest width of an interval, in any unit, so that an interval of one value divides by it."""
 
 
 @dataclass(frozen=True)
@@ -185,6 +189,34 @@ def brier(answer: Answer, label: Label) -> float:
     correct = sum(p for effects, p in answer.hypotheses if effects in accepted)
     wrong = sum(p * p for effects, p in answer.hypotheses if effects not in accepted)
     return (1 - correct) ** 2 + wrong
+
+
+def ranks(answer: Answer, label: Label) -> dict[str, float]:
+    """
+    Return the rank of the truth in the posterior of each parameter that means the same.
+
+    The rank is the probability that the report gives to values below the truth. Its 90 % interval
+    is that of a normal posterior, whose halves may have different widths.
+
+    Parameters
+    ----------
+    answer, label
+        The answer, and what is true.
+
+    Returns
+    -------
+    dict
+        Ranks from 0 to 1 by the name of the parameter.
+
+    """
+    rank_by_name = {}
+    for name, true in true_parameters(label).items():
+        if name in answer.parameters:
+            value, low, high = answer.parameters[name]
+            half_width = high - value if true > value else value - low
+            z = (true - value) * norm.ppf(0.95) / max(half_width, _SMALLEST_WIDTH)
+            rank_by_name[name] = float(norm.cdf(z))
+    return rank_by_name
 
 
 def true_parameters(label: Label) -> dict[str, float]:

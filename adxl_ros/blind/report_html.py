@@ -23,7 +23,7 @@ import textwrap
 from typing import Any
 
 from adxl_ros.blind.grading import UNKNOWN
-from adxl_ros.blind.score_statistics import detection
+from adxl_ros.blind.score_statistics import detection, RANK_BINS
 from adxl_ros.blind.world.unit import G0
 import numpy as np
 
@@ -41,9 +41,14 @@ Table = tuple[list[str], list[list[str]]]
 
 def summary(made: dict[str, Any]) -> str:
     """Return the result of the check in a few lines."""
-    rows = [f'{words:52s}{score:34s}{bar:16s}{met}'
-            for words, score, bar, met in _bars(made)[1]]
+    rows = [f'{row[0]:52s}{row[1]:34s}{row[2]:16s}{row[3]}' for row in _result(made)[1]]
     return '\n'.join([_drawn(made), '', *rows, '', _leaks(made)])
+
+
+def markdown_result(made: dict[str, Any]) -> str:
+    """Return the table of the result for the documentation."""
+    drawn = textwrap.fill(_drawn(made), 99, break_on_hyphens=False)
+    return '\n'.join([drawn, '', _leaks(made), '', *_markdown_table(_result(made))])
 
 
 def markdown(made: dict[str, Any]) -> str:
@@ -51,9 +56,14 @@ def markdown(made: dict[str, Any]) -> str:
     out = [textwrap.fill(_drawn(made), 99, break_on_hyphens=False), '', _leaks(made), '']
     for title, (head, rows) in _tables(made).items():
         if rows:
-            out += [f'### {title}', '', f'| {" | ".join(head)} |', '|' + '---|' * len(head)]
-            out += [f'| {" | ".join(row)} |' for row in rows] + ['']
+            out += [f'### {title}', '', *_markdown_table((head, rows)), '']
     return '\n'.join(out)
+
+
+def _markdown_table(table: Table) -> list[str]:
+    head, rows = table
+    return [f'| {" | ".join(head)} |', '|' + '---|' * len(head),
+            *(f'| {" | ".join(row)} |' for row in rows)]
 
 
 def page(made: dict[str, Any], pyplot: Any) -> str:
@@ -75,7 +85,7 @@ def page(made: dict[str, Any], pyplot: Any) -> str:
     """
     tables = _tables(made)
     pictures = {'Detection against strength': _curves, 'Calibration': _calibration,
-                'Answers by true effect': _confusion}
+                'Ranks of the truth': _ranks_plot, 'Answers by true effect': _confusion}
     parts = ['<h1>Blind check of diagnose</h1>', f'<p class="said">{escape(_drawn(made))}</p>',
              f'<p class="said{" leak" if made["leaks"] else ""}">{escape(_leaks(made))}</p>']
     for title, draw in pictures.items():
@@ -107,8 +117,9 @@ def _leaks(made: dict[str, Any]) -> str:
 
 def _tables(made: dict[str, Any]) -> dict[str, Table]:
     scores = made['scores']
-    return {'Bars': _bars(made), 'Scores': _scores(scores), 'Strength that is detected':
-            _strengths(scores), 'Baselines': _baselines(scores), 'Controls': _controls(made),
+    return {'Result': _result(made), 'Scores': _scores(scores), 'Strength that is detected':
+            _strengths(scores), 'Ranks of the truth in the posterior': _ranks(scores),
+            'Controls': _controls(made),
             'Effect by effect, where the oracle sees it': _by_effect(scores),
             'Real sensors: is the deleted effect put back?': _real(made),
             'Runs that failed': (['trial', 'error'], [
@@ -125,13 +136,35 @@ def _score_text(score: dict[str, Any] | None, scale: float = 1.0, unit: str = ''
     return text + (f', n = {score["count"]}' if 'count' in score else '')
 
 
-def _bars(made: dict[str, Any]) -> Table:
+def _result(made: dict[str, Any]) -> Table:
+    """Return the scores beside their bars, the fourth run and the other methods."""
+    others = made['scores']['comparison']
+    head = ['score', 'diagnose (90 % interval)', 'bar', 'met', 'fourth run', 'no worse', *others]
     sign = {-1: 'at most ', 1: 'at least ', 0: ''}
-    return ['score', 'value (90 % interval)', 'bar', 'met'], [
-        [row['words'], _score_text(row), sign[row['way']] + ' to '.join(
-            f'{bar:g}' for bar in row['bar']),
-         'no trial' if row['met'] is None else 'yes' if row['met'] else 'NO']
-        for row in made['bars']]
+    rows = [[row['words'], _score_text(row),
+             sign[row['way']] + ' to '.join(f'{bar:g}' for bar in row['bar']),
+             'no trial' if row['met'] is None else 'yes' if row['met'] else 'NO',
+             f'{row["fourth_run"]:g}', _NO_WORSE[row['no_worse']],
+             *_other_scores(others, row['name'])] for row in made['bars']]
+    for name, words in _WITHOUT_BAR.items():
+        rows.append([words, _score_text(made['scores'][name]), '-', '-', _FOURTH_RUN[name], '-',
+                     *_other_scores(others, name)])
+    return head, rows
+
+
+def _other_scores(others: dict[str, Any], name: str) -> list[str]:
+    """Return a score of each method; '-' where the method has no such score."""
+    return ['-' if scores.get(name, {}).get('value') is None else f'{scores[name]["value"]:.3g}'
+            for scores in others.values()]
+
+
+_NO_WORSE = {None: 'no trial', 'yes': 'yes', 'open': 'open', 'no': 'NO'}
+"""How a score compares with the fourth run, in words."""
+_WITHOUT_BAR = {'verdict_right': 'verdict right, all trials',
+                'utility': 'utility of the named set, all trials'}
+"""Scores of the result that have no bar, in words."""
+_FOURTH_RUN = {'verdict_right': '0.7', 'utility': '-'}
+"""The same in the fourth run, which did not have the utility."""
 
 
 _WORDS = {
@@ -139,7 +172,7 @@ _WORDS = {
     'leading': 'true effect within the top hypothesis, where the oracle sees it',
     'set_size': 'effects in the named set', 'inseparable_size':
     'effects that are inseparable by the recording (fixed by the generator)',
-    'verdict_right': 'verdict right, all trials', 'brier': 'Brier score, all hypotheses',
+    'brier': 'Brier score, all hypotheses',
     'closed': 'gap closed on a held-out recording, median',
     'unknown_recall_all': 'recall of unknown, visible or not',
     'unknown_wrongly': 'unknown where the library has the effect, or there is none',
@@ -163,10 +196,11 @@ def _strengths(scores: dict[str, Any]) -> Table:
             for level in ('at_50', 'at_90'))] for name, curve in scores['detection'].items()]
 
 
-def _baselines(scores: dict[str, Any]) -> Table:
-    return ['', 'right, all trials', 'false alarms'], [
-        [name, _score_text(baseline['right']), _score_text(baseline['false_alarms'])]
-        for name, baseline in scores['baselines'].items()]
+def _ranks(scores: dict[str, Any]) -> Table:
+    edges = [f'{k / RANK_BINS:g}' for k in range(RANK_BINS + 1)]
+    head = ['parameters of', 'trials', *map('{} to {}'.format, edges, edges[1:]), 'p if uniform']
+    return head, [[name, str(row['trials']), *map(str, row['bins']), f'{row["p"]:.3f}']
+                  for name, row in scores['ranks'].items() if row['p'] is not None]
 
 
 def _controls(made: dict[str, Any]) -> Table:
@@ -238,6 +272,17 @@ def _calibration(made: dict[str, Any], pyplot: Any) -> Any:
                  [8 + row['count'] for row in rows])
     axis.set(xlabel='probability that the verdict gives itself', ylabel='share right',
              xlim=(-0.03, 1.03), ylim=(-0.03, 1.03))
+    return figure
+
+
+def _ranks_plot(made: dict[str, Any], pyplot: Any) -> Any:
+    """Draw the rank histogram of all parameters beside its expectation."""
+    row = made['scores']['ranks']['all']
+    figure, axis = pyplot.subplots(figsize=(5, 3), layout='constrained')
+    axis.bar((np.arange(RANK_BINS) + 0.5) / RANK_BINS, row['bins'], 0.95 / RANK_BINS)
+    axis.axhline(row['count'] / RANK_BINS, color='k', ls=':', lw=0.8)
+    axis.set(xlabel='rank of the truth in the posterior of a parameter', ylabel='parameters',
+             xlim=(0, 1))
     return figure
 
 

@@ -22,10 +22,12 @@ from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize
-from scipy.stats import binomtest
+from scipy.stats import binomtest, kstwo
 
 LEVEL = 0.9
 """Probability of all intervals."""
+RANK_BINS = 10
+"""Number of bins of a rank histogram; chosen: some ten ranks fall into each."""
 _RESAMPLES = 1000
 """Number of bootstrap samples; chosen."""
 
@@ -184,3 +186,39 @@ def reliability(rows: Sequence[tuple[float, bool]]) -> list[dict[str, Any]]:
     return [{'confidence': float(table[index == k, 0].mean()),
              'right': float(table[index == k, 1].mean()), 'count': int(np.sum(index == k))}
             for k in range(len(edges) - 1) if np.any(index == k)]
+
+
+def rank_histogram(groups: Sequence[Sequence[float]]) -> dict[str, Any]:
+    """
+    Return the histogram of ranks, and whether it is uniform.
+
+    Talts and others show how ranks of the truth reveal posteriors that are too narrow (a high
+    count at both ends), too wide (in the middle) or biased (at one end) ("Validating Bayesian
+    inference algorithms with simulation-based calibration", arXiv:1804.06788, 2018). The ranks of
+    one trial are not independent. Each trial therefore has the same weight in the distance of
+    Kolmogorov and Smirnov, and the number of trials is its sample size.
+
+    Parameters
+    ----------
+    groups
+        Ranks from 0 to 1 of each trial.
+
+    Returns
+    -------
+    dict
+        `bins`: number of ranks in bins of equal width; `count` of ranks and of `trials`; the
+        largest `distance` between the shares and uniform ones, and its `p`, None without ranks.
+
+    """
+    groups = [group for group in groups if len(group)]
+    ranks = np.concatenate([np.asarray(group, float) for group in groups] or [np.zeros(0)])
+    bins = np.histogram(ranks, RANK_BINS, (0, 1))[0].tolist()
+    if not len(ranks):
+        return {'bins': bins, 'count': 0, 'trials': 0, 'distance': None, 'p': None}
+    weights = np.concatenate([np.full(len(group), 1 / len(group) / len(groups))
+                              for group in groups])
+    order = np.argsort(ranks)
+    above = np.cumsum(weights[order])
+    distance = max(np.max(above - ranks[order]), np.max(ranks[order] - above + weights[order]))
+    return {'bins': bins, 'count': len(ranks), 'trials': len(groups),
+            'distance': float(distance), 'p': float(kstwo.sf(distance, len(groups)))}

@@ -223,7 +223,7 @@ def test_scores_of_a_diagnosis_with_a_constant_effect(committed_check, null_chec
     permuted = made['controls']['labels_permuted']
     assert permuted['score'] == pytest.approx(permuted['chance'], abs=0.02)
     text = report_html.page(made, pyplot())
-    assert text.count('<img') == 3 and 'http' not in text.replace('http-equiv', '')
+    assert text.count('<img') == 4 and 'http' not in text.replace('http-equiv', '')
     assert '| false alarms | 1 (' in report_html.markdown(made)
 
 

@@ -1,0 +1,149 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Scores of the blind check: the competition's utility, rank histograms, and the fourth run."""
+
+from adxl_ros.blind import diagnostic_utility, reference_methods, report_html, scores
+from adxl_ros.blind.diagnostic_utility import COMPONENTS, pair_utility, utility
+from adxl_ros.blind.grading import Answer
+from adxl_ros.blind.score_statistics import rank_histogram
+from adxl_ros.blind.trials import Label
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+
+def label(group, effects=(), power=1.0, inseparable=()):
+    """Return a label whose effects all have the same power and rivals."""
+    shape = {'w': [0.0] * 6, 'hertz': 9.0}
+    faults = [{'effect': name, 'size': 1.0, 'shape': shape, 'strength_mps2': 0.01,
+               'power': power, 'told': 1.0, 'inseparable': list(inseparable)} for name in effects]
+    return Label('r0', group, tuple(effects), (1, 2, 3), (90.0, 200.0), 'rich', 'xyz', 0.01,
+                 faults, 1.0, {'rmse': 'bias', 'bic': ''})
+
+
+def diagnoses(*effects):
+    """Return a group of diagnoses, each given by its effects as words."""
+    return {frozenset(words.split()) for words in effects}
+
+
+def test_utility_of_one_diagnosis():
+    """The extremes are those of the competition, and a wrong blame costs a test in vain."""
+    f = len(COMPONENTS)
+    every, nothing, bias = frozenset(COMPONENTS), frozenset(), frozenset({'bias'})
+    assert pair_utility(bias, bias) == pair_utility(nothing, nothing) == 1
+    assert pair_utility(every, nothing) == pytest.approx(0)
+    assert pair_utility(nothing, every) == pytest.approx(0)
+    assert pair_utility(bias, nothing) == pytest.approx(1 - 1 / f)
+    assert pair_utility(nothing, bias) == pytest.approx(1 - (f + 1) / (2 * f))
+    assert pair_utility(frozenset({'gravity'}), bias) == pytest.approx(1 - 1 / f - 1 / 2)
+
+
+def test_utility_of_ambiguity_groups():
+    """The true group is best; more and fewer diagnoses lose, and a failure has none."""
+    true = diagnoses('bias', 'gravity')
+    assert utility(true, true) == 1
+    assert utility(diagnoses('supply', 'gravity'), true) < 1
+    assert utility(diagnoses('bias', 'gravity', 'supply'), true) < 1
+    assert utility(diagnoses('bias', 'gravity', 'supply'), diagnoses('bias')) < utility(
+        diagnoses('bias', 'gravity'), diagnoses('bias')) < 1
+    assert utility(set(), true) == 0
+
+
+def test_true_group_has_what_the_ideal_observer_cannot_separate():
+    single = label('single', ['bias'], inseparable=['gravity', 'supply'])
+    assert diagnostic_utility.true_group(single) == diagnoses('bias', 'gravity', 'supply')
+    assert diagnostic_utility.true_group(label('single', ['bias'], 0.1)) == diagnoses('')
+    assert diagnostic_utility.true_group(label('zero', ['bias'])) == diagnoses('')
+    assert diagnostic_utility.true_group(label('outside', ['creep'])) == diagnoses('unknown')
+    pair = label('pair', ['bias', 'gravity'], inseparable=['supply'])
+    assert diagnostic_utility.true_group(pair) == diagnoses(
+        'bias gravity', 'bias supply', 'supply gravity')
+
+
+def test_answered_group():
+    answer = Answer('inseparable', frozenset({'bias'}), (frozenset({'gravity', 'supply'}),),
+                    0.9, ((frozenset(), 1.0),), {}, 1.0)
+    assert diagnostic_utility.answered_group(answer) == diagnoses('bias gravity', 'bias supply')
+    failed = Answer('failed', frozenset(), (), 0.0, ((frozenset(), 0.0),), {}, 1.0)
+    assert diagnostic_utility.answered_group(failed) == set()
+
+
+def test_reference_methods_are_ordered():
+    """The truth has utility 1, and the worst answer 0 where a component is faulty."""
+    labels = [label('single', [name]) for name in COMPONENTS[:-1]] + [label('none')] * 20
+    answers = reference_methods.answers(labels)
+    perfect = [reference_methods.certain(frozenset(row.true)) for row in labels]
+    made = scores.scores([scores.Trial(row, answer, None) for row, answer in zip(
+        labels, perfect)], {'perfect': perfect})
+    value = {name: row['utility']['value'] for name, row in made['comparison'].items()}
+    assert value['perfect'] == made['utility']['value'] == 1
+    assert value['perfect'] > value['Random'] > value['Worst']
+    assert value['perfect'] > value['Null'] > value['Worst']
+    assert value['Worst'] < 0.03
+    assert made['comparison']['Null']['false_alarms']['value'] == 0
+    assert made['comparison']['Worst']['false_alarms']['value'] == 1
+    assert len(answers['Random']) == len(labels)
+
+
+def test_rank_histogram():
+    """Ranks of a right posterior are uniform; those of a narrow or a biased one are not."""
+    rng = np.random.default_rng(1)
+    truth = rng.normal(size=(200, 3))
+
+    def histogram(scale, shift=0.0):
+        return rank_histogram(norm.cdf(truth / scale + shift))
+
+    right, narrow, biased = histogram(1.0), histogram(0.3), histogram(1.0, 1.0)
+    assert right['p'] > 0.01 and narrow['p'] < 1e-6 and biased['p'] < 1e-6
+    assert sum(right['bins']) == right['count'] == 600 and right['trials'] == 200
+    assert narrow['bins'][0] + narrow['bins'][-1] > 0.5 * 600
+    assert rank_histogram([[], []])['p'] is None
+
+
+def test_ranks_of_one_trial_count_as_one():
+    """Ten equal ranks in one trial are no more evidence than one."""
+    assert rank_histogram([[0.9] * 10])['p'] == pytest.approx(rank_histogram([[0.9]])['p'])
+    assert rank_histogram([[0.9]] * 10)['p'] < 1e-6
+
+
+@pytest.mark.parametrize('name, value, ci, no_worse', [
+    ('false_alarms', 0.0, (0.0, 0.05), 'yes'), ('false_alarms', 0.02, (0.0, 0.05), 'open'),
+    ('false_alarms', 0.1, (0.04, 0.2), 'no'), ('top_1', 0.8, (0.7, 0.9), 'yes'),
+    ('top_1', 0.7, (0.6, 0.8), 'open'), ('top_1', 0.5, (0.4, 0.6), 'no'),
+    ('coverage', 0.93, (0.9, 0.95), 'yes'), ('coverage', 0.95, (0.9, 0.99), 'open'),
+    ('coverage', 0.7, (0.6, 0.8), 'no'), ('coverage', 0.99, (0.95, 1.0), 'no')])
+def test_comparison_with_the_fourth_run(name, value, ci, no_worse):
+    bar = next(bar for bar in scores.BARS if bar.name == name)
+    made = {bar.name: {'value': None, 'ci': None, 'count': 0} for bar in scores.BARS}
+    made[name] = {'value': value, 'ci': list(ci), 'count': 10}
+    rows = {row['name']: row['no_worse'] for row in scores.bars(made)}
+    assert rows.pop(bar.name) == no_worse
+    assert set(rows.values()) == {None}
+
+
+def test_result_is_one_table_with_all_methods():
+    labels = [label('single', ['bias']), label('none'), label('outside', ['creep'])]
+    answers = [reference_methods.certain(frozenset(row.true)) for row in labels]
+    made = scores.scores([scores.Trial(row, answer, None) for row, answer in zip(
+        labels, answers)])
+    text = report_html.markdown_result({
+        'trials': 3, 'cases': 3, 'seed': 1, 'date': 'today', 'hash': 'h', 'version': 'v',
+        'diagnose_code': 'c', 'controls': {}, 'bars': scores.bars(made), 'scores': made})
+    head = next(line for line in text.splitlines() if line.startswith('| score'))
+    for name in ('fourth run', 'no worse', 'Null', 'Random', 'Worst', 'BIC, white noise'):
+        assert f'| {name} ' in head
+    rows = [line for line in text.splitlines() if line.startswith('|')]
+    assert len(rows) == len(scores.BARS) + 4
+    assert {row.count('|') for row in rows} == {head.count('|')}
