@@ -24,13 +24,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 from adxl_ros.diagnose import data_checks, decision, gap_closure, noise_detectors
-from adxl_ros.diagnose.baseline_comparison import BaselineComparison, compare, Reference
+from adxl_ros.diagnose.baseline_comparison import BaselineComparison, Reference
 from adxl_ros.diagnose.data_checks import CheckedRecording, DataFault
 from adxl_ros.diagnose.decision import Findings, Verdict
 from adxl_ros.diagnose.drift_checks import walk_log_bayes_factor
 from adxl_ros.diagnose.evidence import bridged
 from adxl_ros.diagnose.gap_closure import GapClosure, HeldOutResidual
 from adxl_ros.diagnose.hypothesis_fit import Hypothesis, residual_channels
+from adxl_ros.diagnose.input_checks import compare_checked
 from adxl_ros.diagnose.linear_model import build_linear_model, LinearModel
 from adxl_ros.diagnose.model_discrepancy import discrepancy, discrepancy_instead_of_drift
 from adxl_ros.diagnose.model_search import search, WORTH_LOG_BAYES_FACTOR
@@ -117,8 +118,8 @@ class Diagnosis:
 
 
 def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None = None,
-             seed: int = 0, show_progress: Callable[[float], None] = lambda fraction: None
-             ) -> Diagnosis:
+             seed: int = 0, show_progress: Callable[[float], None] = lambda fraction: None,
+             align: bool = False) -> Diagnosis:
     """
     Compare recordings of one unit with the simulator, and find which effects it lacks.
 
@@ -134,6 +135,8 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
         Seed of bootstraps and of simulated noise.
     show_progress
         Called with the fraction that is done, 0 to 1.
+    align
+        Whether `sim` is shifted in time where its motion is late or early.
 
     Returns
     -------
@@ -152,7 +155,10 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
     compared: list[BaselineComparison] = []
     for recording in recordings:
         check_unit(recording.stream_info, recording.axes, sensor)
-        compared.append(compare(recording, sensor, sim))
+        comparison = compare_checked(recording, sensor, sim, align)
+        if isinstance(comparison, DataFault):
+            return Diagnosis(comparison, [])
+        compared.append(comparison)
     short = data_checks.find_length_fault(compared)
     if short is not None:
         return Diagnosis(short, compared)

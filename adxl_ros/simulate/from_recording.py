@@ -34,7 +34,8 @@ _MIN_FORCE_SAMPLES = 4
 """Fewest samples of specific force; a cubic spline needs them."""
 
 
-def motion_from_force(path: str | os.PathLike, resampled: bool) -> tuple[Motion, float]:
+def motion_from_force(path: str | os.PathLike, resampled: bool, epoch_ns: int = 0
+                      ) -> tuple[Motion, float]:
     """
     Make a motion from the specific force of a recording.
 
@@ -44,6 +45,8 @@ def motion_from_force(path: str | os.PathLike, resampled: bool) -> tuple[Motion,
         Recording with specific force in the case frame, m/s².
     resampled
         Whether the chain runs at the rate of the samples; otherwise at 1 kHz at least.
+    epoch_ns
+        Origin of the times of the motion, ns: that of the recording it belongs to.
 
     Returns
     -------
@@ -56,7 +59,7 @@ def motion_from_force(path: str | os.PathLike, resampled: bool) -> tuple[Motion,
         The recording has fewer than four samples.
 
     """
-    time_s, force_mps2 = recording.read_ideal(path)
+    time_s, force_mps2 = recording.read_ideal(path, epoch_ns)
     if len(time_s) < _MIN_FORCE_SAMPLES:
         raise UserError(f'{path}: {len(time_s)} samples of specific force; at least '
                         f'{_MIN_FORCE_SAMPLES} are needed')

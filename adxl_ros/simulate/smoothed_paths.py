@@ -288,7 +288,15 @@ def _moving(reading: np.ndarray) -> np.ndarray:
 
 
 class ForcePath:
-    """Specific force of a recording or of another simulator, as cubic splines."""
+    """
+    Specific force of a recording or of another simulator, as cubic splines.
+
+    Attributes
+    ----------
+    time_s
+        Times of the samples, s, (n,).
+
+    """
 
     def __init__(self, time_s: np.ndarray, force_mps2: np.ndarray) -> None:
         """
@@ -302,9 +310,14 @@ class ForcePath:
             Specific force in the case frame, m/s², (n, 3).
 
         """
+        self.time_s = time_s
+        self._force_mps2 = force_mps2
         self._spline = CubicSpline(time_s, force_mps2)
-        self._begin_s, self._end_s = time_s[0], time_s[-1]
 
     def __call__(self, time_s: np.ndarray) -> Components:
         """Return the three components at times, s, (n,), m/s²; constant outside."""
-        return list(self._spline(np.clip(time_s, self._begin_s, self._end_s)).T)
+        return list(self._spline(np.clip(time_s, self.time_s[0], self.time_s[-1])).T)
+
+    def shifted(self, later_s: float) -> ForcePath:
+        """Return the same force at later times, s."""
+        return ForcePath(self.time_s + later_s, self._force_mps2)

@@ -44,6 +44,8 @@ def parser() -> argparse.ArgumentParser:
                        help='what the simulator models (default: the nominal sensor)')
     parse.add_argument('--sim', metavar='RECORDING',
                        help='ideal specific force of the same manoeuvre by another simulator')
+    parse.add_argument('--align', action='store_true',
+                       help='shift --sim in time where its motion is late or early')
     parse.add_argument('--seed', type=int, default=0, help='seed of the bootstraps (default 0)')
     parse.add_argument('--json', action='store_true', help='print the report as JSON')
     parse.add_argument('-o', dest='output', metavar='DIR', required=True,
@@ -59,13 +61,17 @@ def diagnose(options: argparse.Namespace) -> int:
         raise UserError(f'--sim {options.sim}: goes with one recording, but '
                         f'{len(options.recording)} are given')
     sensor = parameter_file.load(options.params or parameter_file.nominal_path())
-    sim = motion_from_force(options.sim, False)[0] if options.sim else None
+    if options.align and not options.sim:
+        raise UserError('--align: shifts --sim, which is not given')
     recordings = []
     for path in options.recording:
         recordings.append(recording.read(path))
         report_reading('diagnose', recordings[-1])
+    sim = motion_from_force(options.sim, False, recordings[0].epoch_ns)[0] if options.sim \
+        else None
     with progress('diagnose') as show:
-        diagnosis = diagnose_recordings(recordings, sensor, sim, options.seed, show)
+        diagnosis = diagnose_recordings(recordings, sensor, sim, options.seed, show,
+                                        options.align)
     folder = Path(options.output)
     make_folder(folder)
     report = report_json.as_json(diagnosis)

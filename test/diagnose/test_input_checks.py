@@ -19,13 +19,18 @@ import json
 
 from adxl_ros.diagnose import data_checks
 from adxl_ros.diagnose.baseline_comparison import compare
+from adxl_ros.diagnose.input_checks import compare_checked
 from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.stream_info import sensor_info
+from adxl_ros.model.constants import G0_MPS2
+from adxl_ros.model.kinematics import specific_force
 from adxl_ros.simulate import trajectories
+from adxl_ros.simulate.from_recording import motion_from_force
 from adxl_ros.simulate.motion import Motion
 from adxl_ros.simulate.simulator import simulate
 import numpy as np
+import pytest
 from units import nominal
 
 
@@ -82,3 +87,63 @@ def test_short_recordings_count_together():
     assert data_checks.find_length_fault([comparison]).status == 'insufficient'
     assert data_checks.find_length_fault([comparison, comparison]) is None
     assert data_checks.find_data_fault(comparison, comparison) is None
+
+
+def ideal(tmp_path, late_s, name='sim.csv'):
+    """Write the ideal force of the recording of `made`, with stamps that are late."""
+    path = script()
+    alpha, beta = path.joints()
+    time_s = np.arange(0, path.now, 0.01)
+    force = specific_force(alpha(time_s), beta(time_s), G0_MPS2)
+    rows = np.column_stack([time_s + late_s, *force])
+    np.savetxt(tmp_path / name, rows, '%.6f', ',', comments='',
+               header='time_s,ax_mps2,ay_mps2,az_mps2')
+    return name
+
+
+@pytest.mark.parametrize('late_s', [0.7, -1.3, 12.0])
+def test_a_shifted_simulator_is_late(run_tool, tmp_path, late_s):
+    """A shift that no latency explains is named with its size, and `--align` with it."""
+    report, run = report_of(run_tool, tmp_path, unit(), made(unit()),
+                            options=['--sim', ideal(tmp_path, late_s)])
+    assert run.returncode == 1
+    assert report['verdict']['data_fault'] == 'time_misaligned'
+    words = report['summary'].split()
+    assert words[:2] == ['--sim', 'is'] and 'use --align' in report['summary']
+    assert words[4] == ('late' if late_s > 0 else 'early')
+    assert float(words[2]) == pytest.approx(abs(late_s), abs=2e-3)
+    assert float(words[6]) < 2e-3
+
+
+def test_a_simulator_of_another_time_does_not_overlap(run_tool, tmp_path):
+    """Both ranges of time are named, and the shift that makes the motion fit."""
+    report, run = report_of(run_tool, tmp_path, unit(), made(unit()),
+                            options=['--sim', ideal(tmp_path, 1000.0)])
+    assert (run.returncode, report['verdict']['data_fault']) == (1, 'no_overlap')
+    summary = report['summary']
+    assert 'from 0 to ' in summary and 'from 1000 to ' in summary and '--align' in summary
+    assert '1000.00' in summary
+
+
+@pytest.mark.parametrize('late_s', [1000.0, 0.7, 0.02])
+def test_align_shifts_the_simulator(tmp_path, late_s):
+    """`--align` removes a shift, and leaves a latency of the sensor where it is."""
+    force = motion_from_force(tmp_path / ideal(tmp_path, late_s), False)[0]
+    comparison = compare_checked(made(unit()), unit(), force, True)
+    residual_g = comparison.residual_v(comparison.sensor)[comparison.used]
+    assert np.sqrt(np.mean(residual_g ** 2)) < (1e-3 if late_s > 0.1 else 1e-2)
+    assert comparison.notes[0].startswith('--align')
+    assert ('nothing is shifted' in comparison.notes[0]) == (late_s < 0.1)
+
+
+def test_a_simulator_of_another_motion_is_no_shift(run_tool, tmp_path):
+    """A motion that fits at no shift is named as another recording's."""
+    recorded = made(unit())
+    time_s = recorded.time_s
+    rng = np.random.default_rng(1)
+    wander = np.cumsum(rng.normal(size=(3, len(time_s))), axis=1) * 0.02
+    np.savetxt(tmp_path / 'sim.csv', np.column_stack([time_s + 500.0, *wander]), '%.6f', ',',
+               comments='', header='time_s,ax_mps2,ay_mps2,az_mps2')
+    report, run = report_of(run_tool, tmp_path, unit(), recorded, options=['--sim', 'sim.csv'])
+    assert (run.returncode, report['verdict']['data_fault']) == (1, 'no_overlap')
+    assert 'no shift' in report['summary']

@@ -1,0 +1,64 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""A recording and its reference before the comparison: what is corrected, and what is left out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from adxl_ros.diagnose.baseline_comparison import BaselineComparison, compare
+from adxl_ros.diagnose.data_checks import DataFault
+from adxl_ros.diagnose.sim_alignment import align_force
+from adxl_ros.files.recording_columns import Recording
+from adxl_ros.model.sensor import Sensor
+from adxl_ros.simulate.motion import Motion
+
+
+def compare_checked(recording: Recording, sensor: Sensor, sim: Motion | None, may_shift: bool
+                    ) -> BaselineComparison | DataFault:
+    """
+    Put a recording beside the simulator, without the parts that have no reference.
+
+    Parameters
+    ----------
+    recording
+        A recording of `sensor`.
+    sensor
+        The baseline.
+    sim
+        Specific force by another simulator, in place of the stage.
+    may_shift
+        Whether `sim` is shifted in time where its motion is late or early.
+
+    Returns
+    -------
+    BaselineComparison or DataFault
+        The comparison with its notes, or why there is none.
+
+    Raises
+    ------
+    UserError
+        The stage angles jump as no stage does.
+
+    """
+    notes: list[str] = []
+    if sim is not None:
+        aligned = align_force(recording, sensor, sim, may_shift)
+        if isinstance(aligned, DataFault):
+            return aligned
+        recording, sim = aligned.recording, aligned.sim
+        notes += aligned.notes
+    comparison = compare(recording, sensor, sim)
+    return replace(comparison, notes=tuple(notes))
