@@ -244,7 +244,6 @@ def _decide(linear_model: LinearModel, explanation: _Explanation) -> Verdict:
         [n.simulated_std_mps2 ** 2 for n in explanation.noise_after])))
     walk = walk_log_bayes_factor(list(residual_channels(linear_model, best))) \
         if drifts_among(best.effects) else 0.0
-    explained_square = max(closure.before_mps2 ** 2 - closure.fitted_rms_mps2 ** 2, 0.0)
     verdict = decision.decide(Findings(
         hypotheses=explanation.hypotheses,
         library_size=linear_model.library_size,
@@ -253,7 +252,7 @@ def _decide(linear_model: LinearModel, explanation: _Explanation) -> Verdict:
         walk_log_bayes_factor=walk,
         detections=explanation.detections,
         noise_mps2=explanation.noise_mps2,
-        explained_mps2=float(np.sqrt(explained_square)),
+        explained_mps2=closure.explained_mps2,
         unexplained_mps2=gap_closure.unexplained_mps2(linear_model, best, closure,
                                                       simulated_noise_mps2),
         code_step_mps2=max(map(_rounding_std_mps2, linear_model.comparisons))))

@@ -15,15 +15,19 @@
 """
 How large the gap is, what each effect contributes, and how far a hypothesis closes the gap.
 
-Blocks are held out in turn, and the blocks next to them are not fitted. The gap is the rms of the
-residual over held-out samples and axes. Zero-g and scale factor have their posterior mean from the
-fitted blocks.
+The gap is the rms of recording minus simulation over all used samples and axes. Nothing is removed
+from it. What zero-g and drift take up is stated beside it.
+
+Blocks are held out in turn, and the blocks next to them are not fitted. The gap after a hypothesis
+is that of the held-out blocks. The decision compares hypotheses by the residual about a zero-g
+that may drift, which is called the levelled residual.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 from adxl_ros.diagnose import evidence, noise_floor
 from adxl_ros.diagnose.baseline_comparison import BaselineComparison, Reference
@@ -31,7 +35,7 @@ from adxl_ros.diagnose.evidence import BLOCKS
 from adxl_ros.diagnose.hypothesis_fit import Hypothesis, linearise
 from adxl_ros.diagnose.linear_model import LinearModel
 from adxl_ros.diagnose.noise_floor import FEWEST_SAMPLES, NoiseFloor, SquareSum
-from adxl_ros.diagnose.noise_whitening import expected_drift_g, USUAL_DENSITY
+from adxl_ros.diagnose.noise_whitening import drifts_among, expected_drift_g, USUAL_DENSITY
 from adxl_ros.model import noise
 from adxl_ros.model.coefficients import neutral
 from adxl_ros.model.constants import G0_MPS2
@@ -66,9 +70,15 @@ class GapClosure:
     Attributes
     ----------
     before_mps2
-        Held-out rms of the baseline, m/s².
+        Rms of the recording minus the simulation of the baseline, m/s².
     after_mps2
-        Held-out rms with the effects of the hypothesis, m/s².
+        The same with the effects of the hypothesis, on held-out blocks, m/s².
+    zero_g_mps2
+        Rms over axes of the constant zero-g in the gap, m/s². The effects of the hypothesis are
+        not in it, unless one of them is the zero-g.
+    drift_mps2
+        Rms of the slow changes of the zero-g about this constant, m/s². It is not larger than the
+        drift of the noise model of the hypothesis.
     floor_mps2
         Noise floor, m/s².
     closed
@@ -76,9 +86,11 @@ class GapClosure:
     closed_ci
         90 % interval of the closed share.
     harm
-        Whether the hypothesis makes the held-out residual larger.
+        Whether the hypothesis makes the levelled held-out residual larger.
+    explained_mps2
+        Rms of the levelled residual that the fit to all blocks explains, m/s².
     fitted_rms_mps2
-        Rms about the fit to all blocks, none held out, m/s².
+        Rms of the levelled residual about the fit to all blocks, none held out, m/s².
     log_likelihood_gain
         Held-out log likelihood with the effects minus that without.
 
@@ -86,10 +98,13 @@ class GapClosure:
 
     before_mps2: float
     after_mps2: float
+    zero_g_mps2: float
+    drift_mps2: float
     floor_mps2: float
     closed: float
     closed_ci: tuple[float, float]
     harm: bool
+    explained_mps2: float
     fitted_rms_mps2: float
     log_likelihood_gain: float
 
@@ -123,13 +138,17 @@ class HeldOutResidual:
     Attributes
     ----------
     squares
-        Sum over samples of the mean square over axes, by block, (m/s²)², (blocks,).
+        Sum over samples of the mean square over axes, of the levelled residual, by block,
+        (m/s²)², (blocks,).
+    plain_squares
+        The same of the residual as it is. Without effects it is that of the baseline itself.
     log_likelihood
         Log likelihood of all blocks.
 
     """
 
     squares: np.ndarray
+    plain_squares: np.ndarray
     log_likelihood: float
 
 
@@ -298,14 +317,8 @@ def unexplained_mps2(linear_model: LinearModel, hypothesis: Hypothesis, closure:
         Rms, m/s².
 
     """
-    channels = [c for c in linear_model.comparisons for _ in c.sensor.axes]
-    drift_squares = []
-    for c, filters, i in zip(channels, linear_model.filters, hypothesis.fit.filter_indices):
-        drift_g = expected_drift_g(filters[i].spectrum, filters[i].density, c.span_s,
-                                   c.sensor.rate_hz)
-        drift_squares.append((G0_MPS2 * drift_g) ** 2)
     floor = max(closure.floor_mps2, noise_mps2) ** 2 \
-        + _DRIFT_QUANTILE * float(np.mean(drift_squares))
+        + _DRIFT_QUANTILE * float(np.mean(_drift_squares(linear_model, hypothesis)))
     return float(np.sqrt(max(closure.fitted_rms_mps2 ** 2 - floor, 0.0)))
 
 
@@ -334,7 +347,7 @@ def held_out_residual(linear_model: LinearModel, comparisons: Sequence[BaselineC
     number = np.arange(BLOCKS)
     linearised = linearise(linear_model, effects, sensor)
     full_fit = linearised.fit()
-    squares, log_likelihood = np.zeros(BLOCKS), 0.0
+    squares, plain_squares, log_likelihood = np.zeros(BLOCKS), np.zeros(BLOCKS), 0.0
     for fold in range(_FOLDS):
         held_out = (number // _RUN_BLOCKS) % _FOLDS == fold
         fitted = np.convolve(held_out, np.ones(3), 'same') == 0
@@ -343,9 +356,17 @@ def held_out_residual(linear_model: LinearModel, comparisons: Sequence[BaselineC
             linearised.channels, fit, np.flatnonzero(held_out)).sum())
         refitted = linearised.refitted_sensor(fit, full_fit)
         for comparison in comparisons:
-            squares[held_out] += _squares_by_block(comparison, refitted, fitted, linear_model,
-                                                   effects)[held_out]
-    return HeldOutResidual(squares, log_likelihood)
+            residual = _residual_mps2(comparison, refitted)
+            levelled = _levelled(comparison, residual, fitted, linear_model, effects)
+            squares[held_out] += _squares_by_block(comparison, levelled)[held_out]
+            if drifts_among(effects) and not _has_zero_g(effects):
+                # The zero-g of this recording does not predict the next one.
+                residual = residual + _zero_g_departure_mps2(comparison, refitted)
+            plain_squares[held_out] += _squares_by_block(comparison, residual)[held_out]
+    if not effects:
+        plain_squares = np.sum([_squares_by_block(c, _residual_mps2(c, c.sensor))
+                                for c in comparisons], axis=0)
+    return HeldOutResidual(squares, plain_squares, log_likelihood)
 
 
 def gap_closure(linear_model: LinearModel, comparisons: Sequence[BaselineComparison],
@@ -377,18 +398,18 @@ def gap_closure(linear_model: LinearModel, comparisons: Sequence[BaselineCompari
     """
     residual = baseline_residual if not hypothesis.effects else held_out_residual(
         linear_model, comparisons, hypothesis.effects, hypothesis.sensor)
-    before, after = baseline_residual.squares, residual.squares
     # Effects on the noise leave the mean and the gap as they are.
     if all(effect_named(effect).acts_on is not ActsOn.MEAN for effect in hypothesis.effects):
-        after = before
+        residual = replace(baseline_residual, log_likelihood=residual.log_likelihood)
+    before, after = baseline_residual.plain_squares, residual.plain_squares
     counts = np.zeros(BLOCKS)
     for c in comparisons:
         counts += np.add.reduceat(c.used, evidence.block_edges(len(c))[:-1])
-    every_block = np.ones(BLOCKS, bool)
-    fitted_squares = sum(_squares_by_block(c, hypothesis.sensor, every_block, linear_model,
-                                           hypothesis.effects).sum() for c in comparisons)
+    count = max(float(counts.sum()), 1.0)
+    level = [_levels(c, linear_model, hypothesis, i) for i, c in enumerate(comparisons)]
+    fitted_square = sum(part.levelled_squares for part in level) / count
     floor = floor_mps2 ** 2
-    before_square, after_square = before.sum() / counts.sum(), after.sum() / counts.sum()
+    before_square, after_square = before.sum() / count, after.sum() / count
     # The rms after can be below the floor by chance.
     lowest_square = min(floor, after_square)
     closed = (before_square - after_square) / (before_square - lowest_square) \
@@ -396,11 +417,15 @@ def gap_closure(linear_model: LinearModel, comparisons: Sequence[BaselineCompari
     return GapClosure(
         before_mps2=float(np.sqrt(before_square)),
         after_mps2=float(np.sqrt(after_square)),
+        zero_g_mps2=float(np.sqrt(sum(part.zero_g_squares for part in level) / count)),
+        drift_mps2=float(np.sqrt(sum(part.drift_squares for part in level) / count)),
         floor_mps2=floor_mps2,
         closed=float(min(closed, 1.0)),
         closed_ci=_closed_interval(before, after, counts, lowest_square, seed),
-        harm=bool(after_square > before_square * _HARM_RATIO),
-        fitted_rms_mps2=float(np.sqrt(fitted_squares / counts.sum())),
+        harm=bool(residual.squares.sum() > baseline_residual.squares.sum() * _HARM_RATIO),
+        explained_mps2=float(np.sqrt(max(
+            baseline_residual.squares.sum() / count - fitted_square, 0.0))),
+        fitted_rms_mps2=float(np.sqrt(fitted_square)),
         log_likelihood_gain=residual.log_likelihood - baseline_residual.log_likelihood)
 
 
@@ -416,25 +441,99 @@ def _closed_interval(before: np.ndarray, after: np.ndarray, counts: np.ndarray, 
     return float(low), float(high)
 
 
-def _squares_by_block(comparison: BaselineComparison, sensor: Sensor, fitted: np.ndarray,
-                      linear_model: LinearModel, effects: Sequence[str]) -> np.ndarray:
-    """
-    Return the sum over samples of the mean square over axes, by block, (m/s²)², (blocks,).
+def _residual_mps2(comparison: BaselineComparison, sensor: Sensor) -> np.ndarray:
+    """Return the recording minus the mean output of a sensor, m/s², (n, m)."""
+    return comparison.residual_v(sensor) / comparison.scale_v_per_mps2
 
-    The zero-g may drift, so that the mean residual of the fitted blocks is subtracted. It shrinks
-    towards zero by the tolerance of the zero-g, unless the zero-g is an effect of the hypothesis.
+
+def _levelled(comparison: BaselineComparison, residual: np.ndarray, fitted: np.ndarray,
+              linear_model: LinearModel, effects: Sequence[str]) -> np.ndarray:
     """
-    residual_v = comparison.residual_v(sensor)
+    Return a residual minus its mean over the fitted blocks, because the zero-g may drift.
+
+    The mean shrinks towards zero by the tolerance of the zero-g, unless the zero-g is an effect of
+    the hypothesis.
+    """
     edges = evidence.block_edges(len(comparison))
     level_samples = comparison.used & np.repeat(fitted, np.diff(edges))
-    if level_samples.any():
-        drift_v2 = USUAL_DENSITY ** 2 * comparison.span_s / 6 \
-            * comparison.sensor.scale_v_per_g ** 2
-        zero_g_free = any(effect_named(e).diagnosis.straight_line is StraightLine.ZERO_G
-                          for e in effects)
-        tolerance_v = np.array([np.inf if zero_g_free else linear_model.zero_g_tolerance_v(axis)
-                                for axis in comparison.sensor.axes])
-        residual_v = residual_v - residual_v[level_samples].mean(axis=0) \
-            / (1 + drift_v2 / tolerance_v ** 2)
-    squares = ((residual_v / comparison.scale_v_per_mps2) ** 2).mean(axis=1)
-    return np.add.reduceat(np.where(comparison.used, squares, 0.0), edges[:-1])
+    if not level_samples.any():
+        return residual
+    drift_square = (USUAL_DENSITY * G0_MPS2) ** 2 * comparison.span_s / 6
+    tolerance_v = np.array([np.inf if _has_zero_g(effects)
+                            else linear_model.zero_g_tolerance_v(axis)
+                            for axis in comparison.sensor.axes])
+    return residual - residual[level_samples].mean(axis=0) \
+        / (1 + drift_square / (tolerance_v / comparison.scale_v_per_mps2) ** 2)
+
+
+def _has_zero_g(effects: Sequence[str]) -> bool:
+    """Determine whether one of the effects is the zero-g."""
+    return any(effect_named(e).diagnosis.straight_line is StraightLine.ZERO_G for e in effects)
+
+
+def _squares_by_block(comparison: BaselineComparison, residual: np.ndarray) -> np.ndarray:
+    """Return the sum over used samples of the mean square over axes, by block, (blocks,)."""
+    squares = np.where(comparison.used, (residual ** 2).mean(axis=1), 0.0)
+    return np.add.reduceat(squares, evidence.block_edges(len(comparison))[:-1])
+
+
+def _zero_g_departure_mps2(comparison: BaselineComparison, sensor: Sensor) -> np.ndarray:
+    """Return the zero-g of a sensor minus that of the baseline, m/s², (m,)."""
+    change_v = sensor.zero_g_v - comparison.sensor.zero_g_v
+    return change_v / comparison.scale_v_per_mps2
+
+
+class _Levels(NamedTuple):
+    """
+    What the zero-g takes up of one recording, as sums over used samples, (m/s²)².
+
+    `zero_g_squares` is that of a constant zero-g, `drift_squares` that of slow changes about it,
+    and `levelled_squares` that of the levelled residual.
+    """
+
+    zero_g_squares: float
+    drift_squares: float
+    levelled_squares: float
+
+
+def _levels(comparison: BaselineComparison, linear_model: LinearModel, hypothesis: Hypothesis,
+            number: int) -> _Levels:
+    """Split the zero-g of a recording into a constant and slow changes; `number` is its number."""
+    residual = _residual_mps2(comparison, hypothesis.sensor)
+    levelled = _levelled(comparison, residual, np.ones(BLOCKS, bool), linear_model,
+                         hypothesis.effects)
+    count = int(comparison.used.sum())
+    mean = residual[comparison.used].mean(axis=0)
+    zero_g = mean + _zero_g_departure_mps2(comparison, hypothesis.sensor)
+    if comparison.reference is Reference.NONE:
+        # The pose is unknown, and the mean of the residual is not compared.
+        zero_g = np.zeros_like(zero_g)
+    axes = len(comparison.sensor.axes)
+    drift = [min(_slow_square(comparison, residual[:, d] - mean[d], d),
+                 _DRIFT_QUANTILE * square) for d, square in enumerate(
+                     _drift_squares(linear_model, hypothesis)[number * axes:][:axes])]
+    return _Levels(count * float(np.mean(zero_g ** 2)), count * float(np.mean(drift)),
+                   float(_squares_by_block(comparison, levelled).sum()))
+
+
+def _slow_square(comparison: BaselineComparison, residual: np.ndarray, axis: int) -> float:
+    """Return the mean square of the means of blocks, above that of white noise, (m/s²)²."""
+    number = np.repeat(np.arange(BLOCKS), np.diff(evidence.block_edges(len(comparison))))
+    number, values = number[comparison.used], residual[comparison.used]
+    counts = np.maximum(np.bincount(number, minlength=BLOCKS), 1)
+    means = np.bincount(number, values, minlength=BLOCKS) / counts
+    noise_square = float(np.mean((values - means[number]) ** 2))
+    rc_s = float(noise.electronics(comparison.sensor).rc_s[axis])
+    independent = noise.effective_samples(counts, comparison.dt_s, rc_s)
+    return max(float(np.average(means ** 2 - noise_square / independent, weights=counts)), 0.0)
+
+
+def _drift_squares(linear_model: LinearModel, hypothesis: Hypothesis) -> list[float]:
+    """Return the mean square of the drift that the noise of each channel has, (m/s²)²."""
+    channels = [c for c in linear_model.comparisons for _ in c.sensor.axes]
+    squares = []
+    for c, filters, i in zip(channels, linear_model.filters, hypothesis.fit.filter_indices):
+        drift_g = expected_drift_g(filters[i].spectrum, filters[i].density, c.span_s,
+                                   c.sensor.rate_hz)
+        squares.append((G0_MPS2 * drift_g) ** 2)
+    return squares
