@@ -27,6 +27,7 @@ from adxl_ros.diagnose import data_checks, decision, gap_closure, noise_detector
 from adxl_ros.diagnose.baseline_comparison import BaselineComparison, Reference
 from adxl_ros.diagnose.data_checks import CheckedRecording, DataFault
 from adxl_ros.diagnose.decision import Findings, Verdict
+from adxl_ros.diagnose.determination import at_baseline, not_determined, NotDetermined
 from adxl_ros.diagnose.drift_checks import walk_log_bayes_factor
 from adxl_ros.diagnose.evidence import bridged
 from adxl_ros.diagnose.gap_closure import GapClosure, HeldOutResidual
@@ -90,6 +91,8 @@ class Diagnosis:
         What to record next.
     contributions_mps2
         Rms that each effect of the best hypothesis contributes, m/s².
+    not_determined
+        Parameters of the effects of the hypotheses that the recordings do not determine.
     single_effect_tests
         Tests of each effect alone.
     noise_before, noise_after
@@ -111,6 +114,7 @@ class Diagnosis:
     not_covered: tuple[str, ...] = ()
     next_experiment: NextExperiment | None = None
     contributions_mps2: dict[str, float] = field(default_factory=dict)
+    not_determined: NotDetermined = field(default_factory=dict)
     single_effect_tests: dict[str, SingleEffectTest] = field(default_factory=dict)
     noise_before: tuple[NoiseComparison, ...] = ()
     noise_after: tuple[NoiseComparison, ...] = ()
@@ -229,6 +233,7 @@ def _explain(checked: Sequence[CheckedRecording], linear_model: LinearModel,
                                                       linear_model.baseline)
     confirmed, closure = _confirmed(linear_model, comparisons, material, baseline_residual,
                                     floor.rms_mps2, seed)
+    confirmed[0] = at_baseline(linear_model, confirmed[0])
     detections = _detections(checked, confirmed[0])
     named_sensor = _with_detections(confirmed[0], detections, sensor)
     return _Explanation(
@@ -287,6 +292,7 @@ def _with_report(linear_model: LinearModel, explanation: _Explanation, verdict: 
         not_covered=tuple(lacking),
         next_experiment=propose_next_experiment(verdict, lacking, seed),
         contributions_mps2=contributions_mps2,
+        not_determined=not_determined(linear_model, explanation.hypotheses),
         single_effect_tests=single_effect_tests(linear_model, seed),
         noise_before=explanation.noise_before,
         noise_after=explanation.noise_after,

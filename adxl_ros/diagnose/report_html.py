@@ -27,6 +27,7 @@ from adxl_ros.diagnose.diagnosis import Diagnosis
 from adxl_ros.diagnose.hypothesis_fit import Hypothesis
 from adxl_ros.diagnose.report_json import (
     as_json,
+    not_determined_text,
     notes,
     p_text,
     shares_of_gap,
@@ -250,6 +251,8 @@ def _candidate_table(report: dict[str, Any]) -> str:
 
 def _parameter_text(name: str, parameter: dict[str, Any]) -> str:
     """Return a parameter with its interval, if it has one, as text."""
+    if not parameter.get('determined', True):
+        return f'{name}: {not_determined_text(parameter)}'
     if 'ci' not in parameter:
         return f'{name} = {parameter["value"]}'
     low, high = parameter['ci']

@@ -27,9 +27,10 @@ from adxl_ros.diagnose.gap_closure import GapClosure
 from adxl_ros.diagnose.hypothesis_fit import Hypothesis
 from adxl_ros.diagnose.next_experiment import NextExperiment
 from adxl_ros.diagnose.residual_map import ResidualCell, SIGNIFICANT_P
-from adxl_ros.model.coefficients import get, parameter_of
+from adxl_ros.model.coefficients import fitted_of, get, parameter_of
 from adxl_ros.model.constants import G0_MPS2, Z_90
 from adxl_ros.model.effects import effect_named, library
+from adxl_ros.model.effects.base import Coefficient
 import numpy as np
 
 _DIGITS = 6
@@ -91,6 +92,7 @@ def _gap(diagnosis: Diagnosis) -> dict[str, Any]:
     assert diagnosis.gap_closure is not None and diagnosis.noise_floor is not None
     closure = diagnosis.gap_closure
     return {'unit': 'm/s^2', 'before': _rounded(closure.before_mps2),
+            'zero_g': _rounded(closure.zero_g_mps2), 'drift': _rounded(closure.drift_mps2),
             'after': _rounded(closure.after_mps2), 'floor': _rounded(closure.floor_mps2),
             'floor_source': diagnosis.noise_floor.source, 'closed': _rounded(closure.closed),
             'closed_ci': [_rounded(c) for c in closure.closed_ci],
@@ -183,7 +185,7 @@ def _candidate(diagnosis: Diagnosis, effect: str, probability: float,
     detection = next((d for d in diagnosis.detections if d.effect == effect), None)
     p = _rounded(test.p) if test else None
     if detection is None:
-        parameters = _parameters(best_with, effect)
+        parameters = _parameters(diagnosis, best_with, effect)
         if effect in verdict.best.effects:
             closed = _rounded(diagnosis.gap_closure.closed)
     else:
@@ -204,21 +206,35 @@ def _rivals(effect: str, verdict: Verdict) -> list[str]:
     return [other for other in group if other != effect]
 
 
-def _parameters(hypothesis: Hypothesis | None, effect: str) -> dict[str, Any]:
-    """Return the parameters of an effect as the parameter file has them, baseline included."""
+def _parameters(diagnosis: Diagnosis, hypothesis: Hypothesis | None, effect: str
+                ) -> dict[str, Any]:
+    """
+    Return the parameters of an effect as the parameter file has them, baseline included.
+
+    A parameter that the recordings do not determine has no value.
+    """
     if hypothesis is None:
         return {}
-    parameters = {}
-    for name, std in zip(hypothesis.names, hypothesis.std):
-        if name.effect != effect:
-            continue
-        value = float(get(hypothesis.sensor, [name])[0])
-        key = f'{name.parameter}.{name.axis}' if name.axis else name.parameter
-        parameters[key] = {
-            'value': _rounded(value),
-            'ci': [_rounded(value - Z_90 * std), _rounded(value + Z_90 * std)],
-            'unit': parameter_of(name).unit}
+    parameters: dict[str, dict[str, Any]] = {}
+    for name in fitted_of(effect_named(effect), hypothesis.sensor.axes):
+        key, unit = _key(name), parameter_of(name).unit
+        if name in diagnosis.not_determined:
+            parameters[key] = {
+                'value': None, 'ci': None, 'unit': unit, 'determined': False,
+                'not_separated_from': [_key(n) for n in diagnosis.not_determined[name]]}
+        elif name in hypothesis.names:
+            value = float(get(hypothesis.sensor, [name])[0])
+            std = hypothesis.std[hypothesis.names.index(name)]
+            parameters[key] = {
+                'value': _rounded(value),
+                'ci': [_rounded(value - Z_90 * std), _rounded(value + Z_90 * std)],
+                'unit': unit, 'determined': True}
     return parameters
+
+
+def _key(name: Coefficient) -> str:
+    """Return the name of a parameter with its axis, as the keys of the report have it."""
+    return f'{name.parameter}.{name.axis}' if name.axis else name.parameter
 
 
 def summary(diagnosis: Diagnosis) -> str:
@@ -273,6 +289,12 @@ def unit_text(parameter: dict[str, Any]) -> str:
     return '' if parameter['unit'] == '1' else parameter['unit']
 
 
+def not_determined_text(parameter: dict[str, Any]) -> str:
+    """Return that a parameter of the report is not determined, as text."""
+    others = parameter['not_separated_from']
+    return f'not determined separately from {", ".join(others)}' if others else 'not determined'
+
+
 def terminal_lines(diagnosis: Diagnosis) -> list[str]:
     """Return the diagnosis as lines for a terminal."""
     lines = wrap(summary(diagnosis), _SCREEN_COLUMNS)
@@ -318,7 +340,9 @@ def _candidate_lines(candidate: dict[str, Any]) -> list[str]:
     """Return the lines for a candidate: its cause and its parameters."""
     lines = ['', *wrap(f'{candidate["effect"]}: {candidate["cause"]}', _SCREEN_COLUMNS)]
     for name, p in candidate['parameters'].items():
-        if 'ci' in p:
+        if not p.get('determined', True):
+            lines.append(f'  {name:32} {not_determined_text(p)}')
+        elif 'ci' in p:
             low, high = p['ci']
             value = f'{p["value"]:.5g} ({low:.4g} to {high:.4g}) {unit_text(p)}'
             lines.append(f'  {name:32} {value}'.rstrip())
