@@ -20,6 +20,7 @@ from dataclasses import replace
 
 from adxl_ros.diagnose.baseline_comparison import BaselineComparison, compare
 from adxl_ros.diagnose.data_checks import DataFault
+from adxl_ros.diagnose.encoder_checks import find_encoder_fault
 from adxl_ros.diagnose.sim_alignment import align_force
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model.sensor import Sensor
@@ -60,5 +61,9 @@ def compare_checked(recording: Recording, sensor: Sensor, sim: Motion | None, ma
             return aligned
         recording, sim = aligned.recording, aligned.sim
         notes += aligned.notes
+    else:
+        fault = find_encoder_fault(recording, sensor)
+        if fault is not None:
+            return fault
     comparison = compare(recording, sensor, sim)
     return replace(comparison, notes=tuple(notes))

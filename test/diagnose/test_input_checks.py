@@ -70,7 +70,7 @@ def report_of(run_tool, tmp_path, sensor, *recordings, options=()):
 def test_no_verdict_is_exit_status_1(run_tool, tmp_path):
     """A fault of the recording ends with 1, a complete report, and one line on stderr."""
     recorded = made(unit())
-    recorded.columns['y_v'] = 5 - recorded.columns['y_v']
+    recorded.columns['x_v'] = 5 - recorded.columns['x_v']
     report, run = report_of(run_tool, tmp_path, unit(), recorded)
     assert run.returncode == 1
     assert run.stderr.count('\n') == 1
@@ -147,3 +147,44 @@ def test_a_simulator_of_another_motion_is_no_shift(run_tool, tmp_path):
     report, run = report_of(run_tool, tmp_path, unit(), recorded, options=['--sim', 'sim.csv'])
     assert (run.returncode, report['verdict']['data_fault']) == (1, 'no_overlap')
     assert 'no shift' in report['summary']
+
+
+@pytest.mark.parametrize('signs', [(1, -1), (-1, 1)])
+@pytest.mark.parametrize('axes', ['xy', 'xyz'])
+def test_an_encoder_that_counts_backwards_is_named(run_tool, tmp_path, signs, axes):
+    """The wrong sign of an encoder is not blamed on the sensor."""
+    sensor = replace(nominal(axes), rate_hz=100.0, stage_resolution_rad=1e-4)
+    recorded = made(sensor)
+    for name, sign in zip(('alpha_rad', 'beta_rad'), signs):
+        recorded.columns[name] = recorded.columns[name] * sign
+    report, run = report_of(run_tool, tmp_path, sensor, recorded)
+    name = 'alpha_rad' if signs[0] < 0 else 'beta_rad'
+    assert (run.returncode, report['verdict']['data_fault']) == (1, 'encoder_sign')
+    assert report['summary'].startswith(f'{name}: opposite sign of the encoder')
+
+
+def test_zero_g_tells_an_inverted_axis_from_an_encoder(run_tool, tmp_path):
+    """An inverted y looks like a wrong sign of beta, but its zero-g is mirrored, too."""
+    sensor = replace(unit(), effects=('bias',),
+                     values={'bias': {'offset_v': np.array([0.0, 0.03, 0.0])}})
+    recorded = made(sensor)
+    recorded.columns['beta_rad'] = -recorded.columns['beta_rad']
+    report, _ = report_of(run_tool, tmp_path, sensor, recorded)
+    assert report['verdict']['data_fault'] == 'encoder_sign'
+    recorded = made(sensor)
+    recorded.columns['y_v'] = 5 - recorded.columns['y_v']
+    report, _ = report_of(run_tool, tmp_path, sensor, recorded)
+    assert report['verdict']['data_fault'] == 'axis_inverted'
+
+
+@pytest.mark.parametrize('names', [['beta_rad'], ['alpha_rad'], ['alpha_rad', 'beta_rad']])
+def test_degrees_in_a_column_of_radians_are_named(run_tool, tmp_path, names):
+    """Column, value, unit and remedy are named."""
+    recorded = made(unit())
+    for name in names:
+        recorded.columns[name] = np.degrees(recorded.columns[name])
+    report, run = report_of(run_tool, tmp_path, unit(), recorded)
+    assert (run.returncode, report['verdict']['data_fault']) == (1, 'unit')
+    assert 'degrees in a column of radians' in report['summary']
+    assert f'multiply {" and ".join(names)} by π/180' in report['summary']
+    assert '229' in report['summary'] or names == ['alpha_rad']
