@@ -12,10 +12,11 @@
 # make fuzz     the decoder and the serial link, two minutes of hostile bytes
 # make long     an 8-hour recording through apply: memory and time
 # make blind    the blind check of diagnose, 600 trials, into blind_output/ (make blind ARGS='--seed 1')
+# make working  working cases of diagnose, drawn, diagnosed and scored, into working_output/
 # make lint     the linters alone
 # make clean    remove what these made
 
-.PHONY: build help demo check test perf bench gallery reproduction coverage long faults soak fuzz blind lint clean \
+.PHONY: build help demo check test perf bench gallery reproduction coverage long faults soak fuzz blind working lint clean \
     FORCE
 .DEFAULT_GOAL := build
 
@@ -144,6 +145,9 @@ long: build
 blind: build
 	./run blind -o blind_output $(ARGS)
 
+working: build
+	OPENBLAS_NUM_THREADS=1 ./run working working_output $(ARGS)
+
 clean:
-	rm -rf .venv build install log demo_output blind_output coverage_output .*_cache .hypothesis
+	rm -rf .venv build install log demo_output blind_output working_output coverage_output .*_cache .hypothesis
 	find adxl_ros launch test -name __pycache__ -prune -exec rm -rf {} +

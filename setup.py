@@ -58,7 +58,8 @@ setup(
         'console_scripts': [
             *scripts('nodes', ('driver', 'stage', 'calibration', 'compensation', 'demo')),
             f'bench = {PACKAGE}.nodes.benchmark:main',
-            *scripts('tools', ('simulate', 'fit', 'apply', 'diagnose', 'blind', 'reproduce')),
+            *scripts('tools', ('simulate', 'fit', 'apply', 'diagnose', 'blind', 'working',
+                               'reproduce')),
         ],
     },
 )
