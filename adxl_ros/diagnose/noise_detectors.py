@@ -73,6 +73,12 @@ step."""
 _NEAREST_CODES_RATIO = 1.5
 """Distance of codes, divided by the smallest one, up to which no code lies between them. Chosen:
 between 1 and 2."""
+_BETWEEN_CODES_STEPS = 0.2
+"""Distance from a multiple of the step, in steps, at which a value is between codes. Chosen: far
+above rounding."""
+_BETWEEN_CODES_SHARE = 0.1
+"""Share of values between codes from which the step is no step of the ADC. Chosen: a curve of the
+converter moves some codes."""
 _COARSE_LOG_BAYES_FACTOR = 1e3
 """Log Bayes factor of coarse codes, rough: there is no other explanation."""
 _CODES_FEWEST = 8
@@ -292,7 +298,7 @@ def _local_std(values: np.ndarray, width: int) -> np.ndarray:
 
 def coarse_codes(volts: np.ndarray, sensor: Sensor) -> Detection | None:
     """
-    Find an ADC whose codes are coarser than stated.
+    Find an ADC whose codes are coarser than stated, on all axes or on some.
 
     Parameters
     ----------
@@ -309,20 +315,35 @@ def coarse_codes(volts: np.ndarray, sensor: Sensor) -> Detection | None:
     """
     if not sensor.lsb_v:
         return None
-    lost_bits = []
-    for v in volts.T:
-        distance_v = np.diff(np.unique(v[np.isfinite(v)]))
-        distance_v = distance_v[distance_v > sensor.lsb_v * _SMALLEST_CODE_STEPS]
-        if len(distance_v) < _CODES_FEWEST:
-            return None
-        step_v = float(np.median(
-            distance_v[distance_v < _NEAREST_CODES_RATIO * distance_v.min()]))
-        lost_bits.append(np.log2(step_v / sensor.lsb_v))
-    bits = float(np.median(lost_bits))
-    if bits < np.log2(_COARSE_STEPS):
+    bits, threshold = np.array([_lost_bits(v, sensor) for v in volts.T]), np.log2(_COARSE_STEPS)
+    if not (bits >= threshold).any():
         return None
-    return Detection(detected_effect(Detector.COARSE_CODES), {'lost_bits': np.array(bits)},
-                     _COARSE_LOG_BAYES_FACTOR, f'codes are {2 ** bits:.3g} steps apart')
+    common = 0.0
+    if not (bits < threshold).any():
+        common = float(np.nanmedian(bits) if np.nanmax(bits) - np.nanmin(bits) < threshold
+                       else np.nanmin(bits))
+    further = np.where(bits - common >= threshold, bits - common, 0.0)
+    where = '' if common or len(bits) == 1 else ' on ' + ', '.join(
+        axis for axis, lost in zip(sensor.axes, further) if lost)
+    return Detection(detected_effect(Detector.COARSE_CODES), {
+        'lost_bits': np.array(common), 'axis_lost_bits': further}, _COARSE_LOG_BAYES_FACTOR,
+        f'codes are {2 ** np.nanmax(bits):.3g} steps apart{where}')
+
+
+def _lost_bits(volts: np.ndarray, sensor: Sensor) -> float:
+    """Return how many bits the codes of one axis, V, (n,), lack; NaN where too few differ."""
+    values_v = np.unique(volts[np.isfinite(volts)])
+    distance_v = np.diff(values_v)
+    distance_v = distance_v[distance_v > sensor.lsb_v * _SMALLEST_CODE_STEPS]
+    if len(distance_v) < _CODES_FEWEST:
+        return float('nan')
+    step_v = float(np.median(distance_v[distance_v < _NEAREST_CODES_RATIO * distance_v.min()]))
+    # A slow motion through few samples leaves codes out; all multiples of a step are occupied.
+    whole_steps = distance_v / step_v
+    between = np.abs(whole_steps - np.rint(whole_steps)) > _BETWEEN_CODES_STEPS
+    if between.mean() > _BETWEEN_CODES_SHARE:
+        return 0.0
+    return float(np.log2(step_v / sensor.lsb_v))
 
 
 @dataclass(frozen=True)

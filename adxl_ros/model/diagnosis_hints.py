@@ -45,8 +45,8 @@ class Detector(Enum):
 
     An effect with a detector has all parameters that the detector estimates. REPEATED_SAMPLES
     estimates `rate_hz` and `duration_s`, ISOLATED_SAMPLES `rate_hz` and `amplitude_v`,
-    COARSE_CODES `lost_bits`, MAINS_LINE `amplitude_v`, `frequency_hz` and `phase_rad`, NOISE_LEVEL
-    `ratio`.
+    COARSE_CODES `lost_bits` and `axis_lost_bits`, MAINS_LINE `amplitude_v`, `frequency_hz` and
+    `phase_rad`, NOISE_LEVEL `ratio`.
     """
 
     REPEATED_SAMPLES = auto()

@@ -412,7 +412,7 @@ def _select(environment: Environment, samples: np.ndarray) -> Environment:
     return Environment(*(values[samples] for values in environment))
 
 
-def quantise(volts: np.ndarray, sensor: Sensor, lsb_v: float) -> np.ndarray:
+def quantise(volts: np.ndarray, sensor: Sensor, lsb_v: np.ndarray) -> np.ndarray:
     """
     Round volts to the steps of the ADC, within its rails.
 
@@ -423,7 +423,7 @@ def quantise(volts: np.ndarray, sensor: Sensor, lsb_v: float) -> np.ndarray:
     sensor
         The unit with the rails of its ADC.
     lsb_v
-        Step, V, which may be coarser than that of the ADC; 0 does not quantise.
+        Step by axis, V, (m,), which may be coarser than that of the ADC; 0 does not quantise.
 
     Returns
     -------
@@ -431,7 +431,7 @@ def quantise(volts: np.ndarray, sensor: Sensor, lsb_v: float) -> np.ndarray:
         Rounded volts, V, (n, m).
 
     """
-    if not lsb_v:
+    if not np.any(lsb_v):
         return volts
     highest = sensor.adc_vref_v - sensor.lsb_v
     return np.clip(np.rint(volts / lsb_v) * lsb_v, 0.0, np.floor(highest / lsb_v) * lsb_v)

@@ -133,7 +133,8 @@ class Response:
         signals.input_v = list((analog_v + self._draw_noise(stamps_s, signals)).T)
         signals.volts = list(signals.input_v)
         self._apply(Place.ADC, signals)
-        coded = signal_chain.quantise(np.column_stack(signals.volts), self.sensor, signals.lsb_v)
+        coded = signal_chain.quantise(np.column_stack(signals.volts), self.sensor,
+                                      signals.lsb_v * np.array(signals.lsb_ratio))
         signals.volts = list(coded.T)
         self._apply(Place.CODE, signals)
         return np.column_stack(signals.volts)
@@ -199,7 +200,7 @@ class Response:
         signals.zero_g_v = self.sensor.nominal_zero_g_v.tolist()
         signals.scale_v_per_g = self.sensor.nominal_scale_v_per_g.tolist()
         signals.rc_s, signals.noise_ratio = [self.sensor.rc_s] * m, [1.0] * m
-        signals.lsb_v = self.sensor.lsb_v
+        signals.lsb_v, signals.lsb_ratio = self.sensor.lsb_v, [1.0] * m
         self._apply(Place.ELECTRONICS, signals)
         volts = np.empty((len(instants_s), m))
         for d, v in enumerate(signal_chain.output_volts(signals)):

@@ -295,7 +295,8 @@ def samples(scene: Scene, faults: Sequence[Fault]) -> np.ndarray:
                 signals.memory, signals.rng = {}, np.random.default_rng([scene.seed, 1, i])
                 fault.act(signals)
         if place is Place.ADC:
-            coded = signal_chain.quantise(np.column_stack(signals.volts), true, true.lsb_v)
+            coded = signal_chain.quantise(np.column_stack(signals.volts), true,
+                                          np.full(len(true.axes), true.lsb_v))
             signals.volts = [column.copy() for column in coded.T]
     return np.column_stack(signals.volts)
 

@@ -55,7 +55,7 @@ def test_effects_of_detectors_have_the_parameters_that_are_estimated():
     """A detection becomes the values of its effect in the parameter file."""
     estimated = {Detector.REPEATED_SAMPLES: {'rate_hz', 'duration_s'},
                  Detector.ISOLATED_SAMPLES: {'rate_hz', 'amplitude_v'},
-                 Detector.COARSE_CODES: {'lost_bits'},
+                 Detector.COARSE_CODES: {'lost_bits', 'axis_lost_bits'},
                  Detector.MAINS_LINE: {'amplitude_v', 'frequency_hz', 'phase_rad'},
                  Detector.NOISE_LEVEL: {'ratio'}}
     for effect in library().values():

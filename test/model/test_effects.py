@@ -239,6 +239,13 @@ def test_variance_of_quantisation_follows_from_its_step():
         assert np.var(coarse - exact) == pytest.approx(lsb ** 2 / 12, rel=0.01)
 
 
+def test_one_axis_may_have_coarser_codes_than_the_others():
+    """Bits that an axis loses add to those that all lose."""
+    sensor = with_effect('quantisation', nominal('xyz'), lost_bits=1, axis_lost_bits=[0, 3, 0])
+    steps = volts(sensor) / sensor.lsb_v
+    assert [np.gcd.reduce(np.rint(axis).astype(int)) for axis in steps.T] == [2, 16, 2]
+
+
 def test_flicker_is_one_over_f():
     """The density is k²/f within 2 % up to a fifth of the rate, in theory and in a simulation."""
     rest = Motion(4000.0, internal_rate_hz=10.0)

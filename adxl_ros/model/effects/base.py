@@ -130,6 +130,8 @@ class Signals:
         ELECTRONICS: density of the white noise divided by the nominal one, by measured axis.
     lsb_v
         ELECTRONICS: step of the ADC, V.
+    lsb_ratio
+        ELECTRONICS: step of the ADC by measured axis divided by `lsb_v`.
     input_v
         ADC: volts at the input of the ADC by measured axis. Effects only read them.
     volts
@@ -162,6 +164,7 @@ class Signals:
     rc_s: list[float] = field(default_factory=list)
     noise_ratio: list[float] = field(default_factory=list)
     lsb_v: float = 0.0
+    lsb_ratio: list[float] = field(default_factory=list)
     input_v: Components = field(default_factory=list)
     volts: Components = field(default_factory=list)
     nominal_scale_v_per_g: list[float] = field(default_factory=list)

@@ -1,0 +1,46 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Codes that are coarser than stated are found on all axes or on one, and never by chance."""
+
+from adxl_ros.diagnose.noise_detectors import coarse_codes
+import numpy as np
+import pytest
+from units import nominal
+
+SENSOR = nominal('xyz')
+
+
+def recorded(count, bits=(0, 0, 0), seed=1):
+    """Return volts of a slow wave with noise, by axis without some bits."""
+    rng, t = np.random.default_rng(seed), np.linspace(0, 20, count)[:, None]
+    analog_v = 2.5 + 0.7 * np.sin(t + np.arange(3)) + 1e-3 * rng.normal(size=(count, 3))
+    step_v = SENSOR.lsb_v * 2.0 ** np.array(bits)
+    return np.rint(analog_v / step_v) * step_v
+
+
+@pytest.mark.parametrize(('bits', 'common', 'further'), [
+    ((4, 4, 4), 4, (0, 0, 0)), ((0, 5, 0), 0, (0, 5, 0)), ((3, 6, 3), 3, (0, 3, 0))])
+def test_lost_bits_by_axis(bits, common, further):
+    """Bits that all axes lose are common; an axis may lose more."""
+    detection = coarse_codes(recorded(6000, bits), SENSOR)
+    assert detection.values['lost_bits'] == pytest.approx(common, abs=0.01)
+    np.testing.assert_allclose(detection.values['axis_lost_bits'], further, atol=0.01)
+    assert (' on y' in detection.message) == (common == 0)
+
+
+@pytest.mark.parametrize('count', [60, 120, 300, 1000, 20000])
+def test_few_samples_of_fine_codes_are_not_coarse(count):
+    """Codes that are left out by chance have no common step."""
+    for seed in range(20):
+        assert coarse_codes(recorded(count, seed=seed), SENSOR) is None
