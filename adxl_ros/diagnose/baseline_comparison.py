@@ -16,7 +16,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import Enum
 
 from adxl_ros.files.recording_columns import Recording
@@ -26,6 +26,7 @@ from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import ActsOn
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals.rest_detection import find_rests
+from adxl_ros.simulate.chain_memo import ChainMemo
 from adxl_ros.simulate.from_recording import environment_paths, motion_from_references
 from adxl_ros.simulate.motion import INTERNAL_RATE_HZ, Motion, Path
 from adxl_ros.simulate.response import Response
@@ -98,6 +99,8 @@ class BaselineComparison:
         reference is not known.
     notes
         What was corrected or left out before the comparison, one line each, for people.
+    memo
+        Signals that simulations of this recording share.
 
     """
 
@@ -111,6 +114,7 @@ class BaselineComparison:
     at_rest: np.ndarray
     used: np.ndarray
     notes: tuple[str, ...] = ()
+    memo: ChainMemo = field(default_factory=ChainMemo, compare=False, repr=False)
 
     def __len__(self) -> int:
         """Return the number of samples."""
@@ -133,7 +137,8 @@ class BaselineComparison:
 
     def simulated_v(self, sensor: Sensor) -> np.ndarray:
         """Return the mean output of a sensor in this recording, V, (n, m)."""
-        return Response(noiseless(sensor), self.motion, 0, float(self.time_s[0]))(self.time_s)
+        respond = Response(noiseless(sensor), self.motion, 0, float(self.time_s[0]))
+        return respond.whole(self.time_s, self.memo)
 
     def residual_v(self, sensor: Sensor) -> np.ndarray:
         """
@@ -172,7 +177,7 @@ class CachedPath:
     """A path that keeps its newest values, because it is evaluated at the same times often."""
 
     def __init__(self, path: Path) -> None:
-        self._path = path
+        self._path: Path = path._path if isinstance(path, CachedPath) else path
         self._values: dict[tuple, np.ndarray] = {}
 
     def __call__(self, time_s: np.ndarray, order: int = 0) -> np.ndarray:
@@ -271,7 +276,7 @@ def at_search_rate(comparison: BaselineComparison) -> BaselineComparison:
         comparison, time_s=comparison.time_s[part], volts=comparison.volts[part],
         motion=_cached(motion, comparison.reference),
         sensor=replace(comparison.sensor, rate_hz=comparison.sensor.rate_hz / every),
-        at_rest=comparison.at_rest[part], used=comparison.used[part])
+        at_rest=comparison.at_rest[part], used=comparison.used[part], memo=ChainMemo())
 
 
 def _motion(recording: Recording, sensor: Sensor, volts: np.ndarray, sim: Motion | None

@@ -25,11 +25,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 from adxl_ros.diagnose.noise_whitening import Whitener
 import numpy as np
 from scipy.linalg import cho_solve
+from scipy.signal import sosfilt
 
 BLOCKS = 48
 """Number of blocks of a recording, of which some are held out. Chosen: a multiple of the folds,
@@ -41,6 +41,8 @@ _ITERATIONS = 3
 """Iterations over coefficients and noise. Chosen: the filters no longer change then."""
 _SMALLEST_SQUARES_V2 = 1e-300
 """Smallest sum of squares, V², whose logarithm is taken: above zero."""
+_CACHED_VALUES = 100_000
+"""Number of values that are filtered at once. Chosen: 0.8 MB stay in the cache of a processor."""
 _RIDGE = 1e-12
 """Ridge on the scaled precision. Chosen: columns that differ by a millionth are separable."""
 _BOUND_TOLERANCE = 1e-9
@@ -101,16 +103,25 @@ def whiten_channel(residual_v: np.ndarray, columns: np.ndarray, column_ids: np.n
         Products of the whitened columns.
 
     """
-    data = np.ascontiguousarray(bridged(np.column_stack([residual_v, columns]), used).T)
-    edges = block_edges(len(used))
+    data = np.concatenate([bridged(residual_v[:, None], used).T, bridged(columns, used).T])
+    edges, unused = block_edges(len(used)), np.flatnonzero(~used)
     grams = np.empty((len(filters), BLOCKS, len(data), len(data)))
-    for i, whitener in enumerate(filters):
-        white = whitener(data)
-        white[:, ~used] = 0.0
-        # The first sample is a step from zero.
-        white[:, 0] = 0.0
-        for b, (begin, end) in enumerate(pairwise(edges)):
-            grams[i, b] = white[:, begin:end] @ white[:, begin:end].T
+    states = [np.zeros((len(f.sections), len(data), 2)) for f in filters]
+    together = max(1, _CACHED_VALUES * BLOCKS // data.size)
+    for first in range(0, BLOCKS, together):
+        blocks = [(b, *edges[b:b + 2] - edges[first])
+                  for b in range(first, min(first + together, BLOCKS))]
+        part = slice(edges[first], edges[first] + blocks[-1][2])
+        values = np.ascontiguousarray(data[:, part])
+        dropped = unused[slice(*np.searchsorted(unused, [part.start, part.stop]))] - part.start
+        for i, whitener in enumerate(filters):
+            white, states[i] = sosfilt(whitener.sections, values, zi=states[i])
+            white[:, dropped] = 0.0
+            if not first:
+                # The first sample is a step from zero.
+                white[:, 0] = 0.0
+            for b, begin, end in blocks:
+                np.matmul(white[:, begin:end], white[:, begin:end].T, out=grams[i, b])
     counts = np.add.reduceat(used, edges[:-1]).astype(float)
     return WhitenedChannel(column_ids, grams, grams.sum(axis=1), counts,
                            np.array([f.log_prior for f in filters]),

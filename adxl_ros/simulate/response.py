@@ -16,6 +16,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Hashable
+from dataclasses import replace
 from math import ceil
 from typing import Any
 import zlib
@@ -31,16 +33,22 @@ from adxl_ros.model.effects.base import (
     NOMINAL_ENVIRONMENT,
     Parameters,
     Place,
+    Role,
     Signals,
 )
 from adxl_ros.model.filters import first_order_recursion, low_pass
 from adxl_ros.model.kinematics import specific_force_in_motion, UPRIGHT
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.simulate.chain_memo import ChainMemo
 from adxl_ros.simulate.motion import Motion
 import numpy as np
 
 _BLOCK_STEPS = 65536
 """Steps of the internal grid in memory at once; chosen: some 10 MB of signals."""
+
+_WHOLE_STEPS = 300_000
+"""Largest number of steps that are simulated at once and kept; chosen: 20 minutes at 250 Hz, some
+200 MB."""
 
 _POINTS = 6
 """Points of the polynomial between the steps of the grid; chosen: as exact as the filters."""
@@ -89,9 +97,14 @@ class Response:
         """
         _check_needs(sensor, motion)
         self.sensor, self._motion, self._begin_s = sensor, motion, begin_s
-        self._effects = {place: [_EffectState(name, signal_chain.parameters(sensor, name), seed)
-                                 for name in sensor.effects
-                                 if effect_named(name).place is place] for place in Place}
+        self._seed = seed
+        states = [_EffectState(name, signal_chain.parameters(sensor, name), seed)
+                  for name in sensor.effects]
+        self._effects = {place: [state for state in states
+                                 if state.place is place and not state.is_neutral]
+                         for place in Place}
+        self._memo: ChainMemo | None = None
+        self._block_steps = _BLOCK_STEPS
         steps_per_sample = ceil(motion.internal_rate_hz / sensor.rate_hz - _ROUNDING)
         self._step_s = 1 / (sensor.rate_hz * steps_per_sample)
         # Rate of the instants by stamps; rounding evens out the steps of float64 times.
@@ -122,14 +135,15 @@ class Response:
         if not len(stamps_s):
             return np.zeros((0, len(self.sensor.axes)))
         steps = (stamps_s - self._begin_s) / self._step_s
-        exceeds_block = ceil(steps[-1]) - self._done_steps > _BLOCK_STEPS
+        exceeds_block = ceil(steps[-1]) - self._done_steps > self._block_steps
         if exceeds_block and len(stamps_s) > 1:
             half = len(stamps_s) // 2
             return np.concatenate([self(stamps_s[:half]), self(stamps_s[half:])])
         instants_s = self._instants(stamps_s)
         analog_v, signals = self._sampled(steps)
         signals.dt_s = 1 / self.sensor.rate_hz
-        signals.environment = self._environment(instants_s)
+        if self._effects[Place.ADC] or self._effects[Place.CODE]:
+            signals.environment = self._environment(instants_s)
         signals.input_v = list((analog_v + self._draw_noise(stamps_s, signals)).T)
         signals.volts = list(signals.input_v)
         self._apply(Place.ADC, signals)
@@ -138,6 +152,34 @@ class Response:
         signals.volts = list(coded.T)
         self._apply(Place.CODE, signals)
         return np.column_stack(signals.volts)
+
+    def whole(self, stamps_s: np.ndarray, memo: ChainMemo) -> np.ndarray:
+        """
+        Simulate a whole recording.
+
+        Parameters
+        ----------
+        stamps_s
+            Stamps of all samples, s, (n,), ascending.
+        memo
+            Signals of earlier simulations of this manoeuvre; this one adds its own.
+
+        Returns
+        -------
+        ndarray
+            Volts of the ADC, V, (n, m). Nothing can follow.
+
+        """
+        steps = ceil((float(stamps_s[-1]) - self._begin_s) / self._step_s) + _POINTS
+        if steps > _WHOLE_STEPS:
+            return self(stamps_s)
+        self._memo, self._block_steps = memo, steps
+        sensor = self.sensor
+        key = (*self._chain_key(), self._seed, sensor.rate_hz, sensor.rc_s, sensor.lsb_v,
+               *sensor.nominal_zero_g_v.tolist(), *sensor.noise_density_g_per_rthz.tolist(),
+               stamps_s.tobytes(), *(state.key for states in self._effects.values()
+                                     for state in states))
+        return self._kept('volts', key, lambda: self(stamps_s)).copy()
 
     def _instants(self, stamps_s: np.ndarray) -> np.ndarray:
         """Return the instants of samples by their stamps, s, (n,)."""
@@ -168,58 +210,96 @@ class Response:
         until = int(nearest[-1]) + 1 + ahead
         kept, signals = [self._tail], None
         while self._done_steps < until or signals is None:
-            volts, signals = self._advance(min(until - self._done_steps, _BLOCK_STEPS))
+            volts, signals = self._advance(min(until - self._done_steps, self._block_steps))
             kept.append(volts)
-            if sum(map(len, kept)) > 2 * _BLOCK_STEPS:  # a gap, without samples
+            if sum(map(len, kept)) > 2 * self._block_steps:  # a gap, without samples
                 first += sum(map(len, kept[:-1]))
                 kept = kept[-1:]
         grid = np.concatenate(kept)
         self._tail = grid[-(2 * _POINTS):]
         if aligned:
             return grid[nearest.astype(np.intp) - first], signals
-        start = np.floor(steps).astype(np.intp) - (_POINTS // 2 - 1)
-        index = np.clip(start[:, None] + np.arange(_POINTS) - first, 0, None)
-        return np.einsum('ij,ijm->im', _lagrange(steps - start), grid[index]), signals
+        key = (first, steps.tobytes())
+        index, weights = self._kept('weights', key, lambda: _interpolation(steps, first))
+        return np.column_stack([np.einsum('ij,ij->i', weights, v[index]) for v in grid.T]), signals
 
     def _advance(self, count: int) -> tuple[np.ndarray, Signals]:
         """Run the chain up to the filter over the next steps of the grid: volts, (n, m)."""
-        stamps_s = self._begin_s + (self._done_steps + np.arange(max(count, 0))) * self._step_s
-        self._done_steps += len(stamps_s)
-        instants_s = self._instants(stamps_s)
-        signals = Signals(self._environment(instants_s), dt_s=self._dt_s,
-                          gravity_mps2=self.sensor.local_gravity_mps2, up=list(UPRIGHT),
-                          nominal_scale_v_per_g=self.sensor.nominal_scale_v_per_g.tolist(),
-                          vref_v=self.sensor.adc_vref_v)
-        self._set_force(signals, instants_s)
-        self._apply(Place.FORCE, signals)
-        signals.sensed = [f / G0_MPS2 for f in signals.force]
-        self._apply(Place.MOUNTING, signals)
-        signals.output = list(signals.sensed)
-        self._apply(Place.ELEMENT, signals)
+        signals = self._output_of_element(max(count, 0))
+        self._done_steps += max(count, 0)
         m = len(self.sensor.axes)
         signals.zero_g_v = self.sensor.nominal_zero_g_v.tolist()
         signals.scale_v_per_g = self.sensor.nominal_scale_v_per_g.tolist()
         signals.rc_s, signals.noise_ratio = [self.sensor.rc_s] * m, [1.0] * m
         signals.lsb_v, signals.lsb_ratio = self.sensor.lsb_v, [1.0] * m
         self._apply(Place.ELECTRONICS, signals)
-        volts = np.empty((len(instants_s), m))
+        volts = np.empty((max(count, 0), m))
         for d, v in enumerate(signal_chain.output_volts(signals)):
-            volts[:, d] = low_pass(np.broadcast_to(v, len(instants_s)), signals.rc_s[d],
+            volts[:, d] = low_pass(np.broadcast_to(v, len(volts)), signals.rc_s[d],
                                    self._dt_s, self._filters[d])
         return volts, signals
 
-    def _set_force(self, signals: Signals, instants_s: np.ndarray) -> None:
+    def _output_of_element(self, count: int) -> Signals:
+        """Run the chain up to the sensing element over the next steps of the grid."""
+        key = (*self._chain_key(), self._done_steps, count)
+        stamps_s = self._begin_s + (self._done_steps + np.arange(count)) * self._step_s
+        signals = Signals(
+            NOMINAL_ENVIRONMENT, time_s=stamps_s, dt_s=self._dt_s, up=list(UPRIGHT),
+            gravity_mps2=self.sensor.local_gravity_mps2, vref_v=self.sensor.adc_vref_v,
+            nominal_scale_v_per_g=self.sensor.nominal_scale_v_per_g.tolist())
+        for place, run in _UP_TO_ELEMENT.items():
+            key = (*key, *(state.key for state in self._effects[place]))
+            # The memo shares its signals; those that follow are a copy.
+            before = signals
+            signals = _copied(self._kept(place.name, key, lambda: run(self, before)))
+        return signals
+
+    def _chain_key(self) -> tuple:
+        """Return what the chain depends on beside its effects, up to the element."""
+        sensor = self.sensor
+        return (self._motion, self._begin_s, self._step_s, sensor.local_gravity_mps2,
+                sensor.adc_vref_v, *sensor.nominal_scale_v_per_g.tolist())
+
+    def _put_in_time(self, signals: Signals) -> Signals:
+        """Set the instants of the samples and the surroundings."""
+        self._apply(Place.CLOCK, signals)
+        signals.environment = self._environment(signals.time_s)
+        return signals
+
+    def _move(self, signals: Signals) -> Signals:
         """Set the specific force by the stage, or by the motion where it states the force."""
-        motion = self._motion
+        motion, instants_s = self._motion, signals.time_s
         if motion.force:
             signals.force = list(motion.force(instants_s))
-            return
+            return signals
         signals.alpha, signals.beta, signals.shift = (
             Joint(*(joint(instants_s, order) for order in range(3)))
             for joint in (motion.alpha, motion.beta, motion.shift))
         self._apply(Place.STAGE, signals)
         signals.force = specific_force_in_motion(
             signals.alpha, signals.beta, signals.shift, signals.gravity_mps2, signals.up)
+        return signals
+
+    def _mount(self, signals: Signals) -> Signals:
+        """Turn the specific force into the force along the axes of the case, g."""
+        self._apply(Place.FORCE, signals)
+        signals.sensed = [f / G0_MPS2 for f in signals.force]
+        return signals
+
+    def _sense(self, signals: Signals) -> Signals:
+        """Turn the force along the axes of the case into that along the sensing axes."""
+        self._apply(Place.MOUNTING, signals)
+        signals.output = list(signals.sensed)
+        return signals
+
+    def _put_out(self, signals: Signals) -> Signals:
+        """Add the effects of the sensing element."""
+        self._apply(Place.ELEMENT, signals)
+        return signals
+
+    def _kept(self, part: str, key: Hashable, compute: Callable[[], Any]) -> Any:
+        """Return a result from the memo, or compute it."""
+        return compute() if self._memo is None else self._memo(part, key, compute)
 
     def _draw_noise(self, stamps_s: np.ndarray, signals: Signals) -> np.ndarray:
         """
@@ -248,14 +328,39 @@ class Response:
         return drawn[np.cumsum(passed) - 1] * std_v
 
 
+_UP_TO_ELEMENT = {Place.CLOCK: Response._put_in_time, Place.STAGE: Response._move,
+                  Place.FORCE: Response._mount, Place.MOUNTING: Response._sense,
+                  Place.ELEMENT: Response._put_out}
+"""What the chain does at each place before the electronics, in its order."""
+
+
 class _EffectState:
     """An effect of the sensor: its parameters, its memory and its random generator."""
 
     def __init__(self, name: str, parameters: Parameters, seed: int) -> None:
-        self.apply = effect_named(name).apply
+        effect = effect_named(name)
+        sizes = [p for p in effect.parameters if p.role is not Role.SHAPE]
+        # At the neutral values of its sizes and limits an effect does nothing.
+        self.is_neutral = bool(sizes) and all(
+            np.all(np.equal(parameters.get(p.name, p.neutral), p.neutral)) for p in sizes)
+        self.place, self.apply = effect.place, effect.apply
+        self.key = (name, *sorted(parameters.items()))
         self.parameters = parameters
         self.memory: dict[str, Any] = {}
         self.rng = np.random.default_rng([seed, zlib.crc32(name.encode())])
+
+
+def _copied(signals: Signals) -> Signals:
+    """Return signals that effects can change without changing these."""
+    return replace(signals, up=list(signals.up), force=list(signals.force),
+                   sensed=list(signals.sensed), output=list(signals.output))
+
+
+def _interpolation(steps: np.ndarray, first: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the steps from `first` on that samples lie between, (n, points), and weights."""
+    start = np.floor(steps).astype(np.intp) - (_POINTS // 2 - 1)
+    index = np.clip(start[:, None] + np.arange(_POINTS) - first, 0, None)
+    return index, _lagrange(steps - start)
 
 
 def _lagrange(position: np.ndarray) -> np.ndarray:
