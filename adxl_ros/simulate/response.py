@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable
 from dataclasses import replace
+from functools import partial
 from math import ceil
 from typing import Any
 import zlib
@@ -250,8 +251,7 @@ class Response:
         for place, run in _UP_TO_ELEMENT.items():
             key = (*key, *(state.key for state in self._effects[place]))
             # The memo shares its signals; those that follow are a copy.
-            before = signals
-            signals = _copied(self._kept(place.name, key, lambda: run(self, before)))
+            signals = _copied(self._kept(place.name, key, partial(run, self, signals)))
         return signals
 
     def _chain_key(self) -> tuple:
