@@ -33,11 +33,11 @@ endif
 ifdef ros_python
 mode := ros
 base_python = $(ros_python)
-requirements := $(patsubst %,requirements/%.txt,build core extras test)
+requirements := $(patsubst %,requirements/%.txt,build core extras blind test)
 else
 mode := wheels
 base_python = $(call first_python,$(fits))
-requirements := $(patsubst %,requirements/%.txt,ros build core extras test)
+requirements := $(patsubst %,requirements/%.txt,ros build core extras blind test)
 ifdef ROS_DISTRO
 # Another ROS that is sourced must not mix with the wheels.
 unexport ROS_DISTRO PYTHONPATH LD_LIBRARY_PATH AMENT_PREFIX_PATH
@@ -143,7 +143,7 @@ long: build
 
 # Goes on where it was cut short; with a seed of its own in ARGS, into another folder.
 blind: build
-	./run blind -o blind_output $(ARGS)
+	./run blind -o blind_output --forest $(ARGS)
 
 working: build
 	OPENBLAS_NUM_THREADS=1 ./run working working_output $(ARGS)

@@ -48,7 +48,7 @@ setup(
     ],
     python_requires='>=3.10',
     install_requires=['setuptools', *requirements('core')],
-    extras_require={name: requirements(name) for name in ('extras', 'test')},
+    extras_require={name: requirements(name) for name in ('extras', 'blind', 'test')},
     zip_safe=True,
     maintainer='the adxl_ros authors',
     maintainer_email='maintainers@example.org',

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Write the tables of a blind check, blind.json, into docs/blind-check-log.md."""
+"""Write a blind check, blind.json, into docs/blind-check.md and docs/blind-check-log.md."""
 
 import json
 from pathlib import Path
@@ -23,16 +23,38 @@ from adxl_ros.blind import report_html
 
 
 def main() -> None:
-    """Replace the text between the marks of the run."""
+    """Replace the result, and the tables of the run in the log; a new run comes last there."""
     source, run = sys.argv[1:]
-    path = Path(__file__).with_name('blind-check-log.md')
-    tables = report_html.markdown(json.loads(Path(source).read_text(encoding='utf-8')))
-    text, found = re.subn(f'<!-- {run} -->.*<!-- /{run} -->',
-                          lambda match: f'<!-- {run} -->\n{tables}\n<!-- /{run} -->',
-                          path.read_text(encoding='utf-8'), flags=re.DOTALL)
-    if not found:
-        sys.exit(f'{path}: has no place for the run {run!r}')
-    path.write_text(text, encoding='utf-8')
+    made = json.loads(Path(source).read_text(encoding='utf-8'))
+    log = Path(__file__).with_name('blind-check-log.md')
+    if f'<!-- {run} -->' not in log.read_text(encoding='utf-8'):
+        with log.open('a', encoding='utf-8') as stream:
+            stream.write(f'\n## {run.capitalize()} run\n\n<!-- {run} -->\n<!-- /{run} -->\n')
+    replace(log, run, report_html.markdown(made))
+    replace(log.with_name('blind-check.md'), 'result', report_html.markdown_result(made))
+
+
+def replace(path: Path, mark: str, text: str) -> None:
+    """
+    Replace the text between two marks of a page.
+
+    Parameters
+    ----------
+    path
+        The page.
+    mark
+        Name of the marks.
+    text
+        What stands between them afterwards.
+
+    """
+    page = path.read_text(encoding='utf-8')
+    page, count = re.subn(f'<!-- {mark} -->.*<!-- /{mark} -->',
+                          lambda match: f'<!-- {mark} -->\n{text}\n<!-- /{mark} -->',
+                          page, flags=re.DOTALL)
+    if not count:
+        sys.exit(f'{path}: has no place for {mark!r}')
+    path.write_text(page, encoding='utf-8')
 
 
 main()

@@ -42,8 +42,9 @@ from adxl_ros.blind.scores import Trial
 from adxl_ros.blind.trials import Label
 from adxl_ros.errors import UserError
 
-OtherMethod = Callable[[Path], dict[str, Answer]]
-"""Receives the folder of recordings and parameter files; returns answers by the names of files."""
+OtherMethod = Callable[[Path, Executor, Callable[[float], None]], dict[str, Answer]]
+"""Receives the folder of recordings and parameter files, a pool, and what receives the finished
+fraction; returns answers by the names of the recordings."""
 Show = Callable[[str], AbstractContextManager[Callable[[float], None]]]
 """Receives the name of a stage; gives a context with what receives the finished fraction."""
 
@@ -132,7 +133,10 @@ def score(folder: Path, command: Sequence[str] | None, pool: Executor, show: Sho
     # Labels may be on another machine: the diagnosis does not need them.
     with show('diagnose') as advance:
         results = diagnosis_runs.diagnose_all(folder, command, pool, advance)
-    compared = {name: method(folder / 'recordings') for name, method in (others or {}).items()}
+    compared = {}
+    for name, method in (others or {}).items():
+        with show(name) as advance:
+            compared[name] = method(folder / 'recordings', pool, advance)
     version = (folder / 'reports' / 'version.txt').read_text()
     committed = label_commitment.committed_labels(folder)
     labels = committed.labels

@@ -185,7 +185,8 @@ def code_version(command: Sequence[str] | None) -> str:
     if command is None:
         root = Path(__file__).parents[1]
         files = [path for path in sorted(root.rglob('*.py'))
-                 if path.relative_to(root).parts[0] != 'blind' and path.name != 'blind.py']
+                 if path.relative_to(root).parts[0] != 'blind'
+                 and path.name not in ('blind.py', 'blind_forest.py')]
     else:
         files = [Path(word) for word in command[1:] if Path(word).is_file()]
         hashed.update(repr(list(command)).encode())

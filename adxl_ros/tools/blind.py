@@ -25,6 +25,7 @@ from adxl_ros.blind import blind_check, diagnosis_runs, real_recordings, report_
 from adxl_ros.errors import UserError
 from adxl_ros.files.atomic_write import write_text
 from adxl_ros.files.plot_file import pyplot
+from adxl_ros.tools import blind_forest
 from adxl_ros.tools.common import make_folder, progress, run
 
 PROG = 'blind'
@@ -41,6 +42,9 @@ def parser() -> argparse.ArgumentParser:
     parse.add_argument('--real', metavar='RECORDING:PARAMS[:SIM]', action='append', default=[],
                        help='a real recording with calibrated parameters, whose effects are '
                             'deleted one by one to see whether they are put back; may be repeated')
+    parse.add_argument('--forest', action='store_true',
+                       help='compare with a random forest that is trained on recordings of '
+                            "the package's own simulator (needs scikit-learn; 6 min of one core)")
     parse.add_argument('--scheduler', metavar='ADDRESS', help='of a Dask cluster to run on')
     where = parse.add_mutually_exclusive_group(required=True)
     where.add_argument('-o', dest='output', metavar='DIR', help='draw, diagnose and score')
@@ -69,6 +73,10 @@ def blind(options: argparse.Namespace) -> int:
 def _check(options: argparse.Namespace, folder: Path, arms: list[real_recordings.Arm]) -> int:
     """Draw and seal the trials, diagnose and score them, and write the report."""
     draw = pyplot()
+    others: dict[str, blind_check.OtherMethod] = {}
+    if options.forest:
+        blind_forest.forest_class()
+        others['random forest'] = blind_forest.answers
     if not options.open:
         make_folder(folder)
     with diagnosis_runs.workers(options.scheduler) as pool:
@@ -76,9 +84,12 @@ def _check(options: argparse.Namespace, folder: Path, arms: list[real_recordings
             with progress('draw') as show:
                 digest = blind_check.draw(folder, options.seed, options.trials, pool, show)
             print(f'SHA-256 of salt and labels: {digest}', flush=True)
+            if options.forest:
+                with progress('random forest') as show:
+                    blind_forest.train(folder, pool, show)
         if options.seal:
             return 0
-        made = blind_check.score(folder, None, pool, progress)
+        made = blind_check.score(folder, None, pool, progress, others)
         if arms:
             with progress('real') as show:
                 made['real'] = real_recordings.put_back(arms, None, pool, show)

@@ -22,7 +22,7 @@ import sys
 
 # Packages with an import name that differs from the distribution, or without an entry in setup.py.
 OTHERS = ('PIL', 'arch', 'cobs', 'iio', 'jinja2', 'mcap', 'numba', 'pandas', 'rosbag2_py',
-          'ruamel', 'serial', 'tqdm')
+          'ruamel', 'serial', 'sklearn', 'tqdm')
 
 BLOCK = """
 import json, sys
