@@ -154,7 +154,7 @@ def _covariance(linear_model: LinearModel, hypothesis: Hypothesis, ids: list[int
     imitated = {linear_model.names[i].effect for i in ids}
     every = [*ids, *(i for i in linear_model.nuisance_ids()
                      if linear_model.names[i].effect not in imitated)]
-    prior_std, _ = linear_model.prior(())
+    prior_std = linear_model.prior(())
     free = np.array([i in ids or hints_of(linear_model.names[i]).straight_line is not None
                      for i in every])
     std = np.where(free, _FREE, 1.0) * prior_std[every]
@@ -165,8 +165,10 @@ def _covariance(linear_model: LinearModel, hypothesis: Hypothesis, ids: list[int
                            for i in ids])
     least = np.zeros(len(ids))
     scales = [scale for c in linear_model.comparisons for scale in c.sensor.scale_v_per_g]
-    for channel, f, variance, scale in zip(linear_model.channels, fit.filter_indices,
-                                           fit.innovation_variance_v2, scales):
+    for channel, filters, whitener, variance, scale in zip(
+            linear_model.channels, linear_model.filters, hypothesis.whiteners,
+            fit.innovation_variance_v2, scales):
+        f = next(i for i, same in enumerate(filters) if same is whitener)
         columns = [i for i, k in enumerate(channel.column_ids) if k in every]
         at = np.array([every.index(channel.column_ids[i]) for i in columns], int)
         rows = 1 + np.array(columns, int)
@@ -211,12 +213,11 @@ def at_baseline(linear_model: LinearModel, hypothesis: Hypothesis) -> Hypothesis
     start = put(hypothesis.sensor, names, get(
         with_neutral(linear_model.baseline, hypothesis.effects), names))
     linearised = linearise(linear_model, hypothesis.effects, start,
-                           filter_indices=hypothesis.fit.filter_indices)
+                           [[whitener] for whitener in hypothesis.whiteners])
     fit = linearised.fit()
     held = [i for i, name in enumerate(linearised.names) if name in open_names]
     departures = evidence.conditional_mean(
         fit, np.array(held), linearised.values[held] - linearised.prior_mean[held])
-    departures = np.clip(departures, -linearised.bounds, linearised.bounds)
     fitted = linearised.prior_mean + departures
     parameters = [parameter_of(name) for name in linearised.names]
     sensor = put(start, linearised.names, np.clip(

@@ -27,20 +27,22 @@ from adxl_ros.diagnose import data_checks, decision, gap_closure, noise_detector
 from adxl_ros.diagnose.baseline_comparison import BaselineComparison, Reference
 from adxl_ros.diagnose.data_checks import CheckedRecording, DataFault
 from adxl_ros.diagnose.decision import Findings, Verdict
+from adxl_ros.diagnose.decision_settings import DecisionSettings
 from adxl_ros.diagnose.determination import at_baseline, not_determined, NotDetermined
 from adxl_ros.diagnose.drift_checks import walk_log_bayes_factor
+from adxl_ros.diagnose.effect_sizes import contribution, size_hypothesis, SizedHypothesis
 from adxl_ros.diagnose.evidence import bridged
 from adxl_ros.diagnose.gap_closure import GapClosure, HeldOutResidual
 from adxl_ros.diagnose.hypothesis_fit import Hypothesis, residual_channels
 from adxl_ros.diagnose.input_checks import compare_checked
 from adxl_ros.diagnose.linear_model import build_linear_model, LinearModel
-from adxl_ros.diagnose.model_discrepancy import discrepancy, discrepancy_instead_of_drift
-from adxl_ros.diagnose.model_search import search, WORTH_LOG_BAYES_FACTOR
+from adxl_ros.diagnose.model_search import fit_without, search
 from adxl_ros.diagnose.next_experiment import NextExperiment, propose_next_experiment
 from adxl_ros.diagnose.noise_comparison import compare_noise, NoiseComparison
 from adxl_ros.diagnose.noise_detectors import Detection, NoiseSamples, UNKNOWN
 from adxl_ros.diagnose.noise_floor import NoiseFloor
 from adxl_ros.diagnose.noise_whitening import drifts_among
+from adxl_ros.diagnose.posterior import posterior, WeighedHypothesis
 from adxl_ros.diagnose.residual_map import (
     not_covered,
     residual_map,
@@ -121,6 +123,10 @@ class Diagnosis:
     sensor: Sensor | None = None
 
 
+SETTINGS = DecisionSettings()
+"""Settings of the decision."""
+
+
 def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None = None,
              seed: int = 0, show_progress: Callable[[float], None] = lambda fraction: None,
              align: bool = False) -> Diagnosis:
@@ -175,7 +181,7 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
     show_progress(0.05)
     linear_model = build_linear_model([c.search_comparison for c in checked],
                                       lambda done: show_progress(0.05 + 0.25 * done))
-    hypotheses = search(linear_model, lambda done: show_progress(0.3 + 0.4 * done))
+    hypotheses = search(linear_model, SETTINGS, lambda done: show_progress(0.3 + 0.4 * done))
     explanation = _explain(checked, linear_model, hypotheses, sensor, seed)
     show_progress(0.8)
     verdict = _decide(linear_model, explanation)
@@ -196,8 +202,8 @@ class _Explanation:
         The noise floor.
     noise_mps2
         Rms of the noise without the steps of the encoder, m/s².
-    hypotheses
-        Material hypotheses that hold, the most probable first.
+    weighed
+        Sets of effects that hold, with and without something unknown, the most probable first.
     closure
         Gap closure of the best hypothesis.
     detections
@@ -211,7 +217,7 @@ class _Explanation:
 
     noise_floor: NoiseFloor
     noise_mps2: float
-    hypotheses: list[Hypothesis]
+    weighed: list[WeighedHypothesis]
     closure: GapClosure
     detections: list[Detection]
     sensor: Sensor
@@ -226,41 +232,65 @@ def _explain(checked: Sequence[CheckedRecording], linear_model: LinearModel,
     floor = gap_closure.estimate_noise_floor(comparisons)
     scale_v_per_mps2 = linear_model.comparisons[0].scale_v_per_mps2
     noise_mps2 = float(np.sqrt(np.mean((floor.noise_v / scale_v_per_mps2) ** 2)))
-    material = decision.material_hypotheses(
-        [gap_closure.size_of(linear_model, h) for h in hypotheses], linear_model.library_size,
-        noise_mps2, linear_model.smallest_angle_rad())
+    weighed = posterior(linear_model, _sized(linear_model, hypotheses, noise_mps2), SETTINGS)
     baseline_residual = gap_closure.held_out_residual(linear_model, comparisons, (),
                                                       linear_model.baseline)
-    confirmed, closure = _confirmed(linear_model, comparisons, material, baseline_residual,
+    confirmed, closure = _confirmed(linear_model, comparisons, weighed, baseline_residual,
                                     floor.rms_mps2, seed)
-    confirmed[0] = at_baseline(linear_model, confirmed[0])
-    detections = _detections(checked, confirmed[0])
-    named_sensor = _with_detections(confirmed[0], detections, sensor)
+    confirmed = _at_baseline(linear_model, confirmed)
+    best = _best(confirmed)
+    detections = _detections(checked, best)
+    named_sensor = _with_detections(best, detections, sensor)
     return _Explanation(
         floor, noise_mps2, confirmed, closure, detections, named_sensor,
         _noise_comparisons(comparisons, sensor, sensor, seed),
-        _noise_comparisons(comparisons, confirmed[0].sensor, named_sensor, seed))
+        _noise_comparisons(comparisons, best.sensor, named_sensor, seed))
+
+
+def _at_baseline(linear_model: LinearModel, weighed: Sequence[WeighedHypothesis]
+                 ) -> list[WeighedHypothesis]:
+    """Return the sets; sizes of the best one that are not determined are those of the baseline."""
+    best = next(w for w in weighed if w.unknown is None)
+    return [replace(w, hypothesis=at_baseline(linear_model, w.hypothesis)) if w is best else w
+            for w in weighed]
+
+
+def _sized(linear_model: LinearModel, hypotheses: Sequence[Hypothesis], noise_mps2: float
+           ) -> list[SizedHypothesis]:
+    """Size hypotheses; fit those, too, that are the material effects of others."""
+    sized = [size_hypothesis(linear_model, h, noise_mps2, SETTINGS) for h in hypotheses]
+    present = {frozenset(h.effects) for h in hypotheses}
+    for s in list(sized):
+        if s.material in present:
+            continue
+        present.add(s.material)
+        smaller = fit_without(linear_model, s.hypothesis, s.immaterial)
+        if smaller is not None:
+            sized.append(size_hypothesis(linear_model, smaller, noise_mps2, SETTINGS))
+    return sized
+
+
+def _best(weighed: Sequence[WeighedHypothesis]) -> Hypothesis:
+    """Return the most probable hypothesis without anything unknown."""
+    return next(w.hypothesis for w in weighed if w.unknown is None)
 
 
 def _decide(linear_model: LinearModel, explanation: _Explanation) -> Verdict:
     """Gather the findings beside the best hypothesis, and decide."""
-    best, closure = explanation.hypotheses[0], explanation.closure
+    best, closure = _best(explanation.weighed), explanation.closure
     simulated_noise_mps2 = float(np.sqrt(np.mean(
         [n.simulated_std_mps2 ** 2 for n in explanation.noise_after])))
     walk = walk_log_bayes_factor(list(residual_channels(linear_model, best))) \
         if drifts_among(best.effects) else 0.0
     verdict = decision.decide(Findings(
-        hypotheses=explanation.hypotheses,
-        library_size=linear_model.library_size,
-        discrepancy=discrepancy(linear_model, best),
-        instead_of_drift=discrepancy_instead_of_drift(linear_model, explanation.hypotheses),
+        weighed=explanation.weighed,
         walk_log_bayes_factor=walk,
         detections=explanation.detections,
         noise_mps2=explanation.noise_mps2,
         explained_mps2=closure.explained_mps2,
         unexplained_mps2=gap_closure.unexplained_mps2(linear_model, best, closure,
                                                       simulated_noise_mps2),
-        code_step_mps2=max(map(_rounding_std_mps2, linear_model.comparisons))))
+        code_step_mps2=max(map(_rounding_std_mps2, linear_model.comparisons))), SETTINGS)
     if verdict.status == 'no_gap' and not any(map(_could_show, linear_model.comparisons)):
         return replace(verdict, status='insufficient')
     return verdict
@@ -277,22 +307,22 @@ def _with_report(linear_model: LinearModel, explanation: _Explanation, verdict: 
     comparisons, best = linear_model.comparisons, verdict.best
     floor, lacking = explanation.noise_floor, not_covered(comparisons)
     contributions_mps2 = {
-        effect: gap_closure.contribution_mps2(linear_model, best, effect)
-        for effect in best.effects}
+        effect: contribution(linear_model, best, effect).rms_mps2 for effect in best.effects}
     named = verdict.status not in ('no_gap', 'unknown', 'insufficient')
+    hypotheses = tuple(w.hypothesis for w in explanation.weighed if w.unknown is None)
     return Diagnosis(
         data_fault=None,
         comparisons=comparisons,
         noise_floor=floor,
         verdict=verdict,
-        hypotheses=tuple(explanation.hypotheses),
+        hypotheses=hypotheses,
         detections=tuple(explanation.detections),
         gap_closure=explanation.closure,
         residual_cells=tuple(residual_map(comparisons[0], floor.rms_mps2, seed)),
         not_covered=tuple(lacking),
         next_experiment=propose_next_experiment(verdict, lacking, seed),
         contributions_mps2=contributions_mps2,
-        not_determined=not_determined(linear_model, explanation.hypotheses),
+        not_determined=not_determined(linear_model, hypotheses),
         single_effect_tests=single_effect_tests(linear_model, seed),
         noise_before=explanation.noise_before,
         noise_after=explanation.noise_after,
@@ -300,8 +330,8 @@ def _with_report(linear_model: LinearModel, explanation: _Explanation, verdict: 
 
 
 def _confirmed(linear_model: LinearModel, comparisons: Sequence[BaselineComparison],
-               hypotheses: Sequence[Hypothesis], baseline_residual: HeldOutResidual,
-               floor_mps2: float, seed: int) -> tuple[list[Hypothesis], GapClosure]:
+               weighed: Sequence[WeighedHypothesis], baseline_residual: HeldOutResidual,
+               floor_mps2: float, seed: int) -> tuple[list[WeighedHypothesis], GapClosure]:
     """
     Remove the most probable hypotheses until the first one holds on held-out blocks.
 
@@ -328,12 +358,17 @@ def _confirmed(linear_model: LinearModel, comparisons: Sequence[BaselineComparis
         steady = [h for h in others if 0 < len(h.effects) < len(best.effects)
                   and frozenset(h.effects) == without_drift]
         return all(closure.log_likelihood_gain - closure_of(h).log_likelihood_gain
-                   >= WORTH_LOG_BAYES_FACTOR for h in steady)
+                   >= SETTINGS.worth_fitting for h in steady)
 
-    remaining = list(hypotheses)
-    while remaining[0].effects and not holds(remaining[0], remaining[1:]):
-        remaining = remaining[1:]
-    return remaining, closure_of(remaining[0])
+    refuted: set[frozenset[str]] = set()
+    known = [w for w in weighed if w.unknown is None]
+    hypotheses = [w.hypothesis for w in known]
+    first = 0
+    while known[first].effects and not holds(hypotheses[first], hypotheses[first + 1:]):
+        refuted.add(known[first].effects)
+        first += 1
+    return ([w for w in weighed if w.effects not in refuted or w.unknown is not None],
+            closure_of(hypotheses[first]))
 
 
 def _detections(checked: Sequence[CheckedRecording], best: Hypothesis) -> list[Detection]:

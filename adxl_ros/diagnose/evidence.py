@@ -25,6 +25,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from adxl_ros.diagnose.noise_whitening import Whitener
 import numpy as np
@@ -45,8 +46,6 @@ _CACHED_VALUES = 100_000
 """Number of values that are filtered at once. Chosen: 0.8 MB stay in the cache of a processor."""
 _RIDGE = 1e-12
 """Ridge on the scaled precision. Chosen: columns that differ by a millionth are separable."""
-_BOUND_TOLERANCE = 1e-9
-"""Relative excess over a bound that is a rounding error."""
 
 
 @dataclass(frozen=True)
@@ -79,8 +78,26 @@ class WhitenedChannel:
     drift_effects: np.ndarray
 
 
+class FlexibleColumns(NamedTuple):
+    """
+    Functions that are integrated out of a channel.
+
+    Attributes
+    ----------
+    values
+        Functions times the prior standard deviations of their coefficients, V, (n, m).
+    variance_v2
+        Variance of the whitened noise, V².
+
+    """
+
+    values: np.ndarray
+    variance_v2: float
+
+
 def whiten_channel(residual_v: np.ndarray, columns: np.ndarray, column_ids: np.ndarray,
-                   used: np.ndarray, filters: Sequence[Whitener]) -> WhitenedChannel:
+                   used: np.ndarray, filters: Sequence[Whitener],
+                   flexible: FlexibleColumns | None = None) -> WhitenedChannel:
     """
     Whiten one axis of one recording.
 
@@ -96,6 +113,8 @@ def whiten_channel(residual_v: np.ndarray, columns: np.ndarray, column_ids: np.n
         Samples that are used, (n,) bool; the others are bridged by straight lines.
     filters
         Whitening filters to choose from.
+    flexible
+        Functions that are integrated out of the total products.
 
     Returns
     -------
@@ -103,7 +122,8 @@ def whiten_channel(residual_v: np.ndarray, columns: np.ndarray, column_ids: np.n
         Products of the whitened columns.
 
     """
-    data = np.concatenate([bridged(residual_v[:, None], used).T, bridged(columns, used).T])
+    series = [residual_v[:, None], columns, *([] if flexible is None else [flexible.values])]
+    data = np.concatenate([bridged(values, used).T for values in series])
     edges, unused = block_edges(len(used)), np.flatnonzero(~used)
     grams = np.empty((len(filters), BLOCKS, len(data), len(data)))
     states = [np.zeros((len(f.sections), len(data), 2)) for f in filters]
@@ -123,9 +143,42 @@ def whiten_channel(residual_v: np.ndarray, columns: np.ndarray, column_ids: np.n
             for b, begin, end in blocks:
                 np.matmul(white[:, begin:end], white[:, begin:end].T, out=grams[i, b])
     counts = np.add.reduceat(used, edges[:-1]).astype(float)
-    return WhitenedChannel(column_ids, grams, grams.sum(axis=1), counts,
+    total, count = grams.sum(axis=1), 1 + columns.shape[1]
+    if flexible is not None:
+        cross = total[:, :count, count:]
+        precision = total[:, count:, count:] + flexible.variance_v2 * np.eye(len(data) - count)
+        total = total[:, :count, :count] - cross @ np.linalg.solve(precision,
+                                                                   cross.transpose(0, 2, 1))
+        grams = grams[:, :, :count, :count]
+    return WhitenedChannel(column_ids, grams, total, counts,
                            np.array([f.log_prior for f in filters]),
                            np.array(['' if f.healthy else f.effect for f in filters]))
+
+
+def whitened(whitener: Whitener, columns: np.ndarray, used: np.ndarray) -> np.ndarray:
+    """
+    Whiten columns.
+
+    Parameters
+    ----------
+    whitener
+        The filter.
+    columns
+        Columns, (n, k).
+    used
+        Samples that are used, (n,) bool; the others are bridged by straight lines.
+
+    Returns
+    -------
+    numpy.ndarray
+        Whitened columns, (k, n), zero where samples are not used.
+
+    """
+    white = whitener(np.ascontiguousarray(bridged(columns, used).T))
+    white[:, ~used] = 0.0
+    # The first sample is a step from zero.
+    white[:, 0] = 0.0
+    return white
 
 
 def block_edges(count: int) -> np.ndarray:
@@ -166,11 +219,9 @@ class LinearFit:
     column_ids
         Numbers of the columns, (k,).
     values
-        Posterior mean of the coefficients, within their bounds, (k,).
+        Posterior mean of the coefficients, (k,).
     covariance
-        Posterior covariance, (k, k); zero for coefficients at a bound.
-    at_bound
-        Coefficients that are at a bound, (k,) bool.
+        Posterior covariance, (k, k).
     log_evidence
         Log evidence of the samples.
     filter_indices
@@ -183,14 +234,13 @@ class LinearFit:
     column_ids: np.ndarray
     values: np.ndarray
     covariance: np.ndarray
-    at_bound: np.ndarray
     log_evidence: float
     filter_indices: tuple[int, ...]
     innovation_variance_v2: np.ndarray
 
 
 def fit_columns(channels: Sequence[WhitenedChannel], column_ids: Sequence[int],
-                prior_std: np.ndarray, bounds: np.ndarray, blocks: np.ndarray | None = None,
+                prior_std: np.ndarray, blocks: np.ndarray | None = None,
                 start: LinearFit | None = None, drifts: Sequence[str] = ()) -> LinearFit:
     """
     Fit the coefficients of some columns, and the noise.
@@ -203,8 +253,6 @@ def fit_columns(channels: Sequence[WhitenedChannel], column_ids: Sequence[int],
         Numbers of the columns of the hypothesis, nuisance parameters included.
     prior_std
         Prior standard deviation of every column's coefficient, by number.
-    bounds
-        Largest magnitude of every column's coefficient, by number.
     blocks
         Blocks that are used, (blocks,) bool; None for all.
     start
@@ -227,18 +275,17 @@ def fit_columns(channels: Sequence[WhitenedChannel], column_ids: Sequence[int],
     for _ in range(_ITERATIONS):
         precision, information = _normal_equations(selected, filters, variance_v2,
                                                    prior_precision)
-        values, at_bound, covariance, half_log_det = _bounded_solution(precision, information,
-                                                                       bounds[ids])
+        values, covariance, half_log_det = _solution(precision, information)
         for i, s in enumerate(selected):
             squares_v2 = np.maximum(_residual_squares(s.grams, values[s.places]),
                                     _SMALLEST_SQUARES_V2)
             filters[i] = int(np.argmax(-s.count / 2 * np.log(squares_v2) + log_priors[i]))
             variance_v2[i] = squares_v2[filters[i]] / s.count
     log_evidence = -0.5 * float(np.sum(prior_precision * values ** 2)) \
-        - half_log_det + 0.5 * float(np.log(prior_precision[~at_bound]).sum())
+        - half_log_det + 0.5 * float(np.log(prior_precision).sum())
     for s, variance, f, channel in zip(selected, variance_v2, filters, channels):
         log_evidence += float(-s.count / 2 * (np.log(variance) + 1) + channel.log_priors[f])
-    return LinearFit(ids, values, covariance, at_bound, log_evidence, tuple(filters), variance_v2)
+    return LinearFit(ids, values, covariance, log_evidence, tuple(filters), variance_v2)
 
 
 @dataclass(frozen=True)
@@ -344,32 +391,21 @@ def log_bayes_factor_by_amplitude(mean: np.ndarray, covariance: np.ndarray,
     return np.array(gains)
 
 
-def _bounded_solution(precision: np.ndarray, information: np.ndarray, bound: np.ndarray
-                      ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+def _solution(precision: np.ndarray, information: np.ndarray
+              ) -> tuple[np.ndarray, np.ndarray, float]:
     """
-    Solve precision · values = information within bounds.
+    Solve precision · values = information.
 
-    Return the values, whether each is at a bound, the covariance of the values that are not, and
-    half the logarithm of the determinant of their precision. The columns are scaled, so that
-    columns of different sizes or nearly equal columns cause no rounding errors.
+    Return the values, their covariance, and half the logarithm of the determinant of the
+    precision. The columns are scaled, so that columns of different sizes or nearly equal columns
+    cause no rounding errors.
     """
     size = 1 / np.sqrt(np.diag(precision))
     scaled = precision * size[:, None] * size + _RIDGE * np.eye(len(size))
-    values, at_bound = np.zeros(len(bound)), np.zeros(len(bound), bool)
-    while True:
-        free = ~at_bound
-        factor = np.linalg.cholesky(scaled[np.ix_(free, free)])
-        remaining = information - precision @ np.where(at_bound, values, 0.0)
-        values[free] = size[free] * cho_solve((factor, True), (size * remaining)[free])
-        outside = np.abs(values) > bound * (1 + _BOUND_TOLERANCE)
-        if not outside.any():
-            break
-        values[outside] = np.sign(values[outside]) * bound[outside]
-        at_bound |= outside
-    covariance = np.zeros_like(precision)
-    covariance[np.ix_(free, free)] = (cho_solve((factor, True), np.eye(int(free.sum())))
-                                      * size[free][:, None] * size[free])
-    return values, at_bound, covariance, float(np.log(np.diag(factor) / size[free]).sum())
+    factor = np.linalg.cholesky(scaled)
+    values = size * cho_solve((factor, True), size * information)
+    covariance = cho_solve((factor, True), np.eye(len(size))) * size[:, None] * size
+    return values, covariance, float(np.log(np.diag(factor) / size).sum())
 
 
 def _residual_squares(grams: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -507,8 +543,7 @@ def log_posterior_loss(channels: Sequence[WhitenedChannel], fit: LinearFit, valu
     for c, f, v in zip(channels, fit.filter_indices, fit.innovation_variance_v2):
         places = np.searchsorted(fit.column_ids, c.column_ids)
         precision[np.ix_(places, places)] += c.total_grams[f, 1:, 1:] / v
-    free = np.flatnonzero(~fit.at_bound)
-    free = free[free >= count]
+    free = np.arange(count, len(fit.values))
     # Schur complement of the free coefficients.
     cross = precision[:count, free]
     marginal = precision[:count, :count] - cross @ np.linalg.solve(

@@ -37,7 +37,6 @@ from adxl_ros.diagnose.linear_model import LinearModel
 from adxl_ros.diagnose.noise_floor import FEWEST_SAMPLES, NoiseFloor, SquareSum
 from adxl_ros.diagnose.noise_whitening import drifts_among, expected_drift_g, USUAL_DENSITY
 from adxl_ros.model import noise
-from adxl_ros.model.coefficients import neutral
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.diagnosis_hints import StraightLine
 from adxl_ros.model.effects import effect_named
@@ -107,27 +106,6 @@ class GapClosure:
     explained_mps2: float
     fitted_rms_mps2: float
     log_likelihood_gain: float
-
-
-@dataclass(frozen=True)
-class SizedHypothesis:
-    """
-    A hypothesis with the sizes of its effects and of its residual, on the samples of the search.
-
-    Attributes
-    ----------
-    hypothesis
-        The fitted hypothesis.
-    contributions_mps2
-        Rms that each effect contributes to the output, m/s².
-    residual_mean_square
-        Mean square of the residual about its mean, (m/s²)².
-
-    """
-
-    hypothesis: Hypothesis
-    contributions_mps2: dict[str, float]
-    residual_mean_square: float
 
 
 @dataclass(frozen=True)
@@ -203,96 +181,6 @@ def _encoder_mean_square(comparison: BaselineComparison) -> float:
     motion, time_s, used = comparison.motion, comparison.time_s, comparison.used
     return noise_floor.encoder_mean_square(motion.alpha(time_s)[used], motion.beta(time_s)[used],
                                            comparison.sensor)
-
-
-def size_of(linear_model: LinearModel, hypothesis: Hypothesis) -> SizedHypothesis:
-    """
-    Simulate how large the effects and the residual of a hypothesis are.
-
-    Parameters
-    ----------
-    linear_model
-        The recordings.
-    hypothesis
-        A fitted hypothesis.
-
-    Returns
-    -------
-    SizedHypothesis
-        The hypothesis with its sizes.
-
-    """
-    return SizedHypothesis(
-        hypothesis, {effect: contribution_mps2(linear_model, hypothesis, effect)
-                     for effect in hypothesis.effects},
-        residual_mean_square(linear_model, hypothesis))
-
-
-def contribution_mps2(linear_model: LinearModel, hypothesis: Hypothesis, effect: str) -> float:
-    """
-    Simulate what one effect of a hypothesis contributes to the output.
-
-    Parameters
-    ----------
-    linear_model
-        The recordings.
-    hypothesis
-        A fitted hypothesis.
-    effect
-        Name of one of its effects.
-
-    Returns
-    -------
-    float
-        Rms over samples and axes, m/s²: about zero for zero-g and scale factor, about the mean for
-        other effects.
-
-    """
-    library_effect = effect_named(effect)
-    if library_effect.diagnosis.drift:
-        density = np.sqrt(np.mean(next(iter(hypothesis.sensor.values[effect].values())) ** 2))
-        return float(np.sqrt(np.mean([
-            (G0_MPS2 * expected_drift_g(library_effect.diagnosis.drift, density, c.span_s,
-                                        c.sensor.rate_hz)) ** 2
-            for c in linear_model.comparisons])))
-    baseline = linear_model.baseline
-    absent = baseline.values[effect] if effect in baseline.effects \
-        else neutral(library_effect, baseline.axes)
-    squares, count = 0.0, 0
-    for c in linear_model.comparisons:
-        sensor = replace(hypothesis.sensor, rate_hz=c.sensor.rate_hz)
-        without = replace(sensor, values={**sensor.values, effect: absent})
-        change_v = (c.simulated_v(sensor) - c.simulated_v(without))[c.used]
-        if not library_effect.diagnosis.straight_line:
-            change_v = change_v - change_v.mean(axis=0)
-        squares += float(np.sum((change_v / c.scale_v_per_mps2) ** 2))
-        count += change_v.size
-    return float(np.sqrt(squares / max(count, 1)))
-
-
-def residual_mean_square(linear_model: LinearModel, hypothesis: Hypothesis) -> float:
-    """
-    Return the mean square of a hypothesis's residual about its mean.
-
-    Parameters
-    ----------
-    linear_model
-        The recordings.
-    hypothesis
-        A fitted hypothesis.
-
-    Returns
-    -------
-    float
-        Mean square over samples and axes, (m/s²)².
-
-    """
-    squares, count = 0.0, 0
-    for c in linear_model.comparisons:
-        residual = (c.residual_v(hypothesis.sensor) / c.scale_v_per_mps2)[c.used]
-        squares += float(np.sum((residual - residual.mean(axis=0)) ** 2))
-        count += residual.size
-    return squares / max(count, 1)
 
 
 def unexplained_mps2(linear_model: LinearModel, hypothesis: Hypothesis, closure: GapClosure,
@@ -532,8 +420,8 @@ def _drift_squares(linear_model: LinearModel, hypothesis: Hypothesis) -> list[fl
     """Return the mean square of the drift that the noise of each channel has, (m/s²)²."""
     channels = [c for c in linear_model.comparisons for _ in c.sensor.axes]
     squares = []
-    for c, filters, i in zip(channels, linear_model.filters, hypothesis.fit.filter_indices):
-        drift_g = expected_drift_g(filters[i].spectrum, filters[i].density, c.span_s,
+    for c, whitener in zip(channels, hypothesis.whiteners):
+        drift_g = expected_drift_g(whitener.spectrum, whitener.density, c.span_s,
                                    c.sensor.rate_hz)
         squares.append((G0_MPS2 * drift_g) ** 2)
     return squares

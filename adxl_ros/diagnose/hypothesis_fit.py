@@ -19,19 +19,19 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
+from typing import NamedTuple
 
 from adxl_ros.diagnose import evidence
 from adxl_ros.diagnose.drift_checks import ResidualChannel, weakest_walk
 from adxl_ros.diagnose.evidence import LinearFit, WhitenedChannel
 from adxl_ros.diagnose.linear_model import (
-    calibration_takes_up,
     hints_of,
     LinearModel,
     NumberedColumn,
-    straight_line_parts,
-    TOLERANCE_STDS,
+    parts_at_rest,
+    rests_by_channel,
 )
-from adxl_ros.diagnose.noise_whitening import drifts_among, fitted_density, neighbouring_filters
+from adxl_ros.diagnose.noise_whitening import drifts_among, fitted_density, Whitener
 from adxl_ros.diagnose.sensitivities import limits, PRIOR_WIDTH, sensitivities_at
 from adxl_ros.model.coefficients import fitted_of, get, parameter_of, put, with_neutral
 from adxl_ros.model.effects import effect_named
@@ -90,6 +90,10 @@ class Hypothesis:
         Log evidence.
     fit
         The last linear fit.
+    linearised
+        The hypothesis linearised at its values.
+    linear_loss
+        How far the log posterior at the values is below the maximum of the linear model.
     converged
         Whether the Gauss-Newton iteration has converged.
 
@@ -102,7 +106,32 @@ class Hypothesis:
     std: np.ndarray
     log_evidence: float
     fit: LinearFit
+    linearised: LinearisedHypothesis
+    linear_loss: float
     converged: bool = True
+
+    @property
+    def whiteners(self) -> list[Whitener]:
+        """Whitening filter of each channel."""
+        return [filters[i] for filters, i in zip(self.linearised.filters,
+                                                 self.fit.filter_indices)]
+
+
+class ChannelColumns(NamedTuple):
+    """
+    The linear model of a hypothesis in one channel.
+
+    Attributes
+    ----------
+    places
+        Places of the k coefficients among all, (k,).
+    values
+        Residual at the prior mean, V, and sensitivities, V per unit, (n, k + 1).
+
+    """
+
+    places: np.ndarray
+    values: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -129,6 +158,10 @@ class LinearisedHypothesis:
         Values of the coefficients of the effects, (j,).
     channels
         Whitened columns, and whitened residuals at the prior mean by the linear model.
+    columns
+        The same before whitening.
+    filters
+        Whitening filters of each channel.
 
     """
 
@@ -139,17 +172,13 @@ class LinearisedHypothesis:
     prior_std: np.ndarray
     values: np.ndarray
     channels: list[WhitenedChannel]
+    columns: list[ChannelColumns]
+    filters: Sequence[Sequence[Whitener]]
 
     @property
     def effect_names(self) -> tuple[Coefficient, ...]:
         """Names of the coefficients of the effects, (j,)."""
         return self.names[:len(self.values)]
-
-    @property
-    def bounds(self) -> np.ndarray:
-        """Largest deviation from the prior mean, (k,); infinite for coefficients of effects."""
-        of_effects = np.arange(len(self.names)) < len(self.values)
-        return np.where(of_effects, np.inf, TOLERANCE_STDS * self.prior_std)
 
     def fit(self, blocks: np.ndarray | None = None, drifts: Sequence[str] = ()) -> LinearFit:
         """
@@ -168,8 +197,7 @@ class LinearisedHypothesis:
             Departures from the prior mean.
 
         """
-        return evidence.fit_columns(self.channels, range(len(self.names)), self.prior_std,
-                                    self.bounds, blocks,
+        return evidence.fit_columns(self.channels, range(len(self.names)), self.prior_std, blocks,
                                     drifts=(*drifts, *drifts_among(self.sensor.effects)))
 
     def sensor_at_values(self, fit: LinearFit) -> Sensor:
@@ -180,10 +208,8 @@ class LinearisedHypothesis:
         fit itself may differ much, because there the effects have other values.
         """
         of_effects = np.arange(len(self.values))
-        departures = np.clip(
-            evidence.conditional_mean(fit, of_effects,
-                                      self.values - self.prior_mean[of_effects]),
-            -self.bounds, self.bounds)
+        departures = evidence.conditional_mean(fit, of_effects,
+                                               self.values - self.prior_mean[of_effects])
         return put(self.sensor, self.names,
                    _within_bounds(self.names, self.prior_mean + departures))
 
@@ -243,15 +269,14 @@ class LinearisedHypothesis:
         changed = np.flatnonzero(values != fitted)
         return evidence.conditional_mean(fit, changed, values[changed] - self.prior_mean[changed])
 
-    def log_evidence(self, fit: LinearFit) -> float:
-        """Return the log evidence at the values themselves."""
-        return fit.log_evidence - evidence.log_posterior_loss(
+    def linear_loss(self, fit: LinearFit) -> float:
+        """Return how far the log posterior at the values is below the linear model's maximum."""
+        return evidence.log_posterior_loss(
             self.channels, fit, self.values - self.prior_mean[:len(self.values)], self.prior_std)
 
 
 def linearise(linear_model: LinearModel, effects: Sequence[str], sensor: Sensor,
-              extra_columns: Sequence[np.ndarray] = (),
-              filter_indices: Sequence[int] | None = None) -> LinearisedHypothesis:
+              filters: Sequence[Sequence[Whitener]] | None = None) -> LinearisedHypothesis:
     """
     Linearise a hypothesis at the coefficients of a sensor.
 
@@ -263,11 +288,8 @@ def linearise(linear_model: LinearModel, effects: Sequence[str], sensor: Sensor,
         Names of the effects.
     sensor
         A sensor with the effects.
-    extra_columns
-        More columns by recording, V per unit, (n, e). Each axis has coefficients of its own,
-        numbered after those of the hypothesis, axis by axis.
-    filter_indices
-        Number of the whitening filter of each channel, where the noise is known.
+    filters
+        Whitening filters of each channel; None for all.
 
     Returns
     -------
@@ -275,6 +297,7 @@ def linearise(linear_model: LinearModel, effects: Sequence[str], sensor: Sensor,
         Whitened residuals and columns.
 
     """
+    filters = linear_model.filters if filters is None else filters
     start = with_neutral(linear_model.baseline, effects)
     names = _fitted_names(linear_model, effects)
     nuisances = [n for n in dict.fromkeys(chain(*linear_model.nuisance_columns))
@@ -285,38 +308,34 @@ def linearise(linear_model: LinearModel, effects: Sequence[str], sensor: Sensor,
     sensor = put(start, names, values)
     all_names = [*names, *nuisances]
     channels: list[WhitenedChannel] = []
+    columns: list[ChannelColumns] = []
     changes_v: list[np.ndarray] = []
-    next_id = len(all_names)
     for number, comparison in enumerate(linear_model.comparisons):
-        extra = extra_columns[number] if extra_columns else np.zeros((len(comparison), 0))
         at_rate = replace(sensor, rate_hz=comparison.sensor.rate_hz)
         output_v = comparison.simulated_v(at_rate)
-        columns = sensitivities_at(comparison.simulated_v, at_rate, names, values, output_v)
-        change_v = output_v - _output_beside_sensor_effects(linear_model, number, at_rate, start,
-                                                            effects)
+        derivatives = sensitivities_at(comparison.simulated_v, at_rate, names, values, output_v)
+        change_v = output_v - linear_model.baseline_v[number]
         for d, axis in enumerate(start.axes):
             places = [i for i, n in enumerate(names) if n.axis in ('', axis)]
-            design = columns[:, d, places]
+            design = derivatives[:, d, places]
             residual_v = comparison.volts[:, d] - output_v[:, d] \
                 + design @ (values - prior_mean)[places]
             on_channel = linear_model.nuisance_columns[len(channels)]
             nuisance_columns = {all_names.index(n): on_channel[n]
                                 for n in nuisances if n in on_channel}
-            extra_ids = range(next_id, next_id + extra.shape[1])
-            next_id = extra_ids.stop
-            filters = linear_model.filters[len(channels)]
-            if filter_indices is not None:
-                filters = neighbouring_filters(filters, filter_indices[len(channels)])
+            ids = np.array([*places, *nuisance_columns], int)
+            design = np.column_stack([design, *nuisance_columns.values()])
             changes_v.append(change_v[:, d])
-            channels.append(evidence.whiten_channel(
-                residual_v, np.column_stack([design, *nuisance_columns.values(), extra]),
-                np.array([*places, *nuisance_columns, *extra_ids], int), comparison.used,
-                filters))
+            columns.append(ChannelColumns(
+                ids, np.column_stack([residual_v, design]).astype(np.float32)))
+            channels.append(evidence.whiten_channel(residual_v, design, ids, comparison.used,
+                                                    filters[len(channels)]))
     nuisance_std = _nuisance_std(linear_model, effects, all_names, nuisances, changes_v)
     return LinearisedHypothesis(
         effects=tuple(effects), sensor=sensor, names=tuple(all_names),
         prior_mean=np.concatenate([prior_mean, get(start, nuisances)]),
-        prior_std=np.array([*prior_std, *nuisance_std]), values=values, channels=channels)
+        prior_std=np.array([*prior_std, *nuisance_std]), values=values, channels=channels,
+        columns=columns, filters=filters)
 
 
 def _nuisance_std(linear_model: LinearModel, effects: Sequence[str], names: list[Coefficient],
@@ -325,14 +344,14 @@ def _nuisance_std(linear_model: LinearModel, effects: Sequence[str], names: list
     """
     Return prior standard deviations of nuisance parameters in a hypothesis with some effects.
 
-    The square of each is that of a healthy unit's tolerance plus that of the straight-line part of
-    the effects. `changes_v` are the outputs of the effects by channel, V, (n,); `names` are all
-    coefficients.
+    The square of each is that of a healthy unit's tolerance plus that of what a calibration can
+    take up of the effects. `changes_v` are the outputs of the effects by channel, V, (n,); `names`
+    are all coefficients.
     """
     lines = [{names.index(n): column for n, column in columns.items() if hints_of(n).straight_line}
              for columns in linear_model.nuisance_columns]
     changes = [[NumberedColumn(0, change_v)] for change_v in changes_v]
-    parts = straight_line_parts(lines, changes, 1)
+    parts = parts_at_rest(lines, changes, 1, rests_by_channel(linear_model.comparisons))
     drifts, std = drifts_among(effects), []
     for name in nuisances:
         part = parts.get(names.index(name), np.zeros(1))
@@ -355,16 +374,6 @@ def _prior(sensor: Sensor, names: Sequence[Coefficient]) -> tuple[np.ndarray, li
     mean = np.array([float(get(sensor, [name])[0]) if p.is_size else p.scale
                      for name, p in zip(names, parameters)])
     return mean, [p.scale * (PRIOR_WIDTH if p.is_size else 1) for p in parameters]
-
-
-def _output_beside_sensor_effects(linear_model: LinearModel, number: int, sensor: Sensor,
-                                  start: Sensor, effects: Sequence[str]) -> np.ndarray:
-    """Simulate a recording without the effects whose straight line is calibrated, V, (n, m)."""
-    taken_up = [effect for effect in effects if calibration_takes_up(effect)]
-    if len(taken_up) == len(effects):
-        return linear_model.baseline_v[number]
-    values = {**sensor.values, **{effect: start.values[effect] for effect in taken_up}}
-    return linear_model.comparisons[number].simulated_v(replace(sensor, values=values))
 
 
 @dataclass(frozen=True)
@@ -414,15 +423,16 @@ def fit_hypothesis(linear_model: LinearModel, effects: Sequence[str],
     effects = tuple(dict.fromkeys(effects))
     neutral_sensor = with_neutral(linear_model.baseline, effects)
     names = _fitted_names(linear_model, effects)
+    filters = linear_model.filters_of(effects)
 
     def linearised_at(values: np.ndarray) -> _HypothesisIterate:
         linearised = linearise(linear_model, effects,
-                               put(neutral_sensor, names, _within_bounds(names, values)))
+                               put(neutral_sensor, names, _within_bounds(names, values)), filters)
         fit = linearised.fit()
         j = len(linearised.values)
         step = linearised.departures(fit)[:j] + linearised.prior_mean[:j] - linearised.values
-        return _HypothesisIterate(linearised.values, step, -linearised.log_evidence(fit),
-                                  linearised, fit)
+        log_evidence = fit.log_evidence - linearised.linear_loss(fit)
+        return _HypothesisIterate(linearised.values, step, -log_evidence, linearised, fit)
 
     smooth = all(effect_named(effect).smooth for effect in effects)
     solution = gauss_newton(
@@ -433,12 +443,13 @@ def fit_hypothesis(linear_model: LinearModel, effects: Sequence[str],
     std = np.sqrt(evidence.robust_std(linearised.channels, fit, linearised.prior_std)[:j] ** 2
                   + _encoder_std(linear_model, linearised.effect_names) ** 2
                   + _form_std(linearised, fit) ** 2)
-    return Hypothesis(
-        effects, _with_drift_densities(linear_model, effects, linearised.sensor_at_values(fit),
-                                       fit),
-        linearised.effect_names, linearised.values - linearised.prior_mean[:j], std,
-        solution.last.log_evidence + _sparsity_log_bayes_factor(linearised, fit), fit,
-        solution.converged)
+    log_evidence = solution.last.log_evidence + sparsity_log_bayes_factor(
+        linearised, fit.values, fit.covariance)
+    hypothesis = Hypothesis(
+        effects, linearised.sensor_at_values(fit), linearised.effect_names,
+        linearised.values - linearised.prior_mean[:j], std, log_evidence, fit, linearised,
+        linearised.linear_loss(fit), solution.converged)
+    return replace(hypothesis, sensor=_with_drift_densities(linear_model, hypothesis))
 
 
 def _first_values(sensor: Sensor, names: Sequence[Coefficient], start: Mapping[Coefficient, float],
@@ -467,16 +478,16 @@ def _has_converged(first: _HypothesisIterate, previous: _HypothesisIterate | Non
     return bool(np.all(np.abs(present.step) < _SMALLEST_STEP * prior_std))
 
 
-def _with_drift_densities(linear_model: LinearModel, effects: Sequence[str], sensor: Sensor,
-                          fit: LinearFit) -> Sensor:
+def _with_drift_densities(linear_model: LinearModel, hypothesis: Hypothesis) -> Sensor:
     """Return the sensor with the densities of its drifts in the first recording."""
-    for drift in drifts_among(effects):
+    sensor, variance_v2 = hypothesis.sensor, hypothesis.fit.innovation_variance_v2
+    for drift in drifts_among(hypothesis.effects):
         densities = np.zeros(len(sensor.axes))
         for d in range(len(densities)):
-            whitener = linear_model.filters[d][fit.filter_indices[d]]
+            whitener = hypothesis.whiteners[d]
             if whitener.effect == drift:
                 densities[d] = fitted_density(
-                    whitener, fit.innovation_variance_v2[d], linear_model.comparisons[0].dt_s,
+                    whitener, variance_v2[d], linear_model.comparisons[0].dt_s,
                     linear_model.baseline.scale_v_per_g[d])
         sensor = replace(sensor, values={**sensor.values, drift: {
             effect_named(drift).parameters[0].name: densities}})
@@ -498,7 +509,8 @@ def _form_std(linearised: LinearisedHypothesis, fit: LinearFit) -> np.ndarray:
     return np.where(exact, 0.0, _FORM_ERROR * np.abs(size))
 
 
-def _sparsity_log_bayes_factor(linearised: LinearisedHypothesis, fit: LinearFit) -> float:
+def sparsity_log_bayes_factor(linearised: LinearisedHypothesis, mean: np.ndarray,
+                              covariance: np.ndarray) -> float:
     """
     Return what the log evidence gains because an effect need not show in all coefficients.
 
@@ -506,8 +518,22 @@ def _sparsity_log_bayes_factor(linearised: LinearisedHypothesis, fit: LinearFit)
     amplitude. Omitting a coefficient multiplies the evidence by the ratio of its posterior and
     prior densities at zero (Dickey 1971). Coefficients are omitted one by one while the evidence
     gains; at least one coefficient of each effect stays.
+
+    Parameters
+    ----------
+    linearised
+        The hypothesis.
+    mean
+        Posterior mean of its coefficients, as departures from the prior mean, (k,).
+    covariance
+        Their posterior covariance, (k, k).
+
+    Returns
+    -------
+    float
+        The gain.
+
     """
-    mean, covariance = fit.values.copy(), fit.covariance.copy()
     gain = 0.0
     for effect in linearised.effects:
         kept = [i for i, name in enumerate(linearised.effect_names)
@@ -559,9 +585,8 @@ def residual_channels(linear_model: LinearModel, hypothesis: Hypothesis
     for comparison in linear_model.comparisons:
         residual_v = evidence.bridged(comparison.residual_v(hypothesis.sensor), comparison.used)
         for axis_v in residual_v.T:
-            filters = linear_model.filters[number]
             yield ResidualChannel(
                 axis_v, comparison.used, comparison.sensor.rate_hz,
-                filters[hypothesis.fit.filter_indices[number]], weakest_walk(filters),
+                hypothesis.whiteners[number], weakest_walk(linear_model.filters[number]),
                 float(hypothesis.fit.innovation_variance_v2[number]))
             number += 1

@@ -20,10 +20,9 @@ the parts of the RC filter have tolerances, and stamps have a latency. These nui
 are free in every hypothesis, within the tolerance of a healthy unit. An effect is named only if
 its parameters exceed this tolerance.
 
-The output of an effect of the sensor has a part that is a straight line over the specific force.
-Zero-g and scale factor of the calibration contain an unknown share of this line. In a hypothesis
-with such an effect, they may therefore change by as much as the line. An effect of the stage or of
-the specific force is no part of the calibrated sensor and leaves their tolerance as it is.
+A unit is calibrated with its effects, and often on the same stage. Zero-g and scale factor of the
+calibration then contain an unknown share of what an effect does at rest. In a hypothesis with an
+effect, they may therefore change by as much.
 """
 
 from __future__ import annotations
@@ -35,21 +34,18 @@ from typing import NamedTuple
 
 from adxl_ros.diagnose import evidence, noise_whitening
 from adxl_ros.diagnose.baseline_comparison import BaselineComparison, Reference
-from adxl_ros.diagnose.evidence import LinearFit, WhitenedChannel
+from adxl_ros.diagnose.evidence import FlexibleColumns, LinearFit, WhitenedChannel
 from adxl_ros.diagnose.noise_whitening import drifts_among, Whitener
 from adxl_ros.diagnose.sensitivities import candidates, Variant, variants
 from adxl_ros.model.diagnosis_hints import DiagnosisHints, StraightLine
 from adxl_ros.model.effects import effect_named, library
-from adxl_ros.model.effects.base import Coefficient, Place
+from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
 _DRIFTED_STD_G = 0.02
 """Prior standard deviation of a zero-g that drifts, g. It has also drifted between calibration and
 recording. Tuned by hand on simulated recordings of the working seeds of the blind check."""
-TOLERANCE_STDS = 4.0
-"""Largest deviation of a healthy unit, in standard deviations. Chosen: beyond it an effect is more
-probable than chance."""
 
 
 class NumberedColumn(NamedTuple):
@@ -99,11 +95,13 @@ class LinearModel:
         Whitened residuals and columns at the baseline.
     filters
         Whitening filters of each channel.
+    columns
+        By channel: sensitivities to the library.
     nuisance_columns
         By channel: nuisance parameters and their sensitivities, V per unit, (n,).
-    straight_line_parts
-        For each coefficient of zero-g and scale factor: how much of it one unit of each column
-        contains, (columns,).
+    parts_at_rest
+        For each coefficient of zero-g and scale factor: how much of it a calibration can take up
+        of one unit of each column, (columns,).
 
     """
 
@@ -115,8 +113,9 @@ class LinearModel:
     prior_std: np.ndarray
     channels: list[WhitenedChannel]
     filters: list[list[Whitener]]
+    columns: list[list[NumberedColumn]]
     nuisance_columns: list[dict[Coefficient, np.ndarray]]
-    straight_line_parts: dict[Coefficient, np.ndarray]
+    parts_at_rest: dict[Coefficient, np.ndarray]
 
     @property
     def baseline(self) -> Sensor:
@@ -133,6 +132,16 @@ class LinearModel:
         """Return the number of effects that have something to act on."""
         return len({v.effect for v in self.variants})
 
+    def place_of_channel(self, number: int) -> tuple[int, int]:
+        """Return the number of the recording and of the axis of a channel."""
+        return divmod(number, len(self.baseline.axes))
+
+    def filters_of(self, effects: Sequence[str]) -> list[list[Whitener]]:
+        """Return for each channel the filters of healthy units and of the drifts of effects."""
+        drifts = drifts_among((*effects, *self.baseline.effects))
+        return [[f for f in filters if f.healthy or f.effect in drifts] or filters
+                for filters in self.filters]
+
     def nuisance_ids(self) -> list[int]:
         """Return the numbers of the columns of nuisance parameters."""
         return [i for variant, ids in zip(self.variants, self.column_ids)
@@ -143,10 +152,9 @@ class LinearModel:
         return max(c.sensor.stage_resolution_rad if c.reference is Reference.STAGE else 0.0
                    for c in self.comparisons) / 12 ** 0.5
 
-    def prior(self, chosen: Sequence[int], drifts: Sequence[str] = ()
-              ) -> tuple[np.ndarray, np.ndarray]:
+    def prior(self, chosen: Sequence[int], drifts: Sequence[str] = ()) -> np.ndarray:
         """
-        Return prior standard deviations and bounds of all coefficients.
+        Return prior standard deviations of all coefficients.
 
         Parameters
         ----------
@@ -158,24 +166,21 @@ class LinearModel:
 
         Returns
         -------
-        tuple of numpy.ndarray
-            Standard deviations and largest magnitudes, (columns,) each.
+        numpy.ndarray
+            Standard deviations, (columns,).
 
         """
-        prior_std, bounds = self.prior_std.copy(), np.full(len(self.prior_std), np.inf)
+        prior_std = self.prior_std.copy()
         effects = {self.variants[i].effect for i in chosen}
-        columns = [k for i in chosen if calibration_takes_up(self.variants[i].effect)
-                   for k in self.column_ids[i]]
+        columns = [k for i in chosen for k in self.column_ids[i]]
         for i in self.nuisance_ids():
             name = self.names[i]
             if name.effect in effects:
                 continue
-            parts = self.straight_line_parts.get(name, np.zeros(len(prior_std)))[columns] \
+            parts = self.parts_at_rest.get(name, np.zeros(len(prior_std)))[columns] \
                 * prior_std[columns]
             prior_std[i] = np.hypot(self.tolerance(name, drifts), np.sqrt(np.sum(parts ** 2)))
-            # A chosen effect may have any size, and so may its straight-line part.
-            bounds[i] = np.inf if np.any(parts) else TOLERANCE_STDS * prior_std[i]
-        return prior_std, bounds
+        return prior_std
 
     def tolerance(self, name: Coefficient, drifts: Sequence[str] = ()) -> float:
         """
@@ -239,9 +244,8 @@ class LinearModel:
         """
         drifts = (*drifts, *drifts_among(self.baseline.effects))
         ids = set(self.nuisance_ids()).union(*(self.column_ids[i] for i in chosen))
-        prior_std, bounds = self.prior(chosen, drifts)
-        fit = evidence.fit_columns(self.channels, sorted(ids), prior_std, bounds, None, start,
-                                   drifts)
+        prior_std = self.prior(chosen, drifts)
+        fit = evidence.fit_columns(self.channels, sorted(ids), prior_std, None, start, drifts)
         gain = 0.0
         for i in chosen:
             places = np.flatnonzero(np.isin(fit.column_ids, self.column_ids[i]))
@@ -251,15 +255,11 @@ class LinearModel:
         return replace(fit, log_evidence=fit.log_evidence + gain)
 
 
-def calibration_takes_up(effect: str) -> bool:
-    """Determine whether a calibration contains the straight-line part of an effect."""
-    return effect_named(effect).place not in (Place.STAGE, Place.FORCE)
-
-
 def build_linear_model(comparisons: Sequence[BaselineComparison],
                        show_progress: Callable[[float], None] = lambda fraction: None,
-                       filter_indices: Sequence[int] | None = None,
-                       only: Sequence[str] | None = None) -> LinearModel:
+                       filters: Sequence[list[Whitener]] | None = None,
+                       only: Sequence[str] | None = None,
+                       flexible: Sequence[FlexibleColumns] | None = None) -> LinearModel:
     """
     Differentiate the baseline by the whole library in all recordings.
 
@@ -269,10 +269,12 @@ def build_linear_model(comparisons: Sequence[BaselineComparison],
         Recordings of one unit, with one baseline.
     show_progress
         Called with the fraction that is done, 0 to 1.
-    filter_indices
-        Number of the whitening filter of each channel, where the noise is known.
+    filters
+        Whitening filters of each channel; None for all.
     only
         Names of the effects beside the nuisance parameters; None for the whole library.
+    flexible
+        For each channel: functions of any size below their prior, which are integrated out.
 
     Returns
     -------
@@ -301,13 +303,13 @@ def build_linear_model(comparisons: Sequence[BaselineComparison],
         kept.append(replace(next(iter(by_recording.values())), names=tuple(numbers),
                             prior_std=np.array([prior_std[j] for j in ids])))
         column_ids.append(ids)
-    channels, filters = _whitened_channels(comparisons, columns, filter_indices)
+    channels, filters = _whitened_channels(comparisons, columns, filters, flexible)
     by_channel = list(chain(*columns))
     nuisance_columns = [_nuisance_columns(channel, names) for channel in by_channel]
-    parts = straight_line_parts([_straight_columns(channel, names)
-                                 for channel in nuisance_columns], by_channel, len(names))
+    parts = parts_at_rest([_straight_columns(channel, names) for channel in nuisance_columns],
+                          by_channel, len(names), rests_by_channel(comparisons))
     return LinearModel(list(comparisons), baseline_v, kept, column_ids, names,
-                       np.array(prior_std), channels, filters, nuisance_columns,
+                       np.array(prior_std), channels, filters, by_channel, nuisance_columns,
                        {names[i]: amounts for i, amounts in parts.items()})
 
 
@@ -320,6 +322,11 @@ def _nuisance_columns(channel: Sequence[NumberedColumn], names: Sequence[Coeffic
                       ) -> dict[Coefficient, np.ndarray]:
     """Return the columns of nuisance parameters of a channel by coefficient."""
     return {names[i]: column for i, column in channel if hints_of(names[i]).nuisance}
+
+
+def rests_by_channel(comparisons: Sequence[BaselineComparison]) -> list[np.ndarray]:
+    """Return the samples at rest of each channel."""
+    return [c.at_rest & c.used for c in comparisons for _ in c.sensor.axes]
 
 
 def _straight_columns(channel: dict[Coefficient, np.ndarray], names: list[Coefficient]
@@ -348,7 +355,8 @@ def _variants(comparisons: Sequence[BaselineComparison], baseline_v: Sequence[np
 
 def _whitened_channels(comparisons: Sequence[BaselineComparison],
                        columns: Sequence[Sequence[Sequence[NumberedColumn]]],
-                       filter_indices: Sequence[int] | None
+                       given: Sequence[list[Whitener]] | None,
+                       flexible: Sequence[FlexibleColumns] | None
                        ) -> tuple[list[WhitenedChannel], list[list[Whitener]]]:
     """Whiten residual and columns of each channel; return them with the filters."""
     channels: list[WhitenedChannel] = []
@@ -356,22 +364,24 @@ def _whitened_channels(comparisons: Sequence[BaselineComparison],
     for comparison, by_axis in zip(comparisons, columns):
         residual_v = comparison.residual_v(comparison.sensor)
         for d, axis_columns in enumerate(by_axis):
-            tried = noise_whitening.whiteners(comparison.sensor, d, comparison.dt_s,
-                                              comparison.span_s)
-            if filter_indices is not None:
-                tried = noise_whitening.neighbouring_filters(tried, filter_indices[len(filters)])
+            tried = given[len(filters)] if given is not None else noise_whitening.whiteners(
+                comparison.sensor, d, comparison.dt_s, comparison.span_s)
             filters.append(tried)
             channels.append(evidence.whiten_channel(
                 residual_v[:, d], np.column_stack([column for _, column in axis_columns]),
-                np.array([i for i, _ in axis_columns]), comparison.used, tried))
+                np.array([i for i, _ in axis_columns]), comparison.used, tried,
+                None if flexible is None else flexible[len(channels)]))
     return channels, filters
 
 
-def straight_line_parts(lines: Sequence[dict[int, np.ndarray]],
-                        columns: Sequence[Sequence[NumberedColumn]], count: int
-                        ) -> dict[int, np.ndarray]:
+def parts_at_rest(lines: Sequence[dict[int, np.ndarray]],
+                  columns: Sequence[Sequence[NumberedColumn]], count: int,
+                  at_rest: Sequence[np.ndarray]) -> dict[int, np.ndarray]:
     """
-    Fit the columns of zero-g and scale factor to other columns, by least squares.
+    Compute how much of other columns a calibration can take for zero-g or scale factor.
+
+    A calibration uses rests. It can take the whole of an effect at rest for an error of zero-g or
+    scale factor, and nothing of an effect that only acts in motion.
 
     Parameters
     ----------
@@ -381,25 +391,23 @@ def straight_line_parts(lines: Sequence[dict[int, np.ndarray]],
         For each channel: the other columns, V per unit, (n,), with their numbers below `count`.
     count
         Number of the other columns.
+    at_rest
+        For each channel: samples at rest, (n,) bool; where none rests, all samples count.
 
     Returns
     -------
     dict
-        By number of a column of zero-g or scale factor: how much of it one unit of each other
-        column contains, (count,).
+        By number of a column of zero-g or scale factor: its largest part in one unit of each
+        other column, in its own unit, (count,).
 
     """
-    grams: dict[tuple[int, ...], np.ndarray] = {}
-    products: dict[tuple[int, ...], np.ndarray] = {}
-    for line, channel_columns in zip(lines, columns):
-        if not line or not channel_columns:
-            continue
-        key, matrix = tuple(line), np.column_stack(list(line.values()))
-        grams[key] = grams.get(key, 0.0) + matrix.T @ matrix
-        product = products.setdefault(key, np.zeros((len(line), count)))
+    parts: dict[int, np.ndarray] = {}
+    for line, channel_columns, resting in zip(lines, columns, at_rest):
+        rows = resting if resting.any() else np.ones(len(resting), bool)
+        sizes = np.zeros(count)
         for i, column in channel_columns:
-            product[:, i] += matrix.T @ column
-    amounts: dict[int, np.ndarray] = {}
-    for key, gram in grams.items():
-        amounts |= dict(zip(key, np.linalg.lstsq(gram, products[key])[0]))
-    return amounts
+            sizes[i] = np.sqrt(np.mean(column[rows] ** 2))
+        for number, column in line.items():
+            part = sizes / max(float(np.sqrt(np.mean(column[rows] ** 2))), np.finfo(float).tiny)
+            parts[number] = np.maximum(parts.get(number, 0.0), part)
+    return parts

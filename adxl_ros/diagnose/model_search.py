@@ -22,13 +22,16 @@ at a shaker of 40 Hz.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
 from typing import NamedTuple
 
+from adxl_ros.diagnose.decision_settings import DecisionSettings
 from adxl_ros.diagnose.drift_checks import unevenness
-from adxl_ros.diagnose.evidence import LinearFit
+from adxl_ros.diagnose.effect_sizes import contribution
+from adxl_ros.diagnose.evidence import FlexibleColumns, LinearFit
+from adxl_ros.diagnose.flexible_terms import flexible_bases
 from adxl_ros.diagnose.hypothesis_fit import (
     fit_hypothesis,
     Hypothesis,
@@ -51,15 +54,15 @@ _SINGLES = 8
 """Number of single effects that are fitted, and whose pairs are tried. Chosen: run time."""
 _FURTHER = 4
 """Number of other hypotheses that each step of the search fits. Chosen: run time."""
-WORTH_LOG_BAYES_FACTOR = 5.0
-"""Log Bayes factor on the linear model from which a hypothesis is fitted, and on held-out blocks
-from which a drift is kept. Tuned by hand on simulated recordings of the working seeds of the
-blind check."""
+_RANKING_FORM_ERROR = 0.3
+"""Share of the size of the present effects by which their form may differ, where a further effect
+is ranked. Chosen: the middle of the shares of the decision."""
 _LARGEST_UNEVENNESS = 1.4
-"""Largest unevenness of the noise beside a drift. Tuned as the limit above."""
+"""Largest unevenness of the noise beside a drift. Tuned by hand on simulated
+recordings of the working seeds of the blind check."""
 
-Hypotheses = dict[tuple[str, ...], Hypothesis]
-"""Hypotheses by the names of their effects, in the order of the search."""
+Hypotheses = dict[frozenset[str], Hypothesis]
+"""Hypotheses by the names of their effects."""
 
 
 class _RankedSet(NamedTuple):
@@ -70,8 +73,8 @@ class _RankedSet(NamedTuple):
     fit: LinearFit
 
 
-def search(linear_model: LinearModel, show_progress: Callable[[float], None]
-           ) -> list[Hypothesis]:
+def search(linear_model: LinearModel, settings: DecisionSettings,
+           show_progress: Callable[[float], None]) -> list[Hypothesis]:
     """
     Search single effects, pairs and triples.
 
@@ -82,6 +85,8 @@ def search(linear_model: LinearModel, show_progress: Callable[[float], None]
     ----------
     linear_model
         The recordings and their sensitivities.
+    settings
+        Settings of the decision.
     show_progress
         Called with the fraction that is done, 0 to 1.
 
@@ -91,33 +96,35 @@ def search(linear_model: LinearModel, show_progress: Callable[[float], None]
         Fitted hypotheses by falling log evidence; the empty one is among them.
 
     """
-    hypotheses: Hypotheses = {(): fit_hypothesis(linear_model, (), {}, {})}
+    hypotheses: Hypotheses = {frozenset(): fit_hypothesis(linear_model, (), {}, {})}
     null_fit = linear_model.fit_variants([])
     singles = _ranked(linear_model, [(i,) for i in _identifiable(linear_model)], null_fit)
-    _fit_best(linear_model, singles[:_SINGLES], null_fit, hypotheses)
+    _fit_best(linear_model, settings, singles[:_SINGLES], null_fit, hypotheses)
     show_progress(0.3)
     # A nominal parameter file may be wrong in zero-g and scale factor, and the sum of both errors
     # may look like neither of them.
     straight = [i for i in _identifiable(linear_model)
                 if effect_named(linear_model.variants[i].effect).diagnosis.straight_line]
-    _fit_best(linear_model, _ranked(linear_model, list(combinations(straight, 2)), null_fit),
-              null_fit, hypotheses)
+    _fit_best(linear_model, settings,
+              _ranked(linear_model, list(combinations(straight, 2)), null_fit), null_fit,
+              hypotheses)
     best = _best(hypotheses)
     if best.effects:
-        _add_effect(linear_model, best, hypotheses)
+        _add_effect(linear_model, settings, best, hypotheses)
         show_progress(0.6)
         first = [ranked.chosen[0] for ranked in singles[:_SINGLES]]
         pairs = _ranked(linear_model, list(combinations(sorted(first), 2)), null_fit)
         smallest_gain = _best(hypotheses).log_evidence - null_fit.log_evidence \
-            + WORTH_LOG_BAYES_FACTOR
-        _fit_best(linear_model, [pair for pair in pairs if pair.gain > smallest_gain][:_FURTHER],
-                  null_fit, hypotheses)
+            + settings.worth_fitting
+        _fit_best(linear_model, settings,
+                  [pair for pair in pairs if pair.gain > smallest_gain][:_FURTHER], null_fit,
+                  hypotheses)
         best = _best(hypotheses)
         if 1 < len(best.effects) < LARGEST_SET:
-            _add_effect(linear_model, best, hypotheses)
+            _add_effect(linear_model, settings, best, hypotheses)
     _remove_each_effect(linear_model, _best(hypotheses), hypotheses)
-    if _drift_shows(linear_model, _best(hypotheses)):
-        _add_drifts(linear_model, hypotheses)
+    if _drift_shows(linear_model, _best(hypotheses), settings):
+        _add_drifts(linear_model, settings, hypotheses)
     show_progress(1.0)
     return sorted(hypotheses.values(), key=lambda h: -h.log_evidence)
 
@@ -133,14 +140,16 @@ def _best(hypotheses: Hypotheses) -> Hypothesis:
     return max(hypotheses.values(), key=lambda h: h.log_evidence)
 
 
-def _drift_shows(linear_model: LinearModel, best: Hypothesis) -> bool:
+def _drift_shows(linear_model: LinearModel, best: Hypothesis, settings: DecisionSettings
+                 ) -> bool:
     """Determine whether a drift makes the residual of a hypothesis much more probable."""
     linearised = linearise(linear_model, best.effects, best.sensor)
     return linearised.fit(drifts=drift_effects()).log_evidence \
-        - linearised.fit().log_evidence > WORTH_LOG_BAYES_FACTOR
+        - linearised.fit().log_evidence > settings.worth_fitting
 
 
-def _add_drifts(linear_model: LinearModel, hypotheses: Hypotheses) -> None:
+def _add_drifts(linear_model: LinearModel, settings: DecisionSettings, hypotheses: Hypotheses
+                ) -> None:
     """
     Let the zero-g drift, alone, beside the best hypotheses, and beside effects best with a drift.
 
@@ -156,11 +165,12 @@ def _add_drifts(linear_model: LinearModel, hypotheses: Hypotheses) -> None:
         _add(hypotheses, fit_hypothesis(linear_model, (drift,), {}, {}))
         beside_drift = _ranked(linear_model, [(i,) for i in _identifiable(linear_model)],
                                drift_fit, (drift,))
-        _fit_best(linear_model, beside_drift[:_FURTHER], drift_fit, hypotheses, (drift,))
+        _fit_best(linear_model, settings, beside_drift[:_FURTHER], drift_fit, hypotheses,
+                  (drift,))
     for h in list(hypotheses.values()):
         if drifts_among(h.effects) \
                 and unevenness(list(residual_channels(linear_model, h))) > _LARGEST_UNEVENNESS:
-            del hypotheses[h.effects]
+            del hypotheses[frozenset(h.effects)]
 
 
 def _model_about(linear_model: LinearModel, best: Hypothesis) -> LinearModel:
@@ -181,10 +191,31 @@ def _model_about(linear_model: LinearModel, best: Hypothesis) -> LinearModel:
     comparisons = [replace(c, sensor=replace(best.sensor, values=values,
                                              rate_hz=c.sensor.rate_hz))
                    for c in linear_model.comparisons]
-    return build_linear_model(comparisons, filter_indices=best.fit.filter_indices)
+    filters = [[f for f in same if f.healthy == w.healthy and f.effect == w.effect] or [w]
+               for same, w in zip(best.linearised.filters, best.whiteners)]
+    return build_linear_model(comparisons, filters=filters,
+                              flexible=_form_functions(linear_model, best))
 
 
-def _add_effect(linear_model: LinearModel, best: Hypothesis, hypotheses: Hypotheses) -> None:
+def _form_functions(linear_model: LinearModel, best: Hypothesis) -> list[FlexibleColumns]:
+    """Return for each channel what the form of the present effects may lack."""
+    sizes = {e: contribution(linear_model, best, e).by_channel_v for e in best.effects}
+    out = []
+    for number in range(len(linear_model.channels)):
+        recording, axis = linear_model.place_of_channel(number)
+        comparison = linear_model.comparisons[recording]
+        basis = flexible_bases(comparison, linear_model.baseline_v[recording])[axis]
+        columns = [_RANKING_FORM_ERROR * size[number] * basis[dimension]
+                   for e, size in sizes.items() for dimension in effect_named(e).diagnosis.form
+                   if dimension in basis]
+        out.append(FlexibleColumns(
+            np.column_stack([np.zeros((len(comparison), 0)), *columns]),
+            float(best.fit.innovation_variance_v2[number])))
+    return out
+
+
+def _add_effect(linear_model: LinearModel, settings: DecisionSettings, best: Hypothesis,
+                hypotheses: Hypotheses) -> None:
     """Add one effect to a hypothesis: rank on the linear model, then fit the best in full."""
     about = _model_about(linear_model, best)
     of_best = [i for i, v in enumerate(about.variants) if v.effect in best.effects]
@@ -197,11 +228,12 @@ def _add_effect(linear_model: LinearModel, best: Hypothesis, hypotheses: Hypothe
             ranked.append(_RankedSet(fit.log_evidence - best_fit.log_evidence, (i,), fit))
     with_variants = {v.effect for v in linear_model.variants}
     for gain, (i,), fit in sorted(ranked, key=lambda r: -r.gain)[:_FURTHER]:
-        if gain < WORTH_LOG_BAYES_FACTOR:
+        if gain < settings.worth_fitting:
             break
         added = about.variants[i]
         effects = (*best.effects, added.effect)
-        if not with_variants.union(drifts).issuperset(effects):
+        if not with_variants.union(drifts).issuperset(effects) \
+                or frozenset(effects) in hypotheses:
             continue
         start = dict(zip(best.names, best.values))
         start |= {about.names[k]: value for k, value in zip(fit.column_ids, fit.values)
@@ -213,12 +245,33 @@ def _add_effect(linear_model: LinearModel, best: Hypothesis, hypotheses: Hypothe
 def _remove_each_effect(linear_model: LinearModel, best: Hypothesis, hypotheses: Hypotheses
                         ) -> None:
     """Fit a hypothesis without each of its effects; two effects may replace an earlier one."""
-    start = dict(zip(best.names, best.values))
-    present = {frozenset(effects) for effects in hypotheses}
     for effect in best.effects:
-        remaining = tuple(e for e in best.effects if e != effect)
-        if frozenset(remaining) not in present:
-            _add(hypotheses, _fit_or_none(linear_model, remaining, start, {}))
+        if frozenset(best.effects) - {effect} not in hypotheses:
+            _add(hypotheses, fit_without(linear_model, best, [effect]))
+
+
+def fit_without(linear_model: LinearModel, hypothesis: Hypothesis, effects: Collection[str]
+                ) -> Hypothesis | None:
+    """
+    Fit a hypothesis without some of its effects.
+
+    Parameters
+    ----------
+    linear_model
+        The recordings.
+    hypothesis
+        A fitted hypothesis.
+    effects
+        The effects to leave out.
+
+    Returns
+    -------
+    Hypothesis or None
+        The smaller hypothesis; None where it cannot be simulated.
+
+    """
+    return _fit_or_none(linear_model, [e for e in hypothesis.effects if e not in effects],
+                        dict(zip(hypothesis.names, hypothesis.values)), {})
 
 
 def _ranked(linear_model: LinearModel, sets: Sequence[tuple[int, ...]], null_fit: LinearFit,
@@ -236,13 +289,13 @@ def _ranked(linear_model: LinearModel, sets: Sequence[tuple[int, ...]], null_fit
     return sorted(best.values(), key=lambda r: -r.gain)
 
 
-def _fit_best(linear_model: LinearModel, ranked: Iterable[_RankedSet], null_fit: LinearFit,
-              hypotheses: Hypotheses, drifts: tuple[str, ...] = ()) -> None:
+def _fit_best(linear_model: LinearModel, settings: DecisionSettings, ranked: Iterable[_RankedSet],
+              null_fit: LinearFit, hypotheses: Hypotheses, drifts: tuple[str, ...] = ()) -> None:
     """Fit in full, together with drifts, those ranked sets that gain enough."""
     for gain, chosen, fit in ranked:
         variants = [linear_model.variants[i] for i in chosen]
         effects = (*(v.effect for v in variants), *drifts)
-        if gain < WORTH_LOG_BAYES_FACTOR or effects in hypotheses:
+        if gain < settings.worth_fitting or frozenset(effects) in hypotheses:
             continue
         start = dict(zip([linear_model.names[i] for i in fit.column_ids], fit.values))
         shapes: dict[Coefficient, float] = {}
@@ -267,9 +320,12 @@ def _named_shape(variant: Variant) -> dict[Coefficient, float]:
 
 
 def _add(hypotheses: Hypotheses, hypothesis: Hypothesis | None) -> None:
-    """Add a hypothesis, if it could be fitted."""
-    if hypothesis is not None:
-        hypotheses[hypothesis.effects] = hypothesis
+    """Add a hypothesis, if it could be fitted and is better than another fit of the same set."""
+    if hypothesis is None:
+        return
+    key = frozenset(hypothesis.effects)
+    if key not in hypotheses or hypothesis.log_evidence > hypotheses[key].log_evidence:
+        hypotheses[key] = hypothesis
 
 
 def _fit_or_none(linear_model: LinearModel, effects: Sequence[str],

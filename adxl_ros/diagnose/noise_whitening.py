@@ -28,7 +28,7 @@ noise, which is searched on a grid.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from adxl_ros.model import noise
@@ -256,27 +256,6 @@ def expected_drift_g(spectrum: DriftSpectrum, density: float, span_s: float, rat
     if spectrum is DriftSpectrum.RANDOM_WALK:
         return float(density * np.sqrt(span_s / 6))
     return float(density * np.sqrt(np.log(rate_hz / 2 * span_s)))
-
-
-def neighbouring_filters(filters: Sequence[Whitener], best: int) -> list[Whitener]:
-    """
-    Return the best filter and its neighbours, which are enough where the noise is known.
-
-    Parameters
-    ----------
-    filters
-        All filters of a channel.
-    best
-        Number of the best one.
-
-    Returns
-    -------
-    list of Whitener
-        Filters of the same drift.
-
-    """
-    return [f for i, f in enumerate(filters)
-            if abs(i - best) <= 1 and f.effect == filters[best].effect]
 
 
 def _power(polynomial: np.ndarray, order: int) -> np.ndarray:

@@ -105,9 +105,9 @@ def _marginal_products(linear_model: LinearModel) -> tuple[np.ndarray, np.ndarra
     Return the Gram matrix of the columns, this matrix with the nuisance parameters eliminated, and
     the products of the columns and the residual with the nuisance parameters eliminated.
     """
-    prior_std, bounds = linear_model.prior(())
+    prior_std = linear_model.prior(())
     nuisances = np.array(linear_model.nuisance_ids())
-    null_fit = fit_columns(linear_model.channels, linear_model.nuisance_ids(), prior_std, bounds)
+    null_fit = fit_columns(linear_model.channels, linear_model.nuisance_ids(), prior_std)
     count = len(linear_model.names)
     gram, product = np.zeros((count, count)), np.zeros(count)
     for c, f, variance in zip(linear_model.channels, null_fit.filter_indices,

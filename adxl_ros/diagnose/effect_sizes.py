@@ -1,0 +1,220 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""How large the effects of a hypothesis are, and which of them matter."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+from adxl_ros.diagnose.decision_settings import DecisionSettings
+from adxl_ros.diagnose.hypothesis_fit import Hypothesis
+from adxl_ros.diagnose.linear_model import (
+    LinearModel,
+    NumberedColumn,
+    parts_at_rest,
+    rests_by_channel,
+)
+from adxl_ros.diagnose.noise_whitening import drifts_among, expected_drift_g
+from adxl_ros.model.coefficients import neutral, parameter_of
+from adxl_ros.model.constants import G0_MPS2, Z_90
+from adxl_ros.model.effects import effect_named
+from adxl_ros.model.effects.base import Coefficient, Role
+from adxl_ros.model.sensor import Sensor
+import numpy as np
+
+
+class Contribution(NamedTuple):
+    """
+    What one effect contributes to the output.
+
+    Attributes
+    ----------
+    rms_mps2
+        Rms over samples and axes, m/s²: about zero for zero-g and scale factor, about the mean
+        for other effects.
+    by_channel_v
+        The same by channel, V, (channels,); zero for a drift.
+
+    """
+
+    rms_mps2: float
+    by_channel_v: np.ndarray
+
+
+@dataclass(frozen=True)
+class SizedHypothesis:
+    """
+    A fitted hypothesis with the sizes of its effects.
+
+    Attributes
+    ----------
+    hypothesis
+        The fitted hypothesis.
+    contributions
+        What each effect contributes.
+    immaterial
+        Effects that do not matter.
+
+    """
+
+    hypothesis: Hypothesis
+    contributions: dict[str, Contribution]
+    immaterial: frozenset[str]
+
+    @property
+    def material(self) -> frozenset[str]:
+        """Effects that matter."""
+        return frozenset(self.hypothesis.effects) - self.immaterial
+
+
+def size_hypothesis(linear_model: LinearModel, hypothesis: Hypothesis, noise_mps2: float,
+                    settings: DecisionSettings) -> SizedHypothesis:
+    """
+    Simulate how large the effects of a hypothesis are, and decide which of them matter.
+
+    An effect must be a visible part of the noise and of the gap. An effect of angles must exceed
+    the step of the encoder. The interval of one of its sizes must exclude zero. Beside another
+    effect, zero-g and scale factor must exceed what the calibration can have taken up of it.
+
+    Parameters
+    ----------
+    linear_model
+        The recordings.
+    hypothesis
+        A fitted hypothesis.
+    noise_mps2
+        Rms of the noise, m/s².
+    settings
+        Limits of materiality.
+
+    Returns
+    -------
+    SizedHypothesis
+        The hypothesis with sizes.
+
+    """
+    contributions = {e: contribution(linear_model, hypothesis, e) for e in hypothesis.effects}
+    inexact_squares = sum(c.rms_mps2 ** 2 for e, c in contributions.items()
+                          if not effect_named(e).exact)
+    smallest_mps2 = max(settings.smallest_share_of_noise * noise_mps2,
+                        settings.smallest_share_of_gap * float(np.sqrt(inexact_squares)))
+    angle_mps2 = linear_model.smallest_angle_rad() * G0_MPS2
+    immaterial = {
+        e for e, c in contributions.items()
+        if c.rms_mps2 < smallest_mps2 or (_turns(e) and c.rms_mps2 < angle_mps2)
+        or _may_be_zero(hypothesis, e) or _calibrated(linear_model, hypothesis, e, settings)}
+    return SizedHypothesis(hypothesis, contributions, frozenset(immaterial))
+
+
+def contribution(linear_model: LinearModel, hypothesis: Hypothesis, effect: str) -> Contribution:
+    """
+    Simulate what one effect of a hypothesis contributes to the output.
+
+    Parameters
+    ----------
+    linear_model
+        The recordings.
+    hypothesis
+        A fitted hypothesis.
+    effect
+        Name of one of its effects.
+
+    Returns
+    -------
+    Contribution
+        Its rms, in all and by channel.
+
+    """
+    library_effect = effect_named(effect)
+    spectrum = library_effect.diagnosis.drift
+    if spectrum:
+        density = np.sqrt(np.mean(next(iter(hypothesis.sensor.values[effect].values())) ** 2))
+        squares = [(G0_MPS2 * expected_drift_g(spectrum, float(density), c.span_s,
+                                               c.sensor.rate_hz)) ** 2
+                   for c in linear_model.comparisons]
+        return Contribution(float(np.sqrt(np.mean(squares))),
+                            np.zeros(len(linear_model.channels)))
+    total, count, by_channel_v = 0.0, 0, []
+    for c, change_v in zip(linear_model.comparisons,
+                           _changes_v(linear_model, hypothesis, [effect])):
+        change_v = change_v[c.used]
+        if not library_effect.diagnosis.straight_line:
+            change_v = change_v - change_v.mean(axis=0)
+        total += float(np.sum((change_v / c.scale_v_per_mps2) ** 2))
+        count += change_v.size
+        by_channel_v += list(np.sqrt(np.mean(change_v ** 2, axis=0)))
+    return Contribution(float(np.sqrt(total / max(count, 1))), np.array(by_channel_v))
+
+
+def _changes_v(linear_model: LinearModel, hypothesis: Hypothesis, effects: Sequence[str]
+               ) -> list[np.ndarray]:
+    """Return what some effects of a hypothesis change in each recording, V, (n, m) each."""
+    changes = []
+    for c in linear_model.comparisons:
+        sensor = replace(hypothesis.sensor, rate_hz=c.sensor.rate_hz)
+        changes.append(c.simulated_v(sensor)
+                       - c.simulated_v(_without(sensor, linear_model.baseline, effects)))
+    return changes
+
+
+def _without(sensor: Sensor, baseline: Sensor, effects: Sequence[str]) -> Sensor:
+    """Return a sensor with some effects as in the baseline."""
+    absent = {e: baseline.values[e] if e in baseline.effects
+              else neutral(effect_named(e), baseline.axes) for e in effects}
+    return replace(sensor, values={**sensor.values, **absent})
+
+
+def _turns(effect: str) -> bool:
+    """Determine whether the sizes of an effect are angles."""
+    return any(p.unit == 'rad' for p in effect_named(effect).parameters if p.is_size)
+
+
+def _may_be_zero(hypothesis: Hypothesis, effect: str) -> bool:
+    """Determine whether the 90 % intervals of all sizes of an effect hold zero."""
+    own = [(name, value, std) for name, value, std in
+           zip(hypothesis.names, hypothesis.values, hypothesis.std) if name.effect == effect]
+    if any(parameter_of(name).role is Role.LIMIT for name, _, _ in own):
+        return False
+    sizes = [abs(value) < Z_90 * std for name, value, std in own if parameter_of(name).is_size]
+    return bool(sizes) and all(sizes)
+
+
+def _calibrated(linear_model: LinearModel, hypothesis: Hypothesis, effect: str,
+                settings: DecisionSettings) -> bool:
+    """Determine whether zero-g or scale factor is what a calibration took up of other effects."""
+    others = [e for e in hypothesis.effects if not effect_named(e).diagnosis.straight_line
+              and not effect_named(e).diagnosis.drift]
+    if not effect_named(effect).diagnosis.straight_line or not others:
+        return False
+    names = [name for name in hypothesis.names if name.effect == effect]
+    values = hypothesis.values[[hypothesis.names.index(name) for name in names]]
+    std = _taken_up_std(linear_model, hypothesis, others, names)
+    return bool(np.all(np.abs(values) < settings.calibration_factor * std))
+
+
+def _taken_up_std(linear_model: LinearModel, hypothesis: Hypothesis, others: Sequence[str],
+                  names: Sequence[Coefficient]) -> np.ndarray:
+    """Return what a calibration can have taken up of effects, in the unit of each name."""
+    columns = [{i: channel[name] for i, name in enumerate(names) if name in channel}
+               for channel in linear_model.nuisance_columns]
+    changes = [[NumberedColumn(0, axis_v)]
+               for change_v in _changes_v(linear_model, hypothesis, others)
+               for axis_v in change_v.T]
+    parts = parts_at_rest(columns, changes, 1, rests_by_channel(linear_model.comparisons))
+    drifts = drifts_among(hypothesis.effects)
+    return np.array([np.hypot(linear_model.tolerance(name, drifts), parts[i][0])
+                     for i, name in enumerate(names)])

@@ -1,0 +1,207 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Flexible functions of the quantities that an error of a sensor may follow.
+
+They stand for what no effect of the library describes, and for the difference between the form of
+an effect and that of a real sensor (Kennedy and O'Hagan 2001, J. R. Stat. Soc. B 63). Each axis
+has functions of its own, by dimension.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from adxl_ros.diagnose.baseline_comparison import BaselineComparison, Reference
+from adxl_ros.diagnose.motion_history import direction_of_last_move, time_since_move_s
+from adxl_ros.model.diagnosis_hints import FormDimension
+from adxl_ros.model.filters import low_pass
+import numpy as np
+
+_CREEP_S = (2.0, 10.0, 50.0)
+"""Time constants of low-pass filtered force (creep), s. Chosen: a factor of five apart."""
+_RELAXATION_S = (1, 4, 16)
+"""Time constants of relaxation after a move, s. Chosen: a factor of four apart."""
+_LAG_S = (0.05, 0.5)
+"""Time constants of fast lags of the force, s. Chosen: slower than the filter of the sensor,
+faster than creep."""
+_FORCE_MODES = 12
+"""Number of cosines over the force along the axis. Chosen: a tenth of the range each."""
+_MODES = 8
+"""Number of cosines over an angle. Chosen: smooth laws."""
+_CROSS_MODES = 6
+"""Number of cosines over a force across the axis. Chosen: smooth laws."""
+_SURROUNDING_MODES = 4
+"""Number of cosines over temperature or supply. Chosen: smooth laws."""
+_HARMONICS = 6
+"""Number of harmonics of beta. Chosen: periods of 60° and more."""
+_CODE_HARMONICS = 8
+"""Number of harmonics over the range of codes. Chosen: the library's curve has eight periods."""
+_BITS = 6
+"""Number of heaviest bits of the ADC that have a wrong weight. Chosen: that of the library."""
+_TIME_MODES = 16
+"""Number of cosines over time. Chosen: a third of the blocks."""
+_PRODUCT_DEGREE = 3
+"""Highest degree of the products of force. Chosen: that of the library."""
+_SMALLEST_RATE_RAD_S = 1e-3
+"""Largest rate of a joint below which it has no functions, rad/s. Chosen: it rests."""
+_SMALLEST_RANGE = {FormDimension.TEMPERATURE: 0.5, FormDimension.SUPPLY: 0.01}
+"""Range of temperature, °C, and supply, V, below which they have no functions. Chosen: less is
+noise."""
+_SMALLEST_SPREAD = 1e-6
+"""Range of a quantity below which it is a point. Chosen: above rounding errors."""
+_SMALLEST_RMS = 1e-9
+"""Rms of a function about its mean below which it is constant. Chosen: above rounding errors."""
+
+Basis = dict[FormDimension, np.ndarray]
+"""Functions of one axis of one recording by dimension, (n, k) each, about their mean. A random
+combination with coefficients of standard deviation 1 has an rms of 1."""
+
+
+def flexible_bases(comparison: BaselineComparison, baseline_v: np.ndarray) -> list[Basis]:
+    """
+    Compute the flexible functions of a recording.
+
+    Parameters
+    ----------
+    comparison
+        The recording.
+    baseline_v
+        Simulated output of its baseline, V, (n, m).
+
+    Returns
+    -------
+    list of dict
+        Functions by dimension, for each axis.
+
+    """
+    force_g = ((baseline_v - comparison.sensor.zero_g_v) / comparison.sensor.scale_v_per_g).T
+    common = _common(comparison)
+    bases = []
+    for axis, along_g in enumerate(force_g):
+        basis = {**common, **_of_axis(comparison, force_g, axis, baseline_v[:, axis])}
+        for dimension in (FormDimension.TEMPERATURE, FormDimension.SUPPLY):
+            if dimension in basis:
+                basis[dimension] = np.column_stack([basis[dimension],
+                                                    basis[dimension] * along_g[:, None]])
+        bases.append({dimension: normalised for dimension, values in basis.items()
+                      if (normalised := _normalised(values, comparison.used)).shape[1]})
+    return bases
+
+
+def _normalised(values: np.ndarray, used: np.ndarray) -> np.ndarray:
+    """Return functions about their mean, so that a random combination has an rms of 1."""
+    centred = values - values[used].mean(axis=0)
+    squares = np.mean(centred[used] ** 2, axis=0)
+    varying = squares > _SMALLEST_RMS ** 2
+    return centred[:, varying] / np.sqrt(max(squares[varying].sum(), _SMALLEST_RMS ** 2))
+
+
+def _common(comparison: BaselineComparison) -> Basis:
+    """Return functions that are the same for all axes."""
+    time_s, motion = comparison.time_s, comparison.motion
+    basis: Basis = {FormDimension.TIME: _modes(time_s, _TIME_MODES, 1.0)}
+    surroundings = {FormDimension.TEMPERATURE: motion.temperature_c,
+                    FormDimension.SUPPLY: motion.supply_v}
+    for dimension, path in surroundings.items():
+        values = None if path is None else path(time_s)
+        if values is not None and np.ptp(values) > _SMALLEST_RANGE[dimension]:
+            basis[dimension] = _modes(values, _SURROUNDING_MODES)
+    if comparison.reference is not Reference.STAGE:
+        return basis
+    beta_rad = motion.beta(time_s)
+    basis[FormDimension.ALPHA] = _modes(motion.alpha(time_s), _MODES)
+    basis[FormDimension.BETA] = np.column_stack([
+        function(k * beta_rad) / k for k in range(1, _HARMONICS + 1)
+        for function in (np.sin, np.cos)])
+    return basis
+
+
+def _of_axis(comparison: BaselineComparison, force_g: np.ndarray, axis: int, volts: np.ndarray
+             ) -> Basis:
+    """Return functions of the force along and across one axis, and of its history."""
+    along_g, across_g = force_g[axis], np.delete(force_g, axis, axis=0)
+    if np.ptp(along_g) < _SMALLEST_SPREAD:
+        return {}
+    time_s, dt_s = comparison.time_s, comparison.dt_s
+    slope = np.gradient(along_g, dt_s)
+    lagging = [low_pass(along_g, tau_s, dt_s, {}) - along_g for tau_s in _LAG_S]
+    basis = {
+        FormDimension.FORCE: _modes(along_g, _FORCE_MODES),
+        FormDimension.CROSS_FORCE: np.column_stack([
+            _products(force_g), *(_modes(f, _CROSS_MODES) for f in across_g)]),
+        FormDimension.CODE: _code_functions(volts, comparison.sensor.adc_vref_v),
+        FormDimension.LAG: _same_size([
+            slope, np.gradient(slope, dt_s), slope * along_g, slope ** 2, *lagging])}
+    if comparison.reference is not Reference.STAGE:
+        return basis
+    rates = [joint(time_s, 1) for joint in (comparison.motion.alpha, comparison.motion.beta)]
+    moving = [r / np.abs(r).max() for r in rates if np.abs(r).max() > _SMALLEST_RATE_RAD_S]
+    if not moving:
+        return basis
+    factors = (np.ones_like(along_g), along_g)
+    basis[FormDimension.RATE] = np.column_stack([
+        column for r in moving for column in (r, r * r, r * along_g, np.abs(r))])
+    directions = [*map(direction_of_last_move, rates), _direction(along_g)]
+    basis[FormDimension.DIRECTION] = np.column_stack([
+        direction * factor for direction in directions for factor in factors])
+    since_s = time_since_move_s(time_s, rates)
+    basis[FormDimension.SINCE_MOVE] = _same_size([
+        *(np.exp(-since_s / tau_s) for tau_s in _RELAXATION_S),
+        *(low_pass(along_g, tau_s, dt_s, {}) - along_g for tau_s in _CREEP_S)])
+    return basis
+
+
+def _same_size(columns: Sequence[np.ndarray]) -> np.ndarray:
+    """Return functions of different units, each divided by its rms about its mean, (n, k)."""
+    return np.column_stack([c / max(float(np.std(c)), _SMALLEST_RMS) for c in columns])
+
+
+def _direction(values: np.ndarray) -> np.ndarray:
+    """Return the direction of the last change of a quantity, −1 or 1, 0 before the first, (n,)."""
+    change = np.diff(values, prepend=values[0])
+    changing = np.abs(change) > np.abs(change).max() * _SMALLEST_RATE_RAD_S
+    last = np.maximum.accumulate(np.where(changing, np.arange(len(values)), -1))
+    return np.where(last >= 0, np.sign(change[np.maximum(last, 0)]), 0.0)
+
+
+def _code_functions(volts: np.ndarray, vref_v: float) -> np.ndarray:
+    """Return harmonics over the range of the volts, and square waves of the heaviest bits."""
+    turn = 2 * np.pi * (volts - volts.min()) / np.ptp(volts)
+    waves = [function(k * turn) for k in range(1, _CODE_HARMONICS + 1)
+             for function in (np.sin, np.cos)]
+    bits = [np.floor(volts / vref_v * 2 ** bit) % 2 for bit in range(1, _BITS + 1)]
+    return np.column_stack(waves + bits)
+
+
+def _products(force_g: np.ndarray) -> np.ndarray:
+    """Return the products of the components of force from degree two on, (n, k)."""
+    count, degrees = len(force_g), range(_PRODUCT_DEGREE + 1)
+    powers = [p for p in np.ndindex(*[_PRODUCT_DEGREE + 1] * count)
+              if 2 <= sum(p) <= degrees[-1]]
+    return np.column_stack([np.prod(force_g ** np.array(p)[:, None], axis=0) for p in powers])
+
+
+def _modes(values: np.ndarray, count: int, decay: float = 1.5) -> np.ndarray:
+    """
+    Return cosines over the range of a quantity, (n, count); the j-th has the size j^(−decay).
+
+    A random combination is a smooth curve; with a decay of 1 it is rough like a random walk.
+    """
+    low, high = float(values.min()), float(values.max())
+    if high - low < _SMALLEST_SPREAD:
+        return np.zeros((len(values), 0))
+    order = np.arange(1, count + 1)
+    return np.cos(np.pi * order * ((values - low) / (high - low))[:, None]) * order ** -decay
