@@ -51,9 +51,13 @@ LARGEST_SET = 3
 """Largest number of effects in a hypothesis. Chosen: more effects are inseparable in one
 recording."""
 _SINGLES = 8
-"""Number of single effects that are fitted, and whose pairs are tried. Chosen: run time."""
-_FURTHER = 4
+"""Number of single effects whose pairs are tried on the linear model. Chosen: run time."""
+_FITTED_SINGLES = 6
+"""Number of single effects that are fitted. Chosen: run time."""
+_FURTHER = 3
 """Number of other hypotheses that each step of the search fits. Chosen: run time."""
+_BESIDE_DRIFTS = 2
+"""Number of hypotheses beside which each drift is tried. Chosen: run time."""
 _RANKING_FORM_ERROR = 0.3
 """Share of the size of the present effects by which their form may differ, where a further effect
 is ranked. Chosen: the middle of the shares of the decision."""
@@ -99,7 +103,7 @@ def search(linear_model: LinearModel, settings: DecisionSettings,
     hypotheses: Hypotheses = {frozenset(): fit_hypothesis(linear_model, (), {}, {})}
     null_fit = linear_model.fit_variants([])
     singles = _ranked(linear_model, [(i,) for i in _identifiable(linear_model)], null_fit)
-    _fit_best(linear_model, settings, singles[:_SINGLES], null_fit, hypotheses)
+    _fit_best(linear_model, settings, singles[:_FITTED_SINGLES], null_fit, hypotheses)
     show_progress(0.3)
     # A nominal parameter file may be wrong in zero-g and scale factor, and the sum of both errors
     # may look like neither of them.
@@ -156,7 +160,7 @@ def _add_drifts(linear_model: LinearModel, settings: DecisionSettings, hypothese
     A drift has the same power all the time; hypotheses with uneven noise are removed.
     """
     ranked = sorted(hypotheses.values(), key=lambda h: -h.log_evidence)
-    best = [h for h in ranked if 0 < len(h.effects) < LARGEST_SET][:_FURTHER]
+    best = [h for h in ranked if 0 < len(h.effects) < LARGEST_SET][:_BESIDE_DRIFTS]
     for drift in drift_effects():
         for h in best:
             _add(hypotheses, _fit_or_none(linear_model, (*h.effects, drift),
@@ -165,7 +169,7 @@ def _add_drifts(linear_model: LinearModel, settings: DecisionSettings, hypothese
         _add(hypotheses, fit_hypothesis(linear_model, (drift,), {}, {}))
         beside_drift = _ranked(linear_model, [(i,) for i in _identifiable(linear_model)],
                                drift_fit, (drift,))
-        _fit_best(linear_model, settings, beside_drift[:_FURTHER], drift_fit, hypotheses,
+        _fit_best(linear_model, settings, beside_drift[:_BESIDE_DRIFTS], drift_fit, hypotheses,
                   (drift,))
     for h in list(hypotheses.values()):
         if drifts_among(h.effects) \

@@ -179,8 +179,10 @@ def posterior(linear_model: LinearModel, sized: Sequence[SizedHypothesis],
             values = [_log_evidence(channels, index, sized[index], by_form[index][1], dimension,
                                     amplitude)
                       for amplitude in settings.unknown_amplitudes_g]
-            add(index, dimension, float(np.logaddexp.reduce(values) - np.log(len(values))),
-                by_form[index][1])
+            total = float(np.logaddexp.reduce(values) - np.log(len(values)))
+            # What the recording does not make more probable is no finding.
+            if total > by_form[index][0]:
+                add(index, dimension, total, by_form[index][1])
     weights = np.array([e.log_weight for e in entries.values()])
     probabilities = np.exp(weights - np.logaddexp.reduce(weights))
     weighed = [WeighedHypothesis(e.effects, e.unknown, e.hypothesis, e.log_weight, float(p),
