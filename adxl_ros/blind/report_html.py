@@ -161,9 +161,10 @@ def _other_scores(others: dict[str, Any], name: str) -> list[str]:
 _NO_WORSE = {None: 'no trial', 'yes': 'yes', 'open': 'open', 'no': 'NO'}
 """How a score compares with the fourth run, in words."""
 _WITHOUT_BAR = {'verdict_right': 'verdict right, all trials',
+                'utility_of_effects': 'utility of the named set where an effect is visible',
                 'utility': 'utility of the named set, all trials'}
 """Scores of the result that have no bar, in words."""
-_FOURTH_RUN = {'verdict_right': '0.7', 'utility': '-'}
+_FOURTH_RUN = {'verdict_right': '0.7', 'utility_of_effects': '-', 'utility': '-'}
 """The same in the fourth run, which did not have the utility."""
 
 

@@ -157,6 +157,9 @@ def scores(trials: Sequence[Trial], others: dict[str, list[Answer]] | None = Non
 def naming_scores(trials: Sequence[Trial]) -> dict[str, Any]:
     """Return the scores that any method has which names effects; no trial has strength zero."""
     outside = _group(trials, 'outside', lambda label: label.flexible >= grading.CERTAIN_POWER)
+    groups = [(diagnostic_utility.answered_group(trial.answer),
+               diagnostic_utility.true_group(trial.label)) for trial in trials]
+    faulty = [(group, true) for group, true in groups if any(true)]
     return {
         'false_alarms': score_statistics.share([trial.answer.gap
                                                 for trial in _group(trials, 'none')]),
@@ -168,9 +171,10 @@ def naming_scores(trials: Sequence[Trial]) -> dict[str, Any]:
         'unknown_recall': score_statistics.share([_unknown(trial) for trial in outside]),
         'verdict_right': score_statistics.share([
             grading.verdict_right(trial.answer, trial.label) for trial in trials]),
-        'utility': score_statistics.resampled([diagnostic_utility.utility(
-            diagnostic_utility.answered_group(trial.answer),
-            diagnostic_utility.true_group(trial.label)) for trial in trials], np.mean),
+        'utility': score_statistics.resampled(
+            [diagnostic_utility.utility(*pair) for pair in groups], np.mean),
+        'utility_of_effects': score_statistics.resampled(
+            [diagnostic_utility.utility(*pair) for pair in faulty], np.mean),
     }
 
 

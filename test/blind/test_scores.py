@@ -145,5 +145,5 @@ def test_result_is_one_table_with_all_methods():
     for name in ('fourth run', 'no worse', 'Null', 'Random', 'Worst', 'BIC, white noise'):
         assert f'| {name} ' in head
     rows = [line for line in text.splitlines() if line.startswith('|')]
-    assert len(rows) == len(scores.BARS) + 4
+    assert len(rows) == len(scores.BARS) + 5
     assert {row.count('|') for row in rows} == {head.count('|')}
