@@ -72,14 +72,14 @@ def not_determined(linear_model: LinearModel, hypotheses: Sequence[Hypothesis]) 
         Parameters that are not determined, and what each cannot be separated from.
 
     """
-    found: NotDetermined = {}
+    undetermined: NotDetermined = {}
     effects: set[str] = set()
     for hypothesis in hypotheses:
         for effect in hypothesis.effects:
             if effect not in effects and not effect_named(effect).diagnosis.drift:
                 effects.add(effect)
-                found |= _not_determined_of(linear_model, hypothesis, effect)
-    return found
+                undetermined |= _not_determined_of(linear_model, hypothesis, effect)
+    return undetermined
 
 
 def _not_determined_of(linear_model: LinearModel, hypothesis: Hypothesis, effect: str
@@ -90,11 +90,11 @@ def _not_determined_of(linear_model: LinearModel, hypothesis: Hypothesis, effect
     places = {name: i for i, name in enumerate(hypothesis.names)}
     fit_variance = np.diag(hypothesis.fit.covariance)
     best = _Information(linear_model, hypothesis, effect)
-    found: NotDetermined = {}
+    undetermined: NotDetermined = {}
     for name in names:
         p = parameter_of(name)
         if name not in places:
-            found[name] = ()
+            undetermined[name] = ()
             continue
         prior_std = p.scale * (PRIOR_WIDTH if p.is_size else 1.0)
         i = places[name]
@@ -104,11 +104,11 @@ def _not_determined_of(linear_model: LinearModel, hypothesis: Hypothesis, effect
         fitted_std = _std_of_data(float(fit_variance[i]), prior_std)
         if not p.is_size or effect_named(effect).diagnosis.imitated:
             if fitted_std > largest:
-                found[name] = ()
+                undetermined[name] = ()
             continue
         if max(best.std(name), fitted_std) > largest:
-            found[name] = best.partners(name, largest)
-    return found
+            undetermined[name] = best.partners(name, largest)
+    return undetermined
 
 
 def _std_of_data(variance: float, prior_std: float) -> float:
@@ -141,9 +141,10 @@ class _Information:
             if name not in names:
                 continue
             i, std = names.index(name), np.sqrt(np.diag(covariance))
-            alone = np.linalg.pinv(covariance / np.outer(std, std))[i, i] ** -0.5 * std[i]
+            scaled_precision = np.linalg.pinv(covariance / np.outer(std, std))
+            conditional_std = std[i] * scaled_precision[i, i] ** -0.5
             correlation = np.abs(covariance[i]) / (std * std[i])
-            if alone <= largest:
+            if conditional_std <= largest:
                 return tuple(n for n, c in zip(names, correlation)
                              if n != name and c > _PARTNER_CORRELATION)
         return ()
@@ -163,24 +164,24 @@ def _covariance(linear_model: LinearModel, hypothesis: Hypothesis, ids: list[int
     angles_rad = np.array([linear_model.smallest_angle_rad()
                            if parameter_of(linear_model.names[i]).unit == 'rad' else 0.0
                            for i in ids])
-    least = np.zeros(len(ids))
+    encoder_information = np.zeros(len(ids))
     scales = [scale for c in linear_model.comparisons for scale in c.sensor.scale_v_per_g]
     for channel, filters, whitener, variance, scale in zip(
             linear_model.channels, linear_model.filters, hypothesis.whiteners,
             fit.innovation_variance_v2, scales):
         f = next(i for i, same in enumerate(filters) if same is whitener)
         columns = [i for i, k in enumerate(channel.column_ids) if k in every]
-        at = np.array([every.index(channel.column_ids[i]) for i in columns], int)
+        places = np.array([every.index(channel.column_ids[i]) for i in columns], int)
         rows = 1 + np.array(columns, int)
-        precision[np.ix_(at, at)] += channel.total_grams[f][np.ix_(rows, rows)] / variance
-        followed = np.isin(np.arange(len(ids)), at)
-        least += followed * channel.counts.sum() * (angles_rad * _ENCODER_STDS * scale) ** 2 \
-            / variance
+        precision[np.ix_(places, places)] += channel.total_grams[f][np.ix_(rows, rows)] / variance
+        followed = np.isin(np.arange(len(ids)), places)
+        error_v = angles_rad * _ENCODER_STDS * scale
+        encoder_information += followed * channel.counts.sum() * error_v ** 2 / variance
     size = 1 / np.sqrt(np.diag(precision))
     covariance = np.linalg.inv(precision * np.outer(size, size)) * np.outer(size, size)
     part = covariance[:len(ids), :len(ids)]
     # An angle that shows by the errors of the encoder alone is not determined.
-    hidden = 1 / np.diag(part) < least
+    hidden = 1 / np.diag(part) < encoder_information
     return part * np.outer(np.where(hidden, _FREE, 1.0), np.where(hidden, _FREE, 1.0))
 
 

@@ -41,6 +41,11 @@ from adxl_ros.diagnose.next_experiment import NextExperiment, propose_next_exper
 from adxl_ros.diagnose.noise_comparison import compare_noise, NoiseComparison
 from adxl_ros.diagnose.noise_detectors import Detection, NoiseSamples, UNKNOWN
 from adxl_ros.diagnose.noise_floor import NoiseFloor
+from adxl_ros.diagnose.noise_remainder import (
+    floor_without,
+    noise_remainders,
+    NoiseRemainder,
+)
 from adxl_ros.diagnose.noise_whitening import drifts_among
 from adxl_ros.diagnose.posterior import posterior, WeighedHypothesis
 from adxl_ros.diagnose.residual_map import (
@@ -52,6 +57,8 @@ from adxl_ros.diagnose.residual_map import (
 from adxl_ros.diagnose.single_effect_tests import single_effect_tests, SingleEffectTest
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.stream_unit import check_unit
+from adxl_ros.model import noise
+from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.diagnosis_hints import StraightLine
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import ActsOn
@@ -83,8 +90,10 @@ class Diagnosis:
         Material hypotheses, the most probable first.
     detections
         Noise-like effects that show.
+    noise_remainders
+        What remains of the noise-like effects after they are added to the simulation.
     gap_closure
-        How far the best hypothesis closes the gap.
+        How far the best hypothesis closes the gap. Its floor is without noise-like effects.
     residual_cells
         Map of the residual of the first recording.
     not_covered
@@ -111,6 +120,7 @@ class Diagnosis:
     verdict: Verdict | None = None
     hypotheses: tuple[Hypothesis, ...] = ()
     detections: tuple[Detection, ...] = ()
+    noise_remainders: tuple[NoiseRemainder, ...] = ()
     gap_closure: GapClosure | None = None
     residual_cells: tuple[ResidualCell, ...] = ()
     not_covered: tuple[str, ...] = ()
@@ -208,6 +218,8 @@ class _Explanation:
         Gap closure of the best hypothesis.
     detections
         Noise-like effects that show.
+    noise_remainders
+        What remains of the noise-like effects.
     sensor
         The baseline with the best hypothesis and the detections.
     noise_before, noise_after
@@ -220,6 +232,7 @@ class _Explanation:
     weighed: list[WeighedHypothesis]
     closure: GapClosure
     detections: list[Detection]
+    noise_remainders: list[NoiseRemainder]
     sensor: Sensor
     noise_before: tuple[NoiseComparison, ...]
     noise_after: tuple[NoiseComparison, ...]
@@ -242,7 +255,10 @@ def _explain(checked: Sequence[CheckedRecording], linear_model: LinearModel,
     detections = _detections(checked, best)
     named_sensor = _with_detections(best, detections, sensor)
     return _Explanation(
-        floor, noise_mps2, confirmed, closure, detections, named_sensor,
+        floor, noise_mps2, confirmed, closure, detections,
+        noise_remainders(comparisons, confirmed[0].sensor, named_sensor, detections,
+                         confirmed[0].effects, seed),
+        named_sensor,
         _noise_comparisons(comparisons, sensor, sensor, seed),
         _noise_comparisons(comparisons, best.sensor, named_sensor, seed))
 
@@ -317,7 +333,8 @@ def _with_report(linear_model: LinearModel, explanation: _Explanation, verdict: 
         verdict=verdict,
         hypotheses=hypotheses,
         detections=tuple(explanation.detections),
-        gap_closure=explanation.closure,
+        noise_remainders=tuple(explanation.noise_remainders),
+        gap_closure=_without_noise_effects(explanation, sensor, seed),
         residual_cells=tuple(residual_map(comparisons[0], floor.rms_mps2, seed)),
         not_covered=tuple(lacking),
         next_experiment=propose_next_experiment(verdict, lacking, seed),
@@ -327,6 +344,15 @@ def _with_report(linear_model: LinearModel, explanation: _Explanation, verdict: 
         noise_before=explanation.noise_before,
         noise_after=explanation.noise_after,
         sensor=explanation.sensor if named else sensor)
+
+
+def _without_noise_effects(explanation: _Explanation, sensor: Sensor, seed: int) -> GapClosure:
+    """Return the gap closure with the noise floor that the noise-like effects are above."""
+    at_rate = replace(sensor, rate_hz=explanation.sensor.rate_hz)
+    stated = noise.sample_std_v(at_rate) / (at_rate.scale_v_per_g / G0_MPS2)
+    floor_mps2 = floor_without(explanation.noise_floor.rms_mps2, explanation.noise_remainders,
+                               float(np.sqrt(np.mean(stated ** 2))))
+    return explanation.closure.at_floor(floor_mps2, seed)
 
 
 def _confirmed(linear_model: LinearModel, comparisons: Sequence[BaselineComparison],

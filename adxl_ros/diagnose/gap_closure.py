@@ -26,7 +26,7 @@ that may drift, which is called the levelled residual.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 from adxl_ros.diagnose import evidence, noise_floor
@@ -92,6 +92,8 @@ class GapClosure:
         Rms of the levelled residual about the fit to all blocks, none held out, m/s².
     log_likelihood_gain
         Held-out log likelihood with the effects minus that without.
+    blocks
+        Squares before and after, and samples, by block, (3, blocks).
 
     """
 
@@ -106,6 +108,27 @@ class GapClosure:
     explained_mps2: float
     fitted_rms_mps2: float
     log_likelihood_gain: float
+    blocks: np.ndarray = field(repr=False)
+
+    def at_floor(self, floor_mps2: float, seed: int) -> GapClosure:
+        """
+        Return the closure with another noise floor.
+
+        Parameters
+        ----------
+        floor_mps2
+            Noise floor, m/s².
+        seed
+            Seed of the bootstrap.
+
+        Returns
+        -------
+        GapClosure
+            The same gap with another closed share.
+
+        """
+        closed, interval = _closed_share(self.blocks, floor_mps2, seed)
+        return replace(self, floor_mps2=floor_mps2, closed=closed, closed_ci=interval)
 
 
 @dataclass(frozen=True)
@@ -296,37 +319,44 @@ def gap_closure(linear_model: LinearModel, comparisons: Sequence[BaselineCompari
     count = max(float(counts.sum()), 1.0)
     level = [_levels(c, linear_model, hypothesis, i) for i, c in enumerate(comparisons)]
     fitted_square = sum(part.levelled_squares for part in level) / count
-    floor = floor_mps2 ** 2
-    before_square, after_square = before.sum() / count, after.sum() / count
-    # The rms after can be below the floor by chance.
-    lowest_square = min(floor, after_square)
-    closed = (before_square - after_square) / (before_square - lowest_square) \
-        if before_square > floor else float('nan')
+    blocks = np.array([before, after, counts])
+    closed, interval = _closed_share(blocks, floor_mps2, seed)
     return GapClosure(
-        before_mps2=float(np.sqrt(before_square)),
-        after_mps2=float(np.sqrt(after_square)),
+        before_mps2=float(np.sqrt(before.sum() / count)),
+        after_mps2=float(np.sqrt(after.sum() / count)),
         zero_g_mps2=float(np.sqrt(sum(part.zero_g_squares for part in level) / count)),
         drift_mps2=float(np.sqrt(sum(part.drift_squares for part in level) / count)),
         floor_mps2=floor_mps2,
-        closed=float(min(closed, 1.0)),
-        closed_ci=_closed_interval(before, after, counts, lowest_square, seed),
+        closed=closed,
+        closed_ci=interval,
         harm=bool(residual.squares.sum() > baseline_residual.squares.sum() * _HARM_RATIO),
         explained_mps2=float(np.sqrt(max(
             baseline_residual.squares.sum() / count - fitted_square, 0.0))),
         fitted_rms_mps2=float(np.sqrt(fitted_square)),
-        log_likelihood_gain=residual.log_likelihood - baseline_residual.log_likelihood)
+        log_likelihood_gain=residual.log_likelihood - baseline_residual.log_likelihood,
+        blocks=blocks)
 
 
-def _closed_interval(before: np.ndarray, after: np.ndarray, counts: np.ndarray, floor: float,
-                     seed: int) -> tuple[float, float]:
-    """Return the 90 % interval of the closed share by a bootstrap of blocks."""
+def _closed_share(blocks: np.ndarray, floor_mps2: float, seed: int
+                  ) -> tuple[float, tuple[float, float]]:
+    """
+    Return the closed share and its 90 % interval by a bootstrap of blocks.
+
+    `blocks` are squares before and after, and samples. The share is NaN without a gap.
+    """
+    before, after, count = blocks.sum(axis=1)
+    floor = floor_mps2 ** 2
+    # The rms after can be below the floor by chance.
+    lowest = min(floor, after / max(count, 1.0))
     drawn = np.random.default_rng(seed).integers(0, BLOCKS, (_BOOTSTRAP_DRAWS, BLOCKS))
-    before_drawn = before[drawn].sum(axis=1) / counts[drawn].sum(axis=1)
-    after_drawn = after[drawn].sum(axis=1) / counts[drawn].sum(axis=1)
+    before_drawn, after_drawn = (row[drawn].sum(axis=1) / blocks[2][drawn].sum(axis=1)
+                                 for row in blocks[:2])
     with np.errstate(all='ignore'):
-        shares = (before_drawn - after_drawn) / (before_drawn - floor)
+        closed = (before - after) / (before - count * lowest)
+        shares = (before_drawn - after_drawn) / (before_drawn - lowest)
     low, high = np.quantile(np.clip(np.nan_to_num(shares), -1, 1), [0.05, 0.95])
-    return float(low), float(high)
+    return (float(min(closed, 1.0)) if before > count * floor else float('nan'),
+            (float(low), float(high)))
 
 
 def _residual_mps2(comparison: BaselineComparison, sensor: Sensor) -> np.ndarray:

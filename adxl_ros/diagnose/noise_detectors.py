@@ -47,6 +47,12 @@ line. Chosen: exp(−14) is one in a million."""
 _LOCAL_ORDINATES = 201
 """Ordinates over which the local level of a periodogram is taken. Chosen: much wider than a
 line."""
+_LINE_PART_S = 4.0
+"""Length of the parts of which the amplitude of a line is taken, s. Chosen: the phase of the mains
+wanders little within it."""
+_LINE_BESIDE = 4.0
+"""Distance at which the power beside a line is taken, in inverse parts. Chosen: beyond the main
+lobe of the window."""
 _SPIKE_STDS = 7.0
 """Deviation of a spike from its neighbours, in robust standard deviations. Chosen: normal noise
 exceeds it once in 4·10¹¹ samples."""
@@ -473,12 +479,77 @@ def _strongest_line(white: np.ndarray, samples: NoiseSamples, sensor: Sensor
         return Detection(UNKNOWN, {}, log_excess,
                          f'the spectrum has a line at {line_hz:.2f} Hz, which is no mains '
                          'frequency')
-    turn = np.exp(-2j * np.pi * line_hz * samples.time_s)
-    amplitude_v = 2 * np.abs(np.nanmean(samples.raw_residual_v * turn[:, None], axis=0))
+    amplitude_v = line_amplitude_v(samples.residual_v, samples.time_s, mains_hz)
     return Detection(detected_effect(Detector.MAINS_LINE), {
         'amplitude_v': amplitude_v, 'frequency_hz': np.array(mains_hz),
         'phase_rad': np.array(0.0)}, log_excess,
         f'the spectrum has a line at {line_hz:.2f} Hz, {amplitude_v.max() * 1e3:.3g} mV')
+
+
+def line_amplitude_v(values_v: np.ndarray, time_s: np.ndarray, line_hz: float) -> np.ndarray:
+    """
+    Estimate the amplitude of a line whose phase may wander.
+
+    It is the rms of the amplitudes of short parts. The power beside the line is subtracted.
+
+    Parameters
+    ----------
+    values_v
+        Series with the line, without gaps, V, (n, m).
+    time_s
+        Stamps, s, (n,).
+    line_hz
+        Frequency of the line, Hz. It may be above half of the sample rate.
+
+    Returns
+    -------
+    numpy.ndarray
+        Amplitude by axis, V, (m,).
+
+    """
+    length = int(np.searchsorted(time_s, time_s[0] + _LINE_PART_S))
+    parts = max(len(values_v) // max(length, 1), 1)
+    length = len(values_v) // parts
+    window = np.hanning(length + 2)[1:-1]
+    shape = (parts, length)
+    squares = []
+    for offset in (0.0, -_LINE_BESIDE, _LINE_BESIDE):
+        hz = line_hz + offset / _LINE_PART_S
+        turn = np.exp(-2j * np.pi * hz * time_s[:parts * length]).reshape(shape) * window
+        series = values_v[:parts * length].reshape(*shape, -1)
+        peaks = 2 * np.einsum('pl,plm->pm', turn, series) / window.sum()
+        squares.append(np.mean(np.abs(peaks) ** 2, axis=0))
+    return np.sqrt(np.maximum(squares[0] - (squares[1] + squares[2]) / 2, 0.0))
+
+
+def white_noise_v(noise_v: np.ndarray, sensor: Sensor) -> np.ndarray:
+    """
+    Estimate the standard deviation of the white noise behind the RC filter.
+
+    The median over the upper half of the frequencies ignores lines, drift and motion. That over
+    the samples ignores spikes. The smaller one counts.
+
+    Parameters
+    ----------
+    noise_v
+        Noise about the mean output, V, (n, m).
+    sensor
+        The sensor at the rate of the samples.
+
+    Returns
+    -------
+    numpy.ndarray
+        Standard deviation of the samples by axis, V, (m,).
+
+    """
+    innovations = _before_filter(noise_v, sensor)
+    frequency_hz, power = periodogram(innovations, sensor.rate_hz, 'hann', axis=0)
+    level = np.median(power[frequency_hz > sensor.rate_hz / 4], axis=0) / np.log(2)
+    rc_s = noise.electronics(sensor).rc_s
+    decay = np.exp(-1 / (sensor.rate_hz * np.where(rc_s > 0, rc_s, 1e-9)))
+    std = np.minimum(np.sqrt(level * sensor.rate_hz / 2),
+                     np.median(np.abs(innovations), axis=0) / _MAD_PER_STD)
+    return std / np.sqrt(1 - decay ** 2)
 
 
 def _mains_frequency_hz(line_hz: float, rate_hz: float) -> float | None:

@@ -25,14 +25,16 @@ from typing import Any
 
 from adxl_ros.diagnose.diagnosis import Diagnosis
 from adxl_ros.diagnose.hypothesis_fit import Hypothesis
-from adxl_ros.diagnose.report_json import (
-    as_json,
-    not_determined_text,
-    notes,
+from adxl_ros.diagnose.report_json import as_json, notes, PROBABLE, shares_of_gap
+from adxl_ros.diagnose.report_wording import (
+    gap_rows,
+    headline,
+    mg,
     p_text,
-    shares_of_gap,
-    summary,
-    unit_text,
+    parameter_text,
+    remainder_rows,
+    Row,
+    tiles,
 )
 from adxl_ros.diagnose.residual_map import RANGES, SIGNIFICANT_P
 from adxl_ros.files.plot_file import pyplot
@@ -41,12 +43,23 @@ import numpy as np
 from scipy.signal import welch
 
 _STYLE = """
-body{font:15px/1.45 system-ui,sans-serif;max-width:1000px;margin:2em auto;padding:0 1em;color:#222}
-h1{font-size:1.3em}h2{font-size:1.1em;margin-top:2em;border-bottom:1px solid #ccc}
+*{box-sizing:border-box}
+body{font:15px/1.45 system-ui,sans-serif;max-width:1080px;margin:1.2em auto;padding:0 1em;
+color:#222;overflow-wrap:break-word}
+h1{font-size:1.15em;margin:.2em 0 .6em}h2{font-size:1.1em;margin-top:2em;
+border-bottom:1px solid #ccc}
 table{border-collapse:collapse;width:100%;font-size:13px}td,th{padding:.25em .6em;
-border-bottom:1px solid #ddd;text-align:left;vertical-align:top}img{width:100%}
-.verdict{background:#eef4fb;border-left:5px solid #36c;padding:.8em 1em;font-size:1.1em}
-code{background:#f3f3f3;padding:.1em .3em}@media print{body{margin:0}h2{break-after:avoid}}
+border-bottom:1px solid #ddd;text-align:left;vertical-align:top}
+.scroll{overflow-x:auto}img{width:100%;min-width:640px;display:block}
+.verdict{border-left:6px solid;background:#f6f6f6;padding:.7em 1em;font-size:1.15em;margin:0}
+.explained{border-color:#2a8a43}.no_gap,.insufficient{border-color:#888}
+.inseparable{border-color:#d9930d}.unknown,.bad_data{border-color:#c33}
+.tiles{display:flex;flex-wrap:wrap;gap:.7em;margin:.9em 0}
+.tile{flex:1 1 10em;border:1px solid #ddd;border-radius:6px;padding:.5em .8em}
+.tile b{display:block;font-size:1.5em}.tile span{color:#555;font-size:13px}
+.rows th{width:11em;font-weight:600}
+code{background:#f3f3f3;padding:.1em .3em}summary{cursor:pointer;color:#36c;margin:.5em 0}
+@media print{body{margin:0}h2{break-after:avoid}}
 """
 _PLOTTED_SAMPLES = 20_000
 """Largest number of samples in a plot. Chosen: the page stays small."""
@@ -77,22 +90,56 @@ def page(diagnosis: Diagnosis, title: str) -> str:
         The page, HTML.
 
     """
-    parts = [f'<h1>{escape(title)}</h1>', f'<p class="verdict">{escape(summary(diagnosis))}</p>',
+    fault, verdict = diagnosis.data_fault, diagnosis.verdict
+    status = fault.status if fault is not None else verdict.status if verdict else 'bad_data'
+    parts = [f'<h1>{escape(title)} minus its simulation</h1>',
+             f'<p class="verdict {status}">{escape(headline(diagnosis))}</p>',
              *(f'<p>{escape(note)}</p>' for note in notes(diagnosis))]
-    if diagnosis.data_fault is None and diagnosis.verdict is not None:
+    if fault is None and verdict is not None:
         report = as_json(diagnosis)
-        parts += ['<h2>How far the gap closes</h2>', _image(_bar_plot(diagnosis)),
+        parts += [_tiles(tiles(diagnosis)), _row_table(gap_rows(diagnosis)),
+                  _remainders(remainder_rows(diagnosis)),
+                  '<h2>Which effects cause the gap</h2>', _candidate_table(report),
+                  _convergence(verdict.best),
+                  '<h2>What to record next</h2>', _next_experiment(report),
+                  '<h2>How far the gap closes</h2>', _image(_bar_plot(diagnosis)),
                   '<h2>Recording minus simulation, before and after</h2>',
                   _image(_residual_plot(diagnosis)),
-                  '<h2>Recorded noise divided by simulated noise</h2>', _noise_table(report),
                   '<h2>Where the gap lies</h2>', _image(_map_plot(diagnosis)),
-                  _cell_table(report), _not_covered(report['not_covered']),
-                  '<h2>Which effects cause it</h2>', _hypothesis_table(report),
-                  _convergence(diagnosis.verdict.best), _candidate_table(report),
-                  '<h2>What to record next</h2>',
-                  _next_experiment(report)]
-    return (f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{escape(title)}'
-            f'</title><style>{_STYLE}</style></head><body>{"".join(parts)}</body></html>\n')
+                  _folded('The cells with the largest shares', _cell_table(report)),
+                  _not_covered(report['not_covered']),
+                  '<h2>All hypotheses</h2>', _hypothesis_table(report),
+                  '<h2>Noise</h2>',
+                  _folded('Recorded noise divided by simulated noise', _noise_table(report))]
+    return (f'<!doctype html><html lang="en"><head><meta charset="utf-8"><meta name="viewport" '
+            f'content="width=device-width,initial-scale=1"><title>{escape(title)}</title>'
+            f'<style>{_STYLE}</style></head><body>{"".join(parts)}</body></html>\n')
+
+
+def _tiles(rows: Sequence[Row]) -> str:
+    """Return the first figures beside each other."""
+    cells = ''.join(f'<div class="tile"><span>{escape(row.label)}</span><b>{escape(row.text)}</b>'
+                    '</div>' for row in rows)
+    return f'<div class="tiles">{cells}</div>'
+
+
+def _row_table(rows: Sequence[Row]) -> str:
+    """Return rows of figures as a table with the labels on the left."""
+    cells = ''.join(f'<tr><th>{escape(row.label)}</th><td>{escape(row.text)}</td></tr>'
+                    for row in rows)
+    return f'<table class="rows">{cells}</table>'
+
+
+def _remainders(rows: Sequence[Row]) -> str:
+    """Return what remains of the noise-like effects, if there are any."""
+    if not rows:
+        return ''
+    return f'<p>Noise-like effects, after they are added to the simulation:</p>{_row_table(rows)}'
+
+
+def _folded(title: str, content: str) -> str:
+    """Return a part of the page that is folded at first."""
+    return f'<details><summary>{escape(title)}</summary>{content}</details>'
 
 
 def _image(plot: Any) -> str:
@@ -100,21 +147,17 @@ def _image(plot: Any) -> str:
     out = BytesIO()
     plot.savefig(out, dpi=100, format='png', metadata={'Software': None})
     pyplot().close(plot)
-    return f'<img alt="" src="data:image/png;base64,{b64encode(out.getvalue()).decode()}">'
-
-
-def _mg(value_mps2: Any) -> Any:
-    """Convert m/s² to mg."""
-    return 1e3 * value_mps2 / G0_MPS2
+    data = b64encode(out.getvalue()).decode()
+    return f'<div class="scroll"><img alt="" src="data:image/png;base64,{data}"></div>'
 
 
 def _bar_plot(diagnosis: Diagnosis) -> Any:
     """Draw the mean square of the gap: noise floor, share of each effect, and the rest."""
     assert diagnosis.gap_closure is not None
     closure = diagnosis.gap_closure
-    floor = _mg(closure.floor_mps2) ** 2
-    after = max(floor, _mg(closure.after_mps2) ** 2)
-    before = max(after, _mg(closure.before_mps2) ** 2)
+    floor = mg(closure.floor_mps2) ** 2
+    after = max(floor, mg(closure.after_mps2) ** 2)
+    before = max(after, mg(closure.before_mps2) ** 2)
     widths = {'noise floor': floor, 'not closed': after - floor} | {
         effect: share * (before - floor) for effect, share in shares_of_gap(diagnosis).items()}
     if sum(widths.values()) < before:
@@ -148,11 +191,11 @@ def _residual_plot(diagnosis: Diagnosis) -> Any:
     every = max(len(comparison) // _PLOTTED_SAMPLES, 1)
     for d, (over_time, spectrum) in enumerate(grid):
         for label, colour, residual_v in residuals:
-            mg = _mg(residual_v[:, d] / comparison.scale_v_per_mps2[d])
-            over_time.plot(comparison.time_s[::every], mg[::every], lw=0.5, color=colour,
+            values = mg(residual_v[:, d] / comparison.scale_v_per_mps2[d])
+            over_time.plot(comparison.time_s[::every], values[::every], lw=0.5, color=colour,
                            label=label)
-            frequency_hz, power = welch(np.nan_to_num(mg), comparison.sensor.rate_hz,
-                                        nperseg=min(_SPECTRUM_SAMPLES, len(mg)))
+            frequency_hz, power = welch(np.nan_to_num(values), comparison.sensor.rate_hz,
+                                        nperseg=min(_SPECTRUM_SAMPLES, len(values)))
             spectrum.loglog(frequency_hz[1:], np.sqrt(power[1:]), lw=1, color=colour)
         over_time.set(ylabel=f'{axes[d]}, mg')
         spectrum.set(ylabel='mg/√Hz')
@@ -166,14 +209,14 @@ def _map_plot(diagnosis: Diagnosis) -> Any:
     """Draw the mean residual of all cells; significant cells have a frame."""
     cells = [c for c in diagnosis.residual_cells if c.statistic == 'mean']
     rows = sorted({(c.dimension, c.axis) for c in cells})
-    largest_mg = _mg(max((abs(c.mean_mps2) for c in cells), default=G0_MPS2 / 1e3))
+    largest_mg = mg(max((abs(c.mean_mps2) for c in cells), default=G0_MPS2 / 1e3))
     plot, axis = pyplot().subplots(figsize=(10, 0.8 + 0.24 * len(rows)), layout='constrained')
     drawn = None
     for i, row in enumerate(rows):
         in_row = sorted((c for c in cells if (c.dimension, c.axis) == row), key=lambda c: c.low)
         drawn = axis.scatter(
             np.arange(len(in_row)), np.full(len(in_row), i), marker='s', s=180,
-            c=[_mg(c.mean_mps2) for c in in_row], cmap='RdBu_r', vmin=-largest_mg,
+            c=[mg(c.mean_mps2) for c in in_row], cmap='RdBu_r', vmin=-largest_mg,
             vmax=largest_mg, edgecolors=['k' if c.p < SIGNIFICANT_P else 'none' for c in in_row])
         axis.text(RANGES, i, f'{in_row[0].low:.4g} to {in_row[-1].high:.4g}', fontsize=8,
                   va='center')
@@ -190,12 +233,14 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     if not rows:
         return '<p>None.</p>'
     top = ''.join(f'<th>{escape(h)}</th>' for h in head)
-    return f'<table><tr>{top}</tr>{"".join(map(_row, rows))}</table>'
+    return (f'<div class="scroll"><table><tr>{top}</tr>{"".join(map(_row, rows))}</table>'
+            '</div>')
 
 
 def _row(cells: Sequence[str]) -> str:
-    """Return a row of a table."""
-    return f'<tr>{"".join(f"<td>{escape(c)}</td>" for c in cells)}</tr>'
+    """Return a row of a table; a line of a cell ends with a line break."""
+    texts = (escape(c).replace('\n', '<br>') for c in cells)
+    return f'<tr>{"".join(f"<td>{text}</td>" for text in texts)}</tr>'
 
 
 def _cell_table(report: dict[str, Any]) -> str:
@@ -204,7 +249,7 @@ def _cell_table(report: dict[str, Any]) -> str:
     for c in report['where'][:_CELL_ROWS]:
         low, high = c['range']
         rows.append([c['axis'], c['dimension'], c['statistic'], f'{low:.4g} to {high:.4g}',
-                     f'{_mg(c["mean"]):+.2f}', f'{c["floor_units"]:+.1f}',
+                     f'{mg(c["mean"]):+.2f}', f'{c["floor_units"]:+.1f}',
                      f'{100 * c["share"]:.1f} %', p_text(c['p'])])
     return _table(['axis', 'dimension', 'statistic', 'range', 'size, mg', 'size / noise floor',
                    'share of the squares', 'family-wise p'], rows)
@@ -224,10 +269,17 @@ def _noise_table(report: dict[str, Any]) -> str:
 
 
 def _hypothesis_table(report: dict[str, Any]) -> str:
-    """Return the most probable hypotheses."""
-    return _table(['hypothesis', 'probability'], [
-        [', '.join(h['effects']) or 'no gap', p_text(h['probability'])]
-        for h in report['hypotheses'][:_TABLE_ROWS]])
+    """Return the most probable hypotheses; improbable ones are folded."""
+    def table(hypotheses: Sequence[dict[str, Any]]) -> str:
+        """Return some hypotheses with their probabilities."""
+        return _table(['hypothesis', 'probability'], [
+            [', '.join(h['effects']) or 'no gap', p_text(h['probability'])] for h in hypotheses])
+
+    first_rows = report['hypotheses'][:_TABLE_ROWS]
+    probable = [h for h in first_rows if h['probability'] >= PROBABLE]
+    improbable = [h for h in first_rows if h['probability'] < PROBABLE]
+    return table(probable) + (_folded('Improbable hypotheses', table(improbable))
+                              if improbable else '')
 
 
 def _convergence(best: Hypothesis) -> str:
@@ -239,24 +291,21 @@ def _convergence(best: Hypothesis) -> str:
 
 
 def _candidate_table(report: dict[str, Any]) -> str:
-    """Return the most probable effects with their parameters."""
-    rows = []
-    for c in report['candidates'][:_TABLE_ROWS]:
-        parameters = '; '.join(_parameter_text(name, p) for name, p in c['parameters'].items())
-        rows.append([c['effect'], p_text(c['probability']), parameters,
-                     ', '.join(c['inseparable_from']), c['cause']])
-    return _table(['effect', 'probability', 'parameters (90 % interval)', 'inseparable from',
-                   'cause'], rows)
+    """Return the most probable effects with their parameters; improbable ones are folded."""
+    def table(candidates: Sequence[dict[str, Any]]) -> str:
+        """Return some effects, with one line for each parameter."""
+        rows = [[c['effect'], p_text(c['probability'] or 0.0),
+                 '\n'.join(f'{name}: {parameter_text(p)}' for name, p in c['parameters'].items()),
+                 '' if c['share'] is None else f'{100 * c["share"]:.0f} %',
+                 ', '.join(c['inseparable_from']), c['cause']] for c in candidates]
+        return _table(['effect', 'probability', 'parameters (90 % interval)', 'share of the gap',
+                       'not separated from', 'cause'], rows)
 
-
-def _parameter_text(name: str, parameter: dict[str, Any]) -> str:
-    """Return a parameter with its interval, if it has one, as text."""
-    if not parameter.get('determined', True):
-        return f'{name}: {not_determined_text(parameter)}'
-    if 'ci' not in parameter:
-        return f'{name} = {parameter["value"]}'
-    low, high = parameter['ci']
-    return f'{name} = {parameter["value"]:.4g} ({low:.3g} to {high:.3g}) {unit_text(parameter)}'
+    first_rows = report['candidates'][:_TABLE_ROWS]
+    probable = [c for c in first_rows if (c['probability'] or 0.0) >= PROBABLE]
+    improbable = [c for c in first_rows if (c['probability'] or 0.0) < PROBABLE]
+    return table(probable) + (_folded('Improbable effects', table(improbable))
+                              if improbable else '')
 
 
 def _not_covered(names: Sequence[str]) -> str:
@@ -266,7 +315,7 @@ def _not_covered(names: Sequence[str]) -> str:
 
 def _next_experiment(report: dict[str, Any]) -> str:
     """Return the inseparable groups, and the manoeuvre that is proposed."""
-    groups = ''.join(f'<p>These recordings cannot separate {escape(" from ".join(group))}.</p>'
+    groups = ''.join(f'<p>{escape(" or ".join(group))}: these recordings do not separate them.</p>'
                      for group in report['verdict']['groups'])
     proposal = report['next_experiment']
     if proposal is None:

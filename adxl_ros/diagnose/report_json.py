@@ -23,12 +23,21 @@ from typing import Any
 
 from adxl_ros.diagnose.decision import Verdict, WeightedHypothesis
 from adxl_ros.diagnose.diagnosis import Diagnosis
-from adxl_ros.diagnose.gap_closure import GapClosure
 from adxl_ros.diagnose.hypothesis_fit import Hypothesis
 from adxl_ros.diagnose.next_experiment import NextExperiment
+from adxl_ros.diagnose.report_wording import (
+    gap_rows,
+    headline,
+    mg,
+    p_text,
+    parameter_text,
+    remainder_rows,
+    Row,
+    summary,
+)
 from adxl_ros.diagnose.residual_map import ResidualCell, SIGNIFICANT_P
 from adxl_ros.model.coefficients import fitted_of, get, parameter_of
-from adxl_ros.model.constants import G0_MPS2, Z_90
+from adxl_ros.model.constants import Z_90
 from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.effects.base import Coefficient
 import numpy as np
@@ -46,8 +55,8 @@ _SCREEN_CANDIDATES = 3
 _CELL_HEAD = (f'{"axis":4} {"dimension":15} {"range":>20} {"statistic":9} {"mg":>7} {"share":>7} '
               f'{"p":>8}')
 """Head of the table of cells on the terminal, with the columns of `_cell_line`."""
-_SCREEN_PROBABILITY = 0.05
-"""Smallest probability of a candidate on the terminal. Chosen: that of a rival."""
+PROBABLE = 0.05
+"""Smallest probability of what terminal and page show first. Chosen: that of a rival."""
 
 
 def as_json(diagnosis: Diagnosis) -> dict[str, Any]:
@@ -76,6 +85,7 @@ def as_json(diagnosis: Diagnosis) -> dict[str, Any]:
         'candidates': _candidates(diagnosis),
         'noise_like': [{'effect': d.effect, 'words': d.message,
                         'nats': _rounded(d.log_bayes_factor)} for d in diagnosis.detections],
+        'noise_remainders': _noise_remainders(diagnosis),
         'next_experiment': _next_experiment(diagnosis.next_experiment),
         'summary': summary(diagnosis)}
 
@@ -117,6 +127,15 @@ def _next_experiment(proposal: NextExperiment | None) -> dict[str, Any] | None:
             'menu': [{'manoeuvre': w.text, 'minutes': _rounded(w.minutes),
                       'nats_per_minute': _rounded(w.log_bayes_factor_per_minute)}
                      for w in proposal.menu]}
+
+
+def _noise_remainders(diagnosis: Diagnosis) -> list[dict[str, Any]]:
+    """Return what remains of the noise-like effects, of the axis on which they are largest."""
+    return [{'effect': r.effect, 'quantity': r.quantity, 'unit': r.unit,
+             'axis': r.axes[r.largest] if r.axes else None,
+             'recorded': _rounded(r.recorded[r.largest]),
+             'simulated': _rounded(r.simulated[r.largest]),
+             'left': _rounded(r.remains[r.largest])} for r in diagnosis.noise_remainders]
 
 
 def _noise(diagnosis: Diagnosis) -> list[dict[str, Any]]:
@@ -189,8 +208,9 @@ def _candidate(diagnosis: Diagnosis, effect: str, probability: float,
         if effect in verdict.best.effects:
             closed = _rounded(diagnosis.gap_closure.closed)
     else:
-        parameters = {parameter: {'value': np.asarray(value).tolist()}
-                      for parameter, value in detection.values.items()}
+        parameters = {p.name: {'value': np.asarray(detection.values[p.name]).tolist(),
+                               'unit': p.unit}
+                      for p in effect_named(effect).parameters if p.name in detection.values}
         if test is None:
             p = float(np.exp(-detection.log_bayes_factor))
     return {'effect': effect, 'probability': _rounded(min(probability, 1.0)), 'closed': closed,
@@ -237,80 +257,21 @@ def _key(name: Coefficient) -> str:
     return f'{name.parameter}.{name.axis}' if name.axis else name.parameter
 
 
-def summary(diagnosis: Diagnosis) -> str:
-    """Return the verdict in one sentence."""
-    if diagnosis.data_fault is not None:
-        return diagnosis.data_fault.message
-    assert diagnosis.verdict is not None and diagnosis.gap_closure is not None
-    verdict, closure = diagnosis.verdict, diagnosis.gap_closure
-    before_mg, floor_mg = _mg(closure.before_mps2), _mg(closure.floor_mps2)
-    probability = f'(probability {verdict.probability:.2f})'
-    if verdict.status == 'no_gap':
-        return (f'No gap: the recording differs from the simulator by {before_mg:.2f} mg rms, '
-                f'and the noise floor is {floor_mg:.2f} mg {probability}.')
-    if verdict.status == 'insufficient':
-        return ('Insufficient: neither motion nor temperature nor supply changes, so that no '
-                'effect can show.')
-    if verdict.status == 'unknown':
-        where = f'; the unknown part shows over {", ".join(verdict.unknown_where[:3])}' \
-            if verdict.unknown_where else ''
-        return (f'Unknown: no effect of the library explains the gap of {before_mg:.2f} mg rms '
-                f'(noise floor {floor_mg:.2f} mg){where} {probability}.')
-    return f'{_named_effects(verdict)} {probability}{_closed_text(closure)}.'
-
-
-def _named_effects(verdict: Verdict) -> str:
-    """Return the effects of a verdict, and its groups, as text."""
-    *first, last = [*verdict.effects, *(f'one of {", ".join(group)}' for group in verdict.groups)]
-    return f'{", ".join(first)} and {last}' if first else last
-
-
-def _closed_text(closure: GapClosure) -> str:
-    """Return how far the gap closes as text, empty where there is no gap to close."""
-    if not np.isfinite(closure.closed):
-        return ''
-    return (f': the gap falls from {_mg(closure.before_mps2):.2f} to '
-            f'{_mg(closure.after_mps2):.2f} mg rms ({100 * closure.closed:.0f} % closed, '
-            f'noise floor {_mg(closure.floor_mps2):.2f} mg)')
-
-
-def _mg(value_mps2: float) -> float:
-    """Convert m/s² to mg."""
-    return 1e3 * value_mps2 / G0_MPS2
-
-
-def p_text(p: float) -> str:
-    """Return a probability as text."""
-    return '< 0.001' if p < 1e-3 else f'{p:.3f}'
-
-
-def unit_text(parameter: dict[str, Any]) -> str:
-    """Return the unit of a parameter of the report as text; '' for a pure number."""
-    return '' if parameter['unit'] == '1' else parameter['unit']
-
-
-def not_determined_text(parameter: dict[str, Any]) -> str:
-    """Return that a parameter of the report is not determined, as text."""
-    others = parameter['not_separated_from']
-    return f'not determined separately from {", ".join(others)}' if others else 'not determined'
-
-
 def terminal_lines(diagnosis: Diagnosis) -> list[str]:
     """Return the diagnosis as lines for a terminal."""
-    lines = wrap(summary(diagnosis), _SCREEN_COLUMNS)
+    lines = wrap(headline(diagnosis), _SCREEN_COLUMNS)
     for note in notes(diagnosis):
         lines += wrap(f'note: {note}', _SCREEN_COLUMNS, subsequent_indent='      ')
     if diagnosis.data_fault is not None or diagnosis.verdict is None:
         return lines
-    assert diagnosis.gap_closure is not None and diagnosis.noise_floor is not None
-    report, closure = as_json(diagnosis), diagnosis.gap_closure
-    source = {'still': 'rests', 'repeats': 'repeats of a trajectory',
-              'assumed': 'the parameter file'}[diagnosis.noise_floor.source]
-    lines += ['', f'The noise floor is from {source}.']
-    if np.isfinite(closure.closed):
-        low, high = closure.closed_ci
-        lines += [f'Closed on held-out blocks: {100 * closure.closed:.1f} % '
-                  f'(90 %: {100 * low:.1f} to {100 * high:.1f} %).']
+    report = as_json(diagnosis)
+    lines += ['', *_row_lines(gap_rows(diagnosis))]
+    remainders = remainder_rows(diagnosis)
+    if remainders:
+        lines += ['', 'noise-like effects, after they are added to the simulation:']
+        for row in remainders:
+            lines += wrap(f'  {row.label}: {row.text}', _SCREEN_COLUMNS,
+                          subsequent_indent='    ')
     lines += ['', 'probability  hypothesis']
     for h in report['hypotheses'][:_SCREEN_ROWS]:
         lines += wrap(f'{p_text(h["probability"]):>11}  {", ".join(h["effects"]) or "no gap"}',
@@ -319,7 +280,7 @@ def terminal_lines(diagnosis: Diagnosis) -> list[str]:
         lines += ['', 'where the gap shows most:', _CELL_HEAD]
         lines += [_cell_line(cell) for cell in report['where'][:_SCREEN_ROWS]]
     for candidate in report['candidates'][:_SCREEN_CANDIDATES]:
-        if (candidate['probability'] or 0) >= _SCREEN_PROBABILITY:
+        if (candidate['probability'] or 0) >= PROBABLE:
             lines += _candidate_lines(candidate)
     if diagnosis.next_experiment is not None:
         proposal = diagnosis.next_experiment
@@ -328,22 +289,25 @@ def terminal_lines(diagnosis: Diagnosis) -> list[str]:
     return lines
 
 
+def _row_lines(rows: Sequence[Row]) -> list[str]:
+    """Return rows as lines, their texts below each other."""
+    width = max(len(row.label) for row in rows) + 2
+    return [line for row in rows for line in wrap(
+        f'{row.label:{width}}{row.text}', _SCREEN_COLUMNS, subsequent_indent=width * ' ')]
+
+
 def _cell_line(cell: dict[str, Any]) -> str:
     """Return one line for a cell of the residual map."""
     low, high = cell['range']
     return (f'{cell["axis"]:4} {cell["dimension"]:15} {low:8.4g} to {high:8.4g} '
-            f'{cell["statistic"]:9} {_mg(cell["mean"]):+7.2f} {100 * cell["share"]:5.1f} % '
+            f'{cell["statistic"]:9} {mg(cell["mean"]):+7.2f} {100 * cell["share"]:5.1f} % '
             f'{p_text(cell["p"]):>8}')
 
 
 def _candidate_lines(candidate: dict[str, Any]) -> list[str]:
     """Return the lines for a candidate: its cause and its parameters."""
     lines = ['', *wrap(f'{candidate["effect"]}: {candidate["cause"]}', _SCREEN_COLUMNS)]
-    for name, p in candidate['parameters'].items():
-        if not p.get('determined', True):
-            lines.append(f'  {name:32} {not_determined_text(p)}')
-        elif 'ci' in p:
-            low, high = p['ci']
-            value = f'{p["value"]:.5g} ({low:.4g} to {high:.4g}) {unit_text(p)}'
-            lines.append(f'  {name:32} {value}'.rstrip())
+    for name, parameter in candidate['parameters'].items():
+        lines += wrap(f'  {name:28} {parameter_text(parameter)}', _SCREEN_COLUMNS,
+                      subsequent_indent=31 * ' ')
     return lines

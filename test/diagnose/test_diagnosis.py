@@ -336,7 +336,7 @@ def test_the_command_writes_report_page_and_parameters(run_tool, tmp_path):
     for name in ('a', 'b'):
         run = run_tool('diagnose', 'run.csv', '--params', 'unit.yaml', '-o', name)
         assert (run.returncode, run.stderr) == (0, '')
-        assert run.stdout.startswith('temperature_bias (probability')
+        assert run.stdout.startswith('Gap explained by temperature_bias (probability')
         files.append([(tmp_path / name / f).read_bytes()
                       for f in ('report.json', 'report.html', 'params.yaml')])
     assert files[0] == files[1]
