@@ -256,8 +256,7 @@ def _explain(checked: Sequence[CheckedRecording], linear_model: LinearModel,
     named_sensor = _with_detections(best, detections, sensor)
     return _Explanation(
         floor, noise_mps2, confirmed, closure, detections,
-        noise_remainders(comparisons, confirmed[0].sensor, named_sensor, detections,
-                         confirmed[0].effects, seed),
+        noise_remainders(comparisons, best.sensor, named_sensor, detections, best.effects, seed),
         named_sensor,
         _noise_comparisons(comparisons, sensor, sensor, seed),
         _noise_comparisons(comparisons, best.sensor, named_sensor, seed))
