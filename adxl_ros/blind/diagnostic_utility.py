@@ -42,9 +42,9 @@ def pair_utility(diagnosis: Diagnosis, true: Diagnosis) -> float:
     """
     Return the utility of one diagnosis ω where ω* is true.
 
-    It is 1 − n(N + 1)/(f(n + 1)) − n̄(N̄ + 1)/(f(n̄ + 1)), where n components are in ω alone, n̄ are
-    in ω* alone, N are in ω, N̄ = f − N, and f is the number of components. Each term is the share
-    of the components that a repair tests in vain: among those in ω, and then among the others.
+    It is 1 − n(N + 1)/(f(n + 1)) − n̄(N̄ + 1)/(f(n̄ + 1)). Of the f components, n are in ω alone,
+    n̄ in ω* alone, N in ω, and N̄ = f − N not in ω. Each term is the share of the components that
+    a repair tests in vain: among those in ω, and then among the others.
 
     Parameters
     ----------

@@ -298,8 +298,8 @@ def _with_effect(sensor: Sensor, motion: Motion, name: str, rng: np.random.Gener
         elif parameter.role in (Role.SHAPE, Role.LIMIT):
             values = values * _SHAPE_FACTOR ** rng.uniform(-1, 1)
         typical[parameter.name] = np.clip(values, parameter.lower, parameter.upper)
-    affected = replace(sensor, effects=(*dict.fromkeys((*sensor.effects, name)),),
-                    values={**sensor.values, name: typical})
+    affected = replace(sensor, effects=tuple(dict.fromkeys((*sensor.effects, name))),
+                       values={**sensor.values, name: typical})
     factor = float(_log_uniform(rng, _TIMES_TYPICAL, 1)[0])
     if effect.acts_on is ActsOn.MEAN:
         quiet = replace(noiseless(sensor), rate_hz=100.0)
