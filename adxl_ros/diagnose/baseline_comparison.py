@@ -30,6 +30,7 @@ from adxl_ros.simulate.chain_memo import ChainMemo
 from adxl_ros.simulate.from_recording import environment_paths, motion_from_references
 from adxl_ros.simulate.motion import INTERNAL_RATE_HZ, Motion, Path
 from adxl_ros.simulate.response import Response
+from adxl_ros.simulate.smoothed_paths import PathErrors, SmoothedPath
 import numpy as np
 
 SEARCH_RATE_HZ = 125.0
@@ -209,6 +210,11 @@ class CachedPath:
         # The entry moves to the end, so that the one that was not used for longest is deleted.
         self._values[key] = self._values.pop(key)
         return self._values[key]
+
+    def errors(self, time_s: np.ndarray) -> PathErrors | None:
+        """Return the errors of the path at times, s, (n,); None where it is exact."""
+        smoothed = isinstance(self._path, SmoothedPath | CachedPath)
+        return self._path.errors(time_s) if smoothed else None
 
 
 def _cached(motion: Motion, reference: Reference) -> Motion:

@@ -27,7 +27,7 @@ from dataclasses import dataclass
 from itertools import combinations, pairwise
 
 from adxl_ros.diagnose.evidence import block_edges
-from adxl_ros.diagnose.noise_whitening import RANDOM_WALKS_G_PER_RTS, Whitener
+from adxl_ros.diagnose.noise_whitening import before_filters, RANDOM_WALKS_G_PER_RTS, Whitener
 from adxl_ros.model.diagnosis_hints import DriftSpectrum
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -81,7 +81,8 @@ class ResidualChannel:
 
     def whitened_v(self) -> np.ndarray:
         """Return the whitened residual, V, (n,), zero where samples are not used."""
-        white = self.whitener(self.residual_v[None])[0] * self.used
+        before = before_filters([self.whitener], self.residual_v[None])
+        white = self.whitener(before)[0] * self.used
         # The first sample is a step from zero.
         white[0] = 0.0
         return white

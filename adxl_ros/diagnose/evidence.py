@@ -27,7 +27,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from adxl_ros.diagnose.noise_whitening import Whitener
+from adxl_ros.diagnose.noise_whitening import before_filters, Whitener
 import numpy as np
 from scipy.linalg import cho_solve
 from scipy.signal import sosfilt
@@ -123,7 +123,8 @@ def whiten_channel(residual_v: np.ndarray, columns: np.ndarray, column_ids: np.n
 
     """
     series = [residual_v[:, None], columns, *([] if flexible is None else [flexible.values])]
-    data = np.concatenate([bridged(values, used).T for values in series])
+    data = before_filters(
+        filters, np.concatenate([bridged(values, used).T for values in series]))
     edges, unused = block_edges(len(used)), np.flatnonzero(~used)
     grams = np.empty((len(filters), BLOCKS, len(data), len(data)))
     states = [np.zeros((len(f.sections), len(data), 2)) for f in filters]

@@ -33,6 +33,7 @@ from itertools import chain
 from typing import NamedTuple
 
 from adxl_ros.diagnose import evidence, noise_whitening
+from adxl_ros.diagnose.angle_errors import angle_error_filter
 from adxl_ros.diagnose.baseline_comparison import BaselineComparison, Reference
 from adxl_ros.diagnose.evidence import FlexibleColumns, LinearFit, WhitenedChannel
 from adxl_ros.diagnose.noise_whitening import drifts_among, Whitener
@@ -365,7 +366,8 @@ def _whitened_channels(comparisons: Sequence[BaselineComparison],
         residual_v = comparison.residual_v(comparison.sensor)
         for d, axis_columns in enumerate(by_axis):
             tried = given[len(filters)] if given is not None else noise_whitening.whiteners(
-                comparison.sensor, d, comparison.dt_s, comparison.span_s)
+                comparison.sensor, d, comparison.dt_s, comparison.span_s,
+                angle_error_filter(comparison, d))
             filters.append(tried)
             channels.append(evidence.whiten_channel(
                 residual_v[:, d], np.column_stack([column for _, column in axis_columns]),

@@ -218,10 +218,27 @@ def encoder_mean_square(alpha_rad: np.ndarray, beta_rad: np.ndarray, sensor: Sen
         step²/12 times the squared slope of gravity, (m/s²)².
 
     """
-    measured = len(sensor.axes)
-    by_alpha = np.array([np.cos(alpha_rad) * np.cos(beta_rad),
-                         -np.cos(alpha_rad) * np.sin(beta_rad), -np.sin(alpha_rad)])[:measured]
-    by_beta = np.array([-np.sin(alpha_rad) * np.sin(beta_rad),
-                        -np.sin(alpha_rad) * np.cos(beta_rad), 0 * alpha_rad])[:measured]
+    slopes = gravity_slopes(alpha_rad, beta_rad)[:, :len(sensor.axes)]
     return float(sensor.local_gravity_mps2 ** 2 * sensor.stage_std_rad ** 2
-                 * np.mean(by_alpha ** 2 + by_beta ** 2))
+                 * np.mean((slopes ** 2).sum(axis=0)))
+
+
+def gravity_slopes(alpha_rad: np.ndarray, beta_rad: np.ndarray) -> np.ndarray:
+    """
+    Return the derivatives of the direction of gravity by the angles of the stage.
+
+    Parameters
+    ----------
+    alpha_rad, beta_rad
+        Angles of the stage, rad, (n,).
+
+    Returns
+    -------
+    numpy.ndarray
+        By angle and component in the sensor's frame, 1/rad, (2, 3, n).
+
+    """
+    sin_alpha, cos_alpha = np.sin(alpha_rad), np.cos(alpha_rad)
+    sin_beta, cos_beta = np.sin(beta_rad), np.cos(beta_rad)
+    return np.array([[cos_alpha * cos_beta, -cos_alpha * sin_beta, -sin_alpha],
+                     [-sin_alpha * sin_beta, -sin_alpha * cos_beta, 0 * sin_alpha]])

@@ -28,9 +28,10 @@ noise, which is searched on a grid.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 
+from adxl_ros.diagnose.angle_errors import AngleErrorFilter
 from adxl_ros.model import noise
 from adxl_ros.model.diagnosis_hints import DriftSpectrum
 from adxl_ros.model.effects import effect_named, library
@@ -88,6 +89,9 @@ class Whitener:
         Name of the drift effect that the filter is for.
     density
         Density of the drift, in the unit of the effect's parameter.
+    angle_errors
+        Filter for the errors of the followed angles, which comes first and is the same for all
+        filters of a channel; None where the reference is exact.
 
     """
 
@@ -95,6 +99,7 @@ class Whitener:
     log_prior: float
     effect: str
     density: float
+    angle_errors: AngleErrorFilter | None = None
 
     @property
     def spectrum(self) -> DriftSpectrum:
@@ -109,11 +114,33 @@ class Whitener:
         return self.density <= effect_named(self.effect).diagnosis.healthy_density
 
     def __call__(self, values: np.ndarray) -> np.ndarray:
-        """Filter k series, (k, n)."""
+        """Filter k series after `before_filters`, (k, n)."""
         return sosfilt(self.sections, values)
 
 
-def whiteners(sensor: Sensor, axis: int, dt_s: float, span_s: float) -> list[Whitener]:
+def before_filters(filters: Sequence[Whitener], values: np.ndarray) -> np.ndarray:
+    """
+    Apply what all whitening filters of a channel have in common.
+
+    Parameters
+    ----------
+    filters
+        Filters of the channel.
+    values
+        The k series, (k, n).
+
+    Returns
+    -------
+    numpy.ndarray
+        Series for each of the filters, (k, n).
+
+    """
+    angle_errors = filters[0].angle_errors
+    return values if angle_errors is None else angle_errors(values)
+
+
+def whiteners(sensor: Sensor, axis: int, dt_s: float, span_s: float,
+              angle_errors: AngleErrorFilter | None = None) -> list[Whitener]:
     """
     Return the filters that are tried for the noise of one axis of a recording.
 
@@ -127,6 +154,8 @@ def whiteners(sensor: Sensor, axis: int, dt_s: float, span_s: float) -> list[Whi
         Time between samples, s.
     span_s
         Length of the recording, s.
+    angle_errors
+        Filter for the errors of the followed angles.
 
     Returns
     -------
@@ -165,7 +194,7 @@ def whiteners(sensor: Sensor, axis: int, dt_s: float, span_s: float) -> list[Whi
         healthy = effect_named(flicker).diagnosis.healthy_density
         flickers.append(_whitener(zpk2sos(zeros, poles, 1.0), flicker,
                                   max(float(lowest), 2 * healthy)))
-    return walks + flickers
+    return [replace(f, angle_errors=angle_errors) for f in walks + flickers]
 
 
 def _walk_whiteners(a: float, std_v: float, step_std_v: float, scale_v_per_g: float, dt_s: float

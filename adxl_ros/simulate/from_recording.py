@@ -24,7 +24,7 @@ from adxl_ros.files import recording
 from adxl_ros.files.recording_columns import JOINTS, Recording
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.simulate.motion import Held, INTERNAL_RATE_HZ, Motion, Path
-from adxl_ros.simulate.smoothed_paths import ForcePath, SmoothedPath
+from adxl_ros.simulate.smoothed_paths import BAND_LIMITED_DEGREE, ForcePath, SmoothedPath
 import numpy as np
 
 _MAX_SPEED_RAD_S = 100.0
@@ -107,7 +107,8 @@ def motion_from_references(read: Recording, sensor: Sensor) -> Motion:
             continue
         if joint != 'shift':
             _check_speed(read, name, resolution[joint])
-        paths[joint] = SmoothedPath(read.time_s, values, resolution[joint])
+        paths[joint] = SmoothedPath(read.time_s, values, resolution[joint],
+                                    BAND_LIMITED_DEGREE)
     return Motion(float(read.time_s[-1] - read.time_s[0]), **paths)
 
 

@@ -17,15 +17,24 @@
 from __future__ import annotations
 
 from bisect import bisect_left
+from dataclasses import dataclass
 
 from adxl_ros.model.effects.base import Components
 import numpy as np
 from scipy.interpolate import BSpline, CubicSpline, make_interp_spline
-from scipy.linalg import solveh_banded
-from scipy.ndimage import maximum_filter1d, uniform_filter1d
+from scipy.linalg import cho_solve_banded, cholesky_banded, solveh_banded
 
 _DEGREE = 5
 """Degree of the splines of joints; chosen: quintic, so that the acceleration is smooth."""
+
+BAND_LIMITED_DEGREE = 11
+"""Degree of the spline through exact readings of a motion that is nearly as fast as its sampling;
+chosen: the acceleration of 40 Hz, sampled at 100 Hz, is exact to 0.1 %, by quintic splines to
+3 %."""
+
+_MAX_UNEVENNESS = 3.0
+"""Longest interval of readings, divided by the median, that splines of a higher degree bridge;
+chosen: they overshoot in longer ones."""
 
 _KNOT_S = 0.03
 """Distance of the knots, s; chosen: motion slower than 10 Hz is free, the penalty smooths it."""
@@ -45,21 +54,23 @@ _PROBES = 12
 _MIN_MOVING = 100
 """Fewest readings in motion that determine a strength; chosen: their rms is then within 7 %."""
 
-_MAX_ROUNDS = 16
-"""Largest number of rounds that soften the penalty; chosen: it is then nearly 0, see `_SOFTER`."""
+_USUAL_STRENGTH = 1.0
+"""Strength where too few readings move to determine one; chosen: that of quick moves."""
 
-_SOFTER = 0.2
-"""Factor of the penalty where the readings deviate too much; chosen: 16 rounds give 7e-12."""
+_BOUNDED_SHARE = 0.03
+"""Strength of the penalty within bounds, divided by the matched one. Tuned, with `_REST_WEIGHT`,
+on manoeuvres of the package from 25 to 250 Hz behind encoders of 0.083 and 0.01°: 0.01 to 1
+differ by 10 %."""
 
-_WIDER = 15
-"""Width of a softened part in knots; chosen: it begins before the move that needs it."""
+_REST_WEIGHT = 0.1
+"""Weight of a reading at rest beside its bounds; tuned as `_BOUNDED_SHARE`."""
 
-_LOCAL_S = 0.3
-"""Time over which deviations are averaged, s; chosen: ten knots."""
+_BOUND_ROUNDS = 100
+"""Iterations over the bounds; chosen: 300 change the error by a tenth of itself."""
 
-_MAX_RATIO = 1.7
-"""Mean squared deviation, divided by step²/12, from which the penalty softens; chosen: above the
-scatter of a mean over `_LOCAL_S`."""
+_ERROR_FACTOR = 2.0
+"""Error in motion, times readings per second, divided by step and corner frequency; measured on
+the same manoeuvres: 0.3 to 2."""
 
 _RIDGE = 1e-12
 """Addition to the diagonal of the normal matrix, divided by its largest element; chosen: it
@@ -76,18 +87,40 @@ _THIRD_DIFFERENCE = np.array([-1.0, 3.0, -3.0, 1.0])
 """Weights of four coefficients in a third difference."""
 
 
+@dataclass(frozen=True)
+class PathErrors:
+    """
+    What is to be expected of the error of a smoothed path, at n times.
+
+    Attributes
+    ----------
+    std
+        Standard deviation, in the unit of the path, (n,).
+    forgetting_per_s
+        Rate at which the error forgets its past value, 1/s, (n,); 0 at rest.
+
+    """
+
+    std: np.ndarray
+    forgetting_per_s: np.ndarray
+
+
 class SmoothedPath:
     """
     A joint by the readings of its encoder: a smoothing spline matched to the encoder's step.
 
     It is a quintic P-spline (Eilers and Marx 1996) with a penalty on the third derivative. The
-    strength is the largest for which the deviation of the readings in motion is at most that of
-    an encoder, step/√12 rms. The spline then removes only the error of the encoder. Where the
-    deviation is larger for a while, in a quick move among slow ones, the penalty is softer there.
+    strength is first matched: it is the largest for which the deviation of the readings in motion
+    is at most that of an encoder, step/√12 rms. Then a spline with a weaker penalty is fitted that
+    deviates from no reading by more than half a step. Where the joint moves through many steps,
+    these bounds say more than squares of deviations do. The error in motion becomes smaller by a
+    third on average.
+
     Windows of the recording are fitted when they are needed.
     """
 
-    def __init__(self, time_s: np.ndarray, reading: np.ndarray, step: float) -> None:
+    def __init__(self, time_s: np.ndarray, reading: np.ndarray, step: float,
+                 degree: int = _DEGREE) -> None:
         """
         Prepare for the readings of an encoder.
 
@@ -99,18 +132,21 @@ class SmoothedPath:
             Readings, rad or m, (n,); NaN where there is none.
         step
             Step of the encoder, in the unit of the readings; 0 for an exact encoder.
+        degree
+            Degree of the spline through exact readings.
 
         """
         sampled = np.isfinite(reading)
         self._time_s, self._reading = time_s[sampled], reading[sampled]
         self._windows: dict[int, BSpline] = {}
         self._step, self._strength = step, self._matched_strength(step)
+        self._degree = degree
 
     def __call__(self, time_s: np.ndarray, order: int = 0) -> np.ndarray:
         """Return a derivative; see `motion.Path`."""
         begin_s, end_s = self._time_s[0], self._time_s[-1]
         inside_s = np.clip(time_s, begin_s, end_s)
-        number = ((inside_s - begin_s) // _WINDOW_S).astype(int)
+        number = self._numbers(inside_s)
         values = np.empty(len(time_s))
         for window in np.unique(number):
             chosen = number == window
@@ -119,12 +155,52 @@ class SmoothedPath:
             values[(time_s < begin_s) | (time_s > end_s)] = 0.0
         return values
 
+    def errors(self, time_s: np.ndarray) -> PathErrors | None:
+        """
+        Predict the error of the path by the steps of its encoder.
+
+        At rest it is that of one reading, step/√12 rms, and stays. In motion it is smaller and
+        changes quickly, because many readings bound the path within the time that the spline
+        averages over. Its corner is 1/(2π·h·s^(1/6)) with the distance h of the knots and the
+        matched strength s.
+
+        Parameters
+        ----------
+        time_s
+            Times, s, (n,).
+
+        Returns
+        -------
+        PathErrors or None
+            The error; None for an exact encoder.
+
+        """
+        if not self._step or len(self._time_s) <= 2 * _DEGREE:
+            return None
+        inside_s = np.clip(time_s, self._time_s[0], self._time_s[-1])
+        rate_hz = 1 / float(np.median(np.diff(self._time_s)))
+        knot_s = max(_KNOT_S, 2 / rate_hz)
+        corner_hz = min(self._strength ** (-1 / 6) / (2 * np.pi * knot_s), 1 / (2 * knot_s))
+        place = np.clip(np.searchsorted(self._time_s, inside_s), 0, len(self._time_s) - 1)
+        # The reading changes at most once in a sample.
+        changes_hz = np.where(_moving(self._reading)[place], np.minimum(
+            np.abs(self(inside_s, 1)) / self._step, rate_hz), 0.0)
+        ratio = _ERROR_FACTOR * corner_hz / np.maximum(changes_hz, 1e-9)
+        # Noise behind a first-order filter with as much power as below the corner forgets at
+        # four times the corner.
+        return PathErrors(self._step * np.minimum(ratio, 1 / np.sqrt(12)),
+                          np.minimum(4 * corner_hz, changes_hz))
+
+    def _numbers(self, time_s: np.ndarray) -> np.ndarray:
+        """Return the number of the window of each time, (n,)."""
+        return ((time_s - self._time_s[0]) // _WINDOW_S).astype(int)
+
     def _spline(self, window: int) -> BSpline:
         if window not in self._windows:
             while len(self._windows) >= _MAX_WINDOWS:
                 del self._windows[min(self._windows)]
             self._windows[window] = smoothing_spline(
-                *self._part(window), self._strength, self._step)
+                *self._part(window), self._strength, self._step, self._degree)
         return self._windows[window]
 
     def _part(self, window: int) -> tuple[np.ndarray, np.ndarray]:
@@ -134,16 +210,16 @@ class SmoothedPath:
         return self._time_s[part], self._reading[part]
 
     def _matched_strength(self, step: float) -> float:
-        """Return the median strength that windows all over the recording need; 0 without any."""
+        """Return the median strength that windows all over the recording need."""
         last = int((self._time_s[-1] - self._time_s[0]) // _WINDOW_S)
         strengths = [matched_strength(*self._part(int(window)), step)
                      for window in np.unique(np.linspace(0, last, _PROBES).round())]
         positive = [strength for strength in strengths if strength]
-        return float(np.median(positive)) if positive else 0.0
+        return float(np.median(positive)) if positive else _USUAL_STRENGTH
 
 
-def smoothing_spline(time_s: np.ndarray, reading: np.ndarray, strength: float, step: float
-                     ) -> BSpline:
+def smoothing_spline(time_s: np.ndarray, reading: np.ndarray, strength: float, step: float,
+                     degree: int = _DEGREE) -> BSpline:
     """
     Fit the smoothing spline of one window; see `SmoothedPath`.
 
@@ -154,9 +230,11 @@ def smoothing_spline(time_s: np.ndarray, reading: np.ndarray, strength: float, s
     reading
         Readings, rad or m, (n,), all finite.
     strength
-        Strength of the penalty per sample; 0 interpolates.
+        Matched strength of the penalty per sample.
     step
-        Step of the encoder, in the unit of the readings.
+        Step of the encoder, in the unit of the readings; 0 interpolates.
+    degree
+        Degree of a spline that interpolates.
 
     Returns
     -------
@@ -167,20 +245,13 @@ def smoothing_spline(time_s: np.ndarray, reading: np.ndarray, strength: float, s
     if len(time_s) <= 2 * _DEGREE or np.ptp(reading) == 0:
         return make_interp_spline(time_s, reading, k=1) if len(time_s) > 1 else \
             BSpline(np.array([0.0, 1.0]), reading, 0, extrapolate=True)
-    if not strength:
-        return make_interp_spline(time_s, reading, k=_DEGREE)
+    if not step:
+        interval_s = np.diff(time_s)
+        even = interval_s.max() < _MAX_UNEVENNESS * np.median(interval_s)
+        return make_interp_spline(time_s, reading, k=degree if even else _DEGREE)
     window = _Window(time_s, reading)
-    strengths = np.full(len(window.right) - 3, strength)
-    for _ in range(_MAX_ROUNDS):
-        coefficients = window.coefficients(strengths)
-        deviation2 = (reading - window.mean - window.design @ coefficients) ** 2
-        width = max(round(_LOCAL_S / (time_s[-1] - time_s[0]) * len(time_s)), 5)
-        local = np.interp(window.centres, time_s, uniform_filter1d(deviation2, width))
-        stiff = local > _MAX_RATIO * step ** 2 / 12
-        if not stiff.any():
-            break
-        strengths[maximum_filter1d(stiff, _WIDER)] *= _SOFTER
-    return BSpline(window.knots, coefficients + window.mean, _DEGREE)
+    return BSpline(window.knots, window.bounded_coefficients(
+        strength, np.where(_moving(reading), 0.0, _REST_WEIGHT), step / 2) + window.mean, _DEGREE)
 
 
 def matched_strength(time_s: np.ndarray, reading: np.ndarray, step: float) -> float:
@@ -208,8 +279,7 @@ def matched_strength(time_s: np.ndarray, reading: np.ndarray, step: float) -> fl
     window = _Window(time_s, reading)
 
     def too_strong(strength: float) -> bool:
-        deviation = reading - window.mean - window.design @ window.coefficients(
-            np.full(len(window.right) - 3, strength))
+        deviation = reading - window.mean - window.design @ window.coefficients(strength)
         return bool(np.sqrt(np.mean(deviation[moving] ** 2)) > step / np.sqrt(12))
 
     index = bisect_left(_STRENGTHS, True, key=too_strong)
@@ -230,8 +300,6 @@ class _Window:
         Mean of the readings, which the spline leaves out.
     right
         Right-hand side of the normal equations, (k,).
-    centres
-        Times of the third differences, s, (k − 3,).
 
     """
 
@@ -243,17 +311,58 @@ class _Window:
         self.knots = np.concatenate([inner[0] - outer[::-1], inner, inner[-1] + outer])
         self.design = BSpline.design_matrix(time_s, self.knots, _DEGREE)
         self.mean = float(reading.mean())
-        self.right = self.design.T @ (reading - self.mean)
+        self._values = reading - self.mean
+        self.right = self.design.T @ self._values
         self._normal = _banded(self.design.T @ self.design)
         self._normal[-1] += _RIDGE * self._normal[-1].max()
         self._samples_per_coefficient = len(time_s) / len(self.right)
-        # A third difference weighs four coefficients, whose splines peak between these knots.
-        self.centres = np.convolve(self.knots, np.full(_DEGREE + 5, 1 / (_DEGREE + 5)), 'valid')
 
-    def coefficients(self, strengths: np.ndarray) -> np.ndarray:
-        """Return the coefficients for strengths by third difference, (k − 3,)."""
-        penalty = _third_differences(strengths * self._samples_per_coefficient)
-        return solveh_banded(self._normal + penalty, self.right)
+    def coefficients(self, strength: float) -> np.ndarray:
+        """Return the coefficients of least squares with a penalty, (k,)."""
+        return solveh_banded(self._normal + self._penalty(strength), self.right)
+
+    def bounded_coefficients(self, strength: float, weights: np.ndarray, bound: float
+                             ) -> np.ndarray:
+        """
+        Return the coefficients whose spline deviates from no reading by more than a bound.
+
+        They are found by alternating directions (Boyd et al. 2011, section 5.2). Where no spline
+        fits the bounds, the deviation becomes as small as it can.
+
+        Parameters
+        ----------
+        strength
+            Matched strength of the penalty per sample.
+        weights
+            Weight of the squared deviation of each reading, beside the bounds, (n,).
+        bound
+            Largest deviation, in the unit of the readings.
+
+        Returns
+        -------
+        numpy.ndarray
+            Coefficients, (k,).
+
+        """
+        transposed = self.design.T.tocsr()
+        weighted = self.design.multiply(1 + weights[:, None]).tocsr()
+        normal = _banded(transposed @ weighted)
+        normal[-1] += _RIDGE * normal[-1].max()
+        factor = cholesky_banded(normal + self._penalty(_BOUNDED_SHARE * strength))
+        low, high, pulled = self._values - bound, self._values + bound, weights * self._values
+        within, excess = self._values, np.zeros(len(self._values))
+        for _ in range(_BOUND_ROUNDS):
+            coefficients = cho_solve_banded((factor, False),
+                                            transposed @ (pulled + within - excess))
+            excess = excess + self.design @ coefficients
+            within = np.clip(excess, low, high)
+            excess = excess - within
+        return coefficients
+
+    def _penalty(self, strength: float) -> np.ndarray:
+        """Return the banded matrix of the penalty."""
+        return _third_differences(np.full(len(self.right) - 3,
+                                          strength * self._samples_per_coefficient))
 
 
 def _banded(matrix: object) -> np.ndarray:

@@ -1,0 +1,74 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Errors of the followed angles are a part of the noise."""
+
+from dataclasses import replace
+
+from adxl_ros.diagnose.angle_errors import angle_error_filter
+from adxl_ros.diagnose.baseline_comparison import compare
+from adxl_ros.files import parameter_file
+from adxl_ros.files.recording_columns import Recording
+from adxl_ros.files.stream_info import sensor_info
+from adxl_ros.simulate import simulator
+from adxl_ros.simulate.motion import Held, Motion
+from adxl_ros.simulate.trajectories import tumble
+import numpy as np
+import pytest
+
+RATE_HZ = 100.0
+"""Sample rate of the recordings, Hz."""
+
+
+def comparison_of(motion, **fields):
+    """Return a recording of the nominal sensor beside its simulation."""
+    sensor = replace(parameter_file.load(parameter_file.nominal_path()), rate_hz=RATE_HZ, **fields)
+    columns = simulator.simulate(sensor, motion, 1)
+    time_s = columns.pop('time_s')
+    return compare(Recording('drawn', time_s, columns, sensor_info(sensor)), sensor)
+
+
+def power(values_v):
+    """Return the mean square of the means over each second."""
+    count = int(RATE_HZ)
+    means = values_v[:len(values_v) // count * count].reshape(-1, count).mean(axis=1)
+    return np.mean(means ** 2)
+
+
+def test_noise_with_errors_of_angles_becomes_that_without():
+    """Rounded poses add five times the power of the noise below 1 Hz; the filter removes it."""
+    comparison = comparison_of(tumble(np.random.default_rng(2)))
+    residual_v = comparison.residual_v(comparison.sensor)
+    noise_v = comparison.simulated_noise_v(comparison.sensor, 5)
+    for axis in range(2):
+        filtered_v = angle_error_filter(comparison, axis)(residual_v.T)[axis]
+        expected = power(noise_v[:, axis])
+        assert power(residual_v[:, axis]) > 6 * expected
+        assert 0.3 * expected < power(filtered_v) < 1.5 * expected
+        assert np.std(filtered_v) == pytest.approx(np.std(noise_v[:, axis]), rel=0.1)
+
+
+def test_an_exact_reference_needs_no_filter():
+    """Without steps of the encoder, and without a stage that moves, there is no filter."""
+    assert angle_error_filter(
+        comparison_of(tumble(np.random.default_rng(2)), stage_resolution_rad=0.0), 0) is None
+    assert angle_error_filter(comparison_of(Motion(20.0, Held(0.5), Held(0.2))), 0) is None
+
+
+def test_a_finer_encoder_changes_the_noise_less():
+    """The filter of an encoder of a millionth of a step leaves a series as it is."""
+    motion = tumble(np.random.default_rng(2))
+    comparison = comparison_of(motion, stage_resolution_rad=1e-9)
+    residual_v = comparison.residual_v(comparison.sensor).T
+    assert angle_error_filter(comparison, 0)(residual_v) == pytest.approx(residual_v, abs=1e-6)

@@ -1,0 +1,88 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Paths through readings of encoders: their error, its prediction, and fast motion."""
+
+from adxl_ros.simulate.smoothed_paths import BAND_LIMITED_DEGREE, SmoothedPath
+from adxl_ros.simulate.trajectories import shaker, tumble
+import numpy as np
+import pytest
+
+STEP = np.radians(1 / 12)
+"""Step of the encoder of the default stage, rad."""
+
+
+def followed_tumble(rate_hz):
+    """Return times, s, path and error, rad, of beta in 30 poses behind an encoder."""
+    motion = tumble(np.random.default_rng(3))
+    time_s = np.arange(200 * rate_hz) / rate_hz
+    true = motion.beta(time_s)
+    path = SmoothedPath(time_s, np.rint(true / STEP) * STEP, STEP)
+    return time_s, path, path(time_s) - true, np.abs(motion.beta(time_s, 1)) > 0.2
+
+
+@pytest.mark.parametrize('rate_hz', [25, 100, 500])
+def test_motion_is_known_better_than_one_reading(rate_hz):
+    """In motion the error is below half of that of a reading; nowhere is it above a step."""
+    _, _, error_rad, moving = followed_tumble(rate_hz)
+    assert np.sqrt(np.mean(error_rad[moving] ** 2)) < 0.5 * STEP / np.sqrt(12)
+    assert np.abs(error_rad).max() < STEP
+
+
+@pytest.mark.parametrize('rate_hz', [25, 100, 500])
+def test_predicted_error_is_that_of_the_path(rate_hz):
+    """At rest the prediction holds within 20 %; in fast motion it is at most five times too large."""
+    time_s, path, error_rad, moving = followed_tumble(rate_hz)
+    errors = path.errors(time_s)
+    at_rest = errors.forgetting_per_s == 0
+    ratio = np.sqrt(np.mean(error_rad[at_rest] ** 2)) / errors.std[at_rest].mean()
+    assert ratio == pytest.approx(1, abs=0.2)
+    ratio = np.sqrt(np.mean(error_rad[moving] ** 2) / np.mean(errors.std[moving] ** 2))
+    assert 0.2 < ratio < 1.2
+
+
+def test_an_exact_path_has_no_error():
+    """Without a step no error is predicted, and the path passes through the readings."""
+    time_s = np.arange(500) / 100
+    reading = np.sin(time_s)
+    path = SmoothedPath(time_s, reading, 0.0)
+    assert path.errors(time_s) is None
+    assert path(time_s) == pytest.approx(reading, abs=1e-12)
+
+
+def test_a_shaker_close_to_half_the_sample_rate_is_followed():
+    """At 100 Hz the acceleration of a shaker up to 40 Hz is exact to 1 %, also between samples."""
+    motion = shaker(np.random.default_rng(0))
+    time_s = np.arange(5500) / 100
+    path = SmoothedPath(time_s, motion.shift(time_s), 0.0, BAND_LIMITED_DEGREE)
+    dense_s = np.arange(54000) / 1000
+    true = motion.shift(dense_s, 2)
+    assert np.abs(path(dense_s, 2) - true).max() < 0.01 * np.abs(true).max()
+
+
+def test_a_gap_between_exact_readings_is_bridged_without_overshoot():
+    """Over a gap the path stays within the range of the readings."""
+    time_s = np.delete(np.arange(1000) / 100, slice(400, 480))
+    reading = np.tanh(time_s - 4.4)
+    path = SmoothedPath(time_s, reading, 0.0, BAND_LIMITED_DEGREE)
+    assert np.abs(path(np.arange(1000) / 100)).max() < 1.1
+
+
+def test_readings_that_no_encoder_gives_are_followed():
+    """Readings with noise of two steps stay within four steps of the path."""
+    time_s = np.arange(6000) / 100
+    rng = np.random.default_rng(0)
+    reading = np.rint(np.sin(0.5 * time_s) / STEP + rng.normal(0, 2, len(time_s))) * STEP
+    error_rad = SmoothedPath(time_s, reading, STEP)(time_s) - np.sin(0.5 * time_s)
+    assert np.sqrt(np.mean(error_rad ** 2)) < 4 * STEP
