@@ -113,22 +113,26 @@ def angle_error_filter(comparison: BaselineComparison, axis: int) -> AngleErrorF
     time_s, motion, sensor = comparison.time_s, comparison.motion, comparison.sensor
     slopes = gravity_slopes(motion.alpha(time_s), motion.beta(time_s))[:, axis]
     v_per_rad = slopes * sensor.scale_v_per_g[axis] * sensor.local_gravity_mps2 / G0_MPS2
-    variance_v2, forgetting = np.zeros(len(time_s)), np.zeros(len(time_s))
+    variance_v2, remembered_v2 = np.zeros(len(time_s)), np.zeros(len(time_s))
     for joint, slope in zip((motion.alpha, motion.beta), v_per_rad):
         errors = joint.errors(time_s) if isinstance(joint, CachedPath) else None
         if errors is not None:
             part = (slope * errors.std) ** 2
+            # An error that grows, after a move, is a new one.
+            grown = np.minimum(errors.std[:-1] / errors.std[1:], 1.0)
+            memory = np.exp(-errors.forgetting_per_s * comparison.dt_s)
+            memory[1:] *= grown
             variance_v2 += part
-            forgetting += part * errors.forgetting_per_s
+            remembered_v2 += part * memory
     if not variance_v2.any():
         return None
-    forgetting_per_s = forgetting / np.where(variance_v2 > 0, variance_v2, 1.0)
     rc_s = float(noise.electronics(sensor).rc_s[axis])
     pole = float(np.exp(-comparison.dt_s / rc_s)) if rc_s else 0.0
     std_v = max(float(noise.analog_std_v(sensor)[axis]), _LOWEST_NOISE_V)
     noise_v2 = std_v ** 2 * (1 - pole ** 2) + sensor.lsb_v ** 2 / 12 * (1 + pole ** 2)
-    return _filter(np.sqrt(variance_v2), np.exp(-forgetting_per_s * comparison.dt_s), pole,
-                   noise_v2)
+    return _filter(np.sqrt(variance_v2),
+                   np.divide(remembered_v2, variance_v2, where=variance_v2 > 0,
+                             out=np.ones(len(time_s))), pole, noise_v2)
 
 
 def _filter(std_v: np.ndarray, memory: np.ndarray, pole: float, noise_v2: float
