@@ -42,7 +42,7 @@ def test_motion_is_known_better_than_one_reading(rate_hz):
 
 @pytest.mark.parametrize('rate_hz', [25, 100, 500])
 def test_predicted_error_is_that_of_the_path(rate_hz):
-    """At rest the prediction holds within 20 %; in fast motion it is at most five times too large."""
+    """At rest it holds within 20 %; in fast motion it is at most five times too large."""
     time_s, path, error_rad, moving = followed_tumble(rate_hz)
     errors = path.errors(time_s)
     at_rest = errors.forgetting_per_s == 0
