@@ -213,8 +213,9 @@ class CachedPath:
 
     def errors(self, time_s: np.ndarray) -> PathErrors | None:
         """Return the errors of the path at times, s, (n,); None where it is exact."""
-        smoothed = isinstance(self._path, SmoothedPath | CachedPath)
-        return self._path.errors(time_s) if smoothed else None
+        if isinstance(self._path, SmoothedPath | CachedPath):
+            return self._path.errors(time_s)
+        return None
 
 
 def _cached(motion: Motion, reference: Reference) -> Motion:
