@@ -58,7 +58,8 @@ class WhitenedChannel:
     column_ids
         Numbers of the k columns that the axis follows, (k,).
     block_grams
-        Products of the residual (first) and the columns, V², (filters, blocks, k + 1, k + 1).
+        Products of the residual (first) and the columns, V², (filters, blocks, k + 1, k + 1);
+        no block where they are not kept.
     total_grams
         Their sums over all blocks, V², (filters, k + 1, k + 1).
     counts
@@ -97,7 +98,8 @@ class FlexibleColumns(NamedTuple):
 
 def whiten_channel(residual_v: np.ndarray, columns: np.ndarray, column_ids: np.ndarray,
                    used: np.ndarray, filters: Sequence[Whitener],
-                   flexible: FlexibleColumns | None = None) -> WhitenedChannel:
+                   flexible: FlexibleColumns | None = None, by_block: bool = True
+                   ) -> WhitenedChannel:
     """
     Whiten one axis of one recording.
 
@@ -115,6 +117,8 @@ def whiten_channel(residual_v: np.ndarray, columns: np.ndarray, column_ids: np.n
         Whitening filters to choose from.
     flexible
         Functions that are integrated out of the total products.
+    by_block
+        Whether the products of each block are kept, too.
 
     Returns
     -------
@@ -123,10 +127,11 @@ def whiten_channel(residual_v: np.ndarray, columns: np.ndarray, column_ids: np.n
 
     """
     series = [residual_v[:, None], columns, *([] if flexible is None else [flexible.values])]
-    data = before_filters(
-        filters, np.concatenate([bridged(values, used).T for values in series]))
+    data = np.empty((sum(values.shape[1] for values in series), len(used)))
+    np.concatenate([values.T for values in series], out=data)
+    data = before_filters(filters, bridged(data.T, used).T)
     edges, unused = block_edges(len(used)), np.flatnonzero(~used)
-    grams = np.empty((len(filters), BLOCKS, len(data), len(data)))
+    grams = np.zeros((len(filters), BLOCKS if by_block else 1, len(data), len(data)))
     states = [np.zeros((len(f.sections), len(data), 2)) for f in filters]
     together = max(1, _CACHED_VALUES * BLOCKS // data.size)
     for first in range(0, BLOCKS, together):
@@ -141,6 +146,9 @@ def whiten_channel(residual_v: np.ndarray, columns: np.ndarray, column_ids: np.n
             if not first:
                 # The first sample is a step from zero.
                 white[:, 0] = 0.0
+            if not by_block:
+                grams[i, 0] += white @ white.T
+                continue
             for b, begin, end in blocks:
                 np.matmul(white[:, begin:end], white[:, begin:end].T, out=grams[i, b])
     counts = np.add.reduceat(used, edges[:-1]).astype(float)
@@ -150,7 +158,7 @@ def whiten_channel(residual_v: np.ndarray, columns: np.ndarray, column_ids: np.n
         precision = total[:, count:, count:] + flexible.variance_v2 * np.eye(len(data) - count)
         total = total[:, :count, :count] - cross @ np.linalg.solve(precision,
                                                                    cross.transpose(0, 2, 1))
-        grams = grams[:, :, :count, :count]
+    grams = grams[:, :, :count, :count] if by_block else np.zeros((len(filters), 0, count, count))
     return WhitenedChannel(column_ids, grams, total, counts,
                            np.array([f.log_prior for f in filters]),
                            np.array(['' if f.healthy else f.effect for f in filters]))
@@ -206,8 +214,13 @@ def bridged(data: np.ndarray, used: np.ndarray) -> np.ndarray:
     """
     if used.all() or not used.any():
         return data
-    rows = np.arange(len(data))
-    return np.column_stack([np.interp(rows, rows[used], column[used]) for column in data.T])
+    kept, missing = np.flatnonzero(used), np.flatnonzero(~used)
+    after = np.searchsorted(kept, missing)
+    left, right = kept[np.maximum(after - 1, 0)], kept[np.minimum(after, len(kept) - 1)]
+    share = np.clip((missing - left) / np.maximum(right - left, 1), 0.0, 1.0)[:, None]
+    out = data.copy(order='K')
+    out[missing] = data[left] + share * (data[right] - data[left])
+    return out
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ has functions of its own, by dimension.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import prod
 
 from adxl_ros.diagnose.baseline_comparison import BaselineComparison, Reference
 from adxl_ros.diagnose.motion_history import direction_of_last_move, time_since_move_s
@@ -65,6 +66,9 @@ _SMALLEST_SPREAD = 1e-6
 _SMALLEST_RMS = 1e-9
 """Rms of a function about its mean below which it is constant. Chosen: above rounding errors."""
 
+_TIMES_FORCE = (FormDimension.TEMPERATURE, FormDimension.SUPPLY)
+"""Dimensions whose functions also multiply the force, because they change the scale factor."""
+
 Basis = dict[FormDimension, np.ndarray]
 """Functions of one axis of one recording by dimension, (n, k) each, about their mean. A random
 combination with coefficients of standard deviation 1 has an rms of 1."""
@@ -88,29 +92,37 @@ def flexible_bases(comparison: BaselineComparison, baseline_v: np.ndarray) -> li
 
     """
     force_g = ((baseline_v - comparison.sensor.zero_g_v) / comparison.sensor.scale_v_per_g).T
-    common = _common(comparison)
+    common, used = _common(comparison), comparison.used
+    fixed = {dimension: _normalised(values, used) for dimension, values in common.items()
+             if dimension not in _TIMES_FORCE}
     bases = []
     for axis, along_g in enumerate(force_g):
-        basis = {**common, **_of_axis(comparison, force_g, axis, baseline_v[:, axis])}
-        for dimension in (FormDimension.TEMPERATURE, FormDimension.SUPPLY):
-            if dimension in basis:
-                basis[dimension] = np.column_stack([basis[dimension],
-                                                    basis[dimension] * along_g[:, None]])
-        bases.append({dimension: normalised for dimension, values in basis.items()
-                      if (normalised := _normalised(values, comparison.used)).shape[1]})
+        own = _of_axis(comparison, force_g, axis, baseline_v[:, axis])
+        own |= {dimension: np.concatenate([common[dimension], common[dimension] * along_g])
+                for dimension in _TIMES_FORCE if dimension in common}
+        basis = fixed | {dimension: _normalised(values, used)
+                         for dimension, values in own.items()}
+        bases.append({dimension: basis[dimension] for dimension in (*common, *own)
+                      if basis[dimension].shape[1]})
     return bases
 
 
-def _normalised(values: np.ndarray, used: np.ndarray) -> np.ndarray:
-    """Return functions about their mean, so that a random combination has an rms of 1."""
-    centred = values - values[used].mean(axis=0)
-    squares = np.mean(centred[used] ** 2, axis=0)
+def _normalised(functions: np.ndarray, used: np.ndarray) -> np.ndarray:
+    """
+    Return functions about their mean, so that a random combination has an rms of 1.
+
+    `functions` are (k, n), the result (n, k).
+    """
+    count = max(int(used.sum()), 1)
+    centred = functions - (functions @ used / count)[:, None]
+    squares = np.einsum('kn,kn,n->k', centred, centred, used.astype(float)) / count
     varying = squares > _SMALLEST_RMS ** 2
-    return centred[:, varying] / np.sqrt(max(squares[varying].sum(), _SMALLEST_RMS ** 2))
+    size = np.sqrt(max(squares[varying].sum(), _SMALLEST_RMS ** 2))
+    return (centred[varying] / size).T
 
 
 def _common(comparison: BaselineComparison) -> Basis:
-    """Return functions that are the same for all axes."""
+    """Return functions that are the same for all axes, (k, n) each, not yet normalised."""
     time_s, motion = comparison.time_s, comparison.motion
     basis: Basis = {FormDimension.TIME: _modes(time_s, _TIME_MODES, 1.0)}
     surroundings = {FormDimension.TEMPERATURE: motion.temperature_c,
@@ -123,7 +135,7 @@ def _common(comparison: BaselineComparison) -> Basis:
         return basis
     beta_rad = motion.beta(time_s)
     basis[FormDimension.ALPHA] = _modes(motion.alpha(time_s), _MODES)
-    basis[FormDimension.BETA] = np.column_stack([
+    basis[FormDimension.BETA] = np.array([
         function(k * beta_rad) / k for k in range(1, _HARMONICS + 1)
         for function in (np.sin, np.cos)])
     return basis
@@ -131,7 +143,7 @@ def _common(comparison: BaselineComparison) -> Basis:
 
 def _of_axis(comparison: BaselineComparison, force_g: np.ndarray, axis: int, volts: np.ndarray
              ) -> Basis:
-    """Return functions of the force along and across one axis, and of its history."""
+    """Return functions of the force along and across one axis and of its history, (k, n) each."""
     along_g, across_g = force_g[axis], np.delete(force_g, axis, axis=0)
     if np.ptp(along_g) < _SMALLEST_SPREAD:
         return {}
@@ -140,7 +152,7 @@ def _of_axis(comparison: BaselineComparison, force_g: np.ndarray, axis: int, vol
     lagging = [low_pass(along_g, tau_s, dt_s, {}) - along_g for tau_s in _LAG_S]
     basis = {
         FormDimension.FORCE: _modes(along_g, _FORCE_MODES),
-        FormDimension.CROSS_FORCE: np.column_stack([
+        FormDimension.CROSS_FORCE: np.concatenate([
             _products(force_g), *(_modes(f, _CROSS_MODES) for f in across_g)]),
         FormDimension.CODE: _code_functions(volts, comparison.sensor.adc_vref_v),
         FormDimension.LAG: _same_size([
@@ -152,10 +164,10 @@ def _of_axis(comparison: BaselineComparison, force_g: np.ndarray, axis: int, vol
     if not moving:
         return basis
     factors = (np.ones_like(along_g), along_g)
-    basis[FormDimension.RATE] = np.column_stack([
+    basis[FormDimension.RATE] = np.array([
         column for r in moving for column in (r, r * r, r * along_g, np.abs(r))])
     directions = [*map(direction_of_last_move, rates), _direction(along_g)]
-    basis[FormDimension.DIRECTION] = np.column_stack([
+    basis[FormDimension.DIRECTION] = np.array([
         direction * factor for direction in directions for factor in factors])
     since_s = time_since_move_s(time_s, rates)
     basis[FormDimension.SINCE_MOVE] = _same_size([
@@ -165,8 +177,8 @@ def _of_axis(comparison: BaselineComparison, force_g: np.ndarray, axis: int, vol
 
 
 def _same_size(columns: Sequence[np.ndarray]) -> np.ndarray:
-    """Return functions of different units, each divided by its rms about its mean, (n, k)."""
-    return np.column_stack([c / max(float(np.std(c)), _SMALLEST_RMS) for c in columns])
+    """Return functions of different units, each divided by its rms about its mean, (k, n)."""
+    return np.array([c / max(float(np.std(c)), _SMALLEST_RMS) for c in columns])
 
 
 def _direction(values: np.ndarray) -> np.ndarray:
@@ -183,25 +195,27 @@ def _code_functions(volts: np.ndarray, vref_v: float) -> np.ndarray:
     waves = [function(k * turn) for k in range(1, _CODE_HARMONICS + 1)
              for function in (np.sin, np.cos)]
     bits = [np.floor(volts / vref_v * 2 ** bit) % 2 for bit in range(1, _BITS + 1)]
-    return np.column_stack(waves + bits)
+    return np.array(waves + bits)
 
 
 def _products(force_g: np.ndarray) -> np.ndarray:
-    """Return the products of the components of force from degree two on, (n, k)."""
+    """Return the products of the components of force from degree two on, (k, n)."""
     count, degrees = len(force_g), range(_PRODUCT_DEGREE + 1)
     powers = [p for p in np.ndindex(*[_PRODUCT_DEGREE + 1] * count)
               if 2 <= sum(p) <= degrees[-1]]
-    return np.column_stack([np.prod(force_g ** np.array(p)[:, None], axis=0) for p in powers])
+    return np.array([prod(f for f, power in zip(force_g, p) for _ in range(power))
+                     for p in powers])
 
 
 def _modes(values: np.ndarray, count: int, decay: float = 1.5) -> np.ndarray:
     """
-    Return cosines over the range of a quantity, (n, count); the j-th has the size j^(−decay).
+    Return cosines over the range of a quantity, (count, n); the j-th has the size j^(−decay).
 
     A random combination is a smooth curve; with a decay of 1 it is rough like a random walk.
     """
     low, high = float(values.min()), float(values.max())
     if high - low < _SMALLEST_SPREAD:
-        return np.zeros((len(values), 0))
+        return np.zeros((0, len(values)))
     order = np.arange(1, count + 1)
-    return np.cos(np.pi * order * ((values - low) / (high - low))[:, None]) * order ** -decay
+    phase = np.pi * (values - low) / (high - low)
+    return np.cos(order[:, None] * phase) * order[:, None] ** -decay

@@ -29,6 +29,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import chain
 from typing import NamedTuple
 
@@ -36,6 +37,7 @@ from adxl_ros.diagnose import evidence, noise_whitening
 from adxl_ros.diagnose.angle_errors import angle_error_filter
 from adxl_ros.diagnose.baseline_comparison import BaselineComparison, Reference
 from adxl_ros.diagnose.evidence import FlexibleColumns, LinearFit, WhitenedChannel
+from adxl_ros.diagnose.flexible_terms import Basis, flexible_bases
 from adxl_ros.diagnose.noise_whitening import drifts_among, Whitener
 from adxl_ros.diagnose.sensitivities import candidates, Variant, variants
 from adxl_ros.model.diagnosis_hints import DiagnosisHints, StraightLine
@@ -142,6 +144,11 @@ class LinearModel:
         drifts = drifts_among((*effects, *self.baseline.effects))
         return [[f for f in filters if f.healthy or f.effect in drifts] or filters
                 for filters in self.filters]
+
+    @cached_property
+    def flexible_bases(self) -> list[list[Basis]]:
+        """Flexible functions of each axis of each recording about the baseline."""
+        return [flexible_bases(c, v) for c, v in zip(self.comparisons, self.baseline_v)]
 
     def nuisance_ids(self) -> list[int]:
         """Return the numbers of the columns of nuisance parameters."""
@@ -370,9 +377,9 @@ def _whitened_channels(comparisons: Sequence[BaselineComparison],
                 angle_error_filter(comparison, d))
             filters.append(tried)
             channels.append(evidence.whiten_channel(
-                residual_v[:, d], np.column_stack([column for _, column in axis_columns]),
+                residual_v[:, d], np.array([column for _, column in axis_columns]).T,
                 np.array([i for i, _ in axis_columns]), comparison.used, tried,
-                None if flexible is None else flexible[len(channels)]))
+                None if flexible is None else flexible[len(channels)], False))
     return channels, filters
 
 

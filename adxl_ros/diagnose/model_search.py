@@ -31,7 +31,6 @@ from adxl_ros.diagnose.decision_settings import DecisionSettings
 from adxl_ros.diagnose.drift_checks import unevenness
 from adxl_ros.diagnose.effect_sizes import contribution
 from adxl_ros.diagnose.evidence import FlexibleColumns, LinearFit
-from adxl_ros.diagnose.flexible_terms import flexible_bases
 from adxl_ros.diagnose.hypothesis_fit import (
     fit_hypothesis,
     Hypothesis,
@@ -208,12 +207,12 @@ def _form_functions(linear_model: LinearModel, best: Hypothesis) -> list[Flexibl
     for number in range(len(linear_model.channels)):
         recording, axis = linear_model.place_of_channel(number)
         comparison = linear_model.comparisons[recording]
-        basis = flexible_bases(comparison, linear_model.baseline_v[recording])[axis]
+        basis = linear_model.flexible_bases[recording][axis]
         columns = [_RANKING_FORM_ERROR * size[number] * basis[dimension]
                    for e, size in sizes.items() for dimension in effect_named(e).diagnosis.form
                    if dimension in basis]
         out.append(FlexibleColumns(
-            np.column_stack([np.zeros((len(comparison), 0)), *columns]),
+            np.concatenate([np.zeros((0, len(comparison))), *(c.T for c in columns)]).T,
             float(best.fit.innovation_variance_v2[number])))
     return out
 

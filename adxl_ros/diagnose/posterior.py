@@ -39,7 +39,7 @@ from typing import NamedTuple
 from adxl_ros.diagnose import evidence
 from adxl_ros.diagnose.decision_settings import DecisionSettings
 from adxl_ros.diagnose.effect_sizes import SizedHypothesis
-from adxl_ros.diagnose.flexible_terms import Basis, flexible_bases
+from adxl_ros.diagnose.flexible_terms import Basis
 from adxl_ros.diagnose.hypothesis_fit import Hypothesis, sparsity_log_bayes_factor
 from adxl_ros.diagnose.linear_model import LinearModel
 from adxl_ros.diagnose.noise_whitening import drifts_among, Whitener
@@ -217,9 +217,9 @@ def _channel(linear_model: LinearModel, number: int, sized: Sequence[SizedHypoth
     """Whiten the basis and the columns of all hypotheses in one channel."""
     recording, axis = linear_model.place_of_channel(number)
     comparison = linear_model.comparisons[recording]
-    basis = flexible_bases(comparison, linear_model.baseline_v[recording])[axis]
+    basis = linear_model.flexible_bases[recording][axis]
     scale = float(comparison.sensor.scale_v_per_g[axis])
-    columns = np.column_stack(list(basis.values())) * scale
+    columns = np.concatenate([values.T for values in basis.values()]).T * scale
     filters = _filters(number, sized)
     used = comparison.used
     grams = np.empty((len(filters), columns.shape[1], columns.shape[1]))
@@ -230,7 +230,7 @@ def _channel(linear_model: LinearModel, number: int, sized: Sequence[SizedHypoth
         white = evidence.whitened(whitener, columns, used)
         grams[f] = white @ white.T
         if f == 0:
-            library = np.column_stack([c for _, c in linear_model.columns[number]])
+            library = np.array([c for _, c in linear_model.columns[number]]).T
             imitated = _imitated(white, evidence.whitened(whitener, library, used))
         for h, s in enumerate(sized):
             mine = evidence.whitened(whitener, s.hypothesis.linearised.columns[number].values,
