@@ -11,12 +11,13 @@
 # make soak     half an hour of random faults, and 200 kills of a sweep
 # make fuzz     the decoder and the serial link, two minutes of hostile bytes
 # make long     an 8-hour recording through apply: memory and time
+# make nulls    recordings without any effect through diagnose: docs/nulls.md, 90 minutes
 # make blind    the blind check of diagnose, 600 trials, into blind_output/ (make blind ARGS='--seed 1')
 # make working  working cases of diagnose, drawn, diagnosed and scored, into working_output/
 # make lint     the linters alone
 # make clean    remove what these made
 
-.PHONY: build help demo check test perf bench gallery reproduction coverage long faults soak fuzz blind working lint clean \
+.PHONY: build help demo check test perf bench gallery reproduction coverage long faults soak fuzz nulls blind working lint clean \
     FORCE
 .DEFAULT_GOAL := build
 
@@ -140,6 +141,11 @@ coverage: build
 long: export PATH := $(CURDIR)/install/adxl_ros/lib/adxl_ros:$(PATH)
 long: build
 	$(python_in_test) long/long_recording.py $(ARGS)
+
+# Goes on where it was cut short.
+nulls: build
+	OPENBLAS_NUM_THREADS=1; export OPENBLAS_NUM_THREADS; \
+	$(python_in_test) long/nulls.py ../docs/nulls.md $(ARGS)
 
 # Goes on where it was cut short; with a seed of its own in ARGS, into another folder.
 blind: build

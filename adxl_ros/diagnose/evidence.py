@@ -164,14 +164,14 @@ def whiten_channel(residual_v: np.ndarray, columns: np.ndarray, column_ids: np.n
                            np.array(['' if f.healthy else f.effect for f in filters]))
 
 
-def whitened(whitener: Whitener, columns: np.ndarray, used: np.ndarray) -> np.ndarray:
+def prepared(filters: Sequence[Whitener], columns: np.ndarray, used: np.ndarray) -> np.ndarray:
     """
-    Whiten columns.
+    Prepare columns for each whitening filter of a channel.
 
     Parameters
     ----------
-    whitener
-        The filter.
+    filters
+        Filters of the channel.
     columns
         Columns, (n, k).
     used
@@ -180,10 +180,32 @@ def whitened(whitener: Whitener, columns: np.ndarray, used: np.ndarray) -> np.nd
     Returns
     -------
     numpy.ndarray
+        Series for `whitened`, (k, n).
+
+    """
+    return before_filters(filters, np.ascontiguousarray(bridged(columns, used).T))
+
+
+def whitened(whitener: Whitener, series: np.ndarray, used: np.ndarray) -> np.ndarray:
+    """
+    Whiten columns.
+
+    Parameters
+    ----------
+    whitener
+        The filter.
+    series
+        Columns that are `prepared`, (k, n).
+    used
+        Samples that are used, (n,) bool.
+
+    Returns
+    -------
+    numpy.ndarray
         Whitened columns, (k, n), zero where samples are not used.
 
     """
-    white = whitener(np.ascontiguousarray(bridged(columns, used).T))
+    white = whitener(series)
     white[:, ~used] = 0.0
     # The first sample is a step from zero.
     white[:, 0] = 0.0

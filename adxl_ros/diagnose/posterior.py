@@ -226,15 +226,18 @@ def _channel(linear_model: LinearModel, number: int, sized: Sequence[SizedHypoth
     own: list[list[np.ndarray]] = [[] for _ in sized]
     cross: list[list[np.ndarray]] = [[] for _ in sized]
     imitated = np.zeros(0)
+    series = evidence.prepared(filters, columns, used)
+    by_hypothesis = [evidence.prepared(
+        filters, s.hypothesis.linearised.columns[number].values, used) for s in sized]
     for f, whitener in enumerate(filters):
-        white = evidence.whitened(whitener, columns, used)
+        white = evidence.whitened(whitener, series, used)
         grams[f] = white @ white.T
         if f == 0:
-            library = np.array([c for _, c in linear_model.columns[number]]).T
+            library = evidence.prepared(
+                filters, np.array([c for _, c in linear_model.columns[number]]).T, used)
             imitated = _imitated(white, evidence.whitened(whitener, library, used))
-        for h, s in enumerate(sized):
-            mine = evidence.whitened(whitener, s.hypothesis.linearised.columns[number].values,
-                                     used)
+        for h, series_of in enumerate(by_hypothesis):
+            mine = evidence.whitened(whitener, series_of, used)
             own[h].append(mine @ mine.T)
             cross[h].append(mine @ white.T)
     numbers = _numbers(basis)
