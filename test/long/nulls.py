@@ -138,7 +138,7 @@ def page(by_case, seed, total):
                     if text not in RIGHT and not text.startswith(('fault', 'refused')))
     lines = [
         '# Recordings without any effect', '',
-        'What `diagnose` says of recordings of the package\'s own simulator without any effect.',
+        "What `diagnose` says of recordings of the package's own simulator without any effect.",
         f'Each is cut after {LONGEST_S:.0f} s, or after {MOST_SAMPLES} samples.',
         '`make nulls` makes this page.', '',
         '| quantity | value |', '|---|---|',
