@@ -170,10 +170,12 @@ def check_recording(comparison: BaselineComparison) -> CheckedRecording | DataFa
 def find_length_fault(comparisons: Sequence[BaselineComparison]) -> DataFault | None:
     """Find recordings that are too short together; one at rest may have any length."""
     span_s = sum(c.span_s for c in comparisons)
-    if span_s >= SHORTEST_S or all(c.reference is Reference.NONE for c in comparisons):
+    used_s = sum(c.span_s * float(c.used.mean()) for c in comparisons)
+    if used_s >= SHORTEST_S or all(c.reference is Reference.NONE for c in comparisons):
         return None
-    return DataFault('too_short', 'insufficient', f'{span_s:.3g} s in all are too short for a '
-                     'verdict; record at least one minute')
+    remaining = '' if used_s == span_s else f', of which {used_s:.3g} s have a usable reference,'
+    return DataFault('too_short', 'insufficient', f'{span_s:.3g} s in all{remaining} are too '
+                     'short for a verdict; record at least one minute')
 
 
 def find_data_fault(comparison: BaselineComparison, search_comparison: BaselineComparison

@@ -423,8 +423,8 @@ def _noise_comparisons(comparisons: Sequence[BaselineComparison], mean_sensor: S
                        noise_sensor: Sensor, seed: int) -> tuple[NoiseComparison, ...]:
     """Compare the residual after one sensor's mean output with the noise of another sensor."""
     return tuple(compare_noise(bridged(c.residual_v(mean_sensor), c.used),
-                               c.simulated_noise_v(noise_sensor, seed), c.sensor.rate_hz,
-                               c.scale_v_per_mps2) for c in comparisons)
+                               bridged(c.simulated_noise_v(noise_sensor, seed), c.used),
+                               c.sensor.rate_hz, c.scale_v_per_mps2) for c in comparisons)
 
 
 def _could_show(comparison: BaselineComparison) -> bool:

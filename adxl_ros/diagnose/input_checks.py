@@ -21,6 +21,7 @@ from dataclasses import replace
 from adxl_ros.diagnose.baseline_comparison import BaselineComparison, compare
 from adxl_ros.diagnose.data_checks import DataFault
 from adxl_ros.diagnose.encoder_checks import find_encoder_fault
+from adxl_ros.diagnose.reference_coverage import too_coarse, without_reading
 from adxl_ros.diagnose.sim_alignment import align_force
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model.sensor import Sensor
@@ -66,4 +67,9 @@ def compare_checked(recording: Recording, sensor: Sensor, sim: Motion | None, ma
         if fault is not None:
             return fault
     comparison = compare(recording, sensor, sim)
-    return replace(comparison, notes=tuple(notes))
+    left_out = [*without_reading(recording, comparison), *too_coarse(recording, comparison)]
+    used = comparison.used.copy()
+    for part in left_out:
+        used &= ~part.rows
+        notes.append(part.text(recording.time_s))
+    return replace(comparison, used=used, notes=tuple(notes))

@@ -36,7 +36,7 @@ _MAX_UNEVENNESS = 3.0
 """Longest interval of readings, divided by the median, that splines of a higher degree bridge;
 chosen: they overshoot in longer ones."""
 
-_KNOT_S = 0.03
+KNOT_S = 0.03
 """Distance of the knots, s; chosen: motion slower than 10 Hz is free, the penalty smooths it."""
 
 _WINDOW_S = 60.0
@@ -179,7 +179,7 @@ class SmoothedPath:
             return None
         inside_s = np.clip(time_s, self._time_s[0], self._time_s[-1])
         rate_hz = 1 / float(np.median(np.diff(self._time_s)))
-        knot_s = max(_KNOT_S, 2 / rate_hz)
+        knot_s = max(KNOT_S, 2 / rate_hz)
         corner_hz = min(self._strength ** (-1 / 6) / (2 * np.pi * knot_s), 1 / (2 * knot_s))
         place = np.clip(np.searchsorted(self._time_s, inside_s), 0, len(self._time_s) - 1)
         # The reading changes at most once in a sample.
@@ -306,7 +306,7 @@ class _Window:
     def __init__(self, time_s: np.ndarray, reading: np.ndarray) -> None:
         duration_s = time_s[-1] - time_s[0]
         inner = np.linspace(time_s[0], time_s[-1],
-                            max(int(min(duration_s / _KNOT_S, len(time_s) / 2)), 1) + 1)
+                            max(int(min(duration_s / KNOT_S, len(time_s) / 2)), 1) + 1)
         outer = (inner[1] - inner[0]) * np.arange(1, _DEGREE + 1)
         self.knots = np.concatenate([inner[0] - outer[::-1], inner, inner[-1] + outer])
         self.design = BSpline.design_matrix(time_s, self.knots, _DEGREE)

@@ -29,6 +29,7 @@ from adxl_ros.simulate import trajectories
 from adxl_ros.simulate.from_recording import motion_from_force
 from adxl_ros.simulate.motion import Motion
 from adxl_ros.simulate.simulator import simulate
+from adxl_ros.simulate.trajectories import shaker
 import numpy as np
 import pytest
 from units import nominal
@@ -188,3 +189,54 @@ def test_degrees_in_a_column_of_radians_are_named(run_tool, tmp_path, names):
     assert 'degrees in a column of radians' in report['summary']
     assert f'multiply {" and ".join(names)} by π/180' in report['summary']
     assert '229' in report['summary'] or names == ['alpha_rad']
+
+
+def rms_mg(comparison, rows):
+    """Return the rms of recording minus simulation over some samples, mg."""
+    return 1e3 * float(np.sqrt(np.mean(comparison.residual_v(comparison.sensor)[rows] ** 2)))
+
+
+@pytest.mark.parametrize('rate_hz, left_out', [(20, True), (50, True), (250, False)])
+def test_a_shaker_is_followed_as_far_as_its_readings_show(rate_hz, left_out):
+    """What is used has the noise of the sensor, and the note names the times of the rest."""
+    sensor = unit(float(rate_hz))
+    columns = simulate(sensor, shaker(None), 1)
+    recorded = Recording('made', columns.pop('time_s'), columns, sensor_info(sensor))
+    comparison = compare_checked(recorded, sensor, None, False)
+    noise_mg = rms_mg(comparison, recorded.time_s < 5)
+    for part in np.array_split(np.flatnonzero(comparison.used), 8):
+        assert rms_mg(comparison, part) < 1.2 * noise_mg
+    assert (not comparison.used.all()) == left_out == bool(comparison.notes)
+    if left_out:
+        assert rms_mg(comparison, ~comparison.used) > 1.05 * noise_mg
+        assert comparison.used.mean() > 0.2
+        assert 'shift_m moves too fast' in comparison.notes[0]
+
+
+def test_long_gaps_of_an_encoder_are_left_out(run_tool, tmp_path):
+    """Single empty cells are bridged. A second without a reading is left out and named."""
+    recorded = made(unit())
+    beta_rad, time_s = recorded.columns['beta_rad'], recorded.time_s
+    beta_rad[::3] = np.nan
+    assert compare_checked(recorded, unit(), None, False).used.all()
+    moving = float(time_s[np.nanargmax(np.abs(np.diff(beta_rad[1::3]))) * 3])
+    beta_rad[(time_s > moving - 1) & (time_s < moving + 1)] = np.nan
+    comparison = compare_checked(recorded, unit(), None, False)
+    assert 0.02 < 1 - comparison.used.mean() < 0.06
+    assert not comparison.used[np.abs(time_s - moving) < 1].any()
+    assert 'no reading of beta_rad for more than 0.1 s' in comparison.notes[0]
+    assert rms_mg(comparison, comparison.used) < 1.0
+    beta_rad[time_s > 20] = np.nan
+    report, run = report_of(run_tool, tmp_path, unit(), recorded)
+    assert (run.returncode, report['verdict']['status']) == (1, 'insufficient')
+    assert 'usable reference' in report['summary'] and 'beta_rad' in report['notes'][0]
+
+
+def test_a_gap_of_the_simulator_is_left_out(tmp_path):
+    """Samples in a hole of `--sim` have no reference."""
+    path = tmp_path / ideal(tmp_path, 0.0)
+    head, *lines = path.read_text().splitlines()
+    path.write_text('\n'.join([head, *lines[:2000], *lines[2300:], '']))
+    comparison = compare_checked(made(unit()), unit(), motion_from_force(path, False)[0], False)
+    assert 'no reading of --sim' in comparison.notes[0]
+    assert 20 <= 66.7 * (1 - comparison.used.mean()) * 1e1 <= 40
