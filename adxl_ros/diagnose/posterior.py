@@ -46,7 +46,7 @@ from adxl_ros.diagnose.noise_whitening import drifts_among, Whitener
 from adxl_ros.model.diagnosis_hints import FormDimension
 from adxl_ros.model.effects import effect_named
 import numpy as np
-from scipy.linalg import solve_triangular
+from scipy.linalg.lapack import dposv
 
 _NOISE_ITERATIONS = 3
 """Iterations over coefficients, noise level and filter. Chosen: they no longer change then."""
@@ -280,8 +280,8 @@ def _imitated(white: np.ndarray, library: np.ndarray) -> np.ndarray:
     gram = (library @ library.T) / np.outer(size, size)
     values, vectors = np.linalg.eigh(gram)
     kept = values > values[-1] * _SMALLEST_EIGENVALUE
-    projection = (vectors[:, kept] / np.sqrt(values[kept])).T @ (library / size[:, None]) \
-        @ white.T
+    projection = (vectors[:, kept] / np.sqrt(values[kept])).T \
+        @ ((library @ white.T) / size[:, None])
     return projection.T @ projection
 
 
@@ -402,12 +402,13 @@ class _ChannelModel:
         scale = 1 / self._variance_v2[i]
         out, half_log_det = scale * own, 0.0
         if len(basis):
-            factor = np.linalg.cholesky(scale * basis + np.eye(len(basis)))
-            solved = solve_triangular(factor, scale * cross.T, lower=True)
-            out = out - solved.T @ solved
+            factor, solved, fault = dposv(scale * basis + np.eye(len(basis)), scale * cross.T)
+            if fault:
+                raise np.linalg.LinAlgError('the flexible functions are singular')
+            out = out - scale * (cross @ solved)
             half_log_det = float(np.log(np.diag(factor)).sum())
             # The flexible functions at their posterior mean leave this residual.
-            flexible = solve_triangular(factor.T, solved @ v)
+            flexible = solved @ v
             squares = v @ own @ v - 2 * v @ cross @ flexible + flexible @ basis @ flexible
         else:
             squares = v @ own @ v

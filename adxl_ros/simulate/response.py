@@ -216,10 +216,14 @@ class Response:
             if sum(map(len, kept)) > 2 * self._block_steps:  # a gap, without samples
                 first += sum(map(len, kept[:-1]))
                 kept = kept[-1:]
-        grid = np.concatenate(kept)
+        grid = np.concatenate(kept) if len(kept[0]) else kept[-1]
         self._tail = grid[-(2 * _POINTS):]
         if aligned:
-            return grid[nearest.astype(np.intp) - first], signals
+            index = nearest.astype(np.intp) - first
+            every = (int(index[-1]) - int(index[0])) // max(len(index) - 1, 1)
+            if every and np.array_equal(np.arange(index[0], index[-1] + 1, every), index):
+                return grid[index[0]:index[-1] + 1:every], signals
+            return grid[index], signals
         key = (first, steps.tobytes())
         index, weights = self._kept('weights', key, lambda: _interpolation(steps, first))
         return np.column_stack([np.einsum('ij,ij->i', weights, v[index]) for v in grid.T]), signals

@@ -17,11 +17,12 @@
 from __future__ import annotations
 
 from bisect import bisect_left
+from itertools import pairwise
 from dataclasses import dataclass
 
 from adxl_ros.model.effects.base import Components
 import numpy as np
-from scipy.interpolate import BSpline, CubicSpline, make_interp_spline
+from scipy.interpolate import BSpline, CubicSpline, make_interp_spline, PPoly
 from scipy.linalg import cho_solve_banded, cholesky_banded, solveh_banded
 
 _DEGREE = 5
@@ -44,6 +45,9 @@ _WINDOW_S = 60.0
 
 _MAX_WINDOWS = 64
 """Largest number of windows in memory; chosen: an hour of motion."""
+
+_MAX_PIECES = 20_000
+"""Largest number of knots of a window that is kept as polynomials; chosen: 1 MB."""
 
 _MARGIN_S = 3.0
 """Overlap of the windows on each side, s; chosen: far beyond the range of the spline's penalty."""
@@ -138,7 +142,7 @@ class SmoothedPath:
         """
         sampled = np.isfinite(reading)
         self._time_s, self._reading = time_s[sampled], reading[sampled]
-        self._windows: dict[int, BSpline] = {}
+        self._windows: dict[int, BSpline | PPoly] = {}
         self._step, self._strength = step, self._matched_strength(step)
         self._degree = degree
 
@@ -148,9 +152,9 @@ class SmoothedPath:
         inside_s = np.clip(time_s, begin_s, end_s)
         number = self._numbers(inside_s)
         values = np.empty(len(time_s))
-        for window in np.unique(number):
-            chosen = number == window
-            values[chosen] = self._spline(int(window))(inside_s[chosen], order)
+        begins = np.flatnonzero(np.diff(number, prepend=-1))
+        for begin, end in pairwise([*begins.tolist(), len(number)]):
+            values[begin:end] = self._spline(int(number[begin]))(inside_s[begin:end], order)
         if order:
             values[(time_s < begin_s) | (time_s > end_s)] = 0.0
         return values
@@ -195,12 +199,15 @@ class SmoothedPath:
         """Return the number of the window of each time, (n,)."""
         return ((time_s - self._time_s[0]) // _WINDOW_S).astype(int)
 
-    def _spline(self, window: int) -> BSpline:
+    def _spline(self, window: int) -> BSpline | PPoly:
         if window not in self._windows:
             while len(self._windows) >= _MAX_WINDOWS:
                 del self._windows[min(self._windows)]
-            self._windows[window] = smoothing_spline(
+            spline = smoothing_spline(
                 *self._part(window), self._strength, self._step, self._degree)
+            # Polynomials are evaluated faster, but need more memory.
+            self._windows[window] = PPoly.from_spline(spline) \
+                if spline.k and len(spline.t) <= _MAX_PIECES else spline
         return self._windows[window]
 
     def _part(self, window: int) -> tuple[np.ndarray, np.ndarray]:
