@@ -17,8 +17,8 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from itertools import pairwise
 from dataclasses import dataclass
+from itertools import pairwise
 
 from adxl_ros.model.effects.base import Components
 import numpy as np
@@ -205,9 +205,10 @@ class SmoothedPath:
                 del self._windows[min(self._windows)]
             spline = smoothing_spline(
                 *self._part(window), self._strength, self._step, self._degree)
-            # Polynomials are evaluated faster, but need more memory.
+            # Polynomials are evaluated faster, but need more memory. FITPACK, which makes them,
+            # ends at this degree.
             self._windows[window] = PPoly.from_spline(spline) \
-                if spline.k and len(spline.t) <= _MAX_PIECES else spline
+                if 0 < spline.k <= _DEGREE and len(spline.t) <= _MAX_PIECES else spline
         return self._windows[window]
 
     def _part(self, window: int) -> tuple[np.ndarray, np.ndarray]:
