@@ -167,7 +167,7 @@ def _separating_experiment(verdict: Verdict, seed: int) -> NextExperiment:
     group = verdict.groups[0]
     worth = {m: _worth(m, verdict.best.sensor, group, seed) for m in MENU}
     order = sorted(MENU, key=lambda m: -worth[m].log_bayes_factor_per_minute)
-    return replace(_experiment(order[0], f'to separate {" from ".join(group)}'),
+    return replace(_experiment(order[0], f'to separate {", ".join(group[:-1])} and {group[-1]}'),
                    log_bayes_factor_per_minute=worth[order[0]].log_bayes_factor_per_minute,
                    menu=tuple(worth[m] for m in order))
 

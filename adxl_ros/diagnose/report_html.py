@@ -20,7 +20,7 @@ from base64 import b64encode
 from collections.abc import Sequence
 from html import escape
 from io import BytesIO
-from itertools import pairwise
+from itertools import compress, pairwise
 from typing import Any
 
 from adxl_ros.diagnose.diagnosis import Diagnosis
@@ -30,8 +30,10 @@ from adxl_ros.diagnose.report_wording import (
     gap_rows,
     headline,
     mg,
+    mg_text,
     p_text,
     parameter_text,
+    range_text,
     remainder_rows,
     Row,
     tiles,
@@ -57,7 +59,8 @@ border-bottom:1px solid #ddd;text-align:left;vertical-align:top}
 .tiles{display:flex;flex-wrap:wrap;gap:.7em;margin:.9em 0}
 .tile{flex:1 1 10em;border:1px solid #ddd;border-radius:6px;padding:.5em .8em}
 .tile b{display:block;font-size:1.5em}.tile span{color:#555;font-size:13px}
-.rows th{width:11em;font-weight:600}
+td:not(:last-child){white-space:nowrap}.scroll td:last-child{min-width:14em}
+.rows td{white-space:normal}.rows th{width:11em;font-weight:600}
 code{background:#f3f3f3;padding:.1em .3em}summary{cursor:pointer;color:#36c;margin:.5em 0}
 @media print{body{margin:0}h2{break-after:avoid}}
 """
@@ -67,6 +70,8 @@ _SPECTRUM_SAMPLES = 2048
 """Samples in a segment of a spectrum. Chosen: 0.06 Hz at 125 Hz."""
 _LEGEND_COLUMNS = 4
 """Columns of a legend below a plot. Chosen: four names of effects fit beside each other."""
+_BAR_COLOURS = {'noise floor': '#999', 'not closed': '#c44', 'not explained': '#e9b'}
+"""Colours of the parts of the bar that no effect explains."""
 _TABLE_ROWS = 10
 """Rows of the tables of hypotheses and candidates. Chosen: others are improbable."""
 _CELL_ROWS = 12
@@ -165,14 +170,15 @@ def _bar_plot(diagnosis: Diagnosis) -> Any:
     plot, axis = pyplot().subplots(figsize=(10, 2.4), layout='constrained')
     begin = 0.0
     for i, (label, width) in enumerate(widths.items()):
-        axis.barh(0, width, left=begin, color='#999' if label == 'noise floor' else f'C{i + 1}',
+        axis.barh(0, width, left=begin, color=_BAR_COLOURS.get(label, f'C{i}'),
                   label=f'{label}: {width:.3g} mg²')
         begin += width
-    for label, square, side, offset in (('after', after, 'right', -3),
-                                        ('before', before, 'left', 3)):
+    ends = ((f'after {mg_text(closure.after_mps2)}', after, 'right', -3),
+            (f'before {mg_text(closure.before_mps2)}', before, 'left', 3))
+    for label, square, side, offset in ends:
         axis.axvline(square, color='k', lw=0.8)
-        axis.annotate(f'{label} {np.sqrt(square):.3g} mg', (square, 0.6), ha=side, fontsize=8,
-                      xytext=(offset, 0), textcoords='offset points')
+        axis.annotate(label, (square, 0.6), ha=side, fontsize=8, xytext=(offset, 0),
+                      textcoords='offset points')
     axis.set(yticks=[], ylim=(-0.4, 1.0), xlabel='mean square on held-out blocks, mg²')
     plot.legend(fontsize=8, ncols=_LEGEND_COLUMNS, loc='outside lower center', frameon=False)
     axis.spines[['top', 'right', 'left']].set_visible(False)
@@ -199,7 +205,9 @@ def _residual_plot(diagnosis: Diagnosis) -> Any:
             spectrum.loglog(frequency_hz[1:], np.sqrt(power[1:]), lw=1, color=colour)
         over_time.set(ylabel=f'{axes[d]}, mg')
         spectrum.set(ylabel='mg/√Hz')
-    grid[0, 0].legend(loc='upper right', fontsize=8)
+    for line in plot.legend(*grid[0, 0].get_legend_handles_labels(), loc='outside upper left',
+                            ncols=2, fontsize=9, frameon=False).get_lines():
+        line.set_linewidth(2)
     grid[-1, 0].set(xlabel='time, s')
     grid[-1, 1].set(xlabel='frequency, Hz')
     return plot
@@ -218,7 +226,7 @@ def _map_plot(diagnosis: Diagnosis) -> Any:
             np.arange(len(in_row)), np.full(len(in_row), i), marker='s', s=180,
             c=[mg(c.mean_mps2) for c in in_row], cmap='RdBu_r', vmin=-largest_mg,
             vmax=largest_mg, edgecolors=['k' if c.p < SIGNIFICANT_P else 'none' for c in in_row])
-        axis.text(RANGES, i, f'{in_row[0].low:.4g} to {in_row[-1].high:.4g}', fontsize=8,
+        axis.text(RANGES, i, range_text(in_row[0].low, in_row[-1].high), fontsize=8,
                   va='center')
     axis.set(yticks=range(len(rows)), xticks=[], xlim=(-0.5, RANGES + 2),
              xlabel=f'parts of the range, ascending; frame: family-wise p < {SIGNIFICANT_P:g}')
@@ -229,9 +237,11 @@ def _map_plot(diagnosis: Diagnosis) -> Any:
 
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Return a table, or "None." where it has no rows."""
+    """Return a table without empty columns, or "None." where it has no rows."""
     if not rows:
         return '<p>None.</p>'
+    filled = [any(column) for column in zip(*rows)]
+    head, *rows = (list(compress(row, filled)) for row in (head, *rows))
     top = ''.join(f'<th>{escape(h)}</th>' for h in head)
     return (f'<div class="scroll"><table><tr>{top}</tr>{"".join(map(_row, rows))}</table>'
             '</div>')
@@ -248,7 +258,7 @@ def _cell_table(report: dict[str, Any]) -> str:
     rows = []
     for c in report['where'][:_CELL_ROWS]:
         low, high = c['range']
-        rows.append([c['axis'], c['dimension'], c['statistic'], f'{low:.4g} to {high:.4g}',
+        rows.append([c['axis'], c['dimension'], c['statistic'], range_text(low, high),
                      f'{mg(c["mean"]):+.2f}', f'{c["floor_units"]:+.1f}',
                      f'{100 * c["share"]:.1f} %', p_text(c['p'])])
     return _table(['axis', 'dimension', 'statistic', 'range', 'size, mg', 'size / noise floor',
@@ -298,7 +308,7 @@ def _candidate_table(report: dict[str, Any]) -> str:
                  '\n'.join(f'{name}: {parameter_text(p)}' for name, p in c['parameters'].items()),
                  '' if c['share'] is None else f'{100 * c["share"]:.0f} %',
                  ', '.join(c['inseparable_from']), c['cause']] for c in candidates]
-        return _table(['effect', 'probability', 'parameters (90 % interval)', 'share of the gap',
+        return _table(['effect', 'probability', 'parameters (90 % interval)', 'share of gap',
                        'not separated from', 'cause'], rows)
 
     first_rows = report['candidates'][:_TABLE_ROWS]
@@ -315,7 +325,7 @@ def _not_covered(names: Sequence[str]) -> str:
 
 def _next_experiment(report: dict[str, Any]) -> str:
     """Return the inseparable groups, and the manoeuvre that is proposed."""
-    groups = ''.join(f'<p>{escape(" or ".join(group))}: these recordings do not separate them.</p>'
+    groups = ''.join(f'<p>{escape(", ".join(group))}: these recordings do not separate them.</p>'
                      for group in report['verdict']['groups'])
     proposal = report['next_experiment']
     if proposal is None:
@@ -324,5 +334,6 @@ def _next_experiment(report: dict[str, Any]) -> str:
         ['manoeuvre', 'minutes', 'log Bayes factor per minute'], [
             [m['manoeuvre'], f'{m["minutes"]:.1f}', f'{m["nats_per_minute"]:.1f}']
             for m in proposal['menu']])
-    return (f'{groups}<p>{escape(proposal["manoeuvre"])}, {escape(proposal["why"])}.</p>'
+    manoeuvre = proposal['manoeuvre'][:1].upper() + proposal['manoeuvre'][1:]
+    return (f'{groups}<p>{escape(manoeuvre)}, {escape(proposal["why"])}.</p>'
             f'<p><code>{escape(proposal["command"])}</code></p>{menu}')

@@ -31,6 +31,7 @@ from adxl_ros.diagnose.report_wording import (
     mg,
     p_text,
     parameter_text,
+    range_text,
     remainder_rows,
     Row,
     summary,
@@ -299,7 +300,7 @@ def _row_lines(rows: Sequence[Row]) -> list[str]:
 def _cell_line(cell: dict[str, Any]) -> str:
     """Return one line for a cell of the residual map."""
     low, high = cell['range']
-    return (f'{cell["axis"]:4} {cell["dimension"]:15} {low:8.4g} to {high:8.4g} '
+    return (f'{cell["axis"]:4} {cell["dimension"]:15} {range_text(low, high):>20} '
             f'{cell["statistic"]:9} {mg(cell["mean"]):+7.2f} {100 * cell["share"]:5.1f} % '
             f'{p_text(cell["p"]):>8}')
 

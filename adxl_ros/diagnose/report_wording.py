@@ -81,12 +81,17 @@ def headline(diagnosis: Diagnosis) -> str:
         where = verdict.unknown_where[:_UNKNOWN_DIMENSIONS]
         follows = f' It shows over {", ".join(where)}.' if where else ''
         return f'Unknown: no effect of the library explains the gap {probability}.{follows}'
-    *first, last = [*verdict.effects, *(' or '.join(group) for group in verdict.groups)]
-    named = f'{", ".join(first)} and {last}' if first else last
+    named = _listed([*verdict.effects, *(_listed(group, 'or') for group in verdict.groups)], 'and')
     several = len(diagnosis.comparisons) > 1
     recordings = 'these recordings do' if several else 'this recording does'
     inseparable = f': {recordings} not separate them' if verdict.groups else ''
     return f'Gap explained by {named}{inseparable} {probability}.'
+
+
+def _listed(names: Sequence[str], word: str) -> str:
+    """Return names separated by commas, with a word before the last one."""
+    *first, last = names
+    return f'{", ".join(first)} {word} {last}' if first else last
 
 
 def summary(diagnosis: Diagnosis) -> str:
@@ -236,6 +241,13 @@ def mg_text(value_mps2: float) -> str:
 def p_text(p: float) -> str:
     """Return a probability as text."""
     return '< 0.001' if p < 1e-3 else f'{p:.3f}'
+
+
+def range_text(low: float, high: float) -> str:
+    """Return a range with as many digits as its width needs."""
+    digits = int(np.clip(np.ceil(1.0 - np.log10(max(high - low, 1e-6))), 0, 4))
+    low_text, high_text = (f'{round(v, digits) + 0.0:.{digits}f}' for v in (low, high))
+    return low_text if low_text == high_text else f'{low_text} to {high_text}'
 
 
 def parameter_text(parameter: dict[str, Any]) -> str:

@@ -14,11 +14,15 @@
 
 """What the diagnosis reports: the gap and its parts, and what it does not determine."""
 
+from html import escape
 import json
 
+from adxl_ros.diagnose.noise_detectors import line_amplitude_v, white_noise_v
+from adxl_ros.diagnose.report_wording import parameter_text
 from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.stream_info import sensor_info
+from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.simulate import trajectories
 from adxl_ros.simulate.motion import Motion
@@ -26,6 +30,7 @@ from adxl_ros.simulate.simulator import simulate
 from adxl_ros.tools.effect_option import with_effects
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 from units import nominal
 
 pytestmark = pytest.mark.long
@@ -50,13 +55,16 @@ def turning(alphas_rad=(np.pi / 2, np.pi / 4)):
 
 
 class Report:
-    """What `diagnose` says of a simulated recording: report, terminal, page and parameters."""
+    """
+    What `diagnose` reports of a simulated recording.
+
+    Attributes: the report `json`, the text of `terminal` and `page`, and the written `sensor`.
+    """
 
     def __init__(self, run_tool, folder, sensor, *effects, motion=None, params=None, change=None):
         columns = simulate(with_effects(sensor, list(effects)), motion or turning(), 3)
         if change is not None:
             columns = change(columns)
-        self.columns = dict(columns)
         recorded = Recording('made', columns.pop('time_s'), columns, sensor_info(sensor))
         recording.write(folder / 'run.csv', recorded, sensor)
         parameter_file.save(folder / 'unit.yaml', params or sensor)
@@ -117,3 +125,102 @@ def test_two_planes_determine_a_tilt_of_the_axes(diagnosed):
     report = diagnosed(unit(), 'misalignment:alpha_rad=0.01,beta_rad=0.004')
     low, high = report.parameters('misalignment')['alpha_rad.x']['ci']
     assert low < 0.01 < high
+
+
+def test_a_line_that_stays_is_shown_and_not_called_closed(diagnosed):
+    """Beside a drift with temperature, hum and its harmonic stay in recording minus simulation."""
+    def change(columns):
+        time_s = columns['time_s']
+        hum_v = 2e-3 * np.sin(2 * np.pi * 50.01 * time_s + 1) \
+            + 1e-3 * np.sin(2 * np.pi * 150.03 * time_s)
+        return columns | {name: columns[name] + hum_v for name in ('x_v', 'y_v')}
+
+    report = diagnosed(unit(), 'time_offset:offset_s=0.01', change=change)
+    assert report.json['verdict']['effects'] == ['mains_hum', 'time_offset']
+    line, harmonic = report.json['noise_remainders']
+    mg = G0_MPS2 / 1e3
+    assert line['recorded'] / mg == pytest.approx(2.0, rel=0.05)
+    assert line['simulated'] / mg == pytest.approx(2.0, rel=0.05)
+    assert line['left'] / mg < 0.1
+    assert harmonic['recorded'] / mg == pytest.approx(1.0, rel=0.1)
+    assert harmonic['left'] / mg == pytest.approx(1.0, rel=0.2)
+    gap = report.json['gap']
+    assert gap['closed_ci'][0] < gap['closed'] < 0.99
+    # The two lines are above the floor, and stay: half of the squares of their amplitudes.
+    assert gap['after'] ** 2 - gap['floor'] ** 2 > 1.8 * mg ** 2
+    assert '100 %' not in report.terminal
+    assert '2.0' in next(row for row in report.terminal.splitlines() if 'line at 50' in row)
+
+
+def test_terminal_page_and_report_agree(diagnosed):
+    """The same figures of the gap stand in all three."""
+    report = diagnosed(unit(), 'scale_factor:offset_v_per_g=0.01')
+    gap, mg = report.json['gap'], G0_MPS2 / 1e3
+    for key in ('before', 'after', 'floor', 'zero_g', 'drift'):
+        text = f'{gap[key] / mg:.2f} mg'
+        shown = text if gap[key] == 0 or gap[key] / mg >= 0.005 else '< 0.01 mg'
+        assert shown in report.terminal
+        assert escape(shown) in report.page and shown in report.json['summary']
+    assert max(map(len, report.terminal.splitlines())) < 80
+
+
+def test_effects_that_are_not_separated_are_named_together(diagnosed):
+    """A turn of the sensor about its axis is one of the stage or of its base at one alpha."""
+    report = diagnosed(unit(), 'stage_offset:beta_rad=0.005', motion=turning([np.pi / 2] * 2))
+    (group,) = report.json['verdict']['groups']
+    assert {'base_tilt', 'stage_offset'} <= set(group)
+    first = ' '.join(report.terminal.split()).split('.')[0]
+    assert f'{", ".join(group[:-1])} or {group[-1]}: this recording does not separate them' \
+        in first
+
+
+@pytest.mark.parametrize('rate_hz', [62.5, 100.0, 250.0])
+def test_amplitude_of_a_line_whose_phase_wanders(rate_hz):
+    """The mains are no exact clock, and a line may alias."""
+    rng = np.random.default_rng(2)
+    time_s = np.arange(round(100 * rate_hz)) / rate_hz
+    phase = 2 * np.pi * 60 * time_s + np.cumsum(rng.normal(size=len(time_s))) * 0.3 / rate_hz
+    values_v = np.column_stack([2e-3 * np.sin(phase + 1), 0 * time_s]) \
+        + 1e-3 * rng.normal(size=(len(time_s), 2))
+    amplitude_v = line_amplitude_v(values_v, time_s, 60.0)
+    assert amplitude_v[0] == pytest.approx(2e-3, rel=0.05)
+    assert amplitude_v[1] < 2e-4
+
+
+def test_level_of_the_noise_beside_a_line_and_spikes():
+    """Neither a line nor spikes nor drift change the level of the white noise."""
+    sensor, rng = unit(), np.random.default_rng(3)
+    std_v = noise.sample_std_v(sensor)
+    time_s = np.arange(8000) / sensor.rate_hz
+    white_v = lfilter_noise(rng, sensor, len(time_s))
+    level_v = white_noise_v(white_v, sensor)
+    np.testing.assert_allclose(level_v, std_v, rtol=0.1)
+    disturbed_v = white_v + 2e-3 * np.sin(2 * np.pi * 12 * time_s)[:, None]
+    disturbed_v[::500] += 0.05
+    np.testing.assert_allclose(white_noise_v(disturbed_v, sensor), level_v, rtol=0.2)
+
+
+def lfilter_noise(rng, sensor, count):
+    """Return noise of the sensor's density behind its RC filter, V, (count, m)."""
+    decay = np.exp(-1 / (sensor.rate_hz * noise.electronics(sensor).rc_s))
+    return np.column_stack([lfilter([np.sqrt(1 - a * a)], [1, -a], rng.normal(size=count)) * std
+                            for a, std in zip(decay, noise.sample_std_v(sensor))])
+
+
+@pytest.mark.parametrize('value, ci, unit_name, text', [
+    (3.9e-4, [3.47e-4, 4.33e-4], 'g/K', '0.390 (0.347 to 0.433) mg/K'),
+    (0.0298, [0.0294, 0.0302], 'm', '29.80 (29.40 to 30.20) mm'),
+    (43.0, [38.0, 48.0], 's', '43 (38 to 48) s'),
+    (0.0040, [0.0039, 0.0041], 'rad', '0.229 (0.223 to 0.235) deg'),
+    (0.3, [0.2, 0.4], '1', '0.30 (0.20 to 0.40)')])
+def test_parameters_have_a_prefix_and_few_digits(value, ci, unit_name, text):
+    """A value has the digits that its interval allows."""
+    assert parameter_text({'value': value, 'ci': ci, 'unit': unit_name}) == text
+
+
+def test_a_parameter_that_is_not_determined_has_no_figure():
+    """The text names what it cannot be separated from."""
+    unknown = {'value': None, 'ci': None, 'unit': 'rad', 'determined': False}
+    assert parameter_text(unknown | {'not_separated_from': []}) == 'not determined'
+    assert parameter_text(unknown | {'not_separated_from': ['beta_rad']}) == \
+        'not determined separately from beta_rad'
