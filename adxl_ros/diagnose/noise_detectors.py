@@ -556,9 +556,10 @@ def _mains_frequency_hz(line_hz: float, rate_hz: float) -> float | None:
     """Return the true frequency of a line that is an alias of the mains or its double."""
     for mains_hz in _MAINS_HZ:
         for harmonic in (1, 2):
-            alias_hz = abs((harmonic * mains_hz + rate_hz / 2) % rate_hz - rate_hz / 2)
-            if abs(alias_hz - line_hz) < _MAINS_TOLERANCE_HZ:
-                return harmonic * mains_hz + (line_hz - alias_hz)
+            folded_hz = (harmonic * mains_hz + rate_hz / 2) % rate_hz - rate_hz / 2
+            deviation_hz = line_hz - abs(folded_hz)
+            if abs(deviation_hz) < _MAINS_TOLERANCE_HZ:
+                return harmonic * mains_hz + (deviation_hz if folded_hz >= 0 else -deviation_hz)
     return None
 
 

@@ -262,7 +262,7 @@ def parameter_text(parameter: dict[str, Any]) -> str:
         return f'{", ".join(f"{v:.4g}" for v in values)} {unit}'.rstrip()
     values, unit = _with_prefix([parameter['value'], *parameter['ci']], parameter['unit'])
     width = max(values[2] - values[1], 1e-12)
-    digits = int(np.clip(np.ceil(1.3 - np.log10(width)), 0, 6))
+    digits = int(np.clip(np.ceil(1.0 - np.log10(width)), 0, 6))
     value, low, high = (f'{v:.{digits}f}' for v in values)
     return f'{value} ({low} to {high}) {unit}'.rstrip()
 
