@@ -52,8 +52,6 @@ LONGEST_S = 200.0
 """Longest recording, s; a longer manoeuvre is cut."""
 MOST_SAMPLES = 200_000
 """Largest number of samples of a recording."""
-PROCESSES = 2
-"""Diagnoses that run at once."""
 RIGHT = ('no gap', 'insufficient')
 """Right answers: a rest at one pose shows nothing but noise."""
 
@@ -105,14 +103,14 @@ def in_words(diagnosis):
     return ' and '.join(named) or verdict.status.replace('_', ' ')
 
 
-def run(cases, seed, minutes, path):
+def run(cases, seed, minutes, processes, path):
     """Run cases until the time is over; append each answer to a file of lines."""
     end_s = time.monotonic() + 60 * minutes
-    with ProcessPoolExecutor(PROCESSES) as pool, path.open('a', encoding='utf-8') as file:
-        for first in range(0, len(cases), PROCESSES):
+    with ProcessPoolExecutor(processes) as pool, path.open('a', encoding='utf-8') as file:
+        for first in range(0, len(cases), processes):
             if time.monotonic() > end_s:
                 return
-            some = cases[first:first + PROCESSES]
+            some = cases[first:first + processes]
             for case, said in zip(some, pool.map(answer, some, [seed] * len(some))):
                 file.write(json.dumps([seed, version('adxl_ros'), asdict(case), asdict(said)])
                            + '\n')
@@ -174,6 +172,7 @@ def main():
     parse = argparse.ArgumentParser(description=__doc__)
     parse.add_argument('page', type=Path)
     parse.add_argument('--minutes', type=float, default=90.0, help='longest run (default 90)')
+    parse.add_argument('--processes', type=int, default=2)
     parse.add_argument('--seed', type=int, default=1)
     parse.add_argument('--results', type=Path, default=Path('../nulls_output.jsonl'))
     options = parse.parse_args()
@@ -181,7 +180,7 @@ def main():
     done = answers(options.seed, options.results)
     order = np.random.default_rng(options.seed).permutation(len(cases))
     run([cases[i] for i in order if cases[i] not in done], options.seed, options.minutes,
-        options.results)
+        options.processes, options.results)
     options.page.write_text(page(answers(options.seed, options.results), options.seed,
                                  len(cases)), encoding='utf-8')
 
