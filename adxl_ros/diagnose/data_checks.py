@@ -203,7 +203,7 @@ def find_data_fault(comparison: BaselineComparison, search_comparison: BaselineC
     if finite.mean() < 1 - _LARGEST_MISSING_SHARE:
         return DataFault('missing', 'bad_data', f'{100 * (1 - finite.mean()):.0f} % of the '
                          'samples are not numbers; record again')
-    clock = _clock_fault(comparison.time_s)
+    clock = find_clock_fault(comparison.time_s)
     if clock is not None:
         return clock
     railed = _share_at_rail(comparison.volts[finite], comparison.sensor.lsb_v)
@@ -231,7 +231,7 @@ def _unexplained_motion(comparison: BaselineComparison, finite: np.ndarray) -> D
                      'specific force of the same manoeuvre')
 
 
-def _clock_fault(time_s: np.ndarray) -> DataFault | None:
+def find_clock_fault(time_s: np.ndarray) -> DataFault | None:
     """Find stamps that run backwards or jump."""
     steps_s = np.diff(time_s)
     backward = np.flatnonzero(steps_s <= 0)

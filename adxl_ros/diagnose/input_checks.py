@@ -19,13 +19,19 @@ from __future__ import annotations
 from dataclasses import replace
 
 from adxl_ros.diagnose.baseline_comparison import BaselineComparison, compare
-from adxl_ros.diagnose.data_checks import DataFault
+from adxl_ros.diagnose.data_checks import DataFault, find_clock_fault
 from adxl_ros.diagnose.encoder_checks import find_encoder_fault
 from adxl_ros.diagnose.reference_coverage import too_coarse, without_reading
 from adxl_ros.diagnose.sim_alignment import align_force
+from adxl_ros.diagnose.stamps import even_stamps
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.simulate.motion import Motion
+import numpy as np
+
+_SAME_ROUGHNESS = 1.05
+"""Ratio of the steps of two residuals up to which they are equal. Chosen: above its scatter by
+noise in a thousand samples."""
 
 
 def compare_checked(recording: Recording, sensor: Sensor, sim: Motion | None, may_shift: bool
@@ -56,6 +62,13 @@ def compare_checked(recording: Recording, sensor: Sensor, sim: Motion | None, ma
 
     """
     notes: list[str] = []
+    even = even_stamps(recording.time_s)
+    if even is not None and even.certain:
+        recording = replace(recording, time_s=even.time_s)
+        notes += [even.note] if even.note else []
+    fault = find_clock_fault(recording.time_s)
+    if fault is not None:
+        return fault
     if sim is not None:
         aligned = align_force(recording, sensor, sim, may_shift)
         if isinstance(aligned, DataFault):
@@ -67,9 +80,20 @@ def compare_checked(recording: Recording, sensor: Sensor, sim: Motion | None, ma
         if fault is not None:
             return fault
     comparison = compare(recording, sensor, sim)
+    if even is not None and not even.certain and len(even.time_s) == len(recording):
+        evenly = replace(recording, time_s=even.time_s)
+        even_comparison = compare(evenly, sensor, sim)
+        if _roughness(even_comparison) < _SAME_ROUGHNESS * _roughness(comparison):
+            recording, comparison = evenly, even_comparison
+            notes += [even.note] if even.note else []
     left_out = [*without_reading(recording, comparison), *too_coarse(recording, comparison)]
     used = comparison.used.copy()
     for part in left_out:
         used &= ~part.rows
         notes.append(part.text(recording.time_s))
     return replace(comparison, used=used, notes=tuple(notes))
+
+
+def _roughness(comparison: BaselineComparison) -> float:
+    """Return the mean square of the residual's steps, V²: wrong instants add to it in motion."""
+    return float(np.nanmean(np.diff(comparison.residual_v(comparison.sensor), axis=0) ** 2))

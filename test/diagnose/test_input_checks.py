@@ -240,3 +240,68 @@ def test_a_gap_of_the_simulator_is_left_out(tmp_path):
     comparison = compare_checked(made(unit()), unit(), motion_from_force(path, False)[0], False)
     assert 'no reading of --sim' in comparison.notes[0]
     assert 20 <= 66.7 * (1 - comparison.used.mean()) * 1e1 <= 40
+
+
+def stamped(stamps_s, rate_hz=300.0):
+    """Compare a recording with other stamps; return it with the true instants, s."""
+    sensor = unit(rate_hz)
+    recorded = made(sensor, turns=2)
+    true_s = recorded.time_s
+    return compare_checked(replace(recorded, time_s=stamps_s(true_s)), sensor, None, False), true_s
+
+
+@pytest.mark.parametrize('lost', [False, True])
+def test_rounded_stamps_get_their_instants_back(lost):
+    """Stamps of whole milliseconds at 300 Hz are an even clock, also where samples are lost."""
+    sensor = unit(300.0)
+    recorded = made(sensor, turns=2)
+    true_s = recorded.time_s
+    kept = np.ones(len(true_s), bool)
+    if lost:
+        kept[4000:4037] = kept[9000] = False
+    recorded = replace(recorded, time_s=np.round(true_s, 3)[kept],
+                       columns={k: v[kept] for k, v in recorded.columns.items()})
+    comparison = compare_checked(recorded, sensor, None, False)
+    assert np.abs(comparison.time_s - true_s[kept]).max() < 2e-5
+    assert comparison.sensor.rate_hz == pytest.approx(300.0, abs=1e-3)
+    assert 'rounded to 0.001 s' in comparison.notes[0]
+
+
+def test_stamps_that_scatter_or_come_in_bursts_are_no_fault():
+    """The instants are even where that fits the motion as well."""
+    rng = np.random.default_rng(4)
+    comparison, true_s = stamped(lambda t: t + rng.uniform(-1e-3, 1e-3, len(t)))
+    assert np.abs(comparison.time_s - true_s).max() < 5e-5
+    assert 'stamps scatter by up to 1' in comparison.notes[0]
+    comparison, true_s = stamped(
+        lambda t: (np.arange(len(t)) // 16 + 1) * 16 / 300 + np.arange(len(t)) % 16 * 1e-5)
+    assert np.ptp(comparison.time_s - true_s) < 2e-3
+    assert comparison.sensor.rate_hz == pytest.approx(300.0, rel=1e-3)
+    assert 'come in bursts' in comparison.notes[0]
+
+
+def test_samples_that_are_taken_unevenly_keep_their_stamps(tmp_path):
+    """Stamps that are right stay, although they scatter."""
+    sensor, path, rng = unit(), script(), np.random.default_rng(5)
+    alpha, beta = path.joints()
+    even = np.arange(0, path.now, 0.01)
+    time_s = even + rng.uniform(-3e-3, 3e-3, len(even))
+    force = specific_force(alpha(time_s), beta(time_s), 1.0)
+    columns = {f'{axis}_v': 2.5 + f + rng.normal(0, 2e-4, len(f)) for axis, f in zip('xyz', force)}
+    recorded = Recording('made', time_s, columns, sensor_info(sensor))
+    sim = motion_from_force(tmp_path / ideal(tmp_path, 0.0), False)[0]
+    comparison = compare_checked(recorded, replace(sensor, rc_resistance_ohm=0.0), sim, False)
+    inside = slice(1, len(comparison.time_s) - 1)
+    assert np.isin(comparison.time_s[inside], time_s).all() and not any(
+        'even rate' in note for note in comparison.notes)
+
+
+def test_rounded_stamps_are_in_the_report(run_tool, tmp_path):
+    """A fault of another kind does not hide the note."""
+    sensor = unit(300.0)
+    recorded = made(sensor, turns=2)
+    recorded = replace(recorded, time_s=np.round(recorded.time_s, 3))
+    recorded.columns['x_v'] = 5 - recorded.columns['x_v']
+    report, _ = report_of(run_tool, tmp_path, sensor, recorded)
+    assert report['verdict']['data_fault'] == 'axis_inverted'
+    assert 'rounded to 0.001 s' in report['notes'][0]
