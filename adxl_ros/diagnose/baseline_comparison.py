@@ -36,9 +36,9 @@ import numpy as np
 SEARCH_RATE_HZ = 125.0
 """The search uses samples at about this rate, Hz. Chosen: it shows motion up to 60 Hz. Samples
 are left out, never averaged, so that aliases of faster signals remain."""
-SEARCH_SAMPLES = 80_000
-"""Largest number of samples of a recording in the search. Chosen: some ten minutes at 125 Hz, and
-less than 1 GB of memory."""
+SEARCH_SAMPLES = 40_000
+"""Largest number of samples of a recording in the search. Chosen: five minutes at 125 Hz; ten
+minutes then take less than 25 s and 1 GB of memory."""
 _LOWEST_INTERNAL_RATE_HZ = 250.0
 """Lowest internal rate of the simulator where something moves, Hz. Chosen: twice the rate of the
 search."""

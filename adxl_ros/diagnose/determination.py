@@ -30,6 +30,7 @@ from dataclasses import replace
 from adxl_ros.diagnose import evidence
 from adxl_ros.diagnose.hypothesis_fit import Hypothesis, linearise
 from adxl_ros.diagnose.linear_model import hints_of, LinearModel
+from adxl_ros.diagnose.noise_whitening import drifts_among
 from adxl_ros.diagnose.sensitivities import PRIOR_WIDTH
 from adxl_ros.model.coefficients import fitted_of, get, parameter_of, put, with_neutral
 from adxl_ros.model.effects import effect_named
@@ -166,9 +167,11 @@ def _covariance(linear_model: LinearModel, hypothesis: Hypothesis, ids: list[int
                            for i in ids])
     encoder_information = np.zeros(len(ids))
     scales = [scale for c in linear_model.comparisons for scale in c.sensor.scale_v_per_g]
+    drifting = bool(drifts_among(hypothesis.effects))
     for channel, filters, whitener, variance, scale in zip(
-            linear_model.channels, linear_model.filters, hypothesis.whiteners,
-            fit.innovation_variance_v2, scales):
+            linear_model.drifting_channels if drifting else linear_model.channels,
+            linear_model.filters if drifting else linear_model.filters_of(()),
+            hypothesis.whiteners, fit.innovation_variance_v2, scales):
         f = next(i for i, same in enumerate(filters) if same is whitener)
         columns = [i for i, k in enumerate(channel.column_ids) if k in every]
         places = np.array([every.index(channel.column_ids[i]) for i in columns], int)

@@ -129,7 +129,9 @@ def whiten_channel(residual_v: np.ndarray, columns: np.ndarray, column_ids: np.n
     series = [residual_v[:, None], columns, *([] if flexible is None else [flexible.values])]
     data = np.empty((sum(values.shape[1] for values in series), len(used)))
     np.concatenate([values.T for values in series], out=data)
-    data = before_filters(filters, bridged(data.T, used).T)
+    if not used.all():
+        data = bridged(data.T, used).T
+    data = before_filters(filters, data)
     edges, unused = block_edges(len(used)), np.flatnonzero(~used)
     grams = np.zeros((len(filters), BLOCKS if by_block else 1, len(data), len(data)))
     states = [np.zeros((len(f.sections), len(data), 2)) for f in filters]

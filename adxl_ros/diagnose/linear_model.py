@@ -95,7 +95,8 @@ class LinearModel:
     prior_std
         Prior standard deviation of each coefficient, (columns,).
     channels
-        Whitened residuals and columns at the baseline.
+        Whitened residuals and columns at the baseline, by the filters for healthy units and for
+        the drifts of the baseline.
     filters
         Whitening filters of each channel.
     columns
@@ -141,9 +142,14 @@ class LinearModel:
 
     def filters_of(self, effects: Sequence[str]) -> list[list[Whitener]]:
         """Return for each channel the filters of healthy units and of the drifts of effects."""
-        drifts = drifts_among((*effects, *self.baseline.effects))
-        return [[f for f in filters if f.healthy or f.effect in drifts] or filters
-                for filters in self.filters]
+        return _filters_of(self.filters, (*effects, *self.baseline.effects))
+
+    @cached_property
+    def drifting_channels(self) -> list[WhitenedChannel]:
+        """Return the channels with all filters, which hypotheses with a drift need."""
+        if list(map(len, self.filters_of(()))) == list(map(len, self.filters)):
+            return self.channels
+        return _whitened_channels(self.comparisons, self.columns, self.filters, None)
 
     @cached_property
     def flexible_bases(self) -> list[list[Basis]]:
@@ -250,10 +256,11 @@ class LinearModel:
             The fit; its log evidence is that with the log-uniform prior over amplitudes.
 
         """
+        channels = self.drifting_channels if drifts else self.channels
         drifts = (*drifts, *drifts_among(self.baseline.effects))
         ids = set(self.nuisance_ids()).union(*(self.column_ids[i] for i in chosen))
         prior_std = self.prior(chosen, drifts)
-        fit = evidence.fit_columns(self.channels, sorted(ids), prior_std, None, start, drifts)
+        fit = evidence.fit_columns(channels, sorted(ids), prior_std, None, start, drifts)
         gain = 0.0
         for i in chosen:
             places = np.flatnonzero(np.isin(fit.column_ids, self.column_ids[i]))
@@ -311,13 +318,18 @@ def build_linear_model(comparisons: Sequence[BaselineComparison],
         kept.append(replace(next(iter(by_recording.values())), names=tuple(numbers),
                             prior_std=np.array([prior_std[j] for j in ids])))
         column_ids.append(ids)
-    channels, filters = _whitened_channels(comparisons, columns, filters, flexible)
     by_channel = list(chain(*columns))
+    if filters is None:
+        filters = [noise_whitening.whiteners(c.sensor, d, c.dt_s, c.span_s,
+                                             angle_error_filter(c, d))
+                   for c in comparisons for d in range(len(c.sensor.axes))]
+    channels = _whitened_channels(
+        comparisons, by_channel, _filters_of(filters, comparisons[0].sensor.effects), flexible)
     nuisance_columns = [_nuisance_columns(channel, names) for channel in by_channel]
     parts = parts_at_rest([_straight_columns(channel, names) for channel in nuisance_columns],
                           by_channel, len(names), rests_by_channel(comparisons))
     return LinearModel(list(comparisons), baseline_v, kept, column_ids, names,
-                       np.array(prior_std), channels, filters, by_channel, nuisance_columns,
+                       np.array(prior_std), channels, list(filters), by_channel, nuisance_columns,
                        {names[i]: amounts for i, amounts in parts.items()})
 
 
@@ -361,26 +373,27 @@ def _variants(comparisons: Sequence[BaselineComparison], baseline_v: Sequence[np
     return list(every.values())
 
 
+def _filters_of(filters: Sequence[list[Whitener]], effects: Sequence[str]
+                ) -> list[list[Whitener]]:
+    """Return for each channel the filters of healthy units and of the drifts among effects."""
+    drifts = drifts_among(effects)
+    return [[f for f in every if f.healthy or f.effect in drifts] or every for every in filters]
+
+
 def _whitened_channels(comparisons: Sequence[BaselineComparison],
-                       columns: Sequence[Sequence[Sequence[NumberedColumn]]],
-                       given: Sequence[list[Whitener]] | None,
-                       flexible: Sequence[FlexibleColumns] | None
-                       ) -> tuple[list[WhitenedChannel], list[list[Whitener]]]:
-    """Whiten residual and columns of each channel; return them with the filters."""
+                       columns: Sequence[Sequence[NumberedColumn]],
+                       filters: Sequence[list[Whitener]],
+                       flexible: Sequence[FlexibleColumns] | None) -> list[WhitenedChannel]:
+    """Whiten residual and columns of each channel."""
     channels: list[WhitenedChannel] = []
-    filters: list[list[Whitener]] = []
-    for comparison, by_axis in zip(comparisons, columns):
-        residual_v = comparison.residual_v(comparison.sensor)
-        for d, axis_columns in enumerate(by_axis):
-            tried = given[len(filters)] if given is not None else noise_whitening.whiteners(
-                comparison.sensor, d, comparison.dt_s, comparison.span_s,
-                angle_error_filter(comparison, d))
-            filters.append(tried)
+    for comparison in comparisons:
+        for residual_v in comparison.residual_v(comparison.sensor).T:
+            number = len(channels)
             channels.append(evidence.whiten_channel(
-                residual_v[:, d], np.array([column for _, column in axis_columns]).T,
-                np.array([i for i, _ in axis_columns]), comparison.used, tried,
-                None if flexible is None else flexible[len(channels)], False))
-    return channels, filters
+                residual_v, np.array([column for _, column in columns[number]]).T,
+                np.array([i for i, _ in columns[number]]), comparison.used, filters[number],
+                None if flexible is None else flexible[number], False))
+    return channels
 
 
 def parts_at_rest(lines: Sequence[dict[int, np.ndarray]],

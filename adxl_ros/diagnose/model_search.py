@@ -55,6 +55,9 @@ _FITTED_SINGLES = 6
 """Number of single effects that are fitted. Chosen: run time."""
 _FURTHER = 3
 """Number of other hypotheses that each step of the search fits. Chosen: run time."""
+_TRIED_THIRD = 10
+"""Number of effects that are tried beside a pair: those that gain most beside the best single
+effect. Chosen: run time; the others gain little beside it."""
 _BESIDE_DRIFTS = 2
 """Number of hypotheses beside which each drift is tried. Chosen: run time."""
 _RANKING_FORM_ERROR = 0.3
@@ -113,7 +116,7 @@ def search(linear_model: LinearModel, settings: DecisionSettings,
               hypotheses)
     best = _best(hypotheses)
     if best.effects:
-        _add_effect(linear_model, settings, best, hypotheses)
+        gaining = _add_effect(linear_model, settings, best, hypotheses)
         show_progress(0.6)
         first = [ranked.chosen[0] for ranked in singles[:_SINGLES]]
         pairs = _ranked(linear_model, list(combinations(sorted(first), 2)), null_fit)
@@ -124,7 +127,7 @@ def search(linear_model: LinearModel, settings: DecisionSettings,
                   hypotheses)
         best = _best(hypotheses)
         if 1 < len(best.effects) < LARGEST_SET:
-            _add_effect(linear_model, settings, best, hypotheses)
+            _add_effect(linear_model, settings, best, hypotheses, gaining[:_TRIED_THIRD])
     _remove_each_effect(linear_model, _best(hypotheses), hypotheses)
     if _drift_shows(linear_model, _best(hypotheses), settings):
         _add_drifts(linear_model, settings, hypotheses)
@@ -176,9 +179,12 @@ def _add_drifts(linear_model: LinearModel, settings: DecisionSettings, hypothese
             del hypotheses[frozenset(h.effects)]
 
 
-def _model_about(linear_model: LinearModel, best: Hypothesis) -> LinearModel:
+def _model_about(linear_model: LinearModel, best: Hypothesis, only: Sequence[str] | None
+                 ) -> LinearModel:
     """
     Return the linear model about a hypothesis: residuals and sensitivities at its fit.
+
+    It holds the effects of the hypothesis and those of `only`, the whole library where it is None.
 
     Filter and latency stay those of the parameter file, unless they are effects of the hypothesis,
     so that their tolerance is the same as before.
@@ -197,6 +203,7 @@ def _model_about(linear_model: LinearModel, best: Hypothesis) -> LinearModel:
     filters = [[f for f in same if f.healthy == w.healthy and f.effect == w.effect] or [w]
                for same, w in zip(best.linearised.filters, best.whiteners)]
     return build_linear_model(comparisons, filters=filters,
+                              only=None if only is None else [*only, *best.effects],
                               flexible=_form_functions(linear_model, best))
 
 
@@ -218,9 +225,14 @@ def _form_functions(linear_model: LinearModel, best: Hypothesis) -> list[Flexibl
 
 
 def _add_effect(linear_model: LinearModel, settings: DecisionSettings, best: Hypothesis,
-                hypotheses: Hypotheses) -> None:
-    """Add one effect to a hypothesis: rank on the linear model, then fit the best in full."""
-    about = _model_about(linear_model, best)
+                hypotheses: Hypotheses, only: Sequence[str] | None = None) -> list[str]:
+    """
+    Add one effect to a hypothesis: rank on the linear model, then fit the best in full.
+
+    Only the effects of `only` are tried, where it is given. Return the tried effects, the one
+    that gains most first.
+    """
+    about = _model_about(linear_model, best, only)
     of_best = [i for i, v in enumerate(about.variants) if v.effect in best.effects]
     drifts = drifts_among(best.effects)
     best_fit = about.fit_variants(of_best, None, drifts)
@@ -230,7 +242,8 @@ def _add_effect(linear_model: LinearModel, settings: DecisionSettings, best: Hyp
             fit = about.fit_variants([*of_best, i], best_fit, drifts)
             ranked.append(_RankedSet(fit.log_evidence - best_fit.log_evidence, (i,), fit))
     with_variants = {v.effect for v in linear_model.variants}
-    for gain, (i,), fit in sorted(ranked, key=lambda r: -r.gain)[:_FURTHER]:
+    ranked.sort(key=lambda r: -r.gain)
+    for gain, (i,), fit in ranked[:_FURTHER]:
         if gain < settings.worth_fitting:
             break
         added = about.variants[i]
@@ -243,6 +256,7 @@ def _add_effect(linear_model: LinearModel, settings: DecisionSettings, best: Hyp
                   if k in about.column_ids[i]}
         start |= _limit_start(added)
         _add(hypotheses, _fit_or_none(linear_model, effects, start, _named_shape(added)))
+    return list(dict.fromkeys(about.variants[r.chosen[0]].effect for r in ranked))
 
 
 def _remove_each_effect(linear_model: LinearModel, best: Hypothesis, hypotheses: Hypotheses
