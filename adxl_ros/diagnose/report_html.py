@@ -173,9 +173,9 @@ def _bar_plot(diagnosis: Diagnosis) -> Any:
         axis.barh(0, width, left=begin, color=_BAR_COLOURS.get(label, f'C{i}'),
                   label=f'{label}: {width:.3g} mg²')
         begin += width
-    ends = ((f'after {mg_text(closure.after_mps2)}', after, 'right', -3),
-            (f'before {mg_text(closure.before_mps2)}', before, 'left', 3))
-    for label, square, side, offset in ends:
+    labels = ((f'after {mg_text(closure.after_mps2)}', after, 'right', -3),
+              (f'before {mg_text(closure.before_mps2)}', before, 'left', 3))
+    for label, square, side, offset in labels:
         axis.axvline(square, color='k', lw=0.8)
         axis.annotate(label, (square, 0.6), ha=side, fontsize=8, xytext=(offset, 0),
                       textcoords='offset points')

@@ -56,6 +56,8 @@ _SCREEN_CANDIDATES = 3
 _CELL_HEAD = (f'{"axis":4} {"dimension":15} {"range":>20} {"statistic":9} {"mg":>7} {"share":>7} '
               f'{"p":>8}')
 """Head of the table of cells on the terminal, with the columns of `_cell_line`."""
+_WITHOUT_GAP = ('no_gap', 'insufficient')
+"""Verdicts in which there is no gap to close."""
 PROBABLE = 0.05
 """Smallest probability of what terminal and page show first. Chosen: that of a rival."""
 
@@ -101,11 +103,13 @@ def notes(diagnosis: Diagnosis) -> list[str]:
 def _gap(diagnosis: Diagnosis) -> dict[str, Any]:
     """Return the gap before and after, and the noise recording by recording."""
     assert diagnosis.gap_closure is not None and diagnosis.noise_floor is not None
-    closure = diagnosis.gap_closure
+    assert diagnosis.verdict is not None
+    closure, has_gap = diagnosis.gap_closure, diagnosis.verdict.status not in _WITHOUT_GAP
     return {'unit': 'm/s^2', 'before': _rounded(closure.before_mps2),
             'zero_g': _rounded(closure.zero_g_mps2), 'drift': _rounded(closure.drift_mps2),
             'after': _rounded(closure.after_mps2), 'floor': _rounded(closure.floor_mps2),
-            'floor_source': diagnosis.noise_floor.source, 'closed': _rounded(closure.closed),
+            'floor_source': diagnosis.noise_floor.source,
+            'closed': _rounded(closure.closed) if has_gap else None,
             'closed_ci': [_rounded(c) for c in closure.closed_ci],
             'noise': _noise(diagnosis)}
 
@@ -250,6 +254,10 @@ def _parameters(diagnosis: Diagnosis, hypothesis: Hypothesis | None, effect: str
                 'value': _rounded(value),
                 'ci': [_rounded(value - Z_90 * std), _rounded(value + Z_90 * std)],
                 'unit': unit, 'determined': True}
+        elif effect_named(effect).diagnosis.drift:
+            # The density of a drift is chosen with the noise, on a grid.
+            parameters[key] = {'value': _rounded(float(get(hypothesis.sensor, [name])[0])),
+                               'unit': unit}
     return parameters
 
 

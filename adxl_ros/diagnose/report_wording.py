@@ -244,7 +244,20 @@ def p_text(p: float) -> str:
 
 
 def range_text(low: float, high: float) -> str:
-    """Return a range with as many digits as its width needs."""
+    """
+    Return a range with as many digits as its width needs.
+
+    Parameters
+    ----------
+    low, high
+        Range of a dimension, in its unit.
+
+    Returns
+    -------
+    str
+        Both ends, or one figure where they are equal.
+
+    """
     digits = int(np.clip(np.ceil(1.0 - np.log10(max(high - low, 1e-6))), 0, 4))
     low_text, high_text = (f'{round(v, digits) + 0.0:.{digits}f}' for v in (low, high))
     return low_text if low_text == high_text else f'{low_text} to {high_text}'

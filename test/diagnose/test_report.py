@@ -158,9 +158,9 @@ def test_terminal_page_and_report_agree(diagnosed):
     gap, mg = report.json['gap'], G0_MPS2 / 1e3
     for key in ('before', 'after', 'floor', 'zero_g', 'drift'):
         text = f'{gap[key] / mg:.2f} mg'
-        shown = text if gap[key] == 0 or gap[key] / mg >= 0.005 else '< 0.01 mg'
-        assert shown in report.terminal
-        assert escape(shown) in report.page and shown in report.json['summary']
+        figure = text if gap[key] == 0 or gap[key] / mg >= 0.005 else '< 0.01 mg'
+        assert figure in report.terminal
+        assert escape(figure) in report.page and figure in report.json['summary']
     assert max(map(len, report.terminal.splitlines())) < 80
 
 
