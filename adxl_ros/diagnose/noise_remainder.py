@@ -86,12 +86,12 @@ class NoiseRemainder:
 
     @property
     def largest(self) -> int:
-        """Number of the axis on which the recorded value is largest."""
+        """Return the number of the axis on which the recorded value is largest."""
         return int(np.argmax(self.recorded))
 
     @property
     def remains(self) -> np.ndarray:
-        """Magnitude of recorded minus simulated, in the shape of `recorded`."""
+        """Return the magnitude of recorded minus simulated, in the shape of `recorded`."""
         return np.abs(self.recorded - self.simulated)
 
 
