@@ -111,10 +111,10 @@ def run(cases, seed, minutes, processes, path):
             if time.monotonic() > end_s:
                 return
             some = cases[first:first + processes]
-            for case, said in zip(some, pool.map(answer, some, [seed] * len(some))):
-                file.write(json.dumps([seed, version('adxl_ros'), asdict(case), asdict(said)])
+            for case, result in zip(some, pool.map(answer, some, [seed] * len(some))):
+                file.write(json.dumps([seed, version('adxl_ros'), asdict(case), asdict(result)])
                            + '\n')
-                print(case, said, file=sys.stderr)
+                print(case, result, file=sys.stderr)
             file.flush()
 
 
@@ -122,16 +122,16 @@ def answers(seed, path):
     """Return the answers of a seed and of this version that a file holds, by case."""
     lines = path.read_text(encoding='utf-8').splitlines() if path.exists() else []
     rows = [json.loads(line) for line in lines]
-    return {Case(**case): Answer(**said) for number, release, case, said in rows
+    return {Case(**case): Answer(**result) for number, release, case, result in rows
             if (number, release) == (seed, version('adxl_ros'))}
 
 
 def page(by_case, seed, total):
     """Return the page in Markdown."""
-    texts = [said.text for said in by_case.values()]
+    texts = [result.text for result in by_case.values()]
     fault = sum(text.startswith(('fault', 'refused')) for text in texts)
     right = sum(text in RIGHT for text in texts)
-    cpu_s = [said.cpu_s for said in by_case.values()]
+    cpu_s = [result.cpu_s for result in by_case.values()]
     wrong = Counter(text for text in texts
                     if text not in RIGHT and not text.startswith(('fault', 'refused')))
     lines = [
@@ -158,13 +158,13 @@ def page(by_case, seed, total):
                                      *(f'- {text}' for text in faults)] if faults else [])]) + '\n'
 
 
-def cell(said):
+def cell(result):
     """Return one cell of the table."""
-    if said is None:
+    if result is None:
         return ''
-    if said.text.startswith(('fault', 'refused')):
+    if result.text.startswith(('fault', 'refused')):
         return 'F'
-    return {'no gap': '·', 'insufficient': '-'}.get(said.text, said.text)
+    return {'no gap': '·', 'insufficient': '-'}.get(result.text, result.text)
 
 
 def main():
