@@ -130,22 +130,22 @@ def decide(findings: Findings, settings: DecisionSettings) -> Verdict:
 
     """
     total = sum(w.probability for w in findings.weighed)
-    known = [w for w in findings.weighed if w.unknown is None]
+    library_sets = [w for w in findings.weighed if w.unknown is None]
     unknown = sum(w.probability for w in findings.weighed if w.unknown is not None) / total
     where = _dimensions(findings.weighed)
-    best = known[0]
+    best = library_sets[0]
     unexplained = _unexplained(findings, best, settings)
     if unexplained:
         unknown, where = max(unknown, 1 - unknown), tuple(dict.fromkeys((*where, *unexplained)))
     detected = tuple(d.effect for d in findings.detections if d.effect != UNKNOWN)
-    share = (1 - unknown) / sum(w.probability for w in known)
+    share = (1 - unknown) / sum(w.probability for w in library_sets)
     weighted = [WeightedHypothesis(tuple(sorted((*w.effects, *detected))), w.probability * share)
-                for w in known]
+                for w in library_sets]
     weighted.append(WeightedHypothesis((UNKNOWN,), unknown))
     weighted = sorted(weighted, key=lambda w: -w.probability)
     if unknown > settings.certain:
         return Verdict('unknown', (), (), float(unknown), tuple(weighted), best.hypothesis, where)
-    rivals = _rivals(known, settings)
+    rivals = _rivals(library_sets, settings)
     effects = tuple(sorted((*(e for e in best.effects if len(rivals[e]) == 1), *detected)))
     groups = tuple(sorted({tuple(sorted(rivals[e])) for e in best.effects
                            if len(rivals[e]) > 1}))
@@ -184,12 +184,12 @@ def _unexplained(findings: Findings, best: WeighedHypothesis, settings: Decision
     return ()
 
 
-def _rivals(known: Sequence[WeighedHypothesis], settings: DecisionSettings
+def _rivals(library_sets: Sequence[WeighedHypothesis], settings: DecisionSettings
             ) -> dict[str, set[str]]:
     """Return for each effect of the best set the effects that can stand in its place."""
-    best = known[0]
+    best = library_sets[0]
     rivals = {effect: {effect} for effect in best.effects}
-    for w in known[1:]:
+    for w in library_sets[1:]:
         if w.probability < settings.smallest_rival_share * best.probability \
                 or len(w.effects) != len(best.effects):
             continue

@@ -54,7 +54,7 @@ class DecisionSettings:
         exact. Between 1 and 15 % its value matters little.
     calibration_factor
         Beside another effect, zero-g and scale factor are immaterial below this multiple of what
-        the calibration can have taken up. Chosen: the whole of the effect at rest.
+        the calibration can have taken up. Chosen: two standard deviations.
     smallest_rival_share
         Smallest probability of an inseparable rival, divided by that of the best set. Chosen:
         odds of 20 to 1.
@@ -79,7 +79,7 @@ class DecisionSettings:
     with_unknown: int = 6
     smallest_share_of_noise: float = 0.05
     smallest_share_of_gap: float = 0.05
-    calibration_factor: float = 1.0
+    calibration_factor: float = 2.0
     smallest_rival_share: float = 0.05
     certain: float = 0.5
     unexplained_share_of_explained: float = 0.7

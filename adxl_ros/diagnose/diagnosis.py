@@ -386,11 +386,11 @@ def _confirmed(linear_model: LinearModel, comparisons: Sequence[BaselineComparis
                    >= SETTINGS.worth_fitting for h in steady)
 
     refuted: set[frozenset[str]] = set()
-    known = [w for w in weighed if w.unknown is None]
-    hypotheses = [w.hypothesis for w in known]
+    library_sets = [w for w in weighed if w.unknown is None]
+    hypotheses = [w.hypothesis for w in library_sets]
     first = 0
-    while known[first].effects and not holds(hypotheses[first], hypotheses[first + 1:]):
-        refuted.add(known[first].effects)
+    while library_sets[first].effects and not holds(hypotheses[first], hypotheses[first + 1:]):
+        refuted.add(library_sets[first].effects)
         first += 1
     return ([w for w in weighed if w.effects not in refuted or w.unknown is not None],
             closure_of(hypotheses[first]))

@@ -185,11 +185,11 @@ def _turns(effect: str) -> bool:
 
 def _may_be_zero(hypothesis: Hypothesis, effect: str) -> bool:
     """Determine whether the 90 % intervals of all sizes of an effect hold zero."""
-    own = [(name, value, std) for name, value, std in
-           zip(hypothesis.names, hypothesis.values, hypothesis.std) if name.effect == effect]
-    if any(parameter_of(name).role is Role.LIMIT for name, _, _ in own):
+    places = [i for i, name in enumerate(hypothesis.names) if name.effect == effect]
+    if any(parameter_of(hypothesis.names[i]).role is Role.LIMIT for i in places):
         return False
-    sizes = [abs(value) < Z_90 * std for name, value, std in own if parameter_of(name).is_size]
+    sizes = [abs(hypothesis.values[i]) < Z_90 * hypothesis.std[i] for i in places
+             if parameter_of(hypothesis.names[i]).is_size]
     return bool(sizes) and all(sizes)
 
 

@@ -207,7 +207,12 @@ def whitened(whitener: Whitener, series: np.ndarray, used: np.ndarray) -> np.nda
         Whitened columns, (k, n), zero where samples are not used.
 
     """
-    white = whitener(series)
+    white = np.empty_like(series, float)
+    state = np.zeros((len(whitener.sections), len(white), 2))
+    step = max(1, _CACHED_VALUES // max(len(white), 1))
+    for first in range(0, white.shape[1], step):
+        part = slice(first, first + step)
+        white[:, part], state = sosfilt(whitener.sections, series[:, part], zi=state)
     white[:, ~used] = 0.0
     # The first sample is a step from zero.
     white[:, 0] = 0.0
@@ -236,14 +241,14 @@ def bridged(data: np.ndarray, used: np.ndarray) -> np.ndarray:
         Series without gaps, (n, k).
 
     """
-    if used.all() or not used.any():
+    if used.all() or not used.any() or not data.shape[1]:
         return data
     kept, missing = np.flatnonzero(used), np.flatnonzero(~used)
     after = np.searchsorted(kept, missing)
-    left, right = kept[np.maximum(after - 1, 0)], kept[np.minimum(after, len(kept) - 1)]
-    share = np.clip((missing - left) / np.maximum(right - left, 1), 0.0, 1.0)[:, None]
+    before, right = kept[np.maximum(after - 1, 0)], kept[np.minimum(after, len(kept) - 1)]
+    share = np.clip((missing - before) / np.maximum(right - before, 1), 0.0, 1.0)[:, None]
     out = data.copy(order='K')
-    out[missing] = data[left] + share * (data[right] - data[left])
+    out[missing] = data[before] + share * (data[right] - data[before])
     return out
 
 

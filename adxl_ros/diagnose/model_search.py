@@ -55,9 +55,6 @@ _FITTED_SINGLES = 6
 """Number of single effects that are fitted. Chosen: run time."""
 _FURTHER = 3
 """Number of other hypotheses that each step of the search fits. Chosen: run time."""
-_TRIED_THIRD = 10
-"""Number of effects that are tried beside a pair: those that gain most beside the best single
-effect. Chosen: run time; the others gain little beside it."""
 _BESIDE_DRIFTS = 2
 """Number of hypotheses beside which each drift is tried. Chosen: run time."""
 _RANKING_FORM_ERROR = 0.3
@@ -116,7 +113,7 @@ def search(linear_model: LinearModel, settings: DecisionSettings,
               hypotheses)
     best = _best(hypotheses)
     if best.effects:
-        gaining = _add_effect(linear_model, settings, best, hypotheses)
+        _add_effects(linear_model, settings, best, hypotheses)
         show_progress(0.6)
         first = [ranked.chosen[0] for ranked in singles[:_SINGLES]]
         pairs = _ranked(linear_model, list(combinations(sorted(first), 2)), null_fit)
@@ -125,9 +122,6 @@ def search(linear_model: LinearModel, settings: DecisionSettings,
         _fit_best(linear_model, settings,
                   [pair for pair in pairs if pair.gain > smallest_gain][:_FURTHER], null_fit,
                   hypotheses)
-        best = _best(hypotheses)
-        if 1 < len(best.effects) < LARGEST_SET:
-            _add_effect(linear_model, settings, best, hypotheses, gaining[:_TRIED_THIRD])
     _remove_each_effect(linear_model, _best(hypotheses), hypotheses)
     if _drift_shows(linear_model, _best(hypotheses), settings):
         _add_drifts(linear_model, settings, hypotheses)
@@ -179,12 +173,9 @@ def _add_drifts(linear_model: LinearModel, settings: DecisionSettings, hypothese
             del hypotheses[frozenset(h.effects)]
 
 
-def _model_about(linear_model: LinearModel, best: Hypothesis, only: Sequence[str] | None
-                 ) -> LinearModel:
+def _model_about(linear_model: LinearModel, best: Hypothesis) -> LinearModel:
     """
     Return the linear model about a hypothesis: residuals and sensitivities at its fit.
-
-    It holds the effects of the hypothesis and those of `only`, the whole library where it is None.
 
     Filter and latency stay those of the parameter file, unless they are effects of the hypothesis,
     so that their tolerance is the same as before.
@@ -203,7 +194,6 @@ def _model_about(linear_model: LinearModel, best: Hypothesis, only: Sequence[str
     filters = [[f for f in same if f.healthy == w.healthy and f.effect == w.effect] or [w]
                for same, w in zip(best.linearised.filters, best.whiteners)]
     return build_linear_model(comparisons, filters=filters,
-                              only=None if only is None else [*only, *best.effects],
                               flexible=_form_functions(linear_model, best))
 
 
@@ -224,39 +214,55 @@ def _form_functions(linear_model: LinearModel, best: Hypothesis) -> list[Flexibl
     return out
 
 
-def _add_effect(linear_model: LinearModel, settings: DecisionSettings, best: Hypothesis,
-                hypotheses: Hypotheses, only: Sequence[str] | None = None) -> list[str]:
+def _add_effects(linear_model: LinearModel, settings: DecisionSettings, best: Hypothesis,
+                 hypotheses: Hypotheses) -> None:
     """
-    Add one effect to a hypothesis: rank on the linear model, then fit the best in full.
+    Add one and two effects to a hypothesis: rank on the linear model, then fit the best in full.
 
-    Only the effects of `only` are tried, where it is given. Return the tried effects, the one
-    that gains most first.
+    A second added effect is ranked beside the first one on the same linear model.
     """
-    about = _model_about(linear_model, best, only)
-    of_best = [i for i, v in enumerate(about.variants) if v.effect in best.effects]
+    about = _model_about(linear_model, best)
+    present = [i for i, v in enumerate(about.variants) if v.effect in best.effects]
+    ranked = _ranked_beside(about, best, present)
+    _fit_added(linear_model, settings, about, best, ranked, hypotheses)
+    larger = _best(hypotheses)
+    added = next((r.chosen[-1] for r in ranked
+                  if {*best.effects, about.variants[r.chosen[-1]].effect} == {*larger.effects}),
+                 None)
+    if added is not None and len(larger.effects) < LARGEST_SET:
+        _fit_added(linear_model, settings, about, larger,
+                   _ranked_beside(about, larger, [*present, added]), hypotheses)
+
+
+def _ranked_beside(about: LinearModel, best: Hypothesis, present: Sequence[int]
+                   ) -> list[_RankedSet]:
+    """Rank the variants of further effects beside the present ones, the best first."""
     drifts = drifts_among(best.effects)
-    best_fit = about.fit_variants(of_best, None, drifts)
+    best_fit = about.fit_variants(present, None, drifts)
     ranked = []
     for i in _identifiable(about):
         if about.variants[i].effect not in best.effects:
-            fit = about.fit_variants([*of_best, i], best_fit, drifts)
+            fit = about.fit_variants([*present, i], best_fit, drifts)
             ranked.append(_RankedSet(fit.log_evidence - best_fit.log_evidence, (i,), fit))
-    with_variants = {v.effect for v in linear_model.variants}
-    ranked.sort(key=lambda r: -r.gain)
+    return sorted(ranked, key=lambda r: -r.gain)
+
+
+def _fit_added(linear_model: LinearModel, settings: DecisionSettings, about: LinearModel,
+               best: Hypothesis, ranked: Sequence[_RankedSet], hypotheses: Hypotheses) -> None:
+    """Fit in full, beside the effects of a hypothesis, the further effects that gain most."""
+    with_variants = {v.effect for v in linear_model.variants} | {*drifts_among(best.effects)}
     for gain, (i,), fit in ranked[:_FURTHER]:
         if gain < settings.worth_fitting:
             break
         added = about.variants[i]
         effects = (*best.effects, added.effect)
-        if not with_variants.union(drifts).issuperset(effects) \
-                or frozenset(effects) in hypotheses:
+        if not with_variants.issuperset(effects) or frozenset(effects) in hypotheses:
             continue
         start = dict(zip(best.names, best.values))
         start |= {about.names[k]: value for k, value in zip(fit.column_ids, fit.values)
                   if k in about.column_ids[i]}
         start |= _limit_start(added)
         _add(hypotheses, _fit_or_none(linear_model, effects, start, _named_shape(added)))
-    return list(dict.fromkeys(about.variants[r.chosen[0]].effect for r in ranked))
 
 
 def _remove_each_effect(linear_model: LinearModel, best: Hypothesis, hypotheses: Hypotheses

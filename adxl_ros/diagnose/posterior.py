@@ -42,7 +42,7 @@ from adxl_ros.diagnose.effect_sizes import SizedHypothesis
 from adxl_ros.diagnose.flexible_terms import Basis
 from adxl_ros.diagnose.hypothesis_fit import Hypothesis, sparsity_log_bayes_factor
 from adxl_ros.diagnose.linear_model import LinearModel
-from adxl_ros.diagnose.noise_whitening import drifts_among, Whitener
+from adxl_ros.diagnose.noise_whitening import Whitener
 from adxl_ros.model.diagnosis_hints import FormDimension
 from adxl_ros.model.effects import effect_named
 import numpy as np
@@ -96,8 +96,8 @@ class _ChannelGrams:
     """Products of the whitened columns of a hypothesis and of the basis, by filter."""
 
     places: np.ndarray
-    own: np.ndarray
-    cross: np.ndarray
+    design: dict[int, np.ndarray]
+    cross: dict[int, np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -223,12 +223,13 @@ def _channel(linear_model: LinearModel, number: int, sized: Sequence[SizedHypoth
     filters = _filters(number, sized)
     used = comparison.used
     grams = np.empty((len(filters), columns.shape[1], columns.shape[1]))
-    own: list[list[np.ndarray]] = [[] for _ in sized]
-    cross: list[list[np.ndarray]] = [[] for _ in sized]
+    linearised = [s.hypothesis.linearised for s in sized]
+    design: list[dict[int, np.ndarray]] = [{} for _ in sized]
+    cross: list[dict[int, np.ndarray]] = [{} for _ in sized]
     imitated = np.zeros(0)
     series = evidence.prepared(filters, columns, used)
-    by_hypothesis = [evidence.prepared(
-        filters, s.hypothesis.linearised.columns[number].values, used) for s in sized]
+    by_hypothesis = [evidence.prepared(filters, hypothesis.columns[number].values, used)
+                     for hypothesis in linearised]
     for f, whitener in enumerate(filters):
         white = evidence.whitened(whitener, series, used)
         grams[f] = white @ white.T
@@ -236,17 +237,23 @@ def _channel(linear_model: LinearModel, number: int, sized: Sequence[SizedHypoth
             library = evidence.prepared(
                 filters, np.array([c for _, c in linear_model.columns[number]]).T, used)
             imitated = _imitated(white, evidence.whitened(whitener, library, used))
-        for h, series_of in enumerate(by_hypothesis):
-            mine = evidence.whitened(whitener, series_of, used)
-            own[h].append(mine @ mine.T)
-            cross[h].append(mine @ white.T)
+        for h, (hypothesis, columns_of) in enumerate(zip(linearised, by_hypothesis)):
+            place = _place(whitener, hypothesis.filters[number])
+            if place is not None:
+                design[h][f] = hypothesis.channels[number].total_grams[place]
+                cross[h][f] = evidence.whitened(whitener, columns_of, used) @ white.T
     numbers = _numbers(basis)
     return _Channel(
         filters, float(used.sum()), scale, numbers,
-        {dimension: _not_imitated(grams[0], imitated, columns_of)
-         for dimension, columns_of in numbers.items()},
-        grams, [_ChannelGrams(s.hypothesis.linearised.columns[number].places, np.array(own[h]),
-                              np.array(cross[h])) for h, s in enumerate(sized)])
+        {dimension: _not_imitated(grams[0], imitated, places)
+         for dimension, places in numbers.items()},
+        grams, [_ChannelGrams(hypothesis.columns[number].places, design[h], cross[h])
+                for h, hypothesis in enumerate(linearised)])
+
+
+def _place(whitener: Whitener, filters: Sequence[Whitener]) -> int | None:
+    """Return the place of a filter among others; None where it is not among them."""
+    return next((i for i, f in enumerate(filters) if f is whitener), None)
 
 
 def _filters(number: int, sized: Sequence[SizedHypothesis]) -> list[Whitener]:
@@ -291,8 +298,8 @@ def _not_imitated(gram: np.ndarray, imitated: np.ndarray, columns: np.ndarray) -
 
     The directions are orthonormal, (basis, r).
     """
-    part, own = imitated[np.ix_(columns, columns)], gram[np.ix_(columns, columns)]
-    values, vectors = np.linalg.eigh(own)
+    part, gram_of = imitated[np.ix_(columns, columns)], gram[np.ix_(columns, columns)]
+    values, vectors = np.linalg.eigh(gram_of)
     kept = values > max(values[-1], 0.0) * _SMALLEST_EIGENVALUE
     whitening = vectors[:, kept] / np.sqrt(values[kept])
     shares, directions = np.linalg.eigh(whitening.T @ part @ whitening)
@@ -330,10 +337,8 @@ def _log_evidence(channels: Sequence[_Channel], index: int, sized: SizedHypothes
     linearised = hypothesis.linearised
     prior_precision = linearised.prior_std ** -2.0
     mean = hypothesis.fit.values.copy()
-    allowed = (*drifts_among(hypothesis.effects), *drifts_among(linearised.sensor.effects))
     models = [_ChannelModel(channel, channel.hypotheses[index],
-                            *_flexible(channel, number, sized, form_error, unknown, amplitude_g),
-                            allowed)
+                            *_flexible(channel, number, sized, form_error, unknown, amplitude_g))
               for number, channel in enumerate(channels)]
     for _ in range(_NOISE_ITERATIONS):
         precision, information = np.diag(prior_precision), np.zeros(len(mean))
@@ -365,42 +370,40 @@ class _ChannelModel:
     """One channel of one model: its noise is fitted to the coefficients of the model."""
 
     def __init__(self, channel: _Channel, grams: _ChannelGrams, directions: np.ndarray,
-                 std: np.ndarray, drifts: Sequence[str]) -> None:
+                 std: np.ndarray) -> None:
         self._places, self._count = grams.places, channel.count
-        allowed = [i for i, f in enumerate(channel.filters) if f.healthy or f.effect in drifts]
-        self._filters = allowed or list(range(len(channel.filters)))
-        self._log_prior = [channel.filters[i].log_prior for i in self._filters]
+        self._log_prior = [channel.filters[i].log_prior for i in grams.design]
         weights = directions * std
-        self._own = [grams.own[i] for i in self._filters]
-        self._cross = [grams.cross[i] @ weights for i in self._filters]
-        self._basis = [weights.T @ channel.basis[i] @ weights for i in self._filters]
+        self._design = list(grams.design.values())
+        self._cross = [cross @ weights for cross in grams.cross.values()]
+        self._basis = [weights.T @ channel.basis[i] @ weights for i in grams.design]
         self._variance_v2 = [max(float(g[0, 0]) / self._count, np.finfo(float).tiny)
-                             for g in self._own]
+                             for g in self._design]
         self._started = False
 
     def marginal(self, mean: np.ndarray) -> _Marginal:
         """Return the best filter's precision and information, given coefficients, (k,)."""
         v = np.concatenate([[1.0], -mean[self._places]])
         best: tuple[float, _Marginal] | None = None
-        for i, (own, cross, basis) in enumerate(zip(self._own, self._cross, self._basis)):
+        for i, (design, cross, basis) in enumerate(zip(self._design, self._cross, self._basis)):
             if not self._started:
-                self._variance_v2[i] = max(float(v @ own @ v) / self._count,
+                self._variance_v2[i] = max(float(v @ design @ v) / self._count,
                                            np.finfo(float).tiny)
-            own_left, constant = self._integrated(i, own, cross, basis, v)
-            log_likelihood = constant - 0.5 * float(v @ own_left @ v)
-            part = _Marginal(self._places, own_left[1:, 1:], own_left[1:, 0],
-                             constant - 0.5 * float(own_left[0, 0]))
+            marginal, constant = self._integrated(i, design, cross, basis, v)
+            log_likelihood = constant - 0.5 * float(v @ marginal @ v)
+            part = _Marginal(self._places, marginal[1:, 1:], marginal[1:, 0],
+                             constant - 0.5 * float(marginal[0, 0]))
             if best is None or log_likelihood > best[0]:
                 best = log_likelihood, part
         self._started = True
         assert best is not None
         return best[1]
 
-    def _integrated(self, i: int, own: np.ndarray, cross: np.ndarray, basis: np.ndarray,
+    def _integrated(self, i: int, design: np.ndarray, cross: np.ndarray, basis: np.ndarray,
                     v: np.ndarray) -> tuple[np.ndarray, float]:
         """Integrate the flexible functions for one filter, and update its noise level."""
         scale = 1 / self._variance_v2[i]
-        out, half_log_det = scale * own, 0.0
+        out, half_log_det = scale * design, 0.0
         if len(basis):
             factor, solved, fault = dposv(scale * basis + np.eye(len(basis)), scale * cross.T)
             if fault:
@@ -409,9 +412,9 @@ class _ChannelModel:
             half_log_det = float(np.log(np.diag(factor)).sum())
             # The flexible functions at their posterior mean leave this residual.
             flexible = solved @ v
-            squares = v @ own @ v - 2 * v @ cross @ flexible + flexible @ basis @ flexible
+            squares = v @ design @ v - 2 * v @ cross @ flexible + flexible @ basis @ flexible
         else:
-            squares = v @ own @ v
+            squares = v @ design @ v
         constant = -0.5 * self._count * float(np.log(self._variance_v2[i])) \
             - half_log_det + self._log_prior[i]
         self._variance_v2[i] = max(float(squares) / self._count, np.finfo(float).tiny)
