@@ -52,9 +52,14 @@ class DecisionSettings:
     smallest_share_of_gap
         An effect is immaterial below this share of the rms of all effects whose form is not
         exact. Between 1 and 15 % its value matters little.
+    smallest_drift_share_of_gap
+        The same for a drift, because what the form of an effect lacks comes and goes like a
+        drift.
     calibration_factor
-        Beside another effect, zero-g and scale factor are immaterial below this multiple of what
-        the calibration can have taken up. Chosen: two standard deviations.
+        Beside another effect, zero-g and scale factor matter above this multiple of what the
+        calibration can have taken up. Chosen: two standard deviations.
+    healthy_factor
+        They also exceed this multiple of the tolerance of a healthy unit. Chosen: one unit in 400.
     smallest_rival_share
         Smallest probability of an inseparable rival, divided by that of the best set. Chosen:
         odds of 20 to 1.
@@ -72,14 +77,16 @@ class DecisionSettings:
 
     prior_by_count: tuple[float, ...] = (0.30, 0.35, 0.13, 0.02)
     prior_of_unknown_by_count: tuple[float, ...] = (0.15, 0.04, 0.01, 0.001)
-    evidence_factor: float = 0.05
-    worth_fitting: float = 60.0
+    evidence_factor: float = 0.2
+    worth_fitting: float = 25.0
     form_errors: tuple[float, ...] = (0.0, 0.1, 0.3, 0.6)
     unknown_amplitudes_g: tuple[float, ...] = (1e-4, 3e-4, 1e-3, 3e-3)
     with_unknown: int = 6
     smallest_share_of_noise: float = 0.05
-    smallest_share_of_gap: float = 0.05
+    smallest_share_of_gap: float = 0.1
+    smallest_drift_share_of_gap: float = 0.3
     calibration_factor: float = 2.0
+    healthy_factor: float = 3.0
     smallest_rival_share: float = 0.05
     certain: float = 0.5
     unexplained_share_of_explained: float = 0.7

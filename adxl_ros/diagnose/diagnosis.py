@@ -36,7 +36,7 @@ from adxl_ros.diagnose.gap_closure import GapClosure, HeldOutResidual
 from adxl_ros.diagnose.hypothesis_fit import Hypothesis, residual_channels
 from adxl_ros.diagnose.input_checks import compare_checked
 from adxl_ros.diagnose.linear_model import build_linear_model, LinearModel
-from adxl_ros.diagnose.model_search import fit_without, search
+from adxl_ros.diagnose.model_search import refit, search
 from adxl_ros.diagnose.next_experiment import NextExperiment, propose_next_experiment
 from adxl_ros.diagnose.noise_comparison import compare_noise, NoiseComparison
 from adxl_ros.diagnose.noise_detectors import Detection, NoiseSamples, UNKNOWN
@@ -279,9 +279,9 @@ def _sized(linear_model: LinearModel, hypotheses: Sequence[Hypothesis], noise_mp
         if s.material in present:
             continue
         present.add(s.material)
-        smaller = fit_without(linear_model, s.hypothesis, s.immaterial)
-        if smaller is not None:
-            sized.append(size_hypothesis(linear_model, smaller, noise_mps2, SETTINGS))
+        refitted = refit(linear_model, s.hypothesis, sorted(s.material))
+        if refitted is not None:
+            sized.append(size_hypothesis(linear_model, refitted, noise_mps2, SETTINGS))
     return sized
 
 

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import NamedTuple
 
 from adxl_ros.diagnose.decision_settings import DecisionSettings
@@ -29,10 +30,10 @@ from adxl_ros.diagnose.linear_model import (
     rests_by_channel,
 )
 from adxl_ros.diagnose.noise_whitening import drifts_among, expected_drift_g
-from adxl_ros.model.coefficients import neutral, parameter_of
+from adxl_ros.model.coefficients import get, neutral, parameter_of, with_neutral
 from adxl_ros.model.constants import G0_MPS2, Z_90
-from adxl_ros.model.effects import effect_named
-from adxl_ros.model.effects.base import Coefficient, Role
+from adxl_ros.model.effects import effect_named, library
+from adxl_ros.model.effects.base import Role
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
@@ -66,19 +67,15 @@ class SizedHypothesis:
         The fitted hypothesis.
     contributions
         What each effect contributes.
-    immaterial
-        Effects that do not matter.
+    material
+        Effects that matter. Zero-g and scale factor, which are free beside other effects, are
+        among them if they exceed what the calibration can have taken up.
 
     """
 
     hypothesis: Hypothesis
     contributions: dict[str, Contribution]
-    immaterial: frozenset[str]
-
-    @property
-    def material(self) -> frozenset[str]:
-        """Effects that matter."""
-        return frozenset(self.hypothesis.effects) - self.immaterial
+    material: frozenset[str]
 
 
 def size_hypothesis(linear_model: LinearModel, hypothesis: Hypothesis, noise_mps2: float,
@@ -108,16 +105,28 @@ def size_hypothesis(linear_model: LinearModel, hypothesis: Hypothesis, noise_mps
 
     """
     contributions = {e: contribution(linear_model, hypothesis, e) for e in hypothesis.effects}
-    inexact_squares = sum(c.rms_mps2 ** 2 for e, c in contributions.items()
-                          if not effect_named(e).exact)
-    smallest_mps2 = max(settings.smallest_share_of_noise * noise_mps2,
-                        settings.smallest_share_of_gap * float(np.sqrt(inexact_squares)))
+    inexact_mps2 = float(np.sqrt(sum(c.rms_mps2 ** 2 for e, c in contributions.items()
+                                     if not effect_named(e).exact
+                                     and not effect_named(e).diagnosis.drift)))
     angle_mps2 = linear_model.smallest_angle_rad() * G0_MPS2
     immaterial = {
         e for e, c in contributions.items()
-        if c.rms_mps2 < smallest_mps2 or (_turns(e) and c.rms_mps2 < angle_mps2)
-        or _may_be_zero(hypothesis, e) or _calibrated(linear_model, hypothesis, e, settings)}
-    return SizedHypothesis(hypothesis, contributions, frozenset(immaterial))
+        if c.rms_mps2 < _smallest_mps2(e, noise_mps2, inexact_mps2, settings)
+        or (_turns(e) and c.rms_mps2 < angle_mps2) or _may_be_zero(hypothesis, e)}
+    material = set(hypothesis.effects) - immaterial
+    if any(not effect_named(e).diagnosis.straight_line for e in material):
+        beyond = _beyond_calibration(linear_model, hypothesis, settings)
+        straight = {e for e in library() if effect_named(e).diagnosis.straight_line}
+        material = (material - straight) | beyond
+    return SizedHypothesis(hypothesis, contributions, frozenset(material))
+
+
+def _smallest_mps2(effect: str, noise_mps2: float, inexact_mps2: float,
+                   settings: DecisionSettings) -> float:
+    """Return the rms of an effect below which it does not matter, m/s²."""
+    share = settings.smallest_drift_share_of_gap if effect_named(effect).diagnosis.drift \
+        else settings.smallest_share_of_gap
+    return max(settings.smallest_share_of_noise * noise_mps2, share * inexact_mps2)
 
 
 def contribution(linear_model: LinearModel, hypothesis: Hypothesis, effect: str) -> Contribution:
@@ -193,28 +202,27 @@ def _may_be_zero(hypothesis: Hypothesis, effect: str) -> bool:
     return bool(sizes) and all(sizes)
 
 
-def _calibrated(linear_model: LinearModel, hypothesis: Hypothesis, effect: str,
-                settings: DecisionSettings) -> bool:
-    """Determine whether zero-g or scale factor is what a calibration took up of other effects."""
+def _beyond_calibration(linear_model: LinearModel, hypothesis: Hypothesis,
+                        settings: DecisionSettings) -> set[str]:
+    """Return whether zero-g or scale factor exceeds what a calibration took up of the effects."""
     others = [e for e in hypothesis.effects if not effect_named(e).diagnosis.straight_line
               and not effect_named(e).diagnosis.drift]
-    if not effect_named(effect).diagnosis.straight_line or not others:
-        return False
-    names = [name for name in hypothesis.names if name.effect == effect]
-    values = hypothesis.values[[hypothesis.names.index(name) for name in names]]
-    std = _taken_up_std(linear_model, hypothesis, others, names)
-    return bool(np.all(np.abs(values) < settings.calibration_factor * std))
-
-
-def _taken_up_std(linear_model: LinearModel, hypothesis: Hypothesis, others: Sequence[str],
-                  names: Sequence[Coefficient]) -> np.ndarray:
-    """Return what a calibration can have taken up of effects, in the unit of each name."""
-    columns = [{i: channel[name] for i, name in enumerate(names) if name in channel}
+    if not others:
+        return set()
+    columns = [{name: column for name, column in channel.items()
+                if effect_named(name.effect).diagnosis.straight_line}
                for channel in linear_model.nuisance_columns]
+    names = list(dict.fromkeys(chain(*columns)))
     changes = [[NumberedColumn(0, axis_v)]
                for change_v in _changes_v(linear_model, hypothesis, others)
                for axis_v in change_v.T]
-    parts = parts_at_rest(columns, changes, 1, rests_by_channel(linear_model.comparisons))
+    parts = parts_at_rest([{names.index(n): column for n, column in channel.items()}
+                           for channel in columns], changes, 1,
+                          rests_by_channel(linear_model.comparisons))
     drifts = drifts_among(hypothesis.effects)
-    return np.array([np.hypot(linear_model.tolerance(name, drifts), parts[i][0])
-                     for i, name in enumerate(names)])
+    departures = get(hypothesis.sensor, names) \
+        - get(with_neutral(linear_model.baseline, [n.effect for n in names]), names)
+    return {name.effect for i, name in enumerate(names)
+            if abs(departures[i]) > np.hypot(
+                settings.healthy_factor * linear_model.tolerance(name, drifts),
+                settings.calibration_factor * parts[i][0])}

@@ -150,13 +150,17 @@ def _of_axis(comparison: BaselineComparison, force_g: np.ndarray, axis: int, vol
     time_s, dt_s = comparison.time_s, comparison.dt_s
     slope = np.gradient(along_g, dt_s)
     lagging = [low_pass(along_g, tau_s, dt_s, {}) - along_g for tau_s in _LAG_S]
+    # The level of a vibration: squares of the slope and of the fast force, smoothed.
+    levels = [low_pass(fast ** 2, tau_s, dt_s, {}) for fast in (slope, lagging[-1])
+              for tau_s in _LAG_S]
     basis = {
         FormDimension.FORCE: _modes(along_g, _FORCE_MODES),
         FormDimension.CROSS_FORCE: np.concatenate([
             _products(force_g), *(_modes(f, _CROSS_MODES) for f in across_g)]),
         FormDimension.CODE: _code_functions(volts, comparison.sensor.adc_vref_v),
         FormDimension.LAG: _same_size([
-            slope, np.gradient(slope, dt_s), slope * along_g, slope ** 2, *lagging])}
+            slope, np.gradient(slope, dt_s), slope * along_g, slope ** 2, *lagging, *levels,
+            *(np.sqrt(np.abs(level)) for level in levels)])}
     if comparison.reference is not Reference.STAGE:
         return basis
     rates = [joint(time_s, 1) for joint in (comparison.motion.alpha, comparison.motion.beta)]

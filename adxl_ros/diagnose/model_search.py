@@ -22,7 +22,7 @@ at a shaker of 40 Hz.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
 from typing import NamedTuple
@@ -270,13 +270,14 @@ def _remove_each_effect(linear_model: LinearModel, best: Hypothesis, hypotheses:
     """Fit a hypothesis without each of its effects; two effects may replace an earlier one."""
     for effect in best.effects:
         if frozenset(best.effects) - {effect} not in hypotheses:
-            _add(hypotheses, fit_without(linear_model, best, [effect]))
+            _add(hypotheses, refit(linear_model, best,
+                                  [e for e in best.effects if e != effect]))
 
 
-def fit_without(linear_model: LinearModel, hypothesis: Hypothesis, effects: Collection[str]
-                ) -> Hypothesis | None:
+def refit(linear_model: LinearModel, hypothesis: Hypothesis, effects: Sequence[str]
+          ) -> Hypothesis | None:
     """
-    Fit a hypothesis without some of its effects.
+    Fit other effects from the values of a hypothesis.
 
     Parameters
     ----------
@@ -285,16 +286,15 @@ def fit_without(linear_model: LinearModel, hypothesis: Hypothesis, effects: Coll
     hypothesis
         A fitted hypothesis.
     effects
-        The effects to leave out.
+        The effects to fit.
 
     Returns
     -------
     Hypothesis or None
-        The smaller hypothesis; None where it cannot be simulated.
+        The hypothesis of these effects; None where it cannot be simulated.
 
     """
-    return _fit_or_none(linear_model, [e for e in hypothesis.effects if e not in effects],
-                        dict(zip(hypothesis.names, hypothesis.values)), {})
+    return _fit_or_none(linear_model, effects, dict(zip(hypothesis.names, hypothesis.values)), {})
 
 
 def _ranked(linear_model: LinearModel, sets: Sequence[tuple[int, ...]], null_fit: LinearFit,

@@ -151,7 +151,7 @@ def posterior(linear_model: LinearModel, sized: Sequence[SizedHypothesis],
             + _log_prior(s.material, unknown, linear_model, settings)
         key = (s.material, unknown)
         # A merged set is represented by its own fit where it has one.
-        exact = not s.immaterial
+        exact = s.material == frozenset(s.hypothesis.effects)
         entry = entries.get(key)
         if entry is None:
             entries[key] = WeighedHypothesis(s.material, unknown, s.hypothesis, weight, 0.0, form)
