@@ -434,7 +434,8 @@ def test_noise_is_compared_with_the_simulated_noise():
 def test_next_experiment_separates_most():
     """Heating separates temperature from warm-up, and a shaker does not."""
     sensor = with_effects(unit('xy'), ['temperature_bias:per_k=3e-4'])
-    best = Hypothesis(('temperature_bias',), sensor, (), np.zeros(0), np.zeros(0), 0.0, None, None, 0.0)
+    best = Hypothesis(('temperature_bias',), sensor, (), np.zeros(0), np.zeros(0), 0.0, None, None,
+                      0.0)
     verdict = Verdict('inseparable', (), (('temperature_bias', 'warm_up'),), 0.9, (), best)
     proposal = propose_next_experiment(verdict, [], 0)
     worth = {m.text: m.log_bayes_factor_per_minute for m in proposal.menu}
