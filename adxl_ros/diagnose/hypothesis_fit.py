@@ -237,9 +237,9 @@ class LinearisedHypothesis:
         """
         Return the departures from the prior mean after a fit.
 
-        A limit or a shape keeps its value if the samples do not determine it, because its prior
-        mean is no better guess. It also keeps its value if only the held-out blocks determine
-        it. A shape changes by a factor of two at most.
+        A limit with its knee, or a shape, keeps its value if the samples do not determine it,
+        because its prior mean is no better guess. It also keeps its value if only the held-out
+        blocks determine it. A shape changes by a factor of two at most.
 
         Parameters
         ----------
@@ -261,7 +261,8 @@ class LinearisedHypothesis:
         if full_fit is not None:
             undetermined |= std > _UNDETERMINED_RATIO * np.sqrt(np.diag(full_fit.covariance)[:j])
         fitted = self.prior_mean[:j] + fit.values[:j]
-        sized = np.array([p.is_size for p in parameters], bool)
+        sized = np.array([p.is_size and not limits(effect_named(name.effect))
+                          for p, name in zip(parameters, self.effect_names)], bool)
         values = np.where(undetermined & ~sized, self.values, fitted)
         shape_range = np.sort([self.values / 2, self.values * 2], axis=0)
         is_shape = [p.role is Role.SHAPE for p in parameters]

@@ -261,7 +261,7 @@ def _fit_added(linear_model: LinearModel, settings: DecisionSettings, about: Lin
         start = dict(zip(best.names, best.values))
         start |= {about.names[k]: value for k, value in zip(fit.column_ids, fit.values)
                   if k in about.column_ids[i]}
-        start |= _limit_start(added)
+        start |= _limit_start(added, start)
         _add(hypotheses, _fit_or_none(linear_model, effects, start, _named_shape(added)))
 
 
@@ -323,17 +323,18 @@ def _fit_best(linear_model: LinearModel, settings: DecisionSettings, ranked: Ite
         start = dict(zip([linear_model.names[i] for i in fit.column_ids], fit.values))
         shapes: dict[Coefficient, float] = {}
         for variant in variants:
-            start |= _limit_start(variant)
+            start |= _limit_start(variant, start)
             shapes |= _named_shape(variant)
         hypothesis = _fit_or_none(linear_model, effects, start, shapes)
         if hypothesis is not None and hypothesis.log_evidence > null_fit.log_evidence:
             _add(hypotheses, hypothesis)
 
 
-def _limit_start(variant: Variant) -> dict[Coefficient, float]:
+def _limit_start(variant: Variant, amounts: Mapping[Coefficient, float]
+                 ) -> dict[Coefficient, float]:
     """Return where the fit of a limit starts, as departures from the prior mean."""
     return {name: value - (0.0 if parameter_of(name).is_size else parameter_of(name).scale)
-            for name, value in variant.limit_start.items()}
+            for name, value in variant.first_limits(amounts).items()}
 
 
 def _named_shape(variant: Variant) -> dict[Coefficient, float]:

@@ -16,8 +16,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import product
 from typing import NamedTuple
 
 from adxl_ros.errors import UserError
@@ -32,8 +33,8 @@ PRIOR_WIDTH = 5.0
 """Prior standard deviation of a coefficient, divided by its typical size. Chosen: faults are
 larger than typical values. `evidence.AMPLITUDES` adds smaller amplitudes to the prior."""
 _SHAPE_FACTORS = (0.2, 1.0, 5.0)
-"""Values of a shape parameter that are tried, divided by its typical value. Chosen: fits reach the
-values between."""
+"""Values of a shape parameter that states no starts, divided by its typical value. Chosen: fits
+reach the values between."""
 _SMOOTH_STEP = 0.2
 """Step of a smooth parameter, divided by its typical size. Chosen: smaller than most faults."""
 _ROUGH_STEPS = (1.0, 4.0, 16.0)
@@ -42,6 +43,11 @@ a play of 1 mrad does not predict a play of 15 mrad."""
 _CLIPPED_SHARES = (0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.3)
 """Shares of the samples that are clipped by the limits that are tried. Chosen: neighbours differ
 by factors of 1.5 to 2.5."""
+_CLIPPING_AMOUNT = 0.3
+"""Share of the change by a limit, on the linear model, below which the axis is not clipped there.
+Chosen: the levels differ by factors, so that a limit between two takes a part of each."""
+_BEYOND_G = 0.1
+"""Distance from the largest sample of a limit that clips none, g. Chosen: five typical knees."""
 _FIT_STEP = 0.02
 """Step of a smooth parameter at its fitted value, divided by its typical size. Chosen: small
 enough for a derivative."""
@@ -93,6 +99,8 @@ class Variant:
     limit_start
         Only for an effect with a limit: first values of its fit, by coefficient. The columns are
         then the change of the output by these values, V.
+    limit_beyond
+        The same for limits that clip no sample.
 
     """
 
@@ -103,6 +111,25 @@ class Variant:
     prior_std: np.ndarray
     columns: tuple[AxisColumns, ...]
     limit_start: dict[Coefficient, float] = field(default_factory=dict)
+    limit_beyond: dict[Coefficient, float] = field(default_factory=dict)
+
+    def first_limits(self, amounts: Mapping[Coefficient, float]) -> dict[Coefficient, float]:
+        """
+        Return first values of a fit of limits; those that hardly clip begin beyond all samples.
+
+        Parameters
+        ----------
+        amounts
+            Share of the change by each limit that the linear model takes, by coefficient.
+
+        Returns
+        -------
+        dict
+            Values by coefficient; none for an effect without a limit.
+
+        """
+        return self.limit_start | {name: value for name, value in self.limit_beyond.items()
+                                   if amounts.get(name, 0.0) < _CLIPPING_AMOUNT}
 
 
 def candidates() -> list[Effect]:
@@ -147,14 +174,28 @@ def variants(simulate: Simulate, sensor: Sensor, effect: Effect, baseline_v: np.
     # An effect with a shape parameter is nearly linear in its sizes. An effect of the baseline
     # keeps its shape.
     rough = not effect.smooth and not any(p.role is Role.SHAPE for p in effect.parameters)
-    for shape in [{}] if modelled else shapes(effect):
+    for shape, sizes in _tried(effect, modelled):
         for step in _ROUGH_STEPS if rough else (_SMOOTH_STEP,):
             try:
-                variant = _variant(simulate, sensor, effect, shape, step, baseline_v, pose_known)
+                variant = _variant(simulate, sensor, replace(effect, parameters=sizes), shape,
+                                   step, baseline_v, pose_known)
             except UserError:
                 return
             if variant is not None:
                 yield variant
+
+
+def _tried(effect: Effect, modelled: bool
+           ) -> Iterator[tuple[dict[str, float], tuple[Parameter, ...]]]:
+    """Return the shapes that are tried, each with the sizes that it concerns."""
+    sizes = tuple(p for p in effect.parameters if p.role is not Role.SHAPE)
+    unshaped = tuple(p for p in sizes if not p.shaped)
+    if modelled or not unshaped:
+        yield from ((shape, sizes) for shape in ([{}] if modelled else shapes(effect)))
+        return
+    yield {}, unshaped
+    shaped = tuple(p for p in sizes if p.shaped)
+    yield from ((shape, shaped) for shape in shapes(effect))
 
 
 def _limit_variants(simulate: Simulate, sensor: Sensor, effect: Effect, limit: Parameter,
@@ -163,10 +204,13 @@ def _limit_variants(simulate: Simulate, sensor: Sensor, effect: Effect, limit: P
     axes = sensor.axes
     with_effect = with_neutral(sensor, [effect.name])
     names = names_of(replace(effect, parameters=(limit,)), axes)
-    # The other parameters have no effect until the limit clips.
-    start = {name: p.scale for p in effect.parameters if p.is_size
+    # The other parameters have no effect until the limit clips; one-sided ones must leave 0.
+    start = {name: p.scale if p.lower == p.neutral else p.neutral
+             for p in effect.parameters if p.is_size
              for name in names_of(replace(effect, parameters=(p,)), axes)}
     magnitude_g = np.abs(baseline_v - sensor.zero_g_v) / sensor.scale_v_per_g
+    beyond = dict(zip(names, np.clip(magnitude_g.max(axis=0) + _BEYOND_G, limit.lower,
+                                     limit.upper)))
     levels = []
     for share in _CLIPPED_SHARES:
         levels.append(np.quantile(magnitude_g, 1 - share, axis=0))
@@ -178,7 +222,7 @@ def _limit_variants(simulate: Simulate, sensor: Sensor, effect: Effect, limit: P
         if clipped:
             yield Variant(effect.name, {}, float(number), tuple(names[d] for d in clipped),
                           np.ones(len(clipped)), _limit_columns(change_v, clipped),
-                          dict(zip(names, values)) | start)
+                          dict(zip(names, values)) | start, beyond)
 
 
 def _limit_columns(change_v: np.ndarray, clipped: list[int]) -> tuple[AxisColumns, ...]:
@@ -188,30 +232,34 @@ def _limit_columns(change_v: np.ndarray, clipped: list[int]) -> tuple[AxisColumn
 
 
 def shapes(effect: Effect) -> list[dict[str, float]]:
-    """Return the values of the shape parameters that are tried; the first parameter varies."""
+    """
+    Return the values of the shape parameters that are tried: all combinations of their starts.
+
+    Where an effect states no starts, its first shape parameter takes multiples of its scale.
+    """
     shape_parameters = [p for p in effect.parameters if p.role is Role.SHAPE and not p.held]
     if not shape_parameters:
         return [{}]
-    first, others = shape_parameters[0], {p.name: p.scale for p in shape_parameters[1:]}
-    values = [float(np.clip(first.scale * factor, first.lower, first.upper))
-              for factor in _SHAPE_FACTORS]
-    return [{first.name: value, **others} for value in dict.fromkeys(values)]
+    starts = [p.starts or (p.scale,) for p in shape_parameters]
+    first = shape_parameters[0]
+    if not any(p.starts for p in shape_parameters):
+        starts[0] = tuple(dict.fromkeys(float(np.clip(first.scale * factor, first.lower,
+                                                      first.upper)) for factor in _SHAPE_FACTORS))
+    return [dict(zip([p.name for p in shape_parameters], values)) for values in product(*starts)]
 
 
 def _variant(simulate: Simulate, sensor: Sensor, effect: Effect, shape: dict[str, float],
              step: float, baseline_v: np.ndarray, pose_known: bool) -> Variant | None:
-    """Differentiate by one effect's coefficients at one shape; None where nothing changes."""
+    """Differentiate by the parameters of an effect at one shape; None where nothing changes."""
     axes = sensor.axes
-    start = _with_shape(with_neutral(sensor, [effect.name]), effect, shape)
+    start = _with_shape(with_neutral(sensor, [effect.name]), effect_named(effect.name), shape)
     names: list[Coefficient] = []
     prior_std: list[float] = []
     columns: list[list[tuple[int, np.ndarray]]] = [[] for _ in axes]
-    start_v = baseline_v if not shape else simulate(start)
     for p in effect.parameters:
-        if p.role is Role.SHAPE:
-            continue
         size = _step_within(p, np.asarray(start.values[effect.name][p.name]), p.scale * step)
-        change = (simulate(_stepped(start, effect.name, p, size)) - start_v) / size
+        # A shape has no influence where the sizes are neutral, as in the baseline.
+        change = (simulate(_stepped(start, effect.name, p, size)) - baseline_v) / size
         # Without a known pose only changes show, except of the zero-g itself.
         if not pose_known and effect.diagnosis.straight_line is not StraightLine.ZERO_G:
             change -= change.mean(axis=0)

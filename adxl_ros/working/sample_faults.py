@@ -137,7 +137,8 @@ def _draw_curve(rng: np.random.Generator, axes: int) -> Shape:
 def _curve(size: float, shape: Shape) -> Parameters:
     """Return the parameters of the library's curve: bits or a sine."""
     bits = shape['bits'] if shape['law'] < 0.5 else [0.0] * len(_BITS)
-    return {'amplitude_v': 0.0 if shape['law'] < 0.5 else size, 'cycles': shape['cycles'],
+    size_v = 0.0 if shape['law'] < 0.5 else size
+    return {'amplitude_v': size_v, 'cosine_v': 0.0, 'cycles': shape['cycles'],
             **{name: size * weight for name, weight in zip(_BITS, bits)}}
 
 

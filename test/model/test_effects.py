@@ -102,6 +102,18 @@ def test_typical_values_change_a_recording_and_blocks_join(name, plain):
     np.testing.assert_array_equal(np.vstack(parts), all_at_once_v)
 
 
+@pytest.mark.parametrize('axes', ['x', 'xy', 'xyz'])
+@pytest.mark.parametrize('name', NAMES)
+def test_an_effect_acts_on_every_axis_of_the_sensor(name, axes):
+    """A typical effect changes each axis of a sensor with one, two or three."""
+    sensor = nominal(axes)
+    plain_v = volts(sensor)
+    events = {'spikes': {'rate_hz': 20.0}, 'stuck': {'rate_hz': 3.0},
+              'saturation': {'limit_g': [0.3] * len(axes)}}
+    with_typical_v = volts(with_effect(name, sensor, **events.get(name, {})))
+    assert np.all(np.abs(with_typical_v - plain_v).max(axis=0) > 1e-5)
+
+
 @pytest.mark.parametrize('name', [n for n in NAMES if library()[n].smooth
                                   and library()[n].acts_on is ActsOn.MEAN])
 def test_tangents_do_not_depend_on_the_step(name):

@@ -271,6 +271,11 @@ class Parameter:
         Whether fits leave it as it is, because zero-g and scale factor can take its place.
     role
         Role in its effect.
+    starts : tuple of float
+        Only for a shape: values from which a fit starts, in rising order. Empty for multiples of
+        the typical magnitude.
+    shaped
+        Only for a size: whether the shape parameters of its effect change what it does.
 
     """
 
@@ -286,6 +291,8 @@ class Parameter:
     typical: float | None = None
     held: bool = False
     role: Role = Role.SIZE
+    starts: tuple[float, ...] = ()
+    shaped: bool = True
 
     @property
     def is_size(self) -> bool:

@@ -49,7 +49,7 @@ EFFECT = Effect(
                   'largest lag behind the input: half of the width of the loop'),
         Parameter('reach_g', 'g', 1e-3, 2.0, 0.2, 'physics: part of the range',
                   'change of the input after a reversal that builds up half of the lag', '',
-                  neutral=0.2, role=Role.SHAPE),
+                  neutral=0.2, role=Role.SHAPE, starts=(0.04, 0.2, 1.0)),
     ),
     apply=apply,
     smooth=False,

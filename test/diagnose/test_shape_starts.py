@@ -1,0 +1,98 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Shapes are searched from several starts, so that no fit depends on one guess."""
+
+from dataclasses import replace
+
+from adxl_ros.diagnose.sensitivities import shapes, variants
+from adxl_ros.model.coefficients import with_neutral
+from adxl_ros.model.effects import library
+from adxl_ros.model.effects.base import Coefficient, Role
+from adxl_ros.model.sensor import Sensor
+import numpy as np
+import pytest
+from units import Fed, nominal
+
+G = 9.80665
+
+
+@pytest.mark.parametrize('effect', library().values(), ids=lambda effect: effect.name)
+def test_starts_belong_to_shapes_and_lie_within_their_bounds(effect):
+    """Starts rise, and every combination is tried."""
+    tried = shapes(effect)
+    for p in effect.parameters:
+        assert not p.starts or p.role is Role.SHAPE
+        assert list(p.starts) == sorted(set(p.starts))
+        if p.role is Role.SHAPE and not p.held:
+            values = {shape[p.name] for shape in tried}
+            assert values.issuperset(p.starts)
+            assert all(p.lower <= value <= p.upper for value in values)
+    assert len({tuple(shape.items()) for shape in tried}) == len(tried)
+
+
+def simulate(sensor: Sensor) -> np.ndarray:
+    """Return the volts of a sensor that turns slowly through 1 g of either sign, (n, m)."""
+    turn = np.linspace(0, 4 * np.pi, 3000)
+    quiet = replace(sensor, noise_density_g_per_rthz=np.zeros(len(sensor.axes)), adc_bits=0)
+    return Fed(quiet)([G * np.sin(turn), G * np.cos(turn), G * np.sin(turn + 1)])
+
+
+@pytest.mark.parametrize('cycles', [1.7, 5.3, 10.2, 17.8, 29.0])
+@pytest.mark.parametrize('phase', [0.0, 1.6])
+def test_a_start_is_near_any_period_and_phase_of_a_converter(cycles, phase):
+    """Some start explains most of a sine of any period, so that a fit reaches it."""
+    sensor = nominal('xyz')
+    baseline_v = simulate(sensor)
+    with_curve = with_neutral(sensor, ['adc_inl'])
+    values = {**with_curve.values['adc_inl'], 'cycles': np.array(cycles),
+              'amplitude_v': np.array(1e-3 * np.cos(phase)),
+              'cosine_v': np.array(1e-3 * np.sin(phase))}
+    changed_v = simulate(replace(with_curve, values={'adc_inl': values})) - baseline_v
+    changed_v -= changed_v.mean(axis=0)
+    shares = []
+    for variant in variants(simulate, sensor, library()['adc_inl'], baseline_v, True):
+        columns = np.zeros((changed_v.size, len(variant.names) + 3))
+        for d, axis in enumerate(variant.columns):
+            rows = slice(d * len(changed_v), (d + 1) * len(changed_v))
+            columns[rows, axis.numbers] = axis.values
+            columns[rows, len(variant.names) + d] = 1.0
+        target = changed_v.T.ravel()
+        rest = target - columns @ np.linalg.lstsq(columns, target, rcond=None)[0]
+        shares.append(1 - float(rest @ rest) / float(target @ target))
+    assert max(shares) > 0.5
+
+
+def test_wrong_bits_are_differentiated_once():
+    """They do not depend on the periods of the sine, and are a variant of their own."""
+    sensor = nominal('xy')
+    tried = list(variants(simulate, sensor, library()['adc_inl'], simulate(sensor), True))
+    with_bits = [v for v in tried if Coefficient('adc_inl', 'third_bit_v') in v.names]
+    assert len(with_bits) == 1
+    assert not with_bits[0].shape
+    assert all(Coefficient('adc_inl', 'cosine_v') in v.names for v in tried if v.shape)
+
+
+def test_a_limit_of_one_axis_starts_without_clipping_the_others():
+    """Where the linear model takes nothing of a limit, its fit begins beyond all samples."""
+    sensor = nominal('xyz')
+    tried = list(variants(simulate, sensor, library()['saturation'], simulate(sensor), True))
+    names = [Coefficient('saturation', 'limit_g', axis) for axis in 'xyz']
+    assert any(all(variant.limit_start[name] < 1.0 for name in names) for variant in tried)
+    for variant in tried:
+        first = variant.first_limits({names[2]: 0.9, names[0]: 0.02})
+        assert first[names[2]] == variant.limit_start[names[2]]
+        assert min(first[names[0]], first[names[1]]) > 1.05
+        assert first[Coefficient('saturation', 'knee_g')] > 0
+        assert first[Coefficient('saturation', 'offset_g', 'x')] == 0
