@@ -115,6 +115,7 @@ class BaselineComparison:
     at_rest: np.ndarray
     used: np.ndarray
     notes: tuple[str, ...] = ()
+    reference_fades: bool = False
     memo: ChainMemo = field(default_factory=ChainMemo, compare=False, repr=False)
 
     def __len__(self) -> int:

@@ -16,8 +16,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from itertools import chain
 from typing import NamedTuple
 
 from adxl_ros.diagnose.decision_settings import DecisionSettings
@@ -25,6 +26,8 @@ from adxl_ros.diagnose.hypothesis_fit import Hypothesis
 from adxl_ros.diagnose.noise_detectors import Detection, UNKNOWN
 from adxl_ros.diagnose.noise_whitening import drifts_among
 from adxl_ros.diagnose.posterior import WeighedHypothesis
+from adxl_ros.model.diagnosis_hints import Manoeuvre
+from adxl_ros.model.effects import effect_named
 
 
 class WeightedHypothesis(NamedTuple):
@@ -205,3 +208,18 @@ def _choices(groups: Sequence[Sequence[str]]) -> list[tuple[str, ...]]:
     for group in groups:
         choices = [(*choice, effect) for choice in choices for effect in group]
     return choices
+
+
+def without_fast_effects(verdict: Verdict) -> Verdict:
+    """Return unknown where an effect is named that a reference without fast motion imitates."""
+    def is_imitated(effects: Iterable[str]) -> bool:
+        """Determine whether an effect shows in fast motion, or is unknown."""
+        return any(e == UNKNOWN or effect_named(e).diagnosis.revealed_by is Manoeuvre.SHAKE
+                   for e in effects)
+
+    if not is_imitated((*verdict.effects, *chain(*verdict.groups))):
+        return verdict
+    probability = sum(h.probability for h in verdict.hypotheses if is_imitated(h.effects))
+    others = [h for h in verdict.hypotheses if not is_imitated(h.effects)]
+    return replace(verdict, status='unknown', effects=(), groups=(), probability=probability,
+                   hypotheses=(WeightedHypothesis((UNKNOWN,), probability), *others))

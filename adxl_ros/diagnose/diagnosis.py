@@ -308,6 +308,8 @@ def _decide(linear_model: LinearModel, explanation: _Explanation) -> Verdict:
         code_step_mps2=max(map(_rounding_std_mps2, linear_model.comparisons))), SETTINGS)
     if verdict.status == 'no_gap' and not any(map(_could_show, linear_model.comparisons)):
         return replace(verdict, status='insufficient')
+    if any(c.reference_fades for c in linear_model.comparisons):
+        return decision.without_fast_effects(verdict)
     return verdict
 
 

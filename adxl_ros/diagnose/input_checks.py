@@ -21,6 +21,7 @@ from dataclasses import replace
 from adxl_ros.diagnose.baseline_comparison import BaselineComparison, compare
 from adxl_ros.diagnose.data_checks import DataFault, find_clock_fault
 from adxl_ros.diagnose.encoder_checks import find_encoder_fault
+from adxl_ros.diagnose.reference_bandwidth import fading_frequency_hz
 from adxl_ros.diagnose.reference_coverage import too_coarse, without_reading
 from adxl_ros.diagnose.sim_alignment import align_force
 from adxl_ros.diagnose.stamps import even_stamps
@@ -91,7 +92,13 @@ def compare_checked(recording: Recording, sensor: Sensor, sim: Motion | None, ma
     for part in left_out:
         used &= ~part.rows
         notes.append(part.text(recording.time_s))
-    return replace(comparison, used=used, notes=tuple(notes))
+    comparison = replace(comparison, used=used)
+    fading_hz = fading_frequency_hz(comparison)
+    if fading_hz is not None:
+        notes.append(f'--sim is smoother than the sensor: above {fading_hz:.3g} Hz it lacks '
+                     'motion that the recording has; effects that show in fast motion are not '
+                     'named')
+    return replace(comparison, notes=tuple(notes), reference_fades=fading_hz is not None)
 
 
 def _roughness(comparison: BaselineComparison) -> float:

@@ -19,6 +19,7 @@ import json
 
 from adxl_ros.diagnose import data_checks
 from adxl_ros.diagnose.baseline_comparison import compare
+from adxl_ros.diagnose.decision import Verdict, WeightedHypothesis, without_fast_effects
 from adxl_ros.diagnose.input_checks import compare_checked
 from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.recording_columns import Recording
@@ -32,6 +33,7 @@ from adxl_ros.simulate.simulator import simulate
 from adxl_ros.simulate.trajectories import shaker
 import numpy as np
 import pytest
+from scipy.signal import butter, sosfiltfilt
 from units import nominal
 
 
@@ -305,3 +307,45 @@ def test_rounded_stamps_are_in_the_report(run_tool, tmp_path):
     report, _ = report_of(run_tool, tmp_path, sensor, recorded)
     assert report['verdict']['data_fault'] == 'axis_inverted'
     assert 'rounded to 0.001 s' in report['notes'][0]
+
+
+def shaken(tmp_path, corner_hz, sensor):
+    """Return a recording by hand, and the motion of a simulator behind a low-pass filter."""
+    rng = np.random.default_rng(6)
+    time_s = np.arange(0, 70, 1 / sensor.rate_hz)
+    angle = sosfiltfilt(butter(2, [0.1, 6.0], 'band', fs=sensor.rate_hz, output='sos'),
+                        rng.normal(size=(2, len(time_s))), axis=1)
+    angle[:, time_s < 8] = 0.0
+    force = np.array(specific_force(1.0 + angle[0], angle[1], G0_MPS2))
+    columns = {f'{axis}_v': 2.5 + f / G0_MPS2 + rng.normal(0, 6e-4, len(f))
+               for axis, f in zip('xyz', force)}
+    if corner_hz:
+        force = sosfiltfilt(butter(2, corner_hz, fs=sensor.rate_hz, output='sos'), force, axis=1)
+    np.savetxt(tmp_path / 'sim.csv', np.column_stack([time_s, *force]), '%.6f', ',', comments='',
+               header='time_s,ax_mps2,ay_mps2,az_mps2')
+    return (Recording('made', time_s, columns, sensor_info(sensor)),
+            motion_from_force(tmp_path / 'sim.csv', False)[0])
+
+
+def test_a_reference_that_is_smoother_than_the_sensor_is_named(tmp_path):
+    """Motion that only the recording has is no effect of the sensor."""
+    sensor = replace(unit(), rc_resistance_ohm=0.0)
+    recorded, sim = shaken(tmp_path, None, sensor)
+    assert not compare_checked(recorded, sensor, sim, False).reference_fades
+    recorded, sim = shaken(tmp_path, 2.0, sensor)
+    comparison = compare_checked(recorded, sensor, sim, False)
+    assert comparison.reference_fades
+    assert comparison.notes[-1].startswith('--sim is smoother than the sensor: above ')
+    # A sensor without its filter has more motion than its simulation, too.
+    recorded, sim = shaken(tmp_path, None, sensor)
+    assert not compare_checked(recorded, unit(), sim, False).reference_fades
+
+
+@pytest.mark.parametrize('effects, status', [
+    (('bandwidth',), 'unknown'), (('misalignment',), 'explained')])
+def test_a_smoother_reference_explains_no_fast_effect(effects, status):
+    """A filter of the reference is not blamed on that of the sensor."""
+    verdict = Verdict('explained', effects, (), 0.9, (
+        WeightedHypothesis(effects, 0.9), WeightedHypothesis((), 0.1)), None)
+    assert without_fast_effects(verdict).status == status
+    assert sum(h.probability for h in without_fast_effects(verdict).hypotheses) == 1
