@@ -62,7 +62,7 @@ class DecisionSettings:
         They also exceed this multiple of the tolerance of a healthy unit. Chosen: one unit in 400.
     smallest_rival_share
         Smallest probability of an inseparable rival, divided by that of the best set. Chosen:
-        odds of 20 to 1.
+        odds of 10 to 1.
     certain
         Probability of something unknown from which the verdict is unknown. Chosen: more likely
         than not.
@@ -77,8 +77,8 @@ class DecisionSettings:
 
     prior_by_count: tuple[float, ...] = (0.30, 0.35, 0.13, 0.02)
     prior_of_unknown_by_count: tuple[float, ...] = (0.15, 0.04, 0.01, 0.001)
-    evidence_factor: float = 0.2
-    worth_fitting: float = 25.0
+    evidence_factor: float = 0.5
+    worth_fitting: float = 10.0
     form_errors: tuple[float, ...] = (0.0, 0.1, 0.3, 0.6)
     unknown_amplitudes_g: tuple[float, ...] = (1e-4, 3e-4, 1e-3, 3e-3)
     with_unknown: int = 6
@@ -87,7 +87,7 @@ class DecisionSettings:
     smallest_drift_share_of_gap: float = 0.3
     calibration_factor: float = 2.0
     healthy_factor: float = 3.0
-    smallest_rival_share: float = 0.05
+    smallest_rival_share: float = 0.1
     certain: float = 0.5
     unexplained_share_of_explained: float = 0.7
     unexplained_share_of_noise: float = 0.5
