@@ -278,7 +278,7 @@ def matched_strength(time_s: np.ndarray, reading: np.ndarray, step: float) -> fl
     Returns
     -------
     float
-        Strength per sample; 0 where too few readings move.
+        Strength per sample; 0 where too few readings move, and where any strength follows them.
 
     """
     moving = _moving(reading)
@@ -291,7 +291,7 @@ def matched_strength(time_s: np.ndarray, reading: np.ndarray, step: float) -> fl
         return bool(np.sqrt(np.mean(deviation[moving] ** 2)) > step / np.sqrt(12))
 
     index = bisect_left(_STRENGTHS, True, key=too_strong)
-    return float(_STRENGTHS[max(index - 1, 0)])
+    return float(_STRENGTHS[max(index - 1, 0)]) if index < len(_STRENGTHS) else 0.0
 
 
 class _Window:

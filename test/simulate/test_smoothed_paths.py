@@ -86,3 +86,11 @@ def test_readings_that_no_encoder_gives_are_followed():
     reading = np.rint(np.sin(0.5 * time_s) / STEP + rng.normal(0, 2, len(time_s))) * STEP
     error_rad = SmoothedPath(time_s, reading, STEP)(time_s) - np.sin(0.5 * time_s)
     assert np.sqrt(np.mean(error_rad ** 2)) < 4 * STEP
+
+
+def test_a_joint_that_rests_for_most_of_the_time_is_followed():
+    """Rests with rounding errors of floats do not make the path stiff for the moves."""
+    time_s = np.arange(40000) / 100
+    true = 1.0 + 1e-15 * np.sin(1e3 * time_s) + 0.5 * (1 + np.tanh(time_s - 200)) * 0.8
+    path = SmoothedPath(time_s, true, STEP)
+    assert np.abs(path(time_s) - true).max() < STEP
