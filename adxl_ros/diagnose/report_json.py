@@ -268,9 +268,9 @@ def _key(name: Coefficient) -> str:
 
 def terminal_lines(diagnosis: Diagnosis) -> list[str]:
     """Return the diagnosis as lines for a terminal."""
-    lines = wrap(headline(diagnosis), _SCREEN_COLUMNS)
+    lines = _wrapped(headline(diagnosis))
     for note in notes(diagnosis):
-        lines += wrap(f'note: {note}', _SCREEN_COLUMNS, subsequent_indent='      ')
+        lines += _wrapped(f'note: {note}', 6)
     if diagnosis.data_fault is not None or diagnosis.verdict is None:
         return lines
     report = as_json(diagnosis)
@@ -279,12 +279,11 @@ def terminal_lines(diagnosis: Diagnosis) -> list[str]:
     if remainders:
         lines += ['', 'noise-like effects, after they are added to the simulation:']
         for row in remainders:
-            lines += wrap(f'  {row.label}: {row.text}', _SCREEN_COLUMNS,
-                          subsequent_indent='    ')
+            lines += _wrapped(f'  {row.label}: {row.text}', 4)
     lines += ['', 'probability  hypothesis']
     for h in report['hypotheses'][:_SCREEN_ROWS]:
-        lines += wrap(f'{p_text(h["probability"]):>11}  {", ".join(h["effects"]) or "no gap"}',
-                      _SCREEN_COLUMNS, subsequent_indent=13 * ' ')
+        lines += _wrapped(f'{p_text(h["probability"]):>11}  {", ".join(h["effects"]) or "no gap"}',
+                          13)
     if report['where']:
         lines += ['', 'where the gap shows most:', _CELL_HEAD]
         lines += [_cell_line(cell) for cell in report['where'][:_SCREEN_ROWS]]
@@ -293,16 +292,23 @@ def terminal_lines(diagnosis: Diagnosis) -> list[str]:
             lines += _candidate_lines(candidate)
     if diagnosis.next_experiment is not None:
         proposal = diagnosis.next_experiment
-        lines += ['', *wrap(f'next: {proposal.manoeuvre}, {proposal.why}', _SCREEN_COLUMNS,
-                            subsequent_indent='      '), f'  {proposal.command}']
+        *first, last = _wrapped(f'  {proposal.command}', 6, _SCREEN_COLUMNS - 2)
+        lines += ['', *_wrapped(f'next: {proposal.manoeuvre}, {proposal.why}', 6),
+                  *(f'{line} \\' for line in first), last]
     return lines
 
 
 def _row_lines(rows: Sequence[Row]) -> list[str]:
     """Return rows as lines, their texts below each other."""
     width = max(len(row.label) for row in rows) + 2
-    return [line for row in rows for line in wrap(
-        f'{row.label:{width}}{row.text}', _SCREEN_COLUMNS, subsequent_indent=width * ' ')]
+    return [line for row in rows
+            for line in _wrapped(f'{row.label:{width}}{row.text}', width)]
+
+
+def _wrapped(text: str, indent: int = 0, columns: int = _SCREEN_COLUMNS) -> list[str]:
+    """Wrap a text between words; further lines have an indent."""
+    return wrap(text, columns, subsequent_indent=indent * ' ', break_on_hyphens=False,
+                break_long_words=False)
 
 
 def _cell_line(cell: dict[str, Any]) -> str:
@@ -315,8 +321,7 @@ def _cell_line(cell: dict[str, Any]) -> str:
 
 def _candidate_lines(candidate: dict[str, Any]) -> list[str]:
     """Return the lines for a candidate: its cause and its parameters."""
-    lines = ['', *wrap(f'{candidate["effect"]}: {candidate["cause"]}', _SCREEN_COLUMNS)]
+    lines = ['', *_wrapped(f'{candidate["effect"]}: {candidate["cause"]}')]
     for name, parameter in candidate['parameters'].items():
-        lines += wrap(f'  {name:28} {parameter_text(parameter)}', _SCREEN_COLUMNS,
-                      subsequent_indent=31 * ' ')
+        lines += _wrapped(f'  {name:28} {parameter_text(parameter)}', 31)
     return lines

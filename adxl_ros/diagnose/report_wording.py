@@ -214,7 +214,8 @@ def _closed_text(diagnosis: Diagnosis) -> str:
     assert diagnosis.gap_closure is not None
     closure, noisy = diagnosis.gap_closure, bool(diagnosis.noise_remainders)
     low, high = (_percent(share, noisy) for share in closure.closed_ci)
-    return f'{_percent(closure.closed, noisy)} % (90 %: {low} to {high} %)'
+    interval = low if low == high else f'{low} to {high}'
+    return f'{_percent(closure.closed, noisy)} % (90 %: {interval} %)'
 
 
 def _percent(share: float, noisy: bool) -> str:

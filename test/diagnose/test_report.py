@@ -162,6 +162,9 @@ def test_terminal_page_and_report_agree(diagnosed):
         assert figure in report.terminal
         assert escape(figure) in report.page and figure in report.json['summary']
     assert max(map(len, report.terminal.splitlines())) < 80
+    # The command may take two lines of a shell.
+    assert report.json['next_experiment']['command'] in ' '.join(
+        report.terminal.replace('\\\n', ' ').split())
 
 
 def test_effects_that_are_not_separated_are_named_together(diagnosed):
