@@ -242,7 +242,7 @@ def find_clock_fault(time_s: np.ndarray) -> DataFault | None:
     if len(wide) and float(steps_s[wide].sum()) > _LARGEST_JUMP_SHARE * float(steps_s.sum()):
         return DataFault('clock_jump', 'bad_data', f'the stamps jump by '
                          f'{steps_s[wide].max():.3g} s at {time_s[wide[0]]:.6g} s; cut the '
-                         'recording there')
+                         'recording there, and diagnose the parts together')
     return None
 
 

@@ -349,3 +349,21 @@ def test_a_smoother_reference_explains_no_fast_effect(effects, status):
         WeightedHypothesis(effects, 0.9), WeightedHypothesis((), 0.1)), None)
     assert without_fast_effects(verdict).status == status
     assert sum(h.probability for h in without_fast_effects(verdict).hypotheses) == 1
+
+
+def test_rests_alone_have_no_motion(run_tool, tmp_path):
+    """Where the moves were cut out of a recording, the samples beside the cuts are left out."""
+    sensor, poses = unit(), [(1.0, 0.0), (1.5, 0.4), (1.5, 0.8), (1.0, 1.2), (0.6, 0.9)]
+    alpha, beta = np.repeat(np.array(poses).T, 800, axis=1)
+    rng = np.random.default_rng(7)
+    columns = {f'{axis}_v': 2.5 + f + rng.normal(0, 6e-4, len(f))
+               for axis, f in zip('xyz', specific_force(alpha, beta, 1.0))}
+    columns |= {'alpha_rad': alpha, 'beta_rad': beta}
+    recorded = Recording('made', np.arange(len(alpha)) / 100.0, columns, sensor_info(sensor))
+    comparison = compare_checked(recorded, sensor, None, False)
+    assert 0.5 < comparison.used.mean() < 0.98
+    assert rms_mg(comparison, comparison.used) < 0.7
+    assert any('beta_rad moves too fast' in note for note in comparison.notes)
+    gaps = replace(recorded, time_s=recorded.time_s + 5.0 * (np.arange(len(alpha)) // 800))
+    report, run = report_of(run_tool, tmp_path, sensor, gaps)
+    assert (run.returncode, report['verdict']['data_fault']) == (1, 'clock_jump')
