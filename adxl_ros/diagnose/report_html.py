@@ -33,6 +33,7 @@ from adxl_ros.diagnose.report_wording import (
     mg_text,
     p_text,
     parameter_text,
+    percent,
     range_text,
     remainder_rows,
     Row,
@@ -302,11 +303,13 @@ def _convergence(best: Hypothesis) -> str:
 
 def _candidate_table(report: dict[str, Any]) -> str:
     """Return the most probable effects with their parameters; improbable ones are folded."""
+    noisy = bool(report['noise_remainders'])
+
     def table(candidates: Sequence[dict[str, Any]]) -> str:
         """Return some effects, with one line for each parameter."""
         rows = [[c['effect'], p_text(c['probability'] or 0.0),
                  '\n'.join(f'{name}: {parameter_text(p)}' for name, p in c['parameters'].items()),
-                 '' if c['share'] is None else f'{100 * c["share"]:.0f} %',
+                 '' if c['share'] is None else f'{percent(c["share"], noisy)} %',
                  ', '.join(c['inseparable_from']), c['cause']] for c in candidates]
         return _table(['effect', 'probability', 'parameters (90 % interval)', 'share of gap',
                        'not separated from', 'cause'], rows)

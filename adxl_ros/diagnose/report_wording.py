@@ -144,7 +144,7 @@ def tiles(diagnosis: Diagnosis) -> list[Row]:
     rows = [Row('gap, recording minus simulation', mg_text(closure.before_mps2))]
     if _closes(diagnosis):
         rows += [Row('with the effects, held out', mg_text(closure.after_mps2)),
-                 Row('closed', _percent(closure.closed, bool(diagnosis.noise_remainders)) + ' %')]
+                 Row('closed', percent(closure.closed, bool(diagnosis.noise_remainders)) + ' %')]
     return [*rows, Row('noise floor', mg_text(closure.floor_mps2))]
 
 
@@ -213,13 +213,28 @@ def _closed_text(diagnosis: Diagnosis) -> str:
     """Return the closed share with its interval."""
     assert diagnosis.gap_closure is not None
     closure, noisy = diagnosis.gap_closure, bool(diagnosis.noise_remainders)
-    low, high = (_percent(share, noisy) for share in closure.closed_ci)
+    low, high = (percent(share, noisy) for share in closure.closed_ci)
     interval = low if low == high else f'{low} to {high}'
-    return f'{_percent(closure.closed, noisy)} % (90 %: {interval} %)'
+    return f'{percent(closure.closed, noisy)} % (90 %: {interval} %)'
 
 
-def _percent(share: float, noisy: bool) -> str:
-    """Return a share in per cent. Where noise-like effects stay, it is never 100."""
+def percent(share: float, noisy: bool) -> str:
+    """
+    Return a share in per cent. Where noise-like effects stay, it is never 100.
+
+    Parameters
+    ----------
+    share
+        The share, at most 1.
+    noisy
+        Whether noise-like effects stay.
+
+    Returns
+    -------
+    str
+        The percentage without its sign.
+
+    """
     if share >= _NEARLY_ALL and (noisy or share < _ALL):
         return '> 99'
     return f'{100 * share:.0f}'
