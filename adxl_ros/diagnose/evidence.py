@@ -30,7 +30,6 @@ from typing import NamedTuple
 from adxl_ros.diagnose.noise_whitening import before_filters, Whitener
 import numpy as np
 from scipy.linalg import cho_solve
-from scipy.signal import sosfilt
 
 BLOCKS = 48
 """Number of blocks of a recording, of which some are held out. Chosen: a multiple of the folds,
@@ -143,7 +142,7 @@ def whiten_channel(residual_v: np.ndarray, columns: np.ndarray, column_ids: np.n
         values = np.ascontiguousarray(data[:, part])
         dropped = unused[slice(*np.searchsorted(unused, [part.start, part.stop]))] - part.start
         for i, whitener in enumerate(filters):
-            white, states[i] = sosfilt(whitener.sections, values, zi=states[i])
+            white, states[i] = whitener.continued(values, states[i])
             white[:, dropped] = 0.0
             if not first:
                 # The first sample is a step from zero.

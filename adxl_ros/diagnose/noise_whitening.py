@@ -37,7 +37,7 @@ from adxl_ros.model.diagnosis_hints import DriftSpectrum
 from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.sensor import Sensor
 import numpy as np
-from scipy.signal import sosfilt, sosfreqz, tf2sos, zpk2sos
+from scipy.signal import lfilter, sosfilt, sosfreqz, tf2sos, zpk2sos
 
 RANDOM_WALKS_G_PER_RTS = (1e-7, 3e-6, 1e-5, 3e-5, 3.8e-5, 5e-5, 8e-5, 2e-4, 6e-4, 2e-3)
 """Grid of densities of a random walk, g/√s. It is densest where a healthy unit ends, because a
@@ -116,6 +116,30 @@ class Whitener:
     def __call__(self, values: np.ndarray) -> np.ndarray:
         """Filter k series after `before_filters`, (k, n)."""
         return sosfilt(self.sections, values)
+
+    def continued(self, values: np.ndarray, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """
+        Filter the next part of k series after `before_filters`.
+
+        Parameters
+        ----------
+        values
+            The part, (k, n).
+        state
+            State before it, (sections, k, 2).
+
+        Returns
+        -------
+        tuple of numpy.ndarray
+            Filtered part, (k, n), and the state after it.
+
+        """
+        if len(self.sections) > 1:
+            return sosfilt(self.sections, values, zi=state)
+        # The same recursion without a copy.
+        numerator, denominator = self.sections[0, :3], self.sections[0, 3:]
+        filtered, after = lfilter(numerator, denominator, values, zi=state[0])
+        return filtered, after[None]
 
 
 def before_filters(filters: Sequence[Whitener], values: np.ndarray) -> np.ndarray:
