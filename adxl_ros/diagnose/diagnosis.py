@@ -48,6 +48,16 @@ from adxl_ros.diagnose.noise_remainder import (
 )
 from adxl_ros.diagnose.noise_whitening import drifts_among
 from adxl_ros.diagnose.posterior import posterior, WeighedHypothesis
+from adxl_ros.diagnose.progress_plan import (
+    BASIS_WORK,
+    CHECKS,
+    LIBRARY,
+    PROBABILITIES,
+    ProgressPlan,
+    REPORT,
+    SET_WORK,
+    ShowProgress,
+)
 from adxl_ros.diagnose.residual_map import (
     not_covered,
     residual_map,
@@ -138,7 +148,7 @@ SETTINGS = DecisionSettings()
 
 
 def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None = None,
-             seed: int = 0, show_progress: Callable[[float], None] = lambda fraction: None,
+             seed: int = 0, show_progress: ShowProgress = lambda stage, fraction: None,
              align: bool = False) -> Diagnosis:
     """
     Compare recordings of one unit with the simulator, and find which effects it lacks.
@@ -154,7 +164,7 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
     seed
         Seed of bootstraps and of simulated noise.
     show_progress
-        Called with the fraction that is done, 0 to 1.
+        Called with the name of the stage and the fraction that is done, 0 to 1.
     align
         Whether `sim` is shifted in time where its motion is late or early.
 
@@ -171,7 +181,8 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
     """
     if not sensor.effects:
         sensor = with_axes(sensor, recordings[0].axes)
-    # The fractions of the progress are shares of the usual run time.
+    plan = ProgressPlan(show_progress)
+    plan.show(CHECKS, 0.0)
     compared: list[BaselineComparison] = []
     for recording in recordings:
         check_unit(recording.stream_info, recording.axes, sensor)
@@ -188,16 +199,16 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
         if isinstance(result, DataFault):
             return Diagnosis(result, [comparison])
         checked.append(result)
-    show_progress(0.05)
     linear_model = build_linear_model([c.search_comparison for c in checked],
-                                      lambda done: show_progress(0.05 + 0.25 * done))
-    hypotheses = search(linear_model, SETTINGS, lambda done: show_progress(0.3 + 0.4 * done))
-    explanation = _explain(checked, linear_model, hypotheses, sensor, seed)
-    show_progress(0.8)
+                                      plan.within(LIBRARY))
+    hypotheses = search(linear_model, SETTINGS, plan)
+    plan.expect(PROBABILITIES, BASIS_WORK + SET_WORK * len(hypotheses))
+    explanation = _explain(checked, linear_model, hypotheses, sensor, seed,
+                           plan.within(PROBABILITIES))
+    plan.show(REPORT, 0.0)
     verdict = _decide(linear_model, explanation)
-    show_progress(0.9)
     diagnosis = _with_report(linear_model, explanation, verdict, sensor, seed)
-    show_progress(1.0)
+    plan.show(REPORT, 1.0)
     return diagnosis
 
 
@@ -239,13 +250,15 @@ class _Explanation:
 
 
 def _explain(checked: Sequence[CheckedRecording], linear_model: LinearModel,
-             hypotheses: Sequence[Hypothesis], sensor: Sensor, seed: int) -> _Explanation:
+             hypotheses: Sequence[Hypothesis], sensor: Sensor, seed: int,
+             show_share: Callable[[float], None]) -> _Explanation:
     """Keep the material hypotheses that hold on held-out blocks, and find noise-like effects."""
     comparisons = [c.comparison for c in checked]
     floor = gap_closure.estimate_noise_floor(comparisons)
     scale_v_per_mps2 = linear_model.comparisons[0].scale_v_per_mps2
     noise_mps2 = float(np.sqrt(np.mean((floor.noise_v / scale_v_per_mps2) ** 2)))
     weighed = posterior(linear_model, _sized(linear_model, hypotheses, noise_mps2), SETTINGS)
+    show_share(0.7)
     baseline_residual = gap_closure.held_out_residual(linear_model, comparisons, (),
                                                       linear_model.baseline)
     confirmed, closure = _confirmed(linear_model, comparisons, weighed, baseline_residual,

@@ -50,6 +50,9 @@ _DRIFTED_STD_G = 0.02
 """Prior standard deviation of a zero-g that drifts, g. It has also drifted between calibration and
 recording. Tuned by hand on simulated recordings of the working seeds of the blind check."""
 
+_SIMULATED_SHARE = 0.5
+"""Share of the run time of a linear model that its simulations take. Measured."""
+
 
 _OTHER_RESTS_SHARE = 0.2
 """Share of an effect at rest by which its straight-line part differs between the rests of a
@@ -309,7 +312,8 @@ def build_linear_model(comparisons: Sequence[BaselineComparison],
     kept: list[Variant] = []
     column_ids: list[list[int]] = []
     columns: list[list[list[NumberedColumn]]] = [_empty_by_axis(c) for c in comparisons]
-    for by_recording in _variants(comparisons, baseline_v, show_progress, only):
+    for by_recording in _variants(comparisons, baseline_v,
+                                  lambda done: show_progress(_SIMULATED_SHARE * done), only):
         numbers: dict[Coefficient, int] = {}
         for i, variant in by_recording.items():
             for name, std in zip(variant.names, variant.prior_std):
@@ -331,6 +335,7 @@ def build_linear_model(comparisons: Sequence[BaselineComparison],
                    for c in comparisons for d in range(len(c.sensor.axes))]
     channels = _whitened_channels(
         comparisons, by_channel, _filters_of(filters, comparisons[0].sensor.effects), flexible)
+    show_progress(1.0)
     nuisance_columns = [_nuisance_columns(channel, names) for channel in by_channel]
     parts = parts_at_rest([_straight_columns(channel, names) for channel in nuisance_columns],
                           by_channel, len(names), rests_by_channel(comparisons))

@@ -22,7 +22,7 @@ at a shaker of 40 Hz.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
 from typing import NamedTuple
@@ -39,6 +39,13 @@ from adxl_ros.diagnose.hypothesis_fit import (
 )
 from adxl_ros.diagnose.linear_model import build_linear_model, LinearModel
 from adxl_ros.diagnose.noise_whitening import drift_effects, drifts_among
+from adxl_ros.diagnose.progress_plan import (
+    FIT_WORK,
+    FURTHER,
+    ProgressPlan,
+    RANKING_WORK,
+    SINGLES,
+)
 from adxl_ros.diagnose.sensitivities import Variant
 from adxl_ros.errors import UserError
 from adxl_ros.model.coefficients import parameter_of, with_neutral
@@ -77,7 +84,7 @@ class _RankedSet(NamedTuple):
 
 
 def search(linear_model: LinearModel, settings: DecisionSettings,
-           show_progress: Callable[[float], None]) -> list[Hypothesis]:
+           plan: ProgressPlan) -> list[Hypothesis]:
     """
     Search single effects, pairs and triples.
 
@@ -90,8 +97,8 @@ def search(linear_model: LinearModel, settings: DecisionSettings,
         The recordings and their sensitivities.
     settings
         Settings of the decision.
-    show_progress
-        Called with the fraction that is done, 0 to 1.
+    plan
+        The stages of the diagnosis, to which the search tells its work.
 
     Returns
     -------
@@ -102,8 +109,14 @@ def search(linear_model: LinearModel, settings: DecisionSettings,
     hypotheses: Hypotheses = {frozenset(): fit_hypothesis(linear_model, (), {}, {})}
     null_fit = linear_model.fit_variants([])
     singles = _ranked(linear_model, [(i,) for i in _identifiable(linear_model)], null_fit)
-    _fit_best(linear_model, settings, singles[:_FITTED_SINGLES], null_fit, hypotheses)
-    show_progress(0.3)
+    worth = [s for s in singles[:_FITTED_SINGLES] if s.gain >= settings.worth_fitting]
+    plan.expect(SINGLES, FIT_WORK * len(worth))
+    if not worth:
+        plan.expect(FURTHER, 0.0)
+    for number, single in enumerate(worth):
+        plan.show(SINGLES, number / len(worth))
+        _fit_best(linear_model, settings, [single], null_fit, hypotheses)
+    plan.show(FURTHER, 0.0)
     # A nominal parameter file may be wrong in zero-g and scale factor, and the sum of both errors
     # may look like neither of them.
     straight = [i for i in _identifiable(linear_model)
@@ -113,8 +126,10 @@ def search(linear_model: LinearModel, settings: DecisionSettings,
               hypotheses)
     best = _best(hypotheses)
     if best.effects:
+        plan.expect(FURTHER, RANKING_WORK + FIT_WORK * _FURTHER)
+        plan.show(FURTHER, 0.0)
         _add_effects(linear_model, settings, best, hypotheses)
-        show_progress(0.6)
+        plan.show(FURTHER, 0.7)
         first = [ranked.chosen[0] for ranked in singles[:_SINGLES]]
         pairs = _ranked(linear_model, list(combinations(sorted(first), 2)), null_fit)
         smallest_gain = _best(hypotheses).log_evidence - null_fit.log_evidence \
@@ -125,7 +140,7 @@ def search(linear_model: LinearModel, settings: DecisionSettings,
     _remove_each_effect(linear_model, _best(hypotheses), hypotheses)
     if _drift_shows(linear_model, _best(hypotheses), settings):
         _add_drifts(linear_model, settings, hypotheses)
-    show_progress(1.0)
+    plan.show(FURTHER, 1.0)
     return sorted(hypotheses.values(), key=lambda h: -h.log_evidence)
 
 

@@ -23,7 +23,9 @@ import os
 from pathlib import Path
 import signal
 import sys
+from time import monotonic
 from types import FrameType
+from typing import Protocol
 
 from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import Recording
@@ -113,15 +115,38 @@ def report_reading(tool: str, recording: Recording) -> None:
                   f'{alignment.gap_s:.3g} s away', file=sys.stderr)
 
 
+class ShowDone(Protocol):
+    """Shows how much is done."""
+
+    def __call__(self, done: float, stage: str = '') -> None:
+        """
+        Show a fraction.
+
+        Parameters
+        ----------
+        done
+            The fraction that is done, 0 to 1.
+        stage
+            Name of the present stage, where there are several.
+
+        """
+
+
+def _show_nothing(done: float, stage: str = '') -> None:
+    """Show nothing; see `ShowDone`."""
+
+
 @contextmanager
-def progress(title: str) -> Iterator[Callable[[float], None]]:
+def progress(title: str) -> Iterator[ShowDone]:
     """
     Show a progress bar on a terminal where rich is installed, else nothing.
 
+    The time that is left is the elapsed time by what is done and left.
+
     Yields
     ------
-    callable
-        Takes the fraction that is done, 0 to 1.
+    ShowDone
+        Shows the fraction that is done.
 
     """
     try:
@@ -132,15 +157,28 @@ def progress(title: str) -> Iterator[Callable[[float], None]]:
             TaskProgressColumn,
             TextColumn,
             TimeElapsedColumn,
-            TimeRemainingColumn,
         )
     except ImportError:
-        yield lambda done: None
+        yield _show_nothing
         return
     console = Console(stderr=True)
     columns = (TextColumn('{task.description}'), BarColumn(), TaskProgressColumn(),
-               TimeElapsedColumn(), TextColumn('left'), TimeRemainingColumn())
+               TimeElapsedColumn(), TextColumn('{task.fields[left]}'))
     with Progress(*columns, console=console, transient=True,
                   disable=not console.is_terminal) as bar:
-        task = bar.add_task(title, total=1.0)
-        yield lambda done: bar.update(task, completed=done)
+        task, begin_s = bar.add_task(title, total=1.0, left=''), monotonic()
+
+        def show(done: float, stage: str = '') -> None:
+            """Show a fraction; see `ShowDone`."""
+            elapsed_s = monotonic() - begin_s
+            left = _left(elapsed_s * (1 - done) / done) if done > 0 else ''
+            bar.update(task, completed=done, left=left,
+                       description=f'{title}: {stage}' if stage else title)
+
+        yield show
+
+
+def _left(left_s: float) -> str:
+    """Return the time that is left, for people."""
+    minutes, seconds = divmod(round(left_s), 60)
+    return f'left {minutes}:{seconds:02d}'

@@ -70,8 +70,8 @@ def diagnose(options: argparse.Namespace) -> int:
     sim = motion_from_force(options.sim, False, recordings[0].epoch_ns)[0] if options.sim \
         else None
     with progress('diagnose') as show:
-        diagnosis = diagnose_recordings(recordings, sensor, sim, options.seed, show,
-                                        options.align)
+        diagnosis = diagnose_recordings(recordings, sensor, sim, options.seed,
+                                        lambda stage, done: show(done, stage), options.align)
     folder = Path(options.output)
     make_folder(folder)
     report = report_json.as_json(diagnosis)
