@@ -211,7 +211,7 @@ def whitened(whitener: Whitener, series: np.ndarray, used: np.ndarray) -> np.nda
     step = max(1, _CACHED_VALUES // max(len(white), 1))
     for first in range(0, white.shape[1], step):
         part = slice(first, first + step)
-        white[:, part], state = sosfilt(whitener.sections, series[:, part], zi=state)
+        white[:, part], state = whitener.continued(series[:, part], state)
     white[:, ~used] = 0.0
     # The first sample is a step from zero.
     white[:, 0] = 0.0
