@@ -277,30 +277,48 @@ def _fine_shift(recording: Recording, sensor: Sensor, force: ForcePath, late_s: 
     inside = finite & (time_s > time_s[0] + LARGEST_LATENCY_S) \
         & (time_s < time_s[-1] - LARGEST_LATENCY_S)
     rows = np.flatnonzero(inside)[::every]
-    more_s, scatter = 0.0, np.zeros(1)
+    more_s, squares, scatter = 0.0, np.ones(2), np.zeros(1)
     for _ in range(_ROUNDS):
-        errors, weights, squares = [], [], np.zeros(2)
         at_s = time_s[rows] + more_s
         shifted, slope = (np.column_stack([np.interp(at_s, time_s, v) for v in series.T])
                           for series in (simulated_v, slope_v))
-        # A block determines the shift by what zero-g and scale factor cannot imitate.
-        nuisance = [np.column_stack([np.ones(len(rows)), s]) for s in shifted.T]
-        for block in np.array_split(np.arange(len(rows)), _BLOCKS):
-            top = bottom = 0.0
-            for d, line in enumerate(nuisance):
-                both = np.column_stack([volts[rows[block], d], slope[block, d]])
-                both = both - line[block] @ np.linalg.lstsq(line[block], both)[0]
-                top += float(both[:, 0] @ both[:, 1])
-                bottom += float(both[:, 1] @ both[:, 1])
-                squares += [float(both[:, 0] @ both[:, 0]), float(np.sum(
-                    (volts[rows[block], d] - volts[rows[block], d].mean()) ** 2))]
-            errors.append(top / bottom if bottom > 0 else 0.0)
-            weights.append(bottom)
-        if not sum(weights):
+        sums = np.array([_block_error(volts[rows[block]], shifted[block], slope[block])
+                         for block in np.array_split(np.arange(len(rows)), _BLOCKS)])
+        products, weights = sums[:, 0], sums[:, 1]
+        if not weights.sum():
             return None
-        share = np.array(weights) / sum(weights)
-        step_s = float(share @ errors)
+        step_s = float(products.sum() / weights.sum())
         more_s += float(np.clip(step_s, -LARGEST_LATENCY_S, LARGEST_LATENCY_S))
-        scatter = share * (np.array(errors) - step_s)
+        scatter = (products - step_s * weights) / weights.sum()
+        squares = sums[:, 2:].sum(axis=0)
     correlation = float(np.sqrt(max(1 - squares[0] / squares[1], 0.0)))
     return Shift(late_s + more_s, float(np.sqrt(np.sum(scatter ** 2))), correlation)
+
+
+def _block_error(volts: np.ndarray, simulated_v: np.ndarray, slope_v: np.ndarray
+                 ) -> np.ndarray:
+    """
+    Fit zero-g and scale factor to a block, and sum what determines its shift.
+
+    Parameters
+    ----------
+    volts
+        The recording, V, (n, m).
+    simulated_v, slope_v
+        The simulated output, V, and its derivative, V/s, (n, m).
+
+    Returns
+    -------
+    numpy.ndarray
+        Product of residual and slope, V²/s, square of the slope, V²/s², and squares of residual
+        and recording about their means, V², (4,).
+
+    """
+    sums = np.zeros(4)
+    for measured, simulated, slope in zip(volts.T, simulated_v.T, slope_v.T):
+        line = np.column_stack([np.ones(len(simulated)), simulated])
+        both = np.column_stack([measured, slope])
+        residual, slope = (both - line @ np.linalg.lstsq(line, both)[0]).T
+        sums += [residual @ slope, slope @ slope, residual @ residual,
+                 np.sum((measured - measured.mean()) ** 2)]
+    return sums

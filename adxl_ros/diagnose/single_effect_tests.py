@@ -91,7 +91,9 @@ def single_effect_tests(linear_model: LinearModel, seed: int) -> dict[str, Singl
         largest = np.maximum(largest, gain[1:])
         name = variant.effect
         gains[name] = max(gains.get(name, -np.inf), float(gain[0]))
-        share = (prior_std ** 2 @ np.diag(marginal)[ids]) / (prior_std ** 2 @ np.diag(gram)[ids])
+        # An effect that changes no sample cannot be seen.
+        square = float(prior_std ** 2 @ np.diag(gram)[ids])
+        share = float(prior_std ** 2 @ np.diag(marginal)[ids]) / square if square else 0.0
         visibility[name] = max(visibility.get(name, 0.0), float(np.clip(share, 0.0, 1.0)))
     return {name: SingleEffectTest(gain, float((1 + np.sum(largest >= gain)) / (1 + _DRAWS)),
                                    visibility[name])

@@ -367,3 +367,13 @@ def test_rests_alone_have_no_motion(run_tool, tmp_path):
     gaps = replace(recorded, time_s=recorded.time_s + 5.0 * (np.arange(len(alpha)) // 800))
     report, run = report_of(run_tool, tmp_path, sensor, gaps)
     assert (run.returncode, report['verdict']['data_fault']) == (1, 'clock_jump')
+
+
+def test_parts_of_a_recording_have_a_verdict_together(run_tool, tmp_path):
+    """Four recordings of 17 s are one of 67 s."""
+    recorded = made(unit())
+    parts = [replace(recorded, time_s=recorded.time_s[rows],
+                     columns={k: v[rows] for k, v in recorded.columns.items()})
+             for rows in np.array_split(np.arange(len(recorded)), 4)]
+    report, run = report_of(run_tool, tmp_path, unit(), *parts)
+    assert (run.returncode, run.stderr, report['verdict']['status']) == (0, '', 'no_gap')
