@@ -28,6 +28,7 @@ from adxl_ros.diagnose.noise_whitening import drifts_among
 from adxl_ros.diagnose.posterior import WeighedHypothesis
 from adxl_ros.model.diagnosis_hints import Manoeuvre
 from adxl_ros.model.effects import effect_named
+import numpy as np
 
 
 class WeightedHypothesis(NamedTuple):
@@ -189,12 +190,19 @@ def _unexplained(findings: Findings, best: WeighedHypothesis, settings: Decision
 
 def _rivals(library_sets: Sequence[WeighedHypothesis], settings: DecisionSettings
             ) -> dict[str, set[str]]:
-    """Return for each effect of the best set the effects that can stand in its place."""
+    """
+    Return for each effect of the best set the effects that can stand in its place.
+
+    The forms of geometry and of straight lines are exact, so that evidence between sets of such
+    effects is not tempered.
+    """
     best = library_sets[0]
     rivals = {effect: {effect} for effect in best.effects}
     for w in library_sets[1:]:
-        if w.probability < settings.smallest_rival_share * best.probability \
-                or len(w.effects) != len(best.effects):
+        share = w.probability / best.probability
+        if all(effect_named(e).exact for e in best.effects | w.effects):
+            share = np.exp(min(w.log_evidence - best.log_evidence, 0.0))
+        if share < settings.smallest_rival_share or len(w.effects) != len(best.effects):
             continue
         new = w.effects - best.effects
         for effect in best.effects - w.effects:

@@ -33,7 +33,7 @@ Effects that do not matter are struck from a set, and sets that become equal are
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 from adxl_ros.diagnose import evidence
@@ -74,8 +74,10 @@ class WeighedHypothesis:
         Dimension of the unknown function; None without one.
     hypothesis
         The fitted hypothesis of the set.
+    log_evidence
+        Log evidence, not tempered.
     log_weight
-        Log evidence and log prior, up to a constant.
+        Tempered log evidence and log prior, up to a constant.
     probability
         Posterior probability.
     form_error
@@ -86,6 +88,7 @@ class WeighedHypothesis:
     effects: frozenset[str]
     unknown: FormDimension | None
     hypothesis: Hypothesis
+    log_evidence: float
     log_weight: float
     probability: float
     form_error: float
@@ -154,11 +157,13 @@ def posterior(linear_model: LinearModel, sized: Sequence[SizedHypothesis],
         exact = s.material == frozenset(s.hypothesis.effects)
         entry = entries.get(key)
         if entry is None:
-            entries[key] = WeighedHypothesis(s.material, unknown, s.hypothesis, weight, 0.0, form)
+            entries[key] = WeighedHypothesis(s.material, unknown, s.hypothesis, log_evidence,
+                                             weight, 0.0, form)
             return
         hypothesis = s.hypothesis if exact else entry.hypothesis
         entries[key] = WeighedHypothesis(
-            s.material, unknown, hypothesis, max(weight, entry.log_weight), 0.0,
+            s.material, unknown, hypothesis, max(log_evidence, entry.log_evidence),
+            max(weight, entry.log_weight), 0.0,
             form if weight > entry.log_weight else entry.form_error)
 
     by_form = []
@@ -185,9 +190,7 @@ def posterior(linear_model: LinearModel, sized: Sequence[SizedHypothesis],
                 add(index, dimension, total, by_form[index][1])
     weights = np.array([e.log_weight for e in entries.values()])
     probabilities = np.exp(weights - np.logaddexp.reduce(weights))
-    weighed = [WeighedHypothesis(e.effects, e.unknown, e.hypothesis, e.log_weight, float(p),
-                                 e.form_error)
-               for e, p in zip(entries.values(), probabilities)]
+    weighed = [replace(e, probability=float(p)) for e, p in zip(entries.values(), probabilities)]
     return sorted(weighed, key=lambda w: -w.probability)
 
 
