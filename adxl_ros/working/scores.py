@@ -136,7 +136,7 @@ def _reliability(graded: Sequence[Graded]) -> list[str]:
     for k in range(_BINS):
         low, high = k / _BINS, (k + 1) / _BINS
         rows = [g for g in graded if low <= g.answer.probability < high
-               or (k == _BINS - 1 and g.answer.probability == 1.0)]
+                or (k == _BINS - 1 and g.answer.probability == 1.0)]
         if rows:
             mean = float(np.mean([g.answer.probability for g in rows]))
             lines.append(f'{100 * low:2.0f}-{100 * high:3.0f} %   {100 * mean:4.1f} '
