@@ -87,6 +87,20 @@ _REST_GAP = 8
 """Gap between changes of a reading, in median gaps and in samples, above which it rests; chosen:
 above the gaps of a slow move."""
 
+_SMALLEST_CHANGE = 1e-6
+"""Change of a reading, in stated steps, that is a rounding error; chosen: above that of floats."""
+
+_WHOLE = 0.05
+"""Deviation of a change from whole steps, in steps, by an inexact step; chosen: five steps of
+0.083° in place of 1/12°."""
+
+_FINER = 0.03
+"""Largest step of a finer reference, in stated steps; chosen: readings between which an encoder
+was interpolated have 0.08."""
+
+_FIFTH_DIFFERENCE = 252.0
+"""Variance of a fifth difference, divided by that of independent readings: 1² + 5² + 10² + …"""
+
 _THIRD_DIFFERENCE = np.array([-1.0, 3.0, -3.0, 1.0])
 """Weights of four coefficients in a third difference."""
 
@@ -143,7 +157,8 @@ class SmoothedPath:
         sampled = np.isfinite(reading)
         self._time_s, self._reading = time_s[sampled], reading[sampled]
         self._windows: dict[int, BSpline | PPoly] = {}
-        self._step, self._strength = step, self._matched_strength(step)
+        self._step = visible_step(self._reading, step)
+        self._strength = self._matched_strength(self._step)
         self._degree = degree
 
     def __call__(self, time_s: np.ndarray, order: int = 0) -> np.ndarray:
@@ -260,6 +275,43 @@ def smoothing_spline(time_s: np.ndarray, reading: np.ndarray, strength: float, s
     window = _Window(time_s, reading)
     return BSpline(window.knots, window.bounded_coefficients(
         strength, np.where(_moving(reading), 0.0, _REST_WEIGHT), step / 2) + window.mean, _DEGREE)
+
+
+def visible_step(reading: np.ndarray, step: float) -> float:
+    """
+    Find the step that readings have where it is much finer than the stated one.
+
+    An encoder changes by whole steps. Readings that do not, and whose noise is far below that of
+    the steps, are those of a finer reference. The noise is taken from fifth differences, because
+    motion hardly shows in them.
+
+    Parameters
+    ----------
+    reading
+        Readings, rad or m, (n,), all finite.
+    step
+        Stated step of the encoder, in the unit of the readings.
+
+    Returns
+    -------
+    float
+        The stated step, or a finer one; 0 for exact readings.
+
+    """
+    changes = np.abs(np.diff(reading))
+    changed = changes[changes > _SMALLEST_CHANGE * step] if step else changes[:0]
+    if len(changed) < _MIN_MOVING:
+        return step
+    steps = changed / step
+    whole = (np.abs(steps - np.rint(steps)) < _WHOLE) & (steps > 0.5)
+    if whole.mean() > 0.5:
+        return step
+    fifth = np.diff(reading, 5)
+    moving = fifth[changes[4:] > _SMALLEST_CHANGE * step]
+    finer = float(np.sqrt(12 * np.mean(moving ** 2) / _FIFTH_DIFFERENCE))
+    if finer > _FINER * step:
+        return step
+    return finer if finer > _SMALLEST_CHANGE * step else 0.0
 
 
 def matched_strength(time_s: np.ndarray, reading: np.ndarray, step: float) -> float:

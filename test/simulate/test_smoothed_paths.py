@@ -14,7 +14,11 @@
 
 """Paths through readings of encoders: their error, its prediction, and fast motion."""
 
-from adxl_ros.simulate.smoothed_paths import BAND_LIMITED_DEGREE, SmoothedPath
+from adxl_ros.simulate.smoothed_paths import (
+    BAND_LIMITED_DEGREE,
+    SmoothedPath,
+    visible_step,
+)
 from adxl_ros.simulate.trajectories import shaker, tumble
 import numpy as np
 import pytest
@@ -94,3 +98,18 @@ def test_a_joint_that_rests_for_most_of_the_time_is_followed():
     true = 1.0 + 1e-15 * np.sin(1e3 * time_s) + 0.5 * (1 + np.tanh(time_s - 200)) * 0.8
     path = SmoothedPath(time_s, true, STEP)
     assert np.abs(path(time_s) - true).max() < STEP
+
+
+@pytest.mark.parametrize('rate_hz', [100, 500])
+def test_a_reference_finer_than_the_stated_step_is_followed_exactly(rate_hz):
+    """A finer reference counts as such, and an encoder does not, even where interpolated."""
+    time_s = np.arange(100 * rate_hz) / rate_hz
+    true = tumble(np.random.default_rng(3)).beta(time_s)
+    coarse = np.rint(true / STEP) * STEP
+    interpolated = np.interp(time_s, time_s[::5], coarse[::5])
+    assert visible_step(true, STEP) < 0.01 * STEP
+    assert visible_step(np.rint(true * 1e5) / 1e5, STEP) < 0.02 * STEP
+    assert np.abs(SmoothedPath(time_s, true, STEP)(time_s) - true).max() < 0.01 * STEP
+    for encoder in (coarse, interpolated):
+        assert visible_step(encoder, STEP) == STEP
+        assert visible_step(encoder, 0.996 * STEP) == 0.996 * STEP
