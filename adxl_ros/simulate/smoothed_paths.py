@@ -303,8 +303,8 @@ def visible_step(reading: np.ndarray, step: float) -> float:
     if len(changed) < _MIN_MOVING:
         return step
     steps = changed / step
-    whole = (np.abs(steps - np.rint(steps)) < _WHOLE) & (steps > 0.5)
-    if whole.mean() > 0.5:
+    by_steps = (np.abs(steps - np.rint(steps)) < _WHOLE) & (steps > 0.5)
+    if by_steps.mean() > 0.5:
         return step
     fifth = np.diff(reading, 5)
     moving = fifth[changes[4:] > _SMALLEST_CHANGE * step]
