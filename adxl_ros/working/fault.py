@@ -61,7 +61,7 @@ class Kind:
         Size at which the search for a strength begins, and the largest size.
     draw
         Draws the shape.
-    parameters
+    parameters : callable or None
         Turns size and shape into parameters of the library's form; None where only `act` exists.
     at_rest
         Whether a calibration at rest contains the fault, if the unit had it then.
