@@ -1,0 +1,87 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Processor time and memory of `diagnose` as a command."""
+
+from dataclasses import replace
+import os
+import subprocess
+import sys
+
+from adxl_ros.files import parameter_file, recording
+from adxl_ros.files.recording_columns import Recording
+from adxl_ros.files.stream_info import sensor_info
+from adxl_ros.simulate.simulator import simulate
+from adxl_ros.simulate.trajectories import rich
+from adxl_ros.tools.effect_option import with_effects
+import numpy as np
+from pace import STANDARD_S, standard_work
+import pytest
+from units import nominal
+
+pytestmark = pytest.mark.perf
+
+
+def used_by(folder, rate_hz, duration_s, *effects):
+    """Diagnose a simulation; return processor time of a standard core, s, and memory, GB."""
+    sensor = replace(nominal('xyz'), rate_hz=rate_hz, stage_resolution_rad=1e-4)
+    motion = rich(np.random.default_rng(1))
+
+    def back_and_forth(path):
+        """Return a path that turns round at its end."""
+        if path is None:
+            return None
+
+        def folded(time_s, order=0):
+            """Return a derivative at times on the way there or back."""
+            place_s = np.mod(time_s, 2 * motion.duration_s)
+            back = place_s > motion.duration_s
+            return path(np.where(back, 2 * motion.duration_s - place_s, place_s), order) \
+                * np.where(back, (-1.0) ** order, 1.0)
+
+        return folded
+
+    longer = replace(motion, duration_s=duration_s, **{
+        name: back_and_forth(getattr(motion, name))
+        for name in ('alpha', 'beta', 'shift', 'temperature_c', 'supply_v')})
+    columns = simulate(with_effects(sensor, list(effects)), longer, 1)
+    time_s = columns.pop('time_s')
+    path, params = folder / 'recording.csv', folder / 'params.yaml'
+    parameter_file.save(params, sensor, [])
+    with recording.writer(path, sensor) as write:
+        write(Recording(str(path), time_s, columns, sensor_info(sensor)))
+    before = standard_work()
+    process = subprocess.Popen(
+        [sys.executable, '-c', 'import sys; from adxl_ros.tools.diagnose import main; '
+         'sys.exit(main())', str(path), '--params', str(params), '-o', str(folder / 'report')],
+        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    _, _, used = os.wait4(process.pid, 0)
+    assert (folder / 'report' / 'report.json').exists()
+    slower = max(before, standard_work()) / STANDARD_S
+    return (used.ru_utime + used.ru_stime) / slower, used.ru_maxrss / 2 ** 20
+
+
+@pytest.mark.parametrize('effects', [
+    (), ('hysteresis',), ('lever_arm', 'temperature_bias'), ('bias_walk', 'nonlinearity')])
+def test_five_minutes_at_250_hz_take_ten_seconds(tmp_path, effects):
+    """Three axes need at most 10 s of processor time, whatever the verdict."""
+    seconds, _ = used_by(tmp_path, 250.0, 300.0, *effects)
+    assert seconds < 10.0
+
+
+def test_ten_minutes_at_1_khz_take_25_s_and_1_gb(tmp_path):
+    """Three axes need at most 25 s of processor time and 1 GB."""
+    seconds, gigabytes = used_by(tmp_path, 1000.0, 600.0, 'backlash', 'cross_axis')
+    assert seconds < 25.0
+    assert gigabytes < 1.0
