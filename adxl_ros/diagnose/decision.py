@@ -142,7 +142,8 @@ def decide(findings: Findings, settings: DecisionSettings) -> Verdict:
     if unexplained:
         unknown, where = max(unknown, 1 - unknown), tuple(dict.fromkeys((*where, *unexplained)))
     detected = tuple(d.effect for d in findings.detections if d.effect != UNKNOWN)
-    share = (1 - unknown) / sum(w.probability for w in library_sets)
+    # Where something unknown is certain, the others have no probability in floating point.
+    share = (1 - unknown) / max(sum(w.probability for w in library_sets), np.finfo(float).tiny)
     weighted = [WeightedHypothesis(tuple(sorted((*w.effects, *detected))), w.probability * share)
                 for w in library_sets]
     weighted.append(WeightedHypothesis((UNKNOWN,), unknown))

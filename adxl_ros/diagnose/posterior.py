@@ -150,6 +150,9 @@ def posterior(linear_model: LinearModel, sized: Sequence[SizedHypothesis],
 
     def add(index: int, unknown: FormDimension | None, log_evidence: float, form: float) -> None:
         s = sized[index]
+        if s.hypothesis.effects and not s.material:
+            # Immaterial effects alone make no gap, and lend it nothing.
+            return
         weight = settings.evidence_factor * log_evidence \
             + _log_prior(s.material, unknown, linear_model, settings)
         key = (s.material, unknown)
