@@ -99,7 +99,7 @@ def flexible_bases(comparison: BaselineComparison, baseline_v: np.ndarray) -> li
     for axis, along_g in enumerate(force_g):
         of_axis = _of_axis(comparison, force_g, axis, baseline_v[:, axis])
         of_axis |= {dimension: np.concatenate([common[dimension], common[dimension] * along_g])
-                for dimension in _TIMES_FORCE if dimension in common}
+                    for dimension in _TIMES_FORCE if dimension in common}
         basis = fixed | {dimension: _normalised(values, used)
                          for dimension, values in of_axis.items()}
         bases.append({dimension: basis[dimension] for dimension in (*common, *of_axis)

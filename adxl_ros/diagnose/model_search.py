@@ -286,7 +286,7 @@ def _remove_each_effect(linear_model: LinearModel, best: Hypothesis, hypotheses:
     for effect in best.effects:
         if frozenset(best.effects) - {effect} not in hypotheses:
             _add(hypotheses, refit(linear_model, best,
-                                  [e for e in best.effects if e != effect]))
+                                   [e for e in best.effects if e != effect]))
 
 
 def refit(linear_model: LinearModel, hypothesis: Hypothesis, effects: Sequence[str]

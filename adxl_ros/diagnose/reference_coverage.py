@@ -127,7 +127,7 @@ def without_reading(recording: Recording, comparison: BaselineComparison) -> lis
         step_rad = comparison.sensor.stage_resolution_rad
         for joint, name in JOINTS.items():
             left_out += _empty_cells(recording, name, 0.0 if joint == 'shift' else step_rad,
-                                  LONGEST_BRIDGE_S)
+                                     LONGEST_BRIDGE_S)
     for name in ('temperature_c', 'supply_v'):
         left_out += _empty_cells(recording, name, np.inf, LONGEST_SLOW_BRIDGE_S)
     return left_out

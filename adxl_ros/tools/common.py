@@ -163,22 +163,22 @@ def progress(title: str) -> Iterator[ShowDone]:
         return
     console = Console(stderr=True)
     columns = (TextColumn('{task.description}'), BarColumn(), TaskProgressColumn(),
-               TimeElapsedColumn(), TextColumn('{task.fields[left]}'))
+               TimeElapsedColumn(), TextColumn('{task.fields[remaining]}'))
     with Progress(*columns, console=console, transient=True,
                   disable=not console.is_terminal) as bar:
-        task, begin_s = bar.add_task(title, total=1.0, left=''), monotonic()
+        task, begin_s = bar.add_task(title, total=1.0, remaining=''), monotonic()
 
         def show(done: float, stage: str = '') -> None:
             """Show a fraction; see `ShowDone`."""
             elapsed_s = monotonic() - begin_s
-            left = _left(elapsed_s * (1 - done) / done) if done > 0 else ''
-            bar.update(task, completed=done, left=left,
+            remaining = _remaining(elapsed_s * (1 - done) / done) if done > 0 else ''
+            bar.update(task, completed=done, remaining=remaining,
                        description=f'{title}: {stage}' if stage else title)
 
         yield show
 
 
-def _left(left_s: float) -> str:
+def _remaining(remaining_s: float) -> str:
     """Return the time that is left, for people."""
-    minutes, seconds = divmod(round(left_s), 60)
+    minutes, seconds = divmod(round(remaining_s), 60)
     return f'left {minutes}:{seconds:02d}'
