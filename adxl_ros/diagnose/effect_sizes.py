@@ -24,6 +24,7 @@ from typing import NamedTuple
 from adxl_ros.diagnose.decision_settings import DecisionSettings
 from adxl_ros.diagnose.hypothesis_fit import Hypothesis
 from adxl_ros.diagnose.linear_model import (
+    calibration_takes_up,
     LinearModel,
     NumberedColumn,
     parts_at_rest,
@@ -105,28 +106,32 @@ def size_hypothesis(linear_model: LinearModel, hypothesis: Hypothesis, noise_mps
 
     """
     contributions = {e: contribution(linear_model, hypothesis, e) for e in hypothesis.effects}
-    inexact_mps2 = float(np.sqrt(sum(c.rms_mps2 ** 2 for e, c in contributions.items()
-                                     if not effect_named(e).exact
-                                     and not effect_named(e).diagnosis.drift)))
     angle_mps2 = linear_model.smallest_angle_rad() * G0_MPS2
     immaterial = {
         e for e, c in contributions.items()
-        if c.rms_mps2 < _smallest_mps2(e, noise_mps2, inexact_mps2, settings)
+        if c.rms_mps2 < _smallest_mps2(e, contributions, noise_mps2, settings)
         or (_turns(e) and c.rms_mps2 < angle_mps2) or _may_be_zero(hypothesis, e)}
     material = set(hypothesis.effects) - immaterial
-    if any(not effect_named(e).diagnosis.straight_line for e in material):
+    if any(calibration_takes_up(e) and not effect_named(e).diagnosis.drift for e in material):
         beyond = _beyond_calibration(linear_model, hypothesis, settings)
         straight = {e for e in library() if effect_named(e).diagnosis.straight_line}
         material = (material - straight) | beyond
     return SizedHypothesis(hypothesis, contributions, frozenset(material))
 
 
-def _smallest_mps2(effect: str, noise_mps2: float, inexact_mps2: float,
+def _smallest_mps2(effect: str, contributions: dict[str, Contribution], noise_mps2: float,
                    settings: DecisionSettings) -> float:
-    """Return the rms of an effect below which it does not matter, m/s²."""
-    share = settings.smallest_drift_share_of_gap if effect_named(effect).diagnosis.drift \
-        else settings.smallest_share_of_gap
-    return max(settings.smallest_share_of_noise * noise_mps2, share * inexact_mps2)
+    """
+    Return the rms of an effect below which it does not matter, m/s².
+
+    A drift counts beside the effects on the mean, and they count beside it.
+    """
+    is_drift = bool(effect_named(effect).diagnosis.drift)
+    share = settings.smallest_drift_share_of_gap if is_drift else settings.smallest_share_of_gap
+    inexact_mps2 = np.sqrt(sum(
+        c.rms_mps2 ** 2 for e, c in contributions.items() if not effect_named(e).exact
+        and not (is_drift and effect_named(e).diagnosis.drift)))
+    return max(settings.smallest_share_of_noise * noise_mps2, share * float(inexact_mps2))
 
 
 def contribution(linear_model: LinearModel, hypothesis: Hypothesis, effect: str) -> Contribution:
@@ -205,7 +210,7 @@ def _may_be_zero(hypothesis: Hypothesis, effect: str) -> bool:
 def _beyond_calibration(linear_model: LinearModel, hypothesis: Hypothesis,
                         settings: DecisionSettings) -> set[str]:
     """Return whether zero-g or scale factor exceeds what a calibration took up of the effects."""
-    others = [e for e in hypothesis.effects if not effect_named(e).diagnosis.straight_line
+    others = [e for e in hypothesis.effects if calibration_takes_up(e)
               and not effect_named(e).diagnosis.drift]
     if not others:
         return set()

@@ -25,6 +25,7 @@ from adxl_ros.diagnose import evidence
 from adxl_ros.diagnose.drift_checks import ResidualChannel, weakest_walk
 from adxl_ros.diagnose.evidence import LinearFit, WhitenedChannel
 from adxl_ros.diagnose.linear_model import (
+    calibration_takes_up,
     hints_of,
     LinearModel,
     NumberedColumn,
@@ -315,7 +316,8 @@ def linearise(linear_model: LinearModel, effects: Sequence[str], sensor: Sensor,
         at_rate = replace(sensor, rate_hz=comparison.sensor.rate_hz)
         output_v = comparison.simulated_v(at_rate)
         derivatives = sensitivities_at(comparison.simulated_v, at_rate, names, values, output_v)
-        change_v = output_v - linear_model.baseline_v[number]
+        change_v = output_v - _output_without_calibrated(linear_model, number, at_rate, start,
+                                                         effects)
         for d, axis in enumerate(start.axes):
             places = [i for i, n in enumerate(names) if n.axis in ('', axis)]
             design = derivatives[:, d, places]
@@ -337,6 +339,16 @@ def linearise(linear_model: LinearModel, effects: Sequence[str], sensor: Sensor,
         prior_mean=np.concatenate([prior_mean, get(start, nuisances)]),
         prior_std=np.array([*prior_std, *nuisance_std]), values=values, channels=channels,
         columns=columns, filters=filters)
+
+
+def _output_without_calibrated(linear_model: LinearModel, number: int, sensor: Sensor,
+                               start: Sensor, effects: Sequence[str]) -> np.ndarray:
+    """Simulate a recording without the effects that a calibration can take up, V, (n, m)."""
+    taken_up = [effect for effect in effects if calibration_takes_up(effect)]
+    if len(taken_up) == len(effects):
+        return linear_model.baseline_v[number]
+    values = {**sensor.values, **{effect: start.values[effect] for effect in taken_up}}
+    return linear_model.comparisons[number].simulated_v(replace(sensor, values=values))
 
 
 def _nuisance_std(linear_model: LinearModel, effects: Sequence[str], names: list[Coefficient],

@@ -195,7 +195,8 @@ class LinearModel:
         """
         prior_std = self.prior_std.copy()
         effects = {self.variants[i].effect for i in chosen}
-        columns = [k for i in chosen for k in self.column_ids[i]]
+        columns = [k for i in chosen if calibration_takes_up(self.variants[i].effect)
+                   for k in self.column_ids[i]]
         for i in self.nuisance_ids():
             name = self.names[i]
             if name.effect in effects:
@@ -277,6 +278,15 @@ class LinearModel:
                 fit.values[places], fit.covariance[np.ix_(places, places)],
                 prior_std[fit.column_ids[places]])
         return replace(fit, log_evidence=fit.log_evidence + gain)
+
+
+def calibration_takes_up(effect: str) -> bool:
+    """
+    Determine whether a calibration can take a part of an effect for zero-g or scale factor.
+
+    Of one that zero-g and scale factor imitate completely, a calibration leaves nothing.
+    """
+    return not effect_named(effect).diagnosis.absorbed
 
 
 def build_linear_model(comparisons: Sequence[BaselineComparison],

@@ -42,7 +42,7 @@ from adxl_ros.diagnose.effect_sizes import SizedHypothesis
 from adxl_ros.diagnose.flexible_terms import Basis
 from adxl_ros.diagnose.hypothesis_fit import Hypothesis, sparsity_log_bayes_factor
 from adxl_ros.diagnose.linear_model import LinearModel
-from adxl_ros.diagnose.noise_whitening import Whitener
+from adxl_ros.diagnose.noise_whitening import drifts_among, Whitener
 from adxl_ros.model.diagnosis_hints import FormDimension
 from adxl_ros.model.effects import effect_named
 import numpy as np
@@ -206,11 +206,13 @@ def _form_errors(sized: SizedHypothesis, settings: DecisionSettings) -> Sequence
 def _log_prior(effects: frozenset[str], unknown: FormDimension | None, linear_model: LinearModel,
                settings: DecisionSettings) -> float:
     """Return the log prior of one set: the probability of its size, spread over such sets."""
-    n, count = linear_model.library_size, len(effects)
+    n, count, drifts = linear_model.library_size, len(effects), len(drifts_among(effects))
+    handicap = settings.beside_drift * (count - drifts if drifts else 0)
     sets = float(np.prod([(n - i) / (i + 1) for i in range(count)]))
     by_count = settings.prior_by_count if unknown is None else settings.prior_of_unknown_by_count
     prior = by_count[min(count, len(by_count) - 1)] / sets
-    return float(np.log(prior if unknown is None else prior / len(FormDimension)))
+    return float(np.log(prior if unknown is None else prior / len(FormDimension))) \
+        - settings.evidence_factor * handicap
 
 
 def _dimensions(channels: Sequence[_Channel]) -> list[FormDimension]:
