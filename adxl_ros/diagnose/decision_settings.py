@@ -60,6 +60,9 @@ class DecisionSettings:
     smallest_drift_share_of_gap
         The same for a drift, because what the form of an effect lacks comes and goes like a
         drift.
+    smallest_unknown_share
+        An unknown function is an error of form below this share of the rms of the effects that
+        have one. Chosen: the middle of `form_errors`.
     calibration_factor
         Beside another effect, zero-g and scale factor matter above this multiple of what the
         calibration can have taken up. Chosen: two standard deviations.
@@ -82,8 +85,8 @@ class DecisionSettings:
 
     prior_by_count: tuple[float, ...] = (0.30, 0.35, 0.13, 0.02)
     prior_of_unknown_by_count: tuple[float, ...] = (0.15, 0.04, 0.01, 0.001)
-    evidence_factor: float = 0.2
-    worth_fitting: float = 25.0
+    evidence_factor: float = 0.3
+    worth_fitting: float = 16.0
     beside_drift: float = 25.0
     form_errors: tuple[float, ...] = (0.0, 0.1, 0.3, 0.6)
     unknown_amplitudes_g: tuple[float, ...] = (1e-4, 3e-4, 1e-3, 3e-3)
@@ -91,6 +94,7 @@ class DecisionSettings:
     smallest_share_of_noise: float = 0.03
     smallest_share_of_gap: float = 0.1
     smallest_drift_share_of_gap: float = 0.3
+    smallest_unknown_share: float = 0.3
     calibration_factor: float = 2.0
     healthy_factor: float = 3.0
     smallest_rival_share: float = 0.1

@@ -46,10 +46,9 @@ class Contribution(NamedTuple):
     Attributes
     ----------
     rms_mps2
-        Rms over samples and axes, m/s²: about zero for zero-g and scale factor, about the mean
-        for other effects.
+        Rms over samples and axes, m/s².
     by_channel_v
-        The same by channel, V, (channels,); zero for a drift.
+        Rms about the mean by channel, V, (channels,); zero for a drift.
 
     """
 
@@ -166,11 +165,9 @@ def contribution(linear_model: LinearModel, hypothesis: Hypothesis, effect: str)
     for c, change_v in zip(linear_model.comparisons,
                            _changes_v(linear_model, hypothesis, [effect])):
         change_v = change_v[c.used]
-        if not library_effect.diagnosis.straight_line:
-            change_v = change_v - change_v.mean(axis=0)
         total += float(np.sum((change_v / c.scale_v_per_mps2) ** 2))
         count += change_v.size
-        by_channel_v += list(np.sqrt(np.mean(change_v ** 2, axis=0)))
+        by_channel_v += list(change_v.std(axis=0))
     return Contribution(float(np.sqrt(total / max(count, 1))), np.array(by_channel_v))
 
 

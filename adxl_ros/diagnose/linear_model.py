@@ -451,14 +451,20 @@ def parts_at_rest(lines: Sequence[dict[int, np.ndarray]],
         rows = resting if resting.any() else np.ones(len(resting), bool)
         if not line or not channel_columns:
             continue
-        matrix = np.column_stack([column[rows] for column in line.values()])
-        others = np.column_stack([column[rows] for _, column in channel_columns])
-        line_parts = np.linalg.lstsq(matrix, others)[0]
-        rms = np.sqrt(np.mean(others ** 2, axis=0))
+        matrix = np.column_stack(list(line.values()))
+        others = np.column_stack([column for _, column in channel_columns])
+        rms = np.sqrt(np.mean(others[rows] ** 2, axis=0))
+        at_rests = np.abs(np.linalg.lstsq(matrix[rows], others[rows])[0])
+        in_all = np.abs(np.linalg.lstsq(matrix, others)[0])
         for j, number in enumerate(line):
             size = max(float(np.sqrt(np.mean(matrix[:, j] ** 2))), np.finfo(float).tiny)
             part = parts.setdefault(number, np.zeros(count))
             ids = [i for i, _ in channel_columns]
-            part[ids] = np.maximum(part[ids], np.hypot(line_parts[j],
+            # The poses of a calibration may reach further than the rests of the recording.
+            reach = np.abs(others).max(axis=0) / np.abs(matrix[:, j]).max() \
+                if np.ptp(matrix[:, j]) else in_all[j]
+            straight = np.maximum(at_rests[j], np.minimum(np.maximum(in_all[j], reach),
+                                                          2 * rms / size))
+            part[ids] = np.maximum(part[ids], np.hypot(straight,
                                                        _OTHER_RESTS_SHARE * rms / size))
     return parts

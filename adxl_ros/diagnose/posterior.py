@@ -43,6 +43,7 @@ from adxl_ros.diagnose.flexible_terms import Basis
 from adxl_ros.diagnose.hypothesis_fit import Hypothesis, sparsity_log_bayes_factor
 from adxl_ros.diagnose.linear_model import LinearModel
 from adxl_ros.diagnose.noise_whitening import drifts_among, Whitener
+from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.diagnosis_hints import FormDimension
 from adxl_ros.model.effects import effect_named
 import numpy as np
@@ -150,8 +151,9 @@ def posterior(linear_model: LinearModel, sized: Sequence[SizedHypothesis],
 
     def add(index: int, unknown: FormDimension | None, log_evidence: float, form: float) -> None:
         s = sized[index]
-        if s.hypothesis.effects and not s.material:
-            # Immaterial effects alone make no gap, and lend it nothing.
+        if s.material != frozenset(s.hypothesis.effects) \
+                and all(effect_named(e).exact for e in s.material):
+            # An exact form lacks nothing that an immaterial effect could take up.
             return
         weight = settings.evidence_factor * log_evidence \
             + _log_prior(s.material, unknown, linear_model, settings)
@@ -188,13 +190,22 @@ def posterior(linear_model: LinearModel, sized: Sequence[SizedHypothesis],
                                     amplitude)
                       for amplitude in settings.unknown_amplitudes_g]
             total = float(np.logaddexp.reduce(values) - np.log(len(values)))
-            # What the recording does not make more probable is no finding.
-            if total > by_form[index][0]:
+            size_mps2 = G0_MPS2 * settings.unknown_amplitudes_g[int(np.argmax(values))]
+            # What the recording does not make more probable is no finding, and what is small
+            # beside the effects is an error of their form.
+            if total > by_form[index][0] and size_mps2 > settings.smallest_unknown_share \
+                    * _inexact_mps2(sized[index]):
                 add(index, dimension, total, by_form[index][1])
     weights = np.array([e.log_weight for e in entries.values()])
     probabilities = np.exp(weights - np.logaddexp.reduce(weights))
     weighed = [replace(e, probability=float(p)) for e, p in zip(entries.values(), probabilities)]
     return sorted(weighed, key=lambda w: -w.probability)
+
+
+def _inexact_mps2(sized: SizedHypothesis) -> float:
+    """Return the rms of the effects of a hypothesis whose form is not exact, m/s²."""
+    return float(np.sqrt(sum(c.rms_mps2 ** 2 for e, c in sized.contributions.items()
+                             if effect_named(e).diagnosis.form)))
 
 
 def _form_errors(sized: SizedHypothesis, settings: DecisionSettings) -> Sequence[float]:
@@ -207,7 +218,8 @@ def _log_prior(effects: frozenset[str], unknown: FormDimension | None, linear_mo
                settings: DecisionSettings) -> float:
     """Return the log prior of one set: the probability of its size, spread over such sets."""
     n, count, drifts = linear_model.library_size, len(effects), len(drifts_among(effects))
-    handicap = settings.beside_drift * (count - drifts if drifts else 0)
+    others = count - drifts + (unknown is not None)
+    handicap = settings.beside_drift * (others if drifts else 0)
     sets = float(np.prod([(n - i) / (i + 1) for i in range(count)]))
     by_count = settings.prior_by_count if unknown is None else settings.prior_of_unknown_by_count
     prior = by_count[min(count, len(by_count) - 1)] / sets
