@@ -101,7 +101,7 @@ class BaselineComparison:
     used
         Samples that are used, (n,) bool; the others are missing, repeated or outliers, or their
         reference is not known.
-    notes
+    notes : tuple of str
         What was corrected or left out before the comparison, one line each, for people.
     memo
         Signals that simulations of this recording share.

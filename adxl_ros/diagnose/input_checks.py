@@ -33,6 +33,11 @@ import numpy as np
 _SAME_ROUGHNESS = 1.05
 """Ratio of the steps of two residuals up to which they are equal. Chosen: above its scatter by
 noise in a thousand samples."""
+_LONGEST_STEP_S = 0.5
+"""Longest time between samples, s, that follow a moving stage. Chosen: the motion between two
+samples is unknown, and stamps in milliseconds are far beyond."""
+_SMALLEST_MOVE_RAD = 0.01
+"""Range of an angle, rad, above which the stage moves. Chosen: beyond the jitter of an encoder."""
 
 
 def compare_checked(recording: Recording, sensor: Sensor, sim: Motion | None, may_shift: bool
@@ -70,6 +75,9 @@ def compare_checked(recording: Recording, sensor: Sensor, sim: Motion | None, ma
     fault = find_clock_fault(recording.time_s)
     if fault is not None:
         return fault
+    fault = _too_slow(recording)
+    if fault is not None:
+        return fault
     if sim is not None:
         aligned = align_force(recording, sensor, sim, may_shift)
         if isinstance(aligned, DataFault):
@@ -104,3 +112,17 @@ def compare_checked(recording: Recording, sensor: Sensor, sim: Motion | None, ma
 def _roughness(comparison: BaselineComparison) -> float:
     """Return the mean square of the residual's steps, V²: wrong instants add to it in motion."""
     return float(np.nanmean(np.diff(comparison.residual_v(comparison.sensor), axis=0) ** 2))
+
+
+def _too_slow(recording: Recording) -> DataFault | None:
+    """Find stamps that are too far apart to follow the stage, as milliseconds in place of s."""
+    step_s = float(np.median(np.diff(recording.time_s)))
+    angles = [recording.columns[name] for name in ('alpha_rad', 'beta_rad')
+              if name in recording.columns]
+    moves = any(np.nanmax(angle) - np.nanmin(angle) > _SMALLEST_MOVE_RAD for angle in angles
+                if np.isfinite(angle).any())
+    if not moves or step_s <= _LONGEST_STEP_S:
+        return None
+    return DataFault('unit', 'bad_data', f'time_s: {step_s:.3g} s between samples while the stage '
+                     f'moves, at most {_LONGEST_STEP_S:g} s are followed; divide stamps in '
+                     'milliseconds by 1000')

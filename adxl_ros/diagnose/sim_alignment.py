@@ -102,7 +102,7 @@ class AlignedForce:
         The samples that the simulator covers.
     sim
         The simulator, shifted where it was asked for.
-    notes
+    notes : tuple of str
         What was shifted or left out, one line each.
 
     """

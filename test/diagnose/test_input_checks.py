@@ -82,6 +82,15 @@ def test_no_verdict_is_exit_status_1(run_tool, tmp_path):
     assert 'Exit status' in run_tool('diagnose', '--help').stdout
 
 
+def test_stamps_in_milliseconds_are_named(run_tool, tmp_path):
+    """Ten seconds between samples do not show how the stage moved."""
+    recorded = made(unit())
+    slow = replace(recorded, time_s=recorded.time_s * 1000)
+    report, run = report_of(run_tool, tmp_path, unit(), slow)
+    assert (run.returncode, report['verdict']['data_fault']) == (1, 'unit')
+    assert 'divide stamps in milliseconds by 1000' in report['summary']
+
+
 def test_short_recordings_count_together():
     """Two recordings of 20 s are long enough, one is not."""
     recorded = made(unit(), turns=1)
