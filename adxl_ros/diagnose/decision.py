@@ -120,6 +120,9 @@ def decide(findings: Findings, settings: DecisionSettings) -> Verdict:
     """
     Sum the probabilities of the sets that the verdict names.
 
+    A verdict can be wrong for a reason that no hypothesis describes. The share of such verdicts
+    among working cases is taken from the probability of the named sets.
+
     Parameters
     ----------
     findings
@@ -144,12 +147,21 @@ def decide(findings: Findings, settings: DecisionSettings) -> Verdict:
     detected = tuple(d.effect for d in findings.detections if d.effect != UNKNOWN)
     # Where something unknown is certain, the others have no probability in floating point.
     share = (1 - unknown) / max(sum(w.probability for w in library_sets), np.finfo(float).tiny)
-    weighted = [WeightedHypothesis(tuple(sorted((*w.effects, *detected))), w.probability * share)
-                for w in library_sets]
-    weighted.append(WeightedHypothesis((UNKNOWN,), unknown))
-    weighted = sorted(weighted, key=lambda w: -w.probability)
-    if unknown > settings.certain:
-        return Verdict('unknown', (), (), float(unknown), tuple(weighted), best.hypothesis, where)
+    is_unknown = unknown > settings.certain
+    count = len(best.effects) + len(detected)
+    wrong = settings.wrong_unknown if is_unknown \
+        else settings.wrong_by_count[min(count, len(settings.wrong_by_count) - 1)]
+    named = (*best.effects, *detected)
+    weights = {tuple(sorted((*w.effects, *detected))): float(w.probability * share * (1 - wrong))
+               for w in library_sets}
+    weights[(UNKNOWN,)] = float(unknown * (1 - wrong))
+    other = tuple(sorted(named if is_unknown else (*named, UNKNOWN)))
+    weights[other] = weights.get(other, 0.0) + wrong
+    weighted = sorted((WeightedHypothesis(*item) for item in weights.items()),
+                      key=lambda w: -w.probability)
+    if is_unknown:
+        return Verdict('unknown', (), (), weights[(UNKNOWN,)], tuple(weighted), best.hypothesis,
+                       where)
     rivals = _rivals(library_sets, settings)
     effects = tuple(sorted((*(e for e in best.effects if len(rivals[e]) == 1), *detected)))
     groups = tuple(sorted({tuple(sorted(rivals[e])) for e in best.effects
