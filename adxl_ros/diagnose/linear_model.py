@@ -58,6 +58,9 @@ _OTHER_RESTS_SHARE = 0.2
 """Share of an effect at rest by which its straight-line part differs between the rests of a
 calibration and those of a recording. Tuned on simulated units that are calibrated by a sweep over
 51 poses and recorded in other poses; shares there are up to 0.25."""
+_SMALLEST_BENT_SHARE = 0.1
+"""Share of an effect that differs from a straight line over the force, below which the effect is
+a straight line itself. Chosen: a tenth of an effect is material."""
 
 
 class NumberedColumn(NamedTuple):
@@ -455,7 +458,11 @@ def parts_at_rest(lines: Sequence[dict[int, np.ndarray]],
         others = np.column_stack([column for _, column in channel_columns])
         rms = np.sqrt(np.mean(others[rows] ** 2, axis=0))
         at_rests = np.abs(np.linalg.lstsq(matrix[rows], others[rows])[0])
-        in_all = np.abs(np.linalg.lstsq(matrix, others)[0])
+        lines_in_all = np.linalg.lstsq(matrix, others)[0]
+        in_all = np.abs(lines_in_all)
+        # A calibration with an effect that is a straight line would have left nothing of it.
+        bent = (others - matrix @ lines_in_all).std(axis=0) \
+            > _SMALLEST_BENT_SHARE * np.sqrt(np.mean(others ** 2, axis=0))
         for j, number in enumerate(line):
             size = max(float(np.sqrt(np.mean(matrix[:, j] ** 2))), np.finfo(float).tiny)
             part = parts.setdefault(number, np.zeros(count))
@@ -465,6 +472,6 @@ def parts_at_rest(lines: Sequence[dict[int, np.ndarray]],
                 if np.ptp(matrix[:, j]) else in_all[j]
             straight = np.maximum(at_rests[j], np.minimum(np.maximum(in_all[j], reach),
                                                           2 * rms / size))
-            part[ids] = np.maximum(part[ids], np.hypot(straight,
-                                                       _OTHER_RESTS_SHARE * rms / size))
+            part[ids] = np.maximum(part[ids], bent * np.hypot(straight,
+                                                              _OTHER_RESTS_SHARE * rms / size))
     return parts
