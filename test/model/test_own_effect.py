@@ -14,6 +14,7 @@
 
 """The package of the page about effects of other packages works as documented."""
 
+import json
 import os
 import re
 import subprocess
@@ -68,3 +69,10 @@ def test_the_documented_package_works(tmp_path, monkeypatch):
     ax = [np.genfromtxt(tmp_path / name, delimiter=',', names=True)['ax_mps2']
           for name in ('out.csv', 'bare.csv')]
     assert abs(np.mean(ax[0] - ax[1])) < 2e-4
+    # The diagnosis names it, or a group that holds it: a wrong zero-g looks nearly the same.
+    run = run_executable(*line[0].split()[:2], *line[1].split()[1:], '-o', 'c.csv', cwd=tmp_path)
+    assert run.returncode == 0, run.stderr
+    run = run_executable('diagnose', 'c.csv', '-o', 'gap', cwd=tmp_path)
+    assert run.returncode == 0, run.stderr
+    verdict = json.loads((tmp_path / 'gap' / 'report.json').read_text())['verdict']
+    assert 'cable_sag' in (*verdict['effects'], *sum(verdict['groups'], []))
