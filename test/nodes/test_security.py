@@ -55,10 +55,15 @@ def test_the_policy_is_what_the_node_needs(start, node):
     permitted = allowed(node)
     with Graph() as graph:
         def existing():
-            return [names_of(find(node, '/')) for find in (
-                graph.node.get_publisher_names_and_types_by_node,
-                graph.node.get_subscriber_names_and_types_by_node,
-                graph.node.get_service_names_and_types_by_node)]
+            # A node of the same name that ended a moment ago may still be in the graph, so that
+            # the queries by the name of a node may answer for that one.
+            topics = names_of(graph.node.get_topic_names_and_types())
+            return [{topic for topic in topics
+                     if any(end.node_name == node for end in ends(topic))} for ends in (
+                         graph.node.get_publishers_info_by_topic,
+                         graph.node.get_subscriptions_info_by_topic)] + [
+                {name for name in names_of(graph.node.get_service_names_and_types())
+                 if name.startswith(f'/{node}/')}]
 
         graph.spin_until(lambda: node in graph.diagnostics, 20, 'diagnostics')
         # Discovery of the other topics and services may come after the first message.
