@@ -47,12 +47,15 @@ class Contribution(NamedTuple):
     ----------
     rms_mps2
         Rms over samples and axes, m/s².
+    varying_mps2
+        Rms about the mean of each channel, m/s².
     by_channel_v
         Rms about the mean by channel, V, (channels,); zero for a drift.
 
     """
 
     rms_mps2: float
+    varying_mps2: float
     by_channel_v: np.ndarray
 
 
@@ -128,7 +131,7 @@ def _smallest_mps2(effect: str, contributions: dict[str, Contribution], noise_mp
     is_drift = bool(effect_named(effect).diagnosis.drift)
     share = settings.smallest_drift_share_of_gap if is_drift else settings.smallest_share_of_gap
     inexact_mps2 = np.sqrt(sum(
-        c.rms_mps2 ** 2 for e, c in contributions.items() if not effect_named(e).exact
+        c.varying_mps2 ** 2 for e, c in contributions.items() if not effect_named(e).exact
         and not (is_drift and effect_named(e).diagnosis.drift)))
     return max(settings.smallest_share_of_noise * noise_mps2, share * float(inexact_mps2))
 
@@ -159,16 +162,19 @@ def contribution(linear_model: LinearModel, hypothesis: Hypothesis, effect: str)
         squares = [(G0_MPS2 * expected_drift_g(spectrum, float(density), c.span_s,
                                                c.sensor.rate_hz)) ** 2
                    for c in linear_model.comparisons]
-        return Contribution(float(np.sqrt(np.mean(squares))),
+        rms_mps2 = float(np.sqrt(np.mean(squares)))
+        return Contribution(rms_mps2, rms_mps2,
                             np.zeros(len(linear_model.channels)))
-    total, count, by_channel_v = 0.0, 0, []
+    total, varying, count, by_channel_v = 0.0, 0.0, 0, []
     for c, change_v in zip(linear_model.comparisons,
                            _changes_v(linear_model, hypothesis, [effect])):
         change_v = change_v[c.used]
         total += float(np.sum((change_v / c.scale_v_per_mps2) ** 2))
+        varying += float(np.sum(change_v.var(axis=0) / c.scale_v_per_mps2 ** 2)) * len(change_v)
         count += change_v.size
         by_channel_v += list(change_v.std(axis=0))
-    return Contribution(float(np.sqrt(total / max(count, 1))), np.array(by_channel_v))
+    return Contribution(float(np.sqrt(total / max(count, 1))),
+                        float(np.sqrt(varying / max(count, 1))), np.array(by_channel_v))
 
 
 def _changes_v(linear_model: LinearModel, hypothesis: Hypothesis, effects: Sequence[str]
