@@ -59,7 +59,7 @@ def test_the_policy_is_what_the_node_needs(start, node):
             # the queries by the name of a node may answer for that one.
             topics = names_of(graph.node.get_topic_names_and_types())
             return [{topic for topic in topics
-                     if any(end.node_name == node for end in ends(topic))} for ends in (
+                     if any(point.node_name == node for point in find(topic))} for find in (
                          graph.node.get_publishers_info_by_topic,
                          graph.node.get_subscriptions_info_by_topic)] + [
                 {name for name in names_of(graph.node.get_service_names_and_types())
