@@ -19,6 +19,7 @@ from __future__ import annotations
 from bisect import bisect_left
 from dataclasses import dataclass
 from itertools import pairwise
+from math import factorial
 
 from adxl_ros.model.effects.base import Components
 import numpy as np
@@ -47,7 +48,7 @@ _MAX_WINDOWS = 64
 """Largest number of windows in memory; chosen: an hour of motion."""
 
 _MAX_PIECES = 20_000
-"""Largest number of knots of a window that is kept as polynomials; chosen: 1 MB."""
+"""Largest number of knots of a window that is kept as polynomials; chosen: at most 2 MB."""
 
 _MARGIN_S = 3.0
 """Overlap of the windows on each side, s; chosen: far beyond the range of the spline's penalty."""
@@ -212,7 +213,7 @@ class SmoothedPath:
 
     def _numbers(self, time_s: np.ndarray) -> np.ndarray:
         """Return the number of the window of each time, (n,)."""
-        return ((time_s - self._time_s[0]) // _WINDOW_S).astype(int)
+        return ((time_s - self._time_s[0]) / _WINDOW_S).astype(int)
 
     def _spline(self, window: int) -> BSpline | PPoly:
         if window not in self._windows:
@@ -220,10 +221,8 @@ class SmoothedPath:
                 del self._windows[min(self._windows)]
             spline = smoothing_spline(
                 *self._part(window), self._strength, self._step, self._degree)
-            # Polynomials are evaluated faster, but need more memory. FITPACK, which makes them,
-            # ends at this degree.
-            self._windows[window] = PPoly.from_spline(spline) \
-                if 0 < spline.k <= _DEGREE and len(spline.t) <= _MAX_PIECES else spline
+            self._windows[window] = _polynomials(spline) \
+                if spline.k and len(spline.t) <= _MAX_PIECES else spline
         return self._windows[window]
 
     def _part(self, window: int) -> tuple[np.ndarray, np.ndarray]:
@@ -275,6 +274,18 @@ def smoothing_spline(time_s: np.ndarray, reading: np.ndarray, strength: float, s
     window = _Window(time_s, reading)
     return BSpline(window.knots, window.bounded_coefficients(
         strength, np.where(_moving(reading), 0.0, _REST_WEIGHT), step / 2) + window.mean, _DEGREE)
+
+
+def _polynomials(spline: BSpline) -> PPoly:
+    """
+    Return a spline as polynomials, which are evaluated faster but need more memory.
+
+    `PPoly.from_spline` does the same up to degree 5.
+    """
+    begins = spline.t[spline.k:-spline.k - 1]
+    coefficients = [spline(begins, order) / factorial(order)
+                    for order in range(spline.k, -1, -1)]
+    return PPoly(np.array(coefficients), spline.t[spline.k:-spline.k])
 
 
 def visible_step(reading: np.ndarray, step: float) -> float:
