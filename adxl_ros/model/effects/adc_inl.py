@@ -28,12 +28,14 @@ def apply(signals: Signals, p: Parameters) -> None:
     """
     turn = 2 * np.pi * p['cycles'] / signals.vref_v
     for d, volts in enumerate(signals.input_v):
-        error_v = p['amplitude_v'] * np.sin(turn * volts) + p['cosine_v'] * np.cos(turn * volts)
-        for bit, name in enumerate(_BITS, 1):
-            if p[name]:
-                is_set = np.floor(volts / signals.vref_v * 2 ** bit) % 2
-                error_v = error_v + p[name] * (is_set - 0.5)
-        signals.volts[d] = signals.volts[d] + error_v
+        errors_v = [p[name] * function(turn * volts)
+                    for name, function in (('amplitude_v', np.sin), ('cosine_v', np.cos))
+                    if p[name]]
+        if any(p[name] for name in _BITS):
+            code = np.floor(volts / signals.vref_v * 2 ** len(_BITS)).astype(int)
+            errors_v += [p[name] * ((code >> (len(_BITS) - bit) & 1) - 0.5)
+                         for bit, name in enumerate(_BITS, 1) if p[name]]
+        signals.volts[d] = sum(errors_v, signals.volts[d])
 
 
 _BITS = ('first_bit_v', 'second_bit_v', 'third_bit_v', 'fourth_bit_v', 'fifth_bit_v',
