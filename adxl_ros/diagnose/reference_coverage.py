@@ -67,6 +67,8 @@ _EVEN = 0.02
 rounding errors."""
 _MOVES = 3.0
 """Motion, divided by the noise, from which an alias is looked for. Chosen: noise alone has 1."""
+_CONSTANT_V = 1e3
+"""Step of the codes of an output that never changes, V. Chosen: above any change."""
 _IMAGES = np.arange(-8, 9)
 """Orders of the images of a spline that are summed. Chosen: the rest is below 1e-6."""
 
@@ -351,16 +353,17 @@ def _with_aliases(comparison: BaselineComparison, coarse: np.ndarray, noise_g: f
     sensor = comparison.sensor
     size = max(round(_WINDOW_S * sensor.rate_hz), _WINDOW_READINGS)
     simulated_v = comparison.simulated_v(sensor)
+    # Coarse codes jump by themselves.
+    scatter_g = np.maximum(noise_g, _code_step_v(comparison.volts) / sensor.scale_v_per_g)
     parts = np.array_split(np.arange(len(coarse)), max(len(coarse) // size, 1))
     differs, touched = np.zeros(len(parts), bool), np.zeros(len(parts), bool)
     for i, part in enumerate(parts):
-        recorded_g, simulated_g = (
-            np.nanmax(np.nanstd(np.diff(v[part], axis=0) / sensor.scale_v_per_g, axis=0))
-            for v in (comparison.volts, simulated_v))
+        recorded_g, simulated_g = (np.nanstd(np.diff(v[part], axis=0) / sensor.scale_v_per_g,
+                                             axis=0) for v in (comparison.volts, simulated_v))
         touched[i] = coarse[part].any()
-        ratio = np.hypot(recorded_g, noise_g) / np.hypot(simulated_g, noise_g)
-        differs[i] = max(recorded_g, simulated_g) > _MOVES * noise_g \
-            and not 1 / _SAME_MOTION < ratio < _SAME_MOTION
+        ratio = np.hypot(recorded_g, scatter_g) / np.hypot(simulated_g, scatter_g)
+        moves = np.maximum(recorded_g, simulated_g) > _MOVES * scatter_g
+        differs[i] = np.any(moves & ((ratio < 1 / _SAME_MOTION) | (ratio > _SAME_MOTION)))
     extended = coarse.copy()
     for begin, end in true_runs(differs | touched):
         if touched[begin:end].any():
@@ -368,3 +371,9 @@ def _with_aliases(comparison: BaselineComparison, coarse: np.ndarray, noise_g: f
                 if differs[i]:
                     extended[parts[i]] = True
     return extended
+
+
+def _code_step_v(volts: np.ndarray) -> np.ndarray:
+    """Return the smallest change of the output on each axis, V, (m,)."""
+    changes_v = np.abs(np.diff(volts, axis=0))
+    return np.min(changes_v, axis=0, initial=_CONSTANT_V, where=changes_v > 0)
