@@ -27,6 +27,7 @@ from math import prod
 
 from adxl_ros.diagnose.baseline_comparison import BaselineComparison, Reference
 from adxl_ros.diagnose.motion_history import direction_of_last_move, time_since_move_s
+from adxl_ros.diagnose.noise_floor import gravity_slopes
 from adxl_ros.model.diagnosis_hints import FormDimension
 from adxl_ros.model.filters import low_pass
 import numpy as np
@@ -68,6 +69,9 @@ _SMALLEST_RMS = 1e-9
 
 _TIMES_FORCE = (FormDimension.TEMPERATURE, FormDimension.SUPPLY)
 """Dimensions whose functions also multiply the force, because they change the scale factor."""
+_TIMES_SLOPE = (FormDimension.ALPHA, FormDimension.BETA)
+"""Dimensions whose functions also multiply the slope of the force over the angle, because they are
+errors of the angle."""
 
 Basis = dict[FormDimension, np.ndarray]
 """Functions of one axis of one recording by dimension, (n, k) each, about their mean. A random
@@ -94,17 +98,28 @@ def flexible_bases(comparison: BaselineComparison, baseline_v: np.ndarray) -> li
     force_g = ((baseline_v - comparison.sensor.zero_g_v) / comparison.sensor.scale_v_per_g).T
     common, used = _common(comparison), comparison.used
     fixed = {dimension: _normalised(values, used) for dimension, values in common.items()
-             if dimension not in _TIMES_FORCE}
+             if dimension not in (*_TIMES_FORCE, *_TIMES_SLOPE)}
+    slopes = _slopes(comparison)
     bases = []
     for axis, along_g in enumerate(force_g):
         of_axis = _of_axis(comparison, force_g, axis, baseline_v[:, axis])
-        of_axis |= {dimension: np.concatenate([common[dimension], common[dimension] * along_g])
-                    for dimension in _TIMES_FORCE if dimension in common}
+        factors = dict.fromkeys(_TIMES_FORCE, along_g) | {
+            dimension: slope[axis] for dimension, slope in slopes.items()}
+        of_axis |= {dimension: np.concatenate([common[dimension], common[dimension] * factor])
+                    for dimension, factor in factors.items() if dimension in common}
         basis = fixed | {dimension: _normalised(values, used)
                          for dimension, values in of_axis.items()}
         bases.append({dimension: basis[dimension] for dimension in (*common, *of_axis)
                       if basis[dimension].shape[1]})
     return bases
+
+
+def _slopes(comparison: BaselineComparison) -> Basis:
+    """Return by angle how gravity along each axis changes with it, (3, n) each."""
+    if comparison.reference is not Reference.STAGE:
+        return {}
+    joints = (comparison.motion.alpha, comparison.motion.beta)
+    return dict(zip(_TIMES_SLOPE, gravity_slopes(*(q(comparison.time_s) for q in joints))))
 
 
 def _normalised(functions: np.ndarray, used: np.ndarray) -> np.ndarray:
