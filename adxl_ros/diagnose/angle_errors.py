@@ -13,12 +13,13 @@
 # limitations under the License.
 
 """
-Errors of the followed angles, as a part of the noise.
+Errors of the followed angles and of coarse rounding, as a part of the noise.
 
 The simulator follows angles that an encoder has rounded. Their error turns into volts by the slope
 of gravity over each angle. At rest it is constant and new after each move; in motion it changes
 quickly and is smaller, see `SmoothedPath.errors`. It belongs to the noise of every hypothesis
-(errors in variables; Fuller 1987).
+(errors in variables; Fuller 1987). The rounding to codes that are coarser than the noise is
+constant at rest, too, and changes with the output.
 
 The model is y = n + g·u. Here n is noise behind the RC filter, an AR(1) sequence with pole a. The
 error u has variance 1 and u_t = φ_t·u_(t−1) + √(1 − φ_t²)·ξ_t, and g is its standard deviation in
@@ -29,6 +30,7 @@ no change. Where g is 0, samples stay as they are.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from math import sqrt
 
@@ -43,6 +45,9 @@ from scipy.signal import lfilter
 _LOWEST_NOISE_V = 1e-7
 """Smallest standard deviation of the noise, V, because the filter divides by it. Chosen: below
 that of any ADC."""
+_SMALLEST_HELD_SHARE = 0.01
+"""Share of the rounding that is held, below which all of it is white. Chosen: the noise is then
+a third of a step, as in any unit whose ADC suits it."""
 _SERIES = 16
 """Series that are filtered together. Chosen: little memory beside all series."""
 
@@ -54,6 +59,8 @@ class AngleErrorFilter:
 
     Attributes
     ----------
+    rms_v
+        Rms of the errors, V.
     pole
         Pole a of the noise.
     transition
@@ -67,6 +74,7 @@ class AngleErrorFilter:
 
     """
 
+    rms_v: float
     pole: float
     transition: np.ndarray
     gain: np.ndarray
@@ -108,31 +116,55 @@ def angle_error_filter(comparison: BaselineComparison, axis: int) -> AngleErrorF
         The filter; None where the reference has no error that is known.
 
     """
-    if comparison.reference is not Reference.STAGE:
-        return None
-    time_s, motion, sensor = comparison.time_s, comparison.motion, comparison.sensor
-    slopes = gravity_slopes(motion.alpha(time_s), motion.beta(time_s))[:, axis]
-    v_per_rad = slopes * sensor.scale_v_per_g[axis] * sensor.local_gravity_mps2 / G0_MPS2
-    variance_v2, remembered_v2 = np.zeros(len(time_s)), np.zeros(len(time_s))
-    for joint, slope in zip((motion.alpha, motion.beta), v_per_rad):
-        errors = joint.errors(time_s) if isinstance(joint, CachedPath) else None
-        if errors is not None:
-            part = (slope * errors.std) ** 2
-            # An error that grows, after a move, is a new one.
-            grown = np.minimum(errors.std[:-1] / errors.std[1:], 1.0)
-            memory = np.exp(-errors.forgetting_per_s * comparison.dt_s)
-            memory[1:] *= grown
-            variance_v2 += part
-            remembered_v2 += part * memory
+    sensor = comparison.sensor
+    rounding = noise.rounding(sensor, axis)
+    variance_v2, remembered_v2 = np.zeros(len(comparison)), np.zeros(len(comparison))
+    for part_v2, memory in (*_angle_errors(comparison, axis),
+                            *_rounding_errors(comparison, axis, rounding.held_v2)):
+        variance_v2 += part_v2
+        remembered_v2 += part_v2 * memory
     if not variance_v2.any():
         return None
     rc_s = float(noise.electronics(sensor).rc_s[axis])
     pole = float(np.exp(-comparison.dt_s / rc_s)) if rc_s else 0.0
     std_v = max(float(noise.analog_std_v(sensor)[axis]), _LOWEST_NOISE_V)
-    noise_v2 = std_v ** 2 * (1 - pole ** 2) + sensor.lsb_v ** 2 / 12 * (1 + pole ** 2)
+    noise_v2 = std_v ** 2 * (1 - pole ** 2) + rounding.white_v2 * (1 + pole ** 2)
     return _filter(np.sqrt(variance_v2),
                    np.divide(remembered_v2, variance_v2, where=variance_v2 > 0,
-                             out=np.ones(len(time_s))), pole, noise_v2)
+                             out=np.ones(len(comparison))), pole, noise_v2)
+
+
+def _angle_errors(comparison: BaselineComparison, axis: int
+                  ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield variance, V², (n,), and memory from sample to sample, (n,), of each joint's error."""
+    if comparison.reference is not Reference.STAGE:
+        return
+    time_s, motion, sensor = comparison.time_s, comparison.motion, comparison.sensor
+    slopes = gravity_slopes(motion.alpha(time_s), motion.beta(time_s))[:, axis]
+    v_per_rad = slopes * sensor.scale_v_per_g[axis] * sensor.local_gravity_mps2 / G0_MPS2
+    for joint, slope in zip((motion.alpha, motion.beta), v_per_rad):
+        errors = joint.errors(time_s) if isinstance(joint, CachedPath) else None
+        if errors is not None:
+            # An error that grows, after a move, is a new one.
+            grown = np.minimum(errors.std[:-1] / errors.std[1:], 1.0)
+            memory = np.exp(-errors.forgetting_per_s * comparison.dt_s)
+            memory[1:] *= grown
+            yield (slope * errors.std) ** 2, memory
+
+
+def _rounding_errors(comparison: BaselineComparison, axis: int, held_v2: float
+                     ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """
+    Yield variance, V², (n,), and memory from sample to sample, (n,), of the held rounding error.
+
+    Rounding errors of two outputs that differ by a small share x of a step have the correlation
+    1 − 6·x.
+    """
+    if held_v2 < _SMALLEST_HELD_SHARE * comparison.sensor.lsb_v ** 2 / 12 or not held_v2:
+        return
+    simulated_v = comparison.simulated_v(comparison.sensor)[:, axis]
+    steps = np.abs(np.diff(simulated_v, prepend=simulated_v[:1])) / comparison.sensor.lsb_v
+    yield np.full(len(comparison), held_v2), np.exp(-6 * steps)
 
 
 def _filter(std_v: np.ndarray, memory: np.ndarray, pole: float, noise_v2: float
@@ -151,4 +183,5 @@ def _filter(std_v: np.ndarray, memory: np.ndarray, pole: float, noise_v2: float
         rows.append((phi - gain * weight, gain, weight, sqrt(noise_v2 / total_v2)))
         variance = phi * phi * variance + renewal2 - gain * gain * total_v2
         previous_v = g
-    return AngleErrorFilter(pole, *np.array(rows).T)
+    rms_v = float(np.sqrt(np.mean(std_v ** 2)))
+    return AngleErrorFilter(rms_v, pole, *np.array(rows).T)

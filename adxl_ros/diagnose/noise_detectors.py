@@ -363,8 +363,6 @@ class NoiseSamples:
         Stamps, s, (n,).
     residual_v
         Residual, bridged over samples that are not used, V, (n, m).
-    raw_residual_v
-        Residual as it is, V, (n, m).
     simulated_v
         Noise that the simulator draws, V, (n, m).
     at_rest
@@ -376,7 +374,6 @@ class NoiseSamples:
 
     time_s: np.ndarray
     residual_v: np.ndarray
-    raw_residual_v: np.ndarray
     simulated_v: np.ndarray
     at_rest: np.ndarray
     used: np.ndarray
@@ -420,8 +417,13 @@ def _excess(white: np.ndarray, at_rest: np.ndarray, samples: NoiseSamples, senso
     enough_rest = at_rest.sum() > _RESTING_FEWEST
     # In motion, effects that are not modelled would look like noise, so that rests are preferred.
     chosen = at_rest if enough_rest else samples.used[2:]
-    ratio = np.median(np.abs(white[chosen]), axis=0) \
-        / np.median(np.abs(simulated[chosen]), axis=0)
+    drawn = np.median(np.abs(simulated[chosen]), axis=0)
+    # The level of noise far below a step of the ADC does not show.
+    shows = np.array([r.held_v2 <= r.white_v2 for r in
+                      (noise.rounding(sensor, d) for d in range(len(drawn)))]) & (drawn > 0)
+    if not shows.any():
+        return None
+    ratio = np.median(np.abs(white[chosen]), axis=0) / np.where(shows, drawn, np.inf)
     if enough_rest:
         # Noise past the RC filter looks excessive in the innovations, but not in the samples.
         ratio = np.minimum(ratio, np.std(samples.residual_v[2:][at_rest], axis=0)

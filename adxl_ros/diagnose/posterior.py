@@ -37,6 +37,7 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 from adxl_ros.diagnose import evidence
+from adxl_ros.diagnose.baseline_comparison import BaselineComparison
 from adxl_ros.diagnose.decision_settings import DecisionSettings
 from adxl_ros.diagnose.effect_sizes import SizedHypothesis
 from adxl_ros.diagnose.flexible_terms import Basis
@@ -46,6 +47,7 @@ from adxl_ros.diagnose.noise_whitening import drifts_among, Whitener
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.diagnosis_hints import FormDimension
 from adxl_ros.model.effects import effect_named
+from adxl_ros.model.noise import rounding
 import numpy as np
 from scipy.linalg.lapack import dposv
 
@@ -106,24 +108,15 @@ class _ChannelGrams:
 
 @dataclass(frozen=True)
 class _Channel:
-    """One axis of one recording: filters, and products of the whitened basis."""
+    """One axis of one recording: log priors of its filters, products of the whitened basis."""
 
-    filters: list[Whitener]
+    log_priors: list[float]
     count: float
     scale_v_per_g: float
     dimensions: dict[FormDimension, np.ndarray]
     unknown: dict[FormDimension, np.ndarray]
     basis: np.ndarray
     hypotheses: list[_ChannelGrams] = field(default_factory=list)
-
-
-@dataclass(frozen=True)
-class _Evidence:
-    """Log evidence of one model, with the posterior of its own coefficients."""
-
-    log_evidence: float
-    mean: np.ndarray
-    covariance: np.ndarray
 
 
 def posterior(linear_model: LinearModel, sized: Sequence[SizedHypothesis],
@@ -182,6 +175,7 @@ def posterior(linear_model: LinearModel, sized: Sequence[SizedHypothesis],
     ranked = sorted(range(len(sized)), key=lambda i: -(
         settings.evidence_factor * by_form[i][0]
         + _log_prior(sized[i].material, None, linear_model, settings)))
+    rounding_mps2 = max(map(_held_rounding_mps2, linear_model.comparisons))
     kept = ranked[:settings.with_unknown]
     kept += [i for i, s in enumerate(sized) if not s.hypothesis.effects and i not in kept]
     for index in kept:
@@ -191,15 +185,22 @@ def posterior(linear_model: LinearModel, sized: Sequence[SizedHypothesis],
                       for amplitude in settings.unknown_amplitudes_g]
             total = float(np.logaddexp.reduce(values) - np.log(len(values)))
             size_mps2 = G0_MPS2 * settings.unknown_amplitudes_g[int(np.argmax(values))]
-            # What the recording does not make more probable is no finding, and what is small
-            # beside the effects is an error of their form.
-            if total > by_form[index][0] and size_mps2 > settings.smallest_unknown_share \
-                    * _inexact_mps2(sized[index]):
+            # What the recording does not make more probable is no finding. What is small beside
+            # the effects is an error of their form, and beside coarse rounding a part of it.
+            smallest_mps2 = max(rounding_mps2, settings.smallest_unknown_share
+                                * _inexact_mps2(sized[index]))
+            if total > by_form[index][0] and size_mps2 > smallest_mps2:
                 add(index, dimension, total, by_form[index][1])
     weights = np.array([e.log_weight for e in entries.values()])
     probabilities = np.exp(weights - np.logaddexp.reduce(weights))
     weighed = [replace(e, probability=float(p)) for e, p in zip(entries.values(), probabilities)]
     return sorted(weighed, key=lambda w: -w.probability)
+
+
+def _held_rounding_mps2(comparison: BaselineComparison) -> float:
+    """Return the rms of the rounding error that stays while the output stays, m/s²."""
+    return max(float(np.sqrt(rounding(comparison.sensor, d).held_v2) / scale)
+               for d, scale in enumerate(comparison.scale_v_per_mps2))
 
 
 def _inexact_mps2(sized: SizedHypothesis) -> float:
@@ -264,7 +265,7 @@ def _channel(linear_model: LinearModel, number: int, sized: Sequence[SizedHypoth
                 cross[h][f] = evidence.whitened(whitener, columns_of, used) @ white.T
     numbers = _numbers(basis)
     return _Channel(
-        filters, float(used.sum()), scale, numbers,
+        [f.log_prior + float(f.log_scale(used).sum()) for f in filters], float(used.sum()), scale, numbers,
         {dimension: _not_imitated(grams[0], imitated, places)
          for dimension, places in numbers.items()},
         grams, [_ChannelGrams(hypothesis.columns[number].places, design[h], cross[h])
@@ -392,7 +393,7 @@ class _ChannelModel:
     def __init__(self, channel: _Channel, grams: _ChannelGrams, directions: np.ndarray,
                  std: np.ndarray) -> None:
         self._places, self._count = grams.places, channel.count
-        self._log_prior = [channel.filters[i].log_prior for i in grams.design]
+        self._log_prior = [channel.log_priors[i] for i in grams.design]
         weights = directions * std
         self._design = list(grams.design.values())
         self._cross = [cross @ weights for cross in grams.cross.values()]

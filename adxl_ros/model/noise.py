@@ -24,6 +24,26 @@ from adxl_ros.model.effects.base import Need, NOMINAL_ENVIRONMENT, Place, Signal
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
+_HARMONICS = 50
+"""Harmonics of the sawtooth of rounding that are summed. Chosen: the others hold 1 %."""
+
+
+class Rounding(NamedTuple):
+    """
+    Variance of the ADC's rounding on one axis.
+
+    Attributes
+    ----------
+    held_v2
+        Part that stays while the output stays, V².
+    white_v2
+        Part that is new in each sample, V².
+
+    """
+
+    held_v2: float
+    white_v2: float
+
 
 class Electronics(NamedTuple):
     """
@@ -71,6 +91,37 @@ def analog_std_v(sensor: Sensor) -> np.ndarray:
 def sample_std_v(sensor: Sensor) -> np.ndarray:
     """Return the standard deviation of one sample by axis, V, (m,): analog noise and LSB²/12."""
     return np.hypot(analog_std_v(sensor), sensor.lsb_v / np.sqrt(12))
+
+
+def rounding(sensor: Sensor, axis: int) -> Rounding:
+    """
+    Split the variance of the ADC's rounding, LSB²/12, by the noise before it.
+
+    Noise of standard deviation σ makes the rounding random. The part that depends on the mean
+    output alone is a sawtooth, whose k-th harmonic has the variance LSB²/(2π²k²)·exp(−(2πkσ/LSB)²)
+    (Widrow and Kollár 2008, section 4.4). Above half a step of noise nothing of it is left.
+
+    Parameters
+    ----------
+    sensor
+        The unit.
+    axis
+        Index of the measured axis.
+
+    Returns
+    -------
+    Rounding
+        Both parts.
+
+    """
+    total_v2 = sensor.lsb_v ** 2 / 12
+    if not total_v2:
+        return Rounding(0.0, 0.0)
+    harmonics = np.arange(1, _HARMONICS + 1)
+    sigma_steps = float(analog_std_v(sensor)[axis]) / sensor.lsb_v
+    shares = 6 / (np.pi * harmonics) ** 2 * np.exp(-(2 * np.pi * harmonics * sigma_steps) ** 2)
+    held_v2 = total_v2 * float(shares.sum())
+    return Rounding(held_v2, total_v2 - held_v2)
 
 
 def density_v2_per_hz(sensor: Sensor, frequency_hz: np.ndarray) -> np.ndarray:
