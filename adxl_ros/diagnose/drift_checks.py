@@ -81,8 +81,8 @@ class ResidualChannel:
 
     def whitened_v(self) -> np.ndarray:
         """Return the whitened residual, V, (n,), zero where samples are not used."""
-        before = before_filters([self.whitener], self.residual_v[None])
-        white = self.whitener(before)[0] * self.used
+        series = before_filters([self.whitener], self.residual_v[None])
+        white = self.whitener(series)[0] * self.used
         # The first sample is a step from zero.
         white[0] = 0.0
         return white

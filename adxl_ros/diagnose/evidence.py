@@ -27,7 +27,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from adxl_ros.diagnose.noise_whitening import before_filters, Whitener
+from adxl_ros.diagnose.noise_whitening import before_filters, Series, Whitener
 import numpy as np
 from scipy.linalg import cho_solve
 
@@ -63,6 +63,8 @@ class WhitenedChannel:
         Their sums over all blocks, V², (filters, k + 1, k + 1).
     counts
         Samples by block, (blocks,).
+    log_scales
+        What the filter for errors of angles adds to the log likelihood, (filters, blocks).
     log_priors
         Log prior probability of each filter, (filters,).
     drift_effects
@@ -74,6 +76,7 @@ class WhitenedChannel:
     block_grams: np.ndarray
     total_grams: np.ndarray
     counts: np.ndarray
+    log_scales: np.ndarray
     log_priors: np.ndarray
     drift_effects: np.ndarray
 
@@ -125,12 +128,12 @@ def whiten_channel(residual_v: np.ndarray, columns: np.ndarray, column_ids: np.n
         Products of the whitened columns.
 
     """
-    series = [residual_v[:, None], columns, *([] if flexible is None else [flexible.values])]
-    data = np.empty((sum(values.shape[1] for values in series), len(used)))
-    np.concatenate([values.T for values in series], out=data)
+    parts = [residual_v[:, None], columns, *([] if flexible is None else [flexible.values])]
+    data = np.empty((sum(values.shape[1] for values in parts), len(used)))
+    np.concatenate([values.T for values in parts], out=data)
     if not used.all():
         data = bridged(data.T, used).T
-    data = before_filters(filters, data)
+    before = before_filters(filters, data)
     edges, unused = block_edges(len(used)), np.flatnonzero(~used)
     grams = np.zeros((len(filters), BLOCKS if by_block else 1, len(data), len(data)))
     states = [np.zeros((len(f.sections), len(data), 2)) for f in filters]
@@ -139,10 +142,10 @@ def whiten_channel(residual_v: np.ndarray, columns: np.ndarray, column_ids: np.n
         blocks = [(b, *edges[b:b + 2] - edges[first])
                   for b in range(first, min(first + together, BLOCKS))]
         part = slice(edges[first], edges[first] + blocks[-1][2])
-        values = np.ascontiguousarray(data[:, part])
+        values = {kind: np.ascontiguousarray(series[:, part]) for kind, series in before.items()}
         dropped = unused[slice(*np.searchsorted(unused, [part.start, part.stop]))] - part.start
         for i, whitener in enumerate(filters):
-            white, states[i] = whitener.continued(values, states[i])
+            white, states[i] = whitener.continued(values[whitener.corrects_angles], states[i])
             white[:, dropped] = 0.0
             if not first:
                 # The first sample is a step from zero.
@@ -160,12 +163,13 @@ def whiten_channel(residual_v: np.ndarray, columns: np.ndarray, column_ids: np.n
         total = total[:, :count, :count] - cross @ np.linalg.solve(precision,
                                                                    cross.transpose(0, 2, 1))
     grams = grams[:, :, :count, :count] if by_block else np.zeros((len(filters), 0, count, count))
-    return WhitenedChannel(column_ids, grams, total, counts,
+    log_scales = np.array([np.add.reduceat(f.log_scale(used), edges[:-1]) for f in filters])
+    return WhitenedChannel(column_ids, grams, total, counts, log_scales,
                            np.array([f.log_prior for f in filters]),
                            np.array(['' if f.healthy else f.effect for f in filters]))
 
 
-def prepared(filters: Sequence[Whitener], columns: np.ndarray, used: np.ndarray) -> np.ndarray:
+def prepared(filters: Sequence[Whitener], columns: np.ndarray, used: np.ndarray) -> Series:
     """
     Prepare columns for each whitening filter of a channel.
 
@@ -180,14 +184,14 @@ def prepared(filters: Sequence[Whitener], columns: np.ndarray, used: np.ndarray)
 
     Returns
     -------
-    numpy.ndarray
-        Series for `whitened`, (k, n).
+    dict
+        Series for `whitened`, (k, n) each.
 
     """
     return before_filters(filters, np.ascontiguousarray(bridged(columns, used).T))
 
 
-def whitened(whitener: Whitener, series: np.ndarray, used: np.ndarray) -> np.ndarray:
+def whitened(whitener: Whitener, series: Series, used: np.ndarray) -> np.ndarray:
     """
     Whiten columns.
 
@@ -196,7 +200,7 @@ def whitened(whitener: Whitener, series: np.ndarray, used: np.ndarray) -> np.nda
     whitener
         The filter.
     series
-        Columns that are `prepared`, (k, n).
+        Columns that are `prepared`, (k, n) each.
     used
         Samples that are used, (n,) bool.
 
@@ -206,12 +210,13 @@ def whitened(whitener: Whitener, series: np.ndarray, used: np.ndarray) -> np.nda
         Whitened columns, (k, n), zero where samples are not used.
 
     """
-    white = np.empty_like(series, float)
+    values = series[whitener.corrects_angles]
+    white = np.empty_like(values, float)
     state = np.zeros((len(whitener.sections), len(white), 2))
     step = max(1, _CACHED_VALUES // max(len(white), 1))
     for first in range(0, white.shape[1], step):
         part = slice(first, first + step)
-        white[:, part], state = whitener.continued(series[:, part], state)
+        white[:, part], state = whitener.continued(values[:, part], state)
     white[:, ~used] = 0.0
     # The first sample is a step from zero.
     white[:, 0] = 0.0
@@ -321,22 +326,29 @@ def fit_columns(channels: Sequence[WhitenedChannel], column_ids: Sequence[int],
         for i, s in enumerate(selected):
             squares_v2 = np.maximum(_residual_squares(s.grams, values[s.places]),
                                     _SMALLEST_SQUARES_V2)
-            filters[i] = int(np.argmax(-s.count / 2 * np.log(squares_v2) + log_priors[i]))
+            filters[i] = int(np.argmax(-s.count / 2 * np.log(squares_v2) + s.log_scales
+                                       + log_priors[i]))
             variance_v2[i] = squares_v2[filters[i]] / s.count
     log_evidence = -0.5 * float(np.sum(prior_precision * values ** 2)) \
         - half_log_det + 0.5 * float(np.log(prior_precision).sum())
     for s, variance, f, channel in zip(selected, variance_v2, filters, channels):
-        log_evidence += float(-s.count / 2 * (np.log(variance) + 1) + channel.log_priors[f])
+        log_evidence += float(-s.count / 2 * (np.log(variance) + 1) + s.log_scales[f]
+                              + channel.log_priors[f])
     return LinearFit(ids, values, covariance, log_evidence, tuple(filters), variance_v2)
 
 
 @dataclass(frozen=True)
 class _SelectedColumns:
-    """Some columns of a channel: places among all that are fitted, grams, count of samples."""
+    """
+    Some columns of a channel, in some blocks.
+
+    They have places among all that are fitted, products, count of samples, and log scales.
+    """
 
     places: np.ndarray
     grams: np.ndarray
     count: float
+    log_scales: np.ndarray
 
 
 def _normal_equations(selected: Sequence[_SelectedColumns], filters: Sequence[int],
@@ -360,7 +372,8 @@ def _selected(channel: WhitenedChannel, ids: np.ndarray, blocks: np.ndarray | No
     chosen = np.ones(BLOCKS, bool) if blocks is None else blocks
     return _SelectedColumns(np.searchsorted(ids, channel.column_ids[columns]),
                             grams[:, rows[:, None], rows],
-                            max(float(channel.counts[chosen].sum()), 1.0))
+                            max(float(channel.counts[chosen].sum()), 1.0),
+                            channel.log_scales[:, chosen].sum(axis=1))
 
 
 def _filter_log_priors(channel: WhitenedChannel, drifts: Sequence[str]) -> np.ndarray:
@@ -542,7 +555,7 @@ def held_out_log_likelihood(channels: Sequence[WhitenedChannel], fit: LinearFit,
     total = np.zeros(len(blocks))
     for c, f, v in zip(channels, fit.filter_indices, fit.innovation_variance_v2):
         squares = _squares_by_block(c, fit, f)[blocks]
-        total += -0.5 * (squares / v + c.counts[blocks] * np.log(v))
+        total += c.log_scales[f][blocks] - 0.5 * (squares / v + c.counts[blocks] * np.log(v))
     return total
 
 

@@ -39,7 +39,8 @@ from adxl_ros.model.sensor import Sensor
 import numpy as np
 from scipy.signal import lfilter, sosfilt, sosfreqz, tf2sos, zpk2sos
 
-RANDOM_WALKS_G_PER_RTS = (1e-7, 3e-6, 1e-5, 3e-5, 3.8e-5, 5e-5, 8e-5, 2e-4, 6e-4, 2e-3)
+RANDOM_WALKS_G_PER_RTS = (1e-7, 3e-6, 1e-5, 3e-5, 3.8e-5, 5e-5, 8e-5, 1.3e-4, 2.1e-4, 3.5e-4, 6e-4, 1.1e-3,
+                          2e-3)
 """Grid of densities of a random walk, g/√s. It is densest where a healthy unit ends, because a
 walk between two coarse steps would look like an unknown effect. Tuned by hand on simulated
 recordings of the working seeds of the blind check."""
@@ -74,6 +75,10 @@ def _drift_effect(spectrum: DriftSpectrum) -> str:
     return next(e.name for e in library().values() if e.diagnosis.drift is spectrum)
 
 
+Series = dict[bool, np.ndarray]
+"""The k series for whitening filters, (k, n), by `Whitener.corrects_angles`."""
+
+
 @dataclass(frozen=True)
 class Whitener:
     """
@@ -90,8 +95,9 @@ class Whitener:
     density
         Density of the drift, in the unit of the effect's parameter.
     angle_errors
-        Filter for the errors of the followed angles, which comes first and is the same for all
-        filters of a channel; None where the reference is exact.
+        Filter for the errors of the followed angles, which comes first; None where the reference
+        is exact, or where the drift within a second exceeds these errors: they would take up a
+        part of it.
 
     """
 
@@ -113,9 +119,25 @@ class Whitener:
         """Whether a unit without the effect may drift as much."""
         return self.density <= effect_named(self.effect).diagnosis.healthy_density
 
-    def __call__(self, values: np.ndarray) -> np.ndarray:
+    @property
+    def corrects_angles(self) -> bool:
+        """Whether the errors of the followed angles are a part of the noise."""
+        return self.angle_errors is not None
+
+    def log_scale(self, used: np.ndarray) -> np.ndarray:
+        """
+        Return what the filter for errors of angles adds to the log likelihood, (n,).
+
+        It is the log determinant of this filter sample by sample; `used`, (n,) bool, are the
+        samples that count.
+        """
+        if self.angle_errors is None:
+            return np.zeros(len(used))
+        return np.where(used, np.log(self.angle_errors.scale), 0.0)
+
+    def __call__(self, series: Series) -> np.ndarray:
         """Filter k series after `before_filters`, (k, n)."""
-        return sosfilt(self.sections, values)
+        return sosfilt(self.sections, series[self.corrects_angles])
 
     def continued(self, values: np.ndarray, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """
@@ -142,9 +164,9 @@ class Whitener:
         return filtered, after[None]
 
 
-def before_filters(filters: Sequence[Whitener], values: np.ndarray) -> np.ndarray:
+def before_filters(filters: Sequence[Whitener], values: np.ndarray) -> Series:
     """
-    Apply what all whitening filters of a channel have in common.
+    Apply what whitening filters of a channel have in common.
 
     Parameters
     ----------
@@ -155,12 +177,13 @@ def before_filters(filters: Sequence[Whitener], values: np.ndarray) -> np.ndarra
 
     Returns
     -------
-    numpy.ndarray
-        Series for each of the filters, (k, n).
+    dict
+        Series, (k, n), for filters that correct errors of angles and for the others.
 
     """
-    angle_errors = filters[0].angle_errors
-    return values if angle_errors is None else angle_errors(values)
+    angle_errors = {f.corrects_angles: f.angle_errors for f in filters}
+    return {corrects: values if errors is None else errors(values)
+            for corrects, errors in angle_errors.items()}
 
 
 def whiteners(sensor: Sensor, axis: int, dt_s: float, span_s: float,
@@ -190,7 +213,7 @@ def whiteners(sensor: Sensor, axis: int, dt_s: float, span_s: float,
     rc_s = float(noise.electronics(sensor).rc_s[axis])
     a = float(np.exp(-dt_s / rc_s)) if rc_s else 0.0
     std_v = max(float(noise.analog_std_v(sensor)[axis]), _LOWEST_NOISE_V)
-    step_std_v = sensor.lsb_v / np.sqrt(12)
+    step_std_v = float(np.sqrt(noise.rounding(sensor, axis).white_v2))
     scale = float(sensor.scale_v_per_g[axis])
     walks = _walk_whiteners(a, std_v, step_std_v, scale, dt_s)
     # Noise and ADC steps without drift are an ARMA(1, 1) sequence; this is the zero of its MA.
@@ -218,7 +241,9 @@ def whiteners(sensor: Sensor, axis: int, dt_s: float, span_s: float,
         healthy = effect_named(flicker).diagnosis.healthy_density
         flickers.append(_whitener(zpk2sos(zeros, poles, 1.0), flicker,
                                   max(float(lowest), 2 * healthy)))
-    return [replace(f, angle_errors=angle_errors) for f in walks + flickers]
+    largest = np.inf if angle_errors is None else angle_errors.rms_v / scale
+    return [replace(f, angle_errors=angle_errors) if f.healthy or f.density < largest else f
+            for f in walks + flickers]
 
 
 def _walk_whiteners(a: float, std_v: float, step_std_v: float, scale_v_per_g: float, dt_s: float
