@@ -30,9 +30,10 @@ from adxl_ros.diagnose.linear_model import (
     parts_at_rest,
     rests_by_channel,
 )
-from adxl_ros.diagnose.noise_whitening import drifts_among, expected_drift_g
+from adxl_ros.diagnose.noise_whitening import drift_effects, drifts_among, expected_drift_g
 from adxl_ros.model.coefficients import get, neutral, parameter_of, with_neutral
 from adxl_ros.model.constants import G0_MPS2, Z_90
+from adxl_ros.model.diagnosis_hints import FormDimension
 from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.effects.base import Role
 from adxl_ros.model.sensor import Sensor
@@ -87,7 +88,7 @@ def size_hypothesis(linear_model: LinearModel, hypothesis: Hypothesis, noise_mps
     Simulate how large the effects of a hypothesis are, and decide which of them matter.
 
     An effect must be a visible part of the noise and of the gap. An effect of angles must exceed
-    the step of the encoder. The interval of one of its sizes must exclude zero. Beside another
+    the step of the encoder, and one that changes with time the drift of a healthy unit. The interval of one of its sizes must exclude zero. Beside another
     effect, zero-g and scale factor must exceed what the calibration can have taken up of it.
 
     Parameters
@@ -112,10 +113,11 @@ def size_hypothesis(linear_model: LinearModel, hypothesis: Hypothesis, noise_mps
     immaterial = {
         e for e, c in contributions.items()
         if c.rms_mps2 < _smallest_mps2(e, contributions, noise_mps2, settings)
-        or (_turns(e) and c.rms_mps2 < angle_mps2) or _may_be_zero(hypothesis, e)}
+        or (_turns(e) and c.rms_mps2 < angle_mps2) or _may_be_zero(hypothesis, e)
+        or (_drifts_in_time(e) and c.varying_mps2 < _healthy_drift_mps2(linear_model))}
     material = set(hypothesis.effects) - immaterial
     if any(calibration_takes_up(e) and not effect_named(e).diagnosis.drift for e in material):
-        beyond = _beyond_calibration(linear_model, hypothesis, settings)
+        beyond = _beyond_calibration(linear_model, hypothesis, contributions, settings)
         straight = {e for e in library() if effect_named(e).diagnosis.straight_line}
         material = (material - straight) | beyond
     return SizedHypothesis(hypothesis, contributions, frozenset(material))
@@ -200,6 +202,19 @@ def _turns(effect: str) -> bool:
     return any(p.unit == 'rad' for p in effect_named(effect).parameters if p.is_size)
 
 
+def _drifts_in_time(effect: str) -> bool:
+    """Determine whether an effect changes with time alone, as a healthy zero-g does."""
+    return effect_named(effect).diagnosis.form == (FormDimension.TIME,)
+
+
+def _healthy_drift_mps2(linear_model: LinearModel) -> float:
+    """Return the largest rms of the drift of a healthy unit's zero-g, m/s²."""
+    return G0_MPS2 * max(
+        expected_drift_g(hints.drift, hints.healthy_density, c.span_s, c.sensor.rate_hz)
+        for hints in (effect_named(drift).diagnosis for drift in drift_effects()) if hints.drift
+        for c in linear_model.comparisons)
+
+
 def _may_be_zero(hypothesis: Hypothesis, effect: str) -> bool:
     """Determine whether the 90 % intervals of all sizes of an effect hold zero."""
     places = [i for i, name in enumerate(hypothesis.names) if name.effect == effect]
@@ -211,8 +226,13 @@ def _may_be_zero(hypothesis: Hypothesis, effect: str) -> bool:
 
 
 def _beyond_calibration(linear_model: LinearModel, hypothesis: Hypothesis,
-                        settings: DecisionSettings) -> set[str]:
-    """Return whether zero-g or scale factor exceeds what a calibration took up of the effects."""
+                        contributions: dict[str, Contribution], settings: DecisionSettings
+                        ) -> set[str]:
+    """
+    Return whether zero-g or scale factor exceeds what a calibration took up of the effects.
+
+    As any other effect, it must also be a visible part of the gap.
+    """
     others = [e for e in hypothesis.effects if calibration_takes_up(e)
               and not effect_named(e).diagnosis.drift]
     if not others:
@@ -230,7 +250,11 @@ def _beyond_calibration(linear_model: LinearModel, hypothesis: Hypothesis,
     drifts = drifts_among(hypothesis.effects)
     departures = get(hypothesis.sensor, names) \
         - get(with_neutral(linear_model.baseline, [n.effect for n in names]), names)
+    visible_g = settings.smallest_share_of_gap / G0_MPS2 * np.sqrt(
+        sum(contributions[e].varying_mps2 ** 2 for e in others))
+    sensor = linear_model.baseline
+    scale_v_per_g = dict(zip(sensor.axes, sensor.scale_v_per_g))
     return {name.effect for i, name in enumerate(names)
-            if abs(departures[i]) > np.hypot(
+            if abs(departures[i]) > max(visible_g * scale_v_per_g[name.axis], np.hypot(
                 settings.healthy_factor * linear_model.tolerance(name, drifts),
-                settings.calibration_factor * parts[i][0])}
+                settings.calibration_factor * parts[i][0]))}
