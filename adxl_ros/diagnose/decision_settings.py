@@ -40,6 +40,11 @@ class DecisionSettings:
         Log Bayes factor from which a further effect is fitted, and from which a drift counts on
         held-out blocks. Derived: times `evidence_factor` it is below the prior odds of a further
         effect.
+    smallest_deficit, deficit_share
+        A hypothesis is hopeless if its log evidence is below that of the best one by more than
+        both the deficit and this share of what the best one gains over no gap. It is neither
+        refined nor compared. Chosen: such a hypothesis would need a form error that explains a
+        tenth of the gap.
     beside_drift
         What a further effect beside a drift must gain in log evidence, because no drift has
         exactly the spectrum of the model at the lowest frequencies. Tuned by hand on simulated
@@ -92,6 +97,8 @@ class DecisionSettings:
     prior_of_unknown_by_count: tuple[float, ...] = (0.15, 0.04, 0.01, 0.001)
     evidence_factor: float = 0.3
     worth_fitting: float = 16.0
+    smallest_deficit: float = 300.0
+    deficit_share: float = 0.1
     beside_drift: float = 25.0
     form_errors: tuple[float, ...] = (0.0, 0.1, 0.3, 0.6)
     unknown_amplitudes_g: tuple[float, ...] = (1e-4, 3e-4, 1e-3, 3e-3)

@@ -285,11 +285,13 @@ def _at_baseline(linear_model: LinearModel, weighed: Sequence[WeighedHypothesis]
 
 def _sized(linear_model: LinearModel, hypotheses: Sequence[Hypothesis], noise_mps2: float
            ) -> list[SizedHypothesis]:
-    """Size hypotheses; fit those, too, that are the material effects of others."""
+    """Size hypotheses; fit the material effects of probable ones, too, and all exact ones."""
     sized = [size_hypothesis(linear_model, h, noise_mps2, SETTINGS) for h in hypotheses]
     present = {frozenset(h.effects) for h in hypotheses}
+    lowest = hypotheses[0].log_evidence - SETTINGS.smallest_deficit
     for s in list(sized):
-        if s.material in present:
+        exact = all(effect_named(e).exact for e in s.material)
+        if s.material in present or not (exact or s.hypothesis.log_evidence >= lowest):
             continue
         present.add(s.material)
         refitted = refit(linear_model, s.hypothesis, sorted(s.material))
@@ -428,7 +430,7 @@ def _detections(checked: Sequence[CheckedRecording], best: Hypothesis) -> list[D
             detections.append(spikes)
         detections += noise_detectors.residual_detections(NoiseSamples(
             time_s=comparison.time_s, residual_v=bridged(residual_v, used),
-            raw_residual_v=residual_v, simulated_v=comparison.simulated_noise_v(sensor, 0),
+            simulated_v=comparison.simulated_noise_v(sensor, 0),
             at_rest=comparison.at_rest & used, used=used), sensor)
     ranked = sorted(detections, key=lambda d: d.log_bayes_factor)
     return list({d.effect: d for d in ranked}.values())

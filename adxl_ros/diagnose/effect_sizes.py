@@ -88,8 +88,9 @@ def size_hypothesis(linear_model: LinearModel, hypothesis: Hypothesis, noise_mps
     Simulate how large the effects of a hypothesis are, and decide which of them matter.
 
     An effect must be a visible part of the noise and of the gap. An effect of angles must exceed
-    the step of the encoder, and one that changes with time the drift of a healthy unit. The interval of one of its sizes must exclude zero. Beside another
-    effect, zero-g and scale factor must exceed what the calibration can have taken up of it.
+    the step of the encoder, and one that changes with time the drift of a healthy unit. The
+    interval of one of its sizes must exclude zero. Beside another effect, zero-g and scale factor
+    must exceed what the calibration can have taken up of it.
 
     Parameters
     ----------

@@ -16,8 +16,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import chain
 from typing import NamedTuple
 
@@ -46,6 +47,8 @@ _SMOOTH_EVALUATIONS = 10
 _ROUGH_EVALUATIONS = 5
 """The same for other hypotheses. Chosen: their derivatives are from wide steps, and more
 iterations do not improve the fit."""
+_BESIDE_DRIFT_EVALUATIONS = 4
+"""The same beside a drift. Chosen: such a fit starts from one without the drift."""
 _HALVINGS = 2
 """How often a step that lowers the log evidence is halved. Chosen: a quarter of a step is
 enough for the library."""
@@ -53,8 +56,9 @@ _EVIDENCE_TOLERANCE = 1e-3
 """A step may lower the log evidence by this. Chosen: far below one unit."""
 _SMALLEST_STEP = 1e-3
 """Smallest step, in prior standard deviations. Chosen: far below any interval."""
-_SMALLEST_GAIN = 0.05
-"""Gain of log evidence below which the fit has converged. Chosen: far below one unit."""
+_SMALLEST_GAIN = 0.5
+"""Gain of log evidence below which the fit has converged. Chosen: tempered, it changes odds by a
+sixth."""
 _SMALLEST_GAIN_SHARE = 1e-4
 """The same limit, divided by the gain of all steps. Chosen: a large effect needs no more
 digits."""
@@ -65,6 +69,9 @@ the blind check."""
 _UNDETERMINED_PRIOR_SHARE = 0.5
 """A coefficient is not determined if its posterior standard deviation exceeds this share of the
 prior's. Chosen: the samples then determine it hardly better than the prior."""
+_LIMIT_STEP = 0.02
+"""Share by which a limit of some blocks may differ from that of all blocks. Chosen: the change of
+the output is linear within a knee, which is that wide."""
 _UNDETERMINED_RATIO = 3.0
 """Some blocks do not determine a coefficient if their standard deviation exceeds that of all
 blocks by this factor. Chosen: a quarter of the blocks is held out."""
@@ -240,7 +247,8 @@ class LinearisedHypothesis:
 
         A limit with its knee, or a shape, keeps its value if the samples do not determine it,
         because its prior mean is no better guess. It also keeps its value if only the held-out
-        blocks determine it. A shape changes by a factor of two at most.
+        blocks determine it. A shape changes by a factor of two at most, and a limit that is fitted
+        to some blocks by a small share.
 
         Parameters
         ----------
@@ -268,6 +276,11 @@ class LinearisedHypothesis:
         shape_range = np.sort([self.values / 2, self.values * 2], axis=0)
         is_shape = [p.role is Role.SHAPE for p in parameters]
         values = np.where(is_shape, np.clip(values, *shape_range), values)
+        if full_fit is not None:
+            limit_range = np.sort(np.outer([1 - _LIMIT_STEP, 1 + _LIMIT_STEP], self.values),
+                                  axis=0)
+            is_limit = [p.role is Role.LIMIT for p in parameters]
+            values = np.where(is_limit, np.clip(values, *limit_range), values)
         changed = np.flatnonzero(values != fitted)
         return evidence.conditional_mean(fit, changed, values[changed] - self.prior_mean[changed])
 
@@ -404,12 +417,14 @@ class _HypothesisIterate(Iterate):
 
 def fit_hypothesis(linear_model: LinearModel, effects: Sequence[str],
                    start: Mapping[Coefficient, float],
-                   shapes: Mapping[Coefficient, float]) -> Hypothesis:
+                   shapes: Mapping[Coefficient, float],
+                   lowest_log_evidence: float = -np.inf) -> Hypothesis:
     """
     Fit a set of effects by re-simulation, shape parameters included.
 
     Each Gauss-Newton step simulates, differentiates, whitens and fits at the present values. The
-    iteration ends where the log evidence no longer gains.
+    iteration ends where the log evidence no longer gains, or where even the maximum of the linear
+    model is hopelessly low.
 
     Parameters
     ----------
@@ -421,6 +436,8 @@ def fit_hypothesis(linear_model: LinearModel, effects: Sequence[str],
         First departures from the baseline by coefficient.
     shapes
         First values of shape parameters, by coefficient without axis.
+    lowest_log_evidence
+        Log evidence below which the hypothesis is hopeless; its values are then not refined.
 
     Returns
     -------
@@ -448,9 +465,24 @@ def fit_hypothesis(linear_model: LinearModel, effects: Sequence[str],
         return _HypothesisIterate(linearised.values, step, -log_evidence, linearised, fit)
 
     smooth = all(effect_named(effect).smooth for effect in effects)
-    solution = gauss_newton(
-        linearised_at, _first_values(neutral_sensor, names, start, shapes), _has_converged,
-        _SMOOTH_EVALUATIONS if smooth else _ROUGH_EVALUATIONS, _HALVINGS, _EVIDENCE_TOLERANCE)
+
+    def has_ended(first: _HypothesisIterate, previous: _HypothesisIterate | None,
+                  present: _HypothesisIterate) -> bool:
+        hopeless = previous is not None and present.fit.log_evidence < lowest_log_evidence
+        return hopeless or _has_converged(first, previous, present)
+
+    evaluations = _SMOOTH_EVALUATIONS if smooth else _ROUGH_EVALUATIONS
+    if drifts_among(effects):
+        evaluations = min(evaluations, _BESIDE_DRIFT_EVALUATIONS)
+    solve = partial(gauss_newton, linearised_at, has_converged=has_ended,
+                    max_evaluations=evaluations, max_halvings=_HALVINGS,
+                    cost_tolerance=_EVIDENCE_TOLERANCE)
+    first = _first_values(neutral_sensor, names, start, shapes)
+    solution = solve(first)
+    nearer = None if solution.converged else _nearer_shape(linearised_at, first, names, shapes)
+    if nearer is not None:
+        other = solve(nearer)
+        solution = other if other.last.cost < solution.last.cost else solution
     linearised, fit = solution.last.linearised, solution.last.fit
     j = len(linearised.values)
     std = np.sqrt(evidence.robust_std(linearised.channels, fit, linearised.prior_std)[:j] ** 2
@@ -461,8 +493,48 @@ def fit_hypothesis(linear_model: LinearModel, effects: Sequence[str],
     hypothesis = Hypothesis(
         effects, linearised.sensor_at_values(fit), linearised.effect_names,
         linearised.values - linearised.prior_mean[:j], std, log_evidence, fit, linearised,
-        linearised.linear_loss(fit), solution.converged)
+        linearised.linear_loss(fit),
+        solution.converged and fit.log_evidence >= lowest_log_evidence)
     return replace(hypothesis, sensor=_with_drift_densities(linear_model, hypothesis))
+
+
+def _nearer_shape(linearised_at: Callable[[np.ndarray], _HypothesisIterate], first: np.ndarray,
+                  names: Sequence[Coefficient], shapes: Mapping[Coefficient, float]
+                  ) -> np.ndarray | None:
+    """
+    Return first values with a shape between two starts, where that is more probable.
+
+    The sizes are those of the linear fit at each shape (variable projection; Golub and Pereyra
+    1973).
+    """
+    tried = [first]
+    for i, name in enumerate(names):
+        starts = parameter_of(name).starts
+        if name.without_axis not in shapes or first[i] not in starts:
+            continue
+        place = starts.index(first[i])
+        for neighbour in starts[max(place - 1, 0):place] + starts[place + 1:place + 2]:
+            values = first.copy()
+            values[i] = (first[i] + neighbour) / 2
+            tried.append(values)
+    if len(tried) == 1:
+        return None
+    fitted = [_with_fitted_sizes(linearised_at(values)) for values in tried]
+    best = max(range(len(fitted)), key=lambda k: fitted[k][0])
+    return fitted[best][1] if best else None
+
+
+def _with_fitted_sizes(iterate: _HypothesisIterate) -> tuple[float, np.ndarray]:
+    """Return log evidence and values, (j,), with the shapes kept and the sizes fitted."""
+    linearised, fit = iterate.linearised, iterate.fit
+    j = len(linearised.values)
+    is_shape = np.array([not parameter_of(name).is_size for name in linearised.effect_names])
+    shapes = np.flatnonzero(is_shape)
+    departures = (linearised.values - linearised.prior_mean[:j])[shapes]
+    deviation = departures - fit.values[shapes]
+    loss = 0.5 * deviation @ np.linalg.solve(fit.covariance[np.ix_(shapes, shapes)], deviation)
+    mean = evidence.conditional_mean(fit, shapes, departures)[:j] + linearised.prior_mean[:j]
+    return fit.log_evidence - float(loss), np.where(is_shape, linearised.values, mean)
 
 
 def _first_values(sensor: Sensor, names: Sequence[Coefficient], start: Mapping[Coefficient, float],

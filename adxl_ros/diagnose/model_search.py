@@ -67,6 +67,9 @@ _BESIDE_DRIFTS = 2
 _RANKING_FORM_ERROR = 0.3
 """Share of the size of the present effects by which their form may differ, where a further effect
 is ranked. Chosen: the middle of the shares of the decision."""
+_LARGEST_GAIN_RATIO = 2.0
+"""What a fit in full may gain, divided by what the linear model promises. Chosen: large effects,
+which gain most, are not linear."""
 _LARGEST_UNEVENNESS = 1.4
 """Largest unevenness of the noise beside a drift. Tuned by hand on simulated
 recordings of the working seeds of the blind check."""
@@ -103,7 +106,8 @@ def search(linear_model: LinearModel, settings: DecisionSettings,
     Returns
     -------
     list of Hypothesis
-        Fitted hypotheses by falling log evidence; the empty one is among them.
+        Fitted hypotheses by falling log evidence; the empty one is among them, hopeless ones are
+        not.
 
     """
     hypotheses: Hypotheses = {frozenset(): fit_hypothesis(linear_model, (), {}, {})}
@@ -137,11 +141,21 @@ def search(linear_model: LinearModel, settings: DecisionSettings,
         _fit_best(linear_model, settings,
                   [pair for pair in pairs if pair.gain > smallest_gain][:_FURTHER], null_fit,
                   hypotheses)
-    _remove_each_effect(linear_model, _best(hypotheses), hypotheses)
+    _remove_each_effect(linear_model, settings, hypotheses)
     if _drift_shows(linear_model, _best(hypotheses), settings):
         _add_drifts(linear_model, settings, hypotheses)
     plan.show(FURTHER, 1.0)
-    return sorted(hypotheses.values(), key=lambda h: -h.log_evidence)
+    lowest = _lowest(hypotheses, settings)
+    return sorted((h for h in hypotheses.values()
+                   if h.log_evidence >= lowest or not h.effects),
+                  key=lambda h: -h.log_evidence)
+
+
+def _lowest(hypotheses: Hypotheses, settings: DecisionSettings) -> float:
+    """Return the log evidence below which a hypothesis is hopeless."""
+    best = _best(hypotheses).log_evidence
+    gain = best - hypotheses[frozenset()].log_evidence
+    return best - max(settings.smallest_deficit, settings.deficit_share * gain)
 
 
 def _identifiable(linear_model: LinearModel) -> list[int]:
@@ -172,12 +186,18 @@ def _add_drifts(linear_model: LinearModel, settings: DecisionSettings, hypothese
     """
     ranked = sorted(hypotheses.values(), key=lambda h: -h.log_evidence)
     best = [h for h in ranked if 0 < len(h.effects) < LARGEST_SET][:_BESIDE_DRIFTS]
+    linearised = [linearise(linear_model, h.effects, h.sensor) for h in best]
     for drift in drift_effects():
-        for h in best:
-            _add(hypotheses, _fit_or_none(linear_model, (*h.effects, drift),
-                                          dict(zip(h.names, h.values)), {}))
         drift_fit = linear_model.fit_variants([], None, (drift,))
-        _add(hypotheses, fit_hypothesis(linear_model, (drift,), {}, {}))
+        drift_only = fit_hypothesis(linear_model, (drift,), {}, {})
+        _add(hypotheses, drift_only)
+        for h, at_values in zip(best, linearised):
+            log_evidence = at_values.fit(drifts=(drift,)).log_evidence
+            if log_evidence >= max(drift_only.log_evidence + settings.worth_fitting,
+                                   _best(hypotheses).log_evidence - settings.smallest_deficit):
+                _add(hypotheses, _fit_or_none(linear_model, (*h.effects, drift),
+                                              dict(zip(h.names, h.values)), {},
+                                              _lowest(hypotheses, settings)))
         beside_drift = _ranked(linear_model, [(i,) for i in _identifiable(linear_model)],
                                drift_fit, (drift,))
         _fit_best(linear_model, settings, beside_drift[:_BESIDE_DRIFTS], drift_fit, hypotheses,
@@ -267,7 +287,8 @@ def _fit_added(linear_model: LinearModel, settings: DecisionSettings, about: Lin
     """Fit in full, beside the effects of a hypothesis, the further effects that gain most."""
     with_variants = {v.effect for v in linear_model.variants} | {*drifts_among(best.effects)}
     for gain, (i,), fit in ranked[:_FURTHER]:
-        if gain < settings.worth_fitting:
+        hopeless = best.log_evidence + _LARGEST_GAIN_RATIO * gain < _lowest(hypotheses, settings)
+        if gain < settings.worth_fitting or hopeless:
             break
         added = about.variants[i]
         effects = (*best.effects, added.effect)
@@ -277,16 +298,19 @@ def _fit_added(linear_model: LinearModel, settings: DecisionSettings, about: Lin
         start |= {about.names[k]: value for k, value in zip(fit.column_ids, fit.values)
                   if k in about.column_ids[i]}
         start |= _limit_start(added, start)
-        _add(hypotheses, _fit_or_none(linear_model, effects, start, _named_shape(added)))
+        _add(hypotheses, _fit_or_none(linear_model, effects, start, _named_shape(added),
+                                      _lowest(hypotheses, settings)))
 
 
-def _remove_each_effect(linear_model: LinearModel, best: Hypothesis, hypotheses: Hypotheses
-                        ) -> None:
-    """Fit a hypothesis without each of its effects; two effects may replace an earlier one."""
+def _remove_each_effect(linear_model: LinearModel, settings: DecisionSettings,
+                        hypotheses: Hypotheses) -> None:
+    """Fit the best set without each of its effects; two effects may replace an earlier one."""
+    best = _best(hypotheses)
     for effect in best.effects:
         if frozenset(best.effects) - {effect} not in hypotheses:
-            _add(hypotheses, refit(linear_model, best,
-                                   [e for e in best.effects if e != effect]))
+            _add(hypotheses, _fit_or_none(
+                linear_model, [e for e in best.effects if e != effect],
+                dict(zip(best.names, best.values)), {}, _lowest(hypotheses, settings)))
 
 
 def refit(linear_model: LinearModel, hypothesis: Hypothesis, effects: Sequence[str]
@@ -335,12 +359,17 @@ def _fit_best(linear_model: LinearModel, settings: DecisionSettings, ranked: Ite
         effects = (*(v.effect for v in variants), *drifts)
         if gain < settings.worth_fitting or frozenset(effects) in hypotheses:
             continue
-        start = dict(zip([linear_model.names[i] for i in fit.column_ids], fit.values))
         shapes: dict[Coefficient, float] = {}
-        for variant in variants:
-            start |= _limit_start(variant, start)
-            shapes |= _named_shape(variant)
-        hypothesis = _fit_or_none(linear_model, effects, start, shapes)
+        without_drift = hypotheses.get(frozenset(v.effect for v in variants)) if drifts else None
+        if without_drift is not None:
+            start = dict(zip(without_drift.names, without_drift.values))
+        else:
+            start = dict(zip([linear_model.names[i] for i in fit.column_ids], fit.values))
+            for variant in variants:
+                start |= _limit_start(variant, start)
+                shapes |= _named_shape(variant)
+        hypothesis = _fit_or_none(linear_model, effects, start, shapes,
+                                  _lowest(hypotheses, settings))
         if hypothesis is not None and hypothesis.log_evidence > null_fit.log_evidence:
             _add(hypotheses, hypothesis)
 
@@ -368,10 +397,10 @@ def _add(hypotheses: Hypotheses, hypothesis: Hypothesis | None) -> None:
 
 
 def _fit_or_none(linear_model: LinearModel, effects: Sequence[str],
-                 start: Mapping[Coefficient, float],
-                 shapes: Mapping[Coefficient, float]) -> Hypothesis | None:
+                 start: Mapping[Coefficient, float], shapes: Mapping[Coefficient, float],
+                 lowest_log_evidence: float = -np.inf) -> Hypothesis | None:
     """Fit a hypothesis; return None where it cannot be simulated or is singular."""
     try:
-        return fit_hypothesis(linear_model, effects, start, shapes)
+        return fit_hypothesis(linear_model, effects, start, shapes, lowest_log_evidence)
     except (UserError, np.linalg.LinAlgError):
         return None

@@ -39,8 +39,8 @@ from adxl_ros.model.sensor import Sensor
 import numpy as np
 from scipy.signal import lfilter, sosfilt, sosfreqz, tf2sos, zpk2sos
 
-RANDOM_WALKS_G_PER_RTS = (1e-7, 3e-6, 1e-5, 3e-5, 3.8e-5, 5e-5, 8e-5, 1.3e-4, 2.1e-4, 3.5e-4, 6e-4, 1.1e-3,
-                          2e-3)
+RANDOM_WALKS_G_PER_RTS = (1e-7, 3e-6, 1e-5, 3e-5, 3.8e-5, 5e-5, 8e-5, 1.3e-4, 2.1e-4,
+                          3.5e-4, 6e-4, 1.1e-3, 2e-3)
 """Grid of densities of a random walk, g/√s. It is densest where a healthy unit ends, because a
 walk between two coarse steps would look like an unknown effect. Tuned by hand on simulated
 recordings of the working seeds of the blind check."""

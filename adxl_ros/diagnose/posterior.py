@@ -265,7 +265,8 @@ def _channel(linear_model: LinearModel, number: int, sized: Sequence[SizedHypoth
                 cross[h][f] = evidence.whitened(whitener, columns_of, used) @ white.T
     numbers = _numbers(basis)
     return _Channel(
-        [f.log_prior + float(f.log_scale(used).sum()) for f in filters], float(used.sum()), scale, numbers,
+        [f.log_prior + float(f.log_scale(used).sum()) for f in filters], float(used.sum()),
+        scale, numbers,
         {dimension: _not_imitated(grams[0], imitated, places)
          for dimension, places in numbers.items()},
         grams, [_ChannelGrams(hypothesis.columns[number].places, design[h], cross[h])
