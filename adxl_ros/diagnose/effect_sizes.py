@@ -232,7 +232,8 @@ def _beyond_calibration(linear_model: LinearModel, hypothesis: Hypothesis,
     """
     Return whether zero-g or scale factor exceeds what a calibration took up of the effects.
 
-    As any other effect, it must also be a visible part of the gap.
+    As any other effect, it must also be a visible part of the gap, and exceed the error of an
+    encoder, which is the same each time a pose returns.
     """
     others = [e for e in hypothesis.effects if calibration_takes_up(e)
               and not effect_named(e).diagnosis.drift]
@@ -251,8 +252,8 @@ def _beyond_calibration(linear_model: LinearModel, hypothesis: Hypothesis,
     drifts = drifts_among(hypothesis.effects)
     departures = get(hypothesis.sensor, names) \
         - get(with_neutral(linear_model.baseline, [n.effect for n in names]), names)
-    visible_g = settings.smallest_share_of_gap / G0_MPS2 * np.sqrt(
-        sum(contributions[e].varying_mps2 ** 2 for e in others))
+    visible_g = max(linear_model.smallest_angle_rad(), settings.smallest_share_of_gap / G0_MPS2
+                    * np.sqrt(sum(contributions[e].varying_mps2 ** 2 for e in others)))
     sensor = linear_model.baseline
     scale_v_per_g = dict(zip(sensor.axes, sensor.scale_v_per_g))
     return {name.effect for i, name in enumerate(names)

@@ -44,7 +44,7 @@ import numpy as np
 
 _SMOOTH_EVALUATIONS = 10
 """Largest number of simulations of a hypothesis of smooth effects. Chosen: most need five."""
-_ROUGH_EVALUATIONS = 5
+_ROUGH_EVALUATIONS = 8
 """The same for other hypotheses. Chosen: their derivatives are from wide steps, and more
 iterations do not improve the fit."""
 _BESIDE_DRIFT_EVALUATIONS = 4
@@ -479,10 +479,10 @@ def fit_hypothesis(linear_model: LinearModel, effects: Sequence[str],
                     cost_tolerance=_EVIDENCE_TOLERANCE)
     first = _first_values(neutral_sensor, names, start, shapes)
     solution = solve(first)
-    nearer = None if solution.converged else _nearer_shape(linearised_at, first, names, shapes)
-    if nearer is not None:
-        other = solve(nearer)
-        solution = other if other.last.cost < solution.last.cost else solution
+    if not solution.converged:
+        nearer = _nearer_shape(linearised_at, first, names, shapes, solution.last.log_evidence)
+        if nearer is not None:
+            solution = min(solution, solve(nearer), key=lambda s: s.last.cost)
     linearised, fit = solution.last.linearised, solution.last.fit
     j = len(linearised.values)
     std = np.sqrt(evidence.robust_std(linearised.channels, fit, linearised.prior_std)[:j] ** 2
@@ -499,15 +499,15 @@ def fit_hypothesis(linear_model: LinearModel, effects: Sequence[str],
 
 
 def _nearer_shape(linearised_at: Callable[[np.ndarray], _HypothesisIterate], first: np.ndarray,
-                  names: Sequence[Coefficient], shapes: Mapping[Coefficient, float]
-                  ) -> np.ndarray | None:
+                  names: Sequence[Coefficient], shapes: Mapping[Coefficient, float],
+                  log_evidence: float) -> np.ndarray | None:
     """
-    Return first values with a shape between two starts, where that is more probable.
+    Return first values with a shape between two starts, where that exceeds a log evidence.
 
     The sizes are those of the linear fit at each shape (variable projection; Golub and Pereyra
     1973).
     """
-    tried = [first]
+    tried: list[np.ndarray] = []
     for i, name in enumerate(names):
         starts = parameter_of(name).starts
         if name.without_axis not in shapes or first[i] not in starts:
@@ -517,11 +517,9 @@ def _nearer_shape(linearised_at: Callable[[np.ndarray], _HypothesisIterate], fir
             values = first.copy()
             values[i] = (first[i] + neighbour) / 2
             tried.append(values)
-    if len(tried) == 1:
-        return None
     fitted = [_with_fitted_sizes(linearised_at(values)) for values in tried]
-    best = max(range(len(fitted)), key=lambda k: fitted[k][0])
-    return fitted[best][1] if best else None
+    best = max(fitted, key=lambda f: f[0], default=None)
+    return best[1] if best is not None and best[0] > log_evidence else None
 
 
 def _with_fitted_sizes(iterate: _HypothesisIterate) -> tuple[float, np.ndarray]:

@@ -67,9 +67,9 @@ _BESIDE_DRIFTS = 2
 _RANKING_FORM_ERROR = 0.3
 """Share of the size of the present effects by which their form may differ, where a further effect
 is ranked. Chosen: the middle of the shares of the decision."""
-_LARGEST_GAIN_RATIO = 2.0
-"""What a fit in full may gain, divided by what the linear model promises. Chosen: large effects,
-which gain most, are not linear."""
+_LARGEST_GAIN_RATIO = 5.0
+"""What a fit in full may gain, divided by what the linear model promises. Chosen: large effects
+are not linear."""
 _LARGEST_UNEVENNESS = 1.4
 """Largest unevenness of the noise beside a drift. Tuned by hand on simulated
 recordings of the working seeds of the blind check."""
@@ -149,6 +149,12 @@ def search(linear_model: LinearModel, settings: DecisionSettings,
     return sorted((h for h in hypotheses.values()
                    if h.log_evidence >= lowest or not h.effects),
                   key=lambda h: -h.log_evidence)
+
+
+def _is_hopeless(log_evidence: float, gain: float, hypotheses: Hypotheses,
+                 settings: DecisionSettings) -> bool:
+    """Determine whether a gain that the linear model promises leaves a hypothesis hopeless."""
+    return log_evidence + _LARGEST_GAIN_RATIO * gain < _lowest(hypotheses, settings)
 
 
 def _lowest(hypotheses: Hypotheses, settings: DecisionSettings) -> float:
@@ -287,8 +293,8 @@ def _fit_added(linear_model: LinearModel, settings: DecisionSettings, about: Lin
     """Fit in full, beside the effects of a hypothesis, the further effects that gain most."""
     with_variants = {v.effect for v in linear_model.variants} | {*drifts_among(best.effects)}
     for gain, (i,), fit in ranked[:_FURTHER]:
-        hopeless = best.log_evidence + _LARGEST_GAIN_RATIO * gain < _lowest(hypotheses, settings)
-        if gain < settings.worth_fitting or hopeless:
+        if gain < settings.worth_fitting \
+                or _is_hopeless(best.log_evidence, gain, hypotheses, settings):
             break
         added = about.variants[i]
         effects = (*best.effects, added.effect)
@@ -357,7 +363,8 @@ def _fit_best(linear_model: LinearModel, settings: DecisionSettings, ranked: Ite
     for gain, chosen, fit in ranked:
         variants = [linear_model.variants[i] for i in chosen]
         effects = (*(v.effect for v in variants), *drifts)
-        if gain < settings.worth_fitting or frozenset(effects) in hypotheses:
+        hopeless = drifts and _is_hopeless(null_fit.log_evidence, gain, hypotheses, settings)
+        if gain < settings.worth_fitting or frozenset(effects) in hypotheses or hopeless:
             continue
         shapes: dict[Coefficient, float] = {}
         without_drift = hypotheses.get(frozenset(v.effect for v in variants)) if drifts else None
