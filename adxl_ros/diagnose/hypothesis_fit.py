@@ -276,13 +276,21 @@ class LinearisedHypothesis:
         shape_range = np.sort([self.values / 2, self.values * 2], axis=0)
         is_shape = [p.role is Role.SHAPE for p in parameters]
         values = np.where(is_shape, np.clip(values, *shape_range), values)
-        if full_fit is not None:
-            limit_range = np.sort(np.outer([1 - _LIMIT_STEP, 1 + _LIMIT_STEP], self.values),
-                                  axis=0)
-            is_limit = [p.role is Role.LIMIT for p in parameters]
-            values = np.where(is_limit, np.clip(values, *limit_range), values)
-        changed = np.flatnonzero(values != fitted)
-        return evidence.conditional_mean(fit, changed, values[changed] - self.prior_mean[changed])
+        changed = values != fitted
+        departures = self._given(fit, changed, values)
+        if full_fit is None:
+            return departures
+        # A limit may follow another coefficient that keeps its value, so that it is bounded last.
+        values = departures[:j] + self.prior_mean[:j]
+        limit_range = np.sort(np.outer([1 - _LIMIT_STEP, 1 + _LIMIT_STEP], self.values), axis=0)
+        is_limit = np.array([p.role is Role.LIMIT for p in parameters], bool)
+        bounded = np.where(is_limit, np.clip(values, *limit_range), values)
+        return self._given(fit, changed | (bounded != values), bounded)
+
+    def _given(self, fit: LinearFit, given: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """Return departures, (k,), where some coefficients of the effects, (j,) bool, are given."""
+        places = np.flatnonzero(given)
+        return evidence.conditional_mean(fit, places, values[places] - self.prior_mean[places])
 
     def linear_loss(self, fit: LinearFit) -> float:
         """Return how far the log posterior at the values is below the linear model's maximum."""
