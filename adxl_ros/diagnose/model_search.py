@@ -67,6 +67,10 @@ _BESIDE_DRIFTS = 2
 _RANKING_FORM_ERROR = 0.3
 """Share of the size of the present effects by which their form may differ, where a further effect
 is ranked. Chosen: the middle of the shares of the decision."""
+_OTHER_STARTS = 2
+"""Other shapes from which a fit that did not converge starts again. Chosen: run time."""
+_OTHER_START_SHARE = 0.5
+"""Smallest gain of another shape, divided by that of the best. Chosen: half of the power."""
 _LARGEST_GAIN_RATIO = 5.0
 """What a fit in full may gain, divided by what the linear model promises. Chosen: large effects
 are not linear."""
@@ -79,11 +83,16 @@ Hypotheses = dict[frozenset[str], Hypothesis]
 
 
 class _RankedSet(NamedTuple):
-    """A set of variants on the linear model: gain of log evidence, their numbers, the fit."""
+    """
+    A set of variants on the linear model: gain of log evidence, their numbers, the fit.
+
+    The others are of the same effects with other shapes, from which a fit may also start.
+    """
 
     gain: float
     chosen: tuple[int, ...]
     fit: LinearFit
+    others: tuple[_RankedSet, ...] = ()
 
 
 def search(linear_model: LinearModel, settings: DecisionSettings,
@@ -280,32 +289,48 @@ def _ranked_beside(about: LinearModel, best: Hypothesis, present: Sequence[int]
     """Rank the variants of further effects beside the present ones, the best first."""
     drifts = drifts_among(best.effects)
     best_fit = about.fit_variants(present, None, drifts)
-    ranked = []
+    fits = []
     for i in _identifiable(about):
         if about.variants[i].effect not in best.effects:
             fit = about.fit_variants([*present, i], best_fit, drifts)
-            ranked.append(_RankedSet(fit.log_evidence - best_fit.log_evidence, (i,), fit))
-    return sorted(ranked, key=lambda r: -r.gain)
+            fits.append(_RankedSet(fit.log_evidence - best_fit.log_evidence, (i,), fit))
+    return _best_of_each(about, fits)
+
+
+def _best_of_each(linear_model: LinearModel, fits: Iterable[_RankedSet]) -> list[_RankedSet]:
+    """Return the best fit of each set of effects, by falling gain, with the next best shapes."""
+    by_effects: dict[frozenset[str], list[_RankedSet]] = {}
+    for fit in sorted(fits, key=lambda f: -f.gain):
+        by_effects.setdefault(
+            frozenset(linear_model.variants[i].effect for i in fit.chosen), []).append(fit)
+    return [best._replace(others=tuple(
+        f for f in others if f.gain > _OTHER_START_SHARE * best.gain
+        and all(linear_model.variants[i].shape for i in f.chosen))[:_OTHER_STARTS])
+        for best, *others in by_effects.values()]
 
 
 def _fit_added(linear_model: LinearModel, settings: DecisionSettings, about: LinearModel,
                best: Hypothesis, ranked: Sequence[_RankedSet], hypotheses: Hypotheses) -> None:
     """Fit in full, beside the effects of a hypothesis, the further effects that gain most."""
     with_variants = {v.effect for v in linear_model.variants} | {*drifts_among(best.effects)}
-    for gain, (i,), fit in ranked[:_FURTHER]:
-        if gain < settings.worth_fitting \
-                or _is_hopeless(best.log_evidence, gain, hypotheses, settings):
+    for first in ranked[:_FURTHER]:
+        if first.gain < settings.worth_fitting \
+                or _is_hopeless(best.log_evidence, first.gain, hypotheses, settings):
             break
-        added = about.variants[i]
-        effects = (*best.effects, added.effect)
+        effects = (*best.effects, about.variants[first.chosen[0]].effect)
         if not with_variants.issuperset(effects) or frozenset(effects) in hypotheses:
             continue
-        start = dict(zip(best.names, best.values))
-        start |= {about.names[k]: value for k, value in zip(fit.column_ids, fit.values)
-                  if k in about.column_ids[i]}
-        start |= _limit_start(added, start)
-        _add(hypotheses, _fit_or_none(linear_model, effects, start, _named_shape(added),
-                                      _lowest(hypotheses, settings)))
+        for _, (i,), fit, _ in (first, *first.others):
+            added = about.variants[i]
+            start = dict(zip(best.names, best.values))
+            start |= {about.names[k]: value for k, value in zip(fit.column_ids, fit.values)
+                      if k in about.column_ids[i]}
+            start |= _limit_start(added, start)
+            hypothesis = _fit_or_none(linear_model, effects, start, _named_shape(added),
+                                      _lowest(hypotheses, settings))
+            _add(hypotheses, hypothesis)
+            if hypothesis is not None and hypothesis.converged:
+                break
 
 
 def _remove_each_effect(linear_model: LinearModel, settings: DecisionSettings,
@@ -345,40 +370,46 @@ def refit(linear_model: LinearModel, hypothesis: Hypothesis, effects: Sequence[s
 def _ranked(linear_model: LinearModel, sets: Sequence[tuple[int, ...]], null_fit: LinearFit,
             drifts: Sequence[str] = ()) -> list[_RankedSet]:
     """Fit sets of variants on the linear model; return the best of each set of effects, ranked."""
-    best: dict[frozenset[str], _RankedSet] = {}
+    fits = []
     for chosen in sets:
-        effects = frozenset(linear_model.variants[i].effect for i in chosen)
-        if len(effects) < len(chosen):
-            continue
-        fit = linear_model.fit_variants(chosen, null_fit, drifts)
-        gain = fit.log_evidence - null_fit.log_evidence
-        if effects not in best or gain > best[effects].gain:
-            best[effects] = _RankedSet(gain, chosen, fit)
-    return sorted(best.values(), key=lambda r: -r.gain)
+        if len({linear_model.variants[i].effect for i in chosen}) == len(chosen):
+            fit = linear_model.fit_variants(chosen, null_fit, drifts)
+            fits.append(_RankedSet(fit.log_evidence - null_fit.log_evidence, chosen, fit))
+    return _best_of_each(linear_model, fits)
 
 
 def _fit_best(linear_model: LinearModel, settings: DecisionSettings, ranked: Iterable[_RankedSet],
               null_fit: LinearFit, hypotheses: Hypotheses, drifts: tuple[str, ...] = ()) -> None:
     """Fit in full, together with drifts, those ranked sets that gain enough."""
-    for gain, chosen, fit in ranked:
-        variants = [linear_model.variants[i] for i in chosen]
-        effects = (*(v.effect for v in variants), *drifts)
-        hopeless = drifts and _is_hopeless(null_fit.log_evidence, gain, hypotheses, settings)
-        if gain < settings.worth_fitting or frozenset(effects) in hypotheses or hopeless:
+    for first in ranked:
+        effects = tuple(linear_model.variants[i].effect for i in first.chosen)
+        hopeless = drifts and _is_hopeless(null_fit.log_evidence, first.gain, hypotheses, settings)
+        if first.gain < settings.worth_fitting or hopeless \
+                or frozenset((*effects, *drifts)) in hypotheses:
             continue
-        shapes: dict[Coefficient, float] = {}
-        without_drift = hypotheses.get(frozenset(v.effect for v in variants)) if drifts else None
-        if without_drift is not None:
-            start = dict(zip(without_drift.names, without_drift.values))
-        else:
-            start = dict(zip([linear_model.names[i] for i in fit.column_ids], fit.values))
-            for variant in variants:
-                start |= _limit_start(variant, start)
-                shapes |= _named_shape(variant)
-        hypothesis = _fit_or_none(linear_model, effects, start, shapes,
-                                  _lowest(hypotheses, settings))
-        if hypothesis is not None and hypothesis.log_evidence > null_fit.log_evidence:
-            _add(hypotheses, hypothesis)
+        without_drift = hypotheses.get(frozenset(effects)) if drifts else None
+        others = [r for r in first.others
+                  if not _is_hopeless(null_fit.log_evidence, r.gain, hypotheses, settings)]
+        starts = [(dict(zip(without_drift.names, without_drift.values)), {})] if without_drift \
+            else [_start(linear_model, r) for r in (first, *others)]
+        for start, shapes in starts:
+            hypothesis = _fit_or_none(linear_model, (*effects, *drifts), start, shapes,
+                                      _lowest(hypotheses, settings))
+            if hypothesis is not None and hypothesis.log_evidence > null_fit.log_evidence:
+                _add(hypotheses, hypothesis)
+                if hypothesis.converged:
+                    break
+
+
+def _start(linear_model: LinearModel, ranked: _RankedSet
+           ) -> tuple[dict[Coefficient, float], dict[Coefficient, float]]:
+    """Return first departures of all coefficients, and first values of shapes."""
+    start = dict(zip([linear_model.names[i] for i in ranked.fit.column_ids], ranked.fit.values))
+    shapes: dict[Coefficient, float] = {}
+    for variant in (linear_model.variants[i] for i in ranked.chosen):
+        start |= _limit_start(variant, start)
+        shapes |= _named_shape(variant)
+    return start, shapes
 
 
 def _limit_start(variant: Variant, amounts: Mapping[Coefficient, float]
