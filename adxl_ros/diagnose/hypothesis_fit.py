@@ -288,7 +288,7 @@ class LinearisedHypothesis:
         return self._given(fit, changed | (bounded != values), bounded)
 
     def _given(self, fit: LinearFit, given: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """Return departures, (k,), where some coefficients of the effects, (j,) bool, are given."""
+        """Return departures, (k,), where coefficients of the effects, (j,) bool, are given."""
         places = np.flatnonzero(given)
         return evidence.conditional_mean(fit, places, values[places] - self.prior_mean[places])
 
