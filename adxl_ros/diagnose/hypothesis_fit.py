@@ -42,11 +42,8 @@ from adxl_ros.model.gauss_newton import gauss_newton, Iterate
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
-_SMOOTH_EVALUATIONS = 10
-"""Largest number of simulations of a hypothesis of smooth effects. Chosen: most need five."""
-_ROUGH_EVALUATIONS = 8
-"""The same for other hypotheses. Chosen: their derivatives are from wide steps, and more
-iterations do not improve the fit."""
+_EVALUATIONS = 8
+"""Largest number of simulations of a hypothesis. Chosen: most need five."""
 _BESIDE_DRIFT_EVALUATIONS = 4
 """The same beside a drift. Chosen: such a fit starts from one without the drift."""
 _HALVINGS = 2
@@ -472,19 +469,15 @@ def fit_hypothesis(linear_model: LinearModel, effects: Sequence[str],
         log_evidence = fit.log_evidence - linearised.linear_loss(fit)
         return _HypothesisIterate(linearised.values, step, -log_evidence, linearised, fit)
 
-    smooth = all(effect_named(effect).smooth for effect in effects)
-
     def has_ended(first: _HypothesisIterate, previous: _HypothesisIterate | None,
                   present: _HypothesisIterate) -> bool:
         hopeless = previous is not None and present.fit.log_evidence < lowest_log_evidence
         return hopeless or _has_converged(first, previous, present)
 
-    evaluations = _SMOOTH_EVALUATIONS if smooth else _ROUGH_EVALUATIONS
-    if drifts_among(effects):
-        evaluations = min(evaluations, _BESIDE_DRIFT_EVALUATIONS)
-    solve = partial(gauss_newton, linearised_at, has_converged=has_ended,
-                    max_evaluations=evaluations, max_halvings=_HALVINGS,
-                    cost_tolerance=_EVIDENCE_TOLERANCE)
+    solve = partial(
+        gauss_newton, linearised_at, has_converged=has_ended, max_halvings=_HALVINGS,
+        max_evaluations=_BESIDE_DRIFT_EVALUATIONS if drifts_among(effects) else _EVALUATIONS,
+        cost_tolerance=_EVIDENCE_TOLERANCE)
     first = _first_values(neutral_sensor, names, start, shapes)
     solution = solve(first)
     if not solution.converged:

@@ -320,7 +320,7 @@ def _fit_added(linear_model: LinearModel, settings: DecisionSettings, about: Lin
         effects = (*best.effects, about.variants[first.chosen[0]].effect)
         if not with_variants.issuperset(effects) or frozenset(effects) in hypotheses:
             continue
-        for _, (i,), fit, _ in (first, *first.others):
+        for _, (i,), fit, _ in (first, *first.others[:1]):
             added = about.variants[i]
             start = dict(zip(best.names, best.values))
             start |= {about.names[k]: value for k, value in zip(fit.column_ids, fit.values)
@@ -388,8 +388,8 @@ def _fit_best(linear_model: LinearModel, settings: DecisionSettings, ranked: Ite
                 or frozenset((*effects, *drifts)) in hypotheses:
             continue
         without_drift = hypotheses.get(frozenset(effects)) if drifts else None
-        others = [r for r in first.others
-                  if not _is_hopeless(null_fit.log_evidence, r.gain, hypotheses, settings)]
+        others = [r for r in first.others if not drifts and not _is_hopeless(
+            null_fit.log_evidence, r.gain, hypotheses, settings)]
         starts = [(dict(zip(without_drift.names, without_drift.values)), {})] if without_drift \
             else [_start(linear_model, r) for r in (first, *others)]
         for start, shapes in starts:
