@@ -17,7 +17,8 @@ Checks of a drift: whether the noise is the same all the time, and has the spect
 
 The evidence alone cannot distinguish a drift from other slow changes. A drift has the same power
 in all blocks, and a random walk has its expected power in every octave. A warm draught or a floor
-that sways has most of its power in a few octaves.
+that sways has most of its power in a few octaves. A drift also goes on while the stage rests. What
+the form of another effect lacks is new after each move, and then stays.
 """
 
 from __future__ import annotations
@@ -28,7 +29,11 @@ from itertools import combinations, pairwise
 
 from adxl_ros.diagnose.evidence import block_edges
 from adxl_ros.diagnose.noise_whitening import before_filters, RANDOM_WALKS_G_PER_RTS, Whitener
+from adxl_ros.model import noise
 from adxl_ros.model.diagnosis_hints import DriftSpectrum
+from adxl_ros.model.effects import effect_named
+from adxl_ros.model.sensor import Sensor
+from adxl_ros.signals.runs import true_runs
 import numpy as np
 from scipy.optimize import minimize_scalar
 from scipy.signal import sosfreqz
@@ -42,6 +47,9 @@ _INDEPENDENT_SHARE = 0.6
 _CORRELATION_S = 0.1
 """Time over which strong noise of another colour than the filter's stays correlated, s. Tuned by
 hand on simulated flicker noise of another form than the library's."""
+_SHORTEST_REST_S = 1.0
+"""Shortest rest within which a drift can show, s. Chosen: the noise then has some independent
+samples."""
 _LOG_LEVEL_RANGE = 3.0
 """Largest magnitude of the logarithm of a walk's power, relative to that of its filter. Chosen:
 wider than the grid."""
@@ -117,6 +125,55 @@ def unevenness(channels: Sequence[ResidualChannel]) -> float:
             * np.sqrt(counts / 2 / variance_factor)
         largest = max(largest, float(np.sqrt(np.mean(deviation ** 2))))
     return largest
+
+
+def log_bayes_factor_within_rests(channel: ResidualChannel, at_rest: np.ndarray, sensor: Sensor,
+                                  axis: int) -> float:
+    """
+    Return the log Bayes factor of a drift over that of a healthy unit, within rests.
+
+    It compares the mean of the last third of each rest of length T with that of the first third.
+    The variance of their difference is w²·T·5/9 for a random walk of density w, and 3·h² for 1/f
+    noise of density h, besides that of the noise.
+
+    Parameters
+    ----------
+    channel
+        Residual of one axis, with the filter of the drift.
+    at_rest
+        Samples that rest, (n,) bool.
+    sensor
+        The baseline at the rate of the residual.
+    axis
+        Index of the axis.
+
+    Returns
+    -------
+    float
+        The log Bayes factor; 0 where nothing rests, or where the drift is that of a healthy unit.
+
+    """
+    if channel.whitener.healthy:
+        return 0.0
+    dt_s, rc_s = 1 / sensor.rate_hz, float(noise.electronics(sensor).rc_s[axis])
+    noise_v2 = float(noise.sample_std_v(sensor)[axis]) ** 2
+    scale_v_per_g = float(sensor.scale_v_per_g[axis])
+    healthy = effect_named(channel.whitener.effect).diagnosis.healthy_density
+    walks = channel.whitener.spectrum is DriftSpectrum.RANDOM_WALK
+    total = 0.0
+    for first, stop in true_runs(at_rest & channel.used):
+        length_s, third = (stop - first) * dt_s, (stop - first) // 3
+        if length_s < _SHORTEST_REST_S:
+            continue
+        change_v = channel.residual_v[stop - third:stop].mean() \
+            - channel.residual_v[first:first + third].mean()
+        mean_v2 = 2 * noise_v2 / float(noise.effective_samples(third, dt_s, rc_s))
+        factor = length_s * 5 / 9 if walks else 3.0
+        drift_v2, healthy_v2 = (mean_v2 + factor * (density * scale_v_per_g) ** 2
+                                for density in (channel.whitener.density, healthy))
+        total += 0.5 * float(np.log(healthy_v2 / drift_v2)
+                             + change_v ** 2 * (1 / healthy_v2 - 1 / drift_v2))
+    return total
 
 
 def walk_log_bayes_factor(channels: Sequence[ResidualChannel]) -> float:

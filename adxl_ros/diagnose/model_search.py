@@ -28,7 +28,7 @@ from itertools import combinations
 from typing import NamedTuple
 
 from adxl_ros.diagnose.decision_settings import DecisionSettings
-from adxl_ros.diagnose.drift_checks import unevenness
+from adxl_ros.diagnose.drift_checks import log_bayes_factor_within_rests, unevenness
 from adxl_ros.diagnose.effect_sizes import contribution
 from adxl_ros.diagnose.evidence import FlexibleColumns, LinearFit
 from adxl_ros.diagnose.hypothesis_fit import (
@@ -37,7 +37,7 @@ from adxl_ros.diagnose.hypothesis_fit import (
     linearise,
     residual_channels,
 )
-from adxl_ros.diagnose.linear_model import build_linear_model, LinearModel
+from adxl_ros.diagnose.linear_model import build_linear_model, LinearModel, rests_by_channel
 from adxl_ros.diagnose.noise_whitening import drift_effects, drifts_among
 from adxl_ros.diagnose.progress_plan import (
     FIT_WORK,
@@ -197,7 +197,8 @@ def _add_drifts(linear_model: LinearModel, settings: DecisionSettings, hypothese
     """
     Let the zero-g drift, alone, beside the best hypotheses, and beside effects best with a drift.
 
-    A drift has the same power all the time; hypotheses with uneven noise are removed.
+    A drift has the same power all the time, and goes on within rests. Other hypotheses with a drift
+    are removed.
     """
     ranked = sorted(hypotheses.values(), key=lambda h: -h.log_evidence)
     best = [h for h in ranked if 0 < len(h.effects) < LARGEST_SET][:_BESIDE_DRIFTS]
@@ -218,9 +219,20 @@ def _add_drifts(linear_model: LinearModel, settings: DecisionSettings, hypothese
         _fit_best(linear_model, settings, beside_drift[:_BESIDE_DRIFTS], drift_fit, hypotheses,
                   (drift,))
     for h in list(hypotheses.values()):
-        if drifts_among(h.effects) \
-                and unevenness(list(residual_channels(linear_model, h))) > _LARGEST_UNEVENNESS:
+        if drifts_among(h.effects) and not _drifts(linear_model, h):
             del hypotheses[frozenset(h.effects)]
+
+
+def _drifts(linear_model: LinearModel, hypothesis: Hypothesis) -> bool:
+    """Determine whether the residual of a hypothesis with a drift drifts as it should."""
+    channels = list(residual_channels(linear_model, hypothesis))
+    within_rests = 0.0
+    for number, (channel, at_rest) in enumerate(zip(
+            channels, rests_by_channel(linear_model.comparisons))):
+        recording, axis = linear_model.place_of_channel(number)
+        within_rests += log_bayes_factor_within_rests(
+            channel, at_rest, linear_model.comparisons[recording].sensor, axis)
+    return within_rests >= 0 and unevenness(channels) <= _LARGEST_UNEVENNESS
 
 
 def _model_about(linear_model: LinearModel, best: Hypothesis) -> LinearModel:
