@@ -197,8 +197,8 @@ def _add_drifts(linear_model: LinearModel, settings: DecisionSettings, hypothese
     """
     Let the zero-g drift, alone, beside the best hypotheses, and beside effects best with a drift.
 
-    A drift has the same power all the time, and goes on within rests. Other hypotheses with a drift
-    are removed.
+    A drift has the same power all the time, and goes on within rests. Other hypotheses with a
+    drift are removed.
     """
     ranked = sorted(hypotheses.values(), key=lambda h: -h.log_evidence)
     best = [h for h in ranked if 0 < len(h.effects) < LARGEST_SET][:_BESIDE_DRIFTS]
