@@ -39,6 +39,10 @@ from adxl_ros.model.effects.base import Role
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
+_POSE = {FormDimension.FORCE, FormDimension.CROSS_FORCE, FormDimension.CODE, FormDimension.ALPHA,
+         FormDimension.BETA}
+"""Dimensions that only change with the pose."""
+
 
 class Contribution(NamedTuple):
     """
@@ -87,10 +91,11 @@ def size_hypothesis(linear_model: LinearModel, hypothesis: Hypothesis, noise_mps
     """
     Simulate how large the effects of a hypothesis are, and decide which of them matter.
 
-    An effect must be a visible part of the noise and of the gap. An effect of angles must exceed
-    the step of the encoder, and one that changes with time the drift of a healthy unit. The
-    interval of one of its sizes must exclude zero. Beside another effect, zero-g and scale factor
-    must exceed what the calibration can have taken up of it.
+    An effect must be a visible part of the noise and of the gap. One that follows the pose must
+    exceed the error of the encoder, which is the same each time a pose returns. One that changes
+    with time must exceed the drift of a healthy unit. The interval of one of its sizes must
+    exclude zero. Beside another effect, zero-g and scale factor must exceed what the calibration
+    can have taken up of it.
 
     Parameters
     ----------
@@ -114,7 +119,7 @@ def size_hypothesis(linear_model: LinearModel, hypothesis: Hypothesis, noise_mps
     immaterial = {
         e for e, c in contributions.items()
         if c.rms_mps2 < _smallest_mps2(e, contributions, noise_mps2, settings)
-        or (_turns(e) and c.rms_mps2 < angle_mps2) or _may_be_zero(hypothesis, e)
+        or (_follows_pose(e) and c.rms_mps2 < angle_mps2) or _may_be_zero(hypothesis, e)
         or (_drifts_in_time(e) and c.varying_mps2 < _healthy_drift_mps2(linear_model))}
     material = set(hypothesis.effects) - immaterial
     if any(calibration_takes_up(e) and not effect_named(e).diagnosis.drift for e in material):
@@ -198,9 +203,11 @@ def _without(sensor: Sensor, baseline: Sensor, effects: Sequence[str]) -> Sensor
     return replace(sensor, values={**sensor.values, **absent})
 
 
-def _turns(effect: str) -> bool:
-    """Determine whether the sizes of an effect are angles."""
-    return any(p.unit == 'rad' for p in effect_named(effect).parameters if p.is_size)
+def _follows_pose(effect: str) -> bool:
+    """Determine whether an effect only follows the pose, as the error of an encoder does."""
+    form = effect_named(effect).diagnosis.form
+    return any(p.unit == 'rad' for p in effect_named(effect).parameters if p.is_size) \
+        or (bool(form) and set(form) <= _POSE)
 
 
 def _drifts_in_time(effect: str) -> bool:
