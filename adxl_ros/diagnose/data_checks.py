@@ -26,6 +26,7 @@ from dataclasses import dataclass, replace
 from adxl_ros.diagnose.baseline_comparison import at_search_rate, BaselineComparison, Reference
 from adxl_ros.diagnose.noise_detectors import (
     coarse_codes,
+    code_step_v,
     Detection,
     isolated_samples,
     repeated_samples,
@@ -69,6 +70,9 @@ shorter gaps."""
 _LARGEST_JUMP_SHARE = 0.2
 """Share of the recording that jumps of the stamps may have. Chosen: gaps of a lossy
 link are no fault of the clock."""
+_COARSE_CODES = 3.0
+"""Distance of codes, in stated steps, from which they are coarse. Chosen: noise moves finer ones.
+"""
 _RAIL_SHARE = 0.05
 """Share of the samples at one extreme value from which it is the end of the range.
 Chosen: a sensor at rest has an extreme value seldom."""
@@ -206,7 +210,7 @@ def find_data_fault(comparison: BaselineComparison, search_comparison: BaselineC
     clock = find_clock_fault(comparison.time_s)
     if clock is not None:
         return clock
-    railed = _share_at_rail(comparison.volts[finite], comparison.sensor.lsb_v)
+    railed = _share_at_rail(comparison, finite)
     if railed > _LARGEST_MISSING_SHARE:
         return DataFault('saturated', 'bad_data', f'{100 * railed:.0f} % of the samples are at '
                          'the end of the range; check supply, range and wiring')
@@ -246,12 +250,21 @@ def find_clock_fault(time_s: np.ndarray) -> DataFault | None:
     return None
 
 
-def _share_at_rail(volts: np.ndarray, lsb_v: float) -> float:
-    """Return the largest share of an axis's samples at an extreme value; 0 below `_RAIL_SHARE`."""
-    largest = 0.0
-    for axis_v in volts.T:
+def _share_at_rail(comparison: BaselineComparison, finite: np.ndarray) -> float:
+    """
+    Return the largest share of an axis's samples at an extreme value; 0 below `_RAIL_SHARE`.
+
+    Coarse codes repeat in an extreme pose, so that the simulation must then differ by a step.
+    """
+    largest, lsb_v = 0.0, max(comparison.sensor.lsb_v, _SMALLEST_STEP_V)
+    volts, simulated_v = (v[finite] for v in (comparison.volts,
+                                              comparison.simulated_v(comparison.sensor)))
+    for axis_v, expected_v, step_v in zip(volts.T, simulated_v.T, code_step_v(volts)):
         for rail_v in (axis_v.max(), axis_v.min()):
-            share = float(np.mean(np.abs(axis_v - rail_v) < max(lsb_v, _SMALLEST_STEP_V) / 2))
+            at_rail = np.abs(axis_v - rail_v) < lsb_v / 2
+            if step_v > _COARSE_CODES * lsb_v:
+                at_rail &= np.abs(expected_v - rail_v) > step_v
+            share = float(np.mean(at_rail))
             if share > _RAIL_SHARE and np.ptp(axis_v) > _SMALLEST_RANGE_V:
                 largest = max(largest, share)
     return largest

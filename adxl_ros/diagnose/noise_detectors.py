@@ -87,6 +87,8 @@ _BETWEEN_CODES_SHARE = 0.1
 converter moves some codes."""
 _COARSE_LOG_BAYES_FACTOR = 1e3
 """Log Bayes factor of coarse codes, rough: there is no other explanation."""
+_CONSTANT_V = 1e3
+"""Smallest change of an output that never changes, V. Chosen: above any change."""
 _CODES_FEWEST = 8
 """Fewest distances between codes from which their step is estimated. Chosen: a median."""
 _RESTING_FEWEST = 500
@@ -334,6 +336,25 @@ def coarse_codes(volts: np.ndarray, sensor: Sensor) -> Detection | None:
     return Detection(detected_effect(Detector.COARSE_CODES), {
         'lost_bits': np.array(common), 'axis_lost_bits': further}, _COARSE_LOG_BAYES_FACTOR,
         f'codes are {2 ** np.nanmax(bits):.3g} steps apart{where}')
+
+
+def code_step_v(volts: np.ndarray) -> np.ndarray:
+    """
+    Return the smallest change of the output on each axis.
+
+    Parameters
+    ----------
+    volts
+        As recorded, V, (n, m).
+
+    Returns
+    -------
+    numpy.ndarray
+        Changes, V, (m,); 1000 V for an axis that never changes.
+
+    """
+    changes_v = np.abs(np.diff(volts, axis=0))
+    return np.min(changes_v, axis=0, initial=_CONSTANT_V, where=changes_v > 0)
 
 
 def _lost_bits(volts: np.ndarray, sensor: Sensor) -> float:

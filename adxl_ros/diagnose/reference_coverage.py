@@ -24,6 +24,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from adxl_ros.diagnose.baseline_comparison import BaselineComparison, Reference
+from adxl_ros.diagnose.noise_detectors import code_step_v
 from adxl_ros.files.recording_columns import JOINTS, Recording
 from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2
@@ -67,8 +68,6 @@ _EVEN = 0.02
 rounding errors."""
 _MOVES = 3.0
 """Motion, divided by the noise, from which an alias is looked for. Chosen: noise alone has 1."""
-_CONSTANT_V = 1e3
-"""Step of the codes of an output that never changes, V. Chosen: above any change."""
 _IMAGES = np.arange(-8, 9)
 """Orders of the images of a spline that are summed. Chosen: the rest is below 1e-6."""
 
@@ -354,7 +353,7 @@ def _with_aliases(comparison: BaselineComparison, coarse: np.ndarray, noise_g: f
     size = max(round(_WINDOW_S * sensor.rate_hz), _WINDOW_READINGS)
     simulated_v = comparison.simulated_v(sensor)
     # Coarse codes jump by themselves.
-    scatter_g = np.maximum(noise_g, _code_step_v(comparison.volts) / sensor.scale_v_per_g)
+    scatter_g = np.maximum(noise_g, code_step_v(comparison.volts) / sensor.scale_v_per_g)
     parts = np.array_split(np.arange(len(coarse)), max(len(coarse) // size, 1))
     differs, touched = np.zeros(len(parts), bool), np.zeros(len(parts), bool)
     for i, part in enumerate(parts):
@@ -371,9 +370,3 @@ def _with_aliases(comparison: BaselineComparison, coarse: np.ndarray, noise_g: f
                 if differs[i]:
                     extended[parts[i]] = True
     return extended
-
-
-def _code_step_v(volts: np.ndarray) -> np.ndarray:
-    """Return the smallest change of the output on each axis, V, (m,)."""
-    changes_v = np.abs(np.diff(volts, axis=0))
-    return np.min(changes_v, axis=0, initial=_CONSTANT_V, where=changes_v > 0)

@@ -320,6 +320,25 @@ def test_faults_of_the_recording_are_named(change, fault):
     assert report['verdict']['effects'] == [] and diagnosis.sensor is None
 
 
+def test_codes_far_above_the_noise_hide_no_effect_and_cause_none():
+    """Rounding to 10 bits follows the pose; beside it, a scale factor is found."""
+    report, _ = diagnosis_of(unit(), 'quantisation:lost_bits=6')
+    assert report['verdict']['effects'] == ['quantisation']
+    report, _ = diagnosis_of(unit(), 'quantisation:lost_bits=6', 'temperature_bias:per_k=2e-3')
+    assert report['verdict']['effects'] == ['quantisation', 'temperature_bias']
+
+
+def test_a_second_harmonic_of_an_eccentric_disc_is_no_further_effect():
+    """What the form of an eccentric disc lacks is an error of the angle, too."""
+    def change(columns):
+        angles = {name: columns[name] - 0.01 * np.sin(columns[name] + 1)
+                  - 0.001 * np.sin(2 * columns[name]) for name in ('alpha_rad', 'beta_rad')}
+        return columns | angles
+
+    report, _ = diagnosis_of(unit(), change=change)
+    assert report['verdict']['effects'] == ['stage_eccentricity']
+
+
 def test_too_short_is_insufficient():
     """A recording of ten seconds has no verdict."""
     report, _ = diagnosis_of(unit(), change=lambda c: {k: v[:1250] for k, v in c.items()})

@@ -16,11 +16,19 @@
 
 from dataclasses import replace
 
+from adxl_ros.diagnose.baseline_comparison import compare
+from adxl_ros.diagnose.hypothesis_fit import fit_hypothesis
+from adxl_ros.diagnose.linear_model import build_linear_model
 from adxl_ros.diagnose.sensitivities import shapes, variants
+from adxl_ros.files.recording_columns import Recording
+from adxl_ros.files.stream_info import sensor_info
 from adxl_ros.model.coefficients import with_neutral
 from adxl_ros.model.effects import library
 from adxl_ros.model.effects.base import Coefficient, Role
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.simulate import simulator
+from adxl_ros.simulate.trajectories import tumble
+from adxl_ros.tools.effect_option import with_effects
 import numpy as np
 import pytest
 from units import Fed, nominal
@@ -96,3 +104,19 @@ def test_a_limit_of_one_axis_starts_without_clipping_the_others():
         assert min(first[names[0]], first[names[1]]) > 1.05
         assert first[Coefficient('saturation', 'knee_g')] > 0
         assert first[Coefficient('saturation', 'offset_g', 'x')] == 0
+
+
+def test_a_fit_reaches_a_period_far_from_its_start():
+    """The start is a whole period of the phase off; the fit tries shapes between the starts."""
+    sensor = replace(nominal('xyz'), rate_hz=100.0)
+    motion = tumble(np.random.default_rng(4))
+    columns = simulator.simulate(with_effects(
+        sensor, ['adc_inl:amplitude_v=0.004,cosine_v=0.002,cycles=6.7']), motion, 1)
+    time_s = columns.pop('time_s')
+    comparison = compare(Recording('drawn', time_s, columns, sensor_info(sensor)), sensor)
+    linear_model = build_linear_model([comparison], only=['adc_inl'])
+    cycles = Coefficient('adc_inl', 'cycles')
+    hypothesis = fit_hypothesis(linear_model, ['adc_inl'], {
+        Coefficient('adc_inl', 'amplitude_v'): -0.003}, {cycles: 5.8})
+    fitted = dict(zip(hypothesis.names, hypothesis.linearised.values))
+    assert fitted[cycles] == pytest.approx(6.7, abs=0.05)
