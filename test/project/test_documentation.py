@@ -1,0 +1,64 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What the documentation shows works: parameter files load, and ROS parses the arguments."""
+
+from pathlib import Path
+import re
+import shlex
+
+from adxl_ros.files import parameter_file
+from processes import REPO
+import pytest
+import rclpy
+from rclpy.context import Context
+
+PAGES = [REPO / 'README.md', *sorted((REPO / 'docs').glob('*.md'))]
+
+
+def blocks(page: Path, language: str) -> list[str]:
+    """Return the code blocks of a page in a language."""
+    return re.findall(rf'^```{language}\n(.*?)^```', page.read_text('utf-8'),
+                      re.DOTALL | re.MULTILINE)
+
+
+def ros_arguments(page: Path) -> list[list[str]]:
+    """Return what stands after `--ros-args` in the commands of a page, without files."""
+    lines = '\n'.join(blocks(page, 'sh')).replace('\\\n', ' ').splitlines()
+    words = [shlex.split(line, comments=True) for line in lines if '--ros-args' in line]
+    return [line[line.index('--ros-args'):] for line in words if '--params-file' not in line]
+
+
+def test_own_sensor_loads(tmp_path: Path) -> None:
+    """The file of docs/sensor.md has eight lines below its head; its additions fit."""
+    whole, *additions = blocks(REPO / 'docs' / 'sensor.md', 'yaml')
+    path = tmp_path / 'my_sensor.yaml'
+    path.write_text(whole)
+    assert len(whole.splitlines()) == 2 + 8
+    assert parameter_file.load(path).effects == ()
+    path.write_text(''.join([whole, *additions]))
+    assert parameter_file.load(path).effects == ('supply',)
+
+
+@pytest.mark.parametrize('page', PAGES, ids=lambda page: page.name)
+def test_ros_parses_the_arguments(page: Path) -> None:
+    for arguments in ros_arguments(page):
+        context = Context()
+        rclpy.init(args=['node', *arguments], context=context)
+        context.shutdown()
+
+
+def test_an_argument_that_ros_does_not_parse() -> None:
+    with pytest.raises(RuntimeError, match='parse'):
+        rclpy.init(args=['node', '--ros-args', '-p', 'link.uri:=local:'], context=Context())
