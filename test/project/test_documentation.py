@@ -42,12 +42,12 @@ def ros_arguments(page: Path) -> list[list[str]]:
 
 def test_own_sensor_loads(tmp_path: Path) -> None:
     """The file of docs/sensor.md has eight lines below its head; its additions fit."""
-    whole, *additions = blocks(REPO / 'docs' / 'sensor.md', 'yaml')
+    head, *additions = blocks(REPO / 'docs' / 'sensor.md', 'yaml')
     path = tmp_path / 'my_sensor.yaml'
-    path.write_text(whole)
-    assert len(whole.splitlines()) == 2 + 8
+    path.write_text(head)
+    assert len(head.splitlines()) == 2 + 8
     assert parameter_file.load(path).effects == ()
-    path.write_text(''.join([whole, *additions]))
+    path.write_text(''.join([head, *additions]))
     assert parameter_file.load(path).effects == ('supply',)
 
 
