@@ -15,35 +15,25 @@
 """
 Start a calibrated sensor on a robot: the driver and the compensation.
 
-    ros2 launch adxl_ros robot.launch.py params_file:=unit_17.yaml namespace:=arm frame_id:=arm_imu
+    ros2 launch adxl_ros robot.launch.py params_file:=unit_17.yaml link_type:=serial \
+        link_port:=/dev/ttyACM0 namespace:=arm frame_id:=arm_imu
+
+A node that ends is started again. The launch ends when a node refuses to start three times.
 """
 
-from adxl_ros.files import parameter_file
-from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument
-from launch.substitutions import LaunchConfiguration
+from adxl_ros.nodes.support import launch_nodes
+from launch import LaunchContext, LaunchDescription
+from launch.actions import OpaqueFunction
 from launch_ros.actions import Node
-from launch_ros.parameter_descriptions import ParameterValue
 
 
 def generate_launch_description() -> LaunchDescription:
-    params = str(parameter_file.nominal_path())
-    frame_id = ParameterValue(LaunchConfiguration('frame_id'), value_type=str)
-    nodes = [
-        Node(package='adxl_ros', executable=executable, output='screen', respawn=True,
-             respawn_delay=2.0, namespace=LaunchConfiguration('namespace'),
-             parameters=[LaunchConfiguration('params_file'), {'frame_id': frame_id}],
-             ros_arguments=['--log-level', LaunchConfiguration('log_level')])
-        for executable in ('driver', 'compensation')
-    ]
     return LaunchDescription([
-        DeclareLaunchArgument('params_file', default_value=params,
-                              description='parameter file of the calibrated sensor and its link'),
-        DeclareLaunchArgument('namespace', default_value='',
-                              description='namespace of the nodes and their topics'),
-        DeclareLaunchArgument('frame_id', default_value='imu_link',
-                              description='frame of the case'),
-        DeclareLaunchArgument('log_level', default_value='info',
-                              description='log level: debug, info, warn, error or fatal'),
-        *nodes,
-    ])
+        *launch_nodes.common_arguments(), OpaqueFunction(function=make_nodes)])
+
+
+def make_nodes(context: LaunchContext) -> list[Node]:
+    """Return the nodes."""
+    return [launch_nodes.make_node(context, executable, {}, respawn=True, respawn_delay=2.0,
+                                   on_exit=launch_nodes.GiveUp())
+            for executable in ('driver', 'compensation')]

@@ -71,7 +71,8 @@ def with_provenance(fitted: Sensor, source: str, poses: Poses, data_sha256: str,
 
     """
     entries = {
-        'date': datetime.now(timezone.utc).isoformat(timespec='seconds'),
+        # A text of YAML, where +00:00 makes a date, which ros2 param cannot set.
+        'date': f'{datetime.now(timezone.utc):%Y-%m-%dT%H:%M:%S}+0000',
         'package_version': package_version(), 'source': source,
         'data_sha256': data_sha256 or _poses_sha256(poses),
         'poses': str(int((~poses.check).sum())), 'check_poses': str(int(poses.check.sum())),

@@ -127,7 +127,8 @@ def _version(sensor: Sensor) -> str:
 def date_of(sensor: Sensor) -> datetime | None:
     """Return the date of a calibration, UTC; None where its file states none."""
     try:
-        date = datetime.fromisoformat(sensor.provenance.get('date', '').replace('Z', '+00:00'))
+        date = datetime.fromisoformat(sensor.provenance.get('date', '').replace('Z', '+00:00')
+                                      .replace('+0000', '+00:00'))
     except ValueError:
         return None
     return date.astimezone(timezone.utc) if date.tzinfo else date.replace(tzinfo=timezone.utc)

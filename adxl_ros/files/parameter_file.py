@@ -68,6 +68,9 @@ DATASHEET = {
 }
 """Meaning of the keys `datasheet.*`; a file has all of them or none."""
 
+_LINK = 'link.'
+"""Begin of the driver's keys, which a file carries unchecked: the driver checks them."""
+
 _SMALLEST_VARIANCE = 1e-300
 """Smaller variances count as this in the check of a covariance (chosen: near the smallest
 float64, so that a variance of 0 divides nothing by 0)."""
@@ -148,6 +151,7 @@ def to_flat(sensor: Sensor) -> dict[str, Any]:
     for key, field in SENSOR_FIELDS.items():
         value = getattr(sensor, field.name)
         flat[key] = value.tolist() if isinstance(value, np.ndarray) else value
+    flat |= {f'{_LINK}{name}': value for name, value in sensor.link.items()}
     if sensor.effects:
         flat['effects'] = list(sensor.effects)
     for name in sensor.effects:
@@ -313,12 +317,14 @@ class _FlatReader:
         covariance, covariance_names = self._covariance(effects, axes)
         provenance = {key.removeprefix('provenance.'): str(value)
                       for key, value in self.flat.items() if key.startswith('provenance.')}
+        link = {key.removeprefix(_LINK): value for key, value in self.flat.items()
+                if key.startswith(_LINK)}
         datasheet_name = str(self.flat.get('datasheet.name', '')) \
             if 'datasheet.figures' in self.flat else ''
         return Sensor(**values, effects=effects, values=coefficients, covariance=covariance,
                       covariance_names=covariance_names, provenance=provenance,
                       envelope=self._envelope(), datasheet_name=datasheet_name,
-                      datasheet=self._datasheet())
+                      datasheet=self._datasheet(), link=link)
 
     def _field(self, field: Field[Any]) -> Any:
         """Return the value of a field of `Sensor`."""

@@ -94,6 +94,8 @@ class Sensor:
     datasheet
         Typical and largest departure by parameter, as the datasheet states them, each in the
         unit of the parameter; 0 where it does not.
+    link
+        How the driver reaches the unit: values of `link.*` by name. Its file carries them.
 
     """
 
@@ -134,6 +136,7 @@ class Sensor:
     envelope: Envelope = Envelope()
     datasheet_name: str = ''
     datasheet: dict[Coefficient, tuple[float, float]] = field(default_factory=dict)
+    link: dict[str, Any] = field(default_factory=dict)
 
     @property
     def zero_g_v(self) -> np.ndarray:

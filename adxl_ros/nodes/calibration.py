@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 import os
 
 from adxl_ros.calibrate.guided.controller import Answer, Controller, Resume, Severity
@@ -25,7 +26,9 @@ from adxl_ros.files.stream_info import StreamInfo
 from adxl_ros.nodes.support.calibration_console import Console
 from adxl_ros.nodes.support.calibration_parameters import declare_settings
 from adxl_ros.nodes.support.diagnostics import DiagnosticsReporter, Level, Status
+from adxl_ros.nodes.support.given_parameters import check_given_parameters
 from adxl_ros.nodes.support.imu_subscription import Samples
+from adxl_ros.nodes.support.link_parameters import given_link
 from adxl_ros.nodes.support.next_pose import Announcer
 from adxl_ros.nodes.support.parameters import declare
 from adxl_ros.nodes.support.run_node import run
@@ -57,7 +60,8 @@ class Calibration(Node):
 
     def __init__(self) -> None:
         super().__init__('calibration')
-        sensor = make_sensor(declare_sensor(self))
+        check_given_parameters(self)
+        sensor = replace(make_sensor(declare_sensor(self)), link=given_link(self))
         autostart = declare(self, 'autostart', False, 'start without a call of ~/start')
         resume = Resume(declare(
             self, 'resume', 'ask', 'go on with an interrupted calibration; ask where there is a '

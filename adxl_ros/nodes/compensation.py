@@ -28,6 +28,7 @@ from adxl_ros.files.stream_info import StreamInfo
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.nodes.support.diagnostics import DiagnosticsReporter, Level, Status
 from adxl_ros.nodes.support.exchangeable_sensor import ExchangeableSensor
+from adxl_ros.nodes.support.given_parameters import check_given_parameters
 from adxl_ros.nodes.support.parameters import declare
 from adxl_ros.nodes.support.receive_thread import ReceiveTurn, RepeatingThread
 from adxl_ros.nodes.support.run_node import run
@@ -55,6 +56,7 @@ class Compensation(Node):
 
     def __init__(self) -> None:
         super().__init__('compensation')
+        check_given_parameters(self)
         paper = declare(
             self, 'inverse', 'exact', "inverse of the model: exact, or the paper's approximation",
             choices=('exact', 'paper')) == 'paper'

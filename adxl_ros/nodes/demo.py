@@ -122,7 +122,8 @@ def _run_sweep(folder: Path, speed: float) -> None:
                  _SWEEP_S / speed + _OVERHEAD_S), '')
     _remove_results(output)
     with open_graph(folder / 'sweep.log') as graph:
-        graph.start('driver', unit, '-p', f'link.speed:={speed}', *_SIM_TIME)
+        graph.start('driver', unit, '-p', 'link.type:=sim', '-p', f'link.speed:={speed}',
+                    *_SIM_TIME)
         graph.start('stage', nominal, *_SIM_TIME)
         graph.start('calibration', nominal, *_SIM_TIME, *_LOSSLESS, *_UNATTENDED,
                     *_plan_arguments(), *_output_arguments(output, report))

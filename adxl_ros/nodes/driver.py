@@ -18,11 +18,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 import traceback
-from typing import Any
 
-from adxl_ros.errors import UserError
+from adxl_ros.errors import one_line, UserError
 from adxl_ros.links.support import base
 from adxl_ros.nodes.support.diagnostics import DiagnosticsReporter, Level, Status
+from adxl_ros.nodes.support.given_parameters import check_given_parameters
+from adxl_ros.nodes.support.link_parameters import declare_link
 from adxl_ros.nodes.support.link_reader import LinkReader
 from adxl_ros.nodes.support.parameters import declare
 from adxl_ros.nodes.support.run_node import run
@@ -31,6 +32,9 @@ from adxl_ros.nodes.support.sample_tally import Tally
 from adxl_ros.nodes.support.sensor_parameters import declare_sensor, make_sensor
 from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+
+_SIMULATED = f'SIMULATED sensor (link.type: {base.DEFAULT_LINK})'
+"""Words of log and diagnostics where no sensor is read."""
 
 
 class Driver(LifecycleNode):
@@ -43,66 +47,61 @@ class Driver(LifecycleNode):
 
     def __init__(self) -> None:
         super().__init__('driver')
+        check_given_parameters(self)
         self._sensor = make_sensor(declare_sensor(self))
         self._frame_id = declare(self, 'frame_id', 'imu_link', 'frame of the case')
         self._delay_ns = round(1e9 * declare(
             self, 'stamp_offset', 0.0, 'delay of the sensor, such as that of its RC filter, that '
             'is taken out of the stamps: they are earlier by this', 's', -10.0, 10.0))
-        self._link_type = declare(self, 'link.type', base.DEFAULT_LINK,
-                                  'where the samples come from', choices=base.link_names())
-        self._module = base.link_module(self._link_type)
-        self._settings = self._declare_settings()
+        self._link = declare_link(self, self._sensor.serial)
+        settings = self._link.settings
         autostart = declare(
             self, 'autostart', True, 'configure and activate at the start; else a system manager '
             'does')
-        paced = isinstance(self._settings, base.PacedSettings)
-        self._speed = self._settings.speed if paced else 1.0
+        paced = isinstance(settings, base.PacedSettings)
+        self._speed = settings.speed if paced else 1.0
         # All nodes must share a sensor time that is not real time: this node then publishes it.
         self._is_clock = self._speed != 1 or (paced and self.get_parameter('use_sim_time').value)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._wall = Clock(clock_type=ClockType.SYSTEM_TIME)
         self._tally = Tally(self._steady.now().nanoseconds)
         self._fault = ''
+        self._announces = not autostart
         self._output: SampleOutput | None = None
         self._reader: LinkReader | None = None
         self._diagnostics = DiagnosticsReporter(self, {'link': self._status})
-        if autostart:
-            self.trigger_configure()
+        if not autostart:
+            self._announce('unconfigured')
+        elif self.trigger_configure() == TransitionCallbackReturn.SUCCESS:
             self.trigger_activate()
-
-    def _declare_settings(self) -> Any:
-        """Declare the parameters of the link and return its settings."""
-        return self._module.Settings(**{
-            option.name: declare(self, f'link.{option.name}', option.default, option.doc,
-                                 option.unit, option.lower, option.upper)
-            for option in base.options(self._module.Settings)})
+        self._announces = True
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Create the topics."""
-        return self._transition(self._configure, super().on_configure, state)
+        return self._transition(self._configure, super().on_configure, state, 'inactive')
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Open the link and read it from now on; a failure leaves no link open."""
-        result = self._transition(self._activate, super().on_activate, state)
+        result = self._transition(self._activate, super().on_activate, state, 'active')
         if result != TransitionCallbackReturn.SUCCESS:
             self.close()
         return result
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Close the link."""
-        return self._transition(self.close, super().on_deactivate, state)
+        return self._transition(self.close, super().on_deactivate, state, 'inactive')
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Remove the topics."""
-        return self._transition(self._clean_up, super().on_cleanup, state)
+        return self._transition(self._clean_up, super().on_cleanup, state, 'unconfigured')
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Close the link and remove the topics."""
-        return self._transition(self._release, super().on_shutdown, state)
+        return self._transition(self._release, super().on_shutdown, state, 'finalized')
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Close the link and remove the topics, so that the node can be configured again."""
-        return self._transition(self._release, super().on_error, state)
+        return self._transition(self._release, super().on_error, state, 'unconfigured')
 
     def close(self) -> None:
         """End the thread and close the link."""
@@ -112,26 +111,42 @@ class Driver(LifecycleNode):
 
     def _transition(self, act: Callable[[], None],
                     parent: Callable[[LifecycleState], TransitionCallbackReturn],
-                    state: LifecycleState) -> TransitionCallbackReturn:
-        """Do what a transition asks for; rclpy itself would not report why it fails."""
+                    state: LifecycleState, goal: str) -> TransitionCallbackReturn:
+        """Do what the transition to a goal asks for; rclpy would not report why it fails."""
         try:
             act()
-            return parent(state)
+            result = parent(state)
         except UserError as error:
             self._fail(error)
             return TransitionCallbackReturn.FAILURE
-        except Exception:
+        except Exception as error:
+            self._fault = f'the driver has failed: {one_line(error)}'
             self.get_logger().fatal(traceback.format_exc())
+            self._diagnostics.notice('link', Level.ERROR)
             return TransitionCallbackReturn.ERROR
+        if goal == 'active' or self._announces:
+            self._announce(goal)
+        self._diagnostics.notice('link', self._level())
+        return result
+
+    def _announce(self, state: str) -> None:
+        """Log a state of the life cycle: link, unit, rate and topic; warn where it simulates."""
+        sensor = self._output.sensor if self._output else self._sensor
+        topic = self.resolve_topic_name('imu/data_raw')
+        self.get_logger().info(f'{state}: link {self._link.name}, unit {sensor.serial}, '
+                               f'{sensor.rate_hz:g} Hz, topic {topic}')
+        if state == 'active' and self._simulates:
+            self.get_logger().warning(f'{_SIMULATED}: no sensor is read')
 
     def _configure(self) -> None:
+        self._fault = ''
         self._output = SampleOutput(self, self._sensor, self._frame_id, self._delay_ns,
                                     self._is_clock, self._tally)
 
     def _activate(self) -> None:
         assert self._output is not None, 'the life cycle configures a node before it activates it'
         self._fault = ''
-        link = self._module.open_link(self._sensor, self._settings)
+        link = self._link.module.open_link(self._sensor, self._link.settings)
         self._reader = LinkReader(self, link, self._output, self._speed, self._fail,
                                   self._on_level)
 
@@ -159,20 +174,31 @@ class Driver(LifecycleNode):
         if sensor_ns and not self._is_clock:
             sensor_ns = self._wall.now().nanoseconds
         values, warning = self._tally.report(self._steady.now().nanoseconds, sensor_ns)
-        level = Level[link.level.name]
+        level = self._level()
         if warning and level is Level.OK:
             level = Level.WARN
-        text = ', '.join(filter(None, (f'{self._link_type}: {link.text}', warning)))
+        kind = _SIMULATED if self._simulates else self._link.name
+        text = ', '.join(filter(None, (f'{kind}: {link.text}', warning)))
         serial = (self._output.sensor if self._output else self._sensor).serial
         return Status(level, text, serial, {
-            **values, 'link_type': self._link_type, 'link_state': link.text, **link.values()})
+            **values, 'link_type': self._link.name, 'link_state': link.text, **link.values()})
+
+    @property
+    def _simulates(self) -> bool:
+        """Whether the samples are those of no sensor."""
+        return self._link.name == base.DEFAULT_LINK
+
+    def _level(self) -> Level:
+        """Return the level of the link; a simulated sensor is a warning at least."""
+        level = Level[self._link_status().level.name]
+        return Level.WARN if self._simulates and level is Level.OK else level
 
     def _link_status(self) -> base.LinkStatus:
         """Return how the link works, or why there is none."""
         if self._fault:
             return base.LinkStatus(base.Level.ERROR, self._fault)
         if self._reader is None:
-            return base.LinkStatus(base.Level.OK, 'inactive')
+            return base.LinkStatus(base.Level.WARN, 'inactive, no samples are published')
         return self._reader.status()
 
 

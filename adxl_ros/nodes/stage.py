@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+from adxl_ros.nodes.support.given_parameters import check_given_parameters
 from adxl_ros.nodes.support.parameters import declare
 from adxl_ros.nodes.support.run_node import run
 from adxl_ros.nodes.support.simulated_stage_node import SimulatedStageNode
@@ -28,6 +29,7 @@ class Stage(Node):
 
     def __init__(self) -> None:
         super().__init__('stage')
+        check_given_parameters(self)
         kind = declare(
             self, 'stage.type', 'simulated', 'the simulated stage, or the bridge to a controller '
             'that takes joint states or trajectories',

@@ -57,8 +57,8 @@ def _record(graph, kind, topic):
 
 def _sweep(start, truth, bare, *options):
     """Return the processes of driver and calibration."""
-    driver = start('driver', '--ros-args', '--params-file', truth, '-p', 'link.speed:=4.0', *FAST,
-                   *KEPT)
+    driver = start('driver', '--ros-args', '--params-file', truth, '-p', 'link.type:=sim', '-p',
+                   'link.speed:=4.0', *FAST, *KEPT)
     start('stage', '--ros-args', '--params-file', bare, *FAST)
     return driver, start('calibration', '--ros-args', '--params-file', bare, *FAST, *LOSSLESS,
                          *QUICK, *options)
@@ -168,7 +168,7 @@ def test_a_stage_that_never_arrives_is_reported(start, tmp_path):
     """Without a stage the node continues, and its diagnostics state what is missing."""
     truth, bare = _files(tmp_path)
     with Graph() as graph:
-        start('driver', '--ros-args', '--params-file', truth)
+        start('driver', '--ros-args', '--params-file', truth, '-p', 'link.type:=sim')
         node = start('calibration', '--ros-args', '--params-file', bare, *QUICK,
                      '-p', 'autostart:=true', '-p', 'stage.timeout_s:=2.0')
         graph.spin_until(lambda: graph.reports('calibration', 'nothing on stage/joint_states')
@@ -266,8 +266,8 @@ def test_a_pose_is_taken_after_the_capture_of_an_operator(start, tmp_path):
     truth, bare = _files(tmp_path, axes='x')
     with Graph() as graph:
         announced = graph.listen(DiagnosticStatus, 'calibration/next_pose', latched=True)
-        start('driver', '--ros-args', '--params-file', truth, '-p', 'link.speed:=4.0', *FAST,
-              '-p', 'link.alpha_rad:=0.785', '-p', 'link.beta_rad:=0.0')
+        start('driver', '--ros-args', '--params-file', truth, '-p', 'link.type:=sim', '-p',
+              'link.speed:=4.0', *FAST, '-p', 'link.alpha_rad:=0.785', '-p', 'link.beta_rad:=0.0')
         start('calibration', '--ros-args', '--params-file', bare, *FAST, *QUICK,
               '-p', 'autostart:=true', '-p', 'stage.mode:=manual')
         graph.spin_until(lambda: graph.reports('calibration', 'then capture'), 30, 'the request')

@@ -34,6 +34,7 @@ from sensor_msgs.msg import BatteryState, Imu, JointState, Temperature
 from units import NOMINAL, nominal
 
 ROS = '--ros-args'
+SIMULATED = 'SIMULATED sensor (link.type: sim)'
 
 
 def written(path, rows=400, columns=('ax_mps2', 'ay_mps2', 'az_mps2'), dt_s=0.005):
@@ -75,7 +76,8 @@ def test_saturation_is_reported_at_the_rails_and_beyond_the_range():
 
 
 def test_sim_publishes_every_sample_as_documented(start):
-    driver = start('driver', ROS, '-p', 'link.alpha_rad:=1.5707963267948966', '-p',
+    driver = start('driver', ROS, '-p', 'link.type:=sim', '-p',
+                   'link.alpha_rad:=1.5707963267948966', '-p',
                    'frame_id:=case', '-p', 'sensor.serial:=A7')
     sensor = nominal()
     with Graph() as graph:
@@ -86,7 +88,8 @@ def test_sim_publishes_every_sample_as_documented(start):
         graph.spin_until(lambda: 'driver' in graph.diagnostics and abs(
             float(graph.value('driver', 'rate_hz')) - 1000) < 100, 15, 'the rate')
         status = graph.diagnostics['driver']
-        assert status.level == DiagnosticStatus.OK
+        assert status.level == DiagnosticStatus.WARN
+        assert SIMULATED in status.message
         assert status.hardware_id == 'A7'
         assert graph.value('driver', 'missing') == graph.value('driver', 'saturated') == '0'
         assert 0 <= float(graph.value('driver', 'age_s')) < 1
@@ -106,7 +109,11 @@ def test_sim_publishes_every_sample_as_documented(start):
     codes = to_volts(a[:, :2], sensor) / sensor.lsb_v
     assert np.abs(codes - np.rint(codes)).max() < 1e-6, 'volts are recovered exactly'
     assert driver.stop() == 0
-    assert 'Traceback' not in driver.output()
+    info, warning = driver.output().splitlines()
+    assert '[INFO]' in info
+    assert 'active: link sim, unit A7, 1000 Hz, topic /imu/data_raw' in info
+    assert '[WARN]' in warning
+    assert SIMULATED in warning
 
 
 def test_replay_publishes_a_recording_faster_than_real_time(start, tmp_path):
@@ -194,9 +201,10 @@ def test_a_signal_ends_the_driver_without_messages(start, number):
     with Graph() as graph:
         samples = graph.listen(Imu, 'imu/data_raw')
         graph.spin_until(lambda: samples, 20, 'a sample')
+    before = driver.output()
     os.kill(driver.popen.pid, number)
     assert driver.wait() == 0
-    assert driver.output() == ''
+    assert driver.output() == before
 
 
 @pytest.mark.parametrize('change, placed, why', [
@@ -220,7 +228,8 @@ def test_an_invalid_parameter_file_is_refused_with_the_place(start, tmp_path, ch
 
 
 @pytest.mark.parametrize('arguments, status', [
-    ((ROS, '-p', 'link.type:=carrier_pigeon'), 1), ((ROS, '-p', 'link.speed:=0.0'), 1),
+    ((ROS, '-p', 'link.type:=carrier_pigeon'), 1),
+    ((ROS, '-p', 'link.type:=sim', '-p', 'link.speed:=0.0'), 1),
     ((ROS, '--params-file', 'nowhere.yaml'), 1), (('--speed', '3'), 2), ((ROS, '--sped', '3'), 2)])
 def test_an_invalid_start_ends_with_one_line(start, arguments, status):
     driver = start('driver', *arguments)

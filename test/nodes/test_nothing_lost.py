@@ -36,7 +36,7 @@ def _driver(start, tmp_path, serial='N1'):
     base = nominal(serial=serial)
     parameter_file.save(tmp_path / f'{serial}.yaml', drawn(np.random.default_rng(3), base))
     return start('driver', '--ros-args', '--params-file', tmp_path / f'{serial}.yaml', '-p',
-                 'link.speed:=4.0', *FAST)
+                 'link.type:=sim', '-p', 'link.speed:=4.0', *FAST)
 
 
 def _stage(start, tmp_path):
@@ -185,7 +185,7 @@ def test_another_mounting_stops_before_a_pose_is_taken(start, tmp_path):
         unit.values['misalignment']['beta_rad'] += np.radians([-2.0, 2.0])
         parameter_file.save(tmp_path / 'N1.yaml', unit)
         start('driver', '--ros-args', '--params-file', tmp_path / 'N1.yaml', '-p',
-              'link.speed:=4.0', *FAST)
+              'link.type:=sim', '-p', 'link.speed:=4.0', *FAST)
         again = _calibration(start, tmp_path)
         again.wait_for(f'mounting changed: in pose {len(poses)} ', 60)
         assert 'before the interruption' in again.output()

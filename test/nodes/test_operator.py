@@ -85,7 +85,7 @@ def _bench(start, tmp_path, mode):
     parameter_file.save(tmp_path / 'truth.yaml', drawn(np.random.default_rng(3), base))
     parameter_file.save(tmp_path / 'bare.yaml', base)
     start('driver', '--ros-args', '--params-file', tmp_path / 'truth.yaml', '-p',
-          'link.speed:=4.0', *FAST)
+          'link.type:=sim', '-p', 'link.speed:=4.0', *FAST)
     start('stage', '--ros-args', '--params-file', tmp_path / 'bare.yaml', *FAST, '-p',
           'slew_rate_rad_s:=1.5', '-p', 'slew_rate_m_s:=2.0', '-p', 'settling_time_s:=0.1')
     return start('calibration', '--ros-args', '--params-file', tmp_path / 'bare.yaml', *FAST,
@@ -160,7 +160,8 @@ def test_by_hand_the_next_direction_is_announced_in_words(start, tmp_path):
     base = nominal('xyz', serial='T3')
     parameter_file.save(tmp_path / 'bare.yaml', base)
     with Operator() as operator:
-        start('driver', '--ros-args', '--params-file', tmp_path / 'bare.yaml')
+        start('driver', '--ros-args', '--params-file', tmp_path / 'bare.yaml', '-p',
+              'link.type:=sim')
         node = start('calibration', '--ros-args', '--params-file', tmp_path / 'bare.yaml', '-p',
                      'mode:=gravity', '-p', 'autostart:=true')
         operator.spin_until(lambda: operator.announced, 60, 'the first direction')
@@ -181,7 +182,8 @@ def test_a_compensated_stream_and_a_wrong_rate_are_refused(start, tmp_path):
     base = nominal(serial='T4')
     parameter_file.save(tmp_path / 'bare.yaml', base)
     with Operator() as operator:
-        start('driver', '--ros-args', '--params-file', tmp_path / 'bare.yaml')
+        start('driver', '--ros-args', '--params-file', tmp_path / 'bare.yaml', '-p',
+              'link.type:=sim')
         start('compensation', '--ros-args', '--params-file', tmp_path / 'bare.yaml')
         start('calibration', '--ros-args', '--params-file', tmp_path / 'bare.yaml', *PLAN, '-p',
               'stage.mode:=manual', '-r', 'imu/data_raw:=imu/data')

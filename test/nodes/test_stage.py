@@ -109,7 +109,7 @@ def test_a_command_without_meaning_is_refused(start):
 def test_the_simulated_sensor_senses_the_true_angles(start, speed):
     clock = SIM_TIME if speed != 1 else (ROS,)
     start('stage', *clock)
-    start('driver', *clock, '-p', f'link.speed:={speed}', *IDEAL)
+    start('driver', *clock, '-p', 'link.type:=sim', '-p', f'link.speed:={speed}', *IDEAL)
     with Commander() as graph:
         samples = graph.listen(Imu, 'imu/data_raw', raw=True)
         graph.spin_until(lambda: graph.reports('driver', 'on the stage') and graph.true, 20,
@@ -134,7 +134,7 @@ def test_the_simulated_sensor_senses_the_true_angles(start, speed):
 
 @pytest.mark.kills
 def test_sensor_time_continues_without_the_stage_and_waits_for_it_again(start):
-    start('driver', *SIM_TIME, '-p', 'link.speed:=5.0', *IDEAL)
+    start('driver', *SIM_TIME, '-p', 'link.type:=sim', '-p', 'link.speed:=5.0', *IDEAL)
     with Commander() as graph:
         samples = graph.listen(Imu, 'imu/data_raw', raw=True)
         clock = graph.listen(Clock, '/clock')
@@ -161,7 +161,7 @@ def test_sensor_time_continues_without_the_stage_and_waits_for_it_again(start):
 
 def test_a_stage_on_another_clock_is_reported(start):
     start('stage', ROS, '-p', 'alpha_rad:=0.5')
-    start('driver', ROS, '-p', 'link.speed:=30.0')
+    start('driver', ROS, '-p', 'link.type:=sim', '-p', 'link.speed:=30.0')
     with Commander() as graph:
         graph.spin_until(lambda: graph.reports('driver', 'another clock') or
                          graph.reports('driver', 'on the stage'), 20, 'the driver')

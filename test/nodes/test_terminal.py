@@ -83,7 +83,7 @@ class Hands(Graph):
 def bench(start, tmp_path):
     """Start the sensor on its stage, at four times real time."""
     start('driver', '--ros-args', '--params-file', tmp_path / 'truth.yaml', '-p',
-          'link.speed:=4.0', *FAST)
+          'link.type:=sim', '-p', 'link.speed:=4.0', *FAST)
     start('stage', '--ros-args', '--params-file', tmp_path / 'bare.yaml', *FAST, '-p',
           'slew_rate_rad_s:=3.0')
 

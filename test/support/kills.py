@@ -82,7 +82,8 @@ class Sweeps:
         parameter_file.save(self.folder / 'bare.yaml', base)
         self._kept_poses, self._written = {}, ''
         self._stored, self._unfinished_before = set(), set()
-        self._others = [self._start('driver', 'truth.yaml', '-p', 'link.speed:=10.0'),
+        self._others = [self._start('driver', 'truth.yaml', '-p', 'link.type:=sim', '-p',
+                                    'link.speed:=10.0'),
                         self._start('stage', 'bare.yaml', '-p', 'slew_rate_rad_s:=6.0')]
 
     def _start(self, name, file, *arguments):

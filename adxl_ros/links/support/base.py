@@ -32,7 +32,7 @@ from adxl_ros.model.sensor import Sensor
 import numpy as np
 
 DEFAULT_LINK = 'sim'
-"""Link of a driver whose parameters name none: it needs no device."""
+"""Link of a driver whose parameters name neither a link nor a unit: it simulates a sensor."""
 
 _LINKS = 'adxl_ros.links'
 """Package whose modules are the links; its folder `support` holds no link."""

@@ -27,7 +27,11 @@ from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.nodes.support.parameters import declare
 from adxl_ros.nodes.support.rclpy_internals import given_parameters
-from adxl_ros.nodes.support.sensor_parameters import declare_sensor, make_sensor
+from adxl_ros.nodes.support.sensor_parameters import (
+    declare_sensor,
+    is_from_file,
+    make_sensor,
+)
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -77,8 +81,7 @@ class ExchangeableSensor:
         self._node, self._check_use, self._use = node, check, use
         self._flat = declare_sensor(node, live=True)
         make_sensor(self._flat)
-        from_file = node.get_parameter_or('format').value is not None
-        self._source = 'the parameters given' if from_file else \
+        self._source = 'the parameters given' if is_from_file(node) else \
             f'the nominal {parameter_file.nominal_path()}'
         self._declare_provenance(given_parameters(node))
         path = declare(

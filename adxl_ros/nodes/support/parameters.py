@@ -17,10 +17,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from difflib import get_close_matches
 from typing import Any
 
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.nodes.support.params_files import place_of
+from adxl_ros.nodes.support.rclpy_internals import store_empty
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.exceptions import ParameterException
 from rclpy.node import Node
@@ -29,7 +31,7 @@ from rclpy.parameter import Parameter
 
 def declare(node: Node, name: str, default: Any, description: str, unit: str = '',
             lower: float | None = None, upper: float | None = None,
-            choices: Sequence[str] = (), live: bool = False) -> Any:
+            choices: Sequence[str] = (), live: bool = False, empty: float = 0.0) -> Any:
     """
     Declare one parameter with its descriptor and return its value.
 
@@ -52,6 +54,8 @@ def declare(node: Node, name: str, default: Any, description: str, unit: str = '
         The values that a string may have; empty for any.
     live
         Whether it can be set while the node runs.
+    empty
+        What others see of a number without a value; texts and lists are empty.
 
     Returns
     -------
@@ -79,6 +83,8 @@ def declare(node: Node, name: str, default: Any, description: str, unit: str = '
         value = node.declare_parameter(name, default, descriptor).value
     except ParameterException as error:
         raise parameter_error(name, one_line(error)) from None
+    if value is None:
+        store_empty(node, name, default, empty)
     if choices and value is not None and value not in choices:
         raise parameter_error(name, f'{value!r} is not {constraint}')
     return value
@@ -93,6 +99,26 @@ def _set_range(descriptor: ParameterDescriptor, default: Any, lower: float, uppe
             FloatingPointRange(from_value=float(lower), to_value=float(upper))]
     elif kind == Parameter.Type.INTEGER:
         descriptor.integer_range = [IntegerRange(from_value=int(lower), to_value=int(upper))]
+
+
+def nearest(name: str, names: Sequence[str]) -> str:
+    """
+    Return the name that is most like a misspelled one.
+
+    Parameters
+    ----------
+    name
+        The misspelled name.
+    names
+        Names to choose from.
+
+    Returns
+    -------
+    str
+        One of `names`.
+
+    """
+    return get_close_matches(name, names, 1, 0.0)[0]
 
 
 def parameter_error(key: str, reason: str) -> UserError:

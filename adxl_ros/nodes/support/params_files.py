@@ -16,6 +16,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+import re
 import sys
 
 from adxl_ros.errors import UserError
@@ -40,12 +42,84 @@ def check_params_files() -> None:
 
 
 def place_of(key: str) -> str:
-    """Return the place of a parameter in the last file: 'file:line:column: ', or ''."""
-    paths = _paths()
-    if not paths:
-        return ''
-    mark = _find_value(compose(paths[-1]), key)
-    return f'{paths[-1]}:{mark.line + 1}:{mark.column + 1}: ' if mark else f'{paths[-1]}: '
+    """
+    Return the place of a parameter in the files: 'file:line:column: ', or ''.
+
+    A parameter that no file has belongs to the last file of a sensor, which has a format: a launch
+    adds files of its own.
+    """
+    trees = [(path, compose(path)) for path in reversed(_paths())]
+    for path, tree in trees:
+        mark = _find_value(tree, key)
+        if mark:
+            return f'{path}:{mark.line + 1}:{mark.column + 1}: '
+    return next((f'{path}: ' for path, tree in trees if _find_value(tree, 'format')),
+                f'{trees[0][0]}: ' if trees else '')
+
+
+def refuse_files_of_others(node_name: str) -> None:
+    """
+    Refuse a file whose sections name other nodes only: the node would run without it.
+
+    Parameters
+    ----------
+    node_name
+        Fully qualified name of the node.
+
+    Raises
+    ------
+    UserError
+        No section of a file is for the node.
+
+    """
+    for path in _paths():
+        sections = [section for section, _ in _sections(compose(path), '')]
+        if sections and not any(_matches(section, node_name) for section in sections):
+            raise UserError(f'{path}: has parameters of {", ".join(sections)}, but none of the '
+                            f'node {node_name}; begin the file with /**: or {node_name}:')
+
+
+def has_section(path: str, node_name: str) -> bool:
+    """
+    Return whether a parameter file has a section for a node.
+
+    Parameters
+    ----------
+    path
+        The file.
+    node_name
+        Fully qualified name of the node.
+
+    Returns
+    -------
+    bool
+        Whether there is one.
+
+    Raises
+    ------
+    UserError
+        The file cannot be read, or is not YAML.
+
+    """
+    return any(_matches(section, node_name) for section, _ in _sections(compose(path), ''))
+
+
+def _sections(node: yaml.Node | None, name: str) -> Iterator[tuple[str, yaml.Node]]:
+    """Yield the sections of a file by the pattern of their node's name."""
+    if not isinstance(node, yaml.MappingNode):
+        return
+    for key, value in node.value:
+        if key.value == 'ros__parameters':
+            yield name, value
+        else:
+            yield from _sections(value, f'{name}/{key.value.strip("/")}')
+
+
+def _matches(pattern: str, node_name: str) -> bool:
+    """Return whether a pattern means a node; * is one part of a name, and ** any number."""
+    wild = {'*': r'/[^/]+', '**': r'(/[^/]+)*'}
+    parts = [wild.get(part, f'/{re.escape(part)}') for part in pattern.strip('/').split('/')]
+    return bool(re.fullmatch(''.join(parts), node_name))
 
 
 def _paths() -> list[str]:

@@ -22,6 +22,7 @@ from typing import Any
 from rclpy.callback_groups import CallbackGroup
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.subscription import Subscription
 
 _LONGEST_WAIT_NS = 100_000_000
@@ -120,6 +121,31 @@ class MessageWait:
                 if message_and_info is None:
                     break
                 callback(message_and_info[0])
+
+
+def store_empty(node: Node, name: str, kind: Parameter.Type, number: float) -> None:
+    """
+    Give a declared parameter without a value an empty one of its type.
+
+    rclpy answers a request for several parameters with nothing when one of them has no value, and
+    takes an empty list as a list of bytes when it declares a parameter.
+
+    Parameters
+    ----------
+    node
+        The node that has the parameter.
+    name
+        Its name.
+    kind
+        Its type.
+    number
+        Value of a number.
+
+    """
+    empty: dict[Parameter.Type, Any] = {
+        Parameter.Type.STRING: '', Parameter.Type.INTEGER: round(number),
+        Parameter.Type.DOUBLE: float(number)}
+    node._parameters[name] = Parameter(name, kind, empty.get(kind, []))
 
 
 def given_parameters(node: Node) -> Iterable[tuple[str, Any]]:

@@ -25,6 +25,7 @@ from adxl_ros.model.effects import library
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.nodes.support.parameters import declare, parameter_error
+from adxl_ros.nodes.support.rclpy_internals import given_parameters
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
@@ -48,6 +49,7 @@ class _Key(NamedTuple):
     lower: float | None = None
     upper: float | None = None
     choices: tuple[str, ...] = ()
+    empty: float = 0.0
 
 
 def declare_sensor(node: Node, live: bool = False) -> dict[str, Any]:
@@ -70,15 +72,26 @@ def declare_sensor(node: Node, live: bool = False) -> dict[str, Any]:
         Values by dotted key.
 
     """
-    version = declare(node, 'format', Kind.INTEGER, 'version of the parameter file', live=live)
-    nominal = {} if version is not None else parameter_file.to_flat(
+    nominal = {} if is_from_file(node) else parameter_file.to_flat(
         parameter_file.load(parameter_file.nominal_path()))
-    flat = {'format': nominal.get('format', version),
+    flat = {'format': declare(node, 'format', parameter_file.FORMAT,
+                              'version of the parameter file', live=live),
             'units': declare(node, 'units', parameter_file.UNITS, 'units of the coefficients',
                              live=live)}
     for key in _keys():
-        flat[key.name] = declare(node, key.name, nominal.get(key.name, key.kind), *key[2:], live)
+        flat[key.name] = declare(node, key.name, nominal.get(key.name, key.kind), *key[2:7], live,
+                                 key.empty)
     return {name: value for name, value in flat.items() if value is not None}
+
+
+def is_from_file(node: Node) -> bool:
+    """Return whether the given parameters are those of a parameter file, which has a format."""
+    return any(name == 'format' for name, _ in given_parameters(node))
+
+
+def sensor_keys() -> set[str]:
+    """Return the names of all parameters that `declare_sensor` declares."""
+    return {'format', 'units', *(key.name for key in _keys())}
 
 
 def _keys() -> Iterator[_Key]:
@@ -92,7 +105,8 @@ def _keys() -> Iterator[_Key]:
         for p in effect.parameters:
             yield _Key(str(Coefficient(effect.name, p.name)),
                        Kind.DOUBLE_ARRAY if p.axes else Kind.DOUBLE,
-                       f'{p.doc}, by axis' if p.axes else p.doc, p.unit, p.lower, p.upper)
+                       f'{p.doc}, by axis' if p.axes else p.doc, p.unit, p.lower, p.upper,
+                       empty=p.neutral)
     yield _Key('covariance_names', Kind.STRING_ARRAY, 'coefficients in the covariance')
     yield _Key('covariance', Kind.DOUBLE_ARRAY, 'covariance of the coefficients, rows flattened')
     for name, description in parameter_file.ENVELOPE.items():

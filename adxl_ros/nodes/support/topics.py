@@ -16,17 +16,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
+from adxl_ros.errors import one_line, UserError
 from adxl_ros.nodes.support.rclpy_internals import take_messages
 from builtin_interfaces.msg import Time
 from rclpy.callback_groups import CallbackGroup
+from rclpy.exceptions import ParameterException
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
+
+_OVERRIDING = QoSOverridingOptions((QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH,
+                                    QoSPolicyKind.RELIABILITY, QoSPolicyKind.DURABILITY))
+"""Policies that parameters can override."""
 
 
 def create_publisher(node: Node, kind: Any, topic: str, depth: int, latched: bool = False
@@ -56,8 +63,8 @@ def create_publisher(node: Node, kind: Any, topic: str, depth: int, latched: boo
     qos = QoSProfile(depth=depth)
     if latched:
         qos.durability = DurabilityPolicy.TRANSIENT_LOCAL
-    return node.create_publisher(
-        kind, topic, qos, qos_overriding_options=QoSOverridingOptions.with_default_policies())
+    with _one_line('publisher', node.resolve_topic_name(topic)):
+        return node.create_publisher(kind, topic, qos, qos_overriding_options=_OVERRIDING)
 
 
 def create_subscription(node: Node, kind: Any, topic: str, callback: Callable[[Any], object],
@@ -101,10 +108,21 @@ def create_subscription(node: Node, kind: Any, topic: str, callback: Callable[[A
     qos = QoSProfile(depth=depth, reliability=ReliabilityPolicy.BEST_EFFORT)
     if latched:
         qos = QoSProfile(depth=depth, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    subscription = node.create_subscription(
-        kind, topic, take_all, qos, raw=raw, callback_group=group,
-        qos_overriding_options=QoSOverridingOptions.with_default_policies())
+    with _one_line('subscription', node.resolve_topic_name(topic)):
+        subscription = node.create_subscription(
+            kind, topic, take_all, qos, raw=raw, callback_group=group,
+            qos_overriding_options=_OVERRIDING)
     return subscription
+
+
+@contextmanager
+def _one_line(entity: str, topic: str) -> Iterator[None]:
+    """Turn rclpy's errors of an invalid QoS override into one line for the user."""
+    try:
+        yield
+    except (RuntimeError, ParameterException) as error:
+        # rclpy has no class for a policy that it does not know.
+        raise UserError(f'qos_overrides.{topic}.{entity}: {one_line(error)}') from None
 
 
 def stamp(time_ns: int) -> Time:

@@ -1,0 +1,71 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The check of what a node is started with: files for another node, and unknown parameters."""
+
+from __future__ import annotations
+
+from itertools import chain
+
+from adxl_ros.nodes.support import link_parameters
+from adxl_ros.nodes.support.parameters import nearest, parameter_error
+from adxl_ros.nodes.support.params_files import refuse_files_of_others
+from adxl_ros.nodes.support.rclpy_internals import given_parameters
+from adxl_ros.nodes.support.sensor_parameters import sensor_keys
+from rclpy.node import Node
+
+OWN_PARAMETERS = {
+    'driver': ('autostart', 'frame_id', 'link.type', 'stamp_offset'),
+    'stage': (
+        'alpha_rad', 'beta_rad', 'bridge.alpha.joint', 'bridge.alpha.offset_rad',
+        'bridge.alpha.sign', 'bridge.beta.joint', 'bridge.beta.offset_rad', 'bridge.beta.sign',
+        'bridge.command', 'bridge.joint_states', 'bridge.speed_rad_s', 'delay_s', 'seed',
+        'settling_time_s', 'shift_m', 'slew_rate_m_s', 'slew_rate_rad_s', 'stage.type'),
+    'calibration': (
+        'autostart', 'journal', 'mode', 'output', 'report', 'resume', 'screen', 'stage.mode',
+        'stage.near_rad', 'stage.timeout_s', 'stage.tolerance_rad', 'store', 'sweep.check_poses',
+        'sweep.dwell_s', 'sweep.plan', 'sweep.planes_rad', 'sweep.step_deg', 'sweep.step_rad',
+        'sweep.temperature_span_c', 'sweep.tilt_error_deg'),
+    'compensation': ('calibration', 'inverse', 'store', 'undo_filter'),
+}
+"""Parameters by node, those of sensor and link aside. One file may serve all nodes: a node
+ignores what another one has."""
+_ANY_NODE = ('use_sim_time', 'start_type_description_service')
+"""Parameters of every node of rclpy."""
+_FREE_PREFIXES = ('provenance.', 'qos_overrides.', link_parameters.PREFIX)
+"""Prefixes whose names are not known here: free keys, topics, and what the driver checks."""
+
+
+def check_given_parameters(node: Node) -> None:
+    """
+    Refuse parameters that no node of this package has, and files that name other nodes.
+
+    Parameters
+    ----------
+    node
+        A node before it declares its parameters.
+
+    Raises
+    ------
+    UserError
+        A parameter is unknown, and the message names the nearest one; or a file has no section
+        for the node.
+
+    """
+    refuse_files_of_others(node.get_fully_qualified_name())
+    names = {*_ANY_NODE, *sensor_keys(), *chain(*OWN_PARAMETERS.values())}
+    for name, _ in given_parameters(node):
+        if name not in names and not name.startswith(_FREE_PREFIXES):
+            raise parameter_error(name, 'no node has a parameter of this name; did you mean '
+                                  f'{nearest(name, sorted(names))}?')

@@ -1,0 +1,131 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The parameters of the driver that choose its link; no real unit gets simulated data."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from adxl_ros.files.stream_info import NO_UNIT
+from adxl_ros.links.support import base
+from adxl_ros.nodes.support.parameters import declare, nearest, parameter_error
+from adxl_ros.nodes.support.rclpy_internals import given_parameters
+from rclpy.node import Node
+
+PREFIX = 'link.'
+"""Begin of the names of all parameters of a link; the driver alone has them."""
+_TYPE = 'link.type'
+"""Parameter that chooses the link."""
+
+
+class ChosenLink(NamedTuple):
+    """
+    The link that the parameters choose.
+
+    Attributes
+    ----------
+    name
+        Value of `link.type`.
+    module
+        Module of the link.
+    settings
+        Instance of the module's `Settings`.
+
+    """
+
+    name: str
+    module: base.LinkModule
+    settings: Any
+
+
+def declare_link(node: Node, serial: str) -> ChosenLink:
+    """
+    Declare the parameters of the link.
+
+    Parameters
+    ----------
+    node
+        The node that gets the parameters.
+    serial
+        Serial number of the sensor. Only the nominal sensor is simulated by default.
+
+    Returns
+    -------
+    ChosenLink
+        The link, not yet open.
+
+    Raises
+    ------
+    UserError
+        The link is not determined, or a given parameter is none of the link.
+
+    """
+    given = [name for name, _ in given_parameters(node) if name.startswith(PREFIX)]
+    if _TYPE not in given:
+        _refuse_to_guess(given, serial)
+    name = declare(node, _TYPE, base.DEFAULT_LINK, 'where the samples come from',
+                   choices=base.link_names())
+    module = base.link_module(name)
+    options = base.options(module.Settings)
+    _refuse_unknown(given, name, [_TYPE, *(f'{PREFIX}{option.name}' for option in options)])
+    return ChosenLink(name, module, module.Settings(**{
+        option.name: declare(node, f'{PREFIX}{option.name}', option.default, option.doc,
+                             option.unit, option.lower, option.upper)
+        for option in options}))
+
+
+def given_link(node: Node) -> dict[str, Any]:
+    """Return the given parameters of the link by name, for a file that carries them."""
+    return {name.removeprefix(PREFIX): value for name, value in given_parameters(node)
+            if name.startswith(PREFIX)}
+
+
+def _refuse_to_guess(given: Sequence[str], serial: str) -> None:
+    """Refuse the default link, which simulates, where the parameters mean a real sensor."""
+    links = _links_by_parameter()
+    for name in given:
+        if name not in links:
+            raise parameter_error(name, f'is no parameter of any link; did you mean '
+                                  f'{nearest(name, [_TYPE, *links])}?')
+    reason = f'the sensor is the unit {serial}' if serial != NO_UNIT else ''
+    if given:
+        reason = f'{given[0]} is given'
+    if reason:
+        devices = [name for name in base.link_names() if name != base.DEFAULT_LINK]
+        raise parameter_error(_TYPE, f'is not set, but {reason}; set it to {", ".join(devices)}, '
+                              f'or to {base.DEFAULT_LINK} for a simulated sensor')
+
+
+def _refuse_unknown(given: Sequence[str], link: str, declared: Sequence[str]) -> None:
+    """Refuse parameters that the chosen link does not have."""
+    for name in given:
+        if name in declared:
+            continue
+        links = _links_by_parameter()
+        if name in links:
+            raise parameter_error(name, f'the link {link} has no such parameter; {_TYPE} '
+                                  f'{" or ".join(links[name])} has it')
+        raise parameter_error(name, f'the link {link} has no such parameter; did you mean '
+                              f'{nearest(name, declared)}?')
+
+
+def _links_by_parameter() -> dict[str, list[str]]:
+    """Return the links that have a parameter, by its name."""
+    links: dict[str, list[str]] = {}
+    for link in base.link_names():
+        for option in base.options(base.link_module(link).Settings):
+            links.setdefault(f'{PREFIX}{option.name}', []).append(link)
+    return links

@@ -1,0 +1,229 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What nodes are started with: no silent simulation, no unknown parameter, no lost file."""
+
+from pathlib import Path
+
+from adxl_ros.files import parameter_file
+from adxl_ros.nodes.support.given_parameters import OWN_PARAMETERS
+from adxl_ros.nodes.support.sensor_parameters import sensor_keys
+from diagnostic_msgs.msg import DiagnosticStatus
+from graph import Graph
+from lifecycle_msgs.msg import Transition
+import numpy as np
+import pytest
+from rcl_interfaces.srv import GetParameters, ListParameters, SetParameters
+from rclpy.parameter import parameter_dict_from_yaml_file, parameter_value_to_python
+from sensor_msgs.msg import Imu
+from units import drawn, NOMINAL, nominal
+
+ROS = '--ros-args'
+SIMULATED = 'SIMULATED sensor (link.type: sim)'
+CHOICES = 'set it to iio, replay, serial, or to sim for a simulated sensor'
+
+
+@pytest.fixture
+def unit(tmp_path: Path) -> Path:
+    """Return the parameter file of a unit."""
+    parameter_file.save(tmp_path / 'unit.yaml', nominal(serial='17'))
+    return tmp_path / 'unit.yaml'
+
+
+def refusal(start, name: str, *arguments: object) -> str:
+    """Start a node that must end with status 1; return the one line that it prints."""
+    node = start(name, ROS, *arguments)
+    assert node.wait() == 1
+    lines = node.output().splitlines()
+    assert len(lines) == 1, node.output()
+    return lines[0]
+
+
+def listed(graph: Graph, node: str) -> list[str]:
+    """Return the names of the parameters of a node."""
+    return graph.call(ListParameters, f'{node}/list_parameters',
+                      ListParameters.Request()).result.names
+
+
+def test_a_driver_alone_warns_that_its_sensor_is_simulated(start):
+    driver = start('driver')
+    driver.wait_for(SIMULATED)
+    with Graph() as graph:
+        samples = graph.listen(Imu, 'imu/data_raw')
+        graph.spin_until(lambda: samples and graph.reports('driver', SIMULATED), 30, 'a sample')
+        assert graph.diagnostics['driver'].level == DiagnosticStatus.WARN
+        assert graph.value('driver', 'link_type') == 'sim'
+    info, warning = driver.output().splitlines()
+    assert '[INFO]' in info
+    assert 'active: link sim, unit nominal, 1000 Hz, topic /imu/data_raw' in info
+    assert '[WARN]' in warning
+
+
+def test_the_file_of_a_unit_without_a_link_is_refused(start, unit):
+    line = refusal(start, 'driver', '--params-file', unit)
+    assert 'link.type: is not set, but the sensor is the unit 17' in line
+    assert CHOICES in line
+
+
+@pytest.mark.parametrize('parameter, words', [
+    ('link.port:=/dev/ttyACM0', 'link.type: is not set, but link.port is given; set it to'),
+    ('link.speed:=2.0', 'link.type: is not set, but link.speed is given; set it to'),
+    ('link.tpye:=serial', 'link.tpye: is no parameter of any link; did you mean link.type?'),
+    ('lnk.type:=serial', 'lnk.type: no node has a parameter of this name; did you mean link.type'),
+    ('sensor.rate_herz:=100.0', 'did you mean sensor.rate_hz?'),
+    ('frameid:=case', 'did you mean frame_id?')])
+def test_a_driver_that_may_mean_a_real_sensor_is_refused(start, parameter, words):
+    assert words in refusal(start, 'driver', '-p', parameter)
+
+
+@pytest.mark.parametrize('link, parameter, words', [
+    ('sim', 'link.port:=/dev/ttyACM0', 'link sim has no such parameter; link.type serial has it'),
+    ('serial', 'link.prot:=/dev/ttyACM0', 'did you mean link.port?'),
+    ('sim', 'link.sped:=2.0', 'did you mean link.speed?')])
+def test_a_parameter_of_another_link_is_refused(start, link, parameter, words):
+    line = refusal(start, 'driver', '-p', f'link.type:={link}', '-p', parameter)
+    assert f'{parameter.split(":")[0]}: ' in line
+    assert words in line
+
+
+@pytest.mark.parametrize('node', ['stage', 'calibration', 'compensation'])
+def test_an_unknown_parameter_of_a_file_is_refused_at_its_line(start, tmp_path, node):
+    text = NOMINAL.read_text() + '    sweep: {dwel_s: 2.0}\n'
+    (tmp_path / 'own.yaml').write_text(text)
+    line = refusal(start, node, '--params-file', 'own.yaml')
+    assert f'own.yaml:{text.count(chr(10))}:' in line
+    assert 'sweep.dwel_s: no node has a parameter of this name; did you mean sweep.dwell_s' in line
+
+
+def test_parameters_of_other_nodes_are_no_error(start, tmp_path):
+    """One file serves all nodes of a launch."""
+    (tmp_path / 'all.yaml').write_text(NOMINAL.read_text() + (
+        '    stage.mode: manual\n    slew_rate_rad_s: 1.0\n    undo_filter: true\n'
+        '    link.type: sim\n    link.seed: 3\n'))
+    nodes = [start(name, ROS, '--params-file', 'all.yaml') for name in OWN_PARAMETERS]
+    with Graph() as graph:
+        graph.spin_until(lambda: set(OWN_PARAMETERS) <= set(graph.diagnostics), 40, 'all nodes')
+    assert all(node.popen.poll() is None for node in nodes)
+
+
+@pytest.mark.parametrize('node', ['driver', 'compensation'])
+def test_a_file_for_another_node_is_refused(start, tmp_path, node):
+    text = NOMINAL.read_text().replace('/**:', 'other:')
+    (tmp_path / 'other.yaml').write_text(text)
+    line = refusal(start, node, '--params-file', 'other.yaml')
+    assert f'other.yaml: has parameters of /other, but none of the node /{node}' in line
+
+
+@pytest.mark.parametrize('section', ['/*', '/**/driver', 'driver', '/arm/driver', '/arm/**'])
+def test_the_sections_of_a_file_are_those_of_ros(start, tmp_path, section):
+    """The frame of the samples comes from the section, or the file is refused."""
+    (tmp_path / 'own.yaml').write_text(
+        f'{section}:\n  ros__parameters:\n    frame_id: case\n')
+    namespace = '/arm' if 'arm' in section or '**' in section else '/'
+    driver = start('driver', ROS, '--params-file', 'own.yaml', '-r', f'__ns:={namespace}')
+    with Graph() as graph:
+        samples = graph.listen(Imu, f'{namespace.rstrip("/")}/imu/data_raw')
+        graph.spin_until(lambda: samples, 30, 'a sample')
+    assert samples[0].header.frame_id == 'case'
+    assert driver.popen.poll() is None
+
+
+def test_the_table_of_parameters_is_what_the_nodes_declare(start, tmp_path):
+    joints = ('-p', 'stage.type:=trajectory', '-p', 'bridge.alpha.joint:=a', '-p',
+              'bridge.beta.joint:=b')
+    for name in OWN_PARAMETERS:
+        start(name)
+    start('stage', ROS, *joints, '-r', '__node:=bridge')
+    ignored = sensor_keys() | {'use_sim_time', 'start_type_description_service'}
+    with Graph() as graph:
+        names = {node: {name for name in listed(graph, node)
+                        if name not in ignored and not name.startswith('qos_overrides.')}
+                 for node in (*OWN_PARAMETERS, 'bridge')}
+    names['stage'] |= names.pop('bridge')
+    names['driver'] = {name for name in names['driver']
+                       if name == 'link.type' or not name.startswith('link.')}
+    assert names == {node: set(table) for node, table in OWN_PARAMETERS.items()}
+
+
+@pytest.mark.parametrize('node', list(OWN_PARAMETERS))
+def test_all_parameters_of_a_node_can_be_dumped(start, tmp_path, node):
+    """`ros2 param dump` asks for all values at once, and gets none where one has no value."""
+    start(node, ROS, '--params-file', NOMINAL)
+    with Graph() as graph:
+        names = listed(graph, node)
+        assert len(names) > 10
+        values = graph.call(GetParameters, f'{node}/get_parameters',
+                            GetParameters.Request(names=names)).values
+    dumped = {name: parameter_value_to_python(value) for name, value in zip(names, values)}
+    assert dumped.keys() == set(names)
+    assert None not in dumped.values()
+    if node != 'stage':
+        assert dumped['sensor.rate_hz'] == 1000.0
+        assert dumped['format'] == 1
+        assert dumped['effects'] == []
+
+
+def test_loading_a_calibration_says_what_to_do(start, run_tool, tmp_path):
+    """`ros2 param load` sets the parameters one by one, which a calibration does not allow."""
+    rng = np.random.default_rng(1)
+    parameter_file.save(tmp_path / 'unit.yaml', drawn(rng, nominal(serial='L1')))
+    for arguments in (('simulate', 'sweep', '--params', 'unit.yaml', '--rate', '50', '-o',
+                       'sweep.csv'), ('fit', 'sweep.csv', '-o', 'fitted.yaml')):
+        done = run_tool(*arguments)
+        assert done.returncode == 0, done.stderr
+    start('compensation', ROS, '--params-file', NOMINAL)
+    parameters = list(parameter_dict_from_yaml_file(
+        str(tmp_path / 'fitted.yaml'), use_wildcard=True).values())
+    with Graph() as graph:
+        results = graph.call(SetParameters, 'compensation/set_parameters',
+                             SetParameters.Request(parameters=parameters)).results
+    reasons = {p.name: result.reason for p, result in zip(parameters, results)}
+    assert 'set calibration to the path of another file' in reasons['sensor.rate_hz']
+    assert not any('\n' in reason for reason in reasons.values())
+
+
+def test_an_invalid_qos_policy_is_one_line(start):
+    override = 'qos_overrides./stage/joint_states.publisher.reliability'
+    line = refusal(start, 'stage', '-p', f'{override}:=relaible')
+    assert 'qos_overrides./stage/joint_states.publisher: ' in line
+    assert 'relaible' in line
+    driver = start('driver', ROS, '-p', 'qos_overrides./imu/data_raw.publisher.depth:=deep')
+    with Graph() as graph:
+        graph.spin_until(lambda: graph.reports('driver', 'qos_overrides./imu/data_raw'), 20, 'why')
+        assert graph.diagnostics['driver'].level == DiagnosticStatus.ERROR
+    assert driver.stop() == 0
+    assert len(driver.output().splitlines()) == 1, driver.output()
+
+
+def test_an_inactive_driver_is_a_warning_and_each_transition_is_one_line(start):
+    driver = start('driver', ROS, '-p', 'link.type:=replay', '-p', 'link.recording:=none.csv',
+                   '-p', 'autostart:=false')
+    with Graph() as graph:
+        graph.spin_until(lambda: graph.reports('driver', 'inactive'), 30, 'inactive')
+        assert graph.diagnostics['driver'].level == DiagnosticStatus.WARN
+        assert graph.change('driver', Transition.TRANSITION_CONFIGURE)
+        assert not graph.change('driver', Transition.TRANSITION_ACTIVATE)
+        graph.spin_until(lambda: graph.reports('driver', 'none.csv'), 5, 'the reason')
+        assert graph.diagnostics['driver'].level == DiagnosticStatus.ERROR
+        assert graph.change('driver', Transition.TRANSITION_CLEANUP)
+    assert driver.stop() == 0
+    states = [line.split('[driver]: ')[1].split(':')[0] for line in driver.output().splitlines()
+              if 'INFO' in line]
+    assert states == ['unconfigured', 'inactive', 'unconfigured']
+
+
+def test_a_calibration_carries_the_link_of_its_parameters(tmp_path):
+    sensor = nominal(serial='17', link={'type': 'serial', 'port': '/dev/ttyACM0'})
+    parameter_file.save(tmp_path / 'unit.yaml', sensor)
+    assert parameter_file.load(tmp_path / 'unit.yaml').link == sensor.link
