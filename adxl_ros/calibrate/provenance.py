@@ -106,7 +106,8 @@ def _sweep_text(poses: Poses) -> str:
     steps = np.abs(changes)[np.abs(changes) > _SAME_BETA_RAD]
     step = np.degrees(np.median(steps)) if steps.size else 0.0
     both_ways = (changes > _SAME_BETA_RAD).any() and (changes < -_SAME_BETA_RAD).any()
-    return (f'{len(fitted)} poses: alpha {alpha_text} deg; beta {lowest:.0f} to {highest:.0f} '
+    # Without a colon: ros2 param reads the text as YAML again.
+    return (f'{len(fitted)} poses, alpha {alpha_text} deg; beta {lowest:.0f} to {highest:.0f} '
             f'deg, steps of {step:.0f}, {"both directions" if both_ways else "one direction"}')
 
 

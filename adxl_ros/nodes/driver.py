@@ -131,6 +131,8 @@ class Driver(LifecycleNode):
 
     def _announce(self, state: str) -> None:
         """Log a state of the life cycle: link, unit, rate and topic; warn where it simulates."""
+        if not self.context.ok():
+            return
         sensor = self._output.sensor if self._output else self._sensor
         topic = self.resolve_topic_name('imu/data_raw')
         self.get_logger().info(f'{state}: link {self._link.name}, unit {sensor.serial}, '

@@ -200,7 +200,7 @@ def test_a_signal_ends_the_driver_without_messages(start, number):
     driver = start('driver')
     with Graph() as graph:
         samples = graph.listen(Imu, 'imu/data_raw')
-        graph.spin_until(lambda: samples, 20, 'a sample')
+        graph.spin_until(lambda: samples and 'driver' in graph.diagnostics, 20, 'a sample')
     before = driver.output()
     os.kill(driver.popen.pid, number)
     assert driver.wait() == 0

@@ -64,13 +64,18 @@ def run(make_node: Callable[[], Node], description: str | None) -> int:
     name = Path(sys.argv[0]).name
     # rclpy's own handler ends the context; Python's would raise in the middle of any statement.
     signal.signal(signal.SIGINT, lambda *_: None)
+    is_initialised = False
     try:
         check_params_files()
         argparse.ArgumentParser(prog=name, description=description, usage=_USAGE).parse_args(
             remove_ros_args(sys.argv)[1:])
         rclpy.init()
+        is_initialised = True
         node = make_node()
     except Exception as error:
+        if is_initialised and not rclpy.ok():
+            # A signal has ended the context during the start.
+            return 0
         if not isinstance(error, UserError) and not rclpy_internals.is_rclpy_error(error):
             raise
         print(f'{name}: {one_line(error)}', file=sys.stderr)
