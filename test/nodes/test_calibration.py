@@ -73,7 +73,8 @@ def test_a_sweep_ends_with_a_file_and_fit_agrees_on_its_bag(start, run_tool, tmp
     with Graph() as graph:
         kept = {topic: _record(graph, kind, topic) for topic, kind in kinds.items()}
         driver, node = _sweep(start, truth, bare, '-p', 'output:=unit.yaml', '-p',
-                              'report:=report')
+                              'report:=report', '-p', 'link.type:=serial', '-p',
+                              'link.port:=/dev/ttyACM0')
         # The record begins before the sweep does.
         graph.spin_until(lambda: all(kept[topic] for topic in kinds if topic != '/stage/command'),
                          60, 'all topics')
@@ -85,6 +86,7 @@ def test_a_sweep_ends_with_a_file_and_fit_agrees_on_its_bag(start, run_tool, tmp
     live = parameter_file.load(tmp_path / 'unit.yaml')
     truth_sensor = parameter_file.load(truth)
     assert (live.model, live.serial) == ('full', 'T1')
+    assert live.link == {'type': 'serial', 'port': '/dev/ttyACM0'}, 'the file carries the link'
     np.testing.assert_allclose(live.zero_g_v, truth_sensor.zero_g_v, atol=1e-3)
     np.testing.assert_allclose(live.scale_v_per_g, truth_sensor.scale_v_per_g, atol=1e-3)
     copy, = (tmp_path / 'ros_home' / 'adxl_ros' / 'calibrations' / 'T1').iterdir()

@@ -223,7 +223,7 @@ def test_an_inactive_driver_is_a_warning_and_each_transition_is_one_line(start):
     assert states == ['unconfigured', 'inactive', 'unconfigured']
 
 
-def test_a_calibration_carries_the_link_of_its_parameters(tmp_path):
+def test_a_parameter_file_carries_a_link(tmp_path):
     sensor = nominal(serial='17', link={'type': 'serial', 'port': '/dev/ttyACM0'})
     parameter_file.save(tmp_path / 'unit.yaml', sensor)
     assert parameter_file.load(tmp_path / 'unit.yaml').link == sensor.link

@@ -101,7 +101,22 @@ def make_node(context: LaunchContext, executable: str, parameters: Mapping[str, 
 
 
 def argument(context: LaunchContext, name: str) -> str:
-    """Return the value of an argument."""
+    """
+    Return the value of an argument.
+
+    Parameters
+    ----------
+    context
+        The launch.
+    name
+        Name of the argument.
+
+    Returns
+    -------
+    str
+        Its value.
+
+    """
     return str(LaunchConfiguration(name).perform(context))
 
 
