@@ -16,7 +16,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
 from typing import NamedTuple
@@ -91,6 +91,8 @@ class Findings:
     weighed
         Sets of effects that hold on held-out blocks, with and without something unknown, by
         falling probability.
+    hidden_odds
+        Odds of each effect that is too small to show, over no effect.
     walk_log_bayes_factor
         Log Bayes factor of another power in some octaves than a random walk's.
     detections
@@ -108,6 +110,7 @@ class Findings:
     """
 
     weighed: Sequence[WeighedHypothesis]
+    hidden_odds: Mapping[str, float]
     walk_log_bayes_factor: float
     detections: Sequence[Detection]
     noise_mps2: float
@@ -154,6 +157,11 @@ def decide(findings: Findings, settings: DecisionSettings) -> Verdict:
     named = (*best.effects, *detected)
     weights = {tuple(sorted((*w.effects, *detected))): float(w.probability * share * (1 - wrong))
                for w in library_sets}
+    if () in weights:
+        nothing = weights[()] / (1 + sum(findings.hidden_odds.values()))
+        for effect, odds in findings.hidden_odds.items():
+            weights[(effect,)] = weights.get((effect,), 0.0) + nothing * odds
+        weights[()] = nothing
     weights[(UNKNOWN,)] = float(unknown * (1 - wrong))
     other = tuple(sorted(named if is_unknown else (*named, UNKNOWN)))
     weights[other] = weights.get(other, 0.0) + wrong

@@ -20,7 +20,7 @@ The stages are comparison, checks, linear model, search and decision. What the r
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from adxl_ros.diagnose import data_checks, decision, gap_closure, noise_detectors
@@ -47,7 +47,7 @@ from adxl_ros.diagnose.noise_remainder import (
     NoiseRemainder,
 )
 from adxl_ros.diagnose.noise_whitening import drifts_among
-from adxl_ros.diagnose.posterior import posterior, WeighedHypothesis
+from adxl_ros.diagnose.posterior import hidden_odds, posterior, WeighedHypothesis
 from adxl_ros.diagnose.progress_plan import (
     BASIS_WORK,
     CHECKS,
@@ -201,12 +201,13 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
         checked.append(result)
     linear_model = build_linear_model([c.search_comparison for c in checked],
                                       plan.within(LIBRARY))
-    hypotheses = search(linear_model, SETTINGS, plan)
-    plan.expect(PROBABILITIES, BASIS_WORK + SET_WORK * len(hypotheses))
-    explanation = _explain(checked, linear_model, hypotheses, sensor, seed,
+    searched = search(linear_model, SETTINGS, plan)
+    plan.expect(PROBABILITIES, BASIS_WORK + SET_WORK * len(searched.hypotheses))
+    explanation = _explain(checked, linear_model, searched.hypotheses, sensor, seed,
                            plan.within(PROBABILITIES))
     plan.show(REPORT, 0.0)
-    verdict = _decide(linear_model, explanation)
+    verdict = _decide(linear_model, explanation,
+                      hidden_odds(linear_model, searched.single_gains, SETTINGS))
     diagnosis = _with_report(linear_model, explanation, verdict, sensor, seed)
     plan.show(REPORT, 1.0)
     return diagnosis
@@ -305,7 +306,8 @@ def _best(weighed: Sequence[WeighedHypothesis]) -> Hypothesis:
     return next(w.hypothesis for w in weighed if w.unknown is None)
 
 
-def _decide(linear_model: LinearModel, explanation: _Explanation) -> Verdict:
+def _decide(linear_model: LinearModel, explanation: _Explanation, hidden: Mapping[str, float]
+            ) -> Verdict:
     """Gather the findings beside the best hypothesis, and decide."""
     best, closure = _best(explanation.weighed), explanation.closure
     simulated_noise_mps2 = float(np.sqrt(np.mean(
@@ -314,6 +316,7 @@ def _decide(linear_model: LinearModel, explanation: _Explanation) -> Verdict:
         if drifts_among(best.effects) else 0.0
     verdict = decision.decide(Findings(
         weighed=explanation.weighed,
+        hidden_odds=hidden,
         walk_log_bayes_factor=walk,
         detections=explanation.detections,
         noise_mps2=explanation.noise_mps2,

@@ -95,8 +95,26 @@ class _RankedSet(NamedTuple):
     others: tuple[_RankedSet, ...] = ()
 
 
+class SearchResult(NamedTuple):
+    """
+    What the search found.
+
+    Attributes
+    ----------
+    hypotheses
+        Fitted hypotheses by falling log evidence; the empty one is among them, hopeless ones are
+        not.
+    single_gains
+        Log Bayes factor of each effect of the library over no effect, on the linear model.
+
+    """
+
+    hypotheses: list[Hypothesis]
+    single_gains: dict[str, float]
+
+
 def search(linear_model: LinearModel, settings: DecisionSettings,
-           plan: ProgressPlan) -> list[Hypothesis]:
+           plan: ProgressPlan) -> SearchResult:
     """
     Search single effects, pairs and triples.
 
@@ -114,9 +132,8 @@ def search(linear_model: LinearModel, settings: DecisionSettings,
 
     Returns
     -------
-    list of Hypothesis
-        Fitted hypotheses by falling log evidence; the empty one is among them, hopeless ones are
-        not.
+    SearchResult
+        Fitted hypotheses, and what single effects gain.
 
     """
     hypotheses: Hypotheses = {frozenset(): fit_hypothesis(linear_model, (), {}, {})}
@@ -155,9 +172,10 @@ def search(linear_model: LinearModel, settings: DecisionSettings,
         _add_drifts(linear_model, settings, hypotheses)
     plan.show(FURTHER, 1.0)
     lowest = _lowest(hypotheses, settings)
-    return sorted((h for h in hypotheses.values()
-                   if h.log_evidence >= lowest or not h.effects),
-                  key=lambda h: -h.log_evidence)
+    return SearchResult(
+        sorted((h for h in hypotheses.values() if h.log_evidence >= lowest or not h.effects),
+               key=lambda h: -h.log_evidence),
+        {linear_model.variants[single.chosen[0]].effect: single.gain for single in singles})
 
 
 def _is_hopeless(log_evidence: float, gain: float, hypotheses: Hypotheses,

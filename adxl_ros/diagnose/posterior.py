@@ -32,7 +32,7 @@ Effects that do not matter are struck from a set, and sets that become equal are
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -195,6 +195,35 @@ def posterior(linear_model: LinearModel, sized: Sequence[SizedHypothesis],
     probabilities = np.exp(weights - np.logaddexp.reduce(weights))
     weighed = [replace(e, probability=float(p)) for e, p in zip(entries.values(), probabilities)]
     return sorted(weighed, key=lambda w: -w.probability)
+
+
+def hidden_odds(linear_model: LinearModel, single_gains: Mapping[str, float],
+                settings: DecisionSettings) -> dict[str, float]:
+    """
+    Return the odds that an effect acts that is too small to show, over no effect.
+
+    The prior of amplitudes reaches far below the noise. A recording without a gap is therefore
+    nearly as probable with such an effect as without one.
+
+    Parameters
+    ----------
+    linear_model
+        The recordings.
+    single_gains
+        Log Bayes factor of each effect over no effect.
+    settings
+        Priors and factors of the decision.
+
+    Returns
+    -------
+    dict
+        Odds by effect, of those effects that are not worth fitting.
+
+    """
+    none = _log_prior(frozenset(), None, linear_model, settings)
+    return {effect: float(np.exp(settings.evidence_factor * gain - none + _log_prior(
+        frozenset({effect}), None, linear_model, settings)))
+        for effect, gain in single_gains.items() if gain < settings.worth_fitting}
 
 
 def _held_rounding_mps2(comparison: BaselineComparison) -> float:
