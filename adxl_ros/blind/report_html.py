@@ -24,6 +24,7 @@ from typing import Any
 
 from adxl_ros.blind.grading import UNKNOWN
 from adxl_ros.blind.score_statistics import detection, RANK_BINS
+from adxl_ros.blind.scores import FEWEST_TRIALS, outcome
 from adxl_ros.blind.world.unit import G0
 import numpy as np
 
@@ -35,20 +36,37 @@ border-bottom:1px solid #ddd;vertical-align:top}img{max-width:100%}
 .said{background:#eef4fb;padding:.8em 1em;border-left:5px solid #36c}
 .leak{background:#fbeeee;border-color:#c33}@media print{body{margin:0}}
 """
+_COLUMNS = 79
+"""Columns of a terminal."""
+_NAME_COLUMNS = 20
+"""Columns of the name of a score in a terminal."""
+_TOO_FEW = (f'Too few: fewer than {FEWEST_TRIALS} trials. '
+            'Not refuted: the interval or the value reaches the bar.')
+"""Meanings of outcomes."""
 Table = tuple[list[str], list[list[str]]]
 """Head and rows."""
 
 
 def summary(made: dict[str, Any]) -> str:
     """Return the result of the check in a few lines."""
-    rows = [f'{row[0]:52s}{row[1]:34s}{row[2]:16s}{row[3]}' for row in _result(made)[1]]
-    return '\n'.join([_drawn(made), '', *rows, '', _leaks(made)])
+    rows = [line for row in _result(made)[1] for line in _row_lines(row)]
+    head = f'{"score":{_NAME_COLUMNS}} {"value (90 % interval)":28}{"n":>4} {"bar":14}met'
+    return '\n'.join([*textwrap.wrap(_drawn(made), _COLUMNS), '', head, *rows, '', _TOO_FEW,
+                      *textwrap.wrap(_leaks(made), _COLUMNS)])
+
+
+def _row_lines(row: list[str]) -> list[str]:
+    """Lay out name, score, bar and outcome of a row in lines of a terminal."""
+    name, *rest = textwrap.wrap(row[0], _NAME_COLUMNS)
+    value, _, count = row[1].partition(', n = ')
+    cells = f'{name:{_NAME_COLUMNS}} {value:28}{count:>4} {row[2]:14}{row[3]}'
+    return [cells.rstrip(), *rest]
 
 
 def markdown_result(made: dict[str, Any]) -> str:
     """Return the table of the result for the documentation."""
     drawn = textwrap.fill(_drawn(made), 99, break_on_hyphens=False)
-    return '\n'.join([drawn, '', _leaks(made), '', *_markdown_table(_result(made))])
+    return '\n'.join([drawn, '', _leaks(made), '', *_markdown_table(_result(made)), '', _TOO_FEW])
 
 
 def markdown(made: dict[str, Any]) -> str:
@@ -143,8 +161,7 @@ def _result(made: dict[str, Any]) -> Table:
     sign = {-1: 'at most ', 1: 'at least ', 0: ''}
     rows = [[row['words'], _score_text(row),
              sign[row['way']] + ' to '.join(f'{bar:g}' for bar in row['bar']),
-             'no trial' if row['met'] is None else 'yes' if row['met'] else 'NO',
-             f'{row["fourth_run"]:g}', _NO_WORSE[row['no_worse']],
+             outcome(row), f'{row["fourth_run"]:g}', _NO_WORSE[row['no_worse']],
              *_other_scores(others, row['name'])] for row in made['bars']]
     for name, words in _WITHOUT_BAR.items():
         rows.append([words, _score_text(made['scores'][name]), '-', '-', _FOURTH_RUN[name], '-',

@@ -66,6 +66,9 @@ BARS = (
     Bar('unknown_recall', 'recall of unknown where a flexible model sees it', 1, (0.8,), 0.75),
 )
 """What a diagnosis should reach; chosen."""
+FEWEST_TRIALS = 10
+"""Fewest trials of a score that is compared with its bar; chosen: the 90 % interval of a share
+is about 0.5 wide there."""
 _DIGITS = 3
 """Number of digits after the point in the scores of the fourth run."""
 _HARM = 0.01
@@ -182,8 +185,8 @@ def bars(made: dict[str, Any]) -> list[dict[str, Any]]:
     """
     Compare the scores with the bars and with the fourth run.
 
-    A bar is met where it lies inside the interval of the score, or where the score is better.
-    `met` is None without a trial. `no_worse` is 'yes' where the score is at least that of the
+    `met` states whether the score does not refute its bar, see `outcome`. It is None without a
+    trial. `no_worse` is 'yes' where the score is at least that of the
     fourth run, 'open' where it is worse but its interval reaches the fourth run, and 'no' else.
     """
     rows = []
@@ -191,14 +194,48 @@ def bars(made: dict[str, Any]) -> list[dict[str, Any]]:
         score, met, no_worse = made[bar.name], None, None
         if score['value'] is not None:
             low, high = score['ci']
-            met = (bar.direction > 0 or low <= bar.levels[-1]) and \
-                (bar.direction < 0 or high >= bar.levels[0])
+            met = _within(bar, score['value'], score['value']) or _within(bar, low, high)
             no_worse = _no_worse(bar, score['value'], low, high)
         rows.append({'name': bar.name, 'words': bar.words, 'way': bar.direction,
                      'bar': list(bar.levels), 'met': met, 'fourth_run': bar.fourth_run,
                      'no_worse': no_worse,
                      **{key: score[key] for key in ('value', 'ci', 'count')}})
     return rows
+
+
+def _within(bar: Bar, low: float, high: float) -> bool:
+    """Return whether some value between `low` and `high` meets the bar."""
+    return (bar.direction > 0 or low <= bar.levels[-1]) and \
+        (bar.direction < 0 or high >= bar.levels[0])
+
+
+def outcome(row: dict[str, Any]) -> str:
+    """
+    Compare a score with its bar in words.
+
+    Parameters
+    ----------
+    row
+        A row of `bars`: `met`, `value`, `ci`, `count`, `way` and `bar`.
+
+    Returns
+    -------
+    str
+        'yes' where score and interval meet the bar, 'NO' where neither reaches it, and else 'not
+        refuted'. 'too few' for fewer than `FEWEST_TRIALS` trials, and 'no trial' without one.
+
+    """
+    if row['met'] is None:
+        return 'no trial'
+    if row['count'] < FEWEST_TRIALS:
+        return 'too few'
+    bar = Bar('', '', row['way'], tuple(row['bar']), 0.0)
+    # The interval of resampled trials may lie beside a score that is biased.
+    values = (row['value'], *row['ci'])
+    if all(_within(bar, value, value) for value in values):
+        return 'yes'
+    reached = _within(bar, row['value'], row['value']) or _within(bar, *row['ci'])
+    return 'not refuted' if reached else 'NO'
 
 
 def _no_worse(bar: Bar, value: float, low: float, high: float) -> str:

@@ -340,15 +340,24 @@ class CompensationPolicy:
 
         """
         sensor = self.sensor
-        unit = 'other' if self.refusal else 'confirmed' if self.info else 'not confirmed'
         age_days = _age_days(sensor) if sensor.effects else None
         return {
-            'unit': unit, 'calibration': self.source, 'serial': sensor.serial,
+            'unit': self._unit(), 'calibration': self.source, 'serial': sensor.serial,
             'axes': sensor.axes, 'model': sensor.model, 'effects': ', '.join(sensor.effects),
             'calibration_id': calibration_store.calibration_id(sensor) if sensor.effects else '',
             'age_days': '' if age_days is None else round(age_days, 3),
             'validity': self._validity(interval, age_days), 'newer': str(newer or ''),
             **{f'provenance.{key}': value for key, value in sensor.provenance.items()}}
+
+    def _unit(self) -> str:
+        """State whether the stream is of the unit of the calibration."""
+        if self.refusal:
+            return 'other'
+        if self.info is None:
+            return 'not confirmed'
+        # A stream or a file without a serial number goes with every unit.
+        return 'no serial number' if NO_UNIT in (self.info.serial, self.sensor.serial) \
+            else 'confirmed'
 
     def _validity(self, interval: Interval, age_days: float | None) -> str:
         """Describe whether the calibration is valid for the samples of the interval."""

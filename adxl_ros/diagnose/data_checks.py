@@ -86,10 +86,10 @@ _SMALLEST_NORM = 1e-12
 _UNIT_TOLERANCE = 0.1
 """Relative deviation of a gain from the ratio of two units. Chosen: above any scale error."""
 _UNIT_RATIOS = {
-    9.80665: 'g instead of m/s²',
+    9.80665: 'm/s² instead of g',
     1e3: 'mV instead of V',
     1e-3: 'kV instead of V',
-    1 / 9.80665: 'm/s² instead of g',
+    1 / 9.80665: 'g instead of m/s²',
 }
 """Gain of an output in the wrong unit, and which unit it has instead of which."""
 
@@ -314,7 +314,7 @@ def _unit_fault(simulated_g: np.ndarray, measured_g: np.ndarray, correlation: np
     for ratio, units in _UNIT_RATIOS.items():
         if abs(np.log(gain / ratio)) < _UNIT_TOLERANCE:
             return DataFault('unit', 'bad_data', f'the output is {gain:.4g} times the simulated '
-                             f'output: {units}; correct the unit of the columns')
+                             f'output, as values in {units} are; correct the unit of the columns')
     return None
 
 

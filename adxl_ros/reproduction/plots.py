@@ -55,7 +55,7 @@ def draw_misalignment(path: str | os.PathLike, search: DirectionSearch) -> None:
             (search.parabola_rad, 'tab:orange', 'parabola through the outputs'),
             (search.null_rad, 'tab:green', 'null crossings at ±90°')):
         axis.axvline(-np.degrees(value), color=colour, lw=1,
-                     label=f'{label}: β = {np.degrees(value):+.2f}°')
+                     label=f'{label}: {-np.degrees(value):+.2f}°')
     axis.set(xlabel='beta of the stage, °', ylabel='x output minus its largest, mg',
              title='Direction of the x axis (18): the maximum is flat')
     axis.legend(fontsize=8)

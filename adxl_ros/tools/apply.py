@@ -33,6 +33,8 @@ from adxl_ros.model.constants import AXES
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import NOMINAL_ENVIRONMENT
 from adxl_ros.model.sensor import Sensor, with_axes
+from adxl_ros.tools.closing_lines import print_end, quoted
+from adxl_ros.tools.command_line import argument_parser, command
 from adxl_ros.tools.common import progress, report_reading, run
 import numpy as np
 
@@ -42,10 +44,17 @@ _BLOCK_ROWS = 16384
 _DIGITS = 12
 """Significant digits of an estimate (chosen: rounding is below a millionth of the noise)."""
 
+_EXAMPLES = {
+    'acceleration and tilt by a calibration': 'recording.csv --params unit.yaml -o tilt.csv',
+    'a moving sensor, without the lag of its filter':
+        'fast.csv --params unit.yaml --undo-filter -o a.csv',
+}
+"""Examples of arguments, by their purpose."""
+
 
 def parser() -> argparse.ArgumentParser:
     """Describe the command line."""
-    parse = argparse.ArgumentParser(prog='apply', description=__doc__)
+    parse = argument_parser('apply', __doc__, _EXAMPLES)
     parse.add_argument('recording', metavar='RECORDING', help='rosbag2 directory, .mcap or CSV')
     parse.add_argument('--params', metavar='FILE', default=None,
                        help='the calibrated sensor (default: the nominal sensor)')
@@ -80,7 +89,17 @@ def apply(options: argparse.Namespace) -> int:
     _report(at_rail, rows, 'have the ADC at its rail: their standard deviations are inf')
     if block is not None:
         report_reading('apply', block)
+    _print_end(options, sensor, rows)
     return 0
+
+
+def _print_end(options: argparse.Namespace, sensor: Sensor, rows: int) -> None:
+    """Print what was corrected, the file, and how the calibration is used live."""
+    by_what = f'the {sensor.model} calibration of {sensor.serial}' if sensor.effects else \
+        'the datasheet values: the sensor is not calibrated'
+    live = f'compensation --ros-args -p calibration:={quoted(options.params or "")}'
+    print_end([f'Corrected {rows} samples by {by_what}.'], [options.output], command(
+        *live.split(' ', 1)) if sensor.effects else command('fit', 'SWEEP -o unit.yaml'))
 
 
 def _estimated(options: argparse.Namespace, sensor: Sensor

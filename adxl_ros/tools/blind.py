@@ -26,15 +26,23 @@ from adxl_ros.errors import UserError
 from adxl_ros.files.atomic_write import write_text
 from adxl_ros.files.plot_file import pyplot
 from adxl_ros.tools import blind_forest
+from adxl_ros.tools.closing_lines import print_end, quoted
+from adxl_ros.tools.command_line import argument_parser, command
 from adxl_ros.tools.common import make_folder, progress, run
 
 PROG = 'blind'
 """Name of the command, for messages."""
+_EXAMPLES = {
+    'a whole check': '--trials 200 -o check',
+    'only draw the trials, and publish the hash of their labels': '--trials 200 --seal check',
+    'diagnose the sealed trials and score them': '--open check',
+}
+"""Examples of arguments, by their purpose."""
 
 
 def parser() -> argparse.ArgumentParser:
     """Describe the command line."""
-    parse = argparse.ArgumentParser(prog=PROG, description=__doc__)
+    parse = argument_parser(PROG, __doc__, _EXAMPLES)
     parse.add_argument('--trials', type=int, default=600,
                        help='number of trials (default 600); a twelfth more has strength zero')
     parse.add_argument('--seed', type=int, default=None,
@@ -88,6 +96,7 @@ def _check(options: argparse.Namespace, folder: Path, arms: list[real_recordings
                 with progress('random forest') as show:
                     blind_forest.train(folder, pool, show)
         if options.seal:
+            print_end([], [folder], command(PROG, f'--open {quoted(folder)}'))
             return 0
         made = blind_check.score(folder, None, pool, progress, others)
         if arms:
@@ -96,8 +105,8 @@ def _check(options: argparse.Namespace, folder: Path, arms: list[real_recordings
     write_text(folder / 'blind.json', json.dumps(made, indent=1, allow_nan=False) + '\n')
     write_text(folder / 'blind.md', report_html.markdown(made))
     write_text(folder / 'blind.html', report_html.page(made, draw))
-    print(report_html.summary(made))
-    print(f'\n{folder / "blind.html"} is written')
+    print_end([*report_html.summary(made).splitlines(), ''],
+              [folder / f'blind.{suffix}' for suffix in ('html', 'md', 'json')])
     return 0
 
 

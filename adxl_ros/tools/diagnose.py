@@ -22,22 +22,33 @@ from pathlib import Path
 import sys
 
 from adxl_ros.diagnose import report_html, report_json
-from adxl_ros.diagnose.diagnosis import diagnose as diagnose_recordings
+from adxl_ros.diagnose.diagnosis import diagnose as diagnose_recordings, Diagnosis
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.atomic_write import write_text
+from adxl_ros.model.effects import library
 from adxl_ros.simulate.from_recording import motion_from_force
+from adxl_ros.tools.closing_lines import print_end, quoted
+from adxl_ros.tools.command_line import argument_parser, command, effect_list
 from adxl_ros.tools.common import make_folder, progress, report_reading, run
 
 _NO_VERDICT = ('bad_data', 'insufficient')
 """Statuses of the report that hold no verdict: the exit status is then 1."""
 
+_EXAMPLES = {
+    'a recording against the simulation of its calibration':
+        'recording.mcap --params unit.yaml -o gap',
+    'against another simulator, whose clock differs':
+        'real.csv --sim gazebo.csv --align -o gap',
+}
+"""Examples of arguments, by their purpose."""
+_FILES = ('report.html', 'params.yaml', 'report.json')
+"""Files of a diagnosis."""
+
 
 def parser() -> argparse.ArgumentParser:
     """Describe the command line."""
-    parse = argparse.ArgumentParser(prog='diagnose', description=__doc__, epilog=(
-        'Exit status: 0 with a verdict, 1 where none was possible (the report then names the '
-        'fault of the recording, or what it lacks), 2 after wrong usage.'))
+    parse = argument_parser('diagnose', __doc__, _EXAMPLES, _details)
     parse.add_argument('recording', nargs='+',
                        help='rosbag2 directory, .mcap or CSV, all of one unit')
     parse.add_argument('--params', metavar='FILE', default=None,
@@ -51,6 +62,13 @@ def parser() -> argparse.ArgumentParser:
     parse.add_argument('-o', dest='output', metavar='DIR', required=True,
                        help='report.json, report.html and params.yaml')
     return parse
+
+
+def _details() -> str:
+    """Return exit status and effects for the help text."""
+    return ('Exit status: 0 with a verdict, 1 where none was possible (the report then\n'
+            'names the fault of the recording, or what it lacks), 2 after wrong usage.\n\n'
+            + effect_list(library().values()))
 
 
 def diagnose(options: argparse.Namespace) -> int:
@@ -82,13 +100,23 @@ def diagnose(options: argparse.Namespace) -> int:
     lines = report_json.terminal_lines(diagnosis)
     if diagnosis.sensor is not None:
         parameter_file.save(folder / 'params.yaml', diagnosis.sensor, lines)
-    print(text if options.json else '\n'.join(lines))
+    if options.json:
+        print(text)
+    else:
+        _print_end(lines, diagnosis, folder)
     if report['verdict']['status'] not in _NO_VERDICT:
         return 0
     reason = report['verdict']['data_fault'] or report['verdict']['status']
     print(f'diagnose: {", ".join(options.recording)}: no verdict ({reason}); the reason is in '
           f'{folder / "report.json"}', file=sys.stderr)
     return 1
+
+
+def _print_end(lines: list[str], diagnosis: Diagnosis, folder: Path) -> None:
+    """Print the diagnosis, the files, and the next command where the diagnosis has none."""
+    is_next_known = diagnosis.next_experiment is not None or diagnosis.sensor is None
+    print_end([*lines, ''], [folder / name for name in _FILES], '' if is_next_known else command(
+        'simulate', f'rich --params {quoted(folder / "params.yaml")} -o simulated.csv'))
 
 
 def main() -> int:

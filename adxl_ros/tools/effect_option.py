@@ -27,11 +27,9 @@ from adxl_ros.model.effects.base import Coefficient, Effect, Parameter
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
-SYNTAX = ('NAME alone has typical values,\nKEY=VALUE sets a parameter for all its axes, '
-          'KEY.AXIS=VALUE for one;\nparameters without a value are neutral')
+SYNTAX = ('NAME alone has typical values, KEY=VALUE sets a parameter for all its axes, '
+          'KEY.AXIS=VALUE for one; parameters without a value are neutral')
 """What an option may be, for help texts."""
-
-
 _SIMILARITY = 0.4
 """Smallest similarity of a suggested name, as `difflib` counts it; chosen."""
 

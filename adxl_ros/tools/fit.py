@@ -18,20 +18,33 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-import sys
 
 from adxl_ros.calibrate import calibration, pose_extraction
-from adxl_ros.calibrate.report import report_html
+from adxl_ros.calibrate.report import report_html, text_tables
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store, parameter_file, recording, sweep_journal
 from adxl_ros.files.checksum import sha256
 from adxl_ros.files.stream_unit import recorded_unit
+from adxl_ros.model.effects import library
+from adxl_ros.model.effects.base import Place
+from adxl_ros.tools.closing_lines import print_end, quoted
+from adxl_ros.tools.command_line import argument_parser, command, effect_list
 from adxl_ros.tools.common import make_folder, report_reading, run
+
+_EXAMPLES = {
+    'the richest model that a sweep determines, with a page':
+        'sweep.csv -o unit.yaml --report report',
+    'two sweeps of one unit, the linear model': 'one.mcap two.mcap --model linear -o unit.yaml',
+    'a further effect': 'sweep.csv --effect temperature_bias -o unit.yaml',
+}
+"""Examples of arguments, by their purpose."""
+_REPORT_FILES = ('report.html', 'calibration.png')
+"""Files of a report."""
 
 
 def parser() -> argparse.ArgumentParser:
     """Describe the command line."""
-    parse = argparse.ArgumentParser(prog='fit', description=__doc__)
+    parse = argument_parser('fit', __doc__, _EXAMPLES, _details)
     parse.add_argument('recording', nargs='+',
                        help='rosbag2 directory, .mcap or CSV, all of one unit')
     parse.add_argument('--params', metavar='FILE', default=None,
@@ -41,7 +54,7 @@ def parser() -> argparse.ArgumentParser:
                             'determine); a three-axis recording without angles is '
                             'calibrated against gravity')
     parse.add_argument('--effect', metavar='NAME', action='append', default=[],
-                       help='a further effect that the full model fits')
+                       help='a further effect that the full model fits; see the list below')
     parse.add_argument('--journal', metavar='FILE',
                        help='use the rests that the journal of this sweep names')
     parse.add_argument('-o', dest='output', metavar='FILE.yaml', required=True,
@@ -52,6 +65,12 @@ def parser() -> argparse.ArgumentParser:
                        help='the calibration store, which gets a copy (default: %(default)s); '
                             'empty for none')
     return parse
+
+
+def _details() -> str:
+    """Return the effects that a fit can have for the help text."""
+    return effect_list(effect for effect in library().values()
+                       if effect.invertible or effect.place is Place.STAGE)
 
 
 def fit(options: argparse.Namespace) -> int:
@@ -77,8 +96,10 @@ def fit(options: argparse.Namespace) -> int:
         report_html.write(options.report, result, options.store)
     result.save(options.output)
     kept = result.keep(options.store)
-    print('\n'.join(result.comments()))
-    print(f'fit: {kept}', file=sys.stderr)
+    report = [Path(options.report) / name for name in _REPORT_FILES] if options.report else []
+    print_end([*calibration.coefficient_lines(result.fitted), '', *result.summary_lines, '',
+               *text_tables.acceptance_lines(result.fitted), ''], [options.output, *report],
+              command('apply', f'RECORDING --params {quoted(options.output)} -o tilt.csv'), [kept])
     return 0
 
 

@@ -38,13 +38,21 @@ from adxl_ros.reproduction import (
     units,
 )
 from adxl_ros.reproduction.report_page import FIGURES
+from adxl_ros.tools.closing_lines import print_end
+from adxl_ros.tools.command_line import argument_parser
 from adxl_ros.tools.common import make_folder, progress, report_reading, run
 import numpy as np
+
+_EXAMPLES = {
+    'the experiments on 20 simulated units': '-o reproduction',
+    'the calibration of the paper on a recorded sweep': 'sweep.csv -o reproduction',
+}
+"""Examples of arguments, by their purpose."""
 
 
 def parser() -> argparse.ArgumentParser:
     """Describe the command line."""
-    parse = argparse.ArgumentParser(prog='reproduce', description=__doc__)
+    parse = argument_parser('reproduce', __doc__, _EXAMPLES)
     parse.add_argument('recording', nargs='*',
                        help='sweeps of one unit; without any, units are simulated')
     parse.add_argument('--params', metavar='FILE', default=None,
@@ -75,7 +83,7 @@ def reproduce(options: argparse.Namespace) -> int:
         else _simulated(sensor, options, folder)
     write_text(folder / 'reproduction.md', text)
     print(text.split('## Figures')[0].strip())
-    print(f'\nWrote {folder / "reproduction.md"} and its plots.')
+    print_end([''], [folder / 'reproduction.md', folder / FIGURES])
     return 0
 
 

@@ -29,17 +29,29 @@ from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.stream_info import sensor_info
 from adxl_ros.links.support import emulated_board
+from adxl_ros.model.effects import library
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.simulate import simulator
 from adxl_ros.simulate.from_recording import motion_from_force, motion_from_references
 from adxl_ros.simulate.motion import INTERNAL_RATE_HZ
 from adxl_ros.simulate.trajectories import TRAJECTORIES
+from adxl_ros.tools.closing_lines import print_end, quoted
+from adxl_ros.tools.command_line import argument_parser, command, effect_list, entry_list
 from adxl_ros.tools.common import progress, report_reading, run
 from adxl_ros.tools.effect_option import SYNTAX, with_effects
 import numpy as np
 
 _SHORTEST_S = 1e-9
 """Shorter durations count as this in the progress, s, so that one sample divides nothing by 0."""
+
+_EXAMPLES = {
+    'a calibration sweep of the nominal sensor': 'sweep -o sweep.csv',
+    'two effects, one of typical size and one with a value':
+        'rich --effect lever_arm \\\n        --effect temperature_bias:per_k.x=4e-4 -o rich.mcap',
+    'the motion of a recording, by a calibrated sensor':
+        'real.csv --params unit.yaml -o simulated.csv',
+}
+"""Examples of arguments, by their purpose."""
 
 Output = Callable[[simulator.Columns], None]
 """Takes a block of simulated samples."""
@@ -71,14 +83,7 @@ class _Run:
 
 def parser() -> argparse.ArgumentParser:
     """Describe the command line."""
-    about = '\n'.join(f'  {name:12}{f.__doc__.splitlines()[0]}'
-                      for name, f in TRAJECTORIES.items() if f.__doc__)
-    parse = argparse.ArgumentParser(
-        prog='simulate', description=__doc__, formatter_class=argparse.RawTextHelpFormatter,
-        epilog=f'trajectories:\n{about}\n'
-               '  imu         Apply the specific force of --force: ax_mps2, ay_mps2, az_mps2 or\n'
-               '              sensor_msgs/Imu, from any simulator.\n'
-               '  RECORDING   Follow the stage angles of a recording, at its stamps.')
+    parse = argument_parser('simulate', __doc__, _EXAMPLES, _details)
     parse.add_argument('trajectory', metavar='TRAJECTORY',
                        help=f'{", ".join(TRAJECTORIES)}, imu, or a recording')
     parse.add_argument('--params', metavar='FILE', default=None,
@@ -91,11 +96,21 @@ def parser() -> argparse.ArgumentParser:
     parse.add_argument('--seed', type=int, default=0,
                        help='seed of noise and manoeuvre (default 0)')
     parse.add_argument('--port', metavar='PATH',
-                       help='act as a board: send the samples in real time to a terminal device,\n'
+                       help='act as a board: send the samples in real time to a terminal device, '
                        'or to a new pseudo-terminal of this name')
     parse.add_argument('-o', dest='output', metavar='RECORDING',
                        help='.csv, .mcap or a rosbag2 directory (optional with --port)')
     return parse
+
+
+def _details() -> str:
+    """Return the trajectories and the effects for the help text."""
+    about = {name: f.__doc__.splitlines()[0] for name, f in TRAJECTORIES.items() if f.__doc__}
+    about['imu'] = ('Apply the specific force of --force, from any simulator: ax_mps2, ay_mps2, '
+                    'az_mps2 or sensor_msgs/Imu.')
+    about['RECORDING'] = 'Follow the stage angles of a recording, at its stamps.'
+    return '\n\n'.join([entry_list('trajectories', about), effect_list(library().values()),
+                        'docs/effects.md has the parameters of each effect.'])
 
 
 def simulate(options: argparse.Namespace) -> int:
@@ -117,7 +132,23 @@ def simulate(options: argparse.Namespace) -> int:
                 output(columns)
             elapsed_s = columns['time_s'][-1] - simulation.begin_s
             show(min(elapsed_s / max(simulation.duration_s, _SHORTEST_S), 1.0))
+    _print_end(options, simulation)
     return 0
+
+
+def _print_end(options: argparse.Namespace, simulation: _Run) -> None:
+    """Print what was simulated, the file, and the command that reads it."""
+    sensor = simulation.sensor
+    effects = f' with {", ".join(sensor.effects)}' if sensor.effects else ', no effects'
+    result = (f'Simulated {options.trajectory}: {simulation.duration_s:.4g} s at '
+              f'{sensor.rate_hz:.4g} Hz, axes {sensor.axes}. Sensor {sensor.serial}{effects}.')
+    if not options.output:
+        print_end([result], [])
+        return
+    params = f' --params {quoted(options.params)}' if options.params else ''
+    tool, output = ('fit', 'unit.yaml') if options.trajectory == 'sweep' else ('diagnose', 'gap')
+    print_end([result], [options.output], command(
+        tool, f'{quoted(options.output)}{params} -o {output}'))
 
 
 def _check(options: argparse.Namespace) -> None:

@@ -27,6 +27,8 @@ import sys
 from adxl_ros.blind import diagnosis_runs, grading, parallel_io
 from adxl_ros.errors import UserError
 from adxl_ros.files.atomic_write import write_text
+from adxl_ros.tools.closing_lines import print_end
+from adxl_ros.tools.command_line import argument_parser
 from adxl_ros.tools.common import make_folder, progress, run
 from adxl_ros.working import cases, scores
 
@@ -41,7 +43,9 @@ _TAG_DIGITS = 10
 
 def parser() -> argparse.ArgumentParser:
     """Describe the command line."""
-    parse = argparse.ArgumentParser(prog=PROG, description=__doc__)
+    parse = argument_parser(PROG, __doc__, {
+        'eighty cases, diagnosed and scored': 'cases',
+        'one part only': 'cases --only score'})
     parse.add_argument('folder', metavar='DIR', help='folder of the cases')
     parse.add_argument('--cases', type=int, default=80, help='number of cases (default 80)')
     parse.add_argument('--first', type=int, default=0, metavar='N',
@@ -78,6 +82,7 @@ def working(options: argparse.Namespace) -> int:
     if options.only in (None, 'score'):
         print(f'reports {tag}')
         print(_scored(folder, reports, drawn), end='')
+    print_end([], [reports])
     return 0
 
 

@@ -133,6 +133,24 @@ def test_comparison_with_the_fourth_run(name, value, ci, no_worse):
     assert set(rows.values()) == {None}
 
 
+@pytest.mark.parametrize('name, value, ci, count, words', [
+    ('calibration_error', 0.0484, (0.052, 0.09), 200, 'not refuted'),
+    ('calibration_error', 0.06, (0.03, 0.09), 200, 'not refuted'),
+    ('calibration_error', 0.03, (0.01, 0.049), 200, 'yes'),
+    ('calibration_error', 0.08, (0.06, 0.09), 200, 'NO'),
+    ('top_1', 0.95, (0.91, 0.99), 56, 'yes'), ('top_1', 0.8, (0.7, 0.91), 56, 'not refuted'),
+    ('top_1', 0.75, (0.645, 0.832), 56, 'NO'), ('coverage', 0.496, (0.1, 0.95), 2, 'too few'),
+    ('coverage', 0.5, (0.4, 0.99), 30, 'not refuted'), ('coverage', 0.9, (0.88, 0.92), 30, 'yes'),
+    ('coverage', 0.99, (0.95, 1.0), 30, 'NO')])
+def test_a_bar_is_met_not_refuted_or_refuted(name, value, ci, count, words):
+    """Few trials show nothing, and an interval that reaches the bar does not refute it."""
+    made = {bar.name: {'value': None, 'ci': None, 'count': 0} for bar in scores.BARS}
+    made[name] = {'value': value, 'ci': list(ci), 'count': count}
+    rows = {row['name']: scores.outcome(row) for row in scores.bars(made)}
+    assert rows.pop(name) == words
+    assert set(rows.values()) == {'no trial'}
+
+
 def test_result_is_one_table_with_all_methods():
     labels = [label('single', ['bias']), label('none'), label('outside', ['creep'])]
     answers = [reference_methods.certain(frozenset(row.true)) for row in labels]
@@ -147,3 +165,15 @@ def test_result_is_one_table_with_all_methods():
     rows = [line for line in text.splitlines() if line.startswith('|')]
     assert len(rows) == len(scores.BARS) + 5
     assert {row.count('|') for row in rows} == {head.count('|')}
+
+
+def test_the_summary_fits_a_terminal():
+    labels = [label('single', ['bias']), label('none'), label('outside', ['creep'])] * 50
+    made = scores.scores([scores.Trial(row, reference_methods.certain(frozenset(row.true)), None)
+                          for row in labels])
+    text = report_html.summary({
+        'trials': 150, 'cases': 150, 'seed': 1, 'date': '2026-01-01', 'hash': 'h' * 64,
+        'version': '0.1.0', 'diagnose_code': 'c' * 64, 'controls': {},
+        'bars': scores.bars(made), 'scores': made})
+    assert max(map(len, text.splitlines())) <= 79
+    assert 'too few: fewer than 10 trials' in text.lower()

@@ -180,6 +180,16 @@ def test_states_of_the_stream() -> None:
     assert policy_for(nominal()).values(QUIET, None)['validity'] == 'not calibrated'
 
 
+@pytest.mark.parametrize(('of_file', 'of_stream', 'stated'), [
+    ('17', '17', 'confirmed'), ('demo', 'nominal', 'no serial number'),
+    ('nominal', '17', 'no serial number')])
+def test_only_equal_serial_numbers_confirm_the_unit(of_file: str, of_stream: str,
+                                                    stated: str) -> None:
+    policy = policy_for(unit(of_file), serial=of_stream)
+    assert policy.refusal == ''
+    assert policy.values(QUIET, None)['unit'] == stated
+
+
 def test_missing_temperature_or_supply_is_reported() -> None:
     policy = policy_for(with_neutral(unit(), ['supply']))
     assert policy.status(QUIET, None, '') == (

@@ -320,6 +320,16 @@ def test_faults_of_the_recording_are_named(change, fault):
     assert report['verdict']['effects'] == [] and diagnosis.sensor is None
 
 
+@pytest.mark.parametrize('factor, units', [
+    (9.80665, 'm/s² instead of g'), (1 / 9.80665, 'g instead of m/s²'), (1e3, 'mV instead of V')])
+def test_a_wrong_unit_is_named_with_the_right_one(factor, units):
+    """Volts 9.81 times too small are those of g where m/s² are expected."""
+    report, _ = diagnosis_of(unit(), change=lambda c: c | {
+        a: (c[a] - 2.5) * factor + 2.5 for a in ('x_v', 'y_v', 'z_v')})
+    assert report['verdict']['data_fault'] == 'unit'
+    assert f'as values in {units} are' in report['summary']
+
+
 def test_codes_far_above_the_noise_hide_no_effect_and_cause_none():
     """Rounding to 10 bits follows the pose; beside it, a scale factor is found."""
     report, _ = diagnosis_of(unit(), 'quantisation:lost_bits=6')

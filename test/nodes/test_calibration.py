@@ -189,7 +189,25 @@ def test_an_output_that_cannot_be_written_is_refused_at_the_start(start, tmp_pat
         graph.spin_until(lambda: graph.reports('calibration', 'output: none/unit.yaml'), 30, 'why')
 
 
+def test_planes_and_step_are_set_in_degrees(start, tmp_path):
+    """The screen, too, is in degrees. Both units at once are refused."""
+    truth, bare = _files(tmp_path)
+    planes = ('-p', 'sweep.planes_deg:=[45.0, 90.0]', '-p', 'sweep.step_deg:=60.0')
+    both = start('calibration', '--ros-args', '--params-file', bare, *planes,
+                 '-p', 'sweep.planes_rad:=[0.5]')
+    assert both.wait() == 1
+    assert 'sweep.planes_deg: sweep.planes_rad is given, too; keep one' in both.output()
+    start('driver', '--ros-args', '--params-file', truth)
+    start('calibration', '--ros-args', '--params-file', bare, *planes, '-p', 'autostart:=true')
+    journal = tmp_path / 'calibration.yaml.journal'
+    wait_until(lambda: journal.exists() and journal.read_text().count('\n'), 30, 'the journal')
+    kind, _ = sweep_journal.read(journal)
+    assert kind['sweep.planes_rad'] == pytest.approx(np.radians([45.0, 90.0]))
+    assert kind['sweep.step_rad'] == pytest.approx(np.radians(60.0))
+
+
 @pytest.mark.parametrize('setting, words', [
+    ('sweep.planes_deg:=[thirty]', 'sweep.planes_deg: '),
     ('sweep.step_rad:=0.0', 'sweep.step_rad'), ('output:=.', 'output: . is a directory; name a')])
 def test_settings_out_of_range_end_the_node(start, tmp_path, setting, words):
     """A step of 0, or a directory for a file, is refused at the start, in one line."""

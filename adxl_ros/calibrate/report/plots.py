@@ -49,6 +49,8 @@ class _AxisData:
     ----------
     d
         Index of the axis: 0 for x, 1 for y.
+    model
+        Name of the model.
     force_g
         Reference along the measured axes, g, (k, m).
     poses
@@ -63,6 +65,7 @@ class _AxisData:
     """
 
     d: int
+    model: str
     force_g: np.ndarray
     poses: Poses
     deviation_mv: np.ndarray
@@ -121,19 +124,21 @@ def sweep(sensor: Sensor, fitted: Sensor, poses: Poses, panels: Sequence[int] = 
     line, regressions = linear.fit(sensor, swept), paper_regression.regress_axes(sensor, swept)
     reference = reference_force(swept, sensor.local_gravity_mps2)
     force_g = np.column_stack(reference) / G0_MPS2
-    predicted = np.column_stack(signal_chain.static_response(fitted)(reference))
+    predicted = np.column_stack(signal_chain.static_response(fitted)(
+        reference, swept.environment))
     vertical = np.abs(np.sin(swept.alpha_rad)) > _VERTICAL
     figure, grid = pyplot().subplots(2, len(panels), figsize=(4.4 * len(panels), 9),
                                      layout='constrained', squeeze=False)
     for d, row in enumerate(grid):
         linear_v = line.zero_g_v[d] + line.scale_v_per_g[d] * force_g[:, d]
-        data = _AxisData(d, force_g, swept, 1e3 * (swept.volts[:, d] - linear_v),
+        data = _AxisData(d, fitted.model, force_g, swept,
+                         1e3 * (swept.volts[:, d] - linear_v),
                          1e3 * (predicted[:, d] - linear_v), regressions[d], vertical)
         for axis, panel in zip(row, panels):
             _PANELS[panel](axis, data)
     if len(panels) > 4:
         figure.suptitle(f'{fitted.serial}: deviation from the linear model, measured and by the '
-                        'physical model (Ang et al. 2007, figures 2 to 8)')
+                        f'{fitted.model} model (Ang et al. 2007, figures 2 to 8)')
     return figure
 
 
@@ -268,7 +273,7 @@ def _modelled(axis: Any, data: _AxisData) -> None:
         axis.plot(force_g[index], data.model_mv[index], lw=1, color=line.get_color())
     axis.legend(title='alpha', fontsize=7)
     axis.set(xlabel=f'{data.name} reference, g', ylabel=f'{data.name} output minus linear, mV',
-             title='figs. 5, 7: measured ● and physical model ─')
+             title=f'figs. 5, 7: measured ● and {data.model} model ─')
 
 
 def _bias_along_z(axis: Any, data: _AxisData) -> None:

@@ -319,7 +319,8 @@ def _plots(result: CalibrationResult) -> list[str]:
     inliers = result.poses.subset(result.inliers)
     parts = ['<p>The first plot has the errors on held-out poses, as figure 10 of Ang, Khosla and '
              'Riviere (2007). The others are figures 2 to 8 of the paper for this unit: the '
-             'deviation from the linear model, measured and by the physical model.</p>']
+             f'deviation from the linear model, measured and by the {result.paper_sensor.model} '
+             'model.</p>']
     if result.held_out:
         parts.append(_picture(plots.held_out(result.held_out, inliers),
                               'errors on held-out poses'))

@@ -17,7 +17,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from adxl_ros.calibrate.guided import pose_plan
 from adxl_ros.calibrate.guided.capture_settings import CaptureSettings, StageMode
@@ -115,6 +115,8 @@ def _declare_plan(node: Node, by_hand: bool) -> _PosePlan:
     planes_rad = list(declare(node, 'sweep.planes_rad', default_planes_rad,
                               'planes alpha of the plan full, rad; the default becomes 0 to pi '
                               'for a sensor with a z axis'))
+    planes_deg = declare(node, 'sweep.planes_deg', (), 'the same in degrees, a list of numbers; '
+                         'empty: sweep.planes_rad counts', 'deg')
     step_rad = declare(node, 'sweep.step_rad', pose_plan.STEP_RAD, 'step of beta', 'rad',
                        0.005, 1.6)
     step_deg = declare(node, 'sweep.step_deg', 0.0,
@@ -126,6 +128,10 @@ def _declare_plan(node: Node, by_hand: bool) -> _PosePlan:
                               f'{step_rad:g} rad are both given; keep one')
     if step_deg:
         step_rad = float(np.radians(step_deg))
+    if planes_deg and planes_rad != default_planes_rad:
+        raise parameter_error('sweep.planes_deg', 'sweep.planes_rad is given, too; keep one')
+    if planes_deg:
+        planes_rad = _planes_rad(planes_deg)
     if kind == 'auto':
         is_default = planes_rad == default_planes_rad and step_rad == pose_plan.STEP_RAD
         kind = 'quick' if by_hand and is_default else 'full'
@@ -133,3 +139,12 @@ def _declare_plan(node: Node, by_hand: bool) -> _PosePlan:
     pose_plan.guided(planes_rad, step_rad, 0)
     return _PosePlan(kind, () if planes_rad == default_planes_rad else tuple(planes_rad), step_rad,
                      _CHECK_POSES[kind] if check_poses < 0 else check_poses)
+
+
+def _planes_rad(planes_deg: Any) -> list[float]:
+    """Return planes, rad, from a list of degrees; one number alone is one plane."""
+    try:
+        return [float(np.radians(float(plane))) for plane in np.atleast_1d(planes_deg)]
+    except (TypeError, ValueError):
+        raise parameter_error('sweep.planes_deg', f'{planes_deg!r} is no list of degrees; write '
+                              '[30.0, 60.0, 90.0]') from None

@@ -108,6 +108,7 @@ def test_the_report_has_its_contents(opened, report_folder):
     assert messages == []
     text = page.locator('body').inner_text()
     assert 'Calibration of <U&7>' in text
+    assert 'measured and by the full model' in text
     rows = page.locator('table').nth(0).locator('tbody tr')
     assert rows.locator('td:first-child').all_inner_texts() == [
         'nominal', 'linear', 'physical', 'full']

@@ -1,0 +1,95 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What the tools print for people: help texts, version, and the end of a run."""
+
+import os
+from pathlib import Path
+import re
+
+from adxl_ros.model.effects import library
+from processes import executable, run_executable
+import pytest
+from terminal import Terminal
+
+TOOLS = ('apply', 'blind', 'diagnose', 'fit', 'reproduce', 'simulate', 'working')
+COLUMNS = 79
+COLOUR = '\x1b['
+
+
+@pytest.mark.parametrize('name', TOOLS)
+def test_version(name: str) -> None:
+    done = run_executable(name, '--version')
+    assert (done.returncode, done.stderr) == (0, '')
+    assert re.fullmatch(r'adxl_ros \d+\.\d+\.\d+\n', done.stdout)
+
+
+@pytest.mark.parametrize('name', TOOLS)
+def test_help_has_examples_within_a_terminal(name: str) -> None:
+    text = run_executable(name, '--help').stdout
+    assert f'    ros2 run adxl_ros {name} ' in text.split('examples:')[1]
+    assert max(map(len, text.splitlines())) <= COLUMNS
+
+
+@pytest.mark.parametrize('name', ['diagnose', 'fit', 'simulate'])
+def test_help_lists_the_effects(name: str) -> None:
+    listed = run_executable(name, '--help').stdout.split('\neffects:\n')[1]
+    names = set(re.findall(r'^  ([a-z_]+) ', listed, re.MULTILINE))
+    assert names <= set(library())
+    assert {'bias', 'temperature_bias', 'stage_offset'} <= names
+    assert (names == set(library())) == (name != 'fit')
+
+
+def end_of(text: str) -> tuple[str, str]:
+    """Return the files and the next command at the end of a text of at most 79 columns."""
+    assert max(map(len, text.splitlines())) <= COLUMNS, text
+    assert COLOUR not in text
+    end = re.search(r'^ wrote  (.*?)^ next   (.*)\Z', text, re.DOTALL | re.MULTILINE)
+    assert end, text
+    return end[1], ' '.join(end[2].replace('\\\n', ' ').split())
+
+
+def test_each_tool_names_its_files_and_the_next_command(tmp_path: Path) -> None:
+    """The next command of one tool is what a user runs then."""
+    done = run_executable('simulate', 'sweep', '--rate', '50', '--effect', 'misalignment', '-o',
+                          'sweep.csv', cwd=tmp_path)
+    assert 'misalignment' in done.stdout
+    assert end_of(done.stdout) == ('sweep.csv\n', 'ros2 run adxl_ros fit sweep.csv -o unit.yaml')
+    done = run_executable('fit', 'sweep.csv', '-o', 'unit.yaml', '--store', '', '--report', '.',
+                          cwd=tmp_path)
+    files, following = end_of(done.stdout)
+    assert files.split()[:3] == ['unit.yaml', 'report.html', 'calibration.png']
+    assert all((tmp_path / name).exists() for name in files.split()[:3])
+    assert re.search('^ (PASS|NOT SHOWN|FAIL) ', done.stdout, re.MULTILINE)
+    assert following == 'ros2 run adxl_ros apply RECORDING --params unit.yaml -o tilt.csv'
+    done = run_executable('apply', 'sweep.csv', '--params', 'unit.yaml', '-o', 'tilt.csv',
+                          cwd=tmp_path)
+    assert end_of(done.stdout) == (
+        'tilt.csv\n',
+        'ros2 run adxl_ros compensation --ros-args -p calibration:=unit.yaml')
+
+
+def test_outcomes_are_coloured_in_a_terminal_only(tmp_path: Path) -> None:
+    run_executable('simulate', 'sweep', '--rate', '50', '-o', 'sweep.csv', cwd=tmp_path)
+    raw = {}
+    for name, environment in (('coloured', {}), ('plain', {'NO_COLOR': '1'})):
+        terminal = Terminal([executable('fit'), 'sweep.csv', '-o', 'unit.yaml', '--store', ''],
+                            {**os.environ, **environment}, tmp_path)
+        try:
+            terminal.wait_for('next ros2 run')
+            raw[name] = terminal.raw.decode()
+        finally:
+            terminal.close()
+    assert re.search(r'\x1b\[3[123]m(PASS|NOT SHOWN|FAIL)\x1b\[0m', raw['coloured'])
+    assert not re.search(r'\x1b\[3[123]m', raw['plain'])
