@@ -19,6 +19,7 @@ from __future__ import annotations
 from base64 import b64encode
 from html import escape
 from io import BytesIO
+from itertools import chain
 import textwrap
 from typing import Any
 
@@ -51,8 +52,9 @@ def summary(made: dict[str, Any]) -> str:
     """Return the result of the check in a few lines."""
     rows = [line for row in _result(made)[1] for line in _row_lines(row)]
     head = f'{"score":{_NAME_COLUMNS}} {"value (90 % interval)":28}{"n":>4} {"bar":14}met'
-    return '\n'.join([*textwrap.wrap(_drawn(made), _COLUMNS), '', head, *rows, '', _TOO_FEW,
-                      *textwrap.wrap(_leaks(made), _COLUMNS)])
+    before, *after = (textwrap.wrap(text, _COLUMNS)
+                      for text in (_drawn(made), _TOO_FEW, _leaks(made)))
+    return '\n'.join([*before, '', head, *rows, '', *chain(*after)])
 
 
 def _row_lines(row: list[str]) -> list[str]:

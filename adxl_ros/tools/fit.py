@@ -97,7 +97,7 @@ def fit(options: argparse.Namespace) -> int:
     result.save(options.output)
     kept = result.keep(options.store)
     report = [Path(options.report) / name for name in _REPORT_FILES] if options.report else []
-    print_end([*calibration.coefficient_lines(result.fitted), '', *result.summary_lines, '',
+    print_end([*text_tables.coefficient_table(result.fitted), '', *result.summary_lines, '',
                *text_tables.acceptance_lines(result.fitted), ''], [options.output, *report],
               command('apply', f'RECORDING --params {quoted(options.output)} -o tilt.csv'), [kept])
     return 0

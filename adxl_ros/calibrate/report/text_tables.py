@@ -20,8 +20,9 @@ from collections.abc import Sequence
 
 from adxl_ros.calibrate.fits.gravity_fit import GravityFit
 from adxl_ros.calibrate.report import acceptance
-from adxl_ros.calibrate.report.against_truth import Comparison
+from adxl_ros.calibrate.report.against_truth import compare, Comparison
 from adxl_ros.calibrate.report.cross_validation import HeldOutErrors
+from adxl_ros.calibrate.report.error_budget import sample_noise_mps2
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.sensor import Sensor
 import numpy as np
@@ -58,8 +59,7 @@ def _three_digits(value: float) -> str:
 
 def truth_table(comparisons: Sequence[Comparison]) -> list[str]:
     """Lay out each fitted coefficient beside the true one, in 79 columns."""
-    longest = max((len(row.label) for row in comparisons), default=0)
-    width = max(min(longest + 1, _LONGEST_LABEL), len('coefficient'))
+    width = _label_width(comparisons)
     inside = sum(row.inside for row in comparisons)
     return [f' {"coefficient":{width}}     fitted (90 %) {"":16}true',
             *(_truth_row(row, width) for row in comparisons),
@@ -69,12 +69,33 @@ def truth_table(comparisons: Sequence[Comparison]) -> list[str]:
 
 def _truth_row(row: Comparison, width: int) -> str:
     """Lay out one coefficient, with a label of the given width."""
+    truth = '0' if row.truth == 0 else _rounded(row, row.truth)
+    return (f'{_fitted_row(row, width)} {truth:>10}   {"ok" if row.inside else "MISSED"}')
+
+
+def coefficient_table(fitted: Sensor) -> list[str]:
+    """Lay out the fitted coefficients with their 90 % intervals, in 79 columns."""
+    rows = compare(fitted, fitted)
+    width = _label_width(rows)
+    return [f' {fitted.serial}: {fitted.model} model, coefficients with 90 % intervals',
+            *(_fitted_row(row, width).rstrip() for row in rows)]
+
+
+def _label_width(rows: Sequence[Comparison]) -> int:
+    longest = max((len(row.label) for row in rows), default=0)
+    return max(min(longest + 1, _LONGEST_LABEL), len('coefficient'))
+
+
+def _fitted_row(row: Comparison, width: int) -> str:
+    """Lay out the fitted value of a coefficient, with a label of the given width."""
+    return (f' {row.label[:width]:{width}} {row.axis:1} {_rounded(row, row.fitted):>10} ± '
+            f'{_rounded(row, row.half_width):8} {row.unit:5}')
+
+
+def _rounded(row: Comparison, value: float) -> str:
+    """Write a value with the decimals that show two digits of the interval."""
     decimals = _decimals(row.half_width)
-    fitted, half_width, truth = (f'{round(value, decimals) + 0.0:.{decimals}f}'
-                                 for value in (row.fitted, row.half_width, row.truth))
-    truth = '0' if row.truth == 0 else truth
-    return (f' {row.label[:width]:{width}} {row.axis:1} {fitted:>10} ± {half_width:8} '
-            f'{row.unit:5} {truth:>10}   {"ok" if row.inside else "MISSED"}')
+    return f'{round(value, decimals) + 0.0:.{decimals}f}'
 
 
 def _decimals(half_width: float) -> int:
@@ -86,21 +107,30 @@ def _decimals(half_width: float) -> int:
 
 
 def acceptance_lines(fitted: Sensor) -> list[str]:
-    """Return whether the calibration error is within the datasheet's limit, as lines."""
+    """
+    Return whether the calibration error is within its limit, as lines.
+
+    The limit is that of the datasheet, or the noise of one sample where no datasheet states one.
+    """
     provenance = fitted.provenance
     if 'own_accel_mg' not in provenance:
         return [f' {acceptance.NOT_SHOWN}  no pose was kept out of the fit to assess it']
     error_mg = float(provenance['own_accel_mg'])
-    limit = f'{1e3 * acceptance.nonlinearity_mps2(fitted) / G0_MPS2:.2g} mg'
-    accel = provenance.get('verdict_datasheet', '')
-    tilt = provenance.get('verdict_tilt_datasheet', '')
-    result = f'calibration error {error_mg:#.2g} mg; the datasheet allows {limit}'
+    limit_mps2, kind, allows = acceptance.nonlinearity_mps2(fitted), 'datasheet', \
+        'the datasheet allows'
+    if not limit_mps2:
+        limit_mps2, kind, allows = sample_noise_mps2(fitted), 'noise', 'the noise of one sample is'
+    limit = f'{1e3 * limit_mps2 / G0_MPS2:.2g} mg'
+    accel = provenance.get(f'verdict_{kind}', '')
+    tilt = provenance.get(f'verdict_tilt_{kind}', '')
+    result = f'calibration error {error_mg:#.2g} mg; {allows} {limit}'
     if acceptance.FAIL in (accel, tilt):
         if accel != acceptance.FAIL:
             tilt_deg = float(provenance['own_tilt_deg'])
             result = f'tilt error {tilt_deg:.2g}°, more than {limit} causes'
         return [f' {acceptance.FAIL}  {result}',
-                '       The sensor is worse than its datasheet states: do not use this file.']
+                '       The sensor is worse than its datasheet states: do not use this file.'
+                if kind == 'datasheet' else '       More poses, or longer ones, reduce it.']
     if acceptance.NOT_SHOWN in (accel, tilt):
         return [f' {acceptance.NOT_SHOWN}  {result}',
                 '            The check poses are too few to show that the error is within it.']
