@@ -21,7 +21,8 @@ Start a guided calibration: the driver, the stage and the calibration.
     ros2 launch adxl_ros calibrate.launch.py mode:=gravity output:=unit_17.yaml
 
 The calibration starts by itself and stays up to show its result. In mode `gravity` there is no
-stage, and `ros2 service call /calibration/finish std_srvs/srv/Trigger` fits the rests so far.
+stage, and `ros2 service call /calibration/finish std_srvs/srv/Trigger` fits the rests so far. A
+driver that is killed is started again; one that refuses to start three times ends the launch.
 """
 
 from adxl_ros.nodes.support import launch_nodes
@@ -42,11 +43,12 @@ def generate_launch_description() -> LaunchDescription:
 
 
 def make_nodes(context: LaunchContext) -> list[Node]:
-    """Return the nodes; a driver that does not start ends the launch."""
+    """Return the nodes; a driver that is killed is started again."""
     mode = argument(context, 'mode')
     stage = [make_node(context, 'stage', {})] if mode == 'stage' else []
     return [
-        make_node(context, 'driver', {}, on_exit=Shutdown()), *stage,
+        make_node(context, 'driver', {}, respawn=True, respawn_delay=2.0,
+                  on_exit=launch_nodes.GiveUp()), *stage,
         make_node(context, 'calibration', {
             'autostart': True, 'mode': mode, 'output': text(argument(context, 'output'))},
             on_exit=Shutdown())]

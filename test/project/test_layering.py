@@ -24,8 +24,9 @@ import pytest
 
 PACKAGE = REPO / 'adxl_ros'
 CORE = {'adxl_ros', 'ament_index_python', 'numpy', 'scipy', 'yaml'}
-ROS = {'builtin_interfaces', 'diagnostic_msgs', 'geometry_msgs', 'rcl_interfaces', 'rclpy',
-       'rosgraph_msgs', 'sensor_msgs', 'std_msgs', 'std_srvs', 'trajectory_msgs'}
+ROS = {'builtin_interfaces', 'diagnostic_msgs', 'geometry_msgs', 'launch', 'launch_ros',
+       'rcl_interfaces', 'rclpy', 'rosgraph_msgs', 'sensor_msgs', 'std_msgs', 'std_srvs',
+       'trajectory_msgs'}
 
 
 def test_contracts(capsys: pytest.CaptureFixture) -> None:

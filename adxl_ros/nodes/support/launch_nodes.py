@@ -61,7 +61,7 @@ def common_arguments() -> list[DeclareLaunchArgument]:
           for name, (default, text) in texts.items())]
 
 
-def make_node(context: LaunchContext, executable: str, parameters: Mapping[str, Any],
+def make_node(context: LaunchContext, executable: str, overrides: Mapping[str, Any],
               **options: Any) -> Node:
     """
     Make a node of this package with the parameter file of the launch.
@@ -72,8 +72,8 @@ def make_node(context: LaunchContext, executable: str, parameters: Mapping[str, 
         The launch, which has the arguments.
     executable
         Its executable, which is its name, too.
-    parameters
-        Further parameters; they override those of the file.
+    overrides
+        Parameters in place of those of the file.
     options
         Further options of the action.
 
@@ -96,7 +96,7 @@ def make_node(context: LaunchContext, executable: str, parameters: Mapping[str, 
                         f'or {name}:')
     shared = {'frame_id': text(argument(context, 'frame_id')), **_link(context)}
     return Node(package='adxl_ros', executable=executable, namespace=namespace, output='screen',
-                parameters=[*([path] if is_named else []), {**shared, **parameters}],
+                parameters=[*([path] if is_named else []), {**shared, **overrides}],
                 ros_arguments=['--log-level', argument(context, 'log_level')], **options)
 
 
