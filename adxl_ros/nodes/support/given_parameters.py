@@ -35,8 +35,8 @@ OWN_PARAMETERS = {
     'calibration': (
         'autostart', 'journal', 'mode', 'output', 'report', 'resume', 'screen', 'stage.mode',
         'stage.near_rad', 'stage.timeout_s', 'stage.tolerance_rad', 'store', 'sweep.check_poses',
-        'sweep.dwell_s', 'sweep.plan', 'sweep.planes_rad', 'sweep.step_deg', 'sweep.step_rad',
-        'sweep.temperature_span_c', 'sweep.tilt_error_deg'),
+        'sweep.dwell_s', 'sweep.plan', 'sweep.planes_deg', 'sweep.planes_rad', 'sweep.step_deg',
+        'sweep.step_rad', 'sweep.temperature_span_c', 'sweep.tilt_error_deg'),
     'compensation': ('calibration', 'inverse', 'store', 'undo_filter'),
 }
 """Parameters by node, those of sensor and link aside. One file may serve all nodes: a node
