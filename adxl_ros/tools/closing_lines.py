@@ -42,8 +42,8 @@ def _wrapped(text: str, indent: int = 0) -> list[str]:
                          break_on_hyphens=False)
 
 
-def print_end(result: Sequence[str], files: Iterable[str | os.PathLike], next_command: str = '',
-              notes: Sequence[str] = ()) -> None:
+def print_end(result: Sequence[str], files: Iterable[str | os.PathLike], next_command: str = ''
+              ) -> None:
     """
     Print the end of a tool within 79 columns; outcomes are coloured in a terminal.
 
@@ -55,15 +55,12 @@ def print_end(result: Sequence[str], files: Iterable[str | os.PathLike], next_co
         The files that were written. One that does not exist is left out.
     next_command
         The command that follows; empty for none.
-    notes
-        Sentences about the files.
 
     """
     lines = [part for line in result for part in _wrapped(line, 2) or ['']]
     written = '  '.join(str(path) for path in files if Path(path).exists())
-    for label, text in (('wrote', written), *(('', note) for note in notes)):
-        if text:
-            lines += _wrapped(f' {label:{_LABEL_COLUMNS - 1}}{text}', _LABEL_COLUMNS)
+    if written:
+        lines += _wrapped(f' {"wrote":{_LABEL_COLUMNS - 1}}{written}', _LABEL_COLUMNS)
     if next_command:
         lines += _command_lines(next_command)
     print('\n'.join(map(_coloured, lines)))

@@ -70,7 +70,7 @@ def argument_parser(tool: str, description: str | None, examples: Mapping[str, s
         Name of the tool.
     description
         Purpose of the tool, one or more sentences.
-    examples
+    examples : mapping
         Arguments of each example, by its purpose.
     details
         Returns further text for the end, with its line breaks; None for none.

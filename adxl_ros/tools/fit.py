@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+import sys
 
 from adxl_ros.calibrate import calibration, pose_extraction
 from adxl_ros.calibrate.report import report_html, text_tables
@@ -95,11 +96,11 @@ def fit(options: argparse.Namespace) -> int:
         make_folder(Path(options.report))
         report_html.write(options.report, result, options.store)
     result.save(options.output)
-    kept = result.keep(options.store)
+    print(f'fit: {result.keep(options.store)}', file=sys.stderr)
     report = [Path(options.report) / name for name in _REPORT_FILES] if options.report else []
     print_end([*text_tables.coefficient_table(result.fitted), '', *result.summary_lines, '',
                *text_tables.acceptance_lines(result.fitted), ''], [options.output, *report],
-              command('apply', f'RECORDING --params {quoted(options.output)} -o tilt.csv'), [kept])
+              command('apply', f'RECORDING --params {quoted(options.output)} -o tilt.csv'))
     return 0
 
 

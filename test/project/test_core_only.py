@@ -26,12 +26,16 @@ from without_extras import extras, run_without_extras
 
 IMPORT_ALL = """
 from importlib import import_module
+from importlib.util import find_spec
 from pkgutil import walk_packages
 import adxl_ros
 
 wanted = sys.argv[1:]
 modules = [m.name for m in walk_packages(adxl_ros.__path__, 'adxl_ros.')
            if m.name.split('.')[1] in wanted]
+if not find_spec('launch'):
+    # The wheels of ROS 2 have no ros2 launch, for which this module is.
+    modules.remove('adxl_ros.nodes.support.launch_nodes')
 for name in modules:
     import_module(name)
 print(json.dumps({'modules': modules, 'blocked': sorted(blocked & set(sys.modules))}))
