@@ -197,7 +197,7 @@ def test_planes_and_step_are_set_in_degrees(start, tmp_path):
                  '-p', 'sweep.planes_rad:=[0.5]')
     assert both.wait() == 1
     assert 'sweep.planes_deg: sweep.planes_rad is given, too; keep one' in both.output()
-    start('driver', '--ros-args', '--params-file', truth)
+    start('driver', '--ros-args', '--params-file', truth, '-p', 'link.type:=sim')
     start('calibration', '--ros-args', '--params-file', bare, *planes, '-p', 'autostart:=true')
     journal = tmp_path / 'calibration.yaml.journal'
     wait_until(lambda: journal.exists() and journal.read_text().count('\n'), 30, 'the journal')
