@@ -166,11 +166,10 @@ def posterior(linear_model: LinearModel, sized: Sequence[SizedHypothesis],
 
     by_form = []
     for index, s in enumerate(sized):
-        values = [_log_evidence(channels, index, s, share)
-                  for share in _form_errors(s, settings)]
-        best = int(np.argmax(values))
+        shares = _form_errors(s, settings)
+        values = [_log_evidence(channels, index, s, share) for share in shares]
         total = float(np.logaddexp.reduce(values) - np.log(len(values)))
-        by_form.append((total, _form_errors(s, settings)[best]))
+        by_form.append((total, shares[int(np.argmax(values))]))
         add(index, None, *by_form[-1])
     ranked = sorted(range(len(sized)), key=lambda i: -(
         settings.evidence_factor * by_form[i][0]
@@ -310,12 +309,11 @@ def _place(whitener: Whitener, filters: Sequence[Whitener]) -> int | None:
 def _filters(number: int, sized: Sequence[SizedHypothesis]) -> list[Whitener]:
     """Return whitening filters of one channel: those of the most probable hypotheses."""
     ranked = sorted(sized, key=lambda s: -s.hypothesis.log_evidence)
-    chosen = {(w.effect, w.density): w for w in
-              (s.hypothesis.whiteners[number] for s in reversed(ranked))}
-    by_rank = [chosen[key] for key in dict.fromkeys(
-        (w.effect, w.density) for w in (s.hypothesis.whiteners[number] for s in ranked))]
-    healthy = [w for w in by_rank if w.healthy]
-    drifting = [w for w in by_rank if not w.healthy]
+    by_rank: dict[tuple[str, float], Whitener] = {}
+    for whitener in (s.hypothesis.whiteners[number] for s in ranked):
+        by_rank.setdefault((whitener.effect, whitener.density), whitener)
+    healthy = [w for w in by_rank.values() if w.healthy]
+    drifting = [w for w in by_rank.values() if not w.healthy]
     return healthy[:_LARGEST_HEALTHY] + drifting[:_LARGEST_DRIFTING]
 
 
