@@ -14,6 +14,7 @@
 
 """What the documentation shows works: parameter files load, and ROS parses the arguments."""
 
+import math
 from pathlib import Path
 import re
 import shlex
@@ -62,3 +63,22 @@ def test_ros_parses_the_arguments(page: Path) -> None:
 def test_an_argument_that_ros_does_not_parse() -> None:
     with pytest.raises(RuntimeError, match='parse'):
         rclpy.init(args=['node', '--ros-args', '-p', 'link.uri:=local:'], context=Context())
+
+
+def sensor_row(path: Path) -> str:
+    """Return the row of docs/sensor.md for a parameter file: values with three digits."""
+    sensor = parameter_file.load(path)
+    noise = dict.fromkeys(f'{density * 1e6:.3g}' for density in sensor.noise_density_g_per_rthz)
+    filter_hz = 1 / (2 * math.pi * sensor.rc_s)
+    step_mg = 1e3 * sensor.lsb_v / sensor.nominal_scale_v_per_g[0]
+    cells = (f'[{path.stem}](../params/{path.name})', sensor.axes, f'±{sensor.range_g:.3g}',
+             ', z '.join(noise), f'{float(f"{filter_hz:.3g}"):g}',
+             f'{sensor.rate_hz:g}', f'{step_mg:.3g}')
+    return f'| {" | ".join(cells)} |'
+
+
+def test_the_table_of_sensors_has_their_values() -> None:
+    """docs/sensor.md lists every file of `params/` with its values, and no other."""
+    text = (REPO / 'docs' / 'sensor.md').read_text('utf-8')
+    rows = [line for line in text.splitlines() if '(../params/' in line and line.startswith('|')]
+    assert rows == [sensor_row(path) for path in sorted((REPO / 'params').glob('*.yaml'))]
