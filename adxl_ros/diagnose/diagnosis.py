@@ -208,7 +208,7 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
     plan.show(REPORT, 0.0)
     verdict = _decide(linear_model, explanation,
                       hidden_odds(linear_model, searched.single_gains, SETTINGS))
-    diagnosis = _with_report(linear_model, explanation, verdict, sensor, seed)
+    diagnosis = _with_report(checked, linear_model, explanation, verdict, sensor, seed)
     plan.show(REPORT, 1.0)
     return diagnosis
 
@@ -336,8 +336,9 @@ def _rounding_std_mps2(comparison: BaselineComparison) -> float:
     return float(comparison.sensor.lsb_v / np.min(comparison.scale_v_per_mps2)) / 12 ** 0.5
 
 
-def _with_report(linear_model: LinearModel, explanation: _Explanation, verdict: Verdict,
-                 sensor: Sensor, seed: int) -> Diagnosis:
+def _with_report(checked: Sequence[CheckedRecording], linear_model: LinearModel,
+                 explanation: _Explanation, verdict: Verdict, sensor: Sensor, seed: int
+                 ) -> Diagnosis:
     """Add to a verdict the other parts of the report."""
     comparisons, best = linear_model.comparisons, verdict.best
     floor, lacking = explanation.noise_floor, not_covered(comparisons)
@@ -354,7 +355,8 @@ def _with_report(linear_model: LinearModel, explanation: _Explanation, verdict: 
         detections=tuple(explanation.detections),
         noise_remainders=tuple(explanation.noise_remainders),
         gap_closure=_without_noise_effects(explanation, sensor, seed),
-        residual_cells=tuple(residual_map(comparisons[0], floor.rms_mps2, seed)),
+        residual_cells=tuple(residual_map(comparisons[0], checked[0].comparison,
+                                          floor.rms_mps2, seed)),
         not_covered=tuple(lacking),
         next_experiment=propose_next_experiment(verdict, lacking, seed),
         contributions_mps2=contributions_mps2,
@@ -366,10 +368,16 @@ def _with_report(linear_model: LinearModel, explanation: _Explanation, verdict: 
 
 
 def _without_noise_effects(explanation: _Explanation, sensor: Sensor, seed: int) -> GapClosure:
-    """Return the gap closure with the noise floor that the noise-like effects are above."""
+    """
+    Return the gap closure with the noise floor that the noise-like effects are above.
+
+    The steps of the encoder count as far as the residual has them: where its angles are smoothed,
+    the residual is smaller than noise and steps together.
+    """
     at_rate = replace(sensor, rate_hz=explanation.sensor.rate_hz)
     stated = noise.sample_std_v(at_rate) / (at_rate.scale_v_per_g / G0_MPS2)
-    floor_mps2 = floor_without(explanation.noise_floor.rms_mps2, explanation.noise_remainders,
+    rms_mps2 = min(explanation.noise_floor.rms_mps2, explanation.closure.after_mps2)
+    floor_mps2 = floor_without(rms_mps2, explanation.noise_remainders,
                                float(np.sqrt(np.mean(stated ** 2))))
     return explanation.closure.at_floor(floor_mps2, seed)
 

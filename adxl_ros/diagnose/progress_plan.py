@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 ShowProgress = Callable[[str, float], None]
-"""Called with the name of the stage and the fraction of all work that is done, 0 to 1."""
+"""Called with number and name of the stage, and the fraction of all work that is done, 0 to 1."""
 
 CHECKS, LIBRARY, SINGLES = 'checks', 'library of effects', 'single effects'
 FURTHER, PROBABILITIES, REPORT = 'further effects', 'probabilities', 'report'
@@ -80,7 +80,9 @@ class ProgressPlan:
                 break
             self._done[before] = self._work[before]
         self._done[stage] = self._work[stage] * share
-        self._show(stage, sum(self._done.values()) / sum(self._work.values()))
+        number = list(self._work).index(stage) + 1
+        self._show(f'{number}/{len(self._work)} {stage}',
+                   sum(self._done.values()) / sum(self._work.values()))
 
     def within(self, stage: str) -> Callable[[float], None]:
         """Return a function that shows how far a stage is, from its share that is done."""

@@ -12,30 +12,19 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The diagnosis as `report.json`, and as a screen of text for the terminal."""
+"""The diagnosis as `report.json`."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from textwrap import wrap
 from typing import Any
 
 from adxl_ros.diagnose.decision import Verdict, WeightedHypothesis
 from adxl_ros.diagnose.diagnosis import Diagnosis
 from adxl_ros.diagnose.hypothesis_fit import Hypothesis
 from adxl_ros.diagnose.next_experiment import NextExperiment
-from adxl_ros.diagnose.report_wording import (
-    gap_rows,
-    headline,
-    mg,
-    p_text,
-    parameter_text,
-    range_text,
-    remainder_rows,
-    Row,
-    summary,
-)
+from adxl_ros.diagnose.report_wording import summary
 from adxl_ros.diagnose.residual_map import ResidualCell, SIGNIFICANT_P
 from adxl_ros.model.coefficients import fitted_of, get, parameter_of
 from adxl_ros.model.constants import Z_90
@@ -47,15 +36,6 @@ _DIGITS = 6
 """Significant digits of the report. Chosen: more than any of its numbers has."""
 _MOST_CELLS = 40
 """Largest number of cells in the report. Chosen: cells of small share say little."""
-_SCREEN_COLUMNS = 79
-"""Columns of text on the terminal. Chosen: a terminal of 80 columns."""
-_SCREEN_ROWS = 6
-"""Rows of each table on the terminal. Chosen: all of it fits on one screen."""
-_SCREEN_CANDIDATES = 3
-"""Candidates on the terminal. Chosen: a verdict names three effects at most."""
-_CELL_HEAD = (f'{"axis":4} {"dimension":15} {"range":>20} {"statistic":9} {"mg":>7} {"share":>7} '
-              f'{"p":>8}')
-"""Head of the table of cells on the terminal, with the columns of `_cell_line`."""
 _WITHOUT_GAP = ('no_gap', 'insufficient')
 """Verdicts in which there is no gap to close."""
 PROBABLE = 0.05
@@ -264,64 +244,3 @@ def _parameters(diagnosis: Diagnosis, hypothesis: Hypothesis | None, effect: str
 def _key(name: Coefficient) -> str:
     """Return the name of a parameter with its axis, as the keys of the report have it."""
     return f'{name.parameter}.{name.axis}' if name.axis else name.parameter
-
-
-def terminal_lines(diagnosis: Diagnosis) -> list[str]:
-    """Return the diagnosis as lines for a terminal."""
-    lines = _wrapped(headline(diagnosis))
-    for note in notes(diagnosis):
-        lines += _wrapped(f'note: {note}', 6)
-    if diagnosis.data_fault is not None or diagnosis.verdict is None:
-        return lines
-    report = as_json(diagnosis)
-    lines += ['', *_row_lines(gap_rows(diagnosis))]
-    remainders = remainder_rows(diagnosis)
-    if remainders:
-        lines += ['', 'noise-like effects, after they are added to the simulation:']
-        for row in remainders:
-            lines += _wrapped(f'  {row.label}: {row.text}', 4)
-    lines += ['', 'probability  hypothesis']
-    for h in report['hypotheses'][:_SCREEN_ROWS]:
-        lines += _wrapped(f'{p_text(h["probability"]):>11}  {", ".join(h["effects"]) or "no gap"}',
-                          13)
-    if report['where']:
-        lines += ['', 'where the gap shows most:', _CELL_HEAD]
-        lines += [_cell_line(cell) for cell in report['where'][:_SCREEN_ROWS]]
-    for candidate in report['candidates'][:_SCREEN_CANDIDATES]:
-        if (candidate['probability'] or 0) >= PROBABLE:
-            lines += _candidate_lines(candidate)
-    if diagnosis.next_experiment is not None:
-        proposal = diagnosis.next_experiment
-        *first, last = _wrapped(f'  {proposal.command}', 6, _SCREEN_COLUMNS - 2)
-        lines += ['', *_wrapped(f'next: {proposal.manoeuvre}, {proposal.why}', 6),
-                  *(f'{line} \\' for line in first), last]
-    return lines
-
-
-def _row_lines(rows: Sequence[Row]) -> list[str]:
-    """Return rows as lines, their texts below each other."""
-    width = max(len(row.label) for row in rows) + 2
-    return [line for row in rows
-            for line in _wrapped(f'{row.label:{width}}{row.text}', width)]
-
-
-def _wrapped(text: str, indent: int = 0, columns: int = _SCREEN_COLUMNS) -> list[str]:
-    """Wrap a text between words; further lines have an indent."""
-    return wrap(text, columns, subsequent_indent=indent * ' ', break_on_hyphens=False,
-                break_long_words=False)
-
-
-def _cell_line(cell: dict[str, Any]) -> str:
-    """Return one line for a cell of the residual map."""
-    low, high = cell['range']
-    return (f'{cell["axis"]:4} {cell["dimension"]:15} {range_text(low, high):>20} '
-            f'{cell["statistic"]:9} {mg(cell["mean"]):+7.2f} {100 * cell["share"]:5.1f} % '
-            f'{p_text(cell["p"]):>8}')
-
-
-def _candidate_lines(candidate: dict[str, Any]) -> list[str]:
-    """Return the lines for a candidate: its cause and its parameters."""
-    lines = ['', *_wrapped(f'{candidate["effect"]}: {candidate["cause"]}')]
-    for name, parameter in candidate['parameters'].items():
-        lines += _wrapped(f'  {name:28} {parameter_text(parameter)}', 31)
-    return lines

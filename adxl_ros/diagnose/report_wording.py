@@ -81,15 +81,30 @@ def headline(diagnosis: Diagnosis) -> str:
         where = verdict.unknown_where[:_UNKNOWN_DIMENSIONS]
         follows = f' It shows over {", ".join(where)}.' if where else ''
         return f'Unknown: no effect of the library explains the gap {probability}.{follows}'
-    named = _listed([*verdict.effects, *(_listed(group, 'or') for group in verdict.groups)], 'and')
+    named = listed([*verdict.effects, *(listed(group, 'or') for group in verdict.groups)], 'and')
     several = len(diagnosis.comparisons) > 1
     recordings = 'these recordings do' if several else 'this recording does'
     inseparable = f': {recordings} not separate them' if verdict.groups else ''
     return f'Gap explained by {named}{inseparable} {probability}.'
 
 
-def _listed(names: Sequence[str], word: str) -> str:
-    """Return names separated by commas, with a word before the last one."""
+def listed(names: Sequence[str], word: str) -> str:
+    """
+    Return names separated by commas, with a word before the last one.
+
+    Parameters
+    ----------
+    names
+        At least one name.
+    word
+        The word, such as 'and'.
+
+    Returns
+    -------
+    str
+        The list as text.
+
+    """
     *first, last = names
     return f'{", ".join(first)} {word} {last}' if first else last
 
@@ -101,21 +116,21 @@ def summary(diagnosis: Diagnosis) -> str:
     closure = diagnosis.gap_closure
     sentences = [headline(diagnosis),
                  f'Recording minus simulation is {mg_text(closure.before_mps2)} rms.']
-    if _pose_known(diagnosis):
+    if pose_is_compared(diagnosis):
         sentences.append(f'Of this, {_parts_text(diagnosis)}.')
-    if _closes(diagnosis):
+    if closes(diagnosis):
         effects = _effects_of_closure(diagnosis)
         sentences.append(f'{effects[0].upper()}{effects[1:]} reduce it to '
                          f'{mg_text(closure.after_mps2)} on held-out blocks: '
-                         f'{_closed_text(diagnosis)} closed.')
-    elif _only_noise(diagnosis):
-        sentences.append(_NOISE_STAYS)
+                         f'{closed_text(diagnosis)} closed.')
+    elif is_only_noise(diagnosis):
+        sentences.append(NOISE_STAYS)
     sentences.append(f'The noise floor is {mg_text(closure.floor_mps2)}.')
     sentences += [f'{row.label}: {row.text}.' for row in remainder_rows(diagnosis)]
     return ' '.join(sentences)
 
 
-_NOISE_STAYS = 'The effects are noise, which no simulation repeats sample by sample.'
+NOISE_STAYS = 'The effects are noise, which no simulation repeats sample by sample.'
 """Why effects on the noise close nothing."""
 
 
@@ -124,14 +139,14 @@ def gap_rows(diagnosis: Diagnosis) -> list[Row]:
     assert diagnosis.gap_closure is not None and diagnosis.noise_floor is not None
     closure = diagnosis.gap_closure
     rows = [Row('gap', f'{mg_text(closure.before_mps2)} rms, recording minus simulation'),
-            Row('of which', _parts_text(diagnosis) if _pose_known(diagnosis)
+            Row('of which', _parts_text(diagnosis) if pose_is_compared(diagnosis)
                 else 'the mean is not compared, because the pose is unknown')]
-    if _closes(diagnosis):
+    if closes(diagnosis):
         rows += [Row('closed to', f'{mg_text(closure.after_mps2)} rms on held-out blocks, by '
                      f'{_effects_of_closure(diagnosis)}'),
-                 Row('closed', _closed_text(diagnosis))]
-    elif _only_noise(diagnosis):
-        rows.append(Row('closed', _NOISE_STAYS))
+                 Row('closed', closed_text(diagnosis))]
+    elif is_only_noise(diagnosis):
+        rows.append(Row('closed', NOISE_STAYS))
     rows.append(Row('noise floor', f'{mg_text(closure.floor_mps2)} rms, '
                     f'{_FLOOR_SOURCES[diagnosis.noise_floor.source]}'))
     return rows
@@ -142,7 +157,7 @@ def tiles(diagnosis: Diagnosis) -> list[Row]:
     assert diagnosis.gap_closure is not None
     closure = diagnosis.gap_closure
     rows = [Row('gap, recording minus simulation', mg_text(closure.before_mps2))]
-    if _closes(diagnosis):
+    if closes(diagnosis):
         rows += [Row('with the effects, held out', mg_text(closure.after_mps2)),
                  Row('closed', percent(closure.closed, bool(diagnosis.noise_remainders)) + ' %')]
     return [*rows, Row('noise floor', mg_text(closure.floor_mps2))]
@@ -179,7 +194,7 @@ def _parts_text(diagnosis: Diagnosis) -> str:
             'drift')
 
 
-def _pose_known(diagnosis: Diagnosis) -> bool:
+def pose_is_compared(diagnosis: Diagnosis) -> bool:
     """Determine whether the mean of a recording is compared."""
     return any(c.reference is not Reference.NONE for c in diagnosis.comparisons)
 
@@ -193,7 +208,7 @@ def _effects_of_closure(diagnosis: Diagnosis) -> str:
         else 'the effects'
 
 
-def _only_noise(diagnosis: Diagnosis) -> bool:
+def is_only_noise(diagnosis: Diagnosis) -> bool:
     """Determine whether a verdict has effects, but none that acts on the mean."""
     verdict = diagnosis.verdict
     assert verdict is not None
@@ -201,7 +216,7 @@ def _only_noise(diagnosis: Diagnosis) -> bool:
         effect_named(e).acts_on is ActsOn.MEAN for e in verdict.best.effects)
 
 
-def _closes(diagnosis: Diagnosis) -> bool:
+def closes(diagnosis: Diagnosis) -> bool:
     """Determine whether there is a gap, and effects that change the mean."""
     assert diagnosis.verdict is not None and diagnosis.gap_closure is not None
     return diagnosis.verdict.status in ('explained', 'inseparable', 'unknown') \
@@ -209,13 +224,15 @@ def _closes(diagnosis: Diagnosis) -> bool:
             effect_named(e).acts_on is ActsOn.MEAN for e in diagnosis.verdict.best.effects)
 
 
-def _closed_text(diagnosis: Diagnosis) -> str:
-    """Return the closed share with its interval."""
+def closed_text(diagnosis: Diagnosis) -> str:
+    """Return the closed share with its 90 % interval."""
     assert diagnosis.gap_closure is not None
     closure, noisy = diagnosis.gap_closure, bool(diagnosis.noise_remainders)
     low, high = (percent(share, noisy) for share in closure.closed_ci)
-    interval = low if low == high else f'{low} to {high}'
-    return f'{percent(closure.closed, noisy)} % (90 %: {interval} %)'
+    closed = percent(closure.closed, noisy)
+    if low == high == closed:
+        return f'{closed} %'
+    return f'{closed} % ({low if low == high else f"{low} to {high}"} %)'
 
 
 def percent(share: float, noisy: bool) -> str:
@@ -252,6 +269,19 @@ def mg_text(value_mps2: float) -> str:
         return f'< {2 * _SMALLEST_MG:g} mg'
     digits = 2 if abs(value) < 10 else 1 if abs(value) < 100 else 0
     return f'{value:.{digits}f} mg'
+
+
+def floor_source(diagnosis: Diagnosis) -> str:
+    """Return in words what determines the noise floor."""
+    assert diagnosis.noise_floor is not None
+    return _FLOOR_SOURCES[diagnosis.noise_floor.source]
+
+
+def probability_text(probability: float) -> str:
+    """Return a probability in per cent; only certainty by definition would be 0 or 100 %."""
+    if probability >= _NEARLY_ALL:
+        return '> 99 %'
+    return '< 1 %' if probability < 1 - _NEARLY_ALL else f'{100 * probability:.0f} %'
 
 
 def p_text(p: float) -> str:
@@ -299,11 +329,11 @@ def parameter_text(parameter: dict[str, Any]) -> str:
 def _with_prefix(values: Sequence[float], unit: str) -> tuple[list[float], str]:
     """Return values and unit, with a prefix where they are small, and angles in degrees."""
     if unit == 'rad':
-        return [float(np.degrees(v)) for v in values], 'deg'
+        return [float(np.degrees(v)) for v in values], '°'
     if unit == '1':
         return list(values), ''
     base, largest = unit.split('/')[0].split('^')[0], max(map(abs, values))
     if base not in _PREFIXED or largest >= _PREFIX_BELOW or '^' in unit.split('/')[0]:
-        return list(values), unit
-    factor, prefix = (1e3, 'm') if largest >= _PREFIX_BELOW * 1e-3 else (1e6, 'u')
-    return [factor * v for v in values], prefix + unit
+        return list(values), unit.replace('^2', '²')
+    factor, prefix = (1e3, 'm') if largest >= _PREFIX_BELOW * 1e-3 else (1e6, 'µ')
+    return [factor * v for v in values], prefix + unit.replace('^2', '²')

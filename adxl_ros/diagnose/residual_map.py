@@ -153,8 +153,8 @@ def not_covered(comparisons: Sequence[BaselineComparison]) -> list[str]:
     return [text for name, text in _COVERAGE.items() if name not in covered]
 
 
-def residual_map(comparison: BaselineComparison, floor_mps2: float, seed: int
-                 ) -> list[ResidualCell]:
+def residual_map(comparison: BaselineComparison, at_full_rate: BaselineComparison,
+                 floor_mps2: float, seed: int) -> list[ResidualCell]:
     """
     Map the residual of a recording.
 
@@ -162,6 +162,8 @@ def residual_map(comparison: BaselineComparison, floor_mps2: float, seed: int
     ----------
     comparison
         The recording beside the baseline.
+    at_full_rate
+        The same with all samples, for the frequencies.
     floor_mps2
         Noise floor, m/s².
     seed
@@ -173,12 +175,16 @@ def residual_map(comparison: BaselineComparison, floor_mps2: float, seed: int
         All cells that can be tested, by falling share.
 
     """
+    cells = [*_cells_over_dimensions(comparison, _levelled(comparison), floor_mps2, seed),
+             *_cells_over_frequency(at_full_rate.sensor, _levelled(at_full_rate), floor_mps2)]
+    return sorted(cells, key=lambda cell: -cell.share)
+
+
+def _levelled(comparison: BaselineComparison) -> np.ndarray:
+    """Return the residual about its mean, m/s², (n, m); 0 where samples are not used."""
     used = comparison.used
     residual = comparison.residual_v(comparison.sensor) / comparison.scale_v_per_mps2
-    residual = np.where(used[:, None], residual - residual[used].mean(axis=0), 0.0)
-    cells = [*_cells_over_dimensions(comparison, residual, floor_mps2, seed),
-             *_cells_over_frequency(comparison.sensor, residual, floor_mps2)]
-    return sorted(cells, key=lambda cell: -cell.share)
+    return np.where(used[:, None], residual - residual[used].mean(axis=0), 0.0)
 
 
 def _candidates(comparison: BaselineComparison, residual: np.ndarray) -> list[_Candidate]:

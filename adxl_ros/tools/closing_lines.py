@@ -23,17 +23,40 @@ import re
 import shlex
 import sys
 import textwrap
+from typing import NamedTuple
 
 from adxl_ros.tools.command_line import COLUMNS
 
 _LABEL_COLUMNS = 8
 """Columns of the words before files and commands."""
-_COLOURS = {'PASS': '\x1b[32m', 'FAIL': '\x1b[31m', 'NO': '\x1b[31m', 'NOT SHOWN': '\x1b[33m',
-            'not refuted': '\x1b[33m', 'too few': '\x1b[33m'}
-"""Colours of outcomes in a terminal: green, red and yellow."""
+_STEP_COLUMNS = _LABEL_COLUMNS + 3
+"""Columns before the purpose of one of several steps."""
+_GREEN, _RED, _YELLOW = '\x1b[32m', '\x1b[31m', '\x1b[33m'
+"""Codes of xterm: good, bad, and not decided."""
+_COLOURS = {'GAP EXPLAINED': _GREEN, 'NO GAP': _GREEN, 'CAUSES NOT SEPARATED': _YELLOW,
+            'UNKNOWN CAUSE': _RED, 'TOO LITTLE DATA': _YELLOW, 'BAD DATA': _RED,
+            'NOT SHOWN': _YELLOW, 'PASS': _GREEN, 'FAIL': _RED, 'NO': _RED,
+            'not refuted': _YELLOW, 'too few': _YELLOW}
+"""Colours of outcomes in a terminal, those of several words first."""
 _NO_COLOUR = '\x1b[0m'
-_OUTCOME = re.compile(r'\b(NOT SHOWN|PASS|FAIL|NO|not refuted|too few)\b')
-"""Outcomes, the longer ones first."""
+_OUTCOME = re.compile(rf'\b({"|".join(_COLOURS)})\b')
+
+
+class NextStep(NamedTuple):
+    """
+    Something that a user does next.
+
+    Attributes
+    ----------
+    purpose
+        What it is for, one sentence without a period.
+    command
+        The command line that does it.
+
+    """
+
+    purpose: str
+    command: str
 
 
 def _wrapped(text: str, indent: int = 0) -> list[str]:
@@ -42,8 +65,8 @@ def _wrapped(text: str, indent: int = 0) -> list[str]:
                          break_on_hyphens=False)
 
 
-def print_end(result: Sequence[str], files: Iterable[str | os.PathLike], next_command: str = ''
-              ) -> None:
+def print_end(result: Sequence[str], files: Iterable[str | os.PathLike],
+              following: str | Sequence[NextStep] = '', took_s: float | None = None) -> None:
     """
     Print the end of a tool within 79 columns; outcomes are coloured in a terminal.
 
@@ -53,17 +76,30 @@ def print_end(result: Sequence[str], files: Iterable[str | os.PathLike], next_co
         Lines of the result; longer ones are wrapped.
     files
         The files that were written. One that does not exist is left out.
-    next_command
-        The command that follows; empty for none.
+    following
+        The command that follows, or several steps; empty for none.
+    took_s
+        Run time of the tool, s; None where it is of no interest.
 
     """
     lines = [part for line in result for part in _wrapped(line, 2) or ['']]
     written = '  '.join(str(path) for path in files if Path(path).exists())
     if written:
+        written += _duration_text(took_s)
         lines += _wrapped(f' {"wrote":{_LABEL_COLUMNS - 1}}{written}', _LABEL_COLUMNS)
-    if next_command:
-        lines += _command_lines(next_command)
+    if isinstance(following, str):
+        lines += _command_lines(following, f' {"next":{_LABEL_COLUMNS - 1}}')
+    else:
+        lines += _step_lines(following)
     print('\n'.join(map(_coloured, lines)))
+
+
+def _duration_text(took_s: float | None) -> str:
+    """Return a run time in brackets; a no-break space keeps number and unit in one line."""
+    if took_s is None:
+        return ''
+    duration = '< 1' if took_s < 1 else f'{took_s:.0f}'
+    return f'  ({duration} s)'.replace(' s)', '\N{NO-BREAK SPACE}s)')
 
 
 def quoted(*words: str | os.PathLike) -> str:
@@ -71,10 +107,24 @@ def quoted(*words: str | os.PathLike) -> str:
     return shlex.join(str(word) for word in words)
 
 
-def _command_lines(text: str) -> list[str]:
-    """Return the lines of the next command, which continue with a backslash."""
-    *first, last = textwrap.wrap(f' {"next":{_LABEL_COLUMNS - 1}}{text}', COLUMNS - 2,
-                                 subsequent_indent=(_LABEL_COLUMNS + 2) * ' ',
+def _step_lines(steps: Sequence[NextStep]) -> list[str]:
+    """Return numbered steps, each with its command below its purpose."""
+    lines = []
+    for number, step in enumerate(steps, 1):
+        label = '' if number > 1 else 'next'
+        lines += _wrapped(f' {label:{_LABEL_COLUMNS - 1}}{number}  {step.purpose}', _STEP_COLUMNS)
+        lines += _command_lines(step.command, _STEP_COLUMNS * ' ')
+    return lines
+
+
+def _command_lines(text: str, start: str) -> list[str]:
+    """Return the lines of a command behind the start of the first one; a backslash joins them."""
+    if not text:
+        return []
+    if len(start + text) <= COLUMNS:
+        return [start + text]
+    *first, last = textwrap.wrap(text, COLUMNS - 2, initial_indent=start,
+                                 subsequent_indent=(len(start) + 2) * ' ',
                                  break_long_words=False, break_on_hyphens=False)
     return [*(f'{line} \\' for line in first), last]
 

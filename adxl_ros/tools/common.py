@@ -32,6 +32,8 @@ from adxl_ros.files.recording_columns import Recording
 
 _UNITS = {'rad': 'rad', 'm': 'm', 'c': 'degC', 'v': 'V'}
 """Units of references by the end of their columns' names."""
+_BAR_COLUMNS = 24
+"""Columns of a progress bar: names of stages and times stand beside it in 80 columns."""
 
 
 def run(parser: argparse.ArgumentParser, command: Callable[[argparse.Namespace], int]) -> int:
@@ -136,12 +138,44 @@ def _show_nothing(done: float, stage: str = '') -> None:
     """Show nothing; see `ShowDone`."""
 
 
+class _Clock:
+    """
+    The elapsed and the expected run time, by the fraction that is done.
+
+    The clock starts when the first work is done, because what comes before, such as reading, is
+    not a part of the fraction.
+    """
+
+    def __init__(self) -> None:
+        self._begin_s, self._total_s = monotonic(), 0.0
+
+    def set_done(self, done: float) -> None:
+        """Estimate the run time from the fraction that is done."""
+        if done <= 0:
+            self._begin_s = monotonic()
+        else:
+            self._total_s = self._elapsed_s() / min(done, 1.0)
+
+    def text(self) -> str:
+        """Return both times; the expected one as soon as it is known."""
+        elapsed_s = self._elapsed_s()
+        if not self._total_s:
+            return _minutes(elapsed_s)
+        return f'{_minutes(elapsed_s)} of about {_minutes(max(self._total_s, elapsed_s))}'
+
+    def _elapsed_s(self) -> float:
+        return monotonic() - self._begin_s
+
+
 @contextmanager
 def progress(title: str) -> Iterator[ShowDone]:
     """
     Show a progress bar on a terminal where rich is installed, else nothing.
 
-    The time that is left is the elapsed time by what is done and left.
+    Parameters
+    ----------
+    title
+        What is done; the name of a stage takes its place.
 
     Yields
     ------
@@ -154,31 +188,40 @@ def progress(title: str) -> Iterator[ShowDone]:
         from rich.progress import (
             BarColumn,
             Progress,
+            ProgressColumn,
             TaskProgressColumn,
             TextColumn,
-            TimeElapsedColumn,
         )
+        from rich.text import Text
     except ImportError:
         yield _show_nothing
         return
+    clock = _Clock()
+
+    class ClockColumn(ProgressColumn):
+        """The elapsed and the expected run time; rich draws it ten times a second."""
+
+        def render(self, task: object) -> Text:
+            return Text(clock.text())
+
     console = Console(stderr=True)
-    columns = (TextColumn('{task.description}'), BarColumn(), TaskProgressColumn(),
-               TimeElapsedColumn(), TextColumn('{task.fields[remaining]}'))
+    columns = (TextColumn('{task.description}'), BarColumn(_BAR_COLUMNS), TaskProgressColumn(),
+               ClockColumn())
     with Progress(*columns, console=console, transient=True,
                   disable=not console.is_terminal) as bar:
-        task, begin_s = bar.add_task(title, total=1.0, remaining=''), monotonic()
+        task = bar.add_task(title, total=1.0)
 
         def show(done: float, stage: str = '') -> None:
             """Show a fraction; see `ShowDone`."""
-            elapsed_s = monotonic() - begin_s
-            remaining = _remaining(elapsed_s * (1 - done) / done) if done > 0 else ''
-            bar.update(task, completed=done, remaining=remaining,
-                       description=f'{title}: {stage}' if stage else title)
+            clock.set_done(done)
+            # A plan that grows does not take the bar back.
+            bar.update(task, completed=max(done, bar.tasks[task].completed),
+                       description=stage or title)
 
         yield show
 
 
-def _remaining(remaining_s: float) -> str:
-    """Return the time that is left, for people."""
-    minutes, seconds = divmod(round(remaining_s), 60)
-    return f'left {minutes}:{seconds:02d}'
+def _minutes(seconds: float) -> str:
+    """Return a duration as minutes and seconds."""
+    minutes, seconds = divmod(round(seconds), 60)
+    return f'{minutes}:{seconds:02d}'

@@ -20,15 +20,20 @@ import argparse
 import json
 from pathlib import Path
 import sys
+from time import monotonic
+from typing import Any
 
-from adxl_ros.diagnose import report_html, report_json
+from adxl_ros.diagnose import report_html, report_json, report_text
 from adxl_ros.diagnose.diagnosis import diagnose as diagnose_recordings, Diagnosis
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.atomic_write import write_text
+from adxl_ros.files.recording_columns import Recording
+from adxl_ros.files.stream_info import NO_UNIT
 from adxl_ros.model.effects import library
+from adxl_ros.model.sensor import Sensor
 from adxl_ros.simulate.from_recording import motion_from_force
-from adxl_ros.tools.closing_lines import print_end, quoted
+from adxl_ros.tools.closing_lines import NextStep, print_end, quoted
 from adxl_ros.tools.command_line import argument_parser, command, effect_list
 from adxl_ros.tools.common import make_folder, progress, report_reading, run
 
@@ -73,6 +78,7 @@ def _details() -> str:
 
 def diagnose(options: argparse.Namespace) -> int:
     """Run the tool; see `parser`."""
+    begin_s = monotonic()
     if options.seed < 0:
         raise UserError(f'--seed {options.seed}: must not be negative')
     if options.sim and len(options.recording) > 1:
@@ -81,42 +87,90 @@ def diagnose(options: argparse.Namespace) -> int:
     sensor = parameter_file.load(options.params or parameter_file.nominal_path())
     if options.align and not options.sim:
         raise UserError('--align: shifts --sim, which is not given')
-    recordings = []
-    for path in options.recording:
-        recordings.append(recording.read(path))
-        report_reading('diagnose', recordings[-1])
-    sim = motion_from_force(options.sim, False, recordings[0].epoch_ns)[0] if options.sim \
-        else None
-    with progress('diagnose') as show:
+    with progress('reading') as show:
+        recordings = [_read(path) for path in options.recording]
+        sim = motion_from_force(options.sim, False, recordings[0].epoch_ns)[0] if options.sim \
+            else None
         diagnosis = diagnose_recordings(recordings, sensor, sim, options.seed,
                                         lambda stage, done: show(done, stage), options.align)
-    folder = Path(options.output)
-    make_folder(folder)
-    report = report_json.as_json(diagnosis)
-    text = json.dumps(report, indent=1, allow_nan=False) + '\n'
-    write_text(folder / 'report.json', text)
-    write_text(folder / 'report.html', report_html.page(diagnosis, ', '.join(
-        Path(path).name for path in options.recording)))
-    lines = report_json.terminal_lines(diagnosis)
-    if diagnosis.sensor is not None:
-        parameter_file.save(folder / 'params.yaml', diagnosis.sensor, lines)
+        lines = report_text.screen_lines(diagnosis, _subject(recordings, sensor, options.sim))
+        report = _write(options, diagnosis, lines)
     if options.json:
-        print(text)
+        print(json.dumps(report, indent=1, allow_nan=False))
     else:
-        _print_end(lines, diagnosis, folder)
+        print_end([*lines, ''], [Path(options.output, name) for name in _FILES],
+                  _next_steps(options, diagnosis), monotonic() - begin_s)
     if report['verdict']['status'] not in _NO_VERDICT:
         return 0
     reason = report['verdict']['data_fault'] or report['verdict']['status']
     print(f'diagnose: {", ".join(options.recording)}: no verdict ({reason}); the reason is in '
-          f'{folder / "report.json"}', file=sys.stderr)
+          f'{Path(options.output, "report.json")}', file=sys.stderr)
     return 1
 
 
-def _print_end(lines: list[str], diagnosis: Diagnosis, folder: Path) -> None:
-    """Print the diagnosis, the files, and the next command where the diagnosis has none."""
-    is_next_known = diagnosis.next_experiment is not None or diagnosis.sensor is None
-    print_end([*lines, ''], [folder / name for name in _FILES], '' if is_next_known else command(
-        'simulate', f'rich --params {quoted(folder / "params.yaml")} -o simulated.csv'))
+def _read(path: str) -> Recording:
+    """Read a recording, and report how."""
+    read = recording.read(path)
+    report_reading('diagnose', read)
+    return read
+
+
+def _write(options: argparse.Namespace, diagnosis: Diagnosis, lines: list[str]
+           ) -> dict[str, Any]:
+    """Write the files of a diagnosis; return its report."""
+    folder = Path(options.output)
+    make_folder(folder)
+    report = report_json.as_json(diagnosis)
+    write_text(folder / 'report.json', json.dumps(report, indent=1, allow_nan=False) + '\n')
+    write_text(folder / 'report.html', report_html.page(diagnosis, ', '.join(
+        Path(path).name for path in options.recording)))
+    if diagnosis.sensor is not None:
+        parameter_file.save(folder / 'params.yaml', diagnosis.sensor, lines)
+    return report
+
+
+def _subject(recordings: list[Recording], sensor: Sensor, sim: str | None) -> str:
+    """Return what is compared with what."""
+    first, count = recordings[0], len(recordings)
+    name = Path(first.path).name if count == 1 else f'{count} recordings'
+    span_s = sum(float(r.time_s[-1] - r.time_s[0]) for r in recordings if len(r))
+    unit = 'the nominal sensor' if sensor.serial == NO_UNIT else f'unit {sensor.serial}'
+    simulated = f'{Path(sim).name} through the chain of {unit}' if sim \
+        else f'simulation of {unit}'
+    return (f'{name} ({span_s:.0f} s, {first.rate_hz:.4g} Hz, {" ".join(first.axes)})  minus  '
+            f'{simulated}')
+
+
+def _next_steps(options: argparse.Namespace, diagnosis: Diagnosis) -> str | list[NextStep]:
+    """Return what to record, how to diagnose that, and how to simulate what was found."""
+    verdict = diagnosis.verdict
+    if verdict is None:
+        return ''
+    params = quoted(Path(options.output) / 'params.yaml')
+    simulate = command('simulate', f'rich --params {params} -o sim.csv')
+    if diagnosis.next_experiment is None:
+        return simulate
+    proposal = diagnosis.next_experiment
+    steps = [NextStep(f'{proposal.manoeuvre}, {proposal.why}', proposal.command)]
+    if verdict.status == 'explained':
+        steps += [NextStep('diagnose that recording: the effects should close its gap, too',
+                           _diagnose_command(options, params, [])),
+                  NextStep('simulate with the effects', simulate)]
+    else:
+        given = options.params and quoted(options.params)
+        steps.append(NextStep('diagnose it' + ('' if options.sim else ' together with this one'),
+                              _diagnose_command(options, given, options.recording)))
+    return steps
+
+
+def _diagnose_command(options: argparse.Namespace, params: str | None, recordings: list[str]
+                      ) -> str:
+    """Return the command that diagnoses the next recording, alone or with others."""
+    words = [quoted(*([] if options.sim else recordings), 'next.csv')]
+    words += [f'--params {params}'] if params else []
+    words += ['--sim next_simulated.csv'] if options.sim else []
+    output = f'{options.output}{"_2" if options.output[-1].isdigit() else "2"}'
+    return command('diagnose', ' '.join([*words, f'-o {quoted(output)}']))
 
 
 def main() -> int:

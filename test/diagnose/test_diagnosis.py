@@ -16,6 +16,7 @@
 
 from dataclasses import replace
 import json
+import re
 
 from adxl_ros.diagnose import report_json
 from adxl_ros.diagnose.baseline_comparison import compare
@@ -366,7 +367,8 @@ def test_the_command_writes_report_page_and_parameters(run_tool, tmp_path):
     for name in ('a', 'b'):
         run = run_tool('diagnose', 'run.csv', '--params', 'unit.yaml', '-o', name)
         assert (run.returncode, run.stderr) == (0, '')
-        assert run.stdout.startswith('Gap explained by temperature_bias (probability')
+        assert '\nGAP EXPLAINED by 1 effect ' in run.stdout
+        assert re.search(r'^ temperature_bias +> 99 % ', run.stdout, re.MULTILINE)
         files.append([(tmp_path / name / f).read_bytes()
                       for f in ('report.json', 'report.html', 'params.yaml')])
     assert files[0] == files[1]

@@ -172,9 +172,9 @@ def test_effects_that_are_not_separated_are_named_together(diagnosed):
     report = diagnosed(unit(), 'stage_offset:beta_rad=0.005', motion=turning([np.pi / 2] * 2))
     (group,) = report.json['verdict']['groups']
     assert {'base_tilt', 'stage_offset'} <= set(group)
-    first = ' '.join(report.terminal.split()).split('.')[0]
-    assert f'{", ".join(group[:-1])} or {group[-1]}: this recording does not separate them' \
-        in first
+    text = ' '.join(report.terminal.split())
+    assert f'{", ".join(group[:-1])} or {group[-1]}: this recording does not separate them' in text
+    assert text.index('CAUSES NOT SEPARATED') < text.index(group[0])
 
 
 @pytest.mark.parametrize('rate_hz', [62.5, 100.0, 250.0])
@@ -215,8 +215,9 @@ def lfilter_noise(rng, sensor, count):
 @pytest.mark.parametrize('value, ci, unit_name, text', [
     (3.9e-4, [3.47e-4, 4.33e-4], 'g/K', '0.390 (0.347 to 0.433) mg/K'),
     (0.0298, [0.0294, 0.0302], 'm', '29.80 (29.40 to 30.20) mm'),
+    (2e-6, [1e-6, 3e-6], 'g/K^2', '2.0 (1.0 to 3.0) µg/K²'),
     (43.0, [38.0, 48.0], 's', '43 (38 to 48) s'),
-    (0.0040, [0.0039, 0.0041], 'rad', '0.229 (0.223 to 0.235) deg'),
+    (0.0040, [0.0039, 0.0041], 'rad', '0.229 (0.223 to 0.235) °'),
     (0.3, [0.2, 0.4], '1', '0.30 (0.20 to 0.40)')])
 def test_parameters_have_a_prefix_and_few_digits(value, ci, unit_name, text):
     """A value has the digits that its interval allows."""
