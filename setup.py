@@ -56,7 +56,8 @@ setup(
     license='Apache-2.0',
     entry_points={
         'console_scripts': [
-            *scripts('nodes', ('driver', 'stage', 'calibration', 'compensation', 'demo')),
+            *scripts('nodes', ('driver', 'stage', 'calibration', 'screen', 'compensation',
+                               'demo')),
             f'bench = {PACKAGE}.nodes.benchmark:main',
             *scripts('tools', ('simulate', 'fit', 'apply', 'diagnose', 'blind', 'working',
                                'reproduce')),

@@ -18,14 +18,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 import os
 
 from adxl_ros.calibrate.guided.controller import Answer, Controller, Resume, Severity
 from adxl_ros.calibrate.guided.guide import NextPose
 from adxl_ros.files.stream_info import StreamInfo
-from adxl_ros.nodes.support.calibration_console import Console
 from adxl_ros.nodes.support.calibration_parameters import declare_settings
 from adxl_ros.nodes.support.diagnostics import DiagnosticsReporter, Level, Status
+from adxl_ros.nodes.support.display_publisher import DisplayPublisher
 from adxl_ros.nodes.support.given_parameters import check_given_parameters
 from adxl_ros.nodes.support.imu_subscription import Samples
 from adxl_ros.nodes.support.link_parameters import given_link
@@ -55,7 +56,7 @@ class Calibration(Node):
     """
     The node of the guided calibration.
 
-    It connects topics, services and the terminal to a `Controller`, which does the work.
+    It connects topics and services to a `Controller`, which does the work.
     """
 
     def __init__(self) -> None:
@@ -73,9 +74,9 @@ class Calibration(Node):
         if autostart:
             self._controller.wait_for_sensor()
         self._connect()
-        shows_screen = declare(self, 'screen', True,
-                               'show a screen, where the node runs in a terminal')
-        self._console = Console(self, self._controller) if shows_screen else None
+        starts_screen = declare(self, 'screen', True,
+                                'show a screen, where the node runs in a terminal')
+        self._display = DisplayPublisher(self, self._controller, starts_screen)
 
     def log(self, severity: Severity, text: str) -> None:
         """
@@ -113,14 +114,12 @@ class Calibration(Node):
 
     def show_fit(self, text: str) -> None:
         """Show that the fit begins."""
-        if self._console is not None:
-            self._console.show_fit(text)
+        self._display.show_fit(text)
 
     def close(self) -> None:
-        """Close the journal and the terminal."""
+        """Close the journal and the screen."""
         self._controller.close()
-        if self._console is not None:
-            self._console.close()
+        self._display.close()
 
     def _connect(self) -> None:
         """Make diagnostics, subscriptions, services and the timer."""
@@ -130,9 +129,14 @@ class Calibration(Node):
         create_subscription(self, JointState, 'stage/command', self._on_command, _QUEUE)
         create_subscription(self, Temperature, 'temperature', self._on_temperature, _QUEUE)
         create_subscription(self, BatteryState, 'supply', self._on_supply, _QUEUE)
-        for request in (self._controller.start, self._controller.redo, self._controller.skip,
-                        self._controller.finish, self._controller.abort):
-            self.create_service(Trigger, f'~/{request.__name__}', _service(request))
+        start = self._controller.start
+        requests: dict[str, Callable[[], Answer]] = {
+            'start': start, 'resume': partial(start, start_over=False),
+            'start_over': partial(start, start_over=True), 'redo': self._controller.redo,
+            'skip': self._controller.skip, 'finish': self._controller.finish,
+            'abort': self._controller.abort}
+        for name, request in requests.items():
+            self.create_service(Trigger, f'~/{name}', self._service(request))
         # The answer comes when the pose is on disk. Until then the node must take samples.
         self.create_service(Trigger, '~/capture', self._on_capture,
                             callback_group=ReentrantCallbackGroup())
@@ -141,8 +145,6 @@ class Calibration(Node):
     def _poll(self) -> None:
         self._controller.poll()
         self._diagnostics.notice('calibration', _level(self._controller.status().late))
-        if self._console is not None:
-            self._console.turn()
 
     def _status(self) -> Status:
         report = self._controller.report()
@@ -167,6 +169,14 @@ class Calibration(Node):
     def _on_supply(self, message: BatteryState) -> None:
         self._controller.read_supply(_stamp_ns(message), message.voltage)
 
+    def _service(self, request: Callable[[], Answer]) -> Callable[..., Trigger.Response]:
+        """Make the callback of a service that calls a request of the controller."""
+        def respond(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+            response.success, response.message = request()
+            self._display.update()
+            return response
+        return respond
+
     async def _on_capture(self, _: Trigger.Request,
                           response: Trigger.Response) -> Trigger.Response:
         answer = self._controller.capture()
@@ -176,14 +186,6 @@ class Calibration(Node):
             answer = await future
         response.success, response.message = answer
         return response
-
-
-def _service(request: Callable[[], Answer]) -> Callable[..., Trigger.Response]:
-    """Make the callback of a service that calls a request of the controller."""
-    def respond(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        response.success, response.message = request()
-        return response
-    return respond
 
 
 def _level(late: bool) -> Level:

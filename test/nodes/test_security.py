@@ -20,7 +20,9 @@ from xml.etree import ElementTree
 
 from ament_index_python.packages import get_package_share_directory
 from graph import Graph
+from processes import executable
 import pytest
+from terminal import Terminal
 
 POLICY = os.path.join(get_package_share_directory('adxl_ros'), 'security', 'adxl_ros.policy.xml')
 # Topics that depend on the parameters use_sim_time and link.speed, or on a replay.
@@ -37,6 +39,22 @@ def allowed(node):
                 for e in profile.findall(path)}
     return (names("topics[@publish='ALLOW']/topic"), names("topics[@subscribe='ALLOW']/topic"),
             names("services[@reply='ALLOW']/service"))
+
+
+def test_the_policy_has_the_services_that_the_screen_calls(ros_env, tmp_path):
+    tree = ElementTree.parse(POLICY)
+    requests = {f'/{e.text}' for e in tree.findall(
+        ".//profile[@node='screen']/services[@request='ALLOW']/service")}
+    seen = Terminal([executable('screen')], ros_env, tmp_path)
+    seen.wait_for('waiting for /calibration')
+    with Graph() as graph:
+        def called():
+            return {name for name in names_of(graph.node.get_client_names_and_types_by_node(
+                'screen', '/')) if not name.endswith('/get_type_description')}
+        graph.spin_until(lambda: 'screen' in graph.node.get_node_names(), 20, 'the screen')
+        graph.spin_until(lambda: called() >= requests, 20, 'all that is permitted')
+        assert called() == requests
+    seen.close()
 
 
 def names_of(entities):

@@ -20,7 +20,6 @@ import re
 import signal
 
 from adxl_ros.files import parameter_file, sweep_journal
-from adxl_ros.nodes.terminal.keys import Keys
 from graph import Graph, RELIABLE
 import numpy as np
 from processes import executable
@@ -103,6 +102,8 @@ def test_the_screen_guides_an_operator_through_a_sweep(start, terminal, tmp_path
         assert 'check poses 0/2' in ' '.join(screen.split())
         # Arrows, a wheel and function keys have no effect. The key c follows them.
         seen.press(OTHERS)
+        for byte in OTHERS:
+            seen.press(byte)
         seen.press('c')
         seen.wait_for('alpha is 45.0° from the target 45°')
         before = _tilt(screen)
@@ -123,7 +124,8 @@ def test_the_screen_guides_an_operator_through_a_sweep(start, terminal, tmp_path
         seen.press('b')
         seen.wait_for('unit.yaml.journal holds 4 poses of an interrupted calibration', 'y  go on')
         seen.press('y')
-        seen.wait_for('once more, to see that the mounting is', 'alpha 45.0°, beta 90.0°')
+        seen.wait_for('once more, to see that the mounting is', 'alpha 45.0°, beta 90.0°',
+                      'c  capture')
         seen.press('c')
         seen.wait_for('alpha 90.0°, beta 0.0° once more')
         hands.turn(90, 0)
@@ -230,22 +232,14 @@ def test_a_change_of_settings_is_reported_with_a_question(start, terminal, tmp_p
     assert sweep_journal.read(kept)[0]['serial'] == 'T0'
 
 
-@pytest.mark.parametrize('length', [1, 2, 3, 100])
-def test_escape_sequences_are_not_keys(length):
-    """Mouse sequences are not keys, independent of the portions of the bytes."""
-    keys, sent = Keys(), f'C{OTHERS}\xe4r{OTHERS} '.encode()
-    assert ''.join(keys.read(sent[i:i + length], i * 1e-3)
-                   for i in range(0, len(sent), length)) == 'cr '
-    assert keys.read(b'\x1b', 1.0) == '' and keys.read(b'f', 3.0) == 'f'
-
-
-def test_without_rich_there_are_plain_lines():
+def test_without_prompt_toolkit_there_are_plain_lines():
     """The screen is an extra, and one line names its missing package."""
     done = run_without_extras("""
 import os
-from adxl_ros.nodes.terminal.terminal_process import open_terminal
+from adxl_ros.nodes.support.own_screen import open_screen
 sys.stdin.isatty = sys.stdout.isatty = lambda: True
 os.tcgetpgrp = lambda fd: os.getpgrp()
-print(open_terminal())
+print(open_screen('/calibration'))
 """)
-    assert done.stdout == "(None, 'no screen, plain lines: it needs rich; pip install rich')\n"
+    assert done.stdout == ("(None, 'no screen, plain lines: it needs prompt_toolkit; pip install "
+                           "prompt_toolkit')\n")

@@ -222,6 +222,7 @@ class Controller:
         self._sensor, self._resume = sensor, resume
         self._samples, self._outputs = samples, outputs
         self._starts_over = resume is Resume.ANEW
+        self._question_is_answered = False
         self._idle_samples: NewestSamples | None = None
         self._outlook = self._last_line = self._last_warning = ''
         self._sensor_fault = self._sample_fault = self._fit_fault = ''
@@ -243,8 +244,8 @@ class Controller:
         Parameters
         ----------
         start_over
-            The answer to the question: whether to put an interrupted calibration aside. None for
-            a start that is no answer.
+            Whether to put an interrupted calibration aside, which also answers the question. None
+            for a start that is no answer.
 
         Returns
         -------
@@ -257,6 +258,7 @@ class Controller:
         if self.state is ControllerState.ASKING and start_over is None:
             return Answer(False, self.question)
         self.state, self.question = ControllerState.WAITING_FOR_SENSOR, ''
+        self._question_is_answered = start_over is not None
         self._starts_over = self._resume is Resume.ANEW if start_over is None else start_over
         self._try_to_start()
         if self.state is ControllerState.ASKING:
@@ -449,10 +451,8 @@ class Controller:
         if self.unit is None:
             return
         try:
-            if self.may_ask:
-                if self._resume is Resume.ASK:
-                    self.question = self.settings.question(self.unit)
-                self.may_ask = False
+            if self.may_ask and self._resume is Resume.ASK and not self._question_is_answered:
+                self.question = self.settings.question(self.unit)
             if self.question:
                 self.state = ControllerState.ASKING
             else:

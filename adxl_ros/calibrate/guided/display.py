@@ -16,6 +16,8 @@
 
 from __future__ import annotations
 
+import math
+
 from adxl_ros.calibrate.guided.live_window import NewestSamples
 from adxl_ros.calibrate.guided.screen_contents import (
     AxisReading,
@@ -91,7 +93,8 @@ def live_reading(newest: NewestSamples, unit: Sensor, stillness: Stillness | Non
     axes = tuple(AxisReading(axis, mean_mps2, rms_mps2) for axis, mean_mps2, rms_mps2 in zip(
         unit.axes, newest.mean_mps2(), newest.rms_mps2()))
     rest = None if stillness is None else _rest(stillness, unit)
-    return LiveReading(axes, newest.rate_hz(), rest)
+    rate_hz = newest.rate_hz()
+    return LiveReading(axes, rate_hz if math.isfinite(rate_hz) else None, rest)
 
 
 def _rest(stillness: Stillness, unit: Sensor) -> RestReading:

@@ -309,8 +309,8 @@ class HandGuide:
             f'{orientations.points_up(orientations.name_nearest(up))} now'
         return Progress(
             number=self.pose_number, destination=self.destination(), position=position,
-            accepted=len(self.accepted), total=ENOUGH_RESTS, skipped=0, remaining_s=None,
-            dwelt_s=None, dwell_s=None)
+            accepted=len(self.accepted), total=ENOUGH_RESTS, skipped=0,
+            open_poses=self.open_poses, remaining_s=None, dwelt_s=None, dwell_s=None)
 
     def estimate_contents(self) -> Estimate:
         """Return what the rests determine so far, for the screen."""

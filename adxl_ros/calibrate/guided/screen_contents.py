@@ -12,12 +12,13 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The contents of the calibration screen, and how they cross to the process that draws them."""
+"""The contents of the calibration screen, and the text that a topic carries them in."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-import pickle
+from dataclasses import asdict, dataclass, fields
+import json
+from typing import Any
 
 
 @dataclass(frozen=True)
@@ -74,14 +75,14 @@ class LiveReading:
     axes
         Reading of each measured axis.
     rate_hz
-        Rate of the samples by their stamps, Hz; NaN while they are too few.
+        Rate of the samples by their stamps, Hz; None while they are too few.
     rest
         Whether the sensor is at rest; None while the samples are too few.
 
     """
 
     axes: tuple[AxisReading, ...]
-    rate_hz: float
+    rate_hz: float | None
     rest: RestReading | None
 
 
@@ -100,6 +101,8 @@ class Progress:
         Where the sensor is at present, for people; '' where it is unknown.
     accepted, total, skipped
         Number of accepted poses, of all poses, and of those that are left out.
+    open_poses
+        Number of poses that a fit would miss now; 0 where the number of poses is not fixed.
     remaining_s
         Time that the open poses take, s; None where the number of poses is not fixed.
     dwelt_s, dwell_s
@@ -113,6 +116,7 @@ class Progress:
     accepted: int
     total: int
     skipped: int
+    open_poses: int
     remaining_s: float | None
     dwelt_s: float | None
     dwell_s: float | None
@@ -186,6 +190,27 @@ class Estimate:
 
 
 @dataclass(frozen=True)
+class KeyAction:
+    """
+    What a key does.
+
+    Attributes
+    ----------
+    key
+        The key.
+    action
+        Its action, for people.
+    service
+        Name of the service of the calibration node that does it.
+
+    """
+
+    key: str
+    action: str
+    service: str
+
+
+@dataclass(frozen=True)
 class ScreenContents:
     """
     Everything that the screen shows, except the log.
@@ -201,7 +226,7 @@ class ScreenContents:
     output
         The parameter file that is to be written.
     keys
-        Keys with the action of each.
+        Keys that have an action now.
     live
         What the sensor reads; None without samples.
     progress, estimate
@@ -215,17 +240,45 @@ class ScreenContents:
     text: str
     unit: str = ''
     output: str = ''
-    keys: tuple[tuple[str, str], ...] = ()
+    keys: tuple[KeyAction, ...] = ()
     live: LiveReading | None = None
     progress: Progress | None = None
     estimate: Estimate | None = None
     outcome: tuple[str, ...] = ()
 
-    def to_bytes(self) -> bytes:
-        """Return the contents as one message for the process that draws them."""
-        return pickle.dumps(self)
+    def to_json(self) -> str:
+        """Return the contents as text."""
+        return json.dumps(asdict(self))
 
     @staticmethod
-    def from_bytes(data: bytes) -> ScreenContents:
-        """Return the contents of a message; only for messages of the process's own parent."""
-        return pickle.loads(data)
+    def from_json(text: str) -> ScreenContents:
+        """
+        Return the contents of a text.
+
+        Raises
+        ------
+        ValueError
+            The text is no contents of this version of the package.
+
+        """
+        contents = json.loads(text, object_hook=_restore)
+        if not isinstance(contents, ScreenContents):
+            raise ValueError('no contents of a screen')
+        return contents
+
+
+_CLASSES = (AxisReading, RestReading, LiveReading, Progress, Coverage, CoefficientRow, Estimate,
+            KeyAction, ScreenContents)
+"""The classes of the contents."""
+_KINDS: dict[frozenset[str], Any] = {
+    frozenset(field.name for field in fields(kind)): kind for kind in _CLASSES}
+"""The class of each object of the text, by the names of its fields."""
+
+
+def _restore(values: dict[str, Any]) -> object:
+    """Return the object whose fields are in an object of JSON."""
+    kind = _KINDS.get(frozenset(values))
+    if kind is None:
+        raise ValueError(f'no object of a screen: {", ".join(values)}')
+    return kind(**{name: tuple(value) if isinstance(value, list) else value
+                   for name, value in values.items()})

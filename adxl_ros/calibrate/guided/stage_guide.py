@@ -392,13 +392,13 @@ class StageGuide:
             alpha_rad, beta_rad = angles_rad
             position = (f'{_position("alpha", alpha_rad, target.alpha_rad)}, '
                         f'{_position("beta", beta_rad, target.beta_rad)}')
-        remaining = len(self.targets) - len(self.accepted) - len(self.skipped)
         averaging = self._attempt.state is PoseState.AVERAGING
         dwelt_s = min(self._attempt.dwell.at_rest_s(), self.settings.dwell_s) if averaging else 0.0
         return Progress(
             number=self.pose_number, destination=self.destination(), position=position,
             accepted=len(self.accepted), total=len(self.targets), skipped=len(self.skipped),
-            remaining_s=remaining * self._seconds_per_pose(), dwelt_s=dwelt_s,
+            open_poses=self.open_poses,
+            remaining_s=self.open_poses * self._seconds_per_pose(), dwelt_s=dwelt_s,
             dwell_s=self.settings.dwell_s)
 
     def estimate_contents(self) -> Estimate:

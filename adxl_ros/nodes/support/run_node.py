@@ -21,13 +21,13 @@ from collections.abc import Callable
 from pathlib import Path
 import signal
 import sys
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.nodes.support import rclpy_internals
 from adxl_ros.nodes.support.params_files import check_params_files
 import rclpy
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.utilities import remove_ros_args
 
@@ -43,7 +43,8 @@ class Closable(Protocol):
         """Close it."""
 
 
-def run(make_node: Callable[[], Node], description: str | None) -> int:
+def run(make_node: Callable[[], Node], description: str | None,
+        work: Callable[[Any, Executor], None] = lambda _, executor: executor.spin()) -> int:
     """
     Run one node until SIGINT or SIGTERM.
 
@@ -53,6 +54,8 @@ def run(make_node: Callable[[], Node], description: str | None) -> int:
         Creates the node; it may raise `UserError`. The node may be `Closable`.
     description
         Text that `--help` prints.
+    work
+        What is done with the node and the executor that it has been added to.
 
     Returns
     -------
@@ -81,7 +84,7 @@ def run(make_node: Callable[[], Node], description: str | None) -> int:
         print(f'{name}: {one_line(error)}', file=sys.stderr)
         return 2 if rclpy_internals.is_usage_error(error) else 1
     try:
-        _spin(node)
+        _spin(node, work)
     finally:
         if isinstance(node, Closable):
             node.close()
@@ -93,11 +96,11 @@ def run(make_node: Callable[[], Node], description: str | None) -> int:
     return 0
 
 
-def _spin(node: Node) -> None:
+def _spin(node: Node, work: Callable[[Any, Executor], None]) -> None:
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     try:
-        executor.spin()
+        work(node, executor)
     except ExternalShutdownException:
         pass
     except Exception:

@@ -12,4 +12,4 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The calibration screen: a process of its own that draws and reads keys."""
+"""What nodes draw in a terminal, without rclpy: the calibration screen, the steps of a job."""

@@ -17,30 +17,26 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-import re
 from textwrap import wrap
-from typing import TYPE_CHECKING
+from typing import NamedTuple
 
 from adxl_ros.calibrate.guided.screen_contents import (
     CoefficientRow,
     Estimate,
+    KeyAction,
     LiveReading,
     Progress,
     RestReading,
     ScreenContents,
 )
 
-if TYPE_CHECKING:
-    from rich.console import ConsoleDimensions, Group
-    from rich.text import Text
+Line = list[tuple[str, str]]
+"""A line of the screen: styles of prompt_toolkit, each with its text."""
 
-_COLOURS = {'dwell': 'green', 'refused': 'red', 'silent': 'red', 'question': 'yellow',
-            'rest': 'yellow', 'stage': 'yellow', 'operator': 'bold cyan', 'fit': 'green'}
-"""Styles of rich by phase."""
-_LEVELS = {'WARN': 'yellow', 'ERROR': 'red', 'FATAL': 'red'}
-"""Styles of rich by level of a log line."""
-_PREFIX = re.compile(r'^\[(\w+)\] \[[\d.]+\] \[[^]]*\]: ')
-"""The beginning of a line of rclpy's log: level, time, and name of the node."""
+_COLOURS = {'dwell': 'ansigreen', 'refused': 'ansired', 'silent': 'ansired',
+            'question': 'ansiyellow', 'rest': 'ansiyellow', 'stage': 'ansiyellow',
+            'operator': 'bold ansicyan', 'fit': 'ansigreen'}
+"""Styles by phase."""
 _LEAST_WIDTH = 20
 """A narrower terminal is drawn as if it had this width, columns."""
 _LEAST_LINES = 4
@@ -61,8 +57,6 @@ _WIDEST_NAME = 36
 """Largest width of the name of a coefficient, columns."""
 _SHORTEST_NAME = 8
 """Smallest width of the name of a coefficient, columns."""
-_MESSAGES = 3
-"""Log lines that are shown."""
 _LABELLED_LINES = 3
 """Largest number of lines of a text with a label."""
 _LEAST_TEXT_WIDTH = 10
@@ -73,7 +67,24 @@ _LONGEST_IN_MIN_S = 5400
 """Times below this are shown in minutes, s."""
 
 
-def draw(contents: ScreenContents, log: Sequence[str], size: ConsoleDimensions) -> Group:
+class LogLine(NamedTuple):
+    """
+    A line of the log.
+
+    Attributes
+    ----------
+    text
+        The line.
+    style
+        Its style.
+
+    """
+
+    text: str
+    style: str = 'ansibrightblack'
+
+
+def draw(contents: ScreenContents, log: Iterable[LogLine], columns: int, rows: int) -> list[Line]:
     """
     Lay the contents out.
 
@@ -83,38 +94,38 @@ def draw(contents: ScreenContents, log: Sequence[str], size: ConsoleDimensions) 
         What the screen shows.
     log
         Lines of the log, the newest last.
-    size
+    columns, rows
         Size of the terminal.
 
     Returns
     -------
-    rich.console.Group
+    list of Line
         The lines of the screen.
 
     """
-    from rich.console import Group
-
-    width = max(size.width, _LEAST_WIDTH)
+    width = max(columns - 1, _LEAST_WIDTH)
     top = [*_head(contents, width), *_pose(contents.progress),
            *_reading(contents.live, contents.progress),
            *_progress(contents.progress, contents.estimate, width)]
-    bottom = [*_log(log), _keys(contents.keys)]
+    bottom = [*(_text(line.text, line.style) for line in log), _keys(contents.keys)]
     middle = _outcome(contents.outcome, width) or _coefficients(contents.estimate, width)
-    room = size.height - len(top) - len(bottom)
+    room = rows - len(top) - len(bottom)
     lines = [*top, *middle[:max(room, 0)]]
-    lines += [_text('')] * (size.height - len(lines) - len(bottom))
+    lines += [_text('')] * (rows - len(lines) - len(bottom))
     # A small terminal keeps the keys and the first lines, which say what to do.
-    return Group(*lines[:max(size.height - len(bottom), _LEAST_LINES)], *bottom)
+    return [_cut_line(line, width)
+            for line in (*lines[:max(rows - len(bottom), _LEAST_LINES)], *bottom)]
 
 
-def _head(contents: ScreenContents, width: int) -> list[Text]:
-    title = f' calibration of {contents.unit or "no sensor yet"} into {contents.output}'
+def _head(contents: ScreenContents, width: int) -> list[Line]:
+    task = f' of {contents.unit or "no sensor yet"} into {contents.output}'
+    title = f' calibration{task if contents.output else ""}'
     style = _COLOURS.get(contents.phase, 'bold')
     return [_text(f'{title:{width}}', 'reverse'),
-            *(_text(line, style) for line in wrap(contents.text, width - 1)[:_TEXT_LINES])]
+            *(_text(line, style) for line in wrap(contents.text, width)[:_TEXT_LINES])]
 
 
-def _pose(progress: Progress | None) -> list[Text]:
+def _pose(progress: Progress | None) -> list[Line]:
     if progress is None:
         return []
     total = '' if progress.remaining_s is None else f' of {progress.total}'
@@ -124,12 +135,13 @@ def _pose(progress: Progress | None) -> list[Text]:
     return lines
 
 
-def _reading(live: LiveReading | None, progress: Progress | None) -> list[Text]:
+def _reading(live: LiveReading | None, progress: Progress | None) -> list[Line]:
     if live is None:
         return []
     axes = '  '.join(f'{axis.axis} {axis.mean_mps2:+.3f} ± {axis.rms_mps2:.3f}'
                      for axis in live.axes)
-    lines = [_row('reads', f'{axes} m/s²  {live.rate_hz:.0f} Hz')]
+    rate = '' if live.rate_hz is None else f'  {live.rate_hz:.0f} Hz'
+    lines = [_row('reads', f'{axes} m/s²{rate}')]
     if live.rest is not None:
         lines.append(_rest(live.rest))
     if progress is not None and progress.dwell_s is not None and progress.dwelt_s is not None:
@@ -138,7 +150,7 @@ def _reading(live: LiveReading | None, progress: Progress | None) -> list[Text]:
     return lines
 
 
-def _rest(rest: RestReading) -> Text:
+def _rest(rest: RestReading) -> Line:
     share = rest.value_mps2 / rest.limit_mps2 if rest.limit_mps2 else 1.0
     motion = 'at rest' if rest.at_rest else {'rms': 'moving', 'drift': 'drifting'}[rest.quantity]
     return _row('rest', f'{_bar(share, _BAR_WIDTH)} {motion}: {rest.value_mps2:.2g} m/s² '
@@ -146,7 +158,7 @@ def _rest(rest: RestReading) -> Text:
                 'green' if rest.at_rest else 'yellow')
 
 
-def _progress(progress: Progress | None, estimate: Estimate | None, width: int) -> list[Text]:
+def _progress(progress: Progress | None, estimate: Estimate | None, width: int) -> list[Line]:
     if progress is None or estimate is None:
         return []
     lines = [_row('poses', _counts(progress))]
@@ -171,7 +183,7 @@ def _counts(progress: Progress) -> str:
             f'{max(progress.total - closed, 0)} left{time}')
 
 
-def _coefficients(estimate: Estimate | None, width: int) -> list[Text]:
+def _coefficients(estimate: Estimate | None, width: int) -> list[Line]:
     """Return a row for each coefficient: name, bar and intervals, shortened to the width."""
     if estimate is None:
         return []
@@ -198,52 +210,46 @@ def _name_room(texts: Sequence[str], bar_width: int, width: int) -> int:
     return min(width - bar_width - 2 - longest, _WIDEST_NAME)
 
 
-def _cut(name: str, width: int) -> str:
-    """Return a name in at most a number of columns; an ellipsis stands for the cut part."""
-    return name if len(name) <= width else f'{name[:width - 1]}…'
+def _cut(text: str, width: int) -> str:
+    """Return a text in at most a number of columns; an ellipsis stands for the cut part."""
+    return text if len(text) <= width else f'{text[:max(width - 1, 0)]}…'[:width]
 
 
-def _outcome(outcome: Sequence[str], width: int) -> list[Text]:
+def _outcome(outcome: Sequence[str], width: int) -> list[Line]:
     lines: list[str] = []
     for line in outcome:
         # A line that fits keeps its spaces.
-        lines += [line] if len(line) < width else wrap(line, width - 1)
+        lines += [line] if len(line) <= width else wrap(line, width)
     return [_text(line) for line in lines]
 
 
-def _log(log: Sequence[str]) -> list[Text]:
-    lines = []
-    for line in log[-_MESSAGES:]:
-        prefix = _PREFIX.match(line)
-        level = prefix[1] if prefix else 'INFO'
-        lines.append(_text(_PREFIX.sub('', line), _LEVELS.get(level, 'dim')))
-    return lines
+def _keys(keys: Iterable[KeyAction]) -> Line:
+    actions = [(key.key, key.action) for key in keys] + [('q', 'quit')]
+    return [part for key, action in actions
+            for part in (('reverse', f' {key} '), ('', f' {action}  '))]
 
 
-def _keys(keys: Iterable[tuple[str, str]]) -> Text:
-    from rich.text import Text
-
-    line = Text(no_wrap=True, overflow='ellipsis')
-    for key, action in keys:
-        line.append(f' {key} ', 'reverse')
-        line.append(f' {action}  ')
-    return line
-
-
-def _row(label: str, text: str, style: str = '') -> Text:
+def _row(label: str, text: str, style: str = '') -> Line:
     return _text(f'{label:{_LABEL_WIDTH}} {text}', style)
 
 
-def _wrapped(label: str, text: str, width: int) -> list[Text]:
+def _wrapped(label: str, text: str, width: int) -> list[Line]:
     """Return the first lines of a text beside its label."""
     first, *others = wrap(text, max(width - _LABEL_WIDTH - 1, _LEAST_TEXT_WIDTH)) or ['']
     return [_row(label, first), *(_row('', line) for line in others[:_LABELLED_LINES - 1])]
 
 
-def _text(text: str, style: str = '') -> Text:
-    from rich.text import Text
+def _text(text: str, style: str = '') -> Line:
+    return [(style, text)]
 
-    return Text(text, style=style, no_wrap=True, overflow='ellipsis')
+
+def _cut_line(line: Line, width: int) -> Line:
+    """Return a line in at most a number of columns."""
+    room, parts = width, []
+    for style, text in line:
+        parts.append((style, _cut(text, room)))
+        room -= len(parts[-1][1])
+    return parts
 
 
 def _bar(share: float, width: int) -> str:

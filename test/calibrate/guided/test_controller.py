@@ -19,7 +19,7 @@ from dataclasses import replace
 from adxl_ros.calibrate.guided.capture_settings import CaptureSettings, Phase, StageMode
 from adxl_ros.calibrate.guided.controller import Controller, ControllerState, Resume, Severity
 from adxl_ros.calibrate.guided.display import live_reading, SessionDisplay
-from adxl_ros.calibrate.guided.screen_contents import ScreenContents
+from adxl_ros.calibrate.guided.screen_contents import KeyAction, ScreenContents
 from adxl_ros.calibrate.guided.session_settings import SessionSettings
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file, sweep_journal
@@ -302,8 +302,8 @@ def test_readings_on_another_clock_count_from_their_arrival(rig):
     assert (record.temperature_c, record.supply_v) == (23.0, 5.0)
 
 
-def test_contents_of_the_screen_are_equal_in_the_other_process(rig):
-    """The contents of a sweep are equal after serialization."""
+def test_contents_of_the_screen_are_equal_at_the_other_end_of_the_topic(rig):
+    """The contents of a sweep are equal after they were text."""
     bench = rig()
     bench.say_info()
     bench.controller.shows_idle_stream = True
@@ -314,9 +314,10 @@ def test_contents_of_the_screen_are_equal_in_the_other_process(rig):
     bench.controller.start()
     bench.turn_until(lambda: bench.controller.session.accepted_count == 4)
     display = SessionDisplay(bench.controller.session)
-    contents = ScreenContents('dwell', 'text', 'C1 (xy)', 'unit.yaml', (('q', 'quit'),),
-                              display.live(), display.progress(), display.estimate())
-    assert ScreenContents.from_bytes(contents.to_bytes()) == contents
+    contents = ScreenContents('dwell', 'text', 'C1 (xy)', 'unit.yaml',
+                              (KeyAction('b', 'begin', 'start'),), display.live(),
+                              display.progress(), display.estimate())
+    assert ScreenContents.from_json(contents.to_json()) == contents
     assert (contents.progress.accepted, contents.progress.total) == (4, 22)
     assert {row.group: row.accepted for row in contents.estimate.coverage} == {
         '45°': 2, '90°': 2, 'beta forth': 1, 'beta back': 0, 'check poses': 0}

@@ -1,0 +1,172 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Show a guided calibration in this terminal, and pass its keys on; on any machine."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import deque
+from contextlib import suppress
+from dataclasses import replace
+import os
+import signal
+import time
+
+from adxl_ros.calibrate.guided.screen_contents import ScreenContents
+from adxl_ros.nodes.support.held_output import held_output
+from adxl_ros.nodes.support.parameters import declare
+from adxl_ros.nodes.support.run_node import run
+from adxl_ros.nodes.support.topics import create_subscription
+from adxl_ros.nodes.terminal.draw import draw, Line, LogLine
+from adxl_ros.nodes.terminal.full_screen import full_screen
+from rcl_interfaces.msg import Log
+import rclpy
+from rclpy.executors import Executor, ExternalShutdownException
+from rclpy.node import Node
+from rclpy.task import Future
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+
+_SERVICES = ('start', 'resume', 'start_over', 'capture', 'redo', 'skip', 'finish', 'abort')
+"""Services of the calibration node that keys call."""
+_SPIN_S = 0.02
+"""Time between two callbacks, s; chosen: far more often than messages come."""
+_SILENT_S = 2.0
+"""Age at which a display is reported as missing, s; chosen: ten missing messages."""
+_QUEUE = 100
+"""Lines of all nodes' logs that wait; chosen: far more than come between two callbacks."""
+_LOG_LINES = 3
+"""Lines of the log that are kept: those that the screen shows."""
+_STYLES = {Log.WARN: 'ansiyellow', Log.ERROR: 'ansired', Log.FATAL: 'ansired'}
+"""Styles of log lines by level; others have that of `LogLine`."""
+
+
+class Screen(Node):
+    """The screen: a client of the topics and services of the calibration node."""
+
+    def __init__(self) -> None:
+        super().__init__('screen')
+        name = declare(self, 'node', 'calibration', 'name of the calibration node')
+        self._node_pid = declare(self, 'node_pid', 0, 'process of the node, if it has started '
+                                 'this screen: both end together; 0: it has not')
+        self._target = self.resolve_topic_name(name)
+        self._contents, self._received_s = ScreenContents('info', ''), 0.0
+        self._log: deque[LogLine] = deque(maxlen=_LOG_LINES)
+        self._finish_is_confirmed = False
+        self._application = full_screen(self._lines, self._press, self._leave)
+        create_subscription(self, String, f'{name}/display', self._on_display, 1, latched=True)
+        create_subscription(self, Log, '/rosout', self._on_log, _QUEUE, latched=True)
+        self._keyed = {service: self.create_client(Trigger, f'{name}/{service}')
+                       for service in _SERVICES}
+
+    def show(self, executor: Executor) -> None:
+        """
+        Draw and read keys until the operator quits, a signal comes, or the terminal hangs up.
+
+        Parameters
+        ----------
+        executor
+            The executor of this node.
+
+        """
+        def begin() -> None:
+            application.create_background_task(self._spin(executor))
+
+        application = self._application
+        signal.signal(signal.SIGHUP, lambda *_: rclpy.try_shutdown())
+        # A terminal that has hung up can be neither read nor drawn in.
+        with held_output(), suppress(EOFError, OSError):
+            application.run(begin, set_exception_handler=False, handle_sigint=False)
+        if not self._node_pid and self._is_fresh():
+            print(f'{self._target} goes on; show it again: ros2 run adxl_ros screen')
+
+    async def _spin(self, executor: Executor) -> None:
+        """Take messages until a signal comes, or the node that has started this screen ends."""
+        try:
+            while self._node_pid in (0, os.getppid()):
+                executor.spin_once(timeout_sec=0.0)
+                await asyncio.sleep(_SPIN_S)
+        except ExternalShutdownException:
+            pass
+        finally:
+            if self._application.is_running and not self._application.is_done:
+                self._application.exit()
+
+    def _lines(self, columns: int, rows: int) -> list[Line]:
+        return draw(self._shown(), self._log, columns, rows)
+
+    def _shown(self) -> ScreenContents:
+        """Return the newest contents, or what the screen waits for."""
+        if self._is_fresh():
+            return self._contents
+        if self._received_s:
+            silent_s = time.monotonic() - self._received_s
+            text = f'nothing from {self._target} for {silent_s:.0f} s; waiting for it'
+        elif self._node_pid:
+            text = 'starting'
+        else:
+            text = f'waiting for {self._target}; is it running in this ROS domain?'
+        return replace(self._contents, phase='silent', text=text, keys=())
+
+    def _is_fresh(self) -> bool:
+        """Return whether the newest contents still hold; a node that fits publishes none."""
+        is_silent = time.monotonic() - self._received_s > _SILENT_S
+        return self._received_s > 0 and self.count_publishers(f'{self._target}/display') > 0 and (
+            not is_silent or self._contents.phase == 'fit')
+
+    def _press(self, key: str) -> None:
+        """Call the service of a key; the space captures, `finish` may need a second key."""
+        contents = self._shown()
+        services = {entry.key: entry.service for entry in contents.keys}
+        service = services.get('c' if key == ' ' else key)
+        open_poses = contents.progress.open_poses if contents.progress else 0
+        if service == 'finish' and open_poses and not self._finish_is_confirmed:
+            self._finish_is_confirmed = True
+            self._say(f'{open_poses} poses are open; press f again to fit what there is')
+            return
+        self._finish_is_confirmed = False
+        if service is not None:
+            answer = self._keyed[service].call_async(Trigger.Request())
+            answer.add_done_callback(self._on_answer)
+
+    def _leave(self) -> None:
+        """End the node, too, if it has started this screen."""
+        if self._node_pid:
+            os.kill(self._node_pid, signal.SIGINT)
+
+    def _on_display(self, message: String) -> None:
+        try:
+            self._contents = ScreenContents.from_json(message.data)
+        except ValueError:
+            self._contents = ScreenContents(
+                'refused', f'{self._target} is of another version of adxl_ros; update both')
+        self._received_s = time.monotonic()
+
+    def _on_log(self, message: Log) -> None:
+        if message.name == self._target.strip('/').replace('/', '.'):
+            style = _STYLES.get(message.level)
+            self._log.append(LogLine(message.msg, style) if style else LogLine(message.msg))
+
+    def _on_answer(self, future: Future) -> None:
+        self._say(future.result().message)
+
+    def _say(self, text: str) -> None:
+        """Show a line unless the log shows it."""
+        if all(line.text != text for line in self._log):
+            self._log.append(LogLine(text))
+
+
+def main() -> int:
+    """Run the screen."""
+    return run(Screen, __doc__, Screen.show)

@@ -1,0 +1,158 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The screen as a client of its own: beside a node without a terminal, before it, and after it."""
+
+import json
+import re
+import subprocess
+
+from adxl_ros.files import parameter_file, sweep_journal
+from graph import Graph, RELIABLE
+import numpy as np
+from processes import executable
+import pytest
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+from terminal import Terminal
+from units import drawn, nominal
+
+FAST = ('-p', 'use_sim_time:=true')
+PLAN = ('-p', 'sweep.planes_deg:=[45.0, 90.0]', '-p', 'sweep.step_deg:=90.0', '-p',
+        'sweep.dwell_s:=0.6', '-p', 'sweep.check_poses:=0', '-p', 'output:=unit.yaml', *RELIABLE)
+
+
+@pytest.fixture
+def screen(ros_env, tmp_path):
+    """Give a function that runs the screen in a terminal; all are closed at the end."""
+    opened = []
+
+    def begin(*options, **size):
+        opened.append(Terminal([executable('screen'), *options], ros_env, tmp_path, **size))
+        return opened[-1]
+
+    yield begin
+    for program in opened:
+        print(program.text())
+        program.close()
+
+
+def bench(start, tmp_path):
+    """Start a sensor on its stage, at four times real time, and a node without a terminal."""
+    base = nominal('xyz', serial='T1')
+    parameter_file.save(tmp_path / 'truth.yaml', drawn(np.random.default_rng(3), base))
+    parameter_file.save(tmp_path / 'bare.yaml', base)
+    start('driver', '--ros-args', '--params-file', tmp_path / 'truth.yaml', '-p',
+          'link.type:=sim', '-p', 'link.speed:=4.0', *FAST)
+    start('stage', '--ros-args', '--params-file', tmp_path / 'bare.yaml', *FAST, '-p',
+          'slew_rate_rad_s:=6.0', '-p', 'settling_time_s:=0.1')
+    return start('calibration', '--ros-args', '--params-file', tmp_path / 'bare.yaml', *FAST,
+                 *PLAN)
+
+
+def test_a_screen_drives_the_sweep_of_a_node_without_a_terminal(start, screen, tmp_path):
+    """Keys begin, leave out, abort, go on and finish; leaving the screen leaves the node."""
+    node = bench(start, tmp_path)
+    seen = screen(lines=24, columns=80)
+    seen.wait_for('press b to begin', 'calibration of T1 (xyz) into unit.yaml', '1000 Hz')
+    seen.press('b')
+    seen.wait_for('3 done', '45°', 's  skip')
+    seen.press('s')
+    seen.wait_for('1 left out')
+    seen.press('a')
+    seen.wait_for('aborted; its poses stay in unit.yaml.journal', 'b  begin')
+    seen.press('b')
+    seen.wait_for('poses of an interrupted calibration', 'y  go on')
+    seen.press('y')
+    text = seen.wait_for('10 done', 'tilt error', 'f  finish')
+    assert max(map(len, text.splitlines())) <= 79
+    seen.press('f')
+    text = seen.wait_for('poses are open; press f again')
+    seen.press('f')
+    # The acceptance of the fit stands in the place of the coefficients.
+    seen.wait_for('wrote unit.yaml', 'linear: datasheet', timeout_s=60.0)
+    assert parameter_file.load(tmp_path / 'unit.yaml').serial == 'T1'
+    seen.press('q')
+    assert seen.popen.wait(20) == 0
+    assert seen.restored()
+    assert '/calibration goes on; show it again: ros2 run adxl_ros screen' in seen.text()
+    _, entries = sweep_journal.read(tmp_path / 'unit.yaml.journal')
+    poses = sweep_journal.accepted_poses(entries)
+    # The screen causes no loss: every pose has all samples.
+    assert len(poses) >= 10
+    assert all(e.stop_ns - e.start_ns == 1_000_000 * (e.samples - 1) for e in poses)
+    assert node.popen.poll() is None
+    with Graph() as graph:
+        # Nobody is at a screen any more, so an interrupted calibration is resumed.
+        graph.spin_until(lambda: not graph.node.count_clients('calibration/resume'), 30,
+                         'no screen')
+        assert graph.call(Trigger, 'calibration/start', Trigger.Request()).success
+    node.wait_for('resumed after')
+
+
+@pytest.mark.kills
+def test_a_screen_waits_for_its_node_and_survives_it(start, screen):
+    """A screen in a namespace shows each node of its name, before and after a kill."""
+    seen = screen('--ros-args', '-r', '__ns:=/bench', '-p', 'node:=bridge')
+    seen.wait_for('waiting for /bench/bridge', 'q  quit')
+    names = ('--ros-args', '-r', '__ns:=/bench', '-r', '__node:=bridge')
+    node = start('calibration', *names)
+    seen.wait_for('press b to begin', 'b  begin')
+    node.popen.kill()
+    seen.wait_for('nothing from /bench/bridge for')
+    # Keys without a node do nothing.
+    seen.press('b')
+    start('calibration', *names, '-p', 'output:=second.yaml')
+    seen.wait_for('second.yaml', 'press b to begin')
+    seen.press('b')
+    seen.wait_for('waiting for sensor_info', 'a  abort')
+    seen.press('a')
+    seen.wait_for('aborted', 'b  begin')
+    seen.press('\x03')
+    assert seen.popen.wait(20) == 0
+    assert seen.restored()
+
+
+@pytest.mark.parametrize('number', ['TERM', 'HUP', 'INT'])
+def test_a_signal_ends_a_screen_and_restores_its_terminal(screen, number):
+    """A screen without a node ends with status 0, and its terminal is as before."""
+    seen = screen()
+    seen.wait_for('waiting for /calibration')
+    subprocess.run(['kill', f'-{number}', str(seen.popen.pid)], check=True)
+    assert seen.popen.wait(20) == 0
+    assert seen.restored()
+
+
+def test_a_screen_without_a_terminal_says_so(start):
+    node = start('screen')
+    assert node.wait() == 1
+    assert node.output() == 'screen: the screen needs a terminal; run it in one\n'
+
+
+def test_a_recorder_of_the_display_is_nobody_at_a_screen(start, tmp_path):
+    """The display is JSON without NaN; whoever only listens is not asked anything."""
+    bench(start, tmp_path)
+    with Graph() as graph:
+        displays = graph.listen(String, 'calibration/display', latched=True)
+
+        def newest():
+            return json.loads(displays[-1].data)
+
+        graph.spin_until(lambda: displays and newest()['live'], 40, 'samples')
+        assert graph.call(Trigger, 'calibration/start', Trigger.Request()).success
+        graph.spin_until(lambda: newest()['progress'] and newest()['progress']['accepted'], 40,
+                         'a pose')
+        graph.call(Trigger, 'calibration/abort', Trigger.Request())
+        answer = graph.call(Trigger, 'calibration/start', Trigger.Request())
+        assert answer.success, answer.message
+    assert not any(re.search(r'NaN|Infinity', message.data) for message in displays)
