@@ -96,9 +96,35 @@ def nominal_path() -> Path:
     return Path(get_package_share_directory('adxl_ros')) / 'params' / _NOMINAL_FILE
 
 
+def installed_path(name: str | os.PathLike) -> Path:
+    """
+    Return the installed file of a sensor by its name, such as MPU-6050.
+
+    A path to a file stays as it is, and so does everything where there is no ROS.
+
+    Raises
+    ------
+    UserError
+        No sensor has this name.
+
+    """
+    path = Path(name)
+    if path.exists() or path.suffix or path.name != str(name):
+        return path
+    try:
+        folder = nominal_path().parent
+    except (ImportError, LookupError):
+        return path
+    file = folder / f'{path.name.lower().replace("-", "")}.yaml'
+    if not file.exists():
+        names = ', '.join(sorted(other.stem for other in folder.glob('*.yaml')))
+        raise UserError(f'{name}: no file, and no sensor of this name; sensors: {names}')
+    return file
+
+
 def load(path: str | os.PathLike) -> Sensor:
     """
-    Read and check a parameter file.
+    Read and check a parameter file, or the installed file of a sensor by its name.
 
     Raises
     ------
@@ -107,7 +133,8 @@ def load(path: str | os.PathLike) -> Sensor:
         message names file, line and column.
 
     """
-    flat, marks = _read(Path(path))
+    path = installed_path(path)
+    flat, marks = _read(path)
 
     def make_error(key: str, reason: str) -> UserError:
         # A missing key has no place of its own: name that of its parent.

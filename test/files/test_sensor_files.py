@@ -127,3 +127,32 @@ def test_simulate_fit_and_apply_take_the_file(run_tool, tmp_path, path):
     for axis in unit.axes:
         error = out[f'a{axis}_mps2'] - force[AXES.index(axis)]
         assert abs(np.median(error)) < np.median(out[f'a{axis}_std_mps2']) / 5
+
+
+def test_a_sensor_is_taken_by_its_name(run_tool, tmp_path):
+    """`--params MPU-6050` is the installed file; a file of that name in the folder is first."""
+    installed = parameter_file.nominal_path().with_name('mpu6050.yaml')
+    for number, params in enumerate(('MPU-6050', installed)):
+        done = run_tool('simulate', 'motion', '--params', params, '--rate', 25,
+                        '-o', f'{number}.csv')
+        assert done.returncode == 0, done.stderr
+    assert (tmp_path / '0.csv').read_bytes() == (tmp_path / '1.csv').read_bytes()
+    (tmp_path / 'mpu6050').write_text('none')
+    assert 'mpu6050:1:1' in run_tool(
+        'simulate', 'motion', '--params', 'mpu6050', '-o', '2.csv').stderr
+
+
+def test_an_unknown_sensor_is_refused(run_tool):
+    """A name without a file is answered with the names that have one."""
+    done = run_tool('simulate', 'motion', '--params', 'mpu6051', '-o', 'out.csv')
+    assert done.returncode == 1 and done.stderr.count('\n') == 1
+    assert 'mpu6051: no file' in done.stderr and 'mpu6050' in done.stderr
+
+
+def test_one_axis_that_is_misaligned_fails_for_its_reason(run_tool):
+    """The other forces of a misaligned axis are unknown, which is no fault of the sensor."""
+    run_tool('simulate', 'sweep', '--params', 'adxl103', '--rate', 25, '--effect',
+             'misalignment', '--seed', 1, '-o', 'sweep.csv')
+    done = run_tool('fit', 'sweep.csv', '--params', 'adxl103', '-o', 'unit.yaml')
+    assert 'FAIL' in done.stdout and 'One axis does not see the force across it' in done.stdout
+    assert 'worse than its datasheet' not in done.stdout and '. mg' not in done.stdout

@@ -123,14 +123,18 @@ def acceptance_lines(fitted: Sensor) -> list[str]:
     limit = f'{1e3 * limit_mps2 / G0_MPS2:.2g} mg'
     accel = provenance.get(f'verdict_{kind}', '')
     tilt = provenance.get(f'verdict_tilt_{kind}', '')
-    result = f'calibration error {error_mg:#.2g} mg; {allows} {limit}'
+    # Two digits with their zeros, as 0.10; the point of "11." goes.
+    result = f'calibration error {f"{error_mg:#.2g}".rstrip(".")} mg; {allows} {limit}'
     if acceptance.FAIL in (accel, tilt):
         if accel != acceptance.FAIL:
             tilt_deg = float(provenance['own_tilt_deg'])
             result = f'tilt error {tilt_deg:.2g}°, more than {limit} causes'
-        return [f' {acceptance.FAIL}  {result}',
-                '       The sensor is worse than its datasheet states: do not use this file.'
-                if kind == 'datasheet' else '       More poses, or longer ones, reduce it.']
+        advice = 'More poses, or longer ones, reduce it.'
+        if len(fitted.axes) == 1:
+            advice = 'One axis does not see the force across it: align it, or accept this error.'
+        elif kind == 'datasheet':
+            advice = 'The sensor is worse than its datasheet states: do not use this file.'
+        return [f' {acceptance.FAIL}  {result}', f'       {advice}']
     if acceptance.NOT_SHOWN in (accel, tilt):
         return [f' {acceptance.NOT_SHOWN}  {result}',
                 '            The check poses are too few to show that the error is within it.']
