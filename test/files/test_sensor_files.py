@@ -105,6 +105,7 @@ def test_a_still_recording_has_the_stated_noise_and_zero_g(run_tool, tmp_path, p
         assert volts.std() == pytest.approx(noise_v, rel=5 / np.sqrt(2 * count))
 
 
+@pytest.mark.long
 @each_file
 def test_simulate_fit_and_apply_take_the_file(run_tool, tmp_path, path):
     """A unit of the sensor is calibrated within its interval, and apply corrects it."""
