@@ -47,6 +47,7 @@ class State(Enum):
 
     REFUSED = auto()
     SILENT = auto()
+    UNKNOWN = auto()
     DROPPING = auto()
     SATURATED = auto()
     NOT_CONFIRMED = auto()
@@ -108,6 +109,8 @@ class Interval:
         Temperature, °C, and supply, V, that the inverse uses, by name.
     ages_s
         Time since each of them was heard, s, by name.
+    obstacle
+        Why the sensor of the samples is still unknown, or ''.
 
     """
 
@@ -116,6 +119,7 @@ class Interval:
     outside: tuple[str, ...]
     surroundings: Mapping[str, float]
     ages_s: Mapping[str, float]
+    obstacle: str = ''
 
 
 class CompensationPolicy:
@@ -283,6 +287,10 @@ class CompensationPolicy:
             return Status(State.REFUSED, f'publishing nothing: {self.refusal}')
         if not counts.get('received') and interval.duration_s > _SHORTEST_SILENCE_S:
             return Status(State.SILENT, f'no samples on {self._topics.data_raw}')
+        if interval.obstacle:
+            return Status(State.UNKNOWN, (
+                f'publishing nothing yet: nothing on {self._topics.sensor_info}, and '
+                f'{self._topics.data_raw} does not show its sensor: {interval.obstacle}'))
         if counts.get('dropped'):
             return Status(State.DROPPING,
                           f'{counts["dropped"]} samples dropped that no force explains')

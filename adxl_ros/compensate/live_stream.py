@@ -16,8 +16,8 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable
+from collections import Counter, deque
+from collections.abc import Callable, Sequence
 from math import cos, sin
 from typing import Any, NamedTuple
 
@@ -37,6 +37,9 @@ yaw = 0 before long. 1e6, as for an axis that is not there, never counts."""
 
 COUNTS = ('received', 'published', 'dropped', 'saturated', 'outside')
 """What a stream counts: samples, and those to which something happened."""
+
+_MAX_UNKNOWN = 5000
+"""Largest number of samples that wait for their sensor; chosen: 5 s at 1 kHz."""
 
 
 class _Chain(NamedTuple):
@@ -64,6 +67,8 @@ class LiveStream:
         Takes a corrected sample, a serialized sensor_msgs/Imu.
     publish_tilt
         Takes roll, pitch and inclination, rad, a serialized geometry_msgs/Vector3Stamped.
+    keep_orientation
+        Whether a sample that states an orientation keeps it.
 
     Attributes
     ----------
@@ -75,12 +80,18 @@ class LiveStream:
         Temperature, °C, and supply, V, that the inverse uses, by name; those that are known.
     refused
         Whether the stream belongs to another unit; then its samples are counted only.
+    may_be_foreign
+        Whether nobody has named the sensor. The stream is then held as soon as it has a value on
+        an axis that the sensor lacks.
+    unknown
+        Newest samples of a stream that is held; None where it is not.
 
     """
 
     def __init__(self, paper: bool, undo_filter: bool, publish_imu: Callable[[bytes], None],
-                 publish_tilt: Callable[[bytes], None]) -> None:
+                 publish_tilt: Callable[[bytes], None], keep_orientation: bool = False) -> None:
         self._paper, self._undo_filter = paper, undo_filter
+        self._keep_orientation = keep_orientation
         self._publish_imu, self._publish_tilt = publish_imu, publish_tilt
         self._chain: _Chain
         self._angles_rad = [0.0, 0.0, 0.0]
@@ -89,6 +100,16 @@ class LiveStream:
         self.outside: tuple[str, ...] = ()
         self.surroundings: dict[str, float] = {}
         self.refused = False
+        self.may_be_foreign = False
+        self.unknown: deque[bytes] | None = None
+
+    def hold(self) -> None:
+        """Keep the samples that follow and publish nothing, until `release` is called."""
+        self.unknown = deque(maxlen=_MAX_UNKNOWN)
+
+    def release(self) -> None:
+        """Correct and publish the samples that follow."""
+        self.unknown, self.may_be_foreign = None, False
 
     def use(self, sensor: Sensor, rate_hz: float) -> None:
         """
@@ -127,6 +148,10 @@ class LiveStream:
     def __call__(self, raw: bytes) -> None:
         """Correct one sample, a serialized sensor_msgs/Imu, and publish the result."""
         self.counts['received'] += 1
+        unknown = self.unknown
+        if unknown is not None:
+            unknown.append(raw)
+            return
         if self.refused:
             return
         try:
@@ -141,6 +166,9 @@ class LiveStream:
             chain.live.set_environment(**new)
             self.surroundings |= new
         volts = chain.live.volts(accel_mps2)
+        if self.may_be_foreign and any(accel_mps2[len(volts):]):
+            self.hold()
+            return
         if not volts:
             self.counts['dropped'] += 1
         elif self._undo_filter:
@@ -159,8 +187,11 @@ class LiveStream:
             self.counts['outside'] += 1
             self.outside = estimate.outside
         xx, xy, xz, yy, yz, zz = estimate.covariance
+        orientation: Sequence[float] | None = self._orientation(estimate)
+        if self._keep_orientation and imu_message.has_orientation(raw):
+            orientation = None
         self._publish_imu(imu_message.corrected(
-            raw, self._orientation(estimate),
+            raw, orientation,
             (*estimate.force, xx, xy, xz, xy, yy, yz, xz, yz, zz)))
         self._publish_tilt(imu_message.vector3_stamped(raw, self._angles_rad))
         self.counts['published'] += 1

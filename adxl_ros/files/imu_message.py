@@ -37,6 +37,12 @@ _FRAME_LENGTH = slice(12, 16)
 _COVARIANCE_BYTES = 72
 """Size of a covariance: nine float64."""
 
+_QUATERNION = 4
+"""Numbers of a quaternion, which stand before the orientation's covariance."""
+
+_UNSET = (0.0, 0.0, 0.0, 1.0, *[0.0] * 9)
+"""Quaternion and covariance of an orientation that nobody has set."""
+
 _MAX_LAYOUTS = 64
 """Layouts that are kept (chosen: a stream has one; bounds the memory for any input)."""
 
@@ -90,7 +96,20 @@ def read(raw: bytes) -> tuple[float, Sequence[float]]:
     return sec + nanosec * 1e-9, layout.vector.unpack_from(raw, layout.acceleration_offset)
 
 
-def corrected(raw: bytes, orientation: Sequence[float], acceleration: Sequence[float]) -> bytes:
+def has_orientation(raw: bytes) -> bool:
+    """
+    Return whether a sensor_msgs/Imu, serialized, that `read` accepted, states an orientation.
+
+    It states none where the first covariance is -1 (REP-145), and where nobody has set it: the
+    default of the message is the identity with covariances of 0.
+    """
+    layout = _layout(raw)
+    values = layout.orientation.unpack_from(raw, layout.orientation_offset)
+    return values[_QUATERNION] != -1.0 and any(values[:_QUATERNION]) and values != _UNSET
+
+
+def corrected(raw: bytes, orientation: Sequence[float] | None, acceleration: Sequence[float]
+              ) -> bytes:
     """
     Return an Imu with another orientation and acceleration.
 
@@ -99,7 +118,7 @@ def corrected(raw: bytes, orientation: Sequence[float], acceleration: Sequence[f
     raw
         The message, serialized, that `read` accepted.
     orientation
-        Quaternion x, y, z, w and the covariance by rows, rad², (13,).
+        Quaternion x, y, z, w and the covariance by rows, rad², (13,); None keeps that of `raw`.
     acceleration
         x, y, z, m/s², and the covariance by rows, (m/s²)², (12,).
 
@@ -111,7 +130,8 @@ def corrected(raw: bytes, orientation: Sequence[float], acceleration: Sequence[f
     """
     layout = _layout(raw)
     message = bytearray(raw)
-    layout.orientation.pack_into(message, layout.orientation_offset, *orientation)
+    if orientation is not None:
+        layout.orientation.pack_into(message, layout.orientation_offset, *orientation)
     layout.acceleration.pack_into(message, layout.acceleration_offset, *acceleration)
     return bytes(message)
 

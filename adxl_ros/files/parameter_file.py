@@ -87,13 +87,24 @@ MakeError = Callable[[str, str], Exception]
 
 _NOMINAL_FILE = 'adxl203.yaml'
 """Parameter file in `params/` of the default sensor; no other place in the code names a sensor."""
+_ANY_IMU_FILE = 'any_imu.yaml'
+"""Parameter file in `params/` of a digital accelerometer of which only the unit is known."""
 
 
 def nominal_path() -> Path:
     """Return the installed parameter file of the nominal sensor, the default everywhere."""
+    return _params_folder() / _NOMINAL_FILE
+
+
+def any_imu_path() -> Path:
+    """Return the installed parameter file of a stream in m/s² that states nothing of itself."""
+    return _params_folder() / _ANY_IMU_FILE
+
+
+def _params_folder() -> Path:
     # Where there is no ROS, only this function fails.
     from ament_index_python.packages import get_package_share_directory
-    return Path(get_package_share_directory('adxl_ros')) / 'params' / _NOMINAL_FILE
+    return Path(get_package_share_directory('adxl_ros')) / 'params'
 
 
 def installed_path(name: str | os.PathLike) -> Path:
@@ -112,7 +123,7 @@ def installed_path(name: str | os.PathLike) -> Path:
     if path.exists() or path.suffix or path.name != str(name):
         return path
     try:
-        folder = nominal_path().parent
+        folder = _params_folder()
     except (ImportError, LookupError):
         return path
     file = folder / f'{path.name.lower().replace("-", "")}.yaml'
@@ -122,9 +133,21 @@ def installed_path(name: str | os.PathLike) -> Path:
     return file
 
 
-def load(path: str | os.PathLike) -> Sensor:
+def load(path: str | os.PathLike, may_measure: bool = False) -> Sensor:
     """
     Read and check a parameter file, or the installed file of a sensor by its name.
+
+    Parameters
+    ----------
+    path
+        The file.
+    may_measure
+        Whether values that can be measured may be missing; they are in `Sensor.unstated` then.
+
+    Returns
+    -------
+    Sensor
+        The sensor.
 
     Raises
     ------
@@ -143,10 +166,11 @@ def load(path: str | os.PathLike) -> Sensor:
             place = place.rpartition('.')[0]
         return UserError(f'{_where(path, marks[place])}: {key}: {reason}')
 
-    return from_flat(flat, make_error)
+    return from_flat(flat, make_error, may_measure)
 
 
-def from_flat(flat: Mapping[str, Any], make_error: MakeError) -> Sensor:
+def from_flat(flat: Mapping[str, Any], make_error: MakeError, may_measure: bool = False
+              ) -> Sensor:
     """
     Make a `Sensor` of flat parameters, and check all of them.
 
@@ -157,6 +181,8 @@ def from_flat(flat: Mapping[str, Any], make_error: MakeError) -> Sensor:
         among them.
     make_error
         Makes the exception to raise from a key and a reason.
+    may_measure
+        See `load`.
 
     Returns
     -------
@@ -169,15 +195,16 @@ def from_flat(flat: Mapping[str, Any], make_error: MakeError) -> Sensor:
                          f'version {FORMAT}; fit the calibration again, or update the package')
     if flat.get('units', UNITS) != UNITS:
         raise make_error('units', f'{flat["units"]!r}, but coefficients are in {UNITS!r}')
-    return _FlatReader(flat, make_error).sensor()
+    return _FlatReader(flat, make_error).sensor(may_measure)
 
 
 def to_flat(sensor: Sensor) -> dict[str, Any]:
     """Return the parameters of a sensor's file by dotted key, plain Python values, in order."""
     flat: dict[str, Any] = {'format': FORMAT, 'units': UNITS, 'model': sensor.model}
     for key, field in SENSOR_FIELDS.items():
-        value = getattr(sensor, field.name)
-        flat[key] = value.tolist() if isinstance(value, np.ndarray) else value
+        if field.name not in sensor.unstated:
+            value = getattr(sensor, field.name)
+            flat[key] = value.tolist() if isinstance(value, np.ndarray) else value
     flat |= {f'{_LINK}{name}': value for name, value in sensor.link.items()}
     if sensor.effects:
         flat['effects'] = list(sensor.effects)
@@ -329,10 +356,15 @@ class _FlatReader:
     flat: Mapping[str, Any]
     make_error: MakeError
 
-    def sensor(self) -> Sensor:
+    def sensor(self, may_measure: bool) -> Sensor:
         """Make the sensor; every value is checked."""
-        values = {field.name: self._field(field) for field in SENSOR_FIELDS.values()}
+        unstated = [field for key, field in SENSOR_FIELDS.items()
+                    if may_measure and key not in self.flat
+                    and field.metadata['placeholder'] is not None]
+        values = {field.name: self._field(field) for field in SENSOR_FIELDS.values()
+                  if field not in unstated}
         axes = values['axes']
+        values |= {field.name: _placeholder(field, axes) for field in unstated}
         for key, field in SENSOR_FIELDS.items():
             value = values[field.name]
             if isinstance(value, np.ndarray) and len(value) != len(axes):
@@ -351,7 +383,8 @@ class _FlatReader:
         return Sensor(**values, effects=effects, values=coefficients, covariance=covariance,
                       covariance_names=covariance_names, provenance=provenance,
                       envelope=self._envelope(), datasheet_name=datasheet_name,
-                      datasheet=self._datasheet(), link=link)
+                      datasheet=self._datasheet(), link=link,
+                      unstated=tuple(field.name for field in unstated))
 
     def _field(self, field: Field[Any]) -> Any:
         """Return the value of a field of `Sensor`."""
@@ -518,6 +551,12 @@ class _FlatReader:
             raise self.make_error(key, f'{len(values)} values, but {count} names need as many, '
                                   'of 0 or more')
         return values.tolist()
+
+
+def _placeholder(field: Field[Any], axes: str) -> Any:
+    """Return what stands in a field of `Sensor` whose key a file leaves out."""
+    value = field.metadata['placeholder']
+    return np.full(len(axes), value) if field.type == 'np.ndarray' else value
 
 
 def _as_float(value: Any) -> str:

@@ -30,10 +30,15 @@ MODELS = ('nominal', 'linear', 'physical', 'full', 'gravity')
 
 
 def _nominal(key: str, doc: str, unit: str = '', lower: float | None = None,
-             upper: float | None = None, choices: tuple[str, ...] = ()) -> Any:
-    """Declare a nominal value: its key in the parameter file, meaning, unit and bounds."""
+             upper: float | None = None, choices: tuple[str, ...] = (),
+             placeholder: float | None = None) -> Any:
+    """
+    Declare a nominal value: its key in the parameter file, meaning, unit and bounds.
+
+    A file may leave a value with a `placeholder` out; the value is then in `Sensor.unstated`.
+    """
     return field(metadata={'key': key, 'doc': doc, 'unit': unit, 'lower': lower,
-                           'upper': upper, 'choices': choices})
+                           'upper': upper, 'choices': choices, 'placeholder': placeholder})
 
 
 @dataclass(frozen=True)
@@ -96,6 +101,11 @@ class Sensor:
         unit of the parameter; 0 where it does not.
     link
         How the driver reaches the unit: values of `link.*` by name. Its file carries them.
+    unstated
+        Names of the nominal values that the parameter file leaves out. Their fields hold
+        placeholders until `signals.measured_values` measures them.
+    measured
+        Names of the nominal values that were measured from samples in their place.
 
     """
 
@@ -108,18 +118,20 @@ class Sensor:
         1e-3, 10.0)
     noise_density_g_per_rthz: np.ndarray = _nominal(
         'sensor.noise_density_g_per_rthz', 'white noise density, by axis', 'g/sqrt(Hz)',
-        0.0, 0.1)
+        0.0, 0.1, placeholder=0.0)
     rc_resistance_ohm: float = _nominal(
         'sensor.rc_resistance_ohm', 'output resistance that the filter capacitor sees', 'Ohm',
-        0.0, 1e9)
+        0.0, 1e9, placeholder=0.0)
     rc_capacitance_f: float = _nominal(
-        'sensor.rc_capacitance_f', 'filter capacitor; 0 is no filter', 'F', 0.0, 1.0)
+        'sensor.rc_capacitance_f', 'filter capacitor; 0 is no filter', 'F', 0.0, 1.0,
+        placeholder=0.0)
     adc_bits: int = _nominal('sensor.adc_bits', 'resolution of the ADC; 0 does not quantise',
-                             'bit', 0, 32)
-    adc_vref_v: float = _nominal('sensor.adc_vref_v', 'full scale of the ADC', 'V', 0.1, 100.0)
+                             'bit', 0, 32, placeholder=0)
+    adc_vref_v: float = _nominal('sensor.adc_vref_v', 'full scale of the ADC', 'V', 0.1, 100.0,
+                                 placeholder=100.0)
     rate_hz: float = _nominal('sensor.rate_hz', 'sample rate', 'Hz', 0.01, 100000.0)
     range_g: float = _nominal('sensor.range_g', 'measuring range by the datasheet', 'g',
-                              0.1, 1000.0)
+                              0.1, 1000.0, placeholder=1000.0)
     local_gravity_mps2: float = _nominal(
         'sensor.local_gravity_mps2', 'gravity where the sensor is', 'm/s^2', 9.7, 9.9)
     z_sign: int = _nominal(
@@ -137,6 +149,8 @@ class Sensor:
     datasheet_name: str = ''
     datasheet: dict[Coefficient, tuple[float, float]] = field(default_factory=dict)
     link: dict[str, Any] = field(default_factory=dict)
+    unstated: tuple[str, ...] = ()
+    measured: tuple[str, ...] = ()
 
     @property
     def zero_g_v(self) -> np.ndarray:

@@ -33,7 +33,7 @@ from adxl_ros.nodes.support.link_parameters import given_link
 from adxl_ros.nodes.support.next_pose import Announcer
 from adxl_ros.nodes.support.parameters import declare
 from adxl_ros.nodes.support.run_node import run
-from adxl_ros.nodes.support.sensor_parameters import declare_sensor, make_sensor
+from adxl_ros.nodes.support.sensor_parameters import anonymous_sensor, declare_sensor, make_sensor
 from adxl_ros.nodes.support.topics import create_subscription
 from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
@@ -62,7 +62,9 @@ class Calibration(Node):
     def __init__(self) -> None:
         super().__init__('calibration')
         check_given_parameters(self)
-        sensor = replace(make_sensor(declare_sensor(self)), link=given_link(self))
+        flat, link = declare_sensor(self), given_link(self)
+        sensor = replace(make_sensor(flat, may_measure=True), link=link)
+        anonymous = replace(anonymous_sensor(self, flat), link=link)
         autostart = declare(self, 'autostart', False, 'start without a call of ~/start')
         resume = Resume(declare(
             self, 'resume', 'ask', 'go on with an interrupted calibration; ask where there is a '
@@ -70,7 +72,8 @@ class Calibration(Node):
         settings = declare_settings(self)
         self._captures: list[Future] = []
         self._announcer = Announcer(self)
-        self._controller = Controller(settings, sensor, resume, Samples(self), self)
+        self._controller = Controller(settings, sensor, resume, Samples(self), self,
+                                      anonymous)
         if autostart:
             self._controller.wait_for_sensor()
         self._connect()

@@ -23,16 +23,20 @@ from typing import Any
 from adxl_ros.compensate import filter_inversion
 from adxl_ros.compensate.compensation_policy import CompensationPolicy, Interval, State, Topics
 from adxl_ros.compensate.live_stream import COUNTS, LiveStream
+from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store
 from adxl_ros.files.stream_info import StreamInfo
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.nodes.support.diagnostics import DiagnosticsReporter, Level, Status
 from adxl_ros.nodes.support.exchangeable_sensor import ExchangeableSensor
 from adxl_ros.nodes.support.given_parameters import check_given_parameters
+from adxl_ros.nodes.support.imu_subscription import finite_samples
 from adxl_ros.nodes.support.parameters import declare
 from adxl_ros.nodes.support.receive_thread import ReceiveTurn, RepeatingThread
 from adxl_ros.nodes.support.run_node import run
+from adxl_ros.nodes.support.sensor_parameters import is_from_file
 from adxl_ros.nodes.support.topics import create_publisher, create_subscription
+from adxl_ros.signals.measured_values import unit_of_stream
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import Vector3Stamped
 from rclpy.clock import Clock, ClockType
@@ -42,6 +46,8 @@ from sensor_msgs.msg import BatteryState, Imu, Temperature
 
 _DEPTH = 100
 """Samples that are kept while the node is busy: 0.1 s at 1 kHz."""
+_MEASURE_S = 0.5
+"""Time between two attempts to measure an unknown sensor, s; chosen."""
 _LEVELS = {State.REFUSED: Level.ERROR, State.COMPENSATING: Level.OK}
 """Levels of the states; all others are warnings."""
 
@@ -63,24 +69,31 @@ class Compensation(Node):
         self._undo_filter = declare(
             self, 'undo_filter', False, 'take the RC filter out, amplitude and phase; a sample '
             f'is published {filter_inversion.HALF} samples late, with its own stamp')
+        keeps_orientation = declare(
+            self, 'orientation', 'keep', 'keep: a sample that states an orientation keeps it; '
+            'tilt: imu/data has that of the tilt', choices=('keep', 'tilt')) == 'keep'
         store = declare(
             self, 'store', str(calibration_store.default_folder()),
             'folder of calibrations, of which the newest of the unit is taken where none is '
             'named; empty: none')
         self._heard_ns: dict[str, int] = {}
+        self._named: tuple[Sensor, str]
+        self._obstacle = ''
         self._reported: Counter[str] = Counter()
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._reported_ns = self._steady.now().nanoseconds
         self._diagnostics = DiagnosticsReporter(self, {'compensation': self._status})
         data = create_publisher(self, Imu, 'imu/data', _DEPTH)
         tilt = create_publisher(self, Vector3Stamped, 'tilt', _DEPTH)
-        self._stream = LiveStream(paper, self._undo_filter, data.publish, tilt.publish)
+        self._stream = LiveStream(paper, self._undo_filter, data.publish, tilt.publish,
+                                  keeps_orientation)
         self._policy = CompensationPolicy(paper, store, Topics(
             data_raw=self.resolve_topic_name('imu/data_raw'),
             sensor_info=self.resolve_topic_name('sensor_info'),
             temperature=self.resolve_topic_name('temperature'),
             supply=self.resolve_topic_name('supply')))
-        ExchangeableSensor(self, self._policy.check, self._use)
+        self._sensor = ExchangeableSensor(self, self._policy.check, self._use)
+        self.create_timer(_MEASURE_S, self._measure, clock=self._steady)
         create_subscription(self, DiagnosticStatus, 'sensor_info', self._on_info, 1, latched=True)
         create_subscription(self, Temperature, 'temperature', self._on_temperature, 1)
         create_subscription(self, BatteryState, 'supply', self._on_supply, 1)
@@ -93,14 +106,42 @@ class Compensation(Node):
 
     def _use(self, sensor: Sensor, source: str) -> None:
         """Correct samples by a sensor from the next one on; `source` says where it is from."""
+        self._named = sensor, source
+        self._stream.release()
+        is_named = sensor.effects or self._calibration() or is_from_file(self)
+        self._stream.may_be_foreign = not (is_named or self._policy.info)
+        if sensor.unstated:
+            self._stream.hold()
+        self._correct_by(sensor, source)
+
+    def _correct_by(self, sensor: Sensor, source: str) -> None:
         text = self._policy.use(sensor, source)
         self._stream.use(sensor, self._policy.rate_hz)
-        self.get_logger().info(text)
+        if self._stream.unknown is None:
+            self.get_logger().info(text)
         self._assess()
+
+    def _measure(self) -> None:
+        """Measure the sensor of a stream that states nothing of itself."""
+        samples = self._stream.unknown
+        if samples is None:
+            return
+        named, _ = self._named
+        try:
+            unit, lines = unit_of_stream(
+                named if named.unstated else self._sensor.anonymous(), *finite_samples([*samples]))
+        except UserError as error:
+            self._obstacle = f'{error}'
+            return
+        self.get_logger().info(f'measured from the stream: {"; ".join(lines)}')
+        self._stream.release()
+        self._correct_by(unit, 'what the stream shows')
 
     def _on_info(self, message: DiagnosticStatus) -> None:
         self._policy.info = StreamInfo({pair.key: pair.value for pair in message.values},
                                        self.resolve_topic_name('sensor_info'))
+        if self._stream.may_be_foreign or self._policy.sensor is not self._named[0]:
+            self._use(*self._named)
         self._take_from_store()
         self._stream.restart_filter(self._policy.rate_hz)
         self._assess()
@@ -168,7 +209,8 @@ class Compensation(Node):
             counts={name: counts[name] - self._reported[name] for name in COUNTS},
             outside=self._stream.outside,
             surroundings=self._stream.surroundings.copy(),
-            ages_s={name: (ros_ns - ns) * 1e-9 for name, ns in self._heard_ns.items()})
+            ages_s={name: (ros_ns - ns) * 1e-9 for name, ns in self._heard_ns.items()},
+            obstacle=self._obstacle if self._stream.unknown is not None else '')
         self._reported, self._reported_ns = counts, steady_ns
         return interval
 

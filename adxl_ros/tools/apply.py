@@ -36,6 +36,7 @@ from adxl_ros.model.sensor import Sensor, with_axes
 from adxl_ros.tools.closing_lines import print_end, quoted
 from adxl_ros.tools.command_line import argument_parser, command
 from adxl_ros.tools.common import progress, report_reading, run
+from adxl_ros.tools.recorded_sensor import BeyondRange, listed, load_sensor, measure_unstated
 import numpy as np
 
 _BLOCK_ROWS = 16384
@@ -72,12 +73,16 @@ def apply(options: argparse.Namespace) -> int:
     """Run the tool; see `parser`."""
     if Path(options.output).resolve() == Path(options.recording).resolve():
         raise UserError(f'{options.output}: is the recording itself; choose another output')
-    sensor = parameter_file.load(options.params or parameter_file.nominal_path())
     rows = unsolved = outside = at_rail = 0
-    block = None
+    block, beyond = None, BeyondRange()
+    blocks = recording.blocks(options.recording, _BLOCK_ROWS)
+    first = next(blocks, None)
+    sensor, measured = _sensor(options.params, first)
     with CsvWriter(options.output, _DIGITS) as out, progress('apply') as show:
-        for block, estimates in _estimated(options, sensor):
+        for block, estimates in _estimated(options, sensor, first, blocks):
             out.write({'time_s': block.epoch_ns * 1e-9 + block.time_s, **_columns(estimates)})
+            explained = ~(estimates.unsolved | estimates.at_rail)
+            beyond.add(block.volts(sensor)[explained], sensor)
             rows += len(block)
             unsolved += int(estimates.unsolved.sum())
             outside += int(estimates.outside.sum())
@@ -87,30 +92,40 @@ def apply(options: argparse.Namespace) -> int:
     _report(outside, rows, 'lie outside of the validity range (temperature or force): their '
             'standard deviations are raised')
     _report(at_rail, rows, 'have the ADC at its rail: their standard deviations are inf')
+    if beyond.describe(sensor):
+        print(f'apply: {beyond.describe(sensor)}', file=sys.stderr)
     if block is not None:
         report_reading('apply', block)
-    _print_end(options, sensor, rows)
+    _print_end(options, sensor, rows, measured)
     return 0
 
 
-def _print_end(options: argparse.Namespace, sensor: Sensor, rows: int) -> None:
+def _sensor(params: str | None, first: Recording | None) -> tuple[Sensor, list[str]]:
+    """Return the sensor of a recording by its first block, and what is measured of it."""
+    if first is None:
+        return parameter_file.load(params or parameter_file.nominal_path()), []
+    sensor, measured = measure_unstated(load_sensor(params, first), first)
+    sensor = _of_unit(first, sensor)
+    rate_hz = first.rate_hz if len(first) > 1 else sensor.rate_hz
+    return replace(sensor, rate_hz=rate_hz), measured
+
+
+def _print_end(options: argparse.Namespace, sensor: Sensor, rows: int, measured: list[str]
+               ) -> None:
     """Print what was corrected, the file, and how the calibration is used live."""
     by_what = f'the {sensor.model} calibration of {sensor.serial}' if sensor.effects else \
         'the datasheet values: the sensor is not calibrated'
     live = f'compensation --ros-args -p calibration:={quoted(options.params or "")}'
-    print_end([f'Corrected {rows} samples by {by_what}.'], [options.output], command(
+    lines = [f'Corrected {rows} samples by {by_what}.', *listed(measured)]
+    print_end(lines, [options.output], command(
         *live.split(' ', 1)) if sensor.effects else command('fit', 'SWEEP -o unit.yaml'))
 
 
-def _estimated(options: argparse.Namespace, sensor: Sensor
-               ) -> Iterator[tuple[Recording, Estimates]]:
-    """Yield the blocks of the recording with their estimates."""
-    blocks = recording.blocks(options.recording, _BLOCK_ROWS)
-    first = next(blocks, None)
+def _estimated(options: argparse.Namespace, sensor: Sensor, first: Recording | None,
+               blocks: Iterator[Recording]) -> Iterator[tuple[Recording, Estimates]]:
+    """Yield the blocks of the recording, of which `first` is the first, with their estimates."""
     if first is None:
         return
-    sensor = _of_unit(first, sensor)
-    sensor = replace(sensor, rate_hz=first.rate_hz if len(first) > 1 else sensor.rate_hz)
     _report_effects(first, sensor, options.undo_filter)
     estimator = RecordingEstimator(sensor, first, options.inverse == 'paper', options.undo_filter)
     yield from estimator.blocks(itertools.chain([first], blocks))

@@ -36,6 +36,7 @@ from adxl_ros.simulate.from_recording import motion_from_force
 from adxl_ros.tools.closing_lines import NextStep, print_end, quoted
 from adxl_ros.tools.command_line import argument_parser, command, effect_list
 from adxl_ros.tools.common import make_folder, progress, report_reading, run
+from adxl_ros.tools.recorded_sensor import load_sensor, measure_unstated
 
 _NO_VERDICT = ('bad_data', 'insufficient')
 """Statuses of the report that hold no verdict: the exit status is then 1."""
@@ -84,13 +85,13 @@ def diagnose(options: argparse.Namespace) -> int:
     if options.sim and len(options.recording) > 1:
         raise UserError(f'--sim {options.sim}: goes with one recording, but '
                         f'{len(options.recording)} are given')
-    sensor = parameter_file.load(options.params or parameter_file.nominal_path())
     if options.align and not options.sim:
         raise UserError('--align: shifts --sim, which is not given')
     with progress('reading') as show:
         recordings = [_read(path) for path in options.recording]
         sim = motion_from_force(options.sim, False, recordings[0].epoch_ns)[0] if options.sim \
             else None
+        sensor, _ = measure_unstated(load_sensor(options.params, recordings[0]), recordings[0])
         diagnosis = diagnose_recordings(recordings, sensor, sim, options.seed,
                                         lambda stage, done: show(done, stage), options.align)
         lines = report_text.screen_lines(diagnosis, _subject(recordings, sensor, options.sim))

@@ -17,20 +17,24 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 import sys
 
 from adxl_ros.calibrate import calibration, pose_extraction
 from adxl_ros.calibrate.report import report_html, text_tables
 from adxl_ros.errors import UserError
-from adxl_ros.files import calibration_store, parameter_file, recording, sweep_journal
+from adxl_ros.files import calibration_store, recording, sweep_journal
 from adxl_ros.files.checksum import sha256
+from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.stream_unit import recorded_unit
 from adxl_ros.model.effects import library
 from adxl_ros.model.effects.base import Place
+from adxl_ros.model.sensor import Sensor
 from adxl_ros.tools.closing_lines import print_end, quoted
 from adxl_ros.tools.command_line import argument_parser, command, effect_list
 from adxl_ros.tools.common import make_folder, report_reading, run
+from adxl_ros.tools.recorded_sensor import BeyondRange, listed, load_sensor, measure_unstated
 
 _EXAMPLES = {
     'the richest model that a sweep determines, with a page':
@@ -49,7 +53,8 @@ def parser() -> argparse.ArgumentParser:
     parse.add_argument('recording', nargs='+',
                        help='rosbag2 directory, .mcap or CSV, all of one unit')
     parse.add_argument('--params', metavar='FILE', default=None,
-                       help='values that are not fitted (default: the nominal sensor)')
+                       help='values that are not fitted (default: the nominal sensor; what '
+                            'a file leaves out is measured)')
     parse.add_argument('--model', choices=list(calibration.STAGE_FITS),
                        help='model to fit to stage angles (default: the richest that the poses '
                             'determine); a three-axis recording without angles is '
@@ -79,19 +84,25 @@ def fit(options: argparse.Namespace) -> int:
     if options.journal and len(options.recording) != 1:
         raise UserError(f'--journal {options.journal}: names the rests of one recording, but '
                         f'{len(options.recording)} are given')
-    sensor = parameter_file.load(options.params or parameter_file.nominal_path())
     records = _records(options.journal)
-    unit = sensor
+    unit: Sensor | None = None
+    measured: list[str] = []
     recordings = []
     for path in options.recording:
         read = recording.read(path)
         report_reading('fit', read)
+        if unit is None:
+            unit, lines = measure_unstated(load_sensor(options.params, read), read)
+            measured = listed(lines)
         unit = recorded_unit(unit, read)
+        _report_range(read, unit)
         poses = pose_extraction.extract_poses(read, unit, records)
         recordings.append(calibration.RecordedPoses(
             Path(path).name, poses, pose_extraction.estimate_filters(read, unit, poses)))
+    assert unit is not None, 'argparse asks for a recording'
     result = calibration.calibrate(unit, recordings, options.model, options.effect,
                                    sha256(options.recording))
+    result = replace(result, report_lines=[*result.report_lines, *measured])
     if options.report:
         make_folder(Path(options.report))
         report_html.write(options.report, result, options.store)
@@ -99,9 +110,19 @@ def fit(options: argparse.Namespace) -> int:
     print(f'fit: {result.keep(options.store)}', file=sys.stderr)
     report = [Path(options.report) / name for name in _REPORT_FILES] if options.report else []
     print_end([*text_tables.coefficient_table(result.fitted), '', *result.summary_lines, '',
-               *text_tables.acceptance_lines(result.fitted), ''], [options.output, *report],
+               *text_tables.acceptance_lines(result.fitted), *measured, ''],
+              [options.output, *report],
               command('apply', f'RECORDING --params {quoted(options.output)} -o tilt.csv'))
     return 0
+
+
+def _report_range(read: Recording, unit: Sensor) -> None:
+    """Report readings beyond the stated range on stderr."""
+    beyond = BeyondRange()
+    beyond.add(read.volts(unit), unit)
+    text = beyond.describe(unit)
+    if text:
+        print(f'fit: {read.path}: {text}', file=sys.stderr)
 
 
 def _records(path: str | None) -> list[sweep_journal.PoseRecord] | None:

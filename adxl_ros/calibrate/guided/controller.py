@@ -37,10 +37,13 @@ from adxl_ros.errors import UserError
 from adxl_ros.files.stream_info import StreamInfo
 from adxl_ros.files.stream_unit import unit_of
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.signals import measured_values
 import numpy as np
 
 IDLE_TEXT = 'idle; call ~/start'
 """Status of a controller that has not been started."""
+_POLLS_PER_MEASUREMENT = 20
+"""Calls of `poll` from one attempt to measure an unknown sensor to the next: one a second."""
 _NOT_RUNNING = 'no calibration is running'
 """The answer to requests that need a session."""
 
@@ -167,6 +170,9 @@ class SampleSource(Protocol):
     def silence(self) -> str:
         """Return one line on the time without samples; '' while samples come."""
 
+    def waiting(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the waiting samples: stamps, ns, (n,), and specific force, m/s², (n, 3)."""
+
     def clear(self) -> None:
         """Forget the waiting samples."""
 
@@ -190,6 +196,8 @@ class Controller:
         Where samples come from.
     outputs
         Where lines, answers and announcements go.
+    anonymous
+        The sensor of a stream that states nothing of itself; None for `sensor`.
 
     Attributes
     ----------
@@ -211,7 +219,8 @@ class Controller:
     """
 
     def __init__(self, settings: SessionSettings, sensor: Sensor, resume: Resume,
-                 samples: SampleSource, outputs: Outputs) -> None:
+                 samples: SampleSource, outputs: Outputs, anonymous: Sensor | None = None
+                 ) -> None:
         self.settings = settings
         self.state = ControllerState.IDLE
         self.unit: Sensor | None = None
@@ -221,6 +230,7 @@ class Controller:
         self.may_ask = self.shows_idle_stream = False
         self._sensor, self._resume = sensor, resume
         self._samples, self._outputs = samples, outputs
+        self._anonymous, self._polls = anonymous or sensor, 0
         self._starts_over = resume is Resume.ANEW
         self._question_is_answered = False
         self._idle_samples: NewestSamples | None = None
@@ -327,9 +337,16 @@ class Controller:
         except UserError as error:
             self._refuse_sensor(f'{error}')
             return
-        self._sensor_fault = ''
+        if unit.unstated:
+            self._anonymous = unit
+            return
         if self.session is not None:
             self._compare_sensor(self.session, unit)
+        self._take_unit(unit)
+
+    def _take_unit(self, unit: Sensor) -> None:
+        """Take a sensor as that of the stream."""
+        self._sensor_fault = ''
         self.unit, self._idle_samples = unit, NewestSamples(unit)
         self._outlook = self.settings.outlook(unit)
 
@@ -510,13 +527,31 @@ class Controller:
 
     def _watch(self) -> None:
         """Keep the newest samples while no calibration runs."""
-        if self.unit is None and self.state is not ControllerState.IDLE:
+        if self.unit is None and (self.state is not ControllerState.IDLE
+                                  or self.shows_idle_stream):
             # A driver that has just begun states its sensor on another topic.
             self._samples.keep_newest()
+            self._polls += 1
+            if self._polls % _POLLS_PER_MEASUREMENT == 0 and not self._sensor_fault:
+                self._measure_unit()
         elif self.unit is not None and self._idle_samples is not None and self.shows_idle_stream:
             self._idle_samples.feed(*self._samples.take(self.unit))
         else:
             self._samples.clear()
+
+    def _measure_unit(self) -> None:
+        """Measure the sensor of a stream that states nothing of itself."""
+        stamps_ns, accel_mps2 = self._samples.waiting()
+        if not len(stamps_ns) or np.ptp(stamps_ns) < measured_values.SHORTEST_S * 1e9:
+            return
+        try:
+            unit, lines = measured_values.unit_of_stream(self._anonymous, stamps_ns, accel_mps2)
+        except UserError as error:
+            self._log_unless_repeated(Severity.WARNING, f'imu/data_raw: {error}')
+            return
+        self._outputs.log(Severity.INFO, 'no sensor_info: measured from the stream: '
+                          + '; '.join(lines))
+        self._take_unit(unit)
 
     def _take_samples(self, session: Session) -> None:
         stamps_ns, volts = self._samples.take(self.unit or session.unit)

@@ -119,7 +119,8 @@ class SessionSettings:
 
     def head(self, unit: Sensor) -> dict[str, Any]:
         """Return the settings and values, by key, that an interrupted calibration must share."""
-        unit_fields = {name: np.asarray(getattr(unit, name)).tolist() for name in _UNIT_FIELDS}
+        unit_fields = {name: 'measured' if name in unit.measured else
+                       np.asarray(getattr(unit, name)).tolist() for name in _UNIT_FIELDS}
         head = {'mode': self.mode, **unit_fields,
                 'sweep.temperature_span_c': self.capture.temperature_span_c}
         if self.mode == 'gravity':

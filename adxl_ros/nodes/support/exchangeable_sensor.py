@@ -28,6 +28,7 @@ from adxl_ros.model.sensor import Sensor
 from adxl_ros.nodes.support.parameters import declare
 from adxl_ros.nodes.support.rclpy_internals import given_parameters
 from adxl_ros.nodes.support.sensor_parameters import (
+    anonymous_sensor,
     declare_sensor,
     is_from_file,
     make_sensor,
@@ -80,7 +81,7 @@ class ExchangeableSensor:
                  use: Callable[[Sensor, str], None]) -> None:
         self._node, self._check_use, self._use = node, check, use
         self._flat = declare_sensor(node, live=True)
-        make_sensor(self._flat)
+        make_sensor(self._flat, may_measure=True)
         self._source = 'the parameters given' if is_from_file(node) else \
             f'the nominal {parameter_file.nominal_path()}'
         self._declare_provenance(given_parameters(node))
@@ -100,6 +101,10 @@ class ExchangeableSensor:
         result = node.set_parameters([Parameter('calibration', value=path)])[0]
         if not result.successful:
             raise UserError(result.reason)
+
+    def anonymous(self) -> Sensor:
+        """Return the sensor of a stream that states nothing of itself, where none is named."""
+        return anonymous_sensor(self._node, self._flat)
 
     def _declare_provenance(self, given: Iterable[tuple[str, Any]]) -> None:
         """Declare what is given of a provenance, whose keys are free."""
@@ -188,4 +193,5 @@ def _refuse_others(changes: Mapping[str, Any], flat: Mapping[str, Any]) -> None:
 def _sensor_of(flat: Mapping[str, Any]) -> Sensor:
     """Make the sensor of parameters, where an empty value stands for none."""
     filled = {name: value for name, value in flat.items() if value not in ([], '', None)}
-    return make_sensor(filled, lambda key, reason: UserError(f'{key}: {reason}'))
+    return make_sensor(filled, lambda key, reason: UserError(f'{key}: {reason}'),
+                       may_measure=True)

@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+from adxl_ros.compensate.live_stream import UNKNOWN_ANGLE_RAD2
 from adxl_ros.files import cdr
 from adxl_ros.model.sensor import Sensor, to_volts
 from adxl_ros.nodes.support.topics import create_subscription
@@ -32,9 +33,6 @@ _SILENT_S = 3.0
 """Time without samples after which the stream is silent, s; chosen."""
 _QUEUE = 20000
 """Samples that are kept: 20 s at 1 kHz, longer than a fit takes."""
-_COMPENSATED_RAD2 = 1e5
-"""Variance of yaw, rad², from which a stream with an orientation is compensation's output, which
-states 1e6; chosen: below that, above every real variance."""
 
 
 class Samples:
@@ -73,18 +71,15 @@ class Samples:
         """Forget all samples but the newest, as many as the queue holds."""
         del self._raw[:-_QUEUE]
 
+    def waiting(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the samples that wait: stamps, ns, (n,), and m/s², (n, 3), finite; keep them."""
+        return finite_samples(self._raw[:])
+
     def take(self, unit: Sensor) -> tuple[np.ndarray, np.ndarray]:
         """Return the samples since the last call: stamps, ns, (n,), and volts, (n, m), finite."""
         batch = self._raw[:]
         self._raw.clear()
-        stamps, accel, yaw_rad2 = np.empty(len(batch), np.int64), np.empty((len(batch), 3)), 0.0
-        for table in cdr.tables(batch, cdr.imu):
-            stamps[table.rows] = table.stamp_ns()
-            accel[table.rows] = table.numbers('linear_acceleration')
-            covariance = table.numbers('orientation_covariance')
-            # -1 in the first place means that a message has no orientation.
-            variances_rad2 = np.where(covariance[:, 0] >= 0, covariance[:, _YAW_VARIANCE], 0.0)
-            yaw_rad2 = max(yaw_rad2, float(np.max(variances_rad2)))
+        stamps, accel, yaw_rad2 = _decoded(batch)
         if batch:
             self.restart_silence()
         accel = accel[:, :len(unit.axes)]
@@ -94,9 +89,9 @@ class Samples:
         complete = finite.all(axis=1)
         return stamps[complete], to_volts(accel[complete], unit)
 
-    def _why_compensated(self, yaw_rad2: float) -> str:
-        """Return that a stream with this variance of yaw is compensated, or ''."""
-        return '' if yaw_rad2 < _COMPENSATED_RAD2 else (
+    def _why_compensated(self, yaw_rad2: np.ndarray) -> str:
+        """Return that a stream with these variances of yaw is compensated, or ''."""
+        return '' if (yaw_rad2 != UNKNOWN_ANGLE_RAD2).all() else (
             f'{self._node.resolve_topic_name(_TOPIC)}: this stream is already compensated '
             '(it carries an orientation, as imu/data does); remap it to imu/data_raw of the '
             'driver')
@@ -109,6 +104,26 @@ class Samples:
         topic = self._node.resolve_topic_name(_TOPIC)
         publishers = '' if self._node.count_publishers(topic) else ', and nobody publishes it'
         return f'nothing on {topic} for {silent_s:.0f} s{publishers}'
+
+
+def finite_samples(batch: list[bytes]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the samples of serialized messages: stamps, ns, (n,), and m/s², (n, 3), finite."""
+    stamps, accel, _ = _decoded(batch)
+    finite = np.isfinite(accel).all(axis=1)
+    return stamps[finite], accel[finite]
+
+
+def _decoded(batch: list[bytes]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return stamps, ns, (n,), m/s², (n, 3), and the variances of yaw, rad², of n messages."""
+    stamps, accel = np.empty(len(batch), np.int64), np.empty((len(batch), 3))
+    yaw_rad2 = np.zeros(len(batch))
+    for table in cdr.tables(batch, cdr.imu):
+        stamps[table.rows] = table.stamp_ns()
+        accel[table.rows] = table.numbers('linear_acceleration')
+        covariance = table.numbers('orientation_covariance')
+        # -1 in the first place means that a message has no orientation.
+        yaw_rad2[table.rows] = np.where(covariance[:, 0] >= 0, covariance[:, _YAW_VARIANCE], 0.0)
+    return stamps, accel, yaw_rad2
 
 
 def _why_not_finite(finite: np.ndarray, unit: Sensor) -> str:

@@ -116,8 +116,34 @@ def _keys() -> Iterator[_Key]:
         yield _Key(f'datasheet.{name}', _DATASHEET_KINDS.get(name, Kind.DOUBLE_ARRAY), description)
 
 
+def anonymous_sensor(node: Node, flat: Mapping[str, Any]) -> Sensor:
+    """
+    Return the sensor of a stream that states nothing of itself.
+
+    Parameters
+    ----------
+    node
+        The node, which knows what is given.
+    flat
+        Values by dotted key, as `declare_sensor` returns them.
+
+    Returns
+    -------
+    Sensor
+        The sensor of the parameter file; without a file any IMU with what is given. Values that
+        neither states are in `unstated`.
+
+    """
+    if is_from_file(node):
+        return make_sensor(flat, may_measure=True)
+    any_imu = parameter_file.load(parameter_file.any_imu_path(), may_measure=True)
+    given = {name: flat[name] for name, _ in given_parameters(node) if name in flat}
+    return make_sensor(parameter_file.to_flat(any_imu) | given, may_measure=True)
+
+
 def make_sensor(flat: Mapping[str, Any],
-                make_error: Callable[[str, str], UserError] = parameter_error) -> Sensor:
+                make_error: Callable[[str, str], UserError] = parameter_error,
+                may_measure: bool = False) -> Sensor:
     """
     Check the parameters of a sensor and make it.
 
@@ -127,6 +153,8 @@ def make_sensor(flat: Mapping[str, Any],
         Values by dotted key, as `declare_sensor` returns them.
     make_error
         Makes the error of a parameter and a reason; by default it names the parameter file.
+    may_measure
+        Whether values that can be measured may be missing.
 
     Returns
     -------
@@ -145,4 +173,4 @@ def make_sensor(flat: Mapping[str, Any],
         if effect.name not in listed:
             for p in effect.parameters:
                 used.pop(str(Coefficient(effect.name, p.name)), None)
-    return parameter_file.from_flat(used, make_error)
+    return parameter_file.from_flat(used, make_error, may_measure)

@@ -1,0 +1,131 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The nodes on the stream of any IMU, which publishes no sensor_info."""
+
+from collections.abc import Callable, Iterator
+
+from adxl_ros.files import parameter_file
+from graph import accel, Graph, stamp_ns
+import numpy as np
+from processes import Started
+import pytest
+from sensor_msgs.msg import Imu
+from std_srvs.srv import Trigger
+
+G = 9.80665
+TOPIC = 'camera/imu'
+NOISE_MPS2 = 0.02
+RATE_HZ = 100.0
+Start = Callable[..., Started]
+
+
+class Camera:
+    """A camera's IMU: three axes, a gyroscope, an orientation, and no sensor_info."""
+
+    def __init__(self, graph: Graph) -> None:
+        self.graph = graph
+        self._publisher = graph.node.create_publisher(Imu, TOPIC, 1000)
+        self._rng = np.random.default_rng(5)
+        self._count = 0
+
+    def connected(self) -> None:
+        """Wait until a node subscribes."""
+        self.graph.spin_until(self._publisher.get_subscription_count, 20, 'a subscriber')
+
+    def rest(self, force_mps2: list[float], seconds: float) -> None:
+        """Publish a rest, faster than real time."""
+        for _ in range(round(seconds * RATE_HZ)):
+            self.send(np.asarray(force_mps2) + self._rng.normal(0, NOISE_MPS2, 3))
+            if self._count % 20 == 0:
+                self.graph.spin(0.005)
+
+    def turn(self, seconds: float = 0.5) -> None:
+        """Publish motion."""
+        for _ in range(round(seconds * RATE_HZ)):
+            self.send(self._rng.normal(0, 5.0, 3))
+
+    def send(self, force_mps2: np.ndarray) -> None:
+        """Publish one sample."""
+        message = Imu()
+        time_ns = 1_700_000_000_000_000_000 + round(self._count * 1e9 / RATE_HZ)
+        self._count += 1
+        message.header.stamp.sec, message.header.stamp.nanosec = divmod(time_ns, 10 ** 9)
+        message.header.frame_id = 'camera_imu'
+        message.orientation.x, message.orientation.w = 0.6, 0.8
+        message.orientation_covariance = [0.01, 0.0, 0.0, 0.0, 0.01, 0.0, 0.0, 0.0, 0.02]
+        message.angular_velocity.x, message.angular_velocity.z = 0.25, -0.5
+        a = message.linear_acceleration
+        a.x, a.y, a.z = map(float, force_mps2)
+        self._publisher.publish(message)
+
+
+@pytest.fixture
+def camera(ros_env: dict[str, str]) -> Iterator[Camera]:
+    with Graph() as graph:
+        yield Camera(graph)
+
+
+@pytest.mark.parametrize('orientation', ['keep', 'tilt'])
+def test_compensation_takes_any_imu(camera: Camera, start: Start, orientation: str) -> None:
+    """Axes, rate and noise are measured; gyroscope and orientation pass through."""
+    graph = camera.graph
+    data = graph.listen(Imu, 'imu/data')
+    node = start('compensation', '--ros-args', '-r', f'imu/data_raw:={TOPIC}', '-p',
+                 f'orientation:={orientation}')
+    camera.connected()
+
+    def published() -> bool:
+        camera.rest([0.0, 0.0, G], 0.1)
+        graph.spin(0.05)
+        return bool(data)
+    graph.spin_until(published, 40, 'corrected samples')
+    node.wait_for('measured from the stream: rate: 100 Hz, axes: xyz')
+    message = data[-1]
+    assert message.header.frame_id == 'camera_imu' and stamp_ns(message) > 0
+    np.testing.assert_allclose(accel(message), [0, 0, G], atol=0.2)
+    assert (message.angular_velocity.x, message.angular_velocity.z) == (0.25, -0.5)
+    variances = np.reshape(message.linear_acceleration_covariance, (3, 3)).diagonal()
+    np.testing.assert_allclose(np.sqrt(variances), NOISE_MPS2, rtol=0.3)
+    kept = (message.orientation.x, message.orientation.w) == (0.6, 0.8)
+    assert kept is (orientation == 'keep')
+
+
+def test_calibration_takes_any_imu(camera: Camera, start: Start, tmp_path) -> None:
+    """A calibration against gravity by remapping; its file states what was measured."""
+    graph = camera.graph
+    node = start('calibration', '--ros-args', '-r', f'imu/data_raw:={TOPIC}', '-p',
+                 'mode:=gravity', '-p', 'autostart:=true', '-p', 'output:=unit.yaml', '-p',
+                 'sensor.serial:=cam7')
+    camera.connected()
+    camera.rest([0.0, 0.0, G], 4.0)
+    node.wait_for('measured from the stream: rate: 100 Hz, axes: xyz')
+    graph.spin_until(lambda: graph.reports('calibration', ''), 20, 'diagnostics')
+    rng = np.random.default_rng(8)
+    directions = rng.normal(size=(30, 3))
+    directions /= np.linalg.norm(directions, axis=1)[:, None]
+    offset, scale = np.array([0.3, -0.2, 0.5]), np.array([1.01, 0.99, 1.02])
+    for direction in directions:
+        camera.turn()
+        camera.rest((direction * G * scale + offset).tolist(), 3.0)
+    camera.turn()
+    answer = graph.call(Trigger, 'calibration/finish', Trigger.Request())
+    assert answer.success, answer.message
+    unit = parameter_file.load(tmp_path / 'unit.yaml')
+    assert (unit.serial, unit.axes, unit.model) == ('cam7', 'xyz', 'gravity')
+    assert unit.rate_hz == pytest.approx(RATE_HZ)
+    assert unit.adc_bits == 0 and unit.rc_s == 0 and unit.range_g >= 2
+    noise_mps2 = unit.noise_density_g_per_rthz * G * np.sqrt(RATE_HZ / 2)
+    np.testing.assert_allclose(noise_mps2, NOISE_MPS2, rtol=0.2)
+    np.testing.assert_allclose(unit.values['bias']['offset_v'] * G, offset, atol=0.01)

@@ -1,0 +1,129 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What no parameter file states is measured from the recording, not taken from another sensor."""
+
+from pathlib import Path
+
+from adxl_ros.files import parameter_file
+import numpy as np
+from processes import REPO
+import pytest
+from scipy.signal import lfilter
+
+G = 9.80665
+RATE_HZ = 200.0
+ERROR = np.array([0.3, -0.2, 0.47 * G])
+PARTIAL = """/**:
+  ros__parameters:
+    format: 1
+    model: nominal
+    sensor:
+      serial: cam7
+      axes: xyz
+      nominal_zero_g_v: [0.0, 0.0, 0.0]
+      nominal_scale_v_per_g: [1.0, 1.0, 1.0]
+      rate_hz: 100.0
+      range_g: 1.2
+      local_gravity_mps2: 9.80665
+      z_sign: 1
+    stage:
+      resolution_rad: 0.001
+"""
+
+
+def tumble(path: Path, noise_mps2: float, tau_s: float = 0.0, step_mps2: float = 0.0) -> Path:
+    """Write a recording of a digital sensor that a hand turns through 30 rests."""
+    rng = np.random.default_rng(4)
+    directions = rng.normal(size=(30, 3))
+    directions /= np.linalg.norm(directions, axis=1)[:, None]
+    rests = np.repeat(directions * G + ERROR, round(3 * RATE_HZ), axis=0)
+    moves = rng.normal(0, 6.0, (30, round(0.5 * RATE_HZ), 3))
+    noise = rng.normal(0, 1, (len(rests), 3))
+    if tau_s:
+        a = np.exp(-1 / (RATE_HZ * tau_s))
+        noise = lfilter([np.sqrt(1 - a * a)], [1, -a], noise, axis=0)
+    parts = (rests + noise_mps2 * noise).reshape(30, -1, 3)
+    samples = np.concatenate([parts, moves], axis=1).reshape(-1, 3)
+    if step_mps2:
+        samples = np.round(samples / step_mps2) * step_mps2
+    rows = [f'{i / RATE_HZ!r},{",".join(map(repr, row))}' for i, row in
+            enumerate(samples.tolist())]
+    path.write_text('\n'.join(['time_s,ax_mps2,ay_mps2,az_mps2', *rows]) + '\n')
+    return path
+
+
+@pytest.mark.parametrize('tau_s', [0.0, 0.02])
+def test_fit_measures_the_sensor(run_tool, tmp_path, tau_s) -> None:
+    """Noise, filter, resolution and range are those of the recording, in file and terminal."""
+    path = tumble(tmp_path / 'a.csv', 0.05, tau_s, 0.01)
+    done = run_tool('fit', path, '-o', tmp_path / 'unit.yaml')
+    assert done.returncode == 0, done.stderr
+    unit = parameter_file.load(tmp_path / 'unit.yaml')
+    bandwidth_hz = 0.25 / tau_s if tau_s else RATE_HZ / 2
+    np.testing.assert_allclose(
+        unit.noise_density_g_per_rthz * G * np.sqrt(bandwidth_hz), 0.05, rtol=0.15)
+    assert unit.rc_s == pytest.approx(tau_s, rel=0.15)
+    assert unit.range_g == pytest.approx(4.0), 'the largest reading is between 2 and 4 g'
+    for text in (done.stdout, (tmp_path / 'unit.yaml').read_text()):
+        assert 'Measured, as no parameter file states it' in text
+        assert 'resolution: x 1 mg, y 1 mg, z 1 mg' in text
+    np.testing.assert_allclose(unit.values['bias']['offset_v'] * G, ERROR, atol=0.02)
+
+
+def test_stated_values_stand_and_readings_beyond_them_are_reported(run_tool, tmp_path) -> None:
+    """The file states the range: it stands, and readings beyond it are counted."""
+    path = tumble(tmp_path / 'a.csv', 0.05)
+    params = tmp_path / 'cam7.yaml'
+    params.write_text(PARTIAL)
+    done = run_tool('fit', path, '--params', params, '-o', tmp_path / 'unit.yaml', '--store', '')
+    assert done.returncode == 0, done.stderr
+    assert 'beyond the stated range of ±1.2 g' in done.stderr
+    unit = parameter_file.load(tmp_path / 'unit.yaml')
+    assert (unit.serial, unit.range_g) == ('cam7', 1.2)
+    assert 'range:' not in done.stdout and 'noise of a sample' in done.stdout
+    done = run_tool('apply', path, '--params', tmp_path / 'unit.yaml', '-o', tmp_path / 'o.csv')
+    assert done.returncode == 0, done.stderr
+    assert 'beyond the stated range of ±1.2 g' in done.stderr
+
+
+def test_a_recording_without_a_calibration_has_the_noise_that_it_shows(run_tool, tmp_path) -> None:
+    """`apply` states the scatter of the recording, not that of another sensor."""
+    path = tumble(tmp_path / 'a.csv', 0.05)
+    done = run_tool('apply', path, '-o', tmp_path / 'o.csv')
+    assert done.returncode == 0, done.stderr
+    table = np.genfromtxt(tmp_path / 'o.csv', delimiter=',', names=True)
+    np.testing.assert_allclose(np.median(table['ax_std_mps2']), 0.05, rtol=0.2)
+
+
+def test_what_cannot_be_measured_is_refused(run_tool, tmp_path) -> None:
+    """A simulation needs all values, and a recording must be long enough."""
+    params = tmp_path / 'cam7.yaml'
+    params.write_text(PARTIAL)
+    done = run_tool('simulate', 'rich', '--params', params, '-o', tmp_path / 's.csv')
+    assert done.returncode == 1
+    assert 'sensor.noise_density_g_per_rthz: missing' in done.stderr
+    lines = tumble(tmp_path / 'a.csv', 0.05).read_text().splitlines()[:30]
+    (tmp_path / 'short.csv').write_text('\n'.join(lines) + '\n')
+    done = run_tool('fit', tmp_path / 'short.csv', '-o', tmp_path / 'unit.yaml')
+    assert done.returncode == 1
+    assert '29 samples at 200 Hz do not show the noise of the sensor' in done.stderr
+
+
+def test_the_file_of_any_imu_leaves_out_what_is_measured() -> None:
+    """No figure of a particular sensor stands in it."""
+    unit = parameter_file.load(REPO / 'params' / 'any_imu.yaml', may_measure=True)
+    assert {'noise_density_g_per_rthz', 'rc_capacitance_f', 'range_g', 'adc_bits'} <= set(
+        unit.unstated)
+    assert not unit.datasheet
