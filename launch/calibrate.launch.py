@@ -13,23 +13,68 @@
 # limitations under the License.
 
 """
-Start a guided calibration: the driver, the stage and the calibration.
+Calibrate a sensor: start the driver, the stage and the calibration, and end with it.
 
     ros2 launch adxl_ros calibrate.launch.py output:=unit_17.yaml
     ros2 launch adxl_ros calibrate.launch.py output:=unit_17.yaml link_type:=serial \
-        link_port:=/dev/ttyACM0
+        link_port:=/dev/ttyACM0 stage_type:=trajectory bridge_alpha_joint:=tilt_joint \
+        bridge_beta_joint:=turn_joint
+    ros2 launch adxl_ros calibrate.launch.py output:=unit_17.yaml link_type:=serial \
+        link_port:=/dev/ttyACM0 stage_mode:=manual
     ros2 launch adxl_ros calibrate.launch.py mode:=gravity output:=unit_17.yaml
 
-The calibration starts by itself and stays up to show its result. In mode `gravity` there is no
+A log line says how long it takes. The launch ends with the calibration: status 0 where it wrote
+its file, else 1. After an interruption the same command resumes. In mode `gravity` there is no
 stage, and `ros2 service call /calibration/finish std_srvs/srv/Trigger` fits the rests so far. A
-driver that is killed is started again; one that refuses to start three times ends the launch.
+driver or stage that is killed is started again; one that refuses to start three times ends the
+launch with an error.
 """
 
+from typing import Any
+
+from adxl_ros.errors import UserError
 from adxl_ros.nodes.support import launch_nodes
-from adxl_ros.nodes.support.launch_nodes import argument, make_node, text
+from adxl_ros.nodes.support.launch_nodes import Argument, given_anywhere, make_node, text
 from launch import LaunchContext, LaunchDescription
-from launch.actions import DeclareLaunchArgument, OpaqueFunction, Shutdown
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch_ros.actions import Node
+
+LINK_TYPE = launch_nodes.LINK[0]
+STAGE_TYPE = Argument('stage_type', 'stage.type', 'the simulated stage, or the type of command '
+                      'that the controller of a real stage takes', str,
+                      ('simulated', 'joint_state', 'trajectory'))
+STAGE_MODE = Argument('stage_mode', 'stage.mode', 'who turns the stage: commanded turns itself, '
+                      'encoder and manual are turned by hand', str,
+                      ('commanded', 'encoder', 'manual'))
+BRIDGE = (
+    Argument('bridge_joint_states', 'bridge.joint_states', "topic of the controller's joint "
+             'states'),
+    Argument('bridge_command', 'bridge.command', 'topic on which the controller listens'),
+    Argument('bridge_speed_rad_s', 'bridge.speed_rad_s', 'speed of the real stage, rad/s', float),
+    *(argument for joint in ('alpha', 'beta') for argument in (
+        Argument(f'bridge_{joint}_joint', f'bridge.{joint}.joint',
+                 f"the controller's name of the joint {joint}"),
+        Argument(f'bridge_{joint}_sign', f'bridge.{joint}.sign',
+                 f'direction in which it counts {joint}: 1 or -1', int),
+        Argument(f'bridge_{joint}_offset_rad', f'bridge.{joint}.offset_rad',
+                 f"{joint} where the controller's joint is at 0, rad", float))))
+SWEEP = (
+    Argument('report', 'report', 'directory for the report, a page of plots'),
+    Argument('resume', 'resume', 'what to do with an interrupted calibration', str,
+             ('ask', 'continue', 'anew')),
+    Argument('sweep_plan', 'sweep.plan', 'poses: full takes 25 minutes, quick about 38 poses',
+             str, ('auto', 'full', 'quick')),
+    Argument('sweep_planes_deg', 'sweep.planes_deg', 'planes alpha of the plan full, deg, with '
+             'commas', list),
+    Argument('sweep_step_deg', 'sweep.step_deg', 'step of beta of the plan full, deg', float),
+    Argument('sweep_dwell_s', 'sweep.dwell_s', 'time at rest in each pose, s', float),
+    Argument('sweep_check_poses', 'sweep.check_poses', 'poses kept out of the fit', int),
+    Argument('sweep_tilt_error_deg', 'sweep.tilt_error_deg', 'rms tilt error that the plan quick '
+             'is to reach, deg', float),
+)
+SPEED = Argument('speed', 'link.speed', 'simulated sensor: its time by real time, such as 10',
+                 float)
+RESUMES = 'its line above says why; accepted poses are kept, and the same command resumes'
 
 
 def generate_launch_description() -> LaunchDescription:
@@ -39,16 +84,50 @@ def generate_launch_description() -> LaunchDescription:
                               description='parameter file that the calibration writes'),
         DeclareLaunchArgument('mode', default_value='stage', choices=['stage', 'gravity'],
                               description='poses of a stage, or rests of a hand-held sensor'),
+        *(argument.declared() for argument in (
+            STAGE_TYPE, STAGE_MODE, *BRIDGE, *SWEEP, SPEED)),
         OpaqueFunction(function=make_nodes)])
 
 
 def make_nodes(context: LaunchContext) -> list[Node]:
-    """Return the nodes; a driver that is killed is started again."""
-    mode = argument(context, 'mode')
-    stage = [make_node(context, 'stage', {})] if mode == 'stage' else []
+    """Return the nodes."""
+    speed = launch_nodes.given_parameters(context, [SPEED])
+    sim_time = {'use_sim_time': True} if speed else {}
+    respawn = {'respawn': True, 'respawn_delay': 2.0}
+    stage = [make_node(context, 'stage', sim_time | launch_nodes.given_parameters(
+        context, [STAGE_TYPE, *BRIDGE]), **respawn, on_exit=launch_nodes.GiveUp())] \
+        if has_stage(context) else []
+    output, report = text(context, 'output'), text(context, 'report')
+    files = ' and '.join(filter(None, (output, report and f'{report}/report.html')))
+    success = f'wrote {files}; next: ros2 launch adxl_ros robot.launch.py params_file:={output}'
+    sweep: dict[str, Any] = launch_nodes.given_parameters(context, [STAGE_MODE, *SWEEP])
     return [
-        make_node(context, 'driver', {}, respawn=True, respawn_delay=2.0,
+        make_node(context, 'driver', simulated(context, speed) | sim_time, **respawn,
                   on_exit=launch_nodes.GiveUp()), *stage,
         make_node(context, 'calibration', {
-            'autostart': True, 'mode': mode, 'output': text(argument(context, 'output'))},
-            on_exit=Shutdown())]
+            **sim_time, **sweep, 'autostart': True, 'exit_when_done': True, 'screen': False,
+            'mode': text(context, 'mode'), 'output': output},
+            on_exit=launch_nodes.end_with(success, RESUMES))]
+
+
+def simulated(context: LaunchContext, speed: dict[str, Any]) -> dict[str, Any]:
+    """Return the parameters of a driver with a speed; a sensor without a link is simulated."""
+    link = given_anywhere(context, LINK_TYPE, 'driver')
+    return {'link.type': link or 'sim', **speed} if speed else {}
+
+
+def has_stage(context: LaunchContext) -> bool:
+    """Return whether there is a stage node; a real sensor never gets a simulated stage unasked."""
+    if text(context, 'mode') == 'gravity':
+        return False
+    link = given_anywhere(context, LINK_TYPE, 'driver')
+    is_real = link not in ('', 'sim')
+    stage = given_anywhere(context, STAGE_TYPE, 'stage')
+    by_hand = given_anywhere(context, STAGE_MODE, 'calibration') in ('encoder', 'manual')
+    if is_real and not stage and not by_hand:
+        raise UserError(
+            f'link_type is {link}, but the stage would be simulated; set stage_type:=trajectory '
+            'or joint_state with bridge_alpha_joint and bridge_beta_joint for a stage that turns '
+            'itself, stage_mode:=encoder or manual for one turned by hand, mode:=gravity for a '
+            'hand-held sensor, or stage_type:=simulated')
+    return bool(stage) or not is_real

@@ -18,7 +18,8 @@ Start a calibrated sensor on a robot: the driver and the compensation.
     ros2 launch adxl_ros robot.launch.py params_file:=unit_17.yaml link_type:=serial \
         link_port:=/dev/ttyACM0 namespace:=arm frame_id:=arm_imu
 
-A node that ends is started again. The launch ends when a node refuses to start three times.
+A node that ends is started again. The launch ends with an error when a node refuses to start
+three times.
 """
 
 from adxl_ros.nodes.support import launch_nodes

@@ -15,5 +15,7 @@
 """The ROS 2 nodes: thin, and the only place that imports rclpy."""
 
 from adxl_ros.blas_threads import use_one_thread
+from adxl_ros.interrupt import end_silently_while_loading
 
+end_silently_while_loading()
 use_one_thread()

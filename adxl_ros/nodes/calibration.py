@@ -21,7 +21,13 @@ from dataclasses import replace
 from functools import partial
 import os
 
-from adxl_ros.calibrate.guided.controller import Answer, Controller, Resume, Severity
+from adxl_ros.calibrate.guided.controller import (
+    Answer,
+    Controller,
+    ControllerState,
+    Resume,
+    Severity,
+)
 from adxl_ros.calibrate.guided.guide import NextPose
 from adxl_ros.files.stream_info import StreamInfo
 from adxl_ros.nodes.support.calibration_parameters import declare_settings
@@ -46,6 +52,8 @@ from std_srvs.srv import Trigger
 
 _POLL_S = 0.05
 """Time between two steps of the controller, s; chosen: short beside a dwell of seconds."""
+_FAREWELL_NS = 2_500_000_000
+"""Time from the end of a calibration to that of the node, ns; chosen: two reports come within."""
 _QUEUE = 100
 """Messages that wait while the node fits; chosen: some seconds of slow topics."""
 _STAGE_QUEUE = 1000
@@ -77,6 +85,11 @@ class Calibration(Node):
         if autostart:
             self._controller.wait_for_sensor()
         self._connect()
+        self._exits = declare(
+            self, 'exit_when_done', False, 'end the node after a calibration: status 0 where it '
+            'wrote its file, else 1')
+        self._has_run = False
+        self._idle_since_ns: int | None = None
         starts_screen = declare(self, 'screen', True,
                                 'show a screen, where the node runs in a terminal')
         self._display = DisplayPublisher(self, self._controller, starts_screen)
@@ -143,11 +156,24 @@ class Calibration(Node):
         # The answer comes when the pose is on disk. Until then the node must take samples.
         self.create_service(Trigger, '~/capture', self._on_capture,
                             callback_group=ReentrantCallbackGroup())
-        self.create_timer(_POLL_S, self._poll, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(_POLL_S, self._poll, clock=self._steady)
 
     def _poll(self) -> None:
         self._controller.poll()
         self._diagnostics.notice('calibration', _level(self._controller.status().late))
+        if self._exits:
+            self._exit_when_done()
+
+    def _exit_when_done(self) -> None:
+        """End the node after a calibration, when its last report has been received."""
+        now_ns = self._steady.now().nanoseconds
+        if self._controller.state is not ControllerState.IDLE:
+            self._has_run, self._idle_since_ns = True, None
+        elif self._has_run and self._idle_since_ns is None:
+            self._idle_since_ns = now_ns
+        elif self._idle_since_ns is not None and now_ns - self._idle_since_ns > _FAREWELL_NS:
+            raise SystemExit(0 if self._controller.outcome else 1)
 
     def _status(self) -> Status:
         report = self._controller.report()

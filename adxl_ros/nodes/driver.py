@@ -60,10 +60,12 @@ class Driver(LifecycleNode):
             'does')
         paced = isinstance(settings, base.PacedSettings)
         self._speed = settings.speed if paced else 1.0
-        # All nodes must share a sensor time that is not real time: this node then publishes it.
+        # All nodes must share a sensor time that is not real time: this node then publishes it,
+        # unless another node does.
         self._is_clock = self._speed != 1 or (paced and self.get_parameter('use_sim_time').value)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._wall = Clock(clock_type=ClockType.SYSTEM_TIME)
+        # A real device lives in real time, whatever the clock of the graph is.
+        self._stamp_clock = self.get_clock() if paced else Clock(clock_type=ClockType.SYSTEM_TIME)
         self._tally = Tally(self._steady.now().nanoseconds)
         self._fault = ''
         self._announces = not autostart
@@ -173,8 +175,8 @@ class Driver(LifecycleNode):
     def _status(self) -> Status:
         link = self._link_status()
         sensor_ns = self._tally.now_ns or 0
-        if sensor_ns and not self._is_clock:
-            sensor_ns = self._wall.now().nanoseconds
+        if sensor_ns and not (self._output and self._output.is_clock):
+            sensor_ns = self._stamp_clock.now().nanoseconds
         values, warning = self._tally.report(self._steady.now().nanoseconds, sensor_ns)
         level = self._level()
         if warning and level is Level.OK:

@@ -166,6 +166,25 @@ def test_services_and_refusals(start, tmp_path):
         assert fitted.model in ('linear', 'physical')
 
 
+@pytest.mark.parametrize('output, status', [('unit.yaml', 0), ('none/unit.yaml', 1)])
+def test_the_node_can_end_with_its_calibration(start, tmp_path, output, status):
+    """Its status tells success, and its last diagnostics have the poses and a short verdict."""
+    truth, bare = _files(tmp_path)
+    with Graph() as graph:
+        _, node = _sweep(start, truth, bare, '-p', 'autostart:=true', '-p',
+                         'exit_when_done:=true', '-p', f'output:={output}')
+        if status == 0:
+            graph.spin_until(lambda: int(graph.value('calibration', 'accepted') or 0) >= 6, 60,
+                             'six poses')
+            assert graph.call(Trigger, 'calibration/finish', Trigger.Request()).success
+        graph.spin_until(lambda: node.popen.poll() is not None, 60, 'the end')
+        assert node.wait() == status
+        if status == 0:
+            assert int(graph.value('calibration', 'accepted')) >= 6
+            assert 0 < len(graph.value('calibration', 'verdict')) < 80
+            assert graph.value('calibration', 'verdict') in node.output()
+
+
 def test_a_stage_that_never_arrives_is_reported(start, tmp_path):
     """Without a stage the node continues, and its diagnostics state what is missing."""
     truth, bare = _files(tmp_path)

@@ -16,12 +16,14 @@
 
 import os
 import signal
+import time
 
 from adxl_ros.files.stream_info import sensor_info
 from adxl_ros.model import noise
 from adxl_ros.model.sensor import to_nominal_mps2, to_volts
 from adxl_ros.nodes.support.references import References
 from adxl_ros.nodes.support.sample_output import imu_message, ImuWriter
+from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus
 from graph import accel, Graph, stamp_ns
 import numpy as np
@@ -144,6 +146,26 @@ def test_replay_publishes_a_recording_faster_than_real_time(start, tmp_path):
     ticks = [c.clock.sec + c.clock.nanosec * 1e-9 for c in clock]
     assert ticks == sorted(ticks)
     assert ticks[-1] > 14.9
+
+
+@pytest.mark.parametrize('option', ['use_sim_time:=true', 'link.speed:=4.0'])
+def test_beside_another_clock_the_driver_follows_it(start, option):
+    """Gazebo publishes /clock, for example; two clocks would tear the time of all nodes."""
+    def tick():
+        now_s = 50 + time.monotonic() - begin_s
+        clock.publish(Clock(clock=Time(sec=int(now_s), nanosec=int(now_s % 1 * 1e9))))
+        return len(samples) > 500
+
+    with Graph() as graph:
+        clock = graph.node.create_publisher(Clock, '/clock', 10)
+        begin_s = time.monotonic()
+        samples = graph.listen(Imu, 'imu/data_raw')
+        driver = start('driver', ROS, '-p', 'link.type:=sim', '-p', option)
+        graph.spin_until(tick, 30, '500 samples')
+        assert graph.node.count_publishers('/clock') == 1
+        now_ns = 1e9 * (50 + time.monotonic() - begin_s)
+        assert abs(stamp_ns(samples[-1]) - now_ns) < 2e9
+    assert '/clock comes from /tester: this driver follows it' in driver.output()
 
 
 def test_replay_in_real_time_is_stamped_now(start, tmp_path):

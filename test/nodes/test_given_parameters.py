@@ -97,6 +97,34 @@ def test_a_parameter_of_another_link_is_refused(start, link, parameter, words):
     assert words in line
 
 
+@pytest.mark.parametrize('rule, words', [
+    ('link.type:=seral', "driver: link.type: 'seral' is not one of sim, iio, replay, serial"),
+    ('driver:sensor.rate_hz:=-4.0', 'driver: sensor.rate_hz: -4.0 is out of range; it must be 0.01'),
+    ('stamp_offset:=1', 'driver: stamp_offset: 1 is a whole number (INTEGER); a DOUBLE is expected: '
+     'write 1.0')])
+def test_the_error_of_an_argument_names_no_file(start, unit, rule, words):
+    line = refusal(start, 'driver', '--params-file', unit, '-p', 'link.type:=sim', '-p', rule)
+    assert words in line
+    assert 'unit.yaml' not in line
+
+
+def test_a_text_with_a_colon_needs_quotes(start):
+    node = start('driver', ROS, '-p', 'link.uri:=local:')
+    assert node.wait() == 2
+    assert 'quotes of its own' in node.output()
+    assert '/src/' not in node.output()
+    line = refusal(start, 'driver', '-p', 'link.uri:="local:"')
+    assert 'link.type: is not set, but link.uri is given' in line
+
+
+def test_an_error_in_the_parameters_of_a_launch_file_names_no_temporary_file(start, tmp_path):
+    """launch_ros passes the parameters of a launch file on in a file of its own."""
+    (tmp_path / 'launch_params_x1').write_text('/**:\n  ros__parameters:\n    link.type: seral\n')
+    line = refusal(start, 'driver', '--params-file', NOMINAL, '--params-file',
+                   tmp_path / 'launch_params_x1')
+    assert line.startswith("driver: parameters of the launch file: link.type: 'seral' is not one")
+
+
 @pytest.mark.parametrize('node', ['stage', 'calibration', 'compensation'])
 def test_an_unknown_parameter_of_a_file_is_refused_at_its_line(start, tmp_path, node):
     text = NOMINAL.read_text() + '    sweep: {dwel_s: 2.0}\n'

@@ -1,9 +1,11 @@
 """How nodes end: Ctrl-C reaches them twice under a launch, from the terminal and from it."""
 
+from pathlib import Path
 import signal
 import time
 
 from graph import Graph
+from processes import wait_until
 import pytest
 
 
@@ -19,4 +21,16 @@ def test_interrupted_twice_a_node_ends_cleanly(start, name):
         node.popen.send_signal(signal.SIGINT)
         time.sleep(0.002)
     assert node.wait() == 0
+    assert 'Traceback' not in node.output()
+
+
+@pytest.mark.parametrize('library', ['_multiarray_umath', '_rclpy_pybind11', 'libfastrtps'])
+@pytest.mark.parametrize('name', ['driver', 'compensation'])
+def test_interrupted_while_it_starts_a_node_prints_no_traceback(start, name, library):
+    """The signal comes while a node loads numpy, loads rclpy, or makes its first topics."""
+    node = start(name)
+    memory = Path(f'/proc/{node.popen.pid}/maps')
+    wait_until(lambda: library in memory.read_text(), 20, f'{library} in {name}')
+    node.popen.send_signal(signal.SIGINT)
+    assert node.wait() in (0, -signal.SIGINT)
     assert 'Traceback' not in node.output()

@@ -237,6 +237,7 @@ class Controller:
         self._outlook = self._last_line = self._last_warning = ''
         self._sensor_fault = self._sample_fault = self._fit_fault = ''
         self._misdated: set[str] = set()
+        self._accepted = 0
 
     @property
     def newest(self) -> NewestSamples | None:
@@ -447,8 +448,8 @@ class Controller:
         if status.late:
             self._warn_once(status)
         values: dict[str, str | float] = {
-            'accepted': '0', 'output': str(self.settings.output),
-            'verdict': '; '.join(self.outcome)}
+            'accepted': str(self._accepted), 'output': str(self.settings.output),
+            'verdict': self.outcome[0] if self.outcome else ''}
         if self.session is not None:
             guide = self.session.guide
             values |= {'phase': status.phase.value, 'pose': str(guide.pose_number),
@@ -618,6 +619,7 @@ class Controller:
         for line in result.comments():
             self._outputs.log(Severity.INFO, line)
         self.outcome = tuple(result.summary_lines)
+        self._outputs.log(Severity.INFO, self.outcome[0])
         open_poses = session.guide.open_poses
         advice = f'; {open_poses} poses are open: start again to go on' if open_poses else ''
         self._stop(Severity.INFO, f'wrote {self.settings.output}{advice}')
@@ -636,6 +638,7 @@ class Controller:
     def _stop(self, severity: Severity, text: str) -> None:
         """End the session, or the wait for one, with a line for people."""
         if self.session is not None:
+            self._accepted = self.session.accepted_count
             self.session.close()
         self.state, self.session, self.question = ControllerState.IDLE, None, ''
         self._sample_fault = self._fit_fault = ''

@@ -12,56 +12,127 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What the launch files share: arguments, the parameter file of each node, failed starts."""
+"""What the launch files share: arguments, the parameters of each node, failed starts."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+import json
+import time
+from typing import Any, NamedTuple
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
-from adxl_ros.nodes.support.params_files import has_section
-from launch.actions import DeclareLaunchArgument, Shutdown
+from adxl_ros.links.support.base import link_names
+from adxl_ros.nodes.support.params_files import given_text, has_section
+from launch.action import Action
+from launch.actions import DeclareLaunchArgument, LogInfo, Shutdown
 from launch.events.process import ProcessExited
 from launch.launch_context import LaunchContext
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
-from launch_ros.parameter_descriptions import ParameterValue
 
-_LINK = {
-    'link_type': 'link of the driver: serial, iio, replay, or sim for a simulated sensor',
-    'link_port': 'serial: device path, such as /dev/ttyACM0, or a pyserial URL',
-    'link_baud': 'serial: baud rate of a UART',
-    'link_uri': 'iio: URI of libiio, such as local: or ip:HOST',
-    'link_device': 'iio: name, id or label of the ADC',
-    'link_channels': 'serial and iio: roles of the channels, with commas',
-    'link_recording': 'replay: the recording to play',
-}
-"""Arguments of the link; each is the parameter of the driver with a dot for the first _."""
-_WHOLE_NUMBERS = ('link_baud',)
-"""Arguments that are whole numbers; the others are texts."""
 _REFUSED_START = (1, 2)
 """Exit statuses of a node that does not start; a signal ends it with 0 or a negative one."""
 _MOST_REFUSALS = 3
 """Failed starts of a node after which a launch ends; chosen: a device may come late once."""
+_REFUSALS_S = 60.0
+"""Time within which failed starts count, s; chosen: three starts on a slow machine."""
+_LOG_LEVELS = ('debug', 'info', 'warn', 'error', 'fatal')
+"""Log levels of rcl."""
+
+
+class Argument(NamedTuple):
+    """
+    An argument of a launch that gives a parameter of a node.
+
+    Attributes
+    ----------
+    name
+        Its name.
+    parameter
+        The parameter.
+    description
+        Its meaning.
+    kind
+        Type of the parameter: str, int, float, or list for a list of float.
+    choices
+        The values that it may have; empty for any.
+
+    """
+
+    name: str
+    parameter: str
+    description: str
+    kind: type = str
+    choices: tuple[str, ...] = ()
+
+    def declared(self) -> DeclareLaunchArgument:
+        """Return the action that declares it; an empty value leaves the parameter as it is."""
+        return DeclareLaunchArgument(
+            self.name, default_value='', description=f'{self.description}; empty: as in '
+            'params_file, or the default', choices=['', *self.choices] if self.choices else None)
+
+    def value(self, text: str) -> Any:
+        """
+        Return the value of the parameter.
+
+        Parameters
+        ----------
+        text
+            The value of the argument.
+
+        Returns
+        -------
+        Any
+            An instance of `kind`.
+
+        Raises
+        ------
+        UserError
+            The text is no number, or no list of numbers.
+
+        """
+        try:
+            if self.kind is list:
+                return [float(part) for part in text.strip('[]').split(',')]
+            return self.kind(text)
+        except ValueError:
+            expected = {int: 'a whole number', float: 'a number'}.get(
+                self.kind, 'numbers with commas, such as 30,60,90')
+            raise UserError(f'{self.name}:={text}: expected {expected}') from None
+
+
+LINK = (
+    Argument('link_type', 'link.type', 'link of the driver; sim is a simulated sensor', str,
+             link_names()),
+    Argument('link_port', 'link.port', 'serial: device path, such as /dev/ttyACM0, or a pyserial '
+             'URL'),
+    Argument('link_baud', 'link.baud', 'serial: baud rate of a UART', int),
+    Argument('link_uri', 'link.uri', 'iio: URI of libiio, such as local: or ip:HOST'),
+    Argument('link_device', 'link.device', 'iio: name, id or label of the ADC'),
+    Argument('link_channels', 'link.channels', 'serial and iio: roles of the channels, with '
+             'commas'),
+    Argument('link_recording', 'link.recording', 'replay: the recording to play'),
+)
+"""Arguments of the link."""
 
 
 def common_arguments() -> list[DeclareLaunchArgument]:
     """Return the arguments that all launch files have."""
-    texts = {
-        'namespace': ('', 'namespace of the nodes and their topics'),
-        'frame_id': ('imu_link', 'frame of the case'),
-        'log_level': ('info', 'log level: debug, info, warn, error or fatal'),
-        **{name: ('', f'{text}; empty: as in params_file') for name, text in _LINK.items()}}
     return [
         DeclareLaunchArgument('params_file', default_value=str(parameter_file.nominal_path()),
                               description='parameter file of the sensor, its link and the nodes'),
-        *(DeclareLaunchArgument(name, default_value=default, description=text)
-          for name, (default, text) in texts.items())]
+        DeclareLaunchArgument('namespace', default_value='',
+                              description='namespace of the nodes and their topics'),
+        DeclareLaunchArgument('frame_id', default_value='imu_link',
+                              description='frame of the case'),
+        DeclareLaunchArgument('log_level', default_value='info', choices=_LOG_LEVELS,
+                              description='log level'),
+        *(argument.declared() for argument in LINK)]
 
 
-def make_node(context: LaunchContext, executable: str, overrides: Mapping[str, Any],
+def make_node(context: LaunchContext, executable: str, parameters: Mapping[str, Any],
               **options: Any) -> Node:
     """
     Make a node of this package with the parameter file of the launch.
@@ -72,7 +143,7 @@ def make_node(context: LaunchContext, executable: str, overrides: Mapping[str, A
         The launch, which has the arguments.
     executable
         Its executable, which is its name, too.
-    overrides
+    parameters
         Parameters in place of those of the file.
     options
         Further options of the action.
@@ -88,19 +159,24 @@ def make_node(context: LaunchContext, executable: str, overrides: Mapping[str, A
         The parameter file cannot be read, or it names other nodes than the driver.
 
     """
-    path, namespace = argument(context, 'params_file'), argument(context, 'namespace')
-    name = '/'.join(('', *filter(None, namespace.split('/')), executable))
+    path, namespace = text(context, 'params_file'), text(context, 'namespace')
+    name = node_name(context, executable)
     is_named = has_section(path, name)
     if executable == 'driver' and not is_named:
         raise UserError(f'{path}: has no parameters of the node {name}; begin the file with /**: '
                         f'or {name}:')
-    shared = {'frame_id': text(argument(context, 'frame_id')), **_link(context)}
+    given = {'frame_id': text(context, 'frame_id'), **given_parameters(context, LINK),
+             **parameters}
+    # The last argument counts. rcl takes the name of a node without its namespace.
+    node = '' if namespace.strip('/') else f'{executable}:'
+    rules = [part for key, value in given.items() for part in (
+        '-p', f'{node}{key}:={json.dumps(value, ensure_ascii=False)}')]
     return Node(package='adxl_ros', executable=executable, namespace=namespace, output='screen',
-                parameters=[*([path] if is_named else []), {**shared, **overrides}],
-                ros_arguments=['--log-level', argument(context, 'log_level')], **options)
+                ros_arguments=['--log-level', text(context, 'log_level'),
+                               *(['--params-file', path] if is_named else []), *rules], **options)
 
 
-def argument(context: LaunchContext, name: str) -> str:
+def text(context: LaunchContext, name: str) -> str:
     """
     Return the value of an argument.
 
@@ -120,26 +196,83 @@ def argument(context: LaunchContext, name: str) -> str:
     return str(LaunchConfiguration(name).perform(context))
 
 
-def text(value: str) -> ParameterValue:
-    """Return a string as a parameter, also where it looks like a number."""
-    return ParameterValue(value, value_type=str)
+def given_parameters(context: LaunchContext, arguments: Sequence[Argument]) -> dict[str, Any]:
+    """
+    Return the parameters that the arguments of a launch give.
+
+    Parameters
+    ----------
+    context
+        The launch.
+    arguments
+        Arguments of the launch.
+
+    Returns
+    -------
+    dict
+        Values by name of the parameter, without those of empty arguments.
+
+    Raises
+    ------
+    UserError
+        An argument has no value of its type.
+
+    """
+    texts = {argument: text(context, argument.name) for argument in arguments}
+    return {argument.parameter: argument.value(given) for argument, given in texts.items()
+            if given}
 
 
-def _link(context: LaunchContext) -> dict[str, ParameterValue]:
-    """Return the parameters of the link that the arguments give."""
-    given = {name: argument(context, name) for name in _LINK}
-    return {name.replace('_', '.', 1): ParameterValue(
-        value, value_type=int if name in _WHOLE_NUMBERS else str)
-        for name, value in given.items() if value}
+def node_name(context: LaunchContext, executable: str) -> str:
+    """
+    Return the fully qualified name of a node.
+
+    Parameters
+    ----------
+    context
+        The launch.
+    executable
+        Executable of the node.
+
+    Returns
+    -------
+    str
+        The name, with a slash first.
+
+    """
+    return '/'.join(('', *filter(None, text(context, 'namespace').split('/')), executable))
+
+
+def given_anywhere(context: LaunchContext, argument: Argument, executable: str) -> str:
+    """
+    Return a parameter that an argument or the parameter file gives.
+
+    Parameters
+    ----------
+    context
+        The launch.
+    argument
+        The argument; it counts before the file.
+    executable
+        Executable of the node that has the parameter.
+
+    Returns
+    -------
+    str
+        Its value; '' where none gives it.
+
+    """
+    return text(context, argument.name) or given_text(
+        text(context, 'params_file'), node_name(context, executable), argument.parameter)
 
 
 class GiveUp:
-    """Ends a launch when a node that is started again and again refuses to start."""
+    """Ends a launch with an error when a node refuses to start again and again."""
 
     def __init__(self) -> None:
-        self._refusals = 0
+        self._refusals_s: list[float] = []
 
-    def __call__(self, event: ProcessExited, context: LaunchContext) -> Shutdown | None:
+    def __call__(self, event: ProcessExited, context: LaunchContext) -> None:
         """
         Count the refused starts of a node.
 
@@ -150,13 +283,43 @@ class GiveUp:
         context
             The launch.
 
-        Returns
-        -------
-        Shutdown
-            The end of the launch, or None while it goes on.
+        Raises
+        ------
+        UserError
+            The node has refused to start too often.
 
         """
-        self._refusals += event.returncode in _REFUSED_START
-        if self._refusals < _MOST_REFUSALS:
-            return None
-        return Shutdown(reason=f'{event.process_name} has refused to start {self._refusals} times')
+        if context.is_shutdown or event.returncode not in _REFUSED_START:
+            return
+        now_s = time.monotonic()
+        self._refusals_s = [s for s in self._refusals_s if now_s - s < _REFUSALS_S] + [now_s]
+        if len(self._refusals_s) >= _MOST_REFUSALS:
+            raise UserError(f'{event.process_name} has refused to start {_MOST_REFUSALS} times; '
+                            'its own line above says why')
+
+
+def end_with(success: str, failure: str) -> Callable[[ProcessExited, LaunchContext], list[Action]]:
+    """
+    Return a function that ends a launch when its main node ends, with the same success.
+
+    Parameters
+    ----------
+    success
+        Line to log where it succeeded.
+    failure
+        What to do where it failed.
+
+    Returns
+    -------
+    Callable
+        Takes the end of the process and the launch.
+
+    """
+    def end(event: ProcessExited, context: LaunchContext) -> list[Action]:
+        if context.is_shutdown:
+            return []
+        if event.returncode:
+            raise UserError(f'{event.process_name} has ended with the status {event.returncode}; '
+                            f'{failure}')
+        return [LogInfo(msg=success), Shutdown(reason=f'{event.process_name} is done')]
+    return end

@@ -28,6 +28,7 @@ from adxl_ros.nodes.support.references import References
 from adxl_ros.nodes.support.sample_output import SampleOutput
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import JointState
@@ -39,9 +40,12 @@ _LONGEST_STEP_NS = 20_000_000
 """Longest step of real time that is caught up where sensor time is the graph's clock, ns; chosen:
 a clock that leaps after a late wake-up would flood the other nodes."""
 _JUMP_NS = 2_000_000_000
-"""Smallest step of the system clock that counts as a jump, ns; chosen."""
+"""Smallest step of the clock that counts as a jump, ns; chosen."""
 _DISCOVERY_NS = 300_000_000
 """Time after which a new subscriber is sure to receive, ns; chosen."""
+_CLOCK_SEARCH_NS = 1_000_000_000
+"""Time between two searches for another clock, and before the first sample, ns; chosen: nodes find
+each other within it."""
 _QUEUE = 5000
 """Messages of the stage that are kept between two reads."""
 _LOG_INTERVAL_S = 1.0
@@ -74,11 +78,11 @@ class LinkReader:
         self._node, self._link, self._output, self._speed = node, link, output, speed
         self._on_error, self._on_level = on_error, on_level
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._wall = Clock(clock_type=ClockType.SYSTEM_TIME)
-        self._failed = False
+        self._ros = node.get_clock()
+        self._failed = self._clock_is_searched = False
         self._now_ns: int | None = None
         self._subscribed_ns = 0
-        self._ticked_ns = self._steady.now().nanoseconds
+        self._ticked_ns = self._searched_ns = self._steady.now().nanoseconds
         self._stage: Subscription | None = None
         self._stage_link: StageLink | None = None
         with ExitStack() as on_close:
@@ -155,8 +159,9 @@ class LinkReader:
             return
         steady_ns = self._steady.now().nanoseconds
         step_ns, self._ticked_ns = steady_ns - self._ticked_ns, steady_ns
+        is_searched = self._search_clock(steady_ns)
         if self._now_ns is None:
-            if not self._may_begin(step_ns):
+            if not is_searched or not self._may_begin(step_ns):
                 return
             self._now_ns = self._begin()
         if self._stage is not None:
@@ -172,15 +177,30 @@ class LinkReader:
         if samples.missing:
             self._on_level(Level.WARN)
 
+    def _search_clock(self, steady_ns: int) -> bool:
+        """Follow the clock of another node; return whether the first search is over."""
+        if self._output.is_clock and steady_ns - self._searched_ns >= _CLOCK_SEARCH_NS:
+            self._searched_ns = steady_ns
+            name = self._output.follow_other_clock()
+            self._clock_is_searched = True
+            if name:
+                self._node.set_parameters([Parameter('use_sim_time', value=True)])
+                self._node.get_logger().warning(
+                    f'/clock comes from {name}: this driver follows it, and link.speed is that '
+                    'of this clock')
+        return self._clock_is_searched or not self._output.is_clock
+
     def _may_begin(self, step_ns: int) -> bool:
-        """Return whether the link may begin: some links wait for a subscriber."""
+        """Return whether the link may begin: time runs, and some links wait for a subscriber."""
+        if not self._output.is_clock and not self._ros.now().nanoseconds:
+            return False
         self._subscribed_ns = self._subscribed_ns + step_ns if self._output.subscribed() else 0
         return not self._link.waits_for_listener or self._subscribed_ns >= _DISCOVERY_NS
 
     def _begin(self) -> int:
         """Let the first sample be due; return its sensor time, ns."""
         start_ns = self._link.start_ns if self._output.is_clock else None
-        now_ns = self._wall.now().nanoseconds if start_ns is None else start_ns
+        now_ns = self._ros.now().nanoseconds if start_ns is None else start_ns
         self._link.begin(now_ns)
         self._output.tally.begin(now_ns)
         return now_ns
@@ -189,14 +209,14 @@ class LinkReader:
         """Return the sensor time up to which samples are due, ns."""
         if self._output.is_clock:
             return now_ns + round(min(step_ns, _LONGEST_STEP_NS) * self._speed)
-        wall_ns = self._wall.now().nanoseconds
-        jump_ns = wall_ns - now_ns
+        ros_ns = self._ros.now().nanoseconds
+        jump_ns = ros_ns - now_ns
         if not -_PERIOD_S * 1e9 < jump_ns < _JUMP_NS:
-            self._output.tally.missing += self._link.begin(wall_ns)
-            self._output.tally.begin(wall_ns)
+            self._output.tally.missing += self._link.begin(ros_ns)
+            self._output.tally.begin(ros_ns)
             self._node.get_logger().warning(f'the clock jumped by {jump_ns * 1e-9:+.3f} s; '
                                             'the samples go on from there')
-        return wall_ns
+        return ros_ns
 
     def _sense_stage(self, message: JointState) -> None:
         """Give the motion of the stage to a simulated sensor."""

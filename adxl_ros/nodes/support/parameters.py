@@ -20,9 +20,9 @@ from collections.abc import Sequence
 from difflib import get_close_matches
 from typing import Any
 
-from adxl_ros.errors import one_line, UserError
+from adxl_ros.errors import UserError
 from adxl_ros.nodes.support.params_files import place_of
-from adxl_ros.nodes.support.rclpy_internals import store_empty
+from adxl_ros.nodes.support.rclpy_internals import given_parameters, store_empty
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.exceptions import ParameterException
 from rclpy.node import Node
@@ -82,7 +82,10 @@ def declare(node: Node, name: str, default: Any, description: str, unit: str = '
     try:
         value = node.declare_parameter(name, default, descriptor).value
     except ParameterException as error:
-        raise parameter_error(name, one_line(error)) from None
+        given = dict(given_parameters(node)).get(name)
+        reason = _type_error(given, default) or f'{given!r} is out of range; it must be ' \
+            f'{constraint}{unit and f" {unit}"}'
+        raise parameter_error(name, reason) from None
     if value is None:
         store_empty(node, name, default, empty)
     if choices and value is not None and value not in choices:
@@ -90,10 +93,25 @@ def declare(node: Node, name: str, default: Any, description: str, unit: str = '
     return value
 
 
+def _type_error(given: Any, default: Any) -> str:
+    """Return why a given value has a wrong type; '' where its type is right."""
+    kind, expected = (Parameter.Type.from_parameter_value(given), _kind(default))
+    if kind == expected:
+        return ''
+    if (kind, expected) == (Parameter.Type.INTEGER, Parameter.Type.DOUBLE):
+        return f'{given} is a whole number (INTEGER); a DOUBLE is expected: write {given}.0'
+    return f'{given!r} is of the type {kind.name}; expected {expected.name}'
+
+
+def _kind(default: Any) -> Parameter.Type:
+    """Return the type of a parameter by its default value, which may be the type."""
+    return default if isinstance(default, Parameter.Type) else \
+        Parameter.Type.from_parameter_value(default)
+
+
 def _set_range(descriptor: ParameterDescriptor, default: Any, lower: float, upper: float) -> None:
     """Give the descriptor of a single number its range; ROS has no range for lists."""
-    kind = default if isinstance(default, Parameter.Type) else \
-        Parameter.Type.from_parameter_value(default)
+    kind = _kind(default)
     if kind == Parameter.Type.DOUBLE:
         descriptor.floating_point_range = [
             FloatingPointRange(from_value=float(lower), to_value=float(upper))]

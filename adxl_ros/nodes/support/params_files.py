@@ -17,12 +17,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
 import re
 import sys
 
 from adxl_ros.errors import UserError
 from adxl_ros.files.parameter_file import compose
 import yaml
+
+_FILE_FLAG = '--params-file'
+"""Argument of rcl before a parameter file."""
+_RULE_FLAGS = ('-p', '--param')
+"""Arguments of rcl before one parameter."""
+_LAUNCH_PLACE = 'parameters of the launch file: '
+"""Place of a parameter that launch_ros passes on in a temporary file."""
 
 
 def check_params_files() -> None:
@@ -45,16 +54,30 @@ def place_of(key: str) -> str:
     """
     Return the place of a parameter in the files: 'file:line:column: ', or ''.
 
-    A parameter that no file has belongs to the last file of a sensor, which has a format: a launch
-    adds files of its own.
+    The last argument that gives a parameter counts. A parameter that none gives belongs to the
+    last file of a sensor, which has a format.
     """
-    trees = [(path, compose(path)) for path in reversed(_paths())]
-    for path, tree in trees:
-        mark = _find_value(tree, key)
-        if mark:
-            return f'{path}:{mark.line + 1}:{mark.column + 1}: '
-    return next((f'{path}: ' for path, tree in trees if _find_value(tree, 'format')),
-                f'{trees[0][0]}: ' if trees else '')
+    for flag, value in reversed(list(pairwise(sys.argv))):
+        if flag in _RULE_FLAGS and _rule_name(value) == key:
+            return ''
+        tree = _find_value(compose(value), key) if flag == _FILE_FLAG else None
+        if tree is not None:
+            mark = tree.start_mark
+            return _LAUNCH_PLACE if _is_of_launch(value) else \
+                f'{value}:{mark.line + 1}:{mark.column + 1}: '
+    files = [path for path in reversed(_paths()) if not _is_of_launch(path)]
+    return next((f'{path}: ' for path in files if _find_value(compose(path), 'format')),
+                f'{files[0]}: ' if files else '')
+
+
+def _rule_name(rule: str) -> str:
+    """Return the name of the parameter in the rule [NODE:]NAME:=VALUE of a command line."""
+    return rule.split(':=')[0].rsplit(':')[-1]
+
+
+def _is_of_launch(path: str) -> bool:
+    """Return whether launch_ros wrote a file for the parameters of a launch file."""
+    return Path(path).name.startswith('launch_params_')
 
 
 def refuse_files_of_others(node_name: str) -> None:
@@ -104,6 +127,35 @@ def has_section(path: str, node_name: str) -> bool:
     return any(_matches(section, node_name) for section, _ in _sections(compose(path), ''))
 
 
+def given_text(path: str, node_name: str, key: str) -> str:
+    """
+    Return the text of a parameter in the sections of a file for a node.
+
+    Parameters
+    ----------
+    path
+        The file.
+    node_name
+        Fully qualified name of the node.
+    key
+        Name of the parameter.
+
+    Returns
+    -------
+    str
+        Its value as it is written; '' where the file does not have it.
+
+    Raises
+    ------
+    UserError
+        The file cannot be read, or is not YAML.
+
+    """
+    values = [_find_value(tree, key) for section, tree in _sections(compose(path), '')
+              if _matches(section, node_name)]
+    return next((str(value.value) for value in values if value is not None), '')
+
+
 def _sections(node: yaml.Node | None, name: str) -> Iterator[tuple[str, yaml.Node]]:
     """Yield the sections of a file by the pattern of their node's name."""
     if not isinstance(node, yaml.MappingNode):
@@ -124,7 +176,7 @@ def _matches(pattern: str, node_name: str) -> bool:
 
 def _paths() -> list[str]:
     """Return the files of `--params-file` in the order of the command line."""
-    return [path for flag, path in zip(sys.argv, sys.argv[1:]) if flag == '--params-file']
+    return [path for flag, path in pairwise(sys.argv) if flag == _FILE_FLAG]
 
 
 def _check_lists(path: str, node: yaml.Node | None) -> None:
@@ -141,17 +193,17 @@ def _check_lists(path: str, node: yaml.Node | None) -> None:
                     f'of {node.value[0].value} before it; a list has one type (1.0, never 1)')
 
 
-def _find_value(node: yaml.Node | None, key: str) -> yaml.Mark | None:
-    """Find the place of a dotted key's value at any depth of a tree."""
+def _find_value(node: yaml.Node | None, key: str) -> yaml.Node | None:
+    """Find a dotted key's value at any depth of a tree."""
     if not isinstance(node, yaml.MappingNode):
         return None
     for name, value in node.value:
         if name.value == key:
-            return value.start_mark
+            return value
         subkey = key.removeprefix(f'{name.value}.')
-        mark = _find_value(value, subkey)
-        if mark is None and subkey != key:
-            mark = _find_value(value, key)
-        if mark is not None:
-            return mark
+        nested = _find_value(value, subkey)
+        if nested is None and subkey != key:
+            nested = _find_value(value, key)
+        if nested is not None:
+            return nested
     return None

@@ -17,8 +17,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
+import re
 from typing import Any
 
+from adxl_ros.errors import one_line
 from rclpy.callback_groups import CallbackGroup
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
@@ -166,3 +168,11 @@ def is_rclpy_error(error: BaseException) -> bool:
 def is_usage_error(error: BaseException) -> bool:
     """Return whether rclpy refuses the ROS arguments; the class is in its C++ module alone."""
     return 'ROSArgs' in type(error).__name__
+
+
+def start_error_text(error: BaseException) -> str:
+    """Return the text of rclpy's refusal of its arguments: one line, without places in rcl."""
+    text = re.sub(r', at /\S+:\d+', '', one_line(error))
+    if 'parameter override rule' in text:
+        text = f"""{text}; a text with a colon needs quotes of its own: -p NAME:='"a:b"'"""
+    return text

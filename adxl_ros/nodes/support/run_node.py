@@ -23,7 +23,7 @@ import signal
 import sys
 from typing import Any, Protocol, runtime_checkable
 
-from adxl_ros.errors import one_line, UserError
+from adxl_ros.errors import UserError
 from adxl_ros.nodes.support import rclpy_internals
 from adxl_ros.nodes.support.params_files import check_params_files
 import rclpy
@@ -65,15 +65,19 @@ def run(make_node: Callable[[], Node], description: str | None,
 
     """
     name = Path(sys.argv[0]).name
-    # rclpy's own handler ends the context; Python's would raise in the middle of any statement.
-    signal.signal(signal.SIGINT, lambda *_: None)
     is_initialised = False
+    interrupts: list[int] = []
     try:
         check_params_files()
         argparse.ArgumentParser(prog=name, description=description, usage=_USAGE).parse_args(
             remove_ros_args(sys.argv)[1:])
+        # rclpy's own handler ends the context; Python's would raise in the middle of any statement.
+        signal.signal(signal.SIGINT, lambda number, _: interrupts.append(number))
         rclpy.init()
         is_initialised = True
+        if interrupts:
+            # The signal came before rclpy's handler.
+            rclpy.try_shutdown()
         node = make_node()
     except Exception as error:
         if is_initialised and not rclpy.ok():
@@ -81,7 +85,7 @@ def run(make_node: Callable[[], Node], description: str | None,
             return 0
         if not isinstance(error, UserError) and not rclpy_internals.is_rclpy_error(error):
             raise
-        print(f'{name}: {one_line(error)}', file=sys.stderr)
+        print(f'{name}: {rclpy_internals.start_error_text(error)}', file=sys.stderr)
         return 2 if rclpy_internals.is_usage_error(error) else 1
     try:
         _spin(node, work)

@@ -134,7 +134,7 @@ class SampleOutput:
     Attributes
     ----------
     sensor, frame_id, is_clock, tally
-        As given; `sensor` may be replaced.
+        As given; `sensor` may be replaced, and `is_clock` ends beside another clock.
 
     """
 
@@ -151,6 +151,29 @@ class SampleOutput:
         """Remove the topics."""
         for publisher in filter(None, (self._data, self._info, self._clock)):
             self._node.destroy_publisher(publisher)
+
+    def follow_other_clock(self) -> str:
+        """
+        Stop being the clock if another node is; a driver follows the one that sorts before it.
+
+        Returns
+        -------
+        str
+            Name of the node that is the clock; '' where this node is, or does not want to be.
+
+        """
+        if self._clock is None:
+            return ''
+        own_name = self._node.get_fully_qualified_name()
+        names = [f'{info.node_namespace.rstrip("/")}/{info.node_name}'
+                 for info in self._node.get_publishers_info_by_topic(self._clock.topic_name)]
+        others = [name for name in names if name != own_name
+                  and (name.split('/')[-1] != self._node.get_name() or name < own_name)]
+        if not others:
+            return ''
+        self._node.destroy_publisher(self._clock)
+        self._clock, self.is_clock = None, False
+        return others[0]
 
     def use(self, sensor: Sensor) -> None:
         """Convert samples by the nominal values of a sensor, and publish these."""

@@ -1,0 +1,34 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Ctrl-C while the executable of a node loads its modules."""
+
+from pathlib import Path
+import signal
+import sys
+
+_EXECUTABLES = ('driver', 'stage', 'calibration', 'compensation')
+"""Executables that set a handler of their own once they have loaded."""
+
+
+def end_silently_while_loading() -> None:
+    """
+    Let SIGINT end the executable of a node without a traceback of its imports.
+
+    Programs that import the package, such as `ros2 launch`, keep their handler.
+    """
+    path = Path(sys.argv[0])
+    is_node = path.name in _EXECUTABLES and path.parent.parts[-2:] == ('lib', 'adxl_ros')
+    if is_node and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)

@@ -1,0 +1,119 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The launch files under `ros2 launch`: refusals, failed starts, a killed driver, the end."""
+
+from collections.abc import Callable, Iterator
+import os
+from pathlib import Path
+import re
+import shutil
+import signal
+import subprocess
+
+from adxl_ros.files import parameter_file
+from processes import Started, wait_until
+import pytest
+from units import NOMINAL, nominal
+
+pytestmark = pytest.mark.skipif(shutil.which('ros2') is None, reason='ros2 is not installed')
+
+
+@pytest.fixture
+def launch(ros_env: dict[str, str], tmp_path: Path) -> Iterator[Callable[..., Started]]:
+    """Give a function of a launch file and its arguments that launches it in the test's graph."""
+    started: list[Started] = []
+
+    def begin(name: str, *arguments: str) -> Started:
+        log = tmp_path / 'launch.log'
+        with open(log, 'wb') as file:
+            popen = subprocess.Popen(
+                ['ros2', 'launch', 'adxl_ros', f'{name}.launch.py', *arguments], env=ros_env,
+                cwd=tmp_path, stdin=subprocess.DEVNULL, stdout=file, stderr=subprocess.STDOUT,
+                start_new_session=True)
+        started.append(Started(name, popen, log))
+        return started[-1]
+
+    yield begin
+    for process in started:
+        process.stop()
+        print(process.output())
+
+
+@pytest.mark.parametrize('name, argument, words', [
+    ('robot', 'params_file:=none.yaml', 'none.yaml: cannot be read'),
+    ('calibrate', 'params_file:=other.yaml', 'other.yaml: has no parameters of the node /driver'),
+    ('robot', 'link_type:=seral', '"seral" is not valid'),
+    ('robot', 'link_baud:=fast', 'link_baud:=fast: expected a whole number'),
+    ('robot', 'log_level:=loud', '"loud" is not valid'),
+    ('calibrate', 'sweep_planes_deg:=flat', 'sweep_planes_deg:=flat: expected numbers'),
+    ('calibrate', 'link_type:=serial', 'link_type is serial, but the stage would be simulated'),
+    ('calibrate', 'params_file:=serial.yaml', 'link_type is serial, but the stage would be')])
+def test_a_launch_refuses_bad_arguments(launch, tmp_path, name, argument, words):
+    text = NOMINAL.read_text()
+    (tmp_path / 'other.yaml').write_text(text.replace('/**:', 'other:'))
+    parameter_file.save(tmp_path / 'serial.yaml',
+                        nominal(serial='17', link={'type': 'serial', 'port': '/dev/ttyACM0'}))
+    launched = launch(name, argument)
+    assert launched.wait() == 1
+    assert words in launched.output()
+    assert 'Traceback' not in launched.output()
+    assert 'process started' not in launched.output()
+
+
+@pytest.mark.parametrize('name', ['robot', 'calibrate'])
+def test_a_driver_that_refuses_to_start_ends_the_launch(launch, tmp_path, name):
+    parameter_file.save(tmp_path / 'unit.yaml', nominal(serial='17'))
+    launched = launch(name, 'params_file:=unit.yaml')
+    assert launched.wait(60) == 1
+    assert launched.output().count('driver: unit.yaml: link.type: is not set') == 3
+    assert 'driver-1 has refused to start 3 times' in launched.output()
+
+
+@pytest.mark.parametrize('name', ['robot', 'calibrate'])
+def test_a_killed_driver_starts_again(launch, name):
+    launched = launch(name)
+    for starts in (1, 2):
+        wait_until(lambda: launched.output().count('active: link sim') == starts, 30, 'active')
+        if starts == 1:
+            pid, = re.findall(r'\[driver-1\]: process started with pid \[(\d+)\]',
+                              launched.output())
+            os.kill(int(pid), signal.SIGKILL)
+    launched.popen.send_signal(signal.SIGINT)
+    assert launched.wait(30) == 0
+    assert 'Traceback' not in launched.output()
+
+
+def test_the_arguments_count_before_the_file(launch, tmp_path):
+    """A section of the file for the node itself counts before a wildcard, but not before them."""
+    (tmp_path / 'own.yaml').write_text(
+        NOMINAL.read_text() + 'driver:\n  ros__parameters:\n    link.type: serial\n')
+    launched = launch('robot', 'params_file:=own.yaml', 'link_type:=sim')
+    launched.wait_for('active: link sim, unit nominal')
+
+
+@pytest.mark.parametrize('output, status', [('unit.yaml', 0), ('none/unit.yaml', 1)])
+def test_the_launch_of_a_calibration_ends_with_it(launch, tmp_path, output, status):
+    launched = launch('calibrate', f'output:={output}', 'speed:=20', 'sweep_planes_deg:=30,60,90',
+                      'sweep_step_deg:=60', 'sweep_dwell_s:=1', 'sweep_check_poses:=3',
+                      'report:=report')
+    assert launched.wait(120) == status
+    assert (tmp_path / output).exists() == (status == 0)
+    if status == 0:
+        assert re.search(r'plan full: \d+ poses, about \d+ min', launched.output())
+        assert (tmp_path / 'report' / 'report.html').exists()
+        assert 'robot.launch.py params_file:=unit.yaml' in launched.output()
+        assert parameter_file.load(tmp_path / output).model != 'nominal'
+    else:
+        assert 'calibration-3 has ended with the status 1' in launched.output()
