@@ -99,9 +99,9 @@ def test_a_parameter_of_another_link_is_refused(start, link, parameter, words):
 
 @pytest.mark.parametrize('rule, words', [
     ('link.type:=seral', "driver: link.type: 'seral' is not one of sim, iio, replay, serial"),
-    ('driver:sensor.rate_hz:=-4.0', 'driver: sensor.rate_hz: -4.0 is out of range; it must be 0.01'),
-    ('stamp_offset:=1', 'driver: stamp_offset: 1 is a whole number (INTEGER); a DOUBLE is expected: '
-     'write 1.0')])
+    ('driver:sensor.rate_hz:=-4.0', 'driver: sensor.rate_hz: -4.0 is out of range; it must be'),
+    ('stamp_offset:=1', 'driver: stamp_offset: 1 is a whole number (INTEGER); a DOUBLE is '
+     'expected: write 1.0')])
 def test_the_error_of_an_argument_names_no_file(start, unit, rule, words):
     line = refusal(start, 'driver', '--params-file', unit, '-p', 'link.type:=sim', '-p', rule)
     assert words in line

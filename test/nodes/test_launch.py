@@ -84,12 +84,10 @@ def test_a_driver_that_refuses_to_start_ends_the_launch(launch, tmp_path, name):
 @pytest.mark.parametrize('name', ['robot', 'calibrate'])
 def test_a_killed_driver_starts_again(launch, name):
     launched = launch(name)
-    for starts in (1, 2):
-        wait_until(lambda: launched.output().count('active: link sim') == starts, 30, 'active')
-        if starts == 1:
-            pid, = re.findall(r'\[driver-1\]: process started with pid \[(\d+)\]',
-                              launched.output())
-            os.kill(int(pid), signal.SIGKILL)
+    launched.wait_for('active: link sim', 30)
+    pid, = re.findall(r'\[driver-1\]: process started with pid \[(\d+)\]', launched.output())
+    os.kill(int(pid), signal.SIGKILL)
+    wait_until(lambda: launched.output().count('active: link sim') == 2, 30, 'active again')
     launched.popen.send_signal(signal.SIGINT)
     assert launched.wait(30) == 0
     assert 'Traceback' not in launched.output()

@@ -33,10 +33,10 @@ OWN_PARAMETERS = {
         'bridge.command', 'bridge.joint_states', 'bridge.speed_rad_s', 'delay_s', 'seed',
         'settling_time_s', 'shift_m', 'slew_rate_m_s', 'slew_rate_rad_s', 'stage.type'),
     'calibration': (
-        'autostart', 'exit_when_done', 'journal', 'mode', 'output', 'report', 'resume', 'screen', 'stage.mode',
-        'stage.near_rad', 'stage.timeout_s', 'stage.tolerance_rad', 'store', 'sweep.check_poses',
-        'sweep.dwell_s', 'sweep.plan', 'sweep.planes_deg', 'sweep.planes_rad', 'sweep.step_deg',
-        'sweep.step_rad', 'sweep.temperature_span_c', 'sweep.tilt_error_deg'),
+        'autostart', 'exit_when_done', 'journal', 'mode', 'output', 'report', 'resume', 'screen',
+        'stage.mode', 'stage.near_rad', 'stage.timeout_s', 'stage.tolerance_rad', 'store',
+        'sweep.check_poses', 'sweep.dwell_s', 'sweep.plan', 'sweep.planes_deg', 'sweep.planes_rad',
+        'sweep.step_deg', 'sweep.step_rad', 'sweep.temperature_span_c', 'sweep.tilt_error_deg'),
     'compensation': ('calibration', 'inverse', 'store', 'orientation', 'undo_filter'),
 }
 """Parameters by node, those of sensor and link aside. One file may serve all nodes: a node

@@ -81,7 +81,7 @@ def declare(node: Node, name: str, default: Any, description: str, unit: str = '
         _set_range(descriptor, default, lower, upper)
     try:
         value = node.declare_parameter(name, default, descriptor).value
-    except ParameterException as error:
+    except ParameterException:
         given = dict(given_parameters(node)).get(name)
         reason = _type_error(given, default) or f'{given!r} is out of range; it must be ' \
             f'{constraint}{unit and f" {unit}"}'

@@ -71,7 +71,7 @@ def run(make_node: Callable[[], Node], description: str | None,
         check_params_files()
         argparse.ArgumentParser(prog=name, description=description, usage=_USAGE).parse_args(
             remove_ros_args(sys.argv)[1:])
-        # rclpy's own handler ends the context; Python's would raise in the middle of any statement.
+        # rclpy's own handler ends the context; Python's would raise in the middle of a statement.
         signal.signal(signal.SIGINT, lambda number, _: interrupts.append(number))
         rclpy.init()
         is_initialised = True
