@@ -18,7 +18,7 @@ from pathlib import Path
 import signal
 import sys
 
-_EXECUTABLES = ('driver', 'stage', 'calibration', 'compensation')
+_EXECUTABLES = ('driver', 'stage', 'calibration', 'compensation', 'screen')
 """Executables that set a handler of their own once they have loaded."""
 
 

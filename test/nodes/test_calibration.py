@@ -174,8 +174,8 @@ def test_the_node_can_end_with_its_calibration(start, tmp_path, output, status):
         _, node = _sweep(start, truth, bare, '-p', 'autostart:=true', '-p',
                          'exit_when_done:=true', '-p', f'output:={output}')
         if status == 0:
-            graph.spin_until(lambda: int(graph.value('calibration', 'accepted') or 0) >= 6, 60,
-                             'six poses')
+            graph.spin_until(lambda: graph.reports('calibration', '')
+                             and int(graph.value('calibration', 'accepted')) >= 6, 60, 'six poses')
             assert graph.call(Trigger, 'calibration/finish', Trigger.Request()).success
         graph.spin_until(lambda: node.popen.poll() is not None, 60, 'the end')
         assert node.wait() == status

@@ -132,7 +132,7 @@ def common_arguments() -> list[DeclareLaunchArgument]:
         *(argument.declared() for argument in LINK)]
 
 
-def make_node(context: LaunchContext, executable: str, parameters: Mapping[str, Any],
+def make_node(context: LaunchContext, executable: str, overrides: Mapping[str, Any],
               **options: Any) -> Node:
     """
     Make a node of this package with the parameter file of the launch.
@@ -143,7 +143,7 @@ def make_node(context: LaunchContext, executable: str, parameters: Mapping[str, 
         The launch, which has the arguments.
     executable
         Its executable, which is its name, too.
-    parameters
+    overrides
         Parameters in place of those of the file.
     options
         Further options of the action.
@@ -166,7 +166,7 @@ def make_node(context: LaunchContext, executable: str, parameters: Mapping[str, 
         raise UserError(f'{path}: has no parameters of the node {name}; begin the file with /**: '
                         f'or {name}:')
     given = {'frame_id': text(context, 'frame_id'), **given_parameters(context, LINK),
-             **parameters}
+             **overrides}
     # The last argument counts. rcl takes the name of a node without its namespace.
     node = '' if namespace.strip('/') else f'{executable}:'
     rules = [part for key, value in given.items() for part in (
