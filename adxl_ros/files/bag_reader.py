@@ -24,6 +24,7 @@ from adxl_ros.errors import UserError
 from adxl_ros.files import cdr
 from adxl_ros.files.bag_messages import Bag, open_bag
 from adxl_ros.files.bag_topics import find_ideal, find_topics, read_info, Topics
+from adxl_ros.files.reading_options import AS_IT_IS, ReadingOptions
 from adxl_ros.files.recording_columns import (
     ACCEL,
     COMMANDS,
@@ -32,6 +33,7 @@ from adxl_ros.files.recording_columns import (
     Recording,
 )
 from adxl_ros.files.reference_alignment import Command, seconds, Track
+from adxl_ros.files.stamp_bursts import describe_bursts
 from adxl_ros.model.constants import AXES, MEASURED_AXES
 import numpy as np
 
@@ -45,8 +47,8 @@ _EXACT_NS = 1 << 53
 """Largest time, ns, that float64 resolves to single nanoseconds."""
 
 
-def blocks(path: str | os.PathLike, rows: int, ideal: bool = False
-           ) -> Generator[Recording, None, None]:
+def blocks(path: str | os.PathLike, rows: int, ideal: bool = False,
+           reading: ReadingOptions = AS_IT_IS) -> Generator[Recording, None, None]:
     """
     Read a bag in blocks of at most `rows` samples.
 
@@ -58,6 +60,8 @@ def blocks(path: str | os.PathLike, rows: int, ideal: bool = False
         Largest number of samples of a block.
     ideal
         Whether it is another simulator's specific force: any sensor_msgs/Imu, all three axes.
+    reading
+        Topic of the samples, sample rate, and what becomes of bad stamps.
 
     Yields
     ------
@@ -71,9 +75,11 @@ def blocks(path: str | os.PathLike, rows: int, ideal: bool = False
 
     """
     with open_bag(path) as bag:
-        topics = find_ideal(bag) if ideal else find_topics(bag)
+        _refuse_mapping(bag, reading)
+        topics = find_ideal(bag) if ideal else find_topics(bag, reading.topic)
         info = read_info(bag, topics.info)
-        samples = _Samples(f'{bag.path}: topic {topics.imu}', AXES if ideal else info.get('axes'))
+        samples = _Samples(f'{bag.path}: topic {topics.imu}', AXES if ideal else info.get('axes'),
+                           reading)
         tracks = _tracks(bag, topics)
         commands = {column: Command() for column in COMMANDS.values() if topics.command}
         for batch, is_last in _batches(bag, topics, rows):
@@ -90,6 +96,15 @@ def blocks(path: str | os.PathLike, rows: int, ideal: bool = False
             samples.drop(ready)
     if not samples.count:
         raise UserError(f'{samples.where}: holds no message')
+
+
+def _refuse_mapping(bag: Bag, reading: ReadingOptions) -> None:
+    """Refuse options that only tables have."""
+    if reading.mapping is not None:
+        raise UserError(f'{reading.mapping.where}: {bag.path} is a bag, which has topics; name '
+                        'one with --topic')
+    if reading.lsb_per_g:
+        raise UserError(f'--lsb-per-g: {bag.path} is a bag, whose readings are in m/s²')
 
 
 @dataclass
@@ -149,8 +164,11 @@ class _Samples:
 
     """
 
-    def __init__(self, where: str, axes: str | None) -> None:
+    def __init__(self, where: str, axes: str | None, reading: ReadingOptions) -> None:
         self.where = where
+        self._reading = reading
+        self._first_ns = 0
+        self._left_out = 0
         self.axes = axes
         self.epoch_ns = 0
         self.count = 0
@@ -173,12 +191,36 @@ class _Samples:
             self._check_frame(table)
         if self._last_ns is None:
             self._begin(raws[0], int(stamp_ns[0]))
+            self._first_ns = int(stamp_ns[0])
+        if self._reading.rate_hz is not None:
+            number = self.count + np.arange(len(raws))
+            stamp_ns = self._first_ns + np.rint(number * 1e9 / self._reading.rate_hz).astype(
+                np.int64)
+        self.arrived_ns = np.concatenate([self.arrived_ns[-1:], stamp_ns])
+        if self._reading.drop_bad_stamps:
+            stamp_ns, accel = self._increasing(stamp_ns, accel)
         self._check_time(stamp_ns)
         self._check_values(stamp_ns, accel)
-        self.count += len(raws)
-        self.arrived_ns = np.concatenate([self.arrived_ns[-1:], stamp_ns])
+        self.count += len(stamp_ns)
         self.stamp_ns = np.concatenate([self.stamp_ns, stamp_ns])
         self.accel = np.concatenate([self.accel, accel])
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """Return what was left out, for people."""
+        if not self._left_out:
+            return ()
+        return (f'{self.where}: {self._left_out} messages whose stamp does not increase are left '
+                'out',)
+
+    def _increasing(self, stamp_ns: np.ndarray, accel: np.ndarray
+                    ) -> tuple[np.ndarray, np.ndarray]:
+        """Leave out and count the samples whose stamp does not increase."""
+        before = stamp_ns[0] - 1 if self._last_ns is None else self._last_ns
+        latest = np.maximum.accumulate(np.concatenate([[before], stamp_ns]))[:-1]
+        is_kept = stamp_ns > latest
+        self._left_out += int((~is_kept).sum())
+        return stamp_ns[is_kept], accel[is_kept]
 
     def ready(self, tracks: dict[str, Track]) -> int:
         """Return how many samples have all their references; the last one always waits."""
@@ -214,6 +256,8 @@ class _Samples:
         self._frame = frame
 
     def _check_time(self, stamp_ns: np.ndarray) -> None:
+        if not len(stamp_ns):
+            return
         before = stamp_ns[0] - 1 if self._last_ns is None else self._last_ns
         earlier = np.concatenate([[before], stamp_ns[:-1]])
         wrong = stamp_ns <= earlier
@@ -221,7 +265,9 @@ class _Samples:
             i = int(wrong.argmax())
             verb = 'stands still' if stamp_ns[i] == earlier[i] else 'runs backwards'
             raise UserError(f'{self.where}: time {verb}: message {self.count + i + 1} is stamped '
-                            f'{seconds(stamp_ns[i])} after {seconds(earlier[i])}')
+                            f'{seconds(stamp_ns[i])} after {seconds(earlier[i])}'
+                            f'{describe_bursts((stamp_ns - stamp_ns[0]) / 1e9)}; '
+                            '--drop-bad-stamps leaves such messages out')
         self._last_ns = int(stamp_ns[-1])
 
     def _check_values(self, stamp_ns: np.ndarray, accel: np.ndarray) -> None:
@@ -327,7 +373,7 @@ def _block(bag: Bag, samples: _Samples, tracks: dict[str, Track], commands: dict
     time_s = (stamp_ns - samples.epoch_ns) / 1e9
     cut = f'{bag.cut}; the last sample read is at {seconds(stamp_ns[-1])}' if bag.cut else ''
     return Recording(bag.path, time_s, columns, dict(info), alignments, cut, samples.epoch_ns,
-                     bag.done)
+                     bag.done, samples.remarks)
 
 
 def drop_unsampled(recording: Recording) -> None:

@@ -75,29 +75,82 @@ class Topics:
                                     self.command) if topic]
 
 
-def find_topics(bag: Bag) -> Topics:
+def find_topics(bag: Bag, topic: str = '') -> Topics:
     """
     Find the topics by their names, in any namespace, and their types.
+
+    Parameters
+    ----------
+    bag
+        The recording.
+    topic
+        Name of the sensor's output; empty for `imu/data_raw`, or the only sensor_msgs/Imu.
+
+    Returns
+    -------
+    Topics
+        The topics that belong together.
 
     Raises
     ------
     UserError
-        There is no `imu/data_raw`, or several sensors, or a topic is of another type.
+        There is no such topic, or there are several sensors, or a topic is of another type.
 
     """
-    imu = _only(bag, 'imu/data_raw', IMU)
-    if imu is None:
-        raise UserError(f'{bag.path}: no topic imu/data_raw of type {IMU}; '
-                        f'it holds {_contents(bag)}')
+    imu = _chosen(bag, topic) if topic else _only(bag, 'imu/data_raw', IMU) or _only_imu(bag)
     space = imu.removesuffix('imu/data_raw')
+    if space == imu:
+        space = imu[:imu.rfind('/') + 1]
     joints = _beside(bag, space, 'stage/joint_states', JOINT_STATE)
     stage = (joints or f'{space}stage/joint_states').removesuffix('joint_states')
     return Topics(imu, joints,
-                  _beside(bag, space, 'sensor_info', DIAGNOSTIC_STATUS),
+                  _info(bag, imu, space),
                   # Other nodes use these names, too: a topic of another type is ignored.
                   _typed(bag, space + 'temperature', TEMPERATURE),
                   _typed(bag, space + 'supply', BATTERY_STATE),
                   _typed(bag, stage + 'command', JOINT_STATE))
+
+
+def _chosen(bag: Bag, topic: str) -> str:
+    """Return the full name of the topic that the user has named."""
+    kinds = {kind for name, kind in bag.types if name.lstrip('/') == topic.lstrip('/')}
+    if IMU in kinds:
+        return next(name for name, kind in bag.types
+                    if kind == IMU and name.lstrip('/') == topic.lstrip('/'))
+    if kinds:
+        raise UserError(f'{bag.path}: topic {topic} is of type {", ".join(sorted(kinds))}, '
+                        f'expected {IMU}; {_imu_choices(bag)}')
+    raise UserError(f'{bag.path}: no topic {topic}; {_imu_choices(bag)}')
+
+
+def _imu_topics(bag: Bag) -> list[str]:
+    return sorted(topic for topic, kind in bag.types if kind == IMU)
+
+
+def _imu_choices(bag: Bag) -> str:
+    """Return which topics `--topic` can name, for messages."""
+    topics = _imu_topics(bag)
+    return f'name one of {", ".join(topics)}' if topics else f'it holds {_contents(bag)}'
+
+
+def _only_imu(bag: Bag) -> str:
+    """Return the only topic of the sensor's type."""
+    topics = _imu_topics(bag)
+    if len(topics) == 1:
+        return topics[0]
+    if topics:
+        raise UserError(f'{bag.path}: several topics of type {IMU}, none of them imu/data_raw: '
+                        f'{", ".join(topics)}; choose one: --topic {topics[0]}')
+    raise UserError(f'{bag.path}: no topic imu/data_raw of type {IMU}, and no other of this type; '
+                    f'it holds {_contents(bag)}')
+
+
+def _info(bag: Bag, imu: str, space: str) -> str | None:
+    """Return the topic on which the sensor states its values."""
+    if imu.endswith('imu/data_raw') or len(_imu_topics(bag)) == 1:
+        return _beside(bag, space, 'sensor_info', DIAGNOSTIC_STATUS)
+    # With several sensors, the only sensor_info may be that of another one.
+    return _typed(bag, space + 'sensor_info', DIAGNOSTIC_STATUS)
 
 
 def find_ideal(bag: Bag) -> Topics:
@@ -140,7 +193,8 @@ def _only(bag: Bag, name: str, kind: str) -> str | None:
             raise UserError(f'{bag.path}: topic {topic} is of type {other}, expected {kind}')
     if len(candidates) > 1:
         raise UserError(f'{bag.path}: several topics {name}: '
-                        f'{", ".join(topic for topic, _ in candidates)}; record one sensor')
+                        f'{", ".join(topic for topic, _ in candidates)}; record one sensor'
+                        + f', or choose one: --topic {candidates[0][0]}' * (kind == IMU))
     return candidates[0][0] if candidates else None
 
 

@@ -37,6 +37,10 @@ _SYMBOLS = {'s': 's', 'v': 'V', 'mps2': 'm/sÂ²', 'rad': 'rad', 'm': 'm', 'c': 'Â
 """Symbols of the package's units, for messages."""
 
 
+class HeaderError(UserError):
+    """The columns are not those of a recording; a mapping may read them."""
+
+
 @dataclass(frozen=True)
 class Header:
     """
@@ -93,7 +97,7 @@ def parse_header(where: str, fields: list[str], needed: tuple[str, ...] | None) 
 
     Raises
     ------
-    UserError
+    HeaderError
         A needed column is missing, a column stands twice, or one is in another unit.
 
     """
@@ -104,12 +108,15 @@ def parse_header(where: str, fields: list[str], needed: tuple[str, ...] | None) 
     for column in _wanted(names):
         _refuse_other_unit(where, names, column)
     if TIME not in names:
-        raise UserError(f'{where}: no column {TIME}; the columns are {", ".join(named)}')
+        raise HeaderError(f'{where}: no column {TIME}; the columns are {", ".join(named)}')
     if needed is None:
-        return Header(names, sensor_columns(named, where))
+        try:
+            return Header(names, sensor_columns(named, where))
+        except UserError as error:
+            raise HeaderError(str(error)) from None
     for column in needed:
         if column not in names:
-            raise UserError(f'{where}: no column {column}; the columns are {", ".join(named)}')
+            raise HeaderError(f'{where}: no column {column}; the columns are {", ".join(named)}')
     return Header(names, needed)
 
 
@@ -125,16 +132,16 @@ def _wanted(names: tuple[str, ...]) -> tuple[str, ...]:
 def _refuse_delimiter(where: str, names: tuple[str, ...]) -> None:
     for mark, name in ((';', 'semicolons'), ('\t', 'tabs')):
         if len(names) == 1 and mark in names[0]:
-            raise UserError(f'{where}: the columns are separated by {name}, expected commas '
-                            'and a decimal point')
+            raise HeaderError(f'{where}: the columns are separated by {name}, expected commas '
+                              'and a decimal point')
 
 
 def _refuse_duplicates(where: str, names: tuple[str, ...]) -> None:
     for name, count in Counter(names).items():
         if name and count > 1:
             fields = [str(i + 1) for i, other in enumerate(names) if other == name]
-            raise UserError(f'{where}:{fields[1]}: column {name} stands {count} times, '
-                            f'in the fields {", ".join(fields)}; keep one')
+            raise HeaderError(f'{where}:{fields[1]}: column {name} stands {count} times, '
+                              f'in the fields {", ".join(fields)}; keep one')
 
 
 def _refuse_other_unit(where: str, names: tuple[str, ...], column: str) -> None:
@@ -144,5 +151,5 @@ def _refuse_other_unit(where: str, names: tuple[str, ...], column: str) -> None:
     others = next(units[1:] for units in _UNITS if units[0] == unit)
     for i, name in enumerate(names):
         if name.lower() in {f'{stem}_{other}' for other in others}:
-            raise UserError(f'{where}:{i + 1}: column {name} is in another unit; expected '
-                            f'{_SYMBOLS[unit]}, in a column named {column}')
+            raise HeaderError(f'{where}:{i + 1}: column {name} is in another unit; expected '
+                              f'{_SYMBOLS[unit]}, in a column named {column}')

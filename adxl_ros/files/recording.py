@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """
-Recordings of any format: rosbag2 directories, single bag files, CSV.
+Recordings of any format: rosbag2 directories, single bag files, CSV, and tables of other formats.
 
 The content of a file decides its format when it is read, its name when it is written: `.csv` is
 CSV, `.mcap` one bag file, everything else a rosbag2 directory.
@@ -27,10 +27,17 @@ import os
 from pathlib import Path
 
 from adxl_ros.errors import UserError
-from adxl_ros.files import bag_reader, csv_file
+from adxl_ros.files import bag_reader, csv_file, mapped_recording
 from adxl_ros.files.bag_writer import BagWriter
+from adxl_ros.files.column_guess import describe
+from adxl_ros.files.column_mapping import ColumnMapping, parse_mapping
+from adxl_ros.files.csv_header import HeaderError
 from adxl_ros.files.csv_writer import CsvWriter, recording_columns, recording_info
+from adxl_ros.files.mounted_axes import mounted
+from adxl_ros.files.reading_options import AS_IT_IS, ReadingOptions
 from adxl_ros.files.recording_columns import ACCEL, concatenate, Recording
+from adxl_ros.files.tables import is_text, open_table
+from adxl_ros.files.tables.base import Table
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
@@ -45,9 +52,21 @@ _ENDINGS = {b'\x89MCAP': '.mcap', b'SQLite format 3': '.db3', b'\x28\xb5\x2f\xfd
 """Usual ends of file names by the first bytes of the files."""
 
 
-def read(path: str | os.PathLike) -> Recording:
+def read(path: str | os.PathLike, reading: ReadingOptions = AS_IT_IS) -> Recording:
     """
     Read a whole recording.
+
+    Parameters
+    ----------
+    path
+        The recording.
+    reading
+        Topic, columns and stamps where the recording does not state them.
+
+    Returns
+    -------
+    Recording
+        All samples.
 
     Raises
     ------
@@ -55,18 +74,19 @@ def read(path: str | os.PathLike) -> Recording:
         The recording cannot be read, or holds values that no sensor gives.
 
     """
-    recording = concatenate(blocks(path, _BLOCK_ROWS))
+    recording = concatenate(blocks(path, _BLOCK_ROWS, reading))
     if _is_bag(path):
         bag_reader.drop_unsampled(recording)
     return recording
 
 
-def blocks(path: str | os.PathLike, rows: int) -> Generator[Recording, None, None]:
+def blocks(path: str | os.PathLike, rows: int, reading: ReadingOptions = AS_IT_IS
+           ) -> Generator[Recording, None, None]:
     """
     Read a recording in blocks; the memory is bounded by a block.
 
     All blocks have the same columns, except for a CSV column that turns out to be text further
-    down. Alignments and cut of a block are those up to its end.
+    down. Alignments, cut and remarks of a block are those up to its end.
 
     Parameters
     ----------
@@ -74,6 +94,8 @@ def blocks(path: str | os.PathLike, rows: int) -> Generator[Recording, None, Non
         The recording.
     rows
         Largest number of samples of a block.
+    reading
+        Topic, columns and stamps where the recording does not state them.
 
     Returns
     -------
@@ -86,7 +108,48 @@ def blocks(path: str | os.PathLike, rows: int) -> Generator[Recording, None, Non
         The recording cannot be read, or holds values that no sensor gives.
 
     """
-    return bag_reader.blocks(path, rows) if _is_bag(path) else csv_file.blocks(path, rows)
+    read_blocks = _blocks(path, rows, reading)
+    if reading.mounting is None:
+        return read_blocks
+    return mounted(read_blocks, reading.mounting)
+
+
+def _blocks(path: str | os.PathLike, rows: int, reading: ReadingOptions
+            ) -> Generator[Recording, None, None]:
+    """Return the blocks along the axes of the file; see `blocks`."""
+    if _is_bag(path):
+        return bag_reader.blocks(path, rows, reading=reading)
+    if is_text(path) and not reading.changes_columns and not reading.topic:
+        return _native_blocks(path, rows)
+    table = open_table(path, reading.topic)
+    mapping = reading.mapping or _mapping_of(table)
+    if mapping is None:
+        raise UserError(f'{path}: {describe(table)}')
+    return mapped_recording.blocks(table, mapping, reading, rows)
+
+
+def _mapping_of(table: Table) -> ColumnMapping | None:
+    """Return the mapping by the definition of a format, or by the package's own columns."""
+    if table.default_mapping:
+        return parse_mapping(table.default_mapping)
+    return mapped_recording.native_mapping(table.names, table.path)
+
+
+def _native_blocks(path: str | os.PathLike, rows: int) -> Generator[Recording, None, None]:
+    """Yield the blocks of a CSV file in the package's columns; propose a mapping for others."""
+    try:
+        yield from csv_file.blocks(path, rows)
+    except HeaderError as error:
+        raise UserError(f'{error}{_proposal(path, str(error))}') from None
+
+
+def _proposal(path: str | os.PathLike, error: str) -> str:
+    """Return the best mapping of a text table after an error; empty where it is no table."""
+    try:
+        table = open_table(path)
+    except UserError:
+        return ''
+    return f'; {describe(table, is_listed=", ".join(table.names[:2]) in error)}'
 
 
 def read_ideal(path: str | os.PathLike, epoch_ns: int = 0) -> tuple[np.ndarray, np.ndarray]:

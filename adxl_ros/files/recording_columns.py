@@ -21,6 +21,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 from adxl_ros.errors import UserError
+from adxl_ros.files.stamp_bursts import rate_lag
 from adxl_ros.files.stream_info import StreamInfo
 from adxl_ros.model.constants import AXES
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2, to_volts
@@ -94,6 +95,8 @@ class Recording:
         count from 1970, because float64 seconds since then resolve only 0.2 µs; else 0.
     done
         Fraction of the file that has been read at the end of these samples.
+    remarks
+        What was assumed or left out so far, one line each, for people.
 
     """
 
@@ -105,10 +108,30 @@ class Recording:
     cut: str = ''
     epoch_ns: int = 0
     done: float = 1.0
+    remarks: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         """Return the number of samples."""
         return len(self.time_s)
+
+    def rows(self, start: int, stop: int) -> Recording:
+        """
+        Return a part of the samples.
+
+        Parameters
+        ----------
+        start, stop
+            First row, and the row after the last.
+
+        Returns
+        -------
+        Recording
+            The part, with all that the recording states.
+
+        """
+        part = slice(start, stop)
+        return replace(self, time_s=self.time_s[part],
+                       columns={name: values[part] for name, values in self.columns.items()})
 
     @property
     def sensor_columns(self) -> tuple[str, ...]:
@@ -133,7 +156,7 @@ class Recording:
     @property
     def rate_hz(self) -> float:
         """
-        Sample rate by the stamps, Hz. Single gaps do not change it.
+        Sample rate by the stamps, Hz. Gaps and bursts of stamps do not change it.
 
         Raises
         ------
@@ -202,7 +225,8 @@ class Recording:
 
 def stamped_rate_hz(time_s: np.ndarray) -> float:
     """Return the sample rate of stamps, s, (n,), from their median step, Hz, to 1e-6 Hz."""
-    return round(float(1 / np.median(np.diff(time_s))), 6)
+    lag = rate_lag(time_s)
+    return round(float(lag / np.median(time_s[lag:] - time_s[:-lag])), 6)
 
 
 def _has_same_nominal_values(first: Sensor, second: Sensor) -> bool:

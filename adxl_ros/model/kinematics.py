@@ -58,6 +58,27 @@ def specific_force(alpha_rad: Value, beta_rad: Value, gravity_mps2: float,
             z * cos_alpha - x * sin_alpha]
 
 
+def stage_angles(roll_rad: np.ndarray, pitch_rad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Return the stage angles that hold the sensor at a tilt.
+
+    Parameters
+    ----------
+    roll_rad, pitch_rad
+        Tilt by REP-103, rad, (n,): roll = atan2(fy, fz), pitch = atan2(−fx, hypot(fy, fz)).
+
+    Returns
+    -------
+    alpha_rad, beta_rad : ndarray
+        Stage angles, rad, (n,): alpha from 0 to π, beta from −π to π, 0 where alpha is 0.
+
+    """
+    x = -np.sin(pitch_rad)
+    y = np.sin(roll_rad) * np.cos(pitch_rad)
+    z = np.cos(roll_rad) * np.cos(pitch_rad)
+    return np.arctan2(np.hypot(x, y), z), np.arctan2(-y, x + 0.0)
+
+
 def specific_force_in_motion(alpha: Joint, beta: Joint, shift: Joint, gravity_mps2: float,
                              up: Components | tuple[float, float, float] = UPRIGHT
                              ) -> Components:

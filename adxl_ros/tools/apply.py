@@ -37,6 +37,11 @@ from adxl_ros.tools.closing_lines import print_end, quoted
 from adxl_ros.tools.command_line import argument_parser, command
 from adxl_ros.tools.common import progress, report_reading, run
 from adxl_ros.tools.recorded_sensor import BeyondRange, listed, load_sensor, measure_unstated
+from adxl_ros.tools.recording_options import (
+    add_recording_options,
+    reading_options,
+    RECORDING_HELP,
+)
 import numpy as np
 
 _BLOCK_ROWS = 16384
@@ -56,7 +61,7 @@ _EXAMPLES = {
 def parser() -> argparse.ArgumentParser:
     """Describe the command line."""
     parse = argument_parser('apply', __doc__, _EXAMPLES)
-    parse.add_argument('recording', metavar='RECORDING', help='rosbag2 directory, .mcap or CSV')
+    parse.add_argument('recording', metavar='RECORDING', help=RECORDING_HELP)
     parse.add_argument('--params', metavar='FILE', default=None,
                        help='the calibrated sensor (default: the nominal sensor)')
     parse.add_argument('--inverse', choices=('exact', 'paper'), default='exact',
@@ -66,6 +71,7 @@ def parser() -> argparse.ArgumentParser:
                        help='undo the RC filter, amplitude and phase, for a sensor that moves')
     parse.add_argument('-o', dest='output', metavar='OUT.csv', required=True,
                        help='acceleration and tilt, with standard deviations')
+    add_recording_options(parse)
     return parse
 
 
@@ -75,7 +81,7 @@ def apply(options: argparse.Namespace) -> int:
         raise UserError(f'{options.output}: is the recording itself; choose another output')
     rows = unsolved = outside = at_rail = 0
     block, beyond = None, BeyondRange()
-    blocks = recording.blocks(options.recording, _BLOCK_ROWS)
+    blocks = recording.blocks(options.recording, _BLOCK_ROWS, reading_options(options))
     first = next(blocks, None)
     sensor, measured = _sensor(options.params, first)
     with CsvWriter(options.output, _DIGITS) as out, progress('apply') as show:

@@ -96,7 +96,7 @@ def make_folder(folder: Path) -> None:
 
 def report_reading(tool: str, recording: Recording) -> None:
     """
-    Report on stderr where a recording is cut, and how well its references are aligned.
+    Report on stderr what was assumed in reading, the cut, and the alignment of references.
 
     Parameters
     ----------
@@ -106,8 +106,8 @@ def report_reading(tool: str, recording: Recording) -> None:
         The recording, or its last block.
 
     """
-    if recording.cut:
-        print(f'{tool}: {recording.cut}', file=sys.stderr)
+    for line in (*recording.remarks, *[recording.cut] * bool(recording.cut)):
+        print(f'{tool}: {line}', file=sys.stderr)
     for name, alignment in recording.alignments.items():
         # References with the stamps of the samples need no alignment.
         if alignment.gap_s:

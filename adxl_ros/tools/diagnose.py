@@ -28,6 +28,7 @@ from adxl_ros.diagnose.diagnosis import diagnose as diagnose_recordings, Diagnos
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.atomic_write import write_text
+from adxl_ros.files.reading_options import ReadingOptions
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.stream_info import NO_UNIT
 from adxl_ros.model.effects import library
@@ -37,6 +38,11 @@ from adxl_ros.tools.closing_lines import NextStep, print_end, quoted
 from adxl_ros.tools.command_line import argument_parser, command, effect_list
 from adxl_ros.tools.common import make_folder, progress, report_reading, run
 from adxl_ros.tools.recorded_sensor import load_sensor, measure_unstated
+from adxl_ros.tools.recording_options import (
+    add_recording_options,
+    reading_options,
+    RECORDING_HELP,
+)
 
 _NO_VERDICT = ('bad_data', 'insufficient')
 """Statuses of the report that hold no verdict: the exit status is then 1."""
@@ -56,7 +62,7 @@ def parser() -> argparse.ArgumentParser:
     """Describe the command line."""
     parse = argument_parser('diagnose', __doc__, _EXAMPLES, _details)
     parse.add_argument('recording', nargs='+',
-                       help='rosbag2 directory, .mcap or CSV, all of one unit')
+                       help=f'{RECORDING_HELP}; all of one unit')
     parse.add_argument('--params', metavar='FILE', default=None,
                        help='what the simulator models (default: the nominal sensor)')
     parse.add_argument('--sim', metavar='RECORDING',
@@ -67,6 +73,7 @@ def parser() -> argparse.ArgumentParser:
     parse.add_argument('--json', action='store_true', help='print the report as JSON')
     parse.add_argument('-o', dest='output', metavar='DIR', required=True,
                        help='report.json, report.html and params.yaml')
+    add_recording_options(parse)
     return parse
 
 
@@ -87,8 +94,9 @@ def diagnose(options: argparse.Namespace) -> int:
                         f'{len(options.recording)} are given')
     if options.align and not options.sim:
         raise UserError('--align: shifts --sim, which is not given')
+    reading = reading_options(options)
     with progress('reading') as show:
-        recordings = [_read(path) for path in options.recording]
+        recordings = [_read(path, reading) for path in options.recording]
         sim = motion_from_force(options.sim, False, recordings[0].epoch_ns)[0] if options.sim \
             else None
         sensor, _ = measure_unstated(load_sensor(options.params, recordings[0]), recordings[0])
@@ -109,9 +117,9 @@ def diagnose(options: argparse.Namespace) -> int:
     return 1
 
 
-def _read(path: str) -> Recording:
+def _read(path: str, reading: ReadingOptions) -> Recording:
     """Read a recording, and report how."""
-    read = recording.read(path)
+    read = recording.read(path, reading)
     report_reading('diagnose', read)
     return read
 

@@ -35,6 +35,11 @@ from adxl_ros.tools.closing_lines import print_end, quoted
 from adxl_ros.tools.command_line import argument_parser, command, effect_list
 from adxl_ros.tools.common import make_folder, report_reading, run
 from adxl_ros.tools.recorded_sensor import BeyondRange, listed, load_sensor, measure_unstated
+from adxl_ros.tools.recording_options import (
+    add_recording_options,
+    reading_options,
+    RECORDING_HELP,
+)
 
 _EXAMPLES = {
     'the richest model that a sweep determines, with a page':
@@ -51,7 +56,7 @@ def parser() -> argparse.ArgumentParser:
     """Describe the command line."""
     parse = argument_parser('fit', __doc__, _EXAMPLES, _details)
     parse.add_argument('recording', nargs='+',
-                       help='rosbag2 directory, .mcap or CSV, all of one unit')
+                       help=f'{RECORDING_HELP}; all of one unit')
     parse.add_argument('--params', metavar='FILE', default=None,
                        help='values that are not fitted (default: the nominal sensor; what '
                             'a file leaves out is measured)')
@@ -70,6 +75,7 @@ def parser() -> argparse.ArgumentParser:
     parse.add_argument('--store', metavar='DIR', default=str(calibration_store.default_folder()),
                        help='the calibration store, which gets a copy (default: %(default)s); '
                             'empty for none')
+    add_recording_options(parse)
     return parse
 
 
@@ -88,8 +94,9 @@ def fit(options: argparse.Namespace) -> int:
     unit: Sensor | None = None
     measured: list[str] = []
     recordings = []
+    reading = reading_options(options)
     for path in options.recording:
-        read = recording.read(path)
+        read = recording.read(path, reading)
         report_reading('fit', read)
         if unit is None:
             unit, lines = measure_unstated(load_sensor(options.params, read), read)

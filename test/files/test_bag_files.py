@@ -360,8 +360,11 @@ CUT_IMU = bytes(STORE.serialize_cdr(imu(T[1]).message, IMU))[:100]
 @pytest.mark.parametrize(('messages', 'message'), [
     ([Sent('/imu/data_raw', STRING, 0, TYPES[STRING](data=''))],
      f': topic /imu/data_raw is of type {STRING}, expected {IMU}'),
-    ([imu(T[0], topic='/imu')],
-     f': no topic imu/data_raw of type {IMU}; it holds /imu ({IMU})'),
+    ([joints(T[0])], f': no topic imu/data_raw of type {IMU}, and no other of this type; it holds '
+                     f'/stage/joint_states ({JOINTS})'),
+    ([imu(T[0], topic='/imu'), imu(T[0], topic='/camera/imu')],
+     f': several topics of type {IMU}, none of them imu/data_raw: /camera/imu, /imu; choose one: '
+     '--topic /camera/imu'),
     ([imu(T[0], topic='/a/imu/data_raw'), imu(T[0], topic='/b/imu/data_raw')],
      ': several topics imu/data_raw: /a/imu/data_raw, /b/imu/data_raw; record one sensor'),
     ([imu(T[0]), Sent('/stage/joint_states', STRING, 0, TYPES[STRING](data=''))],

@@ -19,7 +19,7 @@ import os
 from pathlib import Path
 
 from adxl_ros.errors import UserError
-from adxl_ros.files import csv_file, recording
+from adxl_ros.files import csv_lines, recording
 from adxl_ros.files.csv_writer import CsvWriter
 from adxl_ros.files.recording_columns import ACCEL, Recording
 from adxl_ros.files.stream_info import sensor_info
@@ -236,7 +236,7 @@ def test_paths_that_cannot_be_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize('place', [0, 1600, 2999])
 def test_faults_in_late_lines_are_reported(
         tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: int) -> None:
-    monkeypatch.setattr(csv_file, '_CHUNK_BYTES', 10_000)
+    monkeypatch.setattr(csv_lines, '_CHUNK_BYTES', 10_000)
     lines = [f'{i / 1000!r},2.5,2.5,{i % 7},0.1' for i in range(3000)]
     lines[place] = lines[place].replace('2.5,2.5', '2.5,x')
     path = written(tmp_path, f'{HEADER}\n' + '\n'.join(lines) + '\n')
@@ -253,7 +253,7 @@ def test_the_result_does_not_depend_on_the_blocks(
     rows = GOOD.replace('\n', '\r\n')
     path = written(tmp_path, f'\ufeff# serial: A17\r\n{HEADER}\n{rows}# end: 1\n0.1,1,2,3,4')
     complete = recording.read(path)
-    monkeypatch.setattr(csv_file, '_CHUNK_BYTES', size)
+    monkeypatch.setattr(csv_lines, '_CHUNK_BYTES', size)
     cut = recording.read(path)
     assert cut.info == complete.info == {'serial': 'A17', 'end': '1'}
     assert cut.time_s.tolist() == complete.time_s.tolist() == [0.0, 0.001, 0.002, 0.1]
@@ -262,7 +262,7 @@ def test_the_result_does_not_depend_on_the_blocks(
 
 def test_a_column_that_changes_to_text_is_ignored(
         tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(csv_file, '_CHUNK_BYTES', 10_000)
+    monkeypatch.setattr(csv_lines, '_CHUNK_BYTES', 10_000)
     lines = [f'{i / 1000!r},2.5,{i}' for i in range(3000)]
     lines[-1] = lines[-1].replace('2.5,', '2.5,no')
     path = written(tmp_path, 'time_s,x_v,state\n' + '\n'.join(lines) + '\n')
@@ -271,7 +271,7 @@ def test_a_column_that_changes_to_text_is_ignored(
 
 
 def test_text_columns_are_ignored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(csv_file, '_CHUNK_BYTES', 10_000)
+    monkeypatch.setattr(csv_lines, '_CHUNK_BYTES', 10_000)
     text = ['far out', '', '"q"', 'ä', '7', '"a,b"']
     lines = [f'{text[i % 5]},{text[i // 5 % 5]}, {i / 1000!r} ,{text[i % 3]},{1 / (i + 1)!r},,'
              f'{text[i // 1000]}' for i in range(3000)]

@@ -1,0 +1,289 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The mapping that a table most likely needs, from the names and values of its columns."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+import re
+import shlex
+
+from adxl_ros.files.column_mapping import ColumnMapping, Source
+from adxl_ros.files.column_units import LSB, Quantity, ROLES, unit_in_name
+from adxl_ros.files.mapped_recording import likely_unit, listed
+from adxl_ros.files.tables.base import Table
+from adxl_ros.model.constants import AXES
+import numpy as np
+
+_TIME_NAMES = re.compile(
+    r'(?i)\W*(t|time|times|timestamp|timestamps|stamp|stamps|zeit|clock|elapsed|millis|micros|'
+    r'seconds?|secs?|m?s|ms|us|ns|epoch|unix|dt_?sum|date_?time|header[._]stamp.*|.*time.*|'
+    r'.*stamp.*|(t|sec)[_\W].*)\W*')
+"""Names of a time."""
+
+_INDEX_NAMES = re.compile(r'(?i)index|sample|frame|count|seq|^(n|i|id|no)$|#')
+"""Names of a count."""
+
+_OTHER_SENSORS = re.compile(
+    r'(?i)gyr|mag(?!nit)|angular|omega|rate|\bw[xyz]\b|g[xyz]r|rot|orient|quat|'
+    r'pressure|baro|gps|vel|\bg[xyz]\b|abs|total|norm|std|cov|user|gravity|without')
+"""Names of columns of other sensors."""
+
+_ACCEL_NAMES = (
+    re.compile(r'(?i)^acc(el(eration|erometer)?)?\b|acc'),
+    re.compile(r'(?i)^(a|f|g_?f|ad)_?[xyz]'),
+    re.compile(r'(?i)^[xyz](\b|_|$)'),
+    re.compile(r'(?i)[xyz]'),
+)
+"""Names of acceleration, the surest first."""
+
+_REFERENCES = {
+    'alpha': re.compile(r'(?i)^(alpha|angle|winkel|tilt|inclination)'),
+    'beta': re.compile(r'(?i)^(beta|azimuth)'),
+    'roll': re.compile(r'(?i)^roll'),
+    'pitch': re.compile(r'(?i)^pitch'),
+    'temperature': re.compile(r'(?i)temp'),
+    'supply': re.compile(r'(?i)^(supply|vcc|vdd|v_?bat|batt)'),
+}
+"""Names of references by role."""
+
+_EPOCHS = ((1e17, 'ns'), (1e14, 'us'), (1e11, 'ms'), (1e8, 's'))
+"""Smallest time since 1970 of each unit."""
+
+_STEPS = ((1e6, 'ns'), (1e3, 'us'), (1.0, 'ms'), (0.0, 's'))
+"""Smallest step of each unit, between samples of 1 Hz to 1 kHz."""
+
+_CONSTANT = 0.3
+"""Largest relative scatter of a length that is that of gravity (chosen: a hand that turns a
+sensor makes less)."""
+
+_COUNTS = (64, 100, 128, 256, 512, 1000, 1024, 1365, 2048, 4096, 8192, 16384, 32768)
+"""Usual counts of 1 g."""
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """
+    A mapping that is proposed.
+
+    Attributes
+    ----------
+    mapping
+        Columns and units by role.
+    lsb_per_g
+        Counts of 1 g; 0 where no column is in LSB.
+    reasons
+        What it follows from.
+    needs_rate
+        Whether no column is a time.
+
+    """
+
+    mapping: ColumnMapping
+    lsb_per_g: float
+    reasons: Sequence[str]
+    needs_rate: bool
+
+    def options(self) -> str:
+        """Return the options, quoted for a shell."""
+        text = f'--columns {_shell_quoted(str(self.mapping))}'
+        text += ' --rate HZ' * self.needs_rate
+        return text + (f' --lsb-per-g {self.lsb_per_g:g}' if self.lsb_per_g else '')
+
+
+def _shell_quoted(text: str) -> str:
+    """Return a word for a shell, in quotes even where it needs none."""
+    quoted = shlex.quote(text)
+    return quoted if quoted != text else f"'{text}'"
+
+
+def propose(table: Table) -> Proposal | None:
+    """Return the best mapping of a table; None where no column looks like a sensor's."""
+    values = table.sample()
+    time = _time_column(table, values)
+    outputs = _outputs(table, {name: column for name, column in values.items() if name != time})
+    if not outputs:
+        return None
+    sources: dict[str, Source] = {}
+    reasons = []
+    if time:
+        unit, reason = _time_unit(table, time, values[time])
+        sources['time'] = Source(time, unit)
+        reasons.append(reason)
+    length = float(np.nanmedian(np.linalg.norm(
+        np.column_stack([values[name] for name in outputs]), axis=1)))
+    stated = table.units.get(outputs[0]) or unit_in_name(outputs[0], Quantity.OUTPUT)
+    unit = stated or likely_unit(length) or _count_or_volts(length)
+    sources |= {axis: Source(name, unit) for axis, name in zip(AXES, outputs)}
+    reasons.append(f'the readings have a length of {length:.4g}'
+                   + f', so {unit}' * (not stated))
+    sources |= _references(table, values, {*outputs, time or ''})
+    return Proposal(ColumnMapping(sources), _counts(length) if unit == LSB else 0.0, reasons,
+                    time is None)
+
+
+def describe(table: Table, is_listed: bool = False) -> str:
+    """
+    Return the columns of a table, and the best guess with its options, in one line.
+
+    Parameters
+    ----------
+    table
+        The table.
+    is_listed
+        Whether the columns are named before.
+
+    Returns
+    -------
+    str
+        Clauses for a message.
+
+    """
+    form = f' ({table.form})' if table.form else ''
+    seen = '' if is_listed and not form else f'the columns are {listed(table.names)}{form}; '
+    proposal = propose(table)
+    if proposal is None:
+        return f'{seen}none looks like an accelerometer: name the columns, for example ' \
+               "--columns 'time=COLUMN:s,x=COLUMN:g,y=COLUMN:g,z=COLUMN:g'"
+    return f'{seen}the best guess, because {" and ".join(proposal.reasons)}: {proposal.options()}'
+
+
+def _time_column(table: Table, values: Mapping[str, np.ndarray]) -> str | None:
+    """Return the column that is a time: it does not decrease, and its name or place says so."""
+    rising = [name for name, column in values.items() if _is_rising(column)]
+    named = [name for name in rising if table.has_names and _TIME_NAMES.fullmatch(name)]
+    # A count of the samples is no time, and the name of an index says so.
+    others = [name for name in rising if not _is_count(values[name])
+              and not (table.has_names and _INDEX_NAMES.search(name))]
+    return next(iter([*named, *others]), None)
+
+
+def _is_rising(values: np.ndarray) -> bool:
+    """Return whether values hardly ever decrease, and change."""
+    finite = values[np.isfinite(values)]
+    steps = np.diff(finite)
+    return len(steps) > 2 and float(np.mean(steps >= 0)) > 0.99 and finite[-1] > finite[0] and \
+        float(np.mean(steps > 0)) > 0.05
+
+
+def _is_count(values: np.ndarray) -> bool:
+    """Return whether values count by one."""
+    return bool((np.diff(values) == 1).all()) and abs(values[0]) <= 1
+
+
+def _time_unit(table: Table, name: str, values: np.ndarray) -> tuple[str, str]:
+    """Return the unit of a time and the reason."""
+    finite = values[np.isfinite(values)]
+    steps = np.diff(finite)
+    step = float(np.median(steps[steps > 0])) if (steps > 0).any() else 1.0
+    stated = table.units.get(name) or (unit_in_name(name, Quantity.TIME) if table.has_names
+                                       else None)
+    if stated:
+        return stated, f'{name} has steps of {step:.4g} {stated}'
+    for smallest, unit in _EPOCHS:
+        if finite[0] > smallest and step < finite[0] * 1e-6:
+            return ('epoch' if unit == 's' else unit), f'{name} counts from 1970'
+    unit = next(unit for smallest, unit in _STEPS if step >= smallest)
+    return unit, f'{name} has steps of {step:.4g}, so {unit}'
+
+
+def _outputs(table: Table, values: Mapping[str, np.ndarray]) -> list[str]:
+    """Return the columns of the axes, as many as there are."""
+    if table.has_names:
+        for pattern in _ACCEL_NAMES:
+            names = _by_axis([name for name in values if pattern.search(name)
+                              and not _OTHER_SENSORS.search(name)])
+            if names:
+                return names
+    return _by_length(values)
+
+
+def _by_axis(names: Sequence[str]) -> list[str]:
+    """Return the names of x, y and z in this order, as far as there are any."""
+    by_letter = {_axis(name): name for name in reversed(names)}
+    axes = [by_letter[axis] for axis in AXES if axis in by_letter]
+    if axes:
+        return axes if tuple(axes) == tuple(map(by_letter.get, AXES[:len(axes)])) else []
+    # Names with numbers in place of letters, as acc_0 or acc[1].
+    numbered = [name for name in names if re.search(r'(?<!\d)[0-3]\]?$', name)]
+    return numbered[:len(AXES)] if len(numbered) >= len(AXES) else []
+
+
+def _axis(name: str) -> str | None:
+    """Return the axis that a name states; None without one."""
+    bare = re.sub(r'[(\[{].*?[)\]}]', '', name).strip()
+    words = [word for word in re.split(r'[_\W]+|(?<=[a-z])(?=[A-Z])', bare) if word]
+    for word in reversed(words):
+        if word.lower() in AXES:
+            return word.lower()
+    for word in words:
+        match = re.fullmatch(r'(?i)(a|acc|accel|g_?f|f|ad|gf)([xyz])|([xyz])(acc|accel)', word)
+        if match:
+            return (match[2] or match[3]).lower()
+    return None
+
+
+def _by_length(values: Mapping[str, np.ndarray]) -> list[str]:
+    """Return three neighbouring columns whose length is the most constant, if it is so."""
+    names = [name for name, column in values.items() if not _is_rising(column)]
+    best: tuple[float, list[str]] = (_CONSTANT, [])
+    for triple in combinations(names, 3):
+        if names.index(triple[2]) - names.index(triple[0]) > 2:
+            continue
+        data = np.column_stack([values[name] for name in triple])
+        length = np.linalg.norm(data, axis=1)
+        median = np.nanmedian(length)
+        spread = float(np.nanmedian(np.abs(length - median)) / median) if median > 0 else np.inf
+        # Counts about an offset also have a constant length, as has a unit quaternion.
+        unit_fits = bool(likely_unit(float(median)))
+        best = min(best, (spread + 0.1 * (not unit_fits), list(triple)))
+    return best[1]
+
+
+def _count_or_volts(length: float) -> str:
+    return LSB if length > 40 else 'v' if length < 9 else 'mps2'
+
+
+def _counts(length: float) -> float:
+    """Return the usual counts of 1 g nearest to a length."""
+    return float(min(_COUNTS, key=lambda count: abs(np.log(count / length))))
+
+
+def _references(table: Table, values: Mapping[str, np.ndarray], used: set[str]
+                ) -> dict[str, Source]:
+    """Return the columns of references, with their units."""
+    sources: dict[str, Source] = {}
+    for role, pattern in _REFERENCES.items():
+        name = next((name for name in values if table.has_names and name not in used
+                     and pattern.search(name)), None)
+        if name:
+            stated = unit_in_name(name, ROLES[role])
+            sources[role] = Source(name, stated or _reference_unit(role, values[name]))
+    if ('roll' in sources) != ('pitch' in sources) or 'alpha' in sources:
+        sources.pop('roll', None), sources.pop('pitch', None)
+    return sources
+
+
+def _reference_unit(role: str, values: np.ndarray) -> str:
+    """Return the likely unit of a reference."""
+    finite = np.abs(values[np.isfinite(values)])
+    largest = float(finite.max()) if len(finite) else 0.0
+    if ROLES[role] is Quantity.ANGLE:
+        return 'deg' if largest > 2 * np.pi else 'rad'
+    if ROLES[role] is Quantity.TEMPERATURE:
+        return 'k' if largest > 200 else 'c'
+    return 'mv' if largest > 100 else 'v'

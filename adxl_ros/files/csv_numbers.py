@@ -1,0 +1,191 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The numbers of a block of lines of a CSV file.
+
+A block of lines with numbers alone is parsed as a whole. Any other block is parsed field by
+field, which accepts text and quotes, and finds the line and column to name in a message.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import re
+import warnings
+
+from adxl_ros.errors import UserError
+from adxl_ros.files.csv_lines import Lines
+import numpy as np
+
+_NUMBER = re.compile(r'\s*([-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?|[-+]?(nan|inf|infinity))?\s*',
+                     re.ASCII | re.IGNORECASE)
+"""A field that is a number, or empty."""
+
+
+@dataclass
+class Layout:
+    """
+    The columns of the lines.
+
+    Attributes
+    ----------
+    path
+        The file, for messages.
+    names
+        All columns, in order, each once; an empty name is a column that is not read.
+    used
+        Columns that hold numbers so far.
+    required
+        Columns in which text is an error; any other column with text is left out.
+    source
+        What states the number of columns, for messages.
+
+    """
+
+    path: str
+    names: tuple[str, ...]
+    used: list[str]
+    required: frozenset[str]
+    source: str = 'the header'
+
+
+def parse_numbers(layout: Layout, lines: Lines) -> dict[str, np.ndarray]:
+    """
+    Parse lines.
+
+    Parameters
+    ----------
+    layout
+        Their columns. A column that turns out to hold text is removed from those that are used.
+    lines
+        The n lines.
+
+    Returns
+    -------
+    dict
+        Arrays (n,) by column name; an empty field is NaN.
+
+    Raises
+    ------
+    UserError
+        A line has another number of fields, or a required field is no number.
+
+    """
+    table = _all_at_once(layout, lines)
+    if table is None:
+        table = _field_by_field(layout, lines)
+    return {name: np.ascontiguousarray(table[:, i]) for i, name in enumerate(layout.used)}
+
+
+def _all_at_once(layout: Layout, lines: Lines) -> np.ndarray | None:
+    """Parse all lines as one text; None where a line must be parsed field by field."""
+    names = layout.names
+    data = _unpadded(lines.data)
+    bounds = _bounds(data, len(names))
+    if bounds is None:
+        return None
+    used = [layout.names.index(name) for name in layout.used]
+    data = _blanked(data, bounds, sorted(set(range(len(names))) - set(used)))
+    # numpy reads a field of white space as -1.
+    if any(space in data for space in b' \t\v\f\r'):
+        return None
+    text = data.replace(b'\n', b',')
+    if text.startswith(b','):
+        text = b'nan' + text
+    # Of three commas in a row, one pass sees only the first pair.
+    while b',,' in text:
+        text = text.replace(b',,', b',nan,')
+    with warnings.catch_warnings():
+        # Older numpy warns of text and stops there; an error leads to the other parser.
+        warnings.simplefilter('error')
+        try:
+            values = np.fromstring(text, sep=',')
+        except (ValueError, DeprecationWarning):
+            return None
+    size = len(names) * len(lines.numbers)
+    return values.reshape(-1, len(names))[:, used] if len(values) == size else None
+
+
+def _unpadded(data: bytes) -> bytes:
+    """Remove the spaces next to commas and newlines."""
+    if b'\t' in data:
+        data = data.replace(b'\t', b' ')
+    if b' ' in data:
+        for padded in (b', ', b' ,', b'\n ', b' \n'):
+            while padded in data:
+                data = data.replace(padded, padded.strip(b' '))
+    return data
+
+
+def _bounds(data: bytes, count: int) -> np.ndarray | None:
+    """
+    Return the bounds of the fields, (lines, count + 1); None if a line has not `count` fields.
+
+    Field k is between bounds k and k + 1, the positions of the commas and newlines next to it.
+    """
+    characters = np.frombuffer(data, np.uint8)
+    newlines = np.flatnonzero(characters == ord('\n'))
+    commas = np.flatnonzero(characters == ord(','))
+    if len(commas) != (count - 1) * len(newlines):
+        return None
+    starts = np.concatenate([[-1], newlines[:-1]])
+    bounds = np.column_stack([starts, commas.reshape(len(newlines), count - 1), newlines])
+    return bounds if (np.diff(bounds, axis=1) > 0).all() else None
+
+
+def _blanked(data: bytes, bounds: np.ndarray, unused: list[int]) -> bytes:
+    """Remove the text of unused fields."""
+    if not unused:
+        return data
+    change = np.zeros(len(data) + 1, np.int8)
+    for k in unused:
+        change[bounds[:, k] + 1] += 1
+        change[bounds[:, k + 1]] -= 1
+    is_kept = np.cumsum(change[:-1], dtype=np.int8) == 0
+    return np.frombuffer(data, np.uint8)[is_kept].tobytes()
+
+
+def _field_by_field(layout: Layout, lines: Lines) -> np.ndarray:
+    """Parse with Python; refuse a field that is no number, and drop other columns with text."""
+    rows = lines.rows(layout.path)
+    for i, fields in enumerate(rows):
+        if len(fields) != len(layout.names):
+            _refuse_field_count(layout, lines, i, len(fields))
+    columns = []
+    for name in list(layout.used):
+        index = layout.names.index(name)
+        fields = [row[index] for row in rows]
+        wrong = next((i for i, field in enumerate(fields) if not _NUMBER.fullmatch(field)), None)
+        if wrong is None:
+            columns.append([float(field) if field.strip() else np.nan for field in fields])
+        elif name not in layout.required:
+            layout.used.remove(name)
+        else:
+            raise UserError(f'{lines.where(layout.path, wrong, index)}: {name} is '
+                            f'{fields[wrong]!r}, not a number{_cut_hint(lines, wrong)}')
+    return np.column_stack(columns) if columns else np.empty((len(rows), 0))
+
+
+def _refuse_field_count(layout: Layout, lines: Lines, row: int, count: int) -> None:
+    expected = len(layout.names)
+    raise UserError(f'{lines.where(layout.path, row, min(count, expected))}: {count} fields, but '
+                    f'{layout.source} has {expected}{_cut_hint(lines, row)}')
+
+
+def _cut_hint(lines: Lines, row: int) -> str:
+    """Return what to do about the last line of a file that is cut off, else ''."""
+    if lines.is_open_ended and row == len(lines.numbers) - 1:
+        return '; the file ends in the middle of this line: delete it'
+    return ''

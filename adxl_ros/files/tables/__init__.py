@@ -1,0 +1,73 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Formats of tables, one file each.
+
+A format is a module with `ENDINGS`, the ends of its files' names, and `open_table(path, topic)`.
+It is found by its file. A name with any other end is delimited text.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+import os
+from pathlib import Path
+import pkgutil
+
+from adxl_ros.files.tables import delimited_text
+from adxl_ros.files.tables.base import Table
+
+
+def is_text(path: str | os.PathLike) -> bool:
+    """Return whether a file is delimited text, by the end of its name."""
+    return not any(_is_named(path, format_name) for format_name in _formats())
+
+
+def open_table(path: str | os.PathLike, topic: str = '') -> Table:
+    """
+    Open a table of any format.
+
+    Parameters
+    ----------
+    path
+        The file.
+    topic
+        The message of a file that holds several; empty for the only one.
+
+    Returns
+    -------
+    Table
+        The open table.
+
+    Raises
+    ------
+    UserError
+        The file cannot be read, or a library for its format is missing.
+
+    """
+    name = next((name for name in _formats() if _is_named(path, name)), delimited_text.NAME)
+    return import_module(f'{__name__}.{name}').open_table(str(path), topic)
+
+
+def _formats() -> list[str]:
+    """Return the formats besides text."""
+    return [module.name for module in pkgutil.iter_modules(__path__)
+            if module.name not in ('base', delimited_text.NAME)]
+
+
+def _is_named(path: str | os.PathLike, format_name: str) -> bool:
+    """Return whether the end of a file's name is that of a format."""
+    endings = import_module(f'{__name__}.{format_name}').ENDINGS
+    return Path(path).suffix.lower() in endings

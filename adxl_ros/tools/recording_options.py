@@ -1,0 +1,91 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The options by which all tools read recordings that other software has made."""
+
+from __future__ import annotations
+
+import argparse
+
+from adxl_ros.errors import UserError
+from adxl_ros.files.column_mapping import parse_mapping, parse_mounting
+from adxl_ros.files.reading_options import ReadingOptions
+
+RECORDING_HELP = 'rosbag2 directory, .mcap, CSV or another table'
+"""Help text of the argument that names a recording."""
+
+_HIGHEST_RATE_HZ = 1e5
+"""Largest sample rate, Hz: that of a parameter file."""
+
+
+def add_recording_options(parse: argparse.ArgumentParser) -> None:
+    """Add the options that state topic, columns, units, stamps and mounting of a recording."""
+    group = parse.add_argument_group(
+        'recordings of other software', 'docs/recordings.md has units and examples.')
+    group.add_argument('--topic', metavar='NAME', default='',
+                       help='topic of type sensor_msgs/Imu (default: imu/data_raw, or the only '
+                            'one)')
+    group.add_argument('--columns', metavar='MAPPING',
+                       help='columns and units of a table, for example '
+                            'time=t_ms:ms,x=accX:mg,y=accY:mg,z=accZ:mg; or a file that holds '
+                            'them')
+    group.add_argument('--lsb-per-g', metavar='COUNTS', default='',
+                       help='counts of 1 g of columns in LSB: one number, or one for each axis')
+    group.add_argument('--rate', metavar='HZ', type=float, default=None,
+                       help='stamp the samples by their index at this rate')
+    group.add_argument('--drop-bad-stamps', action='store_true',
+                       help='leave out samples whose stamp does not increase, and count them')
+    group.add_argument('--axes', metavar='x=-y,y=x,z=z',
+                       help='axes of the sensor by those of the file, for a documented mounting')
+
+
+def reading_options(options: argparse.Namespace) -> ReadingOptions:
+    """
+    Return how recordings are to be read.
+
+    Parameters
+    ----------
+    options
+        Parsed options of a parser with `add_recording_options`.
+
+    Returns
+    -------
+    ReadingOptions
+        For `recording.read` and `recording.blocks`.
+
+    Raises
+    ------
+    UserError
+        An option is wrong.
+
+    """
+    if options.rate is not None and not 0 < options.rate <= _HIGHEST_RATE_HZ:
+        raise UserError(f'--rate {options.rate:g}: expected samples a second, at most '
+                        f'{_HIGHEST_RATE_HZ:g}')
+    return ReadingOptions(
+        options.topic, parse_mapping(options.columns) if options.columns else None,
+        _lsb_per_g(options.lsb_per_g), options.rate, options.drop_bad_stamps,
+        parse_mounting(options.axes) if options.axes else None)
+
+
+def _lsb_per_g(text: str) -> tuple[float, ...]:
+    """Return the numbers of a list."""
+    try:
+        values = tuple(float(word) for word in text.split(',')) if text else ()
+    except ValueError:
+        values = (0.0,)
+    if not all(0 < value < float('inf') for value in values):
+        raise UserError(f'--lsb-per-g {text}: expected counts of 1 g, for example 16384 or '
+                        '16384,16384,16500')
+    return values

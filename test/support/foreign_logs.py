@@ -1,0 +1,148 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Logs of a turned sensor in the forms that other software writes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from adxl_ros.model.constants import G0_MPS2
+import numpy as np
+
+BIAS_G = np.array([0.02, -0.03, 0.047])
+"""Bias of the sensor by axis, g."""
+
+SCALE = np.array([1.02, 0.99, 1.01])
+"""Scale factor of the sensor by axis."""
+
+
+@dataclass(frozen=True)
+class Turned:
+    """
+    A sensor that is turned from rest to rest.
+
+    Attributes
+    ----------
+    time_s
+        Instants, s, (n,).
+    output_g
+        Output of the sensor, g, (n, 3).
+    angles_rad
+        Stage angles alpha and beta, rad, (n, 2); NaN in motion.
+
+    """
+
+    time_s: np.ndarray
+    output_g: np.ndarray
+    angles_rad: np.ndarray
+
+    @property
+    def tilt_deg(self) -> np.ndarray:
+        """Roll and pitch, degrees, (n, 2); NaN in motion."""
+        x, y, z = _force(*self.angles_rad.T)
+        return np.degrees(np.column_stack([np.arctan2(y, z), np.arctan2(-x, np.hypot(y, z))]))
+
+
+def turned(rate_hz: float = 100.0, rest_s: float = 2.0, seed: int = 3) -> Turned:
+    """Return a sensor with small errors in 32 rests on the sphere."""
+    rng = np.random.default_rng(seed)
+    forces, angles = [], []
+    steps = np.linspace(0, 1, int(0.7 * rate_hz))[:, None]
+    for alpha in np.radians([0, 30, 60, 90, 120, 150, 180]):
+        for beta in np.radians([0, 60, 120, 180, 240, 300] if 0 < alpha < 3 else [0]):
+            force = np.array(_force(alpha, beta))
+            if forces:
+                forces.append(forces[-1][-1] * (1 - steps) + force * steps
+                              + 0.05 * np.sin(40 * steps))
+                angles.append(np.full((len(steps), 2), np.nan))
+            forces.append(np.tile(force, (int(rest_s * rate_hz), 1)))
+            angles.append(np.tile([alpha, beta], (len(forces[-1]), 1)))
+    force = np.concatenate(forces)
+    output_g = force * SCALE + BIAS_G + rng.normal(0, 0.003, force.shape)
+    return Turned(np.arange(len(force)) / rate_hz, output_g, np.concatenate(angles))
+
+
+def _force(alpha: np.ndarray, beta: np.ndarray) -> list[np.ndarray]:
+    """Return the specific force of a pose, g."""
+    return [np.sin(alpha) * np.cos(beta), -np.sin(alpha) * np.sin(beta), np.cos(alpha)]
+
+
+def lines(columns: list[np.ndarray], formats: list[str], delimiter: str = ',',
+          decimal: str = '.', end: str = '\n') -> str:
+    """Return rows of text; NaN is an empty field."""
+    rows = []
+    for row in zip(*columns):
+        fields = ['' if np.isnan(value) else (form % value).replace('.', decimal)
+                  for form, value in zip(formats, row)]
+        rows.append(delimiter.join(fields) + end)
+    return ''.join(rows)
+
+
+def _arduino(log: Turned) -> str:
+    mg = 1e3 * log.output_g.T
+    return 't_ms,accX,accY,accZ,temp\n' + lines(
+        [1e3 * log.time_s, *mg, 24 + 0 * log.time_s], ['%.0f'] * 4 + ['%.1f'])
+
+
+def _german(log: Turned) -> bytes:
+    return ('Zeit (s);Acc X [m/s²];Acc Y [m/s²];Acc Z [m/s²]\r\n' + lines(
+        [log.time_s, *(G0_MPS2 * log.output_g).T], ['%.3f'] + ['%.4f'] * 3, ';', ',', '\r\n')
+    ).encode('cp1252')
+
+
+def _phyphox(log: Turned) -> str:
+    names = [f'"Acceleration {axis} (m/s^2)"' for axis in 'xyz']
+    return f'"Time (s)",{",".join(names)},"Absolute acceleration (m/s^2)"\n' + lines(
+        [log.time_s, *(G0_MPS2 * log.output_g).T, np.linalg.norm(log.output_g, axis=1)],
+        ['%.9E'] * 5)
+
+
+def _counts(log: Turned) -> str:
+    return lines([np.arange(len(log.time_s)), *16384 * log.output_g.T], ['%.0f'] * 4, '   ')
+
+
+def _tabs(log: Turned) -> str:
+    return lines([1e6 * log.time_s, *log.output_g.T], ['%.0f'] + ['%.5f'] * 3, '\t')
+
+
+def _epoch(log: Turned) -> str:
+    rate = 0.1 + 0 * log.time_s
+    return 'timestamp,ax,ay,az,gx,gy,gz\n' + lines(
+        [1.7e9 + log.time_s, *log.output_g.T, rate, rate, rate], ['%.6f'] + ['%.5f'] * 6)
+
+
+def _app(log: Turned) -> str:
+    return 'Logger 3.1\nDevice: A\n\nTimestamp [ms],Accel X (g),Accel Y (g),Accel Z (g),\n' \
+        + lines([1.7e12 + 1e3 * log.time_s, *log.output_g.T], ['%.0f'] + ['%.4f'] * 3,
+                end=',\n')
+
+
+def _ros_text(log: Turned) -> str:
+    names = [f'field.linear_acceleration.{axis}' for axis in 'xyz']
+    text = f'%time,field.header.frame_id,{",".join(names)}\n'
+    rows = lines([*(G0_MPS2 * log.output_g).T], ['%.6f'] * 3).splitlines()
+    return text + ''.join(f'{1_700_000_000_000_000_000 + round(1e9 * time_s)},imu,{row}\n'
+                          for time_s, row in zip(log.time_s, rows))
+
+
+def _units_row(log: Turned) -> str:
+    return '% export of a lab program\ntime\tx\ty\tz\n[s]\t[mg]\t[mg]\t[mg]\n' + lines(
+        [log.time_s, *1e3 * log.output_g.T], ['%.3f'] + ['%.2f'] * 3, '\t')
+
+
+FORMS = {'arduino.csv': _arduino, 'german.csv': _german, 'phyphox.csv': _phyphox,
+         'counts.txt': _counts, 'tabs.tsv': _tabs, 'epoch.csv': _epoch, 'app.csv': _app,
+         'ros_text.csv': _ros_text, 'units_row.dat': _units_row}
+"""Text of a log by the name of its file."""
