@@ -11,13 +11,14 @@
 # make soak     half an hour of random faults, and 200 kills of a sweep
 # make fuzz     the decoder and the serial link, two minutes of hostile bytes
 # make long     an 8-hour recording through apply: memory and time
+# make noise    how often the intervals of noise hold the truth: docs/noise.md
 # make nulls    recordings without any effect through diagnose: docs/nulls.md, 90 minutes
 # make blind    the blind check of diagnose, 600 trials, into blind_output/ (make blind ARGS='--seed 1')
 # make working  working cases of diagnose, drawn, diagnosed and scored, into working_output/
 # make lint     the linters alone
 # make clean    remove what these made
 
-.PHONY: build help demo check test perf bench gallery reproduction coverage long faults soak fuzz nulls blind working lint clean \
+.PHONY: build help demo check test perf bench gallery reproduction coverage long faults soak fuzz noise nulls blind working lint clean \
     FORCE
 .DEFAULT_GOAL := build
 
@@ -127,6 +128,9 @@ fuzz: build
 	-.venv/bin/python -m pip install --quiet --disable-pip-version-check \
 	    --requirement requirements/fuzz.txt
 	$(python_in_test) long/fuzz_links.py $(ARGS)
+
+noise: build
+	$(python_in_test) long/noise_coverage.py $(ARGS)
 
 gallery: build
 	./run --exec python docs/gallery.py docs

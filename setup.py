@@ -59,7 +59,7 @@ setup(
             *scripts('nodes', ('driver', 'stage', 'calibration', 'screen', 'compensation',
                                'demo')),
             f'bench = {PACKAGE}.nodes.benchmark:main',
-            *scripts('tools', ('simulate', 'fit', 'apply', 'diagnose', 'blind', 'working',
+            *scripts('tools', ('simulate', 'fit', 'apply', 'noise', 'diagnose', 'blind', 'working',
                                'reproduce')),
         ],
     },

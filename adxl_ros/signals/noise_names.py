@@ -1,0 +1,108 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Noise parameters under the names and in the units of other software, ready to paste."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from adxl_ros.signals.axis_noise import AxisNoise
+import numpy as np
+
+_PX4_HZ = 100.0
+"""Rate of the filter of PX4, Hz: EKF2_PREDICT_US is 10 000."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """
+    A line of another program's settings.
+
+    Attributes
+    ----------
+    name
+        Name of the setting.
+    values
+        Its values: one, or nine of a matrix.
+    unit
+        Their unit, and what they are.
+
+    """
+
+    name: str
+    values: tuple[float, ...]
+    unit: str
+
+    def lines(self) -> list[str]:
+        """Return the setting in YAML, with its unit as a comment."""
+        texts = [_yaml_number(value) for value in self.values]
+        if len(texts) == 1:
+            return [f'{self.name}: {texts[0]}  # {self.unit}']
+        rows = [', '.join(texts[i:i + 3]) for i in range(0, len(texts), 3)]
+        return [f'{self.name}:  # {self.unit}', f'  [{rows[0]},',
+                *(f'   {row},' for row in rows[1:-1]), f'   {rows[-1]}]']
+
+
+def _yaml_number(value: float) -> str:
+    """Return three digits as YAML reads a floating-point number: 4.0e-05, not 4e-05."""
+    mantissa, e, exponent = f'{value:.3g}'.partition('e')
+    return f'{mantissa if "." in mantissa else f"{mantissa}.0"}{e}{exponent}'
+
+
+def settings(noises: list[AxisNoise], rate_hz: float) -> dict[str, list[Setting]]:
+    """
+    Return the settings of other programs.
+
+    kalibr takes N and K as they are. VINS-Fusion and PX4 add the variance of a value times the
+    square of the time step, so they take N·√rate and K·√rate, at the rate of their filter.
+    robot_localization takes the variance of a sample from the message. Programs that have one
+    value for all axes get the largest one. Where a random walk is not seen, it is its upper limit.
+
+    Parameters
+    ----------
+    noises
+        The noise by axis.
+    rate_hz
+        Sample rate, Hz.
+
+    Returns
+    -------
+    dict
+        Settings by program.
+
+    """
+    white = max(noise.fit.white.value for noise in noises)
+    walk = max((noise.fit.walk for noise in noises), key=lambda walk: walk.value)
+    limit = ''
+    if not walk.is_seen:
+        walk = max((noise.fit.walk for noise in noises), key=lambda walk: walk.high)
+        limit = ', an upper limit'
+    k = walk.value if walk.is_seen else walk.high
+    variances = [noise.sample_std ** 2 for noise in noises]
+    matrix = np.diag((variances + [1e6] * 3)[:3]).ravel()
+    return {
+        'kalibr, imu.yaml': [
+            Setting('accelerometer_noise_density', (white,), 'm/s^2/sqrt(Hz)'),
+            Setting('accelerometer_random_walk', (k,), f'm/s^3/sqrt(Hz){limit}'),
+            Setting('update_rate', (rate_hz,), 'Hz')],
+        f'VINS-Fusion, at {rate_hz:.4g} Hz': [
+            Setting('acc_n', (white * np.sqrt(rate_hz),), 'm/s^2'),
+            Setting('acc_w', (k * np.sqrt(rate_hz),), f'm/s^3{limit}')],
+        'robot_localization, in sensor_msgs/Imu of the driver': [
+            Setting('linear_acceleration_covariance', tuple(matrix.tolist()), '(m/s^2)^2')],
+        'PX4, its filter at 100 Hz; vibration in flight needs more': [
+            Setting('EKF2_ACC_NOISE', (white * np.sqrt(_PX4_HZ),), 'm/s^2, at least 0.01'),
+            Setting('EKF2_ACC_B_NOISE', (k * np.sqrt(_PX4_HZ),), f'm/s^3{limit}')],
+    }

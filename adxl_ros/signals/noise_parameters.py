@@ -1,0 +1,450 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+White noise, bias instability and random walk of a signal at rest, with intervals.
+
+The points of an Allan deviation are correlated, so a line through them has no simple interval.
+The fit therefore takes the cosine transform of the means of short cells. There a random walk and
+white noise have independent coefficients of known variance, and 1/f noise nearly so. The fit
+maximises the likelihood of the coefficients. The intervals are those of the profile likelihood.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from scipy.fft import dct, dst
+from scipy.optimize import brentq, nnls
+from scipy.stats import chi2
+
+INTERVAL = 0.90
+"""Probability of an interval. The usual one of the package."""
+_DROP = float(chi2.ppf(INTERVAL, 1))
+"""Twice the drop of the log likelihood at the ends of an interval."""
+_SINGLE = 64
+"""Coefficients of the lowest frequencies that are fitted one by one. Chosen: the terms change
+little between the further ones."""
+_WIDTH = 1.03
+"""Ratio of the frequencies of a group of further coefficients. Chosen: a term changes by 6 %."""
+_ROUNDS = 60
+"""Largest number of rounds of a fit. Chosen: usual are ten."""
+_CONVERGED = 1e-9
+"""Change of twice the log likelihood at which a fit ends."""
+_SMALLEST = 1e-4
+"""Square of a term, by the square at which it would dominate, from which an upper limit is
+searched. Chosen: it changes the likelihood of no recording."""
+_OCTAVE_PROBABILITY = 1e-3
+"""Probability by chance, below which an octave contradicts the three terms. Chosen: with ten
+octaves one healthy recording in a hundred."""
+_MARGIN_OCTAVES = 2
+"""Octaves below a filter's effect that are left out. Chosen: the effect falls by 16 in power."""
+_FEWEST = 32
+"""Fewest coefficients of a fit. Chosen: white noise is then known within 20 %."""
+
+_SEEN = 2.0
+"""Value of a term, in its standard deviations, from which an interval excludes 0. Chosen: the
+interval by the likelihood is a little wider than 1.64 of them."""
+_LONGEST_FACTOR = 1024
+"""Largest ratio of a needed time to the time of a recording. Chosen: minutes become days."""
+
+FLOOR = float(np.sqrt(2 * np.log(2) / np.pi))
+"""Allan deviation of bias instability divided by B: 0.664 (IEEE Std 952, equation C.15)."""
+
+
+class Estimate(NamedTuple):
+    """
+    A value with its interval.
+
+    Attributes
+    ----------
+    value
+        The most likely value.
+    low, high
+        Ends of the 90 % interval. Where `low` is 0 the term is not seen, and `high` is an upper
+        limit.
+
+    """
+
+    value: float
+    low: float
+    high: float
+
+    @property
+    def is_seen(self) -> bool:
+        """Whether the interval excludes 0."""
+        return self.low > 0
+
+    def scaled(self, factor: float) -> Estimate:
+        """Return the estimate in another unit."""
+        return Estimate(self.value * factor, self.low * factor, self.high * factor)
+
+
+class Octave(NamedTuple):
+    """
+    An octave of frequency whose power contradicts the fitted terms.
+
+    Attributes
+    ----------
+    low_hz, high_hz
+        Its bounds, Hz.
+    ratio
+        Measured power divided by the fitted power.
+
+    """
+
+    low_hz: float
+    high_hz: float
+    ratio: float
+
+
+@dataclass(frozen=True)
+class NoiseFit:
+    """
+    The noise of one axis; u is the unit of the signal.
+
+    Attributes
+    ----------
+    white
+        White noise N, u/√Hz: the density over positive and negative frequencies is N².
+    instability
+        Bias instability B, u: the density is B²/(2π·f).
+    walk
+        Random walk K, u/√s: the density is K²/(2π·f)².
+    highest
+        Number of cosine coefficients of the fit, from the lowest.
+    highest_hz
+        Frequency of the last one, Hz.
+    octaves
+        Octaves that contradict the fit. Above `highest_hz` only those with too much power.
+    log_likelihood
+        Largest log likelihood, up to a constant.
+
+    """
+
+    white: Estimate
+    instability: Estimate
+    walk: Estimate
+    highest: int
+    highest_hz: float
+    octaves: tuple[Octave, ...]
+    log_likelihood: float
+
+    @property
+    def squares(self) -> np.ndarray:
+        """N², B² and K², (3,)."""
+        return np.square([self.white.value, self.instability.value, self.walk.value])
+
+    def allan_deviation(self, tau_s: np.ndarray) -> np.ndarray:
+        """Return the Allan deviation of the fitted terms at times, s, (k,), in u."""
+        return np.sqrt(np.sum(np.square(self.lines(tau_s)), axis=0))
+
+    def lines(self, tau_s: np.ndarray) -> np.ndarray:
+        """Return the Allan deviations of N, B and K at times, s, (k,), in u, (3, k)."""
+        return np.stack([self.white.value / np.sqrt(tau_s),
+                         np.full(len(tau_s), FLOOR * self.instability.value),
+                         self.walk.value * np.sqrt(tau_s / 3)])
+
+
+@dataclass(frozen=True)
+class _Groups:
+    """
+    Groups of neighbouring coefficients.
+
+    Attributes
+    ----------
+    power
+        Mean square of the coefficients, (g,).
+    count
+        Number of coefficients, (g,).
+    shapes
+        Their mean variance for N², B² and K² of 1, (g, 3).
+    first
+        Number of the first coefficient, from 1, (g,).
+
+    """
+
+    power: np.ndarray
+    count: np.ndarray
+    shapes: np.ndarray
+    first: np.ndarray
+
+    def below(self, stop: int) -> _Groups:
+        """Return the groups that end before coefficient number `stop`."""
+        kept = self.first + self.count <= stop
+        return _Groups(self.power[kept], self.count[kept], self.shapes[kept], self.first[kept])
+
+
+def coefficients(means: np.ndarray) -> np.ndarray:
+    """Return the cosine coefficients 1 to n − 1 of means, (n,); coefficient k is at k/(2·T)."""
+    return dct(means - means.mean(), norm='ortho')[1:]
+
+
+def coefficient_variances(count: int, step_s: float) -> np.ndarray:
+    """
+    Return the variances of the cosine coefficients of cell means, for N, B and K of 1.
+
+    Those of white noise are equal. The means of a random walk have the inverse of the path's
+    Laplacian as covariance, whose eigenvectors are the cosines; the average within a cell adds
+    the factor (2 + cos ω)/3. For 1/f noise the diagonal of its covariance is computed. That
+    covariance is −B²/π·ln|t| up to a constant, averaged over two cells.
+
+    Parameters
+    ----------
+    count
+        Number of cells, n.
+    step_s
+        Length of a cell, s.
+
+    Returns
+    -------
+    ndarray
+        By coefficient and term, (n − 1, 3), in s⁻¹, 1 and s.
+
+    """
+    k = np.arange(1, count)
+    omega = np.pi * k / count
+    lag = np.arange(count + 1.0)
+    integral = np.zeros(count + 1)
+    integral[1:] = lag[1:] ** 2 * np.log(lag[1:])
+    covariance = np.empty(count)
+    covariance[0] = -integral[1]
+    covariance[1:] = -0.5 * (integral[2:] - 2 * integral[1:-1] + integral[:-2])
+    covariance -= covariance[-1]
+    even = dct(np.append((count - lag[:-1]) * covariance, 0.0), type=1)[1:-1]
+    odd = dst(covariance[1:], type=1) / np.sin(omega)
+    flicker = (even - odd) / count / np.pi
+    walk = step_s * (2 + np.cos(omega)) / (12 * np.sin(omega / 2) ** 2)
+    return np.column_stack([np.full(count - 1, 1 / step_s), flicker, walk])
+
+
+def fit_noise(means: np.ndarray, step_s: float, variances: np.ndarray | None = None,
+              highest: int | None = None) -> NoiseFit:
+    """
+    Fit white noise, bias instability and random walk to the means of cells.
+
+    Parameters
+    ----------
+    means
+        Means of neighbouring cells, u, (n,).
+    step_s
+        Length of a cell, s.
+    variances
+        Those of `coefficient_variances`, which axes of one recording share.
+    highest
+        Number of coefficients to use, from the lowest; None leaves out the frequencies at which
+        a filter or vibration shows.
+
+    Returns
+    -------
+    NoiseFit
+        The three terms with intervals.
+
+    """
+    if variances is None:
+        variances = coefficient_variances(len(means), step_s)
+    groups = _grouped(np.square(coefficients(means)), variances)
+    if highest is None:
+        highest = _highest(groups, len(means))
+    used = groups.below(highest)
+    theta, likelihood = _fit(used)
+    white, instability, walk = (_interval(used, theta, likelihood, term) for term in range(3))
+    span_s = 2 * len(means) * step_s
+    return NoiseFit(white, instability, walk, highest, highest / span_s,
+                    _contradictions(groups, theta, highest, span_s), likelihood)
+
+
+def needed_time_s(fit: NoiseFit, term: int, span_s: float) -> float:
+    """
+    Return how long a recording must be to show half of a term's upper limit.
+
+    The Fisher information of the cosine coefficients tells when the interval excludes 0.
+
+    Parameters
+    ----------
+    fit
+        The noise of a recording.
+    term
+        Index of the term: N, B or K.
+    span_s
+        Time of the recording, s.
+
+    Returns
+    -------
+    float
+        Time, s; `inf` beyond a thousand times that of the recording.
+
+    """
+    squares = fit.squares
+    squares[term] = ((fit.white, fit.instability, fit.walk)[term].high / 2) ** 2
+    factor = 1.0
+    while factor <= _LONGEST_FACTOR:
+        time_s = span_s * factor
+        stop = max(int(2 * time_s * fit.highest_hz), _FEWEST)
+        k = np.unique(np.geomspace(1, stop, 400).astype(int))
+        count = np.gradient(k.astype(float))
+        omega = np.pi * k / time_s
+        shapes = np.column_stack([np.ones(len(k)), 1 / omega, 1 / omega ** 2])
+        design = shapes * squares * (np.sqrt(count / 2) / (shapes @ squares))[:, None]
+        design = design[:, squares > 0]
+        place = int((squares[:term] > 0).sum())
+        std = np.sqrt(np.linalg.inv(design.T @ design)[place, place])
+        if std * _SEEN < 1:
+            return time_s
+        factor *= 2 ** 0.25
+    return float('inf')
+
+
+def _grouped(power: np.ndarray, variances: np.ndarray) -> _Groups:
+    """Group coefficients of power (n,) whose frequencies are nearly equal."""
+    edges = [*range(min(_SINGLE, len(power)))]
+    position = float(_SINGLE)
+    while position < len(power):
+        edges.append(int(position))
+        position = max(position * _WIDTH, position + 1)
+    first = np.array(edges)
+    count = np.diff(np.append(first, len(power)))
+    return _Groups(np.add.reduceat(power, first) / count, count,
+                   np.add.reduceat(variances, first) / count[:, None], first + 1)
+
+
+def _log_likelihood(groups: _Groups, theta: np.ndarray) -> float:
+    """Return the log likelihood of N², B² and K², (3,), up to a constant."""
+    variance = groups.shapes @ theta
+    if not (variance > 0).all():
+        return -np.inf
+    return -0.5 * float(groups.count @ (np.log(variance) + groups.power / variance))
+
+
+def _fit(groups: _Groups, fixed: int | None = None, value: float = 0.0
+         ) -> tuple[np.ndarray, float]:
+    """
+    Maximise the likelihood over N², B² and K² of 0 or more by Fisher scoring.
+
+    Parameters
+    ----------
+    groups
+        The coefficients.
+    fixed
+        Index of a term that keeps `value`; None for none.
+    value
+        The square of that term.
+
+    Returns
+    -------
+    theta : ndarray
+        N², B² and K², (3,).
+    likelihood : float
+        The log likelihood there.
+
+    """
+    free = [term for term in range(3) if term != fixed]
+    offset = groups.shapes[:, fixed] * value if fixed is not None else np.zeros(len(groups.power))
+    theta = np.zeros(3)
+    if fixed is not None:
+        theta[fixed] = value
+    white = max(float(np.median(groups.power - offset)), float(groups.power.min()))
+    theta[free[0]] = white / float(np.median(groups.shapes[:, free[0]]))
+    likelihood = _log_likelihood(groups, theta)
+    for _ in range(_ROUNDS):
+        weight = np.sqrt(groups.count) / (groups.shapes @ theta)
+        design = groups.shapes[:, free] * weight[:, None]
+        norm = np.linalg.norm(design, axis=0)
+        solution, _ = nnls(design / norm, (groups.power - offset) * weight)
+        step = -theta
+        step[free] += solution / norm
+        if fixed is not None:
+            step[fixed] = 0.0
+        better, gained = theta, 0.0
+        for halving in range(20):
+            trial = theta + step * 0.5 ** halving
+            gained = _log_likelihood(groups, trial) - likelihood
+            if gained > 0:
+                better = trial
+                break
+        if gained <= 0:
+            break
+        theta, likelihood = better, likelihood + gained
+        if 2 * gained < _CONVERGED:
+            break
+    return theta, likelihood
+
+
+def _interval(groups: _Groups, theta: np.ndarray, likelihood: float, term: int) -> Estimate:
+    """Return a term with the ends of its interval by the profile likelihood."""
+    def excess(logarithm: float) -> float:
+        """Return twice the drop of the profile likelihood, minus its limit."""
+        return 2 * (likelihood - _fit(groups, term, np.exp(logarithm))[1]) - _DROP
+
+    scale = float(np.min(groups.shapes @ theta / groups.shapes[:, term]))
+    best = float(theta[term])
+    low = 0.0
+    begin = np.log(best if best > 0 else scale * _SMALLEST)
+    if best > 0 and 2 * (likelihood - _fit(groups, term, 0.0)[1]) > _DROP:
+        bottom = begin - 1.0
+        while excess(bottom) < 0:
+            bottom -= 1.0
+        low = float(np.exp(brentq(excess, bottom, begin, xtol=1e-6)))
+    top = begin + 1.0
+    while excess(top) < 0:
+        top += 1.0
+    high = float(np.exp(brentq(excess, top - 1.0, top, xtol=1e-6)))
+    return Estimate(*(float(np.sqrt(square)) for square in (best, low, high)))
+
+
+def _highest(groups: _Groups, count: int) -> int:
+    """Return the number of the coefficient at which the fit stops: where a filter shows."""
+    stop = count
+    while stop > 2 * _FEWEST:
+        lower = groups.below(max(stop // 2, _FEWEST))
+        theta, _ = _fit(lower)
+        if _octave_probability(groups.below(stop), theta, stop // 2) > _OCTAVE_PROBABILITY:
+            break
+        stop //= 2
+    return max(stop >> _MARGIN_OCTAVES, min(count, _FEWEST))
+
+
+def _octave_probability(groups: _Groups, theta: np.ndarray, first: int) -> float:
+    """Return the two-sided probability of the power from coefficient `first` on."""
+    kept = groups.first >= first
+    freedom = int(groups.count[kept].sum())
+    if not freedom:
+        return 1.0
+    total = float(groups.count[kept] @ (groups.power[kept] / (groups.shapes[kept] @ theta)))
+    return 2 * float(min(chi2.cdf(total, freedom), chi2.sf(total, freedom)))
+
+
+def _contradictions(groups: _Groups, theta: np.ndarray, highest: int, span_s: float
+                    ) -> tuple[Octave, ...]:
+    """
+    Return the octaves whose power contradicts the fit; `span_s` is twice the time.
+
+    Above the fitted coefficients, less power is that of a filter.
+    """
+    octaves: list[Octave] = []
+    stop = int(groups.first[-1] + groups.count[-1])
+    while stop > _FEWEST:
+        octave = groups.below(stop)
+        begin = stop // 2
+        kept = octave.first >= begin
+        if kept.any() and _octave_probability(octave, theta, begin) < _OCTAVE_PROBABILITY:
+            counts = octave.count[kept]
+            ratio = float(counts @ (octave.power[kept] / (octave.shapes[kept] @ theta))
+                          / counts.sum())
+            if ratio > 1 or stop <= highest:
+                octaves.append(Octave(begin / span_s, stop / span_s, ratio))
+        stop = begin
+    return tuple(octaves[::-1])

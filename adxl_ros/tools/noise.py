@@ -1,0 +1,155 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Find the noise parameters of a sensor in a recording at rest."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from dataclasses import replace
+import json
+from pathlib import Path
+
+from adxl_ros.errors import UserError
+from adxl_ros.files import parameter_file, recording
+from adxl_ros.files.recording_columns import Recording, VOLTS
+from adxl_ros.files.stream_unit import unit_of
+from adxl_ros.model.sensor import Sensor
+from adxl_ros.signals.axis_noise import recording_noise, RecordingNoise, unknown_sensor, with_noise
+from adxl_ros.signals.still_stretch import longest_rest
+from adxl_ros.tools import noise_page, noise_text
+from adxl_ros.tools.closing_lines import print_end, quoted
+from adxl_ros.tools.command_line import argument_parser, command
+from adxl_ros.tools.common import make_folder, progress, report_reading, run, ShowDone
+import numpy as np
+
+_BLOCK_ROWS = 65536
+"""Samples that are read at a time (chosen: some MB)."""
+_EXAMPLES = {
+    'noise of each axis, with the Allan deviation as a page': 'still.mcap --report noise',
+    'a parameter file for compensation, diagnose and simulate':
+        'still.csv --params my_sensor.yaml -o my_noise.yaml',
+}
+"""Examples of arguments, by their purpose."""
+
+
+def parser() -> argparse.ArgumentParser:
+    """Describe the command line."""
+    parse = argument_parser('noise', __doc__, _EXAMPLES)
+    parse.add_argument('recording', metavar='RECORDING',
+                       help='rosbag2 directory, .mcap or CSV of a sensor that nobody touches')
+    parse.add_argument('--params', metavar='FILE', default=None,
+                       help='the other values of the sensor (default: the nominal sensor)')
+    parse.add_argument('-o', dest='output', metavar='FILE.yaml',
+                       help='a parameter file with the measured noise')
+    parse.add_argument('--report', metavar='DIR',
+                       help='write the page report.html, the curve allan.png and allan.csv there')
+    parse.add_argument('--json', action='store_true', help='print the result as JSON')
+    return parse
+
+
+def noise(options: argparse.Namespace) -> int:
+    """Run the tool; see `parser`."""
+    sensor = parameter_file.load(options.params or parameter_file.nominal_path())
+    source = _Source(options.recording, sensor)
+    with progress('noise') as show:
+        rest = longest_rest(lambda: source.blocks(show), source.accel_mps2)
+        result = recording_noise(options.recording, rest, source.axes,
+                                 lambda done: show(done, 'fit'))
+    report_reading('noise', source.last)
+    sensor = source.sensor(rest.rate_hz)
+    if not options.params and not source.is_described:
+        sensor = unknown_sensor(sensor, result.axes)
+    files: list[Path] = []
+    if options.report:
+        make_folder(Path(options.report))
+        files += noise_page.write(Path(options.report), result)
+    if options.output:
+        fresh = with_noise(sensor, result.axes)
+        provenance = {**fresh.provenance, 'noise_from': Path(options.recording).name}
+        parameter_file.save(options.output, replace(fresh, provenance=provenance),
+                            noise_text.comments(result))
+        files.insert(0, Path(options.output))
+    if options.json:
+        print(json.dumps(noise_text.as_json(result), indent=1))
+        return 0
+    _print(options, result, files)
+    return 0
+
+
+class _Source:
+    """
+    The recording and its unit.
+
+    Attributes
+    ----------
+    axes
+        Measured axes, known after the first block.
+    last
+        The newest block.
+    is_described
+        Whether the recording states the nominal values of its sensor, or has volts.
+
+    """
+
+    def __init__(self, path: str, sensor: Sensor) -> None:
+        self._path = path
+        self._sensor = sensor
+        self._unit: Sensor | None = None
+        self.axes = ''
+        self.is_described = False
+
+    def blocks(self, show: ShowDone) -> Iterator[Recording]:
+        """Yield the blocks of the recording, and show how much has been read."""
+        for block in recording.blocks(self._path, _BLOCK_ROWS):
+            self.last = block
+            yield block
+            show(block.done, 'read')
+
+    def accel_mps2(self, block: Recording) -> np.ndarray:
+        """Return the specific force of a block by the nominal values, m/s², (n, m)."""
+        if self._unit is None:
+            self.axes = block.axes
+            self.is_described = (block.sensor_columns[0] in VOLTS
+                                 or 'nominal_scale_v_per_g' in block.info)
+            self._unit = unit_of(self._sensor, block.stream_info, block.axes)
+        return block.accel_mps2(self._unit)
+
+    def sensor(self, rate_hz: float) -> Sensor:
+        """Return the sensor of the parameter file, with the axes and rate of the recording."""
+        assert self._unit is not None
+        if self._sensor.effects and self._sensor.axes != self.axes:
+            raise UserError(f'{self._path}: has the axes {self.axes}, but the parameters of '
+                            f'{self._sensor.serial} are for {self._sensor.axes}; name the '
+                            'parameter file of this sensor')
+        base = self._sensor if self._sensor.effects else self._unit
+        return replace(base, serial=self._unit.serial, rate_hz=round(rate_hz, 6))
+
+
+def _print(options: argparse.Namespace, result: RecordingNoise, files: list[Path]) -> None:
+    """Print the result, the files and the next command."""
+    for line in [*noise_text.head(result), '', *noise_text.tables(result), '',
+                 *noise_text.paste_lines(result), '']:
+        print(line)
+    warnings = noise_text.warnings(result)
+    following = command('diagnose', f'RECORDING --params {quoted(options.output)} -o gap') \
+        if options.output else command('noise', f'{quoted(options.recording)} -o noise.yaml')
+    print_end([*(f'WARNING {text}' for text in warnings), *([''] if warnings else [])], files,
+              following)
+
+
+def main() -> int:
+    """Run the tool on the command line."""
+    return run(parser(), noise)

@@ -1,0 +1,109 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The page and the plot of `noise`: the Allan deviation with the fitted lines."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from adxl_ros.files.atomic_write import write_text
+from adxl_ros.files.csv_writer import CsvWriter
+from adxl_ros.files.html_page import document, picture, table
+from adxl_ros.files.plot_file import pyplot, write_plot
+from adxl_ros.signals.axis_noise import RecordingNoise, TERMS
+from adxl_ros.tools import noise_text
+
+_INCHES = (5.0, 4.4)
+"""Width and height of the plot of an axis, inches. Chosen: three fit beside each other."""
+
+
+def write(folder: Path, result: RecordingNoise) -> list[Path]:
+    """
+    Write the page, the plot and the curve.
+
+    Parameters
+    ----------
+    folder
+        Where to.
+    result
+        The noise of a recording.
+
+    Returns
+    -------
+    list
+        The files.
+
+    Raises
+    ------
+    UserError
+        A file cannot be written, or matplotlib is not installed.
+
+    """
+    page, plot, curve = (folder / name for name in ('report.html', 'allan.png', 'allan.csv'))
+    figure = _plot(result)
+    write_text(page, _page(result, figure))
+    write_plot(figure, plot)
+    with CsvWriter(curve) as file:
+        file.write({'tau_s': result.rest.allan.tau_s, 'averages': result.rest.allan.averages,
+                    **{f'{noise.axis}_mps2': result.rest.allan.deviation[:, i]
+                       for i, noise in enumerate(result.axes)}})
+    return [page, plot, curve]
+
+
+def _page(result: RecordingNoise, figure: Any) -> str:
+    """Return the page."""
+    warnings = noise_text.warnings(result)
+    summary = '\n'.join(noise_text.head(result))
+    rows = [[noise.axis, *(noise_text.interval(estimate.scaled(noise_text.MICRO_G))
+                           for estimate in noise.estimates),
+             f'{noise.lowest * noise_text.MICRO_G:.3g} at {noise.lowest_s:.3g} s',
+             f'{noise.sample_std:.3g}', f'{noise.fit.highest_hz:.3g}'] for noise in result.axes]
+    parts = ['<h1>Noise at rest</h1>', f'<pre class="summary">{summary}</pre>',
+             *(f'<p class="summary open">{text}</p>' for text in warnings),
+             table(['axis', 'white noise N, µg/√Hz', 'bias instability B, µg',
+                    'random walk K, µg/√s', 'lowest Allan deviation, µg',
+                    'noise of a sample, m/s²', 'fitted below, Hz'], rows),
+             picture(figure, 'Allan deviation of each axis over the averaging time'),
+             '<p>Dots: overlapping Allan deviation, with its standard deviation. Lines: N/√τ, '
+             '0.664·B, K·√(τ/3) and the root of their squares. The lines are fitted to the '
+             'cosine transform of the samples, not to the dots.</p>',
+             '<h2>Ready to paste</h2>',
+             f'<pre>{chr(10).join(noise_text.paste_lines(result))}</pre>']
+    return document('Noise at rest', parts)
+
+
+def _plot(result: RecordingNoise) -> Any:
+    """Return the plot of the Allan deviation by axis."""
+    figure, axes = pyplot().subplots(1, len(result.axes), squeeze=False, sharey=True,
+                                     figsize=(_INCHES[0] * len(result.axes), _INCHES[1]),
+                                     layout='constrained')
+    tau_s, error = result.rest.allan.tau_s, result.rest.allan.relative_error
+    for i, (noise, plot) in enumerate(zip(result.axes, axes[0])):
+        measured = result.rest.allan.deviation[:, i] * noise_text.MICRO_G
+        plot.errorbar(tau_s, measured, yerr=measured * error.clip(max=0.9), fmt='o', ms=4,
+                      color='#36c', label='measured')
+        for name, line, estimate in zip(TERMS, noise.fit.lines(tau_s), noise.estimates):
+            if estimate.is_seen:
+                plot.plot(tau_s, line * noise_text.MICRO_G, '--', lw=1,
+                          label=f'{noise_text.NAMES[name]}')
+        plot.plot(tau_s, noise.fit.allan_deviation(tau_s) * noise_text.MICRO_G, color='#222',
+                  lw=1, label='all three')
+        plot.set(xscale='log', yscale='log', title=f'axis {noise.axis}',
+                 xlabel='averaging time τ, s', ylim=(measured.min() / 3, measured.max() * 2))
+        plot.grid(True, which='both', alpha=0.3)
+        plot.legend(fontsize=8)
+    axes[0][0].set_ylabel('Allan deviation, µg')
+    return figure

@@ -1,0 +1,90 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The overlapping Allan deviation: equal to that of allantools, in bounded memory."""
+
+import tracemalloc
+
+from adxl_ros.signals import allan_deviation
+from adxl_ros.signals.allan_deviation import AllanDeviation, AllanStream, CellMeans
+import allantools
+import numpy as np
+import pytest
+from still_noise import still_samples
+
+
+def streamed(samples: np.ndarray, rate_hz: float, portion: int) -> AllanDeviation:
+    stream, cells = AllanStream(samples.shape[1]), CellMeans(samples.shape[1])
+    for start in range(0, len(samples), portion):
+        stream.feed(samples[start:start + portion])
+        cells.feed(samples[start:start + portion])
+    return stream.result(rate_hz, cells)
+
+
+@pytest.mark.parametrize('portion', [1, 777, 65536])
+@pytest.mark.parametrize('count', [9, 5000, 300_001])
+def test_equal_to_allantools(count: int, portion: int) -> None:
+    if count > 1000 * portion:
+        return
+    rng = np.random.default_rng(1)
+    samples = 9.8 + np.column_stack([still_samples(rng, count, 100.0, 1e-3, 1e-4, 1e-5)
+                                     for _ in range(2)])
+    measured = streamed(samples, 100.0, portion)
+    for axis in range(2):
+        tau_s, expected, _, _ = allantools.oadev(samples[:, axis], 100.0, 'freq',
+                                                 measured.tau_s)
+        assert measured.tau_s == pytest.approx(tau_s)
+        assert measured.deviation[:, axis] == pytest.approx(expected, rel=1e-9)
+
+
+def test_long_times_from_cells(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Times beyond all overlaps are those of allantools within a thousandth."""
+    monkeypatch.setattr(allan_deviation, '_LONGEST', 1 << 10)
+    monkeypatch.setattr(allan_deviation, '_MOST_CELLS', 1 << 12)
+    rng = np.random.default_rng(2)
+    samples = still_samples(rng, 400_000, 100.0, 1e-3, 1e-4, 1e-4)[:, None]
+    measured = streamed(samples, 100.0, 65536)
+    _, expected, _, _ = allantools.oadev(samples[:, 0], 100.0, 'freq', measured.tau_s)
+    assert len(measured.tau_s) == 18
+    assert measured.deviation[:11, 0] == pytest.approx(expected[:11], rel=1e-9)
+    assert measured.deviation[11:, 0] == pytest.approx(expected[11:], rel=1e-2)
+
+
+def test_memory_does_not_grow_with_the_stream(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(allan_deviation, '_LONGEST', 1 << 12)
+    monkeypatch.setattr(allan_deviation, '_MOST_CELLS', 1 << 10)
+    block = np.random.default_rng(3).standard_normal((8192, 3))
+    stream, cells, peaks = AllanStream(3), CellMeans(3), []
+    tracemalloc.start()
+    for _ in range(3):
+        for _ in range(40):
+            stream.feed(block)
+            cells.feed(block)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+    tracemalloc.stop()
+    assert peaks[2] < 1.05 * peaks[0]
+    assert stream.count == 3 * 40 * 8192
+
+
+def test_cell_means_do_not_depend_on_the_portions(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(allan_deviation, '_MOST_CELLS', 64)
+    samples = np.random.default_rng(4).standard_normal((1000, 2))
+    cells = CellMeans(2)
+    for start in range(0, 1000, 7):
+        cells.feed(samples[start:start + 7])
+    assert cells.size == 16
+    assert cells.count == 62
+    expected = samples[:992].reshape(62, 16, 2)
+    assert cells.means == pytest.approx(expected.mean(axis=1))
+    assert cells.squares == pytest.approx(16 * expected.var(axis=1))

@@ -1,0 +1,164 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The tool `noise`: its figures, its files, and recordings that are too short or not still."""
+
+import json
+from pathlib import Path
+import subprocess
+
+from adxl_ros.files import parameter_file
+import allantools
+import numpy as np
+from processes import run_executable
+import pytest
+from still_noise import still_samples, write_csv
+import yaml
+
+RATE_HZ = 50.0
+N, B, K = 1e-3, 2e-4, 2e-5
+G = 9.80665
+
+
+def samples(seconds: float, seed: int = 1, terms: tuple[float, float, float] = (N, B, K)
+            ) -> tuple[np.ndarray, np.ndarray]:
+    """Return stamps and three axes at rest with z up."""
+    rng, count = np.random.default_rng(seed), int(seconds * RATE_HZ)
+    axes = [still_samples(rng, count, RATE_HZ, *terms) for _ in range(3)]
+    return np.arange(count) / RATE_HZ, np.column_stack(axes) + [0.0, 0.0, G]
+
+
+def run(folder: Path, *arguments: str) -> subprocess.CompletedProcess:
+    done = run_executable('noise', *arguments, cwd=folder)
+    assert (done.returncode, done.stderr) == (0, '')
+    return done
+
+
+def as_json(folder: Path, *arguments: str) -> dict:
+    return json.loads(run(folder, *arguments, '--json').stdout)
+
+
+def test_terms_curve_files_and_settings(tmp_path: Path) -> None:
+    time_s, accel = samples(3600.0)
+    write_csv(tmp_path / 'still.csv', time_s, accel)
+    result = as_json(tmp_path, 'still.csv', '-o', 'noise.yaml', '--report', 'page')
+    for axis in result['axes'].values():
+        assert axis['white']['ci'][0] <= N * 1.01
+        assert axis['white']['ci'][1] >= N * 0.99
+        assert axis['instability']['ci'][0] <= 1.5 * B
+        assert axis['instability']['ci'][1] >= B / 1.5
+        assert axis['density_g_per_rthz'] == pytest.approx(np.sqrt(2) * N / G, rel=0.03)
+        assert axis['sample_std_mps2'] == pytest.approx(N * np.sqrt(RATE_HZ), rel=0.03)
+    curve = result['allan_deviation']
+    for i, name in enumerate('xyz'):
+        _, expected, _, _ = allantools.oadev(accel[:, i], RATE_HZ, 'freq', curve['tau_s'])
+        assert curve[name] == pytest.approx(expected, rel=1e-6)
+    settings = {name: value for program in result['settings'].values()
+                for name, value in program.items()}
+    assert settings['accelerometer_noise_density'] == pytest.approx(N, rel=0.05)
+    assert settings['acc_n'] == pytest.approx(N * np.sqrt(RATE_HZ), rel=0.05)
+    assert settings['EKF2_ACC_NOISE'] == pytest.approx(N * 10, rel=0.05)
+    assert settings['linear_acceleration_covariance'][4] == pytest.approx(N ** 2 * RATE_HZ,
+                                                                           rel=0.1)
+    assert {path.name for path in (tmp_path / 'page').iterdir()} == {
+        'report.html', 'allan.png', 'allan.csv'}
+    sensor = parameter_file.load(tmp_path / 'noise.yaml')
+    assert sensor.axes == 'xyz'
+    assert sensor.noise_density_g_per_rthz == pytest.approx(np.full(3, np.sqrt(2) * N / G),
+                                                            rel=0.03)
+    assert 'flicker' in sensor.effects
+    # Neither the filter nor the converter of the nominal sensor is this one's.
+    assert (sensor.rc_s, sensor.adc_bits, sensor.rate_hz) == (0.0, 0, RATE_HZ)
+
+
+def test_diagnose_takes_the_measured_noise(tmp_path: Path) -> None:
+    """A sensor at rest shows no effect, so that there is no verdict, but its gap is its noise."""
+    write_csv(tmp_path / 'still.csv', *samples(300.0))
+    run(tmp_path, 'still.csv', '-o', 'noise.yaml')
+    run_executable('diagnose', 'still.csv', '--params', 'noise.yaml', '-o', 'gap', cwd=tmp_path)
+    report = json.loads((tmp_path / 'gap' / 'report.json').read_text())
+    assert report['verdict']['effects'] == []
+    assert report['gap']['before'] == pytest.approx(report['gap']['floor'], rel=0.05)
+
+
+def test_the_lines_to_paste_are_yaml(tmp_path: Path) -> None:
+    write_csv(tmp_path / 'still.csv', *samples(60.0))
+    text = run(tmp_path, 'still.csv').stdout
+    assert max(map(len, text.splitlines())) <= 79
+    pasted = text[text.index('# kalibr'):text.index('WARNING')]
+    values = yaml.safe_load(pasted)
+    assert isinstance(values['accelerometer_random_walk'], float)
+    assert all(isinstance(value, float) for value in values['linear_acceleration_covariance'])
+    assert {'acc_n', 'acc_w', 'EKF2_ACC_NOISE', 'EKF2_ACC_B_NOISE'} <= set(values)
+
+
+def test_a_short_recording_says_how_long_it_must_be(tmp_path: Path) -> None:
+    write_csv(tmp_path / 'still.csv', *samples(60.0, terms=(N, 0.0, 0.0)))
+    result = as_json(tmp_path, 'still.csv')
+    assert result['axes']['x']['walk']['value'] is None
+    assert result['axes']['x']['walk']['ci'][1] > 0
+    warning = next(text for text in result['warnings'] if 'random walk K' in text)
+    assert 'too short' in warning
+    assert 'record about' in warning
+
+
+def test_motion_is_left_out_and_named(tmp_path: Path) -> None:
+    time_s, accel = samples(600.0)
+    accel[(time_s > 400) & (time_s < 402), 0] += 3.0
+    accel[time_s > 401, 1] += 1.0
+    write_csv(tmp_path / 'moved.csv', time_s, accel)
+    result = as_json(tmp_path, 'moved.csv')
+    assert result['rest_s'][0] == 0.0
+    assert 380 < result['rest_s'][1] <= 400
+    assert result['axes']['y']['white']['value'] == pytest.approx(N, rel=0.05)
+    assert any('not still' in text for text in result['warnings'])
+
+
+def test_temperature_is_named(tmp_path: Path) -> None:
+    time_s, accel = samples(1800.0, terms=(N, 0.0, 0.0))
+    temperature_c = 25 + 4 * (1 - np.exp(-time_s / 600))
+    accel[:, 2] += 2e-3 * temperature_c
+    write_csv(tmp_path / 'warm.csv', time_s, accel, temperature_c=temperature_c)
+    result = as_json(tmp_path, 'warm.csv')
+    warning = next(text for text in result['warnings'] if 'temperature' in text)
+    assert warning.startswith('z: ')
+
+
+def test_a_few_lost_samples_are_filled_and_a_long_gap_is_not(tmp_path: Path) -> None:
+    time_s, accel = samples(600.0)
+    kept = np.ones(len(time_s), bool)
+    kept[1000:1020] = False
+    write_csv(tmp_path / 'lost.csv', time_s[kept], accel[kept])
+    result = as_json(tmp_path, 'lost.csv')
+    assert (result['filled_samples'], result['samples']) == (20, 30000)
+    kept[10000:10200] = False
+    write_csv(tmp_path / 'gap.csv', time_s[kept], accel[kept])
+    result = as_json(tmp_path, 'gap.csv')
+    assert result['rest_s'][0] == pytest.approx(10200 / RATE_HZ)
+    assert any('interrupted' in text for text in result['warnings'])
+
+
+@pytest.mark.parametrize(('change', 'reason'), [('stuck', 'az_mps2 never changes'),
+                                                ('short', 'record longer')])
+def test_refusals_are_one_line(tmp_path: Path, change: str, reason: str) -> None:
+    time_s, accel = samples(60.0 if change == 'stuck' else 5.0)
+    if change == 'stuck':
+        accel[:, 2] = G
+    write_csv(tmp_path / 'bad.csv', time_s, accel)
+    done = run_executable('noise', 'bad.csv', '-o', 'noise.yaml', cwd=tmp_path)
+    assert done.returncode == 1
+    assert done.stderr.startswith('noise: bad.csv: ')
+    assert reason in done.stderr
+    assert done.stderr.count('\n') == 1
+    assert not (tmp_path / 'noise.yaml').exists()
