@@ -91,7 +91,7 @@ class CellMeans:
 
     @property
     def squares(self) -> np.ndarray:
-        """Sums of the squared deviations from the mean by cell and column, (k, c)."""
+        """Squared deviations from the mean, summed by cell and column, (k, c)."""
         return self._squares[:self.count]
 
     def feed(self, rows: np.ndarray) -> None:

@@ -163,7 +163,7 @@ class _Segment:
 
     @property
     def count(self) -> int:
-        """Number of samples."""
+        """Count of the samples."""
         return self.allan.count
 
     @property

@@ -69,8 +69,8 @@ def test_terms_curve_files_and_settings(tmp_path: Path) -> None:
     assert settings['accelerometer_noise_density'] == pytest.approx(N, rel=0.05)
     assert settings['acc_n'] == pytest.approx(N * np.sqrt(RATE_HZ), rel=0.05)
     assert settings['EKF2_ACC_NOISE'] == pytest.approx(N * 10, rel=0.05)
-    assert settings['linear_acceleration_covariance'][4] == pytest.approx(N ** 2 * RATE_HZ,
-                                                                           rel=0.1)
+    variances = settings['linear_acceleration_covariance']
+    assert variances[4] == pytest.approx(N ** 2 * RATE_HZ, rel=0.1)
     assert {path.name for path in (tmp_path / 'page').iterdir()} == {
         'report.html', 'allan.png', 'allan.csv'}
     sensor = parameter_file.load(tmp_path / 'noise.yaml')
