@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.sensor import Sensor
@@ -38,11 +39,9 @@ TERMS = ('white', 'instability', 'walk')
 _UNFILTERED = 0.8
 """Variance of a sample, divided by that of unfiltered white noise, from which there is no filter.
 Chosen: a filter at a third of the sample rate."""
-_FILTER_OHM = 1000.0
+_FILTER_OHM = 1.0e4
 """Resistance of the filter that stands for an unknown one, Ω. Chosen: only the product with the
 capacitor matters."""
-_UNKNOWN_RANGE_G = 1000.0
-"""Range that stands for an unknown one, g: the largest that a parameter file can have."""
 
 
 @dataclass(frozen=True)
@@ -162,10 +161,14 @@ def with_noise(sensor: Sensor, noises: list[AxisNoise]) -> Sensor:
     positive frequencies is B²/(π·f), and random walk is `bias_walk`. A term that is not seen on
     an axis is 0 there.
 
+    Where the filter is not stated, it is the first-order one that gives a sample the measured
+    noise: white noise of the density 2·N² over positive frequencies has the variance N²/(2·RC)
+    behind it.
+
     Parameters
     ----------
     sensor
-        The sensor, with the axes of the recording.
+        The sensor, with the axes and the rate of the recording.
     noises
         The noise by axis.
 
@@ -184,35 +187,18 @@ def with_noise(sensor: Sensor, noises: list[AxisNoise]) -> Sensor:
     if walk.any():
         values['bias_walk'] = {'density_g_per_rts': walk}
     kept = [name for name in sensor.effects if name in values]
-    effects = (*kept, *(name for name in values if name not in kept))
-    return replace(sensor, effects=effects, values=values,
-                   noise_density_g_per_rthz=np.array(list(map(density_g_per_rthz, noises))))
+    changed: dict[str, Any] = {
+        'effects': (*kept, *(name for name in values if name not in kept)), 'values': values,
+        'noise_density_g_per_rthz': np.array(list(map(density_g_per_rthz, noises)))}
+    if 'rc_capacitance_f' in sensor.unstated:
+        changed |= {'rc_resistance_ohm': _FILTER_OHM,
+                    'rc_capacitance_f': _filter_s(noises, sensor.rate_hz) / _FILTER_OHM}
+    unstated = tuple(name for name in sensor.unstated if name not in changed)
+    return replace(sensor, unstated=unstated, **changed)
 
 
-def unknown_sensor(sensor: Sensor, noises: list[AxisNoise]) -> Sensor:
-    """
-    Remove from a sensor what only its datasheet states, and what the recording contradicts.
-
-    The filter is the first-order one that gives a sample the measured noise: white noise of the
-    density 2·N² over positive frequencies has the variance N²/(2·RC) behind it. The ADC and the
-    range are left open.
-
-    Parameters
-    ----------
-    sensor
-        A nominal sensor with the axes of the recording.
-    noises
-        The noise by axis.
-
-    Returns
-    -------
-    Sensor
-        The sensor without values of another one.
-
-    """
-    white = np.mean([noise.fit.white.value ** 2 for noise in noises])
-    variance = np.mean([noise.sample_std ** 2 for noise in noises])
-    filtered = variance < _UNFILTERED * white * sensor.rate_hz
-    capacitance_f = float(white / (2 * variance) / _FILTER_OHM) if filtered else 0.0
-    return replace(sensor, rc_resistance_ohm=_FILTER_OHM, rc_capacitance_f=capacitance_f,
-                   adc_bits=0, range_g=_UNKNOWN_RANGE_G, datasheet_name='', datasheet={})
+def _filter_s(noises: list[AxisNoise], rate_hz: float) -> float:
+    """Return the time constant that the noise of a sample shows, s; 0 for no filter."""
+    white = float(np.mean([noise.fit.white.value ** 2 for noise in noises]))
+    variance = float(np.mean([noise.sample_std ** 2 for noise in noises]))
+    return white / (2 * variance) if variance < _UNFILTERED * white * rate_hz else 0.0

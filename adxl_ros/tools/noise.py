@@ -24,15 +24,16 @@ from pathlib import Path
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file, recording
-from adxl_ros.files.recording_columns import Recording, VOLTS
+from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.stream_unit import unit_of
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.signals.axis_noise import recording_noise, RecordingNoise, unknown_sensor, with_noise
+from adxl_ros.signals.axis_noise import recording_noise, RecordingNoise, with_noise
 from adxl_ros.signals.still_stretch import longest_rest
 from adxl_ros.tools import noise_page, noise_text
 from adxl_ros.tools.closing_lines import print_end, quoted
 from adxl_ros.tools.command_line import argument_parser, command
 from adxl_ros.tools.common import make_folder, progress, report_reading, run, ShowDone
+from adxl_ros.tools.recorded_sensor import load_sensor
 import numpy as np
 
 _BLOCK_ROWS = 65536
@@ -51,7 +52,8 @@ def parser() -> argparse.ArgumentParser:
     parse.add_argument('recording', metavar='RECORDING',
                        help='rosbag2 directory, .mcap or CSV of a sensor that nobody touches')
     parse.add_argument('--params', metavar='FILE', default=None,
-                       help='the other values of the sensor (default: the nominal sensor)')
+                       help='the other values of the sensor (default: the nominal sensor; for a '
+                            'recording in m/s² that names no sensor, any IMU)')
     parse.add_argument('-o', dest='output', metavar='FILE.yaml',
                        help='a parameter file with the measured noise')
     parse.add_argument('--report', metavar='DIR',
@@ -62,22 +64,18 @@ def parser() -> argparse.ArgumentParser:
 
 def noise(options: argparse.Namespace) -> int:
     """Run the tool; see `parser`."""
-    sensor = parameter_file.load(options.params or parameter_file.nominal_path())
-    source = _Source(options.recording, sensor)
+    source = _Source(options.recording, options.params)
     with progress('noise') as show:
         rest = longest_rest(lambda: source.blocks(show), source.accel_mps2)
         result = recording_noise(options.recording, rest, source.axes,
                                  lambda done: show(done, 'fit'))
     report_reading('noise', source.last)
-    sensor = source.sensor(rest.rate_hz)
-    if not options.params and not source.is_described:
-        sensor = unknown_sensor(sensor, result.axes)
     files: list[Path] = []
     if options.report:
         make_folder(Path(options.report))
         files += noise_page.write(Path(options.report), result)
     if options.output:
-        fresh = with_noise(sensor, result.axes)
+        fresh = with_noise(source.sensor(rest.rate_hz), result.axes)
         provenance = {**fresh.provenance, 'noise_from': Path(options.recording).name}
         parameter_file.save(options.output, replace(fresh, provenance=provenance),
                             noise_text.comments(result))
@@ -99,17 +97,15 @@ class _Source:
         Measured axes, known after the first block.
     last
         The newest block.
-    is_described
-        Whether the recording states the nominal values of its sensor, or has volts.
 
     """
 
-    def __init__(self, path: str, sensor: Sensor) -> None:
+    def __init__(self, path: str, params: str | None) -> None:
         self._path = path
-        self._sensor = sensor
+        self._params = params
+        self._sensor: Sensor | None = None
         self._unit: Sensor | None = None
         self.axes = ''
-        self.is_described = False
 
     def blocks(self, show: ShowDone) -> Iterator[Recording]:
         """Yield the blocks of the recording, and show how much has been read."""
@@ -122,14 +118,13 @@ class _Source:
         """Return the specific force of a block by the nominal values, m/s², (n, m)."""
         if self._unit is None:
             self.axes = block.axes
-            self.is_described = (block.sensor_columns[0] in VOLTS
-                                 or 'nominal_scale_v_per_g' in block.info)
+            self._sensor = load_sensor(self._params, block)
             self._unit = unit_of(self._sensor, block.stream_info, block.axes)
         return block.accel_mps2(self._unit)
 
     def sensor(self, rate_hz: float) -> Sensor:
         """Return the sensor of the parameter file, with the axes and rate of the recording."""
-        assert self._unit is not None
+        assert self._unit is not None and self._sensor is not None
         if self._sensor.effects and self._sensor.axes != self.axes:
             raise UserError(f'{self._path}: has the axes {self.axes}, but the parameters of '
                             f'{self._sensor.serial} are for {self._sensor.axes}; name the '

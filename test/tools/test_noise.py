@@ -73,13 +73,14 @@ def test_terms_curve_files_and_settings(tmp_path: Path) -> None:
     assert variances[4] == pytest.approx(N ** 2 * RATE_HZ, rel=0.1)
     assert {path.name for path in (tmp_path / 'page').iterdir()} == {
         'report.html', 'allan.png', 'allan.csv'}
-    sensor = parameter_file.load(tmp_path / 'noise.yaml')
+    sensor = parameter_file.load(tmp_path / 'noise.yaml', may_measure=True)
     assert sensor.axes == 'xyz'
     assert sensor.noise_density_g_per_rthz == pytest.approx(np.full(3, np.sqrt(2) * N / G),
                                                             rel=0.03)
     assert 'flicker' in sensor.effects
-    # Neither the filter nor the converter of the nominal sensor is this one's.
-    assert (sensor.rc_s, sensor.adc_bits, sensor.rate_hz) == (0.0, 0, RATE_HZ)
+    # Nothing of the nominal sensor is in the file: a rest shows neither range nor resolution.
+    assert (sensor.rc_s, sensor.rate_hz) == (0.0, RATE_HZ)
+    assert set(sensor.unstated) == {'range_g', 'adc_bits', 'adc_vref_v'}
 
 
 def test_diagnose_takes_the_measured_noise(tmp_path: Path) -> None:
