@@ -34,14 +34,20 @@ from adxl_ros.tools.closing_lines import print_end, quoted
 from adxl_ros.tools.command_line import argument_parser, command
 from adxl_ros.tools.common import make_folder, progress, report_reading, run, ShowDone
 from adxl_ros.tools.recorded_sensor import load_sensor
+from adxl_ros.tools.recording_options import (
+    add_recording_options,
+    reading_options,
+    RECORDING_HELP,
+)
 import numpy as np
 
 _BLOCK_ROWS = 65536
 """Samples that are read at a time (chosen: some MB)."""
 _EXAMPLES = {
     'noise of each axis, with the Allan deviation as a page': 'still.mcap --report noise',
-    'a parameter file for compensation, diagnose and simulate':
+    'a parameter file for compensation and diagnose':
         'still.csv --params my_sensor.yaml -o my_noise.yaml',
+    "a camera's IMU in a bag": 'bag --topic /camera/imu',
 }
 """Examples of arguments, by their purpose."""
 
@@ -50,7 +56,7 @@ def parser() -> argparse.ArgumentParser:
     """Describe the command line."""
     parse = argument_parser('noise', __doc__, _EXAMPLES)
     parse.add_argument('recording', metavar='RECORDING',
-                       help='rosbag2 directory, .mcap or CSV of a sensor that nobody touches')
+                       help=f'{RECORDING_HELP}; of a sensor that nobody touches')
     parse.add_argument('--params', metavar='FILE', default=None,
                        help='the other values of the sensor (default: the nominal sensor; for a '
                             'recording in m/s² that names no sensor, any IMU)')
@@ -59,12 +65,13 @@ def parser() -> argparse.ArgumentParser:
     parse.add_argument('--report', metavar='DIR',
                        help='write the page report.html, the curve allan.png and allan.csv there')
     parse.add_argument('--json', action='store_true', help='print the result as JSON')
+    add_recording_options(parse)
     return parse
 
 
 def noise(options: argparse.Namespace) -> int:
     """Run the tool; see `parser`."""
-    source = _Source(options.recording, options.params)
+    source = _Source(options)
     with progress('noise') as show:
         rest = longest_rest(lambda: source.blocks(show), source.accel_mps2)
         result = recording_noise(options.recording, rest, source.axes,
@@ -100,16 +107,17 @@ class _Source:
 
     """
 
-    def __init__(self, path: str, params: str | None) -> None:
-        self._path = path
-        self._params = params
+    def __init__(self, options: argparse.Namespace) -> None:
+        self._path = options.recording
+        self._params = options.params
+        self._reading = reading_options(options)
         self._sensor: Sensor | None = None
         self._unit: Sensor | None = None
         self.axes = ''
 
     def blocks(self, show: ShowDone) -> Iterator[Recording]:
         """Yield the blocks of the recording, and show how much has been read."""
-        for block in recording.blocks(self._path, _BLOCK_ROWS):
+        for block in recording.blocks(self._path, _BLOCK_ROWS, self._reading):
             self.last = block
             yield block
             show(block.done, 'read')

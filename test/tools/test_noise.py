@@ -163,3 +163,13 @@ def test_refusals_are_one_line(tmp_path: Path, change: str, reason: str) -> None
     assert reason in done.stderr
     assert done.stderr.count('\n') == 1
     assert not (tmp_path / 'noise.yaml').exists()
+
+
+def test_a_foreign_log_in_g_and_milliseconds(tmp_path: Path) -> None:
+    time_s, accel = samples(120.0)
+    table = np.column_stack([1e3 * time_s, accel / G])
+    np.savetxt(tmp_path / 'log.csv', table, fmt='%.9g', delimiter=';',
+               header='t_ms;accX;accY;accZ', comments='')
+    result = as_json(tmp_path, 'log.csv', '--columns', 'time=t_ms:ms,x=accX:g,y=accY:g,z=accZ:g')
+    assert result['rate_hz'] == pytest.approx(RATE_HZ)
+    assert result['axes']['z']['white']['value'] == pytest.approx(N, rel=0.05)
