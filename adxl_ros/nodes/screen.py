@@ -46,8 +46,8 @@ _SILENT_S = 2.0
 """Age at which a display is reported as missing, s; chosen: ten missing messages."""
 _QUEUE = 100
 """Lines of all nodes' logs that wait; chosen: far more than come between two callbacks."""
-_LOG_LINES = 3
-"""Lines of the log that are kept: those that the screen shows."""
+_MESSAGES = 3
+"""Messages of the log that are kept: as many as the screen shows at most."""
 _STYLES = {Log.WARN: 'ansiyellow', Log.ERROR: 'ansired', Log.FATAL: 'ansired'}
 """Styles of log lines by level; others have that of `LogLine`."""
 
@@ -62,7 +62,7 @@ class Screen(Node):
                                  'this screen: both end together; 0: it has not')
         self._target = self.resolve_topic_name(name)
         self._contents, self._received_s = ScreenContents('info', ''), 0.0
-        self._log: deque[LogLine] = deque(maxlen=_LOG_LINES)
+        self._log: deque[LogLine] = deque(maxlen=_MESSAGES)
         self._finish_is_confirmed = False
         self._application = full_screen(self._lines, self._press, self._leave)
         create_subscription(self, String, f'{name}/display', self._on_display, 1, latched=True)

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+import math
 
 from adxl_ros.calibrate import pose_response
 from adxl_ros.calibrate.fits import full_model
@@ -50,6 +51,8 @@ _LONGEST_STEP_RAD = 0.3
 """Longest step of the search of `angles_of`, rad; chosen: the response is nearly linear in it."""
 _SEARCH_STEPS = 25
 """Steps of the search of `angles_of`; chosen: several turns at the longest step."""
+_MOST_DECIMALS = 6
+"""Most decimals of a coefficient on the screen; chosen: 1 µV."""
 _EXPLAINED_STDS = 3.0
 """Largest residual of angles that explain volts, standard deviations; chosen: the usual 3."""
 
@@ -309,7 +312,15 @@ def coefficient_rows(names: Sequence[Coefficient], values: np.ndarray, std: np.n
 def _row(name: Coefficient, names: Sequence[Coefficient], values: np.ndarray, std: np.ndarray,
          prior: np.ndarray, rows: list[int]) -> CoefficientRow:
     unit = parameter_of(names[rows[0]]).unit
-    intervals = tuple(f'{names[i].axis or names[i].parameter} {values[i]:+.2g} ± '
-                      f'{Z_90 * std[i]:.1g}' for i in rows)
+    intervals = tuple(f'{names[i].axis or names[i].parameter} '
+                      f'{_interval(values[i], Z_90 * std[i])}' for i in rows)
     determined = float(np.min(1 - np.clip(std[rows] / prior[rows], 0, 1)))
     return CoefficientRow(f'{name}, {unit}' if unit else str(name), intervals, determined)
+
+
+def _interval(value: float, half_width: float) -> str:
+    """Return a value, with the decimals of one digit of the half width of its interval."""
+    decimals = -math.floor(math.log10(half_width)) if half_width > 0 else _MOST_DECIMALS
+    decimals = min(max(decimals, 0), _MOST_DECIMALS)
+    # A sum with 0 has no negative zero.
+    return f'{round(value, decimals) + 0.0:+.{decimals}f} ± {half_width:.{decimals}f}'

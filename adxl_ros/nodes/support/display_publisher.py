@@ -99,9 +99,10 @@ class DisplayPublisher:
     def _publish(self, phase: Phase, text: str) -> None:
         controller, unit = self._controller, self._controller.unit
         display = self._session_display()
+        keys = () if phase is Phase.FIT else self._keys()
         self._publisher.publish(String(data=ScreenContents(
             phase=phase.value, text=text, unit=f'{unit.serial} ({unit.axes})' if unit else '',
-            output=str(controller.settings.output), keys=self._keys(),
+            output=str(controller.settings.output), keys=keys,
             live=self._idle_reading() if display is None else display.live(),
             progress=None if display is None else display.progress(),
             estimate=None if display is None else display.estimate(),

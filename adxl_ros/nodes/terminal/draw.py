@@ -51,12 +51,10 @@ _COEFFICIENT_BAR_WIDTH = 6
 """Width of the bar of a coefficient, columns."""
 _NARROW_BAR_WIDTH = 3
 """Width of the bar of a coefficient where a row has little room, columns."""
-_LEAST_NAME_WIDTH = 24
-"""Names of coefficients that have less room make the row narrow, columns."""
-_WIDEST_NAME = 36
-"""Largest width of the name of a coefficient, columns."""
 _SHORTEST_NAME = 8
 """Smallest width of the name of a coefficient, columns."""
+_LOG_LINES = 3
+"""Largest number of lines of the log."""
 _LABELLED_LINES = 3
 """Largest number of lines of a text with a label."""
 _LEAST_TEXT_WIDTH = 10
@@ -84,7 +82,7 @@ class LogLine(NamedTuple):
     style: str = 'ansibrightblack'
 
 
-def draw(contents: ScreenContents, log: Iterable[LogLine], columns: int, rows: int) -> list[Line]:
+def draw(contents: ScreenContents, log: Sequence[LogLine], columns: int, rows: int) -> list[Line]:
     """
     Lay the contents out.
 
@@ -104,17 +102,24 @@ def draw(contents: ScreenContents, log: Iterable[LogLine], columns: int, rows: i
 
     """
     width = max(columns - 1, _LEAST_WIDTH)
-    top = [*_head(contents, width), *_pose(contents.progress),
+    top = [*_head(contents, width), *_pose(contents.progress, width),
            *_reading(contents.live, contents.progress),
            *_progress(contents.progress, contents.estimate, width)]
-    bottom = [*(_text(line.text, line.style) for line in log), _keys(contents.keys)]
+    bottom = [*_log(log, width), _keys(contents.keys)]
     middle = _outcome(contents.outcome, width) or _coefficients(contents.estimate, width)
-    room = rows - len(top) - len(bottom)
-    lines = [*top, *middle[:max(room, 0)]]
+    lines = [*top, *_shorten(middle, rows - len(top) - len(bottom))]
     lines += [_text('')] * (rows - len(lines) - len(bottom))
     # A small terminal keeps the keys and the first lines, which say what to do.
     return [_cut_line(line, width)
             for line in (*lines[:max(rows - len(bottom), _LEAST_LINES)], *bottom)]
+
+
+def _shorten(lines: list[Line], room: int) -> list[Line]:
+    """Return as many lines as there is room for; the last one counts those that are missing."""
+    if len(lines) <= room:
+        return lines
+    kept = max(room - 1, 0)
+    return [*lines[:kept], _text(f'… {len(lines) - kept} more lines in a taller window')][:room]
 
 
 def _head(contents: ScreenContents, width: int) -> list[Line]:
@@ -125,11 +130,11 @@ def _head(contents: ScreenContents, width: int) -> list[Line]:
             *(_text(line, style) for line in wrap(contents.text, width)[:_TEXT_LINES])]
 
 
-def _pose(progress: Progress | None) -> list[Line]:
+def _pose(progress: Progress | None, width: int) -> list[Line]:
     if progress is None:
         return []
     total = '' if progress.remaining_s is None else f' of {progress.total}'
-    lines = [_row('pose', f'{progress.number}{total}: {progress.destination}')]
+    lines = _wrapped('pose', f'{progress.number}{total}: {progress.destination}', width)
     if progress.position:
         lines.append(_row('now', progress.position))
     return lines
@@ -187,16 +192,19 @@ def _coefficients(estimate: Estimate | None, width: int) -> list[Line]:
     """Return a row for each coefficient: name, bar and intervals, shortened to the width."""
     if estimate is None:
         return []
-    rows = estimate.coefficients
-    texts = ['  '.join(row.intervals) for row in rows]
-    bar_width = _COEFFICIENT_BAR_WIDTH
-    if _name_room(texts, bar_width, width) < _LEAST_NAME_WIDTH:
-        # Intervals of three axes are long.
+    rows, bar_width = estimate.coefficients, _COEFFICIENT_BAR_WIDTH
+    names, texts = [row.name for row in rows], ['  '.join(row.intervals) for row in rows]
+    if any(len(name) > _name_room(text, bar_width, width) for name, text in zip(names, texts)):
+        # Intervals of three axes are long. The name of a parameter has its unit, too.
         bar_width = _NARROW_BAR_WIDTH
-        texts = [_narrow(row) for row in rows]
-    name_width = max(_name_room(texts, bar_width, width), _SHORTEST_NAME)
-    return [_text(f'{_cut(row.name, name_width):{name_width}} '
-                  f'{_bar(row.determined, bar_width)} {text}') for row, text in zip(rows, texts)]
+        names, texts = [row.name.split(',')[0] for row in rows], [_narrow(row) for row in rows]
+    widest = max(map(len, names), default=0)
+    lines = []
+    for row, name, text in zip(rows, names, texts):
+        room = min(_name_room(text, bar_width, width), widest)
+        bar = _bar(row.determined, bar_width)
+        lines.append(_text(f'{_cut(name, room):{room}} {bar} {text}'))
+    return lines
 
 
 def _narrow(row: CoefficientRow) -> str:
@@ -204,10 +212,9 @@ def _narrow(row: CoefficientRow) -> str:
     return ' '.join(interval.replace(' ± ', '±') for interval in row.intervals)
 
 
-def _name_room(texts: Sequence[str], bar_width: int, width: int) -> int:
-    """Return the columns that the names have beside bars and texts in rows of a width."""
-    longest = max((len(text) for text in texts), default=0)
-    return min(width - bar_width - 2 - longest, _WIDEST_NAME)
+def _name_room(text: str, bar_width: int, width: int) -> int:
+    """Return the columns that a name has beside bar and text in a row of a width."""
+    return max(width - bar_width - 2 - len(text), _SHORTEST_NAME)
 
 
 def _cut(text: str, width: int) -> str:
@@ -221,6 +228,17 @@ def _outcome(outcome: Sequence[str], width: int) -> list[Line]:
         # A line that fits keeps its spaces.
         lines += [line] if len(line) <= width else wrap(line, width)
     return [_text(line) for line in lines]
+
+
+def _log(log: Sequence[LogLine], width: int) -> list[Line]:
+    """Return the newest messages that have room as a whole, and always the newest one."""
+    lines: list[Line] = []
+    for message in reversed(log):
+        wrapped = [_text(line, message.style) for line in wrap(message.text, width)]
+        if lines and len(lines) + len(wrapped) > _LOG_LINES:
+            break
+        lines = wrapped[:_LOG_LINES] + lines
+    return lines
 
 
 def _keys(keys: Iterable[KeyAction]) -> Line:
