@@ -26,8 +26,11 @@ from adxl_ros.compensate.sample_by_sample import Estimate, LiveEstimator
 from adxl_ros.files import imu_message
 from adxl_ros.files.cdr import CdrError
 from adxl_ros.model import noise
+from adxl_ros.model.effects.base import Components
+from adxl_ros.model.mounting import Mounting
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.model.tilt import UNOBSERVABLE_RAD2
+import numpy as np
 
 UNKNOWN_ANGLE_RAD2 = 1e6
 """Variance of an angle that is not known, rad²; yaw is never known.
@@ -69,6 +72,9 @@ class LiveStream:
         Takes roll, pitch and inclination, rad, a serialized geometry_msgs/Vector3Stamped.
     keep_orientation
         Whether a sample that states an orientation keeps it.
+    publish_free
+        Takes the acceleration without gravity of a sample that states an orientation, m/s², a
+        serialized geometry_msgs/Vector3Stamped; None for no such output.
 
     Attributes
     ----------
@@ -89,9 +95,13 @@ class LiveStream:
     """
 
     def __init__(self, paper: bool, undo_filter: bool, publish_imu: Callable[[bytes], None],
-                 publish_tilt: Callable[[bytes], None], keep_orientation: bool = False) -> None:
+                 publish_tilt: Callable[[bytes], None], keep_orientation: bool = False,
+                 publish_free: Callable[[bytes], None] | None = None) -> None:
         self._paper, self._undo_filter = paper, undo_filter
-        self._keep_orientation = keep_orientation
+        self._keep_orientation, self._publish_free = keep_orientation, publish_free
+        self._mounting, self._frame_id = Mounting(), ''
+        self._sensor: tuple[Sensor, float]
+        self._forces: list[Components] | None = None
         self._publish_imu, self._publish_tilt = publish_imu, publish_tilt
         self._chain: _Chain
         self._angles_rad = [0.0, 0.0, 0.0]
@@ -123,9 +133,44 @@ class LiveStream:
             Sample rate of the stream, Hz.
 
         """
-        live = LiveEstimator(sensor, self._paper, self._undo_filter)
+        self._sensor = sensor, rate_hz
+        live = LiveEstimator(sensor, self._paper, self._undo_filter,
+                             self._mounting if self._mounting.turns else None)
         live.set_environment(**self.surroundings)
         self._chain = _Chain(live, _delayed(sensor, rate_hz))
+
+    @property
+    def sensor(self) -> Sensor:
+        """Return the sensor that corrects the samples."""
+        return self._sensor[0]
+
+    def mount(self, mounting: Mounting, frame_id: str) -> None:
+        """
+        Turn the samples that follow into the frame of the robot.
+
+        Parameters
+        ----------
+        mounting
+            The case in the frame of the robot.
+        frame_id
+            Name of that frame.
+
+        """
+        self._mounting, self._frame_id = mounting, frame_id
+        self.use(*self._sensor)
+
+    def collect(self) -> None:
+        """Begin to keep the corrected forces, for `collected`."""
+        self._forces = []
+
+    def collected(self) -> np.ndarray:
+        """Return the forces since `collect` in the frame of the case, m/s², (n, 3)."""
+        forces = self._forces or []
+        return np.reshape(forces[:], (-1, 3)) @ np.array(self._mounting.rows)
+
+    def stop_collecting(self) -> None:
+        """Forget the kept forces."""
+        self._forces = None
 
     def restart_filter(self, rate_hz: float) -> None:
         """Forget the samples that wait for their neighbours; the stream has a rate, Hz."""
@@ -187,9 +232,17 @@ class LiveStream:
             self.counts['outside'] += 1
             self.outside = estimate.outside
         xx, xy, xz, yy, yz, zz = estimate.covariance
+        if self._forces is not None:
+            self._forces.append(estimate.force)
+        if live.mounting is not None:
+            raw = imu_message.with_frame(imu_message.turned(raw, live.mounting), self._frame_id)
         orientation: Sequence[float] | None = self._orientation(estimate)
         if self._keep_orientation and imu_message.has_orientation(raw):
             orientation = None
+            if self._publish_free is not None:
+                self._publish_free(imu_message.vector3_stamped(raw, free_acceleration(
+                    estimate.force, imu_message.orientation(raw),
+                    live.sensor.local_gravity_mps2)))
         self._publish_imu(imu_message.corrected(
             raw, orientation,
             (*estimate.force, xx, xy, xz, xy, yy, yz, xz, yz, zz)))
@@ -215,6 +268,31 @@ class LiveStream:
         sr, cr, sp, cp = sin(half_roll), cos(half_roll), sin(half_pitch), cos(half_pitch)
         return (sr * cp, cr * sp, -sr * sp, cr * cp,
                 roll, both, 0.0, both, pitch, 0.0, 0.0, 0.0, UNKNOWN_ANGLE_RAD2)
+
+
+def free_acceleration(force_mps2: Components, quaternion: Sequence[float], gravity_mps2: float
+                      ) -> list[float]:
+    """
+    Return the acceleration without gravity, m/s², three floats.
+
+    Parameters
+    ----------
+    force_mps2
+        Specific force in a frame, m/s².
+    quaternion
+        Orientation of this frame in the world, whose z is up: x, y, z, w.
+    gravity_mps2
+        Local gravity, m/s².
+
+    Returns
+    -------
+    list
+        The force less the vertical g, in the same frame.
+
+    """
+    x, y, z, w = quaternion
+    vertical = (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y))
+    return [f - gravity_mps2 * v for f, v in zip(force_mps2, vertical)]
 
 
 def _delayed(sensor: Sensor, rate_hz: float) -> filter_inversion.DelayedInversion:

@@ -29,6 +29,7 @@ from adxl_ros.model.covariance import (
     UNMEASURED_VARIANCE,
 )
 from adxl_ros.model.effects.base import Components, Environment, NOMINAL_ENVIRONMENT
+from adxl_ros.model.mounting import Mounting
 from adxl_ros.model.scalar_or_array import FLOATS
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.model.tilt import angles, roll_pitch_covariance
@@ -73,7 +74,8 @@ class Estimate(NamedTuple):
     Attributes
     ----------
     force
-        Specific force in the case frame, m/s², three floats.
+        Specific force in the frame of the case, or of the robot where there is a mounting, m/s²,
+        three floats.
     covariance
         Covariance of the force: xx, xy, xz, yy, yz, zz, (m/s²)².
     roll, pitch, inclination
@@ -132,7 +134,8 @@ class LiveEstimator:
     variance of a measured axis.
     """
 
-    def __init__(self, sensor: Sensor, paper: bool = False, undo_filter: bool = False) -> None:
+    def __init__(self, sensor: Sensor, paper: bool = False, undo_filter: bool = False,
+                 mounting: Mounting | None = None) -> None:
         """
         Prepare for a unit.
 
@@ -145,9 +148,11 @@ class LiveEstimator:
         undo_filter
             Whether the samples come from `filter_inversion.DelayedInversion`. Their noise then
             is that before the filter.
+        mounting
+            The case in the frame of the robot, in which the estimates are; None for the case's.
 
         """
-        self.sensor = sensor
+        self.sensor, self.mounting = sensor, mounting
         self._paper_inverse = paper_inverse.inverse(sensor, maths=FLOATS) if paper else None
         self._variance_v2 = filter_inversion.noise_variance_v2(sensor) if undo_filter \
             else noise.sample_std_v(sensor) ** 2
@@ -224,6 +229,10 @@ class LiveEstimator:
         # The angles are those of gravity, so that motion adds to the variance of each axis.
         moved = (covariance[0] + motion, covariance[1], covariance[2], covariance[3] + motion,
                  covariance[4], covariance[5] if self._derives_z else covariance[5] + motion)
+        if self.mounting is not None:
+            force, covariance, moved = (
+                self.mounting.rotate(force), self.mounting.rotate_covariance(covariance),
+                self.mounting.rotate_covariance(moved))
         roll, pitch, inclination, _ = angles(force, moved, FLOATS)
         return Estimate(force, covariance, roll, pitch, inclination,
                         roll_pitch_covariance(force, moved, FLOATS), saturated, cell.outside)

@@ -27,6 +27,7 @@ import struct
 from typing import NamedTuple
 
 from adxl_ros.files import cdr
+from adxl_ros.model.mounting import Mounting
 
 _STAMP_OFFSET = 4
 """Offset of the header's stamp, bytes."""
@@ -53,6 +54,8 @@ class _Layout(NamedTuple):
 
     Attributes
     ----------
+    order
+        Byte order, < or >.
     stamp
         Two integers: s, ns.
     vector
@@ -68,6 +71,7 @@ class _Layout(NamedTuple):
 
     """
 
+    order: str
     stamp: struct.Struct
     vector: struct.Struct
     orientation: struct.Struct
@@ -106,6 +110,74 @@ def has_orientation(raw: bytes) -> bool:
     layout = _layout(raw)
     values = layout.orientation.unpack_from(raw, layout.orientation_offset)
     return values[_QUATERNION] != -1.0 and any(values[:_QUATERNION]) and values != _UNSET
+
+
+def with_frame(raw: bytes, frame_id: str) -> bytes:
+    """
+    Return an Imu with another frame in its header.
+
+    Parameters
+    ----------
+    raw
+        The message, serialized, that `read` accepted.
+    frame_id
+        Name of the frame.
+
+    Returns
+    -------
+    bytes
+        The new message, serialized.
+
+    """
+    layout = _layout(raw)
+    name = frame_id.encode() + b'\0'
+    length = struct.pack(layout.order + 'I', len(name))
+    # The numbers behind the header begin at a multiple of 8 bytes behind the encapsulation.
+    padding = -(_FRAME_LENGTH.stop - _STAMP_OFFSET + len(name)) % 8
+    return (raw[:_FRAME_LENGTH.start] + length + name + bytes(padding)
+            + raw[layout.orientation_offset:])
+
+
+def turned(raw: bytes, mounting: Mounting) -> bytes:
+    """
+    Return an Imu with angular velocity and orientation in the frame of the robot.
+
+    A part that is not there (its first covariance is -1) stays as it is.
+
+    Parameters
+    ----------
+    raw
+        The message, serialized, that `read` accepted.
+    mounting
+        The case in the frame of the robot.
+
+    Returns
+    -------
+    bytes
+        The new message, serialized.
+
+    """
+    layout = _layout(raw)
+    message = bytearray(raw)
+    if has_orientation(raw):
+        values = layout.orientation.unpack_from(raw, layout.orientation_offset)
+        layout.orientation.pack_into(
+            message, layout.orientation_offset,
+            *mounting.rotate_orientation(values[:_QUATERNION]), *values[_QUATERNION:])
+    # Angular velocity has twelve numbers, as the acceleration has, and stands before it.
+    offset = layout.acceleration_offset - layout.acceleration.size
+    rate = layout.acceleration.unpack_from(raw, offset)
+    if rate[3] != -1.0:
+        layout.acceleration.pack_into(message, offset, *mounting.rotate(rate[:3]),
+                                      *mounting.rotate_matrix(rate[3:]))
+    return bytes(message)
+
+
+def orientation(raw: bytes) -> tuple[float, ...]:
+    """Return the quaternion x, y, z, w of a sensor_msgs/Imu, serialized, that `read` accepted."""
+    layout = _layout(raw)
+    values = layout.orientation.unpack_from(raw, layout.orientation_offset)
+    return tuple(values[:_QUATERNION])
 
 
 def corrected(raw: bytes, orientation: Sequence[float] | None, acceleration: Sequence[float]
@@ -173,7 +245,7 @@ def _layout(raw: bytes) -> _Layout:
 def _find_layout(raw: bytes) -> _Layout:
     imu = cdr.imu(raw)
     return _Layout(
-        struct.Struct(imu.order + 'iI'), struct.Struct(imu.order + '3d'),
+        imu.order, struct.Struct(imu.order + 'iI'), struct.Struct(imu.order + '3d'),
         struct.Struct(imu.order + '13d'), struct.Struct(imu.order + '12d'),
         imu.fields['orientation'].offset, imu.fields['linear_acceleration'].offset,
         imu.fields['linear_acceleration_covariance'].offset + _COVARIANCE_BYTES)

@@ -31,6 +31,7 @@ from adxl_ros.nodes.support.diagnostics import DiagnosticsReporter, Level, Statu
 from adxl_ros.nodes.support.exchangeable_sensor import ExchangeableSensor
 from adxl_ros.nodes.support.given_parameters import check_given_parameters
 from adxl_ros.nodes.support.imu_subscription import finite_samples
+from adxl_ros.nodes.support.mounting_parameters import MountingParameters
 from adxl_ros.nodes.support.parameters import declare
 from adxl_ros.nodes.support.receive_thread import ReceiveTurn, RepeatingThread
 from adxl_ros.nodes.support.run_node import run
@@ -85,14 +86,20 @@ class Compensation(Node):
         self._diagnostics = DiagnosticsReporter(self, {'compensation': self._status})
         data = create_publisher(self, Imu, 'imu/data', _DEPTH)
         tilt = create_publisher(self, Vector3Stamped, 'tilt', _DEPTH)
+        publishes_free = declare(
+            self, 'free_acceleration', False, 'publish imu/linear_acceleration_free: the '
+            'acceleration without gravity of samples that state an orientation')
+        free = create_publisher(self, Vector3Stamped, 'imu/linear_acceleration_free', _DEPTH) \
+            if publishes_free else None
         self._stream = LiveStream(paper, self._undo_filter, data.publish, tilt.publish,
-                                  keeps_orientation)
+                                  keeps_orientation, free.publish if free else None)
         self._policy = CompensationPolicy(paper, store, Topics(
             data_raw=self.resolve_topic_name('imu/data_raw'),
             sensor_info=self.resolve_topic_name('sensor_info'),
             temperature=self.resolve_topic_name('temperature'),
             supply=self.resolve_topic_name('supply')))
         self._sensor = ExchangeableSensor(self, self._policy.check, self._use)
+        MountingParameters(self, self._stream)
         self.create_timer(_MEASURE_S, self._measure, clock=self._steady)
         create_subscription(self, DiagnosticStatus, 'sensor_info', self._on_info, 1, latched=True)
         create_subscription(self, Temperature, 'temperature', self._on_temperature, 1)

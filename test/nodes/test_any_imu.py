@@ -17,6 +17,7 @@
 from collections.abc import Callable, Iterator
 
 from adxl_ros.files import parameter_file
+from geometry_msgs.msg import Vector3Stamped
 from graph import accel, Graph, stamp_ns
 import numpy as np
 from processes import Started
@@ -129,3 +130,62 @@ def test_calibration_takes_any_imu(camera: Camera, start: Start, tmp_path) -> No
     noise_mps2 = unit.noise_density_g_per_rthz * G * np.sqrt(RATE_HZ / 2)
     np.testing.assert_allclose(noise_mps2, NOISE_MPS2, rtol=0.2)
     np.testing.assert_allclose(unit.values['bias']['offset_v'] * G, offset, atol=0.01)
+
+
+def test_a_mounted_sensor_is_turned_into_the_frame_of_the_robot(camera: Camera, start: Start
+                                                                ) -> None:
+    """Acceleration, covariance, gyroscope and tilt are those of the robot, after ~/level, too."""
+    graph = camera.graph
+    data, tilt = graph.listen(Imu, 'imu/data'), graph.listen(Vector3Stamped, 'tilt')
+    free = graph.listen(Vector3Stamped, 'imu/linear_acceleration_free')
+    start('compensation', '--ros-args', '-r', f'imu/data_raw:={TOPIC}', '-p',
+          'mounting.rpy_rad:=[3.141592653589793, 0.0, 0.0]', '-p', 'free_acceleration:=true')
+    camera.connected()
+
+    def until(condition: Callable[[], bool], purpose: str) -> None:
+        def met() -> bool:
+            camera.rest([0.0, 1.0, -G], 0.1)
+            graph.spin(0.05)
+            return bool(data and tilt and free) and condition()
+        graph.spin_until(met, 40, purpose)
+    until(lambda: True, 'corrected samples')
+    assert data[-1].header.frame_id == tilt[-1].header.frame_id == 'base_link'
+    np.testing.assert_allclose(accel(data[-1]), [0, -1, G], atol=0.2)
+    w = data[-1].angular_velocity
+    np.testing.assert_allclose([w.x, w.y, w.z], [0.25, 0, 0.5], atol=1e-12)
+    assert tilt[-1].vector.x == pytest.approx(-0.1, abs=0.02)
+    client = graph.node.create_client(Trigger, 'compensation/level')
+    assert client.wait_for_service(20)
+    answer = client.call_async(Trigger.Request())
+    until(answer.done, 'the answer of ~/level')
+    assert answer.result().success, answer.result().message
+    until(lambda: abs(tilt[-1].vector.x) < 0.01, 'a level robot')
+    # The orientation that the camera states is 2·atan2(0.6, 0.8) about x, whatever it measures.
+    quaternion = data[-1].orientation
+    assert quaternion.x ** 2 + quaternion.w ** 2 == pytest.approx(1)
+    assert np.linalg.norm([free[-1].vector.y, free[-1].vector.z]) > 1
+
+
+def test_a_moving_sensor_is_not_level(camera: Camera, start: Start) -> None:
+    """The answer names the scatter, and the mounting stays."""
+    graph = camera.graph
+    data = graph.listen(Imu, 'imu/data')
+    start('compensation', '--ros-args', '-r', f'imu/data_raw:={TOPIC}')
+    camera.connected()
+
+    def published() -> bool:
+        camera.rest([0.0, 0.0, G], 0.1)
+        graph.spin(0.05)
+        return bool(data)
+    graph.spin_until(published, 40, 'corrected samples')
+    client = graph.node.create_client(Trigger, 'compensation/level')
+    assert client.wait_for_service(20)
+    answer = client.call_async(Trigger.Request())
+
+    def moved() -> bool:
+        camera.turn(0.1)
+        graph.spin(0.05)
+        return answer.done()
+    graph.spin_until(moved, 40, 'the answer of ~/level')
+    assert not answer.result().success
+    assert 'the sensor moves' in answer.result().message
