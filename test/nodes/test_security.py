@@ -25,8 +25,8 @@ import pytest
 from terminal import Terminal
 
 POLICY = os.path.join(get_package_share_directory('adxl_ros'), 'security', 'adxl_ros.policy.xml')
-# Topics that depend on the parameters use_sim_time and link.speed, or on a replay.
-SOMETIMES = {'/clock', '/stage/joint_states'}
+# Topics that depend on the parameters use_sim_time, link.speed and free_acceleration, or on a replay.
+SOMETIMES = {'/clock', '/imu/linear_acceleration_free', '/stage/joint_states'}
 
 
 def allowed(node):
