@@ -25,7 +25,7 @@ import pytest
 from terminal import Terminal
 
 POLICY = os.path.join(get_package_share_directory('adxl_ros'), 'security', 'adxl_ros.policy.xml')
-# Topics that depend on the parameters use_sim_time, link.speed and free_acceleration, or on a replay.
+# Topics that depend on parameters, such as use_sim_time and link.speed, or on a replay.
 SOMETIMES = {'/clock', '/imu/linear_acceleration_free', '/stage/joint_states'}
 
 
