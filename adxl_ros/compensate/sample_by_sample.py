@@ -227,8 +227,9 @@ class LiveEstimator:
         cell = self._cell(force)
         covariance = self._covariance(force, cell, unknown, motion)
         # The angles are those of gravity, so that motion adds to the variance of each axis.
-        moved = (covariance[0] + motion, covariance[1], covariance[2], covariance[3] + motion,
-                 covariance[4], covariance[5] if self._derives_z else covariance[5] + motion)
+        moved: tuple[float, ...] = (
+            covariance[0] + motion, covariance[1], covariance[2], covariance[3] + motion,
+            covariance[4], covariance[5] if self._derives_z else covariance[5] + motion)
         if self.mounting is not None:
             force, covariance, moved = (
                 self.mounting.rotate(force), self.mounting.rotate_covariance(covariance),
