@@ -38,7 +38,8 @@ setup(
     name=PACKAGE,
     version='0.1.0',
     packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*']),
-    package_data={PACKAGE: ['calibrate/report/*.js']},
+    package_data={PACKAGE: ['calibrate/report/*.html', 'calibrate/report/*.js', 'diagnose/*.html',
+                            'files/page_templates/*']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
         (f'share/{PACKAGE}', ['package.xml']),

@@ -20,11 +20,11 @@ from collections.abc import Mapping
 from dataclasses import fields, replace
 from datetime import datetime, timezone
 import hashlib
-from importlib.metadata import PackageNotFoundError, version
 
 from adxl_ros.calibrate.fits.paper_regression import planes
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.files import calibration_store
+from adxl_ros.files.package_version import package_version
 from adxl_ros.model.covariance import leverage
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Coefficient
@@ -36,14 +36,6 @@ _SAME_BETA_RAD = 1e-3
 """Smaller changes of beta are no step of the sweep, rad. Chosen: below any step of a plan."""
 _MAX_PLANES_LISTED = 12
 """Largest count of planes that are listed one by one."""
-
-
-def package_version() -> str:
-    """Return the version of this package; 'unknown' when it runs from its source."""
-    try:
-        return version('adxl_ros')
-    except PackageNotFoundError:
-        return 'unknown'
 
 
 def with_provenance(fitted: Sensor, source: str, poses: Poses, data_sha256: str,

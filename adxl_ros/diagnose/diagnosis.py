@@ -92,6 +92,8 @@ class Diagnosis:
         Fault of a recording; then everything else is empty.
     comparisons
         The recordings at the rate of the search, beside the baseline.
+    full_rate
+        The same recordings at their full rate.
     noise_floor
         The noise floor.
     verdict
@@ -126,6 +128,7 @@ class Diagnosis:
 
     data_fault: DataFault | None
     comparisons: list[BaselineComparison]
+    full_rate: tuple[BaselineComparison, ...] = ()
     noise_floor: NoiseFloor | None = None
     verdict: Verdict | None = None
     hypotheses: tuple[Hypothesis, ...] = ()
@@ -210,7 +213,7 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
                       hidden_odds(linear_model, searched.single_gains, SETTINGS))
     diagnosis = _with_report(checked, linear_model, explanation, verdict, sensor, seed)
     plan.show(REPORT, 1.0)
-    return diagnosis
+    return replace(diagnosis, full_rate=tuple(c.comparison for c in checked))
 
 
 @dataclass(frozen=True)

@@ -191,13 +191,30 @@ def _changes_v(linear_model: LinearModel, hypothesis: Hypothesis, effects: Seque
     changes = []
     for c in linear_model.comparisons:
         sensor = replace(hypothesis.sensor, rate_hz=c.sensor.rate_hz)
-        changes.append(c.simulated_v(sensor)
-                       - c.simulated_v(_without(sensor, linear_model.baseline, effects)))
+        changes.append(c.simulated_v(sensor) - c.simulated_v(
+            without_effects(sensor, linear_model.baseline, effects)))
     return changes
 
 
-def _without(sensor: Sensor, baseline: Sensor, effects: Sequence[str]) -> Sensor:
-    """Return a sensor with some effects as in the baseline."""
+def without_effects(sensor: Sensor, baseline: Sensor, effects: Sequence[str]) -> Sensor:
+    """
+    Return a sensor with some effects as in the baseline.
+
+    Parameters
+    ----------
+    sensor
+        The sensor.
+    baseline
+        The baseline.
+    effects
+        Names of the effects.
+
+    Returns
+    -------
+    Sensor
+        The sensor, whose other effects stay.
+
+    """
     absent = {e: baseline.values[e] if e in baseline.effects
               else neutral(effect_named(e), baseline.axes) for e in effects}
     return replace(sensor, values={**sensor.values, **absent})

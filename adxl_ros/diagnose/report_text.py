@@ -110,8 +110,8 @@ def screen_lines(diagnosis: Diagnosis, subject: str) -> list[str]:
     lines = [*_wrapped(subject), '']
     note_lines = [line for note in notes(diagnosis) for line in _row_lines('note', note)]
     if diagnosis.data_fault is not None:
-        badge = 'BAD DATA' if diagnosis.data_fault.status == 'bad_data' else 'TOO LITTLE DATA'
-        return [*lines, *_wrapped(f'{badge}  {diagnosis.data_fault.message}', len(badge) + 2),
+        word = badge(diagnosis)
+        return [*lines, *_wrapped(f'{word}  {diagnosis.data_fault.message}', len(word) + 2),
                 *note_lines]
     report = as_json(diagnosis)
     lines += _gap_lines(diagnosis)
@@ -123,7 +123,7 @@ def screen_lines(diagnosis: Diagnosis, subject: str) -> list[str]:
     for i, row in enumerate(remainder_rows(diagnosis)):
         lines += _row_lines('' if i else 'noise', f'{row.label}: {row.text}')
     lines += _where_lines(report['where'])
-    lines += _cause_lines(_named(diagnosis, report), report)
+    lines += _cause_lines(named_effects(diagnosis, report), report)
     return lines + note_lines
 
 
@@ -139,7 +139,7 @@ def _gap_lines(diagnosis: Diagnosis) -> list[str]:
     parts = f'zero-g {mg_text(closure.zero_g_mps2)}, drift {mg_text(closure.drift_mps2)}; ' \
         if pose_is_compared(diagnosis) else 'the pose is unknown, so the mean is not compared; '
     further += wrap(f'{parts}floor {floor_source(diagnosis)}', COLUMNS - _BADGE_COLUMNS)
-    lines = [f'{_badge(diagnosis):{_BADGE_COLUMNS - 1}} {values:{_VALUE_COLUMNS - 1}} '
+    lines = [f'{badge(diagnosis):{_BADGE_COLUMNS - 1}} {values:{_VALUE_COLUMNS - 1}} '
              f'noise floor {mg_text(closure.floor_mps2)}',
              *(f'{"":{_BADGE_COLUMNS}}{line}' for line in further)]
     if diagnosis.verdict.status in ('inseparable', 'unknown', 'insufficient'):
@@ -149,8 +149,10 @@ def _gap_lines(diagnosis: Diagnosis) -> list[str]:
     return lines
 
 
-def _badge(diagnosis: Diagnosis) -> str:
+def badge(diagnosis: Diagnosis) -> str:
     """Return the verdict in a few words."""
+    if diagnosis.data_fault is not None:
+        return 'BAD DATA' if diagnosis.data_fault.status == 'bad_data' else 'TOO LITTLE DATA'
     assert diagnosis.verdict is not None
     verdict = diagnosis.verdict
     count = len(verdict.effects) + len(verdict.groups)
@@ -166,8 +168,23 @@ def _badge(diagnosis: Diagnosis) -> str:
     return f'GAP EXPLAINED by {count} effect{"" if count == 1 else "s"}'
 
 
-def _named(diagnosis: Diagnosis, report: dict[str, Any]) -> list[str]:
-    """Return the effects of the verdict, or the nearest ones to something unknown, by share."""
+def named_effects(diagnosis: Diagnosis, report: dict[str, Any]) -> list[str]:
+    """
+    Return the effects of the verdict, or the nearest ones to something unknown, by share.
+
+    Parameters
+    ----------
+    diagnosis
+        The diagnosis.
+    report
+        Its objects of JSON.
+
+    Returns
+    -------
+    list of str
+        Names of effects.
+
+    """
     assert diagnosis.verdict is not None
     verdict = diagnosis.verdict
     named = [*verdict.effects, *(effect for group in verdict.groups for effect in group)]
@@ -181,7 +198,7 @@ def _named(diagnosis: Diagnosis, report: dict[str, Any]) -> list[str]:
 def _effect_table(diagnosis: Diagnosis, report: dict[str, Any]) -> list[str]:
     """Lay out the named effects, and the probable ones that are not named."""
     assert diagnosis.verdict is not None
-    named = _named(diagnosis, report)
+    named = named_effects(diagnosis, report)
     candidates = {c['effect']: c for c in report['candidates']}
     named_rows = [_effect_row(candidates[name]) for name in named]
     others = _others(diagnosis, report, named)
@@ -216,7 +233,7 @@ def _sizes(parameters: dict[str, Any]) -> list[str]:
     names = {key.partition('.')[0] for key in parameters}
     lines, zeros = [], []
     for key, parameter in parameters.items():
-        label = _parameter_label(key, len(names) == 1)
+        label = parameter_label(key, len(names) == 1)
         ci = parameter.get('ci')
         if ci and ci[0] <= 0 <= ci[1]:
             zeros.append(label)
@@ -228,8 +245,23 @@ def _sizes(parameters: dict[str, Any]) -> list[str]:
     return lines
 
 
-def _parameter_label(key: str, is_single: bool) -> str:
-    """Return the name of a parameter without its unit, or its axis where that is enough."""
+def parameter_label(key: str, is_single: bool) -> str:
+    """
+    Return the name of a parameter without its unit, or its axis where that is enough.
+
+    Parameters
+    ----------
+    key
+        Name of the parameter, with its axis.
+    is_single
+        Whether the effect has no other parameter.
+
+    Returns
+    -------
+    str
+        The label.
+
+    """
     name, _, axis = key.partition('.')
     stem, _, suffix = name.rpartition('_')
     short = stem if stem and suffix in _UNIT_SUFFIXES else name

@@ -156,11 +156,12 @@ def tiles(diagnosis: Diagnosis) -> list[Row]:
     """Return the figures of the gap that the page shows first."""
     assert diagnosis.gap_closure is not None
     closure = diagnosis.gap_closure
-    rows = [Row('gap, recording minus simulation', mg_text(closure.before_mps2))]
-    if closes(diagnosis):
-        rows += [Row('with the effects, held out', mg_text(closure.after_mps2)),
-                 Row('closed', percent(closure.closed, bool(diagnosis.noise_remainders)) + ' %')]
-    return [*rows, Row('noise floor', mg_text(closure.floor_mps2))]
+    before = Row('gap, recording minus simulation', mg_text(closure.before_mps2))
+    floor = Row('noise floor', mg_text(closure.floor_mps2))
+    if not closes(diagnosis):
+        return [before, floor]
+    return [before, Row('with the effects, held out', mg_text(closure.after_mps2)), floor,
+            Row('closed', percent(closure.closed, bool(diagnosis.noise_remainders)) + ' %')]
 
 
 def remainder_rows(diagnosis: Diagnosis) -> list[Row]:

@@ -11,127 +11,102 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
+"""
+HTML pages of one file that open offline and can be printed.
 
-"""HTML pages of one file that open offline and can be printed."""
+A page is a jinja2 template that extends `page_templates/base.html`. Its plots are figures of
+plotly.js, which the package plotly brings. The page holds plotly.js compressed.
+"""
 
 from __future__ import annotations
 
 from base64 import b64encode
-from collections.abc import Sequence
-from html import escape
+from collections.abc import Mapping
+from datetime import datetime
+import gzip
 from io import BytesIO
-import json
+from pathlib import Path
+import shlex
+import sys
 from typing import Any
 
-_STYLE = """
-body{font:15px/1.45 system-ui,sans-serif;max-width:1000px;margin:2em auto;padding:0 1em;color:#222;
-background:#fff}h1{font-size:1.4em}h2{font-size:1.1em;margin-top:2em;border-bottom:1px solid #ccc}
-table{border-collapse:collapse;width:100%;font-size:13px}td,th{padding:.25em .6em;
-border-bottom:1px solid #ddd;text-align:left;vertical-align:top}img{max-width:100%}
-.summary{background:#eef4fb;border-left:5px solid #36c;padding:.8em 1em}
-.good{background:#eef8ee;border-color:#393}.bad{background:#fbeeee;border-color:#c33}.open{background:#fdf6e3;border-color:#b80}
-pre{background:#f6f6f6;padding:.8em 1em;font-size:12px;white-space:pre-wrap}
-figure{margin:1em 0}figcaption{font-size:13px;color:#555}canvas{max-width:100%}
-@page{margin:12mm}@media print{body{margin:0;max-width:none;font-size:12px}
-table,pre{font-size:9px}td,th{padding:.15em .4em}
-h2{break-after:avoid}tr,figure,img,.summary{break-inside:avoid}
-*{-webkit-print-color-adjust:exact;print-color-adjust:exact}.screen{display:none}}
-"""
-"""Style sheet of all pages, on screen and on paper."""
+from adxl_ros.errors import UserError
+from adxl_ros.files.package_version import package_version
 
 _DPI = 100
-"""Resolution of plots, dots per inch (chosen: sharp at the page's width)."""
+"""Resolution of pictures, dots per inch (chosen: sharp at the page's width)."""
+_GZIP_LEVEL = 6
+"""Level of compression (chosen: 0.3 s for plotly.js; level 9 takes three times as long)."""
 
 
-def document(title: str, parts: Sequence[str]) -> str:
+def check_libraries() -> None:
+    """
+    Import what pages need.
+
+    Raises
+    ------
+    UserError
+        Plotly or jinja2 is not installed.
+
+    """
+    try:
+        import jinja2  # noqa: F401
+        from plotly.offline import get_plotlyjs  # noqa: F401
+    except ImportError as error:
+        raise UserError(f'pages need {error.name}; apt install python3-plotly python3-jinja2'
+                        ) from None
+
+
+def render(package: str, template: str, values: Mapping[str, Any]) -> str:
     """
     Return a whole page.
 
     Parameters
     ----------
-    title
-        Plain text.
-    parts
-        HTML of the body, in order.
+    package
+        The package whose folder holds the template.
+    template
+        Name of the template file, which extends `base.html`.
+    values
+        Values of the template by name.
 
     Returns
     -------
     str
         HTML.
 
-    """
-    return ('<!doctype html><html lang="en"><head><meta charset="utf-8"><meta name="viewport" '
-            f'content="width=device-width, initial-scale=1"><title>{escape(title)}</title>'
-            f'<style>{_STYLE}</style></head><body>\n{"".join(parts)}\n</body></html>\n')
-
-
-def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """
-    Return a table.
-
-    Parameters
-    ----------
-    head
-        Plain text of the header's cells, (columns,).
-    rows
-        Plain text of the other cells, (rows, columns).
-
-    Returns
-    -------
-    str
-        HTML.
+    Raises
+    ------
+    UserError
+        Plotly or jinja2 is not installed.
 
     """
-    top = ''.join(f'<th>{escape(cell)}</th>' for cell in head)
-    body = ''.join('<tr>' + ''.join(f'<td>{escape(cell)}</td>' for cell in row) + '</tr>\n'
-                   for row in rows)
-    return f'<table><thead><tr>{top}</tr></thead><tbody>{body}</tbody></table>'
+    check_libraries()
+    from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
+    from plotly.offline import get_plotlyjs
+    loader = ChoiceLoader([PackageLoader(package, ''),
+                           PackageLoader('adxl_ros.files', 'page_templates')])
+    environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined,
+                              trim_blocks=True, lstrip_blocks=True)
+    plotly_js = gzip.compress(get_plotlyjs().encode(), _GZIP_LEVEL, mtime=0)
+    made = f'made {datetime.now().astimezone():%Y-%m-%d %H:%M} by adxl_ros {package_version()}'
+    return environment.get_template(template).render(
+        {'made': made, 'command': command_of_this_process(), **values},
+        plotly_js=b64encode(plotly_js).decode())
 
 
-def picture(figure: Any, about: str) -> str:
-    """
-    Return a plot that is part of the page.
+def command_of_this_process() -> str:
+    """Return the command line that started this executable, as a shell reads it."""
+    return shlex.join(['ros2', 'run', 'adxl_ros', Path(sys.argv[0]).name, *sys.argv[1:]])
 
-    Parameters
-    ----------
-    figure
-        A matplotlib figure.
-    about
-        What the plot shows, for readers who cannot see it.
 
-    Returns
-    -------
-    str
-        HTML.
-
-    """
+def picture_url(figure: Any) -> str:
+    """Return a matplotlib figure as the URL of an image that is part of the page."""
     out = BytesIO()
     figure.savefig(out, dpi=_DPI, format='png', metadata={'Software': None})
-    return (f'<figure><img alt="{escape(about)}" '
-            f'src="data:image/png;base64,{b64encode(out.getvalue()).decode()}"></figure>')
+    return f'data:image/png;base64,{b64encode(out.getvalue()).decode()}'
 
 
-def data(name: str, values: Any) -> str:
-    """
-    Return an element with data for a script of the page.
-
-    Parameters
-    ----------
-    name
-        The element's id, by which the script finds it.
-    values
-        The data, anything that JSON can hold. No text in it can end the element.
-
-    Returns
-    -------
-    str
-        HTML.
-
-    """
-    text = json.dumps(values, allow_nan=False).replace('<', '\\u003c')
-    return f'<script type="application/json" id="{name}">{text}</script>'
-
-
-def script(text: str) -> str:
-    """Return an element with a script, JavaScript."""
-    return f'<script>\n{text}</script>'
+def download_url(text: str) -> str:
+    """Return a text as the URL of a file that the page offers for download."""
+    return f'data:application/yaml;base64,{b64encode(text.encode()).decode()}'

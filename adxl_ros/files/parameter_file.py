@@ -247,6 +247,26 @@ def save(path: str | os.PathLike, sensor: Sensor, comments: Iterable[str] = ()) 
         The file cannot be written.
 
     """
+    write_text(path, as_text(sensor, comments))
+
+
+def as_text(sensor: Sensor, comments: Iterable[str] = ()) -> str:
+    """
+    Return the text of a parameter file.
+
+    Parameters
+    ----------
+    sensor
+        The sensor.
+    comments
+        Lines for people, before the parameters.
+
+    Returns
+    -------
+    str
+        The text.
+
+    """
     tree: dict[str, Any] = {}
     for key, value in to_flat(sensor).items():
         *parents, leaf = key.split('.')
@@ -256,7 +276,7 @@ def save(path: str | os.PathLike, sensor: Sensor, comments: Iterable[str] = ()) 
         branch[leaf] = value
     text = yaml.dump({'/**': {'ros__parameters': tree}}, Dumper=_Dumper, sort_keys=False,
                      default_flow_style=None, width=99, allow_unicode=True)
-    write_text(path, ''.join(f'# {line}\n' for line in comments) + text)
+    return ''.join(f'# {line}\n' for line in comments) + text
 
 
 class _Dumper(yaml.SafeDumper):

@@ -101,6 +101,33 @@ class FormDimension(Enum):
     """Recent history of the specific force along the axis."""
 
 
+class ProofVariable(Enum):
+    """
+    Variable over which a plot shows that an effect is there.
+
+    The values name the variable and its unit for people.
+    """
+
+    OWN_FORCE = 'specific force along the axis, g'
+    CROSS_FORCE = 'specific force along the other axis, g'
+    FORCE_Z = 'specific force along z, g'
+    FORCE_RATE = 'change of the specific force along the axis, g/s'
+    ALPHA = 'alpha, °'
+    BETA = 'beta, °'
+    ALPHA_RATE = 'rate of alpha, °/s'
+    BETA_RATE = 'rate of beta, °/s'
+    ALPHA_ACCELERATION = 'angular acceleration of alpha, °/s²'
+    BETA_ACCELERATION = 'angular acceleration of beta, °/s²'
+    TEMPERATURE = 'temperature, °C'
+    SUPPLY = 'supply, V'
+    TIME = 'time, s'
+    OUTPUT = 'output, V'
+    FREQUENCY = 'frequency, Hz'
+    """The plot shows spectra."""
+    STEP = 'change from one sample to the next, mg'
+    """The plot shows histograms."""
+
+
 @dataclass(frozen=True)
 class DiagnosisHints:
     """
@@ -131,6 +158,8 @@ class DiagnosisHints:
     form : tuple of FormDimension
         Dimensions along which the form differs between real sensors. Empty where the form is
         exact, as of geometry, of a clock and of a straight line, and for effects of the noise.
+    proof : tuple of ProofVariable
+        Variables over which the effect shows; the report takes the one that shows it best.
 
     """
 
@@ -143,6 +172,7 @@ class DiagnosisHints:
     revealed_by: Manoeuvre | None = None
     half_turn: str = ''
     form: tuple[FormDimension, ...] = ()
+    proof: tuple[ProofVariable, ...] = ()
 
     @property
     def nuisance(self) -> bool:

@@ -102,8 +102,9 @@ def diagnose(options: argparse.Namespace) -> int:
         sensor, _ = measure_unstated(load_sensor(options.params, recordings[0]), recordings[0])
         diagnosis = diagnose_recordings(recordings, sensor, sim, options.seed,
                                         lambda stage, done: show(done, stage), options.align)
-        lines = report_text.screen_lines(diagnosis, _subject(recordings, sensor, options.sim))
-        report = _write(options, diagnosis, lines)
+        subject = _subject(recordings, sensor, options.sim)
+        lines = report_text.screen_lines(diagnosis, subject)
+        report = _write(options, diagnosis, subject, lines)
     if options.json:
         print(json.dumps(report, indent=1, allow_nan=False))
     else:
@@ -124,17 +125,22 @@ def _read(path: str, reading: ReadingOptions) -> Recording:
     return read
 
 
-def _write(options: argparse.Namespace, diagnosis: Diagnosis, lines: list[str]
+def _write(options: argparse.Namespace, diagnosis: Diagnosis, subject: str, lines: list[str]
            ) -> dict[str, Any]:
     """Write the files of a diagnosis; return its report."""
     folder = Path(options.output)
     make_folder(folder)
     report = report_json.as_json(diagnosis)
     write_text(folder / 'report.json', json.dumps(report, indent=1, allow_nan=False) + '\n')
-    write_text(folder / 'report.html', report_html.page(diagnosis, ', '.join(
-        Path(path).name for path in options.recording)))
-    if diagnosis.sensor is not None:
-        parameter_file.save(folder / 'params.yaml', diagnosis.sensor, lines)
+    parameters = '' if diagnosis.sensor is None else \
+        parameter_file.as_text(diagnosis.sensor, lines)
+    if parameters:
+        write_text(folder / 'params.yaml', parameters)
+    steps = _next_steps(options, diagnosis)
+    write_text(folder / 'report.html', report_html.page(diagnosis, report_html.Run(
+        subject, Path(options.params or parameter_file.nominal_path()).name,
+        [('Simulate with the effects', steps)] if isinstance(steps, str) and steps
+        else list(steps), parameters)))
     return report
 
 

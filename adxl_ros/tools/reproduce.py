@@ -22,11 +22,12 @@ from dataclasses import replace
 from datetime import date
 from pathlib import Path
 
-from adxl_ros.calibrate import calibration, pose_extraction, provenance
+from adxl_ros.calibrate import calibration, pose_extraction
 from adxl_ros.calibrate.report import plots as sweep_figures, report_html
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.atomic_write import write_text
+from adxl_ros.files.package_version import package_version
 from adxl_ros.files.stream_unit import recorded_unit
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.reproduction import (
@@ -126,7 +127,7 @@ def _simulated(sensor: Sensor, options: argparse.Namespace, folder: Path) -> str
     plots.draw_components(pictures / 'components.png', truth, unit.fitted['physical'],
                           unit.fitted['linear'])
     drawn = 'one unit' if sensor.effects else f'{options.units} units'
-    made = (f'adxl_ros {provenance.package_version()}, {date.today()}, {drawn} on each stage, '
+    made = (f'adxl_ros {package_version()}, {date.today()}, {drawn} on each stage, '
             f'seed {options.seed}.')
     bound_mmps2 = error_statistics.motion_bound_mmps2(sensor)
     return report_page.wrap_prose(report_page.page(results, bound_mmps2, made, coverage_part))
@@ -137,7 +138,7 @@ def _coverage(sensor: Sensor, options: argparse.Namespace) -> str:
     with progress('coverage') as show:
         draws = coverage.draw_all(replace(sensor, effects=(), values={}), options.draws,
                                   options.seed, show)
-    return coverage.page(draws, f'adxl_ros {provenance.package_version()}, {date.today()}, seed '
+    return coverage.page(draws, f'adxl_ros {package_version()}, {date.today()}, seed '
                                 f'{options.seed}; `make coverage`.')
 
 

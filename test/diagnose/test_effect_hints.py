@@ -88,3 +88,8 @@ def test_a_form_differs_over_what_the_effect_follows(effect):
         assert not form & {'alpha_rad', 'beta_rad', 'rate', 'since_move_s'}
     if effect.place is Place.ADC and form:
         assert form == {'code'}
+
+
+def test_each_effect_declares_what_shows_it():
+    """The report draws the proof of each effect over a variable that the effect declares."""
+    assert [name for name, effect in library().items() if not effect.diagnosis.proof] == []

@@ -79,7 +79,7 @@ for name, settings in (('serial', {'port': '/dev/null'}), ('iio', {})):
 
 
 def test_a_csv_is_fitted(tmp_path: Path) -> None:
-    """`simulate` and `fit` on CSV need only numpy and scipy. A plot names the missing package."""
+    """`simulate` and `fit` on CSV need only numpy and scipy. A page names the missing package."""
     run = 'from adxl_ros.tools.{0} import main\nsys.argv[0] = {0!r}\nsys.exit(main())'
     sweep, output = str(tmp_path / 'sweep.csv'), str(tmp_path / 'unit.yaml')
     done = run_without_extras(run.format('simulate'), 'sweep', '--rate', '100', '-o', sweep)
@@ -89,4 +89,5 @@ def test_a_csv_is_fitted(tmp_path: Path) -> None:
     assert Path(output).exists()
     done = run_without_extras(run.format('fit'), sweep, '-o', output, '--report', str(tmp_path))
     assert done.returncode == 1
-    assert done.stderr == 'fit: plots need matplotlib; pip install matplotlib\n'
+    assert done.stderr == \
+        'fit: pages need jinja2; apt install python3-plotly python3-jinja2\n'

@@ -22,6 +22,7 @@ from typing import NamedTuple
 from adxl_ros.calibrate.fits import full_model
 from adxl_ros.calibrate.fits.term_selection import Term
 from adxl_ros.calibrate.poses import Poses
+from adxl_ros.calibrate.value_text import with_half_width
 from adxl_ros.model.coefficients import get, parameter_of
 from adxl_ros.model.constants import Z_90
 from adxl_ros.model.effects.base import Coefficient
@@ -122,7 +123,7 @@ def _stage_lines(full: full_model.FullFit) -> list[str]:
     lines = [f'stage error: alpha {setting_deg[0]:.2g}, beta {setting_deg[1]:.2g} deg rms by '
              f'setting{by_pose} (stated {np.degrees(full.stated_std_rad):.2g} deg)']
     std = np.sqrt(np.diag(np.linalg.inv(full.information)))
-    values = [f'{name} {value:.2g} +- {Z_90 * value_std:.1g} {parameter_of(name).unit}'
+    values = [f'{name} {with_half_width(float(value), Z_90 * value_std)} {parameter_of(name).unit}'
               for name, value, value_std in zip(full.names, get(full.unit, full.names), std)
               if full_model.belongs_to_stage(name)]
     lines.append(f'stage: {", ".join(values)} (90 % intervals)')

@@ -30,6 +30,7 @@ from adxl_ros.calibrate.report.error_budget import (
     rms_mg,
     sample_noise_mps2,
 )
+from adxl_ros.calibrate.value_text import with_half_width
 from adxl_ros.model.coefficients import get, parameter_of
 from adxl_ros.model.constants import G0_MPS2, Z_90
 from adxl_ros.model.effects.base import Coefficient
@@ -160,8 +161,8 @@ def beyond_datasheet(sensor: Sensor) -> list[str]:
         _, maximum = sensor.datasheet.get(name.without_axis, (0.0, 0.0))
         half_width = Z_90 * std
         if maximum and abs(value) - half_width > maximum:
-            lines.append(f'{name} is {value:.4g} +- {half_width:.2g} {parameter_of(name).unit}, '
-                         f'beyond {maximum:g}')
+            lines.append(f'{name} is {with_half_width(float(value), half_width)} '
+                         f'{parameter_of(name).unit}, beyond {maximum:g}')
     return lines
 
 

@@ -25,7 +25,6 @@ from adxl_ros.calibrate.fits import linear, paper_regression
 from adxl_ros.calibrate.fits.gravity_fit import GravityFit
 from adxl_ros.calibrate.poses import Poses, reference_force
 from adxl_ros.calibrate.report.cross_validation import HeldOutErrors
-from adxl_ros.calibrate.report.drift_history import DriftSeries
 from adxl_ros.files.plot_file import pyplot, write_plot
 from adxl_ros.model import signal_chain
 from adxl_ros.model.constants import G0_MPS2, Z_90
@@ -37,7 +36,7 @@ _FINE_G = np.linspace(-1, 1, 201)
 _VERTICAL = np.sin(np.radians(89))
 """Smallest sine of alpha in the plane alpha = 90°; chosen: stages are better than 1°."""
 _MARKERS = 'os^D'
-"""Markers of models and axes, in order."""
+"""Markers of models, in order."""
 
 
 @dataclass(frozen=True)
@@ -206,22 +205,6 @@ def held_out(models: Sequence[HeldOutErrors], poses: Poses) -> Any:
         axis.set_ylim(bottom=1e-6 * axis.get_ylim()[1])
         axis.grid(alpha=0.3)
     axes[0].legend(fontsize=8)
-    return figure
-
-
-def drift(series: DriftSeries) -> Any:
-    """Draw zero-g and scale factor of a unit over its calibrations, relative to the newest."""
-    figure, row = pyplot().subplots(1, 2, figsize=(12, 3.6), layout='constrained')
-    for axis, values, std, label in (
-            (row[0], series.zero_g_mg, series.zero_g_std_mg, 'zero-g, mg'),
-            (row[1], series.scale_permille, series.scale_std_permille, 'scale factor, ‰')):
-        for d, name in enumerate(series.axes):
-            axis.errorbar(series.dates, values[:, d], yerr=Z_90 * std[:, d],
-                          fmt='-' + _MARKERS[d], ms=5, lw=1, capsize=3, label=name)
-        axis.axhline(0, color='0.7', lw=0.8)
-        axis.set(ylabel=f'{label}, minus the newest')
-        axis.tick_params(axis='x', rotation=20)
-        axis.legend(fontsize=8)
     return figure
 
 

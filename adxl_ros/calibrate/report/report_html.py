@@ -18,47 +18,58 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from html import escape
-from importlib.resources import files
 import os
 from pathlib import Path
+import re
 from typing import Any, NamedTuple
 
 from adxl_ros.calibrate.calibration import CalibrationResult
 from adxl_ros.calibrate.poses import reference_force
-from adxl_ros.calibrate.report import cross_validation, plots
+from adxl_ros.calibrate.report import cross_validation, page_figures, plots, text_tables
 from adxl_ros.calibrate.report.acceptance import (
     Assessment,
-    beyond_datasheet,
     FAIL,
+    nonlinearity_mps2,
     NOT_SHOWN,
     PASS,
 )
-from adxl_ros.calibrate.report.cross_validation import ErrorStatistic
+from adxl_ros.calibrate.report.against_truth import compare
+from adxl_ros.calibrate.report.cross_validation import ErrorStatistic, HeldOutErrors
 from adxl_ros.calibrate.report.drift_history import DriftHistory
+from adxl_ros.calibrate.report.error_budget import ErrorBudget, rms_mg, sample_noise_mps2
 from adxl_ros.errors import UserError
-from adxl_ros.files import calibration_store, html_page, plot_file
-from adxl_ros.files.atomic_write import atomic_path
+from adxl_ros.files import (
+    calibration_store,
+    html_page,
+    parameter_file,
+    plot_file,
+    plotly_figures,
+)
+from adxl_ros.files.atomic_write import write_text
 from adxl_ros.model import signal_chain
-from adxl_ros.model.coefficients import get, parameter_of
+from adxl_ros.model.coefficients import get
 from adxl_ros.model.constants import G0_MPS2, Z_90
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
 _PANELS = ((0, 1), (2, 3), (4, 5))
 """Panels of `plots.sweep` that stand side by side on the page."""
-_ERROR_TABLE_HEAD = ('model', 'poses', 'tilt, deg', 'alpha, deg', 'beta, deg', 'acceleration, mg',
-                     'calibration error, mg', 'datasheet', 'noise', 'limited by')
-_COEFFICIENT_TABLE_HEAD = ('coefficient', 'value', '90 % interval', 'typical ±', 'maximum ±',
-                           'unit', 'datasheet')
-_SPHERE = (
-    '<figure><p class="screen"><label>model <select id="sphere-model"></select></label> '
-    '<label>shows <select id="sphere-quantity"></select></label></p><canvas id="sphere" '
-    'width="900" height="520" style="width:900px;aspect-ratio:900/520;touch-action:none;'
-    'cursor:grab" tabindex="0" role="img" aria-label="residuals over the sphere of '
-    'poses"></canvas><figcaption id="sphere-about">Drag to turn, wheel to zoom, point at a pose.'
-    '</figcaption></figure><p>Each point is the direction of the vertical in the case of the '
-    'sensor. Its colour is the error of the model at that pose.</p>')
+_COLOURS = {PASS: 'green', NOT_SHOWN: 'amber', FAIL: 'red'}
+"""Colour of the badge by outcome."""
+_PART_COLOURS = {'noise': '#7b8794', 'stage': '#d9930d', 'coefficients': '#1f5fbf',
+                 'model': '#c0392b'}
+"""Colours of the parts of the error budget."""
+_ADVICE = {
+    'noise': 'Noise limits it most: longer rests at each pose reduce the error.',
+    'stage': 'The stage limits it most: a finer encoder, or more poses, reduce the error.',
+    'model': 'The model limits it most: a model with more terms reduces the error.',
+    'stage or model': 'Stage or model limits it most: visit some poses twice to see which.',
+}
+"""How to get better, by the largest cause of error."""
+_BEYOND = 'beyond the maximum'
+"""Outcome of a coefficient whose whole interval exceeds the maximum of the datasheet."""
+_BEYOND_WHISKER = 1.08
+"""Half of a whisker's range divided by the largest value in it. Chosen: no dot is cut."""
 
 
 class _SphereData(NamedTuple):
@@ -104,12 +115,13 @@ def write(folder: str | os.PathLike, result: CalibrationResult,
     Raises
     ------
     UserError
-        matplotlib is not installed, or a file cannot be written.
+        Plotly, jinja2 or matplotlib is not installed, or a file cannot be written.
 
     """
+    html_page.check_libraries()
     past = calibration_store.history(store, result.fitted.serial).calibrations \
         if str(store) else []
-    _write_page(Path(folder) / 'report.html', result, [sensor for _, sensor in past])
+    write_text(Path(folder) / 'report.html', page(result, [sensor for _, sensor in past]))
     # If the poses do not suffice for the figures of the paper, the page states the reason.
     with suppress(UserError):
         draw(Path(folder) / 'calibration.png', result)
@@ -138,93 +150,174 @@ def draw(path: str | os.PathLike, result: CalibrationResult) -> None:
         plots.draw_sweep(path, result.nominal, result.paper_sensor, result.poses)
 
 
-def _write_page(path: Path, result: CalibrationResult, past: Sequence[Sensor]) -> None:
-    fitted = result.fitted
-    title = f'Calibration of {fitted.serial}, {fitted.provenance["date"][:10]}'
-    script = (files('adxl_ros.calibrate.report') / 'sphere.js').read_text('utf-8')
-    parts = [f'<h1>{escape(title)}</h1>', _summary(result), '<h2>Acceptance</h2>',
-             _error_table(result),
-             '<h2>Residuals over the sphere of poses</h2>', _sphere(result),
-             '<h2>Coefficients</h2>', _coefficients(fitted),
-             '<h2>History of this unit</h2>', _history(DriftHistory.from_store(fitted, past)),
-             '<h2>Plots</h2>', *_plots(result),
-             '<h2>Details</h2>', _preformatted(result.report_lines),
-             '<h2>Provenance</h2>', _provenance(fitted), html_page.script(script)]
-    with atomic_path(path) as temporary:
-        temporary.write_text(html_page.document(title, parts), encoding='utf-8')
+def page(result: CalibrationResult, past: Sequence[Sensor]) -> str:
+    """
+    Lay out the page.
 
+    Parameters
+    ----------
+    result
+        The calibration.
+    past
+        Earlier calibrations of the unit, oldest first.
 
-def _preformatted(lines: Sequence[str]) -> str:
-    text = '\n'.join(lines)
-    return f'<pre>{escape(text)}</pre>'
+    Returns
+    -------
+    str
+        The page, HTML.
 
+    Raises
+    ------
+    UserError
+        Plotly, jinja2 or matplotlib is not installed.
 
-def _summary(result: CalibrationResult) -> str:
-    """Return the outcomes, the errors and the largest cause of error, as a paragraph."""
+    """
     fitted = result.fitted
     assessment = next((row for row in result.assessments if row.model == fitted.model), None)
-    if assessment is None:
-        return ('<p class="summary open">Too few poses were held out to assess this calibration. '
-                'Take more poses.</p>')
-    beyond = beyond_datasheet(fitted)
-    outcomes = {
-        'acceleration error against the datasheet': assessment.accel_datasheet,
-        'acceleration error against the noise': assessment.accel_noise,
-        'tilt error against datasheet and noise': ', '.join(filter(
-            None, (assessment.tilt_datasheet, assessment.tilt_noise))),
-        'unit against the datasheet': (FAIL if beyond else PASS) if fitted.datasheet else ''}
-    text = '; '.join(f'{name}: {outcome}' for name, outcome in outcomes.items() if outcome)
-    lines = [f'{text[0].upper()}{text[1:]}.']
     errors = next((row for row in result.held_out if row.model == fitted.model), None)
-    if errors is not None:
-        tilt = '' if np.isnan(errors.tilt_deg.rms) else \
-            f'{_with_interval(errors.tilt_deg)} deg of tilt and '
-        lines.append(f'On {errors.pose_count} held-out poses the {fitted.model} model has an '
-                     f'error of {tilt}{_with_interval(errors.accel_mg)} mg rms (90 %).')
-    tilt = '' if np.isnan(assessment.error_deg) else \
-        f' and {assessment.error_deg:.2g} deg of tilt'
-    lines.append('Without noise and stage error of the check, the calibration error is '
-                 f'{assessment.error_mg:.3g} mg{tilt}. Limited by: {assessment.limited_by}.')
-    lines += [f'Beyond the datasheet: {line}.' for line in beyond]
-    joined = ' '.join(outcomes.values())
-    kind = 'bad' if FAIL in joined else 'open' if NOT_SHOWN in joined else 'good'
-    return f'<p class="summary {kind}">' + '<br>'.join(map(escape, lines)) + '</p>'
+    history, coefficients = DriftHistory.from_store(fitted, past), _coefficients(fitted)
+    pictures, fault = _paper_figures(result)
+    return html_page.render('adxl_ros.calibrate.report', 'calibration.html', {
+        'title': f'Calibration of {fitted.serial}, {fitted.provenance["date"][:10]}',
+        'about': [f'{fitted.model} model', f'{len(result.poses)} poses', f'axes {fitted.axes}'],
+        'badge': _badge(fitted),
+        'tiles': _tiles(result, assessment),
+        'advice': _ADVICE.get(assessment.limited_by, '') if assessment else
+        'Take more poses: too few were held out to assess this calibration.',
+        'file_name': re.sub(r'[^\w.-]+', '_', fitted.serial) + '.yaml',
+        'download': html_page.download_url(parameter_file.as_text(fitted, result.comments())),
+        'figures': _figures(result, assessment, errors, history),
+        'sphere': _sphere(result),
+        'coefficients': coefficients,
+        'beyond': [row for row in coefficients if row['outcome'] == _BEYOND],
+        'datasheet': fitted.datasheet_name,
+        'limit_head': _limit_head(fitted),
+        'limits': _limits(result),
+        'budget': _budget(assessment.accel) if assessment and errors else None,
+        'history': history.table() if history.sensors else None,
+        'changes': history.changes() if history.sensors else [],
+        'paper_model': '' if result.gravity_fit else result.paper_sensor.model,
+        'pictures': pictures, 'pictures_fault': fault,
+        'report_lines': result.report_lines,
+        'provenance': _provenance(fitted)})
 
 
-def _with_interval(statistic: ErrorStatistic) -> str:
-    low, high = statistic.interval
-    return f'{statistic.rms:.3g} ({low:.2g} to {high:.2g})'
+def _badge(fitted: Sensor) -> dict[str, str]:
+    """Return the acceptance as the terminal shows it, and its colour."""
+    first, *others = (line.strip() for line in text_tables.acceptance_lines(fitted))
+    outcome = next(outcome for outcome in (NOT_SHOWN, PASS, FAIL) if first.startswith(outcome))
+    sentence = '. '.join([first.removeprefix(outcome).strip(), *others])
+    return {'colour': _COLOURS[outcome], 'word': outcome,
+            'sentence': f'{sentence[:1].upper()}{sentence[1:].rstrip(".")}.'}
 
 
-def _error_table(result: CalibrationResult) -> str:
+def _tiles(result: CalibrationResult, assessment: Assessment | None) -> list[dict[str, str]]:
+    """Return tilt and acceleration error before and after, and what limits them."""
+    if result.gravity_fit is not None:
+        fit = result.gravity_fit
+        used = np.setdiff1d(np.arange(len(fit.before_mps2)), fit.outliers)
+        before, after = (1e3 * float(np.sqrt(np.mean(v[used] ** 2))) / G0_MPS2
+                         for v in (fit.before_mps2, fit.leave_one_out_mps2))
+        tiles = [{'label': 'error of the magnitude of gravity',
+                  'text': f'{_digits(before)} → {_digits(after)} mg',
+                  'note': f'rms over {len(used)} rests, held out'}]
+    elif result.held_out:
+        first, last = result.held_out[0], result.held_out[-1]
+        tiles = [_before_after('tilt error', first.tilt_deg, last.tilt_deg, '°'),
+                 _before_after('acceleration error', first.accel_mg, last.accel_mg, 'mg')]
+        tiles = [tile for tile in tiles if tile]
+    else:
+        tiles = []
+    if assessment is not None:
+        tiles.append({'label': 'limited by', 'text': assessment.limited_by,
+                      'note': f'calibration error {_digits(assessment.error_mg)} mg, without '
+                              'noise and stage error of the check'})
+    return tiles
+
+
+def _before_after(label: str, before: ErrorStatistic, after: ErrorStatistic, unit: str
+                  ) -> dict[str, str]:
+    """Return an error by the datasheet values and by the calibration; empty where not known."""
+    if np.isnan(after.rms):
+        return {}
+    low, high = after.interval
+    return {'label': label, 'text': f'{_digits(before.rms)} → {_digits(after.rms)} {unit}',
+            'note': f'rms on held-out poses, 90 %: {_digits(low)} to {_digits(high)} {unit}'}
+
+
+def _digits(value: float) -> str:
+    """Write a positive value with three digits at most, without an exponent."""
+    decimals = 1 if value >= 10 else 2 if value >= 1 else 3
+    return f'{value:.{decimals}f}' if value >= 5e-4 else '< 0.001'
+
+
+def _figures(result: CalibrationResult, assessment: Assessment | None,
+             errors: HeldOutErrors | None, history: DriftHistory
+             ) -> dict[str, plotly_figures.Figure]:
+    """Return the figures of the page by name."""
+    figures = {}
+    if result.gravity_fit is not None:
+        figures['errors'] = page_figures.gravity_errors(result.gravity_fit)
+    elif assessment is not None and errors is not None:
+        figures['errors'] = page_figures.pose_errors(
+            errors, assessment, result.poses.subset(result.inliers), result.fitted.axes)
+    if history.sensors:
+        figures['drift'] = page_figures.drift(history.series())
+    return figures
+
+
+def _limit_head(fitted: Sensor) -> list[str]:
+    """Return the head of the table of limits."""
+    datasheet_mps2 = nonlinearity_mps2(fitted)
+    datasheet = f'datasheet ({1e3 * datasheet_mps2 / G0_MPS2:.2g} mg)' if datasheet_mps2 \
+        else 'datasheet'
+    noise = f'noise ({1e3 * sample_noise_mps2(fitted) / G0_MPS2:.2g} mg)'
+    return ['model', 'poses', 'tilt error, °', 'alpha, °', 'beta, °', 'acceleration error, mg',
+            'calibration error, mg', f'acceleration, {datasheet}', f'acceleration, {noise}',
+            'tilt, datasheet', 'tilt, noise', 'limited by']
+
+
+def _limits(result: CalibrationResult) -> list[list[str]]:
+    """Return the errors of each model, and one outcome for each limit."""
     row_of = {row.model: row for row in result.assessments}
     rows = []
     for errors in result.held_out:
         statistics = (errors.tilt_deg, errors.alpha_deg, errors.beta_deg, errors.accel_mg)
-        assessment = row_of.get(errors.model)
-        rows.append([errors.model, str(errors.pose_count), *map(_error_cell, statistics),
-                     *(_outcome_cells(assessment) if assessment else ['-'] * 4)])
+        row = [errors.model, str(errors.pose_count), *map(_error_cell, statistics)]
+        assessed = row_of.get(errors.model)
+        rows.append(row + (['-'] * 6 if assessed is None else _outcome_cells(assessed)))
     if not rows:
-        return _preformatted(result.report_lines)
-    return html_page.table(_ERROR_TABLE_HEAD, rows) + (
-        '<p>Errors: rms with its 90 % interval, which allows for correlated errors of '
-        'neighbouring poses. Calibration error: without noise and stage error of the check. '
-        'Datasheet and noise: outcome of acceleration, then of tilt.</p>')
+        rows = [[row.model, str(len(result.poses)), *['-'] * 4, *_outcome_cells(row)]
+                for row in result.assessments]
+    return rows
+
+
+def _outcome_cells(row: Assessment) -> list[str]:
+    return [_digits(row.error_mg), *(outcome or '-' for outcome in (
+        row.accel_datasheet, row.accel_noise, row.tilt_datasheet, row.tilt_noise)),
+        row.limited_by]
 
 
 def _error_cell(statistic: ErrorStatistic) -> str:
     if np.isnan(statistic.rms):
         return '-'
-    return f'{_with_interval(statistic)}, max {statistic.largest:.3g}'
+    return f'{_digits(statistic.rms)} (max {_digits(statistic.largest)})'
 
 
-def _outcome_cells(row: Assessment) -> list[str]:
-    pairs = (row.accel_datasheet, row.tilt_datasheet), (row.accel_noise, row.tilt_noise)
-    return [f'{row.error_mg:.3g}', *(', '.join(filter(None, pair)) or '-' for pair in pairs),
-            row.limited_by]
+def _budget(budget: ErrorBudget) -> dict[str, Any]:
+    """Return the parts of the acceleration error as parts of a bar, and in words."""
+    squares = {name: float(getattr(budget, name)) for name in _PART_COLOURS}
+    total = max(sum(squares.values()), 1e-30)
+    return {'expected': f'{_digits(rms_mg(budget.expected))} mg',
+            'measured': f'{_digits(rms_mg(budget.measured))} mg',
+            'separable': budget.separable,
+            'parts': [{'name': name, 'text': f'{_digits(rms_mg(square))} mg',
+                       'percent': round(100 * square / total, 2), 'colour': _PART_COLOURS[name]}
+                      for name, square in squares.items()]}
 
 
-def _sphere(result: CalibrationResult) -> str:
+def _sphere(result: CalibrationResult) -> dict[str, Any]:
+    """Return the data of the sphere's script."""
     data = _stage_sphere(result) if result.gravity_fit is None else _gravity_sphere(result)
     up = data.force / np.linalg.norm(data.force, axis=1, keepdims=True)
 
@@ -233,9 +326,8 @@ def _sphere(result: CalibrationResult) -> str:
                 'held_out': bool(result.poses.check[i]),
                 'values': [list(map(_number, errors[i])) for errors in data.errors]}
 
-    return html_page.data('sphere-data', {
-        'models': data.models, 'quantities': data.quantities,
-        'poses': [point(i) for i in range(len(data.labels))]}) + _SPHERE
+    return {'models': data.models, 'quantities': data.quantities,
+            'poses': [point(i) for i in range(len(data.labels))]}
 
 
 def _gravity_sphere(result: CalibrationResult) -> _SphereData:
@@ -258,9 +350,9 @@ def _stage_sphere(result: CalibrationResult) -> _SphereData:
         unit_errors = cross_validation.pose_errors(unit, poses)
         errors.append(np.column_stack([np.degrees(unit_errors.tilt_rad),
                                        1e3 * unit_errors.accel_mps2 / G0_MPS2]))
-    labels = [f'pose {i + 1}, alpha {np.degrees(a):.1f}, beta {np.degrees(b):.1f} deg'
+    labels = [f'pose {i + 1}, alpha {np.degrees(a):.1f}°, beta {np.degrees(b):.1f}°'
               for i, (a, b) in enumerate(zip(poses.alpha_rad, poses.beta_rad))]
-    quantities = [['error of tilt', 'deg'], *([f'error of {a}', 'mg'] for a in fitted.axes)]
+    quantities = [['error of tilt', '°'], *([f'error of {a}', 'mg'] for a in fitted.axes)]
     return _SphereData(list(units), quantities, errors, force, labels)
 
 
@@ -268,30 +360,34 @@ def _number(value: float) -> float | None:
     return float(f'{value:.4g}') if np.isfinite(value) else None
 
 
-def _coefficients(fitted: Sensor) -> str:
-    stds = np.sqrt(np.diag(fitted.covariance))
-    rows = _absolute_rows('zero-g', 'V', fitted, fitted.zero_g_v, fitted.nominal_zero_g_v)
-    rows += _absolute_rows('scale factor', 'V/g', fitted, fitted.scale_v_per_g,
-                           fitted.nominal_scale_v_per_g)
-    values = get(fitted, fitted.covariance_names)
-    for name, value, std in zip(fitted.covariance_names, values, stds):
-        half_width = Z_90 * std
+def _coefficients(fitted: Sensor) -> list[dict[str, Any]]:
+    """Return the coefficients with their intervals within the range of the datasheet."""
+    half_widths = Z_90 * np.sqrt(np.diag(fitted.covariance))
+    departures = get(fitted, fitted.covariance_names)
+    rows = []
+    for row, name, value, half_width in zip(compare(fitted, fitted), fitted.covariance_names,
+                                            departures, half_widths):
         typical, maximum = fitted.datasheet.get(name.without_axis, (0.0, 0.0))
-        rows.append([str(name), f'{value:.5g}',
-                     f'{value - half_width:.5g} to {value + half_width:.5g}',
-                     f'{typical:g}' if typical else '-', f'{maximum:g}' if maximum else '-',
-                     parameter_of(name).unit,
-                     _against_datasheet(abs(value) - half_width, typical, maximum)])
-    source = escape(fitted.datasheet_name) or 'none in the parameter file'
-    return html_page.table(_COEFFICIENT_TABLE_HEAD, rows) + (
-        '<p>The rows below zero-g and scale factor are departures from nominal. '
-        f'Datasheet: {source}.</p>')
+        largest = max(typical, maximum, abs(value) + half_width, 1e-12) * _BEYOND_WHISKER
+        unit = '' if row.unit == '1' else f' {row.unit}'
+        text = f'{text_tables.rounded(row, row.fitted)} ± ' \
+            f'{text_tables.rounded(row, row.half_width)}{unit}'
+        beyond = _against_datasheet(abs(value) - half_width, typical, maximum)
+        rows.append({
+            'label': f'{row.label} {row.axis}', 'name': str(name), 'text': text,
+            'datasheet': _range_text(typical, maximum, row.unit), 'outcome': beyond,
+            'mark': plotly_figures.whisker(
+                value, value - half_width, value + half_width, (-largest, largest), text,
+                typical or maximum, beyond.startswith('beyond'))})
+    return rows
 
 
-def _absolute_rows(label: str, unit: str, fitted: Sensor, values: Sequence[float] | np.ndarray,
-                   nominal: Sequence[float] | np.ndarray) -> list[list[str]]:
-    return [[f'{label} {axis}', f'{value:.6g}', '', f'nominal {stated:g}', '', unit, '']
-            for axis, value, stated in zip(fitted.axes, values, nominal)]
+def _range_text(typical: float, maximum: float, unit: str) -> str:
+    """Return the departures that the datasheet permits."""
+    factor = float(np.degrees(1.0)) if unit == '°' else 1.0
+    texts = [f'{word} ±{factor * value:.2g}'
+             for word, value in (('typical', typical), ('maximum', maximum)) if value]
+    return ', '.join(texts) or '-'
 
 
 def _against_datasheet(magnitude: float, typical: float, maximum: float) -> str:
@@ -299,51 +395,34 @@ def _against_datasheet(magnitude: float, typical: float, maximum: float) -> str:
     if not (typical or maximum):
         return ''
     if maximum and magnitude > maximum:
-        return 'beyond the maximum'
+        return _BEYOND
     return 'beyond typical' if typical and magnitude > typical else 'within'
 
 
-def _history(history: DriftHistory) -> str:
-    if not history.sensors:
-        return '<p>No earlier calibration of this unit is in the store.</p>'
-    head, rows = history.table()
-    return ''.join([html_page.table(head, rows),
-                    *(f'<p>{escape(line)}</p>' for line in history.changes()),
-                    _picture(plots.drift(history.series()), 'drift of zero-g and scale factor')])
-
-
-def _plots(result: CalibrationResult) -> list[str]:
+def _paper_figures(result: CalibrationResult) -> tuple[list[str], str]:
+    """Return the figures of the paper as URLs of pictures, or the reason why there are none."""
     if result.gravity_fit is not None:
-        return [_picture(plots.gravity_rests(result.name, result.gravity_fit),
-                         'magnitude of gravity over the rests')]
-    inliers = result.poses.subset(result.inliers)
-    parts = ['<p>The first plot has the errors on held-out poses, as figure 10 of Ang, Khosla and '
-             'Riviere (2007). The others are figures 2 to 8 of the paper for this unit: the '
-             f'deviation from the linear model, measured and by the {result.paper_sensor.model} '
-             'model.</p>']
-    if result.held_out:
-        parts.append(_picture(plots.held_out(result.held_out, inliers),
-                              'errors on held-out poses'))
+        return [_picture(plots.gravity_rests(result.name, result.gravity_fit))], ''
+    pictures = [_picture(plots.held_out(
+        result.held_out, result.poses.subset(result.inliers)))] if result.held_out else []
     try:
-        return parts + [_picture(
-            plots.sweep(result.nominal, result.paper_sensor, result.poses, pair),
-            'figures 2 to 8 of the paper') for pair in _PANELS]
+        return pictures + [
+            _picture(plots.sweep(result.nominal, result.paper_sensor, result.poses, pair))
+            for pair in _PANELS], ''
     except UserError as error:
-        return [*parts, f'<p>Figures 2 to 8 of the paper cannot be drawn: {escape(str(error))}'
-                '</p>']
+        return pictures, str(error)
 
 
-def _picture(figure: Any, description: str) -> str:
-    html = html_page.picture(figure, description)
+def _picture(figure: Any) -> str:
+    url = html_page.picture_url(figure)
     plot_file.pyplot().close(figure)
-    return html
+    return url
 
 
-def _provenance(fitted: Sensor) -> str:
+def _provenance(fitted: Sensor) -> list[list[str]]:
     temperature_c = fitted.envelope.temperature_c
-    rows = [['serial', fitted.serial], ['model', fitted.model],
+    return [['serial', fitted.serial], ['model', fitted.model],
             ['effects', ', '.join(fitted.effects)],
             *([key.replace('_', ' '), value] for key, value in fitted.provenance.items()),
-            ['valid for temperatures', f'{temperature_c[0]:.1f} to {temperature_c[1]:.1f} degC'
+            ['valid for temperatures', f'{temperature_c[0]:.1f} to {temperature_c[1]:.1f} °C'
              if temperature_c else 'not measured']]
-    return html_page.table(['', ''], rows)

@@ -9,7 +9,7 @@
   const model = document.getElementById('sphere-model');
   const quantity = document.getElementById('sphere-quantity');
   const about = document.getElementById('sphere-about');
-  const SIZE = [900, 520], CENTRE = [400, 260], RADIUS = 215;
+  const SIZE = [640, 480], CENTRE = [245, 240], RADIUS = 190;
   let yaw = -0.7, pitch = 0.45, zoom = 1, drag = null, shown = [];
 
   function option(list, texts, chosen) {
@@ -18,6 +18,10 @@
   option(model, data.models, data.models.length - 1);
   option(quantity, data.quantities.map(function (q) { return q[0] + ', ' + q[1]; }), 0);
 
+  // At most three digits, and no exponent.
+  function text(value) {
+    return String(Number(value.toFixed(Math.abs(value) < 0.1 ? 4 : Math.abs(value) < 10 ? 3 : 1)));
+  }
   function turned(u) {
     const a = Math.cos(yaw) * u[0] - Math.sin(yaw) * u[1];
     const b = Math.sin(yaw) * u[0] + Math.cos(yaw) * u[1];
@@ -64,16 +68,15 @@
   function legend(largest, lowest, unit) {
     for (let i = 0; i < 200; i++) {
       pen.fillStyle = colour(1 - (1 - lowest) * i / 199);
-      pen.fillRect(690, 160 + i, 22, 1.5);
+      pen.fillRect(505, 130 + i, 22, 1.5);
     }
     pen.fillStyle = '#222';
-    [[1, 165], [0, lowest < 0 ? 264 : 363], [-1, 363]].forEach(function (tick) {
+    [[1, 140], [0, lowest < 0 ? 234 : 333], [-1, 333]].forEach(function (tick) {
       if (tick[0] < lowest) { return; }
-      pen.fillText((tick[0] * largest).toPrecision(2) + ' ' + unit + (tick[0] ? ' and beyond' : ''), 720,
-                   tick[1]);
+      pen.fillText(text(tick[0] * largest) + ' ' + unit, 535, tick[1]);
     });
-    pen.fillText('● in the fit   ■ held out', 690, 395);
-    pen.fillText('× not determined', 690, 415);
+    pen.fillText('● fitted ■ held out', 495, 370);
+    pen.fillText('× not determined', 495, 392);
   }
   function mark(point, size, largest) {
     const x = point.at[0], y = point.at[1];
@@ -100,7 +103,7 @@
     canvas.width = SIZE[0] * ratio;
     canvas.height = SIZE[1] * ratio;
     pen.setTransform(ratio, 0, 0, ratio, 0, 0);
-    pen.font = '13px system-ui, sans-serif';
+    pen.font = '14px system-ui, sans-serif';
     pen.lineWidth = 1;
     for (let k = 0; k < 6; k++) {
       const t = k * Math.PI / 6;
@@ -147,7 +150,7 @@
     }).pop();
     about.textContent = !near ? 'Drag to turn, wheel to zoom, point at a pose.' :
         near.pose.label + ': ' + (near.value === null ? 'not determined' :
-            near.value.toPrecision(3) + ' ' + data.quantities[quantity.value][1]);
+            text(near.value) + ' ' + data.quantities[quantity.value][1]);
   }
   function turn(right, up) {
     yaw += right;

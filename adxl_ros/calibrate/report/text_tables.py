@@ -23,6 +23,7 @@ from adxl_ros.calibrate.report import acceptance
 from adxl_ros.calibrate.report.against_truth import compare, Comparison
 from adxl_ros.calibrate.report.cross_validation import HeldOutErrors
 from adxl_ros.calibrate.report.error_budget import sample_noise_mps2
+from adxl_ros.calibrate.value_text import decimals
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.sensor import Sensor
 import numpy as np
@@ -34,10 +35,6 @@ _LONGEST_LABEL = 26
 """Columns that a coefficient's name may take, so that its line has at most 79."""
 _COVERED = 0.9
 """Share of the 90 % intervals that contain the true value if the intervals are right."""
-_MOST_DECIMALS = 7
-"""Largest number of decimals in the table of coefficients, which has room for 10 columns."""
-_UNKNOWN_DECIMALS = 4
-"""Number of decimals of a coefficient without an interval."""
 
 
 def error_table(models: Sequence[HeldOutErrors]) -> list[str]:
@@ -69,7 +66,7 @@ def truth_table(comparisons: Sequence[Comparison]) -> list[str]:
 
 def _truth_row(row: Comparison, width: int) -> str:
     """Lay out one coefficient, with a label of the given width."""
-    truth = '0' if row.truth == 0 else _rounded(row, row.truth)
+    truth = '0' if row.truth == 0 else rounded(row, row.truth)
     return (f'{_fitted_row(row, width)} {truth:>10}   {"ok" if row.inside else "MISSED"}')
 
 
@@ -88,22 +85,29 @@ def _label_width(rows: Sequence[Comparison]) -> int:
 
 def _fitted_row(row: Comparison, width: int) -> str:
     """Lay out the fitted value of a coefficient, with a label of the given width."""
-    return (f' {row.label[:width]:{width}} {row.axis:1} {_rounded(row, row.fitted):>10} ± '
-            f'{_rounded(row, row.half_width):8} {row.unit:5}')
+    return (f' {row.label[:width]:{width}} {row.axis:1} {rounded(row, row.fitted):>10} ± '
+            f'{rounded(row, row.half_width):8} {row.unit:5}')
 
 
-def _rounded(row: Comparison, value: float) -> str:
-    """Write a value with the decimals that show two digits of the interval."""
-    decimals = _decimals(row.half_width)
-    return f'{round(value, decimals) + 0.0:.{decimals}f}'
+def rounded(row: Comparison, value: float) -> str:
+    """
+    Write a value with the decimals that show two digits of the interval.
 
+    Parameters
+    ----------
+    row
+        The coefficient.
+    value
+        A value in its unit.
 
-def _decimals(half_width: float) -> int:
-    """Return the number of decimals that shows two digits of an interval."""
-    if not half_width > 0:
-        return _UNKNOWN_DECIMALS
-    exponent = int(f'{half_width:.1e}'.partition('e')[2])
-    return min(max(1 - exponent, 0), _MOST_DECIMALS)
+    Returns
+    -------
+    str
+        The value without its unit.
+
+    """
+    places = decimals(row.half_width)
+    return f'{round(value, places) + 0.0:.{places}f}'
 
 
 def acceptance_lines(fitted: Sensor) -> list[str]:

@@ -14,7 +14,7 @@
 
 """Integral nonlinearity of the ADC: one curve over its codes for all channels."""
 
-from adxl_ros.model.diagnosis_hints import DiagnosisHints, FormDimension, Manoeuvre
+from adxl_ros.model.diagnosis_hints import DiagnosisHints, FormDimension, Manoeuvre, ProofVariable
 from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Role, Signals
 import numpy as np
 
@@ -69,5 +69,6 @@ EFFECT = Effect(
     apply=apply,
     invertible=True,
     cause='The ADC is nonlinear; calibrate it with a voltage source, or choose another.',
-    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.REMOUNT, form=(FormDimension.CODE,)),
+    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.REMOUNT, form=(FormDimension.CODE,),
+                             proof=(ProofVariable.OUTPUT,)),
 )

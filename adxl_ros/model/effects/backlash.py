@@ -14,7 +14,7 @@
 
 """Backlash of the stage: a joint follows its encoder with play."""
 
-from adxl_ros.model.diagnosis_hints import DiagnosisHints, FormDimension, Manoeuvre
+from adxl_ros.model.diagnosis_hints import DiagnosisHints, FormDimension, Manoeuvre, ProofVariable
 from adxl_ros.model.effects.base import Effect, Joint, Need, Parameter, Parameters, Place, Signals
 from adxl_ros.model.play_operator import play
 
@@ -47,5 +47,6 @@ EFFECT = Effect(
     smooth=False,
     needs=(Need.STAGE,),
     cause='The gears have play; approach each pose from the same side, or preload them.',
-    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.SPEEDS, form=(FormDimension.DIRECTION,)),
+    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.SPEEDS, form=(FormDimension.DIRECTION,),
+                             proof=(ProofVariable.BETA, ProofVariable.ALPHA)),
 )

@@ -14,7 +14,7 @@
 
 """Bandwidth of the RC filter: the on-chip resistor has a tolerance of 25 %."""
 
-from adxl_ros.model.diagnosis_hints import DiagnosisHints, FormDimension, Manoeuvre
+from adxl_ros.model.diagnosis_hints import DiagnosisHints, FormDimension, Manoeuvre, ProofVariable
 from adxl_ros.model.effects.base import Effect, Need, Parameter, Parameters, Place, Signals
 
 
@@ -38,5 +38,6 @@ EFFECT = Effect(
     # The RC product of a healthy unit is within some 2 % of the measured one (chosen: resistors
     # and capacitors of 1 %, and their temperature).
     diagnosis=DiagnosisHints(healthy_std=0.02, revealed_by=Manoeuvre.SHAKE,
-                             form=(FormDimension.LAG,)),
+                             form=(FormDimension.LAG,),
+                             proof=(ProofVariable.FREQUENCY,)),
 )

@@ -16,7 +16,7 @@
 
 from math import cos, sin
 
-from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre
+from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre, ProofVariable
 from adxl_ros.model.effects.base import Effect, Need, Parameter, Parameters, Place, Signals
 
 
@@ -43,5 +43,6 @@ EFFECT = Effect(
     exact=True,
     needs=(Need.STAGE,),
     cause='The base of the stage is not level; level it, or measure its tilt.',
-    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.PLANES),
+    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.PLANES,
+                             proof=(ProofVariable.BETA, ProofVariable.ALPHA)),
 )

@@ -14,7 +14,7 @@
 
 """Zero-g of a unit minus the nominal one (B of equation 2)."""
 
-from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre, StraightLine
+from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre, ProofVariable, StraightLine
 from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
 
 
@@ -38,5 +38,6 @@ EFFECT = Effect(
     # Zero-g of a healthy unit changes by 0.1 mg from day to day (tuned by hand on simulated
     # recordings).
     diagnosis=DiagnosisHints(straight_line=StraightLine.ZERO_G, healthy_std=1e-4,
-                             revealed_by=Manoeuvre.REMOUNT),
+                             revealed_by=Manoeuvre.REMOUNT,
+                             proof=(ProofVariable.TIME,)),
 )

@@ -14,7 +14,7 @@
 
 """Random walk of the zero-g: acceleration random walk, rate noise of an Allan deviation."""
 
-from adxl_ros.model.diagnosis_hints import DiagnosisHints, DriftSpectrum, Manoeuvre
+from adxl_ros.model.diagnosis_hints import DiagnosisHints, DriftSpectrum, Manoeuvre, ProofVariable
 from adxl_ros.model.effects.base import ActsOn, Effect, Parameter, Parameters, Place, Signals
 import numpy as np
 
@@ -48,5 +48,6 @@ EFFECT = Effect(
     # A healthy unit drifts by 0.3 mg within 100 s at most (tuned by hand on simulated
     # recordings).
     diagnosis=DiagnosisHints(drift=DriftSpectrum.RANDOM_WALK, healthy_density=3e-5,
-                             revealed_by=Manoeuvre.HEAT),
+                             revealed_by=Manoeuvre.HEAT,
+                             proof=(ProofVariable.FREQUENCY,)),
 )

@@ -14,7 +14,7 @@
 
 """Clock skew: the clock that stamps the samples runs fast or slow."""
 
-from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre
+from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre, ProofVariable
 from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
 
 
@@ -33,5 +33,6 @@ EFFECT = Effect(
     apply=apply,
     exact=True,
     cause='The clocks of sensor and stage drift apart; discipline them by one source.',
-    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.SPEEDS),
+    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.SPEEDS,
+                             proof=(ProofVariable.FORCE_RATE, ProofVariable.TIME)),
 )

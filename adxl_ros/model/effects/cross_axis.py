@@ -18,7 +18,7 @@ Bias from the other in-plane axis: g(V_c) of equations 10 and 11, centred and in
 The z axis gets it from x.
 """
 
-from adxl_ros.model.diagnosis_hints import DiagnosisHints, FormDimension, Manoeuvre
+from adxl_ros.model.diagnosis_hints import DiagnosisHints, FormDimension, Manoeuvre, ProofVariable
 from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
 
 OTHER = (1, 0, 0)
@@ -44,5 +44,6 @@ EFFECT = Effect(
     apply=apply,
     invertible=True,
     cause='The other in-plane axis shifts the bias; calibrate with the plane alpha = 90 deg.',
-    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.PLANES, form=(FormDimension.CROSS_FORCE,)),
+    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.PLANES, form=(FormDimension.CROSS_FORCE,),
+                             proof=(ProofVariable.CROSS_FORCE,)),
 )

@@ -18,7 +18,7 @@ Bias from the out-of-plane axis: h(V_z) of equations 12 and 13, centred and in g
 The z axis gets it from y.
 """
 
-from adxl_ros.model.diagnosis_hints import DiagnosisHints, FormDimension, Manoeuvre
+from adxl_ros.model.diagnosis_hints import DiagnosisHints, FormDimension, Manoeuvre, ProofVariable
 from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
 
 OTHER = (2, 2, 1)
@@ -44,5 +44,6 @@ EFFECT = Effect(
     apply=apply,
     invertible=True,
     cause='The out-of-plane axis shifts the bias; calibrate with several planes alpha.',
-    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.PLANES, form=(FormDimension.CROSS_FORCE,)),
+    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.PLANES, form=(FormDimension.CROSS_FORCE,),
+                             proof=(ProofVariable.FORCE_Z,)),
 )

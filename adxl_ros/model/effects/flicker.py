@@ -16,7 +16,7 @@
 
 from functools import lru_cache
 
-from adxl_ros.model.diagnosis_hints import DiagnosisHints, DriftSpectrum, Manoeuvre
+from adxl_ros.model.diagnosis_hints import DiagnosisHints, DriftSpectrum, Manoeuvre, ProofVariable
 from adxl_ros.model.effects.base import ActsOn, Effect, Parameter, Parameters, Place, Signals
 from adxl_ros.model.filters import first_order_recursion
 import numpy as np
@@ -86,5 +86,6 @@ EFFECT = Effect(
     # A healthy unit has 0.2 mg rms over five decades of frequency at most (tuned by hand on
     # simulated recordings).
     diagnosis=DiagnosisHints(drift=DriftSpectrum.FLICKER, healthy_density=6e-5,
-                             revealed_by=Manoeuvre.HEAT),
+                             revealed_by=Manoeuvre.HEAT,
+                             proof=(ProofVariable.FREQUENCY,)),
 )

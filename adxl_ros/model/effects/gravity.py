@@ -14,7 +14,7 @@
 
 """Local gravity that differs from the stated one."""
 
-from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre
+from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre, ProofVariable
 from adxl_ros.model.effects.base import Effect, Need, Parameter, Parameters, Place, Signals
 
 
@@ -36,5 +36,6 @@ EFFECT = Effect(
     invertible=True,
     needs=(Need.STAGE,),
     cause='Local gravity is not the stated one; look it up for latitude and height.',
-    diagnosis=DiagnosisHints(imitated=True, revealed_by=Manoeuvre.REMOUNT),
+    diagnosis=DiagnosisHints(imitated=True, revealed_by=Manoeuvre.REMOUNT,
+                             proof=(ProofVariable.OWN_FORCE,)),
 )

@@ -14,7 +14,7 @@
 
 """Hysteresis of the sensing element: a Prandtl-Ishlinskii operator of the acceleration."""
 
-from adxl_ros.model.diagnosis_hints import DiagnosisHints, FormDimension, Manoeuvre
+from adxl_ros.model.diagnosis_hints import DiagnosisHints, FormDimension, Manoeuvre, ProofVariable
 from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Role, Signals
 from adxl_ros.model.play_operator import play
 
@@ -57,5 +57,6 @@ EFFECT = Effect(
           'sides and average, or relieve the package of mounting stress.',
     diagnosis=DiagnosisHints(revealed_by=Manoeuvre.SPEEDS,
                              form=(FormDimension.FORCE, FormDimension.DIRECTION,
-                                   FormDimension.LAG)),
+                                   FormDimension.LAG),
+                             proof=(ProofVariable.FORCE_RATE, ProofVariable.OWN_FORCE)),
 )

@@ -15,7 +15,7 @@
 """Lever arm: rotation accelerates a sensor that is not on the axes of the stage."""
 
 from adxl_ros.model.constants import AXES
-from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre
+from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre, ProofVariable
 from adxl_ros.model.effects.base import Effect, Need, Parameter, Parameters, Place, Signals
 from adxl_ros.model.kinematics import angular_motion, carried_acceleration
 
@@ -39,5 +39,8 @@ EFFECT = Effect(
     exact=True,
     needs=(Need.STAGE,),
     cause='The sensor is not on the axis of rotation; mount it there, or state the arm.',
-    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.SPEEDS),
+    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.SPEEDS,
+                             proof=(ProofVariable.ALPHA_RATE, ProofVariable.BETA_RATE,
+                                    ProofVariable.ALPHA_ACCELERATION,
+                                    ProofVariable.BETA_ACCELERATION)),
 )

@@ -14,7 +14,7 @@
 
 """Mains hum: a sine at the input of the ADC."""
 
-from adxl_ros.model.diagnosis_hints import Detector, DiagnosisHints
+from adxl_ros.model.diagnosis_hints import Detector, DiagnosisHints, ProofVariable
 from adxl_ros.model.effects.base import ActsOn, Effect, Parameter, Parameters, Place, Role, Signals
 import numpy as np
 
@@ -40,5 +40,6 @@ EFFECT = Effect(
     apply=apply,
     acts_on=ActsOn.NOISE,
     cause='The mains couple into the signal; shield and twist the cable, and ground one end.',
-    diagnosis=DiagnosisHints(detector=Detector.MAINS_LINE),
+    diagnosis=DiagnosisHints(detector=Detector.MAINS_LINE,
+                             proof=(ProofVariable.FREQUENCY,)),
 )

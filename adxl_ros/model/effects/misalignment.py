@@ -17,7 +17,7 @@
 from functools import lru_cache
 from math import cos, sin
 
-from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre
+from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre, ProofVariable
 from adxl_ros.model.effects.base import Components, Effect, Parameter, Parameters, Place, Signals
 
 
@@ -69,5 +69,6 @@ EFFECT = Effect(
     exact=True,
     invertible=True,
     cause='The sensing axes are not those of the case; calibrate, or mount the package better.',
-    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.PLANES),
+    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.PLANES,
+                             proof=(ProofVariable.CROSS_FORCE, ProofVariable.FORCE_Z)),
 )

@@ -14,7 +14,7 @@
 
 """Resonance of the mount: it transmits the motion like a spring and a damper."""
 
-from adxl_ros.model.diagnosis_hints import DiagnosisHints, FormDimension, Manoeuvre
+from adxl_ros.model.diagnosis_hints import DiagnosisHints, FormDimension, Manoeuvre, ProofVariable
 from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Role, Signals
 from adxl_ros.model.filters import resonator
 
@@ -43,5 +43,6 @@ EFFECT = Effect(
     ),
     apply=apply,
     cause='The mount is a spring; stiffen it, or keep the motion away from its resonance.',
-    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.SHAKE, form=(FormDimension.LAG,)),
+    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.SHAKE, form=(FormDimension.LAG,),
+                             proof=(ProofVariable.FREQUENCY,)),
 )

@@ -14,7 +14,7 @@
 
 """White noise beyond the stated density."""
 
-from adxl_ros.model.diagnosis_hints import Detector, DiagnosisHints
+from adxl_ros.model.diagnosis_hints import Detector, DiagnosisHints, ProofVariable
 from adxl_ros.model.effects.base import ActsOn, Effect, Need, Parameter, Parameters, Place, Signals
 
 
@@ -36,5 +36,6 @@ EFFECT = Effect(
     acts_on=ActsOn.NOISE,
     needs=(Need.NOISE,),
     cause='The noise is not the stated one; check the supply, its decoupling and the cable.',
-    diagnosis=DiagnosisHints(detector=Detector.NOISE_LEVEL),
+    diagnosis=DiagnosisHints(detector=Detector.NOISE_LEVEL,
+                             proof=(ProofVariable.FREQUENCY,)),
 )

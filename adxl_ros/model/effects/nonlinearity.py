@@ -14,7 +14,7 @@
 
 """Odd nonlinearity of an axis: its scale factor changes with its own input."""
 
-from adxl_ros.model.diagnosis_hints import DiagnosisHints, FormDimension, Manoeuvre
+from adxl_ros.model.diagnosis_hints import DiagnosisHints, FormDimension, Manoeuvre, ProofVariable
 from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
 
 
@@ -36,5 +36,6 @@ EFFECT = Effect(
     apply=apply,
     invertible=True,
     cause='The scale factor changes with the input; calibrate with poses between 0 and 1 g.',
-    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.PLANES, form=(FormDimension.FORCE,)),
+    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.PLANES, form=(FormDimension.FORCE,),
+                             proof=(ProofVariable.OWN_FORCE,)),
 )

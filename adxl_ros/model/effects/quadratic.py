@@ -14,7 +14,7 @@
 
 """Even nonlinearity of an axis: its scale factors up and down differ."""
 
-from adxl_ros.model.diagnosis_hints import DiagnosisHints, FormDimension, Manoeuvre
+from adxl_ros.model.diagnosis_hints import DiagnosisHints, FormDimension, Manoeuvre, ProofVariable
 from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
 
 
@@ -36,5 +36,6 @@ EFFECT = Effect(
     apply=apply,
     invertible=True,
     cause='Scale factors up and down differ; calibrate, and let no supply clip one side.',
-    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.PLANES, form=(FormDimension.FORCE,)),
+    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.PLANES, form=(FormDimension.FORCE,),
+                             proof=(ProofVariable.OWN_FORCE,)),
 )

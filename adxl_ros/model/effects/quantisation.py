@@ -14,7 +14,7 @@
 
 """Quantisation that is coarser than the resolution of the ADC."""
 
-from adxl_ros.model.diagnosis_hints import Detector, DiagnosisHints
+from adxl_ros.model.diagnosis_hints import Detector, DiagnosisHints, ProofVariable
 from adxl_ros.model.effects.base import (
     ActsOn,
     Effect,
@@ -49,5 +49,6 @@ EFFECT = Effect(
     acts_on=ActsOn.NOISE,
     needs=(Need.ADC,),
     cause='The ADC resolves less than stated; check its setting, reference and format.',
-    diagnosis=DiagnosisHints(detector=Detector.COARSE_CODES),
+    diagnosis=DiagnosisHints(detector=Detector.COARSE_CODES,
+                             proof=(ProofVariable.STEP,)),
 )

@@ -14,7 +14,7 @@
 
 """Saturation: the output stage clips at its limit."""
 
-from adxl_ros.model.diagnosis_hints import DiagnosisHints, FormDimension
+from adxl_ros.model.diagnosis_hints import DiagnosisHints, FormDimension, ProofVariable
 from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Role, Signals
 import numpy as np
 
@@ -56,5 +56,6 @@ EFFECT = Effect(
     apply=apply,
     smooth=False,
     cause='The output clips; raise the supply, lower the gain, or choose a wider range.',
-    diagnosis=DiagnosisHints(form=(FormDimension.FORCE,)),
+    diagnosis=DiagnosisHints(form=(FormDimension.FORCE,),
+                             proof=(ProofVariable.OWN_FORCE,)),
 )

@@ -14,7 +14,7 @@
 
 """Scale factor of a unit minus the nominal one (SF of equation 1)."""
 
-from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre, StraightLine
+from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre, ProofVariable, StraightLine
 from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
 
 
@@ -38,5 +38,6 @@ EFFECT = Effect(
     # The scale factor of a healthy unit changes by 0.01 % from day to day (tuned by hand on
     # simulated recordings).
     diagnosis=DiagnosisHints(straight_line=StraightLine.SCALE_FACTOR, healthy_std=1e-4,
-                             revealed_by=Manoeuvre.REMOUNT),
+                             revealed_by=Manoeuvre.REMOUNT,
+                             proof=(ProofVariable.OWN_FORCE,)),
 )

@@ -20,7 +20,7 @@ of the other two. A quadratic term would equal a sum of `nonlinearity`, `scale_f
 `scale_factor`, so that the effect has none.
 """
 
-from adxl_ros.model.diagnosis_hints import DiagnosisHints, FormDimension
+from adxl_ros.model.diagnosis_hints import DiagnosisHints, FormDimension, ProofVariable
 from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
 
 OTHER = (1, 0, 0)
@@ -45,5 +45,6 @@ EFFECT = Effect(
     invertible=True,
     cause='The other in-plane axis changes the scale factor; calibrate with several planes '
           'alpha.',
-    diagnosis=DiagnosisHints(form=(FormDimension.FORCE, FormDimension.CROSS_FORCE)),
+    diagnosis=DiagnosisHints(form=(FormDimension.FORCE, FormDimension.CROSS_FORCE),
+                             proof=(ProofVariable.CROSS_FORCE, ProofVariable.OWN_FORCE)),
 )

@@ -18,7 +18,7 @@ Scale factor that depends on the out-of-plane axis: equations 15 and 17, centred
 The scale factor of the z axis depends on y.
 """
 
-from adxl_ros.model.diagnosis_hints import DiagnosisHints, FormDimension, Manoeuvre
+from adxl_ros.model.diagnosis_hints import DiagnosisHints, FormDimension, Manoeuvre, ProofVariable
 from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
 
 OTHER = (2, 2, 1)
@@ -45,5 +45,6 @@ EFFECT = Effect(
     invertible=True,
     cause='The out-of-plane axis changes the scale factor; calibrate with several planes alpha.',
     diagnosis=DiagnosisHints(revealed_by=Manoeuvre.PLANES,
-                             form=(FormDimension.FORCE, FormDimension.CROSS_FORCE)),
+                             form=(FormDimension.FORCE, FormDimension.CROSS_FORCE),
+                             proof=(ProofVariable.FORCE_Z, ProofVariable.OWN_FORCE)),
 )

@@ -14,7 +14,7 @@
 
 """Spikes: single samples with a large error."""
 
-from adxl_ros.model.diagnosis_hints import Detector, DiagnosisHints
+from adxl_ros.model.diagnosis_hints import Detector, DiagnosisHints, ProofVariable
 from adxl_ros.model.effects.base import ActsOn, Effect, Parameter, Parameters, Place, Signals
 import numpy as np
 
@@ -43,5 +43,6 @@ EFFECT = Effect(
     smooth=False,
     acts_on=ActsOn.NOISE,
     cause='Single samples have large errors; check for loose contacts and loads that switch.',
-    diagnosis=DiagnosisHints(detector=Detector.ISOLATED_SAMPLES),
+    diagnosis=DiagnosisHints(detector=Detector.ISOLATED_SAMPLES,
+                             proof=(ProofVariable.STEP,)),
 )

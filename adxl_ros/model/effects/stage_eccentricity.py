@@ -14,7 +14,7 @@
 
 """Eccentricity of the stage's encoder discs: an error with one period per turn."""
 
-from adxl_ros.model.diagnosis_hints import DiagnosisHints, FormDimension, Manoeuvre
+from adxl_ros.model.diagnosis_hints import DiagnosisHints, FormDimension, Manoeuvre, ProofVariable
 from adxl_ros.model.effects.base import Effect, Joint, Need, Parameter, Parameters, Place, Signals
 import numpy as np
 
@@ -45,5 +45,6 @@ EFFECT = Effect(
     cause='The disc of an encoder is not centred on its axis; '
           'use two reading heads, or a table of errors.',
     diagnosis=DiagnosisHints(revealed_by=Manoeuvre.PLANES,
-                             form=(FormDimension.ALPHA, FormDimension.BETA)),
+                             form=(FormDimension.ALPHA, FormDimension.BETA),
+                             proof=(ProofVariable.BETA, ProofVariable.ALPHA)),
 )

@@ -14,7 +14,7 @@
 
 """Offset of the stage's encoders: true angle minus reading."""
 
-from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre
+from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre, ProofVariable
 from adxl_ros.model.effects.base import Effect, Need, Parameter, Parameters, Place, Signals
 
 
@@ -38,5 +38,6 @@ EFFECT = Effect(
     exact=True,
     needs=(Need.STAGE,),
     cause='The zero of an encoder is wrong; set it by a level, or remount the sensor by 180 deg.',
-    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.REMOUNT, half_turn='beta_rad'),
+    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.REMOUNT, half_turn='beta_rad',
+                             proof=(ProofVariable.BETA, ProofVariable.ALPHA)),
 )

@@ -14,7 +14,7 @@
 
 """Stuck samples: the link repeats its last sample for a while."""
 
-from adxl_ros.model.diagnosis_hints import Detector, DiagnosisHints
+from adxl_ros.model.diagnosis_hints import Detector, DiagnosisHints, ProofVariable
 from adxl_ros.model.effects.base import ActsOn, Effect, Parameter, Parameters, Place, Role, Signals
 import numpy as np
 
@@ -58,5 +58,6 @@ EFFECT = Effect(
     smooth=False,
     acts_on=ActsOn.NOISE,
     cause='The link repeats samples; check the bus, its load and its buffers.',
-    diagnosis=DiagnosisHints(detector=Detector.REPEATED_SAMPLES),
+    diagnosis=DiagnosisHints(detector=Detector.REPEATED_SAMPLES,
+                             proof=(ProofVariable.STEP,)),
 )

@@ -15,7 +15,7 @@
 """Supply voltage: zero-g and scale factor follow it, though not exactly in proportion."""
 
 from adxl_ros.model.constants import NOMINAL_SUPPLY_V
-from adxl_ros.model.diagnosis_hints import DiagnosisHints, FormDimension, Manoeuvre
+from adxl_ros.model.diagnosis_hints import DiagnosisHints, FormDimension, Manoeuvre, ProofVariable
 from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Role, Signals
 
 _SCALE_EXPONENT = 1.135
@@ -49,5 +49,6 @@ EFFECT = Effect(
     invertible=True,
     follows=('supply_v',),
     cause='The output follows the supply; measure the supply and correct, or regulate it.',
-    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.SUPPLY, form=(FormDimension.SUPPLY,)),
+    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.SUPPLY, form=(FormDimension.SUPPLY,),
+                             proof=(ProofVariable.SUPPLY,)),
 )

@@ -15,7 +15,7 @@
 """Zero-g that changes with temperature."""
 
 from adxl_ros.model.constants import NOMINAL_TEMPERATURE_C
-from adxl_ros.model.diagnosis_hints import DiagnosisHints, FormDimension, Manoeuvre
+from adxl_ros.model.diagnosis_hints import DiagnosisHints, FormDimension, Manoeuvre, ProofVariable
 from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Role, Signals
 
 
@@ -40,5 +40,6 @@ EFFECT = Effect(
     invertible=True,
     follows=('temperature_c',),
     cause='The zero-g follows the temperature; measure it and correct, or keep it steady.',
-    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.HEAT, form=(FormDimension.TEMPERATURE,)),
+    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.HEAT, form=(FormDimension.TEMPERATURE,),
+                             proof=(ProofVariable.TEMPERATURE,)),
 )

@@ -15,7 +15,7 @@
 """Scale factor that changes with temperature."""
 
 from adxl_ros.model.constants import NOMINAL_TEMPERATURE_C
-from adxl_ros.model.diagnosis_hints import DiagnosisHints, FormDimension, Manoeuvre
+from adxl_ros.model.diagnosis_hints import DiagnosisHints, FormDimension, Manoeuvre, ProofVariable
 from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Role, Signals
 
 
@@ -43,5 +43,6 @@ EFFECT = Effect(
     invertible=True,
     follows=('temperature_c',),
     cause='The scale factor follows the temperature; measure it and correct, or keep it steady.',
-    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.HEAT, form=(FormDimension.TEMPERATURE,)),
+    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.HEAT, form=(FormDimension.TEMPERATURE,),
+                             proof=(ProofVariable.TEMPERATURE,)),
 )

@@ -14,7 +14,7 @@
 
 """Time offset: the stamps are late."""
 
-from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre
+from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre, ProofVariable
 from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Signals
 
 
@@ -34,5 +34,6 @@ EFFECT = Effect(
     exact=True,
     cause='The stamps of sensor and stage differ; synchronise the clocks, or state the delay.',
     # Stamps have a latency of some 0.1 ms (chosen: buffers of a board that works).
-    diagnosis=DiagnosisHints(healthy_std=1e-4, revealed_by=Manoeuvre.SHAKE),
+    diagnosis=DiagnosisHints(healthy_std=1e-4, revealed_by=Manoeuvre.SHAKE,
+                             proof=(ProofVariable.FORCE_RATE,)),
 )

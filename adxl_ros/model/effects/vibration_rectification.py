@@ -14,7 +14,7 @@
 
 """Vibration rectification: vibration shifts the zero-g by its mean square."""
 
-from adxl_ros.model.diagnosis_hints import DiagnosisHints, FormDimension, Manoeuvre
+from adxl_ros.model.diagnosis_hints import DiagnosisHints, FormDimension, Manoeuvre, ProofVariable
 from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Role, Signals
 from adxl_ros.model.filters import low_pass
 
@@ -45,5 +45,6 @@ EFFECT = Effect(
     ),
     apply=apply,
     cause='Vibration shifts the zero-g; damp the mount, or stay away from its resonance.',
-    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.SHAKE, form=(FormDimension.LAG,)),
+    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.SHAKE, form=(FormDimension.LAG,),
+                             proof=(ProofVariable.TIME,)),
 )

@@ -14,7 +14,7 @@
 
 """Warm-up: a zero-g that settles after power-on."""
 
-from adxl_ros.model.diagnosis_hints import DiagnosisHints, FormDimension, Manoeuvre
+from adxl_ros.model.diagnosis_hints import DiagnosisHints, FormDimension, Manoeuvre, ProofVariable
 from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Role, Signals
 import numpy as np
 
@@ -40,5 +40,6 @@ EFFECT = Effect(
     invertible=True,
     follows=('time_s',),
     cause='The sensor warms up after power-on; wait some time constants before measuring.',
-    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.HEAT, form=(FormDimension.TIME,)),
+    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.HEAT, form=(FormDimension.TIME,),
+                             proof=(ProofVariable.TIME,)),
 )

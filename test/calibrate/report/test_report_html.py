@@ -17,51 +17,30 @@
 from dataclasses import replace
 from itertools import product
 import re
-import shutil
 import subprocess
 
 from adxl_ros.files import calibration_store, parameter_file
 import numpy as np
+from pages import layout_faults, NEEDS_CHROMIUM, opener, running_browser, wait_until_drawn, WIDTHS
 from processes import executable
 import pytest
 from units import NOMINAL
 
-CHROMIUM = next(filter(None, map(shutil.which, (
-    'chromium', 'chromium-browser', 'google-chrome'))), None)
-pytestmark = [pytest.mark.long, pytest.mark.skipif(
-    CHROMIUM is None, reason='no Chromium: apt install chromium')]
+pytestmark = [pytest.mark.long, NEEDS_CHROMIUM]
 
 
 @pytest.fixture(scope='module')
 def browser():
     """Yield a headless Chromium."""
-    driver = pytest.importorskip(
-        'playwright.sync_api', reason='playwright is not installed: pip install playwright')
-    with driver.sync_playwright() as playwright:
-        launched = playwright.chromium.launch(executable_path=CHROMIUM, args=['--no-sandbox'])
+    with running_browser() as launched:
         yield launched
-        launched.close()
 
 
 @pytest.fixture
 def opened(browser):
     """Give a function that opens a file, and returns the page and messages of the browser."""
-    pages = []
-
-    def begin(path):
-        page = browser.new_page(viewport={'width': 1366, 'height': 768})
-        pages.append(page)
-        messages = []
-        page.on('console', lambda message: messages.append(f'{message.type}: {message.text}'))
-        page.on('pageerror', lambda error: messages.append(f'error: {error}'))
-        page.on('request', lambda request: messages.append(f'loads {request.url}')
-                if not request.url.startswith(('data:', f'file://{path}')) else None)
-        page.goto(f'file://{path}')
-        return page, messages
-
-    yield begin
-    for page in pages:
-        page.close()
+    with opener(browser) as begin:
+        yield begin
 
 
 @pytest.fixture(scope='module')
@@ -105,29 +84,55 @@ def test_the_browser_reports_faults_of_a_page(opened, tmp_path):
 def test_the_report_has_its_contents(opened, report_folder):
     """It has acceptance by model, coefficients with the datasheet, drift and plots, offline."""
     page, messages = opened(report_folder / 'report' / 'report.html')
+    wait_until_drawn(page)
     assert messages == []
     text = page.locator('body').inner_text()
     assert 'Calibration of <U&7>' in text
-    assert 'measured and by the full model' in text
-    rows = page.locator('table').nth(0).locator('tbody tr')
+    assert 'measured and by the full model' in ' '.join(text.split())
+    assert 'green' in page.locator('.badge').get_attribute('class')
+    assert page.locator('.tile').count() == 3
+    rows = page.locator('table.limits tbody tr')
     assert rows.locator('td:first-child').all_inner_texts() == [
         'nominal', 'linear', 'physical', 'full']
     assert 'PASS' in rows.nth(3).inner_text() and 'FAIL' in rows.nth(1).inner_text()
-    coefficients = page.locator('table').nth(1).inner_text()
+    # Each cell has one outcome.
+    assert not any(' ' in cell for cell in page.locator(
+        'table.limits .PASS, table.limits .FAIL').all_inner_texts())
+    coefficients = page.locator('table.coefficients')
     sensor = parameter_file.load(report_folder / 'unit.yaml')
-    assert all(str(name) in coefficients for name in sensor.covariance_names)
-    line = next(line for line in coefficients.splitlines()
-                if line.startswith('nonlinearity.cubic_per_g2.x'))
-    assert '\t0.00069\t0.0043\t' in line
+    names = coefficients.inner_text()
+    assert all(str(name) in names for name in sensor.covariance_names)
+    assert coefficients.locator('.whisker').count() == len(sensor.covariance_names)
+    cubic = coefficients.locator('tr', has_text='nonlinearity.cubic_per_g2.x').inner_text()
+    assert 'typical ±0.00069, maximum ±0.0043' in cubic and 'cubic x' in cubic
     change = re.search(r'In [\d.]+ days since last-year: zero-g of x changed by \+[34]\.\d+', text)
     assert change, text
     assert 'zero-g of y' not in text
-    assert page.locator('img').count() == 5
+    for name in ('errors', 'drift'):
+        assert page.locator(f'[data-figure={name}] .point').count() >= 2
+    assert page.locator('img').count() == 4
     assert page.evaluate('[...document.images].every(i => i.complete && i.naturalWidth > 500)')
-    # The page fits in the window of a laptop.
-    assert page.evaluate('document.documentElement.scrollWidth <= innerWidth')
     for value in (sensor.provenance['id'], sensor.provenance['data_sha256']):
         assert value in text
+
+
+@pytest.mark.parametrize('width', WIDTHS)
+def test_layout(opened, report_folder, width):
+    """No text overlaps another one or is cut, and no number has an exponent."""
+    path = report_folder / 'report' / 'report.html'
+    page, messages = opened(path, width)
+    assert layout_faults(page) == []
+    assert messages == []
+    assert path.stat().st_size < 5_000_000
+
+
+def test_the_parameter_file_is_in_the_page(opened, report_folder):
+    """The button gives the file that `fit` writes."""
+    page, _ = opened(report_folder / 'report' / 'report.html')
+    with page.expect_download() as download:
+        page.get_by_text('download _U_7_.yaml').click()
+    with open(download.value.path(), encoding='utf-8') as file:
+        assert file.read() == (report_folder / 'unit.yaml').read_text()
 
 
 def test_the_sphere_turns(opened, report_folder):
@@ -168,7 +173,7 @@ def test_the_sphere_turns(opened, report_folder):
         page.mouse.move(box['x'] + x, box['y'] + y)
         if pose_text.inner_text().startswith('pose'):
             break
-    assert re.match(r'pose \d+, alpha [\d.]+, beta [\d.]+ deg: -?[\d.]+(e-\d)? mg',
+    assert re.match(r'pose \d+, alpha [\d.]+°, beta [\d.]+°: -?[\d.]+ mg',
                     pose_text.inner_text())
     assert messages == []
 
@@ -189,11 +194,13 @@ def test_reports_without_history_and_without_a_stage(opened, report_folder, run_
                                                      tmp_path):
     """The page names a missing history, and the report by hand has its plots."""
     page, messages = opened(report_folder / 'first' / 'report.html')
+    wait_until_drawn(page)
     assert 'No earlier calibration of this unit' in page.locator('body').inner_text()
     done = run_tool('fit', shared_dir / 'real' / 'mpu9150_0.csv', '-o', 'u.yaml', '--report',
                     'by_hand')
     assert done.returncode == 0, done.stderr
     by_hand, messages_by_hand = opened(tmp_path / 'by_hand' / 'report.html')
+    assert layout_faults(by_hand) == []
     text = by_hand.locator('body').inner_text()
     assert 'magnitude minus gravity, mg' in text and 'magnitude of gravity over 23 rests' in text
     assert messages == messages_by_hand == []

@@ -1,0 +1,224 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""
+Figures of plotly.js as plain objects, which `html_page` puts into pages.
+
+Plain objects serve every version of plotly. Its Python classes would cost a second at start-up.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+
+Figure = dict[str, Any]
+"""A figure of plotly.js: `data` is the list of its traces, `layout` its layout."""
+AXIS_COLOURS = {'x': '#1f5fbf', 'y': '#c8641b', 'z': '#2a8a43'}
+"""Colours of the axes of the sensor (chosen: colour-blind people can distinguish them)."""
+BEFORE_COLOUR = '#c0392b'
+"""Colour of what the simulator lacks at first."""
+AFTER_COLOUR = '#2a8a43'
+"""Colour of the state after a correction."""
+QUIET_COLOUR = '#7b8794'
+"""Colour of what is only there for comparison."""
+_DIGITS = 5
+"""Significant digits of plotted values (chosen: below a pixel of a zoomed plot)."""
+_FINE_DECADES = 4
+"""Decades from which a logarithmic axis has a tick at the powers of ten only."""
+_FONT = {'family': 'system-ui, "DejaVu Sans", sans-serif', 'size': 12, 'color': '#1f2933'}
+_GRID = {'gridcolor': '#e4e7eb', 'zerolinecolor': '#9aa5b1', 'linecolor': '#9aa5b1',
+         'automargin': True, 'exponentformat': 'none', 'hoverformat': '.4~g'}
+"""Properties of all axes of a plot."""
+
+
+def figure(traces: Iterable[Figure], height: int, **layout: Any) -> Figure:
+    """
+    Make a figure.
+
+    Parameters
+    ----------
+    traces
+        The traces.
+    height
+        Height, pixels.
+    **layout
+        Further properties of the layout; those of `xaxis...` and `yaxis...` have a grid.
+
+    Returns
+    -------
+    dict
+        The figure.
+
+    """
+    axes = {name: _GRID | value for name, value in layout.items()
+            if name.startswith(('xaxis', 'yaxis'))}
+    return {'data': list(traces), 'layout': {
+        'height': height, 'autosize': True, 'font': _FONT, 'paper_bgcolor': '#fff',
+        'plot_bgcolor': '#fff', 'margin': {'l': 8, 'r': 12, 't': 10, 'b': 8}, 'bargap': 0.3,
+        'legend': {'orientation': 'h', 'x': 0, 'y': 1, 'yanchor': 'bottom'},
+        'hovermode': 'closest', 'dragmode': 'zoom', **layout, **axes}}
+
+
+def line(x: Iterable[float], y: Iterable[float], name: str, colour: str, **properties: Any
+         ) -> Figure:
+    """
+    Make a line.
+
+    Parameters
+    ----------
+    x, y
+        Its points.
+    name
+        Name in the legend.
+    colour
+        Its colour.
+    **properties
+        Further properties of the trace.
+
+    Returns
+    -------
+    dict
+        The trace.
+
+    """
+    return {'type': 'scatter', 'mode': 'lines', 'x': rounded(x), 'y': rounded(y), 'name': name,
+            'line': {'color': colour, 'width': 1.2}} | properties
+
+
+def points(x: Iterable[float], y: Iterable[float], half_width: Iterable[float], name: str,
+           colour: str) -> Figure:
+    """
+    Make points with error bars.
+
+    Parameters
+    ----------
+    x, y
+        The points.
+    half_width
+        Half of the error bars.
+    name
+        Name in the legend.
+    colour
+        Their colour.
+
+    Returns
+    -------
+    dict
+        The trace.
+
+    """
+    return {'type': 'scatter', 'mode': 'markers', 'x': rounded(x), 'y': rounded(y), 'name': name,
+            'error_y': {'type': 'data', 'array': rounded(half_width), 'thickness': 1.2,
+                        'width': 3}, 'marker': {'color': colour, 'size': 6}}
+
+
+def axis_number(name: str, number: int) -> str:
+    """
+    Return plotly's name of the i-th axis of a figure.
+
+    Parameters
+    ----------
+    name
+        'x', 'y', 'xaxis' or 'yaxis'.
+    number
+        Its number from 1.
+
+    Returns
+    -------
+    str
+        The name, whose number is absent for the first one.
+
+    """
+    return name if number == 1 else f'{name}{number}'
+
+
+def log_axis(values: np.ndarray) -> Figure:
+    """Return the properties of a logarithmic axis with ticks at 1, 2 and 5 of each decade."""
+    positive = values[values > 0]
+    low, high = (float(f(positive)) for f in (np.min, np.max)) if positive.size else (1.0, 10.0)
+    decades = 10.0 ** np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1)
+    fine = (1, 2, 5) if len(decades) < _FINE_DECADES else (1,)
+    ticks = [float(f'{step * decade:.1g}') for decade in decades for step in fine]
+    return {'type': 'log', 'tickmode': 'array', 'tickvals': ticks,
+            'ticktext': [np.format_float_positional(tick, trim='-') for tick in ticks]}
+
+
+def rounded(values: Iterable[float]) -> list[float | None]:
+    """Return values with the digits of a plot; None where they are not finite."""
+    return [float(f'{v:.{_DIGITS}g}') if np.isfinite(v) else None
+            for v in np.asarray(values, float)]
+
+
+def extremes(values: np.ndarray, count: int) -> np.ndarray:
+    """
+    Choose samples of a signal so that its plot looks as that of all samples.
+
+    Parameters
+    ----------
+    values
+        The signal, (n,).
+    count
+        Number of samples that are wanted.
+
+    Returns
+    -------
+    numpy.ndarray
+        Rising indices: the smallest and the largest sample of each of `count / 2` blocks.
+
+    """
+    if len(values) <= count:
+        return np.arange(len(values))
+    size = -(-len(values) // (count // 2))
+    chosen = []
+    for begin in range(0, len(values), size):
+        block = np.nan_to_num(values[begin:begin + size])
+        chosen += sorted({begin + int(np.argmin(block)), begin + int(np.argmax(block))})
+    return np.array(chosen)
+
+
+def whisker(value: float, low: float, high: float, bounds: tuple[float, float], text: str,
+            typical: float = 0.0, beyond: bool = False) -> Mapping[str, Any]:
+    """
+    Place a value with its interval between bounds, in percent of their distance.
+
+    Parameters
+    ----------
+    value, low, high
+        The value and its interval.
+    bounds
+        Both ends of the drawn range.
+    text
+        The value in words.
+    typical
+        Half of a range about 0 that is shaded; 0 for none.
+    beyond
+        Whether the value exceeds its limit.
+
+    Returns
+    -------
+    mapping
+        What the macro `whisker` of `parts.html` draws.
+
+    """
+    begin, end = bounds
+
+    def place(position: float) -> float:
+        share = (position - begin) / (end - begin) if end > begin else 0.5
+        return round(100 * float(np.clip(share, 0.0, 1.0)), 2)
+
+    shaded = (place(-typical), place(typical) - place(-typical)) if typical else None
+    return {'text': text, 'zero': place(0.0), 'dot': place(value), 'typical': shaded,
+            'line': (place(low), place(high) - place(low)), 'beyond': beyond}

@@ -1,0 +1,167 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The page of a diagnosis in a real browser: what it shows first, its proofs, layout and files."""
+
+import json
+from subprocess import run
+
+from pages import layout_faults, NEEDS_CHROMIUM, opener, running_browser, wait_until_drawn, WIDTHS
+from processes import executable
+import pytest
+
+pytestmark = [pytest.mark.long, NEEDS_CHROMIUM]
+
+EFFECTS = ('lever_arm', 'temperature_bias')
+
+
+@pytest.fixture(scope='module')
+def browser():
+    """Yield a headless Chromium."""
+    with running_browser() as launched:
+        yield launched
+
+
+@pytest.fixture
+def opened(browser):
+    """Give a function that opens a file, and returns the page and messages of the browser."""
+    with opener(browser) as begin:
+        yield begin
+
+
+@pytest.fixture(scope='module')
+def folder(tmp_path_factory):
+    """Return the folder of two diagnoses: one with two effects, one of swapped axes."""
+    made = tmp_path_factory.mktemp('diagnosed')
+
+    def call(name, *arguments, status=0):
+        done = run([executable(name), *arguments], cwd=made, capture_output=True, text=True,
+                   timeout=300)
+        assert done.returncode == status, done.stderr
+
+    effects = [word for effect in EFFECTS for word in ('--effect', effect)]
+    call('simulate', 'rich', '--rate', '62.5', *effects, '-o', 'run.csv')
+    call('diagnose', 'run.csv', '-o', 'gap')
+    text = (made / 'run.csv').read_text()
+    swapped = text.replace(',x_v,y_v,', ',y_v,x_v,')
+    assert swapped != text
+    (made / 'swapped.csv').write_text(swapped)
+    call('diagnose', 'swapped.csv', '-o', 'fault', status=1)
+    return made
+
+
+@pytest.fixture
+def page(opened, folder):
+    """Return the page with two effects, drawn."""
+    shown, _ = opened(folder / 'gap' / 'report.html', 1280)
+    wait_until_drawn(shown)
+    return shown
+
+
+def test_the_first_screen(page):
+    """Badge, tiles, waterfall and effects are visible without scrolling."""
+    page.set_viewport_size({'width': 1280, 'height': 900})
+    assert 'green' in page.locator('.badge').get_attribute('class')
+    assert page.locator('.tile').count() == 4
+    assert page.locator('.effect h3').all_inner_texts() == list(EFFECTS)
+    for place in ('.badge', '.tiles', '[data-figure=waterfall]', '.effect >> nth=1'):
+        box = page.locator(place).first.bounding_box()
+        assert box['y'] + box['height'] < 900, place
+    assert page.locator('.command code').first.inner_text() == \
+        'ros2 run adxl_ros diagnose run.csv -o gap'
+
+
+@pytest.mark.parametrize('width', WIDTHS)
+@pytest.mark.parametrize('name', ['gap', 'fault'])
+def test_layout(opened, folder, name, width):
+    """No text overlaps another one or is cut, and no number has an exponent."""
+    path = folder / name / 'report.html'
+    shown, messages = opened(path, width)
+    assert layout_faults(shown) == []
+    assert messages == []
+    assert path.stat().st_size < 5_000_000
+
+
+def test_faults_of_layout_are_found(opened, tmp_path):
+    """The search for faults can fail."""
+    path = tmp_path / 'bad.html'
+    path.write_text('<body data-drawn="yes"><p>1.3e-14</p><p style="width:3000px">wide</p>'
+                    '<p style="position:absolute;top:0">above</p>'
+                    '<div style="width:30px;overflow:hidden;white-space:nowrap">a long text</div>')
+    shown, _ = opened(path)
+    kinds = {fault.partition(':')[0] for fault in layout_faults(shown)}
+    assert kinds == {'exponent', 'overlap', 'cut', 'wider than the window'}
+
+
+def test_each_effect_has_its_proof(page):
+    """Means over the temperature lie on the line of the model, within their error bars."""
+    plots = page.locator('.plot[data-figure^=proof]')
+    assert plots.count() == len(EFFECTS)
+    shown = page.locator('[data-figure=proof-temperature_bias]')
+    assert 'temperature, °C' in shown.inner_text()
+    traces = shown.evaluate('plot => plot.data.map(t => ({x: t.x, y: t.y, e: t.error_y}))')
+    recorded, model = traces[:2]
+    assert recorded['x'] == model['x'] and len(recorded['x']) > 5
+    off = [abs(r - m) / e for r, m, e in zip(recorded['y'], model['y'], recorded['e']['array'])]
+    assert sum(ratio < 1.5 for ratio in off) > 0.8 * len(off)
+    # The effect is visible: the line rises by far more than the error bars.
+    assert max(model['y']) - min(model['y']) > 5 * min(recorded['e']['array'])
+
+
+def test_zoom_is_linked(page):
+    """A zoom in one panel of the signals changes the time of all."""
+    plot = page.locator('[data-figure=signals]')
+    plot.scroll_into_view_if_needed()
+    box = plot.locator('.nsewdrag').first.bounding_box()
+    page.mouse.move(box['x'] + 100, box['y'] + 20)
+    page.mouse.down()
+    page.mouse.move(box['x'] + 300, box['y'] + 21, steps=5)
+    page.mouse.up()
+    page.wait_for_function(
+        'document.querySelector("[data-figure=signals]").layout.xaxis.autorange !== true')
+    assert plot.evaluate('plot => plot.data.every(t => !t.xaxis || t.xaxis === "x")')
+    assert plot.locator('.nsewdrag').count() == 4
+
+
+def test_files_and_commands(page, folder):
+    """The button gives the parameter file, and each command has a button that copies it."""
+    with page.expect_download() as download:
+        page.get_by_text('download params.yaml').click()
+    with open(download.value.path(), encoding='utf-8') as file:
+        assert file.read() == (folder / 'gap' / 'params.yaml').read_text()
+    button = page.locator('ol.steps button').first
+    proposal = json.loads((folder / 'gap' / 'report.json').read_text())['next_experiment']
+    assert button.get_attribute('data-copy') == proposal['command']
+    button.click()
+    page.wait_for_function('document.querySelector("ol.steps button").textContent === "copied"')
+
+
+def test_print(page, tmp_path):
+    """The paper has the contents of all tabs, and no plot is wider than it."""
+    page.emulate_media(media='print')
+    page.set_viewport_size({'width': 700, 'height': 900})
+    assert page.locator('[data-figure=spectrum]').is_visible()
+    assert not page.locator('.tabs').is_visible()
+    assert page.evaluate("""() => [...document.querySelectorAll('.main-svg')].every(
+        svg => svg.getBoundingClientRect().right <= innerWidth)""")
+    page.pdf(path=tmp_path / 'page.pdf', format='A4')
+    assert 3 <= (tmp_path / 'page.pdf').read_bytes().count(b'/Type /Page\n') <= 15
+
+
+def test_a_fault_of_the_recording(opened, folder):
+    """Swapped axes give a red badge that names the fault, and no effects."""
+    shown, _ = opened(folder / 'fault' / 'report.html')
+    assert 'red' in shown.locator('.badge').get_attribute('class')
+    report = json.loads((folder / 'fault' / 'report.json').read_text())
+    assert report['summary'] in shown.locator('.badge').inner_text()
+    assert shown.locator('.effect').count() == 0
