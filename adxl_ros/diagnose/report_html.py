@@ -121,10 +121,10 @@ def _sentence(diagnosis: Diagnosis, report: dict[str, Any]) -> str:
     if report['verdict']['status'] != 'explained':
         return headline(diagnosis)
     assert diagnosis.gap_closure is not None
-    closure, effects = diagnosis.gap_closure, diagnosis.verdict.effects if diagnosis.verdict else ()
+    closure, effects = diagnosis.gap_closure, listed(report['verdict']['effects'], 'and')
     if is_only_noise(diagnosis):
-        return f'{listed(effects, "and")}. {NOISE_STAYS}'
-    return (f'{listed(effects, "and")}: the difference falls from {mg_text(closure.before_mps2)} '
+        return f'{effects}. {NOISE_STAYS}'
+    return (f'{effects}: the difference falls from {mg_text(closure.before_mps2)} '
             f'to {mg_text(closure.after_mps2)} rms.')
 
 

@@ -26,7 +26,7 @@ from typing import Any
 from adxl_ros.diagnose import report_html, report_json, report_text
 from adxl_ros.diagnose.diagnosis import diagnose as diagnose_recordings, Diagnosis
 from adxl_ros.errors import UserError
-from adxl_ros.files import parameter_file, recording
+from adxl_ros.files import html_page, parameter_file, recording
 from adxl_ros.files.atomic_write import write_text
 from adxl_ros.files.reading_options import ReadingOptions
 from adxl_ros.files.recording_columns import Recording
@@ -95,6 +95,7 @@ def diagnose(options: argparse.Namespace) -> int:
     if options.align and not options.sim:
         raise UserError('--align: shifts --sim, which is not given')
     reading = reading_options(options)
+    html_page.check_libraries()
     with progress('reading') as show:
         recordings = [_read(path, reading) for path in options.recording]
         sim = motion_from_force(options.sim, False, recordings[0].epoch_ns)[0] if options.sim \
@@ -137,10 +138,10 @@ def _write(options: argparse.Namespace, diagnosis: Diagnosis, subject: str, line
     if parameters:
         write_text(folder / 'params.yaml', parameters)
     steps = _next_steps(options, diagnosis)
+    if isinstance(steps, str):
+        steps = [NextStep('simulate with these parameters', steps)] if steps else []
     write_text(folder / 'report.html', report_html.page(diagnosis, report_html.Run(
-        subject, Path(options.params or parameter_file.nominal_path()).name,
-        [('Simulate with the effects', steps)] if isinstance(steps, str) and steps
-        else list(steps), parameters)))
+        subject, Path(options.params or parameter_file.nominal_path()).name, steps, parameters)))
     return report
 
 

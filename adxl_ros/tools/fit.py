@@ -24,7 +24,7 @@ import sys
 from adxl_ros.calibrate import calibration, pose_extraction
 from adxl_ros.calibrate.report import report_html, text_tables
 from adxl_ros.errors import UserError
-from adxl_ros.files import calibration_store, recording, sweep_journal
+from adxl_ros.files import calibration_store, html_page, recording, sweep_journal
 from adxl_ros.files.checksum import sha256
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.stream_unit import recorded_unit
@@ -90,6 +90,8 @@ def fit(options: argparse.Namespace) -> int:
     if options.journal and len(options.recording) != 1:
         raise UserError(f'--journal {options.journal}: names the rests of one recording, but '
                         f'{len(options.recording)} are given')
+    if options.report:
+        html_page.check_libraries()
     records = _records(options.journal)
     unit: Sensor | None = None
     measured: list[str] = []
