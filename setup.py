@@ -39,7 +39,7 @@ setup(
     version='0.1.0',
     packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*']),
     package_data={PACKAGE: ['calibrate/report/*.html', 'calibrate/report/*.js', 'diagnose/*.html',
-                            'files/page_templates/*']},
+                            'files/page_templates/*', 'tools/*.html']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
         (f'share/{PACKAGE}', ['package.xml']),

@@ -230,21 +230,21 @@ def _values(comparison: BaselineComparison, variable: ProofVariable) -> np.ndarr
     time_s, motion, axes = comparison.time_s, comparison.motion, comparison.sensor.axes
     if variable is ProofVariable.OUTPUT:
         return comparison.volts
-    by_time = {ProofVariable.TIME: lambda: time_s - time_s[0]}
+    by_time = {ProofVariable.TIME: time_s - time_s[0]}
     if motion.temperature_c is not None:
-        by_time[ProofVariable.TEMPERATURE] = lambda: motion.temperature_c(time_s)
+        by_time[ProofVariable.TEMPERATURE] = motion.temperature_c(time_s)
     if motion.supply_v is not None:
-        by_time[ProofVariable.SUPPLY] = lambda: motion.supply_v(time_s)
+        by_time[ProofVariable.SUPPLY] = motion.supply_v(time_s)
     if comparison.reference is Reference.STAGE:
         by_time |= {
-            ProofVariable.ALPHA: lambda: np.degrees(motion.alpha(time_s)),
-            ProofVariable.BETA: lambda: np.degrees(motion.beta(time_s)) % 360,
-            ProofVariable.ALPHA_RATE: lambda: np.degrees(motion.alpha(time_s, 1)),
-            ProofVariable.BETA_RATE: lambda: np.degrees(motion.beta(time_s, 1)),
-            ProofVariable.ALPHA_ACCELERATION: lambda: np.degrees(motion.alpha(time_s, 2)),
-            ProofVariable.BETA_ACCELERATION: lambda: np.degrees(motion.beta(time_s, 2))}
+            ProofVariable.ALPHA: np.degrees(motion.alpha(time_s)),
+            ProofVariable.BETA: np.degrees(motion.beta(time_s)) % 360,
+            ProofVariable.ALPHA_RATE: np.degrees(motion.alpha(time_s, 1)),
+            ProofVariable.BETA_RATE: np.degrees(motion.beta(time_s, 1)),
+            ProofVariable.ALPHA_ACCELERATION: np.degrees(motion.alpha(time_s, 2)),
+            ProofVariable.BETA_ACCELERATION: np.degrees(motion.beta(time_s, 2))}
     if variable in by_time:
-        return np.repeat(by_time[variable]()[:, None], len(axes), axis=1)
+        return np.repeat(by_time[variable][:, None], len(axes), axis=1)
     force_g = _force_g(comparison)
     if force_g is None:
         return None

@@ -90,7 +90,7 @@ def waterfall(diagnosis: Diagnosis) -> Figure:
     text.append(mg_text(closure.floor_mps2))
     colours = [BEFORE_COLOUR, *[_EFFECT_COLOUR] * len(steps),
                *[AFTER_COLOUR] * bool(steps), QUIET_COLOUR]
-    bars = {'type': 'bar', 'orientation': 'h', 'y': labels, 'x': rounded(width),
+    bars = {'type': 'bar', 'width': 0.62, 'orientation': 'h', 'y': labels, 'x': rounded(width),
             'base': rounded(base), 'text': text, 'textposition': 'outside', 'cliponaxis': False,
             'marker': {'color': colours}, 'hovertemplate': '%{y}: %{text}<extra></extra>',
             'showlegend': False}
@@ -100,31 +100,31 @@ def waterfall(diagnosis: Diagnosis) -> Figure:
                   yaxis={'autorange': 'reversed', 'ticks': '', 'type': 'category'})
 
 
-def proof(shown: EffectProof) -> Figure:
+def proof(evidence: EffectProof) -> Figure:
     """Draw the proof of one effect."""
-    return _binned_proof(shown) if shown.binned else _curve_proof(shown)
+    return _binned_proof(evidence) if evidence.binned else _curve_proof(evidence)
 
 
-def _binned_proof(shown: EffectProof) -> Figure:
+def _binned_proof(evidence: EffectProof) -> Figure:
     """Draw the means over ranges of the variable, and the line of the model."""
     traces = []
-    for binned in shown.binned:
+    for binned in evidence.binned:
         colour = AXIS_COLOURS[binned.axis]
         order = np.argsort(binned.variable)
         traces += [points(binned.variable, binned.residual_mg, binned.half_width_mg,
                           f'{binned.axis} recorded', colour),
                    line(binned.variable[order], binned.model_mg[order],
                         f'{binned.axis} model', colour)]
-    return figure(traces, 300, xaxis={'title': {'text': shown.variable}},
+    return figure(traces, 300, xaxis={'title': {'text': evidence.variable}},
                   yaxis={'title': {'text': 'recording minus simulation, mg'}},
                   margin={'l': 8, 'r': 12, 't': 36, 'b': 8})
 
 
-def _curve_proof(shown: EffectProof) -> Figure:
+def _curve_proof(evidence: EffectProof) -> Figure:
     """Draw spectra or histograms, one panel for each axis."""
-    axes = list(dict.fromkeys(curve.axis for curve in shown.curves))
-    unit = 'mg/√Hz' if shown.is_spectrum else 'samples'
-    return _panels(shown.curves, axes, shown.variable, unit, shown.is_spectrum)
+    axes = list(dict.fromkeys(curve.axis for curve in evidence.curves))
+    unit = 'mg/√Hz' if evidence.is_spectrum else 'samples'
+    return _panels(evidence.curves, axes, evidence.variable, unit, evidence.is_spectrum)
 
 
 def _panels(curves: Sequence[Curve], axes: Sequence[str], title: str, unit: str, is_log: bool,

@@ -118,7 +118,10 @@ def page(diagnosis: Diagnosis, run: Run) -> str:
 
 def _sentence(diagnosis: Diagnosis, report: dict[str, Any]) -> str:
     """Return the verdict in one sentence beside its badge."""
-    if report['verdict']['status'] != 'explained':
+    status = report['verdict']['status']
+    if status == 'no_gap':
+        return 'The recording agrees with its simulation within the noise.'
+    if status != 'explained':
         return headline(diagnosis)
     assert diagnosis.gap_closure is not None
     closure, effects = diagnosis.gap_closure, listed(report['verdict']['effects'], 'and')
@@ -132,11 +135,11 @@ def _contents(diagnosis: Diagnosis, report: dict[str, Any]) -> dict[str, Any]:
     """Return what the template shows of a diagnosis with a verdict."""
     assert diagnosis.verdict is not None
     named = named_effects(diagnosis, report)
-    shown = sorted((c for c in report['candidates'] if (c['probability'] or 0.0) >= PROBABLE),
+    probable = sorted((c for c in report['candidates'] if (c['probability'] or 0.0) >= PROBABLE),
                    key=lambda c: named.index(c['effect']) if c['effect'] in named else len(named))
     refuted = [c for c in report['candidates'] if (c['probability'] or 0.0) < PROBABLE]
     after = diagnosis.verdict.best.sensor
-    proofs = _proofs(diagnosis, shown)
+    proofs = _proofs(diagnosis, probable)
     figures = {'waterfall': page_figures.waterfall(diagnosis),
                'signals': page_figures.signals(diagnosis.comparisons[0], after),
                'spectrum': page_figures.gap_spectrum(diagnosis.full_rate[0], after),
@@ -147,7 +150,7 @@ def _contents(diagnosis: Diagnosis, report: dict[str, Any]) -> dict[str, Any]:
         'has_verdict': True,
         'figures': figures,
         'tiles': tiles(diagnosis),
-        'effects': [_effect(c, noisy) for c in shown],
+        'effects': [_effect(c, noisy) for c in probable],
         'refuted': [[c['effect'], p_text(c['probability'] or 0.0), c['cause']] for c in refuted],
         'proofs': [{'effect': p.effect, 'text': _proof_text(p)} for p in proofs],
         'gap_rows': gap_rows(diagnosis),
@@ -166,12 +169,12 @@ def _contents(diagnosis: Diagnosis, report: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _proofs(diagnosis: Diagnosis, shown: Sequence[dict[str, Any]]) -> list[EffectProof]:
+def _proofs(diagnosis: Diagnosis, candidates: Sequence[dict[str, Any]]) -> list[EffectProof]:
     """Prove the effects that the page shows, as far as the fitted sensor has them."""
     assert diagnosis.verdict is not None
     detected = {d.effect for d in diagnosis.detections}
     proofs = []
-    for candidate in shown:
+    for candidate in candidates:
         effect = candidate['effect']
         sensor = _sensor_with(diagnosis, effect, effect in detected)
         if sensor is not None:
@@ -186,14 +189,14 @@ def _sensor_with(diagnosis: Diagnosis, effect: str, detected: bool) -> Sensor | 
     return next((h.sensor for h in diagnosis.hypotheses if effect in h.effects), None)
 
 
-def _proof_text(shown: EffectProof) -> str:
+def _proof_text(evidence: EffectProof) -> str:
     """Explain the proof of an effect in one sentence."""
-    if shown.binned:
+    if evidence.binned:
         return ('Points: recording minus a simulation with all other effects, with 90 % bars. '
                 'Line: the model of this effect.')
-    kind = 'spectrum' if shown.is_spectrum else 'histogram'
+    kind = 'spectrum' if evidence.is_spectrum else 'histogram'
     return f'The effect is there if the recorded {kind} follows the green line, not the red one.' \
-        if any(c.label == 'recorded' for c in shown.curves) else \
+        if any(c.label == 'recorded' for c in evidence.curves) else \
         'The effect is there if the spectrum of the difference falls from red to green.'
 
 
@@ -221,14 +224,16 @@ def _size(label: str, parameter: dict[str, Any], stated: Parameter,
           parameters: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
     """Return one size of an effect, with its whisker where it has an interval."""
     text = parameter_text(parameter)
-    size = {'label': label or 'size', 'doc': stated.doc, 'text': text, 'mark': None}
+    size: dict[str, Any] = {'label': label or 'size', 'doc': stated.doc, 'text': text,
+                            'mark': None}
     if parameter.get('ci'):
-        alike = [p for p in parameters.values() if p.get('ci') and p['unit'] == stated.unit]
-        low = min(0.0, *(p['ci'][0] for p in alike))
-        high = max(0.0, *(p['ci'][1] for p in alike))
+        comparable = [p for p in parameters.values() if p.get('ci') and p['unit'] == stated.unit]
+        low = min(0.0, *(p['ci'][0] for p in comparable))
+        high = max(0.0, *(p['ci'][1] for p in comparable))
         margin = _MARGIN * (high - low)
         size['mark'] = plotly_figures.whisker(
-            parameter['value'], *parameter['ci'], (low - margin, high + margin), text)
+            parameter['value'], parameter['ci'][0], parameter['ci'][1],
+            (low - margin, high + margin), text)
     return size
 
 

@@ -19,15 +19,18 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from adxl_ros.files import html_page
 from adxl_ros.files.atomic_write import write_text
 from adxl_ros.files.csv_writer import CsvWriter
-from adxl_ros.files.html_page import document, picture, table
 from adxl_ros.files.plot_file import pyplot, write_plot
 from adxl_ros.signals.axis_noise import RecordingNoise, TERMS
 from adxl_ros.tools import noise_text
 
 _INCHES = (5.0, 4.4)
 """Width and height of the plot of an axis, inches. Chosen: three fit beside each other."""
+_COLUMNS = ('axis', 'white noise N, µg/√Hz', 'bias instability B, µg', 'random walk K, µg/√s',
+            'lowest Allan deviation, µg', 'noise of a sample, m/s²', 'fitted below, Hz')
+"""Head of the table."""
 
 
 def write(folder: Path, result: RecordingNoise) -> list[Path]:
@@ -49,7 +52,7 @@ def write(folder: Path, result: RecordingNoise) -> list[Path]:
     Raises
     ------
     UserError
-        A file cannot be written, or matplotlib is not installed.
+        A file cannot be written, or plotly, jinja2 or matplotlib is not installed.
 
     """
     page, plot, curve = (folder / name for name in ('report.html', 'allan.png', 'allan.csv'))
@@ -65,24 +68,15 @@ def write(folder: Path, result: RecordingNoise) -> list[Path]:
 
 def _page(result: RecordingNoise, figure: Any) -> str:
     """Return the page."""
-    warnings = noise_text.warnings(result)
-    summary = '\n'.join(noise_text.head(result))
     rows = [[noise.axis, *(noise_text.interval(estimate.scaled(noise_text.MICRO_G))
                            for estimate in noise.estimates),
              f'{noise.lowest * noise_text.MICRO_G:.3g} at {noise.lowest_s:.3g} s',
              f'{noise.sample_std:.3g}', f'{noise.fit.highest_hz:.3g}'] for noise in result.axes]
-    parts = ['<h1>Noise at rest</h1>', f'<pre class="summary">{summary}</pre>',
-             *(f'<p class="summary open">{text}</p>' for text in warnings),
-             table(['axis', 'white noise N, µg/√Hz', 'bias instability B, µg',
-                    'random walk K, µg/√s', 'lowest Allan deviation, µg',
-                    'noise of a sample, m/s²', 'fitted below, Hz'], rows),
-             picture(figure, 'Allan deviation of each axis over the averaging time'),
-             '<p>Dots: overlapping Allan deviation, with its standard deviation. Lines: N/√τ, '
-             '0.664·B, K·√(τ/3) and the root of their squares. The lines are fitted to the '
-             'cosine transform of the samples, not to the dots.</p>',
-             '<h2>Ready to paste</h2>',
-             f'<pre>{chr(10).join(noise_text.paste_lines(result))}</pre>']
-    return document('Noise at rest', parts)
+    return html_page.render('adxl_ros.tools', 'noise.html', {
+        'title': 'Noise at rest', 'about': noise_text.head(result), 'badge': None, 'figures': {},
+        'warnings': noise_text.warnings(result), 'columns': _COLUMNS, 'rows': rows,
+        'picture': html_page.picture_url(figure),
+        'paste_lines': noise_text.paste_lines(result)})
 
 
 def _plot(result: RecordingNoise) -> Any:

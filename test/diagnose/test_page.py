@@ -63,9 +63,9 @@ def folder(tmp_path_factory):
 @pytest.fixture
 def page(opened, folder):
     """Return the page with two effects, drawn."""
-    shown, _ = opened(folder / 'gap' / 'report.html', 1280)
-    wait_until_drawn(shown)
-    return shown
+    drawn, _ = opened(folder / 'gap' / 'report.html', 1280)
+    wait_until_drawn(drawn)
+    return drawn
 
 
 def test_the_first_screen(page):
@@ -86,8 +86,8 @@ def test_the_first_screen(page):
 def test_layout(opened, folder, name, width):
     """No text overlaps another one or is cut, and no number has an exponent."""
     path = folder / name / 'report.html'
-    shown, messages = opened(path, width)
-    assert layout_faults(shown) == []
+    page, messages = opened(path, width)
+    assert layout_faults(page) == []
     assert messages == []
     assert path.stat().st_size < 5_000_000
 
@@ -98,8 +98,8 @@ def test_faults_of_layout_are_found(opened, tmp_path):
     path.write_text('<body data-drawn="yes"><p>1.3e-14</p><p style="width:3000px">wide</p>'
                     '<p style="position:absolute;top:0">above</p>'
                     '<div style="width:30px;overflow:hidden;white-space:nowrap">a long text</div>')
-    shown, _ = opened(path)
-    kinds = {fault.partition(':')[0] for fault in layout_faults(shown)}
+    page, _ = opened(path)
+    kinds = {fault.partition(':')[0] for fault in layout_faults(page)}
     assert kinds == {'exponent', 'overlap', 'cut', 'wider than the window'}
 
 
@@ -107,13 +107,13 @@ def test_each_effect_has_its_proof(page):
     """Means over the temperature lie on the line of the model, within their error bars."""
     plots = page.locator('.plot[data-figure^=proof]')
     assert plots.count() == len(EFFECTS)
-    shown = page.locator('[data-figure=proof-temperature_bias]')
-    assert 'temperature, °C' in shown.inner_text()
-    traces = shown.evaluate('plot => plot.data.map(t => ({x: t.x, y: t.y, e: t.error_y}))')
+    plot = page.locator('[data-figure=proof-temperature_bias]')
+    assert 'temperature, °C' in plot.inner_text()
+    traces = plot.evaluate('plot => plot.data.map(t => ({x: t.x, y: t.y, e: t.error_y}))')
     recorded, model = traces[:2]
     assert recorded['x'] == model['x'] and len(recorded['x']) > 5
-    off = [abs(r - m) / e for r, m, e in zip(recorded['y'], model['y'], recorded['e']['array'])]
-    assert sum(ratio < 1.5 for ratio in off) > 0.8 * len(off)
+    ratios = [abs(r - m) / e for r, m, e in zip(recorded['y'], model['y'], recorded['e']['array'])]
+    assert sum(ratio < 1.5 for ratio in ratios) > 0.8 * len(ratios)
     # The effect is visible: the line rises by far more than the error bars.
     assert max(model['y']) - min(model['y']) > 5 * min(recorded['e']['array'])
 
@@ -160,8 +160,8 @@ def test_print(page, tmp_path):
 
 def test_a_fault_of_the_recording(opened, folder):
     """Swapped axes give a red badge that names the fault, and no effects."""
-    shown, _ = opened(folder / 'fault' / 'report.html')
-    assert 'red' in shown.locator('.badge').get_attribute('class')
+    page, _ = opened(folder / 'fault' / 'report.html')
+    assert 'red' in page.locator('.badge').get_attribute('class')
     report = json.loads((folder / 'fault' / 'report.json').read_text())
-    assert report['summary'] in shown.locator('.badge').inner_text()
-    assert shown.locator('.effect').count() == 0
+    assert report['summary'] in page.locator('.badge').inner_text()
+    assert page.locator('.effect').count() == 0

@@ -100,7 +100,7 @@ def drift(series: DriftSeries) -> Figure:
     """Draw zero-g and scale factor of a unit over its calibrations, relative to the newest."""
     traces, layout = [], {}
     number_of = np.arange(len(series.dates))
-    shown = np.unique(np.linspace(0, len(series.dates) - 1, _DATES).astype(int))
+    labelled = np.unique(np.linspace(0, len(series.dates) - 1, _DATES).astype(int))
     panels = (('zero-g, mg', series.zero_g_mg, series.zero_g_std_mg),
               ('scale factor, ‰', series.scale_permille, series.scale_std_permille))
     for number, (label, values, std) in enumerate(panels, 1):
@@ -114,14 +114,14 @@ def drift(series: DriftSeries) -> Figure:
         layout[axis_number('yaxis', number)] = {
             'title': {'text': label}, 'domain': [0.54, 1] if number == 1 else [0, 0.46]}
     return figure(traces, 340, margin=_ROOM, **layout,
-                  xaxis={'anchor': 'y2', 'tickvals': shown.tolist(),
-                         'ticktext': [series.dates[i][:10] for i in shown]})
+                  xaxis={'anchor': 'y2', 'tickvals': labelled.tolist(),
+                         'ticktext': [series.dates[i][:10] for i in labelled]})
 
 
 def _band(count: int, low: float, high: float, panel: int) -> Figure:
     """Draw the band of the expected errors in a panel."""
-    ends = [0.5, count + 0.5]
-    return line([*ends, *ends[::-1]], [low, low, high, high], 'expected 90 %', QUIET_COLOUR,
+    edges = [0.5, count + 0.5]
+    return line([*edges, *edges[::-1]], [low, low, high, high], 'expected 90 %', QUIET_COLOUR,
                 fill='toself', fillcolor=_BAND_COLOUR, hoverinfo='skip',
                 line={'color': QUIET_COLOUR, 'width': 0.5}, xaxis='x',
                 yaxis=axis_number('y', panel), showlegend=panel == 1)

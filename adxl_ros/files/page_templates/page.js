@@ -18,6 +18,7 @@
     });
   }
   async function draw() {
+    if (!document.getElementById('figures')) { return; }
     const figures = JSON.parse(document.getElementById('figures').textContent);
     const options = {responsive: true, displaylogo: false, displayModeBar: 'hover',
                      modeBarButtonsToRemove: ['lasso2d', 'select2d']};
