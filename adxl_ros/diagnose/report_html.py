@@ -135,9 +135,10 @@ def _contents(diagnosis: Diagnosis, report: dict[str, Any]) -> dict[str, Any]:
     """Return what the template shows of a diagnosis with a verdict."""
     assert diagnosis.verdict is not None
     named = named_effects(diagnosis, report)
-    probable = sorted((c for c in report['candidates'] if (c['probability'] or 0.0) >= PROBABLE),
-                   key=lambda c: named.index(c['effect']) if c['effect'] in named else len(named))
-    refuted = [c for c in report['candidates'] if (c['probability'] or 0.0) < PROBABLE]
+    candidates = report['candidates']
+    probable = [c for c in candidates if (c['probability'] or 0.0) >= PROBABLE]
+    probable.sort(key=lambda c: named.index(c['effect']) if c['effect'] in named else len(named))
+    refuted = [c for c in candidates if (c['probability'] or 0.0) < PROBABLE]
     after = diagnosis.verdict.best.sensor
     proofs = _proofs(diagnosis, probable)
     figures = {'waterfall': page_figures.waterfall(diagnosis),
