@@ -202,23 +202,37 @@ def test_all_parameters_of_a_node_can_be_dumped(start, tmp_path, node):
         assert dumped['effects'] == []
 
 
-def test_loading_a_calibration_says_what_to_do(start, run_tool, tmp_path):
-    """`ros2 param load` sets the parameters one by one, which a calibration does not allow."""
+def test_a_calibration_can_be_loaded_as_ros2_param_does(start, run_tool, tmp_path):
+    """`ros2 param load` sends all parameters of a file: all of them count, or none."""
     rng = np.random.default_rng(1)
     parameter_file.save(tmp_path / 'unit.yaml', drawn(rng, nominal(serial='L1')))
     for arguments in (('simulate', 'sweep', '--params', 'unit.yaml', '--rate', '50', '-o',
                        'sweep.csv'), ('fit', 'sweep.csv', '-o', 'fitted.yaml')):
         done = run_tool(*arguments)
         assert done.returncode == 0, done.stderr
-    start('compensation', ROS, '--params-file', NOMINAL)
-    parameters = list(parameter_dict_from_yaml_file(
-        str(tmp_path / 'fitted.yaml'), use_wildcard=True).values())
+    fitted = parameter_file.load(tmp_path / 'fitted.yaml')
+    node = start('compensation', ROS, '--params-file', NOMINAL)
+    parameters = parameter_dict_from_yaml_file(str(tmp_path / 'fitted.yaml'), use_wildcard=True)
     with Graph() as graph:
-        results = graph.call(SetParameters, 'compensation/set_parameters',
-                             SetParameters.Request(parameters=parameters)).results
-    reasons = {p.name: result.reason for p, result in zip(parameters, results)}
-    assert 'set calibration to the path of another file' in reasons['sensor.rate_hz']
-    assert not any('\n' in reason for reason in reasons.values())
+        def load(names):
+            request = SetParameters.Request(parameters=[parameters[name] for name in names])
+            return graph.call(SetParameters, 'compensation/set_parameters', request).results
+
+        def effects():
+            answer = graph.call(GetParameters, 'compensation/get_parameters',
+                                GetParameters.Request(names=['effects']))
+            return parameter_value_to_python(answer.values[0])
+
+        incomplete = load([name for name in parameters if name != 'bias.offset_v'])
+        assert not any(result.successful for result in incomplete)
+        assert all('bias.offset_v' in result.reason for result in incomplete)
+        assert effects() == []
+        alone = load(['sensor.rate_hz'])
+        assert 'set calibration to the path of another file' in alone[0].reason
+        results = load(parameters)
+        assert all(result.successful for result in results), results
+        assert effects() == list(fitted.effects)
+    assert 'compensating by the file loaded: L1, model full' in node.output()
 
 
 def test_an_invalid_qos_policy_is_one_line(start):

@@ -26,14 +26,14 @@ from adxl_ros.model.effects import library
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.nodes.support.parameters import declare
-from adxl_ros.nodes.support.rclpy_internals import given_parameters
+from adxl_ros.nodes.support.rclpy_internals import given_parameters, on_set_request
 from adxl_ros.nodes.support.sensor_parameters import (
     anonymous_sensor,
     declare_sensor,
     is_from_file,
     make_sensor,
 )
-from rcl_interfaces.msg import SetParametersResult
+from rcl_interfaces.msg import ParameterType, SetParametersResult
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
@@ -49,6 +49,8 @@ _NEUTRAL = {str(Coefficient(effect.name, p.name)): p.neutral
 """Neutral value by the name of a parameter."""
 _COEFFICIENT_KEYS = {'effects', 'covariance_names', 'covariance', *_EFFECT_OF}
 """Parameters that can be set one by one, or several at once."""
+_NUMBERS = (ParameterType.PARAMETER_DOUBLE, ParameterType.PARAMETER_DOUBLE_ARRAY)
+"""Types of numbers."""
 _CHANGED = ', with coefficients set since'
 """Appended to the source of coefficients when some of them are set."""
 
@@ -58,8 +60,9 @@ class ExchangeableSensor:
     The sensor that a node's parameters describe.
 
     Coefficients can be set, several at once by `set_parameters_atomically`. The nominal values
-    belong to the file and come with it, when the parameter `calibration` is set to its path; then
-    all parameters are those of the file. A set that is refused changes nothing.
+    belong to the file and come with it, when the parameter `calibration` is set to its path, or
+    when `ros2 param load` sends all that it holds; then all parameters are those of the file. A
+    set that is refused changes nothing.
 
     Parameters
     ----------
@@ -91,7 +94,9 @@ class ExchangeableSensor:
         # A set of `calibration` that is under way: what its file holds, or why it is refused.
         self._file: dict[str, Any] | None = None
         self._file_error: UserError | None = None
+        self._loaded: dict[str, Any] | None = None
         self._declaring = False
+        on_set_request(node, self._load)
         node.add_pre_set_parameters_callback(self._add_file)
         node.add_on_set_parameters_callback(self._check)
         node.add_post_set_parameters_callback(self._apply)
@@ -115,19 +120,45 @@ class ExchangeableSensor:
                                            'where the coefficients come from', live=True)
         self._declaring = False
 
+    def _load(self, parameters: list[Parameter]) -> SetParametersResult | None:
+        """Use the file that `ros2 param load` sends; None where they are no whole file."""
+        changes = _changes(parameters)
+        if 'format' not in changes:
+            return None
+        try:
+            changes = {name: self._as_declared(name, value) for name, value in changes.items()}
+            self._loaded = parameter_file.to_flat(_sensor_of(changes))
+            return self._node.set_parameters_atomically([Parameter('calibration', value='')])
+        except UserError as error:
+            return SetParametersResult(successful=False, reason=one_line(error))
+        finally:
+            self._loaded = None
+
+    def _as_declared(self, name: str, value: Any) -> Any:
+        """Return a value with its declared type: rclpy makes a text of a file's number 3.0e-05."""
+        kind = self._node.describe_parameter(name).type if self._node.has_parameter(name) else 0
+        if not isinstance(value, str) or kind not in _NUMBERS:
+            return value
+        try:
+            numbers = [float(part) for part in value.strip('[]').split(',')]
+        except ValueError:
+            raise UserError(f'{name}: {value!r} is not a number') from None
+        return numbers[0] if kind == ParameterType.PARAMETER_DOUBLE else numbers
+
     def _add_file(self, parameters: list[Parameter]) -> list[Parameter]:
         """Add everything that the file of `calibration` holds to a set."""
-        self._file = self._file_error = None
-        if not any(p.name == 'calibration' and p.value for p in parameters):
-            return parameters
-        try:
-            if len(parameters) > 1:
-                raise UserError('calibration: cannot be set together with other parameters: its '
-                                'file holds all of them')
-            self._file = parameter_file.to_flat(parameter_file.load(parameters[0].value))
-        except UserError as error:
-            self._file_error = error
-            return parameters
+        self._file, self._file_error = self._loaded, None
+        if self._file is None:
+            if not any(p.name == 'calibration' and p.value for p in parameters):
+                return parameters
+            try:
+                if len(parameters) > 1:
+                    raise UserError('calibration: cannot be set together with other parameters: '
+                                    'its file holds all of them')
+                self._file = parameter_file.to_flat(parameter_file.load(parameters[0].value))
+            except UserError as error:
+                self._file_error = error
+                return parameters
         names = [*_FILE_KEYS, *_COEFFICIENT_KEYS,
                  *(name for name in self._flat if name.startswith('provenance.'))]
         return parameters + [self._parameter(name, self._file.get(name)) for name in names]
@@ -162,7 +193,7 @@ class ExchangeableSensor:
             return
         self._flat |= changes
         if self._file is not None:
-            self._source = self._node.get_parameter('calibration').value
+            self._source = self._node.get_parameter('calibration').value or 'the file loaded'
             self._declare_provenance(self._file.items())
         else:
             # The leverage is that of the fit; other coefficients have another.

@@ -21,6 +21,8 @@ import re
 from typing import Any
 
 from adxl_ros.errors import one_line
+from rcl_interfaces.msg import SetParametersResult
+from rcl_interfaces.srv import SetParameters
 from rclpy.callback_groups import CallbackGroup
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
@@ -158,6 +160,33 @@ def given_parameters(node: Node) -> Iterable[tuple[str, Any]]:
     that no declaration can know their names.
     """
     return ((name, parameter.value) for name, parameter in node._parameter_overrides.items())
+
+
+def on_set_request(node: Node,
+                   take: Callable[[list[Parameter]], SetParametersResult | None]) -> None:
+    """
+    Let a function take a request of ~/set_parameters, which rclpy carries out one by one.
+
+    Parameters
+    ----------
+    node
+        The node that has the service.
+    take
+        Gets the parameters of a request. It returns the result of all of them, or None for a
+        request that rclpy shall carry out.
+
+    """
+    service = next(s for s in node.services if s.service_name.endswith('/set_parameters'))
+    set_one_by_one = service.callback
+
+    def respond(request: SetParameters.Request, response: SetParameters.Response
+                ) -> SetParameters.Response:
+        result = take([Parameter.from_parameter_msg(p) for p in request.parameters])
+        if result is None:
+            return set_one_by_one(request, response)
+        response.results = [result] * len(request.parameters)
+        return response
+    service.callback = respond
 
 
 def is_rclpy_error(error: BaseException) -> bool:
