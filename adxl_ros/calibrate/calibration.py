@@ -17,11 +17,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 import os
 
 from adxl_ros.calibrate.fits import (
     full_fit_text,
+    full_model,
     gravity_fit as gravity,
     linear,
     paper_regression,
@@ -43,7 +45,7 @@ from adxl_ros.files import calibration_store, parameter_file
 from adxl_ros.files.atomic_write import keep_previous
 from adxl_ros.files.stream_info import NO_UNIT
 from adxl_ros.model import signal_chain
-from adxl_ros.model.coefficients import get
+from adxl_ros.model.coefficients import get, parameter_of
 from adxl_ros.model.constants import AXES, G0_MPS2, Z_90
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Coefficient
@@ -326,14 +328,36 @@ def _richest_fit(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str
     if model:
         return _fit(model, sensor, recordings, effects)
     refusals: list[str] = []
-    for name in reversed(STAGE_FITS):
+    for name in ('full', 'physical'):
         try:
             return replace(_fit(name, sensor, recordings, effects), refusals=refusals)
         except UserError as error:
-            if name == 'linear':
-                raise
             refusals.append(f'not {name}: {error}')
-    raise AssertionError('the linear model returns or raises')
+    if sensor.axes == AXES and not effects:
+        with suppress(UserError):
+            return _fit_affine(sensor, recordings)
+    return replace(_fit('linear', sensor, recordings, effects), refusals=refusals)
+
+
+def _fit_affine(sensor: Sensor, recordings: Sequence[RecordedPoses]) -> _StageFit:
+    """Fit the twelve coefficients of a three-axis unit to poses that determine no more."""
+    poses = join_poses([recording.poses for recording in recordings])
+    poses = poses.subset(~poses.check)
+    full = term_selection.fit_affine(sensor, poses)
+    std = np.sqrt(np.diag(np.linalg.inv(full.information)))
+    still_open = [name for name, value in zip(full.names, std)
+                  if not full_model.belongs_to_stage(name) and value > parameter_of(name).scale]
+    lines = [f'{len(poses)} poses determine zero-g, scale factor and misalignment, no further '
+             'terms; more poses show those']
+    if still_open:
+        lines.append(f'open, by its prior alone: {", ".join(map(str, still_open))}; add poses '
+                     'with this axis up and down')
+
+    def refit(sensor: Sensor, poses: Poses) -> Sensor:
+        return term_selection.fit_affine(sensor, poses).fitted
+
+    return _StageFit(full.fitted, refit, [*lines, *full_fit_text.report_lines(full, poses, [])],
+                     full=full)
 
 
 def _fit(model: str, sensor: Sensor, recordings: Sequence[RecordedPoses], effects: Sequence[str]

@@ -17,6 +17,7 @@
 from pathlib import Path
 
 from adxl_ros.files import parameter_file
+from adxl_ros.model.signal_chain import static_response
 import numpy as np
 from processes import REPO
 import pytest
@@ -127,3 +128,59 @@ def test_the_file_of_any_imu_leaves_out_what_is_measured() -> None:
     assert {'noise_density_g_per_rthz', 'rc_capacitance_f', 'range_g', 'adc_bits'} <= set(
         unit.unstated)
     assert not unit.datasheet
+
+
+FACES_DEG = {'+x': (90, 0), '-x': (90, 180), '+y': (90, -90), '-y': (90, 90), '+z': (0, 0),
+             '-z': (180, 0)}
+MATRIX = np.eye(3) + np.array([[.01, .004, -.003], [.002, -.02, .006], [-.005, .001, .015]])
+
+
+def faces(path: Path, names: list[str]) -> Path:
+    """Write rests on faces whose angles are stated; between them the angles are empty."""
+    rng = np.random.default_rng(2)
+    rows: list[str] = []
+    for name in names:
+        alpha, beta = np.radians(FACES_DEG[name])
+        force = G * np.array([np.sin(alpha) * np.cos(beta), -np.sin(alpha) * np.sin(beta),
+                              np.cos(alpha)])
+        rest = MATRIX @ force + ERROR + rng.normal(0, 0.05, (600, 3))
+        move = rng.normal(0, 3.0, (200, 3))
+        angles = f'{float(alpha)!r},{float(beta)!r}'
+        rows += [f'{",".join(map(repr, row))},{angles}' for row in rest.tolist()]
+        rows += [f'{",".join(map(repr, row))},,' for row in move.tolist()]
+    lines = [f'{i / RATE_HZ!r},{row}' for i, row in enumerate(rows)]
+    path.write_text('\n'.join(['time_s,ax_mps2,ay_mps2,az_mps2,alpha_rad,beta_rad', *lines])
+                    + '\n')
+    return path
+
+
+def matrix_of(unit) -> np.ndarray:
+    """Return the matrix of an affine unit, g/g, (3, 3): columns by finite differences."""
+    respond = static_response(unit)
+    zero = np.array(respond([0.0, 0.0, 0.0]))
+    return np.column_stack([np.array(respond(list(row * G))) - zero for row in np.eye(3)])
+
+
+def test_six_known_faces_determine_twelve_coefficients(run_tool, tmp_path) -> None:
+    """Zero-g, scale factor and misalignment of each axis, each within its interval."""
+    path = faces(tmp_path / 'six.csv', list(FACES_DEG))
+    done = run_tool('fit', path, '-o', tmp_path / 'unit.yaml')
+    assert done.returncode == 0, done.stderr
+    unit = parameter_file.load(tmp_path / 'unit.yaml')
+    assert unit.effects[:3] == ('bias', 'scale_factor', 'misalignment')
+    np.testing.assert_allclose(unit.zero_g_v * G, ERROR, atol=0.01)
+    np.testing.assert_allclose(matrix_of(unit), MATRIX, atol=0.002)
+
+
+def test_an_open_coefficient_is_named_and_the_others_are_fitted(run_tool, tmp_path) -> None:
+    """Without a face of z, the scale factor of z has its prior; zero-g of z is known."""
+    path = faces(tmp_path / 'four.csv', ['+x', '-x', '+y', '-y'])
+    done = run_tool('fit', path, '-o', tmp_path / 'unit.yaml')
+    assert done.returncode == 0, done.stderr
+    assert 'open, by its prior alone: scale_factor.offset_v_per_g.z' in done.stdout.replace(
+        '\n  ', ' ')
+    unit = parameter_file.load(tmp_path / 'unit.yaml')
+    np.testing.assert_allclose(unit.zero_g_v * G, ERROR, atol=0.03)
+    np.testing.assert_allclose(unit.scale_v_per_g[:2], np.diag(MATRIX)[:2], atol=0.002)
+    std = dict(zip(map(str, unit.covariance_names), np.sqrt(np.diag(unit.covariance))))
+    assert std['scale_factor.offset_v_per_g.z'] > 20 * std['scale_factor.offset_v_per_g.x']

@@ -110,7 +110,7 @@ def report_lines(full: full_model.FullFit, poses: Poses, terms: Sequence[Term]) 
         f'next poses that would help most, (alpha, beta) in deg: '
         f'{full_model.format_poses(next_poses)}',
         *_temperature_lines(full, poses),
-        'log Bayes factor of each term, nats; above 0 the poses support it:',
+        *(['log Bayes factor of each term, nats; above 0 the poses support it:'] if terms else []),
         *(f'  {term.name:20} {term.log_bayes_factor:10.1f}'
           f'{"" if term.is_supported else "   not supported by these poses"}' for term in terms)]
 

@@ -179,7 +179,8 @@ def default_terms(axes: str) -> tuple[str, ...]:
     return TERMS + (_THREE_AXES if axes == AXES else ())
 
 
-def fit_full(sensor: Sensor, poses: Poses, terms: Sequence[str] | None = None) -> FullFit:
+def fit_full(sensor: Sensor, poses: Poses, terms: Sequence[str] | None = None, max_open: int = 0
+             ) -> FullFit:
     """
     Fit the terms to the poses by maximum likelihood.
 
@@ -195,6 +196,8 @@ def fit_full(sensor: Sensor, poses: Poses, terms: Sequence[str] | None = None) -
     terms
         Effects to fit, of the sensor or of the stage, and names of `GAUGE`. By default
         `default_terms` of the sensor's axes.
+    max_open
+        Largest number of coefficients that the poses may leave to their priors.
 
     Returns
     -------
@@ -209,14 +212,14 @@ def fit_full(sensor: Sensor, poses: Poses, terms: Sequence[str] | None = None) -
     """
     terms = default_terms(sensor.axes) if terms is None else terms
     effects = [effect_of(term) for term in terms]
-    unit = with_neutral(linear.fit(sensor, poses).without_covariance(), effects)
+    unit = with_neutral(_start(sensor, poses, bool(max_open)), effects)
     unit = with_neutral(unit, ['base_tilt'])
     problem = _Problem(poses, fitted_coefficients(unit.axes, terms),
                        StageError(sensor.stage_std_rad))
     fits, failure = [], None
     for start in _starts(unit, problem, effects):
         try:
-            require_determined(start, poses, problem.names, problem.stated)
+            require_determined(start, poses, problem.names, problem.stated, max_open)
             fits.append(_fit_from(start, problem))
         except UserError as error:
             failure = failure or error
@@ -224,6 +227,16 @@ def fit_full(sensor: Sensor, poses: Poses, terms: Sequence[str] | None = None) -
         assert failure is not None
         raise failure
     return min(fits, key=lambda fit: fit.deviance)
+
+
+def _start(sensor: Sensor, poses: Poses, may_be_open: bool) -> Sensor:
+    """Return the linear fit; the nominal sensor where an open coefficient does not allow one."""
+    try:
+        return linear.fit(sensor, poses).without_covariance()
+    except UserError:
+        if not may_be_open:
+            raise
+        return sensor
 
 
 @dataclass(frozen=True)
@@ -582,10 +595,10 @@ def _without_stage(unit: Sensor) -> Sensor:
     return replace(unit, effects=effects, values={name: unit.values[name] for name in effects})
 
 
-def require_determined(unit: Sensor, poses: Poses, names: Sequence[Coefficient],
-                       stage: StageError) -> None:
+def open_coefficients(unit: Sensor, poses: Poses, names: Sequence[Coefficient],
+                      stage: StageError) -> list[Coefficient]:
     """
-    Refuse poses that leave a coefficient as uncertain as its typical size.
+    Return the coefficients that poses leave as uncertain as their typical size.
 
     Parameters
     ----------
@@ -598,10 +611,10 @@ def require_determined(unit: Sensor, poses: Poses, names: Sequence[Coefficient],
     stage
         Standard deviations of the stage's error.
 
-    Raises
-    ------
-    UserError
-        The message names the coefficients and poses that would determine them.
+    Returns
+    -------
+    list
+        The open ones; errors of the stage and terms for which the prior suffices are never open.
 
     """
     scale = np.array([parameter_of(name).scale for name in names])
@@ -612,11 +625,32 @@ def require_determined(unit: Sensor, poses: Poses, names: Sequence[Coefficient],
         prior_precision(names) * required)
     variances = np.diag(np.linalg.inv(
         information * np.outer(scale, scale) + _REGULARISATION * np.eye(len(names))))
-    undetermined = [str(name) for name, variance, is_required
-                    in zip(names, variances, required) if is_required and variance > 1.0]
-    if not undetermined and poses.volts.size > len(names):
+    return [name for name, variance, is_required in zip(names, variances, required)
+            if is_required and variance > 1.0]
+
+
+def require_determined(unit: Sensor, poses: Poses, names: Sequence[Coefficient],
+                       stage: StageError, max_open: int = 0) -> None:
+    """
+    Refuse poses that leave coefficients open.
+
+    Parameters
+    ----------
+    unit, poses, names, stage
+        As for `open_coefficients`.
+    max_open
+        Largest number of open coefficients.
+
+    Raises
+    ------
+    UserError
+        The message names the coefficients and poses that would determine them.
+
+    """
+    undetermined = open_coefficients(unit, poses, names, stage)
+    if len(undetermined) <= max_open and poses.volts.size > len(names) - max_open:
         return
-    reason = f'they do not determine {", ".join(undetermined)}' if undetermined else \
+    reason = f'they do not determine {", ".join(map(str, undetermined))}' if undetermined else \
         f'they have {poses.volts.size} values for {len(names)} coefficients'
     raise UserError(
         f'the full model is not determined by {len(poses)} poses: {reason}; add poses (alpha, '

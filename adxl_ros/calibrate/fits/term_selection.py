@@ -39,6 +39,11 @@ from scipy.special import chdtri
 
 ALWAYS = ('bias', 'scale_factor')
 """Terms that every fit has and that are not compared."""
+AFFINE = ('bias', 'scale_factor', 'misalignment')
+"""Terms of the twelve coefficients of a three-axis unit that six known faces determine."""
+_MAX_OPEN = 3
+"""Largest number of the twelve coefficients that their priors may give. Chosen: an axis that never
+points up or down leaves its scale factor and two misalignments open."""
 _MIN_CHANGE = {'temperature_c': 0.5, 'supply_v': 0.02}
 """Smallest range of temperature, °C, and supply, V, for which effects that follow them are
 candidates. Chosen: 0.5 °C changes the zero-g by 0.05 mg, about the noise of a mean."""
@@ -116,6 +121,29 @@ def fit(sensor: Sensor, poses: Poses) -> Sensor:
 
     """
     return fit_selected(sensor, poses).full.fitted
+
+
+def fit_affine(sensor: Sensor, poses: Poses) -> full_model.FullFit:
+    """
+    Fit zero-g, scale factor and misalignment alone, for poses that do not determine more.
+
+    Parameters
+    ----------
+    sensor, poses
+        As for `full_model.fit_full`.
+
+    Returns
+    -------
+    FullFit
+        The fit. The poses may leave three coefficients to their priors.
+
+    Raises
+    ------
+    UserError
+        The poses leave more of them open.
+
+    """
+    return full_model.fit_full(sensor, poses, AFFINE, _MAX_OPEN)
 
 
 def fit_selected(sensor: Sensor, poses: Poses, effects: Sequence[str] = ()) -> SelectedFit:
