@@ -110,9 +110,11 @@ class Screen(Node):
         """Return the newest contents, or what the screen waits for."""
         if self._is_fresh():
             return self._contents
-        if self._received_s:
+        if self._received_s and self._is_there():
             silent_s = time.monotonic() - self._received_s
             text = f'nothing from {self._target} for {silent_s:.0f} s; waiting for it'
+        elif self._received_s:
+            text = f'{self._target} has ended; waiting until it is started again'
         elif self._node_pid:
             text = 'starting'
         else:
@@ -122,8 +124,11 @@ class Screen(Node):
     def _is_fresh(self) -> bool:
         """Return whether the newest contents still hold; a node that fits publishes none."""
         is_silent = time.monotonic() - self._received_s > _SILENT_S
-        return self._received_s > 0 and self.count_publishers(f'{self._target}/display') > 0 and (
+        return self._received_s > 0 and self._is_there() and (
             not is_silent or self._contents.phase == 'fit')
+
+    def _is_there(self) -> bool:
+        return self.count_publishers(f'{self._target}/display') > 0
 
     def _press(self, key: str) -> None:
         """Call the service of a key; the space captures, `finish` may need a second key."""

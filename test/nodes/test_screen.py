@@ -112,12 +112,14 @@ def test_a_screen_waits_for_its_node_and_survives_it(start, screen):
     seen.wait_for('nothing from /bench/bridge for')
     # Keys without a node do nothing.
     seen.press('b')
-    start('calibration', *names, '-p', 'output:=second.yaml')
+    node = start('calibration', *names, '-p', 'output:=second.yaml')
     seen.wait_for('second.yaml', 'press b to begin')
     seen.press('b')
     seen.wait_for('waiting for sensor_info', 'a  abort')
     seen.press('a')
     seen.wait_for('aborted', 'b  begin')
+    assert node.stop() == 0
+    seen.wait_for('/bench/bridge has ended; waiting until it is started again')
     seen.press('\x03')
     assert seen.popen.wait(20) == 0
     assert seen.restored()
@@ -131,6 +133,18 @@ def test_a_signal_ends_a_screen_and_restores_its_terminal(screen, number):
     subprocess.run(['kill', f'-{number}', str(seen.popen.pid)], check=True)
     assert seen.popen.wait(20) == 0
     assert seen.restored()
+
+
+def test_a_screen_finds_the_terminal_of_a_launch(ros_env, tmp_path):
+    """A launch keeps stdin and stdout; the screen then uses the terminal that controls it."""
+    seen = Terminal(['sh', '-c', f'{executable("screen")} </dev/null >output.txt 2>&1'], ros_env,
+                    tmp_path)
+    seen.wait_for('waiting for /calibration', 'q  quit')
+    seen.press('q')
+    assert seen.popen.wait(20) == 0
+    assert seen.restored()
+    assert (tmp_path / 'output.txt').read_text() == ''
+    seen.close()
 
 
 def test_a_screen_without_a_terminal_says_so(start):

@@ -38,6 +38,9 @@ OTHERS = '\x1b[A\x1b[1;5A\x1bOA\x1bOS\x1b[[A\x1b[M af\x1b[<65;10;10M\x1b[15~\x1b
 """Arrow up, with Ctrl, of keypad mode; F4; F1 of a console; a mouse's wheel twice; F5; Alt-q."""
 
 
+SIGNALS = {'term': signal.SIGTERM, 'hup': signal.SIGHUP, 'kill': signal.SIGKILL}
+
+
 @pytest.fixture
 def terminal(ros_env, tmp_path):
     """Give a function that runs the calibration in a terminal; all are closed at the end."""
@@ -178,7 +181,7 @@ def children(pid):
 
 
 @pytest.mark.kills
-@pytest.mark.parametrize('how', ['ctrl-c', 'term', 'kill', 'kill of the screen'])
+@pytest.mark.parametrize('how', ['ctrl-c', 'term', 'hup', 'kill', 'kill of the screen'])
 def test_the_terminal_is_restored(terminal, how):
     """After each kind of end, settings, screen and cursor are as before."""
     seen = terminal()
@@ -192,8 +195,8 @@ def test_the_terminal_is_restored(terminal, how):
         assert seen.restored() and seen.popen.poll() is None
         seen.press('\x03')
     else:
-        os.kill(seen.popen.pid, signal.SIGTERM if how == 'term' else signal.SIGKILL)
-    assert seen.popen.wait(20) == (-signal.SIGKILL if how == 'kill' else 0)
+        os.kill(seen.popen.pid, SIGNALS[how])
+    assert seen.popen.wait(20) == (-SIGNALS[how] if how in ('hup', 'kill') else 0)
     with Graph() as graph:
         graph.spin_until(lambda: seen.restored() and not Path(f'/proc/{screen}').exists(), 20,
                          'the terminal as it was')
