@@ -12,7 +12,10 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The one exception that reaches a user."""
+"""The one exception that reaches a user, and words that its messages share."""
+
+import shlex
+import sys
 
 
 class UserError(Exception):
@@ -22,6 +25,16 @@ class UserError(Exception):
     The message names the file, line and column, or the topic, the wrong value, and what to do.
     Tools print it and exit with status 1. Nodes log it and show it in diagnostics.
     """
+
+
+def install_hint(*requirements: str) -> str:
+    """
+    Return the command that installs Python packages, for the running Python.
+
+    Ubuntu 24.04 refuses `pip install` outside of a virtual environment (PEP 668).
+    """
+    options = '' if sys.prefix != sys.base_prefix else '--user --break-system-packages '
+    return f'python3 -m pip install {options}{shlex.join(requirements)}'
 
 
 def one_line(error: BaseException) -> str:

@@ -36,8 +36,8 @@ from adxl_ros.errors import UserError
 from adxl_ros.nodes.support import launch_nodes
 from adxl_ros.nodes.support.launch_nodes import Argument, given_anywhere, make_node, text
 from launch import LaunchContext, LaunchDescription
-from launch.actions import DeclareLaunchArgument, OpaqueFunction
-from launch_ros.actions import Node
+from launch.action import Action
+from launch.actions import DeclareLaunchArgument, LogInfo, OpaqueFunction
 
 LINK_TYPE = launch_nodes.LINK[0]
 STAGE_TYPE = Argument('stage_type', 'stage.type', 'the simulated stage, or the type of command '
@@ -89,7 +89,7 @@ def generate_launch_description() -> LaunchDescription:
         OpaqueFunction(function=make_nodes)])
 
 
-def make_nodes(context: LaunchContext) -> list[Node]:
+def make_nodes(context: LaunchContext) -> list[Action]:
     """Return the nodes."""
     speed = launch_nodes.given_parameters(context, [SPEED])
     sim_time = {'use_sim_time': True} if speed else {}
@@ -102,8 +102,11 @@ def make_nodes(context: LaunchContext) -> list[Node]:
     success = f'wrote {files}; next: ros2 launch adxl_ros robot.launch.py params_file:={output}'
     sweep: dict[str, Any] = launch_nodes.given_parameters(context, [STAGE_MODE, *SWEEP])
     return [
+        LogInfo(msg='its screen, in a second terminal: ros2 run adxl_ros screen --ros-args -p '
+                f'node:={launch_nodes.node_name(context, "calibration")}'),
         make_node(context, 'driver', simulated(context, speed) | sim_time, **respawn,
-                  on_exit=launch_nodes.GiveUp()), *stage,
+                  on_exit=launch_nodes.GiveUp()),
+        *stage,
         make_node(context, 'calibration', {
             **sim_time, **sweep, 'autostart': True, 'exit_when_done': True, 'screen': False,
             'mode': text(context, 'mode'), 'output': output},

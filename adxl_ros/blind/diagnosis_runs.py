@@ -34,7 +34,7 @@ import time
 from typing import Any
 
 from adxl_ros.blind import parallel_io
-from adxl_ros.errors import UserError
+from adxl_ros.errors import install_hint, UserError
 from ament_index_python.packages import get_package_prefix
 
 _ENVIRONMENT = ('PATH', 'LD_LIBRARY_PATH', 'PYTHONPATH', 'AMENT_PREFIX_PATH', 'VIRTUAL_ENV',
@@ -236,7 +236,7 @@ def workers(scheduler: str | None) -> Iterator[Executor]:
     try:
         from distributed import Client
     except ImportError:
-        raise UserError("--scheduler needs Dask: pip install 'distributed'") from None
+        raise UserError(f'--scheduler needs Dask; {install_hint("distributed")}') from None
     try:
         client = Client(scheduler, timeout='20s')
     except (OSError, ValueError) as error:

@@ -31,7 +31,7 @@ import shutil
 from tempfile import TemporaryDirectory
 from typing import Any, Protocol
 
-from adxl_ros.errors import UserError
+from adxl_ros.errors import install_hint, UserError
 from adxl_ros.files import mcap_recovery
 import yaml
 
@@ -177,7 +177,7 @@ def import_rosbags() -> Any:
         import rosbags.rosbag2
     except ImportError:
         raise UserError('rosbag2 recordings need the Python package rosbags: '
-                        'pip install "rosbags>=0.11.8,<0.12"') from None
+                        + install_hint('rosbags>=0.11.8,<0.12')) from None
     return rosbags.rosbag2
 
 

@@ -19,7 +19,7 @@ from __future__ import annotations
 import os
 from typing import Any
 
-from adxl_ros.errors import UserError
+from adxl_ros.errors import install_hint, UserError
 from adxl_ros.files.atomic_write import atomic_path
 
 _DPI = 80
@@ -39,7 +39,7 @@ def pyplot() -> Any:
     try:
         import matplotlib
     except ImportError:
-        raise UserError('plots need matplotlib; pip install matplotlib') from None
+        raise UserError(f'plots need matplotlib; {install_hint("matplotlib")}') from None
     matplotlib.use('Agg')
     import matplotlib.pyplot
     return matplotlib.pyplot

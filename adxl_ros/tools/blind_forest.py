@@ -33,7 +33,7 @@ from typing import Any
 
 from adxl_ros.blind import parallel_io
 from adxl_ros.blind.grading import Answer, UNKNOWN
-from adxl_ros.errors import UserError
+from adxl_ros.errors import install_hint, UserError
 from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model import coefficients
@@ -178,7 +178,7 @@ def forest_class() -> Any:
         from sklearn.ensemble import RandomForestClassifier
     except ImportError:
         raise UserError('the random forest of the blind check needs scikit-learn; '
-                        'pip install scikit-learn') from None
+                        + install_hint('scikit-learn')) from None
     return RandomForestClassifier
 
 

@@ -446,9 +446,9 @@ def test_writing_is_all_or_nothing(tmp_path: Path) -> None:
 def test_without_rosbags(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, 'rosbags.rosbag2', None)
     (tmp_path / 'run').mkdir()
-    with pytest.raises(UserError, match='pip install "rosbags'):
+    with pytest.raises(UserError, match="pip install 'rosbags"):
         recording.read(tmp_path / 'run')
-    with pytest.raises(UserError, match='pip install "rosbags'):
+    with pytest.raises(UserError, match="pip install 'rosbags"):
         recording.write(tmp_path / 'run', recorded(5), nominal('xyz'))
 
 

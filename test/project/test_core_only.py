@@ -75,7 +75,7 @@ for name, settings in (('serial', {'port': '/dev/null'}), ('iio', {})):
     assert done.returncode == 0, done.stderr
     serial, iio = done.stdout.splitlines()
     assert 'pip install pyserial cobs' in serial
-    assert 'pip install "pylibiio<1", apt install libiio0' in iio
+    assert "pip install 'pylibiio<1' and sudo apt install libiio0" in iio
 
 
 def test_a_csv_is_fitted(tmp_path: Path) -> None:

@@ -25,7 +25,7 @@ import socket
 import time
 from typing import Any, NamedTuple
 
-from adxl_ros.errors import UserError
+from adxl_ros.errors import install_hint, UserError
 from adxl_ros.links.support import channels
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.sensor import Sensor
@@ -54,7 +54,7 @@ _MIN_RATE_HZ = 0.01
 _MAX_RATE_HZ = 1e5
 """Largest sample rate, Hz, as `sensor.rate_hz` permits."""
 _INSTALL = ('link.type iio needs the Python package pylibiio and the library libiio 0.x: '
-            'pip install "pylibiio<1", apt install libiio0')
+            f'{install_hint("pylibiio<1")} and sudo apt install libiio0')
 """What a user is told where libiio is not installed."""
 
 

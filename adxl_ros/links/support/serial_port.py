@@ -25,7 +25,7 @@ import termios
 import time
 from typing import Any
 
-from adxl_ros.errors import UserError
+from adxl_ros.errors import install_hint, UserError
 from adxl_ros.links.support.backoff import Backoff
 
 SILENT = 'silent, the board sends nothing'
@@ -197,5 +197,5 @@ def _import_pyserial() -> Any:
         import serial
     except ImportError:
         raise UserError('link.type serial needs the Python packages pyserial and cobs: '
-                        'pip install pyserial cobs') from None
+                        + install_hint('pyserial', 'cobs')) from None
     return serial

@@ -27,7 +27,7 @@ import struct
 from typing import Any
 import zlib
 
-from adxl_ros.errors import UserError
+from adxl_ros.errors import install_hint, UserError
 import numpy as np
 
 VERSION = 1
@@ -322,5 +322,5 @@ def import_cobs() -> Any:
         from cobs import cobs
     except ImportError:
         raise UserError('the serial wire format needs the Python package cobs: '
-                        'pip install pyserial cobs') from None
+                        + install_hint('pyserial', 'cobs')) from None
     return cobs
