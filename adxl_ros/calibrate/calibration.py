@@ -37,6 +37,7 @@ from adxl_ros.calibrate.report import (
     acceptance,
     cross_validation,
     error_budget,
+    unit_errors,
 )
 from adxl_ros.calibrate.report.acceptance import Assessment
 from adxl_ros.calibrate.report.cross_validation import HeldOutErrors
@@ -226,6 +227,15 @@ def calibrate(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str | 
         The poses do not determine the model, or the recordings contradict each other.
 
     """
+    result = _calibrated(sensor, recordings, model, effects, data_sha256)
+    lines = unit_errors.turn_on_lines(result.fitted, [item.poses for item in recordings])
+    return replace(result, report_lines=[*result.report_lines, *lines],
+                   summary_lines=[*result.summary_lines, *lines])
+
+
+def _calibrated(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str | None,
+                effects: Sequence[str], data_sha256: str) -> CalibrationResult:
+    """Fit against the stage, or against gravity; see `calibrate`."""
     poses = join_poses([recording.poses for recording in recordings])
     source = ', '.join(recording.source for recording in recordings)
     if np.isfinite(poses.alpha_rad).all():

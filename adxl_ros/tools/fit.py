@@ -23,6 +23,7 @@ import sys
 
 from adxl_ros.calibrate import calibration, pose_extraction
 from adxl_ros.calibrate.report import report_html, text_tables
+from adxl_ros.calibrate.report.unit_errors import errors_in_words
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store, html_page, recording, sweep_journal
 from adxl_ros.files.checksum import sha256
@@ -118,7 +119,8 @@ def fit(options: argparse.Namespace) -> int:
     result.save(options.output)
     print(f'fit: {result.keep(options.store)}', file=sys.stderr)
     report = [Path(options.report) / name for name in _REPORT_FILES] if options.report else []
-    print_end([*text_tables.coefficient_table(result.fitted), '', *result.summary_lines, '',
+    print_end([errors_in_words(result.fitted), '',
+               *text_tables.coefficient_table(result.fitted), '', *result.summary_lines, '',
                *text_tables.acceptance_lines(result.fitted), *measured, ''],
               [options.output, *report],
               command('apply', f'RECORDING --params {quoted(options.output)} -o tilt.csv'))
