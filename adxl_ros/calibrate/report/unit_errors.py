@@ -26,6 +26,8 @@ import numpy as np
 _RIDGE = 1e-3
 """Weight of a change of 0, relative to a rest, for a direction that no rest of a recording has.
 Chosen: small beside one rest."""
+_NEGLIGIBLE_MG = 0.01
+"""Scatter below which only this limit is shown, mg. Chosen: no sensor repeats that well."""
 
 
 def turn_on_lines(fitted: Sensor, recordings: Sequence[Poses]) -> list[str]:
@@ -49,7 +51,9 @@ def turn_on_lines(fitted: Sensor, recordings: Sequence[Poses]) -> list[str]:
         return []
     changes_mg = np.array([_zero_g_change_mg(fitted, poses) for poses in recordings])
     scatter_mg = np.std(changes_mg, axis=0, ddof=1)
-    by_axis = ', '.join(f'{axis} {value:.2g}' for axis, value in zip(fitted.axes, scatter_mg))
+    texts = [f'{value:.2g}' if value > _NEGLIGIBLE_MG else f'< {_NEGLIGIBLE_MG:g}'
+             for value in scatter_mg]
+    by_axis = ', '.join(f'{axis} {text}' for axis, text in zip(fitted.axes, texts))
     return [f'turn-on to turn-on: the zero-g scatters by {by_axis} mg (standard deviation over '
             f'{len(recordings)} recordings)']
 
