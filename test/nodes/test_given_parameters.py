@@ -227,8 +227,8 @@ def test_a_calibration_can_be_loaded_as_ros2_param_does(start, run_tool, tmp_pat
         assert not any(result.successful for result in incomplete)
         assert all('bias.offset_v' in result.reason for result in incomplete)
         assert effects() == []
-        alone = load(['sensor.rate_hz'])
-        assert 'set calibration to the path of another file' in alone[0].reason
+        single = load(['sensor.rate_hz'])
+        assert 'set calibration to the path of another file' in single[0].reason
         results = load(parameters)
         assert all(result.successful for result in results), results
         assert effects() == list(fitted.effects)
