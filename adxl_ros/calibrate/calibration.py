@@ -30,6 +30,7 @@ from adxl_ros.calibrate.fits import (
     term_selection,
 )
 from adxl_ros.calibrate.fits.full_model import FullFit
+from adxl_ros.calibrate.pose_references import has_angles
 from adxl_ros.calibrate.poses import check_polarity, join_poses, Poses, reference_force
 from adxl_ros.calibrate.provenance import envelope, with_provenance
 from adxl_ros.calibrate.recording_consistency import require_one_mounting
@@ -56,6 +57,8 @@ import numpy as np
 
 STAGE_FITS = {'linear': linear.fit, 'physical': paper_regression.fit, 'full': term_selection.fit}
 """Models that are fitted against the stage, simplest first."""
+_LISTED_RESTS = 5
+"""Largest number of rests that a line lists (chosen: fits into a line)."""
 _SAME_FIT_TOLERANCE = 1e-6
 """Largest relative difference of coefficients of the same fit: the rounding in a file."""
 
@@ -238,9 +241,12 @@ def _calibrated(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str 
     """Fit against the stage, or against gravity; see `calibrate`."""
     poses = join_poses([recording.poses for recording in recordings])
     source = ', '.join(recording.source for recording in recordings)
-    if np.isfinite(poses.alpha_rad).all():
+    if has_angles(poses).any():
         model = model or ('full' if effects else None)
-        return _against_stage(sensor, recordings, model, effects, data_sha256)
+        referenced = [replace(recording, poses=recording.poses.subset(has_angles(recording.poses)))
+                      for recording in recordings]
+        result = _against_stage(sensor, referenced, model, effects, data_sha256)
+        return _with_lines(result, _without_angles_lines(poses))
     if model not in (None, 'full'):
         raise UserError(f'{source}: the {model} model is fitted against stage angles (alpha_rad '
                         'and beta_rad), which are missing; leave --model out to calibrate a '
@@ -249,6 +255,22 @@ def _calibrated(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str 
         raise UserError(f'{source}: no stage angles and only the axes {sensor.axes}: the '
                         'magnitude of gravity needs x, y and z; record alpha_rad and beta_rad')
     return _against_gravity(sensor, poses, source, data_sha256)
+
+
+def _without_angles_lines(poses: Poses) -> list[str]:
+    """Return which rests have no angles, as text; none where all have."""
+    starts_s = poses.time_s[~has_angles(poses), 0]
+    if not len(starts_s):
+        return []
+    listed = ', '.join(f'{start_s:.1f}' for start_s in starts_s[:_LISTED_RESTS])
+    further = ' ...' * (len(starts_s) > _LISTED_RESTS)
+    return [f'rests without angles, left out: {len(starts_s)} (from {listed}{further} s)']
+
+
+def _with_lines(result: CalibrationResult, lines: list[str]) -> CalibrationResult:
+    """Add lines to the end of the reports of a calibration."""
+    return replace(result, report_lines=[*result.report_lines, *lines],
+                   summary_lines=[*result.summary_lines, *lines])
 
 
 @dataclass(frozen=True)

@@ -103,7 +103,7 @@ def _refuse_mapping(bag: Bag, reading: ReadingOptions) -> None:
     if reading.mapping is not None:
         raise UserError(f'{reading.mapping.where}: {bag.path} is a bag, which has topics; name '
                         'one with --topic')
-    if reading.lsb_per_g:
+    if reading.lsb_per_g or reading.lsb_at_0g:
         raise UserError(f'--lsb-per-g: {bag.path} is a bag, whose readings are in m/s²')
 
 
@@ -210,8 +210,8 @@ class _Samples:
         """Return what was left out, for people."""
         if not self._left_out:
             return ()
-        return (f'{self.where}: {self._left_out} messages whose stamp does not increase are left '
-                'out',)
+        return (f'{self.where}: left out, messages whose stamp does not increase: '
+                f'{self._left_out}',)
 
     def _increasing(self, stamp_ns: np.ndarray, accel: np.ndarray
                     ) -> tuple[np.ndarray, np.ndarray]:

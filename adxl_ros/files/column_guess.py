@@ -61,8 +61,11 @@ _REFERENCES = {
 }
 """Names of references by role."""
 
-_EPOCHS = ((1e17, 'ns'), (1e14, 'us'), (1e11, 'ms'), (1e8, 's'))
-"""Smallest time since 1970 of each unit."""
+_EPOCHS = ((1e9, 'ns'), (1e6, 'us'), (1e3, 'ms'), (1.0, 's'))
+"""Counts of a second of each unit."""
+
+_EPOCH_S = (9e8, 4e9)
+"""Bounds of times since 1970, s: 1998 to 2096."""
 
 _STEPS = ((1e6, 'ns'), (1e3, 'us'), (1.0, 'ms'), (0.0, 's'))
 """Smallest step of each unit, between samples of 1 Hz to 1 kHz."""
@@ -70,6 +73,15 @@ _STEPS = ((1e6, 'ns'), (1e3, 'us'), (1.0, 'ms'), (0.0, 's'))
 _CONSTANT = 0.3
 """Largest relative scatter of a length that is that of gravity (chosen: a hand that turns a
 sensor makes less)."""
+
+_SPHERE_ROWS = 20
+"""Smallest number of rows to which a sphere is fitted."""
+
+_SPHERE_SCATTER = 0.2
+"""Largest scatter of the distances from the centre, in radii: noise alone makes a third."""
+
+_TURNED = 0.3
+"""Smallest spread of an axis in that of another one of a sensor that is turned."""
 
 _COUNTS = (64, 100, 128, 256, 512, 1000, 1024, 1365, 2048, 4096, 8192, 16384, 32768)
 """Usual counts of 1 g."""
@@ -84,8 +96,8 @@ class Proposal:
     ----------
     mapping
         Columns and units by role.
-    lsb_per_g
-        Counts of 1 g; 0 where no column is in LSB.
+    lsb_per_g, lsb_at_0g
+        Counts of 1 g, and at 0 g; 0 where no column is in LSB.
     reasons
         What it follows from.
     needs_rate
@@ -95,6 +107,7 @@ class Proposal:
 
     mapping: ColumnMapping
     lsb_per_g: float
+    lsb_at_0g: float
     reasons: Sequence[str]
     needs_rate: bool
 
@@ -102,7 +115,8 @@ class Proposal:
         """Return the options, quoted for a shell."""
         text = f'--columns {_shell_quoted(str(self.mapping))}'
         text += ' --rate HZ' * self.needs_rate
-        return text + (f' --lsb-per-g {self.lsb_per_g:g}' if self.lsb_per_g else '')
+        text += f' --lsb-per-g {self.lsb_per_g:.0f}' if self.lsb_per_g else ''
+        return text + (f' --lsb-at-0g {self.lsb_at_0g:.0f}' if self.lsb_at_0g else '')
 
 
 def _shell_quoted(text: str) -> str:
@@ -124,15 +138,16 @@ def propose(table: Table) -> Proposal | None:
         unit, reason = _time_unit(table, time, values[time])
         sources['time'] = Source(time, unit)
         reasons.append(reason)
-    length = float(np.nanmedian(np.linalg.norm(
-        np.column_stack([values[name] for name in outputs]), axis=1)))
+    zero, length = _zero_and_length(np.column_stack([values[name] for name in outputs]))
     stated = table.units.get(outputs[0]) or unit_in_name(outputs[0], Quantity.OUTPUT)
     unit = stated or likely_unit(length) or _count_or_volts(length)
     sources |= {axis: Source(name, unit) for axis, name in zip(AXES, outputs)}
-    reasons.append(f'the readings have a length of {length:.4g}'
+    about = f' about {zero:.0f}' * (zero != 0)
+    reasons.append(f'the readings have a length of {length:.4g}{about}'
                    + f', so {unit}' * (not stated))
     sources |= _references(table, values, {*outputs, time or ''})
-    return Proposal(ColumnMapping(sources), _counts(length) if unit == LSB else 0.0, reasons,
+    per_g = (round(length) if zero else _counts(length)) if unit == LSB else 0.0
+    return Proposal(ColumnMapping(sources), per_g, zero if unit == LSB else 0.0, reasons,
                     time is None)
 
 
@@ -159,7 +174,9 @@ def describe(table: Table, is_listed: bool = False) -> str:
     if proposal is None:
         return f'{seen}none looks like an accelerometer: name the columns, for example ' \
                "--columns 'time=COLUMN:s,x=COLUMN:g,y=COLUMN:g,z=COLUMN:g'"
-    return f'{seen}the best guess, because {" and ".join(proposal.reasons)}: {proposal.options()}'
+    reasons = ' and '.join(proposal.reasons)
+    rate = ' (write the sample rate for HZ)' * proposal.needs_rate
+    return f'{seen}the best guess, because {reasons}{rate}: {proposal.options()}'
 
 
 def _time_column(table: Table, values: Mapping[str, np.ndarray]) -> str | None:
@@ -194,8 +211,8 @@ def _time_unit(table: Table, name: str, values: np.ndarray) -> tuple[str, str]:
                                        else None)
     if stated:
         return stated, f'{name} has steps of {step:.4g} {stated}'
-    for smallest, unit in _EPOCHS:
-        if finite[0] > smallest and step < finite[0] * 1e-6:
+    for second, unit in _EPOCHS:
+        if _EPOCH_S[0] < finite[0] / second < _EPOCH_S[1]:
             return ('epoch' if unit == 's' else unit), f'{name} counts from 1970'
     unit = next(unit for smallest, unit in _STEPS if step >= smallest)
     return unit, f'{name} has steps of {step:.4g}, so {unit}'
@@ -252,6 +269,28 @@ def _by_length(values: Mapping[str, np.ndarray]) -> list[str]:
         unit_fits = bool(likely_unit(float(median)))
         best = min(best, (spread + 0.1 * (not unit_fits), list(triple)))
     return best[1]
+
+
+def _zero_and_length(readings: np.ndarray) -> tuple[float, float]:
+    """
+    Return the reading at 0 g and the length of gravity about it.
+
+    The zero is 0 where an axis reads on both sides of it, or where the readings do not turn.
+    """
+    readings = readings[np.isfinite(readings).all(axis=1)]
+    length = float(np.median(np.linalg.norm(readings, axis=1)))
+    spread = np.ptp(readings, axis=0)
+    if len(readings) < _SPHERE_ROWS or readings.shape[1] < len(AXES) or \
+            (readings.min(axis=0) < 0).any() or spread.min() < _TURNED * spread.max():
+        return 0.0, length
+    # A sphere: |r|^2 = 2 r.c + radius^2 - |c|^2 is linear in its centre.
+    terms = np.column_stack([2 * readings, np.ones(len(readings))])
+    solution = np.linalg.lstsq(terms, (readings ** 2).sum(axis=1), rcond=None)[0]
+    radius = float(np.sqrt(max(solution[3] + solution[:3] @ solution[:3], 0.0)))
+    centre = float(np.mean(solution[:3]))
+    scatter = np.std(np.linalg.norm(readings - solution[:3], axis=1))
+    is_sphere = scatter < _SPHERE_SCATTER * radius and radius < centre * len(AXES)
+    return (centre, radius) if is_sphere else (0.0, length)
 
 
 def _count_or_volts(length: float) -> str:

@@ -151,10 +151,11 @@ def _resolved(table: Table, mapping: ColumnMapping, reading: ReadingOptions
         raise UserError(f'{mapping.where}: some axes are in volts and others are not; state one '
                         'kind')
     lsb = [column.unit_name == LSB for column in outputs]
-    if reading.lsb_per_g and len(reading.lsb_per_g) not in (1, len(outputs)):
-        raise UserError(f'--lsb-per-g: has {len(reading.lsb_per_g)} values for {len(outputs)} '
-                        'axes; write one for all, or one for each')
-    if reading.lsb_per_g and not any(lsb):
+    for option, values in (('--lsb-per-g', reading.lsb_per_g), ('--lsb-at-0g', reading.lsb_at_0g)):
+        if values and len(values) not in (1, len(outputs)):
+            raise UserError(f'{option}: has {len(values)} values for {len(outputs)} axes; write '
+                            'one for all, or one for each')
+    if (reading.lsb_per_g or reading.lsb_at_0g) and not any(lsb):
         raise UserError(f'--lsb-per-g: no column is in LSB; write for example '
                         f'x={outputs[0].name}:lsb')
     if any(lsb) and not reading.lsb_per_g:
@@ -256,10 +257,16 @@ class _Converter:
     def _outputs(self, block: TableBlock) -> np.ndarray:
         """Return the output of the sensor, (n, m), V or m/s²."""
         axes = [axis for axis in AXES if axis in self.columns]
-        outputs = np.column_stack([self._values(block, axis) for axis in axes])
-        is_lsb = [self.columns[axis].unit_name == LSB for axis in axes]
-        divisors = np.broadcast_to(np.array(self.reading.lsb_per_g or (1.0,)), len(axes))
-        return outputs / np.where(is_lsb, divisors, 1.0)
+        per_g = np.broadcast_to(np.array(self.reading.lsb_per_g or 1.0), len(axes))
+        zero = np.broadcast_to(np.array(self.reading.lsb_at_0g or 0.0), len(axes))
+        outputs = []
+        for index, axis in enumerate(axes):
+            column = self.columns[axis]
+            values = block.columns[column.name]
+            if column.unit_name == LSB:
+                values = (values - zero[index]) / per_g[index]
+            outputs.append(column.unit.convert(values))
+        return np.column_stack(outputs)
 
     def _output_names(self) -> tuple[str, ...]:
         return VOLTS if self.columns['x'].unit.is_volts else ACCEL
@@ -401,9 +408,9 @@ class _Converter:
         """Yield how many rows were left out so far."""
         path = self.table.path
         if self._empty:
-            yield f'{path}: {self._empty} lines without a reading of the sensor are left out'
+            yield f'{path}: left out, lines without a reading of the sensor: {self._empty}'
         if self._duplicates:
-            yield f'{path}: {self._duplicates} samples with the stamp of the sample before are ' \
-                  'left out'
+            yield f'{path}: left out, samples with the stamp of the one before: ' \
+                  f'{self._duplicates}'
         if self._backward:
-            yield f'{path}: {self._backward} samples whose stamp steps back are left out'
+            yield f'{path}: left out, samples whose stamp steps back: {self._backward}'

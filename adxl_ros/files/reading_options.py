@@ -34,6 +34,8 @@ class ReadingOptions:
         Columns of a table; None for those of the package.
     lsb_per_g
         Counts of 1 g by axis, for columns in LSB: one for all axes, or one each.
+    lsb_at_0g
+        Counts at 0 g by axis, for columns in LSB; none for 0.
     rate_hz
         Sample rate, Hz, that replaces the stamps; None keeps them.
     drop_bad_stamps
@@ -46,6 +48,7 @@ class ReadingOptions:
     topic: str = ''
     mapping: ColumnMapping | None = None
     lsb_per_g: tuple[float, ...] = ()
+    lsb_at_0g: tuple[float, ...] = ()
     rate_hz: float | None = None
     drop_bad_stamps: bool = False
     mounting: Mounting | None = None

@@ -22,11 +22,13 @@ from pathlib import Path
 import sys
 
 from adxl_ros.calibrate import calibration, pose_extraction
+from adxl_ros.calibrate.pose_references import with_table_angles
 from adxl_ros.calibrate.report import report_html, text_tables
 from adxl_ros.calibrate.report.unit_errors import errors_in_words
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store, html_page, recording, sweep_journal
 from adxl_ros.files.checksum import sha256
+from adxl_ros.files.pose_table import read_pose_table
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.stream_unit import recorded_unit
 from adxl_ros.model.effects import library
@@ -69,6 +71,10 @@ def parser() -> argparse.ArgumentParser:
                        help='a further effect that the full model fits; see the list below')
     parse.add_argument('--journal', metavar='FILE',
                        help='use the rests that the journal of this sweep names')
+    parse.add_argument('--poses', metavar='FILE',
+                       help='table with the angles of each rest: alpha_deg and beta_deg, or '
+                            'roll_deg and pitch_deg; start_s and stop_s where the rows are not '
+                            'the rests in their order')
     parse.add_argument('-o', dest='output', metavar='FILE.yaml', required=True,
                        help='the parameter file of the calibrated sensor')
     parse.add_argument('--report', metavar='DIR',
@@ -93,6 +99,8 @@ def fit(options: argparse.Namespace) -> int:
                         f'{len(options.recording)} are given')
     if options.report:
         html_page.check_libraries()
+    if options.poses and (options.journal or len(options.recording) != 1):
+        raise UserError(f'--poses {options.poses}: goes with one recording, and without --journal')
     records = _records(options.journal)
     unit: Sensor | None = None
     measured: list[str] = []
@@ -107,6 +115,8 @@ def fit(options: argparse.Namespace) -> int:
         unit = recorded_unit(unit, read)
         _report_range(read, unit)
         poses = pose_extraction.extract_poses(read, unit, records)
+        if options.poses:
+            poses = with_table_angles(poses, read_pose_table(options.poses), read.epoch_ns)
         recordings.append(calibration.RecordedPoses(
             Path(path).name, poses, pose_extraction.estimate_filters(read, unit, poses)))
     assert unit is not None, 'argparse asks for a recording'

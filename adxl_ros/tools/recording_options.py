@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 
 from adxl_ros.errors import UserError
 from adxl_ros.files.column_mapping import parse_mapping, parse_mounting
@@ -42,6 +43,8 @@ def add_recording_options(parse: argparse.ArgumentParser) -> None:
                             'them')
     group.add_argument('--lsb-per-g', metavar='COUNTS', default='',
                        help='counts of 1 g of columns in LSB: one number, or one for each axis')
+    group.add_argument('--lsb-at-0g', metavar='COUNTS', default='',
+                       help='counts at 0 g of columns in LSB (default: 0), as 512 of a 10 bit ADC')
     group.add_argument('--rate', metavar='HZ', type=float, default=None,
                        help='stamp the samples by their index at this rate')
     group.add_argument('--drop-bad-stamps', action='store_true',
@@ -75,17 +78,18 @@ def reading_options(options: argparse.Namespace) -> ReadingOptions:
                         f'{_HIGHEST_RATE_HZ:g}')
     return ReadingOptions(
         options.topic, parse_mapping(options.columns) if options.columns else None,
-        _lsb_per_g(options.lsb_per_g), options.rate, options.drop_bad_stamps,
+        _counts('--lsb-per-g', options.lsb_per_g, True),
+        _counts('--lsb-at-0g', options.lsb_at_0g, False), options.rate, options.drop_bad_stamps,
         parse_mounting(options.axes) if options.axes else None)
 
 
-def _lsb_per_g(text: str) -> tuple[float, ...]:
+def _counts(option: str, text: str, is_positive: bool) -> tuple[float, ...]:
     """Return the numbers of a list."""
     try:
         values = tuple(float(word) for word in text.split(',')) if text else ()
     except ValueError:
-        values = (0.0,)
-    if not all(0 < value < float('inf') for value in values):
-        raise UserError(f'--lsb-per-g {text}: expected counts of 1 g, for example 16384 or '
+        values = (math.nan,)
+    if not all(math.isfinite(value) and (value > 0 or not is_positive) for value in values):
+        raise UserError(f'{option} {text}: expected counts, for example 16384 or '
                         '16384,16384,16500')
     return values

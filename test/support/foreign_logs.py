@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+import struct
 
 from adxl_ros.model.constants import G0_MPS2
 import numpy as np
@@ -146,3 +147,25 @@ FORMS = {'arduino.csv': _arduino, 'german.csv': _german, 'phyphox.csv': _phyphox
          'counts.txt': _counts, 'tabs.tsv': _tabs, 'epoch.csv': _epoch, 'app.csv': _app,
          'ros_text.csv': _ros_text, 'units_row.dat': _units_row}
 """Text of a log by the name of its file."""
+
+
+def text_with_angles(log: Turned, angles_deg: np.ndarray, names: str) -> str:
+    """Return a table with semicolons and two columns of angles, which are empty in motion."""
+    return f't;x;y;z;{names}\n' + lines([log.time_s, *log.output_g.T, *angles_deg.T],
+                                        ['%.3f'] + ['%.4f'] * 3 + ['%.3f'] * 2, ';')
+
+
+def ulog(log: Turned, message: str = 'sensor_accel') -> bytes:
+    """Return a log of PX4 with one message (docs.px4.io, ULog file format)."""
+    def record(kind: bytes, data: bytes) -> bytes:
+        return struct.pack('<Hc', len(data), kind) + data
+
+    fields = 'uint64_t timestamp;uint64_t timestamp_sample;float x;float y;float z;' \
+             'float temperature;'
+    parts = [b'ULog\x01\x12\x35\x01' + struct.pack('<Q', 0), record(b'B', bytes(40)),
+             record(b'F', f'{message}:{fields}'.encode()),
+             record(b'A', struct.pack('<BH', 0, 0) + message.encode())]
+    parts += [record(b'D', struct.pack('<HQQffff', 0, stamp_us + 500, stamp_us, *force, 30.0))
+              for stamp_us, force in zip(np.rint(1e6 * (1 + log.time_s)).astype(int).tolist(),
+                                         (G0_MPS2 * log.output_g).tolist())]
+    return b''.join(parts)

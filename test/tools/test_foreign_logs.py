@@ -18,14 +18,27 @@ from pathlib import Path
 import shlex
 
 from adxl_ros.files import parameter_file
-from foreign_logs import BIAS_G, FORMS, SCALE, turned
+from adxl_ros.model.constants import G0_MPS2
+from bags import bag_of, EPOCH_NS, imu
+from foreign_logs import BIAS_G, FORMS, lines, SCALE, text_with_angles, Turned, turned, ulog
 import numpy as np
 import pytest
+from without_extras import run_without_extras
+
+XYZ_G = 'time=t:s,x=x:g,y=y:g,z=z:g'
+LOG = turned()
+SHORT = 't,x,y,z\n' + ''.join(f'{i / 100},0.01,-0.02,{1 + i % 3 / 1e3}\n' for i in range(500))
+NO_UNIT = 'time=t:s,x=x,y=y,z=z'
 
 
 def written(folder: Path, name: str, text: str | bytes) -> str:
     (folder / name).write_bytes(text if isinstance(text, bytes) else text.encode())
     return name
+
+
+def plain_text(columns: list[np.ndarray]) -> str:
+    """Return a table of time in s and outputs in g."""
+    return 't,x,y,z\n' + lines(columns, ['%.3f'] + ['%.5f'] * 3)
 
 
 def proposed(error: str) -> list[str]:
@@ -46,9 +59,249 @@ def check_errors(path: Path, atol_g: float = 2e-3) -> None:
 @pytest.mark.parametrize('name', FORMS)
 def test_two_commands_from_a_log_to_a_calibration(run_tool, tmp_path, name) -> None:
     """The first answer proposes the columns and writes nothing; with them `fit` calibrates."""
-    written(tmp_path, name, FORMS[name](turned()))
+    written(tmp_path, name, FORMS[name](LOG))
     done = run_tool('fit', name, '-o', 'unit.yaml')
     assert done.returncode == 1 and not (tmp_path / 'unit.yaml').exists()
     done = run_tool('fit', name, '-o', 'unit.yaml', *proposed(done.stderr))
+    assert done.returncode == 0, done.stderr
+    check_errors(tmp_path / 'unit.yaml')
+
+
+def test_the_proposal_is_never_used_in_silence(run_tool, tmp_path) -> None:
+    """Without --columns a log is refused although its columns are certain."""
+    written(tmp_path, 'log.csv', FORMS['arduino.csv'](LOG))
+    done = run_tool('apply', 'log.csv', '-o', 'out.csv')
+    assert done.returncode == 1
+    assert done.stderr.startswith('apply: log.csv:1: no column time_s; the columns are t_ms, accX')
+    assert done.stderr.endswith("--columns 'time=t_ms:ms,x=accX:mg,y=accY:mg,z=accZ:mg,"
+                                "temperature=temp:c'\n")
+
+
+def test_counts_about_an_offset(run_tool, tmp_path) -> None:
+    """Counts of a 10 bit ADC, as an analog sensor on a board gives them."""
+    counts = 512 + 102 * LOG.output_g
+    rows = lines([1e3 * LOG.time_s, *counts.T], ['%.0f'] + ['%.2f'] * 3, ' ')
+    written(tmp_path, 'adc.txt', 'ms A0 A1 A2\n' + rows)
+    done = run_tool('fit', 'adc.txt', '-o', 'unit.yaml')
+    options = proposed(done.stderr)
+    assert options[:2] == ['--columns', 'time=ms:ms,x=A0:lsb,y=A1:lsb,z=A2:lsb']
+    assert float(options[options.index('--lsb-at-0g') + 1]) == pytest.approx(512, abs=6)
+    assert float(options[options.index('--lsb-per-g') + 1]) == pytest.approx(102, abs=4)
+    done = run_tool('fit', 'adc.txt', '-o', 'unit.yaml', '--columns', options[1],
+                    '--lsb-per-g', 102, '--lsb-at-0g', 512)
+    assert done.returncode == 0, done.stderr
+    check_errors(tmp_path / 'unit.yaml')
+
+
+@pytest.mark.parametrize('name', ['log.npz', 'log.parquet', 'log.ulg'])
+def test_tables_of_libraries(run_tool, tmp_path, name) -> None:
+    if name == 'log.npz':
+        np.savez(tmp_path / name, t=LOG.time_s, acc=LOG.output_g, note=np.array('still'))
+    elif name == 'log.parquet':
+        parquet = pytest.importorskip('pyarrow.parquet', reason='no pyarrow')
+        import pyarrow
+        stamps = (EPOCH_NS + np.rint(1e9 * LOG.time_s)).astype(np.int64)
+        parquet.write_table(pyarrow.table({
+            'stamp': pyarrow.array(stamps, pyarrow.timestamp('ns')), 'device': ['a'] * len(stamps),
+            **{f'acc_{axis}': LOG.output_g[:, i] for i, axis in enumerate('xyz')}}),
+            tmp_path / name)
+    else:
+        pytest.importorskip('pyulog', reason='no pyulog')
+        (tmp_path / name).write_bytes(ulog(LOG))
+    done = run_tool('fit', name, '-o', 'unit.yaml')
+    if name != 'log.ulg':  # its format states columns and units
+        assert done.returncode == 1
+        done = run_tool('fit', name, '-o', 'unit.yaml', *proposed(done.stderr))
+    assert done.returncode == 0, done.stderr
+    check_errors(tmp_path / 'unit.yaml')
+
+
+@pytest.mark.parametrize(('name', 'package'), [('a.parquet', 'pyarrow'), ('a.ulg', 'pyulog')])
+def test_a_missing_library_is_named(tmp_path, name, package) -> None:
+    (tmp_path / name).write_bytes(b'')
+    done = run_without_extras('import sys\nfrom adxl_ros.files import recording\n'
+                              'from adxl_ros.errors import UserError\n'
+                              'try:\n    recording.read(sys.argv[1])\n'
+                              'except UserError as error:\n    print(error)\n',
+                              str(tmp_path / name))
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.endswith(f': pip install {package}\n'), done.stdout
+
+
+@pytest.mark.parametrize('names', ['angle;beta', 'roll;pitch'])
+def test_angles_in_a_log_are_the_reference(run_tool, tmp_path, names) -> None:
+    """Degrees, empty in motion, and in a whole rest: `fit` keeps the stage as reference."""
+    angles = np.degrees(LOG.angles_rad) if names == 'angle;beta' else LOG.tilt_deg
+    angles[(LOG.time_s > 10.5) & (LOG.time_s < 14)] = np.nan
+    written(tmp_path, 'log.csv', text_with_angles(LOG, angles, names))
+    done = run_tool('fit', 'log.csv', '-o', 'unit.yaml')
+    done = run_tool('fit', 'log.csv', '-o', 'unit.yaml', *proposed(done.stderr))
+    assert done.returncode == 0, done.stderr
+    fitted = parameter_file.load(tmp_path / 'unit.yaml')
+    assert fitted.provenance['reference'] == 'stage'
+    assert 'rests without angles, left out: 1 (from 10.' in ' '.join(done.stdout.split())
+    check_errors(tmp_path / 'unit.yaml', 5e-3)
+
+
+def pose_table(log: Turned) -> list[str]:
+    """Return a row for each rest: alpha and beta in degrees; beta is empty where it is free."""
+    starts = np.flatnonzero(np.diff(np.isfinite(log.angles_rad[:, 0]).astype(int), prepend=0) > 0)
+    rows = []
+    for start in starts:
+        alpha, beta = np.degrees(log.angles_rad[start])
+        rows.append(f'{alpha:.3f},' + (f'{beta:.3f}' if 1 < alpha < 179 else ''))
+    return rows
+
+
+def test_a_table_of_poses_is_the_reference(run_tool, tmp_path) -> None:
+    written(tmp_path, 'log.csv', plain_text([LOG.time_s, *LOG.output_g.T]))
+    rows = pose_table(LOG)
+    rows[3] = ','
+    written(tmp_path, 'poses.csv', 'alpha_deg,beta_deg\n' + '\n'.join(rows) + '\n')
+    done = run_tool('fit', 'log.csv', '--columns', XYZ_G, '--poses', 'poses.csv', '-o', 'u.yaml')
+    assert done.returncode == 0, done.stderr
+    fitted = parameter_file.load(tmp_path / 'u.yaml')
+    assert fitted.provenance['reference'] == 'stage'
+    assert fitted.provenance['poses'].startswith('31')
+    check_errors(tmp_path / 'u.yaml', 5e-3)
+    written(tmp_path, 'poses.csv', 'alpha_deg,beta_deg\n' + '\n'.join(rows[:-1]) + '\n')
+    done = run_tool('fit', 'log.csv', '--columns', XYZ_G, '--poses', 'poses.csv', '-o', 'v.yaml')
+    assert 'poses.csv: has 31 poses, but the recording has 32 rests, which begin at 0.' \
+        in done.stderr
+
+
+def test_stamps_in_bursts(run_tool, tmp_path) -> None:
+    """Eight samples share a stamp: refused and named; an index gives their times."""
+    stamps = 0.08 * np.floor(LOG.time_s / 0.08 + 1e-9)
+    written(tmp_path, 'log.csv', plain_text([stamps, *LOG.output_g.T]))
+    command = ['fit', 'log.csv', '--columns', XYZ_G, '-o', 'unit.yaml']
+    done = run_tool(*command)
+    assert done.returncode == 1
+    assert 'log.csv:3:1: t: time stands still' in done.stderr
+    assert 'bursts of about 8 samples' in done.stderr and ' 100 Hz' in done.stderr
+    done = run_tool(*command, '--rate', 100)
+    assert done.returncode == 0, done.stderr
+    check_errors(tmp_path / 'unit.yaml')
+    written(tmp_path, 'log.csv', 't,x,y,z\n' + lines(
+        [stamps + 1e-4 * (np.arange(len(stamps)) % 8), *LOG.output_g.T],
+        ['%.4f'] + ['%.5f'] * 3))
+    done = run_tool(*command)
+    assert done.returncode == 0 and 'bursts of about 8 samples' in done.stderr
+    assert parameter_file.load(tmp_path / 'unit.yaml').rate_hz == pytest.approx(100, rel=0.01)
+
+
+def test_bad_stamps_are_left_out_and_counted(run_tool, tmp_path) -> None:
+    rows = FORMS['arduino.csv'](LOG).splitlines(keepends=True)
+    rows[300:300] = rows[290:293]
+    rows[200:200] = rows[199:200]
+    written(tmp_path, 'log.csv', ''.join(rows))
+    options = ['--columns', 'time=t_ms:ms,x=accX:mg,y=accY:mg,z=accZ:mg', '-o', 'unit.yaml']
+    done = run_tool('fit', 'log.csv', *options)
+    assert done.returncode == 1
+    assert 'log.csv:201:1: t_ms: time stands still' in done.stderr
+    assert '--drop-bad-stamps' in done.stderr
+    done = run_tool('fit', 'log.csv', *options, '--drop-bad-stamps')
+    assert done.returncode == 0, done.stderr
+    assert 'samples with the stamp of the one before: 1\n' in done.stderr
+    assert 'samples whose stamp steps back: 3\n' in done.stderr
+    check_errors(tmp_path / 'unit.yaml')
+
+
+def test_a_documented_mounting(run_tool, tmp_path) -> None:
+    """The log has x along -y of the sensor; --axes brings both together."""
+    x, y, z = LOG.output_g.T
+    written(tmp_path, 'log.csv', plain_text([LOG.time_s, -y, x, z]))
+    done = run_tool('fit', 'log.csv', '--columns', XYZ_G, '--axes', 'x=y,y=-x,z=z', '-o', 'u.yaml')
+    assert done.returncode == 0, done.stderr
+    check_errors(tmp_path / 'u.yaml')
+
+
+def test_numbered_columns_and_a_mapping_file(run_tool, tmp_path) -> None:
+    """A header may be missing, and a file may hold the mapping; `apply` reads both alike."""
+    text = lines([1e3 * LOG.time_s, *1e3 * LOG.output_g.T], ['%.0f'] + ['%.1f'] * 3, ';', ',')
+    written(tmp_path, 'log.csv', text)
+    written(tmp_path, 'columns.txt', '# the board of the lab\ntime=1:ms\nx=2:mg\ny=3:mg, z=4:mg\n')
+    for columns, out in (('columns.txt', 'a.csv'), ('time=1:ms,x=2:mg,y=3:mg,z=4:mg', 'b.csv')):
+        done = run_tool('apply', 'log.csv', '--columns', columns, '-o', out)
+        assert done.returncode == 0, done.stderr
+    assert (tmp_path / 'a.csv').read_bytes() == (tmp_path / 'b.csv').read_bytes()
+    read = np.genfromtxt(tmp_path / 'a.csv', delimiter=',', names=True)
+    np.testing.assert_allclose(read['ax_mps2'], G0_MPS2 * LOG.output_g[:, 0], atol=1e-3)
+    np.testing.assert_allclose(read['time_s'], LOG.time_s, atol=1e-9)
+
+
+@pytest.mark.parametrize(('text', 'options', 'words'), [
+    (SHORT, ['--columns', 'time=t:s,x=x:g,y=y:g,z=w:g'],
+     "--columns: log.csv has no column 'w' for z; the columns are t, x, y, z"),
+    (SHORT, ['--columns', 'time=t:s,x=x:foot'], "x=x:foot: unknown unit 'foot'; write one of g, "),
+    (SHORT, ['--columns', 'tme=t:s,x=x:g'], "no role 'tme'; the roles are time, x, y"),
+    (SHORT, ['--columns', 'x=x:g,y=y:g,z=z:g'], 'has no time; add time=COLUMN:UNIT, or give'),
+    (SHORT, ['--columns', 'time=t:s,x=x:lsb,y=y:lsb,z=z:lsb'], 'x is in LSB; add --lsb-per-g'),
+    (SHORT, ['--columns', 'time=t:s,x=x:g,y=y:v'], 'some axes are in volts and others are not'),
+    (SHORT, ['--columns', 'time=t:s,x=x:g,roll=y:deg'], 'roll without pitch is no reference'),
+    (SHORT, ['--columns', NO_UNIT], 'x, y, z have a length of 0.102 g in mps2, where gravity has '
+                                    '1 g; state their unit, for example x=x:g'),
+    (SHORT, ['--columns', 'gone.txt'], '--columns gone.txt: is neither a mapping nor a file'),
+    (SHORT, ['--columns', XYZ_G, '--axes', 'x=-y,y=y'], '--axes x=-y,y=y: each axis of the'),
+    (SHORT, ['--columns', XYZ_G, '--lsb-per-g', '4'], '--lsb-per-g: no column is in LSB'),
+    (SHORT, ['--columns', XYZ_G, '--rate', '0'], '--rate 0: expected samples a second'),
+    (SHORT, ['--topic', '/imu'], '--topic /imu: log.csv is no bag; leave --topic out'),
+    (SHORT.replace('-0.02,1.002', 'off,1.002', 1), ['--columns', XYZ_G],
+     "log.csv:4:3: y is 'off', not a number"),
+    (SHORT.replace('0.02,0.01', '0.02,', 1), ['--columns', XYZ_G],
+     'log.csv:4:2: x is empty; every sample needs it'),
+    (SHORT.replace('0.02,0.01', ',0.01', 1), ['--columns', XYZ_G],
+     'log.csv:4:1: t is empty; every sample needs a time'),
+    (SHORT.replace('\n0.02,', '\n0.02;', 1), ['--columns', XYZ_G],
+     'log.csv:4:4: 3 fields, but the header has 4'),
+    ('name,state\na,b\nc,d\n', [], 'log.csv:1: no column time_s; the columns are name, state'),
+    ('height,width\n1,2\n3,4\n', [], 'none looks like an accelerometer: name the columns'),
+])
+def test_wrong_input_has_one_line_that_says_what_to_write(run_tool, tmp_path, text, options, words
+                                                          ) -> None:
+    written(tmp_path, 'log.csv', text)
+    done = run_tool('fit', 'log.csv', '-o', 'unit.yaml', *options)
+    assert done.returncode == 1 and not (tmp_path / 'unit.yaml').exists()
+    assert words in done.stderr and done.stderr.count('\n') == 1, done.stderr
+
+
+def bag_with(folder: Path, topics: list[str], log: Turned = LOG) -> None:
+    """Write a bag of drivers that state no covariance and no sensor_info."""
+    stamps = EPOCH_NS + np.rint(1e9 * log.time_s).astype(np.int64)
+    bag_of(folder / 'bag', [imu(stamp, force, topic, (0.0, 0.0, 0.0), topic)
+                            for stamp, force in zip(stamps.tolist(), G0_MPS2 * log.output_g)
+                            for topic in topics])
+
+
+def test_any_imu_topic_of_a_bag(run_tool, tmp_path) -> None:
+    """The only Imu topic is read whatever its name is."""
+    bag_with(tmp_path, ['/camera/imu'])
+    done = run_tool('fit', 'bag', '-o', 'unit.yaml')
+    assert done.returncode == 0, done.stderr
+    check_errors(tmp_path / 'unit.yaml')
+
+
+def test_several_imu_topics_of_a_bag_are_named(run_tool, tmp_path) -> None:
+    bag_with(tmp_path, ['/camera/imu', '/body/imu/data'])
+    done = run_tool('fit', 'bag', '-o', 'unit.yaml')
+    assert done.returncode == 1
+    assert '/body/imu/data, /camera/imu; choose one: --topic /body/imu/data' in done.stderr
+    done = run_tool('fit', 'bag', '--topic', 'camera/gyro', '-o', 'unit.yaml')
+    assert 'no topic camera/gyro; name one of /body/imu/data, /camera/imu' in done.stderr
+    done = run_tool('fit', 'bag', '--topic', 'camera/imu', '-o', 'unit.yaml')
+    assert done.returncode == 0, done.stderr
+    check_errors(tmp_path / 'unit.yaml')
+
+
+def test_bad_stamps_of_a_bag(run_tool, tmp_path) -> None:
+    log = turned()
+    log.time_s[500] = log.time_s[499]
+    bag_with(tmp_path, ['/imu'], log)
+    done = run_tool('fit', 'bag', '-o', 'unit.yaml')
+    assert 'time stands still: message 501' in done.stderr
+    assert '--drop-bad-stamps' in done.stderr
+    done = run_tool('fit', 'bag', '--drop-bad-stamps', '-o', 'unit.yaml')
+    assert done.returncode == 0 and 'whose stamp does not increase: 1\n' in done.stderr
+    done = run_tool('fit', 'bag', '--rate', 100, '-o', 'unit.yaml')
     assert done.returncode == 0, done.stderr
     check_errors(tmp_path / 'unit.yaml')

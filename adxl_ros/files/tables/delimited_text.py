@@ -42,9 +42,6 @@ NAME = 'delimited_text'
 _HEAD_LINES = 200
 """Lines that show the form of a file (chosen: more than any preamble seen)."""
 
-_SAMPLE_LINES = 5000
-"""Lines that show what the columns hold (chosen: some seconds of any sensor)."""
-
 _DELIMITERS = {'\t': 'tabs', ';': 'semicolons', ',': 'commas', ' ': 'blanks'}
 """Names of delimiters; the first that fits is taken."""
 
@@ -117,15 +114,13 @@ class DelimitedText:
             lines = next(_samples(self.path, file, {}, self._form), None)
             if lines is None:
                 return {}
-            rows = lines.data.split(b'\n')[:min(_SAMPLE_LINES, len(lines.numbers))]
-            head = replace(lines, data=b'\n'.join(rows) + b'\n',
-                           numbers=lines.numbers[:len(rows)])
             # Lines of another length, as at the end of a file, do not hide the others.
-            even = [i for i in range(len(rows))
-                    if len(head.fields(self.path, i)) == len(self.names)]
-            head = replace(head, data=b''.join(rows[i] + b'\n' for i in even),
-                           numbers=[lines.numbers[i] for i in even])
-            return parse_numbers(layout, head) if even else {}
+            texts = lines.data.split(b'\n')
+            even = [i for i, fields in enumerate(lines.rows(self.path))
+                    if len(fields) == len(self.names)]
+            lines = replace(lines, data=b''.join(texts[i] + b'\n' for i in even),
+                            numbers=[lines.numbers[i] for i in even])
+            return parse_numbers(layout, lines) if even else {}
 
     def _layout(self, used: Collection[str], required: frozenset[str]) -> Layout:
         source = 'the header' if self.has_names else 'the first line'
