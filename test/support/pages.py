@@ -44,7 +44,7 @@ FAULTS = r"""
     range.selectNodeContents(node);
     for (const rect of range.getClientRects()) { add(node.textContent, rect, node); }
     for (let e = parent; e; e = e.parentElement) {
-      if (getComputedStyle(e).overflowX === 'hidden' && e.scrollWidth > e.clientWidth + 1) {
+      if (getComputedStyle(e).overflowX !== 'visible' && e.scrollWidth > e.clientWidth + 1) {
         faults.push('cut: ' + node.textContent.trim().slice(0, 40));
       }
     }
