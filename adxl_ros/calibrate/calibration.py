@@ -107,6 +107,8 @@ class CalibrationResult:
         The fit of a calibration against gravity.
     outliers
         Indices of the outliers, which the fit leaves out.
+    warnings
+        What is wrong with the poses or the fit, and why no richer model was fitted.
 
     """
 
@@ -119,6 +121,7 @@ class CalibrationResult:
     held_out: tuple[HeldOutErrors, ...] = ()
     gravity_fit: gravity.GravityFit | None = None
     outliers: tuple[int, ...] = ()
+    warnings: tuple[str, ...] = ()
 
     def comments(self) -> list[str]:
         """Return coefficients and assessment as text: the head of the parameter file."""
@@ -288,6 +291,8 @@ class _StageFit:
         Report of a full fit.
     refusals
         Reasons why richer models are not fitted.
+    warnings
+        What is wrong with the poses or a full fit.
     full
         The full fit; None for other models.
 
@@ -297,6 +302,7 @@ class _StageFit:
     refit: cross_validation.Fit
     report_lines: Sequence[str] = ()
     refusals: Sequence[str] = ()
+    warnings: Sequence[str] = ()
     full: FullFit | None = None
 
 
@@ -329,7 +335,7 @@ def _against_stage(sensor: Sensor, recordings: Sequence[RecordedPoses], model: s
     unit_lines = acceptance.unit_line(fitted)
     return CalibrationResult(
         nominal=sensor, fitted=fitted, poses=poses, assessments=assessments,
-        held_out=held_out, outliers=outliers,
+        held_out=held_out, outliers=outliers, warnings=(*fit.warnings, *fit.refusals),
         report_lines=[*fit.refusals, *cross_validation.table(held_out),
                       *acceptance.table(assessments, held_out), *explanation, *unit_lines,
                       *fit_lines],
@@ -408,7 +414,7 @@ def _fit(model: str, sensor: Sensor, recordings: Sequence[RecordedPoses], effect
         require_one_mounting(full, [recording.poses for recording in recordings],
                              [recording.source for recording in recordings])
     return _StageFit(full.fitted, fit_full, full_fit_text.report_lines(full, poses, terms),
-                     full=full)
+                     warnings=full_fit_text.warnings(full, poses), full=full)
 
 
 def _rms_residual_mg(fitted: Sensor, poses: Poses) -> float:
@@ -443,6 +449,7 @@ def _against_gravity(sensor: Sensor, poses: Poses, source: str, data_sha256: str
              *acceptance.explanation(assessment, fitted), *acceptance.unit_line(fitted)]
     return CalibrationResult(
         nominal=sensor, fitted=fitted, poses=poses, assessments=(assessment,), gravity_fit=fit,
+        warnings=tuple(_gravity_fit_lines(fit, poses)),
         report_lines=lines, summary_lines=[*acceptance.headline(assessment, ()), *lines])
 
 

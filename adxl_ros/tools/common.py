@@ -17,7 +17,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 import os
 from pathlib import Path
@@ -32,6 +32,8 @@ from adxl_ros.files.recording_columns import Recording
 
 _UNITS = {'rad': 'rad', 'm': 'm', 'c': 'degC', 'v': 'V'}
 """Units of references by the end of their columns' names."""
+_FIRST_ESTIMATE = 0.2
+"""Fraction from which the run time is estimated. Chosen: begin and reading count little then."""
 _BAR_COLUMNS = 24
 """Columns of a progress bar: names of stages and times stand beside it in 80 columns."""
 
@@ -139,21 +141,14 @@ def _show_nothing(done: float, stage: str = '') -> None:
 
 
 class _Clock:
-    """
-    The elapsed and the expected run time, by the fraction that is done.
-
-    The clock starts when the first work is done, because what comes before, such as reading, is
-    not a part of the fraction.
-    """
+    """The elapsed and the expected run time, by the fraction that is done."""
 
     def __init__(self) -> None:
         self._begin_s, self._total_s = monotonic(), 0.0
 
     def set_done(self, done: float) -> None:
         """Estimate the run time from the fraction that is done."""
-        if done <= 0:
-            self._begin_s = monotonic()
-        else:
+        if done >= _FIRST_ESTIMATE:
             self._total_s = self._elapsed_s() / min(done, 1.0)
 
     def text(self) -> str:
@@ -219,6 +214,33 @@ def progress(title: str) -> Iterator[ShowDone]:
                        description=stage or title)
 
         yield show
+
+
+@contextmanager
+def staged_progress(work: Mapping[str, float]) -> Iterator[Callable[[str, float], None]]:
+    """
+    Show a progress bar over stages of different length, as `progress` does.
+
+    Parameters
+    ----------
+    work
+        Usual duration of each stage in any unit, in their order.
+
+    Yields
+    ------
+    callable
+        Takes the name of the present stage and the fraction of it that is done.
+
+    """
+    names, total = list(work), sum(work.values())
+    with progress(f'1/{len(names)} {names[0]}') as show:
+        def show_stage(stage: str, share: float = 0.0) -> None:
+            number = names.index(stage)
+            before = sum(work[name] for name in names[:number])
+            show((before + share * work[stage]) / total,
+                 f'{number + 1}/{len(names)} {stage}')
+
+        yield show_stage
 
 
 def _minutes(seconds: float) -> str:

@@ -72,7 +72,7 @@ def test_each_tool_names_its_files_and_the_next_command(tmp_path: Path) -> None:
     assert files.split()[:3] == ['unit.yaml', 'report.html', 'calibration.png']
     assert all((tmp_path / name).exists() for name in files.split()[:3])
     assert re.search('^ (PASS|NOT SHOWN|FAIL) ', done.stdout, re.MULTILINE)
-    assert following == 'ros2 run adxl_ros apply RECORDING --params unit.yaml -o tilt.csv'
+    assert following == 'ros2 run adxl_ros apply sweep.csv --params unit.yaml -o tilt.csv'
     done = run_executable('apply', 'sweep.csv', '--params', 'unit.yaml', '-o', 'tilt.csv',
                           cwd=tmp_path)
     assert end_of(done.stdout) == (

@@ -22,7 +22,7 @@ def test_simulate_fit_and_apply_make_one_path(run_tool, tmp_path):
     done = run_tool('fit', 'sweep.csv', '--params', 'nominal.yaml', '-o', 'unit.yaml',
                     '--report', 'figures')
     assert done.returncode == 0, done.stderr
-    assert 'full model' in done.stdout and 'held out' in done.stdout
+    assert 'full model' in done.stdout and 'poses that the fit has not seen' in done.stdout
     assert (tmp_path / 'figures' / 'calibration.png').stat().st_size > 20000
     fitted = parameter_file.load(tmp_path / 'unit.yaml')
     np.testing.assert_allclose(fitted.zero_g_v, truth.zero_g_v, atol=5e-4)
@@ -134,5 +134,6 @@ def test_sweeps_of_another_generator(run_tool, tmp_path, shared_dir, name):
     done = run_tool('fit', shared_dir / 'samples' / name / 'cal.csv', '--model', 'linear',
                     '-o', 'unit.yaml')
     assert done.returncode == 0, done.stderr
-    linear = next(line for line in done.stdout.splitlines() if line.startswith('linear '))
-    assert float(linear.split('/')[-2].split()[-1]) < 0.1
+    linear = next(line for line in done.stdout.splitlines() if line.endswith('<- saved'))
+    assert linear.startswith(' linear calibration ')
+    assert float(linear.split('°')[1].split()[0]) < 0.1

@@ -103,16 +103,38 @@ def report_lines(full: full_model.FullFit, poses: Poses, terms: Sequence[Term]) 
     next_poses = full_model.next_poses(full.unit, poses, full.names, full.stage)
     return [
         *_stage_lines(full),
-        *([] if full.converged else [NOT_CONVERGED]),
-        *_outlier_lines(full, poses),
+        *warnings(full, poses),
         f'least determined: {direction}, std {weakest.std:.2g} typical sizes '
         f'(condition number {weakest.condition_number:.0f})',
         f'next poses that would help most, (alpha, beta) in deg: '
         f'{full_model.format_poses(next_poses)}',
-        *_temperature_lines(full, poses),
         *(['log Bayes factor of each term, nats; above 0 the poses support it:'] if terms else []),
         *(f'  {term.name:20} {term.log_bayes_factor:10.1f}'
           f'{"" if term.is_supported else "   not supported by these poses"}' for term in terms)]
+
+
+def warnings(full: full_model.FullFit, poses: Poses) -> list[str]:
+    """
+    Return what is wrong with the poses or the fit, one line each.
+
+    Parameters
+    ----------
+    full
+        The fit.
+    poses
+        The fitted poses.
+
+    Returns
+    -------
+    list of str
+        Nothing where all is well.
+
+    """
+    lines = [] if full.converged else [NOT_CONVERGED]
+    if full.stage_std_rad > _BAD_STAGE_RATIO * full.stated_std_rad + _MIN_STAGE_EXCESS_RAD:
+        lines.append('the reference is worse than stated, or the model lacks an effect that looks '
+                     'like a stage error; poses are weighted accordingly')
+    return [*lines, *_outlier_lines(full, poses), *_temperature_lines(full, poses)]
 
 
 def _stage_lines(full: full_model.FullFit) -> list[str]:
@@ -127,9 +149,6 @@ def _stage_lines(full: full_model.FullFit) -> list[str]:
               for name, value, value_std in zip(full.names, get(full.unit, full.names), std)
               if full_model.belongs_to_stage(name)]
     lines.append(f'stage: {", ".join(values)} (90 % intervals)')
-    if full.stage_std_rad > _BAD_STAGE_RATIO * full.stated_std_rad + _MIN_STAGE_EXCESS_RAD:
-        lines.append('the reference is worse than stated, or the model lacks an effect that looks '
-                     'like a stage error; poses are weighted accordingly')
     return lines
 
 

@@ -243,6 +243,43 @@ def explanation(assessment: Assessment, sensor: Sensor) -> list[str]:
     return lines
 
 
+def limit_table(assessment: Assessment, sensor: Sensor) -> list[str]:
+    """
+    Lay out the error of the calibration below its limits, with one outcome for each figure.
+
+    Parameters
+    ----------
+    assessment
+        Assessment of the saved model.
+    sensor
+        The unit with its datasheet values and noise.
+
+    Returns
+    -------
+    list of str
+        A line for the error, and a line for each limit.
+
+    """
+    rows = [('calibration error', 1e3 * assessment.accel.calibration ** 0.5 / G0_MPS2,
+             assessment.error_deg, '', '')]
+    for name, limit_mps2, accel, tilt in (
+            ('limit by the datasheet', nonlinearity_mps2(sensor), assessment.accel_datasheet,
+             assessment.tilt_datasheet),
+            ('noise of one sample', sample_noise_mps2(sensor), assessment.accel_noise,
+             assessment.tilt_noise)):
+        if accel:
+            rows.append((name, 1e3 * limit_mps2 / G0_MPS2, _tilt_deg(assessment, limit_mps2),
+                         accel, tilt))
+    return [f' {name:24} {"-" if np.isnan(value_deg) else two_digits(value_deg):>7} ° {tilt:9} '
+            f'{two_digits(value_mg):>8} mg {accel}'.rstrip()
+            for name, value_mg, value_deg, accel, tilt in rows]
+
+
+def two_digits(value: float) -> str:
+    """Write a value with two digits, the last zero too."""
+    return f'{value:.0f}' if value >= 10 else f'{value:#.2g}'
+
+
 def _tilt_deg(assessment: Assessment, accel_mps2: float) -> float:
     """Return the tilt that an acceleration error of each axis causes, deg rms."""
     return float(np.degrees(accel_mps2 * np.sqrt(assessment.tilt.tilt_per_axis)))

@@ -227,11 +227,22 @@ def summarise(model: str, errors: PoseErrors, pose_index: np.ndarray | None = No
 
     """
     count = len(errors.accel_mps2)
+    accel_mg = errors.accel_mps2[determining_alpha(errors)] / G0_MPS2 * 1e3
     return HeldOutErrors(
         model, _statistic(np.degrees(errors.tilt_rad)), _statistic(np.degrees(errors.alpha_rad)),
-        _statistic(np.degrees(errors.beta_rad)), _statistic(errors.accel_mps2 / G0_MPS2 * 1e3),
+        _statistic(np.degrees(errors.beta_rad)), _statistic(accel_mg),
         errors, np.arange(count) if pose_index is None else pose_index, tuple(fitted),
         np.zeros(count, int) if fold is None else fold)
+
+
+def determining_alpha(errors: PoseErrors) -> np.ndarray:
+    """
+    Mark the poses whose errors of acceleration count, (k,) bool: those that determine alpha.
+
+    Without z, a wrong root of equation (5) shifts x and y of the others.
+    """
+    has_tilt = np.isfinite(errors.tilt_rad)
+    return has_tilt if has_tilt.any() else np.isfinite(errors.accel_mps2).all(axis=1)
 
 
 def _statistic(values: np.ndarray) -> ErrorStatistic:

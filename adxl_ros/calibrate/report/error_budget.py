@@ -44,6 +44,7 @@ from adxl_ros.calibrate.poses import Poses, reference_force
 from adxl_ros.calibrate.report.cross_validation import (
     angle_between,
     degrees_of_freedom,
+    determining_alpha,
     HeldOutErrors,
     pose_errors,
 )
@@ -225,8 +226,7 @@ def error_budgets(errors: HeldOutErrors, poses: Poses, stage: Sensor | None = No
         stage_force(stage, held.alpha_rad, held.beta_rad))
     has_tilt = np.isfinite(measured.tilt_rad)
     axes = [AXES.index(axis) for axis in sensor.axes]
-    # Without z, a wrong root of equation (5) shifts x and y, an error that no part describes.
-    used = has_tilt if has_tilt.any() else np.isfinite(measured.force_mps2).all(axis=1)
+    used = determining_alpha(measured)
     covariances = _covariances(errors, held, reference)
     scatter = _scatter(sensor, poses.subset(~poses.check))
     accel = tilt = _NO_BUDGET

@@ -20,7 +20,7 @@ from collections.abc import Sequence
 
 from adxl_ros.calibrate.fits.gravity_fit import GravityFit
 from adxl_ros.calibrate.report import acceptance
-from adxl_ros.calibrate.report.against_truth import compare, Comparison
+from adxl_ros.calibrate.report.against_truth import Comparison
 from adxl_ros.calibrate.report.cross_validation import HeldOutErrors
 from adxl_ros.calibrate.report.error_budget import sample_noise_mps2
 from adxl_ros.calibrate.value_text import decimals
@@ -70,14 +70,6 @@ def _truth_row(row: Comparison, width: int) -> str:
     return (f'{_fitted_row(row, width)} {truth:>10}   {"ok" if row.inside else "MISSED"}')
 
 
-def coefficient_table(fitted: Sensor) -> list[str]:
-    """Lay out the fitted coefficients with their 90 % intervals, in 79 columns."""
-    rows = compare(fitted, fitted)
-    width = _label_width(rows)
-    return [f' {fitted.serial}: {fitted.model} model, coefficients with 90 % intervals',
-            *(_fitted_row(row, width).rstrip() for row in rows)]
-
-
 def _label_width(rows: Sequence[Comparison]) -> int:
     longest = max((len(row.label) for row in rows), default=0)
     return max(min(longest + 1, _LONGEST_LABEL), len('coefficient'))
@@ -124,11 +116,10 @@ def acceptance_lines(fitted: Sensor) -> list[str]:
         'the datasheet allows'
     if not limit_mps2:
         limit_mps2, kind, allows = sample_noise_mps2(fitted), 'noise', 'the noise of one sample is'
-    limit = f'{1e3 * limit_mps2 / G0_MPS2:.2g} mg'
+    limit = f'{acceptance.two_digits(1e3 * limit_mps2 / G0_MPS2)} mg'
     accel = provenance.get(f'verdict_{kind}', '')
     tilt = provenance.get(f'verdict_tilt_{kind}', '')
-    # Two digits with their zeros, as 0.10; the point of "11." goes.
-    result = f'calibration error {f"{error_mg:#.2g}".rstrip(".")} mg; {allows} {limit}'
+    result = f'calibration error {acceptance.two_digits(error_mg)} mg; {allows} {limit}'
     if acceptance.FAIL in (accel, tilt):
         if accel != acceptance.FAIL:
             tilt_deg = float(provenance['own_tilt_deg'])

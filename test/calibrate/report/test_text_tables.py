@@ -24,7 +24,6 @@ from adxl_ros.calibrate.report.against_truth import added_effects, compare
 from adxl_ros.calibrate.report.text_tables import (
     acceptance_lines,
     added_effect_lines,
-    coefficient_table,
     error_table,
     gravity_lines,
     truth_table,
@@ -135,16 +134,6 @@ def test_terms_that_the_unit_lacks_are_named() -> None:
     assert added_effects(fitted, with_neutral(truth, ['temperature_bias'])) == []
     assert added_effect_lines(added_effects(fitted, truth)) == [
         '       The fit has the term temperature_bias, which this unit does not have.']
-
-
-@pytest.mark.parametrize('axes', ['xy', 'xyz'])
-def test_table_of_the_coefficients(axes: str) -> None:
-    fitted, _ = fitted_and_truth(axes=axes)
-    head, *rows = coefficient_table(fitted)
-    assert 'full model' in head
-    assert len(rows) == len(fitted.covariance_names)
-    assert max(map(len, rows)) <= 79
-    assert rows[0].split() == ['zero-g', 'x', f'{fitted.zero_g_v[0]:.4f}', '±', '0.0016', 'V']
 
 
 def test_without_a_datasheet_the_noise_is_the_limit() -> None:
