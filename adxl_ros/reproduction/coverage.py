@@ -293,13 +293,29 @@ def page(draws: Sequence[Draw], made: str) -> str:
     return '\n'.join(lines) + '\n'
 
 
-def _several(label: str, parts: Sequence[np.ndarray]) -> str:
+def screen_lines(draws: Sequence[Draw]) -> list[str]:
+    """Return the coverage of all intervals as lines for a terminal."""
+    parts = {'coefficients': [d.z for d in draws], 'tilt': [d.tilt_z for d in draws],
+             'acceleration': [d.force_z for d in draws]}
+    lines = [f' Coverage of 90 % intervals over {len(draws)} drawn units and stages']
+    for label, z_of_draws in parts.items():
+        share, (low, high) = _coverage(z_of_draws)
+        lines.append(f' {label:28}{100 * share:15.1f} %   ({100 * low:.1f} to {100 * high:.1f})')
+    return lines
+
+
+def _coverage(parts: Sequence[np.ndarray]) -> tuple[float, tuple[float, float]]:
+    """Return the share of intervals with the truth, and its 90 % interval over draws."""
     inside = np.array([[np.sum(np.abs(z) < Z_90), len(z)] for z in parts])
     rng = np.random.default_rng(0)
     resampled = inside[rng.integers(0, len(parts), (1000, len(parts)))].sum(axis=1)
     low, high = np.quantile(resampled[:, 0] / resampled[:, 1], [0.05, 0.95])
     total = inside.sum(axis=0)
-    return _row(label, total[0] / total[1], (low, high), np.concatenate(parts))
+    return float(total[0] / total[1]), (float(low), float(high))
+
+
+def _several(label: str, parts: Sequence[np.ndarray]) -> str:
+    return _row(label, *_coverage(parts), np.concatenate(parts))
 
 
 def _row(label: str, share: float, share_interval: tuple[float, float], z: np.ndarray) -> str:

@@ -95,6 +95,49 @@ def page(results: dict[str, list[Unit]], bound_mmps2: float, made: str, coverage
     return '\n\n'.join(part.strip('\n') for part in parts) + '\n'
 
 
+def screen_lines(results: dict[str, list[Unit]], bound_mmps2: float) -> list[str]:
+    """
+    Return Table I and the motion experiment as lines for a terminal.
+
+    Parameters
+    ----------
+    results
+        Units by stage.
+    bound_mmps2
+        Noise floor of the motion experiment, mm/s².
+
+    Returns
+    -------
+    list of str
+        Lines of at most 79 columns.
+
+    """
+    lines = [f' {"Table I, rms error of":28}{"paper":>15}'
+             + ''.join(f'{name:>9}' for name in MODELS) + f'{"bound":>8}']
+    for stage, units in results.items():
+        for row, angle in enumerate(('alpha', 'beta')):
+            label = f'{_STAGE_WORDS[stage].partition(" (")[0]}, {angle}'
+            paper = ' / '.join(f'{rms:.2f}' for (a, _), (rms, _) in TABLE_I.items() if a == angle)
+            values = [float(np.degrees(_rms(_errors(units, name, row)))) for name in MODELS]
+            bound = float(np.degrees(_rms(_bounds(units, row))))
+            lines.append(_screen_row(label, paper, values, bound))
+    for stage, units in results.items():
+        label = f'{_STAGE_WORDS[stage].partition(" (")[0]}, motion'
+        paper = ' / '.join(f'{value:.1f}' for value in MOTION_MMPS2.values())
+        values = [_rms(np.array([np.hypot(unit.models[name].motion.rmse_mmps2,
+                                          unit.models[name].motion.offset_mmps2)
+                                 for unit in units])) for name in MODELS]
+        lines.append(_screen_row(label, paper, values, bound_mmps2))
+    return [*lines, ' tilt in °, motion in mm/s²; paper: linear / physical; bound: Cramér-Rao,',
+            ' or the noise floor']
+
+
+def _screen_row(label: str, paper: str, values: Sequence[float], bound: float) -> str:
+    """Lay out one row of the terminal's table."""
+    cells = ''.join(f'{value:9.3g}' for value in values)
+    return f' {label:28}{paper:>15}{cells}{bound:8.3g}'
+
+
 _DRAWN = '\n\n'.join(f'![{title}]({FIGURES}/{name}.png)' for name, title in (
     ('sweep', 'Figures 2 to 8: deviation from the linear model, and the physical model'),
     ('misalignment', 'Figure 9: the direction of the x axis'),

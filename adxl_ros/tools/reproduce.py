@@ -21,9 +21,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 from datetime import date
 from pathlib import Path
+from typing import NamedTuple
 
 from adxl_ros.calibrate import calibration, pose_extraction
-from adxl_ros.calibrate.report import plots as sweep_figures, report_html
+from adxl_ros.calibrate.report import plots as sweep_figures, report_html, text_tables
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.atomic_write import write_text
@@ -39,8 +40,8 @@ from adxl_ros.reproduction import (
     units,
 )
 from adxl_ros.reproduction.report_page import FIGURES
-from adxl_ros.tools.closing_lines import print_end
-from adxl_ros.tools.command_line import argument_parser
+from adxl_ros.tools.closing_lines import print_end, quoted
+from adxl_ros.tools.command_line import argument_parser, command
 from adxl_ros.tools.common import make_folder, progress, report_reading, run
 import numpy as np
 
@@ -80,16 +81,34 @@ def reproduce(options: argparse.Namespace) -> int:
     sensor = parameter_file.load(options.params or parameter_file.nominal_path())
     folder = Path(options.output)
     make_folder(folder / FIGURES)
-    text = _of_recordings(sensor, options.recording, folder) if options.recording \
+    made = _of_recordings(sensor, options.recording, folder) if options.recording \
         else _simulated(sensor, options, folder)
-    write_text(folder / 'reproduction.md', text)
-    print(text.split('## Figures')[0].strip())
-    print_end([''], [folder / 'reproduction.md', folder / FIGURES])
+    write_text(folder / 'reproduction.md', made.page)
+    print_end([*made.screen, ''], [folder / 'reproduction.md', folder / FIGURES],
+              command('reproduce', f'--draws 300 --units 0 -o {quoted(f"{folder}_coverage")}')
+              if not options.draws else '')
     return 0
 
 
-def _of_recordings(sensor: Sensor, paths: Sequence[str], folder: Path) -> str:
-    """Calibrate from recordings; return the page."""
+class _Reproduction(NamedTuple):
+    """
+    What a reproduction shows.
+
+    Attributes
+    ----------
+    page
+        The page, Markdown.
+    screen
+        The most important of it as lines for a terminal.
+
+    """
+
+    page: str
+    screen: list[str]
+
+
+def _of_recordings(sensor: Sensor, paths: Sequence[str], folder: Path) -> _Reproduction:
+    """Calibrate from recordings."""
     unit, recordings = sensor, []
     for path in paths:
         read = recording.read(path)
@@ -100,19 +119,21 @@ def _of_recordings(sensor: Sensor, paths: Sequence[str], folder: Path) -> str:
     result = calibration.calibrate(unit, recordings, 'full')
     report_html.draw(folder / FIGURES / 'sweep.png', result)
     lines = '\n'.join(result.comments())
-    return (f"# The paper's calibration of {', '.join(paths)}\n\n```\n{lines}\n```\n\n"
-            f'The paper: alpha {report_page.in_words("alpha")}; '
-            f'beta {report_page.in_words("beta")}.\n\n'
+    paper = (f'The paper: alpha {report_page.in_words("alpha")}; '
+             f'beta {report_page.in_words("beta")}.')
+    page = (f"# The paper's calibration of {', '.join(paths)}\n\n```\n{lines}\n```\n\n{paper}\n\n"
             f'## Figures\n\n![Figures 2 to 8]({FIGURES}/sweep.png)\n')
+    return _Reproduction(page, [*text_tables.error_table(result.held_out), f' {paper}'])
 
 
-def _simulated(sensor: Sensor, options: argparse.Namespace, folder: Path) -> str:
-    """Repeat the experiments on simulated units and draw the figures; return the page."""
+def _simulated(sensor: Sensor, options: argparse.Namespace, folder: Path
+               ) -> _Reproduction:
+    """Repeat the experiments on simulated units and draw the figures."""
     if not sensor.axes.startswith('xy'):
         raise UserError(f'the paper has a sensor of the axes x and y, not {sensor.axes}')
-    coverage_part = _coverage(sensor, options) if options.draws else ''
+    intervals = _coverage(sensor, options) if options.draws else _Reproduction('', [])
     if not options.units:
-        return report_page.wrap_prose(coverage_part)
+        return intervals
     with progress('reproduce') as show:
         results = units.evaluate_all(sensor, options.units, options.seed, show)
     first = 1000 * options.seed
@@ -130,16 +151,21 @@ def _simulated(sensor: Sensor, options: argparse.Namespace, folder: Path) -> str
     made = (f'adxl_ros {package_version()}, {date.today()}, {drawn} on each stage, '
             f'seed {options.seed}.')
     bound_mmps2 = error_statistics.motion_bound_mmps2(sensor)
-    return report_page.wrap_prose(report_page.page(results, bound_mmps2, made, coverage_part))
+    page = report_page.page(results, bound_mmps2, made, intervals.page)
+    screen = [f"The paper's experiments, {drawn} on each stage, seed {options.seed}", '',
+              *report_page.screen_lines(results, bound_mmps2)]
+    return _Reproduction(report_page.wrap_prose(page),
+                         screen + (['', *intervals.screen] if intervals.screen else []))
 
 
-def _coverage(sensor: Sensor, options: argparse.Namespace) -> str:
-    """Return the part of the page on how often the intervals hold the truth."""
+def _coverage(sensor: Sensor, options: argparse.Namespace) -> _Reproduction:
+    """Count how often the intervals hold the truth."""
     with progress('coverage') as show:
         draws = coverage.draw_all(replace(sensor, effects=(), values={}), options.draws,
                                   options.seed, show)
-    return coverage.page(draws, f'adxl_ros {package_version()}, {date.today()}, seed '
+    page = coverage.page(draws, f'adxl_ros {package_version()}, {date.today()}, seed '
                                 f'{options.seed}; `make coverage`.')
+    return _Reproduction(report_page.wrap_prose(page), coverage.screen_lines(draws))
 
 
 def main() -> int:
