@@ -28,6 +28,7 @@ import time
 from adxl_ros.errors import UserError
 from adxl_ros.files import cdr
 from adxl_ros.nodes.support import offline_benchmark
+from adxl_ros.nodes.support.node_help import program_parser
 from adxl_ros.nodes.support.processes import cpu_time_s, executable, running, use_own_graph
 import numpy as np
 import rclpy
@@ -134,15 +135,18 @@ class BareRelay(Node):
         self.create_subscription(Imu, 'bare', publisher.publish, qos_profile_sensor_data)
 
 
+_EXAMPLES = {'all measurements, four minutes': '',
+             'a short look': '--seconds 5'}
+"""Examples of arguments, by their purpose."""
 _BARE_NODES = {'publisher': BarePublisher, 'relay': BareRelay}
 """Bare nodes by the value of the hidden option `--bare`, which runs one in its own process."""
 
 
 def main() -> int:
     """Run the benchmark; return the exit status."""
-    parser = argparse.ArgumentParser(prog='bench', description=__doc__)
+    parser = program_parser('bench', __doc__, _EXAMPLES)
     parser.add_argument('--seconds', type=float, default=_SECONDS,
-                        help='duration of each live measurement')
+                        help=f'duration of each live measurement, s (default {_SECONDS:g})')
     parser.add_argument('--iiod', metavar='FILE', help="the tests' IIOD, for the link iio")
     parser.add_argument('--bare', choices=list(_BARE_NODES), help=argparse.SUPPRESS)
     parser.add_argument('--read', metavar='PORT', help=argparse.SUPPRESS)

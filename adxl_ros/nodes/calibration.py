@@ -37,6 +37,7 @@ from adxl_ros.nodes.support.given_parameters import check_given_parameters
 from adxl_ros.nodes.support.imu_subscription import Samples
 from adxl_ros.nodes.support.link_parameters import given_link
 from adxl_ros.nodes.support.next_pose import Announcer
+from adxl_ros.nodes.support.node_help import NodeHelp
 from adxl_ros.nodes.support.parameters import declare
 from adxl_ros.nodes.support.run_node import run
 from adxl_ros.nodes.support.sensor_parameters import anonymous_sensor, declare_sensor, make_sensor
@@ -58,6 +59,13 @@ _QUEUE = 100
 """Messages that wait while the node fits; chosen: some seconds of slow topics."""
 _STAGE_QUEUE = 1000
 """Messages of the stage that wait meanwhile; more, because its angles come faster."""
+_EXAMPLES = {
+    'a sweep on a stage, with a screen': '--ros-args -p output:=unit.yaml',
+    'a stage that is turned by hand':
+        '--ros-args -p stage.mode:=manual -p output:=unit.yaml',
+    'a three-axis sensor without a stage': '--ros-args -p mode:=gravity -p output:=unit.yaml',
+}
+"""Examples of arguments, by their purpose."""
 
 
 class Calibration(Node):
@@ -236,4 +244,4 @@ def main() -> int:
     # Through shared memory, Fast DDS does not reach a process again that was killed and started
     # again (eProsima/Fast-DDS issues 2811, 5053 and 5469): a sweep could not be resumed.
     os.environ.setdefault('FASTDDS_BUILTIN_TRANSPORTS', 'UDPv4')
-    return run(Calibration, __doc__)
+    return run(Calibration, NodeHelp(__doc__, _EXAMPLES))

@@ -32,6 +32,7 @@ from adxl_ros.nodes.support.exchangeable_sensor import ExchangeableSensor
 from adxl_ros.nodes.support.given_parameters import check_given_parameters
 from adxl_ros.nodes.support.imu_subscription import finite_samples
 from adxl_ros.nodes.support.mounting_parameters import MountingParameters
+from adxl_ros.nodes.support.node_help import NodeHelp
 from adxl_ros.nodes.support.parameters import declare
 from adxl_ros.nodes.support.receive_thread import ReceiveTurn, RepeatingThread
 from adxl_ros.nodes.support.run_node import run
@@ -51,6 +52,13 @@ _MEASURE_S = 0.5
 """Time between two attempts to measure an unknown sensor, s; chosen."""
 _LEVELS = {State.REFUSED: Level.ERROR, State.COMPENSATING: Level.OK}
 """Levels of the states; all others are warnings."""
+_EXAMPLES = {
+    'the newest calibration of the unit in the store': '',
+    'a calibration by its file': '--ros-args -p calibration:=unit.yaml',
+    'a sensor that moves, without the lag of its filter':
+        '--ros-args -p calibration:=unit.yaml -p undo_filter:=true',
+}
+"""Examples of arguments, by their purpose."""
 
 
 class Compensation(Node):
@@ -224,4 +232,4 @@ class Compensation(Node):
 
 def main() -> int:
     """Run the node."""
-    return run(Compensation, __doc__)
+    return run(Compensation, NodeHelp(__doc__, _EXAMPLES))

@@ -16,7 +16,6 @@
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import replace
 import math
 import os
@@ -39,6 +38,7 @@ from adxl_ros.files import parameter_file, recording, sweep_journal
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.nodes.support.demo_graph import DemoGraph, FIT_S, open_graph
+from adxl_ros.nodes.support.node_help import program_parser
 from adxl_ros.nodes.support.processes import use_own_graph
 from adxl_ros.nodes.terminal import steps
 import numpy as np
@@ -75,14 +75,18 @@ _COLOURS = {acceptance.PASS: '\x1b[32m', acceptance.FAIL: '\x1b[31m'}
 """Green and red by the word that they colour, as codes of xterm."""
 _NO_COLOUR = '\x1b[0m'
 """Code of xterm that ends a colour."""
+_EXAMPLES = {'the simulated sensor': '-o demo_output',
+             'a real recording, too': '--real imu.csv -o demo_output'}
+"""Examples of arguments, by their purpose."""
 NEXT_PAGE = 'docs/guided.md'
 """Page that a user reads next."""
 
 
 def main() -> int:
     """Run the demonstration; return the exit status."""
-    parser = argparse.ArgumentParser(prog='demo', description=__doc__)
-    parser.add_argument('-o', dest='output', metavar='DIR', default='demo_output', type=Path)
+    parser = program_parser('demo', __doc__, _EXAMPLES)
+    parser.add_argument('-o', dest='output', metavar='DIR', default='demo_output', type=Path,
+                        help='folder of pages and calibrations (default demo_output)')
     parser.add_argument('--real', metavar='CSV', type=Path,
                         help='a three-axis recording turned by hand, calibrated too')
     parser.add_argument('--speed', type=float, default=_SPEED,

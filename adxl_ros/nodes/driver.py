@@ -25,6 +25,7 @@ from adxl_ros.nodes.support.diagnostics import DiagnosticsReporter, Level, Statu
 from adxl_ros.nodes.support.given_parameters import check_given_parameters
 from adxl_ros.nodes.support.link_parameters import declare_link
 from adxl_ros.nodes.support.link_reader import LinkReader
+from adxl_ros.nodes.support.node_help import NodeHelp
 from adxl_ros.nodes.support.parameters import declare
 from adxl_ros.nodes.support.run_node import run
 from adxl_ros.nodes.support.sample_output import SampleOutput
@@ -35,6 +36,12 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 
 _SIMULATED = f'SIMULATED sensor (link.type: {base.DEFAULT_LINK})'
 """Words of log and diagnostics where no sensor is read."""
+_EXAMPLES = {
+    'a simulated sensor': '',
+    'a board on a serial port': '--ros-args -p link.type:=serial -p link.port:=/dev/ttyACM0',
+    'an ADC of the kernel': '--ros-args -p link.type:=iio -p link.device:=ads8688',
+}
+"""Examples of arguments, by their purpose."""
 
 
 class Driver(LifecycleNode):
@@ -208,4 +215,4 @@ class Driver(LifecycleNode):
 
 def main() -> int:
     """Run the node."""
-    return run(Driver, __doc__)
+    return run(Driver, NodeHelp(__doc__, _EXAMPLES))

@@ -25,6 +25,7 @@ import time
 
 from adxl_ros.calibrate.guided.screen_contents import ScreenContents
 from adxl_ros.nodes.support.held_output import held_output
+from adxl_ros.nodes.support.node_help import NodeHelp
 from adxl_ros.nodes.support.parameters import declare
 from adxl_ros.nodes.support.run_node import run
 from adxl_ros.nodes.support.topics import create_subscription
@@ -50,6 +51,11 @@ _MESSAGES = 3
 """Messages of the log that are kept: as many as the screen shows at most."""
 _STYLES = {Log.WARN: 'ansiyellow', Log.ERROR: 'ansired', Log.FATAL: 'ansired'}
 """Styles of log lines by level; others have that of `LogLine`."""
+_EXAMPLES = {
+    'the screen of a calibration that runs elsewhere': '',
+    'in the namespace of the sensor': '--ros-args -r __ns:=/arm',
+}
+"""Examples of arguments, by their purpose."""
 
 
 class Screen(Node):
@@ -174,4 +180,4 @@ class Screen(Node):
 
 def main() -> int:
     """Run the screen."""
-    return run(Screen, __doc__, Screen.show)
+    return run(Screen, NodeHelp(__doc__, _EXAMPLES), Screen.show)

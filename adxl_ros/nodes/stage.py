@@ -17,11 +17,23 @@
 from __future__ import annotations
 
 from adxl_ros.nodes.support.given_parameters import check_given_parameters
+from adxl_ros.nodes.support.node_help import NodeHelp
 from adxl_ros.nodes.support.parameters import declare
 from adxl_ros.nodes.support.run_node import run
 from adxl_ros.nodes.support.simulated_stage_node import SimulatedStageNode
 from adxl_ros.nodes.support.stage_bridge import StageBridge
 from rclpy.node import Node
+
+_EXAMPLES = {
+    'the simulated stage': '',
+    'the bridge to a controller of ros2_control':
+        '--ros-args -p stage.type:=trajectory '
+        '-p bridge.alpha.joint:=tilt -p bridge.beta.joint:=turn',
+}
+"""Examples of arguments, by their purpose."""
+_VARIANTS = {'stage.type:=trajectory, or joint_state': (
+    'stage.type:=trajectory', 'bridge.alpha.joint:=alpha', 'bridge.beta.joint:=beta')}
+"""Parameters of a bridge, with those that have no default."""
 
 
 class Stage(Node):
@@ -39,4 +51,4 @@ class Stage(Node):
 
 def main() -> int:
     """Run the node."""
-    return run(Stage, __doc__)
+    return run(Stage, NodeHelp(__doc__, _EXAMPLES, _VARIANTS))

@@ -27,7 +27,7 @@ from rclpy.node import Node
 
 PREFIX = 'link.'
 """Begin of the names of all parameters of a link; the driver alone has them."""
-_TYPE = 'link.type'
+LINK_TYPE = 'link.type'
 """Parameter that chooses the link."""
 
 
@@ -74,13 +74,13 @@ def declare_link(node: Node, serial: str) -> ChosenLink:
 
     """
     given = [name for name, _ in given_parameters(node) if name.startswith(PREFIX)]
-    if _TYPE not in given:
+    if LINK_TYPE not in given:
         _refuse_to_guess(given, serial)
-    name = declare(node, _TYPE, base.DEFAULT_LINK, 'where the samples come from',
+    name = declare(node, LINK_TYPE, base.DEFAULT_LINK, 'where the samples come from',
                    choices=base.link_names())
     module = base.link_module(name)
     options = base.options(module.Settings)
-    _refuse_unknown(given, name, [_TYPE, *(f'{PREFIX}{option.name}' for option in options)])
+    _refuse_unknown(given, name, [LINK_TYPE, *(f'{PREFIX}{option.name}' for option in options)])
     return ChosenLink(name, module, module.Settings(**{
         option.name: declare(node, f'{PREFIX}{option.name}', option.default, option.doc,
                              option.unit, option.lower, option.upper)
@@ -99,14 +99,15 @@ def _refuse_to_guess(given: Sequence[str], serial: str) -> None:
     for name in given:
         if name not in links:
             raise parameter_error(name, f'is no parameter of any link; did you mean '
-                                  f'{nearest(name, [_TYPE, *links])}?')
+                                  f'{nearest(name, [LINK_TYPE, *links])}?')
     reason = f'the sensor is the unit {serial}' if serial != NO_UNIT else ''
     if given:
         reason = f'{given[0]} is given'
     if reason:
         devices = [name for name in base.link_names() if name != base.DEFAULT_LINK]
-        raise parameter_error(_TYPE, f'is not set, but {reason}; set it to {", ".join(devices)}, '
-                              f'or to {base.DEFAULT_LINK} for a simulated sensor')
+        raise parameter_error(LINK_TYPE, f'is not set, but {reason}; set it to '
+                              f'{", ".join(devices)}, or to {base.DEFAULT_LINK} for a '
+                              'simulated sensor')
 
 
 def _refuse_unknown(given: Sequence[str], link: str, declared: Sequence[str]) -> None:
@@ -116,7 +117,7 @@ def _refuse_unknown(given: Sequence[str], link: str, declared: Sequence[str]) ->
             continue
         links = _links_by_parameter()
         if name in links:
-            raise parameter_error(name, f'the link {link} has no such parameter; {_TYPE} '
+            raise parameter_error(name, f'the link {link} has no such parameter; {LINK_TYPE} '
                                   f'{" or ".join(links[name])} has it')
         raise parameter_error(name, f'the link {link} has no such parameter; did you mean '
                               f'{nearest(name, declared)}?')

@@ -25,6 +25,7 @@ from typing import Any, Protocol, runtime_checkable
 
 from adxl_ros.errors import UserError
 from adxl_ros.nodes.support import rclpy_internals
+from adxl_ros.nodes.support.node_help import NodeHelp, print_if_asked
 from adxl_ros.nodes.support.params_files import check_params_files
 import rclpy
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
@@ -32,7 +33,7 @@ from rclpy.node import Node
 from rclpy.utilities import remove_ros_args
 
 _USAGE = '%(prog)s [--ros-args -p NAME:=VALUE ... --params-file FILE -r FROM:=TO ...]'
-"""Usage that `--help` prints."""
+"""Usage that follows an unknown argument."""
 
 
 @runtime_checkable
@@ -43,7 +44,7 @@ class Closable(Protocol):
         """Close it."""
 
 
-def run(make_node: Callable[[], Node], description: str | None,
+def run(make_node: Callable[[], Node], node_help: NodeHelp,
         work: Callable[[Any, Executor], None] = lambda _, executor: executor.spin()) -> int:
     """
     Run one node until SIGINT or SIGTERM.
@@ -52,8 +53,8 @@ def run(make_node: Callable[[], Node], description: str | None,
     ----------
     make_node
         Creates the node; it may raise `UserError`. The node may be `Closable`.
-    description
-        Text that `--help` prints.
+    node_help
+        What `--help` prints beside the node's declarations.
     work
         What is done with the node and the executor that it has been added to.
 
@@ -68,9 +69,11 @@ def run(make_node: Callable[[], Node], description: str | None,
     is_initialised = False
     interrupts: list[int] = []
     try:
+        arguments = remove_ros_args(sys.argv)[1:]
+        if print_if_asked(arguments, make_node, node_help):
+            return 0
         check_params_files()
-        argparse.ArgumentParser(prog=name, description=description, usage=_USAGE).parse_args(
-            remove_ros_args(sys.argv)[1:])
+        argparse.ArgumentParser(prog=name, usage=_USAGE).parse_args(arguments)
         # rclpy's own handler ends the context; Python's would raise in the middle of a statement.
         signal.signal(signal.SIGINT, lambda number, _: interrupts.append(number))
         rclpy.init()

@@ -1,0 +1,89 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""`--help` and `--version` of the nodes: what each declares, seen by no graph."""
+
+import re
+
+from adxl_ros.links.support import base
+from adxl_ros.nodes.support.given_parameters import OWN_PARAMETERS
+from graph import Graph
+from processes import executable, run_executable
+import pytest
+from terminal import Terminal
+
+NODES = ('driver', 'stage', 'calibration', 'compensation')
+PROGRAMS = (*NODES, 'screen', 'demo', 'bench')
+
+
+def parts_of(text: str) -> dict[str, str]:
+    """Return the parts of a help text by their first lines."""
+    return {part.split('\n')[0]: part for part in text.split('\n\n')}
+
+
+@pytest.mark.parametrize('name', PROGRAMS)
+def test_version(name: str, ros_env: dict[str, str]) -> None:
+    done = run_executable(name, '--version', env=ros_env)
+    assert (done.returncode, done.stderr) == (0, '')
+    assert re.fullmatch(r'adxl_ros \d+\.\d+\.\d+\n', done.stdout)
+
+
+@pytest.mark.parametrize('name', PROGRAMS)
+def test_help_has_examples_within_a_terminal(name: str, ros_env: dict[str, str]) -> None:
+    done = run_executable(name, '--help', env=ros_env)
+    assert (done.returncode, done.stderr) == (0, '')
+    assert f'    ros2 run adxl_ros {name}' in done.stdout.split('examples:')[1]
+    assert max(map(len, done.stdout.splitlines())) <= 79 and '\x1b' not in done.stdout
+
+
+@pytest.mark.parametrize('name', NODES)
+def test_help_lists_each_parameter_with_type_default_and_meaning(
+        name: str, ros_env: dict[str, str]) -> None:
+    text = run_executable(name, '--help', env=ros_env).stdout
+    entries = re.findall(r'^  ([\w.]+)  (float|floats|int|bool|text|texts)(?:, .+)?\n {6}\S',
+                         text, re.MULTILINE)
+    listed = {entry[0] for entry in entries}
+    missing = set(OWN_PARAMETERS[name]) - listed
+    assert not missing
+    assert '/parameter_events' not in text and 'qos_overrides' not in text
+
+
+def test_help_of_the_driver_has_links_sensor_and_topics(ros_env: dict[str, str]) -> None:
+    parts = parts_of(run_executable('driver', '--help', env=ros_env).stdout)
+    for link in base.link_names():
+        for option in base.options(base.link_module(link).Settings):
+            assert f'\n  link.{option.name}  ' in parts[f'with link.type:={link}']
+    sensor = parts['parameters of the sensor, usually from --params-file']
+    assert '\n  sensor.rate_hz  float, 1000\n      sample rate, Hz' in sensor
+    assert re.search(r'^  imu/data_raw +sensor_msgs/Imu$', parts['publishes'], re.MULTILINE)
+
+
+def test_help_opens_no_screen_and_is_not_seen(ros_env: dict[str, str], tmp_path) -> None:
+    """A terminal, where a calibration opens its screen, shows the text and no more."""
+    with Graph() as graph:
+        seen: set[str] = set()
+        terminal = Terminal([executable('calibration'), '--help'], ros_env, tmp_path, lines=200)
+        try:
+            def ended() -> bool:
+                seen.update(graph.node.get_node_names())
+                return terminal.popen.poll() is not None
+
+            graph.spin_until(ended, 60.0, 'the help text')
+            screen = terminal.wait_for('~/capture std_srvs/Trigger')
+            assert terminal.popen.returncode == 0 and terminal.restored()
+        finally:
+            terminal.close()
+    assert 'usage: calibration' in screen and b'\x1b[?1049h' not in terminal.raw
+    assert seen == {'tester'}
+    assert not list(tmp_path.iterdir())
