@@ -5,6 +5,7 @@
 # make perf     limits of processor time, for a quiet machine
 # make bench    rate, missing samples, latency and CPU of the live nodes
 # make gallery  docs/effects.md and its plots, from the library of effects
+# make screenshots  docs/screenshots: terminals and pages from real runs, six minutes
 # make reproduction  docs/reproduction.md and its plots: the paper's experiments on simulated units
 # make coverage do the intervals hold? 300 drawn units and stages, as a table
 # make faults   the links under every fault, as a table
@@ -18,7 +19,7 @@
 # make lint     the linters alone
 # make clean    remove what these made
 
-.PHONY: build help demo check test perf bench gallery reproduction coverage long faults soak fuzz noise nulls blind working lint clean \
+.PHONY: build help demo check test perf bench gallery screenshots reproduction coverage long faults soak fuzz noise nulls blind working lint clean \
     FORCE
 .DEFAULT_GOAL := build
 
@@ -134,6 +135,10 @@ noise: build
 
 gallery: build
 	./run --exec python docs/gallery.py docs
+
+# One of them: make screenshots ARGS=diagnose. Pages need Chromium: apt install chromium.
+screenshots: build
+	OPENBLAS_NUM_THREADS=1 ./run --exec python docs/screenshots.py docs $(ARGS)
 
 reproduction: build
 	OPENBLAS_NUM_THREADS=1 ./run reproduce --units 40 --draws 300 -o docs $(ARGS)

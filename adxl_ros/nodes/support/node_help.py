@@ -64,7 +64,7 @@ class NodeHelp(NamedTuple):
     ----------
     description
         Purpose of the node.
-    examples
+    examples : mapping
         Arguments of each example, by its purpose.
     variants
         Parameters `NAME:=VALUE` with which the node declares others, by a title.
@@ -117,7 +117,7 @@ def program_parser(name: str, description: str | None, examples: Mapping[str, st
         Its name.
     description
         Its purpose.
-    examples
+    examples : mapping
         Arguments of each example, by its purpose.
 
     Returns
@@ -141,7 +141,7 @@ class _Made:
 
     Attributes
     ----------
-    parameters
+    parameters : dict
         Parameters with their descriptors, by name.
     topics
         Names and types of the topics, by direction.
