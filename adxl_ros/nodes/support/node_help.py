@@ -28,8 +28,8 @@ import sys
 import textwrap
 from typing import Any, NamedTuple
 
-from adxl_ros.calibrate.provenance import package_version
 from adxl_ros.errors import UserError
+from adxl_ros.files.package_version import package_version
 from adxl_ros.links.support import base
 from adxl_ros.nodes.support.link_parameters import LINK_TYPE, PREFIX
 from adxl_ros.nodes.support.sensor_parameters import sensor_keys
