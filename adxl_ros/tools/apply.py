@@ -21,7 +21,6 @@ from collections.abc import Iterator
 from dataclasses import replace
 import itertools
 from pathlib import Path
-import sys
 
 from adxl_ros.compensate.recordings import effects_left, Estimates, RecordingEstimator
 from adxl_ros.errors import UserError
@@ -35,7 +34,7 @@ from adxl_ros.model.effects.base import NOMINAL_ENVIRONMENT
 from adxl_ros.model.sensor import Sensor, with_axes
 from adxl_ros.tools.closing_lines import print_end, quoted
 from adxl_ros.tools.command_line import argument_parser, command
-from adxl_ros.tools.common import progress, report_reading, run
+from adxl_ros.tools.common import note, progress, report_reading, run
 from adxl_ros.tools.recorded_sensor import BeyondRange, listed, load_sensor, measure_unstated
 from adxl_ros.tools.recording_options import (
     add_recording_options,
@@ -99,7 +98,7 @@ def apply(options: argparse.Namespace) -> int:
             'standard deviations are raised')
     _report(at_rail, rows, 'have the ADC at its rail: their standard deviations are inf')
     if beyond.describe(sensor):
-        print(f'apply: {beyond.describe(sensor)}', file=sys.stderr)
+        note(f'apply: {beyond.describe(sensor)}')
     if block is not None:
         report_reading('apply', block)
     _print_end(options, sensor, rows, measured)
@@ -148,7 +147,7 @@ def _of_unit(block: Recording, sensor: Sensor) -> Sensor:
 def _report(count: int, rows: int, statement: str) -> None:
     """Print a statement about a number of samples; nothing where there are none."""
     if count:
-        print(f'apply: {count} of {rows} samples {statement}', file=sys.stderr)
+        note(f'apply: {count} of {rows} samples {statement}')
 
 
 def _report_effects(block: Recording, sensor: Sensor, undo_filter: bool) -> None:
@@ -156,13 +155,11 @@ def _report_effects(block: Recording, sensor: Sensor, undo_filter: bool) -> None
     not_undone = effects_left(sensor, undo_filter)
     for effect in map(effect_named, sensor.effects):
         if effect in not_undone:
-            print(f'apply: {effect.name} is not undone: a single sample does not determine it',
-                  file=sys.stderr)
+            note(f'apply: {effect.name} is not undone: a single sample does not determine it')
         for name in effect.follows:
             if name != 'time_s' and not np.isfinite(block.columns.get(name, np.nan)).all():
-                print(f'apply: {block.path}: {name} is missing or has gaps: {effect.name} is '
-                      f'taken at {getattr(NOMINAL_ENVIRONMENT, name):g} there',
-                      file=sys.stderr)
+                note(f'apply: {block.path}: {name} is missing or has gaps: {effect.name} is '
+                     f'taken at {getattr(NOMINAL_ENVIRONMENT, name):g} there')
 
 
 def _columns(estimates: Estimates) -> dict[str, np.ndarray]:

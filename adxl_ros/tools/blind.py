@@ -19,7 +19,6 @@ from __future__ import annotations
 import argparse
 import json
 from pathlib import Path
-import sys
 
 from adxl_ros.blind import blind_check, diagnosis_runs, real_recordings, report_html
 from adxl_ros.errors import UserError
@@ -28,7 +27,7 @@ from adxl_ros.files.plot_file import pyplot
 from adxl_ros.tools import blind_forest
 from adxl_ros.tools.closing_lines import print_end, quoted
 from adxl_ros.tools.command_line import argument_parser, command
-from adxl_ros.tools.common import make_folder, progress, run
+from adxl_ros.tools.common import make_folder, note, progress, run
 
 PROG = 'blind'
 """Name of the command, for messages."""
@@ -74,7 +73,7 @@ def blind(options: argparse.Namespace) -> int:
     try:
         return _check(options, folder, arms)
     except KeyboardInterrupt:
-        print(f'{PROG}: interrupted; the same command continues', file=sys.stderr)
+        note(f'{PROG}: interrupted; the same command continues')
         return 130
 
 

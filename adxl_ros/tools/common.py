@@ -23,12 +23,14 @@ import os
 from pathlib import Path
 import signal
 import sys
+import textwrap
 from time import monotonic
 from types import FrameType
 from typing import Protocol
 
 from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import Recording
+from adxl_ros.tools.command_line import COLUMNS
 
 _UNITS = {'rad': 'rad', 'm': 'm', 'c': 'degC', 'v': 'V'}
 """Units of references by the end of their columns' names."""
@@ -63,16 +65,24 @@ def run(parser: argparse.ArgumentParser, command: Callable[[argparse.Namespace],
         finally:
             sys.stdout.flush()
     except UserError as error:
-        print(f'{parser.prog}: {" ".join(str(error).split())}', file=sys.stderr)
+        note(f'{parser.prog}: {" ".join(str(error).split())}')
         return 1
     except KeyboardInterrupt:
-        print(f'{parser.prog}: interrupted; nothing was written', file=sys.stderr)
+        note(f'{parser.prog}: interrupted; nothing was written')
         return 130
     except BrokenPipeError:
         # The reader of stdout has ended; Python must not report that when it flushes at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     return status
+
+
+def note(text: str) -> None:
+    """Print a message on stderr: one line, which a terminal gets wrapped between words."""
+    if sys.stderr.isatty():
+        text = textwrap.fill(text, COLUMNS, subsequent_indent='  ', break_long_words=False,
+                             break_on_hyphens=False)
+    print(text, file=sys.stderr)
 
 
 def _terminated(number: int, frame: FrameType | None) -> None:
@@ -109,14 +119,14 @@ def report_reading(tool: str, recording: Recording) -> None:
 
     """
     for line in (*recording.remarks, *[recording.cut] * bool(recording.cut)):
-        print(f'{tool}: {line}', file=sys.stderr)
+        note(f'{tool}: {line}')
     for name, alignment in recording.alignments.items():
         # References with the stamps of the samples need no alignment.
         if alignment.gap_s:
             unit = _UNITS[name.rsplit('_', 1)[1]]
-            print(f'{tool}: {recording.path}: {name} aligned by its stamps: residual '
-                  f'{alignment.residual:.3g} {unit} rms, nearest message at most '
-                  f'{alignment.gap_s:.3g} s away', file=sys.stderr)
+            note(f'{tool}: {recording.path}: {name} aligned by its stamps: residual '
+                 f'{alignment.residual:.3g} {unit} rms, nearest message at most '
+                 f'{alignment.gap_s:.3g} s away')
 
 
 class ShowDone(Protocol):

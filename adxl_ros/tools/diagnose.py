@@ -19,7 +19,6 @@ from __future__ import annotations
 import argparse
 import json
 from pathlib import Path
-import sys
 from time import monotonic
 from typing import Any
 
@@ -36,7 +35,7 @@ from adxl_ros.model.sensor import Sensor
 from adxl_ros.simulate.from_recording import motion_from_force
 from adxl_ros.tools.closing_lines import NextStep, print_end, quoted
 from adxl_ros.tools.command_line import argument_parser, command, effect_list
-from adxl_ros.tools.common import make_folder, progress, report_reading, run
+from adxl_ros.tools.common import make_folder, note, progress, report_reading, run
 from adxl_ros.tools.recorded_sensor import load_sensor, measure_unstated
 from adxl_ros.tools.recording_options import (
     add_recording_options,
@@ -114,8 +113,8 @@ def diagnose(options: argparse.Namespace) -> int:
     if report['verdict']['status'] not in _NO_VERDICT:
         return 0
     reason = report['verdict']['data_fault'] or report['verdict']['status']
-    print(f'diagnose: {", ".join(options.recording)}: no verdict ({reason}); the reason is in '
-          f'{Path(options.output, "report.json")}', file=sys.stderr)
+    note(f'diagnose: {", ".join(options.recording)}: no verdict ({reason}); the reason is in '
+         f'{Path(options.output, "report.json")}')
     return 1
 
 

@@ -19,7 +19,6 @@ from __future__ import annotations
 import argparse
 from dataclasses import replace
 from pathlib import Path
-import sys
 
 from adxl_ros.calibrate import calibration, pose_extraction
 from adxl_ros.calibrate.pose_references import with_table_angles
@@ -36,7 +35,7 @@ from adxl_ros.model.effects.base import Place
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.tools.closing_lines import print_end, quoted
 from adxl_ros.tools.command_line import argument_parser, command, effect_list
-from adxl_ros.tools.common import make_folder, report_reading, run, staged_progress
+from adxl_ros.tools.common import make_folder, note, report_reading, run, staged_progress
 from adxl_ros.tools.recorded_sensor import BeyondRange, listed, load_sensor, measure_unstated
 from adxl_ros.tools.recording_options import (
     add_recording_options,
@@ -140,7 +139,7 @@ def fit(options: argparse.Namespace) -> int:
             make_folder(Path(options.report))
             report_html.write(options.report, result, options.store)
     result.save(options.output)
-    print(f'fit: {result.keep(options.store)}', file=sys.stderr)
+    note(f'fit: {result.keep(options.store)}')
     report = [Path(options.report) / name for name in _REPORT_FILES] if options.report else []
     print_end([errors_in_words(result.fitted), '', *_result_lines(result), *measured, ''],
               [options.output, *report], command(
@@ -154,7 +153,7 @@ def _report_range(read: Recording, unit: Sensor) -> None:
     beyond.add(read.volts(unit), unit)
     text = beyond.describe(unit)
     if text and 'range_g' not in unit.measured:
-        print(f'fit: {read.path}: {text}', file=sys.stderr)
+        note(f'fit: {read.path}: {text}')
 
 
 def _result_lines(result: calibration.CalibrationResult) -> list[str]:

@@ -14,8 +14,10 @@
 
 """What the diagnosis reports: the gap and its parts, and what it does not determine."""
 
+from dataclasses import replace
 from html import escape
 import json
+import re
 
 from adxl_ros.diagnose.noise_detectors import line_amplitude_v, white_noise_v
 from adxl_ros.diagnose.report_wording import parameter_text
@@ -161,10 +163,20 @@ def test_terminal_page_and_report_agree(diagnosed):
         figure = text if gap[key] == 0 or gap[key] / mg >= 0.005 else '< 0.01 mg'
         assert figure in report.terminal
         assert escape(figure) in report.page and figure in report.json['summary']
-    assert max(map(len, report.terminal.splitlines())) < 80
+    assert max(map(len, report.terminal.splitlines())) < 80 and '\x1b' not in report.terminal
+    assert f'{gap["before"] / mg:.2f} mg -> {gap["after"] / mg:.2f} mg rms' in report.terminal
+    shares = re.findall(r'(\d+) %$', report.terminal, re.MULTILINE)
+    assert sum(map(int, shares)) == pytest.approx(100 * gap['closed'], abs=1)
     # The command may take two lines of a shell.
     assert report.json['next_experiment']['command'] in ' '.join(
         report.terminal.replace('\\\n', ' ').split())
+
+
+def test_the_floor_is_not_above_what_the_effects_leave(diagnosed):
+    """Coarse steps of an encoder count as far as the residual has them."""
+    sensor = replace(unit(), stage_resolution_rad=2e-3)
+    gap = diagnosed(sensor).json['gap']
+    assert gap['floor'] <= gap['after'] == gap['before']
 
 
 def test_effects_that_are_not_separated_are_named_together(diagnosed):

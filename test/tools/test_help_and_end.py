@@ -93,3 +93,41 @@ def test_outcomes_are_coloured_in_a_terminal_only(tmp_path: Path) -> None:
             terminal.close()
     assert re.search(r'\x1b\[3[123]m(PASS|NOT SHOWN|FAIL)\x1b\[0m', raw['coloured'])
     assert not re.search(r'\x1b\[3[123]m', raw['plain'])
+
+
+def test_diagnose_in_a_terminal_of_80_columns(tmp_path: Path) -> None:
+    """Stages while it runs; then a coloured verdict, files and steps, none wrapped in a word."""
+    run_executable('simulate', 'tilt_both', '--rate', '100', '-o', 'tilt.csv', cwd=tmp_path)
+    terminal = Terminal([executable('diagnose'), 'tilt.csv', '-o', 'gap'], dict(os.environ),
+                        tmp_path, lines=60, columns=80)
+    try:
+        screen = terminal.wait_for('next', 'ros2 run adxl_ros simulate', timeout_s=120.0)
+        assert terminal.popen.wait(30.0) == 0
+        raw = terminal.raw.decode()
+    finally:
+        terminal.close()
+    lines = screen.splitlines()
+    assert max(map(len, lines)) <= COLUMNS
+    assert re.match(r'tilt\.csv \(\d+ s, 100 Hz, x y\) +minus +simulation of the nominal sensor$',
+                    lines[0])
+    assert re.search(r'^(NO GAP|GAP EXPLAINED|UNKNOWN CAUSE).* mg rms +noise floor ', screen,
+                     re.MULTILINE)
+    assert re.search(r'\x1b\[3\dm(NO GAP|GAP EXPLAINED|UNKNOWN CAUSE)\x1b\[0m', raw)
+    assert '1/6 checks' in raw and '2/6 library of effects' in raw
+    assert re.search(r'^ wrote +gap/report\.html +gap/params\.yaml +gap/report\.json', screen,
+                     re.MULTILINE)
+
+
+def test_an_error_wraps_between_words_in_a_terminal_only(tmp_path: Path) -> None:
+    name = 'a' * 30
+    words = ('apply', f'{name}.csv', '--params', f'{name}.yaml', '-o', 'out.csv')
+    done = run_executable(*words, cwd=tmp_path)
+    assert len(done.stderr.splitlines()) == 1 and len(done.stderr) > COLUMNS
+    terminal = Terminal([executable(words[0]), *words[1:]], dict(os.environ), tmp_path,
+                        columns=80)
+    try:
+        screen = terminal.wait_for(' '.join(done.stderr.split()))
+        assert terminal.popen.wait(30.0) == 1
+    finally:
+        terminal.close()
+    assert max(map(len, screen.splitlines())) <= COLUMNS
