@@ -18,6 +18,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 import fcntl
 import io
+from itertools import groupby
 import os
 from pathlib import Path
 import pty
@@ -108,8 +109,9 @@ def draw(terminal: Terminal, title: str, path: Path) -> None:
     for number in range(terminal.screen.lines):
         row = terminal.screen.buffer[number]
         line = Text()
-        for column in range(COLUMNS):
-            line.append(row[column].data, style_of(row[column]))
+        cells = [row[column] for column in range(COLUMNS)]
+        for style, run_of_cells in groupby(cells, style_of):
+            line.append(''.join(cell.data for cell in run_of_cells), style)
         line.rstrip()
         lines.append(line)
     while lines and not lines[-1].plain:
