@@ -58,8 +58,8 @@ class Part(Protocol):
     done: float
     types: set[tuple[str, str]]
 
-    def messages(self, topics: Collection[str]) -> Iterator[tuple[str, bytes]]:
-        """Yield topic and bytes of each message of some topics, in the order of recording."""
+    def messages(self, topics: Collection[str]) -> Iterator[tuple[str, bytes, int]]:
+        """Yield topic, bytes and log time, ns, of each message, in the order of recording."""
 
 
 class Bag:
@@ -114,11 +114,25 @@ class Bag:
             A file or a message is damaged.
 
         """
+        for topic, raw, _ in self.logged_messages(topics):
+            yield topic, raw
+
+    def logged_messages(self, topics: Collection[str]) -> Iterator[tuple[str, bytes, int]]:
+        """
+        Yield topic, CDR and log time, ns, of each message, in the order of recording.
+
+        Raises
+        ------
+        UserError
+            A file or a message is damaged.
+
+        """
         self._read = 0
         for part in self._parts:
-            for topic, raw in part.messages(topics):
+            for topic, raw, log_ns in part.messages(topics):
                 # `--compression-mode message`: no CDR begins as compressed data does.
-                yield topic, self._unpacked(topic, raw) if raw[:4] == _ZSTD_MAGIC else raw
+                raw = self._unpacked(topic, raw) if raw[:4] == _ZSTD_MAGIC else raw
+                yield topic, raw, log_ns
             self._read += 1
 
     def _unpacked(self, topic: str, raw: bytes) -> bytes:
@@ -137,7 +151,7 @@ class _RosbagsPart:
         self._path = path
         self._reader = reader
 
-    def messages(self, topics: Collection[str]) -> Iterator[tuple[str, bytes]]:
+    def messages(self, topics: Collection[str]) -> Iterator[tuple[str, bytes, int]]:
         connections = [c for c in self._reader.connections if c.topic in topics and c.msgcount]
         if not connections:
             return  # for rosbags, an empty choice means all connections
@@ -148,10 +162,10 @@ class _RosbagsPart:
         share = 1 / sum(c.msgcount for c in connections)
         count = 0
         try:
-            for connection, _, raw in self._reader.messages(connections):
+            for connection, log_ns, raw in self._reader.messages(connections):
                 count += 1
                 self.done = count * share
-                yield connection.topic, raw
+                yield connection.topic, raw, log_ns
         except Exception as error:
             # In a damaged file, rosbags can raise errors of any kind.
             raise _unreadable(self._path, error) from error

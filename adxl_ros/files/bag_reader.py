@@ -27,6 +27,7 @@ from adxl_ros.files.bag_topics import find_ideal, find_topics, read_info, Topics
 from adxl_ros.files.reading_options import AS_IT_IS, ReadingOptions
 from adxl_ros.files.recording_columns import (
     ACCEL,
+    BadStamps,
     COMMANDS,
     JOINTS,
     LIMIT,
@@ -168,7 +169,7 @@ class _Samples:
         self.where = where
         self._reading = reading
         self._first_ns = 0
-        self._left_out = 0
+        self.bad_stamps = BadStamps(0, 0)
         self.axes = axes
         self.epoch_ns = 0
         self.count = 0
@@ -208,10 +209,11 @@ class _Samples:
     @property
     def remarks(self) -> tuple[str, ...]:
         """Return what was left out, for people."""
-        if not self._left_out:
+        left_out = sum(self.bad_stamps)
+        if not left_out:
             return ()
         return (f'{self.where}: left out, messages whose stamp does not increase: '
-                f'{self._left_out}',)
+                f'{left_out}',)
 
     def _increasing(self, stamp_ns: np.ndarray, accel: np.ndarray
                     ) -> tuple[np.ndarray, np.ndarray]:
@@ -219,7 +221,10 @@ class _Samples:
         before = stamp_ns[0] - 1 if self._last_ns is None else self._last_ns
         latest = np.maximum.accumulate(np.concatenate([[before], stamp_ns]))[:-1]
         is_kept = stamp_ns > latest
-        self._left_out += int((~is_kept).sum())
+        duplicates = int((stamp_ns == latest).sum())
+        before_them = self.bad_stamps
+        self.bad_stamps = BadStamps(before_them.duplicates + duplicates,
+                                    before_them.backward + int((~is_kept).sum()) - duplicates)
         return stamp_ns[is_kept], accel[is_kept]
 
     def ready(self, tracks: dict[str, Track]) -> int:
@@ -373,7 +378,7 @@ def _block(bag: Bag, samples: _Samples, tracks: dict[str, Track], commands: dict
     time_s = (stamp_ns - samples.epoch_ns) / 1e9
     cut = f'{bag.cut}; the last sample read is at {seconds(stamp_ns[-1])}' if bag.cut else ''
     return Recording(bag.path, time_s, columns, dict(info), alignments, cut, samples.epoch_ns,
-                     bag.done, samples.remarks)
+                     bag.done, samples.remarks, samples.bad_stamps)
 
 
 def drop_unsampled(recording: Recording) -> None:

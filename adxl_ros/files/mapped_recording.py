@@ -24,7 +24,15 @@ from adxl_ros.files.column_mapping import ColumnMapping, Source
 from adxl_ros.files.column_units import LSB, ROLES, Unit, unit_in_name, UNITS
 from adxl_ros.files.csv_file import epoch_ns, TIME_LIMIT_S
 from adxl_ros.files.reading_options import ReadingOptions
-from adxl_ros.files.recording_columns import ACCEL, JOINTS, LIMIT, Recording, TIME, VOLTS
+from adxl_ros.files.recording_columns import (
+    ACCEL,
+    BadStamps,
+    JOINTS,
+    LIMIT,
+    Recording,
+    TIME,
+    VOLTS,
+)
 from adxl_ros.files.stamp_bursts import describe_bursts
 from adxl_ros.files.tables.base import Table, TableBlock
 from adxl_ros.model.constants import AXES, G0_MPS2
@@ -247,7 +255,8 @@ class _Converter:
         info = {key: text for key, text in block.info.items() if key != 'epoch_ns'}
         return Recording(self.table.path, time_s[is_kept], columns, info,
                          epoch_ns=self._epoch_ns or 0, done=block.done,
-                         remarks=(*self._remarks, *self._counts()))
+                         remarks=(*self._remarks, *self._counts()),
+                         bad_stamps=BadStamps(self._duplicates, self._backward))
 
     def _values(self, block: TableBlock, role: str) -> np.ndarray:
         """Return a column in the unit of the package, (n,)."""

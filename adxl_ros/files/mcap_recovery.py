@@ -54,6 +54,12 @@ _LAST_CODE = 0x0F
 _FIRST_PRIVATE_CODE = 0x80
 """Smallest operation code of records that the specification leaves to applications."""
 
+_LOG_TIME = struct.Struct('<Q')
+"""Log time of a message, ns."""
+
+_LOG_TIME_BYTE = 6
+"""Place of the log time in a message record, after channel and sequence number."""
+
 _RECORD_HEAD = struct.Struct('<BQ')
 """Operation code and length of a record."""
 
@@ -199,12 +205,13 @@ class ScannedMcap:
             self.cut = (f'cut off or damaged in the record that begins at byte {self._offset} '
                         f'of {self._size}')
 
-    def messages(self, topics: Collection[str]) -> Iterator[tuple[str, bytes]]:
-        """Yield topic and CDR of each whole message of some topics, in the order of the file."""
+    def messages(self, topics: Collection[str]) -> Iterator[tuple[str, bytes, int]]:
+        """Yield topic, CDR and log time, ns, of each whole message, in the order of the file."""
         wanted = {key: topic for key, (topic, _) in self._channels.items() if topic in topics}
         for code, data, start, stop in self._records():
             if code == _MESSAGE and (topic := wanted.get(_u16(data, start))) is not None:
-                yield topic, data[start + _MESSAGE_HEAD_BYTES:stop]
+                log_ns, = _LOG_TIME.unpack_from(data, start + _LOG_TIME_BYTE)
+                yield topic, data[start + _MESSAGE_HEAD_BYTES:stop], log_ns
 
     def _records(self) -> Iterator[Record]:
         """Yield the whole records, and the records of a chunk in its place."""

@@ -68,6 +68,23 @@ class Alignment(NamedTuple):
     gap_s: float
 
 
+class BadStamps(NamedTuple):
+    """
+    Samples whose stamp does not increase.
+
+    Attributes
+    ----------
+    duplicates
+        Samples with the stamp of the sample before.
+    backward
+        Samples whose stamp is earlier.
+
+    """
+
+    duplicates: int
+    backward: int
+
+
 @dataclass
 class Recording:
     """
@@ -97,6 +114,8 @@ class Recording:
         Fraction of the file that has been read at the end of these samples.
     remarks
         What was assumed or left out so far, one line each, for people.
+    bad_stamps
+        Samples that were left out so far because their stamp does not increase.
 
     """
 
@@ -109,6 +128,7 @@ class Recording:
     epoch_ns: int = 0
     done: float = 1.0
     remarks: tuple[str, ...] = ()
+    bad_stamps: BadStamps = BadStamps(0, 0)
 
     def __len__(self) -> int:
         """Return the number of samples."""

@@ -50,8 +50,9 @@ def duration(seconds: float) -> str:
     """Return a time with two units at most, for people."""
     if not np.isfinite(seconds):
         return 'more than a year'
+    seconds = round(seconds, 3)
     for unit_s, unit, smaller_s, smaller in ((86400, 'd', 3600, 'h'), (3600, 'h', 60, 'min')):
-        if seconds >= unit_s:
+        if round(seconds) >= unit_s:
             count, rest = divmod(round(seconds / smaller_s), round(unit_s / smaller_s))
             return f'{count} {unit} {rest} {smaller}' if rest else f'{count} {unit}'
     return f'{seconds / 60:.3g} min' if seconds >= 120 else f'{seconds:.3g} s'

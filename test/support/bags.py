@@ -34,13 +34,14 @@ EPOCH_NS = 1_750_000_000_000_000_000
 
 @dataclass
 class Sent:
-    """A message of a bag; `raw` holds the bytes of a message without a type."""
+    """A message of a bag; `raw` are bytes of a message without a type, `log_ns` its log time."""
 
     topic: str
     kind: str
     stamp_ns: int
     message: Any = None
     raw: bytes | None = None
+    log_ns: int | None = None
 
 
 def header(stamp_ns: int, frame: str = 'imu_link') -> Any:
@@ -84,7 +85,8 @@ def bag_of(path: Path, messages: Iterable[Sent], little_endian: bool = True) -> 
                 connections[key] = writer.add_connection(*key, typestore=STORE)
             raw = sent.raw or STORE.serialize_cdr(sent.message, sent.kind,
                                                   little_endian=little_endian)
-            writer.write(connections[key], EPOCH_NS + 1000 * i, raw)  # in the order of arrival
+            log_ns = EPOCH_NS + 1000 * i if sent.log_ns is None else sent.log_ns
+            writer.write(connections[key], log_ns, raw)  # in the order of arrival
     return path
 
 

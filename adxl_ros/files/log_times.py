@@ -1,0 +1,80 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Times of the samples of a bag by their header and by the recorder."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+import os
+from pathlib import Path
+import struct
+
+from adxl_ros.errors import UserError
+from adxl_ros.files.bag_messages import open_bag
+from adxl_ros.files.bag_topics import find_topics
+import numpy as np
+
+_STAMP = {0: struct.Struct('>iI'), 1: struct.Struct('<iI')}
+"""Seconds and nanoseconds at the begin of a header, by the lowest bit of the CDR identifier."""
+
+_STAMP_BYTE = 4
+"""Place of the stamp, after the identifier (DDSI-RTPS, 10.2)."""
+
+_ROWS = 65536
+"""Messages of a block (chosen: some MB)."""
+
+
+def has_log_times(path: str | os.PathLike) -> bool:
+    """Return whether a recording is a bag."""
+    return Path(path).is_dir() or Path(path).suffix in ('.mcap', '.db3')
+
+
+def log_times(path: str | os.PathLike, topic: str) -> Iterator[np.ndarray]:
+    """
+    Read header stamp and log time of the samples of a bag in blocks.
+
+    Parameters
+    ----------
+    path
+        The bag.
+    topic
+        Topic of the samples; empty for the only one.
+
+    Yields
+    ------
+    ndarray
+        Header stamp and log time by message, ns, (k, 2).
+
+    Raises
+    ------
+    UserError
+        The bag cannot be read.
+
+    """
+    with open_bag(path) as bag:
+        imu = find_topics(bag, topic).imu
+        times: list[tuple[int, int]] = []
+        for _, raw, log_ns in bag.logged_messages([imu]):
+            try:
+                seconds, nanoseconds = _STAMP[raw[1] & 1].unpack_from(raw, _STAMP_BYTE)
+            except (IndexError, struct.error):
+                raise UserError(f'{bag.path}: topic {imu}: a message is damaged: it ends before '
+                                'its stamp') from None
+            times.append((seconds * 1_000_000_000 + nanoseconds, log_ns))
+            if len(times) == _ROWS:
+                yield np.array(times)
+                times = []
+        if times:
+            yield np.array(times)

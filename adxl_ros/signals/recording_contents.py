@@ -1,0 +1,429 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What a recording holds, and what is wrong with its stamps and samples, read in blocks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+
+from adxl_ros.errors import UserError
+from adxl_ros.files.recording_columns import BadStamps, Recording, REFERENCES
+from adxl_ros.files.stamp_bursts import burst_samples, rate_lag
+from adxl_ros.model.constants import G0_MPS2
+from adxl_ros.signals.rest_detection import Rest, RestFinder
+from adxl_ros.signals.runs import true_runs
+import numpy as np
+
+_SCATTER_QUANTILE = 0.9
+"""Quantile of the deviations of steps that is their scatter. Chosen: one of ten may be a gap."""
+_LARGE_SCATTER = 0.25
+"""Scatter in periods from which the mean step is the period, not the median. Chosen."""
+_LONG_STEPS = (1.25, 1.5)
+"""Steps beyond the first number of periods, plus the second one times the scatter, are gaps.
+Chosen: a sample that is missing among stamps rounded to a seventh of a period is found."""
+_SHORTEST_GAP = 1.5
+"""Shortest gap, periods. Chosen: halfway to two."""
+_OUTLYING_STEP = 5.0
+"""Steps beyond this number of medians are not part of the mean step."""
+_REST_PART_S = 3600.0
+"""Time after which the search for rests begins again, s. Chosen: it bounds the memory."""
+_SAME_POSE_G = 0.1
+"""Distance of the means of two rests of one orientation, g. Chosen: 6° of tilt."""
+_MOST_POSES = 200
+"""Orientations that are counted at most. Chosen: more than a sweep has."""
+_CLIPPED_SAMPLES = 3
+"""Equal samples in a row at an extreme value that are clipped. Chosen: noise hardly repeats it."""
+_CLIPPED_STEP_G = 0.05
+"""Change before or after them, g. Chosen: a sensor at rest has none."""
+_HELD_S = 1.0
+"""Shortest time without any change that is reported, s. Chosen: noise changes samples sooner."""
+_HELD_SAMPLES = 20
+"""Fewest samples of such a time. Chosen: a slow sensor repeats a few."""
+_CHANGING = 0.5
+"""Share of samples that usually change. Chosen: a coarse sensor at rest changes less."""
+
+
+@dataclass(frozen=True)
+class AxisRange:
+    """
+    The samples of one axis.
+
+    Attributes
+    ----------
+    name
+        Its column.
+    lowest_mps2, highest_mps2
+        Its extreme values, m/s².
+    clipped
+        Times at which it stays at an extreme value in motion.
+    is_stuck
+        Whether it never changes.
+
+    """
+
+    name: str
+    lowest_mps2: float
+    highest_mps2: float
+    clipped: int
+    is_stuck: bool
+
+
+@dataclass(frozen=True)
+class LogDelay:
+    """
+    Log time minus header stamp of the samples of a bag.
+
+    Attributes
+    ----------
+    median_s
+        Median, s.
+    spread_s
+        Time from the 1st to the 99th percentile, s.
+    drift_ppm
+        Its drift by time, 10⁻⁶.
+
+    """
+
+    median_s: float
+    spread_s: float
+    drift_ppm: float
+
+
+@dataclass(frozen=True)
+class RecordingContents:
+    """
+    What a recording holds.
+
+    Attributes
+    ----------
+    path
+        The recording.
+    samples
+        Number of samples.
+    span_s
+        Time from the first to the last sample, s.
+    rate_hz
+        Usual rate, Hz.
+    jitter_s
+        Rms deviation of the steps of the stamps, without gaps, s.
+    burst
+        Samples of a burst of stamps; 1 for none.
+    missing
+        Missing samples.
+    gaps
+        Number of gaps.
+    longest_gap_s
+        Longest gap, s; 0 for none.
+    bad_stamps
+        Samples whose stamp does not increase.
+    axes
+        Ranges by axis.
+    held_s
+        Longest time in which no axis changes although the samples usually do, s; 0 for none.
+    rest_share
+        Share of the time at rest.
+    longest_rest_s
+        Longest rest, s.
+    rests
+        Number of rests.
+    poses
+        Number of different orientations among them.
+    length_g
+        Median length of the specific force at rest, g; None without three axes or rests.
+    references
+        Lowest and highest value of each reference, by column.
+    delay
+        Log time minus header stamp; None where there is no bag.
+    remarks
+        What was assumed or left out in reading.
+    cut
+        Where a damaged file ends; empty if it is whole.
+
+    """
+
+    path: str
+    samples: int
+    span_s: float
+    rate_hz: float
+    jitter_s: float
+    burst: int
+    missing: int
+    gaps: int
+    longest_gap_s: float
+    bad_stamps: BadStamps
+    axes: tuple[AxisRange, ...]
+    held_s: float
+    rest_share: float
+    longest_rest_s: float
+    rests: int
+    poses: int
+    length_g: float | None
+    references: dict[str, tuple[float, float]]
+    delay: LogDelay | None
+    remarks: tuple[str, ...]
+    cut: str
+
+
+def examine(blocks: Iterable[Recording], accel_mps2: Callable[[Recording], np.ndarray],
+            delay: LogDelay | None) -> RecordingContents:
+    """
+    Find what a recording holds.
+
+    Parameters
+    ----------
+    blocks
+        Its blocks, without samples whose stamp does not increase.
+    accel_mps2
+        Returns the specific force of a block, m/s², (n, m).
+    delay
+        Its log times; None where there is no bag.
+
+    Returns
+    -------
+    RecordingContents
+        Stamps, ranges, rests and references.
+
+    Raises
+    ------
+    UserError
+        The recording cannot be read, or has fewer than two samples.
+
+    """
+    stamps = values = rests = block = None
+    references: dict[str, tuple[float, float]] = {}
+    for block in blocks:
+        if not len(block):
+            continue
+        accel = accel_mps2(block)
+        if stamps is None or values is None or rests is None:
+            stamps = _Stamps(block)
+            values = _Values(block.sensor_columns, stamps.period_s)
+            rests = _Rests(accel.shape[1], 1 / stamps.period_s)
+        stamps.feed(block.time_s)
+        values.feed(block.time_s, accel)
+        rests.feed(block.time_s, accel)
+        _add_references(references, block)
+    if block is None or stamps is None or values is None or rests is None:
+        raise UserError('the recording holds no samples')
+    rests.close()
+    span_s = stamps.last_s - stamps.first_s
+    return RecordingContents(
+        block.path, stamps.count, span_s, 1 / stamps.period_s, stamps.jitter_s, stamps.burst,
+        stamps.missing, stamps.gaps, stamps.longest_gap_s,
+        block.bad_stamps, values.axes(), values.held_s,
+        min(sum(rests.spans_s) / span_s, 1.0), max(rests.spans_s, default=0.0),
+        len(rests.spans_s), len(rests.poses_mps2), rests.length_g, references, delay,
+        block.remarks, block.cut)
+
+
+def log_delay(times_ns: Iterable[np.ndarray]) -> LogDelay | None:
+    """Compare log times with header stamps, ns, (k, 2) by block; None without messages."""
+    # A few messages of each block are enough, whatever the length of the recording.
+    parts = [block[::max(len(block) // 512, 1)] for block in times_ns]
+    if not parts:
+        return None
+    times = np.concatenate(parts)
+    delay_s = (times[:, 1] - times[:, 0]) * 1e-9
+    time_s = (times[:, 1] - times[0, 1]) * 1e-9
+    low_s, median_s, high_s = np.quantile(delay_s, [0.01, 0.5, 0.99])
+    drift = np.polyfit(time_s, delay_s, 1)[0] if np.ptp(time_s) > 0 else 0.0
+    return LogDelay(float(median_s), float(high_s - low_s), 1e6 * float(drift))
+
+
+class _Stamps:
+    """Statistics of the steps of the stamps; the period is that of the first block."""
+
+    def __init__(self, first: Recording) -> None:
+        if len(first) < 2:
+            raise UserError(f'{first.path}: {len(first)} sample with a usable stamp; at least 2 '
+                            f'are needed{_stamp_hint(first)}')
+        time_s, lag = first.time_s, rate_lag(first.time_s)
+        self.burst = burst_samples(time_s)
+        self.period_s = float(np.median(time_s[lag:] - time_s[:-lag])) / lag
+        self.first_s = float(time_s[0])
+        self.last_s = np.nan
+        self.count = self.missing = self.gaps = 0
+        self.longest_gap_s = 0.0
+        self._squares, self._usual = 0.0, 0
+        self._gap_periods = self._find_gap_periods(np.diff(time_s))
+
+    def _find_gap_periods(self, steps_s: np.ndarray) -> float:
+        """Return the shortest gap, periods, by the scatter of the first steps, s, (n,)."""
+        if self.burst > 1:
+            return _SHORTEST_GAP * self.burst
+        scatter = float(np.quantile(np.abs(steps_s / self.period_s - 1), _SCATTER_QUANTILE))
+        if scatter > _LARGE_SCATTER:
+            self.period_s = float(np.mean(steps_s[steps_s < _OUTLYING_STEP * self.period_s]))
+        return max(_LONG_STEPS[0] + _LONG_STEPS[1] * scatter, _SHORTEST_GAP)
+
+    def feed(self, time_s: np.ndarray) -> None:
+        """Add further stamps."""
+        before = time_s[0] - self.period_s if np.isnan(self.last_s) else self.last_s
+        steps = np.diff(time_s, prepend=before) / self.period_s
+        self.count += len(time_s)
+        self.last_s = float(time_s[-1])
+        is_gap = steps > self._gap_periods
+        self.missing += int((np.rint(steps[is_gap]) - self.burst).sum())
+        self.gaps += int(is_gap.sum())
+        if is_gap.any():
+            self.longest_gap_s = max(self.longest_gap_s, float(steps.max()) * self.period_s)
+        usual = steps[~is_gap]
+        self._squares += float(((usual - 1) ** 2).sum())
+        self._usual += len(usual)
+
+    @property
+    def jitter_s(self) -> float:
+        """Rms deviation of the steps that are no gaps, s."""
+        return self.period_s * float(np.sqrt(self._squares / max(self._usual, 1)))
+
+
+def _stamp_hint(first: Recording) -> str:
+    """Return what is wrong with the stamps, for a message."""
+    left_out = sum(first.bad_stamps)
+    return f': the stamps of {left_out} samples do not increase; --rate HZ stamps by index' \
+        if left_out else ''
+
+
+@dataclass
+class _Values:
+    """Extreme values of each axis, and times without change."""
+
+    names: tuple[str, ...]
+    period_s: float
+    held_s: float = 0.0
+    _last: np.ndarray | None = None
+    _extremes: list[list[float]] = field(default_factory=list)
+    _clipped: list[list[int]] = field(default_factory=list)
+    _has_changed: np.ndarray | None = None
+    _changes: int = 0
+    _count: int = 0
+    _held_samples: int = 0
+    _longest_held: int = 0
+
+    def feed(self, time_s: np.ndarray, accel: np.ndarray) -> None:
+        """Add further samples, m/s², (n, m)."""
+        if self._last is None:
+            self._extremes = [[np.inf, -np.inf] for _ in self.names]
+            self._clipped = [[0, 0] for _ in self.names]
+            self._has_changed = np.zeros(len(self.names), bool)
+            self._last = accel[0]
+        rows = np.vstack([self._last, accel])
+        changed = np.diff(rows, axis=0) != 0
+        assert self._has_changed is not None
+        self._has_changed |= changed.any(axis=0)
+        self._add_held(changed.any(axis=1))
+        for axis in range(len(self.names)):
+            for side, sign in enumerate((-1.0, 1.0)):
+                self._add_extreme(axis, side, sign * rows[:, axis], sign)
+        self._last = accel[-1]
+        self._count += len(accel)
+
+    def _add_held(self, is_new: np.ndarray) -> None:
+        """Count samples without any change."""
+        self._changes += int(is_new.sum())
+        places = np.flatnonzero(is_new)
+        if not len(places):
+            self._held_samples += len(is_new)
+        else:
+            inner = int(np.diff(places).max(initial=1)) - 1
+            self._longest_held = max(self._longest_held, self._held_samples + int(places[0]),
+                                     inner)
+            self._held_samples = len(is_new) - 1 - int(places[-1])
+        self._longest_held = max(self._longest_held, self._held_samples)
+        is_held = (self._longest_held >= max(_HELD_S / self.period_s, _HELD_SAMPLES)
+                   and self._changes > _CHANGING * (self._count + len(is_new)
+                                                    - self._longest_held))
+        self.held_s = self._longest_held * self.period_s if is_held else 0.0
+
+    def _add_extreme(self, axis: int, side: int, values: np.ndarray, sign: float) -> None:
+        """
+        Count how often an axis stays at its largest value; `values` has the sign of the side.
+
+        A new extreme value begins the count again.
+        """
+        largest = float(values.max())
+        if largest < sign * self._extremes[axis][side]:
+            return
+        if largest > sign * self._extremes[axis][side]:
+            self._extremes[axis][side], self._clipped[axis][side] = sign * largest, 0
+        for first, stop in true_runs(values == largest):
+            before = values[first - 1] if first else largest
+            after = values[stop] if stop < len(values) else largest
+            jump_g = (largest - min(before, after)) / G0_MPS2
+            if stop - first >= _CLIPPED_SAMPLES and jump_g > _CLIPPED_STEP_G:
+                self._clipped[axis][side] += 1
+
+    def axes(self) -> tuple[AxisRange, ...]:
+        """Return the ranges by axis."""
+        assert self._has_changed is not None
+        return tuple(AxisRange(name, low, high, sum(clipped), not has_changed)
+                     for name, (low, high), clipped, has_changed in zip(
+                         self.names, self._extremes, self._clipped, self._has_changed.tolist()))
+
+
+class _Rests:
+    """Rests of a recording of any length, and their orientations."""
+
+    def __init__(self, axes: int, rate_hz: float) -> None:
+        self._axes, self._rate_hz = axes, rate_hz
+        self._finder = RestFinder(rate_hz, axes)
+        self._begin_s = -np.inf
+        self.spans_s: list[float] = []
+        self.poses_mps2: list[np.ndarray] = []
+        self._lengths: list[float] = []
+
+    def feed(self, time_s: np.ndarray, accel: np.ndarray) -> None:
+        """Add further samples, m/s², (n, m)."""
+        if time_s[0] - self._begin_s > _REST_PART_S:
+            self.close()
+            self._finder, self._begin_s = RestFinder(self._rate_hz, self._axes), float(time_s[0])
+        self._finder.feed(time_s, accel)
+
+    def close(self) -> None:
+        """Take the rests of the part that ends."""
+        rests = self._finder.rests() if len(self._finder.blocks()) else []
+        if not rests:
+            return
+        means, _ = self._finder.means(rests)
+        for rest, mean in zip(rests, means):
+            self._add(rest, mean)
+
+    def _add(self, rest: Rest, mean_mps2: np.ndarray) -> None:
+        """Add a rest with its mean, m/s², (m,)."""
+        self.spans_s.append(rest.time_stop_s - rest.time_start_s)
+        self._lengths.append(float(np.linalg.norm(mean_mps2)))
+        is_new = all(np.linalg.norm(mean_mps2 - pose) > _SAME_POSE_G * G0_MPS2
+                     for pose in self.poses_mps2)
+        if is_new and len(self.poses_mps2) < _MOST_POSES:
+            self.poses_mps2.append(mean_mps2)
+
+    @property
+    def length_g(self) -> float | None:
+        """Median length of the specific force at rest, g."""
+        if self._axes < 3 or not self._lengths:
+            return None
+        return float(np.median(self._lengths)) / G0_MPS2
+
+
+def _add_references(references: dict[str, tuple[float, float]], block: Recording) -> None:
+    """Widen the ranges of the references by those of a block."""
+    for name, values in block.columns.items():
+        if name not in REFERENCES:
+            continue
+        finite = values[np.isfinite(values)]
+        if len(finite):
+            low, high = references.get(name, (np.inf, -np.inf))
+            references[name] = (min(low, float(finite.min())), max(high, float(finite.max())))

@@ -1,0 +1,165 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Check whether recordings are sound, and what the other tools can do with them."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from dataclasses import asdict, replace
+import json
+from pathlib import Path
+from typing import Any
+
+from adxl_ros.errors import one_line, UserError
+from adxl_ros.files import recording
+from adxl_ros.files.atomic_write import write_text
+from adxl_ros.files.log_times import has_log_times, log_times
+from adxl_ros.files.reading_options import ReadingOptions
+from adxl_ros.files.recording_columns import Recording
+from adxl_ros.files.stream_unit import uncalibrated
+from adxl_ros.model.sensor import Sensor
+from adxl_ros.signals.recording_contents import examine, log_delay
+from adxl_ros.tools import check_text
+from adxl_ros.tools.check_findings import assess, Findings
+from adxl_ros.tools.closing_lines import print_end, quoted
+from adxl_ros.tools.command_line import argument_parser, command
+from adxl_ros.tools.common import make_folder, progress, run, ShowDone
+from adxl_ros.tools.recorded_sensor import load_sensor
+from adxl_ros.tools.recording_options import (
+    add_recording_options,
+    reading_options,
+    RECORDING_HELP,
+)
+import numpy as np
+
+_BLOCK_ROWS = 65536
+"""Samples that are read at a time (chosen: some MB)."""
+_EXAMPLES = {
+    'all recordings of a day, with a page': '*.mcap --report check',
+    'a log of other software': 'log.csv --columns time=t_ms:ms,x=accX:mg,y=accY:mg,z=accZ:mg',
+}
+"""Examples of arguments, by their purpose."""
+
+
+def parser() -> argparse.ArgumentParser:
+    """Describe the command line."""
+    parse = argument_parser('check', __doc__, _EXAMPLES)
+    parse.add_argument('recording', nargs='+', metavar='RECORDING', help=RECORDING_HELP)
+    parse.add_argument('--params', metavar='FILE', default=None,
+                       help='the sensor, for recordings in volts (default: the nominal sensor)')
+    parse.add_argument('--report', metavar='DIR', help='write the page check.html there')
+    parse.add_argument('--json', action='store_true', help='print the result as JSON')
+    add_recording_options(parse)
+    return parse
+
+
+def check(options: argparse.Namespace) -> int:
+    """Run the tool; see `parser`."""
+    reading = replace(reading_options(options), drop_bad_stamps=True)
+    results = []
+    with progress('check') as show:
+        for i, path in enumerate(options.recording):
+            step = _Step(show, i, len(options.recording), Path(path).name)
+            results.append(_checked(path, options.params, reading, step))
+    page = []
+    if options.report:
+        make_folder(Path(options.report))
+        page = [Path(options.report) / 'check.html']
+        write_text(page[0], check_text.page(results))
+    if options.json:
+        print(json.dumps([_as_json(result) for result in results], indent=1))
+    else:
+        print('\n'.join(check_text.lines(results)))
+        print_end([check_text.verdict(results)], page, _next_command(results))
+    return 0 if all(result.is_sound for result in results) else 1
+
+
+class _Step:
+    """Shows how much of one recording among several is done."""
+
+    def __init__(self, show: ShowDone, number: int, count: int, name: str) -> None:
+        self._show, self._number, self._count, self._name = show, number, count, name
+
+    def __call__(self, done: float) -> None:
+        """Show the fraction of this recording that is done."""
+        self._show((self._number + done) / self._count, self._name)
+
+
+def _checked(path: str, params: str | None, reading: ReadingOptions, show: _Step) -> Findings:
+    """Return the findings of a recording; one that cannot be read is not sound."""
+    try:
+        delay = None
+        if has_log_times(path) and reading.rate_hz is None:
+            delay = log_delay(log_times(path, reading.topic))
+        source = _Source(params)
+        blocks = recording.blocks(path, _BLOCK_ROWS, reading)
+        contents = examine(_shown(blocks, show), source.accel_mps2, delay)
+    except UserError as error:
+        reason = one_line(error).removeprefix(f'{path}: ')
+        return Findings(path, None, (reason,))
+    return replace(assess(contents), path=path)
+
+
+def _shown(blocks: Iterator[Recording], show: _Step) -> Iterator[Recording]:
+    """Yield blocks, and show how much has been read."""
+    for block in blocks:
+        yield block
+        show(block.done)
+
+
+class _Source:
+    """Converts the samples of a recording by the nominal values of its sensor."""
+
+    def __init__(self, params: str | None) -> None:
+        self._params = params
+        self._unit: Sensor | None = None
+
+    def accel_mps2(self, block: Recording) -> np.ndarray:
+        """Return the specific force of a block, m/s², (n, m)."""
+        if self._unit is None:
+            sensor = load_sensor(self._params, block)
+            self._unit = uncalibrated(sensor, block.stream_info, block.axes, sensor.rate_hz)
+        return block.accel_mps2(self._unit)
+
+
+def _next_command(results: list[Findings]) -> str:
+    """Return the command that a sound recording allows; empty for none."""
+    for result in results:
+        able = {ability.tool for ability in result.abilities if ability.is_able}
+        if result.is_sound and 'fit' in able:
+            return command('fit', f'{quoted(result.path)} -o unit.yaml --report report')
+        if result.is_sound and 'noise' in able:
+            return command('noise', f'{quoted(result.path)} -o noise.yaml --report noise')
+    return ''
+
+
+def _as_json(result: Findings) -> dict[str, Any]:
+    """Return the findings for programs, in SI units."""
+    values: dict[str, Any] = {}
+    if result.contents is not None:
+        values = asdict(result.contents)
+        values['bad_stamps'] = result.contents.bad_stamps._asdict()
+        for name in ('path', 'remarks', 'cut'):
+            values.pop(name)
+    return {'schema': 1, 'recording': result.path, 'sound': result.is_sound,
+            'faults': list(result.faults), 'remarks': list(result.remarks), 'contents': values,
+            'can': {ability.tool: {'able': ability.is_able, 'reason': ability.reason}
+                    for ability in result.abilities}}
+
+
+def main() -> int:
+    """Run the tool on the command line."""
+    return run(parser(), check)

@@ -1,0 +1,192 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The tool `check`: faults of stamps and samples, what other tools can do, and damaged files."""
+
+from collections.abc import Callable
+from dataclasses import replace
+import json
+from pathlib import Path
+import subprocess
+
+from bags import bag_of, imu, stamps
+import numpy as np
+from processes import run_executable
+import pytest
+from still_noise import write_csv
+
+RATE_HZ = 100.0
+G = 9.80665
+
+
+def samples(seconds: float = 60.0) -> tuple[np.ndarray, np.ndarray]:
+    """Return stamps and a sensor that is turned from rest to rest every 5 s."""
+    time_s = np.arange(int(seconds * RATE_HZ)) / RATE_HZ
+    rng = np.random.default_rng(1)
+    directions = rng.normal(size=(int(seconds // 5) + 2, 3))
+    directions /= np.linalg.norm(directions, axis=1)[:, None]
+    place = time_s / 5
+    moved = np.clip((place % 1) * 5, 0, 1)[:, None]
+    first = place.astype(int)
+    force = directions[first] * (1 - moved) + directions[first + 1] * moved
+    return time_s, G * force + rng.normal(0, 0.02, force.shape)
+
+
+def run(folder: Path, *arguments: str) -> subprocess.CompletedProcess:
+    done = run_executable('check', *arguments, cwd=folder)
+    assert done.stderr == ''
+    return done
+
+
+def checked(folder: Path, *arguments: str) -> dict:
+    """Return the findings of one recording."""
+    done = run(folder, *arguments, '--json')
+    result, = json.loads(done.stdout)
+    assert done.returncode == (0 if result['sound'] else 1)
+    return result
+
+
+def test_a_sound_recording(tmp_path: Path) -> None:
+    time_s, accel = samples()
+    write_csv(tmp_path / 'turned.csv', time_s, accel, temperature_c=25 + time_s / 60,
+              supply_v=np.full(len(time_s), 5.0))
+    result = checked(tmp_path, 'turned.csv')
+    contents = result['contents']
+    assert result['faults'] == []
+    assert contents['rate_hz'] == pytest.approx(RATE_HZ)
+    assert (contents['samples'], contents['missing'], contents['gaps']) == (6000, 0, 0)
+    assert contents['rests'] >= 10
+    assert 0.5 < contents['rest_share'] < 0.9
+    assert contents['length_g'] == pytest.approx(1.0, abs=0.01)
+    assert contents['references']['temperature_c'] == pytest.approx([25.0, 26.0], abs=0.01)
+    assert contents['references']['supply_v'] == [5.0, 5.0]
+    assert result['can']['fit']['able']
+    assert not result['can']['diagnose']['able']
+    assert 'stage angles' in result['can']['diagnose']['reason']
+
+
+def lost(time_s: np.ndarray, accel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    kept = (time_s < 20) | (time_s > 23)
+    return time_s[kept], accel[kept]
+
+
+def repeated(time_s: np.ndarray, accel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    time_s[100:103] = time_s[99]
+    return time_s, accel
+
+
+def stepped_back(time_s: np.ndarray, accel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    time_s[1000:1005] -= 2.0
+    return time_s, accel
+
+
+def scattered(time_s: np.ndarray, accel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(2)
+    return np.sort(time_s + rng.uniform(0, 0.02, len(time_s))), accel
+
+
+def stuck(time_s: np.ndarray, accel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    accel[:, 1] = 0.0
+    return time_s, accel
+
+
+def clipped(time_s: np.ndarray, accel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    shaken = 3 * G * np.sin(2 * np.pi * 2 * time_s) * ((time_s > 10) & (time_s < 20))
+    accel[:, 0] = np.clip(accel[:, 0] + shaken, -2 * G, 2 * G)
+    return time_s, accel
+
+
+def held(time_s: np.ndarray, accel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    accel[3000:3300] = accel[2999]
+    return time_s, accel
+
+
+def in_g(time_s: np.ndarray, accel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return time_s, accel / G
+
+
+@pytest.mark.parametrize(('change', 'fault'), [
+    (lost, '301 samples are missing'),
+    (repeated, '3 samples have the stamp of the sample before'),
+    (stepped_back, '5 stamps go back'),
+    (scattered, 'stamps scatter by'),
+    (stuck, 'ay_mps2 never changes'),
+    (clipped, 'ax_mps2 stays at its extreme value'),
+    (held, 'no axis changes for 3 s'),
+    (in_g, 'seem to be in g'),
+], ids=lambda value: value.__name__ if callable(value) else '')
+def test_each_fault_is_named(
+        tmp_path: Path, fault: str,
+        change: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]) -> None:
+    write_csv(tmp_path / 'faulty.csv', *change(*samples()))
+    faults = checked(tmp_path, 'faulty.csv')['faults']
+    assert any(fault in text for text in faults), faults
+    if change not in (stuck, in_g):
+        assert len(faults) == 1, faults
+
+
+def test_a_coarse_sensor_at_rest_is_sound(tmp_path: Path) -> None:
+    """Equal samples at an extreme value and for a second are no fault where the steps are wide."""
+    time_s, accel = samples()
+    accel = np.round(accel / 0.3) * 0.3
+    write_csv(tmp_path / 'coarse.csv', time_s, accel)
+    assert checked(tmp_path, 'coarse.csv')['faults'] == []
+
+
+def test_a_damaged_file_does_not_stop_the_others(tmp_path: Path) -> None:
+    write_csv(tmp_path / 'good.csv', *samples())
+    (tmp_path / 'damaged.mcap').write_bytes(b'\x89MCAP0\r\n' + bytes(100))
+    (tmp_path / 'text.csv').write_text('time_s,ax_mps2\n1.0,none\n')
+    done = run(tmp_path, 'damaged.mcap', 'good.csv', 'text.csv', 'missing.csv', '--report', 'page')
+    assert done.returncode == 1
+    assert max(map(len, done.stdout.splitlines())) <= 79
+    rows = {line.split()[0]: line for line in done.stdout.splitlines() if line.startswith(' ')}
+    assert rows['good.csv'].endswith('sound')
+    for name in ('damaged.mcap', 'text.csv', 'missing.csv'):
+        assert rows[name].endswith('unreadable')
+    assert '1 of 4 recordings is sound.' in done.stdout
+    page = (tmp_path / 'page' / 'check.html').read_text()
+    assert all(name in page for name in ('good.csv', 'damaged.mcap', 'missing.csv'))
+
+
+def test_wrong_usage_is_status_2(tmp_path: Path) -> None:
+    assert run_executable('check', cwd=tmp_path).returncode == 2
+
+
+def test_log_time_against_header_time(tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    sent = [imu(stamp, (*rng.normal(0, 0.02, 2), G + rng.normal(0, 0.02)), variance=[1e-4] * 3)
+            for stamp in stamps(1000, 10_000_000)]
+    late = [replace(item, log_ns=item.stamp_ns + 250_000_000) for item in sent]
+    bag_of(tmp_path / 'late', late)
+    result = checked(tmp_path, 'late')
+    assert result['contents']['delay']['median_s'] == pytest.approx(0.25)
+    assert result['contents']['delay']['spread_s'] < 1e-3
+    assert result['sound']
+    assert any('log time is 0.25 s after header time' in text for text in result['remarks'])
+    jumped = [replace(item, log_ns=item.stamp_ns + (5 * 10 ** 9 if i > 500 else 0))
+              for i, item in enumerate(sent)]
+    bag_of(tmp_path / 'jumped', jumped)
+    faults = checked(tmp_path, 'jumped')['faults']
+    assert any('log time minus header time varies' in text for text in faults)
+
+
+def test_a_foreign_log(tmp_path: Path) -> None:
+    time_s, accel = samples()
+    np.savetxt(tmp_path / 'log.csv', np.column_stack([1e3 * time_s, 1e3 * accel / G]),
+               fmt='%.6g', delimiter=';', header='t_ms;accX;accY;accZ', comments='')
+    result = checked(tmp_path, 'log.csv', '--columns',
+                     'time=t_ms:ms,x=accX:mg,y=accY:mg,z=accZ:mg')
+    assert result['contents']['length_g'] == pytest.approx(1.0, abs=0.01)
+    assert result['sound']
