@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from adxl_ros.errors import one_line, UserError
-from adxl_ros.files import recording
+from adxl_ros.files import html_page, recording
 from adxl_ros.files.atomic_write import write_text
 from adxl_ros.files.log_times import has_log_times, log_times
 from adxl_ros.files.reading_options import ReadingOptions
@@ -69,6 +69,8 @@ def parser() -> argparse.ArgumentParser:
 def check(options: argparse.Namespace) -> int:
     """Run the tool; see `parser`."""
     reading = replace(reading_options(options), drop_bad_stamps=True)
+    if options.report:
+        html_page.check_libraries()
     results = []
     with progress('check') as show:
         for i, path in enumerate(options.recording):

@@ -16,11 +16,10 @@
 
 from __future__ import annotations
 
-from html import escape
 from pathlib import Path
 import textwrap
 
-from adxl_ros.files.html_page import document, table
+from adxl_ros.files import html_page
 from adxl_ros.signals.recording_contents import RecordingContents
 from adxl_ros.tools.check_findings import Findings
 from adxl_ros.tools.command_line import COLUMNS
@@ -79,16 +78,20 @@ def _short(path: str) -> str:
     return name if len(name) < _NAME_COLUMNS - 1 else f'{name[:_NAME_COLUMNS - 3]}…'
 
 
-def _details(result: Findings) -> list[str]:
-    """Return faults, values, remarks and abilities below the name of a recording."""
+def _entries(result: Findings) -> list[tuple[str, str]]:
+    """Return faults, values, remarks and abilities of a recording, each with its label."""
     entries = [('NOT SOUND' if result.contents else 'unreadable', fault)
                for fault in result.faults]
     if result.contents is not None:
         entries += [('values', text) for text in values(result.contents)]
     entries += [('remark', remark) for remark in result.remarks]
-    entries += [(ability.tool, f'{"yes" if ability.is_able else "no"}: {ability.reason}')
-                for ability in result.abilities]
-    return [line for label, text in entries for line in textwrap.wrap(
+    return entries + [(ability.tool, f'{"yes" if ability.is_able else "no"}: {ability.reason}')
+                      for ability in result.abilities]
+
+
+def _details(result: Findings) -> list[str]:
+    """Return the lines below the name of a recording."""
+    return [line for label, text in _entries(result) for line in textwrap.wrap(
         f'  {label:{_LABEL_COLUMNS - 3}} {text}', COLUMNS, subsequent_indent=_LABEL_COLUMNS * ' ',
         break_on_hyphens=False)]
 
@@ -114,19 +117,13 @@ def _milliseconds(seconds: float) -> str:
 
 def page(results: list[Findings]) -> str:
     """Return the page."""
+    is_sound = all(result.is_sound for result in results)
+    badge = {'colour': 'green' if is_sound else 'red', 'sentence': verdict(results),
+             'word': 'Sound.' if is_sound else 'Not sound.'}
     rows = [[Path(result.path).name, *_cells(result.contents), _verdict(result)]
             for result in results]
-    kind = 'good' if all(result.is_sound for result in results) else 'bad'
-    parts = ['<h1>Check of recordings</h1>',
-             f'<p class="summary {kind}">{verdict(results)}</p>',
-             table(['recording', *_HEAD, 'verdict'], rows)]
-    for result in results:
-        parts.append(f'<h2>{escape(result.path)}</h2>')
-        entries = [['not sound', fault] for fault in result.faults]
-        if result.contents is not None:
-            entries += [['values', text] for text in values(result.contents)]
-        entries += [['remark', remark] for remark in result.remarks]
-        entries += [[ability.tool, f'{"yes" if ability.is_able else "no"}: {ability.reason}']
-                    for ability in result.abilities]
-        parts.append(table(['', ''], entries))
-    return document('Check of recordings', parts)
+    recordings = [{'path': result.path, 'entries': _entries(result)} for result in results]
+    return html_page.render('adxl_ros.tools', 'check.html', {
+        'title': 'Check of recordings', 'about': [f'{len(results)} recordings'], 'badge': badge,
+        'figures': {}, 'columns': ('recording', *_HEAD, 'verdict'), 'rows': rows,
+        'recordings': recordings})

@@ -23,7 +23,7 @@ import json
 from pathlib import Path
 
 from adxl_ros.errors import UserError
-from adxl_ros.files import parameter_file, recording
+from adxl_ros.files import html_page, parameter_file, recording
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.stream_unit import unit_of
 from adxl_ros.model.sensor import Sensor
@@ -71,6 +71,8 @@ def parser() -> argparse.ArgumentParser:
 
 def noise(options: argparse.Namespace) -> int:
     """Run the tool; see `parser`."""
+    if options.report:
+        html_page.check_libraries()
     source = _Source(options)
     with progress('noise') as show:
         rest = longest_rest(lambda: source.blocks(show), source.accel_mps2)
