@@ -143,7 +143,7 @@ class RecordingContents:
         Number of different orientations among them.
     length_g
         Median length of the specific force at rest, g; None without three axes or rests.
-    references
+    reference_ranges
         Lowest and highest value of each reference, by column.
     delay
         Log time minus header stamp; None where there is no bag.
@@ -171,7 +171,7 @@ class RecordingContents:
     rests: int
     poses: int
     length_g: float | None
-    references: dict[str, tuple[float, float]]
+    reference_ranges: dict[str, tuple[float, float]]
     delay: LogDelay | None
     remarks: tuple[str, ...]
     cut: str

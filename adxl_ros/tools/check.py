@@ -49,7 +49,8 @@ _BLOCK_ROWS = 65536
 """Samples that are read at a time (chosen: some MB)."""
 _EXAMPLES = {
     'all recordings of a day, with a page': '*.mcap --report check',
-    'a log of other software': 'log.csv --columns time=t_ms:ms,x=accX:mg,y=accY:mg,z=accZ:mg',
+    'a log of other software':
+        'log.csv \\\n        --columns time=t_ms:ms,x=accX:mg,y=accY:mg,z=accZ:mg',
 }
 """Examples of arguments, by their purpose."""
 

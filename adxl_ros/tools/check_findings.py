@@ -195,7 +195,7 @@ def _remarks(contents: RecordingContents) -> list[str]:
 
 def _range_rad(contents: RecordingContents) -> float | None:
     """Return the larger range of both stage angles, rad; None without them."""
-    ranges = [contents.references.get(name) for name in ('alpha_rad', 'beta_rad')]
+    ranges = [contents.reference_ranges.get(name) for name in ('alpha_rad', 'beta_rad')]
     if any(limits is None for limits in ranges):
         return None
     return max(limits[1] - limits[0] for limits in ranges if limits is not None)
@@ -220,7 +220,7 @@ def _diagnose(contents: RecordingContents) -> Ability:
     range_rad = _range_rad(contents)
     if contents.poses <= 1 and not (range_rad and range_rad > _MOVED_RAD):
         follows = [text for name, (text, smallest) in _FOLLOWED.items()
-                   if np.ptp(contents.references.get(name, (0.0, 0.0))) > smallest]
+                   if np.ptp(contents.reference_ranges.get(name, (0.0, 0.0))) > smallest]
         if follows:
             return Ability('diagnose', True, f'at rest, for effects of {" and ".join(follows)}')
     if range_rad is None:

@@ -103,7 +103,7 @@ def values(contents: RecordingContents) -> list[str]:
                            for axis in contents.axes))
     units = {'rad': 'rad', 'm': 'm', 'c': '°C', 'v': 'V'}
     texts += [f'{name} {low:.4g} to {high:.4g} {units[name.rsplit("_", 1)[1]]}'
-              for name, (low, high) in contents.references.items()]
+              for name, (low, high) in contents.reference_ranges.items()]
     if contents.delay is not None:
         texts.append(f'log time minus header time {_milliseconds(contents.delay.median_s)}, '
                      f'spread {_milliseconds(contents.delay.spread_s)}')

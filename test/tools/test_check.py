@@ -69,8 +69,8 @@ def test_a_sound_recording(tmp_path: Path) -> None:
     assert contents['rests'] >= 10
     assert 0.5 < contents['rest_share'] < 0.9
     assert contents['length_g'] == pytest.approx(1.0, abs=0.01)
-    assert contents['references']['temperature_c'] == pytest.approx([25.0, 26.0], abs=0.01)
-    assert contents['references']['supply_v'] == [5.0, 5.0]
+    assert contents['reference_ranges']['temperature_c'] == pytest.approx([25.0, 26.0], abs=0.01)
+    assert contents['reference_ranges']['supply_v'] == [5.0, 5.0]
     assert result['can']['fit']['able']
     assert not result['can']['diagnose']['able']
     assert 'stage angles' in result['can']['diagnose']['reason']
