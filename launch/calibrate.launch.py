@@ -21,7 +21,7 @@ Calibrate a sensor: start the driver, the stage and the calibration, and end wit
         bridge_beta_joint:=turn_joint
     ros2 launch adxl_ros calibrate.launch.py output:=unit_17.yaml link_type:=serial \
         link_port:=/dev/ttyACM0 stage_mode:=manual
-    ros2 launch adxl_ros calibrate.launch.py mode:=gravity output:=unit_17.yaml
+    ros2 launch adxl_ros calibrate.launch.py mode:=gravity output:=unit_17.yaml screen:=true
 
 A log line says how long it takes. The launch ends with the calibration: status 0 where it wrote
 its file, else 1. After an interruption the same command resumes. In mode `gravity` there is no
@@ -84,6 +84,9 @@ def generate_launch_description() -> LaunchDescription:
                               description='parameter file that the calibration writes'),
         DeclareLaunchArgument('mode', default_value='stage', choices=['stage', 'gravity'],
                               description='poses of a stage, or rests of a hand-held sensor'),
+        DeclareLaunchArgument('screen', default_value='false', choices=['true', 'false'],
+                              description='show the calibration screen in this terminal; logs '
+                              'then go to files'),
         *(argument.declared() for argument in (
             STAGE_TYPE, STAGE_MODE, *BRIDGE, *SWEEP, SPEED)),
         OpaqueFunction(function=make_nodes)])
@@ -93,7 +96,10 @@ def make_nodes(context: LaunchContext) -> list[Action]:
     """Return the nodes."""
     speed = launch_nodes.given_parameters(context, [SPEED])
     sim_time = {'use_sim_time': True} if speed else {}
-    respawn = {'respawn': True, 'respawn_delay': 2.0}
+    shows_screen = text(context, 'screen') == 'true'
+    # A line on the terminal would tear the screen.
+    log = {'output': 'log'} if shows_screen else {}
+    respawn = {'respawn': True, 'respawn_delay': 2.0, **log}
     stage = [make_node(context, 'stage', sim_time | launch_nodes.given_parameters(
         context, [STAGE_TYPE, *BRIDGE]), **respawn, on_exit=launch_nodes.GiveUp())] \
         if has_stage(context) else []
@@ -102,15 +108,23 @@ def make_nodes(context: LaunchContext) -> list[Action]:
     success = f'wrote {files}; next: ros2 launch adxl_ros robot.launch.py params_file:={output}'
     sweep: dict[str, Any] = launch_nodes.given_parameters(context, [STAGE_MODE, *SWEEP])
     return [
-        LogInfo(msg='its screen, in a second terminal: ros2 run adxl_ros screen --ros-args -p '
-                f'node:={launch_nodes.node_name(context, "calibration")}'),
+        show_screen(context, shows_screen),
         make_node(context, 'driver', simulated(context, speed) | sim_time, **respawn,
                   on_exit=launch_nodes.GiveUp()),
         *stage,
         make_node(context, 'calibration', {
             **sim_time, **sweep, 'autostart': True, 'exit_when_done': True, 'screen': False,
-            'mode': text(context, 'mode'), 'output': output},
+            'mode': text(context, 'mode'), 'output': output}, **log,
             on_exit=launch_nodes.end_with(success, RESUMES))]
+
+
+def show_screen(context: LaunchContext, is_here: bool) -> Action:
+    """Show the screen in the terminal of the launch, or say how to show it in another one."""
+    name = launch_nodes.node_name(context, 'calibration')
+    if is_here:
+        return make_node(context, 'screen', {'node': name})
+    return LogInfo(msg='its screen, in a second terminal: ros2 run adxl_ros screen --ros-args -p '
+                   f'node:={name}')
 
 
 def simulated(context: LaunchContext, speed: dict[str, Any]) -> dict[str, Any]:

@@ -18,23 +18,28 @@ Start a calibrated sensor on a robot: the driver and the compensation.
     ros2 launch adxl_ros robot.launch.py params_file:=unit_17.yaml link_type:=serial \
         link_port:=/dev/ttyACM0 namespace:=arm frame_id:=arm_imu
 
-A node that ends is started again. The launch ends with an error when a node refuses to start
-three times.
+    ros2 launch adxl_ros robot.launch.py params_file:=unit_17.yaml base_frame:=base_link \
+        mounting_xyz_m:=0.1,0,0.05 mounting_rpy_rad:=3.14159,0,0
+
+The second line also publishes the static transform from the robot to the case. A node that ends
+is started again. The launch ends with an error when a node refuses to start three times.
 """
 
 from adxl_ros.nodes.support import launch_nodes
 from launch import LaunchContext, LaunchDescription
+from launch.action import Action
 from launch.actions import OpaqueFunction
-from launch_ros.actions import Node
 
 
 def generate_launch_description() -> LaunchDescription:
     return LaunchDescription([
-        *launch_nodes.common_arguments(), OpaqueFunction(function=make_nodes)])
+        *launch_nodes.common_arguments(), *launch_nodes.TRANSFORM,
+        OpaqueFunction(function=make_nodes)])
 
 
-def make_nodes(context: LaunchContext) -> list[Node]:
+def make_nodes(context: LaunchContext) -> list[Action]:
     """Return the nodes."""
-    return [launch_nodes.make_node(context, executable, {}, respawn=True, respawn_delay=2.0,
-                                   on_exit=launch_nodes.GiveUp())
-            for executable in ('driver', 'compensation')]
+    return [*launch_nodes.static_transform(context), *(
+        launch_nodes.make_node(context, executable, {}, respawn=True, respawn_delay=2.0,
+                               on_exit=launch_nodes.GiveUp())
+        for executable in ('driver', 'compensation'))]

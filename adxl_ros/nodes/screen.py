@@ -94,8 +94,13 @@ class Screen(Node):
         # A terminal that has hung up can be neither read nor drawn in.
         with held_output(), suppress(EOFError, OSError):
             application.run(begin, set_exception_handler=False, handle_sigint=False)
-        if not self._node_pid and self._is_fresh():
+        if self._node_pid or not self._received_s:
+            return
+        if self._is_fresh() and not self._contents.outcome:
             print(f'{self._target} goes on; show it again: ros2 run adxl_ros screen')
+        else:
+            # The screen is gone, and its last text with it.
+            print('\n'.join(self._contents.outcome or [self._contents.text]))
 
     async def _spin(self, executor: Executor) -> None:
         """Take messages until a signal comes, or the node that has started this screen ends."""

@@ -25,6 +25,7 @@ import subprocess
 from adxl_ros.files import parameter_file
 from processes import Started, wait_until
 import pytest
+from terminal import Terminal
 from units import NOMINAL, nominal
 
 pytestmark = pytest.mark.skipif(shutil.which('ros2') is None, reason='ros2 is not installed')
@@ -57,6 +58,8 @@ def launch(ros_env: dict[str, str], tmp_path: Path) -> Iterator[Callable[..., St
     ('robot', 'link_type:=seral', '"seral" is not valid'),
     ('robot', 'link_baud:=fast', 'link_baud:=fast: expected a whole number'),
     ('robot', 'log_level:=loud', '"loud" is not valid'),
+    ('calibrate', 'screen:=maybe', '"maybe" is not valid'),
+    ('robot', 'mounting_xyz_m:=0.1', 'mounting_xyz_m:=0.1: expected three numbers'),
     ('calibrate', 'sweep_planes_deg:=flat', 'sweep_planes_deg:=flat: expected numbers'),
     ('calibrate', 'link_type:=serial', 'link_type is serial, but the stage would be simulated'),
     ('calibrate', 'params_file:=serial.yaml', 'link_type is serial, but the stage would be')])
@@ -65,7 +68,8 @@ def test_a_launch_refuses_bad_arguments(launch, tmp_path, name, argument, words)
     (tmp_path / 'other.yaml').write_text(text.replace('/**:', 'other:'))
     parameter_file.save(tmp_path / 'serial.yaml',
                         nominal(serial='17', link={'type': 'serial', 'port': '/dev/ttyACM0'}))
-    launched = launch(name, argument)
+    frame = ['base_frame:=base_link'] if 'mounting' in argument else []
+    launched = launch(name, argument, *frame)
     assert launched.wait() == 1
     assert words in launched.output()
     assert 'Traceback' not in launched.output()
@@ -115,3 +119,16 @@ def test_the_launch_of_a_calibration_ends_with_it(launch, tmp_path, output, stat
         assert parameter_file.load(tmp_path / output).model != 'nominal'
     else:
         assert 'calibration-3 has ended with the status 1' in launched.output()
+
+
+def test_a_launch_shows_the_screen_in_its_terminal(ros_env, tmp_path):
+    """The screen stands alone on the terminal; its last lines remain there after the launch."""
+    seen = Terminal([shutil.which('ros2'), 'launch', 'adxl_ros', 'calibrate.launch.py',
+                     'output:=unit.yaml', 'screen:=true', 'speed:=20',
+                     'sweep_planes_deg:=30,60,90', 'sweep_step_deg:=60', 'sweep_dwell_s:=1',
+                     'sweep_check_poses:=3'], ros_env, tmp_path)
+    seen.wait_for('r  redo', 'zero-g')
+    assert 'INFO' not in '\n'.join(seen.screen.display[2:-4])
+    assert seen.popen.wait(120) == 0
+    assert parameter_file.load(tmp_path / 'unit.yaml').model != 'nominal'
+    seen.wait_for('robot.launch.py params_file:=unit.yaml')

@@ -118,6 +118,18 @@ LINK = (
 """Arguments of the link."""
 
 
+TRANSFORM = (
+    DeclareLaunchArgument('base_frame', default_value='', description='frame of the robot, such '
+                          'as base_link, of which the static transform to frame_id is published; '
+                          'empty: none'),
+    DeclareLaunchArgument('mounting_xyz_m', default_value='0,0,0',
+                          description='place of the case in base_frame, m'),
+    DeclareLaunchArgument('mounting_rpy_rad', default_value='0,0,0',
+                          description='roll, pitch and yaw of the case in base_frame, rad'),
+)
+"""Arguments of the static transform."""
+
+
 def common_arguments() -> list[DeclareLaunchArgument]:
     """Return the arguments that all launch files have."""
     return [
@@ -171,9 +183,44 @@ def make_node(context: LaunchContext, executable: str, overrides: Mapping[str, A
     node = '' if namespace.strip('/') else f'{executable}:'
     rules = [part for key, value in given.items() for part in (
         '-p', f'{node}{key}:={json.dumps(value, ensure_ascii=False)}')]
-    return Node(package='adxl_ros', executable=executable, namespace=namespace, output='screen',
+    options.setdefault('output', 'screen')
+    return Node(package='adxl_ros', executable=executable, namespace=namespace,
                 ros_arguments=['--log-level', text(context, 'log_level'),
                                *(['--params-file', path] if is_named else []), *rules], **options)
+
+
+def static_transform(context: LaunchContext) -> list[Action]:
+    """
+    Publish where the case is on the robot, if the launch names the frame of the robot.
+
+    Parameters
+    ----------
+    context
+        The launch, with the arguments of `TRANSFORM`.
+
+    Returns
+    -------
+    list
+        The publisher of tf2_ros; nothing without `base_frame`.
+
+    """
+    base_frame = text(context, 'base_frame')
+    if not base_frame:
+        return []
+    values = [*_three_numbers(context, 'mounting_xyz_m'),
+              *_three_numbers(context, 'mounting_rpy_rad')]
+    options = zip(('x', 'y', 'z', 'roll', 'pitch', 'yaw'), values)
+    return [Node(package='tf2_ros', executable='static_transform_publisher', arguments=[
+        *(part for name, value in options for part in (f'--{name}', repr(value))),
+        '--frame-id', base_frame, '--child-frame-id', text(context, 'frame_id')])]
+
+
+def _three_numbers(context: LaunchContext, name: str) -> list[float]:
+    given = text(context, name)
+    values: list[float] = Argument(name, '', '', list).value(given)
+    if len(values) != 3:
+        raise UserError(f'{name}:={given}: expected three numbers')
+    return values
 
 
 def text(context: LaunchContext, name: str) -> str:
