@@ -80,7 +80,7 @@ def test_a_screen_drives_the_sweep_of_a_node_without_a_terminal(start, screen, t
     text = seen.wait_for('poses are open; press f again')
     seen.press('f')
     # The acceptance of the fit stands in the place of the coefficients.
-    seen.wait_for('wrote unit.yaml', 'linear: datasheet', timeout_s=60.0)
+    seen.wait_for('wrote unit.yaml', 'held out: tilt', timeout_s=60.0)
     assert parameter_file.load(tmp_path / 'unit.yaml').serial == 'T1'
     seen.press('q')
     assert seen.popen.wait(20) == 0
