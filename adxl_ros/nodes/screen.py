@@ -33,7 +33,7 @@ from adxl_ros.nodes.terminal.draw import draw, Line, LogLine
 from adxl_ros.nodes.terminal.full_screen import full_screen
 from rcl_interfaces.msg import Log
 import rclpy
-from rclpy.executors import Executor, ExternalShutdownException
+from rclpy.executors import Executor
 from rclpy.node import Node
 from rclpy.task import Future
 from std_msgs.msg import String
@@ -94,13 +94,13 @@ class Screen(Node):
         # A terminal that has hung up can be neither read nor drawn in.
         with held_output(), suppress(EOFError, OSError):
             application.run(begin, set_exception_handler=False, handle_sigint=False)
-        if self._node_pid or not self._received_s:
+        if self._node_pid:
             return
-        if self._is_fresh() and not self._contents.outcome:
+        if self._contents.outcome:
+            # The screen is gone, and its last lines with it.
+            print(f'{self._contents.outcome[0]}\n{self._contents.text}')
+        elif rclpy.ok() and self._is_fresh():
             print(f'{self._target} goes on; show it again: ros2 run adxl_ros screen')
-        else:
-            # The screen is gone, and its last text with it.
-            print('\n'.join(self._contents.outcome or [self._contents.text]))
 
     async def _spin(self, executor: Executor) -> None:
         """Take messages until a signal comes, or the node that has started this screen ends."""
@@ -108,8 +108,10 @@ class Screen(Node):
             while self._node_pid in (0, os.getppid()):
                 executor.spin_once(timeout_sec=0.0)
                 await asyncio.sleep(_SPIN_S)
-        except ExternalShutdownException:
-            pass
+        except Exception:
+            # A signal makes rclpy's calls fail in several ways.
+            if rclpy.ok():
+                raise
         finally:
             if self._application.is_running and not self._application.is_done:
                 self._application.exit()
@@ -139,7 +141,7 @@ class Screen(Node):
             not is_silent or self._contents.phase == 'fit')
 
     def _is_there(self) -> bool:
-        return self.count_publishers(f'{self._target}/display') > 0
+        return rclpy.ok() and self.count_publishers(f'{self._target}/display') > 0
 
     def _press(self, key: str) -> None:
         """Call the service of a key; the space captures, `finish` may need a second key."""
