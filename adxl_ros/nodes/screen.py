@@ -96,11 +96,11 @@ class Screen(Node):
             application.run(begin, set_exception_handler=False, handle_sigint=False)
         if self._node_pid:
             return
-        if self._contents.outcome:
+        if self._is_fresh():
+            print(f'{self._target} goes on; show it again: ros2 run adxl_ros screen')
+        elif self._contents.outcome:
             # The screen is gone, and its last lines with it.
             print(f'{self._contents.outcome[0]}\n{self._contents.text}')
-        elif rclpy.ok() and self._is_fresh():
-            print(f'{self._target} goes on; show it again: ros2 run adxl_ros screen')
 
     async def _spin(self, executor: Executor) -> None:
         """Take messages until a signal comes, or the node that has started this screen ends."""

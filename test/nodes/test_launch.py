@@ -127,8 +127,8 @@ def test_a_launch_shows_the_screen_in_its_terminal(ros_env, tmp_path):
                      'output:=unit.yaml', 'screen:=true', 'speed:=20',
                      'sweep_planes_deg:=30,60,90', 'sweep_step_deg:=60', 'sweep_dwell_s:=1',
                      'sweep_check_poses:=3'], ros_env, tmp_path)
-    seen.wait_for('r  redo', 'zero-g')
-    assert 'INFO' not in '\n'.join(seen.screen.display[2:-4])
+    seen.wait_for('redo', timeout_s=60)
+    assert '[INFO]' not in seen.text()
     assert seen.popen.wait(120) == 0
     assert parameter_file.load(tmp_path / 'unit.yaml').model != 'nominal'
     seen.wait_for('wrote unit.yaml')
