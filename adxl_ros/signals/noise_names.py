@@ -56,7 +56,9 @@ class Setting:
 
 
 def _yaml_number(value: float) -> str:
-    """Return three digits as YAML reads a floating-point number: 4.0e-05, not 4e-05."""
+    """Return a value as YAML reads a floating-point number: 4.0e-05, not 4e-05."""
+    if value >= 1:
+        return repr(float(f'{value:.6g}'))
     mantissa, e, exponent = f'{value:.3g}'.partition('e')
     return f'{mantissa if "." in mantissa else f"{mantissa}.0"}{e}{exponent}'
 

@@ -221,9 +221,9 @@ def examine(blocks: Iterable[Recording], accel_mps2: Callable[[Recording], np.nd
     rests.close()
     span_s = stamps.last_s - stamps.first_s
     return RecordingContents(
-        block.path, stamps.count, span_s, 1 / stamps.period_s, stamps.jitter_s, stamps.burst,
-        stamps.missing, stamps.gaps, stamps.longest_gap_s,
-        block.bad_stamps, values.axes(), values.held_s,
+        block.path, stamps.count, span_s, round(1 / stamps.period_s, 6), stamps.jitter_s,
+        stamps.burst, stamps.missing, stamps.gaps, stamps.longest_gap_s, block.bad_stamps,
+        values.axes(), values.held_s,
         min(sum(rests.spans_s) / span_s, 1.0), max(rests.spans_s, default=0.0),
         len(rests.spans_s), len(rests.poses_mps2), rests.length_g, references, delay,
         block.remarks, block.cut)

@@ -48,8 +48,6 @@ _UNITS = {'white': 'm/s^2/sqrt(Hz)', 'instability': 'm/s^2', 'walk': 'm/s^2/sqrt
 
 def duration(seconds: float) -> str:
     """Return a time with two units at most, for people."""
-    if not np.isfinite(seconds):
-        return 'more than a year'
     seconds = round(seconds, 3)
     for unit_s, unit, smaller_s, smaller in ((86400, 'd', 3600, 'h'), (3600, 'h', 60, 'min')):
         if round(seconds) >= unit_s:
@@ -128,10 +126,8 @@ def warnings(result: RecordingNoise) -> list[str]:
     for noise in result.axes:
         if noise.drift is not None:
             texts.append(_drift_text(rest, noise, noise.drift))
-        texts += [f'{noise.axis}: from {octave.low_hz:.3g} to {octave.high_hz:.3g} Hz the power '
-                  f'is {octave.ratio:.3g} times that of N, B and K. Look for a fan, mains or a '
-                  'person nearby.' for octave in noise.fit.octaves
-                  if abs(np.log(octave.ratio)) > np.log(_LARGEST_RATIO)]
+        else:
+            texts += _unexplained(noise)
         if noise.sample_std < noise.resolution / 2:
             texts.append(f'{noise.axis}: samples change in steps of '
                          f'{noise.resolution * MICRO_G:.3g} µg, which exceed the noise. N, B and '
@@ -158,30 +154,54 @@ def _too_short(result: RecordingNoise) -> list[str]:
         needed_s = {noise.axis: noise.needed_s[name] for noise in result.axes
                     if name in noise.needed_s}
         if needed_s:
+            longest_s = max(needed_s.values())
+            further = 'To see half of the limit above, record about ' \
+                f'{duration(_two_digits(longest_s))}.' if np.isfinite(longest_s) else \
+                'The other terms hide it, in longer recordings, too.'
             texts.append(f'{duration(result.rest.span_s)} is too short to see the {NAMES[name]} '
-                         f'of {", ".join(needed_s)}. To see half of the limit above, record '
-                         f'about {duration(_two_digits(max(needed_s.values())))}.')
+                         f'of {", ".join(needed_s)}. {further}')
     return texts
 
 
 def _two_digits(seconds: float) -> float:
     """Round a time to two digits of its unit."""
     unit_s = next((unit_s for unit_s in (86400.0, 3600.0, 60.0) if seconds >= 2 * unit_s), 1.0)
-    return float(f'{seconds / unit_s:.2g}') * unit_s if np.isfinite(seconds) else seconds
+    return float(f'{seconds / unit_s:.2g}') * unit_s
+
+
+def _unexplained(noise: AxisNoise) -> list[str]:
+    """Return at which frequencies N, B and K do not describe the noise."""
+    texts = []
+    octaves = [octave for octave in noise.fit.octaves
+               if abs(np.log(octave.ratio)) > np.log(_LARGEST_RATIO)]
+    for is_excess, advice in ((True, 'Look for a fan, mains or a person nearby.'),
+                              (False, 'The noise is none of these three there.')):
+        part = [octave for octave in octaves if (octave.ratio > 1) == is_excess]
+        if part:
+            ratio = max(part, key=lambda octave: abs(np.log(octave.ratio))).ratio
+            texts.append(f'{noise.axis}: from {part[0].low_hz:.3g} to {part[-1].high_hz:.3g} Hz '
+                         f'the power is {"up" if is_excess else "down"} to {ratio:.2g} times that '
+                         f'of N, B and K. {advice}')
+    return texts
+
+
+def _micro_or_milli_g(size_mps2: float, unit: str) -> str:
+    """Return a drift with its sign in µg or mg."""
+    size = size_mps2 * MICRO_G
+    return f'{size:+.3g} µg{unit}' if abs(size) < 1000 else f'{size / 1000:+.3g} mg{unit}'
 
 
 def _drift_text(rest: StillStretch, noise: AxisNoise, drift: Drift) -> str:
     """Return what the axis follows, and the random walk without it."""
-    size = drift.size * MICRO_G
     if drift.kind is DriftKind.TEMPERATURE:
         assert rest.temperature_c is not None
-        text = (f'follows the temperature by {size:+.3g} µg/K '
+        text = (f'follows the temperature by {_micro_or_milli_g(drift.size, "/K")} '
                 f'({np.ptp(rest.temperature_c):.2g} K in all)')
     elif drift.kind is DriftKind.TREND:
-        text = f'drifts by {size * 3600:+.3g} µg/h throughout'
+        text = f'drifts by {_micro_or_milli_g(3600 * drift.size, "/h")} throughout'
     else:
         at_s = rest.start_s + drift.cell * rest.step_s
-        text = f'has a step of {size:+.3g} µg at {at_s:.6g} s'
+        text = f'has a step of {_micro_or_milli_g(drift.size, "")} at {at_s:.6g} s'
     without = [interval(estimate.scaled(MICRO_G))
                for estimate in (drift.without.instability, drift.without.walk)]
     return (f'{noise.axis}: {text}. B and K contain this drift. Without it B is {without[0]} µg, '

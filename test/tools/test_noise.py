@@ -126,6 +126,15 @@ def test_motion_is_left_out_and_named(tmp_path: Path) -> None:
     assert any('not still' in text for text in result['warnings'])
 
 
+def test_a_tone_is_one_warning(tmp_path: Path) -> None:
+    time_s, accel = samples(900.0, terms=(N, 0.0, 0.0))
+    accel[:, 0] += 5e-3 * np.sin(2 * np.pi * 0.3 * time_s)
+    write_csv(tmp_path / 'fan.csv', time_s, accel)
+    tones = [text for text in as_json(tmp_path, 'fan.csv')['warnings'] if 'the power is' in text]
+    assert len(tones) == 1
+    assert tones[0].startswith('x: from 0.')
+
+
 def test_temperature_is_named(tmp_path: Path) -> None:
     time_s, accel = samples(1800.0, terms=(N, 0.0, 0.0))
     temperature_c = 25 + 4 * (1 - np.exp(-time_s / 600))
