@@ -163,7 +163,8 @@ def with_noise(sensor: Sensor, noises: list[AxisNoise]) -> Sensor:
 
     Where the filter is not stated, it is the first-order one that gives a sample the measured
     noise: white noise of the density 2·N² over positive frequencies has the variance N²/(2·RC)
-    behind it.
+    behind it. A rest shows neither range nor resolution: where they are not stated, the
+    placeholders of `Sensor` stay, which limit and round nothing.
 
     Parameters
     ----------
@@ -193,8 +194,7 @@ def with_noise(sensor: Sensor, noises: list[AxisNoise]) -> Sensor:
     if 'rc_capacitance_f' in sensor.unstated:
         changed |= {'rc_resistance_ohm': _FILTER_OHM,
                     'rc_capacitance_f': _filter_s(noises, sensor.rate_hz) / _FILTER_OHM}
-    unstated = tuple(name for name in sensor.unstated if name not in changed)
-    return replace(sensor, unstated=unstated, **changed)
+    return replace(sensor, unstated=(), **changed)
 
 
 def _filter_s(noises: list[AxisNoise], rate_hz: float) -> float:

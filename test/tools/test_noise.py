@@ -14,6 +14,7 @@
 
 """The tool `noise`: its figures, its files, and recordings that are too short or not still."""
 
+from collections.abc import Callable
 import json
 from pathlib import Path
 import subprocess
@@ -21,7 +22,7 @@ import subprocess
 from adxl_ros.files import parameter_file
 import allantools
 import numpy as np
-from processes import run_executable
+from processes import run_executable, Started
 import pytest
 from still_noise import still_samples, write_csv
 import yaml
@@ -73,14 +74,14 @@ def test_terms_curve_files_and_settings(tmp_path: Path) -> None:
     assert variances[4] == pytest.approx(N ** 2 * RATE_HZ, rel=0.1)
     assert {path.name for path in (tmp_path / 'page').iterdir()} == {
         'report.html', 'allan.png', 'allan.csv'}
-    sensor = parameter_file.load(tmp_path / 'noise.yaml', may_measure=True)
+    sensor = parameter_file.load(tmp_path / 'noise.yaml')
     assert sensor.axes == 'xyz'
     assert sensor.noise_density_g_per_rthz == pytest.approx(np.full(3, np.sqrt(2) * N / G),
                                                             rel=0.03)
     assert 'flicker' in sensor.effects
     # Nothing of the nominal sensor is in the file: a rest shows neither range nor resolution.
     assert (sensor.rc_s, sensor.rate_hz) == (0.0, RATE_HZ)
-    assert set(sensor.unstated) == {'range_g', 'adc_bits', 'adc_vref_v'}
+    assert (sensor.range_g, sensor.adc_bits) == (1000.0, 0)
 
 
 def test_diagnose_takes_the_measured_noise(tmp_path: Path) -> None:
@@ -91,6 +92,14 @@ def test_diagnose_takes_the_measured_noise(tmp_path: Path) -> None:
     report = json.loads((tmp_path / 'gap' / 'report.json').read_text())
     assert report['verdict']['effects'] == []
     assert report['gap']['before'] == pytest.approx(report['gap']['floor'], rel=0.05)
+
+
+def test_compensation_takes_the_file(tmp_path: Path, start: Callable[..., Started]) -> None:
+    write_csv(tmp_path / 'still.csv', *samples(60.0))
+    run(tmp_path, 'still.csv', '-o', 'noise.yaml')
+    path = tmp_path / 'noise.yaml'
+    start('compensation', '--ros-args', '-p', f'calibration:={path}').wait_for(
+        f'compensating by {path}')
 
 
 def test_the_lines_to_paste_are_yaml(tmp_path: Path) -> None:
