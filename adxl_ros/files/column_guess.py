@@ -74,6 +74,9 @@ _CONSTANT = 0.3
 """Largest relative scatter of a length that is that of gravity (chosen: a hand that turns a
 sensor makes less)."""
 
+_LARGEST = 1e30
+"""Larger magnitudes are no readings and no stamps."""
+
 _SPHERE_ROWS = 20
 """Smallest number of rows to which a sphere is fitted."""
 
@@ -127,10 +130,13 @@ def _shell_quoted(text: str) -> str:
 
 def propose(table: Table) -> Proposal | None:
     """Return the best mapping of a table; None where no column looks like a sensor's."""
-    values = table.sample()
+    values = {name: np.where(np.abs(column) < _LARGEST, column, np.nan)
+              for name, column in table.sample().items()}
     time = _time_column(table, values)
     outputs = _outputs(table, {name: column for name, column in values.items() if name != time})
-    if not outputs:
+    readings = np.column_stack([values[name] for name in outputs]) if outputs else np.zeros((0, 1))
+    readings = readings[np.isfinite(readings).all(axis=1)]
+    if not len(readings):
         return None
     sources: dict[str, Source] = {}
     reasons = []
@@ -138,9 +144,9 @@ def propose(table: Table) -> Proposal | None:
         unit, reason = _time_unit(table, time, values[time])
         sources['time'] = Source(time, unit)
         reasons.append(reason)
-    zero, length = _zero_and_length(np.column_stack([values[name] for name in outputs]))
+    zero, length = _zero_and_length(readings)
     stated = table.units.get(outputs[0]) or unit_in_name(outputs[0], Quantity.OUTPUT)
-    unit = stated or likely_unit(length) or _count_or_volts(length)
+    unit = stated or ('' if zero else likely_unit(length)) or _count_or_volts(zero or length)
     sources |= {axis: Source(name, unit) for axis, name in zip(AXES, outputs)}
     about = f' about {zero:.0f}' * (zero != 0)
     reasons.append(f'the readings have a length of {length:.4g}{about}'
@@ -262,9 +268,9 @@ def _by_length(values: Mapping[str, np.ndarray]) -> list[str]:
         if names.index(triple[2]) - names.index(triple[0]) > 2:
             continue
         data = np.column_stack([values[name] for name in triple])
-        length = np.linalg.norm(data, axis=1)
-        median = np.nanmedian(length)
-        spread = float(np.nanmedian(np.abs(length - median)) / median) if median > 0 else np.inf
+        length = np.linalg.norm(data[np.isfinite(data).all(axis=1)], axis=1)
+        median = np.median(length) if len(length) else 0.0
+        spread = float(np.median(np.abs(length - median)) / median) if median > 0 else np.inf
         # Counts about an offset also have a constant length, as has a unit quaternion.
         unit_fits = bool(likely_unit(float(median)))
         best = min(best, (spread + 0.1 * (not unit_fits), list(triple)))
@@ -277,7 +283,6 @@ def _zero_and_length(readings: np.ndarray) -> tuple[float, float]:
 
     The zero is 0 where an axis reads on both sides of it, or where the readings do not turn.
     """
-    readings = readings[np.isfinite(readings).all(axis=1)]
     length = float(np.median(np.linalg.norm(readings, axis=1)))
     spread = np.ptp(readings, axis=0)
     if len(readings) < _SPHERE_ROWS or readings.shape[1] < len(AXES) or \

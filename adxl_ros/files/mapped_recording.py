@@ -245,10 +245,9 @@ class _Converter:
         self._check_outputs(block, outputs, is_sample)
         time_s, is_kept = self._times(block, is_sample)
         columns = dict(zip(self._output_names(), outputs[is_kept].T.copy()))
-        references = {role: self._values(block, role)[is_kept] for role in self.columns
+        references = {role: self._reference(block, role)[is_kept] for role in self.columns
                       if role != 'time' and role not in AXES}
         columns.update(self._references(references))
-        self._check_references(block, columns, np.flatnonzero(is_kept))
         if is_first and is_kept.any():
             self._begin_remarks(outputs[is_kept], time_s[is_kept])
         self._count += int(is_kept.sum())
@@ -258,10 +257,16 @@ class _Converter:
                          remarks=(*self._remarks, *self._counts()),
                          bad_stamps=BadStamps(self._duplicates, self._backward))
 
-    def _values(self, block: TableBlock, role: str) -> np.ndarray:
-        """Return a column in the unit of the package, (n,)."""
+    def _reference(self, block: TableBlock, role: str) -> np.ndarray:
+        """Return a reference in the unit of the package, (n,); NaN where it was not sampled."""
         column = self.columns[role]
-        return column.unit.convert(block.columns[column.name])
+        values = block.columns[column.name]
+        wrong = np.abs(values) > LIMIT
+        if wrong.any():
+            row = int(wrong.argmax())
+            raise UserError(f'{block.where(row, column.name)} is {values[row]:g}, no {role}; '
+                            'delete the line')
+        return column.unit.convert(values)
 
     def _outputs(self, block: TableBlock) -> np.ndarray:
         """Return the output of the sensor, (n, m), V or m/s²."""
@@ -370,19 +375,6 @@ class _Converter:
         if sampled.any():
             self._last_beta_rad = float(turned[sampled][-1])
         return turned
-
-    def _check_references(self, block: TableBlock, columns: Mapping[str, np.ndarray],
-                          rows: np.ndarray) -> None:
-        """Refuse a reference that is too large; an empty one was not sampled."""
-        for name, values in columns.items():
-            wrong = np.abs(values) > LIMIT
-            if wrong.any():
-                role = next(role for role in ROLES if name.startswith(role)
-                            and role in self.columns)
-                column = self.columns[role]
-                row = int(rows[wrong.argmax()])
-                raise UserError(f'{block.where(row, column.name)} is '
-                                f'{block.columns[column.name][row]:g}, no {role}; delete the line')
 
     def _begin_remarks(self, outputs: np.ndarray, time_s: np.ndarray) -> None:
         """Note what is assumed, and what the first stamps show."""
