@@ -24,7 +24,28 @@ class UserError(Exception):
 
     The message names the file, line and column, or the topic, the wrong value, and what to do.
     Tools print it and exit with status 1. Nodes log it and show it in diagnostics.
+
+    Attributes
+    ----------
+    paste
+        End of the message that is for a command line, quoted for a shell; empty for none.
+
     """
+
+    def __init__(self, message: str = '', paste: str = '') -> None:
+        """
+        Take the message.
+
+        Parameters
+        ----------
+        message
+            What is wrong, and what to do.
+        paste
+            What follows it, for a command line.
+
+        """
+        super().__init__(f'{message} {paste}' if paste else message)
+        self.paste = paste
 
 
 def install_hint(*requirements: str) -> str:

@@ -157,9 +157,9 @@ def propose(table: Table) -> Proposal | None:
                     time is None)
 
 
-def describe(table: Table, is_listed: bool = False) -> str:
+def describe(table: Table, is_listed: bool = False) -> tuple[str, str]:
     """
-    Return the columns of a table, and the best guess with its options, in one line.
+    Describe the columns of a table, and the options that most likely read it.
 
     Parameters
     ----------
@@ -170,19 +170,21 @@ def describe(table: Table, is_listed: bool = False) -> str:
 
     Returns
     -------
-    str
+    text : str
         Clauses for a message.
+    options : str
+        What follows them, quoted for a shell.
 
     """
     form = f' ({table.form})' if table.form else ''
     seen = '' if is_listed and not form else f'the columns are {listed(table.names)}{form}; '
     proposal = propose(table)
     if proposal is None:
-        return f'{seen}none looks like an accelerometer: name the columns, for example ' \
-               "--columns 'time=COLUMN:s,x=COLUMN:g,y=COLUMN:g,z=COLUMN:g'"
+        return f'{seen}none looks like an accelerometer: name the columns, for example', \
+            "--columns 'time=COLUMN:s,x=COLUMN:g,y=COLUMN:g,z=COLUMN:g'"
     reasons = ' and '.join(proposal.reasons)
     rate = ' (write the sample rate for HZ)' * proposal.needs_rate
-    return f'{seen}the best guess, because {reasons}{rate}: {proposal.options()}'
+    return f'{seen}the best guess, because {reasons}{rate}:', proposal.options()
 
 
 def _time_column(table: Table, values: Mapping[str, np.ndarray]) -> str | None:

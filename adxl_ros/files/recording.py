@@ -124,7 +124,8 @@ def _blocks(path: str | os.PathLike, rows: int, reading: ReadingOptions
     table = open_table(path, reading.topic)
     mapping = reading.mapping or _mapping_of(table)
     if mapping is None:
-        raise UserError(f'{path}: {describe(table)}')
+        text, options = describe(table)
+        raise UserError(f'{path}: {text}', options)
     return mapped_recording.blocks(table, mapping, reading, rows)
 
 
@@ -140,16 +141,17 @@ def _native_blocks(path: str | os.PathLike, rows: int) -> Generator[Recording, N
     try:
         yield from csv_file.blocks(path, rows)
     except HeaderError as error:
-        raise UserError(f'{error}{_proposal(path, str(error))}') from None
+        raise _with_proposal(path, error) from None
 
 
-def _proposal(path: str | os.PathLike, error: str) -> str:
-    """Return the best mapping of a text table after an error; empty where it is no table."""
+def _with_proposal(path: str | os.PathLike, error: HeaderError) -> UserError:
+    """Add the best mapping to an error about the columns of a text table."""
     try:
         table = open_table(path)
     except UserError:
-        return ''
-    return f'; {describe(table, is_listed=", ".join(table.names[:2]) in error)}'
+        return error
+    text, options = describe(table, is_listed=', '.join(table.names[:2]) in str(error))
+    return UserError(f'{error}; {text}', options)
 
 
 def read_ideal(path: str | os.PathLike, epoch_ns: int = 0) -> tuple[np.ndarray, np.ndarray]:

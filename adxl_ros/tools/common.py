@@ -65,7 +65,7 @@ def run(parser: argparse.ArgumentParser, command: Callable[[argparse.Namespace],
         finally:
             sys.stdout.flush()
     except UserError as error:
-        note(f'{parser.prog}: {" ".join(str(error).split())}')
+        note(f'{parser.prog}: {" ".join(str(error).split())}', error.paste)
         return 1
     except KeyboardInterrupt:
         note(f'{parser.prog}: interrupted; nothing was written')
@@ -77,11 +77,22 @@ def run(parser: argparse.ArgumentParser, command: Callable[[argparse.Namespace],
     return status
 
 
-def note(text: str) -> None:
-    """Print a message on stderr: one line, which a terminal gets wrapped between words."""
+def note(text: str, paste: str = '') -> None:
+    """
+    Print a message on stderr: one line, which a terminal gets wrapped between words.
+
+    Parameters
+    ----------
+    text
+        The message.
+    paste
+        Its end for a command line, which a terminal gets on a line of its own, as it is.
+
+    """
     if sys.stderr.isatty():
-        text = textwrap.fill(text, COLUMNS, subsequent_indent='  ', break_long_words=False,
-                             break_on_hyphens=False)
+        text = textwrap.fill(text.removesuffix(paste), COLUMNS, subsequent_indent='  ',
+                             break_long_words=False, break_on_hyphens=False)
+        text += f'\n{paste}' * bool(paste)
     print(text, file=sys.stderr)
 
 

@@ -14,6 +14,7 @@
 
 """Logs of other software, from the file as it came to a calibrated parameter file."""
 
+import os
 from pathlib import Path
 import shlex
 
@@ -22,7 +23,9 @@ from adxl_ros.model.constants import G0_MPS2
 from bags import bag_of, EPOCH_NS, imu
 from foreign_logs import BIAS_G, FORMS, lines, SCALE, text_with_angles, Turned, turned, ulog
 import numpy as np
+from processes import executable
 import pytest
+from terminal import Terminal
 from without_extras import run_without_extras
 
 XYZ_G = 'time=t:s,x=x:g,y=y:g,z=z:g'
@@ -125,7 +128,7 @@ def test_a_missing_library_is_named(tmp_path, name, package) -> None:
                               'except UserError as error:\n    print(error)\n',
                               str(tmp_path / name))
     assert done.returncode == 0, done.stderr
-    assert done.stdout.endswith(f': pip install {package}\n'), done.stdout
+    assert ' pip install ' in done.stdout and done.stdout.endswith(f' {package}\n'), done.stdout
 
 
 @pytest.mark.parametrize('names', ['angle;beta', 'roll;pitch'])
@@ -305,3 +308,16 @@ def test_bad_stamps_of_a_bag(run_tool, tmp_path) -> None:
     done = run_tool('fit', 'bag', '--rate', 100, '-o', 'unit.yaml')
     assert done.returncode == 0, done.stderr
     check_errors(tmp_path / 'unit.yaml')
+
+
+def test_a_terminal_gets_the_mapping_on_one_line(tmp_path) -> None:
+    """The message wraps between words; a name with blanks stays whole, so that it can be pasted."""
+    written(tmp_path, 'log.csv', FORMS['phyphox.csv'](LOG))
+    terminal = Terminal([executable('fit'), 'log.csv', '-o', 'unit.yaml'], dict(os.environ),
+                        tmp_path, columns=300)
+    try:
+        rows = terminal.wait_for('Acceleration z (m/s^2):mps2\'').splitlines()
+    finally:
+        terminal.close()
+    mapping = next(row for row in rows if row.startswith('--columns'))
+    assert shlex.split(mapping)[1].count('=') == 4

@@ -266,6 +266,7 @@ def _are_units(fields: Sequence[str]) -> bool:
 
 def _distinct(names: Sequence[str]) -> tuple[str, ...]:
     """Return names that are distinct: a name that is empty or stands twice gives its number."""
+    names = [' '.join(name.split()) for name in names]
     counts = Counter(names)
     return tuple(name if name and counts[name] == 1 else str(i + 1)
                  for i, name in enumerate(names))

@@ -20,7 +20,7 @@ from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from adxl_ros.errors import UserError
+from adxl_ros.errors import install_hint, UserError
 from adxl_ros.files.tables.base import BLOCK_ROWS, RowPlaces, TableBlock
 import numpy as np
 
@@ -109,8 +109,8 @@ def _opened(path: str) -> Any:
         import pyarrow
         import pyarrow.parquet
     except ImportError:
-        raise UserError(f'{path}: Parquet needs the Python package pyarrow: pip install pyarrow'
-                        ) from None
+        raise UserError(f'{path}: Parquet needs the Python package pyarrow: '
+                        f'{install_hint("pyarrow")}') from None
     try:
         return pyarrow.parquet.ParquetFile(path)
     except (OSError, pyarrow.ArrowException) as error:

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from adxl_ros.errors import UserError
+from adxl_ros.errors import install_hint, UserError
 from adxl_ros.files.tables.base import ArrayTable
 
 ENDINGS = ('.ulg',)
@@ -101,8 +101,8 @@ def _read(path: str) -> Any:
     try:
         from pyulog import ULog
     except ImportError:
-        raise UserError(f'{path}: logs of PX4 need the Python package pyulog: pip install pyulog'
-                        ) from None
+        raise UserError(f'{path}: logs of PX4 need the Python package pyulog: '
+                        f'{install_hint("pyulog")}') from None
     try:
         return ULog(path)
     except OSError as error:
