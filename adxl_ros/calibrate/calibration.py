@@ -249,7 +249,9 @@ def _calibrated(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str 
         referenced = [replace(recording, poses=recording.poses.subset(has_angles(recording.poses)))
                       for recording in recordings]
         result = _against_stage(sensor, referenced, model, effects, data_sha256)
-        return _with_lines(result, _without_angles_lines(poses))
+        lines = _without_angles_lines(poses)
+        return replace(result, report_lines=[*result.report_lines, *lines],
+                       warnings=(*result.warnings, *lines))
     if model not in (None, 'full'):
         raise UserError(f'{source}: the {model} model is fitted against stage angles (alpha_rad '
                         'and beta_rad), which are missing; leave --model out to calibrate a '
@@ -268,12 +270,6 @@ def _without_angles_lines(poses: Poses) -> list[str]:
     listed = ', '.join(f'{start_s:.1f}' for start_s in starts_s[:_LISTED_RESTS])
     further = ' ...' * (len(starts_s) > _LISTED_RESTS)
     return [f'rests without angles, left out: {len(starts_s)} (from {listed}{further} s)']
-
-
-def _with_lines(result: CalibrationResult, lines: list[str]) -> CalibrationResult:
-    """Add lines to the end of the reports of a calibration."""
-    return replace(result, report_lines=[*result.report_lines, *lines],
-                   summary_lines=[*result.summary_lines, *lines])
 
 
 @dataclass(frozen=True)

@@ -27,6 +27,9 @@ from typing import NamedTuple
 
 from adxl_ros.tools.command_line import COLUMNS
 
+_NO_BREAK = '\N{NO-BREAK SPACE}'
+"""A blank at which no line is wrapped."""
+
 _LABEL_COLUMNS = 8
 """Columns of the words before files and commands."""
 _STEP_COLUMNS = _LABEL_COLUMNS + 3
@@ -123,9 +126,12 @@ def _command_lines(text: str, start: str) -> list[str]:
         return []
     if len(start + text) <= COLUMNS:
         return [start + text]
-    *first, last = textwrap.wrap(text, COLUMNS - 2, initial_indent=start,
-                                 subsequent_indent=(len(start) + 2) * ' ',
-                                 break_long_words=False, break_on_hyphens=False)
+    # A line must not end within quotes.
+    whole = re.sub(r"'[^']*'", lambda quotes: quotes[0].replace(' ', _NO_BREAK), text)
+    lines = textwrap.wrap(whole, COLUMNS - 2, initial_indent=start,
+                          subsequent_indent=(len(start) + 2) * ' ',
+                          break_long_words=False, break_on_hyphens=False)
+    *first, last = [line.replace(_NO_BREAK, ' ') for line in lines]
     return [*(f'{line} \\' for line in first), last]
 
 

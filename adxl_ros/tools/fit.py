@@ -40,6 +40,7 @@ from adxl_ros.tools.recorded_sensor import BeyondRange, listed, load_sensor, mea
 from adxl_ros.tools.recording_options import (
     add_recording_options,
     reading_options,
+    reading_text,
     RECORDING_HELP,
 )
 
@@ -143,7 +144,8 @@ def fit(options: argparse.Namespace) -> int:
     report = [Path(options.report) / name for name in _REPORT_FILES] if options.report else []
     print_end([errors_in_words(result.fitted), '', *_result_lines(result), *measured, ''],
               [options.output, *report], command(
-        'apply', f'{quoted(options.recording[0])} --params {quoted(options.output)} -o tilt.csv'))
+        'apply', f'{quoted(options.recording[0])}{reading_text(options)} --params '
+        f'{quoted(options.output)} -o tilt.csv'))
     return 0
 
 

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import shlex
 
 from adxl_ros.errors import UserError
 from adxl_ros.files.column_mapping import parse_mapping, parse_mounting
@@ -81,6 +82,30 @@ def reading_options(options: argparse.Namespace) -> ReadingOptions:
         _counts('--lsb-per-g', options.lsb_per_g, True),
         _counts('--lsb-at-0g', options.lsb_at_0g, False), options.rate, options.drop_bad_stamps,
         parse_mounting(options.axes) if options.axes else None)
+
+
+def reading_text(options: argparse.Namespace) -> str:
+    """
+    Return the given options for a command line that reads the same recording.
+
+    Parameters
+    ----------
+    options
+        Parsed options of a parser with `add_recording_options`.
+
+    Returns
+    -------
+    str
+        A blank and the options, quoted for a shell; empty where none is given.
+
+    """
+    values = {'--topic': options.topic, '--columns': options.columns,
+              '--lsb-per-g': options.lsb_per_g, '--lsb-at-0g': options.lsb_at_0g,
+              '--rate': '' if options.rate is None else f'{options.rate:g}',
+              '--axes': options.axes}
+    words = [word for option, value in values.items() if value for word in (option, value)]
+    words += ['--drop-bad-stamps'] * options.drop_bad_stamps
+    return f' {shlex.join(words)}' if words else ''
 
 
 def _counts(option: str, text: str, is_positive: bool) -> tuple[float, ...]:

@@ -68,6 +68,9 @@ def test_two_commands_from_a_log_to_a_calibration(run_tool, tmp_path, name) -> N
     done = run_tool('fit', name, '-o', 'unit.yaml', *proposed(done.stderr))
     assert done.returncode == 0, done.stderr
     check_errors(tmp_path / 'unit.yaml')
+    following = shlex.split(done.stdout[done.stdout.index('ros2 run'):].replace('\\\n', ' '))
+    done = run_tool(*following[3:])
+    assert done.returncode == 0, done.stderr
 
 
 def test_the_proposal_is_never_used_in_silence(run_tool, tmp_path) -> None:
@@ -311,12 +314,12 @@ def test_bad_stamps_of_a_bag(run_tool, tmp_path) -> None:
 
 
 def test_a_terminal_gets_the_mapping_on_one_line(tmp_path) -> None:
-    """The message wraps between words; a name with blanks stays whole, so that it can be pasted."""
+    """The message wraps between words; a name with blanks stays whole, to be pasted."""
     written(tmp_path, 'log.csv', FORMS['phyphox.csv'](LOG))
     terminal = Terminal([executable('fit'), 'log.csv', '-o', 'unit.yaml'], dict(os.environ),
                         tmp_path, columns=300)
     try:
-        rows = terminal.wait_for('Acceleration z (m/s^2):mps2\'').splitlines()
+        rows = terminal.wait_for("Acceleration z (m/s^2):mps2'").splitlines()
     finally:
         terminal.close()
     mapping = next(row for row in rows if row.startswith('--columns'))
