@@ -127,8 +127,8 @@ def _command_lines(text: str, start: str) -> list[str]:
     if len(start + text) <= COLUMNS:
         return [start + text]
     # A line must not end within quotes.
-    whole = re.sub(r"'[^']*'", lambda quotes: quotes[0].replace(' ', _NO_BREAK), text)
-    lines = textwrap.wrap(whole, COLUMNS - 2, initial_indent=start,
+    text = re.sub(r"'[^']*'", lambda quotes: quotes[0].replace(' ', _NO_BREAK), text)
+    lines = textwrap.wrap(text, COLUMNS - 2, initial_indent=start,
                           subsequent_indent=(len(start) + 2) * ' ',
                           break_long_words=False, break_on_hyphens=False)
     *first, last = [line.replace(_NO_BREAK, ' ') for line in lines]
