@@ -91,9 +91,9 @@ class LogDelay:
     median_s
         Median, s.
     spread_s
-        Time from the 1st to the 99th percentile, s.
+        Time from the 1st to the 99th percentile without drift, s.
     drift_ppm
-        Its drift by time, 10⁻⁶.
+        Its drift by log time, 10⁻⁶.
 
     """
 
@@ -238,9 +238,9 @@ def log_delay(times_ns: Iterable[np.ndarray]) -> LogDelay | None:
     times = np.concatenate(parts)
     delay_s = (times[:, 1] - times[:, 0]) * 1e-9
     time_s = (times[:, 1] - times[0, 1]) * 1e-9
-    low_s, median_s, high_s = np.quantile(delay_s, [0.01, 0.5, 0.99])
-    drift = np.polyfit(time_s, delay_s, 1)[0] if np.ptp(time_s) > 0 else 0.0
-    return LogDelay(float(median_s), float(high_s - low_s), 1e6 * float(drift))
+    line = np.polyfit(time_s, delay_s, 1) if np.ptp(time_s) > 0 else np.zeros(2)
+    low_s, high_s = np.quantile(delay_s - np.polyval(line, time_s), [0.01, 0.99])
+    return LogDelay(float(np.median(delay_s)), float(high_s - low_s), 1e6 * float(line[0]))
 
 
 class _Stamps:

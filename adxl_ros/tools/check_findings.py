@@ -185,11 +185,12 @@ def _remarks(contents: RecordingContents) -> list[str]:
     delay = contents.delay
     if delay is not None and abs(delay.median_s) > _LARGEST_DELAY_S:
         order = 'after' if delay.median_s > 0 else 'before'
-        remarks.append(f'log time is {abs(delay.median_s):.3g} s {order} header time; the clocks '
-                       'of sensor and recorder differ')
+        remarks.append(f'log time is {duration(abs(delay.median_s))} {order} header time; the '
+                       'clocks of sensor and recorder differ')
     if delay is not None and abs(delay.drift_ppm) > _LARGEST_DRIFT_PPM:
-        remarks.append(f'the clock of the headers drifts by {delay.drift_ppm:+.0f} ppm against '
-                       'that of the recorder')
+        ratio = 1 - 1e-6 * delay.drift_ppm
+        remarks.append(f'header time runs {ratio:.6g} times as fast as log time; the headers have '
+                       'simulated time, or a clock of their own')
     return remarks
 
 

@@ -55,6 +55,8 @@ def lines(results: list[Findings]) -> list[str]:
 
 def verdict(results: list[Findings]) -> str:
     """Return how many recordings are sound."""
+    if len(results) == 1:
+        return f'The recording is {"" if results[0].is_sound else "not "}sound.'
     count = sum(result.is_sound for result in results)
     return f'{count} of {len(results)} recordings ' + ('is sound.' if count == 1 else 'are sound.')
 
@@ -111,7 +113,9 @@ def values(contents: RecordingContents) -> list[str]:
 
 
 def _milliseconds(seconds: float) -> str:
-    """Return a short time."""
+    """Return a time that is mostly short."""
+    if abs(seconds) >= 1:
+        return f'{seconds:.4g} s'
     return f'{1e3 * seconds:.3g} ms' if abs(seconds) >= 1e-6 else '< 0.001 ms'
 
 
@@ -124,6 +128,6 @@ def page(results: list[Findings]) -> str:
             for result in results]
     recordings = [{'path': result.path, 'entries': _entries(result)} for result in results]
     return html_page.render('adxl_ros.tools', 'check.html', {
-        'title': 'Check of recordings', 'about': [f'{len(results)} recordings'], 'badge': badge,
+        'title': 'Check of recordings', 'about': [], 'badge': badge,
         'figures': {}, 'columns': ('recording', *_HEAD, 'verdict'), 'rows': rows,
         'recordings': recordings})

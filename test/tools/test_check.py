@@ -175,6 +175,12 @@ def test_log_time_against_header_time(tmp_path: Path) -> None:
     assert result['contents']['delay']['spread_s'] < 1e-3
     assert result['sound']
     assert any('log time is 0.25 s after header time' in text for text in result['remarks'])
+    simulated = [replace(item, log_ns=item.stamp_ns + 4 * 10 ** 7 * i)
+                 for i, item in enumerate(sent)]
+    bag_of(tmp_path / 'simulated', simulated)
+    result = checked(tmp_path, 'simulated')
+    assert result['sound']
+    assert any('header time runs 0.2 times as fast' in text for text in result['remarks'])
     jumped = [replace(item, log_ns=item.stamp_ns + (5 * 10 ** 9 if i > 500 else 0))
               for i, item in enumerate(sent)]
     bag_of(tmp_path / 'jumped', jumped)
