@@ -235,7 +235,8 @@ def calibrate(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str | 
     """
     result = _calibrated(sensor, recordings, model, effects, data_sha256)
     lines = unit_errors.turn_on_lines(result.fitted, [item.poses for item in recordings])
-    return replace(result, report_lines=[*result.report_lines, *lines],
+    return replace(result, warnings=(*result.warnings, *lines),
+                   report_lines=[*result.report_lines, *lines],
                    summary_lines=[*result.summary_lines, *lines])
 
 
@@ -391,7 +392,7 @@ def _fit_affine(sensor: Sensor, recordings: Sequence[RecordedPoses]) -> _StageFi
         return term_selection.fit_affine(sensor, poses).fitted
 
     return _StageFit(full.fitted, refit, [*lines, *full_fit_text.report_lines(full, poses, [])],
-                     full=full)
+                     warnings=[*lines, *full_fit_text.warnings(full, poses)], full=full)
 
 
 def _fit(model: str, sensor: Sensor, recordings: Sequence[RecordedPoses], effects: Sequence[str]
