@@ -49,8 +49,8 @@ def test_a_recording_is_simulated_and_fitted(tmp_path) -> None:
     assert simulated.returncode == 0
     fitted = run_executable('fit', 'sweep.csv', '-o', 'unit.yaml', '--store', '', cwd=tmp_path)
     assert fitted.returncode == 0
-    assert 'scale factor' in fitted.stdout
-    assert (tmp_path / 'unit.yaml').is_file()
+    assert 'full model' in fitted.stdout
+    assert '#   scale factor ' in (tmp_path / 'unit.yaml').read_text()
 
 
 def test_a_reader_that_closes_the_pipe_causes_no_traceback(tmp_path) -> None:
