@@ -91,7 +91,7 @@ def listed(measured: list[str]) -> list[str]:
     """Return the lines of `measure_unstated` below a heading; none where nothing is measured."""
     if not measured:
         return []
-    return ['Measured, as no parameter file states it:', *(f'  {line}' for line in measured)]
+    return ['', 'Measured, as no parameter file states it:', *(f'  {line}' for line in measured)]
 
 
 class BeyondRange:

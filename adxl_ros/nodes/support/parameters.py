@@ -71,7 +71,7 @@ def declare(node: Node, name: str, default: Any, description: str, unit: str = '
     text_or_list = isinstance(default, tuple)
     if text_or_list:
         default = ''
-    constraint = '' if lower is None else f'{lower:g} to {upper:g}'
+    constraint = '' if lower is None else f'{lower:.10g} to {upper:.10g}'
     if choices:
         constraint = f'one of {", ".join(choices)}'
     descriptor = ParameterDescriptor(
