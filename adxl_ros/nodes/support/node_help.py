@@ -272,7 +272,7 @@ def _link_lines() -> list[str]:
             is_list = isinstance(option.default, tuple)
             kind = 'texts' if is_list else _TYPES[
                 Parameter.Type.from_parameter_value(option.default)]
-            limits = '' if option.lower is None else f'{option.lower:g} to {option.upper:g}'
+            limits = '' if option.lower is None else f'{option.lower:.10g} to {option.upper:.10g}'
             lines += _parameter_lines(
                 f'{PREFIX}{option.name}', kind, '' if is_list else option.default,
                 ', '.join(filter(None, (option.doc, option.unit))), limits)
