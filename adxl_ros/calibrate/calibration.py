@@ -235,9 +235,13 @@ def calibrate(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str | 
     """
     result = _calibrated(sensor, recordings, model, effects, data_sha256)
     lines = unit_errors.turn_on_lines(result.fitted, [item.poses for item in recordings])
+    return _with_warnings(result, lines)
+
+
+def _with_warnings(result: CalibrationResult, lines: Sequence[str]) -> CalibrationResult:
+    """Add warnings, which the report has, too."""
     return replace(result, warnings=(*result.warnings, *lines),
-                   report_lines=[*result.report_lines, *lines],
-                   summary_lines=[*result.summary_lines, *lines])
+                   report_lines=[*result.report_lines, *lines])
 
 
 def _calibrated(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str | None,
@@ -250,9 +254,7 @@ def _calibrated(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str 
         referenced = [replace(recording, poses=recording.poses.subset(has_angles(recording.poses)))
                       for recording in recordings]
         result = _against_stage(sensor, referenced, model, effects, data_sha256)
-        lines = _without_angles_lines(poses)
-        return replace(result, report_lines=[*result.report_lines, *lines],
-                       warnings=(*result.warnings, *lines))
+        return _with_warnings(result, _without_angles_lines(poses))
     if model not in (None, 'full'):
         raise UserError(f'{source}: the {model} model is fitted against stage angles (alpha_rad '
                         'and beta_rad), which are missing; leave --model out to calibrate a '

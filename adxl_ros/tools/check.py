@@ -41,6 +41,7 @@ from adxl_ros.tools.recorded_sensor import load_sensor
 from adxl_ros.tools.recording_options import (
     add_recording_options,
     reading_options,
+    reading_text,
     RECORDING_HELP,
 )
 import numpy as np
@@ -86,7 +87,7 @@ def check(options: argparse.Namespace) -> int:
         print(json.dumps([_as_json(result) for result in results], indent=1))
     else:
         print('\n'.join(check_text.lines(results)))
-        print_end([check_text.verdict(results)], page, _next_command(results))
+        print_end([check_text.verdict(results)], page, _next_command(results, options))
     return 0 if all(result.is_sound for result in results) else 1
 
 
@@ -138,14 +139,15 @@ class _Source:
         return block.accel_mps2(self._unit)
 
 
-def _next_command(results: list[Findings]) -> str:
+def _next_command(results: list[Findings], options: argparse.Namespace) -> str:
     """Return the command that a sound recording allows; empty for none."""
     for result in results:
         able = {ability.tool for ability in result.abilities if ability.is_able}
+        words = f'{quoted(result.path)}{reading_text(options)}'
         if result.is_sound and 'fit' in able:
-            return command('fit', f'{quoted(result.path)} -o unit.yaml --report report')
+            return command('fit', f'{words} -o unit.yaml --report report')
         if result.is_sound and 'noise' in able:
-            return command('noise', f'{quoted(result.path)} -o noise.yaml --report noise')
+            return command('noise', f'{words} -o noise.yaml --report noise')
     return ''
 
 

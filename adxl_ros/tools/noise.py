@@ -37,6 +37,7 @@ from adxl_ros.tools.recorded_sensor import load_sensor
 from adxl_ros.tools.recording_options import (
     add_recording_options,
     reading_options,
+    reading_text,
     RECORDING_HELP,
 )
 import numpy as np
@@ -150,7 +151,8 @@ def _print(options: argparse.Namespace, result: RecordingNoise, files: list[Path
         print(line)
     warnings = noise_text.warnings(result)
     following = command('diagnose', f'RECORDING --params {quoted(options.output)} -o gap') \
-        if options.output else command('noise', f'{quoted(options.recording)} -o noise.yaml')
+        if options.output else command(
+            'noise', f'{quoted(options.recording)}{reading_text(options)} -o noise.yaml')
     print_end([*(f'WARNING {text}' for text in warnings), *([''] if warnings else [])], files,
               following)
 

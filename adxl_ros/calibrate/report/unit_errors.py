@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from adxl_ros.calibrate.pose_references import has_angles
 from adxl_ros.calibrate.poses import Poses, reference_force
 from adxl_ros.model import signal_chain
 from adxl_ros.model.sensor import Sensor
@@ -60,7 +61,8 @@ def turn_on_lines(fitted: Sensor, recordings: Sequence[Poses]) -> list[str]:
 
 def _zero_g_change_mg(fitted: Sensor, poses: Poses) -> np.ndarray:
     """Return the zero-g of a recording minus that of the fit by axis, mg, (m,)."""
-    if np.isfinite(poses.alpha_rad).all():
+    if has_angles(poses).any():
+        poses = poses.subset(has_angles(poses))
         force = list(reference_force(poses, fitted.local_gravity_mps2))
         predicted = signal_chain.static_response(fitted)(force, poses.environment)
         residual_v = poses.volts - np.column_stack(predicted)
