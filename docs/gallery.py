@@ -143,6 +143,8 @@ SWING = Motion(6.0, Held(np.pi / 2), Knots([0, 1, 2, 3, 4, 5, 6], [0, 0, 1.5, 0,
 SHAKE = Motion(44.0, Held(np.pi / 2), Held(np.pi / 2), SweptSine(2.0, 40.0))
 WARM = replace(REST, duration_s=1200.0, internal_rate_hz=10.0,
                temperature_c=Steps(25.0, ((200, 45), (700, 10)), 60.0))
+CYCLE = replace(WARM, temperature_c=Knots([0, 600, 1200], [5.0, 65.0, 5.0],
+                                          [0.1, 0.0, -0.1]))
 SUPPLY = replace(REST, duration_s=60.0, supply_v=Steps(5.0, ((15, 4.8), (30, 5.2), (45, 5.0)), 1))
 TILTING = Scene(Motion(18.0, turning(0.0).beta, Held(np.radians(30))), 'alpha_rad',
                 'alpha at beta = 30°, deg', 180 / np.pi)
@@ -155,7 +157,9 @@ SCENES = {
     'lever_arm': Scene(SWING), 'time_offset': Scene(SWING), 'bandwidth': Scene(SWING),
     'clock_skew': Scene(turning(90, 120.0)), 'mount_resonance': Scene(SHAKE, axes='x'),
     'vibration_rectification': Scene(SHAKE, axes='x'), 'temperature_bias': Scene(WARM),
-    'temperature_scale': Scene(WARM), 'warm_up': Scene(WARM), 'supply': Scene(SUPPLY),
+    'temperature_scale': Scene(WARM), 'warm_up': Scene(WARM), 'thermal_lag': Scene(WARM),
+    'thermal_hysteresis': Scene(CYCLE, 'temperature_c', 'temperature, °C'),
+    'supply': Scene(SUPPLY),
     'bias_walk': Scene(replace(REST, duration_s=1200.0)), 'spikes': replace(
         OVER_TIME, motion=replace(REST, duration_s=20.0)),
     'stuck': Scene(replace(SWING, duration_s=6.0), noisy=True, axes='x'),

@@ -82,8 +82,10 @@ def generate_launch_description() -> LaunchDescription:
         *launch_nodes.common_arguments(),
         DeclareLaunchArgument('output', default_value='calibrated.yaml',
                               description='parameter file that the calibration writes'),
-        DeclareLaunchArgument('mode', default_value='stage', choices=['stage', 'gravity'],
-                              description='poses of a stage, or rests of a hand-held sensor'),
+        DeclareLaunchArgument('mode', default_value='stage',
+                              choices=['stage', 'gravity', 'thermal'],
+                              description='poses of a stage, rests of a hand-held sensor, or one '
+                                          'rest over temperature'),
         DeclareLaunchArgument('screen', default_value='false', choices=['true', 'false'],
                               description='show the calibration screen in this terminal; logs '
                               'then go to files'),
@@ -135,7 +137,7 @@ def simulated(context: LaunchContext, speed: dict[str, Any]) -> dict[str, Any]:
 
 def has_stage(context: LaunchContext) -> bool:
     """Return whether there is a stage node; a real sensor never gets a simulated stage unasked."""
-    if text(context, 'mode') == 'gravity':
+    if text(context, 'mode') in ('gravity', 'thermal'):
         return False
     link = given_anywhere(context, LINK_TYPE, 'driver')
     is_real = link not in ('', 'sim')

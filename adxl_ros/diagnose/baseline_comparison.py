@@ -234,7 +234,9 @@ def _cached(motion: Motion, reference: Reference) -> Motion:
 def noiseless(sensor: Sensor) -> Sensor:
     """Return the sensor without noise and without the steps of its ADC."""
     mean = tuple(e for e in sensor.effects if effect_named(e).acts_on is ActsOn.MEAN)
-    return replace(sensor, noise_density_g_per_rthz=np.zeros(len(sensor.axes)), adc_bits=48,
+    # Without an ADC there are no rails, and pseudo-volts may be negative.
+    bits = 48 if sensor.adc_bits else 0
+    return replace(sensor, noise_density_g_per_rthz=np.zeros(len(sensor.axes)), adc_bits=bits,
                    effects=mean, values={e: sensor.values[e] for e in mean})
 
 

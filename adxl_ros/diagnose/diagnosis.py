@@ -423,7 +423,11 @@ def _confirmed(linear_model: LinearModel, comparisons: Sequence[BaselineComparis
     while library_sets[first].effects and not holds(hypotheses[first], hypotheses[first + 1:]):
         refuted.add(library_sets[first].effects)
         first += 1
-    return ([w for w in weighed if w.effects not in refuted or w.unknown is not None],
+    kept = [w for w in weighed if w.effects not in refuted or w.unknown is not None]
+    log_weights = np.array([w.log_weight for w in kept])
+    # Beside a refuted set, the others may have no probability in floating point.
+    probabilities = np.exp(log_weights - np.logaddexp.reduce(log_weights))
+    return ([replace(w, probability=float(p)) for w, p in zip(kept, probabilities)],
             closure_of(hypotheses[first]))
 
 

@@ -30,6 +30,7 @@ from adxl_ros.diagnose.motion_history import direction_of_last_move, time_since_
 from adxl_ros.diagnose.noise_floor import gravity_slopes
 from adxl_ros.model.diagnosis_hints import FormDimension
 from adxl_ros.model.filters import low_pass
+from adxl_ros.model.play_operator import loop
 import numpy as np
 
 _CREEP_S = (2.0, 10.0, 50.0)
@@ -39,6 +40,10 @@ _RELAXATION_S = (1, 4, 16)
 _LAG_S = (0.05, 0.5)
 """Time constants of fast lags of the force, s. Chosen: slower than the filter of the sensor,
 faster than creep."""
+_THERMAL_LAG_S = (20.0, 100.0, 500.0)
+"""Time constants of lags of the temperature, s. Chosen: a factor of five apart."""
+_THERMAL_REACH = (0.05, 0.25)
+"""Reach of loops over temperature, divided by its range. Chosen: a factor of five apart."""
 _FORCE_MODES = 12
 """Number of cosines over the force along the axis. Chosen: a tenth of the range each."""
 _MODES = 8
@@ -146,6 +151,8 @@ def _common(comparison: BaselineComparison) -> Basis:
         values = None if path is None else path(time_s)
         if values is not None and np.ptp(values) > _SMALLEST_RANGE[dimension]:
             basis[dimension] = _modes(values, _SURROUNDING_MODES)
+            if dimension is FormDimension.TEMPERATURE:
+                basis[FormDimension.WARMING] = _history(values, comparison.dt_s)
     if comparison.reference is not Reference.STAGE:
         return basis
     beta_rad = motion.beta(time_s)
@@ -193,6 +200,16 @@ def _of_axis(comparison: BaselineComparison, force_g: np.ndarray, axis: int, vol
         *(np.exp(-since_s / tau_s) for tau_s in _RELAXATION_S),
         *(low_pass(along_g, tau_s, dt_s, {}) - along_g for tau_s in _CREEP_S)])
     return basis
+
+
+def _history(temperature_c: np.ndarray, dt_s: float) -> np.ndarray:
+    """Return lags of the temperature and branches of loops, plain and times it, (k, n)."""
+    lags = [low_pass(temperature_c, tau_s, dt_s, {}) - temperature_c for tau_s in _THERMAL_LAG_S]
+    branches = [loop(temperature_c, share * np.ptp(temperature_c), {})
+                for share in _THERMAL_REACH]
+    history = _same_size([*lags, *branches])
+    middle_c = (temperature_c.min() + temperature_c.max()) / 2
+    return np.concatenate([history, _same_size(list(history * (temperature_c - middle_c)))])
 
 
 def _same_size(columns: Sequence[np.ndarray]) -> np.ndarray:

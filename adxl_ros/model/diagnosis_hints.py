@@ -89,6 +89,8 @@ class FormDimension(Enum):
     """Angle beta."""
     TEMPERATURE = 'temperature_c'
     """Temperature of the sensor."""
+    WARMING = 'warming'
+    """Recent history of the temperature: the branch of a loop."""
     SUPPLY = 'supply_v'
     """Supply voltage."""
     TIME = 'time_s'

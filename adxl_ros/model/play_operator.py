@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The play operator, which backlash and hysteresis consist of."""
+"""The operators of play and stop, which backlash and hysteresis consist of."""
 
 from __future__ import annotations
 
@@ -20,6 +20,66 @@ from math import ceil
 from typing import Any
 
 import numpy as np
+
+_THRESHOLDS = (0.25, 0.5, 0.75, 1.0)
+"""Thresholds of the stop operators, divided by the reach; chosen: four of equal weight."""
+
+
+def stop(x: np.ndarray, reach: float, memory: dict[Any, Any]) -> np.ndarray:
+    """
+    Return the mean of stop operators, x − play(x), each divided by its threshold.
+
+    It is at most 1. It reaches that when the input has changed by 2·`reach` after a reversal
+    (Prandtl-Ishlinskii; Brokate and Sprekels, "Hysteresis and Phase Transitions", 1996).
+
+    Parameters
+    ----------
+    x
+        Input, (n,).
+    reach
+        Largest threshold, in the unit of the input.
+    memory
+        Keeps the state from one block to the next. It is empty before the first block.
+
+    Returns
+    -------
+    ndarray
+        Lag behind the input, −1 to 1, (n,).
+
+    """
+    lag = np.zeros(len(x))
+    for i, fraction in enumerate(_THRESHOLDS):
+        threshold = fraction * reach
+        lag = lag + (x - play(x, threshold, memory.setdefault(i, {}))) / threshold
+    return lag / len(_THRESHOLDS)
+
+
+def loop(x: np.ndarray, reach: float, memory: dict[Any, Any]) -> np.ndarray:
+    """
+    Return the stop operator minus its first branch, which is 0 until the input turns back.
+
+    The first branch is a function of the input alone, and no hysteresis.
+
+    Parameters
+    ----------
+    x
+        Input, (n,).
+    reach
+        Largest threshold, in the unit of the input.
+    memory
+        Keeps the state from one block to the next. It is empty before the first block.
+
+    Returns
+    -------
+    ndarray
+        Difference of the branches, −2 to 2, (n,).
+
+    """
+    if not len(x):
+        return x
+    change = x - memory.setdefault('start', float(x[0]))
+    first_branch = sum(np.clip(change / (fraction * reach), -1, 1) for fraction in _THRESHOLDS)
+    return stop(x, reach, memory) - first_branch / len(_THRESHOLDS)
 
 
 def play(x: np.ndarray, half_width: float, memory: dict[str, Any]) -> np.ndarray:

@@ -20,8 +20,10 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
-from adxl_ros.calibrate import calibration, pose_extraction
+from adxl_ros.calibrate import calibration, pose_extraction, thermal_calibration
+from adxl_ros.calibrate.fits import thermal_fit
 from adxl_ros.calibrate.pose_references import with_table_angles
+from adxl_ros.calibrate.poses import Poses
 from adxl_ros.calibrate.report import acceptance, report_html, text_tables
 from adxl_ros.calibrate.report.unit_errors import errors_in_words
 from adxl_ros.errors import UserError
@@ -32,7 +34,7 @@ from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.stream_unit import recorded_unit
 from adxl_ros.model.effects import library
 from adxl_ros.model.effects.base import Place
-from adxl_ros.model.sensor import Sensor
+from adxl_ros.model.sensor import Sensor, with_axes
 from adxl_ros.tools.closing_lines import print_end, quoted
 from adxl_ros.tools.command_line import argument_parser, command, effect_list
 from adxl_ros.tools.common import make_folder, note, report_reading, run, staged_progress
@@ -49,6 +51,8 @@ _EXAMPLES = {
         'sweep.csv -o unit.yaml --report report',
     'two sweeps of one unit, the linear model': 'one.mcap two.mcap --model linear -o unit.yaml',
     'a further effect': 'sweep.csv --effect temperature_bias -o unit.yaml',
+    'zero-g over temperature of a calibrated unit at rest':
+        'oven.csv --params unit.yaml --effect temperature_bias -o warm.yaml',
 }
 """Examples of arguments, by their purpose."""
 _LIMITS = {
@@ -111,8 +115,10 @@ def fit(options: argparse.Namespace) -> int:
         raise UserError(f'--poses {options.poses}: goes with one recording, and without --journal')
     records = _records(options.journal)
     unit: Sensor | None = None
+    base: Sensor | None = None
     measured: list[str] = []
     recordings = []
+    thermal: Poses | None = None
     reading = reading_options(options)
     work = {name: seconds for name, seconds in _WORK.items() if options.report or name != 'report'}
     with staged_progress(work) as show:
@@ -121,19 +127,24 @@ def fit(options: argparse.Namespace) -> int:
             report_reading('fit', read)
             if unit is None:
                 unit, lines = measure_unstated(load_sensor(options.params, read), read)
-                measured = listed(lines)
+                base, measured = unit, listed(lines)
             unit = recorded_unit(unit, read)
             _report_range(read, unit)
             show('reading', (number + 0.5) / len(options.recording))
+            thermal = _thermal_blocks(options, read, unit)
+            if thermal is not None:
+                break
             poses = pose_extraction.extract_poses(read, unit, records)
             if options.poses:
                 poses = with_table_angles(poses, read_pose_table(options.poses), read.epoch_ns)
             recordings.append(calibration.RecordedPoses(
                 Path(path).name, poses, pose_extraction.estimate_filters(read, unit, poses)))
-        assert unit is not None, 'argparse asks for a recording'
+        assert unit is not None and base is not None, 'argparse asks for a recording'
         show('fit', 0.0)
-        result = calibration.calibrate(unit, recordings, options.model, options.effect,
-                                       sha256(options.recording))
+        sha = sha256(options.recording)
+        result = calibration.calibrate(unit, recordings, options.model, options.effect, sha) \
+            if thermal is None else thermal_calibration.calibrate(
+                with_axes(base, unit.axes), thermal, Path(options.recording[0]).name, sha)
         result = replace(result, report_lines=[*result.report_lines, *measured])
         if options.report:
             show('report', 0.0)
@@ -142,11 +153,25 @@ def fit(options: argparse.Namespace) -> int:
     result.save(options.output)
     note(f'fit: {result.keep(options.store)}')
     report = [Path(options.report) / name for name in _REPORT_FILES] if options.report else []
-    print_end([errors_in_words(result.fitted), '', *_result_lines(result), *measured, ''],
+    lines = [errors_in_words(result.fitted), '', *_result_lines(result)] if thermal is None else \
+        [*result.summary_lines, '']
+    print_end([*lines, *measured, ''],
               [options.output, *report], command(
         'apply', f'{quoted(options.recording[0])}{reading_text(options)} --params '
         f'{quoted(options.output)} -o tilt.csv'))
     return 0
+
+
+def _thermal_blocks(options: argparse.Namespace, read: Recording, unit: Sensor) -> Poses | None:
+    """Return the blocks of a resting sensor whose temperature effects are asked for, else None."""
+    if len(options.recording) > 1 or options.model or options.journal or options.poses \
+            or not options.effect or not set(options.effect) <= set(thermal_fit.EFFECTS):
+        return None
+    blocks = thermal_calibration.rest_blocks(read, unit)
+    if blocks is not None and options.report:
+        raise UserError(f'--report {options.report}: a fit over temperature has no page; leave '
+                        'it out')
+    return blocks
 
 
 def _report_range(read: Recording, unit: Sensor) -> None:

@@ -102,6 +102,8 @@ def test_no_gap():
 
 @pytest.mark.parametrize('option, parameter, value', [
     ('temperature_bias:per_k=4e-4', 'per_k.x', 4e-4),
+    ('thermal_lag:per_k=-5e-4,tau_s=10', 'tau_s', 10.0),
+    ('thermal_hysteresis:half_width_g=4e-3,reach_k=3', 'half_width_g.y', 4e-3),
     ('backlash:alpha_rad=0.004,beta_rad=0.004', 'beta_rad', 0.004),
     ('misalignment:alpha_rad=0.003,beta_rad=-0.002', 'alpha_rad.y', 0.003),
     # The signal is a straight line, which zero-g and scale factor can imitate.
@@ -117,6 +119,16 @@ def test_one_effect_is_named_and_the_gap_closed(option, parameter, value):
     assert candidate['parameters'][parameter]['value'] == pytest.approx(value, rel=0.1)
     assert report['gap']['closed'] > 0.95
     assert sum(h['probability'] for h in report['hypotheses']) == pytest.approx(1, abs=1e-9)
+
+
+def test_a_sensor_without_an_adc_may_have_negative_volts():
+    """A digital sensor whose zero-g is 0 pseudo-volts has no rail there."""
+    sensor = replace(unit(), adc_bits=0, nominal_zero_g_v=np.zeros(3))
+    report, _ = diagnosis_of(sensor, 'temperature_bias:per_k=4e-4')
+    assert report['verdict']['effects'] == ['temperature_bias']
+    candidate = next(c for c in report['candidates'] if c['effect'] == 'temperature_bias')
+    assert [candidate['parameters'][f'per_k.{axis}']['value'] for axis in 'xyz'] \
+        == pytest.approx([4e-4] * 3, rel=0.1)
 
 
 def test_an_effect_outside_the_library_is_unknown():

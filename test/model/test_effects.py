@@ -46,7 +46,7 @@ NAMES = sorted(library())
 CLEAN = {'noise_density_g_per_rthz': np.zeros(3), 'adc_bits': 0}
 MOTION = Motion(12.0, Knots([0, 1, 3, 5, 7, 12], [0.5, 0.5, 1.2, 0.9, 2.0, 2.0]),
                 Knots([0, 2, 4, 5, 12], [0, 0, 2, 1.5, 3]), Knots([0, 6, 7, 12], [0, 0, 0.02, 0]),
-                temperature_c=Steps(25.0, ((2.0, 35.0),), 1.0),
+                temperature_c=Steps(25.0, ((2.0, 35.0), (7.0, 20.0)), 1.0),
                 supply_v=Steps(5.0, ((4.0, 4.8),), 0.5))
 
 
@@ -76,7 +76,8 @@ def test_the_library_has_the_documented_effects():
              'nonlinearity quadratic hysteresis bandwidth mount_resonance temperature_bias '
              'temperature_scale warm_up bias_walk supply saturation quantisation adc_inl '
              'noise_excess flicker mains_hum spikes stuck vibration_rectification time_offset '
-             'clock_skew gravity base_tilt stage_offset stage_eccentricity backlash lever_arm')
+             'clock_skew gravity base_tilt stage_offset stage_eccentricity backlash lever_arm '
+             'thermal_lag thermal_hysteresis')
     listed = names.split()
     assert not set(listed) - set(NAMES)
 
@@ -230,6 +231,33 @@ def test_temperature_moves_zero_g_and_scale():
                    for name in ('temperature_bias', 'temperature_scale'))
     assert bias([0.0, 0.0, 0.0], around)[0] == pytest.approx(2.501, abs=1e-12)
     assert scale([G, 0.0, 0.0], around)[0] == pytest.approx(3.501, abs=1e-12)
+
+
+def test_thermal_lag_makes_the_zero_g_follow_a_slower_temperature():
+    """With the slope of the zero-g, a step of temperature arrives by 1 − exp(−t/τ)."""
+    step = Motion(300.0, internal_rate_hz=10.0, temperature_c=Steps(25.0, ((100.0, 35.0),), 0.01))
+    plain = nominal('x', **{key: CLEAN[key][:1] if np.ndim(CLEAN[key]) else CLEAN[key]
+                            for key in CLEAN}, rate_hz=10.0)
+    bias, lag = with_effect('temperature_bias', plain), with_effect('thermal_lag', plain)
+    both = replace(bias, effects=(*bias.effects, *lag.effects), values=bias.values | lag.values)
+    moved_g = volts(both, step)[:, 0] - volts(plain, step)[:, 0]
+    assert moved_g[990] == pytest.approx(0.0, abs=1e-12)
+    assert moved_g[1600] == pytest.approx(1e-3 * (1 - np.exp(-1)), rel=1e-3)
+    leads = put(both, [Coefficient('thermal_lag', 'per_k', 'x')], [-1e-4])
+    assert (volts(leads, step) - volts(plain, step))[1005:1100].min() > 1.2e-3
+
+
+def test_thermal_hysteresis_depends_on_the_direction_and_not_on_the_speed():
+    """Warming at first adds nothing; far behind the reversal, cooling adds the width."""
+    middles = []
+    for seconds in (400.0, 40.0):
+        cycle = Motion(seconds, internal_rate_hz=10.0, temperature_c=Knots(
+            [0, seconds / 2, seconds], [10.0, 60.0, 10.0]))
+        plain = nominal('xyz', **CLEAN, rate_hz=10.0)
+        moved_v = (volts(with_effect('thermal_hysteresis', plain), cycle)
+                   - volts(plain, cycle))[:, 2]
+        middles += [moved_v[len(moved_v) // 4], moved_v[3 * len(moved_v) // 4]]
+    assert middles == pytest.approx([0.0, 4e-3] * 2, abs=1e-9)
 
 
 def test_vibration_shifts_by_its_mean_square():

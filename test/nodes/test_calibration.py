@@ -1,11 +1,16 @@
 """The guided calibration through the live graph: stage, rests, journal, verdict, file."""
 
+from dataclasses import replace
 import time
 
 from adxl_ros.files import parameter_file, recording, sweep_journal
 from adxl_ros.files.stream_info import sensor_info
 from adxl_ros.files.stream_unit import recorded_unit
+from adxl_ros.model.coefficients import with_neutral
 from adxl_ros.model.constants import G0_MPS2
+from adxl_ros.simulate.motion import Held, Knots, Motion
+from adxl_ros.simulate.simulator import simulate
+from adxl_ros.tools.effect_option import with_effects
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from graph import Graph, RELIABLE
 from lifecycle_msgs.msg import Transition
@@ -266,6 +271,39 @@ def test_a_real_sensor_through_the_live_graph(start, run_tool, tmp_path, shared_
     for effect, values in live.values.items():
         for parameter, value in values.items():
             np.testing.assert_allclose(offline.values[effect][parameter], value, atol=1e-9)
+
+
+def test_a_resting_sensor_is_calibrated_over_temperature(start, tmp_path):
+    """The span and the expected error show; the file is written when both ways are covered."""
+    unit = with_neutral(nominal('xyz', serial='T7', rate_hz=20.0), ['bias'])
+    parameter_file.save(tmp_path / 'base.yaml', replace(unit, model='linear'))
+    motion = Motion(440.0, Held(0.7), Held(0.4), temperature_c=Knots(
+        [0, 200, 400, 440], [5, 45, 5, 5]), internal_rate_hz=20.0)
+    columns = simulate(with_effects(unit, ['temperature_bias:per_k=4e-4']), motion, 3)
+    columns['temperature_c'] = np.round(columns['temperature_c'], 1)
+    columns = {name: values for name, values in columns.items() if not name.endswith('_rad')}
+    with open(tmp_path / 'oven.csv', 'w', encoding='utf-8') as file:
+        print(','.join(columns), file=file)
+        np.savetxt(file, np.column_stack(list(columns.values())), '%.9f', ',')
+    with Graph() as graph:
+        start('calibration', '--ros-args', '--params-file', tmp_path / 'base.yaml', *FAST,
+              *LOSSLESS, '-p', 'mode:=thermal', '-p', 'thermal.range_c:=[10.0, 40.0]', '-p',
+              'thermal.block_s:=4.0', '-p', 'autostart:=true', '-p', 'output:=warm.yaml')
+        graph.spin_until(lambda: graph.reports('calibration', 'waiting for sensor_info'), 30, 'up')
+        start('driver', '--ros-args', '--params-file', tmp_path / 'base.yaml', *FAST, '-p',
+              'link.type:=replay', '-p', f'link.recording:={tmp_path / "oven.csv"}', '-p',
+              'link.speed:=40.0', '-p', 'autostart:=false', *KEPT)
+        assert graph.change('driver', Transition.TRANSITION_CONFIGURE)
+        graph.spin_until(lambda: graph.node.count_publishers('imu/data_raw'), 30, 'a publisher')
+        assert graph.change('driver', Transition.TRANSITION_ACTIVATE)
+        graph.spin_until(lambda: graph.reports('calibration', 'of 10 to 40 °C, warming'), 30,
+                         'the span')
+        graph.spin_until(lambda: graph.reports('calibration', 'expected error'), 30, 'the error')
+        graph.spin_until((tmp_path / 'warm.yaml').exists, 60, 'the file')
+    warm = parameter_file.load(tmp_path / 'warm.yaml')
+    assert warm.effects == ('bias', 'temperature_bias')
+    np.testing.assert_allclose(warm.values['temperature_bias']['per_k'], 4e-4, atol=5e-5)
+    assert len(warm.covariance_names) == 6
 
 
 def test_rests_before_the_info_of_the_driver_count(start, tmp_path):

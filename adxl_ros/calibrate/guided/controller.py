@@ -453,7 +453,8 @@ class Controller:
         if self.session is not None:
             guide = self.session.guide
             values |= {'phase': status.phase.value, 'pose': str(guide.pose_number),
-                       'next': guide.destination(), 'accepted': str(self.session.accepted_count)}
+                       'next': guide.destination(), 'accepted': str(self.session.accepted_count),
+                       **guide.values()}
             tilt_rad = guide.tilt_error_rad()
             if np.isfinite(tilt_rad):
                 values['tilt_error_deg'] = float(np.degrees(tilt_rad))
@@ -479,7 +480,7 @@ class Controller:
             self._stop(Severity.ERROR, f'{error}')
 
     def _begin_session(self, unit: Sensor) -> None:
-        self.session = session = Session(unit, self.settings, self._starts_over)
+        self.session = session = Session(unit, self.settings, self._starts_over, self._sensor)
         self.state, self.outcome = ControllerState.RUNNING, ()
         self._samples.restart_silence()
         task = self._outlook or 'rest in 24 or more directions, then call ~/finish'

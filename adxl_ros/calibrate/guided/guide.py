@@ -166,6 +166,9 @@ class Guide(Protocol):
     def next_pose(self) -> NextPose | None:
         """Return the pose to announce; None where no pose is open."""
 
+    def values(self) -> dict[str, str | float]:
+        """Return further values for programs, by key."""
+
     def tilt_error_rad(self) -> float:
         """Return the expected rms error of alpha and beta by the poses so far, rad."""
 

@@ -320,6 +320,10 @@ class HandGuide:
             tilt_error_deg=running_estimate.degrees_or_none(self.tilt_error_rad()),
             final_tilt_error_deg=None)
 
+    def values(self) -> dict[str, str | float]:
+        """Return no further values for programs."""
+        return {}
+
     def tilt_error_rad(self) -> float:
         """Return the expected rms error of alpha and beta by the rests so far, rad."""
         std_v = np.mean([record.std_v for record in self.accepted.values()] or

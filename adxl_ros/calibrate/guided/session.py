@@ -21,13 +21,14 @@ from dataclasses import replace
 import os
 from pathlib import Path
 
-from adxl_ros.calibrate import calibration
+from adxl_ros.calibrate import calibration, thermal_calibration
 from adxl_ros.calibrate.guided import pose_checks
 from adxl_ros.calibrate.guided.guide import Guide
 from adxl_ros.calibrate.guided.hand_guide import HandGuide
 from adxl_ros.calibrate.guided.live_window import NewestSamples
 from adxl_ros.calibrate.guided.session_settings import SessionSettings
 from adxl_ros.calibrate.guided.stage_guide import StageGuide
+from adxl_ros.calibrate.guided.thermal_guide import ThermalGuide
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store
@@ -42,7 +43,7 @@ from adxl_ros.files.sweep_journal import (
     skipped_poses,
 )
 from adxl_ros.model.constants import AXES
-from adxl_ros.model.sensor import Sensor
+from adxl_ros.model.sensor import Sensor, with_axes
 import numpy as np
 
 
@@ -58,6 +59,8 @@ class Session:
         What the calibration is to do.
     start_over
         Begin a new journal although an interrupted calibration could be resumed.
+    base
+        The unit as it is calibrated so far, for a calibration over temperature; None for `unit`.
 
     Attributes
     ----------
@@ -77,7 +80,8 @@ class Session:
 
     """
 
-    def __init__(self, unit: Sensor, settings: SessionSettings, start_over: bool) -> None:
+    def __init__(self, unit: Sensor, settings: SessionSettings, start_over: bool,
+                 base: Sensor | None = None) -> None:
         if not os.access(settings.output.parent, os.W_OK):
             raise UserError(f'output: {settings.output}: {settings.output.parent} is not a '
                             'directory that can be written; choose another')
@@ -85,6 +89,7 @@ class Session:
             raise UserError(f'mode: gravity needs the axes x, y and z, but the sensor has '
                             f'{unit.axes}; use mode:=stage')
         targets = settings.targets(unit)
+        self._base = _calibrated(base, unit) if settings.mode == 'thermal' else unit
         self.unit, self.settings = unit, settings
         self.newest = NewestSamples(unit)
         self.journal = Journal(settings.journal, settings.head(unit), start_over)
@@ -94,9 +99,14 @@ class Session:
                                           for entry in self.journal.entries)
         accepted = accepted_poses(self.journal.entries)
         self.resumed = len(accepted)
-        self.guide: Guide = HandGuide(unit, settings.capture.temperature_span_c, accepted) \
-            if settings.mode == 'gravity' else StageGuide(
-                unit, targets, settings.capture, accepted, skipped_poses(self.journal.entries))
+        self.guide: Guide
+        if settings.mode == 'gravity':
+            self.guide = HandGuide(unit, settings.capture.temperature_span_c, accepted)
+        elif settings.mode == 'thermal':
+            self.guide = ThermalGuide(unit, self._base, settings.thermal, accepted)
+        else:
+            self.guide = StageGuide(unit, targets, settings.capture, accepted,
+                                    skipped_poses(self.journal.entries))
 
     @property
     def accepted_count(self) -> int:
@@ -198,8 +208,11 @@ class Session:
         if all(record.check for record in records):
             raise UserError('only check poses are taken, which the fit does not use; take other '
                             'poses, too')
-        result = calibration.calibrate(self.unit, [calibration.RecordedPoses(
-            self.journal.path.name, Poses.from_records(records))])
+        poses = Poses.from_records(records)
+        result = thermal_calibration.calibrate(
+            self._base, poses, self.journal.path.name, range_c=self.settings.thermal.range_c) \
+            if self.settings.mode == 'thermal' else calibration.calibrate(
+                self.unit, [calibration.RecordedPoses(self.journal.path.name, poses)])
         if self._is_mounting_unchecked:
             provenance = {**result.fitted.provenance,
                           'mounting': 'not checked after an interruption'}
@@ -240,3 +253,10 @@ class Session:
             places.append((calibration_store.unit_folder(settings.store, self.unit.serial), ''))
         for folder, name in places:
             remove_unfinished(folder, name)
+
+
+def _calibrated(base: Sensor | None, unit: Sensor) -> Sensor:
+    """Return the calibrated unit with the nominal values of its stream."""
+    if base is None or not base.effects:
+        return unit
+    return replace(with_axes(base, unit.axes), serial=unit.serial, rate_hz=unit.rate_hz)

@@ -22,6 +22,7 @@ from typing import Any
 
 from adxl_ros.calibrate.guided import pose_plan, quick_plan
 from adxl_ros.calibrate.guided.capture_settings import CaptureSettings, StageMode
+from adxl_ros.calibrate.guided.thermal_guide import ThermalSettings
 from adxl_ros.files.sweep_journal import unfinished
 from adxl_ros.model.sensor import Sensor
 import numpy as np
@@ -41,7 +42,7 @@ class SessionSettings:
     Attributes
     ----------
     mode
-        'stage' or 'gravity'.
+        'stage', 'gravity' or 'thermal'.
     plan_kind
         Kind of the pose plan: 'full' or 'quick'.
     planes_rad
@@ -62,6 +63,8 @@ class SessionSettings:
         Folder of the report, or ''.
     store
         Folder of the calibration store, or ''.
+    thermal
+        What a calibration over temperature is to cover.
 
     """
 
@@ -76,6 +79,7 @@ class SessionSettings:
     journal: Path
     report: str
     store: str
+    thermal: ThermalSettings = ThermalSettings()
 
     @property
     def operator_captures(self) -> bool:
@@ -92,7 +96,7 @@ class SessionSettings:
             The parameters make no pose plan.
 
         """
-        if self.mode == 'gravity':
+        if self.mode != 'stage':
             return []
         if self.plan_kind == 'quick':
             return quick_plan.quick(unit, self.capture.dwell_s, self.tilt_error_rad,
@@ -101,7 +105,11 @@ class SessionSettings:
         return pose_plan.guided(planes_rad, self.step_rad, self.check_poses)
 
     def outlook(self, unit: Sensor) -> str:
-        """Return number, duration and expected tilt error of the poses; '' without a stage."""
+        """Return what is ahead, for people: the poses of a stage, or a range of temperature."""
+        if self.mode == 'thermal':
+            low_c, high_c = self.thermal.range_c
+            return (f'leave it at rest from {low_c:g} to {high_c:g} °C and back; call ~/finish to '
+                    'end early')
         targets = self.targets(unit)
         if not targets:
             return ''
@@ -125,6 +133,9 @@ class SessionSettings:
                 'sweep.temperature_span_c': self.capture.temperature_span_c}
         if self.mode == 'gravity':
             return head
+        if self.mode == 'thermal':
+            return {**head, 'thermal.range_c': list(self.thermal.range_c),
+                    'thermal.block_s': self.thermal.block_s}
         return {**head, 'stage.mode': self.capture.stage_mode.value,
                 'stage.tolerance_rad': self.capture.tolerance_rad,
                 'stage.near_rad': self.capture.near_rad,

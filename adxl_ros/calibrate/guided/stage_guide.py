@@ -329,6 +329,10 @@ class StageGuide:
         """Return the accepted poses, by number."""
         return [self.accepted[number] for number in sorted(self.accepted)]
 
+    def values(self) -> dict[str, str | float]:
+        """Return no further values for programs."""
+        return {}
+
     def tilt_error_rad(self) -> float:
         """Return the expected rms error of alpha and beta by the poses so far, rad."""
         return self.estimate.tilt_error_rad()

@@ -16,29 +16,20 @@
 
 from adxl_ros.model.diagnosis_hints import DiagnosisHints, FormDimension, Manoeuvre, ProofVariable
 from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Role, Signals
-from adxl_ros.model.play_operator import play
-
-_THRESHOLDS = (0.25, 0.5, 0.75, 1.0)
-"""Thresholds of the stop operators, divided by the reach; chosen: four of equal weight."""
+from adxl_ros.model.play_operator import stop
 
 
 def apply(signals: Signals, p: Parameters) -> None:
     """
-    Let the output lag by a mean of stop operators, x − play(x), each divided by its threshold.
+    Let the output lag by a stop operator of the force along the sensing axis.
 
     The lag is at most `half_width_g`. It reaches that when the input has changed by 2·`reach_g`
-    after a reversal (Prandtl-Ishlinskii; Brokate and Sprekels, "Hysteresis and Phase
-    Transitions", 1996).
+    after a reversal.
     """
     for d, half_width in enumerate(p['half_width_g']):
-        if not half_width:
-            continue
-        sensed, lag = signals.sensed[d], 0.0
-        for i, fraction in enumerate(_THRESHOLDS):
-            threshold = fraction * p['reach_g']
-            memory = signals.memory.setdefault((d, i), {})
-            lag = lag + (sensed - play(sensed, threshold, memory)) / threshold
-        signals.output[d] = signals.output[d] - half_width / len(_THRESHOLDS) * lag
+        if half_width:
+            lag = stop(signals.sensed[d], p['reach_g'], signals.memory.setdefault(d, {}))
+            signals.output[d] = signals.output[d] - half_width * lag
 
 
 EFFECT = Effect(

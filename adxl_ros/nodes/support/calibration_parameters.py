@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 from adxl_ros.calibrate.guided import pose_plan
 from adxl_ros.calibrate.guided.capture_settings import CaptureSettings, StageMode
 from adxl_ros.calibrate.guided.session_settings import SessionSettings
+from adxl_ros.calibrate.guided.thermal_guide import ThermalSettings
 from adxl_ros.files import calibration_store
 from adxl_ros.nodes.support.parameters import declare, parameter_error
 import numpy as np
@@ -68,7 +69,8 @@ def declare_settings(node: Node) -> SessionSettings:
         A parameter is out of range, or the parameters make no pose plan.
 
     """
-    mode = declare(node, 'mode', 'stage', 'what the reference is', choices=('stage', 'gravity'))
+    mode = declare(node, 'mode', 'stage', 'what the reference is',
+                   choices=('stage', 'gravity', 'thermal'))
     output = Path(declare(node, 'output', 'calibration.yaml', 'parameter file to write'))
     journal_name = declare(node, 'journal', '', 'file of accepted poses; empty: beside the output')
     journal = Path(journal_name or f'{output}.journal')
@@ -79,13 +81,29 @@ def declare_settings(node: Node) -> SessionSettings:
     plan = _declare_plan(node, capture.stage_mode is not StageMode.COMMANDED)
     tilt_error_deg = declare(node, 'sweep.tilt_error_deg', 0.1,
                              'rms tilt error that the plan quick is to reach', 'deg', 1e-3, 10.0)
+    thermal = _declare_thermal(node)
+    if mode == 'thermal' and report:
+        raise parameter_error('report', 'mode thermal writes no page; leave it empty')
     for name, path in (('output', output), ('journal', journal)):
         if path.is_dir():
             raise parameter_error(name, f'{path} is a directory; name a file')
     return SessionSettings(
         mode=mode, plan_kind=plan.kind, planes_rad=plan.planes_rad, step_rad=plan.step_rad,
         tilt_error_rad=float(np.radians(tilt_error_deg)), check_poses=plan.check_poses,
-        capture=capture, output=output, journal=journal, report=report, store=store)
+        capture=capture, output=output, journal=journal, report=report, store=store,
+        thermal=thermal)
+
+
+def _declare_thermal(node: Node) -> ThermalSettings:
+    """Declare the parameters of the mode `thermal`."""
+    given = declare(node, 'thermal.range_c', (0.0, 50.0),
+                    'lowest and highest temperature that mode thermal is to cover', 'degC')
+    if len(given) != 2 or not given[0] < given[1]:
+        raise parameter_error('thermal.range_c', f'{list(given)} is no lowest and highest '
+                              'temperature; give two, as [0.0, 50.0]')
+    return ThermalSettings((float(given[0]), float(given[1])), declare(
+        node, 'thermal.block_s', 10.0, 'length of a block of samples in mode thermal', 's', 0.5,
+        600.0))
 
 
 def _declare_capture(node: Node) -> CaptureSettings:

@@ -36,7 +36,8 @@ OWN_PARAMETERS = {
         'autostart', 'exit_when_done', 'journal', 'mode', 'output', 'report', 'resume', 'screen',
         'stage.mode', 'stage.near_rad', 'stage.timeout_s', 'stage.tolerance_rad', 'store',
         'sweep.check_poses', 'sweep.dwell_s', 'sweep.plan', 'sweep.planes_deg', 'sweep.planes_rad',
-        'sweep.step_deg', 'sweep.step_rad', 'sweep.temperature_span_c', 'sweep.tilt_error_deg'),
+        'sweep.step_deg', 'sweep.step_rad', 'sweep.temperature_span_c', 'sweep.tilt_error_deg',
+        'thermal.block_s', 'thermal.range_c'),
     'compensation': (
         'calibration', 'free_acceleration', 'inverse', 'mounting.frame_id', 'mounting.rpy_rad',
         'orientation', 'store', 'undo_filter'),

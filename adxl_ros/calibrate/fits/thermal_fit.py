@@ -1,0 +1,438 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Zero-g over temperature, fitted to a sensor that rests while it warms and cools."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+from adxl_ros.errors import UserError
+from adxl_ros.model.coefficients import get, parameter_of, put, with_neutral
+from adxl_ros.model.constants import NOMINAL_TEMPERATURE_C
+from adxl_ros.model.effects.base import Coefficient
+from adxl_ros.model.play_operator import loop, stop
+from adxl_ros.model.sensor import Sensor
+import numpy as np
+from scipy.linalg import block_diag
+from scipy.optimize import minimize_scalar
+
+EFFECTS = ('temperature_bias', 'temperature_scale', 'thermal_lag', 'thermal_hysteresis')
+"""Effects that the fit knows."""
+_TURN_G = 0.1
+"""Change of the output, g, from which the sensor was turned. Chosen: 6°, and above any zero-g over
+temperature between two neighbouring blocks."""
+_SCALE_FORCES_G = 0.5
+"""Range of the force along an axis, g, from which the slope of its scale factor is fitted. Chosen:
+the error of that slope is then at most twice that of the zero-g's."""
+_SMALLEST_SPAN_K = 5.0
+"""Smallest range of temperature, K, that is fitted. Chosen: 0.5 mg of a typical sensor."""
+_FEWEST_BLOCKS = 12
+"""Fewest blocks of an orientation. Chosen: twice the coefficients of one axis."""
+PRIOR_WIDTH = 5.0
+"""Prior standard deviation of a coefficient divided by its typical size, as in the diagnosis."""
+_LAGS_S = tuple(np.geomspace(10.0, 1000.0, 7))
+"""Time constants of `thermal_lag` that are tried, s. Chosen: each is twice the one before."""
+_REACHES = tuple(np.geomspace(0.02, 0.5, 6))
+"""Reaches of `thermal_hysteresis` that are tried, divided by the range of temperature. Chosen: a
+loop whose reach is larger has no corner in the range."""
+_SMALLEST_GAIN = 5.0
+"""Gain in half of the BIC from which a dependence on the history counts. Chosen: odds of 150."""
+_LARGEST_CORRELATION = 0.95
+"""Largest correlation of neighbouring blocks. Chosen: beyond it the drift is a random walk."""
+_ITERATIONS = 4
+"""Iterations over coefficients and correlation. Chosen: they no longer change then."""
+_RELATIVE_STEP = 0.02
+"""Step of the derivative by a shape, divided by its value. Chosen: smooth."""
+
+
+@dataclass(frozen=True)
+class ThermalBlocks:
+    """
+    Means of k blocks of a resting sensor with m axes, in the order of time.
+
+    Attributes
+    ----------
+    time_s
+        Middle of each block, s, (k,).
+    temperature_c
+        Temperature of each block, °C, (k,).
+    volts
+        Mean output, V, (k, m).
+
+    """
+
+    time_s: np.ndarray
+    temperature_c: np.ndarray
+    volts: np.ndarray
+
+
+class History(NamedTuple):
+    """
+    A dependence on the history of the temperature.
+
+    Attributes
+    ----------
+    effect
+        `thermal_lag` or `thermal_hysteresis`; '' for none.
+    shape
+        Its time constant, s, or its reach, K.
+
+    """
+
+    effect: str = ''
+    shape: float = 0.0
+
+
+@dataclass(frozen=True)
+class ThermalFit:
+    """
+    Zero-g over temperature with its covariance.
+
+    Attributes
+    ----------
+    names
+        Coefficients, (p,).
+    values
+        Their values, (p,), each in the unit of its parameter.
+    covariance
+        Their covariance, (p, p).
+    history
+        The supported dependence on the history.
+    gains
+        Gain of each tried history in half of the BIC, by effect.
+    residual_g
+        Rms residual of each axis, g, (m,).
+    span_c
+        Lowest and highest temperature, °C.
+
+    """
+
+    names: tuple[Coefficient, ...]
+    values: np.ndarray
+    covariance: np.ndarray
+    history: History
+    gains: dict[str, float]
+    residual_g: np.ndarray
+    span_c: tuple[float, float]
+
+    def error_g(self, temperatures_c: np.ndarray, calibrated_c: float) -> np.ndarray:
+        """
+        Return the expected error of the zero-g of the worst axis.
+
+        Parameters
+        ----------
+        temperatures_c
+            Temperatures, °C, (n,).
+        calibrated_c
+            Temperature at which the zero-g is calibrated, °C.
+
+        Returns
+        -------
+        ndarray
+            Standard deviation, g, (n,).
+
+        """
+        warmer_k = np.asarray(temperatures_c) - NOMINAL_TEMPERATURE_C
+        base_k = calibrated_c - NOMINAL_TEMPERATURE_C
+        slopes = np.column_stack([warmer_k - base_k, warmer_k ** 2 - base_k ** 2])
+        worst = np.zeros(len(slopes))
+        for axis, residual_g in zip(_axes(self.names), self.residual_g):
+            places = [self.names.index(Coefficient('temperature_bias', parameter, axis))
+                      for parameter in ('per_k', 'per_k2')]
+            part = self.covariance[np.ix_(places, places)]
+            variance = np.einsum('ni,ij,nj->n', slopes, part, slopes) + residual_g ** 2
+            worst = np.maximum(worst, np.sqrt(variance))
+        return worst
+
+
+def fit(sensor: Sensor, blocks: ThermalBlocks, with_history: bool = True) -> ThermalFit:
+    """
+    Fit slope and curvature of the zero-g over temperature.
+
+    The zero-g of each orientation is free, because the pose is unknown. Neighbouring residuals
+    are correlated (AR(1), by Cochrane and Orcutt). An effect of the history is kept where it
+    gains enough, and only after a reversal.
+
+    Parameters
+    ----------
+    sensor
+        The unit.
+    blocks
+        Means at rest.
+    with_history
+        Whether `thermal_lag` and `thermal_hysteresis` are tried.
+
+    Returns
+    -------
+    ThermalFit
+        The fit.
+
+    Raises
+    ------
+    UserError
+        The blocks are too few, or the temperature hardly changes.
+
+    """
+    model = _Model(sensor, blocks)
+    histories: dict[str, History] = {}
+    gains: dict[str, float] = {}
+    plain = model.score(History())
+    if with_history and model.reverses:
+        for effect, shapes in (('thermal_lag', _LAGS_S), ('thermal_hysteresis', tuple(
+                np.array(_REACHES) * model.span_k))):
+            histories[effect] = model.best_shape(effect, shapes)
+            gains[effect] = model.score(histories[effect]) - plain
+    best = max(gains, key=lambda effect: gains[effect], default='')
+    history = histories[best] if best and gains[best] > _SMALLEST_GAIN else History()
+    return model.solve(history, gains)
+
+
+class _Axis(NamedTuple):
+    """Least squares of one axis: design, coefficients, correlation, variance and residual."""
+
+    design: np.ndarray
+    values: np.ndarray
+    correlation: float
+    variance_g2: float
+    residual_g: np.ndarray
+
+
+class _Model:
+    """The design of all axes."""
+
+    def __init__(self, sensor: Sensor, blocks: ThermalBlocks) -> None:
+        self._sensor, self._blocks = sensor, blocks
+        temperature_c = blocks.temperature_c
+        if len(temperature_c) < _FEWEST_BLOCKS:
+            raise UserError(f'thermal: {len(temperature_c)} blocks at rest with a temperature, '
+                            f'at least {_FEWEST_BLOCKS} are needed; record for longer')
+        self.span_k = float(np.ptp(temperature_c))
+        if self.span_k < _SMALLEST_SPAN_K:
+            raise UserError(f'thermal: the temperature changes by {self.span_k:.1f} K, at least '
+                            f'{_SMALLEST_SPAN_K:g} K are needed; warm or cool the sensor')
+        self._outputs_g = (blocks.volts - sensor.zero_g_v) / sensor.scale_v_per_g
+        turned = np.abs(np.diff(self._outputs_g, axis=0)).max(axis=1) > _TURN_G
+        self._orientation = np.concatenate([[0], np.cumsum(turned)])
+        branch = stop(temperature_c, self.span_k * _REACHES[1], {})
+        self.reverses = bool(branch.max() > 0.5 and branch.min() < -0.5)
+
+    def score(self, history: History) -> float:
+        """Return half of the BIC's log likelihood term minus its penalty."""
+        axes = [self._solved(d, history) for d in range(len(self._sensor.axes))]
+        count = sum(len(a.residual_g) for a in axes)
+        likelihood = sum(-0.5 * len(a.residual_g) * np.log(a.variance_g2)
+                         + 0.5 * np.log(1 - a.correlation ** 2) for a in axes)
+        coefficients = len(axes) + 1 if history.effect else 0
+        return float(likelihood - 0.5 * coefficients * np.log(count))
+
+    def best_shape(self, effect: str, shapes: Sequence[float]) -> History:
+        """Return the history of an effect with its most probable shape."""
+        scores = [self.score(History(effect, shape)) for shape in shapes]
+        best = int(np.argmax(scores))
+        low, high = np.log([shapes[max(best - 1, 0)], shapes[min(best + 1, len(shapes) - 1)]])
+        minimum = minimize_scalar(lambda v: -self.score(History(effect, float(np.exp(v)))),
+                                bounds=(low, high), method='bounded', options={'xatol': 0.01})
+        return History(effect, float(np.exp(minimum.x)) if -minimum.fun > scores[best]
+                       else shapes[best])
+
+    def solve(self, history: History, gains: dict[str, float]) -> ThermalFit:
+        """Return values and covariance of all coefficients, the shape among them."""
+        axes = self._sensor.axes
+        solved = [self._solved(d, history) for d in range(len(axes))]
+        names: list[Coefficient] = []
+        places: list[list[int]] = []
+        for d, axis in enumerate(axes):
+            of_axis = [Coefficient(*name, axis) for name in self._parameters(d, history)]
+            places.append(list(range(len(names), len(names) + len(of_axis))))
+            names += of_axis
+        values = np.concatenate([a.values[:len(p)] for a, p in zip(solved, places)])
+        if history.effect:
+            names.append(Coefficient(history.effect, _SHAPES[history.effect]))
+            values = np.append(values, history.shape)
+        precision = np.diag([(PRIOR_WIDTH * parameter_of(name).scale) ** -2.0 for name in names])
+        for a, place in zip(solved, places):
+            columns, free = a.design[:, :len(place)], a.design[:, len(place):]
+            if history.effect:
+                place = [*place, len(names) - 1]
+                size = a.values[len(place) - 2]
+                columns = np.column_stack([columns, size * self._shape_slope(history)])
+            white, white_free = (self._whitened(v, a.correlation) for v in (columns, free))
+            white = white - white_free @ np.linalg.lstsq(white_free, white, rcond=None)[0]
+            precision[np.ix_(place, place)] += white.T @ white / a.variance_g2
+        return ThermalFit(
+            tuple(names), values, np.linalg.inv(precision), history, gains,
+            np.array([float(np.std(a.residual_g)) for a in solved]),
+            (float(self._blocks.temperature_c.min()), float(self._blocks.temperature_c.max())))
+
+    def _parameters(self, d: int, history: History) -> list[tuple[str, str]]:
+        """Return effect and parameter of the columns of one axis."""
+        scale = [('temperature_scale', 'per_k')] if self._has_scale(d) else []
+        size = [(history.effect, _SIZES[history.effect])] if history.effect else []
+        return [('temperature_bias', 'per_k'), ('temperature_bias', 'per_k2'), *scale, *size]
+
+    def _has_scale(self, d: int) -> bool:
+        """Return whether the orientations separate the scale factor of an axis from its zero-g."""
+        return float(np.ptp(self._forces_g(d))) > _SCALE_FORCES_G
+
+    def _forces_g(self, d: int) -> np.ndarray:
+        """Return the mean force of each orientation along an axis, g, (orientations,)."""
+        return np.array([self._outputs_g[self._orientation == i, d].mean()
+                         for i in range(self._orientation[-1] + 1)])
+
+    def _design(self, d: int, history: History) -> np.ndarray:
+        """Return the columns of one axis, g per unit; those of the orientations are last."""
+        warmer_k = self._blocks.temperature_c - NOMINAL_TEMPERATURE_C
+        columns = [warmer_k, warmer_k ** 2]
+        if self._has_scale(d):
+            columns.append(self._forces_g(d)[self._orientation] * warmer_k)
+        if history.effect:
+            columns.append(self._history(history))
+        orientations = np.arange(self._orientation[-1] + 1)
+        return np.column_stack([*columns, self._orientation[:, None] == orientations])
+
+    def _history(self, history: History) -> np.ndarray:
+        """Return the output of an effect of size 1, g, (k,)."""
+        if history.effect == 'thermal_lag':
+            return lagging(self._blocks.time_s, self._blocks.temperature_c, history.shape) \
+                - self._blocks.temperature_c
+        return -loop(self._blocks.temperature_c, history.shape, {})
+
+    def _shape_slope(self, history: History) -> np.ndarray:
+        """Differentiate that output by the shape, (k,)."""
+        step = _RELATIVE_STEP * history.shape
+        above, below = (self._history(history._replace(shape=history.shape + s))
+                        for s in (step, -step))
+        return (above - below) / (2 * step)
+
+    def _solved(self, d: int, history: History) -> _Axis:
+        """Fit one axis, its correlation among neighbours included."""
+        design, output_g, correlation = self._design(d, history), self._outputs_g[:, d], 0.0
+        for _ in range(_ITERATIONS):
+            white, target = (self._whitened(v, correlation) for v in (design, output_g))
+            size = np.sqrt((white ** 2).sum(axis=0))
+            values = np.linalg.lstsq(white / size, target, rcond=None)[0] / size
+            residual_g = output_g - design @ values
+            neighbours = residual_g[1:] @ residual_g[:-1] / max(residual_g @ residual_g,
+                                                                np.finfo(float).tiny)
+            rest = target - white @ values
+            correlation = float(np.clip(neighbours, 0.0, _LARGEST_CORRELATION))
+        degrees = max(len(output_g) - design.shape[1], 1)
+        variance_g2 = max(float(rest @ rest) / degrees, np.finfo(float).tiny)
+        return _Axis(design, values, correlation, variance_g2, residual_g)
+
+    def _whitened(self, values: np.ndarray, correlation: float) -> np.ndarray:
+        """Return what neighbouring blocks do not predict; an orientation begins anew."""
+        begins = np.diff(self._orientation, prepend=-1) > 0
+        white = values - correlation * np.roll(values, 1, axis=0)
+        white[begins] = values[begins] * np.sqrt(1 - correlation ** 2)
+        return white
+
+
+_SIZES = {'thermal_lag': 'per_k', 'thermal_hysteresis': 'half_width_g'}
+"""Size of each effect of the history."""
+_SHAPES = {'thermal_lag': 'tau_s', 'thermal_hysteresis': 'reach_k'}
+"""Shape of each effect of the history."""
+
+
+def lagging(time_s: np.ndarray, values: np.ndarray, tau_s: float) -> np.ndarray:
+    """
+    Filter by 1/(1 + τ·s), exactly for straight lines between the samples.
+
+    Parameters
+    ----------
+    time_s
+        Ascending times, s, (k,).
+    values
+        Input, (k,).
+    tau_s
+        Time constant, s.
+
+    Returns
+    -------
+    ndarray
+        Output, (k,); it begins at the first input.
+
+    """
+    steps_s = np.diff(time_s)
+    decay = np.exp(-steps_s / tau_s)
+    ramp = (1 - decay) * tau_s / np.maximum(steps_s, np.finfo(float).tiny)
+    output = np.empty(len(values))
+    output[0] = values[0]
+    for i in range(1, len(values)):
+        output[i] = decay[i - 1] * output[i - 1] + (ramp[i - 1] - decay[i - 1]) * values[i - 1] \
+            + (1 - ramp[i - 1]) * values[i]
+    return output
+
+
+def applied(base: Sensor, fitted: ThermalFit, calibrated_c: float) -> Sensor:
+    """
+    Put a fit over temperature into a calibrated unit, whose zero-g stays right.
+
+    Parameters
+    ----------
+    base
+        The calibrated unit.
+    fitted
+        The fit.
+    calibrated_c
+        Temperature at which the zero-g of the unit was calibrated, °C.
+
+    Returns
+    -------
+    Sensor
+        The unit with effects and covariance of both.
+
+    """
+    names, effects = fitted.names, dict.fromkeys(name.effect for name in fitted.names)
+    kept = [i for i, name in enumerate(base.covariance_names) if name.effect not in EFFECTS]
+    kept_names = tuple(base.covariance_names[i] for i in kept)
+    dropped = [e for e in base.effects if e in EFFECTS and e not in effects]
+    before = replace(base, effects=tuple(e for e in base.effects if e not in dropped),
+                     values={e: v for e, v in base.values.items() if e not in dropped})
+    sensor = put(with_neutral(before, [*effects, 'bias']), names, fitted.values)
+    joint = np.eye(len(kept) + len(names))
+    shifts_v = []
+    for d, axis in enumerate(base.axes):
+        bias = Coefficient('bias', 'offset_v', axis)
+        shift_v = _zero_g_v(base, d, calibrated_c) - _zero_g_v(sensor, d, calibrated_c)
+        shifts_v.append((bias, shift_v))
+        if bias not in kept_names:
+            continue
+        for power, parameter in enumerate(('per_k', 'per_k2'), 1):
+            column = len(kept) + names.index(Coefficient('temperature_bias', parameter, axis))
+            joint[kept_names.index(bias), column] = -base.scale_v_per_g[d] * (
+                calibrated_c - NOMINAL_TEMPERATURE_C) ** power
+    biases = [bias for bias, _ in shifts_v]
+    sensor = put(sensor, biases, get(sensor, biases) + [shift for _, shift in shifts_v])
+    covariance = joint @ block_diag(base.covariance[np.ix_(kept, kept)], fitted.covariance) \
+        @ joint.T
+    return replace(sensor, covariance=covariance, covariance_names=(*kept_names, *names))
+
+
+def _zero_g_v(sensor: Sensor, d: int, temperature_c: float) -> float:
+    """Return what temperature adds to the zero-g of an axis, V."""
+    values = sensor.values.get('temperature_bias')
+    if values is None:
+        return 0.0
+    warmer_k = temperature_c - NOMINAL_TEMPERATURE_C
+    return float(sensor.scale_v_per_g[d] * warmer_k * (
+        values['per_k'][d] + warmer_k * values['per_k2'][d]))
+
+
+def _axes(names: Sequence[Coefficient]) -> list[str]:
+    """Return the axes of coefficients in their order."""
+    return list(dict.fromkeys(name.axis for name in names if name.axis))

@@ -1,0 +1,422 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The guide of a sensor that rests while it warms and cools: samples in, blocks out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from adxl_ros.calibrate import thermal_calibration
+from adxl_ros.calibrate.fits import thermal_fit
+from adxl_ros.calibrate.fits.thermal_fit import ThermalFit
+from adxl_ros.calibrate.guided import running_estimate
+from adxl_ros.calibrate.guided.capture_settings import Phase, Status
+from adxl_ros.calibrate.guided.dwell import Dwell
+from adxl_ros.calibrate.guided.guide import NextPose
+from adxl_ros.calibrate.guided.live_window import NewestSamples, Surroundings, went_back
+from adxl_ros.calibrate.guided.screen_contents import CoefficientRow, Coverage, Estimate, Progress
+from adxl_ros.calibrate.poses import Poses
+from adxl_ros.errors import UserError
+from adxl_ros.files.sweep_journal import JournalEntry, PoseRecord
+from adxl_ros.model.coefficients import parameter_of
+from adxl_ros.model.play_operator import play
+from adxl_ros.model.sensor import Sensor
+from adxl_ros.signals.rest_detection import Stillness
+import numpy as np
+
+_PARTS = 10
+"""Parts of the wanted range that are to be passed in each direction. Chosen: a curve of degree two
+is certain between them."""
+_STEADY_K = 0.25
+"""Change of temperature, K, that is no change of direction. Chosen: above the noise of a
+thermometer."""
+_PATIENCE = 3
+"""Lengths of a block without rest after which its samples are forgotten. Chosen: memory."""
+
+
+@dataclass(frozen=True)
+class ThermalSettings:
+    """
+    What a calibration over temperature is to cover.
+
+    Attributes
+    ----------
+    range_c
+        Lowest and highest wanted temperature, °C.
+    block_s
+        Length of a block, s.
+
+    """
+
+    range_c: tuple[float, float] = (0.0, 50.0)
+    block_s: float = thermal_calibration.BLOCK_S
+
+
+@dataclass(frozen=True)
+class Passed:
+    """
+    Parts of the wanted range that the temperature has passed.
+
+    Attributes
+    ----------
+    middles_c
+        Middle of each part, °C, (parts,).
+    warming, cooling
+        Whether the temperature has passed it in that direction, (parts,) bool.
+    rises
+        Whether the temperature rose last.
+
+    """
+
+    middles_c: np.ndarray
+    warming: np.ndarray
+    cooling: np.ndarray
+    rises: bool
+
+    @property
+    def complete(self) -> bool:
+        """Return whether all parts are passed in both directions."""
+        return bool(self.warming.all() and self.cooling.all())
+
+    def advice(self) -> str:
+        """Return what to do next, for people."""
+        half_c = (self.middles_c[1] - self.middles_c[0]) / 2
+        open_warm, open_cool = self.middles_c[~self.warming], self.middles_c[~self.cooling]
+        if self.complete:
+            return 'both directions are covered'
+        if len(open_warm) and (self.rises or not len(open_cool)):
+            if self.rises:
+                return f'warm it to {open_warm[-1] + half_c:.0f} °C'
+            return (f'cool it to {open_warm[0] - half_c:.0f} °C, then warm it to '
+                    f'{open_warm[-1] + half_c:.0f} °C')
+        if not self.rises:
+            return f'cool it to {open_cool[0] - half_c:.0f} °C'
+        return (f'warm it to {open_cool[-1] + half_c:.0f} °C, then cool it to '
+                f'{open_cool[0] - half_c:.0f} °C')
+
+
+def passed(temperatures_c: np.ndarray, range_c: tuple[float, float]) -> Passed:
+    """
+    Return which parts of a range the temperature has passed.
+
+    Parameters
+    ----------
+    temperatures_c
+        Temperatures in the order of time, °C, (k,).
+    range_c
+        The wanted range, °C.
+
+    Returns
+    -------
+    Passed
+        Parts by direction.
+
+    """
+    low_c, high_c = range_c
+    middles_c = low_c + (high_c - low_c) * (np.arange(_PARTS) + 0.5) / _PARTS
+    steady_c = play(np.asarray(temperatures_c, float), _STEADY_K, {})
+    before_c, after_c = steady_c[:-1, None], steady_c[1:, None]
+    warming = ((before_c < middles_c) & (middles_c <= after_c)).any(axis=0)
+    cooling = ((after_c <= middles_c) & (middles_c < before_c)).any(axis=0)
+    changes = np.diff(steady_c)
+    changes = changes[changes != 0]
+    rises = bool(not len(changes) or changes[-1] > 0)
+    return Passed(middles_c, np.asarray(warming), np.asarray(cooling), rises)
+
+
+class ThermalGuide:
+    """
+    Averages a resting sensor block by block while its temperature changes; a `Guide`.
+
+    Parameters
+    ----------
+    sensor
+        The nominal sensor of the stream.
+    base
+        The unit as it is calibrated at one temperature.
+    settings
+        What is to be covered.
+    accepted
+        Blocks of an interrupted calibration.
+
+    """
+
+    moves_itself = False
+    open_poses = 0
+    poses_to_verify = 0
+
+    def __init__(self, sensor: Sensor, base: Sensor, settings: ThermalSettings,
+                 accepted: Sequence[PoseRecord] = ()) -> None:
+        self.sensor = sensor
+        self.accepted = {record.pose: record for record in accepted}
+        self.surroundings = Surroundings()
+        self.newest_ns: int | None = None
+        self._base, self._settings = base, settings
+        self._refusal = self._new_refusal = ''
+        self._begin_block()
+        self._update()
+
+    def _begin_block(self) -> None:
+        """Begin a block with the next sample."""
+        self._stamps: list[np.ndarray] = []
+        self._volts: list[np.ndarray] = []
+        self._dwell: Dwell | None = None
+
+    @property
+    def is_over(self) -> bool:
+        """Return whether the wanted range is covered in both directions."""
+        return self._passed.complete
+
+    @property
+    def pose_number(self) -> int:
+        """Return the number of the next block, from 1."""
+        return len(self.accepted) + 1
+
+    @property
+    def previous(self) -> int | None:
+        """Return the number of the newest block, from 0; None where there is none."""
+        return max(self.accepted, default=None)
+
+    def verify(self) -> None:
+        """Do nothing: a block cannot be taken again at the same temperature."""
+
+    def read_encoder(self, stamp_ns: int, alpha_rad: float, beta_rad: float) -> None:
+        """
+        Do nothing: no stage carries the sensor.
+
+        Parameters
+        ----------
+        stamp_ns
+            Stamp of the angles, ns.
+        alpha_rad, beta_rad
+            Angles of a stage that carries something else, rad.
+
+        """
+
+    def read_command(self, alpha_rad: float, beta_rad: float) -> None:
+        """
+        Do nothing: no stage carries the sensor.
+
+        Parameters
+        ----------
+        alpha_rad, beta_rad
+            Command for a stage that carries something else, rad.
+
+        """
+
+    def feed(self, stamps_ns: np.ndarray, volts: np.ndarray) -> None:
+        """
+        Take samples.
+
+        Parameters
+        ----------
+        stamps_ns
+            Their stamps, ns, (n,).
+        volts
+            The samples, V, (n, m).
+
+        """
+        if not len(stamps_ns):
+            return
+        if self.newest_ns is not None and went_back(self.newest_ns, int(stamps_ns[0])):
+            self._begin_block()
+        self.newest_ns = int(stamps_ns[-1])
+        self._stamps.append(stamps_ns)
+        self._volts.append(volts)
+        if self._dwell is None:
+            self._dwell = Dwell(self.sensor, int(stamps_ns[0]))
+        self._dwell.feed(stamps_ns, volts)
+
+    def accept(self) -> PoseRecord | None:
+        """Return the block that is complete, for the journal, else None."""
+        dwell = self._dwell
+        samples = max(round(self._settings.block_s * self.sensor.rate_hz), 2)
+        if dwell is None or sum(map(len, self._stamps)) < samples:
+            return None
+        rest = next((r for r in dwell.rests() if r.stop - r.start >= samples), None)
+        if rest is None:
+            if sum(map(len, self._stamps)) > _PATIENCE * samples:
+                self._begin_block()
+            return None
+        mean = dwell.mean(rest, samples)
+        temperature_c = self.surroundings.temperature_c.mean(mean.start_ns, mean.stop_ns)
+        self._refuse(self._fault(temperature_c, dwell.volts(rest)[:samples]))
+        if self._refusal:
+            self._continue_after(mean.stop_ns)
+            return None
+        return PoseRecord(
+            pose=max(self.accepted, default=-1) + 1, start_ns=mean.start_ns,
+            stop_ns=mean.stop_ns, samples=mean.samples, mean_v=mean.mean_v, std_v=mean.std_v,
+            temperature_c=temperature_c,
+            supply_v=self.surroundings.supply_v.mean(mean.start_ns, mean.stop_ns))
+
+    def _fault(self, temperature_c: float, volts: np.ndarray) -> str:
+        """Return why a block is refused, or ''."""
+        if not np.isfinite(temperature_c):
+            return ('no temperature: nothing on the topic temperature; publish the reading of a '
+                    'thermometer at the sensor')
+        if self.sensor.saturated(volts).any():
+            return ('saturated: samples of the block are beyond the range of '
+                    f'±{self.sensor.range_g:g} g or at a rail of the ADC; check supply and wiring')
+        return ''
+
+    def _refuse(self, reason: str) -> None:
+        """Keep a new reason for `new_refusal`."""
+        if reason != self._refusal:
+            self._new_refusal = reason
+        self._refusal = reason
+
+    def _continue_after(self, stop_ns: int) -> None:
+        """Begin a block with the samples after a stamp."""
+        stamps_ns, volts = np.concatenate(self._stamps), np.concatenate(self._volts)
+        self._begin_block()
+        later = stamps_ns > stop_ns
+        self.feed(stamps_ns[later], volts[later])
+
+    def take(self, record: PoseRecord) -> None:
+        """Count a block that is on disk."""
+        self.accepted[record.pose] = record
+        self._continue_after(record.stop_ns)
+        self._update()
+
+    def retry(self) -> None:
+        """Keep the samples, so that the block is offered again."""
+
+    def capture(self) -> str:
+        """Return that nothing needs a capture."""
+        return 'nothing to capture: leave the sensor at rest, and each block is taken by itself'
+
+    def skip_entry(self) -> JournalEntry | None:
+        """Return None: a part of the range that is left out has no entry in the journal."""
+        return None
+
+    def skip(self) -> str:
+        """Return that nothing can be left out."""
+        return 'nothing to skip: finish ends the calibration before the range is covered'
+
+    def redo(self) -> str:
+        """Forget the newest block; return a line for people, or '' where there is none."""
+        number = self.previous
+        if number is None:
+            return ''
+        del self.accepted[number]
+        self._update()
+        return f'block {number + 1} is forgotten'
+
+    def poses_to_fit(self) -> list[PoseRecord]:
+        """Return the blocks, by number."""
+        return [self.accepted[number] for number in sorted(self.accepted)]
+
+    def new_refusal(self) -> str:
+        """Return why a block was refused since the last call, or ''."""
+        text, self._new_refusal = self._new_refusal, ''
+        return text
+
+    def stillness(self, newest: NewestSamples) -> Stillness | None:
+        """Return whether the newest samples are at rest; None while they are too few."""
+        return newest.stillness()
+
+    def destination(self) -> str:
+        """Return what to do with the temperature, for people."""
+        return self._passed.advice()
+
+    def next_pose(self) -> NextPose | None:
+        """Return what to announce; None once the range is covered."""
+        return None if self.is_over else NextPose(self.destination(), self.values(), None)
+
+    def values(self) -> dict[str, str | float]:
+        """Return span, coverage and expected error for programs, by key."""
+        low_c, high_c = self._settings.range_c
+        values: dict[str, str | float] = {
+            'range_c': f'{low_c:g} to {high_c:g}',
+            'warming': f'{self._passed.warming.mean():.0%}',
+            'cooling': f'{self._passed.cooling.mean():.0%}'}
+        if self.accepted:
+            temperatures_c = self._temperatures_c()
+            values['span_c'] = f'{temperatures_c.min():.1f} to {temperatures_c.max():.1f}'
+        if self._error_mg is not None:
+            values['expected_error_mg'] = self._error_mg
+        return values
+
+    def status(self) -> Status:
+        """Return what the guide waits for, with the values that matter."""
+        if self._refusal:
+            return Status(Phase.REFUSED, self._refusal, True)
+        if self.is_over:
+            return Status(Phase.DONE, self.destination(), False)
+        at_rest = self._dwell is not None and self._dwell.at_rest()
+        rest = '' if at_rest or self._dwell is None else 'the sensor moves; '
+        return Status(Phase.DWELL if at_rest else Phase.REST,
+                      f'{len(self.accepted)} blocks; {self._covered_text()}{rest}'
+                      f'{self.destination()}', False)
+
+    def _covered_text(self) -> str:
+        """Return span and expected error, for people."""
+        values = self.values()
+        if 'span_c' not in values:
+            return ''
+        error = '' if self._error_mg is None else f'expected error {self._error_mg:.2g} mg; '
+        return (f'{values["span_c"]} of {values["range_c"]} °C, warming {values["warming"]}, '
+                f'cooling {values["cooling"]}; {error}')
+
+    def progress(self) -> Progress:
+        """Return the progress of the calibration, for the screen."""
+        position = ''
+        if self.accepted:
+            direction = 'warming' if self._passed.rises else 'cooling'
+            position = f'{self._temperatures_c()[-1]:.1f} °C, {direction}'
+        done = int(self._passed.warming.sum() + self._passed.cooling.sum())
+        return Progress(
+            number=self.pose_number, destination=self.destination(), position=position,
+            accepted=done, total=2 * _PARTS, skipped=0, open_poses=self.open_poses,
+            remaining_s=None, dwelt_s=None, dwell_s=None)
+
+    def estimate_contents(self) -> Estimate:
+        """Return what the blocks determine so far, for the screen."""
+        coverage = (Coverage('warming', int(self._passed.warming.sum()), _PARTS),
+                    Coverage('cooling', int(self._passed.cooling.sum()), _PARTS))
+        rows: tuple[CoefficientRow, ...] = ()
+        if self._fit is not None:
+            prior = np.array([thermal_fit.PRIOR_WIDTH * parameter_of(name).scale
+                              for name in self._fit.names])
+            rows = running_estimate.coefficient_rows(
+                self._fit.names, self._fit.values, np.sqrt(np.diag(self._fit.covariance)), prior)
+        return Estimate(coverage=coverage, covered_faces='', coefficients=rows,
+                        tilt_error_deg=None, final_tilt_error_deg=None)
+
+    def tilt_error_rad(self) -> float:
+        """Return NaN: blocks in one orientation do not determine the tilt."""
+        return float('nan')
+
+    def _temperatures_c(self) -> np.ndarray:
+        """Return the temperatures of the blocks in the order of time, °C, (k,)."""
+        return np.array([record.temperature_c for record in self.poses_to_fit()])
+
+    def _update(self) -> None:
+        """Bring coverage, fit and expected error up to date."""
+        self._passed = passed(self._temperatures_c(), self._settings.range_c)
+        self._fit: ThermalFit | None = None
+        self._error_mg: float | None = None
+        if not self.accepted:
+            return
+        poses = Poses.from_records(self.poses_to_fit())
+        try:
+            self._fit = thermal_fit.fit(self._base, thermal_calibration.blocks_of(poses), False)
+        except UserError:
+            return
+        self._error_mg = 1e3 * float(self._fit.error_g(
+            self._passed.middles_c,
+            thermal_calibration.calibrated_temperature_c(self._base)).max())
