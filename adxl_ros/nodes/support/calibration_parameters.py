@@ -96,8 +96,9 @@ def declare_settings(node: Node) -> SessionSettings:
 
 def _declare_thermal(node: Node) -> ThermalSettings:
     """Declare the parameters of the mode `thermal`."""
-    given = declare(node, 'thermal.range_c', (0.0, 50.0),
-                    'lowest and highest temperature that mode thermal is to cover', 'degC')
+    given = declare(node, 'thermal.range_c', (), 'lowest and highest temperature that mode '
+                    'thermal is to cover, a list of numbers; empty: 0 to 50', 'degC') \
+        or ThermalSettings.range_c
     if len(given) != 2 or not given[0] < given[1]:
         raise parameter_error('thermal.range_c', f'{list(given)} is no lowest and highest '
                               'temperature; give two, as [0.0, 50.0]')
