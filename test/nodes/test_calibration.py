@@ -233,7 +233,8 @@ def test_planes_and_step_are_set_in_degrees(start, tmp_path):
 @pytest.mark.parametrize('setting, words', [
     ('sweep.planes_deg:=[thirty]', 'sweep.planes_deg: '),
     ('sweep.step_rad:=0.0', 'sweep.step_rad'),
-    ('thermal.range_c:=[50.0, 0.0]', 'thermal.range_c: [50.0, 0.0] is no lowest'), ('output:=.', 'output: . is a directory; name a')])
+    ('thermal.range_c:=[50.0, 0.0]', 'thermal.range_c: [50.0, 0.0] is no lowest'),
+    ('output:=.', 'output: . is a directory; name a')])
 def test_settings_out_of_range_end_the_node(start, tmp_path, setting, words):
     """A step of 0, or a directory for a file, is refused at the start, in one line."""
     _, bare = _files(tmp_path)
