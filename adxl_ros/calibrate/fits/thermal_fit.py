@@ -244,10 +244,11 @@ class _Model:
         scores = [self.score(History(effect, shape)) for shape in shapes]
         best = int(np.argmax(scores))
         low, high = np.log([shapes[max(best - 1, 0)], shapes[min(best + 1, len(shapes) - 1)]])
-        minimum = minimize_scalar(lambda v: -self.score(History(effect, float(np.exp(v)))),
-                                bounds=(low, high), method='bounded', options={'xatol': 0.01})
-        return History(effect, float(np.exp(minimum.x)) if -minimum.fun > scores[best]
-                       else shapes[best])
+        minimum = minimize_scalar(
+            lambda logarithm: -self.score(History(effect, float(np.exp(logarithm)))),
+            bounds=(low, high), method='bounded', options={'xatol': 0.01})
+        shape = float(np.exp(minimum.x)) if -minimum.fun > scores[best] else shapes[best]
+        return History(effect, shape)
 
     def solve(self, history: History, gains: dict[str, float]) -> ThermalFit:
         """Return values and covariance of all coefficients, the shape among them."""
