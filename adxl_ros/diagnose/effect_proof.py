@@ -31,6 +31,7 @@ from adxl_ros.model.constants import AXES, G0_MPS2, Z_90
 from adxl_ros.model.diagnosis_hints import ProofVariable
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import ActsOn
+from adxl_ros.model.filters import low_pass
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.sensor import Sensor
 import numpy as np
@@ -38,6 +39,8 @@ from scipy.signal import welch
 
 _BINS = 10
 """Number of ranges of equal width, and of ranges of equal counts. Chosen: a curve is visible."""
+_RATE_S = 20.0
+"""Time over which a temperature changes, s. Chosen: beyond the noise of a thermometer."""
 _FEWEST_SAMPLES = 20
 """Fewest samples of a range. Chosen: their mean is worth a point."""
 _BLOCK_S = 2.0
@@ -232,7 +235,10 @@ def _values(comparison: BaselineComparison, variable: ProofVariable) -> np.ndarr
         return comparison.volts
     by_time = {ProofVariable.TIME: time_s - time_s[0]}
     if motion.temperature_c is not None:
-        by_time[ProofVariable.TEMPERATURE] = motion.temperature_c(time_s)
+        temperature_c = motion.temperature_c(time_s)
+        late_k = temperature_c - low_pass(temperature_c, _RATE_S, comparison.dt_s, {})
+        by_time |= {ProofVariable.TEMPERATURE: temperature_c,
+                    ProofVariable.TEMPERATURE_RATE: late_k * 60 / _RATE_S}
     if motion.supply_v is not None:
         by_time[ProofVariable.SUPPLY] = motion.supply_v(time_s)
     if comparison.reference is Reference.STAGE:

@@ -121,6 +121,7 @@ class ProofVariable(Enum):
     ALPHA_ACCELERATION = 'angular acceleration of alpha, °/s²'
     BETA_ACCELERATION = 'angular acceleration of beta, °/s²'
     TEMPERATURE = 'temperature, °C'
+    TEMPERATURE_RATE = 'change of the temperature, K/min'
     SUPPLY = 'supply, V'
     TIME = 'time, s'
     OUTPUT = 'output, V'

@@ -14,7 +14,7 @@
 
 """Thermal hysteresis: a zero-g that differs between warming and cooling."""
 
-from adxl_ros.model.diagnosis_hints import DiagnosisHints, FormDimension, Manoeuvre
+from adxl_ros.model.diagnosis_hints import DiagnosisHints, FormDimension, Manoeuvre, ProofVariable
 from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Role, Signals
 from adxl_ros.model.play_operator import loop
 import numpy as np
@@ -52,5 +52,6 @@ EFFECT = Effect(
     cause='The zero-g depends on whether the sensor warms or cools; relieve its package of '
           'stress, or state the loop as an uncertainty.',
     diagnosis=DiagnosisHints(revealed_by=Manoeuvre.HEAT,
-                             form=(FormDimension.TEMPERATURE, FormDimension.WARMING)),
+                             form=(FormDimension.TEMPERATURE, FormDimension.WARMING),
+                             proof=(ProofVariable.TEMPERATURE_RATE, ProofVariable.TEMPERATURE)),
 )

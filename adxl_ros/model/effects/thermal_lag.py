@@ -14,7 +14,7 @@
 
 """A thermometer that differs from the sensor in time, so that the zero-g is late or early."""
 
-from adxl_ros.model.diagnosis_hints import DiagnosisHints, FormDimension, Manoeuvre
+from adxl_ros.model.diagnosis_hints import DiagnosisHints, FormDimension, Manoeuvre, ProofVariable
 from adxl_ros.model.effects.base import Effect, Parameter, Parameters, Place, Role, Signals
 from adxl_ros.model.filters import low_pass
 import numpy as np
@@ -50,5 +50,6 @@ EFFECT = Effect(
     cause='The thermometer is warm earlier or later than the sensor; mount it at the sensor, or '
           'change the temperature slowly.',
     diagnosis=DiagnosisHints(revealed_by=Manoeuvre.HEAT,
-                             form=(FormDimension.TEMPERATURE, FormDimension.WARMING)),
+                             form=(FormDimension.TEMPERATURE, FormDimension.WARMING),
+                             proof=(ProofVariable.TEMPERATURE_RATE,)),
 )
