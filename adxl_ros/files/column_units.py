@@ -78,7 +78,8 @@ class Unit:
 
     def convert(self, values: np.ndarray) -> np.ndarray:
         """Return values in the unit of the package."""
-        return values * self.factor / self.divisor + self.offset
+        with np.errstate(over='ignore'):  # such a value is refused afterwards
+            return values * self.factor / self.divisor + self.offset
 
 
 UNITS: Mapping[Quantity, Mapping[str, Unit]] = {

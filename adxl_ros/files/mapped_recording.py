@@ -252,7 +252,7 @@ class _Converter:
             self._begin_remarks(outputs[is_kept], time_s[is_kept])
         self._count += int(is_kept.sum())
         info = {key: text for key, text in block.info.items() if key != 'epoch_ns'}
-        return Recording(self.table.path, time_s[is_kept], columns, info,
+        return Recording(self.table.path, time_s[is_kept], columns, info, cut=block.cut,
                          epoch_ns=self._epoch_ns or 0, done=block.done,
                          remarks=(*self._remarks, *self._counts()),
                          bad_stamps=BadStamps(self._duplicates, self._backward))

@@ -122,6 +122,24 @@ def test_tables_of_libraries(run_tool, tmp_path, name) -> None:
     check_errors(tmp_path / 'unit.yaml')
 
 
+def test_a_damaged_log_is_read_to_its_damage(run_tool, tmp_path) -> None:
+    pytest.importorskip('pyulog', reason='no pyulog')
+    whole = ulog(LOG)
+    (tmp_path / 'log.ulg').write_bytes(whole[:-2000] + bytes(500) + whole[-1500:])
+    done = run_tool('fit', 'log.ulg', '-o', 'unit.yaml')
+    assert done.returncode == 0, done.stderr
+    assert 'log.ulg: is damaged; what can be read of it is used' in done.stderr
+    check_errors(tmp_path / 'unit.yaml')
+
+
+@pytest.mark.parametrize('name', ['log.npz', 'log.parquet', 'log.ulg'])
+def test_a_file_of_another_format_is_refused_in_one_line(run_tool, tmp_path, name) -> None:
+    (tmp_path / name).write_bytes(bytes(range(256)))
+    done = run_tool('fit', name, '-o', 'unit.yaml')
+    assert done.returncode == 1 and done.stderr.count('\n') == 1
+    assert done.stderr.startswith(f'fit: {name}: cannot read it as '), done.stderr
+
+
 @pytest.mark.parametrize(('name', 'package'), [('a.parquet', 'pyarrow'), ('a.ulg', 'pyulog')])
 def test_a_missing_library_is_named(tmp_path, name, package) -> None:
     (tmp_path / name).write_bytes(b'')

@@ -41,6 +41,8 @@ class TableBlock:
         Keys and values that the file states.
     done
         Fraction of the file that has been read at the end of the rows.
+    cut
+        Where a damaged file ends; empty if it is whole.
 
     """
 
@@ -48,6 +50,7 @@ class TableBlock:
     where: Callable[[int, str], str]
     info: Mapping[str, str] = field(default_factory=dict)
     done: float = 1.0
+    cut: str = ''
 
 
 class Table(Protocol):
@@ -104,6 +107,8 @@ class ArrayTable:
         Units that the format states, by column.
     default_mapping
         The mapping that the definition of the format states.
+    cut
+        Where a damaged file ends; empty if it is whole.
 
     """
 
@@ -113,6 +118,7 @@ class ArrayTable:
     default_mapping: str = ''
     has_names: bool = True
     form: str = ''
+    cut: str = ''
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -126,7 +132,7 @@ class ArrayTable:
             stop = min(start + BLOCK_ROWS, rows)
             yield TableBlock({name: np.asarray(self.columns[name][start:stop], float)
                               for name in names},
-                             RowPlaces(self.path, start), done=stop / rows)
+                             RowPlaces(self.path, start), done=stop / rows, cut=self.cut)
 
     def sample(self) -> Mapping[str, np.ndarray]:
         """Return the first rows; see `Table`."""

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections import Counter
 import zipfile
+import zlib
 
 from adxl_ros.errors import UserError
 from adxl_ros.files.tables.base import ArrayTable
@@ -56,7 +57,8 @@ def open_table(path: str, topic: str = '') -> ArrayTable:
         with np.load(path, allow_pickle=False) as arrays:
             for name in arrays.files:
                 columns |= _columns(name, arrays[name])
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, EOFError, NotImplementedError, zipfile.BadZipFile,
+            zlib.error) as error:
         raise UserError(f'{path}: cannot read it as .npz: {" ".join(str(error).split())}; save '
                         'plain arrays of numbers with numpy.savez') from None
     if not columns:

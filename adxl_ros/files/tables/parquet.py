@@ -20,7 +20,7 @@ from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from adxl_ros.errors import install_hint, UserError
+from adxl_ros.errors import install_hint, one_line, UserError
 from adxl_ros.files.tables.base import BLOCK_ROWS, RowPlaces, TableBlock
 import numpy as np
 
@@ -55,12 +55,20 @@ class ParquetTable:
         """Yield blocks of rows; see `Table`."""
         with _opened(self.path) as file:
             total, first = max(file.metadata.num_rows, 1), 0
-            for batch in file.iter_batches(BLOCK_ROWS, columns=list(names)):
+            for batch in self._batches(file, names):
                 columns = {name: _numbers(batch.column(batch.schema.get_field_index(name)))
                            for name in names}
                 yield TableBlock(columns, RowPlaces(self.path, first),
                                  done=(first + batch.num_rows) / total)
                 first += batch.num_rows
+
+    def _batches(self, file: Any, names: Collection[str]) -> Iterator[Any]:
+        """Yield the batches of an open file."""
+        import pyarrow
+        try:
+            yield from file.iter_batches(BLOCK_ROWS, columns=list(names))
+        except (OSError, pyarrow.ArrowException) as error:
+            raise _unreadable(self.path, error) from None
 
     def sample(self) -> Mapping[str, np.ndarray]:
         """Return the first rows; see `Table`."""
@@ -114,8 +122,12 @@ def _opened(path: str) -> Any:
     try:
         return pyarrow.parquet.ParquetFile(path)
     except (OSError, pyarrow.ArrowException) as error:
-        raise UserError(f'{path}: cannot read it as Parquet: {" ".join(str(error).split())}'
-                        ) from None
+        raise _unreadable(path, error) from None
+
+
+def _unreadable(path: str, error: Exception) -> UserError:
+    """Return the error of a file that the library cannot read."""
+    return UserError(f'{path}: cannot read it as Parquet: {one_line(error)}')
 
 
 def _numbers(column: Any) -> np.ndarray:

@@ -16,6 +16,8 @@
 
 from __future__ import annotations
 
+from contextlib import redirect_stdout
+from io import StringIO
 from typing import Any
 
 from adxl_ros.errors import install_hint, UserError
@@ -58,7 +60,8 @@ def open_table(path: str, topic: str = '') -> ArrayTable:
         The file cannot be read, it has no such message, or the library is missing.
 
     """
-    messages = {_name(data): data for data in _read(path).data_list}
+    log = _read(path)
+    messages = {_name(data): data for data in log.data_list}
     data = messages.get(topic.removesuffix('_0') or _only(path, messages))
     if data is None:
         raise UserError(f'{path}: no message {topic}; name one of '
@@ -69,7 +72,9 @@ def open_table(path: str, topic: str = '') -> ArrayTable:
     mapping = _MAPPINGS.get(data.name, '').format(time=time)
     if 'temperature' not in columns:
         mapping = mapping.partition(',temperature=')[0]
-    return ArrayTable(path, columns, {'timestamp': 'us', 'timestamp_sample': 'us'}, mapping)
+    return ArrayTable(path, columns, {'timestamp': 'us', 'timestamp_sample': 'us'}, mapping,
+                      cut=f'{path}: is damaged; what can be read of it is used'
+                      if log.file_corruption else '')
 
 
 def _name(data: Any) -> str:
@@ -104,7 +109,9 @@ def _read(path: str) -> Any:
         raise UserError(f'{path}: logs of PX4 need the Python package pyulog: '
                         f'{install_hint("pyulog")}') from None
     try:
-        return ULog(path)
+        # The library prints its warnings.
+        with redirect_stdout(StringIO()):
+            return ULog(path)
     except OSError as error:
         raise UserError(f'{path}: cannot read: {error.strerror or error}') from None
     except Exception as error:
