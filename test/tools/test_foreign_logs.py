@@ -124,8 +124,8 @@ def test_tables_of_libraries(run_tool, tmp_path, name) -> None:
 
 def test_a_damaged_log_is_read_to_its_damage(run_tool, tmp_path) -> None:
     pytest.importorskip('pyulog', reason='no pyulog')
-    whole = ulog(LOG)
-    (tmp_path / 'log.ulg').write_bytes(whole[:-2000] + bytes(500) + whole[-1500:])
+    data = ulog(LOG)
+    (tmp_path / 'log.ulg').write_bytes(data[:-2000] + bytes(500) + data[-1500:])
     done = run_tool('fit', 'log.ulg', '-o', 'unit.yaml')
     assert done.returncode == 0, done.stderr
     assert 'log.ulg: is damaged; what can be read of it is used' in done.stderr
