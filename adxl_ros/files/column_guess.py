@@ -61,6 +61,9 @@ _REFERENCES = {
 }
 """Names of references by role."""
 
+_ATTITUDE = re.compile(r'(?i)yaw|heading|quat')
+"""Names beside an attitude that software has estimated."""
+
 _EPOCHS = ((1e9, 'ns'), (1e6, 'us'), (1e3, 'ms'), (1.0, 's'))
 """Counts of a second of each unit."""
 
@@ -148,7 +151,7 @@ def propose(table: Table) -> Proposal | None:
     stated = table.units.get(outputs[0]) or unit_in_name(outputs[0], Quantity.OUTPUT)
     unit = stated or ('' if zero else likely_unit(length)) or _count_or_volts(zero or length)
     sources |= {axis: Source(name, unit) for axis, name in zip(AXES, outputs)}
-    about = f' about {zero:.0f}' * (zero != 0)
+    about = f' about {zero:.4g}' * (zero != 0)
     reasons.append(f'the readings have a length of {length:.4g}{about}'
                    + f', so {unit}' * (not stated))
     sources |= _references(table, values, {*outputs, time or ''})
@@ -287,9 +290,11 @@ def _zero_and_length(readings: np.ndarray) -> tuple[float, float]:
     """
     length = float(np.median(np.linalg.norm(readings, axis=1)))
     spread = np.ptp(readings, axis=0)
-    if len(readings) < _SPHERE_ROWS or readings.shape[1] < len(AXES) or \
-            (readings.min(axis=0) < 0).any() or spread.min() < _TURNED * spread.max():
+    if len(readings) < _SPHERE_ROWS or (readings.min(axis=0) < 0).any() or \
+            spread.min() < _TURNED * spread.max():
         return 0.0, length
+    if readings.shape[1] < len(AXES):
+        return float(np.mean(readings.min(axis=0) + spread / 2)), float(spread.max() / 2)
     # A sphere: |r|^2 = 2 r.c + radius^2 - |c|^2 is linear in its centre.
     terms = np.column_stack([2 * readings, np.ones(len(readings))])
     solution = np.linalg.lstsq(terms, (readings ** 2).sum(axis=1), rcond=None)[0]
@@ -319,7 +324,9 @@ def _references(table: Table, values: Mapping[str, np.ndarray], used: set[str]
         if name:
             stated = unit_in_name(name, ROLES[role])
             sources[role] = Source(name, stated or _reference_unit(role, values[name]))
-    if ('roll' in sources) != ('pitch' in sources) or 'alpha' in sources:
+    # An estimate of attitude, which has a yaw, is made of the readings and is no reference.
+    is_estimate = any(_ATTITUDE.search(name) for name in values)
+    if ('roll' in sources) != ('pitch' in sources) or 'alpha' in sources or is_estimate:
         sources.pop('roll', None), sources.pop('pitch', None)
     return sources
 

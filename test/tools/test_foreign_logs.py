@@ -99,6 +99,26 @@ def test_counts_about_an_offset(run_tool, tmp_path) -> None:
     check_errors(tmp_path / 'unit.yaml')
 
 
+def test_an_estimated_attitude_is_no_reference(run_tool, tmp_path) -> None:
+    """Roll and pitch beside a yaw come from the readings themselves."""
+    zero = 0 * LOG.time_s
+    written(tmp_path, 'log.csv', 'Time,AccX,AccY,AccZ,Roll,Pitch,Yaw\n' + lines(
+        [LOG.time_s, *LOG.output_g.T, zero, zero, zero], ['%.3f'] + ['%.4f'] * 6))
+    options = proposed(run_tool('fit', 'log.csv', '-o', 'unit.yaml').stderr)
+    assert options == ['--columns', 'time=Time:s,x=AccX:g,y=AccY:g,z=AccZ:g']
+
+
+def test_two_axes_of_counts(run_tool, tmp_path) -> None:
+    """The middle of the readings is 0 g of a two-axis sensor that was turned."""
+    counts = 32768 + 13107 * LOG.output_g[:, :2]
+    written(tmp_path, 'log.csv', 'ms,adc_x,adc_y\n' + lines([1e3 * LOG.time_s, *counts.T],
+                                                            ['%.0f'] * 3))
+    options = proposed(run_tool('fit', 'log.csv', '-o', 'unit.yaml').stderr)
+    assert options[1] == 'time=ms:ms,x=adc_x:lsb,y=adc_y:lsb'
+    assert float(options[options.index('--lsb-at-0g') + 1]) == pytest.approx(32768, rel=0.02)
+    assert float(options[options.index('--lsb-per-g') + 1]) == pytest.approx(13107, rel=0.05)
+
+
 @pytest.mark.parametrize('name', ['log.npz', 'log.parquet', 'log.ulg'])
 def test_tables_of_libraries(run_tool, tmp_path, name) -> None:
     if name == 'log.npz':
