@@ -179,6 +179,8 @@ class Estimate:
         Expected rms error of alpha and beta, degrees; None where no pose shows both.
     final_tilt_error_deg
         The same after all poses; None where the number of poses is not fixed.
+    range_error
+        Expected error over a range of temperature, for people; '' for other calibrations.
 
     """
 
@@ -187,6 +189,7 @@ class Estimate:
     coefficients: tuple[CoefficientRow, ...]
     tilt_error_deg: float | None
     final_tilt_error_deg: float | None
+    range_error: str = ''
 
 
 @dataclass(frozen=True)

@@ -395,7 +395,17 @@ class ThermalGuide:
             rows = running_estimate.coefficient_rows(
                 self._fit.names, self._fit.values, np.sqrt(np.diag(self._fit.covariance)), prior)
         return Estimate(coverage=coverage, covered_faces='', coefficients=rows,
-                        tilt_error_deg=None, final_tilt_error_deg=None)
+                        tilt_error_deg=None, final_tilt_error_deg=None,
+                        range_error=self._range_error())
+
+    def _range_error(self) -> str:
+        """Return the expected error over the wanted range, for people."""
+        low_c, high_c = self._settings.range_c
+        if self._error_mg is None:
+            return f'not known yet over {low_c:g} to {high_c:g} °C'
+        span_c = self._temperatures_c()
+        return (f'zero-g {self._error_mg:.2g} mg expected over {low_c:g} to {high_c:g} °C, after '
+                f'{span_c.min():.1f} to {span_c.max():.1f} °C')
 
     def tilt_error_rad(self) -> float:
         """Return NaN: blocks in one orientation do not determine the tilt."""

@@ -166,11 +166,13 @@ def _rest(rest: RestReading) -> Line:
 def _progress(progress: Progress | None, estimate: Estimate | None, width: int) -> list[Line]:
     if progress is None or estimate is None:
         return []
-    lines = [_row('poses', _counts(progress))]
+    lines = [_row('parts' if estimate.range_error else 'poses', _counts(progress))]
     covered = ', '.join(f'{row.group} {row.accepted}/{row.total}' for row in estimate.coverage)
     if estimate.covered_faces:
         covered += f' ({estimate.covered_faces} up)'
     lines += _wrapped('coverage', covered, width)
+    if estimate.range_error:
+        return [*lines, *_wrapped('error', estimate.range_error, width)]
     if estimate.tilt_error_deg is None:
         return [*lines, _row('tilt error', 'no pose shows both angles to one axis')]
     final = '' if estimate.final_tilt_error_deg is None else \
