@@ -24,6 +24,7 @@ from adxl_ros.calibrate.fits import thermal_fit
 from adxl_ros.calibrate.fits.thermal_fit import ThermalBlocks, ThermalFit
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.calibrate.provenance import with_provenance
+from adxl_ros.calibrate.thermal_coverage import expected_error_mg, passed
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model.coefficients import get
 from adxl_ros.model.constants import G0_MPS2, NOMINAL_TEMPERATURE_C, Z_90
@@ -153,7 +154,7 @@ def calibrate(base: Sensor, poses: Poses, source: str, data_sha256: str = '',
         'residual_mg': f'{misfit_mps2 / G0_MPS2 * 1e3:.4f}',
         'sweep': f'{len(blocks.time_s)} blocks at rest, {fit.span_c[0]:.1f} to '
                  f'{fit.span_c[1]:.1f} degC'})
-    error_mg = 1e3 * float(fit.error_g(np.linspace(low_c, high_c, 50), calibrated_c).max())
+    error_mg = expected_error_mg(fit, passed(blocks.temperature_c, (low_c, high_c)), calibrated_c)
     lines = [
         f'zero-g over temperature: {len(blocks.time_s)} blocks at rest, '
         f'{fit.span_c[0]:.1f} to {fit.span_c[1]:.1f} °C',

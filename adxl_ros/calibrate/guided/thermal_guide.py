@@ -29,20 +29,14 @@ from adxl_ros.calibrate.guided.guide import NextPose
 from adxl_ros.calibrate.guided.live_window import NewestSamples, Surroundings, went_back
 from adxl_ros.calibrate.guided.screen_contents import CoefficientRow, Coverage, Estimate, Progress
 from adxl_ros.calibrate.poses import Poses
+from adxl_ros.calibrate.thermal_coverage import expected_error_mg, PARTS, passed
 from adxl_ros.errors import UserError
 from adxl_ros.files.sweep_journal import JournalEntry, PoseRecord
 from adxl_ros.model.coefficients import parameter_of
-from adxl_ros.model.play_operator import play
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals.rest_detection import Stillness
 import numpy as np
 
-_PARTS = 10
-"""Parts of the wanted range that are to be passed in each direction. Chosen: a curve of degree two
-is certain between them."""
-_STEADY_K = 0.25
-"""Change of temperature, K, that is no change of direction. Chosen: above the noise of a
-thermometer."""
 _PATIENCE = 3
 """Lengths of a block without rest after which its samples are forgotten. Chosen: memory."""
 
@@ -63,78 +57,6 @@ class ThermalSettings:
 
     range_c: tuple[float, float] = (0.0, 50.0)
     block_s: float = thermal_calibration.BLOCK_S
-
-
-@dataclass(frozen=True)
-class Passed:
-    """
-    Parts of the wanted range that the temperature has passed.
-
-    Attributes
-    ----------
-    middles_c
-        Middle of each part, °C, (parts,).
-    warming, cooling
-        Whether the temperature has passed it in that direction, (parts,) bool.
-    rises
-        Whether the temperature rose last.
-
-    """
-
-    middles_c: np.ndarray
-    warming: np.ndarray
-    cooling: np.ndarray
-    rises: bool
-
-    @property
-    def complete(self) -> bool:
-        """Return whether all parts are passed in both directions."""
-        return bool(self.warming.all() and self.cooling.all())
-
-    def advice(self) -> str:
-        """Return what to do next, for people."""
-        half_c = (self.middles_c[1] - self.middles_c[0]) / 2
-        open_warm, open_cool = self.middles_c[~self.warming], self.middles_c[~self.cooling]
-        if self.complete:
-            return 'both directions are covered'
-        if len(open_warm) and (self.rises or not len(open_cool)):
-            if self.rises:
-                return f'warm it to {open_warm[-1] + half_c:.0f} °C'
-            return (f'cool it to {open_warm[0] - half_c:.0f} °C, then warm it to '
-                    f'{open_warm[-1] + half_c:.0f} °C')
-        if not self.rises:
-            return f'cool it to {open_cool[0] - half_c:.0f} °C'
-        return (f'warm it to {open_cool[-1] + half_c:.0f} °C, then cool it to '
-                f'{open_cool[0] - half_c:.0f} °C')
-
-
-def passed(temperatures_c: np.ndarray, range_c: tuple[float, float]) -> Passed:
-    """
-    Return which parts of a range the temperature has passed.
-
-    Parameters
-    ----------
-    temperatures_c
-        Temperatures in the order of time, °C, (k,).
-    range_c
-        The wanted range, °C.
-
-    Returns
-    -------
-    Passed
-        Parts by direction.
-
-    """
-    low_c, high_c = range_c
-    middles_c = low_c + (high_c - low_c) * (np.arange(_PARTS) + 0.5) / _PARTS
-    steady_c = play(np.asarray(temperatures_c, float), _STEADY_K, {})
-    before_c, after_c = steady_c[:-1, None], steady_c[1:, None]
-    warming = ((before_c < middles_c) & (middles_c <= after_c)).any(axis=0)
-    cooling = ((after_c <= middles_c) & (middles_c < before_c)).any(axis=0)
-    changes = np.diff(steady_c)
-    changes = changes[changes != 0]
-    rises = bool(not len(changes) or changes[-1] > 0)
-    return Passed(middles_c, np.asarray(warming), np.asarray(cooling), rises)
 
 
 class ThermalGuide:
@@ -381,13 +303,13 @@ class ThermalGuide:
         done = int(self._passed.warming.sum() + self._passed.cooling.sum())
         return Progress(
             number=self.pose_number, destination=self.destination(), position=position,
-            accepted=done, total=2 * _PARTS, skipped=0, open_poses=self.open_poses,
+            accepted=done, total=2 * PARTS, skipped=0, open_poses=self.open_poses,
             remaining_s=None, dwelt_s=None, dwell_s=None)
 
     def estimate_contents(self) -> Estimate:
         """Return what the blocks determine so far, for the screen."""
-        coverage = (Coverage('warming', int(self._passed.warming.sum()), _PARTS),
-                    Coverage('cooling', int(self._passed.cooling.sum()), _PARTS))
+        coverage = (Coverage('warming', int(self._passed.warming.sum()), PARTS),
+                    Coverage('cooling', int(self._passed.cooling.sum()), PARTS))
         rows: tuple[CoefficientRow, ...] = ()
         if self._fit is not None:
             prior = np.array([thermal_fit.PRIOR_WIDTH * parameter_of(name).scale
@@ -427,6 +349,5 @@ class ThermalGuide:
             self._fit = thermal_fit.fit(self._base, thermal_calibration.blocks_of(poses), False)
         except UserError:
             return
-        self._error_mg = 1e3 * float(self._fit.error_g(
-            self._passed.middles_c,
-            thermal_calibration.calibrated_temperature_c(self._base)).max())
+        self._error_mg = expected_error_mg(
+            self._fit, self._passed, thermal_calibration.calibrated_temperature_c(self._base))

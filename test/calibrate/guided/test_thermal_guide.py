@@ -19,7 +19,8 @@ from dataclasses import replace
 from adxl_ros.calibrate.guided.capture_settings import CaptureSettings, StageMode
 from adxl_ros.calibrate.guided.session import Session
 from adxl_ros.calibrate.guided.session_settings import SessionSettings
-from adxl_ros.calibrate.guided.thermal_guide import passed, ThermalSettings
+from adxl_ros.calibrate.guided.thermal_guide import ThermalSettings
+from adxl_ros.calibrate.thermal_coverage import passed
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file, sweep_journal
 from adxl_ros.model.coefficients import with_neutral
