@@ -60,8 +60,8 @@ setup(
             *scripts('nodes', ('driver', 'stage', 'calibration', 'screen', 'compensation',
                                'demo')),
             f'bench = {PACKAGE}.nodes.benchmark:main',
-            *scripts('tools', ('simulate', 'fit', 'apply', 'noise', 'check', 'diagnose', 'blind',
-                               'working', 'reproduce')),
+            *scripts('tools', ('simulate', 'fit', 'apply', 'noise', 'check', 'diagnose', 'export',
+                               'blind', 'working', 'reproduce')),
         ],
     },
 )

@@ -283,13 +283,14 @@ class _Dumper(yaml.SafeDumper):
     """Writes floats so that ROS reads doubles (1.0, not 1; 1.0e-06, not 1e-06)."""
 
 
-def _float_text(value: float) -> str:
+def float_text(value: float) -> str:
+    """Return a number as YAML that ROS reads as a double."""
     text = repr(value)
     return text if '.' in text else text.replace('e', '.0e')
 
 
 def _represent_float(dumper: yaml.SafeDumper, value: float) -> yaml.Node:
-    return dumper.represent_scalar('tag:yaml.org,2002:float', _float_text(value))
+    return dumper.represent_scalar('tag:yaml.org,2002:float', float_text(value))
 
 
 _Dumper.add_representer(float, _represent_float)
@@ -582,6 +583,6 @@ def _placeholder(field: Field[Any], axes: str) -> Any:
 def _as_float(value: Any) -> str:
     """Suggest what to write for an integer, or for 1e-6, which YAML reads as text."""
     try:
-        return f'; write {_float_text(float(value))}'
+        return f'; write {float_text(float(value))}'
     except (TypeError, ValueError):
         return ''

@@ -23,7 +23,8 @@ from processes import executable, run_executable
 import pytest
 from terminal import Terminal
 
-TOOLS = ('apply', 'blind', 'check', 'diagnose', 'fit', 'noise', 'reproduce', 'simulate', 'working')
+TOOLS = ('apply', 'blind', 'check', 'diagnose', 'export', 'fit', 'noise', 'reproduce', 'simulate',
+         'working')
 COLUMNS = 79
 COLOUR = '\x1b['
 

@@ -1,0 +1,45 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Isaac Lab: a Python module with the offset of the sensor and the noise of its observation."""
+
+from __future__ import annotations
+
+from adxl_ros.files.exports.base import arm_m, axes, Export, head, WHITE_NOISE
+from adxl_ros.model.constants import AXES
+
+HOLDS = {WHITE_NOISE: 'std', 'noise_excess': 'std', 'bias': 'mean', 'lever_arm': 'pos'}
+
+
+def text(export: Export) -> str:
+    """Return the content of a file: configurations of Isaac Lab, `isaaclab.sensors.ImuCfg`."""
+    sensor = export.sensor
+    by_name = {axis.name: axis for axis in axes(sensor)}
+    mean, std = ([getattr(by_name[name], field) if name in by_name else 0.0 for name in AXES]
+                 for field in ('zero_g_mps2', 'noise_std_mps2'))
+    comment = [*head(export, 'Isaac Lab', HOLDS), '',
+               'White noise is not filtered here: its spectrum is flat up to half the rate.']
+    return '\n'.join([
+        *(f'# {line}'.rstrip() for line in comment), '',
+        'from isaaclab.sensors import ImuCfg',
+        'from isaaclab.utils.noise import GaussianNoiseCfg',
+        'import torch', '',
+        '# ImuCfg(prim_path=..., offset=OFFSET, update_period=UPDATE_PERIOD_S)',
+        f'OFFSET = ImuCfg.OffsetCfg(pos={tuple(arm_m(sensor))!r})',
+        f'UPDATE_PERIOD_S = {1 / sensor.rate_hz!r}', '',
+        '# ObsTerm(func=mdp.imu_lin_acc, noise=ACCELERATION_NOISE), m/s^2',
+        'ACCELERATION_NOISE = GaussianNoiseCfg(',
+        f'    mean=torch.tensor({mean!r}),',
+        f'    std=torch.tensor({std!r}),',
+        "    operation='add')", ''])

@@ -1,0 +1,57 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Kalibr: the accelerometer's part of `imu.yaml`."""
+
+from __future__ import annotations
+
+from adxl_ros.errors import UserError
+from adxl_ros.files.exports.base import axes, Export, head, WHITE_NOISE
+from adxl_ros.files.parameter_file import float_text
+from adxl_ros.model.constants import G0_MPS2
+from adxl_ros.model.effects import effect_named
+
+HOLDS = {WHITE_NOISE: 'accelerometer_noise_density',
+         'noise_excess': 'accelerometer_noise_density', 'bias_walk': 'accelerometer_random_walk'}
+
+
+def text(export: Export) -> str:
+    """
+    Return the content of a file.
+
+    Kalibr has one value for all axes: the largest.
+
+    Raises
+    ------
+    UserError
+        The sensor states no noise, which Kalibr refuses.
+
+    """
+    values = axes(export.sensor)
+    density = max(axis.noise_density for axis in values)
+    if not density:
+        raise UserError(f'{export.source}: sensor.noise_density_g_per_rthz is 0, which Kalibr '
+                        'refuses; measure it: ros2 run adxl_ros noise RECORDING -o FILE.yaml')
+    walk = max(axis.walk_density for axis in values)
+    comment = [*head(export, 'Kalibr', HOLDS), '', 'Densities are the largest of the axes.']
+    if not walk:
+        walk = effect_named('bias_walk').diagnosis.healthy_density * G0_MPS2
+        comment += ['The random walk is that of a healthy unit: the file states none.']
+    comment += ['This sensor has no gyroscope. Kalibr needs these lines of yours, too:',
+                'gyroscope_noise_density, gyroscope_random_walk']
+    return '\n'.join([
+        *(f'# {line}'.rstrip() for line in comment), 'rostopic: /imu/data_raw',
+        f'update_rate: {float_text(export.sensor.rate_hz)}  # Hz',
+        f'accelerometer_noise_density: {float_text(density)}  # m/s^2/sqrt(Hz)',
+        f'accelerometer_random_walk: {float_text(walk)}  # m/s^3/sqrt(Hz)', ''])

@@ -1,0 +1,45 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""MuJoCo: a body with a site and an accelerometer, as MJCF."""
+
+from __future__ import annotations
+
+from xml.sax.saxutils import quoteattr
+
+from adxl_ros.files.exports.base import arm_m, axes, Export, head, WHITE_NOISE
+
+HOLDS = {'lever_arm': 'pos of the site', WHITE_NOISE: 'noise (MuJoCo does not add it)',
+         'noise_excess': 'noise (MuJoCo does not add it)'}
+
+
+def text(export: Export) -> str:
+    """
+    Return the content of a file.
+
+    MuJoCo stores `noise` since 3.1.4 without adding it, and has one value for all axes: the
+    largest.
+    """
+    sensor = export.sensor
+    noise_mps2 = max(axis.noise_std_mps2 for axis in axes(sensor))
+    name = quoteattr(sensor.serial)
+    comment = [*head(export, 'MuJoCo', HOLDS), '',
+               'noise is the largest of the axes.', 'Include this file, or copy site and sensor.']
+    return '\n'.join([
+        '<!--', *(f'  {line}'.rstrip().replace('--', '- -') for line in comment), '-->',
+        '<mujoco>', '  <worldbody>', '    <body name="imu_link">',
+        f'      <site name={name} pos="{" ".join(map(repr, arm_m(sensor)))}"/>',
+        '    </body>', '  </worldbody>', '  <sensor>',
+        f'    <accelerometer name={name} site={name} noise="{noise_mps2!r}"/>',
+        '  </sensor>', '</mujoco>', ''])
