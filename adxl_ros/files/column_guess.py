@@ -23,8 +23,9 @@ import re
 import shlex
 
 from adxl_ros.files.column_mapping import ColumnMapping, Source
-from adxl_ros.files.column_units import LSB, Quantity, ROLES, unit_in_name
+from adxl_ros.files.column_units import LSB, Quantity, ROLES, unit_in_name, UNITS
 from adxl_ros.files.mapped_recording import likely_unit, listed
+from adxl_ros.files.stamp_bursts import burst_rate_hz, burst_samples
 from adxl_ros.files.tables.base import Table
 from adxl_ros.model.constants import AXES
 import numpy as np
@@ -40,8 +41,12 @@ _INDEX_NAMES = re.compile(r'(?i)index|sample|frame|count|seq|^(n|i|id|no)$|#')
 
 _OTHER_SENSORS = re.compile(
     r'(?i)gyr|mag(?!nit)|angular|omega|rate|\bw[xyz]\b|g[xyz]r|rot|orient|quat|'
-    r'pressure|baro|gps|vel|\bg[xyz]\b|abs|total|norm|std|cov|user|gravity|without')
+    r'pressure|baro|gps|vel|\bg[xyz]\b|abs|total|norm|std|cov|user|gravity|without|'
+    r'\brad\b|dps|(deg|°)\s?/\s?s|angle')
 """Names of columns of other sensors."""
+
+_ACCEL_UNITS = ('g', 'mg', 'mps2')
+"""Units that only acceleration has."""
 
 _ACCEL_NAMES = (
     re.compile(r'(?i)^acc(el(eration|erometer)?)?\b|acc'),
@@ -51,8 +56,12 @@ _ACCEL_NAMES = (
 )
 """Names of acceleration, the surest first."""
 
+_AXIS_WORD = re.compile(
+    r'(?i)(a|acc|accel|g_?f|f|ad|gf|v)([xyz])|([xyz])(acc|accel|adc|v)')
+"""A word in which x, y or z is the axis."""
+
 _REFERENCES = {
-    'alpha': re.compile(r'(?i)^(alpha|angle|winkel|tilt|inclination)'),
+    'alpha': re.compile(r'(?i)^(alpha|angle(?!_?[xyz]\b)|winkel|tilt|inclination)'),
     'beta': re.compile(r'(?i)^(beta|azimuth)'),
     'roll': re.compile(r'(?i)^roll'),
     'pitch': re.compile(r'(?i)^pitch'),
@@ -89,6 +98,12 @@ _SPHERE_SCATTER = 0.2
 _TURNED = 0.3
 """Smallest spread of an axis in that of another one of a sensor that is turned."""
 
+_NOMINAL_V = 2.5
+"""Output at 0 g of the nominal sensor, V (ADXL203 data sheet, table 1)."""
+
+_NEAR_NOMINAL = 0.1
+"""Largest relative difference from it (chosen: units of one kind differ by less)."""
+
 _COUNTS = (64, 100, 128, 256, 512, 1000, 1024, 1365, 2048, 4096, 8192, 16384, 32768)
 """Usual counts of 1 g."""
 
@@ -106,8 +121,10 @@ class Proposal:
         Counts of 1 g, and at 0 g; 0 where no column is in LSB.
     reasons
         What it follows from.
-    needs_rate
-        Whether no column is a time.
+    stamps
+        Options without which the stamps are refused; empty where they are sound.
+    note
+        What the user has to add, in brackets; empty for nothing.
 
     """
 
@@ -115,12 +132,13 @@ class Proposal:
     lsb_per_g: float
     lsb_at_0g: float
     reasons: Sequence[str]
-    needs_rate: bool
+    stamps: str = ''
+    note: str = ''
 
     def options(self) -> str:
         """Return the options, quoted for a shell."""
         text = f'--columns {_shell_quoted(str(self.mapping))}'
-        text += ' --rate HZ' * self.needs_rate
+        text += f' {self.stamps}' if self.stamps else ''
         text += f' --lsb-per-g {self.lsb_per_g:.0f}' if self.lsb_per_g else ''
         return text + (f' --lsb-at-0g {self.lsb_at_0g:.0f}' if self.lsb_at_0g else '')
 
@@ -156,8 +174,31 @@ def propose(table: Table) -> Proposal | None:
                    + f', so {unit}' * (not stated))
     sources |= _references(table, values, {*outputs, time or ''})
     per_g = (round(length) if zero else _counts(length)) if unit == LSB else 0.0
-    return Proposal(ColumnMapping(sources), per_g, zero if unit == LSB else 0.0, reasons,
-                    time is None)
+    note = _note(time is not None, unit, zero)
+    stamps = _stamp_options(values[time], sources['time']) if time else '--rate HZ'
+    return Proposal(ColumnMapping(sources), per_g, zero if unit == LSB else 0.0, reasons, stamps,
+                    note)
+
+
+def _note(has_time: bool, unit: str, zero: float) -> str:
+    """Return what the user has to add to the options, in brackets."""
+    if not has_time:
+        return ' (write the sample rate for HZ)'
+    output = UNITS[Quantity.OUTPUT][unit]
+    ratio = float(output.convert(np.array(zero))) / _NOMINAL_V
+    is_other = output.is_volts and zero != 0 and abs(ratio - 1) > _NEAR_NOMINAL
+    return ' (add --params with the parameter file of the sensor)' * is_other
+
+
+def _stamp_options(values: np.ndarray, source: Source) -> str:
+    """Return the option that stamps need which stand still or step back; empty for none."""
+    time_s = UNITS[Quantity.TIME][source.unit].convert(values[np.isfinite(values)] - values[0])
+    steps = np.diff(time_s)
+    if (steps > 0).all():
+        return ''
+    if burst_samples(time_s) > 1:
+        return f'--rate {burst_rate_hz(time_s):.4g}'
+    return '--drop-bad-stamps'
 
 
 def describe(table: Table, is_listed: bool = False) -> tuple[str, str]:
@@ -186,8 +227,7 @@ def describe(table: Table, is_listed: bool = False) -> tuple[str, str]:
         return f'{seen}none looks like an accelerometer: name the columns, for example', \
             "--columns 'time=COLUMN:s,x=COLUMN:g,y=COLUMN:g,z=COLUMN:g'"
     reasons = ' and '.join(proposal.reasons)
-    rate = ' (write the sample rate for HZ)' * proposal.needs_rate
-    return f'{seen}the best guess, because {reasons}{rate}:', proposal.options()
+    return f'{seen}the best guess, because {reasons}{proposal.note}:', proposal.options()
 
 
 def _time_column(table: Table, values: Mapping[str, np.ndarray]) -> str | None:
@@ -232,11 +272,14 @@ def _time_unit(table: Table, name: str, values: np.ndarray) -> tuple[str, str]:
 def _outputs(table: Table, values: Mapping[str, np.ndarray]) -> list[str]:
     """Return the columns of the axes, as many as there are."""
     if table.has_names:
-        for pattern in _ACCEL_NAMES:
-            names = _by_axis([name for name in values if pattern.search(name)
-                              and not _OTHER_SENSORS.search(name)])
-            if names:
-                return names
+        names = [name for name in values if not _OTHER_SENSORS.search(name)]
+        stated = [name for name in names
+                  if unit_in_name(name, Quantity.OUTPUT) in _ACCEL_UNITS]
+        groups = [stated, *([name for name in names if pattern.search(name)]
+                            for pattern in _ACCEL_NAMES)]
+        outputs = next(filter(None, map(_by_axis, groups)), None)
+        if outputs:
+            return outputs
     return _by_length(values)
 
 
@@ -259,7 +302,7 @@ def _axis(name: str) -> str | None:
         if word.lower() in AXES:
             return word.lower()
     for word in words:
-        match = re.fullmatch(r'(?i)(a|acc|accel|g_?f|f|ad|gf)([xyz])|([xyz])(acc|accel)', word)
+        match = _AXIS_WORD.fullmatch(word)
         if match:
             return (match[2] or match[3]).lower()
     return None

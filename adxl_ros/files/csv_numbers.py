@@ -33,6 +33,9 @@ _NUMBER = re.compile(r'\s*([-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?|[-+]?(nan|inf|infi
                      re.ASCII | re.IGNORECASE)
 """A field that is a number, or empty."""
 
+_LONGEST_CELL = 24
+"""Characters of a cell in a message. Chosen: a number with all its digits."""
+
 
 @dataclass
 class Layout:
@@ -174,8 +177,19 @@ def _field_by_field(layout: Layout, lines: Lines) -> np.ndarray:
             layout.used.remove(name)
         else:
             raise UserError(f'{lines.where(layout.path, wrong, index)}: {name} is '
-                            f'{fields[wrong]!r}, not a number{_cut_hint(lines, wrong)}')
+                            f'{_shortened(fields[wrong])}, not a number'
+                            f'{_damage_hint(fields[wrong])}{_cut_hint(lines, wrong)}')
     return np.column_stack(columns) if columns else np.empty((len(rows), 0))
+
+
+def _shortened(text: str) -> str:
+    """Return a cell in quotes for a message, with its end cut where it is long."""
+    return repr(text if len(text) <= _LONGEST_CELL else f'{text[:_LONGEST_CELL]}…')
+
+
+def _damage_hint(text: str) -> str:
+    """Return what to do about zero bytes, as a cut of the power leaves them in a file."""
+    return '; the file is damaged here: delete the zero bytes' if '\x00' in text else ''
 
 
 def _refuse_field_count(layout: Layout, lines: Lines, row: int, count: int) -> None:

@@ -63,12 +63,16 @@ def rate_lag(time_s: np.ndarray) -> int:
     return 1 if size == 1 else max(1, min(_LAG_BURSTS * size, len(time_s) // 2))
 
 
+def burst_rate_hz(time_s: np.ndarray) -> float:
+    """Return the mean rate of stamps in bursts, Hz."""
+    lag = rate_lag(time_s)
+    return float(lag / np.median(time_s[lag:] - time_s[:-lag]))
+
+
 def describe_bursts(time_s: np.ndarray) -> str:
     """Return `; ` and a clause for messages; empty where stamps do not come in bursts."""
     size = burst_samples(time_s)
     if size == 1:
         return ''
-    lag = rate_lag(time_s)
-    rate_hz = lag / np.median(time_s[lag:] - time_s[:-lag])
     return f'; stamps come in bursts of about {size} samples (USB, or a buffer), at a mean of ' \
-           f'{rate_hz:.4g} Hz'
+           f'{burst_rate_hz(time_s):.4g} Hz'

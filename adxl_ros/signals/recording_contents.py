@@ -17,7 +17,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import BadStamps, Recording, REFERENCES
@@ -48,8 +48,16 @@ _CLIPPED_SAMPLES = 3
 """Equal samples in a row at an extreme value that are clipped. Chosen: noise hardly repeats it."""
 _CLIPPED_STEP_G = 0.05
 """Change before or after them, g. Chosen: a sensor at rest has none."""
+_CLIPPED_WINDOW_S = 0.1
+"""Longest time before or after them in which it changes, s. Chosen: within a motion of a hand."""
+_CLIPPED_CODES = 20
+"""Change, in steps of the resolution, that a smooth peak does not reach within the time that it
+stays at its top. Chosen: a parabola reaches nine."""
 _HELD_S = 1.0
 """Shortest time without any change that is reported, s. Chosen: noise changes samples sooner."""
+_STUCK_S = 5.0
+"""Shortest time without any change of one axis alone that is reported, s. Chosen: a coarse axis
+may rest for some seconds between two codes."""
 _HELD_SAMPLES = 20
 """Fewest samples of such a time. Chosen: a slow sensor repeats a few."""
 _CHANGING = 0.5
@@ -71,6 +79,8 @@ class AxisRange:
         Times at which it stays at an extreme value in motion.
     is_stuck
         Whether it never changes.
+    held_s
+        Longest time in which it does not change although it usually does, s; 0 for none.
 
     """
 
@@ -79,6 +89,7 @@ class AxisRange:
     highest_mps2: float
     clipped: int
     is_stuck: bool
+    held_s: float
 
 
 @dataclass(frozen=True)
@@ -213,7 +224,7 @@ def examine(blocks: Iterable[Recording], accel_mps2: Callable[[Recording], np.nd
             values = _Values(block.sensor_columns, stamps.period_s)
             rests = _Rests(accel.shape[1], 1 / stamps.period_s)
         stamps.feed(block.time_s)
-        values.feed(block.time_s, accel)
+        values.feed(accel)
         rests.feed(block.time_s, accel)
         _add_references(references, block)
     if block is None or stamps is None or values is None or rests is None:
@@ -298,55 +309,64 @@ def _stamp_hint(first: Recording) -> str:
 
 
 @dataclass
+class _Held:
+    """The longest time without change of samples that usually change."""
+
+    shortest: float
+    _changes: int = 0
+    _count: int = 0
+    _samples: int = 0
+    _longest: int = 0
+
+    def feed(self, is_new: np.ndarray) -> None:
+        """Add whether each further sample differs from the one before, (n,)."""
+        self._changes += int(is_new.sum())
+        self._count += len(is_new)
+        places = np.flatnonzero(is_new)
+        if not len(places):
+            self._samples += len(is_new)
+        else:
+            inner = int(np.diff(places).max(initial=1)) - 1
+            self._longest = max(self._longest, self._samples + int(places[0]), inner)
+            self._samples = len(is_new) - 1 - int(places[-1])
+        self._longest = max(self._longest, self._samples)
+
+    @property
+    def samples(self) -> int:
+        """Return the number of samples without change; 0 where it is usual or short."""
+        is_held = (self._longest >= max(self.shortest, _HELD_SAMPLES)
+                   and self._changes > _CHANGING * (self._count - self._longest))
+        return self._longest if is_held else 0
+
+
 class _Values:
     """Extreme values of each axis, and times without change."""
 
-    names: tuple[str, ...]
-    period_s: float
-    held_s: float = 0.0
-    _last: np.ndarray | None = None
-    _extremes: list[list[float]] = field(default_factory=list)
-    _clipped: list[list[int]] = field(default_factory=list)
-    _has_changed: np.ndarray | None = None
-    _changes: int = 0
-    _count: int = 0
-    _held_samples: int = 0
-    _longest_held: int = 0
+    def __init__(self, names: tuple[str, ...], period_s: float) -> None:
+        self._names, self._period_s = names, period_s
+        self._last: np.ndarray | None = None
+        self._extremes = [[np.inf, -np.inf] for _ in names]
+        self._clipped = [[0, 0] for _ in names]
+        self._has_changed = np.zeros(len(names), bool)
+        self._held = _Held(_HELD_S / period_s)
+        self._held_axes = [_Held(_STUCK_S / period_s) for _ in names]
 
-    def feed(self, time_s: np.ndarray, accel: np.ndarray) -> None:
+    @property
+    def held_s(self) -> float:
+        """Return the longest time in which no axis changes, s; 0 for none."""
+        return self._held.samples * self._period_s
+
+    def feed(self, accel: np.ndarray) -> None:
         """Add further samples, m/s², (n, m)."""
-        if self._last is None:
-            self._extremes = [[np.inf, -np.inf] for _ in self.names]
-            self._clipped = [[0, 0] for _ in self.names]
-            self._has_changed = np.zeros(len(self.names), bool)
-            self._last = accel[0]
-        rows = np.vstack([self._last, accel])
+        rows = np.vstack([accel[0] if self._last is None else self._last, accel])
         changed = np.diff(rows, axis=0) != 0
-        assert self._has_changed is not None
         self._has_changed |= changed.any(axis=0)
-        self._add_held(changed.any(axis=1))
-        for axis in range(len(self.names)):
+        self._held.feed(changed.any(axis=1))
+        for axis, held in enumerate(self._held_axes):
+            held.feed(changed[:, axis])
             for side, sign in enumerate((-1.0, 1.0)):
                 self._add_extreme(axis, side, sign * rows[:, axis], sign)
         self._last = accel[-1]
-        self._count += len(accel)
-
-    def _add_held(self, is_new: np.ndarray) -> None:
-        """Count samples without any change."""
-        self._changes += int(is_new.sum())
-        places = np.flatnonzero(is_new)
-        if not len(places):
-            self._held_samples += len(is_new)
-        else:
-            inner = int(np.diff(places).max(initial=1)) - 1
-            self._longest_held = max(self._longest_held, self._held_samples + int(places[0]),
-                                     inner)
-            self._held_samples = len(is_new) - 1 - int(places[-1])
-        self._longest_held = max(self._longest_held, self._held_samples)
-        is_held = (self._longest_held >= max(_HELD_S / self.period_s, _HELD_SAMPLES)
-                   and self._changes > _CHANGING * (self._count + len(is_new)
-                                                    - self._longest_held))
-        self.held_s = self._longest_held * self.period_s if is_held else 0.0
 
     def _add_extreme(self, axis: int, side: int, values: np.ndarray, sign: float) -> None:
         """
@@ -359,19 +379,32 @@ class _Values:
             return
         if largest > sign * self._extremes[axis][side]:
             self._extremes[axis][side], self._clipped[axis][side] = sign * largest, 0
+        steps = np.abs(np.diff(values))
+        smooth = _CLIPPED_CODES * float(steps[steps > 0].min(initial=np.inf))
         for first, stop in true_runs(values == largest):
-            before = values[first - 1] if first else largest
-            after = values[stop] if stop < len(values) else largest
-            jump_g = (largest - min(before, after)) / G0_MPS2
-            if stop - first >= _CLIPPED_SAMPLES and jump_g > _CLIPPED_STEP_G:
+            if stop - first < _CLIPPED_SAMPLES:
+                continue
+            jump = largest - _lowest_beside(values, first, stop, 1)
+            window = min(stop - first, round(_CLIPPED_WINDOW_S / self._period_s))
+            slope = largest - _lowest_beside(values, first, stop, max(window, 1))
+            if jump > _CLIPPED_STEP_G * G0_MPS2 or \
+                    slope > max(_CLIPPED_STEP_G * G0_MPS2, smooth):
                 self._clipped[axis][side] += 1
 
     def axes(self) -> tuple[AxisRange, ...]:
         """Return the ranges by axis."""
-        assert self._has_changed is not None
-        return tuple(AxisRange(name, low, high, sum(clipped), not has_changed)
-                     for name, (low, high), clipped, has_changed in zip(
-                         self.names, self._extremes, self._clipped, self._has_changed.tolist()))
+        return tuple(
+            AxisRange(name, low, high, sum(clipped), not has_changed,
+                      held.samples * self._period_s)
+            for name, (low, high), clipped, has_changed, held in zip(
+                self._names, self._extremes, self._clipped, self._has_changed.tolist(),
+                self._held_axes))
+
+
+def _lowest_beside(values: np.ndarray, first: int, stop: int, count: int) -> float:
+    """Return the lowest of `count` values before, and after, those from `first` to `stop`."""
+    beside = np.concatenate([values[max(first - count, 0):first], values[stop:stop + count]])
+    return float(beside.min(initial=values[first]))
 
 
 class _Rests:

@@ -133,7 +133,8 @@ def _stamp_faults(contents: RecordingContents) -> list[str]:
         faults.append(f'{duplicates} samples have the stamp of the sample before; '
                       '--drop-bad-stamps leaves them out')
     if backward:
-        faults.append(f'{backward} stamps go back; --drop-bad-stamps leaves these samples out')
+        faults.append(f'{_count(backward, "stamp")} {"goes" if backward == 1 else "go"} back; '
+                      '--drop-bad-stamps leaves such samples out')
     if _has_wide_gaps(contents):
         faults.append(f'{_missing(contents)}; record again, or use the parts')
     period_s = 1 / contents.rate_hz
@@ -154,6 +155,9 @@ def _sample_faults(contents: RecordingContents) -> list[str]:
     """Return what is wrong with the samples."""
     faults = [f'{axis.name} never changes; the axis is stuck, or not connected'
               for axis in contents.axes if axis.is_stuck]
+    faults += [f'{axis.name} does not change for {axis.held_s:.3g} s while other axes do; the '
+               'axis is stuck then' for axis in contents.axes
+               if axis.held_s > contents.held_s and not axis.is_stuck]
     faults += [f'{axis.name} stays at its extreme value {axis.clipped} times in motion; its range '
                f'ends at {axis.lowest_mps2 / G0_MPS2:.3g} or {axis.highest_mps2 / G0_MPS2:.3g} g'
                for axis in contents.axes if axis.clipped >= _FEWEST_CLIPPED]

@@ -143,9 +143,30 @@ def _units_row(log: Turned) -> str:
         [log.time_s, *1e3 * log.output_g.T], ['%.3f'] + ['%.2f'] * 3, '\t')
 
 
+def _euroc(log: Turned) -> str:
+    names = [f'{axis} [{unit}]' for sensor, unit in (('w_RS_S', 'rad s^-1'), ('a_RS_S', 'm s^-2'))
+             for axis in (f'{sensor}_x', f'{sensor}_y', f'{sensor}_z')]
+    rate = 0.02 + 0 * log.time_s
+    rows = lines([rate, 2 * rate, 3 * rate, *(G0_MPS2 * log.output_g).T], ['%.5f'] * 6)
+    return f'#timestamp [ns],{",".join(names)}\n' + ''.join(
+        f'{1_403_636_579_758_555_392 + round(1e9 * time_s)},{row}\n'
+        for time_s, row in zip(log.time_s, rows.splitlines()))
+
+
+def _usb(log: Turned) -> str:
+    stamps = 0.08 * np.floor(log.time_s / 0.08 + 1e-9)
+    return 'time_s,ax_g,ay_g,az_g\n' + lines([stamps, *log.output_g.T], ['%.3f'] + ['%.5f'] * 3)
+
+
+def _repeated(log: Turned) -> str:
+    rows = _arduino(log).splitlines(keepends=True)
+    return ''.join([*rows[:200], rows[199], *rows[200:300], *rows[290:293], *rows[300:]])
+
+
 FORMS = {'arduino.csv': _arduino, 'german.csv': _german, 'phyphox.csv': _phyphox,
          'counts.txt': _counts, 'tabs.tsv': _tabs, 'epoch.csv': _epoch, 'app.csv': _app,
-         'ros_text.csv': _ros_text, 'units_row.dat': _units_row}
+         'ros_text.csv': _ros_text, 'units_row.dat': _units_row, 'euroc.csv': _euroc,
+         'usb.csv': _usb, 'repeated.csv': _repeated}
 """Text of a log by the name of its file."""
 
 

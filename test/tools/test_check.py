@@ -112,6 +112,20 @@ def held(time_s: np.ndarray, accel: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     return time_s, accel
 
 
+def stuck_at_the_end(time_s: np.ndarray, accel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    accel[4500:, 2] = accel[4499, 2]
+    return time_s, accel
+
+
+def clipped_slowly(time_s: np.ndarray, accel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Change so slowly from sample to sample that no single step is large."""
+    is_moved = (time_s > 10) & (time_s < 30)
+    swing = 3 * G * np.sin(np.pi * time_s / 2.5)
+    accel[is_moved, 0] = np.clip(swing[is_moved], -2 * G, 2 * G)
+    accel[is_moved, 1] = G * np.sin(20 * time_s[is_moved])
+    return time_s, accel
+
+
 def in_g(time_s: np.ndarray, accel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return time_s, accel / G
 
@@ -123,6 +137,8 @@ def in_g(time_s: np.ndarray, accel: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     (scattered, 'stamps scatter by'),
     (stuck, 'ay_mps2 never changes'),
     (clipped, 'ax_mps2 stays at its extreme value'),
+    (clipped_slowly, 'ax_mps2 stays at its extreme value'),
+    (stuck_at_the_end, 'az_mps2 does not change for 15 s while other axes do'),
     (held, 'no axis changes for 3 s'),
     (in_g, 'seem to be in g'),
 ], ids=lambda value: value.__name__ if callable(value) else '')
@@ -142,6 +158,23 @@ def test_a_coarse_sensor_at_rest_is_sound(tmp_path: Path) -> None:
     accel = np.round(accel / 0.3) * 0.3
     write_csv(tmp_path / 'coarse.csv', time_s, accel)
     assert checked(tmp_path, 'coarse.csv')['faults'] == []
+
+
+def test_a_smooth_peak_is_not_clipped(tmp_path: Path) -> None:
+    """A coarse sensor stays at the top of a slow swing for some samples."""
+    time_s, accel = samples()
+    accel[:, 0] = G * np.sin(2 * np.pi * time_s)
+    write_csv(tmp_path / 'swing.csv', time_s, np.round(accel / 0.1) * 0.1)
+    assert checked(tmp_path, 'swing.csv')['faults'] == []
+
+
+def test_zero_bytes_are_one_line(tmp_path: Path) -> None:
+    """A cut of the power leaves zero bytes, which the message does not repeat."""
+    write_csv(tmp_path / 'log.csv', *samples())
+    data = (tmp_path / 'log.csv').read_bytes()
+    (tmp_path / 'log.csv').write_bytes(data[:5000] + bytes(4096) + data[9096:])
+    fault, = checked(tmp_path, 'log.csv')['faults']
+    assert 'delete the zero bytes' in fault and len(fault) < 200
 
 
 def test_a_damaged_file_does_not_stop_the_others(tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ from adxl_ros.model.constants import G0_MPS2
 from bags import bag_of, EPOCH_NS, imu
 from foreign_logs import BIAS_G, FORMS, lines, SCALE, text_with_angles, Turned, turned, ulog
 import numpy as np
-from processes import executable
+from processes import executable, REPO
 import pytest
 from terminal import Terminal
 from without_extras import run_without_extras
@@ -248,6 +248,21 @@ def test_bad_stamps_are_left_out_and_counted(run_tool, tmp_path) -> None:
     assert done.returncode == 0, done.stderr
     assert 'samples with the stamp of the one before: 1\n' in done.stderr
     assert 'samples whose stamp steps back: 3\n' in done.stderr
+    check_errors(tmp_path / 'unit.yaml')
+
+
+def test_volts_of_another_sensor(run_tool, tmp_path) -> None:
+    """Volts about 1.65 V: the answer asks for the file of the sensor, which then calibrates."""
+    volts = 1.65 + 0.33 * LOG.output_g
+    written(tmp_path, 'log.csv', 't,Vx,Vy,Vz,AngleX(deg)\n' + lines(
+        [LOG.time_s, *volts.T, 0 * LOG.time_s], ['%.3f'] + ['%.5f'] * 3 + ['%.1f']))
+    done = run_tool('fit', 'log.csv', '-o', 'unit.yaml')
+    assert 'add --params with the parameter file of the sensor' in done.stderr
+    options = proposed(done.stderr)
+    assert options == ['--columns', 'time=t:s,x=Vx:v,y=Vy:v,z=Vz:v']
+    params = REPO / 'params' / 'adxl335.yaml'
+    done = run_tool('fit', 'log.csv', '-o', 'unit.yaml', *options, '--params', params)
+    assert done.returncode == 0, done.stderr
     check_errors(tmp_path / 'unit.yaml')
 
 
