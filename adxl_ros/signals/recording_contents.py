@@ -403,8 +403,8 @@ class _Values:
 
 def _lowest_beside(values: np.ndarray, first: int, stop: int, count: int) -> float:
     """Return the lowest of `count` values before, and after, those from `first` to `stop`."""
-    beside = np.concatenate([values[max(first - count, 0):first], values[stop:stop + count]])
-    return float(beside.min(initial=values[first]))
+    neighbours = np.concatenate([values[max(first - count, 0):first], values[stop:stop + count]])
+    return float(neighbours.min(initial=values[first]))
 
 
 class _Rests:
