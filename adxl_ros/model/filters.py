@@ -102,7 +102,7 @@ def pole(x: np.ndarray, rate: complex, dt_s: float, memory: dict[str, Any]) -> n
     Parameters
     ----------
     x
-        Input, (n,).
+        Input, (n,), or (n, k) for k independent filters.
     rate
         The pole, 1/s; its real part is negative.
     dt_s
@@ -114,16 +114,22 @@ def pole(x: np.ndarray, rate: complex, dt_s: float, memory: dict[str, Any]) -> n
     Returns
     -------
     ndarray
-        w at the samples, (n,), in the unit of the input times s; complex for a complex rate.
+        w at the samples, in the shape of the input and its unit times s; complex for a complex
+        rate.
 
     """
     if not len(x):
         return x
     first = not memory
-    previous = memory.get('inputs', np.full(ORDER - 1, x[0]))
+    previous = memory['inputs'] if memory else np.repeat(x[:1], ORDER - 1, axis=0)
     last_w = memory.get('w', -x[0] / rate)
     inputs = np.concatenate([previous, x])
-    drive = np.convolve(inputs, _weights(rate * dt_s) * dt_s, 'valid')
+    weights = _weights(rate * dt_s) * dt_s
+    if x.ndim == 1:
+        drive = np.convolve(inputs, weights, 'valid')
+    else:
+        drive = sum(weight * inputs[ORDER - 1 - j:len(inputs) - j]
+                    for j, weight in enumerate(weights))
     decay = np.exp(rate * dt_s)
     if first:
         drive[0] = -x[0] / rate * (1 - decay)
@@ -132,8 +138,8 @@ def pole(x: np.ndarray, rate: complex, dt_s: float, memory: dict[str, Any]) -> n
     return w
 
 
-def first_order_recursion(gain: float, decay: complex, inputs: np.ndarray, previous: complex
-                          ) -> np.ndarray:
+def first_order_recursion(gain: float, decay: complex, inputs: np.ndarray,
+                          previous: complex | np.ndarray) -> np.ndarray:
     """
     Filter by y[i] = decay · y[i − 1] + gain · inputs[i].
 
@@ -144,19 +150,22 @@ def first_order_recursion(gain: float, decay: complex, inputs: np.ndarray, previ
     decay
         Weight of the output before.
     inputs
-        Inputs, (n,).
+        Inputs, (n,), or (n, k) for k independent filters.
     previous
-        Output before the first one.
+        Output before the first one, a scalar or (k,).
 
     Returns
     -------
     ndarray
-        Outputs, (n,).
+        Outputs, in the shape of the inputs.
 
     """
+    if len(inputs) == 1:
+        return gain * inputs + decay * previous
     # scipy.signal takes 0.3 s to import, and a node that does not simulate needs no filter.
     from scipy.signal import lfilter
-    outputs, _ = lfilter([gain], [1.0, -decay], inputs, zi=np.array([decay * previous]))
+    state = np.broadcast_to(decay * previous, (1, *inputs.shape[1:]))
+    outputs, _ = lfilter([gain], [1.0, -decay], inputs, axis=0, zi=state)
     return outputs
 
 

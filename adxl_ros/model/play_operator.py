@@ -35,7 +35,7 @@ def stop(x: np.ndarray, reach: float, memory: dict[Any, Any]) -> np.ndarray:
     Parameters
     ----------
     x
-        Input, (n,).
+        Input, (n,), or (n, k) for k independent operators.
     reach
         Largest threshold, in the unit of the input.
     memory
@@ -47,7 +47,7 @@ def stop(x: np.ndarray, reach: float, memory: dict[Any, Any]) -> np.ndarray:
         Lag behind the input, −1 to 1, (n,).
 
     """
-    lag = np.zeros(len(x))
+    lag = np.zeros(x.shape)
     for i, fraction in enumerate(_THRESHOLDS):
         threshold = fraction * reach
         lag = lag + (x - play(x, threshold, memory.setdefault(i, {}))) / threshold
@@ -63,7 +63,7 @@ def loop(x: np.ndarray, reach: float, memory: dict[Any, Any]) -> np.ndarray:
     Parameters
     ----------
     x
-        Input, (n,).
+        Input, (n,), or (n, k) for k independent operators.
     reach
         Largest threshold, in the unit of the input.
     memory
@@ -72,12 +72,12 @@ def loop(x: np.ndarray, reach: float, memory: dict[Any, Any]) -> np.ndarray:
     Returns
     -------
     ndarray
-        Difference of the branches, −2 to 2, (n,).
+        Difference of the branches, −2 to 2, in the shape of the input.
 
     """
     if not len(x):
         return x
-    change = x - memory.setdefault('start', float(x[0]))
+    change = x - memory.setdefault('start', x[0].copy())
     first_branch = sum(np.clip(change / (fraction * reach), -1, 1) for fraction in _THRESHOLDS)
     return stop(x, reach, memory) - first_branch / len(_THRESHOLDS)
 
@@ -92,7 +92,7 @@ def play(x: np.ndarray, half_width: float, memory: dict[str, Any]) -> np.ndarray
     Parameters
     ----------
     x
-        Input, (n,).
+        Input, (n,), or (n, k) for k independent operators.
     half_width
         r, in the unit of the input.
     memory
@@ -102,11 +102,13 @@ def play(x: np.ndarray, half_width: float, memory: dict[str, Any]) -> np.ndarray
     Returns
     -------
     ndarray
-        Output, (n,).
+        Output, in the shape of the input.
 
     """
     if not half_width or not len(x):
         return x
+    if x.ndim > 1:
+        return _play_side_by_side(x, half_width, memory)
     length = ceil(np.sqrt(len(x)) / 3)
     padded = np.concatenate([x, np.full(-len(x) % length, x[-1])])
     stretches = np.ascontiguousarray(padded.reshape(-1, length).T)
@@ -122,3 +124,14 @@ def play(x: np.ndarray, half_width: float, memory: dict[str, Any]) -> np.ndarray
         output = max(bottom, min(top, output))
     memory['output'] = output
     return np.maximum(low, np.minimum(high, starts)).T.ravel()[:len(x)]
+
+
+def _play_side_by_side(x: np.ndarray, half_width: float, memory: dict[str, Any]) -> np.ndarray:
+    """Run operators side by side, step by step; see `play`."""
+    output = memory.get('output', x[0])
+    outputs = np.empty_like(x)
+    for n, inputs in enumerate(x):
+        output = outputs[n] = np.maximum(inputs - half_width,
+                                         np.minimum(inputs + half_width, output))
+    memory['output'] = output
+    return outputs

@@ -96,10 +96,10 @@ class Response:
             An effect needs the stage, the filter, the ADC or the noise, which is missing.
 
         """
-        _check_needs(sensor, motion)
+        check_needs(sensor, motion)
         self.sensor, self._motion, self._begin_s = sensor, motion, begin_s
         self._seed = seed
-        states = [_EffectState(name, signal_chain.parameters(sensor, name), seed)
+        states = [EffectState(name, signal_chain.parameters(sensor, name), seed)
                   for name in sensor.effects]
         self._effects = {place: [state for state in states
                                  if state.place is place and not state.is_neutral]
@@ -338,10 +338,23 @@ _UP_TO_ELEMENT = {Place.CLOCK: Response._put_in_time, Place.STAGE: Response._mov
 """What the chain does at each place before the electronics, in its order."""
 
 
-class _EffectState:
+class EffectState:
     """An effect of the sensor: its parameters, its memory and its random generator."""
 
     def __init__(self, name: str, parameters: Parameters, seed: int) -> None:
+        """
+        Prepare the effect before its first sample.
+
+        Parameters
+        ----------
+        name
+            Name of the effect.
+        parameters
+            Values of its parameters.
+        seed
+            Seed of all randomness.
+
+        """
         effect = effect_named(name)
         sizes = [p for p in effect.parameters if p.role is not Role.SHAPE]
         # At the neutral values of its sizes and limits an effect does nothing.
@@ -374,8 +387,23 @@ def _lagrange(position: np.ndarray) -> np.ndarray:
         np.prod([(position - k) / (j - k) for k in nodes if k != j], axis=0) for j in nodes])
 
 
-def _check_needs(sensor: Sensor, motion: Motion) -> None:
-    """Refuse an effect that has nothing to act on."""
+def check_needs(sensor: Sensor, motion: Motion) -> None:
+    """
+    Refuse an effect that has nothing to act on.
+
+    Parameters
+    ----------
+    sensor
+        The unit with its effects.
+    motion
+        The manoeuvre.
+
+    Raises
+    ------
+    UserError
+        An effect needs the stage, the filter, the ADC or the noise, which is missing.
+
+    """
     missing = {}
     if motion.force is not None:
         missing[Need.STAGE] = 'this manoeuvre has none, only specific force'

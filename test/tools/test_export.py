@@ -111,10 +111,23 @@ def test_sdf(exported):
 def test_mujoco(exported):
     mujoco = pytest.importorskip('mujoco', reason='mujoco is not installed: pip install mujoco')
     model = mujoco.MjModel.from_xml_path(str(exported['mujoco'].path))
-    assert model.site('SN--7').pos == pytest.approx(ARM_M)
-    assert model.sensor('SN--7').type[0] == mujoco.mjtSensor.mjSENS_ACCELEROMETER
+    assert model.site('SN-7').pos == pytest.approx(ARM_M)
+    assert model.sensor('SN-7').type[0] == mujoco.mjtSensor.mjSENS_ACCELEROMETER
     std_mps2 = noise.analog_std_v(unit()) / unit().nominal_scale_v_per_g * G0_MPS2
     assert model.sensor_noise[0] == pytest.approx(std_mps2.max())
+
+
+def test_the_head_for_mujoco_runs(exported, monkeypatch):
+    """The lines of Python in the head apply the whole chain to mjData."""
+    mujoco = pytest.importorskip('mujoco', reason='mujoco is not installed: pip install mujoco')
+    model = mujoco.MjModel.from_xml_path(str(exported['mujoco'].path))
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data)
+    monkeypatch.chdir(exported['mujoco'].path.parent)
+    lines = exported['mujoco'].text.split('after each mj_step:')[1].split('-->')[0]
+    names = {'model': model, 'data': data}
+    exec('\n'.join(line.strip() for line in lines.splitlines()), names)
+    assert names['reading'][:2] == pytest.approx(zero_g_mps2(unit()), abs=0.3)
 
 
 def test_isaaclab(exported, monkeypatch):

@@ -29,7 +29,11 @@ def text(export: Export) -> str:
     mean, std = ([getattr(by_name[name], field) if name in by_name else 0.0 for name in AXES]
                  for field in ('zero_g_mps2', 'noise_std_mps2'))
     comment = [*head(export, 'Isaac Lab', HOLDS), '',
-               'White noise is not filtered here: its spectrum is flat up to half the rate.']
+               'White noise is not filtered here: its spectrum is flat up to half the rate.',
+               'The whole chain for all environments, in each step:',
+               '  from adxl_ros.simulate.sensor_model import SensorModel',
+               f'  sensor = SensorModel({export.source!r})',
+               '  readings = sensor(imu.data.lin_acc_b.cpu().numpy(), dt)']
     return '\n'.join([
         *(f'# {line}'.rstrip() for line in comment), '',
         'from isaaclab.sensors import ImuCfg',

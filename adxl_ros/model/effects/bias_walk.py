@@ -23,7 +23,7 @@ def apply(signals: Signals, p: Parameters) -> None:
     """Add the sum of independent steps, g; after a time t its rms is k·√t."""
     assert signals.rng is not None
     density = np.array(p['density_g_per_rts'])
-    drawn = signals.rng.standard_normal((len(signals.environment.time_s), len(density)))
+    drawn = signals.rng.standard_normal((*np.shape(signals.environment.time_s), len(density)))
     if not density.any():
         return
     drawn *= density * np.sqrt(signals.dt_s)
@@ -31,7 +31,7 @@ def apply(signals: Signals, p: Parameters) -> None:
     walk = np.cumsum(drawn, axis=0)
     signals.memory['walked'] = walk[-1] if len(walk) else drawn.sum(axis=0)
     for d, scale in enumerate(signals.nominal_scale_v_per_g):
-        signals.volts[d] = signals.volts[d] + walk[:, d] * scale
+        signals.volts[d] = signals.volts[d] + walk[..., d] * scale
 
 
 EFFECT = Effect(

@@ -40,20 +40,20 @@ def apply(signals: Signals, p: Parameters) -> None:
     """
     assert signals.rng is not None
     corners = corners_hz(1 / signals.dt_s)
-    count = len(signals.environment.time_s)
-    drawn = signals.rng.standard_normal((count, len(p['density_g_per_rthz']), len(corners)))
+    shape = np.shape(signals.environment.time_s)
+    drawn = signals.rng.standard_normal((*shape, len(p['density_g_per_rthz']), len(corners)))
     # The densities of the processes, σ²·2/(π·f_c)/(1 + (f/f_c)²), sum up to σ²/(f·Δln f).
     sigma = np.sqrt(np.log(10) / _PER_DECADE)
     decay = np.exp(-2 * np.pi * corners * signals.dt_s)
     for d, density in enumerate(p['density_g_per_rthz']):
-        if not density or not count:
+        if not density or not shape[0]:
             continue
         previous = signals.memory.get(d)
-        noise = np.zeros(count)
-        last = np.empty(len(corners))
+        noise = np.zeros(shape)
+        last = np.empty((len(corners), *shape[1:]))
         for i, a in enumerate(decay):
             step = np.sqrt(1 - a * a)
-            steps = drawn[:, d, i].copy()
+            steps = drawn[..., d, i].copy()
             if previous is None:
                 steps[0] /= step  # stationary from the first sample on
             x = first_order_recursion(step, a, steps, 0.0 if previous is None else previous[i])

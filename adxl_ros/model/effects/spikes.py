@@ -23,11 +23,11 @@ def apply(signals: Signals, p: Parameters) -> None:
     """Add plus or minus A to random samples of each axis, at a mean rate."""
     assert signals.rng is not None
     axes = len(signals.volts)
-    drawn = signals.rng.random((len(signals.environment.time_s), axes, 2))
-    hit = drawn[:, :, 0] < p['rate_hz'] * signals.dt_s
-    sign = np.where(drawn[:, :, 1] < 0.5, -1.0, 1.0)
+    drawn = signals.rng.random((*np.shape(signals.environment.time_s), axes, 2))
+    hit = drawn[..., 0] < p['rate_hz'] * signals.dt_s
+    sign = np.where(drawn[..., 1] < 0.5, -1.0, 1.0)
     for d, amplitude in enumerate(p['amplitude_v']):
-        signals.volts[d] = signals.volts[d] + np.where(hit[:, d], amplitude * sign[:, d], 0.0)
+        signals.volts[d] = signals.volts[d] + np.where(hit[..., d], amplitude * sign[..., d], 0.0)
 
 
 EFFECT = Effect(

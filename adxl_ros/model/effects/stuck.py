@@ -25,19 +25,20 @@ _NEVER = -2 ** 40
 def apply(signals: Signals, p: Parameters) -> None:
     """Hold all axes for a fixed time, beginning at random instants at a mean rate."""
     assert signals.rng is not None
-    count = len(signals.environment.time_s)
-    starts = signals.rng.random(count) < p['rate_hz'] * signals.dt_s
+    shape = np.shape(signals.environment.time_s)
+    count = shape[0]
+    starts = signals.rng.random(shape) < p['rate_hz'] * signals.dt_s
     length = max(round(p['duration_s'] / signals.dt_s), 1)
-    index = np.arange(count)
+    index = np.arange(count).reshape(-1, *[1] * (len(shape) - 1))
     # A sample is stuck where the newest start is less than the length behind.
-    newest = np.maximum.accumulate(np.where(starts, index, _NEVER))
+    newest = np.maximum.accumulate(np.where(starts, index, _NEVER), axis=0)
     newest = np.where(newest < 0, signals.memory.get('newest', _NEVER), newest)
     fresh = index - newest >= length
     # Each stuck sample repeats the last fresh one, which may be in the previous block.
-    source = np.maximum.accumulate(np.where(fresh, index, -1))
+    source = np.maximum.accumulate(np.where(fresh, index, -1), axis=0)
     for d, volts in enumerate(signals.volts):
         previous = signals.memory.get(d, volts[0] if count else 0.0)
-        held = np.where(source < 0, previous, volts[source])
+        held = np.where(source < 0, previous, np.take_along_axis(volts, np.maximum(source, 0), 0))
         signals.volts[d] = held
         if count:
             signals.memory[d] = held[-1]

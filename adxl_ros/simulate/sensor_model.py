@@ -1,0 +1,222 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The signal chain as a call for simulators: one sample of one or many sensors at a time."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from os import PathLike
+from typing import Any
+
+from adxl_ros.errors import UserError
+from adxl_ros.files import parameter_file
+from adxl_ros.model import noise, signal_chain
+from adxl_ros.model.constants import (
+    AXES,
+    G0_MPS2,
+    NOMINAL_SUPPLY_V,
+    NOMINAL_TEMPERATURE_C,
+)
+from adxl_ros.model.effects import effect_named
+from adxl_ros.model.effects.base import Effect, Environment, Need, Place, Signals
+from adxl_ros.model.filters import low_pass
+from adxl_ros.model.sensor import Sensor, to_nominal_mps2
+from adxl_ros.simulate.motion import Motion
+from adxl_ros.simulate.response import check_needs, EffectState
+import numpy as np
+
+_SAME_STEP = 1e-6
+"""Largest relative change of the time step; chosen: far above rounding of a simulator's clock."""
+
+
+class SensorModel:
+    """
+    A sensor in a simulator: specific force of each time step in, readings out.
+
+    All sensors of a batch are copies of one unit with noise of their own. The chain runs at the
+    time steps of the simulator. Otherwise it is that of `simulate`, and one sensor gives the same
+    readings with the same seed.
+
+    Attributes
+    ----------
+    sensor
+        The unit.
+    left_out
+        Reason by name of an effect of the unit that is not simulated.
+
+    """
+
+    def __init__(self, params: Sensor | str | PathLike, seed: int = 0) -> None:
+        """
+        Put the sensors at the time of power-on.
+
+        Parameters
+        ----------
+        params
+            The unit, or its parameter file.
+        seed
+            Seed of all randomness; equal seeds give equal readings.
+
+        Raises
+        ------
+        UserError
+            The file cannot be read, or an effect needs the filter, the ADC or the noise, which is
+            missing.
+
+        """
+        self.sensor = params if isinstance(params, Sensor) else parameter_file.load(params)
+        check_needs(self.sensor, Motion(0.0))
+        effects = [effect_named(name) for name in self.sensor.effects]
+        self.left_out = {effect.name: reason for effect in effects
+                         if (reason := _reason_to_leave_out(effect))}
+        states = [EffectState(name, signal_chain.parameters(self.sensor, name), seed)
+                  for name in self.sensor.effects if name not in self.left_out]
+        self._effects = {place: [state for state in states
+                                 if state.place is place and not state.is_neutral]
+                         for place in Place}
+        self._filters: list[dict[str, Any]] = [{} for _ in self.sensor.axes]
+        self._white = np.random.default_rng([seed, 0])
+        self._noise: np.ndarray | None = None
+        self._shape: tuple[int, ...] = ()
+        self._dt_s = 0.0
+        self._std_v = np.zeros(0)
+        self._steps = 0
+
+    def __call__(self, specific_force: np.ndarray, dt: float,
+                 temperature: float | np.ndarray = NOMINAL_TEMPERATURE_C,
+                 supply: float | np.ndarray = NOMINAL_SUPPLY_V) -> np.ndarray:
+        """
+        Advance by one time step.
+
+        Parameters
+        ----------
+        specific_force
+            Specific force in the frame of the sensor at this step, m/s²: (3,), or (n, 3) for n
+            sensors. At rest, an axis that points up has +g.
+        dt
+            Time step, s; the same in each call.
+        temperature
+            Temperature, °C: a number, or (n,).
+        supply
+            Supply voltage, V: a number, or (n,).
+
+        Returns
+        -------
+        ndarray
+            Readings by the nominal conversion, m/s², in the shape of the force, as in
+            `imu/data_raw`; 0 for an axis that the sensor does not have.
+
+        Raises
+        ------
+        UserError
+            The shape or the time step is wrong, or changes, or the force is not finite.
+
+        """
+        force = np.asarray(specific_force, float)
+        self._check(force, dt)
+        rows = force.reshape(-1, 3)
+        count = len(rows)
+        # Time is the first axis of the components, as in a recording; sensors are the second.
+        now = Environment(*(np.broadcast_to(np.asarray(values, float), (1, count)) for values in (
+            self._steps * self._dt_s, temperature, supply)))
+        volts = self._digital_v(self._analog(now, [rows[None, :, c] for c in range(3)]))
+        self._steps += 1
+        readings = np.zeros((count, 3))
+        readings[:, [AXES.index(axis) for axis in self.sensor.axes]] = to_nominal_mps2(
+            volts, self.sensor)
+        return readings.reshape(force.shape)
+
+    def _check(self, force: np.ndarray, dt_s: float) -> None:
+        """Refuse a call that does not continue the last one."""
+        if not force.ndim or force.ndim > 2 or force.shape[-1] != 3:
+            raise UserError(f'specific force has the shape {force.shape}; expected (3,) or (n, 3)')
+        if not dt_s > 0:
+            raise UserError(f'dt is {dt_s} s; it must be positive')
+        if not np.isfinite(force).all():
+            raise UserError('the specific force is not finite; check the simulation')
+        if not self._steps:
+            self._shape, self._dt_s = force.shape, float(dt_s)
+        if force.shape != self._shape:
+            raise UserError(f'specific force has the shape {force.shape}, but {self._shape} '
+                            'before; make a new SensorModel')
+        if abs(dt_s - self._dt_s) > _SAME_STEP * self._dt_s:
+            raise UserError(f'dt is {dt_s} s, but {self._dt_s} s before; call it at equal time '
+                            'steps, or make a new SensorModel')
+
+    def _apply(self, place: Place, signals: Signals) -> None:
+        """Apply the effects of a place."""
+        for effect in self._effects[place]:
+            signals.memory, signals.rng = effect.memory, effect.rng
+            effect.apply(signals, effect.parameters)
+
+    def _analog(self, now: Environment, force: list[np.ndarray]) -> Signals:
+        """Run the chain up to the filter; its volts are in `input_v`, (1, n) each."""
+        sensor, count = self.sensor, len(self.sensor.axes)
+        signals = Signals(
+            now, time_s=now.time_s, dt_s=self._dt_s, force=force, vref_v=sensor.adc_vref_v,
+            nominal_scale_v_per_g=sensor.nominal_scale_v_per_g.tolist())
+        self._apply(Place.FORCE, signals)
+        signals.sensed = [f / G0_MPS2 for f in signals.force]
+        self._apply(Place.MOUNTING, signals)
+        signals.output = list(signals.sensed)
+        self._apply(Place.ELEMENT, signals)
+        signals.zero_g_v = sensor.nominal_zero_g_v.tolist()
+        signals.scale_v_per_g = sensor.nominal_scale_v_per_g.tolist()
+        signals.rc_s, signals.noise_ratio = [sensor.rc_s] * count, [1.0] * count
+        signals.lsb_v, signals.lsb_ratio = sensor.lsb_v, [1.0] * count
+        self._apply(Place.ELECTRONICS, signals)
+        signals.input_v = [low_pass(np.asarray(volts), rc_s, self._dt_s, memory)
+                           for volts, rc_s, memory in zip(signal_chain.output_volts(signals),
+                                                          signals.rc_s, self._filters)]
+        return signals
+
+    def _digital_v(self, signals: Signals) -> np.ndarray:
+        """Add noise, and run the chain through the ADC: volts, (n, m)."""
+        drawn_v = self._draw_noise(signals)
+        if drawn_v is not None:
+            signals.input_v = [volts + drawn_v[:, d] for d, volts in enumerate(signals.input_v)]
+        signals.volts = list(signals.input_v)
+        self._apply(Place.ADC, signals)
+        coded = signal_chain.quantise(np.stack([volts[0] for volts in signals.volts], axis=-1),
+                                      self.sensor, signals.lsb_v * np.array(signals.lsb_ratio))
+        if not self._effects[Place.CODE]:
+            return coded
+        signals.volts = [volts[None] for volts in coded.T]
+        self._apply(Place.CODE, signals)
+        return np.stack([volts[0] for volts in signals.volts], axis=-1)
+
+    def _draw_noise(self, signals: Signals) -> np.ndarray | None:
+        """Draw the noise behind the filter, V, (n, m), as `Response` does; None without any."""
+        if not self._steps:
+            self._std_v = noise.analog_std_v(replace(self.sensor, rate_hz=1 / self._dt_s))
+        if not self._std_v.any():
+            return None
+        decay = np.array([np.exp(-self._dt_s / rc_s) if rc_s else 0.0 for rc_s in signals.rc_s])
+        drawn = self._white.standard_normal((signals.force[0].shape[-1], len(decay)))
+        # The first sample is stationary.
+        self._noise = drawn if self._noise is None else \
+            decay * self._noise + np.sqrt(1 - decay ** 2) * drawn
+        return self._noise * self._std_v
+
+
+def _reason_to_leave_out(effect: Effect) -> str:
+    """Return why a simulator cannot call an effect sample by sample; empty if it can."""
+    if effect.place is Place.CLOCK:
+        return 'needs samples between and after those of the simulator: shift the stamps instead'
+    if effect.name == 'lever_arm':
+        return 'needs the rotation: set the position of the sensor in the simulator'
+    if effect.place is Place.STAGE or Need.STAGE in effect.needs:
+        return 'is a property of stage and site: set it in the simulator'
+    return ''
