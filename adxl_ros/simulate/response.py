@@ -51,7 +51,7 @@ _WHOLE_STEPS = 300_000
 """Largest number of steps that are simulated at once and kept; chosen: 20 minutes at 250 Hz, some
 200 MB."""
 
-_POINTS = 6
+POINTS = 6
 """Points of the polynomial between the steps of the grid; chosen: as exact as the filters."""
 
 _ALIGNED_STEPS = 1e-4
@@ -171,7 +171,7 @@ class Response:
             Volts of the ADC, V, (n, m). Nothing can follow.
 
         """
-        steps = ceil((float(stamps_s[-1]) - self._begin_s) / self._step_s) + _POINTS
+        steps = ceil((float(stamps_s[-1]) - self._begin_s) / self._step_s) + POINTS
         if steps > _WHOLE_STEPS:
             return self(stamps_s)
         self._memo, self._block_steps = memo, steps
@@ -206,7 +206,7 @@ class Response:
         """Return filtered volts, (n, m), at samples in steps of the grid, and its signals."""
         nearest = np.rint(steps)
         aligned = bool(np.abs(steps - nearest).max() < _ALIGNED_STEPS)
-        ahead = 0 if aligned else _POINTS // 2
+        ahead = 0 if aligned else POINTS // 2
         first = self._done_steps - len(self._tail)
         until = int(nearest[-1]) + 1 + ahead
         kept, signals = [self._tail], None
@@ -217,7 +217,7 @@ class Response:
                 first += sum(map(len, kept[:-1]))
                 kept = kept[-1:]
         grid = np.concatenate(kept) if len(kept[0]) else kept[-1]
-        self._tail = grid[-(2 * _POINTS):]
+        self._tail = grid[-(2 * POINTS):]
         if aligned:
             index = nearest.astype(np.intp) - first
             every = (int(index[-1]) - int(index[0])) // max(len(index) - 1, 1)
@@ -375,14 +375,14 @@ def _copied(signals: Signals) -> Signals:
 
 def _interpolation(steps: np.ndarray, first: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the steps from `first` on that samples lie between, (n, points), and weights."""
-    start = np.floor(steps).astype(np.intp) - (_POINTS // 2 - 1)
-    index = np.clip(start[:, None] + np.arange(_POINTS) - first, 0, None)
-    return index, _lagrange(steps - start)
+    start = np.floor(steps).astype(np.intp) - (POINTS // 2 - 1)
+    index = np.clip(start[:, None] + np.arange(POINTS) - first, 0, None)
+    return index, lagrange_weights(steps - start)
 
 
-def _lagrange(position: np.ndarray) -> np.ndarray:
-    """Return the weights of `_POINTS` steps for interpolation at positions, (n, points)."""
-    nodes = np.arange(_POINTS)
+def lagrange_weights(position: np.ndarray) -> np.ndarray:
+    """Return the weights of `POINTS` steps for interpolation at positions, (n, points)."""
+    nodes = np.arange(POINTS)
     return np.column_stack([
         np.prod([(position - k) / (j - k) for k in nodes if k != j], axis=0) for j in nodes])
 

@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import replace
 from os import PathLike
 from typing import Any
@@ -34,7 +35,7 @@ from adxl_ros.model.effects.base import Effect, Environment, Need, Place, Signal
 from adxl_ros.model.filters import low_pass
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
 from adxl_ros.simulate.motion import Motion
-from adxl_ros.simulate.response import check_needs, EffectState
+from adxl_ros.simulate.response import check_needs, EffectState, lagrange_weights, POINTS
 import numpy as np
 
 _SAME_STEP = 1e-6
@@ -78,9 +79,10 @@ class SensorModel:
         """
         self.sensor = params if isinstance(params, Sensor) else parameter_file.load(params)
         check_needs(self.sensor, Motion(0.0))
-        effects = [effect_named(name) for name in self.sensor.effects]
-        self.left_out = {effect.name: reason for effect in effects
-                         if (reason := _reason_to_leave_out(effect))}
+        self._delay_s = float(self.sensor.values.get('time_offset', {}).get('offset_s', 0.0))
+        reasons = {name: _reason_to_leave_out(effect_named(name), self._delay_s)
+                   for name in self.sensor.effects}
+        self.left_out = {name: reason for name, reason in reasons.items() if reason}
         states = [EffectState(name, signal_chain.parameters(self.sensor, name), seed)
                   for name in self.sensor.effects if name not in self.left_out]
         self._effects = {place: [state for state in states
@@ -89,6 +91,8 @@ class SensorModel:
         self._filters: list[dict[str, Any]] = [{} for _ in self.sensor.axes]
         self._white = np.random.default_rng([seed, 0])
         self._noise: np.ndarray | None = None
+        self._past: deque[np.ndarray] = deque()
+        self._past_weights = np.zeros(0)
         self._shape: tuple[int, ...] = ()
         self._dt_s = 0.0
         self._std_v = np.zeros(0)
@@ -126,7 +130,7 @@ class SensorModel:
         """
         force = np.asarray(specific_force, float)
         self._check(force, dt)
-        rows = force.reshape(-1, 3)
+        rows = self._delayed(force.reshape(-1, 3))
         count = len(rows)
         # Time is the first axis of the components, as in a recording; sensors are the second.
         now = Environment(*(np.broadcast_to(np.asarray(values, float), (1, count)) for values in (
@@ -154,6 +158,20 @@ class SensorModel:
         if abs(dt_s - self._dt_s) > _SAME_STEP * self._dt_s:
             raise UserError(f'dt is {dt_s} s, but {self._dt_s} s before; call it at equal time '
                             'steps, or make a new SensorModel')
+
+    def _delayed(self, rows: np.ndarray) -> np.ndarray:
+        """Return the force of the instant that `time_offset` sets, from the past samples."""
+        if self._delay_s <= 0:
+            return rows
+        if not self._steps:
+            steps = self._delay_s / self._dt_s
+            newest = max(int(steps) + 1 - POINTS // 2, 0)
+            self._past_weights = lagrange_weights(np.array([steps - newest]))[0]
+            self._past = deque([rows.copy()] * (newest + POINTS), maxlen=newest + POINTS)
+        self._past.append(rows.copy())
+        # The oldest samples of the queue, whose newest one has the first weight.
+        oldest = [self._past[i] for i in range(POINTS)]
+        return sum(weight * past for weight, past in zip(self._past_weights, reversed(oldest)))
 
     def _apply(self, place: Place, signals: Signals) -> None:
         """Apply the effects of a place."""
@@ -211,10 +229,12 @@ class SensorModel:
         return self._noise * self._std_v
 
 
-def _reason_to_leave_out(effect: Effect) -> str:
+def _reason_to_leave_out(effect: Effect, delay_s: float) -> str:
     """Return why a simulator cannot call an effect sample by sample; empty if it can."""
+    if effect.name == 'time_offset':
+        return '' if delay_s >= 0 else 'needs future samples: shift the stamps instead'
     if effect.place is Place.CLOCK:
-        return 'needs samples between and after those of the simulator: shift the stamps instead'
+        return 'needs samples of any distance in time: change the stamps instead'
     if effect.name == 'lever_arm':
         return 'needs the rotation: set the position of the sensor in the simulator'
     if effect.place is Place.STAGE or Need.STAGE in effect.needs:

@@ -115,10 +115,30 @@ def test_an_axis_that_the_sensor_does_not_have_reads_0(tmp_path):
 
 
 def test_effects_that_a_simulator_cannot_call_are_named():
-    model = SensorModel(unit('bias', *sorted(STAGE), *sorted(CLOCK)))
+    model = SensorModel(unit('bias', 'time_offset:offset_s=-0.01', 'clock_skew', *sorted(STAGE)))
     assert set(model.left_out) == STAGE | CLOCK
-    assert 'after' in model.left_out['time_offset']
+    assert 'future' in model.left_out['time_offset']
     assert 'position' in model.left_out['lever_arm']
+
+
+@pytest.mark.parametrize('delay_s', [0.0012, 0.005, 0.0327])
+def test_time_offset_delays_the_force(delay_s):
+    """It reads the force of an earlier time, between the steps of the simulator."""
+    def force(time_s):
+        return G0_MPS2 * np.stack([np.sin(7 * time_s), np.cos(5 * time_s), np.sin(3 * time_s)], -1)
+
+    time_s = np.arange(300) / RATE_HZ
+    late, prompt = unit(f'time_offset:offset_s={delay_s}'), unit()
+    begin = 100
+    batch = np.stack([force(time_s), 0.5 * force(time_s)], axis=1)
+    expected = np.stack([force(time_s - delay_s), 0.5 * force(time_s - delay_s)], axis=1)
+    assert called(late, 1, batch)[begin:] == pytest.approx(
+        called(prompt, 1, expected)[begin:], abs=2 * lsb_mps2(late))
+    assert np.abs(batch - expected)[begin:].max() > 5 * lsb_mps2(late)
+
+
+def lsb_mps2(sensor):
+    return sensor.lsb_v / sensor.nominal_scale_v_per_g[0] * G0_MPS2
 
 
 @pytest.mark.parametrize(('force', 'dt_s', 'words'), [
