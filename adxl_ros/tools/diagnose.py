@@ -166,15 +166,17 @@ def _next_steps(options: argparse.Namespace, diagnosis: Diagnosis) -> str | list
     if diagnosis.next_experiment is None:
         return simulate
     proposal = diagnosis.next_experiment
+    steps = [NextStep(f'record next.csv: {proposal.manoeuvre}, {proposal.why}; simulated, it is',
+                      proposal.command)]
     if verdict.status == 'explained':
-        confirm = f'record next.csv to confirm the effects: {proposal.manoeuvre}; then'
-        return [NextStep(confirm, _diagnose_command(options, params, [])),
-                NextStep('simulate with the effects', simulate)]
-    given = options.params and quoted(options.params)
-    together = 'diagnose it' + ('' if options.sim else ' together with this one')
-    return [NextStep(f'record next.csv: {proposal.manoeuvre}, {proposal.why}; simulated, it is',
-                     proposal.command),
-            NextStep(together, _diagnose_command(options, given, options.recording))]
+        steps += [NextStep('diagnose the recording: the effects should close its gap, too',
+                           _diagnose_command(options, params, [])),
+                  NextStep('simulate with the effects', simulate)]
+    else:
+        given = options.params and quoted(options.params)
+        steps.append(NextStep('diagnose it' + ('' if options.sim else ' together with this one'),
+                              _diagnose_command(options, given, options.recording)))
+    return steps
 
 
 def _diagnose_command(options: argparse.Namespace, params: str | None, recordings: list[str]
