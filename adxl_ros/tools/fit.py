@@ -51,8 +51,6 @@ _EXAMPLES = {
         'sweep.csv -o unit.yaml --report report',
     'two sweeps of one unit, the linear model': 'one.mcap two.mcap --model linear -o unit.yaml',
     'a further effect': 'sweep.csv --effect temperature_bias -o unit.yaml',
-    'zero-g over temperature of a calibrated unit at rest':
-        'o.csv --params u.yaml --effect temperature_bias -o w.yaml',
 }
 """Examples of arguments, by their purpose."""
 _LIMITS = {
