@@ -146,6 +146,7 @@ def longest_rest(read: Callable[[], Iterable[Recording]],
                         'touches')
     end_s = np.inf if stop == len(moving) else begin_s + stop * length_s
     rest = _read(read, accel_mps2, begin_s + start * length_s, end_s)
+    _check_axes(rest, f' from {rest.longest.start_s:.4g} s to {rest.longest.stop_s:.4g} s')
     return _stretch(survey, rest, sorted(breaks))
 
 
@@ -280,11 +281,11 @@ def _held(block: Recording, last: float) -> tuple[np.ndarray, float]:
     return np.where(place < 0, first, values[place]), float(values[is_read][-1])
 
 
-def _check_axes(survey: _Survey) -> None:
-    """Refuse an axis that never changes."""
+def _check_axes(survey: _Survey, span: str = '') -> None:
+    """Refuse an axis that never changes; `span` names the part of the recording."""
     for name, resolution in zip(survey.names, survey.longest.resolution):
         if not np.isfinite(resolution):
-            raise UserError(f'{survey.path}: {name} never changes; the axis is stuck, or not '
+            raise UserError(f'{survey.path}: {name} never changes{span}; the axis is stuck, or not '
                             'connected')
 
 

@@ -168,12 +168,15 @@ def test_a_few_lost_samples_are_filled_and_a_long_gap_is_not(tmp_path: Path) -> 
     assert any('interrupted' in text for text in result['warnings'])
 
 
-@pytest.mark.parametrize(('change', 'reason'), [('stuck', 'az_mps2 never changes'),
-                                                ('short', 'record longer')])
+@pytest.mark.parametrize(('change', 'reason'), [
+    ('stuck', 'az_mps2 never changes;'), ('stuck half way', 'az_mps2 never changes from '),
+    ('short', 'record longer')])
 def test_refusals_are_one_line(tmp_path: Path, change: str, reason: str) -> None:
-    time_s, accel = samples(60.0 if change == 'stuck' else 5.0)
+    time_s, accel = samples(5.0 if change == 'short' else 60.0)
     if change == 'stuck':
         accel[:, 2] = G
+    if change == 'stuck half way':
+        accel[len(accel) // 2:, 2] = G
     write_csv(tmp_path / 'bad.csv', time_s, accel)
     done = run_executable('noise', 'bad.csv', '-o', 'noise.yaml', cwd=tmp_path)
     assert done.returncode == 1
