@@ -285,8 +285,8 @@ def _check_axes(survey: _Survey, span: str = '') -> None:
     """Refuse an axis that never changes; `span` names the part of the recording."""
     for name, resolution in zip(survey.names, survey.longest.resolution):
         if not np.isfinite(resolution):
-            raise UserError(f'{survey.path}: {name} never changes{span}; the axis is stuck, or not '
-                            'connected')
+            raise UserError(f'{survey.path}: {name} never changes{span}; the axis is stuck, or '
+                            'not connected')
 
 
 def _moving(segment: _Segment) -> tuple[np.ndarray, int]:

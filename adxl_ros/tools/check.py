@@ -113,7 +113,7 @@ def _checked(path: str, params: str | None, reading: ReadingOptions, show: _Step
         contents = examine(_shown(blocks, show), source.accel_mps2, delay)
     except UserError as error:
         reason = one_line(error).removeprefix(f'{path}: ')
-        return Findings(path, None, (reason,))
+        return Findings(path, None, (reason,), paste=error.paste)
     return replace(assess(contents), path=path)
 
 

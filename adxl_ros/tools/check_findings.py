@@ -90,6 +90,8 @@ class Findings:
         What else is noteworthy, one line each.
     abilities
         What the tools can do with it.
+    paste
+        End of the last fault that is for a command line; empty for none.
 
     """
 
@@ -98,6 +100,7 @@ class Findings:
     faults: tuple[str, ...]
     remarks: tuple[str, ...] = ()
     abilities: tuple[Ability, ...] = ()
+    paste: str = ''
 
     @property
     def is_sound(self) -> bool:

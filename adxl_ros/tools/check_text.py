@@ -92,10 +92,15 @@ def _entries(result: Findings) -> list[tuple[str, str]]:
 
 
 def _details(result: Findings) -> list[str]:
-    """Return the lines below the name of a recording."""
-    return [line for label, text in _entries(result) for line in textwrap.wrap(
-        f'  {label:{_LABEL_COLUMNS - 3}} {text}', COLUMNS, subsequent_indent=_LABEL_COLUMNS * ' ',
-        break_on_hyphens=False)]
+    """Return the lines below the name of a recording; options to paste are one line."""
+    rows = []
+    for label, text in _entries(result):
+        paste = result.paste if result.paste and text.endswith(result.paste) else ''
+        rows += textwrap.wrap(
+            f'  {label:{_LABEL_COLUMNS - 3}} {text.removesuffix(paste).rstrip()}', COLUMNS,
+            subsequent_indent=_LABEL_COLUMNS * ' ', break_on_hyphens=False)
+        rows += [_LABEL_COLUMNS * ' ' + paste] if paste else []
+    return rows
 
 
 def values(contents: RecordingContents) -> list[str]:

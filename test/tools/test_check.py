@@ -18,6 +18,7 @@ from collections.abc import Callable
 from dataclasses import replace
 import json
 from pathlib import Path
+import shlex
 import subprocess
 
 from bags import bag_of, imu, stamps
@@ -219,6 +220,17 @@ def test_log_time_against_header_time(tmp_path: Path) -> None:
     bag_of(tmp_path / 'jumped', jumped)
     faults = checked(tmp_path, 'jumped')['faults']
     assert any('log time minus header time varies' in text for text in faults)
+
+
+def test_the_mapping_of_a_foreign_log_is_one_line(tmp_path: Path) -> None:
+    """A name with blanks is not broken, so that the options can be pasted."""
+    time_s, accel = samples()
+    names = ';'.join(f'Acceleration {axis} [m/s^2]' for axis in 'xyz')
+    np.savetxt(tmp_path / 'log.csv', np.column_stack([time_s, accel]), fmt='%.6g', delimiter=';',
+               header=f'Time [s];{names}', comments='')
+    done = run(tmp_path, 'log.csv')
+    line = next(line for line in done.stdout.splitlines() if '--columns' in line)
+    assert checked(tmp_path, 'log.csv', *shlex.split(line))['sound']
 
 
 def test_a_foreign_log(tmp_path: Path) -> None:

@@ -74,6 +74,9 @@ _LTS_MAX_DEVIATIONS = 5.0
 """Largest residual of a rest that belongs to the best fit of most rests, standard deviations."""
 _MIN_REMAINDER = 1e-9
 """Lower bound of 1 − leverage, as a divisor."""
+_OTHER_SENSOR_G = 0.3
+"""Range of the magnitudes by nominal values, g, from which those are wrong. Chosen: errors within
+PRIOR_STD make less."""
 _MIN_GRAVITY_RATIO = 0.5
 """Smallest ratio of the measured magnitude to local gravity; a smaller one is a wrong unit."""
 _MAX_GRAVITY_RATIO = 2.0
@@ -351,5 +354,17 @@ def _require_determined(rests: NominalRests, parameters: np.ndarray, excess_g2: 
     scatter = f' and scatter by {1e3 * np.sqrt(excess_g2):.2g} mg' if excess_g2 else ''
     rests_needed = rests_to_add(max(MIN_RESTS - count, 0), information, parameters,
                                 rests.gravity_g, TRIAL_STD_G ** 2 + excess_g2)
-    raise UserError(f'gravity: the {count} rests {reason}{scatter}; add rests with '
-                    f'{", ".join(rests_needed)}')
+    raise UserError(f'gravity: the {count} rests {reason}{scatter}'
+                    f'{_other_sensor(rests)}; add rests with '
+                    f'{", ".join(rests_needed)}, or state the angles of the rests: fit --poses')
+
+
+def _other_sensor(rests: NominalRests) -> str:
+    """Return that the nominal values seem to be those of another sensor; empty if they fit."""
+    if not len(rests.mean):
+        return ''
+    low_g, high_g = np.quantile(np.linalg.norm(rests.mean, axis=1), [0.1, 0.9])
+    if high_g - low_g < _OTHER_SENSOR_G:
+        return ''
+    return (f', and read {low_g:.2f} to {high_g:.2f} g: zero-g and scale factor are those of '
+            'another sensor, so that --params needs the file of this one')

@@ -153,17 +153,26 @@ def level(mounting: Mounting, forces_mps2: np.ndarray, sensor: Sensor) -> Mounti
 
 
 def _mounting(rpy_rad: Sequence[float]) -> Mounting:
-    if len(rpy_rad) != 3 or not np.isfinite(rpy_rad).all():
-        raise parameter_error(_RPY, f'{list(rpy_rad)} is not roll, pitch and yaw in rad')
+    if _fault(rpy_rad):
+        raise parameter_error(_RPY, _fault(rpy_rad))
     roll, pitch, yaw = rpy_rad
     return Mounting((float(roll), float(pitch), float(yaw)))
 
 
+def _fault(rpy_rad: Sequence[float]) -> str:
+    """Return why a rotation is not three angles in rad; empty where it is."""
+    if len(rpy_rad) != 3 or not np.isfinite(rpy_rad).all():
+        return f'{list(rpy_rad)} is not roll, pitch and yaw in rad'
+    if np.abs(rpy_rad).max() > 2 * np.pi:
+        in_rad = ', '.join(f'{angle:.6g}' for angle in np.radians(rpy_rad))
+        return f'{list(rpy_rad)} is more than a turn in rad; if it is in degrees, write [{in_rad}]'
+    return ''
+
+
 def _check(parameters: Sequence[Parameter]) -> SetParametersResult:
-    """Refuse a rotation that is not three finite numbers."""
+    """Refuse a rotation that is not three angles in rad."""
     for parameter in parameters:
-        if parameter.name == _RPY and not (
-                len(parameter.value) == 3 and np.isfinite(parameter.value).all()):
-            return SetParametersResult(successful=False, reason=(
-                f'{_RPY}: {list(parameter.value)} is not roll, pitch and yaw in rad'))
+        fault = _fault(parameter.value) if parameter.name == _RPY else ''
+        if fault:
+            return SetParametersResult(successful=False, reason=f'{_RPY}: {fault}')
     return SetParametersResult(successful=True)
