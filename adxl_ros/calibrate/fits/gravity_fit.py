@@ -354,9 +354,8 @@ def _require_determined(rests: NominalRests, parameters: np.ndarray, excess_g2: 
     scatter = f' and scatter by {1e3 * np.sqrt(excess_g2):.2g} mg' if excess_g2 else ''
     rests_needed = rests_to_add(max(MIN_RESTS - count, 0), information, parameters,
                                 rests.gravity_g, TRIAL_STD_G ** 2 + excess_g2)
-    raise UserError(f'gravity: the {count} rests {reason}{scatter}'
-                    f'{_other_sensor(rests)}; add rests with '
-                    f'{", ".join(rests_needed)}, or state the angles of the rests: fit --poses')
+    raise UserError(f'gravity: without their angles (fit --poses), the {count} rests {reason}'
+                    f'{scatter}{_other_sensor(rests)}; add rests with {", ".join(rests_needed)}')
 
 
 def _other_sensor(rests: NominalRests) -> str:

@@ -211,7 +211,8 @@ def test_undetermined_parameters_are_refused(poses, names, advice):
     with pytest.raises(UserError) as refused:
         fit_gravity(means, errors, bare(sensor))
     text = str(refused.value)
-    assert text.startswith(f'gravity: the {len(poses)} rests do not determine ')
+    assert text.startswith(f'gravity: without their angles (fit --poses), the {len(poses)} rests '
+                           'do not determine ')
     assert f'{names}; add rests with ' in text
     assert advice in text.split('add rests with')[1]
     assert '\n' not in text
