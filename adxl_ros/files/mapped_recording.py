@@ -46,6 +46,9 @@ _LENGTHS_G = (0.5, 2.0)
 """Bounds of the median length of the readings, g, within which their unit is right (chosen: a
 sensor is mostly near 1 g)."""
 
+_TURN_RAD = 2 * np.pi
+"""Largest roll and pitch, rad."""
+
 _LISTED_NAMES = 12
 """Largest number of columns that a message names (chosen: some lines of a terminal)."""
 
@@ -262,6 +265,11 @@ class _Converter:
         column = self.columns[role]
         values = block.columns[column.name]
         wrong = np.abs(values) > LIMIT
+        is_tilt = role in ('roll', 'pitch') and column.unit_name == 'rad'
+        if is_tilt and (np.abs(values) > _TURN_RAD).any():
+            row = int((np.abs(values) > _TURN_RAD).argmax())
+            raise UserError(f'{block.where(row, column.name)} is {values[row]:g} rad, more than a '
+                            f'turn; if it is in degrees, write {role}={column.name}:deg')
         if wrong.any():
             row = int(wrong.argmax())
             raise UserError(f'{block.where(row, column.name)} is {values[row]:g}, no {role}; '

@@ -300,6 +300,9 @@ def test_numbered_columns_and_a_mapping_file(run_tool, tmp_path) -> None:
     (SHORT, ['--columns', 'time=t:s,x=x:lsb,y=y:lsb,z=z:lsb'], 'x is in LSB; add --lsb-per-g'),
     (SHORT, ['--columns', 'time=t:s,x=x:g,y=y:v'], 'some axes are in volts and others are not'),
     (SHORT, ['--columns', 'time=t:s,x=x:g,roll=y:deg'], 'roll without pitch is no reference'),
+    ('t,x,y,z,r,p\n' + 20 * '0,0,0,1,90,0\n',
+     ['--columns', f'{XYZ_G},roll=r:rad,pitch=p:deg', '--rate', '9'],
+     'log.csv:2:5: r is 90 rad, more than a turn; if it is in degrees, write roll=r:deg'),
     (SHORT, ['--columns', NO_UNIT], 'x, y, z have a length of 0.102 g in mps2, where gravity has '
                                     '1 g; state their unit, for example x=x:g'),
     (SHORT, ['--columns', 'gone.txt'], '--columns gone.txt: is neither a mapping nor a file'),
