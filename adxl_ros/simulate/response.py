@@ -341,7 +341,7 @@ _UP_TO_ELEMENT = {Place.CLOCK: Response._put_in_time, Place.STAGE: Response._mov
 class EffectState:
     """An effect of the sensor: its parameters, its memory and its random generator."""
 
-    def __init__(self, name: str, parameters: Parameters, seed: int) -> None:
+    def __init__(self, name: str, values: Parameters, seed: int) -> None:
         """
         Prepare the effect before its first sample.
 
@@ -349,7 +349,7 @@ class EffectState:
         ----------
         name
             Name of the effect.
-        parameters
+        values
             Values of its parameters.
         seed
             Seed of all randomness.
@@ -359,10 +359,10 @@ class EffectState:
         sizes = [p for p in effect.parameters if p.role is not Role.SHAPE]
         # At the neutral values of its sizes and limits an effect does nothing.
         self.is_neutral = bool(sizes) and all(
-            np.all(np.equal(parameters.get(p.name, p.neutral), p.neutral)) for p in sizes)
+            np.all(np.equal(values.get(p.name, p.neutral), p.neutral)) for p in sizes)
         self.place, self.apply = effect.place, effect.apply
-        self.key = (name, *sorted(parameters.items()))
-        self.parameters = parameters
+        self.key = (name, *sorted(values.items()))
+        self.parameters = values
         self.memory: dict[str, Any] = {}
         self.rng = np.random.default_rng([seed, zlib.crc32(name.encode())])
 
