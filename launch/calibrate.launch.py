@@ -37,7 +37,7 @@ from adxl_ros.nodes.support import launch_nodes
 from adxl_ros.nodes.support.launch_nodes import Argument, given_anywhere, make_node, text
 from launch import LaunchContext, LaunchDescription
 from launch.action import Action
-from launch.actions import DeclareLaunchArgument, LogInfo, OpaqueFunction
+from launch.actions import DeclareLaunchArgument, LogInfo
 
 LINK_TYPE = launch_nodes.LINK[0]
 STAGE_TYPE = Argument('stage_type', 'stage.type', 'the simulated stage, or the type of command '
@@ -78,7 +78,7 @@ RESUMES = 'its line above says why; accepted poses are kept, and the same comman
 
 
 def generate_launch_description() -> LaunchDescription:
-    return LaunchDescription([
+    return launch_nodes.describe([
         *launch_nodes.common_arguments(),
         DeclareLaunchArgument('output', default_value='calibrated.yaml',
                               description='parameter file that the calibration writes'),
@@ -90,8 +90,7 @@ def generate_launch_description() -> LaunchDescription:
                               description='show the calibration screen in this terminal; logs '
                               'then go to files'),
         *(argument.declared() for argument in (
-            STAGE_TYPE, STAGE_MODE, *BRIDGE, *SWEEP, SPEED)),
-        OpaqueFunction(function=make_nodes)])
+            STAGE_TYPE, STAGE_MODE, *BRIDGE, *SWEEP, SPEED))], make_nodes)
 
 
 def make_nodes(context: LaunchContext) -> list[Action]:

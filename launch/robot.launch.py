@@ -28,13 +28,11 @@ is started again. The launch ends with an error when a node refuses to start thr
 from adxl_ros.nodes.support import launch_nodes
 from launch import LaunchContext, LaunchDescription
 from launch.action import Action
-from launch.actions import OpaqueFunction
 
 
 def generate_launch_description() -> LaunchDescription:
-    return LaunchDescription([
-        *launch_nodes.common_arguments(), *launch_nodes.TRANSFORM,
-        OpaqueFunction(function=make_nodes)])
+    return launch_nodes.describe(
+        [*launch_nodes.common_arguments(), *launch_nodes.TRANSFORM], make_nodes)
 
 
 def make_nodes(context: LaunchContext) -> list[Action]:

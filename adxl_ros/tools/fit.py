@@ -188,7 +188,9 @@ def _result_lines(result: calibration.CalibrationResult) -> list[str]:
              f'{len(fitted.covariance_names)} coefficients', '',
              *text_tables.acceptance_lines(fitted)]
     if result.held_out:
-        lines += ['', f' on {result.held_out[-1].pose_count} poses that the fit has not seen',
+        count = result.held_out[-1].pose_count
+        folds = ': a fifth is left out at a time' if count >= len(result.inliers) else ''
+        lines += ['', f' on {count} poses that the fit has not seen{folds}',
                   *text_tables.error_table(result.held_out)]
     elif result.gravity_fit is not None:
         lines += ['', *text_tables.gravity_lines(result.gravity_fit)]

@@ -77,6 +77,16 @@ def test_a_launch_refuses_bad_arguments(launch, tmp_path, name, argument, words)
 
 
 @pytest.mark.parametrize('name', ['robot', 'calibrate'])
+def test_a_launch_names_the_nearest_of_a_misspelt_argument(launch, name):
+    launched = launch(name, 'parms_file:=unit.yaml', 'frame_id:=case', 'link_baud:=fast')
+    assert launched.wait() == 1
+    output = launched.output()
+    assert 'parms_file:=... is no argument of this launch' in output
+    assert 'did you mean params_file?' in output
+    assert output.count('did you mean') == 1
+
+
+@pytest.mark.parametrize('name', ['robot', 'calibrate'])
 def test_a_driver_that_refuses_to_start_ends_the_launch(launch, tmp_path, name):
     parameter_file.save(tmp_path / 'unit.yaml', nominal(serial='17'))
     launched = launch(name, 'params_file:=unit.yaml')

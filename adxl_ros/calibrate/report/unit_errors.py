@@ -82,6 +82,13 @@ def errors_in_words(fitted: Sensor) -> str:
     offset_g = (fitted.zero_g_v - fitted.nominal_zero_g_v) / fitted.nominal_scale_v_per_g
     gain = fitted.scale_v_per_g / fitted.nominal_scale_v_per_g - 1
     first, second = int(np.argmax(np.abs(offset_g))), int(np.argmax(np.abs(gain)))
-    return (f'Uncalibrated, {fitted.axes[first]} is {offset_g[first]:+.2g} g off, and '
+    return (f'Uncalibrated, {fitted.axes[first]} is {_force_text(offset_g[first])} off, and '
             f'{fitted.axes[second]} reads {abs(100 * gain[second]):.2g} % too '
             f'{"much" if gain[second] > 0 else "little"}.')
+
+
+def _force_text(force_g: float) -> str:
+    """Return a specific force with two digits, below 10 mg in mg."""
+    if abs(force_g) < 1e-5:
+        return 'less than 0.01 mg'
+    return f'{force_g:+.2g} g' if abs(force_g) >= 0.01 else f'{1e3 * force_g:+.2g} mg'

@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+import difflib
 import json
 import time
 from typing import Any, NamedTuple
@@ -26,9 +27,11 @@ from adxl_ros.files import parameter_file
 from adxl_ros.links.support.base import link_names
 from adxl_ros.nodes.support.params_files import given_text, has_section
 from launch.action import Action
-from launch.actions import DeclareLaunchArgument, LogInfo, Shutdown
+from launch.actions import DeclareLaunchArgument, LogInfo, OpaqueFunction, Shutdown
 from launch.events.process import ProcessExited
 from launch.launch_context import LaunchContext
+from launch.launch_description import LaunchDescription
+from launch.logging import get_logger
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
@@ -38,6 +41,8 @@ _MOST_REFUSALS = 3
 """Failed starts of a node after which a launch ends; chosen: a device may come late once."""
 _REFUSALS_S = 60.0
 """Time within which failed starts count, s; chosen: three starts on a slow machine."""
+_LEAST_LIKENESS = 0.6
+"""Smallest likeness of a misspelt name, by difflib; chosen: `params` is like `params_file`."""
 _LOG_LEVELS = ('debug', 'info', 'warn', 'error', 'fatal')
 """Log levels of rcl."""
 
@@ -142,6 +147,43 @@ def common_arguments() -> list[DeclareLaunchArgument]:
         DeclareLaunchArgument('log_level', default_value='info', choices=_LOG_LEVELS,
                               description='log level'),
         *(argument.declared() for argument in LINK)]
+
+
+def describe(arguments: Sequence[DeclareLaunchArgument],
+             make_nodes: Callable[[LaunchContext], list[Action]]) -> LaunchDescription:
+    """
+    Describe a launch, which warns of misspelt arguments.
+
+    Parameters
+    ----------
+    arguments
+        Its arguments.
+    make_nodes
+        Takes the context of the launch and returns the nodes.
+
+    Returns
+    -------
+    LaunchDescription
+        The launch.
+
+    """
+    return LaunchDescription([
+        *arguments,
+        OpaqueFunction(function=_warn_of_misspelt, args=[[part.name for part in arguments]]),
+        OpaqueFunction(function=make_nodes)])
+
+
+def _warn_of_misspelt(context: LaunchContext, names: Sequence[str]) -> None:
+    """
+    Warn of misspelt arguments, which ros2 launch ignores without a message.
+
+    They are no error: a launch file that includes this one may have arguments of its own.
+    """
+    for name in sorted(context.launch_configurations.keys() - set(names)):
+        near = difflib.get_close_matches(name, names, 1, _LEAST_LIKENESS)
+        if near:
+            get_logger('launch.user').warning(
+                f'{name}:=... is no argument of this launch; did you mean {near[0]}?')
 
 
 def make_node(context: LaunchContext, executable: str, overrides: Mapping[str, Any],
