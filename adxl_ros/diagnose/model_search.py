@@ -197,6 +197,12 @@ def _identifiable(linear_model: LinearModel) -> list[int]:
             or not effect_named(variant.effect).diagnosis.straight_line]
 
 
+def _is_meaningful(linear_model: LinearModel, effects: Iterable[str]) -> bool:
+    """Determine whether each effect stands beside the effect without which it has no meaning."""
+    present = {*effects, *linear_model.baseline.effects}
+    return all(effect_named(effect).diagnosis.beside in ('', *present) for effect in present)
+
+
 def _best(hypotheses: Hypotheses) -> Hypothesis:
     """Return the hypothesis of the largest log evidence."""
     return max(hypotheses.values(), key=lambda h: h.log_evidence)
@@ -321,7 +327,8 @@ def _ranked_beside(about: LinearModel, best: Hypothesis, present: Sequence[int]
     best_fit = about.fit_variants(present, None, drifts)
     fits = []
     for i in _identifiable(about):
-        if about.variants[i].effect not in best.effects:
+        effect = about.variants[i].effect
+        if effect not in best.effects and _is_meaningful(about, [*best.effects, effect]):
             fit = about.fit_variants([*present, i], best_fit, drifts)
             fits.append(_RankedSet(fit.log_evidence - best_fit.log_evidence, (i,), fit))
     return _best_of_each(about, fits)
@@ -368,7 +375,8 @@ def _remove_each_effect(linear_model: LinearModel, settings: DecisionSettings,
     """Fit the best set without each of its effects; two effects may replace an earlier one."""
     best = _best(hypotheses)
     for effect in best.effects:
-        if frozenset(best.effects) - {effect} not in hypotheses:
+        remaining = frozenset(best.effects) - {effect}
+        if remaining not in hypotheses and _is_meaningful(linear_model, remaining):
             _add(hypotheses, _fit_or_none(
                 linear_model, [e for e in best.effects if e != effect],
                 dict(zip(best.names, best.values)), {}, _lowest(hypotheses, settings)))
@@ -402,7 +410,8 @@ def _ranked(linear_model: LinearModel, sets: Sequence[tuple[int, ...]], null_fit
     """Fit sets of variants on the linear model; return the best of each set of effects, ranked."""
     fits = []
     for chosen in sets:
-        if len({linear_model.variants[i].effect for i in chosen}) == len(chosen):
+        effects = {linear_model.variants[i].effect for i in chosen}
+        if len(effects) == len(chosen) and _is_meaningful(linear_model, effects):
             fit = linear_model.fit_variants(chosen, null_fit, drifts)
             fits.append(_RankedSet(fit.log_evidence - null_fit.log_evidence, chosen, fit))
     return _best_of_each(linear_model, fits)

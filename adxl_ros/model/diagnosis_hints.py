@@ -147,6 +147,8 @@ class DiagnosisHints:
         hypothesis.
     imitated
         Whether zero-g and scale factor together imitate the effect completely.
+    beside
+        Effect without which this one has no meaning; a hypothesis has it only beside that one.
     drift
         Spectrum, if the effect lets the zero-g drift.
     healthy_density
@@ -169,6 +171,7 @@ class DiagnosisHints:
     straight_line: StraightLine | None = None
     healthy_std: float | None = None
     imitated: bool = False
+    beside: str = ''
     drift: DriftSpectrum | None = None
     healthy_density: float = 0.0
     detector: Detector | None = None

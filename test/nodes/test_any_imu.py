@@ -110,8 +110,12 @@ def test_calibration_takes_any_imu(camera: Camera, start: Start, tmp_path) -> No
                  'mode:=gravity', '-p', 'autostart:=true', '-p', 'output:=unit.yaml', '-p',
                  'sensor.serial:=cam7')
     camera.connected()
-    camera.rest([0.0, 0.0, G], 4.0)
-    node.wait_for('measured from the stream: rate: 100 Hz, axes: xyz')
+
+    def measured() -> bool:
+        camera.rest([0.0, 0.0, G], 0.5)
+        graph.spin(0.1)
+        return 'measured from the stream: rate: 100 Hz, axes: xyz' in node.output()
+    graph.spin_until(measured, 40, 'the measured sensor')
     graph.spin_until(lambda: graph.reports('calibration', ''), 20, 'diagnostics')
     rng = np.random.default_rng(8)
     directions = rng.normal(size=(30, 3))

@@ -49,7 +49,8 @@ EFFECT = Effect(
     follows=('temperature_c',),
     cause='The thermometer is warm earlier or later than the sensor; mount it at the sensor, or '
           'change the temperature slowly.',
-    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.HEAT,
+    # Alone, a long lag would imitate the temperature itself.
+    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.HEAT, beside='temperature_bias',
                              form=(FormDimension.TEMPERATURE, FormDimension.WARMING),
                              proof=(ProofVariable.TEMPERATURE_RATE,)),
 )

@@ -69,10 +69,11 @@ def run(make_node: Callable[[], Node], node_help: NodeHelp,
     is_initialised = False
     interrupts: list[int] = []
     try:
+        # It names a fault of a file by its place; rclpy does not.
+        check_params_files()
         arguments = remove_ros_args(sys.argv)[1:]
         if print_if_asked(arguments, make_node, node_help):
             return 0
-        check_params_files()
         argparse.ArgumentParser(prog=name, usage=_USAGE).parse_args(arguments)
         # rclpy's own handler ends the context; Python's would raise in the middle of a statement.
         signal.signal(signal.SIGINT, lambda number, _: interrupts.append(number))
