@@ -67,6 +67,9 @@ _BESIDE_DRIFTS = 2
 _RANKING_FORM_ERROR = 0.3
 """Share of the size of the present effects by which their form may differ, where a further effect
 is ranked. Chosen: the middle of the shares of the decision."""
+_FEWEST_TIME_CONSTANTS = 4.0
+"""Length of a recording that shows a time constant, relative to it. Chosen: the response to a step
+is then complete to 2 %."""
 _OTHER_STARTS = 2
 """Other shapes from which a fit that did not converge starts again. Chosen: run time."""
 _OTHER_START_SHARE = 0.5
@@ -197,12 +200,6 @@ def _identifiable(linear_model: LinearModel) -> list[int]:
             or not effect_named(variant.effect).diagnosis.straight_line]
 
 
-def _is_meaningful(linear_model: LinearModel, effects: Iterable[str]) -> bool:
-    """Determine whether each effect stands beside the effect without which it has no meaning."""
-    present = {*effects, *linear_model.baseline.effects}
-    return all(effect_named(effect).diagnosis.beside in ('', *present) for effect in present)
-
-
 def _best(hypotheses: Hypotheses) -> Hypothesis:
     """Return the hypothesis of the largest log evidence."""
     return max(hypotheses.values(), key=lambda h: h.log_evidence)
@@ -327,8 +324,7 @@ def _ranked_beside(about: LinearModel, best: Hypothesis, present: Sequence[int]
     best_fit = about.fit_variants(present, None, drifts)
     fits = []
     for i in _identifiable(about):
-        effect = about.variants[i].effect
-        if effect not in best.effects and _is_meaningful(about, [*best.effects, effect]):
+        if about.variants[i].effect not in best.effects:
             fit = about.fit_variants([*present, i], best_fit, drifts)
             fits.append(_RankedSet(fit.log_evidence - best_fit.log_evidence, (i,), fit))
     return _best_of_each(about, fits)
@@ -375,8 +371,7 @@ def _remove_each_effect(linear_model: LinearModel, settings: DecisionSettings,
     """Fit the best set without each of its effects; two effects may replace an earlier one."""
     best = _best(hypotheses)
     for effect in best.effects:
-        remaining = frozenset(best.effects) - {effect}
-        if remaining not in hypotheses and _is_meaningful(linear_model, remaining):
+        if frozenset(best.effects) - {effect} not in hypotheses:
             _add(hypotheses, _fit_or_none(
                 linear_model, [e for e in best.effects if e != effect],
                 dict(zip(best.names, best.values)), {}, _lowest(hypotheses, settings)))
@@ -410,8 +405,7 @@ def _ranked(linear_model: LinearModel, sets: Sequence[tuple[int, ...]], null_fit
     """Fit sets of variants on the linear model; return the best of each set of effects, ranked."""
     fits = []
     for chosen in sets:
-        effects = {linear_model.variants[i].effect for i in chosen}
-        if len(effects) == len(chosen) and _is_meaningful(linear_model, effects):
+        if len({linear_model.variants[i].effect for i in chosen}) == len(chosen):
             fit = linear_model.fit_variants(chosen, null_fit, drifts)
             fits.append(_RankedSet(fit.log_evidence - null_fit.log_evidence, chosen, fit))
     return _best_of_each(linear_model, fits)
@@ -476,8 +470,21 @@ def _add(hypotheses: Hypotheses, hypothesis: Hypothesis | None) -> None:
 def _fit_or_none(linear_model: LinearModel, effects: Sequence[str],
                  start: Mapping[Coefficient, float], shapes: Mapping[Coefficient, float],
                  lowest_log_evidence: float = -np.inf) -> Hypothesis | None:
-    """Fit a hypothesis; return None where it cannot be simulated or is singular."""
+    """Fit a hypothesis; return None where it cannot be simulated, is singular or does not show."""
     try:
-        return fit_hypothesis(linear_model, effects, start, shapes, lowest_log_evidence)
+        fitted = fit_hypothesis(linear_model, effects, start, shapes, lowest_log_evidence)
     except (UserError, np.linalg.LinAlgError):
         return None
+    return fitted if _shows_time_constants(linear_model, fitted) else None
+
+
+def _shows_time_constants(linear_model: LinearModel, hypothesis: Hypothesis) -> bool:
+    """Determine whether the longest recording shows the time constants of the effects."""
+    longest_s = max(float(np.ptp(comparison.time_s))
+                    for comparison in linear_model.comparisons)
+    time_constants = [Coefficient(effect, effect_named(effect).diagnosis.time_constant)
+                      for effect in hypothesis.effects
+                      if effect_named(effect).diagnosis.time_constant]
+    values = dict(zip(hypothesis.names, hypothesis.values))
+    return all(longest_s >= _FEWEST_TIME_CONSTANTS * values[name] for name in time_constants
+               if name in values)

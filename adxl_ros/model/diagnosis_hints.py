@@ -147,8 +147,9 @@ class DiagnosisHints:
         hypothesis.
     imitated
         Whether zero-g and scale factor together imitate the effect completely.
-    beside
-        Effect without which this one has no meaning; a hypothesis has it only beside that one.
+    time_constant
+        Name of the parameter that is a time constant, s. Recordings that are not much longer do
+        not show it: the effect would imitate what drives it.
     drift
         Spectrum, if the effect lets the zero-g drift.
     healthy_density
@@ -171,7 +172,7 @@ class DiagnosisHints:
     straight_line: StraightLine | None = None
     healthy_std: float | None = None
     imitated: bool = False
-    beside: str = ''
+    time_constant: str = ''
     drift: DriftSpectrum | None = None
     healthy_density: float = 0.0
     detector: Detector | None = None

@@ -49,8 +49,7 @@ EFFECT = Effect(
     follows=('temperature_c',),
     cause='The thermometer is warm earlier or later than the sensor; mount it at the sensor, or '
           'change the temperature slowly.',
-    # Alone, a long lag would imitate the temperature itself.
-    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.HEAT, beside='temperature_bias',
+    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.HEAT, time_constant='tau_s',
                              form=(FormDimension.TEMPERATURE, FormDimension.WARMING),
                              proof=(ProofVariable.TEMPERATURE_RATE,)),
 )
