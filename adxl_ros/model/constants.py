@@ -26,6 +26,9 @@ MEASURED_AXES = ('x', 'xy', 'xyz')
 Z_90 = 1.6449
 """Half of a 90 % interval in standard deviations: the 95 % quantile of the normal distribution."""
 
+MAD_TO_STD = 1.4826
+"""Standard deviation of a normal deviate, relative to the median of its magnitude."""
+
 NOMINAL_TEMPERATURE_C = 25.0
 """Temperature of the datasheet values, °C (ADXL203 datasheet, specifications)."""
 

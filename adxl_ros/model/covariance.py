@@ -21,10 +21,15 @@ Outside of the validity range of the calibration, `validity` adds to the covaria
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
+from typing import NamedTuple
 
-from adxl_ros.model import coefficients, noise, signal_chain
+from adxl_ros.model import analog_stages, noise, signal_chain
+from adxl_ros.model.coefficient_tangent import coefficient_tangent
 from adxl_ros.model.constants import AXES, G0_MPS2
+from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Components, Environment, NOMINAL_ENVIRONMENT, Value
+from adxl_ros.model.polynomial_chain import coefficients_of, drawn, MANY, monomials
 from adxl_ros.model.scalar_or_array import ARRAYS, Maths
 from adxl_ros.model.sensor import Sensor
 import numpy as np
@@ -35,12 +40,12 @@ UNMEASURED_VARIANCE = 1e6
 _FORCE2_FLOOR = 1e-30
 """Square of a negligible force, (m/s²)²; chosen: below any noise, it keeps divisors from 0."""
 
+_AGREEMENT = 1e-8
+"""Largest relative difference of polynomials from the derivatives by a coefficient; chosen: far
+above the rounding of these differences, and far below any standard deviation of the covariance."""
+
 _OVERHANG_MPS2 = -0.5
 """Lowest z of a sensor that is stated to be upright, m/s²; chosen: it may lean over by 3°."""
-
-_RELATIVE_STEP = 1e-3
-"""Step of the central differences by coefficients, in typical sizes; chosen: the chain is smooth
-and nearly linear in them."""
 
 _ROOT_MEAN = 1.25
 """Factor of the term that keeps the divisor of derived z from 0 where the in-plane force is g.
@@ -73,21 +78,69 @@ def force_covariance(sensor: Sensor, force: Components,
         Covariance, (m/s²)², (3, 3, n).
 
     """
-    force = [np.atleast_1d(np.asarray(f, float)) for f in force]
-    measured, tangent = measured_covariance(sensor, sample_variance_v2)(force, environment)
+    return prepared_covariance(sensor, sample_variance_v2)(force, environment)[0]
+
+
+def prepared_covariance(sensor: Sensor, sample_variance_v2: np.ndarray | None = None
+                        ) -> Callable[[Components, Environment], tuple[np.ndarray, np.ndarray]]:
+    """
+    Prepare `force_covariance` for one block of samples after the other.
+
+    Parameters
+    ----------
+    sensor
+        Calibrated unit with the covariance of its coefficients.
+    sample_variance_v2
+        Variance of the volts by axis, V², (m,); that of the noise of one sample unless given.
+
+    Returns
+    -------
+    callable
+        Maps specific force, m/s², three components (n,), and an `Environment` to the covariance,
+        (m/s²)², (3, 3, n), and to the leverage of the forces, (m/s²)², (n,).
+
+    """
+    of_measured = measured_covariance(sensor, sample_variance_v2)
     axes = [AXES.index(axis) for axis in sensor.axes]
-    covariance = np.zeros((3, 3, len(force[0])))
-    covariance[1, 1] = covariance[2, 2] = UNMEASURED_VARIANCE
-    covariance[np.ix_(axes, axes)] = measured
-    if sensor.axes == 'xy':
-        in_plane = measured[0, 0], measured[0, 1], measured[1, 1]
-        xx, xy, xz, yy, yz, zz = derived_z_covariance(force, in_plane, tangent.slope, ARRAYS)
-        covariance = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    return covariance
+
+    def covariance_and_leverage(force: Components, environment: Environment
+                                ) -> tuple[np.ndarray, np.ndarray]:
+        force = [np.atleast_1d(np.asarray(f, float)) for f in force]
+        measured, tangent, force_leverage = of_measured(force, environment)
+        covariance = np.zeros((3, 3, len(force[0])))
+        covariance[1, 1] = covariance[2, 2] = UNMEASURED_VARIANCE
+        covariance[np.ix_(axes, axes)] = measured
+        if sensor.axes == 'xy':
+            in_plane = measured[0, 0], measured[0, 1], measured[1, 1]
+            xx, xy, xz, yy, yz, zz = derived_z_covariance(force, in_plane, tangent.slope, ARRAYS)
+            covariance = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        return covariance, force_leverage
+
+    return covariance_and_leverage
+
+
+class MeasuredCovariance(NamedTuple):
+    """
+    Uncertainty of the force along the measured axes.
+
+    Attributes
+    ----------
+    covariance
+        Covariance, (m/s²)², (m, m, n).
+    tangent
+        The tangent of the inverse at the force.
+    leverage
+        Leverage of the force in the validity range, (m/s²)², (n,); 0 without such a range.
+
+    """
+
+    covariance: np.ndarray
+    tangent: signal_chain.Tangent
+    leverage: np.ndarray
 
 
 def measured_covariance(sensor: Sensor, sample_variance_v2: np.ndarray | None = None
-                        ) -> Callable[..., tuple[np.ndarray, signal_chain.Tangent]]:
+                        ) -> Callable[..., MeasuredCovariance]:
     """
     Prepare the covariance of the measured axes, given the others.
 
@@ -102,37 +155,170 @@ def measured_covariance(sensor: Sensor, sample_variance_v2: np.ndarray | None = 
     -------
     callable
         Maps specific force, m/s², three components (n,) or floats, and an `Environment` (the
-        nominal one unless given) to the covariance, (m/s²)², (m, m, n), and to the
-        `signal_chain.Tangent` at the force.
+        nominal one unless given) to a `MeasuredCovariance`.
 
     """
     if sample_variance_v2 is None:
         sample_variance_v2 = noise.sample_std_v(sensor) ** 2
-    m = len(sensor.axes)
-    respond = signal_chain.analog_response(sensor)
-    by_coefficient = coefficient_tangent(sensor)
+    tangents = signal_chain.prepared_tangent(sensor)
+    follows = any(effect_named(name).follows for name in sensor.effects)
+    variance = _prepared_variance(sensor, follows)
     force_leverage = leverage(sensor)
+    envelope = sensor.envelope
 
     def covariance(force: Components, environment: Environment = NOMINAL_ENVIRONMENT
-                   ) -> tuple[np.ndarray, signal_chain.Tangent]:
-        tangent = signal_chain.tangent(respond, sensor.axes, force, environment)
-        volts = np.diag(sample_variance_v2)
+                   ) -> MeasuredCovariance:
+        tangent = tangents(force, environment)
+        count = np.size(force[0])
+        by_coefficients = np.zeros((len(sensor.axes), len(sensor.axes), count))
         if len(sensor.covariance):
-            slope = by_coefficient(force, environment).reshape(m, len(sensor.covariance), -1)
-            slope = np.moveaxis(slope, 2, 0)
-            volts = volts + slope @ sensor.covariance @ np.swapaxes(slope, 1, 2)
-        back: np.ndarray = np.moveaxis(np.array(tangent.back).reshape(m, m, -1), 2, 0)
-        measured = np.moveaxis(back @ volts @ np.swapaxes(back, 1, 2), 0, 2)
-        envelope = sensor.envelope
+            by_coefficients = variance(force, environment)
+        noise_v2 = np.diag(sample_variance_v2)[:, :, None]
+        measured = _propagated(tangent.back, by_coefficients + noise_v2)
+        largest = np.zeros(count)
+        if envelope.leverage:
+            # The range is that of the nominal surroundings.
+            largest = force_leverage(force) if follows else _trace(
+                _propagated(tangent.back, by_coefficients))
         if envelope.temperature_c or envelope.leverage:
-            extrapolation = envelope.extrapolation(
-                force, force_leverage(force) if envelope.leverage else 0.0)
+            extrapolation = envelope.extrapolation(force, largest if envelope.leverage else 0.0)
             for d, axis in enumerate(sensor.axes):
                 measured[d, d] += envelope.added_variance(
                     force[AXES.index(axis)], environment.temperature_c, extrapolation, G0_MPS2)
-        return measured, tangent
+        return MeasuredCovariance(measured, tangent, largest)
 
     return covariance
+
+
+def _prepared_variance(sensor: Sensor, follows: bool
+                       ) -> Callable[[Components, Environment], np.ndarray]:
+    """
+    Prepare the covariance of the volts by that of the coefficients.
+
+    Parameters
+    ----------
+    sensor
+        Calibrated unit with the covariance of its coefficients.
+    follows
+        Whether an effect depends on the surroundings.
+
+    Returns
+    -------
+    callable
+        Maps specific force, m/s², three components (n,) or floats, and the surroundings to the
+        covariance, V², (m, m, n). Many samples get that of polynomials, where the derivatives
+        by the coefficients consist of them.
+
+    """
+    by_coefficient = coefficient_tangent(sensor)
+    roots = cache(lambda: None if follows else _polynomial_roots(sensor, by_coefficient))
+
+    def variance(force: Components, environment: Environment) -> np.ndarray:
+        polynomials = roots() if np.size(force[0]) >= MANY else None
+        if polynomials is None:
+            return _coefficient_variance(by_coefficient(force, environment), sensor.covariance)
+        return _products(polynomials @ monomials(np.array(force)))
+
+    return variance
+
+
+def _polynomial_roots(sensor: Sensor, by_coefficient: Callable[..., np.ndarray]
+                      ) -> np.ndarray | None:
+    """
+    Return polynomials of which the sums of products are the covariance of the volts.
+
+    Parameters
+    ----------
+    sensor
+        Calibrated unit with the covariance of its k coefficients.
+    by_coefficient
+        From `coefficient_tangent`.
+
+    Returns
+    -------
+    ndarray or None
+        Coefficients of the monomials by axis, (m, k, 20); None where the derivatives by the
+        coefficients are no polynomials.
+
+    """
+    force, _ = drawn()
+    slopes = by_coefficient(list(force))
+    m, k, count = slopes.shape
+    polynomials = coefficients_of(force, slopes.reshape(m * k, count), _AGREEMENT)
+    if polynomials is None:
+        return None
+    variances, directions = np.linalg.eigh(sensor.covariance)
+    root = np.sqrt(np.maximum(variances, 0.0))[:, None] * directions.T
+    return root @ polynomials.reshape(m, k, -1)
+
+
+def _products(parts: np.ndarray) -> np.ndarray:
+    """Return the sums of products of parts, (m, k, n), over k: (m, m, n)."""
+    m, _, count = parts.shape
+    sums = np.empty((m, m, count))
+    for i in range(m):
+        for j in range(i + 1):
+            sums[i, j] = sums[j, i] = np.einsum('kn,kn->n', parts[i], parts[j])
+    return sums
+
+
+def _coefficient_variance(slope: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """
+    Propagate the covariance of coefficients to the volts.
+
+    Parameters
+    ----------
+    slope
+        Derivatives of the volts by the coefficients, (m, k), or (m, k, n) for arrays.
+    covariance
+        Covariance of the coefficients, (k, k).
+
+    Returns
+    -------
+    ndarray
+        Covariance of the volts, V², (m, m, n).
+
+    """
+    m, k = slope.shape[:2]
+    columns = np.ascontiguousarray(np.swapaxes(slope, 0, 1)).reshape(k, m, -1)
+    spread = (covariance @ columns.reshape(k, -1)).reshape(columns.shape)
+    variance = np.empty((m, m, columns.shape[2]))
+    for i in range(m):
+        for j in range(i + 1):
+            variance[i, j] = variance[j, i] = np.einsum('kn,kn->n', columns[:, i], spread[:, j])
+    return variance
+
+
+def _propagated(back: list[Components], volts: np.ndarray) -> np.ndarray:
+    """
+    Propagate a covariance of the volts to the force.
+
+    Parameters
+    ----------
+    back
+        Derivatives of the force by the volts, m rows of m components, arrays (n,) or floats.
+    volts
+        Covariance of the volts, V², (m, m, n).
+
+    Returns
+    -------
+    ndarray
+        Covariance of the force, (m/s²)², (m, m, n).
+
+    """
+    m = len(back)
+    half = [[sum(back[i][a] * volts[a, b] for a in range(m)) for b in range(m)] for i in range(m)]
+    covariance = np.empty_like(volts)
+    for i in range(m):
+        for j in range(i + 1):
+            covariance[i, j] = covariance[j, i] = sum(
+                half[i][b] * back[j][b] for b in range(m))
+    return covariance
+
+
+def _trace(covariance: np.ndarray) -> np.ndarray:
+    """Return the trace of covariances, (m, m, n), as (n,)."""
+    return sum(covariance[d, d] for d in range(len(covariance)))
 
 
 def leverage(sensor: Sensor) -> Callable[[Components], np.ndarray]:
@@ -146,18 +332,15 @@ def leverage(sensor: Sensor) -> Callable[[Components], np.ndarray]:
         measured axes in the nominal environment, (m/s²)², (n,); 0 without a covariance.
 
     """
-    m = len(sensor.axes)
-    respond = signal_chain.analog_response(sensor)
+    respond = analog_stages.analog_response(sensor)
     by_coefficient = coefficient_tangent(sensor)
 
     def force_leverage(force: Components) -> np.ndarray:
         if not sensor.covariance_names:
             return np.zeros(np.shape(force[0]) or 1)
-        slope = np.moveaxis(by_coefficient(force).reshape(m, len(sensor.covariance), -1), 2, 0)
+        variance = _coefficient_variance(by_coefficient(force), sensor.covariance)
         tangent = signal_chain.tangent(respond, sensor.axes, force)
-        back: np.ndarray = np.moveaxis(np.array(tangent.back).reshape(m, m, -1), 2, 0)
-        force_slope = back @ slope
-        return np.einsum('nap,pq,naq->n', force_slope, sensor.covariance, force_slope)
+        return _trace(_propagated(tangent.back, variance))
 
     return force_leverage
 
@@ -200,38 +383,9 @@ def derived_z_covariance(force: Components, measured: tuple[Value, Value, Value]
     upright = maths.where(divisor < 0, -1.0, 1.0) * (z - distance) > _OVERHANG_MPS2
     independent = (_ROOT_MEAN * along * along * along / (blunted2 * blunted2)
                    + maths.where(upright, distance * distance / 2, 0.0))
-    rows = ((1 + slope[0] * by_x, slope[0] * by_y, slope[0]),
-            (slope[1] * by_x, 1 + slope[1] * by_y, slope[1]), (by_x, by_y, 1.0))
-    return tuple(a * c * xx + (a * d + b * c) * xy + b * d * yy + e * f * independent
-                 for i, (a, b, e) in enumerate(rows) for c, d, f in rows[i:])
-
-
-def coefficient_tangent(sensor: Sensor) -> Callable[..., np.ndarray]:
-    """
-    Prepare the derivatives of the volts by the coefficients in `sensor.covariance_names`.
-
-    Returns
-    -------
-    callable
-        Maps specific force, m/s², three components (n,) or floats, and an `Environment` (the
-        nominal one unless given) to derivatives by axis and coefficient, V by the unit of the
-        coefficient, (m, k, n). They are central differences.
-
-    """
-    differences = []
-    for name in sensor.covariance_names:
-        value = coefficients.get(sensor, [name])
-        step = _RELATIVE_STEP * coefficients.parameter_of(name).scale
-        above, below = (
-            signal_chain.static_response(coefficients.put(sensor, [name], value + change))
-            for change in (step, -step))
-        differences.append((above, below, 2 * step))
-
-    def by_coefficient(force: Components,
-                       environment: Environment = NOMINAL_ENVIRONMENT) -> np.ndarray:
-        columns = [[(a - b) / distance for a, b in zip(above(force, environment),
-                                                       below(force, environment))]
-                   for above, below, distance in differences]
-        return np.swapaxes(np.array(columns), 0, 1)
-
-    return by_coefficient
+    xz, yz = by_x * xx + by_y * xy, by_x * xy + by_y * yy
+    zz = by_x * xz + by_y * yz + independent
+    # The error of z goes on to x and y.
+    by_zz = [by_z * zz for by_z in slope]
+    return (xx + slope[0] * (2 * xz + by_zz[0]), xy + slope[0] * yz + slope[1] * (xz + by_zz[0]),
+            xz + by_zz[0], yy + slope[1] * (2 * yz + by_zz[1]), yz + by_zz[1], zz)

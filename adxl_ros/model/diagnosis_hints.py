@@ -161,6 +161,12 @@ class DiagnosisHints:
     half_turn
         Name of the parameter, rad, that changes by π when the sensor is remounted by half a turn
         about its z axis; empty for other effects.
+    imitated_by
+        Name of the effect of the sensor that gives the same samples, so that no recording
+        separates the two; empty for other effects.
+    smooths_reference
+        Whether the effect describes a reference that lacks fast motion. What no reference has
+        cannot be simulated, and remains beside it.
     form : tuple of FormDimension
         Dimensions along which the form differs between real sensors. Empty where the form is
         exact, as of geometry, of a clock and of a straight line, and for effects of the noise.
@@ -178,6 +184,8 @@ class DiagnosisHints:
     detector: Detector | None = None
     revealed_by: Manoeuvre | None = None
     half_turn: str = ''
+    imitated_by: str = ''
+    smooths_reference: bool = False
     form: tuple[FormDimension, ...] = ()
     proof: tuple[ProofVariable, ...] = ()
 

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from adxl_ros.model import signal_chain
+from adxl_ros.model import analog_stages
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Need, NOMINAL_ENVIRONMENT, Place, Signals
 from adxl_ros.model.sensor import Sensor
@@ -71,7 +71,7 @@ def electronics(sensor: Sensor) -> Electronics:
                       noise_ratio=[1.0] * count)
     for effect in map(effect_named, sensor.effects):
         if effect.needs in ((Need.FILTER,), (Need.NOISE,)) and effect.place is Place.ELECTRONICS:
-            effect.apply(signals, signal_chain.parameters(sensor, effect.name))
+            effect.apply(signals, analog_stages.parameters(sensor, effect.name))
     return Electronics(np.array(signals.rc_s), np.array(signals.noise_ratio))
 
 

@@ -37,6 +37,8 @@ class Maths:
     ----------
     sqrt
         Square root.
+    sin, cos
+        Sine and cosine of an angle, rad.
     atan2
         Angle of the point (second value, first value), rad.
     maximum
@@ -47,6 +49,8 @@ class Maths:
     """
 
     sqrt: Callable[[Any], Any]
+    sin: Callable[[Any], Any]
+    cos: Callable[[Any], Any]
     atan2: Callable[[Any, Any], Any]
     maximum: Callable[[Any, Any], Any]
     where: Callable[[Any, Any, Any], Any]
@@ -56,8 +60,8 @@ def _choose(condition: bool, value: float, otherwise: float) -> float:
     return value if condition else otherwise
 
 
-ARRAYS = Maths(np.sqrt, np.arctan2, np.maximum, np.where)
+ARRAYS = Maths(np.sqrt, np.sin, np.cos, np.arctan2, np.maximum, np.where)
 """Functions for arrays, (n,)."""
 
-FLOATS = Maths(math.sqrt, math.atan2, max, _choose)
+FLOATS = Maths(math.sqrt, math.sin, math.cos, math.atan2, max, _choose)
 """Functions for single samples: ten times faster than those of numpy."""

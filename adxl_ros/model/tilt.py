@@ -178,3 +178,25 @@ def roll_pitch_covariance(force: Components, covariance: tuple[Value, ...],
     side2 = y * y + z * z + _FORCE2_FLOOR
     by_pitch = x * (y * (z * yy - y * yz) + z * (z * yz - y * zz)) / side2 - (z * xy - y * xz)
     return by_pitch / (maths.sqrt(side2) * (x * x + side2))
+
+
+def quaternion(roll_rad: Value, pitch_rad: Value, maths: Maths) -> tuple[Value, ...]:
+    """
+    Return the orientation of a roll and pitch at a yaw of 0.
+
+    Parameters
+    ----------
+    roll_rad, pitch_rad
+        Angles, rad, (n,) each or floats.
+    maths
+        Functions for them.
+
+    Returns
+    -------
+    tuple
+        x, y, z and w.
+
+    """
+    sr, cr = maths.sin(roll_rad / 2), maths.cos(roll_rad / 2)
+    sp, cp = maths.sin(pitch_rad / 2), maths.cos(pitch_rad / 2)
+    return sr * cp, cr * sp, -sr * sp, cr * cp

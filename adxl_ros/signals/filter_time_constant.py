@@ -31,8 +31,7 @@ from adxl_ros.model.coefficients import names_of, put, with_neutral
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.sensor import Sensor
 import numpy as np
-from scipy.linalg import block_diag
-from scipy.optimize import minimize
+import scipy
 
 _SEGMENT_S = 1.0
 """Length of a segment of the periodogram, s. Chosen: several fit into a rest."""
@@ -141,8 +140,8 @@ def estimate_filter(rests: Iterable[np.ndarray], rate_hz: float, rc_s: float, ls
         return float(np.sum(power[used] / expected + np.log(expected)) + prior / (2 * weight))
 
     for _ in range(_FIT_ROUNDS):
-        fit = minimize(cost, start, method='Nelder-Mead',
-                       options={'xatol': 1e-5, 'fatol': 1e-6, 'maxiter': 2000})
+        fit = scipy.optimize.minimize(cost, start, method='Nelder-Mead',
+                                      options={'xatol': 1e-5, 'fatol': 1e-6, 'maxiter': 2000})
         deviation = power / _expected(fit.x, lags) - 1
         used &= deviation < _LINE_STD / np.sqrt(weight)
         if used.sum() < _MIN_SEGMENT_SAMPLES // 2:
@@ -221,5 +220,5 @@ def with_filter(fitted: Sensor, estimates: Sequence[Sequence[FilterNoise | None]
         variances.append((rc_s / fitted.rc_s) ** 2 / weights.sum())
     names = names_of(effect_named('bandwidth'), fitted.axes)
     unit = put(with_neutral(fitted, ['bandwidth']), names, ratios)
-    return replace(unit, covariance=block_diag(fitted.covariance, np.diag(variances)),
+    return replace(unit, covariance=scipy.linalg.block_diag(fitted.covariance, np.diag(variances)),
                    covariance_names=(*fitted.covariance_names, *names)), []

@@ -21,7 +21,7 @@ from enum import Enum
 
 from adxl_ros.signals.noise_parameters import coefficients, fit_noise, NoiseFit
 import numpy as np
-from scipy.fft import dst
+import scipy
 
 _TREND_GAIN = 12.0
 """Gain in twice the log likelihood from which a trend is named. Chosen: one chance in 2000."""
@@ -138,7 +138,7 @@ def _likely_step(measured: np.ndarray, variances: np.ndarray, fit: NoiseFit) -> 
     k = np.arange(1, count)
     variance = variances @ fit.squares
     factor = np.where(k < fit.highest, 1 / np.sin(k * np.pi / (2 * count)), 0.0)
-    score = dst(measured * factor / variance, type=1)
+    score = scipy.fft.dst(measured * factor / variance, type=1)
     weight = np.zeros(count)
     weight[1:] = factor ** 2 / variance
     # The sum of sin² by place: (1 − cos)/2 of the double angle.

@@ -18,12 +18,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from adxl_ros.model.constants import MAD_TO_STD
 from adxl_ros.model.noise import effective_samples, sample_std_v
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals.block_statistics import block_samples, Blocks
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from scipy.special import chdtri
+import scipy
 
 _WINDOW_S = 0.25
 """Length of the window of a variance, s. Chosen: under half of the shortest rest."""
@@ -47,8 +48,6 @@ _QUIET_STEPS = 50
 """Largest number of steps of that search."""
 _QUIET_DEVIATIONS = 5.0
 """Distance of a variance's limit from the noise, standard deviations of ln(variance)."""
-_MAD_TO_STD = 1.4826
-"""Standard deviation of a normal deviate, relative to the median of its magnitude."""
 _QUARTILE_TO_STD = 0.3186
 """First quartile of a normal deviate's magnitude, relative to its standard deviation."""
 _ROUNDING = 1e-9
@@ -207,7 +206,7 @@ def stated_limits(noise: Noise, step: np.ndarray, spans: Spans) -> NoiseLimits:
     """
     a = np.exp(-spans.dt_s / noise.tau_s) if noise.tau_s else 0.0
     freedom = max((spans.window * spans.size - 1) * (1 - a * a) / (1 + a * a), 1.0)
-    ratio = max(chdtri(freedom, _FALSE_ALARM) / freedom, _MIN_VARIANCE_RATIO)
+    ratio = max(scipy.special.chdtri(freedom, _FALSE_ALARM) / freedom, _MIN_VARIANCE_RATIO)
     sigma = np.hypot(noise.sigma, step / np.sqrt(12))
     halves = spans.half * spans.size << np.arange(DRIFT_OCTAVES)
     drift = np.sqrt(2 / effective_samples(halves, spans.dt_s, noise.tau_s))[:, None] * sigma
@@ -313,7 +312,7 @@ def _quietest(variances: np.ndarray, smallest: float) -> tuple[float, float]:
         if centre == before:
             break
     logs = np.log(values[:np.searchsorted(values, _QUIET_RATIO * centre)])
-    scatter = _MAD_TO_STD * np.median(np.abs(logs - np.log(centre)))
+    scatter = MAD_TO_STD * np.median(np.abs(logs - np.log(centre)))
     return float(centre), float(np.clip(np.exp(_QUIET_DEVIATIONS * scatter),
                                         _MIN_VARIANCE_RATIO, _MAX_VARIANCE_RATIO))
 

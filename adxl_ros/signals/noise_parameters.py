@@ -24,17 +24,14 @@ maximises the likelihood of the coefficients. The intervals are those of the pro
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
-from scipy.fft import dct, dst
-from scipy.optimize import brentq, nnls
-from scipy.stats import chi2
+import scipy
 
 INTERVAL = 0.90
 """Probability of an interval. The usual one of the package."""
-_DROP = float(chi2.ppf(INTERVAL, 1))
-"""Twice the drop of the log likelihood at the ends of an interval."""
 _SINGLE = 64
 """Coefficients of the lowest frequencies that are fitted one by one. Chosen: the terms change
 little between the further ones."""
@@ -190,7 +187,7 @@ class _Groups:
 
 def coefficients(means: np.ndarray) -> np.ndarray:
     """Return the cosine coefficients 1 to n − 1 of means, (n,); coefficient k is at k/(2·T)."""
-    return dct(means - means.mean(), norm='ortho')[1:]
+    return scipy.fft.dct(means - means.mean(), norm='ortho')[1:]
 
 
 def coefficient_variances(count: int, step_s: float) -> np.ndarray:
@@ -224,8 +221,8 @@ def coefficient_variances(count: int, step_s: float) -> np.ndarray:
     covariance[0] = -integral[1]
     covariance[1:] = -0.5 * (integral[2:] - 2 * integral[1:-1] + integral[:-2])
     covariance -= covariance[-1]
-    even = dct(np.append((count - lag[:-1]) * covariance, 0.0), type=1)[1:-1]
-    odd = dst(covariance[1:], type=1) / np.sin(omega)
+    even = scipy.fft.dct(np.append((count - lag[:-1]) * covariance, 0.0), type=1)[1:-1]
+    odd = scipy.fft.dst(covariance[1:], type=1) / np.sin(omega)
     flicker = (even - odd) / count / np.pi
     walk = step_s * (2 + np.cos(omega)) / (12 * np.sin(omega / 2) ** 2)
     return np.column_stack([np.full(count - 1, 1 / step_s), flicker, walk])
@@ -363,7 +360,7 @@ def _fit(groups: _Groups, fixed: int | None = None, value: float = 0.0
         weight = np.sqrt(groups.count) / (groups.shapes @ theta)
         design = groups.shapes[:, free] * weight[:, None]
         norm = np.linalg.norm(design, axis=0)
-        solution, _ = nnls(design / norm, (groups.power - offset) * weight)
+        solution, _ = scipy.optimize.nnls(design / norm, (groups.power - offset) * weight)
         step = -theta
         step[free] += solution / norm
         if fixed is not None:
@@ -387,21 +384,21 @@ def _interval(groups: _Groups, theta: np.ndarray, likelihood: float, term: int) 
     """Return a term with the ends of its interval by the profile likelihood."""
     def excess(logarithm: float) -> float:
         """Return twice the drop of the profile likelihood, minus its limit."""
-        return 2 * (likelihood - _fit(groups, term, np.exp(logarithm))[1]) - _DROP
+        return 2 * (likelihood - _fit(groups, term, np.exp(logarithm))[1]) - _drop()
 
     scale = float(np.min(groups.shapes @ theta / groups.shapes[:, term]))
     best = float(theta[term])
     low = 0.0
     begin = np.log(best if best > 0 else scale * _SMALLEST)
-    if best > 0 and 2 * (likelihood - _fit(groups, term, 0.0)[1]) > _DROP:
+    if best > 0 and 2 * (likelihood - _fit(groups, term, 0.0)[1]) > _drop():
         bottom = begin - 1.0
         while excess(bottom) < 0:
             bottom -= 1.0
-        low = float(np.exp(brentq(excess, bottom, begin, xtol=1e-6)))
+        low = float(np.exp(scipy.optimize.brentq(excess, bottom, begin, xtol=1e-6)))
     top = begin + 1.0
     while excess(top) < 0:
         top += 1.0
-    high = float(np.exp(brentq(excess, top - 1.0, top, xtol=1e-6)))
+    high = float(np.exp(scipy.optimize.brentq(excess, top - 1.0, top, xtol=1e-6)))
     return Estimate(*(float(np.sqrt(square)) for square in (best, low, high)))
 
 
@@ -424,7 +421,8 @@ def _octave_probability(groups: _Groups, theta: np.ndarray, first: int) -> float
     if not freedom:
         return 1.0
     total = float(groups.count[kept] @ (groups.power[kept] / (groups.shapes[kept] @ theta)))
-    return 2 * float(min(chi2.cdf(total, freedom), chi2.sf(total, freedom)))
+    tails = scipy.stats.chi2.cdf(total, freedom), scipy.stats.chi2.sf(total, freedom)
+    return 2 * float(min(tails))
 
 
 def _contradictions(groups: _Groups, theta: np.ndarray, highest: int, span_s: float
@@ -448,3 +446,9 @@ def _contradictions(groups: _Groups, theta: np.ndarray, highest: int, span_s: fl
                 octaves.append(Octave(begin / span_s, stop / span_s, ratio))
         stop = begin
     return tuple(octaves[::-1])
+
+
+@cache
+def _drop() -> float:
+    """Return twice the drop of the log likelihood at the ends of an interval."""
+    return float(scipy.stats.chi2.ppf(INTERVAL, 1))

@@ -156,6 +156,8 @@ class RecordingContents:
         Median length of the specific force at rest, g; None without three axes or rests.
     reference_ranges
         Lowest and highest value of each reference, by column.
+    reference_means
+        Mean of each reference, by column.
     delay
         Log time minus header stamp; None where there is no bag.
     remarks
@@ -183,6 +185,7 @@ class RecordingContents:
     poses: int
     length_g: float | None
     reference_ranges: dict[str, tuple[float, float]]
+    reference_means: dict[str, float]
     delay: LogDelay | None
     remarks: tuple[str, ...]
     cut: str
@@ -214,7 +217,7 @@ def examine(blocks: Iterable[Recording], accel_mps2: Callable[[Recording], np.nd
 
     """
     stamps = values = rests = block = None
-    references: dict[str, tuple[float, float]] = {}
+    references: dict[str, _Reference] = {}
     for block in blocks:
         if not len(block):
             continue
@@ -236,7 +239,9 @@ def examine(blocks: Iterable[Recording], accel_mps2: Callable[[Recording], np.nd
         stamps.burst, stamps.missing, stamps.gaps, stamps.longest_gap_s, block.bad_stamps,
         values.axes(), values.held_s,
         min(sum(rests.spans_s) / span_s, 1.0), max(rests.spans_s, default=0.0),
-        len(rests.spans_s), len(rests.poses_mps2), rests.length_g, references, delay,
+        len(rests.spans_s), len(rests.poses_mps2), rests.length_g,
+        {name: (reference.low, reference.high) for name, reference in references.items()},
+        {name: reference.total / reference.count for name, reference in references.items()}, delay,
         block.remarks, block.cut)
 
 
@@ -451,12 +456,28 @@ class _Rests:
         return float(np.median(self._lengths)) / G0_MPS2
 
 
-def _add_references(references: dict[str, tuple[float, float]], block: Recording) -> None:
-    """Widen the ranges of the references by those of a block."""
+@dataclass
+class _Reference:
+    """Range, sum and number of the values of a reference."""
+
+    low: float = np.inf
+    high: float = -np.inf
+    total: float = 0.0
+    count: int = 0
+
+    def feed(self, values: np.ndarray) -> None:
+        """Add further values, (n,)."""
+        self.low = min(self.low, float(values.min()))
+        self.high = max(self.high, float(values.max()))
+        self.total += float(values.sum())
+        self.count += len(values)
+
+
+def _add_references(references: dict[str, _Reference], block: Recording) -> None:
+    """Add the references of a block."""
     for name, values in block.columns.items():
         if name not in REFERENCES:
             continue
         finite = values[np.isfinite(values)]
         if len(finite):
-            low, high = references.get(name, (np.inf, -np.inf))
-            references[name] = (min(low, float(finite.min())), max(high, float(finite.max())))
+            references.setdefault(name, _Reference()).feed(finite)

@@ -22,7 +22,7 @@ from typing import Protocol
 
 from adxl_ros.model.effects.base import Components
 import numpy as np
-from scipy.interpolate import BPoly, PPoly
+import scipy
 
 INTERNAL_RATE_HZ = 1000.0
 """Lowest rate at which the chain runs, Hz; chosen: slow samples then get the motion between
@@ -95,7 +95,8 @@ class Knots:
         """
         rates = np.zeros(len(time_s)) if velocity is None else np.asarray(velocity, float)
         derivatives = np.column_stack([position, rates, np.zeros(len(time_s))])
-        pieces = PPoly.from_bernstein_basis(BPoly.from_derivatives(time_s, derivatives))
+        pieces = scipy.interpolate.PPoly.from_bernstein_basis(
+            scipy.interpolate.BPoly.from_derivatives(time_s, derivatives))
         self._orders = [pieces, pieces.derivative(), pieces.derivative(2)]
         self._begin_s, self._end_s = float(time_s[0]), float(time_s[-1])
 

@@ -24,10 +24,11 @@ from typing import Any
 import zlib
 
 from adxl_ros.errors import UserError
-from adxl_ros.model import noise, signal_chain
+from adxl_ros.model import analog_stages, noise, signal_chain
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import (
+    Components,
     Environment,
     Joint,
     Need,
@@ -42,6 +43,7 @@ from adxl_ros.model.kinematics import specific_force_in_motion, UPRIGHT
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.simulate.chain_memo import ChainMemo
 from adxl_ros.simulate.motion import Motion
+from adxl_ros.simulate.smoothed_paths import ForcePath
 import numpy as np
 
 _BLOCK_STEPS = 65536
@@ -99,7 +101,8 @@ class Response:
         check_needs(sensor, motion)
         self.sensor, self._motion, self._begin_s = sensor, motion, begin_s
         self._seed = seed
-        states = [EffectState(name, signal_chain.parameters(sensor, name), seed)
+        self._force_path: Callable[[np.ndarray], Components] | None = None
+        states = [EffectState(name, analog_stages.parameters(sensor, name), seed)
                   for name in sensor.effects]
         self._effects = {place: [state for state in states
                                  if state.place is place and not state.is_neutral]
@@ -239,7 +242,7 @@ class Response:
         signals.lsb_v, signals.lsb_ratio = self.sensor.lsb_v, [1.0] * m
         self._apply(Place.ELECTRONICS, signals)
         volts = np.empty((max(count, 0), m))
-        for d, v in enumerate(signal_chain.output_volts(signals)):
+        for d, v in enumerate(analog_stages.output_volts(signals)):
             volts[:, d] = low_pass(np.broadcast_to(v, len(volts)), signals.rc_s[d],
                                    self._dt_s, self._filters[d])
         return volts, signals
@@ -262,7 +265,8 @@ class Response:
         """Return what the chain depends on beside its effects, up to the element."""
         sensor = self.sensor
         return (self._motion, self._begin_s, self._step_s, sensor.local_gravity_mps2,
-                sensor.adc_vref_v, *sensor.nominal_scale_v_per_g.tolist())
+                sensor.adc_vref_v, *sensor.nominal_scale_v_per_g.tolist(),
+                *(state.key for state in self._effects[Place.REFERENCE]))
 
     def _put_in_time(self, signals: Signals) -> Signals:
         """Set the instants of the samples and the surroundings."""
@@ -274,7 +278,11 @@ class Response:
         """Set the specific force by the stage, or by the motion where it states the force."""
         motion, instants_s = self._motion, signals.time_s
         if motion.force:
-            signals.force = list(motion.force(instants_s))
+            if self._force_path is None:
+                keys = [state.key for state in self._effects[Place.REFERENCE]]
+                self._force_path = self._kept('reference', (motion, *keys),
+                                              partial(self._acting_force, motion.force))
+            signals.force = list(self._force_path(instants_s))
             return signals
         signals.alpha, signals.beta, signals.shift = (
             Joint(*(joint(instants_s, order) for order in range(3)))
@@ -283,6 +291,20 @@ class Response:
         signals.force = specific_force_in_motion(
             signals.alpha, signals.beta, signals.shift, signals.gravity_mps2, signals.up)
         return signals
+
+    def _acting_force(self, force: Callable[[np.ndarray], Components]
+                      ) -> Callable[[np.ndarray], Components]:
+        """
+        Return the specific force that acts on the sensor, from that of the reference.
+
+        Only a recorded force has the errors of a reference; others are exact.
+        """
+        if not isinstance(force, ForcePath) or not self._effects[Place.REFERENCE]:
+            return force
+        signals = Signals(NOMINAL_ENVIRONMENT, time_s=force.time_s, force=force(force.time_s),
+                          dt_s=float(np.median(np.diff(force.time_s))))
+        self._apply(Place.REFERENCE, signals)
+        return ForcePath(signals.time_s, np.column_stack(signals.force))
 
     def _mount(self, signals: Signals) -> Signals:
         """Turn the specific force into the force along the axes of the case, g."""

@@ -23,7 +23,7 @@ from typing import Any
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
-from adxl_ros.model import noise, signal_chain
+from adxl_ros.model import analog_stages, noise, signal_chain
 from adxl_ros.model.constants import (
     AXES,
     G0_MPS2,
@@ -83,7 +83,7 @@ class SensorModel:
         reasons = {name: _reason_to_leave_out(effect_named(name), self._delay_s)
                    for name in self.sensor.effects}
         self.left_out = {name: reason for name, reason in reasons.items() if reason}
-        states = [EffectState(name, signal_chain.parameters(self.sensor, name), seed)
+        states = [EffectState(name, analog_stages.parameters(self.sensor, name), seed)
                   for name in self.sensor.effects if name not in self.left_out]
         self._effects = {place: [state for state in states
                                  if state.place is place and not state.is_neutral]
@@ -196,7 +196,7 @@ class SensorModel:
         signals.lsb_v, signals.lsb_ratio = sensor.lsb_v, [1.0] * count
         self._apply(Place.ELECTRONICS, signals)
         signals.input_v = [low_pass(np.asarray(volts), rc_s, self._dt_s, memory)
-                           for volts, rc_s, memory in zip(signal_chain.output_volts(signals),
+                           for volts, rc_s, memory in zip(analog_stages.output_volts(signals),
                                                           signals.rc_s, self._filters)]
         return signals
 
@@ -235,6 +235,8 @@ def _reason_to_leave_out(effect: Effect, delay_s: float) -> str:
         return '' if delay_s >= 0 else 'needs future samples: shift the stamps instead'
     if effect.place is Place.CLOCK:
         return 'needs samples of any distance in time: change the stamps instead'
+    if effect.place is Place.REFERENCE:
+        return 'is an error of the reference that the sensor was compared with'
     if effect.name == 'lever_arm':
         return 'needs the rotation: set the position of the sensor in the simulator'
     if effect.place is Place.STAGE or Need.STAGE in effect.needs:

@@ -104,8 +104,10 @@ class SimulatedStage:
                 raise UserError(f'{name} = {position:g} is out of reach; the stage goes to '
                                 f'+-{_REACH[name]:g}')
             target[JOINTS.index(name)] = position
-        self._goal = np.where(target == self._commanded, self._goal, self._reachable(target))
-        self._commanded = target
+        is_new = target != self._commanded
+        if is_new.any():
+            self._goal = np.where(is_new, self._reachable(target), self._goal)
+            self._commanded = target
 
     def step(self, dt_s: float) -> None:
         """Advance by a time step, s."""

@@ -23,8 +23,7 @@ from math import factorial
 
 from adxl_ros.model.effects.base import Components
 import numpy as np
-from scipy.interpolate import BSpline, CubicSpline, make_interp_spline, PPoly
-from scipy.linalg import cho_solve_banded, cholesky_banded, solveh_banded
+import scipy
 
 _DEGREE = 5
 """Degree of the splines of joints; chosen: quintic, so that the acceleration is smooth."""
@@ -157,7 +156,7 @@ class SmoothedPath:
         """
         sampled = np.isfinite(reading)
         self._time_s, self._reading = time_s[sampled], reading[sampled]
-        self._windows: dict[int, BSpline | PPoly] = {}
+        self._windows: dict[int, scipy.interpolate.BSpline | scipy.interpolate.PPoly] = {}
         self._step = visible_step(self._reading, step)
         self._strength = self._matched_strength(self._step)
         self._degree = degree
@@ -215,7 +214,7 @@ class SmoothedPath:
         """Return the number of the window of each time, (n,)."""
         return ((time_s - self._time_s[0]) / _WINDOW_S).astype(int)
 
-    def _spline(self, window: int) -> BSpline | PPoly:
+    def _spline(self, window: int) -> scipy.interpolate.BSpline | scipy.interpolate.PPoly:
         if window not in self._windows:
             while len(self._windows) >= _MAX_WINDOWS:
                 del self._windows[min(self._windows)]
@@ -241,7 +240,7 @@ class SmoothedPath:
 
 
 def smoothing_spline(time_s: np.ndarray, reading: np.ndarray, strength: float, step: float,
-                     degree: int = _DEGREE) -> BSpline:
+                     degree: int = _DEGREE) -> scipy.interpolate.BSpline:
     """
     Fit the smoothing spline of one window; see `SmoothedPath`.
 
@@ -265,18 +264,18 @@ def smoothing_spline(time_s: np.ndarray, reading: np.ndarray, strength: float, s
 
     """
     if len(time_s) <= 2 * _DEGREE or np.ptp(reading) == 0:
-        return make_interp_spline(time_s, reading, k=1) if len(time_s) > 1 else \
-            BSpline(np.array([0.0, 1.0]), reading, 0, extrapolate=True)
+        return scipy.interpolate.make_interp_spline(time_s, reading, k=1) if len(time_s) > 1 else \
+            scipy.interpolate.BSpline(np.array([0.0, 1.0]), reading, 0, extrapolate=True)
     if not step:
         interval_s = np.diff(time_s)
         even = interval_s.max() < _MAX_UNEVENNESS * np.median(interval_s)
-        return make_interp_spline(time_s, reading, k=degree if even else _DEGREE)
+        return scipy.interpolate.make_interp_spline(time_s, reading, k=degree if even else _DEGREE)
     window = _Window(time_s, reading)
-    return BSpline(window.knots, window.bounded_coefficients(
+    return scipy.interpolate.BSpline(window.knots, window.bounded_coefficients(
         strength, np.where(_moving(reading), 0.0, _REST_WEIGHT), step / 2) + window.mean, _DEGREE)
 
 
-def _polynomials(spline: BSpline) -> PPoly:
+def _polynomials(spline: scipy.interpolate.BSpline) -> scipy.interpolate.PPoly:
     """
     Return a spline as polynomials, which are evaluated faster but need more memory.
 
@@ -285,7 +284,7 @@ def _polynomials(spline: BSpline) -> PPoly:
     begins = spline.t[spline.k:-spline.k - 1]
     coefficients = [spline(begins, order) / factorial(order)
                     for order in range(spline.k, -1, -1)]
-    return PPoly(np.array(coefficients), spline.t[spline.k:-spline.k])
+    return scipy.interpolate.PPoly(np.array(coefficients), spline.t[spline.k:-spline.k])
 
 
 def visible_step(reading: np.ndarray, step: float) -> float:
@@ -380,7 +379,7 @@ class _Window:
                             max(int(min(duration_s / KNOT_S, len(time_s) / 2)), 1) + 1)
         outer = (inner[1] - inner[0]) * np.arange(1, _DEGREE + 1)
         self.knots = np.concatenate([inner[0] - outer[::-1], inner, inner[-1] + outer])
-        self.design = BSpline.design_matrix(time_s, self.knots, _DEGREE)
+        self.design = scipy.interpolate.BSpline.design_matrix(time_s, self.knots, _DEGREE)
         self.mean = float(reading.mean())
         self._values = reading - self.mean
         self.right = self.design.T @ self._values
@@ -390,7 +389,7 @@ class _Window:
 
     def coefficients(self, strength: float) -> np.ndarray:
         """Return the coefficients of least squares with a penalty, (k,)."""
-        return solveh_banded(self._normal + self._penalty(strength), self.right)
+        return scipy.linalg.solveh_banded(self._normal + self._penalty(strength), self.right)
 
     def bounded_coefficients(self, strength: float, weights: np.ndarray, bound: float
                              ) -> np.ndarray:
@@ -419,12 +418,12 @@ class _Window:
         weighted = self.design.multiply(1 + weights[:, None]).tocsr()
         normal = _banded(transposed @ weighted)
         normal[-1] += _RIDGE * normal[-1].max()
-        factor = cholesky_banded(normal + self._penalty(_BOUNDED_SHARE * strength))
+        factor = scipy.linalg.cholesky_banded(normal + self._penalty(_BOUNDED_SHARE * strength))
         low, high, pulled = self._values - bound, self._values + bound, weights * self._values
         within, excess = self._values, np.zeros(len(self._values))
         for _ in range(_BOUND_ROUNDS):
-            coefficients = cho_solve_banded((factor, False),
-                                            transposed @ (pulled + within - excess))
+            coefficients = scipy.linalg.cho_solve_banded((factor, False),
+                                                         transposed @ (pulled + within - excess))
             excess = excess + self.design @ coefficients
             within = np.clip(excess, low, high)
             excess = excess - within
@@ -492,7 +491,7 @@ class ForcePath:
         """
         self.time_s = time_s
         self._force_mps2 = force_mps2
-        self._spline = CubicSpline(time_s, force_mps2)
+        self._spline = scipy.interpolate.CubicSpline(time_s, force_mps2)
 
     def __call__(self, time_s: np.ndarray) -> Components:
         """Return the three components at times, s, (n,), m/s²; constant outside."""

@@ -35,7 +35,7 @@ SETTLE_S = 0.2
 _JERK_PEAK = 1.875
 """Peak velocity of the motion of minimum jerk, divided by its mean: 15/8."""
 
-_RUN_UP_S = 1.0
+RUN_UP_S = 1.0
 """Time in which a joint reaches a constant velocity, s; chosen: 60° per second squared at most."""
 
 _SHAKE_LOW_HZ = 2.0
@@ -186,6 +186,8 @@ class Script:
         Angles at present, rad.
     now
         Time at present, s.
+    slew_rad_s
+        Largest velocity of a move to a pose, rad/s.
     rows
         Knots: time, s, alpha and beta, rad, and their derivatives, rad/s.
 
@@ -194,6 +196,7 @@ class Script:
     alpha: float
     beta: float
     now: float = 0.0
+    slew_rad_s: float = SLEW_RAD_S
     rows: list[tuple[float, ...]] = field(default_factory=list)
 
     def rest(self, seconds: float) -> None:
@@ -214,7 +217,7 @@ class Script:
         """
         distance = max(abs(alpha - self.alpha), abs(beta - self.beta))
         self._knot(0.0, 0.0)
-        self.now += _JERK_PEAK * distance / SLEW_RAD_S
+        self.now += _JERK_PEAK * distance / self.slew_rad_s
         self.alpha, self.beta = alpha, beta
         self._knot(0.0, 0.0)
 
@@ -234,12 +237,12 @@ class Script:
         """
         distance = to - getattr(self, joint)
         rate = np.copysign(speed, distance)
-        run_up = rate * _RUN_UP_S / 2
+        run_up = rate * RUN_UP_S / 2
         constant = distance - 2 * run_up
         self._knot(0.0, 0.0)
-        self._turn(joint, run_up, _RUN_UP_S, rate)
+        self._turn(joint, run_up, RUN_UP_S, rate)
         self._turn(joint, constant, abs(constant) / speed, rate)
-        self._turn(joint, run_up, _RUN_UP_S, 0.0)
+        self._turn(joint, run_up, RUN_UP_S, 0.0)
 
     def _turn(self, joint: str, angle: float, seconds: float, rate: float) -> None:
         """Turn a joint by an angle, rad, within a time, s, up to a velocity, rad/s."""

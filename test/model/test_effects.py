@@ -15,6 +15,7 @@
 """Each effect: neutral values change nothing, blocks join, tangents agree, closed forms hold."""
 
 from dataclasses import replace
+from functools import cache
 
 from adxl_ros.errors import UserError
 from adxl_ros.model import signal_chain
@@ -28,13 +29,14 @@ from adxl_ros.model.coefficients import (
     with_neutral,
 )
 from adxl_ros.model.effects import library
-from adxl_ros.model.effects.base import ActsOn, Coefficient, Need, NOMINAL_ENVIRONMENT
+from adxl_ros.model.effects.base import ActsOn, Coefficient, Need, NOMINAL_ENVIRONMENT, Place
 from adxl_ros.model.filters import low_pass, resonator
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.play_operator import play
 from adxl_ros.simulate.motion import Held, Knots, Motion
 from adxl_ros.simulate.response import Response
 from adxl_ros.simulate.simulator import simulate
+from adxl_ros.simulate.smoothed_paths import ForcePath
 from adxl_ros.simulate.trajectories import Sine, Steps
 import numpy as np
 import pytest
@@ -50,6 +52,12 @@ MOTION = Motion(12.0, Knots([0, 1, 3, 5, 7, 12], [0.5, 0.5, 1.2, 0.9, 2.0, 2.0])
                 supply_v=Steps(5.0, ((4.0, 4.8),), 0.5))
 
 
+_TIME_S = np.arange(0.0, 12.0, 0.01)
+FOLLOWED = Motion(12.0, force=ForcePath(_TIME_S, G * np.column_stack([
+    0.3 * np.sin(9 * _TIME_S), 0.4 * np.cos(5 * _TIME_S), 1 + 0.2 * np.sin(23 * _TIME_S)])),
+    temperature_c=MOTION.temperature_c, supply_v=MOTION.supply_v)
+
+
 def with_effect(name, sensor=None, **changes):
     """Return a sensor with one effect at its typical values, except for the changes."""
     sensor = sensor or nominal('xyz', **CLEAN)
@@ -58,16 +66,23 @@ def with_effect(name, sensor=None, **changes):
     return replace(sensor, effects=(name,), values={name: values})
 
 
-def volts(sensor, motion=MOTION, seed=1):
+def motion_of(name):
+    """Return a motion on which an effect acts: errors of a reference act on a recorded force."""
+    return FOLLOWED if library()[name].place is Place.REFERENCE else MOTION
+
+
+def volts(sensor, motion=None, seed=1):
     """Simulate a motion; return volts, (n, m)."""
+    if motion is None:
+        motion = motion_of(sensor.effects[0]) if sensor.effects else MOTION
     columns = simulate(sensor, motion, seed)
     return np.column_stack([columns[f'{axis}_v'] for axis in sensor.axes])
 
 
 @pytest.fixture(scope='module')
 def plain():
-    """Return the volts of a sensor without effects, with noise and ADC."""
-    return volts(nominal('xyz'))
+    """Give a function that returns volts without an effect, in its motion, with noise and ADC."""
+    return cache(lambda name: volts(nominal('xyz'), motion_of(name)))
 
 
 def test_the_library_has_the_documented_effects():
@@ -77,7 +92,7 @@ def test_the_library_has_the_documented_effects():
              'temperature_scale warm_up bias_walk supply saturation quantisation adc_inl '
              'noise_excess flicker mains_hum spikes stuck vibration_rectification time_offset '
              'clock_skew gravity base_tilt stage_offset stage_eccentricity backlash lever_arm '
-             'thermal_lag thermal_hysteresis')
+             'thermal_lag thermal_hysteresis reference_filter reference_delay reference_frame')
     listed = names.split()
     assert not set(listed) - set(NAMES)
 
@@ -85,7 +100,7 @@ def test_the_library_has_the_documented_effects():
 @pytest.mark.parametrize('name', NAMES)
 def test_neutral_is_identity_to_the_bit(name, plain):
     """An effect at its neutral values changes no bit of a noisy recording in motion."""
-    np.testing.assert_array_equal(volts(with_neutral(nominal('xyz'), [name])), plain)
+    np.testing.assert_array_equal(volts(with_neutral(nominal('xyz'), [name])), plain(name))
 
 
 @pytest.mark.parametrize('name', NAMES)
@@ -97,9 +112,12 @@ def test_typical_values_change_a_recording_and_blocks_join(name, plain):
     if name == 'spikes' or name == 'stuck':
         sensor = put(sensor, [Coefficient(name, 'rate_hz')], [3.0])
     all_at_once_v = volts(sensor)
-    assert np.abs(all_at_once_v - plain).max() > 5e-5
-    respond, stamps = Response(sensor, MOTION, 1), np.arange(len(all_at_once_v)) / sensor.rate_hz
-    parts = [respond(stamps[i:i + 777]) for i in range(0, len(stamps), 777)]
+    assert np.abs(all_at_once_v - plain(name)).max() > 5e-5
+    respond = Response(sensor, motion_of(name), 1)
+    stamps = np.arange(len(all_at_once_v)) / sensor.rate_hz
+    # Short blocks of a live sensor, and long ones of a file.
+    bounds = [1, 3, 53, *range(777, len(stamps), 777)]
+    parts = [respond(part) for part in np.split(stamps, bounds)]
     np.testing.assert_array_equal(np.vstack(parts), all_at_once_v)
 
 
@@ -108,7 +126,7 @@ def test_typical_values_change_a_recording_and_blocks_join(name, plain):
 def test_an_effect_acts_on_every_axis_of_the_sensor(name, axes):
     """A typical effect changes each axis of a sensor with one, two or three."""
     sensor = nominal(axes)
-    plain_v = volts(sensor)
+    plain_v = volts(sensor, motion_of(name))
     events = {'spikes': {'rate_hz': 20.0}, 'stuck': {'rate_hz': 3.0},
               'saturation': {'limit_g': [0.3] * len(axes)}}
     with_typical_v = volts(with_effect(name, sensor, **events.get(name, {})))
@@ -300,6 +318,21 @@ def test_flicker_is_one_over_f():
         assert shape[(f > low) & (f < 2 * low)].mean() == pytest.approx(1.0, abs=tolerance)
     corners = np.array([0.001, 0.02, 0.1, 0.7, 3.0, 9.0, 19.0])
     assert flicker_theory(corners, 100.0) == pytest.approx(np.ones(7), abs=0.02)
+
+
+def test_flicker_is_stationary_from_the_first_sample_on():
+    """Over many units, the first second has the covariance of the sampled processes."""
+    from adxl_ros.model.effects.flicker import corners_hz
+    sensor = with_effect('flicker', nominal('xyz', **CLEAN, rate_hz=100.0),
+                         density_g_per_rthz=[1e-4] * 3)
+    rest = Motion(1.0, internal_rate_hz=10.0)
+    still_v = nominal('xyz').nominal_zero_g_v + [0, 0, nominal('xyz').nominal_scale_v_per_g[2]]
+    drawn = np.stack([volts(sensor, rest, seed) - still_v for seed in range(500)])
+    drawn = drawn[:, [0, 1, 10, 99]] / (1e-4 * sensor.nominal_scale_v_per_g)
+    measured = np.einsum('uid,ujd->ij', drawn, drawn) / (3 * len(drawn))
+    lag = np.abs(np.subtract.outer([0, 1, 10, 99], [0, 1, 10, 99]))
+    decay = np.exp(-2 * np.pi * corners_hz(100.0) / 100.0)[:, None, None]
+    assert measured == pytest.approx(np.log(10) / 2 * np.sum(decay ** lag, axis=0), rel=0.12)
 
 
 def flicker_theory(f, rate_hz):

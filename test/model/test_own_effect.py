@@ -71,7 +71,8 @@ def test_the_documented_package_works(tmp_path, monkeypatch):
           for name in ('out.csv', 'bare.csv')]
     assert abs(np.mean(ax[0] - ax[1])) < 2e-4
     # The diagnosis names it, or a group that holds it: a wrong zero-g looks nearly the same.
-    run = run_executable(*line[0].split()[:2], *line[1].split()[1:], '-o', 'c.csv', cwd=tmp_path)
+    run = run_executable(*line[0].split()[:2], *line[1].split()[1:], '--rate', '50',
+                         '-o', 'c.csv', cwd=tmp_path)
     assert run.returncode == 0, run.stderr
     run = run_executable('diagnose', 'c.csv', '-o', 'gap', cwd=tmp_path)
     assert run.returncode == 0, run.stderr

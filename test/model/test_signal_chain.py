@@ -17,11 +17,19 @@
 from dataclasses import replace
 
 from adxl_ros.errors import UserError
-from adxl_ros.model import noise, signal_chain
+from adxl_ros.model import analog_stages, noise, signal_chain
 from adxl_ros.model.coefficients import get, names_of, parameter_of, put, with_neutral
-from adxl_ros.model.covariance import coefficient_tangent, force_covariance
+from adxl_ros.model.covariance import coefficient_tangent, force_covariance, prepared_covariance
 from adxl_ros.model.effects import library
-from adxl_ros.model.effects.base import Coefficient, Need, Role
+from adxl_ros.model.effects.base import (
+    Coefficient,
+    Need,
+    NOMINAL_ENVIRONMENT,
+    Parameters,
+    Place,
+    Role,
+    Signals,
+)
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.scalar_or_array import ARRAYS, FLOATS
 from adxl_ros.model.sensor import Sensor, with_axes
@@ -78,7 +86,7 @@ def bit_error_v(sensor: Sensor) -> float:
 
 def near_a_step(sensor: Sensor, force: np.ndarray) -> bool:
     """Return whether the input of the ADC is so near a step that another input has its code."""
-    input_v = np.array(signal_chain.analog_response(sensor)([float(f) for f in force]))
+    input_v = np.array(analog_stages.analog_response(sensor)([float(f) for f in force]))
     step_v = sensor.adc_vref_v / 64
     off_v = np.abs(input_v - np.rint(input_v / step_v) * step_v)
     return bool((off_v <= 2 * bit_error_v(sensor)).any())
@@ -190,6 +198,118 @@ def test_coefficient_tangent_equals_the_paper() -> None:
                           Coefficient('scale_factor', 'offset_v_per_g', 'x')))
     tangent = coefficient_tangent(sensor)([np.array([G / 2]), np.array([1.0]), np.array([0.0])])
     np.testing.assert_allclose(tangent[:, :, 0], [[1, 0.5], [0, 0]], atol=1e-9)
+
+
+def many_forces(axes: str, count: int = 3000) -> list[np.ndarray]:
+    """Return forces all around; at rest and upright where z is derived, up to the vertical."""
+    vectors = np.random.default_rng(12).normal(size=(3, count))
+    force = G * vectors / np.linalg.norm(vectors, axis=0)
+    return list(force if axes == 'xyz' else np.array([force[0], force[1], np.abs(force[2])]))
+
+
+@pytest.mark.parametrize('axes', AXES)
+@pytest.mark.parametrize('has_adc', [False, True])
+def test_shared_parts_of_the_chain_change_no_derivative(axes: str, has_adc: bool) -> None:
+    drawn = drawn_sensor(axes, 7)
+    if not has_adc:
+        kept = tuple(n for n in drawn.covariance_names if n.effect != 'adc_inl')
+        drawn = replace(drawn, effects=tuple(e for e in drawn.effects if e != 'adc_inl'),
+                        covariance=np.eye(len(kept)), covariance_names=kept)
+    force = many_forces(axes)
+    surroundings = NOMINAL_ENVIRONMENT._replace(
+        temperature_c=np.linspace(0, 60, len(force[0])), time_s=np.arange(len(force[0])) * 1.0)
+    by_coefficient = coefficient_tangent(drawn)
+    many = by_coefficient(force, surroundings)
+    few = np.concatenate([
+        by_coefficient([f[part] for f in force], surroundings._replace(
+            temperature_c=surroundings.temperature_c[part], time_s=surroundings.time_s[part]))
+        for part in np.split(np.arange(len(force[0])), 6)], axis=2)
+    scale = np.abs(few).max(axis=(0, 2), keepdims=True)
+    assert many.shape == few.shape
+    assert (np.abs(many - few) <= 1e-9 * scale).all()
+
+
+def test_effects_that_break_the_contract_get_the_complete_chain(
+        monkeypatch: pytest.MonkeyPatch) -> None:
+    """An effect of the element that multiplies the output instead of adding to it."""
+    def doubled(signals: Signals, p: Parameters) -> None:
+        signals.output[0] = signals.output[0] * (2 + p['linear'][0])
+
+    broken = replace(library()['cross_axis'], apply=doubled)
+    monkeypatch.setitem(library(), 'cross_axis', broken)
+    sensor = replace(drawn_sensor('xyz', 3), effects=('bias', 'scale_factor_z', 'cross_axis'))
+    kept = tuple(n for n in sensor.covariance_names if n.effect in sensor.effects)
+    sensor = replace(sensor, covariance=np.eye(len(kept)), covariance_names=kept)
+    force = many_forces('xyz')
+    assert library()['cross_axis'] is broken
+    by_coefficient = coefficient_tangent(sensor)
+    np.testing.assert_allclose(by_coefficient(force)[:, :, :9],
+                               by_coefficient([f[:9] for f in force]), rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize('axes', AXES)
+def test_steps_with_one_tangent_lead_to_the_same_force(
+        axes: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Including samples whose noise puts the in-plane force beyond g."""
+    drawn = drawn_sensor(axes, 7)
+    volts = signal_chain.static_response(drawn)(many_forces(axes))
+    noisy = list(np.array(volts) + np.random.default_rng(3).normal(
+        size=np.shape(volts)) * noise.sample_std_v(drawn)[:, None])
+    quick = np.array(signal_chain.inverse(drawn)(noisy))
+    monkeypatch.setattr(signal_chain, '_CHORD_STEPS', 0)
+    newton = np.array(signal_chain.inverse(drawn)(noisy))
+    np.testing.assert_allclose(quick, newton, rtol=0, atol=1e-9)
+
+
+def of_effects(sensor: Sensor, effects: tuple[str, ...]) -> Sensor:
+    """Return the sensor with some of its effects, and their coefficients."""
+    kept = tuple(n for n in sensor.covariance_names if n.effect in effects)
+    mixed = np.random.default_rng(4).normal(size=(len(kept), len(kept)))
+    scale = np.array([parameter_of(name).scale for name in kept])
+    return replace(sensor, effects=effects, covariance_names=kept,
+                   covariance=1e-4 * mixed @ mixed.T * np.outer(scale, scale))
+
+
+@pytest.mark.parametrize('axes', AXES)
+@pytest.mark.parametrize('case', ['all', 'at rest', 'no polynomial', 'with force'])
+def test_many_samples_get_the_force_and_covariance_of_few(
+        axes: str, case: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Polynomials replace the chain for many samples, if the effects are polynomials."""
+    def rippled(signals: Signals, p: Parameters) -> None:
+        for d, k in enumerate(p['quadratic_per_g']):
+            signals.output[d] = signals.output[d] + k * np.sin(3 * signals.sensed[d])
+
+    def following(signals: Signals, p: Parameters) -> None:
+        for d, k in enumerate(p['quadratic_per_g']):
+            signals.zero_g_v[d] = signals.zero_g_v[d] + k * signals.sensed[d] ** 2
+
+    shapes = {'no polynomial': rippled, 'with force': following}
+    if case in shapes:
+        monkeypatch.setitem(library(), 'quadratic', replace(
+            library()['quadratic'], apply=shapes[case],
+            place=Place.ELEMENT if case == 'no polynomial' else Place.ELECTRONICS))
+    drawn = drawn_sensor(axes, 7)
+    sensor = of_effects(drawn, drawn.effects if case == 'all' else tuple(
+        name for name in drawn.effects if name != 'adc_inl' and not library()[name].follows))
+    volts = np.array(signal_chain.static_response(sensor)(many_forces(axes)))
+    volts += np.random.default_rng(3).normal(size=volts.shape) * noise.sample_std_v(
+        sensor)[:, None]
+    count = volts.shape[1]
+    surroundings = NOMINAL_ENVIRONMENT._replace(
+        temperature_c=np.linspace(0, 60, count), time_s=np.arange(count) * 1.0)
+    parts = [slice(begin, begin + 500) for begin in range(0, count, 500)]
+    invert, covariance = signal_chain.inverse(sensor), prepared_covariance(sensor)
+    around = [surroundings._replace(temperature_c=surroundings.temperature_c[part],
+                                    time_s=surroundings.time_s[part]) for part in parts]
+    few = np.hstack([invert(list(volts[:, part]), e) for part, e in zip(parts, around)])
+    many = invert(list(volts), surroundings)
+    # Where z is derived and 0, it is a root of rounding.
+    np.testing.assert_allclose(many, few, rtol=0, atol=1e-9 if axes == 'xyz' else 1e-7)
+    of_few = np.concatenate([covariance(list(few[:, part]), e)[0]
+                             for part, e in zip(parts, around)], axis=2)
+    of_many = covariance(list(few), surroundings)[0]
+    scale = np.sqrt(np.einsum('iin,jjn->ijn', of_few, of_few))
+    assert (np.abs(of_many - of_few) <= 1e-7 * scale).all()
 
 
 def test_vertical_z_has_the_predicted_deviation() -> None:

@@ -42,9 +42,11 @@ class Place(IntEnum):
     Place of an effect in the chain; the chain runs in this order.
 
     The clock is last because it decides which stamp a sample gets. It is evaluated first: samples
-    are taken at their instants, and nothing is resampled.
+    are taken at their instants, and nothing is resampled. Effects of the reference change the
+    specific force that another instrument or simulator states, before the sensor follows it.
     """
 
+    REFERENCE = 0
     STAGE = 1
     FORCE = 2
     MOUNTING = 3
@@ -107,7 +109,8 @@ class Signals:
     environment
         Surroundings at the instants of the samples.
     time_s
-        CLOCK: stamps, s, which effects turn into the instants of the samples.
+        CLOCK: stamps, s, which effects turn into the instants of the samples. REFERENCE: the same
+        of all samples of the reference.
     alpha, beta, shift
         STAGE: joints as the encoders read them, which effects turn into the true ones.
     up
@@ -115,7 +118,8 @@ class Signals:
     gravity_mps2
         STAGE: local gravity, m/s².
     force
-        FORCE: specific force in the case frame, m/s², three components.
+        FORCE: specific force in the case frame, m/s², three components. REFERENCE: the force that
+        the reference states, all of it, which effects turn into the one that acts on the sensor.
     sensed
         MOUNTING: specific force along the sensing axes, g, always three components. Axes that
         are not measured keep the component along the axis of the case.
@@ -232,6 +236,17 @@ class ActsOn(Enum):
     """The statistics of the noise only."""
 
 
+class Concern(Enum):
+    """What an effect is an error of: a verdict names it."""
+
+    REFERENCE = 'reference'
+    """The other instrument or simulator that states the specific force."""
+    STAGE = 'stage'
+    """The stage, its encoders and its site."""
+    SENSOR = 'sensor'
+    """The sensor with its mount, its link and its stamps."""
+
+
 class Need(Enum):
     """Part of the chain without which an effect has nothing to act on."""
 
@@ -272,8 +287,8 @@ class Parameter:
     role
         Role in its effect.
     starts : tuple of float
-        Only for a shape: values from which a fit starts, in rising order. Empty for multiples of
-        the typical magnitude.
+        Values from which a fit starts, in rising order: of a shape, or of a size in which the
+        effect is far from linear. Empty for multiples of the typical magnitude.
     shaped
         Only for a size: whether the shape parameters of its effect change what it does.
 
@@ -369,3 +384,11 @@ class Effect:
     def __post_init__(self) -> None:
         object.__setattr__(self, 'acts_on', ActsOn(self.acts_on))
         object.__setattr__(self, 'needs', tuple(map(Need, self.needs)))
+
+    @property
+    def concern(self) -> Concern:
+        """Return what it is an error of."""
+        if self.place is Place.REFERENCE:
+            return Concern.REFERENCE
+        return Concern.STAGE if Need.STAGE in self.needs or self.place is Place.STAGE \
+            else Concern.SENSOR

@@ -12,13 +12,15 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Flicker noise: 1/f noise as a sum of Ornstein-Uhlenbeck processes."""
+"""Flicker noise: 1/f noise as a sum of Ornstein-Uhlenbeck processes, drawn by one filter."""
+
+from __future__ import annotations
 
 from functools import lru_cache
+from typing import NamedTuple
 
 from adxl_ros.model.diagnosis_hints import DiagnosisHints, DriftSpectrum, Manoeuvre, ProofVariable
 from adxl_ros.model.effects.base import ActsOn, Effect, Parameter, Parameters, Place, Signals
-from adxl_ros.model.filters import first_order_recursion
 import numpy as np
 
 _LOWEST_HZ = 1e-5
@@ -30,38 +32,50 @@ _HIGHEST_RATIO = 10 ** -0.5
 _PER_DECADE = 2
 """Corners per decade; chosen: the sum is 1/f within 2 % up to a fifth of the sample rate."""
 
+_BISECTIONS = 60
+"""Bisections between two poles on a logarithmic axis; chosen: as fine as float64."""
+
+
+class _Shaping(NamedTuple):
+    """
+    Filter of k first-order sections that turns white noise into flicker noise.
+
+    Attributes
+    ----------
+    sections : ndarray
+        Coefficients of the sections as `scipy.signal.sosfilt` takes them, (k, 6).
+    stationary : ndarray
+        States of the sections in stationary noise, of k independent standard normals, (k, k).
+
+    """
+
+    sections: np.ndarray
+    stationary: np.ndarray
+
 
 def apply(signals: Signals, p: Parameters) -> None:
     """
     Add noise of the one-sided density k²/f, g²/Hz, from 10⁻⁴ Hz up to a fifth of the rate.
 
     Ornstein-Uhlenbeck processes of equal variance, whose corners are evenly spaced on a
-    logarithmic axis, sum up to 1/f (van der Ziel 1950). Each is sampled exactly.
+    logarithmic axis, sum up to 1/f (van der Ziel 1950). Their sum is sampled exactly.
     """
     assert signals.rng is not None
-    corners = corners_hz(1 / signals.dt_s)
-    shape = np.shape(signals.environment.time_s)
-    drawn = signals.rng.standard_normal((*shape, len(p['density_g_per_rthz']), len(corners)))
-    # The densities of the processes, σ²·2/(π·f_c)/(1 + (f/f_c)²), sum up to σ²/(f·Δln f).
-    sigma = np.sqrt(np.log(10) / _PER_DECADE)
-    decay = np.exp(-2 * np.pi * corners * signals.dt_s)
+    shape = (*np.shape(signals.environment.time_s), len(p['density_g_per_rthz']))
+    if not shape[0]:
+        return
+    # scipy.signal takes 0.5 s to import.
+    from scipy.signal import sosfilt
+    shaping = _shaping(1 / signals.dt_s)
+    if 'state' not in signals.memory:
+        drawn = signals.rng.standard_normal((len(shaping.stationary), *shape[1:]))
+        state = np.tensordot(shaping.stationary, drawn, 1)
+        signals.memory['state'] = np.stack([state, np.zeros_like(state)], axis=1)
+    noise, signals.memory['state'] = sosfilt(
+        shaping.sections, signals.rng.standard_normal(shape), axis=0, zi=signals.memory['state'])
     for d, density in enumerate(p['density_g_per_rthz']):
-        if not density or not shape[0]:
-            continue
-        previous = signals.memory.get(d)
-        noise = np.zeros(shape)
-        last = np.empty((len(corners), *shape[1:]))
-        for i, a in enumerate(decay):
-            step = np.sqrt(1 - a * a)
-            steps = drawn[..., d, i].copy()
-            if previous is None:
-                steps[0] /= step  # stationary from the first sample on
-            x = first_order_recursion(step, a, steps, 0.0 if previous is None else previous[i])
-            noise += x
-            last[i] = x[-1]
-        signals.memory[d] = last
         signals.volts[d] = (signals.volts[d]
-                            + density * sigma * noise * signals.nominal_scale_v_per_g[d])
+                            + density * noise[..., d] * signals.nominal_scale_v_per_g[d])
 
 
 @lru_cache(maxsize=8)
@@ -70,6 +84,59 @@ def corners_hz(rate_hz: float) -> np.ndarray:
     highest = _HIGHEST_RATIO * rate_hz
     count = int(np.log10(highest / _LOWEST_HZ) * _PER_DECADE) + 1
     return highest * 10 ** (-np.arange(count) / _PER_DECADE)
+
+
+@lru_cache(maxsize=8)
+def _shaping(rate_hz: float) -> _Shaping:
+    """
+    Factor the spectrum of the sampled processes for a sample rate, Hz.
+
+    A process of variance 1 has the spectrum sinh θ/(cosh θ − cos ω), with the pole exp(−θ) at
+    θ = 2π·corner/rate. In cos ω, the zeros of the sum are real and separate the poles. White noise
+    through these poles and zeros has the spectrum of the sum (Wold's decomposition).
+    """
+    poles = 2 * np.pi * corners_hz(rate_hz) / rate_hz
+    zeros = _zeros(poles)
+    # The densities of the processes, σ²·2/(π·f_c)/(1 + (f/f_c)²), sum up to σ²/(f·Δln f).
+    variance = np.log(10) / _PER_DECADE
+    gain = (np.sqrt(variance * np.tanh(poles / 2).sum())
+            * np.prod(1 + np.exp(-poles)) / np.prod(1 + np.exp(-zeros)))  # at half the rate
+    sections = np.zeros((len(poles), 6))
+    sections[:, [0, 3]] = 1.0
+    sections[:, 1], sections[:, 4] = -np.exp(-zeros), -np.exp(-poles)
+    sections[0, :2] *= gain
+    return _Shaping(sections, gain * _stationary(poles, zeros))
+
+
+def _zeros(poles: np.ndarray) -> np.ndarray:
+    """Return the zeros of Σ sinh θ/(cosh θ − cosh φ) for k poles θ, (k,); the last is infinite."""
+    upper, lower = np.log(poles[:-1]), np.log(poles[1:])
+    pole = poles[:, None]
+    for _ in range(_BISECTIONS):
+        middle = (lower + upper) / 2
+        zero = np.exp(middle)
+        sums = np.sum(np.sinh(pole) / (np.sinh((pole + zero) / 2) * np.sinh((pole - zero) / 2)),
+                      axis=0)
+        # From pole to pole the sum rises from −∞ to ∞.
+        upper, lower = np.where(sums > 0, middle, upper), np.where(sums > 0, lower, middle)
+    return np.append(np.exp(lower), np.inf)
+
+
+def _stationary(poles: np.ndarray, zeros: np.ndarray) -> np.ndarray:
+    """Return the states of sections of gain 1 in stationary noise by standard normals, (k, k)."""
+    # One pole alone, y' = exp(−θ)·y + white noise, has the covariance 1/(1 − exp(−θ − θ')).
+    single = np.linalg.cholesky(-1 / np.expm1(-(poles[:, None] + poles)))
+    # Partial fractions: the output of section j is a weighted sum of the single poles up to j.
+    states = np.zeros_like(single)
+    weights = np.zeros(len(poles))
+    for j, (pole, zero) in enumerate(zip(poles, zeros)):
+        apart = np.expm1(poles[:j] - pole)
+        states[j, :j] = weights[:j] * np.exp(-pole) * np.expm1(pole - zero) / apart
+        weights[:j] *= np.expm1(poles[:j] - zero) / apart
+        weights[j] = -np.expm1(pole - zero) * np.prod(np.expm1(pole - zeros[:j])
+                                                      / np.expm1(pole - poles[:j]))
+        states[j, j] = weights[j] * np.exp(-pole)
+    return states @ single
 
 
 EFFECT = Effect(

@@ -1,0 +1,210 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The population of units that a unit is from, as a prior of its zero-g and scale factor.
+
+A fleet determines the mean of each coefficient and its standard deviation over units. A unit of
+the same population has both as a normal prior. The estimate of a calibration and its covariance
+then have a normal posterior in closed form, because the chain is nearly linear in them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+from adxl_ros.model.coefficients import get, put, with_neutral
+from adxl_ros.model.effects.base import Coefficient
+from adxl_ros.model.sensor import Sensor
+import numpy as np
+import scipy
+
+STRANGER_CHANCE = 1e-3
+"""Probability that a unit of the population counts as a stranger. Chosen: one fit in 1000."""
+_EFFECTS = ('bias', 'scale_factor')
+"""Effects of the coefficients that a population can have."""
+
+
+@dataclass(frozen=True)
+class PooledCoefficient:
+    """
+    A coefficient over the units of a fleet, in the unit of its column.
+
+    Attributes
+    ----------
+    mean, mean_std
+        Mean over the units and its standard deviation.
+    spread
+        Standard deviation of the units about the mean, without their own errors.
+    spread_low, spread_high
+        90 % interval of the spread.
+    prediction_std
+        Standard deviation of the coefficient of a further unit about the mean.
+    units
+        Number of units.
+
+    """
+
+    mean: float
+    mean_std: float
+    spread: float
+    spread_low: float
+    spread_high: float
+    prediction_std: float
+    units: int
+
+
+@dataclass(frozen=True)
+class Population:
+    """
+    Coefficients over the units of a fleet.
+
+    Attributes
+    ----------
+    name
+        What messages call it.
+    coefficients
+        Coefficients by their column of the fleet's table: `zero_g_x_v`, `scale_x_v_per_g`, ...
+
+    """
+
+    name: str
+    coefficients: Mapping[str, PooledCoefficient]
+
+    def prior(self, sensor: Sensor) -> Prior:
+        """Return the prior of a unit's departures from its nominal values."""
+        names, mean, std = [], [], []
+        for effect, parameter, column, nominal in (
+                ('bias', 'offset_v', 'zero_g_{}_v', sensor.nominal_zero_g_v),
+                ('scale_factor', 'offset_v_per_g', 'scale_{}_v_per_g',
+                 sensor.nominal_scale_v_per_g)):
+            for axis, nominal_value in zip(sensor.axes, nominal):
+                pooled = self.coefficients.get(column.format(axis))
+                if pooled is not None:
+                    names.append(Coefficient(effect, parameter, axis))
+                    mean.append(pooled.mean - float(nominal_value))
+                    std.append(pooled.prediction_std)
+        return Prior(tuple(names), np.array(mean), np.array(std))
+
+
+class Prior(NamedTuple):
+    """
+    A normal prior of coefficients.
+
+    Attributes
+    ----------
+    names
+        The coefficients, (k,).
+    mean, std
+        Their means and standard deviations, (k,) each.
+
+    """
+
+    names: tuple[Coefficient, ...]
+    mean: np.ndarray
+    std: np.ndarray
+
+
+class Posterior(NamedTuple):
+    """
+    A unit as one of a population.
+
+    Attributes
+    ----------
+    sensor
+        The unit; unchanged if it is a stranger.
+    line
+        How the population is used, or why it is not, for people.
+    is_stranger
+        Whether the unit is not of the population.
+
+    """
+
+    sensor: Sensor
+    line: str
+    is_stranger: bool = False
+
+
+def posterior(sensor: Sensor, population: Population) -> Posterior:
+    """
+    Combine the coefficients of a unit with its population.
+
+    Parameters
+    ----------
+    sensor
+        The unit. Without zero-g and scale factor of its own it takes those of the population.
+    population
+        The population.
+
+    Returns
+    -------
+    Posterior
+        The unit, and how the population is used.
+
+    """
+    prior = population.prior(sensor)
+    if not prior.names:
+        return Posterior(sensor, f'{population.name} has no zero-g or scale factor of the axes '
+                         f'{sensor.axes}; it is not used')
+    if not set(_EFFECTS) & set(sensor.effects):
+        return Posterior(_of_population(sensor, prior), f'zero-g and scale factor are those of '
+                         f'{population.name}: the unit has none of its own')
+    used = [i for i, name in enumerate(prior.names) if name in sensor.covariance_names]
+    if not used:
+        return Posterior(sensor, f'{population.name} is not used: zero-g and scale factor of '
+                         'the unit have no uncertainty')
+    return _combined(sensor, population, Prior(tuple(prior.names[i] for i in used),
+                                               prior.mean[used], prior.std[used]))
+
+
+def _of_population(sensor: Sensor, prior: Prior) -> Sensor:
+    """Return a unit without coefficients of its own at the mean of its population."""
+    unit = put(with_neutral(sensor, _EFFECTS), prior.names, prior.mean)
+    return replace(unit, covariance=np.diag(prior.std ** 2), covariance_names=prior.names)
+
+
+def _combined(sensor: Sensor, population: Population, prior: Prior) -> Posterior:
+    """Return the unit by its own estimate and the prior, unless they contradict each other."""
+    places = [sensor.covariance_names.index(name) for name in prior.names]
+    departure = prior.mean - get(sensor, prior.names)
+    total = sensor.covariance[np.ix_(places, places)] + np.diag(prior.std ** 2)
+    square = float(departure @ np.linalg.solve(total, departure))
+    chance = float(scipy.special.chdtrc(len(places), square))
+    distance = departure / np.sqrt(np.diag(total))
+    if chance < STRANGER_CHANCE:
+        farthest = int(np.abs(distance).argmax())
+        return Posterior(sensor, (
+            f'{sensor.serial} is not of {population.name}: χ² {square:.3g} for {len(places)} '
+            f'coefficients (probability {_chance_text(chance)}); '
+            f'{_words(prior.names[farthest])} is {abs(distance[farthest]):.1f} standard '
+            'deviations from its mean. The prior is not used'), True)
+    gain = np.linalg.solve(total, sensor.covariance[places]).T
+    covariance = sensor.covariance - gain @ sensor.covariance[places]
+    values = get(sensor, sensor.covariance_names) + gain @ departure
+    unit = replace(put(sensor, sensor.covariance_names, values),
+                   covariance=(covariance + covariance.T) / 2)
+    return Posterior(unit, (
+        f'{population.name} is the prior of {len(places)} coefficients: χ² {square:.3g}, '
+        f'probability {_chance_text(chance)}'))
+
+
+def _words(name: Coefficient) -> str:
+    """Return a coefficient for people."""
+    return f'{"zero-g" if name.effect == "bias" else "scale factor"} {name.axis}'
+
+
+def _chance_text(chance: float) -> str:
+    return f'{chance:.2g}' if chance >= STRANGER_CHANCE else f'< {STRANGER_CHANCE:g}'

@@ -1,0 +1,126 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The sensor of a recording: its parameter file, and what is measured where the file is silent."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from adxl_ros.files import parameter_file
+from adxl_ros.files.recording_columns import Recording, VOLTS
+from adxl_ros.model.sensor import Sensor, with_axes
+from adxl_ros.signals import measured_values
+import numpy as np
+
+
+def load_sensor(params: str | None, read: Recording) -> Sensor:
+    """
+    Load the parameter file of a recording.
+
+    Parameters
+    ----------
+    params
+        The file; None takes the nominal sensor. A recording in m/s² that states nothing of its
+        sensor is of any IMU.
+    read
+        The recording, or its first block.
+
+    Returns
+    -------
+    Sensor
+        The sensor. Values that the file leaves out are in `unstated`.
+
+    Raises
+    ------
+    UserError
+        The file cannot be read, or something in it is wrong.
+
+    """
+    if params is None:
+        is_of_nominal = read.sensor_columns[0] in VOLTS or \
+            read.stream_info.nominal_values(read.axes)
+        params = str(parameter_file.nominal_path() if is_of_nominal
+                     else parameter_file.any_imu_path())
+    return parameter_file.load(params, may_measure=True)
+
+
+def measure_unstated(sensor: Sensor, read: Recording) -> tuple[Sensor, list[str]]:
+    """
+    Measure from a recording what the parameter file of its sensor leaves out.
+
+    Parameters
+    ----------
+    sensor
+        The sensor.
+    read
+        The recording, or its first block.
+
+    Returns
+    -------
+    tuple
+        The sensor, in which everything is stated, and a line for each measured quantity.
+
+    Raises
+    ------
+    UserError
+        The samples are too few to show the noise.
+
+    """
+    if not sensor.unstated:
+        return sensor, []
+    unit = sensor if sensor.effects else with_axes(sensor, read.axes)
+    unit = replace(unit, rate_hz=read.rate_hz)
+    values = measured_values.measure(read.time_s, read.volts(unit), unit)
+    return (measured_values.with_measured_values(unit, values),
+            measured_values.describe(unit, values))
+
+
+def listed(measured: list[str]) -> list[str]:
+    """Return the lines of `measure_unstated` below a heading; none where nothing is measured."""
+    if not measured:
+        return []
+    return ['', 'Measured, as no parameter file states it:', *(f'  {line}' for line in measured)]
+
+
+class BeyondRange:
+    """Counts the readings of a recording that are beyond the stated range of its sensor."""
+
+    def __init__(self) -> None:
+        self._samples, self._largest_g = 0, 0.0
+
+    def add(self, volts: np.ndarray, sensor: Sensor) -> None:
+        """
+        Count further samples.
+
+        Parameters
+        ----------
+        volts
+            Samples, V, (n, m).
+        sensor
+            The sensor, with its range.
+
+        """
+        readings_g = np.abs(volts - sensor.nominal_zero_g_v) / sensor.nominal_scale_v_per_g
+        beyond = readings_g > sensor.range_g
+        if beyond.any():
+            self._samples += int(beyond.any(axis=1).sum())
+            self._largest_g = max(self._largest_g, float(readings_g[beyond].max()))
+
+    def describe(self, sensor: Sensor) -> str:
+        """Return the count for people; '' where no reading is beyond the range."""
+        if not self._samples:
+            return ''
+        return (f'{self._samples} samples are beyond the stated range of ±{sensor.range_g:g} g '
+                f'(largest reading {self._largest_g:.3g} g); check sensor.range_g')

@@ -1,0 +1,110 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""A population as prior of a unit: the closed form, coverage, and units that are not of it."""
+
+from dataclasses import replace
+
+from adxl_ros.errors import UserError
+from adxl_ros.files import population_file
+from adxl_ros.model.coefficients import get, put, with_neutral
+from adxl_ros.model.effects.base import Coefficient
+from adxl_ros.model.population import PooledCoefficient, Population, posterior
+import numpy as np
+import pytest
+from units import nominal
+
+ZERO_G, SCALE = Coefficient('bias', 'offset_v', 'x'), Coefficient('scale_factor',
+                                                                  'offset_v_per_g', 'x')
+POPULATION = Population('population.yaml', {
+    'zero_g_x_v': PooledCoefficient(2.52, 0.001, 0.02, 0.015, 0.03, 0.02, 50),
+    'scale_x_v_per_g': PooledCoefficient(1.01, 0.001, 0.01, 0.008, 0.02, 0.01, 50)})
+
+
+def estimated(zero_g_v, scale_v_per_g, covariance):
+    """Return a unit with estimates of zero-g and scale factor."""
+    unit = put(with_neutral(nominal('x'), ['bias', 'scale_factor']), [ZERO_G, SCALE],
+               [zero_g_v - 2.5, scale_v_per_g - 1.0])
+    return replace(unit, covariance=np.asarray(covariance), covariance_names=(ZERO_G, SCALE))
+
+
+def test_the_posterior_is_that_of_two_normal_densities():
+    covariance = np.array([[4e-4, 1e-4], [1e-4, 2e-4]])
+    unit = posterior(estimated(2.54, 1.02, covariance), POPULATION).sensor
+    prior = np.diag([0.02 ** -2, 0.01 ** -2])
+    precision = np.linalg.inv(covariance)
+    expected = np.linalg.inv(precision + prior)
+    np.testing.assert_allclose(unit.covariance, expected)
+    np.testing.assert_allclose(get(unit, [ZERO_G, SCALE]), expected @ (
+        precision @ [0.04, 0.02] + prior @ [0.02, 0.01]))
+
+
+def test_intervals_are_smaller_and_still_true():
+    """Over drawn units the 90 % intervals hold 90 % of the truths, and one in 1000 is refused."""
+    rng = np.random.default_rng(0)
+    covariance = np.array([[4e-4, 1e-4], [1e-4, 2e-4]])
+    inside, strangers = [], 0
+    for _ in range(1000):
+        truth = np.array([2.52, 1.01]) + rng.normal(size=2) * [0.02, 0.01]
+        unit = estimated(*rng.multivariate_normal(truth, covariance), covariance)
+        combined = posterior(unit, POPULATION)
+        strangers += combined.is_stranger
+        std = np.sqrt(np.diag(combined.sensor.covariance))
+        error = get(combined.sensor, [ZERO_G, SCALE]) - (truth - [2.5, 1.0])
+        inside += (np.abs(error) < 1.645 * std).tolist()
+        assert combined.is_stranger or np.all(std < 0.8 * np.sqrt(np.diag(covariance)))
+    assert abs(np.mean(inside) - 0.9) < 3 * np.sqrt(0.09 / 1000)
+    assert strangers < 8
+
+
+def test_a_stranger_is_named_and_keeps_its_estimates():
+    unit = estimated(2.75, 1.01, np.diag([1e-6, 1e-6]))
+    combined = posterior(unit, POPULATION)
+    assert combined.is_stranger and combined.sensor is unit
+    assert 'zero-g x is 11.5 standard deviations' in combined.line
+    assert 'not used' in combined.line
+
+
+def test_a_unit_without_coefficients_takes_those_of_its_population():
+    unit = posterior(nominal('x'), POPULATION).sensor
+    assert unit.zero_g_v[0] == pytest.approx(2.52)
+    assert unit.scale_v_per_g[0] == pytest.approx(1.01)
+    np.testing.assert_allclose(np.sqrt(np.diag(unit.covariance)), [0.02, 0.01])
+
+
+def test_a_population_without_the_axes_is_not_used():
+    empty = Population('empty.yaml', {})
+    combined = posterior(nominal('x'), empty)
+    assert combined.sensor.effects == () and 'not used' in combined.line
+
+
+def test_the_file_keeps_a_population(tmp_path):
+    path = tmp_path / 'population.yaml'
+    population_file.write(path, POPULATION, [{'serial': 'A', 'coefficient': 'zero_g_x_v',
+                                              'value': 2.7, 'distance': 9.0}])
+    assert population_file.read(path) == POPULATION
+
+
+@pytest.mark.parametrize('text, words', [
+    ('', 'no population of format 1'),
+    ('format: 2\ncoefficients: {}\n', 'no population of format 1'),
+    ('format: [1\n', 'line 2, column 1: not YAML'),
+    ('format: 1\ncoefficients: {zero_g_x_v: 3}\n', 'coefficients.zero_g_x_v: 3 is no mapping'),
+    ('format: 1\ncoefficients: {zero_g_x_v: {mean: .nan}}\n',
+     'coefficients.zero_g_x_v.mean: nan is no number')])
+def test_a_bad_file_is_refused(tmp_path, text, words):
+    path = tmp_path / 'p.yaml'
+    path.write_text(text)
+    with pytest.raises(UserError) as error:
+        population_file.read(path)
+    assert words in str(error.value) and str(error.value).startswith(str(path))
