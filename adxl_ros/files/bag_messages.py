@@ -24,6 +24,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager, ExitStack
+from dataclasses import replace
 import os
 from pathlib import Path
 import re
@@ -32,7 +33,10 @@ from tempfile import TemporaryDirectory
 from typing import Any, Protocol
 
 from adxl_ros.errors import install_hint, UserError
-from adxl_ros.files import mcap_recovery
+from adxl_ros.files import mcap_chunks, mcap_recovery
+from adxl_ros.files.cdr import Raws
+from adxl_ros.files.message_pieces import collected_pieces, Piece
+import numpy as np
 import yaml
 
 _ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
@@ -60,6 +64,9 @@ class Part(Protocol):
 
     def messages(self, topics: Collection[str]) -> Iterator[tuple[str, bytes, int]]:
         """Yield topic, bytes and log time, ns, of each message, in the order of recording."""
+
+    def pieces(self, topics: Collection[str]) -> Iterator[Piece]:
+        """Yield the messages in pieces, in the order of recording."""
 
 
 class Bag:
@@ -135,6 +142,31 @@ class Bag:
                 yield topic, raw, log_ns
             self._read += 1
 
+    def pieces(self, topics: Collection[str]) -> Iterator[Piece]:
+        """
+        Yield the messages of some topics in pieces, in the order of recording.
+
+        Raises
+        ------
+        UserError
+            A file or a message is damaged.
+
+        """
+        self._read = 0
+        for part in self._parts:
+            for piece in part.pieces(topics):
+                yield replace(piece, messages={topic: self._all_unpacked(topic, raws)
+                                               for topic, raws in piece.messages.items()})
+            self._read += 1
+
+    def _all_unpacked(self, topic: str, raws: Raws) -> Raws:
+        """Decompress the messages that are compressed one by one."""
+        if isinstance(raws, np.ndarray):
+            if not (raws[:, :len(_ZSTD_MAGIC)] == list(_ZSTD_MAGIC)).all(axis=1).any():
+                return raws
+            raws = [row.tobytes() for row in raws]
+        return [self._unpacked(topic, raw) if raw[:4] == _ZSTD_MAGIC else raw for raw in raws]
+
     def _unpacked(self, topic: str, raw: bytes) -> bytes:
         try:
             return mcap_recovery.unpack('zstd', raw)
@@ -151,14 +183,19 @@ class _RosbagsPart:
         self._path = path
         self._reader = reader
 
-    def messages(self, topics: Collection[str]) -> Iterator[tuple[str, bytes, int]]:
+    def _connections(self, topics: Collection[str]) -> list[Any]:
+        """Return the connections of some topics; refuse those without CDR."""
         connections = [c for c in self._reader.connections if c.topic in topics and c.msgcount]
-        if not connections:
-            return  # for rosbags, an empty choice means all connections
         for connection in connections:
             if connection.ext.serialization_format != 'cdr':
                 raise UserError(f'{self._path}: topic {connection.topic} is serialized as '
                                 f'{connection.ext.serialization_format}, expected cdr')
+        return connections
+
+    def messages(self, topics: Collection[str]) -> Iterator[tuple[str, bytes, int]]:
+        connections = self._connections(topics)
+        if not connections:
+            return  # for rosbags, an empty choice means all connections
         share = 1 / sum(c.msgcount for c in connections)
         count = 0
         try:
@@ -169,6 +206,20 @@ class _RosbagsPart:
         except Exception as error:
             # In a damaged file, rosbags can raise errors of any kind.
             raise _unreadable(self._path, error) from error
+
+    def pieces(self, topics: Collection[str]) -> Iterator[Piece]:
+        storage = self._reader.storage
+        names = {c.id: c.topic for c in self._connections(topics)}
+        chunks = mcap_chunks.in_order(storage, names)
+        if not chunks:
+            yield from collected_pieces(self.messages(topics))
+        for number, chunk in enumerate(chunks):
+            self.done = (number + 1) / len(chunks)
+            try:
+                yield mcap_chunks.read_chunk(storage.bio, chunk, names)
+            except Exception as error:
+                # In a damaged file, rosbags can raise errors of any kind.
+                raise _unreadable(self._path, error) from error
 
 
 def _unreadable(path: Path, error: Exception) -> UserError:

@@ -17,13 +17,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterator, Mapping
-from dataclasses import dataclass
 import os
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import cdr
 from adxl_ros.files.bag_messages import Bag, open_bag
 from adxl_ros.files.bag_topics import find_ideal, find_topics, read_info, Topics
+from adxl_ros.files.cdr import Raws
+from adxl_ros.files.message_pieces import Piece
 from adxl_ros.files.reading_options import AS_IT_IS, ReadingOptions
 from adxl_ros.files.recording_columns import (
     ACCEL,
@@ -108,7 +109,6 @@ def _refuse_mapping(bag: Bag, reading: ReadingOptions) -> None:
         raise UserError(f'--lsb-per-g: {bag.path} is a bag, whose readings are in m/s²')
 
 
-@dataclass
 class _Batch:
     """
     Messages in the order of recording.
@@ -116,29 +116,42 @@ class _Batch:
     Attributes
     ----------
     messages
-        Their bytes by topic.
+        Their bytes by topic, in parts.
     samples_before
         How many samples of the batch precede each command, (k,).
+    count
+        Samples of the batch.
 
     """
 
-    messages: dict[str, list[bytes]]
-    samples_before: list[int]
+    def __init__(self, topics: Topics) -> None:
+        self._topics = topics
+        self.messages: dict[str, list[Raws]] = {name: [] for name in topics.sampled()}
+        self.samples_before: list[int] = []
+        self.count = 0
+
+    def add(self, piece: Piece) -> None:
+        """Append messages."""
+        samples = piece.places.get(self._topics.imu, np.zeros(0, np.int64))
+        commands = piece.places.get(self._topics.command or '')
+        if commands is not None:
+            self.samples_before += (self.count + np.searchsorted(samples, commands)).tolist()
+        for topic, raws in piece.messages.items():
+            if len(raws):
+                self.messages[topic].append(raws)
+        self.count += len(samples)
 
 
 def _batches(bag: Bag, topics: Topics, rows: int) -> Iterator[tuple[_Batch, bool]]:
     """Yield batches, each with `rows` samples of the sensor, and whether it is the last."""
-    names = topics.sampled()
-    batch = _Batch({name: [] for name in names}, [])
-    imu = batch.messages[topics.imu]
-    for topic, raw in bag.messages(names):
-        batch.messages[topic].append(raw)
-        if topic == topics.command:
-            batch.samples_before.append(len(imu))
-        if len(imu) == rows:
+    batch = _Batch(topics)
+    for piece in bag.pieces(topics.sampled()):
+        while batch.count + len(piece.places.get(topics.imu, ())) >= rows:
+            head, piece = piece.split(topics.imu, rows - batch.count)
+            batch.add(head)
             yield batch, False
-            batch = _Batch({name: [] for name in names}, [])
-            imu = batch.messages[topics.imu]
+            batch = _Batch(topics)
+        batch.add(piece)
     yield batch, True
 
 
@@ -179,22 +192,23 @@ class _Samples:
         self._last_ns: int | None = None
         self._frame: str | None = None
 
-    def add(self, raws: list[bytes]) -> None:
+    def add(self, parts: list[Raws]) -> None:
         """Decode and check further messages."""
-        if not raws:
+        if not parts:
             self.arrived_ns = self.arrived_ns[-1:]
             return
-        stamp_ns = np.empty(len(raws), np.int64)
-        accel = np.empty((len(raws), 3))
-        for table in _tables(self.where, raws, cdr.imu):
+        size = _count(parts)
+        stamp_ns = np.empty(size, np.int64)
+        accel = np.empty((size, 3))
+        for table in _tables(self.where, parts, cdr.imu):
             stamp_ns[table.rows] = table.stamp_ns()
             accel[table.rows] = table.numbers('linear_acceleration')
             self._check_frame(table)
         if self._last_ns is None:
-            self._begin(raws[0], int(stamp_ns[0]))
+            self._begin(parts[0][:1], int(stamp_ns[0]))
             self._first_ns = int(stamp_ns[0])
         if self._reading.rate_hz is not None:
-            number = self.count + np.arange(len(raws))
+            number = self.count + np.arange(size)
             stamp_ns = self._first_ns + np.rint(number * 1e9 / self._reading.rate_hz).astype(
                 np.int64)
         self.arrived_ns = np.concatenate([self.arrived_ns[-1:], stamp_ns])
@@ -238,10 +252,10 @@ class _Samples:
         """Forget the oldest samples."""
         self.stamp_ns, self.accel = self.stamp_ns[count:], self.accel[count:]
 
-    def _begin(self, raw: bytes, stamp_ns: int) -> None:
+    def _begin(self, first: Raws, stamp_ns: int) -> None:
         if stamp_ns > _EXACT_NS:
             self.epoch_ns = stamp_ns // 1_000_000_000 * 1_000_000_000
-        table = next(_tables(self.where, [raw], cdr.imu))
+        table = next(_tables(self.where, [first], cdr.imu))
         variance = table.numbers('linear_acceleration_covariance')[0, [0, 4, 8]]
         if variance[0] == -1:
             raise UserError(f'{self.where}: states no linear acceleration: '
@@ -284,11 +298,16 @@ class _Samples:
                             f'{accel[i, axis]:g} m/s², expected a number within ±{LIMIT:g}')
 
 
-def _tables(where: str, raws: list[bytes],
+def _count(parts: list[Raws]) -> int:
+    """Return the number of messages."""
+    return sum(map(len, parts))
+
+
+def _tables(where: str, parts: list[Raws],
             find: Callable[[bytes], cdr.Layout]) -> Iterator[cdr.Table]:
     """Group messages by layout; a damaged one is an error that names file and topic."""
     try:
-        yield from cdr.tables(raws, find)
+        yield from cdr.joined_tables(parts, find)
     except cdr.CdrError as error:
         raise UserError(f'{where}: a message is damaged: {error}') from None
 
@@ -302,16 +321,16 @@ def _tracks(bag: Bag, topics: Topics) -> dict[str, Track]:
 
 
 def _add_references(bag: Bag, topics: Topics, tracks: dict[str, Track],
-                    messages: dict[str, list[bytes]]) -> None:
+                    messages: dict[str, list[Raws]]) -> None:
     """Decode the messages of references, by topic, and add them to the tracks of their columns."""
-    for topic, raws in messages.items():
+    for topic, parts in messages.items():
         where = f'{bag.path}: topic {topic}'
         if topic == topics.joints:
-            columns = _joints(where, raws, JOINTS)
+            columns = _joints(where, parts, JOINTS)
         elif topic == topics.temperature:
-            columns = {'temperature_c': _scalar(where, raws, cdr.temperature, 'temperature')}
+            columns = {'temperature_c': _scalar(where, parts, cdr.temperature, 'temperature')}
         else:
-            columns = {'supply_v': _scalar(where, raws, cdr.battery_state, 'voltage')}
+            columns = {'supply_v': _scalar(where, parts, cdr.battery_state, 'voltage')}
         for column, (stamp_ns, value) in columns.items():
             wrong = np.abs(value) > LIMIT
             if wrong.any():
@@ -320,34 +339,34 @@ def _add_references(bag: Bag, topics: Topics, tracks: dict[str, Track],
             tracks[column].add(stamp_ns, value)
 
 
-def _add_commands(where: str, commands: dict[str, Command], raws: list[bytes],
+def _add_commands(where: str, commands: dict[str, Command], parts: list[Raws],
                   arrived_ns: np.ndarray) -> None:
     """
     Add commands; one without a stamp counts from the newest sample that was recorded before it.
 
     A value that is no angle is left out, because the stage refuses it.
     """
-    for column, (stamp_ns, value) in _joints(where, raws, COMMANDS).items():
+    for column, (stamp_ns, value) in _joints(where, parts, COMMANDS).items():
         commands[column].add(np.where(stamp_ns == 0, arrived_ns, stamp_ns),
                              np.where(np.abs(value) <= LIMIT, value, np.nan))
 
 
-def _scalar(where: str, raws: list[bytes], find: Callable[[bytes], cdr.Layout],
+def _scalar(where: str, parts: list[Raws], find: Callable[[bytes], cdr.Layout],
             name: str) -> tuple[np.ndarray, np.ndarray]:
     """Return stamps, ns, (k,), and the values of one field, (k,)."""
-    stamp_ns, value = np.empty(len(raws), np.int64), np.empty(len(raws))
-    for table in _tables(where, raws, find):
+    stamp_ns, value = np.empty(_count(parts), np.int64), np.empty(_count(parts))
+    for table in _tables(where, parts, find):
         stamp_ns[table.rows] = table.stamp_ns()
         value[table.rows] = table.numbers(name)[:, 0]
     return stamp_ns, value
 
 
-def _joints(where: str, raws: list[bytes], names: Mapping[str, str]
+def _joints(where: str, parts: list[Raws], names: Mapping[str, str]
             ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Return stamps and positions by column; a joint that a message does not name is NaN there."""
-    stamp_ns = np.empty(len(raws), np.int64)
-    values = {column: np.full(len(raws), np.nan) for column in names.values()}
-    for table in _tables(where, raws, cdr.joint_state):
+    stamp_ns = np.empty(_count(parts), np.int64)
+    values = {column: np.full(_count(parts), np.nan) for column in names.values()}
+    for table in _tables(where, parts, cdr.joint_state):
         stamp_ns[table.rows] = table.stamp_ns()
         joints = [text for key, text in table.layout.texts.items() if key != 'frame_id']
         if 'position' not in table.layout.fields:

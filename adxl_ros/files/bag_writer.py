@@ -16,12 +16,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 import os
 from pathlib import Path
 from types import TracebackType
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import cdr
@@ -35,6 +35,7 @@ from adxl_ros.files.bag_topics import (
     TEMPERATURE,
     typestore,
 )
+from adxl_ros.files.mcap_chunks import Batch, write_messages
 from adxl_ros.files.recording_columns import COMMANDS, JOINTS, Recording
 from adxl_ros.files.stream_info import converted_info
 from adxl_ros.model.constants import G0_MPS2
@@ -43,7 +44,7 @@ from adxl_ros.model.noise import sample_std_v
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
-_FRAME = 'imu_link'
+FRAME = 'imu_link'
 """Frame of the sensor's messages (REP-145)."""
 
 _ROWS_AT_ONCE = 65536
@@ -62,31 +63,96 @@ _DEPTH = 10
 """Messages that any other topic keeps, the default depth of ROS."""
 
 
-class _Batch(NamedTuple):
+class OpenBag:
     """
-    Messages of one layout.
-
-    Attributes
-    ----------
-    connection
-        Their topic in the bag.
-    rows
-        Samples that they belong to, (n,).
-    data
-        Their bytes, one message after the other.
-
-    """
-
-    connection: Any
-    rows: np.ndarray
-    data: bytes
-
-
-class BagWriter:
-    """
-    Writes a bag block by block: a rosbag2 directory, or one file for a name.mcap.
+    A new bag: a rosbag2 directory, or one file for a name.mcap.
 
     A context manager: the bag appears under its name when the block ends without an error.
+    """
+
+    def __init__(self, path: str | os.PathLike) -> None:
+        """
+        Prepare to write to `path`, which is replaced if it exists.
+
+        Raises
+        ------
+        UserError
+            The library rosbags is not installed.
+
+        """
+        self._path = Path(path)
+        self._rosbag2 = import_rosbags()
+        self.types = typestore()
+        self._connections: dict[str, Any] = {}
+
+    def __enter__(self) -> Self:
+        """Open a new bag next to the one to replace."""
+        with ExitStack() as stack:
+            fresh = stack.enter_context(atomic_path(self._path))
+            folder = fresh
+            if self._path.suffix == '.mcap':
+                # rosbags writes directories; only the file inside is kept.
+                folder = fresh.with_suffix('')
+                stack.callback(_keep_file, folder / f'{folder.name}.mcap', fresh)
+            self._writer = stack.enter_context(self._rosbag2.Writer(
+                folder, version=9, storage_plugin=self._rosbag2.StoragePlugin.MCAP))
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
+                 trace: TracebackType | None) -> None:
+        """Close the bag and, if all went well, put it in its place."""
+        self._stack.__exit__(kind, error, trace)
+
+    def connection(self, topic: str, kind: str, is_latched: bool = False) -> Any:
+        """
+        Return the connection of a topic.
+
+        Parameters
+        ----------
+        topic
+            Its full name.
+        kind
+            Its type.
+        is_latched
+            Whether late subscribers get its last message.
+
+        Returns
+        -------
+        Connection
+            What rosbags writes messages to.
+
+        """
+        if topic not in self._connections:
+            self._connections[topic] = self._writer.add_connection(
+                topic, kind, typestore=self.types, offered_qos_profiles=[_qos(is_latched)])
+        return self._connections[topic]
+
+    def check_stamps(self, stamp_ns: np.ndarray) -> None:
+        """Refuse stamps, ns, (n,), rising, that a ROS message cannot have."""
+        if stamp_ns[0] < 0 or stamp_ns[-1] >= _END_OF_TIME_NS:
+            raise UserError(f'{self._path}: times from {stamp_ns[0] / 1e9:g} to '
+                            f'{stamp_ns[-1] / 1e9:g} s cannot be stamps of ROS messages, '
+                            'which go from 0 to 2^31 s')
+
+    def write_messages(self, stamp_ns: np.ndarray, batches: Sequence[Batch]) -> None:
+        """
+        Append the messages of samples.
+
+        Parameters
+        ----------
+        stamp_ns
+            Stamps of the samples, ns, (n,), rising.
+        batches
+            Messages of the samples, in their order within a sample.
+
+        """
+        write_messages(self._writer, stamp_ns, batches)
+
+
+class BagWriter(OpenBag):
+    """
+    Writes the samples of a recording, block by block, into a bag.
 
     Each sample becomes a message of `imu/data_raw`. Sampled references become messages of
     `stage/joint_states`, `temperature` and `supply` with the same stamp; the voltage of
@@ -111,31 +177,9 @@ class BagWriter:
             The library rosbags is not installed.
 
         """
-        self._path = Path(path)
+        super().__init__(path)
         self._sensor = sensor
-        self._rosbag2 = import_rosbags()
-        self._types = typestore()
-        self._connections: dict[str, Any] = {}
-        self._imu = _imu_template(self._types, sensor)
-
-    def __enter__(self) -> BagWriter:
-        """Open a new bag next to the one to replace."""
-        with ExitStack() as stack:
-            fresh = stack.enter_context(atomic_path(self._path))
-            folder = fresh
-            if self._path.suffix == '.mcap':
-                # rosbags writes directories; only the file inside is kept.
-                folder = fresh.with_suffix('')
-                stack.callback(_keep_file, folder / f'{folder.name}.mcap', fresh)
-            self._writer = stack.enter_context(self._rosbag2.Writer(
-                folder, version=9, storage_plugin=self._rosbag2.StoragePlugin.MCAP))
-            self._stack = stack.pop_all()
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
-                 trace: TracebackType | None) -> None:
-        """Close the bag and, if all went well, put it in its place."""
-        self._stack.__exit__(kind, error, trace)
+        self._imu = imu_template(self.types, _noise_covariance(sensor))
 
     def write(self, recording: Recording) -> None:
         """
@@ -148,11 +192,8 @@ class BagWriter:
 
         """
         stamp_ns = recording.stamp_ns
-        if stamp_ns[0] < 0 or stamp_ns[-1] >= _END_OF_TIME_NS:
-            raise UserError(f'{self._path}: times from {stamp_ns[0] / 1e9:g} to '
-                            f'{stamp_ns[-1] / 1e9:g} s cannot be stamps of ROS messages, '
-                            'which go from 0 to 2^31 s')
-        if 'sensor_info' not in self._connections:
+        self.check_stamps(stamp_ns)
+        if '/sensor_info' not in self._connections:
             self._write_info(recording, int(stamp_ns[0]))
         accel = recording.accel_mps2(self._sensor)
         for start in range(0, len(recording), _ROWS_AT_ONCE):
@@ -164,33 +205,27 @@ class BagWriter:
                        *self._joint_batches(stamp_ns[part], _changes(references), COMMANDS,
                                             '/stage/command'),
                        *self._scalar_batches(stamp_ns[part], references)]
-            self._write_in_order(stamp_ns[part], batches)
-
-    def _connection(self, topic: str, kind: str, is_latched: bool = False) -> Any:
-        if topic not in self._connections:
-            self._connections[topic] = self._writer.add_connection(
-                topic, kind, typestore=self._types, offered_qos_profiles=[_qos(is_latched)])
-        return self._connections[topic]
+            self.write_messages(stamp_ns[part], batches)
 
     def _write_info(self, recording: Recording, stamp_ns: int) -> None:
-        kinds = self._types.types
+        kinds = self.types.types
         pair = kinds['diagnostic_msgs/msg/KeyValue']
         info = converted_info(recording.info, self._sensor)
         message = kinds[DIAGNOSTIC_STATUS](
             level=0, name='sensor_info', message='', hardware_id=info['serial'],
             values=[pair(key=key, value=value) for key, value in info.items()])
-        raw = self._types.serialize_cdr(message, DIAGNOSTIC_STATUS)
-        connection = self._connection('/sensor_info', DIAGNOSTIC_STATUS, is_latched=True)
+        raw = self.types.serialize_cdr(message, DIAGNOSTIC_STATUS)
+        connection = self.connection('/sensor_info', DIAGNOSTIC_STATUS, is_latched=True)
         self._writer.write(connection, stamp_ns, raw)
 
-    def _imu_batch(self, stamp_ns: np.ndarray, accel: np.ndarray) -> _Batch:
+    def _imu_batch(self, stamp_ns: np.ndarray, accel: np.ndarray) -> Batch:
         force = np.zeros((len(accel), 3))
         force[:, :accel.shape[1]] = accel
         data = cdr.fill(self._imu, cdr.imu(self._imu), stamp_ns, {'linear_acceleration': force})
-        return _Batch(self._connection('/imu/data_raw', IMU), np.arange(len(accel)), data)
+        return Batch(self.connection('/imu/data_raw', IMU), np.arange(len(accel)), data)
 
     def _joint_batches(self, stamp_ns: np.ndarray, columns: dict[str, np.ndarray],
-                       names: Mapping[str, str], topic: str) -> list[_Batch]:
+                       names: Mapping[str, str], topic: str) -> list[Batch]:
         """Return one batch for each set of joints that were sampled together."""
         joints = {joint: columns[column] for joint, column in names.items() if column in columns}
         if not joints:
@@ -202,39 +237,25 @@ class BagWriter:
             rows = np.flatnonzero((is_sampled == pattern).all(axis=1))
             sampled_joints = [joint for joint, sampled in zip(joints, pattern) if sampled]
             if sampled_joints:
-                template = _joint_template(self._types, sampled_joints)
+                template = _joint_template(self.types, sampled_joints)
                 data = cdr.fill(template, cdr.joint_state(template), stamp_ns[rows],
                                 {'position': values[rows][:, pattern]})
-                batches.append(_Batch(self._connection(topic, JOINT_STATE), rows, data))
+                batches.append(Batch(self.connection(topic, JOINT_STATE), rows, data))
         return batches
 
     def _scalar_batches(self, stamp_ns: np.ndarray,
-                        references: dict[str, np.ndarray]) -> list[_Batch]:
+                        references: dict[str, np.ndarray]) -> list[Batch]:
         """Return the batches of temperature and supply, where they were sampled."""
         batches = []
         for scalar in _SCALARS:
             values = references.get(scalar.column, np.zeros(0))
             rows = np.flatnonzero(~np.isnan(values))
             if len(rows):
-                template = scalar.template(self._types)
+                template = scalar.template(self.types)
                 data = cdr.fill(template, scalar.layout(template), stamp_ns[rows],
                                 {scalar.field: values[rows]})
-                batches.append(_Batch(self._connection(scalar.topic, scalar.kind), rows, data))
+                batches.append(Batch(self.connection(scalar.topic, scalar.kind), rows, data))
         return batches
-
-    def _write_in_order(self, stamp_ns: np.ndarray, batches: list[_Batch]) -> None:
-        """Write the messages of all batches sample by sample."""
-        rows = np.concatenate([batch.rows for batch in batches])
-        batch_numbers = np.repeat(np.arange(len(batches)), [len(batch.rows) for batch in batches])
-        positions = np.concatenate([np.arange(len(batch.rows)) for batch in batches])
-        order = np.argsort(rows, kind='stable')
-        sizes = [len(batch.data) // len(batch.rows) for batch in batches]
-        stamps = stamp_ns.tolist()
-        write = self._writer.write
-        for row, k, i in zip(rows[order].tolist(), batch_numbers[order].tolist(),
-                             positions[order].tolist()):
-            connection, _, data = batches[k]
-            write(connection, stamps[row], data[i * sizes[k]:(i + 1) * sizes[k]])
 
 
 def _changes(columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -297,26 +318,61 @@ def _qos(is_latched: bool) -> Any:
                forever, False)
 
 
-def _header(types: Any, frame: str) -> Any:
-    """Return a header with the stamp 0."""
+def message_header(types: Any, frame: str) -> Any:
+    """
+    Return a header with the stamp 0.
+
+    Parameters
+    ----------
+    types
+        Message types of rosbags.
+    frame
+        Name of the frame.
+
+    Returns
+    -------
+    Header
+        The header.
+
+    """
     time = types.types['builtin_interfaces/msg/Time'](sec=0, nanosec=0)
     return types.types['std_msgs/msg/Header'](stamp=time, frame_id=frame)
 
 
-def _imu_template(types: Any, sensor: Sensor) -> bytes:
-    """Return an Imu without orientation and angular velocity, with the noise of one sample."""
-    absent = np.zeros(9)
-    absent[0] = -1.0
+def _noise_covariance(sensor: Sensor) -> np.ndarray:
+    """Return the covariance of the noise of one sample by rows, (m/s²)², (9,)."""
     variance = np.full(3, UNMEASURED_VARIANCE)
     noise = sample_std_v(sensor) / sensor.nominal_scale_v_per_g * G0_MPS2
     variance[:len(sensor.axes)] = noise ** 2
+    return np.diag(variance).ravel()
+
+
+def imu_template(types: Any, covariance: np.ndarray) -> bytes:
+    """
+    Return an Imu without orientation and angular velocity, at the stamp 0.
+
+    Parameters
+    ----------
+    types
+        Message types of rosbags.
+    covariance
+        That of the acceleration by rows, (m/s²)², (9,).
+
+    Returns
+    -------
+    bytes
+        The message, serialized.
+
+    """
+    absent = np.zeros(9)
+    absent[0] = -1.0
     vector = types.types['geometry_msgs/msg/Vector3'](x=0.0, y=0.0, z=0.0)
     message = types.types[IMU](
-        header=_header(types, _FRAME),
+        header=message_header(types, FRAME),
         orientation=types.types['geometry_msgs/msg/Quaternion'](x=0.0, y=0.0, z=0.0, w=1.0),
         orientation_covariance=absent,
         angular_velocity=vector, angular_velocity_covariance=absent,
-        linear_acceleration=vector, linear_acceleration_covariance=np.diag(variance).ravel())
+        linear_acceleration=vector, linear_acceleration_covariance=covariance)
     return bytes(types.serialize_cdr(message, IMU))
 
 
@@ -324,7 +380,7 @@ def _joint_template(types: Any, names: list[str]) -> bytes:
     """Return a JointState with the positions of some joints."""
     none = np.zeros(0)
     message = types.types[JOINT_STATE](
-        header=_header(types, ''), name=names, position=np.zeros(len(names)),
+        header=message_header(types, ''), name=names, position=np.zeros(len(names)),
         velocity=none, effort=none)
     return bytes(types.serialize_cdr(message, JOINT_STATE))
 
@@ -332,7 +388,7 @@ def _joint_template(types: Any, names: list[str]) -> bytes:
 def _temperature_template(types: Any) -> bytes:
     """Return a Temperature of unknown variance."""
     message = types.types[TEMPERATURE](
-        header=_header(types, _FRAME), temperature=0.0, variance=0.0)
+        header=message_header(types, FRAME), temperature=0.0, variance=0.0)
     return bytes(types.serialize_cdr(message, TEMPERATURE))
 
 
@@ -341,7 +397,7 @@ def _battery_template(types: Any) -> bytes:
     unknown = float('nan')
     none = np.zeros(0, np.float32)
     message = types.types[BATTERY_STATE](
-        header=_header(types, _FRAME), voltage=0.0, temperature=unknown, current=unknown,
+        header=message_header(types, FRAME), voltage=0.0, temperature=unknown, current=unknown,
         charge=unknown, capacity=unknown, design_capacity=unknown, percentage=unknown,
         power_supply_status=0, power_supply_health=0, power_supply_technology=0, present=True,
         cell_voltage=none, cell_temperature=none, location='', serial_number='')

@@ -126,9 +126,13 @@ def _version(sensor: Sensor) -> str:
 
 def date_of(sensor: Sensor) -> datetime | None:
     """Return the date of a calibration, UTC; None where its file states none."""
+    return date_in(sensor.provenance.get('date', ''))
+
+
+def date_in(text: str) -> datetime | None:
+    """Return the date of a provenance, UTC; None where the text is none."""
     try:
-        date = datetime.fromisoformat(sensor.provenance.get('date', '').replace('Z', '+00:00')
-                                      .replace('+0000', '+00:00'))
+        date = datetime.fromisoformat(text.replace('Z', '+00:00').replace('+0000', '+00:00'))
     except ValueError:
         return None
     return date.astimezone(timezone.utc) if date.tzinfo else date.replace(tzinfo=timezone.utc)

@@ -23,7 +23,7 @@ written, as one table of bytes.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import struct
 
 import numpy as np
@@ -154,13 +154,22 @@ def imu(raw: bytes) -> Layout:
     return layout
 
 
+def vector3_stamped(raw: bytes) -> Layout:
+    """Find the fields of a geometry_msgs/Vector3Stamped."""
+    layout = Layout(raw)
+    layout.header()
+    layout.numbers('vector', 'f8', 3)
+    return layout
+
+
 def joint_state(raw: bytes) -> Layout:
-    """Find the names and positions of a sensor_msgs/JointState."""
+    """Find the names, positions and velocities of a sensor_msgs/JointState."""
     layout = Layout(raw)
     layout.header()
     for i in range(layout.length()):
         layout.text(f'name{i}')
-    layout.numbers('position', 'f8', layout.length())
+    for name in ('position', 'velocity'):
+        layout.numbers(name, 'f8', layout.length())
     return layout
 
 
@@ -213,7 +222,11 @@ class Table:
         return sec * 1_000_000_000 + nanosec
 
 
-def tables(raws: Sequence[bytes], find: Callable[[bytes], Layout]) -> Iterator[Table]:
+Raws = Sequence[bytes] | np.ndarray
+"""Messages of one type: their bytes one by one, or as rows of equal length, (n, size)."""
+
+
+def tables(raws: Raws, find: Callable[[bytes], Layout]) -> Iterator[Table]:
     """
     Group messages by layout.
 
@@ -235,22 +248,60 @@ def tables(raws: Sequence[bytes], find: Callable[[bytes], Layout]) -> Iterator[T
         A message is too short or in another encoding.
 
     """
-    remaining = np.arange(len(raws))
-    while len(remaining):
-        first = raws[remaining[0]]
-        layout = find(first)
-        rows = np.array([i for i in remaining.tolist() if len(raws[i]) == len(first)])
+    if isinstance(raws, np.ndarray):
+        yield from _tables_of_rows(np.arange(len(raws)), raws, find)
+        return
+    sizes = np.array([len(raw) for raw in raws])
+    for size in dict.fromkeys(sizes.tolist()):
+        rows = np.flatnonzero(sizes == size)
         data = np.frombuffer(b''.join([raws[i] for i in rows.tolist()]), np.uint8)
-        data = data.reshape(len(rows), len(first))
-        is_same = (data[:, layout.fixed] == data[0, layout.fixed]).all(axis=1)
-        if not is_same.all():
-            rows, data = rows[is_same], data[is_same]
-        yield Table(rows, data, layout)
-        remaining = np.setdiff1d(remaining, rows, assume_unique=True)
+        yield from _tables_of_rows(rows, data.reshape(len(rows), size), find)
+
+
+def _tables_of_rows(rows: np.ndarray, data: np.ndarray, find: Callable[[bytes], Layout]
+                    ) -> Iterator[Table]:
+    """Group messages of one length, (n, size), by layout; `rows` are their indices, (n,)."""
+    while len(rows):
+        layout = find(data[0].tobytes())
+        differs = (data[:, layout.fixed] != data[0, layout.fixed]).any(axis=1)
+        if not differs.any():
+            yield Table(rows, data, layout)
+            return
+        yield Table(rows[~differs], data[~differs], layout)
+        rows, data = rows[differs], data[differs]
+
+
+def joined_tables(parts: Sequence[Raws], find: Callable[[bytes], Layout]) -> Iterator[Table]:
+    """
+    Group messages by layout, part by part.
+
+    Parameters
+    ----------
+    parts
+        The messages of one type, in parts.
+    find
+        Finds the layout of a message of that type, such as `imu`.
+
+    Yields
+    ------
+    Table
+        Messages of one layout; their indices count over all parts.
+
+    Raises
+    ------
+    CdrError
+        A message is too short or in another encoding.
+
+    """
+    begin = 0
+    for raws in parts:
+        for table in tables(raws, find):
+            yield replace(table, rows=table.rows + begin)
+        begin += len(raws)
 
 
 def fill(template: bytes, layout: Layout, stamp_ns: np.ndarray,
-         fields: Mapping[str, np.ndarray]) -> bytes:
+         fields: Mapping[str, np.ndarray]) -> np.ndarray:
     """
     Return one message for each stamp.
 
@@ -267,15 +318,20 @@ def fill(template: bytes, layout: Layout, stamp_ns: np.ndarray,
 
     Returns
     -------
-    bytes
-        The messages, one after the other, each as long as the template.
+    ndarray
+        The bytes of the messages, (n, size), each as long as the template.
 
     """
-    data = np.tile(np.frombuffer(template, np.uint8), (len(stamp_ns), 1))
     sec, nanosec = np.divmod(stamp_ns, 1_000_000_000)
-    for name, values in {'sec': sec, 'nanosec': nanosec, **fields}.items():
-        field = layout.fields[name]
-        part = np.ascontiguousarray(
-            values.reshape(-1, field.count).astype(layout.order + field.code))
-        data[:, field.offset:field.offset + part.itemsize * field.count] = part.view(np.uint8)
-    return data.tobytes()
+    values = {'sec': sec, 'nanosec': nanosec, **fields}
+    places = [layout.fields[name] for name in values]
+    record = np.dtype({'names': list(values), 'offsets': [place.offset for place in places],
+                       'formats': [(layout.order + place.code, (place.count,))
+                                   for place in places],
+                       'itemsize': len(template)})
+    data = np.empty((len(stamp_ns), len(template)), np.uint8)
+    data[:] = np.frombuffer(template, np.uint8)
+    records = data.view(record)[:, 0]
+    for name, place in zip(values, places):
+        records[name] = values[name].reshape(-1, place.count)
+    return data

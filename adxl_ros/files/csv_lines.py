@@ -25,8 +25,9 @@ import re
 from typing import BinaryIO
 
 from adxl_ros.errors import UserError
+import numpy as np
 
-_CHUNK_BYTES = 1 << 22
+_CHUNK_BYTES = 1 << 21
 """Bytes that are read at a time (chosen: bounds the memory, and large enough for numpy)."""
 
 _LONGEST_LINE_BYTES = 1 << 20
@@ -158,12 +159,15 @@ def chunks(path: str, file: BinaryIO, info: dict[str, str], skip: int = 0,
         if recode is not None:
             data = recode(data)
         is_open_ended = not data.endswith(b'\n')
-        data = data.replace(b'\r\n', b'\n') + b'\n' * is_open_ended
-        count = data.count(b'\n')
+        if b'\r' in data:
+            data = data.replace(b'\r\n', b'\n')
+        data += b'\n' * is_open_ended
+        is_newline = np.frombuffer(data, np.uint8) == ord('\n')
+        count = int(np.count_nonzero(is_newline))
         lines = Lines(data, range(number, number + count), file.tell() / max(size, 1),
                       is_open_ended)
         number += count
-        if _has_other_lines(data):
+        if _has_other_lines(data, is_newline):
             _drop_other_lines(path, lines, info)
         if lines.data and lines.numbers[0] <= skip:
             _drop_first_lines(lines, skip)
@@ -234,10 +238,11 @@ def without_byte_order_mark(path: str, data: bytes) -> bytes:
     return data.removeprefix(b'\xef\xbb\xbf')
 
 
-def _has_other_lines(data: bytes) -> bool:
-    """Return whether there may be comments or empty lines."""
-    return data.startswith(b'\n') or any(
-        mark in data for mark in (b'#', b'\n\n', b' \n', b'\t\n'))
+def _has_other_lines(data: bytes, is_newline: np.ndarray) -> bool:
+    """Return whether there may be comments or empty lines, by a mask (n,) of the n bytes."""
+    # A search for one byte takes a tenth of the time of a search for two.
+    return (b'#' in data or bool(is_newline[0] or (is_newline[1:] & is_newline[:-1]).any())
+            or (b' ' in data and b' \n' in data) or (b'\t' in data and b'\t\n' in data))
 
 
 def _drop_first_lines(lines: Lines, skip: int) -> None:

@@ -20,14 +20,15 @@ from collections.abc import Mapping
 from contextlib import ExitStack
 import os
 from types import TracebackType
-from typing import TextIO
+from typing import BinaryIO
 
 from adxl_ros.files.atomic_write import atomic_path
+from adxl_ros.files.csv_text import exact_rows, rounded_rows
 from adxl_ros.files.recording_columns import Recording, TIME
 import numpy as np
 
-_ROWS_AT_ONCE = 65536
-"""Rows that are made into text at a time (chosen: some MB of text)."""
+_NUMBERS_AT_ONCE = 8192
+"""Numbers that are made into text at a time (chosen: their arrays stay in the cache)."""
 
 
 class CsvWriter:
@@ -47,8 +48,7 @@ class CsvWriter:
         path
             The file, replaced if it exists.
         digits
-            Significant digits of all columns but the first; None keeps every bit. Twelve digits
-            take a third of the time.
+            Significant digits of all columns but the first; None keeps every bit.
 
         """
         self._path = path
@@ -59,8 +59,7 @@ class CsvWriter:
         """Open a new file next to the one to replace."""
         with ExitStack() as stack:
             fresh = stack.enter_context(atomic_path(self._path))
-            self._file: TextIO = stack.enter_context(
-                open(fresh, 'w', encoding='utf-8', newline='\n'))
+            self._file: BinaryIO = stack.enter_context(open(fresh, 'wb'))
             self._stack = stack.pop_all()
         return self
 
@@ -84,34 +83,15 @@ class CsvWriter:
         """
         if not self._names:
             self._names = list(columns)
-            self._file.writelines(f'# {key}: {" ".join(value.split())}\n'
+            self._file.writelines(f'# {key}: {" ".join(value.split())}\n'.encode()
                                   for key, value in (info or {}).items())
-            self._file.write(','.join(self._names) + '\n')
+            self._file.write((','.join(self._names) + '\n').encode())
         arrays = [np.asarray(columns[name]) for name in self._names]
-        for start in range(0, len(arrays[0]), _ROWS_AT_ONCE):
-            part = [array[start:start + _ROWS_AT_ONCE] for array in arrays]
-            self._file.write(_exactly(part) if self._digits is None else
-                             _rounded(part, self._digits))
-
-
-def _exactly(columns: list[np.ndarray]) -> str:
-    """Return rows with all digits of the columns, (n,) each."""
-    return '\n'.join(map(','.join, zip(*map(_fields, columns)))) + '\n'
-
-
-def _rounded(columns: list[np.ndarray], digits: int) -> str:
-    """Return rows with all digits of the first column, and some digits of the others."""
-    row = ','.join(['%r', *[f'%.{digits}g'] * (len(columns) - 1)]) + '\n'
-    rows = (row * len(columns[0])) % tuple(np.column_stack(columns).ravel().tolist())
-    return rows.replace('nan', '')
-
-
-def _fields(values: np.ndarray) -> list[str]:
-    """Return numbers as text; NaN is empty."""
-    text = list(map(repr, values.tolist()))
-    for i in np.flatnonzero(np.isnan(values)):
-        text[i] = ''
-    return text
+        rows = max(_NUMBERS_AT_ONCE // len(arrays), 1)
+        for start in range(0, len(arrays[0]), rows):
+            part = [array[start:start + rows] for array in arrays]
+            self._file.write(exact_rows(part) if self._digits is None else
+                             rounded_rows(part, self._digits))
 
 
 def recording_info(recording: Recording) -> dict[str, str]:

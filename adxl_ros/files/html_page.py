@@ -26,6 +26,7 @@ from datetime import datetime
 import gzip
 from io import BytesIO
 from pathlib import Path
+import re
 import shlex
 import sys
 from typing import Any
@@ -35,6 +36,8 @@ from adxl_ros.files.package_version import package_version
 
 _DPI = 100
 """Resolution of pictures, dots per inch (chosen: sharp at the page's width)."""
+_PASSWORD = re.compile(r'(?<=://)([^/@:]*):[^/@]*@')
+"""User and password of a URL."""
 _GZIP_LEVEL = 6
 """Level of compression (chosen: 0.3 s for plotly.js; level 9 takes three times as long)."""
 
@@ -96,8 +99,9 @@ def render(package: str, template: str, values: Mapping[str, Any]) -> str:
 
 
 def command_of_this_process() -> str:
-    """Return the command line that started this executable, as a shell reads it."""
-    return shlex.join(['ros2', 'run', 'adxl_ros', Path(sys.argv[0]).name, *sys.argv[1:]])
+    """Return the command line that started this executable, without the passwords of URLs."""
+    words = [_PASSWORD.sub(r'\1@', word) for word in sys.argv[1:]]
+    return shlex.join(['ros2', 'run', 'adxl_ros', Path(sys.argv[0]).name, *words])
 
 
 def picture_url(figure: Any) -> str:

@@ -32,6 +32,7 @@ from typing import BinaryIO, NamedTuple
 import zlib
 
 from adxl_ros.errors import UserError
+from adxl_ros.files.message_pieces import collected_pieces, Piece
 
 _MAGIC = b'\x89MCAP0\r\n'
 """First and last bytes of a whole file (specification, "Magic")."""
@@ -213,6 +214,10 @@ class ScannedMcap:
                 log_ns, = _LOG_TIME.unpack_from(data, start + _LOG_TIME_BYTE)
                 yield topic, data[start + _MESSAGE_HEAD_BYTES:stop], log_ns
 
+    def pieces(self, topics: Collection[str]) -> Iterator[Piece]:
+        """Yield the messages in pieces, in the order of the file."""
+        return collected_pieces(self.messages(topics))
+
     def _records(self) -> Iterator[Record]:
         """Yield the whole records, and the records of a chunk in its place."""
         self._offset = len(_MAGIC)
@@ -222,7 +227,8 @@ class ScannedMcap:
             if not _is_record(code, size):
                 return
             begin = self._offset + len(head)
-            content = self._file.read(min(size, self._size - begin))
+            # A file that is still written may have grown since it was opened.
+            content = self._file.read(min(size, max(self._size - begin, 0)))
             is_whole = len(content) == size
             if code == _CHUNK:
                 is_whole = yield from _chunk(content, is_whole)

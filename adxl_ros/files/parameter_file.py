@@ -21,6 +21,7 @@ It is a YAML file that ROS nodes can load: flat keys below `/**: ros__parameters
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, Field, fields
 import os
 from pathlib import Path
@@ -102,16 +103,20 @@ def any_imu_path() -> Path:
 
 
 def _params_folder() -> Path:
-    # Where there is no ROS, only this function fails.
-    from ament_index_python.packages import get_package_share_directory
-    return Path(get_package_share_directory('adxl_ros')) / 'params'
+    """Return the folder of the installed parameter files: as ROS has it, else the package's."""
+    with suppress(ImportError, LookupError, OSError):
+        from ament_index_python.packages import get_package_share_directory
+        return Path(get_package_share_directory('adxl_ros')) / 'params'
+    package = Path(__file__).resolve().parents[1]
+    return next((folder for folder in (package / 'params', package.parent / 'params')
+                 if folder.is_dir()), package / 'params')
 
 
 def installed_path(name: str | os.PathLike) -> Path:
     """
     Return the installed file of a sensor by its name, such as MPU-6050.
 
-    A path to a file stays as it is, and so does everything where there is no ROS.
+    A path to a file stays as it is.
 
     Raises
     ------
@@ -122,10 +127,7 @@ def installed_path(name: str | os.PathLike) -> Path:
     path = Path(name)
     if path.exists() or path.suffix or path.name != str(name):
         return path
-    try:
-        folder = _params_folder()
-    except (ImportError, LookupError):
-        return path
+    folder = _params_folder()
     file = folder / f'{path.name.lower().replace("-", "")}.yaml'
     if not file.exists():
         names = ', '.join(sorted(other.stem for other in folder.glob('*.yaml')))

@@ -17,9 +17,10 @@
 from dataclasses import replace
 from pathlib import Path
 import sys
+from typing import Any
 
 from adxl_ros.errors import UserError
-from adxl_ros.files import bag_reader, cdr, recording
+from adxl_ros.files import bag_reader, cdr, mcap_chunks, recording
 from adxl_ros.files.recording_columns import ACCEL, Recording, REFERENCES
 from adxl_ros.files.stream_info import sensor_info
 import numpy as np
@@ -194,7 +195,7 @@ def test_layouts_are_those_of_an_independent_decoder() -> None:
             assert table.layout.texts == {'frame_id': frame}
             new = cdr.fill(raw, table.layout, np.array([5]),
                            {'linear_acceleration': np.array([[1.0, 2.0, 3.0]])})
-            back = STORE.deserialize_cdr(new, IMU)
+            back = STORE.deserialize_cdr(new[0].tobytes(), IMU)
             assert (back.linear_acceleration.y, back.header.stamp.nanosec) == (2.0, 5)
 
 
@@ -271,6 +272,44 @@ def test_a_command_is_in_force_until_the_next_one(tmp_path: Path) -> None:
             # A command that is recorded 3 ms late may not apply to the samples before it.
             assert np.count_nonzero(~((joined == got.columns[name]) | np.isnan(joined))) <= 3
             assert (np.isnan(joined) == np.isnan(got.columns[name])).all()
+
+
+def mixed_messages() -> list[Any]:
+    """Return messages of every kind, at rates of their own and of two lengths."""
+    times = stamps(6000)
+    sent: list[Any] = []
+    for i, t in enumerate(times):
+        sent.append(imu(t))
+        if i % 3 == 0:
+            sent.append(joints(t + 300_000, alpha=i / 7, **({'beta': 1.0} if i % 2 else {})))
+        if i % 500 == 7:
+            sent.append(joints(t, '/stage/command', alpha=float(i)))
+    return sent
+
+
+@pytest.mark.parametrize('fault', ['none', 'index'])
+@pytest.mark.parametrize('rows', [1000, 65536])
+def test_messages_in_arrays_are_those_read_one_by_one(
+        tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: str, rows: int) -> None:
+    path = bags.bag_of(tmp_path / 'run', mixed_messages())
+    file, = path.glob('*.mcap')
+    if fault == 'index':
+        data = bytearray(file.read_bytes())
+        with rosbag2.Reader(file) as reader:
+            chunk = reader.storage.chunks[0]
+        for place in chunk.message_index_offsets.values():
+            data[place + 15 + 8] ^= 1  # the offset of the first message in the chunk
+        file.write_bytes(data)
+    quick = list(recording.blocks(path, rows))
+    monkeypatch.setattr(mcap_chunks, 'in_order', lambda *_: [])
+    plain = list(recording.blocks(path, rows))
+    assert len(quick) == len(plain)
+    for first, second in zip(quick, plain):
+        assert (first.stamp_ns == second.stamp_ns).all()
+        assert first.columns.keys() == second.columns.keys()
+        assert first.alignments == second.alignments
+        for name, values in first.columns.items():
+            assert np.array_equal(values, second.columns[name], equal_nan=True), name
 
 
 def test_commands_are_those_of_the_stage_and_of_the_right_type(tmp_path: Path) -> None:

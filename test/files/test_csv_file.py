@@ -19,7 +19,7 @@ import os
 from pathlib import Path
 
 from adxl_ros.errors import UserError
-from adxl_ros.files import csv_lines, recording
+from adxl_ros.files import csv_lines, csv_numbers, csv_text, recording
 from adxl_ros.files.csv_writer import CsvWriter
 from adxl_ros.files.recording_columns import ACCEL, Recording
 from adxl_ros.files.stream_info import sensor_info
@@ -33,6 +33,16 @@ from units import nominal
 
 HEADER = 'time_s,x_v,y_v,alpha_rad,beta_rad'
 GOOD = '0.0,2.5,2.6,1.5,0.1\n0.001,2.51,2.61,,\n0.002,2.52,2.62,1.6,0.2\n'
+
+
+@pytest.fixture(autouse=True, params=['pyarrow', 'numpy'])
+def parser(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Read and write small files as large ones, and as without pyarrow and orjson."""
+    if request.param == 'pyarrow':
+        monkeypatch.setattr(csv_numbers, '_ARROW_BYTES', 0)
+    else:
+        monkeypatch.setattr(csv_numbers, '_arrow', lambda: None)
+        monkeypatch.setattr(csv_text, '_dumps', lambda: None)
 
 
 def written(tmp_path: Path, text: str | bytes, name: str = 'run.csv') -> Path:

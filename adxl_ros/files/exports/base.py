@@ -22,7 +22,7 @@ from textwrap import wrap
 from typing import Protocol
 
 from adxl_ros.files.package_version import package_version
-from adxl_ros.model import noise, signal_chain
+from adxl_ros.model import analog_stages, noise
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Place
@@ -126,7 +126,7 @@ class Axis:
 def axes(sensor: Sensor) -> list[Axis]:
     """Return the values of the measured axes at 25 °C and the nominal supply."""
     mps2_per_v = G0_MPS2 / sensor.nominal_scale_v_per_g
-    at_zero_v = np.array([signal_chain.analog_response(sensor)([0.0, 0.0, 0.0])])
+    at_zero_v = np.array([analog_stages.analog_response(sensor)([0.0, 0.0, 0.0])])
     zero_g = to_nominal_mps2(at_zero_v, sensor)[0]
     lost = sensor.values.get('quantisation', {})
     lost_bits = np.asarray(lost.get('lost_bits', 0.0)) + lost.get('axis_lost_bits', 0.0)
@@ -184,15 +184,18 @@ def head(export: Export, format_name: str, holds: Mapping[str, str]) -> list[str
         lines += ['', f'The sensor has no {" and no ".join(missing)}: do not use that output.']
     stage = stage_effects(sensor)
     if stage:
-        lines += ['', *wrap(f'Left out, as errors of the stage: {", ".join(stage)}.', COLUMNS)]
+        lines += ['', *wrap('Left out, as errors of the stage or of another reference: '
+                            f'{", ".join(stage)}.', COLUMNS)]
     return [*lines, '', 'Sizes: change of the output in the manoeuvre rich (7 minutes of turns,',
             'shaking, warming and a step of the supply), by simulation.',
-            f'Not held in all, without noise and steps: {size_text(export.remaining_mg)} mg rms.']
+            'All that is not held, but for noise and steps: '
+            f'{size_text(export.remaining_mg)} mg rms.']
 
 
 def stage_effects(sensor: Sensor) -> list[str]:
-    """Return the effects that are errors of the stage, and do not go with the sensor."""
-    return [name for name in sensor.effects if effect_named(name).place is Place.STAGE]
+    """Return the effects that are errors of a reference, and do not go with the sensor."""
+    return [name for name in sensor.effects
+            if effect_named(name).place in (Place.REFERENCE, Place.STAGE)]
 
 
 def size_text(size_mg: float) -> str:

@@ -31,7 +31,7 @@ from adxl_ros.files.exports.base import (
     WHITE_NOISE,
 )
 from adxl_ros.files.package_version import package_version
-from adxl_ros.model import noise, signal_chain
+from adxl_ros.model import analog_stages, noise, signal_chain
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects import effect_named
 import numpy as np
@@ -50,7 +50,7 @@ def text(export: Export) -> str:
     steps. The parameters of all effects are in it, but not their functions.
     """
     sensor = export.sensor
-    by_force = signal_chain.jacobian(signal_chain.analog_response(sensor), [0.0, 0.0, 0.0])
+    by_force = signal_chain.jacobian(analog_stages.analog_response(sensor), [0.0, 0.0, 0.0])
     gain = by_force * G0_MPS2 / sensor.nominal_scale_v_per_g[:, None]
     content: dict[str, Any] = {
         'schema': 1,

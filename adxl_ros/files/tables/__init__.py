@@ -71,3 +71,9 @@ def _is_named(path: str | os.PathLike, format_name: str) -> bool:
     """Return whether the end of a file's name is that of a format."""
     endings = import_module(f'{__name__}.{format_name}').ENDINGS
     return Path(path).suffix.lower() in endings
+
+
+def table_endings() -> tuple[str, ...]:
+    """Return the ends of the names of tables that are no text."""
+    return tuple(ending for name in _formats()
+                 for ending in import_module(f'{__name__}.{name}').ENDINGS)

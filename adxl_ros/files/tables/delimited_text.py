@@ -165,7 +165,10 @@ def open_table(path: str, topic: str = '') -> DelimitedText:
     if topic:
         raise UserError(f'--topic {topic}: {path} is no bag; leave --topic out')
     with _opened(path) as file:
-        form = find_form(_head(path, file))
+        head = _head(path, file)
+    if not head:
+        raise UserError(f'{path}: is empty')
+    form = find_form(head)
     if form is None:
         raise UserError(f'{path}: the first {_HEAD_LINES} lines hold no row of numbers; expected '
                         'a header, and a line of numbers for each sample')

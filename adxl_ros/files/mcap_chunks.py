@@ -1,0 +1,432 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The messages of MCAP files, chunk by chunk.
+
+A chunk is followed by the places of its messages (https://mcap.dev/spec, "Message Index").
+Messages of one length are therefore taken from it, and put into it, as the rows of one array.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from io import BytesIO
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+from adxl_ros.files.cdr import Raws
+from adxl_ros.files.message_pieces import collected, Piece
+import numpy as np
+
+_MESSAGE = 5
+"""Operation code of a message record (specification, "Records"; so is the next one)."""
+
+_MESSAGE_INDEX = 7
+"""Operation code of a message index record."""
+
+_CHUNK = 6
+"""Operation code of a chunk record."""
+
+_RECORD_HEAD_BYTES = 9
+"""Size of the operation code and length of a record."""
+
+_MESSAGE_HEAD = np.dtype([('code', 'u1'), ('size', '<u8'), ('channel', '<u2'), ('sequence', '<u4'),
+                          ('log_ns', '<u8'), ('publish_ns', '<u8')])
+"""Beginning of a message record; the CDR follows."""
+
+_INDEX_HEAD = np.dtype([('code', 'u1'), ('size', '<u8'), ('channel', '<u2'), ('bytes', '<u4')])
+"""Beginning of a message index record; the entries follow."""
+
+_INDEX_ENTRY = np.dtype([('log_ns', '<u8'), ('offset', '<u8')])
+"""Log time of a message, and where its record begins in the chunk."""
+
+_CHUNK_HEAD = np.dtype([('code', 'u1'), ('size', '<u8'), ('begin_ns', '<u8'), ('end_ns', '<u8'),
+                        ('unpacked_bytes', '<u8'), ('crc', '<u4'), ('compression', '<u4'),
+                        ('bytes', '<u8')])
+"""Beginning of a chunk record without compression and CRC-32; the records follow."""
+
+_PLACES_HEAD = np.dtype([('begin_ns', '<u8'), ('end_ns', '<u8'), ('offset', '<u8'),
+                         ('chunk_bytes', '<u8'), ('places_bytes', '<u4')])
+"""Beginning of the entry of a chunk in the index of the file; places of the indices follow."""
+
+_PLACE = np.dtype([('channel', '<u2'), ('offset', '<u8')])
+"""Where the message index of a channel begins in the file."""
+
+_PLACES_END = np.dtype([('index_bytes', '<u8'), ('compression', '<u4'), ('bytes', '<u8'),
+                        ('unpacked_bytes', '<u8')])
+"""End of the entry of a chunk without compression."""
+
+_CHUNK_BYTES = 1 << 20
+"""Size that a chunk hardly exceeds, bytes; that of rosbags."""
+
+_CRC_BYTES = 4
+"""Size of a CRC-32."""
+
+_CRC_BYTE = 24
+"""Place of the CRC-32 in the content of a chunk record."""
+
+_DATA_BYTE = 40
+"""Place of the data in the content of a chunk record without the name of its compression."""
+
+
+class IndexFault(ValueError):
+    """A message index that does not describe its chunk."""
+
+
+class _Found(NamedTuple):
+    """
+    Messages of one channel in a chunk.
+
+    Attributes
+    ----------
+    raws
+        The messages.
+    log_ns
+        Their log times, ns, (n,).
+    offset
+        Where their records begin in the chunk, (n,).
+
+    """
+
+    raws: Raws
+    log_ns: np.ndarray
+    offset: np.ndarray
+
+
+def in_order(storage: Any, topics: Mapping[int, str]) -> list[Any]:
+    """
+    Return the chunks that hold messages of some topics.
+
+    Parameters
+    ----------
+    storage
+        The storage of rosbags.
+    topics
+        Names of the topics by channel number.
+
+    Returns
+    -------
+    list
+        The entries of the chunks in the index of the file; empty where it is no MCAP file, or
+        where the log times of chunks overlap.
+
+    """
+    chunks = [chunk for chunk in getattr(storage, 'chunks', ())
+              if any(chunk.channel_count.get(channel, 0) for channel in topics)]
+    chunks.sort(key=lambda chunk: (chunk.message_start_time, chunk.chunk_start_offset))
+    is_ordered = all(first.message_end_time <= second.message_start_time
+                     and first.chunk_start_offset < second.chunk_start_offset
+                     for first, second in pairwise(chunks))
+    return chunks if is_ordered else []
+
+
+def read_chunk(file: Any, chunk: Any, topics: Mapping[int, str]) -> Piece:
+    """
+    Read the messages of a chunk.
+
+    Where its message index does not describe it, its records are read one by one.
+
+    Parameters
+    ----------
+    file
+        The open file.
+    chunk
+        The entry of the chunk in the index of the file, as rosbags reads it.
+    topics
+        Names of the topics to read, by channel number.
+
+    Returns
+    -------
+    Piece
+        The messages, in the order of their log times.
+
+    """
+    from rosbags.rosbag2.storage_mcap import decompress, msgsrc
+    try:
+        file.seek(chunk.chunk_start_offset + _RECORD_HEAD_BYTES + _CRC_BYTE)
+        crc = int.from_bytes(file.read(_CRC_BYTES), 'little')
+        file.seek(chunk.chunk_start_offset + _RECORD_HEAD_BYTES + _DATA_BYTE
+                  + len(chunk.compression))
+        data = np.frombuffer(decompress(file.read(chunk.compressed_size), chunk.compression,
+                                        chunk.uncompressed_size, crc), np.uint8)
+        return _ordered({topic: _messages(data, channel, _index(file, chunk, channel))
+                         for channel, topic in _channels(chunk, topics).items()})
+    except IndexFault:
+        names: Any = dict(topics)
+        records: Any = msgsrc(chunk, names, 0, chunk.message_end_time + 1, file)
+        return collected([(topic, raw) for _, _, topic, raw in records if raw is not None])
+
+
+def _channels(chunk: Any, topics: Mapping[int, str]) -> dict[int, str]:
+    """Return the topics of a chunk by channel number; two channels of a topic are a fault."""
+    channels = {channel: topic for channel, topic in topics.items()
+                if channel in chunk.message_index_offsets}
+    if len(set(channels.values())) < len(channels):
+        raise IndexFault('several channels have one topic')
+    return channels
+
+
+def _ordered(parts: dict[str, _Found]) -> Piece:
+    """Put the messages of a chunk, by topic, in the order of their log times."""
+    order = np.lexsort((np.concatenate([part.offset for part in parts.values()]),
+                        np.concatenate([part.log_ns for part in parts.values()])))
+    place = np.empty(len(order), np.int64)
+    place[order] = np.arange(len(order))
+    bounds = np.cumsum([len(part.offset) for part in parts.values()])[:-1]
+    return Piece({topic: part.raws for topic, part in parts.items()},
+                 dict(zip(parts, np.split(place, bounds))))
+
+
+def _index(file: Any, chunk: Any, channel: int) -> np.ndarray:
+    """Return the entries of the message index of a channel, (n,), in the order of time."""
+    file.seek(chunk.message_index_offsets[channel])
+    head = np.frombuffer(file.read(_INDEX_HEAD.itemsize), _INDEX_HEAD)
+    if len(head) != 1 or head['code'] != _MESSAGE_INDEX or head['channel'] != channel:
+        raise IndexFault('no message index where the file says')
+    content = file.read(int(head['bytes'][0]))
+    if len(content) != head['bytes'] or len(content) % _INDEX_ENTRY.itemsize:
+        raise IndexFault('a message index is cut off')
+    entries = np.frombuffer(content, _INDEX_ENTRY)
+    return entries[np.lexsort((entries['offset'], entries['log_ns']))]
+
+
+def _messages(data: np.ndarray, channel: int, entries: np.ndarray) -> _Found:
+    """
+    Take the messages of a channel out of a chunk.
+
+    Parameters
+    ----------
+    data
+        The bytes of the chunk.
+    channel
+        Number of the channel.
+    entries
+        Its message index, (n,).
+
+    Returns
+    -------
+    _Found
+        Its messages.
+
+    Raises
+    ------
+    IndexFault
+        There are other records at the places of the index.
+
+    """
+    offset = entries['offset'].astype(np.int64)
+    head_bytes = _MESSAGE_HEAD.itemsize
+    if not len(offset) or offset.min() < 0 or offset.max() + head_bytes > len(data):
+        raise IndexFault('a message index points out of its chunk')
+    heads = _rows(data, offset, head_bytes).view(_MESSAGE_HEAD)[:, 0]
+    sizes = heads['size'].astype(np.int64) + _RECORD_HEAD_BYTES - head_bytes
+    if ((heads['code'] != _MESSAGE) | (heads['channel'] != channel)
+            | (heads['log_ns'] != entries['log_ns']) | (sizes < 1)
+            | (offset + head_bytes + sizes > len(data))).any():
+        raise IndexFault('a message index does not describe its chunk')
+    begin = offset + head_bytes
+    raws: Raws
+    if (sizes == sizes[0]).all():
+        raws = _rows(data, begin, int(sizes[0]))
+    else:
+        raws = [data[first:last].tobytes()
+                for first, last in zip(begin.tolist(), (begin + sizes).tolist())]
+    return _Found(raws, entries['log_ns'], offset)
+
+
+def _rows(data: np.ndarray, begin: np.ndarray, size: int) -> np.ndarray:
+    """Return `size` bytes from each of the places, (n,), as rows, (n, size)."""
+    return np.lib.stride_tricks.sliding_window_view(data, size)[_even(begin)]
+
+
+def _put(data: np.ndarray, begin: np.ndarray, rows: np.ndarray) -> None:
+    """Copy rows, (n, size), to the places, (n,)."""
+    windows = np.lib.stride_tricks.sliding_window_view(data, rows.shape[1], writeable=True)
+    windows[_even(begin)] = rows
+
+
+def _even(begin: np.ndarray) -> slice | np.ndarray:
+    """Return rising places, (n,), as a slice where they are evenly spaced: it copies faster."""
+    steps = np.diff(begin)
+    if not len(steps) or steps[0] < 1 or (steps != steps[0]).any():
+        return begin
+    return slice(int(begin[0]), int(begin[-1]) + 1, int(steps[0]))
+
+
+class Batch(NamedTuple):
+    """
+    Messages of one topic and one length.
+
+    Attributes
+    ----------
+    connection
+        Their topic, as rosbags states it.
+    rows
+        Samples that they belong to, rising, (n,).
+    data
+        Their bytes, (n, size).
+
+    """
+
+    connection: Any
+    rows: np.ndarray
+    data: np.ndarray
+
+
+def write_messages(writer: Any, stamp_ns: np.ndarray, batches: Sequence[Batch]) -> None:
+    """
+    Append messages to an MCAP file, sample by sample, in chunks of their own.
+
+    Parameters
+    ----------
+    writer
+        The writer of rosbags, without compression.
+    stamp_ns
+        Stamps of the samples, ns, (n,), rising.
+    batches
+        Messages of the samples, in their order within a sample.
+
+    """
+    if writer.storage.chunk.msgs:
+        writer.storage.close_chunk()
+    sample_bytes = sum(batch.data.shape[1] + _MESSAGE_HEAD.itemsize for batch in batches)
+    step = max(_CHUNK_BYTES // sample_bytes, 1)
+    for begin in range(0, len(stamp_ns), step):
+        parts = []
+        for connection, rows, data in batches:
+            part = slice(*np.searchsorted(rows, (begin, begin + step)))
+            if len(rows[part]):
+                parts.append(Batch(connection, rows[part], data[part]))
+        if parts:
+            _write_chunk(writer, stamp_ns, parts)
+
+
+def _write_chunk(writer: Any, stamp_ns: np.ndarray, batches: list[Batch]) -> None:
+    """Append a chunk with its message indices; the arguments are those of `write_messages`."""
+    storage = writer.storage
+    # Schemas and channels of new topics wait in the open chunk of rosbags.
+    pending = storage.chunk.bio.getvalue()
+    storage.chunk.bio.seek(0)
+    storage.chunk.bio.truncate()
+    records, offsets = _records(stamp_ns, batches, len(pending))
+    content_bytes = len(pending) + len(records)
+    first, last = (int(stamp_ns[pick(batch.rows[end] for batch in batches)])
+                   for pick, end in ((min, 0), (max, -1)))
+    chunk_begin = storage.bio.tell()
+    storage.bio.write(_packed(_CHUNK_HEAD, _CHUNK, content_bytes + _CHUNK_HEAD.itemsize
+                              - _RECORD_HEAD_BYTES, first, last, content_bytes, 0, 0,
+                              content_bytes))
+    storage.bio.write(pending)
+    storage.bio.write(records)
+    chunk_end = storage.bio.tell()
+    places = b''
+    for channel in dict.fromkeys(batch.connection.id for batch in batches):
+        places += _packed(_PLACE, channel, storage.bio.tell())
+        entries = _entries(stamp_ns, [
+            (batch.rows, offset) for batch, offset in zip(batches, offsets)
+            if batch.connection.id == channel])
+        storage.bio.write(_packed(_INDEX_HEAD, _MESSAGE_INDEX, entries.nbytes
+                                  + _INDEX_HEAD.itemsize - _RECORD_HEAD_BYTES, channel,
+                                  entries.nbytes))
+        storage.bio.write(entries)
+    entry = BytesIO()
+    entry.write(_packed(_PLACES_HEAD, first, last, chunk_begin, chunk_end - chunk_begin,
+                        len(places)))
+    entry.write(places)
+    entry.write(_packed(_PLACES_END, storage.bio.tell() - chunk_end, 0, content_bytes,
+                        content_bytes))
+    storage.chunks.append(entry)
+    _count(writer, batches, first, last)
+
+
+def _entries(stamp_ns: np.ndarray, messages: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+    """
+    Make the message index of a channel.
+
+    Parameters
+    ----------
+    stamp_ns
+        Stamps of the samples, ns, (n,).
+    messages
+        Samples and places in the chunk of its messages, (k,) each, by batch.
+
+    Returns
+    -------
+    ndarray
+        The entries of all batches, in the order of their places.
+
+    """
+    rows, offset = map(np.concatenate, zip(*messages))
+    order = np.argsort(offset, kind='stable')  # fast where the places rise
+    entries = np.empty(len(order), _INDEX_ENTRY)
+    entries['log_ns'], entries['offset'] = stamp_ns[rows[order]], offset[order]
+    return entries
+
+
+def _count(writer: Any, batches: list[Batch], first_ns: int, last_ns: int) -> None:
+    """Count messages in what rosbags states at the end of the file; the times are in ns."""
+    storage = writer.storage
+    for batch in batches:
+        storage.channel_stats[batch.connection.id] += len(batch.rows)
+        writer.counts[batch.connection.id] += len(batch.rows)
+    storage.message_start_time = min(storage.message_start_time, first_ns)
+    storage.message_end_time = max(storage.message_end_time, last_ns)
+    writer.min_timestamp = min(writer.min_timestamp, first_ns)
+    writer.max_timestamp = max(writer.max_timestamp, last_ns)
+
+
+def _records(stamp_ns: np.ndarray, batches: list[Batch], begin: int
+             ) -> tuple[np.ndarray, list[np.ndarray]]:
+    """
+    Make the message records of a chunk, sample by sample.
+
+    Parameters
+    ----------
+    stamp_ns
+        Stamps of the samples, ns, (n,).
+    batches
+        The messages.
+    begin
+        Where the records begin in the chunk.
+
+    Returns
+    -------
+    records : ndarray
+        Their bytes, (size,).
+    offsets : list of ndarray
+        Where the records of each batch begin in the chunk.
+
+    """
+    lengths = [batch.data.shape[1] + _MESSAGE_HEAD.itemsize for batch in batches]
+    counts = [len(batch.rows) for batch in batches]
+    order = np.argsort(np.concatenate([batch.rows for batch in batches]), kind='stable')
+    stops = np.cumsum(np.repeat(lengths, counts)[order])
+    begins = np.empty(len(order), np.int64)
+    begins[order] = np.concatenate([[0], stops[:-1]])
+    places = np.split(begins, np.cumsum(counts)[:-1])
+    records = np.empty(stops[-1], np.uint8)
+    for batch, length, place in zip(batches, lengths, places):
+        head = np.array([(_MESSAGE, length - _RECORD_HEAD_BYTES, batch.connection.id, 0, 0, 0)],
+                        _MESSAGE_HEAD)
+        heads = head.repeat(len(place))
+        heads['log_ns'] = heads['publish_ns'] = stamp_ns[batch.rows]
+        _put(records, place, heads.view(np.uint8).reshape(len(place), -1))
+        _put(records, place + _MESSAGE_HEAD.itemsize, batch.data)
+    return records, [place + begin for place in places]
+
+
+def _packed(layout: np.dtype, *values: int) -> bytes:
+    """Return the bytes of one record."""
+    return np.array([values], layout).tobytes()

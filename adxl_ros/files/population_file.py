@@ -1,0 +1,133 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The file of a population: YAML with mean and spread of each coefficient over the units of a fleet.
+
+`fleet` writes it, and `fit --prior` and `diagnose --prior` read it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, fields
+import math
+import os
+from pathlib import Path
+from typing import Any
+
+from adxl_ros.errors import UserError
+from adxl_ros.files.atomic_write import write_text
+from adxl_ros.files.package_version import package_version
+from adxl_ros.model.population import PooledCoefficient, Population
+import yaml
+
+FORMAT = 1
+"""Version of the format. A file of another version is refused."""
+_DIGITS = 9
+"""Significant digits of the values (chosen: far below any uncertainty)."""
+_HEAD = """\
+# Mean and spread of each coefficient over the units of a fleet, written by fleet.
+# The name of a coefficient is its column of fleet.parquet, which ends in its unit.
+# prediction_std is the standard deviation of a further unit about the mean.
+# Use it: ros2 run adxl_ros fit NEW.mcap --prior {name} -o unit.yaml
+"""
+"""Comments at the begin of the file."""
+
+
+def write(path: str | os.PathLike, population: Population, far_out: Sequence[Mapping[str, Any]]
+          ) -> None:
+    """
+    Write a population.
+
+    Parameters
+    ----------
+    path
+        The file.
+    population
+        The population.
+    far_out
+        Units that are not of it: serial, coefficient, value and distance.
+
+    Raises
+    ------
+    UserError
+        The file cannot be written.
+
+    """
+    contents = {
+        'format': FORMAT, 'version': package_version(),
+        'coefficients': {name: {key: _rounded(value) for key, value in asdict(pooled).items()}
+                         for name, pooled in population.coefficients.items()},
+        'far_out': [{key: _rounded(value) for key, value in unit.items()} for unit in far_out]}
+    text = yaml.safe_dump(contents, sort_keys=False, allow_unicode=True, default_flow_style=None)
+    write_text(path, _HEAD.format(name=Path(path).name) + text)
+
+
+def _rounded(value: Any) -> Any:
+    return float(f'{value:.{_DIGITS}g}') if isinstance(value, float) else value
+
+
+def read(path: str | os.PathLike) -> Population:
+    """
+    Read and check a population.
+
+    Parameters
+    ----------
+    path
+        The file.
+
+    Returns
+    -------
+    Population
+        The population.
+
+    Raises
+    ------
+    UserError
+        The file cannot be read, is not YAML, or a value is missing or wrong.
+
+    """
+    try:
+        text = Path(path).read_text(encoding='utf-8')
+        contents = yaml.safe_load(text)
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else 'not UTF-8'
+        raise UserError(f'{path}: cannot be read: {reason}') from None
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark
+        place = f', line {mark.line + 1}, column {mark.column + 1}' if mark else ''
+        raise UserError(f'{path}{place}: not YAML: {error.problem}') from None
+    if not isinstance(contents, dict) or contents.get('format') != FORMAT \
+            or not isinstance(contents.get('coefficients'), dict):
+        raise UserError(f'{path}: no population of format {FORMAT}; give the population.yaml '
+                        'that fleet writes')
+    pooled = {str(name): _coefficient(f'{path}: coefficients.{name}', values)
+              for name, values in contents['coefficients'].items()}
+    return Population(Path(path).name, pooled)
+
+
+def _coefficient(place: str, values: Any) -> PooledCoefficient:
+    """Check one coefficient."""
+    if not isinstance(values, dict):
+        raise UserError(f'{place}: {values!r} is no mapping of mean, spread and others')
+    for field in fields(PooledCoefficient):
+        value = values.get(field.name)
+        if isinstance(value, bool) or not isinstance(value, (int, float)) \
+                or not math.isfinite(value):
+            raise UserError(f'{place}.{field.name}: {value!r} is no number')
+    if not values['prediction_std'] > 0:
+        raise UserError(f'{place}.prediction_std: {values["prediction_std"]!r} must be positive')
+    return PooledCoefficient(**{field.name: values[field.name]
+                                for field in fields(PooledCoefficient)})

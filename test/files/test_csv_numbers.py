@@ -1,0 +1,83 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The quick ways to read and write the numbers of CSV files do the same as the plain ways."""
+
+from adxl_ros.files import csv_numbers, csv_text
+from adxl_ros.files.csv_lines import Lines
+from adxl_ros.files.csv_numbers import Layout
+import numpy as np
+import pytest
+
+CELLS = ('', 'nan', 'NaN', '-nan', 'inf', '-Infinity', '+1.5', '1.', '.5', '1E+5', '1e400',
+         '1e-400', '0x10', '1_000', ' 1.5 ', '\t2', ' ', '"1.5"', 'text', '1e', 'NULL', 'nan(1)',
+         '1\x00', '-0', '5e-324', '2.2250738585072011e-308', '1.7976931348623159e308',
+         '9007199254740992.5', '1.00000000000000011102230246251565404236316680908203125',
+         '\ufeff1', '1\v', '1\xa0', '١')
+"""Fields that a parser may read in another way than Python."""
+
+
+def any_field(rng: np.random.Generator) -> str:
+    """Return a random field, mostly a number with up to 40 digits."""
+    kind = rng.integers(6)
+    if kind == 0:
+        return str(rng.choice(CELLS))
+    if kind == 1:
+        return f'{rng.normal() * 10.0 ** rng.integers(-300, 300):.{rng.integers(25)}e}'
+    if kind == 2:
+        return ''.join(rng.choice(list('0123456789'), rng.integers(1, 40))) + '.5'
+    return repr(float(rng.normal()))
+
+
+def same_bits(first: np.ndarray, second: np.ndarray) -> bool:
+    """Return whether two float64 arrays are equal, with NaN equal to NaN."""
+    return np.array_equal(first, second, equal_nan=True) and np.array_equal(
+        np.signbit(first[~np.isnan(first)]), np.signbit(second[~np.isnan(second)]))
+
+
+def test_both_parsers_read_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip('pyarrow')
+    monkeypatch.setattr(csv_numbers, '_ARROW_BYTES', 0)
+    rng = np.random.default_rng(8)
+    parsed = 0
+    for _ in range(2000):
+        rows = [','.join(any_field(rng) for _ in range(3)) for _ in range(2)]
+        lines = Lines('\n'.join([*rows, '']).encode(), range(1, 3), 1.0, False)
+        layout = Layout('a.csv', ('a', 'b', 'c'), ['a', 'c'], frozenset('ac'))
+        columns = csv_numbers._by_arrow(layout, lines)
+        if columns is not None:
+            parsed += 1
+            table = csv_numbers._field_by_field(layout, lines)
+            assert all(map(same_bits, columns.values(), table.T)), rows
+    assert parsed > 500
+
+
+def test_the_text_of_numbers_is_that_of_python() -> None:
+    pytest.importorskip('orjson')
+    rng = np.random.default_rng(9)
+    bits = rng.integers(0, 2 ** 64, 4000, dtype=np.uint64).view(float)
+    ties = (rng.integers(10 ** 11, 10 ** 12, 4000) * 10 + 5) / 10.0 ** rng.integers(1, 17, 4000)
+    edges = np.nextafter(10.0 ** rng.integers(-6, 18, 4000), rng.choice([-np.inf, np.inf], 4000))
+    special = rng.choice([0.0, -0.0, np.nan, np.inf, -np.inf, 1.0, 1e12, 5e-324], 4000)
+    plain = rng.normal(size=4000)
+    columns = [plain, bits, ties, edges, special, np.round(plain, 3)]
+
+    def text(value: float, form: str) -> str:
+        return '' if np.isnan(value) else form % value
+
+    for digits in (None, 12, 6):
+        forms = ['%r'] + [f'%.{digits}g' if digits else '%r'] * 5
+        expected = [','.join(map(text, row, forms)) for row in np.column_stack(columns).tolist()]
+        got = csv_text.rounded_rows(columns, digits) if digits else csv_text.exact_rows(columns)
+        assert got.decode().splitlines() == expected
