@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 import os
 
 from adxl_ros.calibrate.fits import (
@@ -51,6 +52,7 @@ from adxl_ros.model.coefficients import get, parameter_of
 from adxl_ros.model.constants import AXES, G0_MPS2, Z_90
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Coefficient
+from adxl_ros.model.population import Population, posterior
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals.filter_time_constant import FilterNoise, with_filter
 import numpy as np
@@ -205,7 +207,8 @@ class CalibrationResult:
 
 
 def calibrate(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str | None = None,
-              effects: Sequence[str] = (), data_sha256: str = '') -> CalibrationResult:
+              effects: Sequence[str] = (), data_sha256: str = '',
+              population: Population | None = None) -> CalibrationResult:
     """
     Fit the poses of one unit: against the stage where there are angles, else against gravity.
 
@@ -221,6 +224,8 @@ def calibrate(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str | 
         Further terms of the full model.
     data_sha256
         Hash of the recordings' files. Empty takes the hash of the poses.
+    population
+        Prior of zero-g and scale factor; None for the fit's own.
 
     Returns
     -------
@@ -233,7 +238,7 @@ def calibrate(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str | 
         The poses do not determine the model, or the recordings contradict each other.
 
     """
-    result = _calibrated(sensor, recordings, model, effects, data_sha256)
+    result = _calibrated(sensor, recordings, model, effects, data_sha256, population)
     lines = unit_errors.turn_on_lines(result.fitted, [item.poses for item in recordings])
     return _with_warnings(result, lines)
 
@@ -245,7 +250,8 @@ def _with_warnings(result: CalibrationResult, lines: Sequence[str]) -> Calibrati
 
 
 def _calibrated(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str | None,
-                effects: Sequence[str], data_sha256: str) -> CalibrationResult:
+                effects: Sequence[str], data_sha256: str, population: Population | None
+                ) -> CalibrationResult:
     """Fit against the stage, or against gravity; see `calibrate`."""
     poses = join_poses([recording.poses for recording in recordings])
     source = ', '.join(recording.source for recording in recordings)
@@ -253,7 +259,7 @@ def _calibrated(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str 
         model = model or ('full' if effects else None)
         referenced = [replace(recording, poses=recording.poses.subset(has_angles(recording.poses)))
                       for recording in recordings]
-        result = _against_stage(sensor, referenced, model, effects, data_sha256)
+        result = _against_stage(sensor, referenced, model, effects, data_sha256, population)
         return _with_warnings(result, _without_angles_lines(poses))
     if model not in (None, 'full'):
         raise UserError(f'{source}: the {model} model is fitted against stage angles (alpha_rad '
@@ -262,7 +268,7 @@ def _calibrated(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str 
     if sensor.axes != AXES:
         raise UserError(f'{source}: no stage angles and only the axes {sensor.axes}: the '
                         'magnitude of gravity needs x, y and z; record alpha_rad and beta_rad')
-    return _against_gravity(sensor, poses, source, data_sha256)
+    return _against_gravity(sensor, poses, source, data_sha256, population)
 
 
 def _without_angles_lines(poses: Poses) -> list[str]:
@@ -306,10 +312,13 @@ class _StageFit:
 
 
 def _against_stage(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str | None,
-                   effects: Sequence[str], data_sha256: str) -> CalibrationResult:
+                   effects: Sequence[str], data_sha256: str, population: Population | None
+                   ) -> CalibrationResult:
     poses = join_poses([recording.poses for recording in recordings])
     check_polarity(sensor, poses)
-    fit = _richest_fit(sensor, recordings, model, effects)
+    fit = _richest_fit(sensor, recordings, model, effects, population)
+    if population is not None:
+        fit = _with_population(fit, population)
     full, fitted = fit.full, fit.fitted
     fitting = np.flatnonzero(~poses.check)
     outliers = tuple(fitting[list(full.outliers)].tolist()) if full else ()
@@ -327,7 +336,7 @@ def _against_stage(sensor: Sensor, recordings: Sequence[RecordedPoses], model: s
     fitted = replace(fitted, envelope=envelope(fitted, force, poses, error_mps2))
     fitted = with_provenance(
         fitted, ', '.join(recording.source for recording in recordings), poses, data_sha256,
-        {'reference': 'stage', 'residual_mg': f'{residual_mg:.4f}',
+        {'reference': 'stage', **_prior_entry(population), 'residual_mg': f'{residual_mg:.4f}',
          **({'converged': _yes_or_no(full.converged)} if full else {}),
          **acceptance.provenance_entries(assessment, held_out)})
     explanation = acceptance.explanation(assessment, fitted) if assessment else []
@@ -341,6 +350,19 @@ def _against_stage(sensor: Sensor, recordings: Sequence[RecordedPoses], model: s
         summary_lines=[*acceptance.headline(assessment, held_out), *unit_lines,
                        *acceptance.narrow_table(assessments, held_out), *explanation,
                        *fit_lines, *fit.refusals])
+
+
+def _with_population(fit: _StageFit, population: Population) -> _StageFit:
+    """Combine a fit with the population of the unit, those of cross-validation as well."""
+    combined = posterior(fit.fitted, population)
+
+    def refit(sensor: Sensor, poses: Poses) -> Sensor:
+        fitted = fit.refit(sensor, poses)
+        return fitted if combined.is_stranger else posterior(fitted, population).sensor
+
+    line = f'prior: {combined.line}'
+    return replace(fit, fitted=combined.sensor, refit=refit, warnings=[*fit.warnings, line],
+                   report_lines=[*fit.report_lines, line])
 
 
 def _assessed(sensor: Sensor, inliers: Poses, fit: _StageFit
@@ -360,8 +382,10 @@ def _assessed(sensor: Sensor, inliers: Poses, fit: _StageFit
 
 
 def _richest_fit(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str | None,
-                 effects: Sequence[str]) -> _StageFit:
-    """Fit the given model, or the richest one that the poses determine."""
+                 effects: Sequence[str], population: Population | None) -> _StageFit:
+    """Fit the given model, or the richest one that the poses and the population determine."""
+    if model == 'linear' and population is not None:
+        return _fit_open(sensor, recordings, population)
     if model:
         return _fit(model, sensor, recordings, effects)
     refusals: list[str] = []
@@ -373,6 +397,8 @@ def _richest_fit(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str
     if sensor.axes == AXES and not effects:
         with suppress(UserError):
             return _fit_affine(sensor, recordings)
+    if population is not None:
+        return replace(_fit_open(sensor, recordings, population), refusals=refusals)
     return replace(_fit('linear', sensor, recordings, effects), refusals=refusals)
 
 
@@ -395,6 +421,22 @@ def _fit_affine(sensor: Sensor, recordings: Sequence[RecordedPoses]) -> _StageFi
 
     return _StageFit(full.fitted, refit, [*lines, *full_fit_text.report_lines(full, poses, [])],
                      warnings=[*lines, *full_fit_text.warnings(full, poses)], full=full)
+
+
+def _fit_open(sensor: Sensor, recordings: Sequence[RecordedPoses], population: Population
+              ) -> _StageFit:
+    """Fit the linear model to poses that may leave to the population what it has."""
+    poses = join_poses([recording.poses for recording in recordings])
+    axes = {name.axis for name in population.prior(sensor).names if name.effect == 'scale_factor'}
+    fit_line = partial(linear.fit, may_be_open=set(sensor.axes) <= axes)
+    fitted = fit_line(sensor, poses.subset(~poses.check))
+    combined = posterior(fitted, population)
+    if not combined.is_stranger:
+        return _StageFit(fitted, fit_line)
+    try:
+        return _fit('linear', sensor, recordings, ())
+    except UserError as error:
+        raise UserError(f'{error}; {combined.line}') from None
 
 
 def _fit(model: str, sensor: Sensor, recordings: Sequence[RecordedPoses], effects: Sequence[str]
@@ -423,8 +465,8 @@ def _rms_residual_mg(fitted: Sensor, poses: Poses) -> float:
     return float(np.sqrt(np.mean(residual ** 2)))
 
 
-def _against_gravity(sensor: Sensor, poses: Poses, source: str, data_sha256: str
-                     ) -> CalibrationResult:
+def _against_gravity(sensor: Sensor, poses: Poses, source: str, data_sha256: str,
+                     population: Population | None) -> CalibrationResult:
     fit = gravity.fit_gravity(poses.volts, poses.std_v, sensor)
     kept = np.setdiff1d(np.arange(len(poses)), fit.outliers)
     before, after, leave_one_out = (_rms_mg(values[kept]) for values in (
@@ -432,23 +474,28 @@ def _against_gravity(sensor: Sensor, poses: Poses, source: str, data_sha256: str
     fitted = replace(
         sensor, model='gravity', effects=('bias', 'scale_factor', 'misalignment'),
         values=fit.values, covariance=fit.covariance, covariance_names=gravity.NAMES)
+    prior_lines: list[str] = []
+    if population is not None:
+        combined = posterior(fitted, population)
+        fitted, prior_lines = combined.sensor, [f'prior: {combined.line}']
     force = np.column_stack(signal_chain.inverse(fitted)(list(poses.volts.T), poses.environment))
     budgets = error_budget.gravity_error_budgets(fit, fitted, force, kept)
     assessment = acceptance.assess('gravity', budgets, fitted)
     fitted = replace(fitted, envelope=envelope(fitted, force[kept], poses,
                                                float(np.sqrt(budgets.accel.model))))
     fitted = with_provenance(fitted, source, poses, data_sha256, {
-        'reference': 'gravity', 'residual_mg': f'{after:.4f}',
+        'reference': 'gravity', **_prior_entry(population), 'residual_mg': f'{after:.4f}',
         'leave_one_out_mg': f'{leave_one_out:.4f}', 'converged': _yes_or_no(fit.converged),
         **acceptance.provenance_entries(assessment, ())})
     lines = [f'magnitude of gravity over {len(kept)} rests, rms in mg: nominal {before:.2f}, '
              f'nine parameters {after:.3f}, leave-one-out {leave_one_out:.3f}',
              *_gravity_fit_lines(fit, poses),
              acceptance.gravity_line(assessment, fit.leave_one_out_mps2[kept]),
-             *acceptance.explanation(assessment, fitted), *acceptance.unit_line(fitted)]
+             *acceptance.explanation(assessment, fitted), *acceptance.unit_line(fitted),
+             *prior_lines]
     return CalibrationResult(
         nominal=sensor, fitted=fitted, poses=poses, assessments=(assessment,), gravity_fit=fit,
-        warnings=tuple(_gravity_fit_lines(fit, poses)),
+        warnings=(*_gravity_fit_lines(fit, poses), *prior_lines),
         report_lines=lines, summary_lines=[*acceptance.headline(assessment, ()), *lines])
 
 
@@ -485,6 +532,11 @@ def _labelled(sensor: Sensor, effect: str, parameter: str) -> tuple[str, np.ndar
     if (effect, parameter) == ('scale_factor', 'offset_v_per_g'):
         return 'scale factor', sensor.scale_v_per_g
     return f'{effect}.{parameter}', sensor.values[effect][parameter]
+
+
+def _prior_entry(population: Population | None) -> dict[str, str]:
+    """Return the entry of the provenance that names a prior; none without one."""
+    return {} if population is None else {'prior': population.name}
 
 
 def _yes_or_no(condition: bool) -> str:

@@ -22,7 +22,7 @@ from adxl_ros.calibrate import pose_response
 from adxl_ros.calibrate.fits.full_model import FullFit
 from adxl_ros.calibrate.poses import Poses, reference_force
 from adxl_ros.errors import UserError
-from adxl_ros.model import signal_chain
+from adxl_ros.model import analog_stages, signal_chain
 from adxl_ros.model.constants import AXES
 import numpy as np
 
@@ -83,7 +83,7 @@ def _turn_and_shifts(full: FullFit, poses: Poses) -> tuple[np.ndarray, np.ndarra
     unit = full.unit
     force = reference_force(poses, unit.local_gravity_mps2)
     by_force = np.moveaxis(signal_chain.jacobian(
-        signal_chain.analog_response(unit), force, poses.environment), 2, 0)
+        analog_stages.analog_response(unit), force, poses.environment), 2, 0)
     turned = np.stack([np.cross(axis, np.column_stack(force)) for axis in np.eye(3)], axis=2)
     shifted = np.broadcast_to(np.diag(unit.scale_v_per_g),
                               (len(poses), len(unit.axes), len(unit.axes)))

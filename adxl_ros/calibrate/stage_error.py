@@ -36,7 +36,7 @@ from typing import NamedTuple
 
 from adxl_ros.calibrate.poses import Poses
 import numpy as np
-from scipy.linalg import solve_triangular
+import scipy
 
 _MIN_VARIANCE_RAD2 = 1e-24
 """Smallest variance of an angle as a divisor, rad². Chosen: avoids 0/0 on a perfect stage."""
@@ -162,7 +162,7 @@ class PoseCovariance:
             np.eye(self._shared) + self._white_settings.T @ self._white_settings)
 
     def _solve_settings(self, products: np.ndarray) -> np.ndarray:
-        return solve_triangular(self._settings_root, products, lower=True)
+        return scipy.linalg.solve_triangular(self._settings_root, products, lower=True)
 
     def whiten_by_pose(self, columns: np.ndarray) -> np.ndarray:
         """Whiten columns by the blocks only, (k, m, c) to (k·m, c); 0 for poses without weight."""
@@ -231,7 +231,8 @@ class PoseCovariance:
         """
         by_setting = self._solve_settings(
             self._white_settings.T @ self.whiten_by_pose(residual[:, :, None]))
-        factor = solve_triangular(self._settings_root, by_setting, lower=True, trans=1)[:, 0]
+        factor = scipy.linalg.solve_triangular(self._settings_root, by_setting, lower=True,
+                                               trans=1)[:, 0]
         setting = np.append(self._error.setting_rad * factor, 0.0)[self._number]
         white = (self._whitening @ (residual - self._settings @ factor)[:, :, None])[:, :, 0]
         weighted = np.swapaxes(self._whitening, 1, 2) @ white[:, :, None]

@@ -46,3 +46,33 @@ def with_half_width(value: float, half_width: float) -> str:
     """
     places = decimals(half_width)
     return f'{round(value, places) + 0.0:.{places}f} +- {half_width:.{places}f}'
+
+
+def counted(number: int, noun: str) -> str:
+    """
+    Return a number of things.
+
+    Parameters
+    ----------
+    number
+        The number.
+    noun
+        Its noun, whose plural ends in s.
+
+    Returns
+    -------
+    str
+        Both.
+
+    """
+    return f'{number} {noun}{"" if number == 1 else "s"}'
+
+
+def duration(seconds: float) -> str:
+    """Return a time with two units at most, for people."""
+    seconds = round(seconds, 3)
+    for unit_s, unit, smaller_s, smaller in ((86400, 'd', 3600, 'h'), (3600, 'h', 60, 'min')):
+        if round(seconds) >= unit_s:
+            count, rest = divmod(round(seconds / smaller_s), round(unit_s / smaller_s))
+            return f'{count} {unit} {rest} {smaller}' if rest else f'{count} {unit}'
+    return f'{seconds / 60:.3g} min' if seconds >= 120 else f'{seconds:.3g} s'

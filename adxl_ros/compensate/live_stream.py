@@ -18,7 +18,6 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
-from math import cos, sin
 from typing import Any, NamedTuple
 
 from adxl_ros.compensate import filter_inversion
@@ -28,8 +27,9 @@ from adxl_ros.files.cdr import CdrError
 from adxl_ros.model import noise
 from adxl_ros.model.effects.base import Components
 from adxl_ros.model.mounting import Mounting
+from adxl_ros.model.scalar_or_array import FLOATS
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.model.tilt import UNOBSERVABLE_RAD2
+from adxl_ros.model.tilt import quaternion, UNOBSERVABLE_RAD2
 import numpy as np
 
 UNKNOWN_ANGLE_RAD2 = 1e6
@@ -264,9 +264,7 @@ class LiveStream:
             variances.append(variance if observable else UNKNOWN_ANGLE_RAD2)
         roll, pitch, _ = variances
         both = estimate.roll_pitch if max(roll, pitch) < UNKNOWN_ANGLE_RAD2 else 0.0
-        half_roll, half_pitch = self._angles_rad[0] / 2, self._angles_rad[1] / 2
-        sr, cr, sp, cp = sin(half_roll), cos(half_roll), sin(half_pitch), cos(half_pitch)
-        return (sr * cp, cr * sp, -sr * sp, cr * cp,
+        return (*quaternion(self._angles_rad[0], self._angles_rad[1], FLOATS),
                 roll, both, 0.0, both, pitch, 0.0, 0.0, 0.0, UNKNOWN_ANGLE_RAD2)
 
 

@@ -23,7 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from adxl_ros.model import signal_chain
+from adxl_ros.model import analog_stages, signal_chain
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.effects.base import (
     Components,
@@ -70,8 +70,8 @@ def inverse(sensor: Sensor, z_sign: np.ndarray | None = None, maths: Maths = ARR
     gravity_g = signal_chain.gravity_mps2(sensor) / G0_MPS2
     up: Value = sensor.z_sign if z_sign is None else z_sign
     directions = _directions(sensor)
-    element = signal_chain.effects_at(sensor, Place.ELEMENT, True)
-    electronics = signal_chain.effects_at(sensor, Place.ELECTRONICS, True)
+    element = analog_stages.effects_at(sensor, Place.ELEMENT, True)
+    electronics = analog_stages.effects_at(sensor, Place.ELECTRONICS, True)
     zero_g_v = sensor.nominal_zero_g_v.tolist()
     scale_v_per_g = sensor.nominal_scale_v_per_g.tolist()
 
@@ -86,7 +86,7 @@ def inverse(sensor: Sensor, z_sign: np.ndarray | None = None, maths: Maths = ARR
                           scale_v_per_g=list(scale_v_per_g))
         for apply, values in electronics:
             apply(signals, values)
-        return signal_chain.output_volts(signals)
+        return analog_stages.output_volts(signals)
 
     def invert(volts: Components, environment: Environment = NOMINAL_ENVIRONMENT) -> Components:
         at_0_g = converted([0.0 * volts[0]] * 3, environment)
@@ -123,6 +123,6 @@ def _away_from_zero(value: Value) -> Value:
 def _directions(sensor: Sensor) -> list[list[float]]:
     """Return the rows Θ of the sensing axes, (18) and (19), by the effects of the mounting."""
     signals = Signals(NOMINAL_ENVIRONMENT, sensed=[np.array(row) for row in np.eye(3)])
-    for apply, values in signal_chain.effects_at(sensor, Place.MOUNTING, True):
+    for apply, values in analog_stages.effects_at(sensor, Place.MOUNTING, True):
         apply(signals, values)
     return [np.asarray(row).tolist() for row in signals.sensed]

@@ -23,7 +23,7 @@ from adxl_ros.compensate import filter_inversion, paper_inverse
 from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model import noise, signal_chain
-from adxl_ros.model.covariance import force_covariance, leverage
+from adxl_ros.model.covariance import prepared_covariance
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import (
     ActsOn,
@@ -51,20 +51,26 @@ class Estimates:
         Specific force in the case frame, m/s², (3, n).
     force_std_mps2
         Standard deviations of the force, m/s², (3, n).
+    covariance
+        Covariance of the force, (m/s²)², (3, 3, n); very large for an axis that is not measured.
     tilt
         Angles of the samples with their standard deviations, rad, (n,) each.
     at_rail
         Whether the ADC was at a rail, (n,).
     outside
         Whether temperature or force lie outside of the validity range, (n,).
+    volts
+        Volts of the ADC, V, (n, m).
 
     """
 
     force_mps2: np.ndarray
     force_std_mps2: np.ndarray
+    covariance: np.ndarray
     tilt: Tilt
     at_rail: np.ndarray
     outside: np.ndarray
+    volts: np.ndarray
 
     @property
     def unsolved(self) -> np.ndarray:
@@ -106,24 +112,23 @@ class RecordingEstimator:
         self._sensor, self._undo_filter = sensor, undo_filter
         self._begin_s = float(first.time_s[0])
         self._inverse = (paper_inverse if paper else signal_chain).inverse(sensor)
-        self._leverage = leverage(sensor)
-        self._variance_v2 = filter_inversion.noise_variance_v2(sensor) if undo_filter else None
+        self._covariance = prepared_covariance(
+            sensor, filter_inversion.noise_variance_v2(sensor) if undo_filter else None)
 
     def blocks(self, recording: Iterable[Recording]) -> Iterator[tuple[Recording, Estimates]]:
         """Yield each block of the recording with its estimates."""
-        for block, volts in self._with_volts(recording):
-            at_rail = signal_chain.at_a_rail(block.volts(self._sensor), self._sensor)
-            yield block, self._estimate(volts, at_rail, self._environment(block))
+        measured = ((block, block.volts(self._sensor)) for block in recording)
+        for (block, volts), input_v in self._before_filter(measured):
+            yield block, self._estimate(volts, input_v, self._environment(block))
 
-    def _with_volts(self, recording: Iterable[Recording]
-                    ) -> Iterator[tuple[Recording, np.ndarray]]:
-        """Return blocks with their volts, (n, m), without the RC filter if it is undone."""
-        sensor = self._sensor
+    def _before_filter(self, measured: Iterable[tuple[Recording, np.ndarray]]
+                       ) -> Iterator[tuple[tuple[Recording, np.ndarray], np.ndarray]]:
+        """Return blocks and volts, (n, m), with the volts before the RC filter if it is undone."""
         if not self._undo_filter:
-            return ((block, block.volts(sensor)) for block in recording)
+            return ((pair, pair[1]) for pair in measured)
         return filter_inversion.undo_blocks(
-            ((block, block.time_s, block.volts(sensor)) for block in recording),
-            noise.electronics(sensor).rc_s, sensor.rate_hz)
+            ((pair, pair[0].time_s, pair[1]) for pair in measured),
+            noise.electronics(self._sensor).rc_s, self._sensor.rate_hz)
 
     def _environment(self, block: Recording) -> Environment:
         """Return the surroundings of the samples; nominal where they are not measured."""
@@ -136,16 +141,16 @@ class RecordingEstimator:
                     **{name: np.where(np.isfinite(values), values, nominal)})
         return environment
 
-    def _estimate(self, volts: np.ndarray, at_rail: np.ndarray, environment: Environment
+    def _estimate(self, volts: np.ndarray, input_v: np.ndarray, environment: Environment
                   ) -> Estimates:
-        """Estimate from volts, V, (n, m); samples at a rail, (n,), determine no quantity."""
+        """Estimate from volts of the ADC and before the filter; rails determine no quantity."""
         sensor = self._sensor
+        at_rail = signal_chain.at_a_rail(volts, sensor)
         with np.errstate(all='ignore'):  # some volts have no solution
-            force = self._inverse(list(volts.T), environment)
-            covariance = force_covariance(sensor, force, self._variance_v2, environment)
+            force = self._inverse(list(input_v.T), environment)
+            covariance, leverage = self._covariance(force, environment)
             outside = np.isfinite(force[0]) & sensor.envelope.is_outside(
-                environment.temperature_c, force,
-                self._leverage(force) if sensor.envelope.leverage else 0.0)
+                environment.temperature_c, force, leverage)
             covariance[:, :, at_rail] = np.inf
             angles = tilt(force, covariance, 'z' in sensor.axes)
         force_mps2 = np.array(force)
@@ -153,7 +158,7 @@ class RecordingEstimator:
         if sensor.axes == 'x':
             force_mps2[1:] = np.nan
         force_std_mps2[np.isnan(force_mps2)] = np.inf
-        return Estimates(force_mps2, force_std_mps2, angles, at_rail, outside)
+        return Estimates(force_mps2, force_std_mps2, covariance, angles, at_rail, outside, volts)
 
 
 def effects_left(sensor: Sensor, undo_filter: bool) -> list[Effect]:

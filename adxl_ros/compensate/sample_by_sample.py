@@ -20,11 +20,10 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from adxl_ros.compensate import filter_inversion, paper_inverse
-from adxl_ros.model import noise, signal_chain
+from adxl_ros.model import analog_stages, noise, signal_chain
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.covariance import (
     derived_z_covariance,
-    leverage,
     measured_covariance,
     UNMEASURED_VARIANCE,
 )
@@ -159,7 +158,7 @@ class LiveEstimator:
         self._zero_g_v = sensor.nominal_zero_g_v.tolist()
         self._v_per_mps2 = (sensor.nominal_scale_v_per_g / G0_MPS2).tolist()
         self._rails = (0.0, sensor.adc_vref_v - sensor.lsb_v, sensor.lsb_v / 2)
-        self._respond = signal_chain.analog_response(sensor)
+        self._respond = analog_stages.analog_response(sensor)
         self._undo_adc = signal_chain.adc_inverse(sensor)
         self._newton_step = signal_chain.newton_step(
             sensor.axes, signal_chain.gravity_mps2(sensor), sensor.z_sign, FLOATS)
@@ -267,7 +266,7 @@ class LiveEstimator:
     def _use(self, sensor: Sensor) -> None:
         """Take covariance and validity range from the unit, with or without temperature range."""
         self._measured_covariance = measured_covariance(sensor, self._variance_v2)
-        self._leverage, self._envelope = leverage(sensor), sensor.envelope
+        self._envelope = sensor.envelope
         self._knows_temperature = sensor is self.sensor
 
     def _inverse(self, volts: Components) -> Components | None:
@@ -353,9 +352,9 @@ class LiveEstimator:
 
     def _new_cell(self, middle: Components) -> _Cell:
         """Compute the cell around a force, m/s², three floats."""
-        measured, tangent = self._measured_covariance(middle, self._environment)
+        measured, tangent, leverage = self._measured_covariance(middle, self._environment)
         outside = self._envelope.describe_outside(self._environment.temperature_c, middle,
-                                                  float(self._leverage(middle)[0]))
+                                                  float(leverage[0]))
         covariance = np.diag([0.0, UNMEASURED_VARIANCE, UNMEASURED_VARIANCE])
         axes = [AXES.index(axis) for axis in self.sensor.axes]
         covariance[np.ix_(axes, axes)] = measured[:, :, 0]

@@ -40,8 +40,7 @@ from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import Sensor, with_axes
 from adxl_ros.reproduction import error_statistics
 import numpy as np
-from scipy.special import ndtr
-from scipy.stats import beta, chisquare
+import scipy
 
 STAGES = ('errors per pose', 'errors per setting', 'eccentric', 'tilted base')
 """Errors of a joint are new with each pose, or with each move; the last two are per setting."""
@@ -241,8 +240,8 @@ def interval(inside: int, count: int) -> tuple[float, float]:
         Ends of the interval.
 
     """
-    low = beta.ppf(0.05, inside, count - inside + 1) if inside else 0.0
-    high = beta.ppf(0.95, inside + 1, count - inside) if inside < count else 1.0
+    low = scipy.stats.beta.ppf(0.05, inside, count - inside + 1) if inside else 0.0
+    high = scipy.stats.beta.ppf(0.95, inside + 1, count - inside) if inside < count else 1.0
     return float(low), float(high)
 
 
@@ -320,7 +319,7 @@ def _several(label: str, parts: Sequence[np.ndarray]) -> str:
 
 def _row(label: str, share: float, share_interval: tuple[float, float], z: np.ndarray) -> str:
     low, high = (100 * end for end in share_interval)
-    counts = np.histogram(ndtr(z), BINS, (0, 1))[0]
+    counts = np.histogram(scipy.special.ndtr(z), BINS, (0, 1))[0]
     return (f'| {label} | {100 * share:.1f} ({low:.1f} to {high:.1f}) | '
             f'{np.sqrt(np.mean(z ** 2)):.2f} | {" ".join(map(str, counts))} | '
-            f'{chisquare(counts).pvalue:.2f} |')
+            f'{scipy.stats.chisquare(counts).pvalue:.2f} |')

@@ -32,7 +32,7 @@ from adxl_ros.model.effects.base import Components
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.model.tilt import tilt
 import numpy as np
-from scipy.signal import butter, lfilter
+import scipy
 
 MAX_BOUND_RAD = np.radians(1.0)
 """Largest bound of an angle, rad, at which a pose counts; chosen."""
@@ -246,15 +246,15 @@ def motion_errors(fitted: Sensor, time_s: np.ndarray, volts: np.ndarray, referen
     unfiltered = filter_inversion.undo(volts, time_s, noise.electronics(fitted).rc_s,
                                        fitted.rate_hz)
     estimate = signal_chain.inverse(fitted)(list(unfiltered.T))[0]
-    b, a = butter(_BUTTERWORTH_ORDER, _BUTTERWORTH_HZ, fs=fitted.rate_hz)
-    smooth, expected = lfilter(b, a, estimate), lfilter(b, a, reference_mps2)
+    b, a = scipy.signal.butter(_BUTTERWORTH_ORDER, _BUTTERWORTH_HZ, fs=fitted.rate_hz)
+    smooth, expected = (scipy.signal.lfilter(b, a, v) for v in (estimate, reference_mps2))
     residual = 1e3 * (smooth - expected)[time_s > _SETTLED_S]
     return MotionErrors(float(residual.std()), float(residual.mean())), smooth, expected
 
 
 def motion_bound_mmps2(nominal: Sensor) -> float:
     """Return the floor of the motion experiment, mm/s²: white noise after the Butterworth."""
-    b, a = butter(_BUTTERWORTH_ORDER, _BUTTERWORTH_HZ, fs=nominal.rate_hz)
-    impulse = lfilter(b, a, np.eye(1, round(nominal.rate_hz))[0])
+    b, a = scipy.signal.butter(_BUTTERWORTH_ORDER, _BUTTERWORTH_HZ, fs=nominal.rate_hz)
+    impulse = scipy.signal.lfilter(b, a, np.eye(1, round(nominal.rate_hz))[0])
     density = nominal.noise_density_g_per_rthz[0] * G0_MPS2
     return float(1e3 * density * np.sqrt(nominal.rate_hz / 2 * np.sum(impulse ** 2)))

@@ -53,7 +53,7 @@ from adxl_ros.model.effects.base import Coefficient, Parameter, Place, Role
 from adxl_ros.model.gauss_newton import gauss_newton, halve_until, Iterate, Solution
 from adxl_ros.model.sensor import Sensor
 import numpy as np
-from scipy.special import chdtri
+import scipy
 
 TERMS = ('bias', 'scale_factor', 'misalignment', 'cross_axis', 'cross_axis_z', 'scale_factor_z',
          'nonlinearity')
@@ -401,7 +401,8 @@ def _round(state: _State, problem: _Problem, number: int) -> tuple[_State, float
 def _inliers(about: Linearised, stage: StageError) -> np.ndarray:
     """Mark the poses that are no outliers, (k,) bool; all poses if too many are outliers."""
     errors = about.covariance(stage).predicted_errors(about.residual)
-    kept = errors.squared_distances < chdtri(about.residual.shape[1], _OUTLIER_CHANCE)
+    kept = errors.squared_distances < scipy.special.chdtri(
+        about.residual.shape[1], _OUTLIER_CHANCE)
     return kept if kept.mean() >= 1 - _MAX_OUTLIERS else np.ones(len(kept), bool)
 
 
@@ -499,7 +500,7 @@ def fisher_information(unit: Sensor, poses: Poses, names: Sequence[Coefficient],
 
     """
     about = linearised(unit, poses, names, prior_precision(names))
-    return about.solve(about.covariance(stage))[1]
+    return about.information(about.covariance(stage))
 
 
 @dataclass(frozen=True)

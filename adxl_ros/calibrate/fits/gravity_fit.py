@@ -23,12 +23,15 @@ magnitude. The gauge therefore holds Θx on the case's x and Θy in its x-y plan
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from typing import NamedTuple
 
 from adxl_ros.calibrate.fits.gravity_model import (
     effect_values,
     fisher_information,
+    linearised,
     magnitude,
     magnitude_jacobian,
     magnitude_variance,
@@ -45,13 +48,21 @@ from adxl_ros.errors import UserError
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.sensor import Sensor
 import numpy as np
-from scipy.optimize import brentq, least_squares
-from scipy.special import gammaln, stdtrit
+import scipy
 
 MIN_RESTS = len(NAMES) + 1
 """Smallest count of rests: one more than coefficients, so that residuals show the error."""
 _TOLERANCE = 1e-12
-"""Relative tolerance of `least_squares` in cost, parameters and gradient."""
+"""Relative tolerance of `leastsq` in cost, parameters and gradient."""
+_UNSCALED = np.ones(len(NAMES))
+"""Weights of the parameters in the trust region of `leastsq`: none."""
+_CONVERGED = (1, 2, 3, 4)
+"""States of `leastsq` in which it has converged (MINPACK, lmder)."""
+_NEARBY_STEPS = 8
+"""Gauss-Newton steps from a fit to a similar one, such as that without a rest; chosen: three
+suffice."""
+_NEARBY_STEP = 1e-10
+"""Largest component of a last step, after which the next one is below rounding."""
 _MAX_ROUNDS = 20
 """Largest count of rounds of parameters and excess variance."""
 _EXCESS_TOLERANCE = 1e-6
@@ -169,8 +180,9 @@ def fit_gravity(mean_v: np.ndarray, std_v: np.ndarray, sensor: Sensor) -> Gravit
     rests = nominal_rests(mean_v, std_v, sensor)
     nominal = np.zeros(len(NAMES))
     _require_determined(rests, nominal, 0.0)
-    kept = _inliers(rests, nominal)
-    parameters, excess_g2, converged = _fit(rests[kept], nominal)
+    fit = _subset_fits(rests, nominal)
+    kept = _inliers(rests, nominal, fit)
+    parameters, excess_g2, converged = fit(kept)
     _require_determined(rests[kept], parameters, excess_g2)
     variance = magnitude_variance(rests, parameters) + excess_g2
     covariance = np.linalg.inv(fisher_information(rests[kept], parameters, excess_g2))
@@ -190,7 +202,7 @@ def fit_gravity(mean_v: np.ndarray, std_v: np.ndarray, sensor: Sensor) -> Gravit
 
 
 def _residual(rests: NominalRests, parameters: np.ndarray) -> np.ndarray:
-    """Return magnitude minus local gravity, g, (k,)."""
+    """Return magnitude minus local gravity, g, (k,), or (s, k) for s sets of parameters."""
     return magnitude(rests.mean, parameters) - rests.gravity_g
 
 
@@ -198,24 +210,39 @@ def _solve(rests: NominalRests, start: np.ndarray, variance: np.ndarray
            ) -> tuple[np.ndarray, bool]:
     """Fit with given variances of the magnitudes, g², (k,); also return whether it converged."""
     std = np.sqrt(variance)
-    solution = least_squares(lambda p: _residual(rests, p) / std, start,
-                             lambda p: magnitude_jacobian(rests.mean, p) / std[:, None],
-                             method='lm', xtol=_TOLERANCE, ftol=_TOLERANCE, gtol=_TOLERANCE)
-    return solution.x, bool(solution.success)
+    # `least_squares` calls the same routine of MINPACK, and takes twice the time around it.
+    parameters, _, _, _, status = scipy.optimize.leastsq(
+        lambda p: _residual(rests, p) / std, start,
+        Dfun=lambda p: magnitude_jacobian(rests.mean, p) / std[:, None],
+        full_output=True, xtol=_TOLERANCE, ftol=_TOLERANCE, gtol=_TOLERANCE, diag=_UNSCALED)
+    return parameters, status in _CONVERGED
 
 
 def _fit(rests: NominalRests, start: np.ndarray) -> _Estimate:
     """Fit the parameters, and the excess variance that makes χ² equal its degrees of freedom."""
     parameters, excess_g2 = start, 0.0
     freedom = len(rests.mean) - len(NAMES)
-    for _ in range(_MAX_ROUNDS):
+    for number in range(_MAX_ROUNDS):
         variance = magnitude_variance(rests, parameters)
-        parameters, solved = _solve(rests, parameters, variance + excess_g2)
+        solve = _solve_nearby if number else _solve
+        parameters, solved = solve(rests, parameters, variance + excess_g2)
         squares = _residual(rests, parameters) ** 2
         before_g2, excess_g2 = excess_g2, _excess(squares, variance, freedom)
         if abs(excess_g2 - before_g2) <= _EXCESS_TOLERANCE * (excess_g2 + variance.min()):
             return _Estimate(parameters, excess_g2, solved)
     return _Estimate(parameters, excess_g2, False)
+
+
+def _subset_fits(rests: NominalRests, start: np.ndarray) -> Callable[[np.ndarray], _Estimate]:
+    """Return a function that fits the rests of a mask, (k,) bool, once for each mask."""
+    @cache
+    def fit(mask: bytes) -> _Estimate:
+        return _fit(rests[np.frombuffer(mask, bool)], start)
+
+    def fit_kept(kept: np.ndarray) -> _Estimate:
+        return fit(kept.tobytes())
+
+    return fit_kept
 
 
 def _excess(squares: np.ndarray, variance: np.ndarray, freedom: int) -> float:
@@ -224,7 +251,8 @@ def _excess(squares: np.ndarray, variance: np.ndarray, freedom: int) -> float:
         return float((squares / (variance + excess_g2)).sum()) - freedom
     if surplus(0.0) <= 0:
         return 0.0
-    return float(brentq(surplus, 0.0, squares.sum() / freedom, rtol=1e-9, xtol=1e-30))
+    return float(scipy.optimize.brentq(surplus, 0.0, squares.sum() / freedom, rtol=1e-9,
+                                       xtol=1e-30))
 
 
 def _t_factor(excess_g2: float, variance: np.ndarray) -> float:
@@ -234,7 +262,8 @@ def _t_factor(excess_g2: float, variance: np.ndarray) -> float:
     return 1 + excess_g2 / variance.mean() * 2 / max(freedom - 2, 1)
 
 
-def _inliers(rests: NominalRests, start: np.ndarray) -> np.ndarray:
+def _inliers(rests: NominalRests, start: np.ndarray, fit: Callable[[np.ndarray], _Estimate]
+             ) -> np.ndarray:
     """
     Mark the rests that fit the others, (k,) bool.
 
@@ -247,19 +276,19 @@ def _inliers(rests: NominalRests, start: np.ndarray) -> np.ndarray:
     everything = np.ones(count, bool)
     if max_outliers < 1:
         return everything
-    results = [_exchanged(rests, begin, start, max_outliers)
+    results = [_exchanged(rests, begin, fit, max_outliers)
                for begin in (everything, _robust_inliers(rests, start, max_outliers))]
-    return min(results, key=lambda kept: _negative_log_likelihood(rests, kept, start))
+    return min(results, key=lambda kept: _negative_log_likelihood(rests, kept, fit))
 
 
-def _exchanged(rests: NominalRests, kept: np.ndarray, start: np.ndarray, max_outliers: int
-               ) -> np.ndarray:
+def _exchanged(rests: NominalRests, kept: np.ndarray, fit: Callable[[np.ndarray], _Estimate],
+               max_outliers: int) -> np.ndarray:
     """Let rests leave or return until each kept rest fits and each other does not, (k,) bool."""
     kept = kept.copy()
     for _ in range(2 * max_outliers):
-        distance = _studentised(rests, kept, start)
+        distance = _studentised(rests, kept, fit(kept))
         freedom = max(kept.sum() - MIN_RESTS, 1)
-        limit = -stdtrit(freedom, _OUTLIER_CHANCE / (2 * len(kept)))
+        limit = -scipy.special.stdtrit(freedom, _OUTLIER_CHANCE / (2 * len(kept)))
         excluded = np.where(kept, np.inf, distance)
         included = np.where(kept, distance, 0)
         if excluded.min() <= limit:
@@ -271,12 +300,14 @@ def _exchanged(rests: NominalRests, kept: np.ndarray, start: np.ndarray, max_out
     return kept
 
 
-def _negative_log_likelihood(rests: NominalRests, kept: np.ndarray, start: np.ndarray) -> float:
+def _negative_log_likelihood(rests: NominalRests, kept: np.ndarray,
+                             fit: Callable[[np.ndarray], _Estimate]) -> float:
     """Return −ln of the residual likelihood; outliers are uniform within `_OUTLIER_RANGE_G`."""
-    parameters, excess_g2, _ = _fit(rests[kept], start)
+    parameters, excess_g2, _ = fit(kept)
     variance = magnitude_variance(rests[kept], parameters).mean() + excess_g2
     count, outliers = len(kept), (~kept).sum()
-    log_choices = gammaln(count + 1) - gammaln(outliers + 1) - gammaln(count - outliers + 1)
+    log_choices = (scipy.special.gammaln(count + 1) - scipy.special.gammaln(outliers + 1)
+                   - scipy.special.gammaln(count - outliers + 1))
     return float((kept.sum() - len(NAMES)) / 2 * np.log(variance * 2 * np.pi * np.e)
                  + outliers * np.log(_OUTLIER_RANGE_G) + log_choices)
 
@@ -286,31 +317,24 @@ def _robust_inliers(rests: NominalRests, start: np.ndarray, max_outliers: int) -
     Mark the rests that are near the best fit to all but `max_outliers` rests, (k,) bool.
 
     This is least trimmed squares: each start fits a few rests, then repeatedly the rests that
-    its fit suits best (Rousseeuw and Van Driessen 2006).
+    its fit suits best (Rousseeuw and Van Driessen 2006). All starts run side by side.
     """
     count = len(rests.mean)
     rng = np.random.default_rng(0)
-
-    def nearest(parameters: np.ndarray) -> NominalRests:
-        squares = _residual(rests, parameters) ** 2
-        return rests[np.argsort(squares)[:count - max_outliers]]
-
-    best, smallest_sum = start, np.inf
-    for _ in range(_LTS_STARTS):
-        few = rests[rng.choice(count, MIN_RESTS, replace=False)]
-        parameters = regularised_fit(few, start, _LTS_FIRST_STEPS)
-        parameters = regularised_fit(nearest, parameters, _LTS_STEPS)
-        trimmed_sum = np.sum(_residual(nearest(parameters), parameters) ** 2)
-        if trimmed_sum < smallest_sum:
-            best, smallest_sum = parameters, trimmed_sum
+    few = np.array([rng.choice(count, MIN_RESTS, replace=False) for _ in range(_LTS_STARTS)])
+    parameters = regularised_fit(rests[few], np.tile(start, (_LTS_STARTS, 1)), _LTS_FIRST_STEPS)
+    parameters = regularised_fit(rests, parameters, _LTS_STEPS, count - max_outliers)
+    squares = np.sort(_residual(rests, parameters) ** 2, axis=1)
+    trimmed_sums = np.nan_to_num(squares[:, :count - max_outliers].sum(axis=1), nan=np.inf)
+    best = parameters[trimmed_sums.argmin()]
     freedom = max(count - max_outliers - len(NAMES), 1)
-    std = np.sqrt(smallest_sum / freedom + magnitude_variance(rests, best).mean())
+    std = np.sqrt(trimmed_sums.min() / freedom + magnitude_variance(rests, best).mean())
     return np.abs(_residual(rests, best)) <= _LTS_MAX_DEVIATIONS * std
 
 
-def _studentised(rests: NominalRests, kept: np.ndarray, start: np.ndarray) -> np.ndarray:
+def _studentised(rests: NominalRests, kept: np.ndarray, estimate: _Estimate) -> np.ndarray:
     """Return the distance of each rest from the fit to the others by its std, (k,)."""
-    parameters, excess_g2, _ = _fit(rests[kept], start)
+    parameters, excess_g2, _ = estimate
     variance = magnitude_variance(rests, parameters) + excess_g2
     covariance = np.linalg.inv(posterior_information(rests[kept], parameters, excess_g2))
     jacobian = magnitude_jacobian(rests.mean, parameters)
@@ -327,13 +351,75 @@ def _studentised(rests: NominalRests, kept: np.ndarray, start: np.ndarray) -> np
 def _leave_one_out(rests: NominalRests, kept: np.ndarray, parameters: np.ndarray,
                    variance: np.ndarray, residual: np.ndarray) -> np.ndarray:
     """Return magnitude minus gravity by the fit to all other rests, g, (k,)."""
-    errors = residual.copy()
-    for i in np.flatnonzero(kept):
-        others = kept.copy()
-        others[i] = False
-        without, _ = _solve(rests[others], parameters, variance[others])
-        errors[i] = _residual(rests[np.array([i])], without)[0]
+    errors, used = residual.copy(), rests[kept]
+    count = len(used.mean)
+    weights = (1 - np.eye(count)) / variance[kept]
+    without, converged = _nearby(used, np.tile(parameters, (count, 1)), weights)
+    for i in np.flatnonzero(~converged):
+        others = np.arange(count) != i
+        without[i], _ = _solve(used[others], parameters, variance[kept][others])
+    errors[kept] = _residual(used, without).diagonal()
     return errors
+
+
+def _solve_nearby(rests: NominalRests, start: np.ndarray, variance: np.ndarray
+                  ) -> tuple[np.ndarray, bool]:
+    """
+    Fit as `_solve`, from a start near the solution, where plain Gauss-Newton steps suffice.
+
+    Parameters
+    ----------
+    rests
+        k rests.
+    start
+        First values of the parameters, (9,).
+    variance
+        Variances of the magnitudes, g², (k,).
+
+    Returns
+    -------
+    tuple
+        Parameters, (9,), and whether they have converged.
+
+    """
+    (parameters,), (converged,) = _nearby(rests, start[None], 1 / variance[None])
+    return (parameters, True) if converged else _solve(rests, start, variance)
+
+
+def _nearby(rests: NominalRests, starts: np.ndarray, weights: np.ndarray
+            ) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Take plain Gauss-Newton steps for several fits side by side.
+
+    Parameters
+    ----------
+    rests
+        k rests.
+    starts
+        First values of the parameters, (s, 9).
+    weights
+        Weights of the rests in each fit, 1/g², (s, k).
+
+    Returns
+    -------
+    tuple
+        Parameters, (s, 9), and which of them have converged, (s,) bool.
+
+    """
+    parameters, converged = starts, np.zeros(len(starts), bool)
+    for _ in range(_NEARBY_STEPS):
+        length, _, rows = linearised(rests.mean, parameters)
+        weighted = np.swapaxes(rows * weights[..., None], -1, -2)
+        try:
+            steps = np.linalg.solve(weighted @ rows,
+                                    weighted @ (rests.gravity_g - length)[..., None])[..., 0]
+        except np.linalg.LinAlgError:
+            break  # without a rest, the others do not determine the parameters
+        parameters = parameters + steps
+        converged = np.abs(steps).max(axis=1) < _NEARBY_STEP
+        if converged.all():
+            break
+    return parameters, converged
 
 
 def _require_determined(rests: NominalRests, parameters: np.ndarray, excess_g2: float) -> None:

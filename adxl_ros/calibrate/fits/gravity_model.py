@@ -16,9 +16,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+import math
+from typing import Any, NamedTuple
 
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.effects.base import Coefficient
@@ -147,10 +147,19 @@ def sensing_axes(parameters: np.ndarray) -> np.ndarray:
 
     The angles are the last three parameters: beta of y, alpha of z and beta of z.
     """
-    sy, cy = np.sin(parameters[6]), np.cos(parameters[6])
-    sa, ca = np.sin(parameters[7]), np.cos(parameters[7])
-    sb, cb = np.sin(parameters[8]), np.cos(parameters[8])
+    (sy, cy), (sa, ca), (sb, cb) = _sines(parameters)
     return np.array([[1.0, 0.0, 0.0], [-sy, cy, 0.0], [sb, -sa * cb, ca * cb]])
+
+
+def _sines(parameters: np.ndarray) -> list[tuple[Any, Any]]:
+    """
+    Return sine and cosine of each angle: beta of y, alpha of z and beta of z.
+
+    Those of several sets of parameters, (s, 9), are arrays, (s, 1).
+    """
+    if parameters.ndim > 1:
+        return [(np.sin(angle), np.cos(angle)) for angle in parameters.T[6:, :, None]]
+    return [(math.sin(angle), math.cos(angle)) for angle in parameters[6:].tolist()]
 
 
 def force_g(mean: np.ndarray, parameters: np.ndarray) -> np.ndarray:
@@ -170,8 +179,18 @@ def force_g(mean: np.ndarray, parameters: np.ndarray) -> np.ndarray:
         Specific force, g, (k, 3).
 
     """
-    sensed = (mean - parameters[:3]) / (1 + parameters[3:6])
-    return np.linalg.solve(sensing_axes(parameters), sensed.T).T
+    return _components(mean, parameters, _sines(parameters)).T
+
+
+def _components(mean: np.ndarray, parameters: np.ndarray, sines: list[tuple[Any, Any]]
+                ) -> np.ndarray:
+    """Return the components of the force, g, (3, k) or (3, s, k); `sines` as of `_sines`."""
+    (sy, cy), (sa, ca), (sb, cb) = sines
+    sensed = (mean - parameters[..., None, :3]) / (1 + parameters[..., None, 3:6])
+    x, y, z = sensed[..., 0], sensed[..., 1], sensed[..., 2]
+    # The matrix of the sensing axes is triangular.
+    y = (y + sy * x) / cy
+    return np.array([x, y, (z - sb * x + sa * cb * y) / (ca * cb)])
 
 
 def magnitude(mean: np.ndarray, parameters: np.ndarray) -> np.ndarray:
@@ -181,21 +200,83 @@ def magnitude(mean: np.ndarray, parameters: np.ndarray) -> np.ndarray:
     Parameters
     ----------
     mean, parameters
-        As for `force_g`.
+        As for `linearised`.
 
     Returns
     -------
     ndarray
-        Magnitude, g, (k,).
+        Magnitude, g, (k,) or (s, k).
 
     """
-    return np.linalg.norm(force_g(mean, parameters), axis=1)
+    return _length(_components(mean, parameters, _sines(parameters)))
 
 
-def _sensed_gradient(force: np.ndarray, parameters: np.ndarray) -> np.ndarray:
-    """Differentiate magnitudes by the force along the sensing axes: Θ⁻ᵀ·f/|f|, (k, 3)."""
-    direction = force / np.linalg.norm(force, axis=1, keepdims=True)
-    return np.linalg.solve(sensing_axes(parameters).T, direction.T).T
+def _length(components: np.ndarray) -> np.ndarray:
+    """Return the length of vectors, (3, ...), as (...)."""
+    x, y, z = components
+    return np.sqrt(x * x + y * y + z * z)
+
+
+def _sensed_gradient(direction: np.ndarray, sines: list[tuple[Any, Any]]) -> np.ndarray:
+    """Differentiate magnitudes by the force along the sensing axes: Θ⁻ᵀ·f/|f|, (3, ...)."""
+    (sy, cy), (sa, ca), (sb, cb) = sines
+    x, y, z = direction
+    z = z / (ca * cb)
+    y = (y + sa * cb * z) / cy
+    return np.array([x + sy * y - sb * z, y, z])
+
+
+class Linearised(NamedTuple):
+    """
+    Magnitudes of k rests to first order; s sets of parameters put an axis of length s in front.
+
+    Attributes
+    ----------
+    magnitude
+        Magnitudes, g, (k,).
+    by_output
+        Derivatives by the means, (k, 3).
+    jacobian
+        Derivatives by the parameters, (k, 9).
+
+    """
+
+    magnitude: np.ndarray
+    by_output: np.ndarray
+    jacobian: np.ndarray
+
+
+def linearised(mean: np.ndarray, parameters: np.ndarray) -> Linearised:
+    """
+    Return the magnitudes with their derivatives.
+
+    Parameters
+    ----------
+    mean, parameters
+        Means by nominal values, g, (k, 3), and the nine parameters, (9,). There may be s sets of
+        parameters, (s, 9), and a set of rests for each, (s, k, 3).
+
+    Returns
+    -------
+    Linearised
+        Magnitudes and derivatives.
+
+    """
+    (sy, cy), (sa, ca), (sb, cb) = sines = _sines(parameters)
+    force = _components(mean, parameters, sines)
+    length = _length(force)
+    by_sensed = _sensed_gradient(force / length, sines)
+    scale = 1 + parameters[..., None, 3:6]
+    by_output = np.moveaxis(by_sensed, 0, -1) / scale
+    x, y, z = force
+    jacobian = np.empty((*length.shape, len(NAMES)))
+    jacobian[..., :3] = -by_output
+    jacobian[..., 3:6] = -by_output * ((mean - parameters[..., None, :3]) / scale)
+    # Rows of ∂Θ/∂angle: of Θy by its angle, of Θz by both of its angles.
+    jacobian[..., 6] = by_sensed[1] * (cy * x + sy * y)
+    jacobian[..., 7] = by_sensed[2] * (ca * cb * y + sa * cb * z)
+    jacobian[..., 8] = -by_sensed[2] * (cb * x + sa * sb * y - ca * sb * z)
+    return Linearised(length, by_output, jacobian)
 
 
 def magnitude_jacobian(mean: np.ndarray, parameters: np.ndarray) -> np.ndarray:
@@ -213,18 +294,7 @@ def magnitude_jacobian(mean: np.ndarray, parameters: np.ndarray) -> np.ndarray:
         Jacobian, g by parameter, (k, 9).
 
     """
-    force = force_g(mean, parameters)
-    by_sensed = _sensed_gradient(force, parameters)
-    by_output = by_sensed / (1 + parameters[3:6])
-    sensed = (mean - parameters[:3]) / (1 + parameters[3:6])
-    sy, cy = np.sin(parameters[6]), np.cos(parameters[6])
-    sa, ca = np.sin(parameters[7]), np.cos(parameters[7])
-    sb, cb = np.sin(parameters[8]), np.cos(parameters[8])
-    # Rows of ∂Θ/∂angle: of Θy by its angle, of Θz by both of its angles.
-    by_angles = [by_sensed[:, 1] * (force @ np.array([-cy, -sy, 0.0])),
-                 by_sensed[:, 2] * (force @ np.array([0.0, -ca * cb, -sa * cb])),
-                 by_sensed[:, 2] * (force @ np.array([cb, sa * sb, -ca * sb]))]
-    return -np.column_stack([by_output, by_output * sensed, *by_angles])
+    return linearised(mean, parameters).jacobian
 
 
 def magnitude_variance(rests: NominalRests, parameters: np.ndarray) -> np.ndarray:
@@ -244,40 +314,53 @@ def magnitude_variance(rests: NominalRests, parameters: np.ndarray) -> np.ndarra
         Variance, g², (k,).
 
     """
-    by_output = _sensed_gradient(force_g(rests.mean, parameters), parameters) / (
-        1 + parameters[3:6])
-    return (by_output ** 2 * rests.variance).sum(axis=1)
+    sines = _sines(parameters)
+    force = _components(rests.mean, parameters, sines)
+    by_sensed = _sensed_gradient(force / _length(force), sines)
+    return _variance(rests, by_sensed.T / (1 + parameters[3:6]))
 
 
-def regularised_fit(rests: NominalRests | Callable[[np.ndarray], NominalRests],
-                    start: np.ndarray, steps: int) -> np.ndarray:
+def _variance(rests: NominalRests, by_output: np.ndarray) -> np.ndarray:
+    """Return the variance of each magnitude, g², (..., k), by its derivatives, (..., k, 3)."""
+    return np.einsum('...kd,...kd,...kd->...k', by_output, by_output, rests.variance)
+
+
+def regularised_fit(rests: NominalRests, start: np.ndarray, steps: int,
+                    closest: int | None = None) -> np.ndarray:
     """
     Fit rests with the prior, by Gauss-Newton steps.
 
     Parameters
     ----------
     rests
-        The rests, or a function that selects them by the parameters.
+        k rests, or s sets of them with an axis of length s in front.
     start
-        First values of the parameters, (9,).
+        First values of the parameters, (9,), or (s, 9) for s fits side by side.
     steps
         Largest count of steps.
+    closest
+        Count of the rests that a step uses, those that fit best; None uses all.
 
     Returns
     -------
     ndarray
-        Parameters, (9,).
+        Parameters, in the shape of `start`.
 
     """
     def linearise(parameters: np.ndarray) -> Iterate:
         parameters = np.clip(parameters, -_MAX_VALUE, _MAX_VALUE)
-        part = rests if isinstance(rests, NominalRests) else rests(parameters)
-        rows = magnitude_jacobian(part.mean, parameters)
-        weight = 1 / (magnitude_variance(part, parameters).mean() + TRIAL_STD_G ** 2)
-        residual = part.gravity_g - magnitude(part.mean, parameters)
-        gradient = weight * rows.T @ residual - parameters / PRIOR_STD ** 2
-        information = weight * rows.T @ rows + _PRIOR_INFORMATION
-        return Iterate(parameters, np.linalg.solve(information, gradient), 0.0)
+        length, by_output, rows = linearised(rests.mean, parameters)
+        residual, variance = rests.gravity_g - length, _variance(rests, by_output)
+        if closest is not None:
+            part = np.argsort(residual * residual)[..., :closest]
+            residual = np.take_along_axis(residual, part, -1)
+            variance = np.take_along_axis(variance, part, -1)
+            rows = np.take_along_axis(rows, part[..., None], -2)
+        weight = 1 / (variance.mean(axis=-1)[..., None, None] + TRIAL_STD_G ** 2)
+        weighted = weight * np.swapaxes(rows, -1, -2)
+        gradient = weighted @ residual[..., None] - parameters[..., None] / PRIOR_STD ** 2
+        step = np.linalg.solve(weighted @ rows + _PRIOR_INFORMATION, gradient)
+        return Iterate(parameters, step[..., 0], 0.0)
 
     return gauss_newton(
         linearise, start, lambda _, __, present: bool(np.abs(present.step).max() < _MIN_STEP),

@@ -33,6 +33,12 @@ _MIN_SPAN_G = 0.2
 cross-axis terms dominate the slope."""
 
 
+_OPEN_STD_V = 0.5
+"""Prior standard deviation of a zero-g that may be open, V. Chosen: far wider than any unit."""
+_OPEN_STD_V_PER_G = 0.2
+"""Prior standard deviation of a scale factor that may be open, V/g. Chosen: as above."""
+
+
 class _Line(NamedTuple):
     """
     A line fitted to one axis.
@@ -53,7 +59,7 @@ class _Line(NamedTuple):
     covariance: np.ndarray
 
 
-def fit(sensor: Sensor, poses: Poses) -> Sensor:
+def fit(sensor: Sensor, poses: Poses, may_be_open: bool = False) -> Sensor:
     """
     Fit scale factor and zero-g of each axis by least squares over the reference.
 
@@ -68,6 +74,9 @@ def fit(sensor: Sensor, poses: Poses) -> Sensor:
         Nominal values and local gravity of the unit.
     poses
         Poses on the stage.
+    may_be_open
+        Whether an axis may leave its scale factor open. It is nominal then, with an uncertainty
+        that any prior reduces.
 
     Returns
     -------
@@ -83,7 +92,8 @@ def fit(sensor: Sensor, poses: Poses) -> Sensor:
     gravity_g = sensor.local_gravity_mps2 / G0_MPS2
     force = np.column_stack(reference_force(poses, sensor.local_gravity_mps2)) / G0_MPS2
     lines = [_fit_line(axis, force[:, AXES.index(axis)], poses.volts[:, d], poses.std_v[:, d],
-                       gravity_g) for d, axis in enumerate(sensor.axes)]
+                       gravity_g, _open_line(sensor, d) if may_be_open else None)
+             for d, axis in enumerate(sensor.axes)]
     count = len(sensor.axes)
     covariance = np.zeros((2 * count, 2 * count))
     for d, line in enumerate(lines):
@@ -104,10 +114,12 @@ def _is_upright(reference_g: np.ndarray, gravity_g: float) -> np.ndarray:
 
 
 def _fit_line(axis: str, reference_g: np.ndarray, volts: np.ndarray, std_v: np.ndarray,
-              gravity_g: float) -> _Line:
+              gravity_g: float, prior: _Line | None) -> _Line:
     used = _is_upright(reference_g, gravity_g)
     if not ((reference_g[used] > 0).any() and (reference_g[used] < 0).any()):
         used = np.ones(len(volts), bool)
+    if prior is not None and np.ptp(reference_g[used]) < _MIN_SPAN_G:
+        return _fit_open_line(reference_g, volts, std_v, prior)
     if used.sum() < 2 or np.ptp(reference_g[used]) < _MIN_SPAN_G:
         raise UserError(f'{axis}: its reference spans {np.ptp(reference_g[used]):.2f} g over '
                         f'{used.sum()} poses, which does not determine the scale factor; add '
@@ -117,3 +129,22 @@ def _fit_line(axis: str, reference_g: np.ndarray, volts: np.ndarray, std_v: np.n
     residual = volts - zero - scale * reference_g
     variance = max(np.sum(residual ** 2) / max(len(volts) - 2, 1), np.mean(std_v ** 2))
     return _Line(zero, scale, variance * np.linalg.inv(design.T @ design))
+
+
+def _open_line(sensor: Sensor, axis: int) -> _Line:
+    """Return the nominal line of an axis, whose uncertainty is far wider than that of units."""
+    return _Line(float(sensor.nominal_zero_g_v[axis]), float(sensor.nominal_scale_v_per_g[axis]),
+                 np.diag([_OPEN_STD_V ** 2, _OPEN_STD_V_PER_G ** 2]))
+
+
+def _fit_open_line(reference_g: np.ndarray, volts: np.ndarray, std_v: np.ndarray, prior: _Line
+                   ) -> _Line:
+    """Fit a line that its poses do not determine, by its prior."""
+    design = np.column_stack([np.ones(len(volts)), reference_g])
+    nominal = np.array([prior.zero_g_v, prior.scale_v_per_g])
+    residual = volts - design @ nominal
+    variance = max(float(np.var(residual, ddof=min(1, len(volts) - 1))),
+                   float(np.mean(std_v ** 2)))
+    covariance = np.linalg.inv(design.T @ design / variance + np.linalg.inv(prior.covariance))
+    zero_g_v, scale_v_per_g = nominal + covariance @ (design.T @ residual) / variance
+    return _Line(float(zero_g_v), float(scale_v_per_g), covariance)

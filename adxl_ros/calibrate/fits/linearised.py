@@ -39,8 +39,7 @@ from adxl_ros.model.coefficients import get
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import Sensor
 import numpy as np
-from scipy.optimize import minimize
-from scipy.special import chdtri
+import scipy
 
 _MIN_TOTAL_RAD = 1e-7
 """Smallest standard deviation of an angle error, rad. Chosen: no encoder is as good."""
@@ -113,6 +112,11 @@ class Linearised:
         step = scale * np.linalg.solve(information * np.outer(scale, scale), scale * gradient)
         return step, information
 
+    def information(self, covariance: PoseCovariance) -> np.ndarray:
+        """Return the information of the coefficients and of their prior, (p, p)."""
+        normal = covariance.normal_equations(self.design, self.residual)
+        return normal.information + np.diag(self.precision)
+
     def without(self, excluded: np.ndarray) -> Linearised:
         """Return the poses with some coefficients at 0 and not fitted, (p,) bool."""
         fitted = ~excluded
@@ -177,9 +181,10 @@ class Linearised:
         share = (start.pose_rad / max(start.total_rad, _MIN_TOTAL_RAD)) ** 2
         bounds = np.array([np.log((_MIN_TOTAL_RAD, _MAX_TOTAL_RAD)), (0.0, 1.0),
                            (-_MAX_LOG_RATIO, _MAX_LOG_RATIO)])
-        search = minimize(lambda x: cost(x * _SEARCH_UNIT),
-                          np.array([total, share, np.log(start.ratio)]) / _SEARCH_UNIT,
-                          method='L-BFGS-B', options=_SEARCH_OPTIONS, bounds=bounds / _SEARCH_UNIT)
+        search = scipy.optimize.minimize(
+            lambda x: cost(x * _SEARCH_UNIT),
+            np.array([total, share, np.log(start.ratio)]) / _SEARCH_UNIT,
+            method='L-BFGS-B', options=_SEARCH_OPTIONS, bounds=bounds / _SEARCH_UNIT)
         return _from_search(search.x * _SEARCH_UNIT)
 
 
@@ -193,7 +198,7 @@ def _from_search(x: np.ndarray) -> StageError:
 @cache
 def _huber_bound(axes: int) -> float:
     """Return the squared distance beyond which a pose has less weight."""
-    return float(chdtri(axes, _HUBER_CHANCE))
+    return float(scipy.special.chdtri(axes, _HUBER_CHANCE))
 
 
 def linearised(unit: Sensor, poses: Poses, names: Sequence[Coefficient], precision: np.ndarray,

@@ -35,7 +35,7 @@ from adxl_ros.model.coefficients import with_neutral
 from adxl_ros.model.effects import library
 from adxl_ros.model.sensor import Sensor
 import numpy as np
-from scipy.special import chdtri
+import scipy
 
 ALWAYS = ('bias', 'scale_factor')
 """Terms that every fit has and that are not compared."""
@@ -221,7 +221,7 @@ def gauge_is_identifiable(full: full_model.FullFit) -> bool:
     about, term = _linearised(full, full_model.GAUGE)
     gauge = np.isin(term, full_model.GAUGE)
     ratio = about.without(gauge).misfit(full.stage) - about.misfit(full.stage)
-    return bool(ratio > chdtri(gauge.sum(), _GAUGE_CHANCE))
+    return bool(ratio > scipy.special.chdtri(gauge.sum(), _GAUGE_CHANCE))
 
 
 def _linearised(full: full_model.FullFit, added: Sequence[str]) -> tuple[Linearised, np.ndarray]:

@@ -27,8 +27,7 @@ from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.play_operator import loop, stop
 from adxl_ros.model.sensor import Sensor
 import numpy as np
-from scipy.linalg import block_diag
-from scipy.optimize import minimize_scalar
+import scipy
 
 EFFECTS = ('temperature_bias', 'temperature_scale', 'thermal_lag', 'thermal_hysteresis')
 """Effects that the fit knows."""
@@ -244,7 +243,7 @@ class _Model:
         scores = [self.score(History(effect, shape)) for shape in shapes]
         best = int(np.argmax(scores))
         low, high = np.log([shapes[max(best - 1, 0)], shapes[min(best + 1, len(shapes) - 1)]])
-        minimum = minimize_scalar(
+        minimum = scipy.optimize.minimize_scalar(
             lambda logarithm: -self.score(History(effect, float(np.exp(logarithm)))),
             bounds=(low, high), method='bounded', options={'xatol': 0.01})
         shape = float(np.exp(minimum.x)) if -minimum.fun > scores[best] else shapes[best]
@@ -419,8 +418,8 @@ def applied(base: Sensor, fitted: ThermalFit, calibrated_c: float) -> Sensor:
                 calibrated_c - NOMINAL_TEMPERATURE_C) ** power
     biases = [bias for bias, _ in shifts_v]
     sensor = put(sensor, biases, get(sensor, biases) + [shift for _, shift in shifts_v])
-    covariance = joint @ block_diag(base.covariance[np.ix_(kept, kept)], fitted.covariance) \
-        @ joint.T
+    blocks = scipy.linalg.block_diag(base.covariance[np.ix_(kept, kept)], fitted.covariance)
+    covariance = joint @ blocks @ joint.T
     return replace(sensor, covariance=covariance, covariance_names=(*kept_names, *names))
 
 

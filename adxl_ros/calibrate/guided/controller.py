@@ -42,7 +42,7 @@ import numpy as np
 
 IDLE_TEXT = 'idle; call ~/start'
 """Status of a controller that has not been started."""
-_POLLS_PER_MEASUREMENT = 20
+_POLLS_PER_MEASUREMENT = 50
 """Calls of `poll` from one attempt to measure an unknown sensor to the next: one a second."""
 _NOT_RUNNING = 'no calibration is running'
 """The answer to requests that need a session."""

@@ -67,6 +67,10 @@ class Dwell:
         self._stamps: list[np.ndarray] = []
         self._volts: list[np.ndarray] = []
 
+    def __len__(self) -> int:
+        """Return the number of samples since the arrival."""
+        return sum(map(len, self._stamps))
+
     def feed(self, stamps_ns: np.ndarray, volts: np.ndarray) -> None:
         """
         Take samples.
@@ -105,7 +109,7 @@ class Dwell:
 
     def age_s(self) -> float:
         """Return for how long there have been samples, s."""
-        return sum(map(len, self._stamps)) / self._sensor.rate_hz
+        return len(self) / self._sensor.rate_hz
 
     def volts(self, rest: Rest) -> np.ndarray:
         """Return the samples of a rest, V, (n, m)."""

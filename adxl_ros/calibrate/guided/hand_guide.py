@@ -35,9 +35,10 @@ from adxl_ros.calibrate.fits.gravity_model import (
 from adxl_ros.calibrate.guided import coverage, pose_checks, running_estimate
 from adxl_ros.calibrate.guided.capture_settings import Phase, Status
 from adxl_ros.calibrate.guided.guide import NextPose
-from adxl_ros.calibrate.guided.live_window import NewestSamples, Surroundings, went_back
+from adxl_ros.calibrate.guided.live_window import NewestSamples, went_back
 from adxl_ros.calibrate.guided.screen_contents import Estimate, Progress
-from adxl_ros.files.sweep_journal import JournalEntry, PoseRecord
+from adxl_ros.calibrate.guided.stageless_guide import StagelessGuide
+from adxl_ros.files.sweep_journal import PoseRecord
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals.noise_limits import datasheet_noise
 from adxl_ros.signals.rest_detection import Rest, RestFinder, Stillness
@@ -71,7 +72,7 @@ class _Interval:
         return self.first_ns <= record.stop_ns and record.start_ns <= self.last_ns
 
 
-class HandGuide:
+class HandGuide(StagelessGuide):
     """
     Collects the rests of a hand-held sensor, and asks for the next direction; a `Guide`.
 
@@ -90,20 +91,13 @@ class HandGuide:
 
     """
 
-    moves_itself = False
     is_over = False
-    open_poses = 0
-    poses_to_verify = 0
 
     def __init__(self, sensor: Sensor, temperature_span_c: float,
                  accepted: Sequence[PoseRecord] = ()) -> None:
-        self.sensor = sensor
-        self.accepted = {record.pose: record for record in accepted}
-        self.surroundings = Surroundings()
-        self.newest_ns: int | None = None
+        super().__init__(sensor, accepted)
         self._span_c = temperature_span_c
         self._skipped = np.zeros(len(orientations.UP), bool)
-        self._new_refusal = ''
         self._begin_stream()
         self._update_estimate()
 
@@ -117,43 +111,6 @@ class HandGuide:
         self._saturated_ns: list[int] = []
         self._finder = RestFinder(
             self.sensor.rate_hz, len(self.sensor.axes), datasheet_noise(self.sensor), learn=True)
-
-    @property
-    def pose_number(self) -> int:
-        """Return the number of the next rest, from 1."""
-        return len(self.accepted) + 1
-
-    @property
-    def previous(self) -> int | None:
-        """Return the number of the newest rest, from 0; None where there is none."""
-        return max(self.accepted, default=None)
-
-    def verify(self) -> None:
-        """Do nothing: without a stage no rest can be taken again in the same pose."""
-
-    def read_encoder(self, stamp_ns: int, alpha_rad: float, beta_rad: float) -> None:
-        """
-        Do nothing: no stage carries the sensor.
-
-        Parameters
-        ----------
-        stamp_ns
-            Stamp of the angles, ns.
-        alpha_rad, beta_rad
-            Angles of a stage that carries something else, rad.
-
-        """
-
-    def read_command(self, alpha_rad: float, beta_rad: float) -> None:
-        """
-        Do nothing: no stage carries the sensor.
-
-        Parameters
-        ----------
-        alpha_rad, beta_rad
-            Command for a stage that carries something else, rad.
-
-        """
 
     def feed(self, stamps_ns: np.ndarray, volts: np.ndarray) -> None:
         """
@@ -184,7 +141,7 @@ class HandGuide:
         stamps = self._all_stamps()
         self._next_search_ns = int(stamps[-1]) + _SEARCH_PERIOD_NS
         for rest in self._finder.rests():
-            record = self._record(max(self.accepted, default=-1) + 1, rest, stamps)
+            record = self._record(self.next_number, rest, stamps)
             has_ended = (stamps[-1] - record.stop_ns) * 1e-9 > _ENDED_S
             if has_ended and record.start_ns > self._announced_ns:
                 self._announced_ns = record.stop_ns
@@ -208,10 +165,6 @@ class HandGuide:
     def capture(self) -> str:
         """Return that nothing needs a capture."""
         return 'nothing to capture: hold the sensor still, and each rest is taken by itself'
-
-    def skip_entry(self) -> JournalEntry | None:
-        """Return None: a direction that is left out has no entry in the journal."""
-        return None
 
     def skip(self) -> str:
         """Ask for another direction; return a line for people."""
@@ -251,11 +204,6 @@ class HandGuide:
             if not is_dropped and not self._fault(record):
                 records.append(record)
         return records
-
-    def new_refusal(self) -> str:
-        """Return why a rest was refused since the last call, or ''."""
-        text, self._new_refusal = self._new_refusal, ''
-        return text
 
     def stillness(self, newest: NewestSamples) -> Stillness | None:
         """Return whether the newest samples are at rest, by the noise that the stream shows."""
@@ -332,7 +280,7 @@ class HandGuide:
 
     def _update_estimate(self) -> None:
         """Fit the gravity model to the rests so far, with the priors of the datasheet."""
-        records = [self.accepted[number] for number in sorted(self.accepted)]
+        records = self._accepted_records()
         mean_v = np.array([record.mean_v for record in records]).reshape(-1, 3)
         std_v = np.array([record.std_v for record in records]).reshape(-1, 3)
         rests = nominal_rests(mean_v, std_v, self.sensor)
@@ -363,8 +311,7 @@ class HandGuide:
         saturated = (bisect_right(self._saturated_ns, record.stop_ns)
                      - bisect_left(self._saturated_ns, record.start_ns))
         if saturated > _MOST_SATURATED * record.samples:
-            return ('saturated: samples of the rest are beyond the range of '
-                    f'±{self.sensor.range_g:g} g or at a rail of the ADC; check supply and wiring')
+            return self._saturated('rest')
         first_c = next((accepted.temperature_c for accepted in self.accepted.values()
                         if np.isfinite(accepted.temperature_c)), np.nan)
         return pose_checks.temperature_fault(first_c, record.temperature_c, self._span_c)

@@ -159,7 +159,7 @@ class RunningEstimate:
         poses = Poses.without_volts(alpha_rad, beta_rad, self.pose_std_v)
         no_prior = np.zeros(len(self.names))
         model = linearised(self.unit, poses, self.names, no_prior)
-        information = model.solve(model.covariance(self.stage))[1]
+        information = model.information(model.covariance(self.stage))
         return replace(self, covariance=np.linalg.inv(
             np.linalg.inv(self.covariance) + information))
 

@@ -296,6 +296,8 @@ class StageGuide:
             return None
         dwell = self._attempt.dwell
         samples = round(self.settings.dwell_s * self.sensor.rate_hz)
+        if len(dwell) < samples:
+            return None
         rest = next((r for r in dwell.rests() if r.stop - r.start >= samples), None)
         if rest is None:
             self._forget_long_motion()

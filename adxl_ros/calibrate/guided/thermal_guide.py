@@ -26,12 +26,13 @@ from adxl_ros.calibrate.guided import running_estimate
 from adxl_ros.calibrate.guided.capture_settings import Phase, Status
 from adxl_ros.calibrate.guided.dwell import Dwell
 from adxl_ros.calibrate.guided.guide import NextPose
-from adxl_ros.calibrate.guided.live_window import NewestSamples, Surroundings, went_back
+from adxl_ros.calibrate.guided.live_window import NewestSamples, went_back
 from adxl_ros.calibrate.guided.screen_contents import CoefficientRow, Coverage, Estimate, Progress
+from adxl_ros.calibrate.guided.stageless_guide import StagelessGuide
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.calibrate.thermal_coverage import expected_error_mg, PARTS, passed
 from adxl_ros.errors import UserError
-from adxl_ros.files.sweep_journal import JournalEntry, PoseRecord
+from adxl_ros.files.sweep_journal import PoseRecord
 from adxl_ros.model.coefficients import parameter_of
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals.rest_detection import Stillness
@@ -59,7 +60,7 @@ class ThermalSettings:
     block_s: float = thermal_calibration.BLOCK_S
 
 
-class ThermalGuide:
+class ThermalGuide(StagelessGuide):
     """
     Averages a resting sensor block by block while its temperature changes; a `Guide`.
 
@@ -76,18 +77,11 @@ class ThermalGuide:
 
     """
 
-    moves_itself = False
-    open_poses = 0
-    poses_to_verify = 0
-
     def __init__(self, sensor: Sensor, base: Sensor, settings: ThermalSettings,
                  accepted: Sequence[PoseRecord] = ()) -> None:
-        self.sensor = sensor
-        self.accepted = {record.pose: record for record in accepted}
-        self.surroundings = Surroundings()
-        self.newest_ns: int | None = None
+        super().__init__(sensor, accepted)
         self._base, self._settings = base, settings
-        self._refusal = self._new_refusal = ''
+        self._refusal = ''
         self._begin_block()
         self._update()
 
@@ -101,43 +95,6 @@ class ThermalGuide:
     def is_over(self) -> bool:
         """Return whether the wanted range is covered in both directions."""
         return self._passed.complete
-
-    @property
-    def pose_number(self) -> int:
-        """Return the number of the next block, from 1."""
-        return len(self.accepted) + 1
-
-    @property
-    def previous(self) -> int | None:
-        """Return the number of the newest block, from 0; None where there is none."""
-        return max(self.accepted, default=None)
-
-    def verify(self) -> None:
-        """Do nothing: a block cannot be taken again at the same temperature."""
-
-    def read_encoder(self, stamp_ns: int, alpha_rad: float, beta_rad: float) -> None:
-        """
-        Do nothing: no stage carries the sensor.
-
-        Parameters
-        ----------
-        stamp_ns
-            Stamp of the angles, ns.
-        alpha_rad, beta_rad
-            Angles of a stage that carries something else, rad.
-
-        """
-
-    def read_command(self, alpha_rad: float, beta_rad: float) -> None:
-        """
-        Do nothing: no stage carries the sensor.
-
-        Parameters
-        ----------
-        alpha_rad, beta_rad
-            Command for a stage that carries something else, rad.
-
-        """
 
     def feed(self, stamps_ns: np.ndarray, volts: np.ndarray) -> None:
         """
@@ -180,7 +137,7 @@ class ThermalGuide:
             self._continue_after(mean.stop_ns)
             return None
         return PoseRecord(
-            pose=max(self.accepted, default=-1) + 1, start_ns=mean.start_ns,
+            pose=self.next_number, start_ns=mean.start_ns,
             stop_ns=mean.stop_ns, samples=mean.samples, mean_v=mean.mean_v, std_v=mean.std_v,
             temperature_c=temperature_c,
             supply_v=self.surroundings.supply_v.mean(mean.start_ns, mean.stop_ns))
@@ -191,8 +148,7 @@ class ThermalGuide:
             return ('no temperature: nothing on the topic temperature; publish the reading of a '
                     'thermometer at the sensor')
         if self.sensor.saturated(volts).any():
-            return ('saturated: samples of the block are beyond the range of '
-                    f'±{self.sensor.range_g:g} g or at a rail of the ADC; check supply and wiring')
+            return self._saturated('block')
         return ''
 
     def _refuse(self, reason: str) -> None:
@@ -221,10 +177,6 @@ class ThermalGuide:
         """Return that nothing needs a capture."""
         return 'nothing to capture: leave the sensor at rest, and each block is taken by itself'
 
-    def skip_entry(self) -> JournalEntry | None:
-        """Return None: a part of the range that is left out has no entry in the journal."""
-        return None
-
     def skip(self) -> str:
         """Return that nothing can be left out."""
         return 'nothing to skip: finish ends the calibration before the range is covered'
@@ -240,12 +192,7 @@ class ThermalGuide:
 
     def poses_to_fit(self) -> list[PoseRecord]:
         """Return the blocks, by number."""
-        return [self.accepted[number] for number in sorted(self.accepted)]
-
-    def new_refusal(self) -> str:
-        """Return why a block was refused since the last call, or ''."""
-        text, self._new_refusal = self._new_refusal, ''
-        return text
+        return self._accepted_records()
 
     def stillness(self, newest: NewestSamples) -> Stillness | None:
         """Return whether the newest samples are at rest; None while they are too few."""

@@ -28,7 +28,7 @@ from adxl_ros.model.covariance import force_covariance
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.model.tilt import tilt
 import numpy as np
-from scipy.special import chdtri
+import scipy
 
 Fit = Callable[[Sensor, Poses], Sensor]
 """A function that fits a nominal sensor to poses and returns the fitted unit."""
@@ -290,8 +290,8 @@ def rms_interval(values: np.ndarray) -> tuple[float, float]:
     """Return the 90 % interval of the rms of correlated errors; see `degrees_of_freedom`."""
     with np.errstate(invalid='ignore'):
         rms, nu = _rms(values), degrees_of_freedom(values)
-    return rms * float(np.sqrt(nu / chdtri(nu, 0.05))), \
-        rms * float(np.sqrt(nu / chdtri(nu, 0.95)))
+    return rms * float(np.sqrt(nu / scipy.special.chdtri(nu, 0.05))), \
+        rms * float(np.sqrt(nu / scipy.special.chdtri(nu, 0.95)))
 
 
 def cross_validate(fits: dict[str, Fit], sensor: Sensor, poses: Poses,

@@ -53,8 +53,7 @@ from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.covariance import force_covariance
 from adxl_ros.model.sensor import Sensor
 import numpy as np
-from scipy.spatial import cKDTree
-from scipy.special import chdtri
+import scipy
 
 _SAME_POSE_RAD = np.radians(0.5)
 """Largest distance of the joint angles of two visits of the same pose, rad; chosen."""
@@ -279,8 +278,8 @@ def _budget(errors: np.ndarray, measured: float, predicted: _PredictedParts,
 
     """
     mean_square, nu = float(np.mean(errors ** 2)), degrees_of_freedom(errors)
-    lower = mean_square * nu / float(chdtri(nu, _CHANCE))
-    upper = mean_square * nu / float(chdtri(nu, _UPPER_QUANTILE))
+    lower = mean_square * nu / float(scipy.special.chdtri(nu, _CHANCE))
+    upper = mean_square * nu / float(scipy.special.chdtri(nu, _UPPER_QUANTILE))
     largest_stage = predicted.stated_stage if unexplainable is None else \
         max(predicted.stated_stage, unexplainable)
     explained = predicted.noise + predicted.coefficients + largest_stage
@@ -339,7 +338,8 @@ def _scatter(sensor: Sensor, poses: Poses) -> _Scatter | None:
     """Return the scatter that no model can explain; None where the poses do not show it."""
     joints = np.column_stack([np.cos(poses.alpha_rad), np.sin(poses.alpha_rad),
                               np.cos(poses.beta_rad), np.sin(poses.beta_rad)])
-    pairs = np.array(sorted(cKDTree(joints).query_pairs(_SAME_POSE_RAD)), int).reshape(-1, 2)
+    near = scipy.spatial.cKDTree(joints).query_pairs(_SAME_POSE_RAD)
+    pairs = np.array(sorted(near), int).reshape(-1, 2)
     gravity = sensor.local_gravity_mps2
     errors = pose_errors(sensor, poses)
     reference = np.column_stack(reference_force(poses, gravity))
@@ -388,7 +388,8 @@ def gravity_error_budgets(fit: GravityFit, fitted: Sensor, force: np.ndarray, ke
     covariance = force_covariance(fitted, list(force[kept].T), np.zeros(len(fitted.axes)))
     gravity, used = fitted.local_gravity_mps2, np.ones(len(kept), bool)
     measured, nu = float(np.mean(errors ** 2)), degrees_of_freedom(errors)
-    upper = max(measured * nu / float(chdtri(nu, _UPPER_QUANTILE)) - by_noise, excess)
+    quantile = float(scipy.special.chdtri(nu, _UPPER_QUANTILE))
+    upper = max(measured * nu / quantile - by_noise, excess)
     accel = _axis_variance(covariance, [0, 1, 2], used)
     tilt = _tilt_variance(covariance, force[kept], gravity, used)
     # Each of three axes has the error of a magnitude; two of the three turn the vertical.

@@ -18,7 +18,7 @@ from __future__ import annotations
 from adxl_ros.calibrate.fits.gravity_fit import GravityFit
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.calibrate.report.acceptance import Assessment
-from adxl_ros.calibrate.report.cross_validation import HeldOutErrors
+from adxl_ros.calibrate.report.cross_validation import determining_alpha, HeldOutErrors
 from adxl_ros.calibrate.report.drift_history import DriftSeries
 from adxl_ros.files.plotly_figures import (
     AXIS_COLOURS,
@@ -69,8 +69,11 @@ def pose_errors(errors: HeldOutErrors, assessment: Assessment, poses: Poses, axe
     accel_mg = errors.errors.accel_mps2 / G0_MPS2 * 1e3
     half_mg = Z_90 * 1e3 * float(np.sqrt(assessment.accel.expected)) / G0_MPS2
     traces = [_band(len(number), -half_mg, half_mg, 1)]
+    symbols = np.where(determining_alpha(errors.errors), 'circle', 'circle-open').tolist()
     traces += [_dots(number, accel_mg[:, d], f'{axis}', AXIS_COLOURS[axis], labels, 'mg', 1)
                for d, axis in enumerate(axes)]
+    for trace in traces[1:]:
+        trace['marker']['symbol'] = symbols
     tilt_deg = np.degrees(errors.errors.tilt_rad)
     if not np.isfinite(tilt_deg).any():
         return figure(traces, 320, margin=_ROOM, xaxis={'title': {'text': 'held-out pose'}},

@@ -187,6 +187,7 @@ def page(result: CalibrationResult, past: Sequence[Sensor]) -> str:
         'file_name': re.sub(r'[^\w.-]+', '_', fitted.serial) + '.yaml',
         'download': html_page.download_url(parameter_file.as_text(fitted, result.comments())),
         'figures': _figures(result, assessment, errors, history),
+        'open_circles': errors.poses_without_alpha if errors else 0,
         'sphere': _sphere(result),
         'coefficients': coefficients,
         'beyond': [row for row in coefficients if row['outcome'] == _BEYOND],

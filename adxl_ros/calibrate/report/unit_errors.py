@@ -28,7 +28,10 @@ _RIDGE = 1e-3
 """Weight of a change of 0, relative to a rest, for a direction that no rest of a recording has.
 Chosen: small beside one rest."""
 _NEGLIGIBLE_MG = 0.01
-"""Scatter below which only this limit is shown, mg. Chosen: no sensor repeats that well."""
+"""Error or scatter below which only this limit is shown, mg. Chosen: no sensor repeats that
+well."""
+_SMALL_MG = 10.0
+"""Error below which mg is the unit, and above which g is. Chosen: two digits read as 9.9 mg."""
 
 
 def turn_on_lines(fitted: Sensor, recordings: Sequence[Poses]) -> list[str]:
@@ -88,7 +91,8 @@ def errors_in_words(fitted: Sensor) -> str:
 
 
 def _force_text(force_g: float) -> str:
-    """Return a specific force with two digits, below 10 mg in mg."""
-    if abs(force_g) < 1e-5:
-        return 'less than 0.01 mg'
-    return f'{force_g:+.2g} g' if abs(force_g) >= 0.01 else f'{1e3 * force_g:+.2g} mg'
+    """Return a specific force with two digits, small ones in mg."""
+    force_mg = 1e3 * force_g
+    if abs(force_mg) < _NEGLIGIBLE_MG:
+        return f'less than {_NEGLIGIBLE_MG:g} mg'
+    return f'{force_g:+.2g} g' if abs(force_mg) >= _SMALL_MG else f'{force_mg:+.2g} mg'
