@@ -42,12 +42,19 @@ from adxl_ros.links.support.iio_stream import (
 )
 from adxl_ros.links.support.sample_stamps import clock_events, Stamper
 from adxl_ros.model.sensor import Sensor
-import numpy as np
 
 _SILENT_S = 0.5
-"""Time without a buffer after which a device counts as silent, s. Chosen: 25 buffers."""
+"""Time without a buffer after which a device counts as silent, s. Chosen: 250 buffers."""
 _SILENT_BUFFERS = 3
 """A device also counts as silent only after this many times the duration of its buffer."""
+_BATCH_S = 0.02
+"""Longest duration of the buffers that one read passes on together, s; chosen: passing twenty
+samples on costs little more than passing two."""
+_WAITING_SHARE = 0.5
+"""A buffer has waited for the reader if its read takes less than this share of its duration."""
+_DECISION_S = 0.5
+"""Duration of late samples after which the clock of the device counts as stopped, s. Chosen: by
+then a busy machine has read what the kernel keeps, each buffer with an answer of its own."""
 _BACK_NS = 500_000_000
 """Stamps that go back by more belong to another clock, ns; others are samples that came before."""
 _URI_KINDS = ('local:', 'ip:', 'usb:', 'serial:')
@@ -91,11 +98,14 @@ class Statistics:
         How often the device was opened.
     repeated
         Samples that came twice.
+    buffer_ms
+        Duration of a buffer, ms: its first sample waits for as long; 0 without a device.
 
     """
 
     connections: int
     repeated: int
+    buffer_ms: float
 
 
 def open_link(sensor: Sensor, settings: Settings) -> IioLink:
@@ -163,12 +173,13 @@ class IioLink:
         self._entries = channels.parse_channels(settings.channels)
         self._layout = channels.Layout(sensor.axes, self.references, settings.supply_scale)
         self._stream: Stream | None = None
-        self._stamper = Stamper(ClockMap(settings.delay))
+        self._stamper = Stamper(ClockMap(settings.delay, _DECISION_S))
         self._backoff = Backoff()
         self._error = ''
         self._adc: AdcInfo | None = None
         self._connections = self._repeated = 0
         self._last_ns: int | None = None
+        self._is_behind = False
         self._last_buffer_s = time.monotonic()
 
     def begin(self, now_ns: int) -> int:
@@ -182,7 +193,7 @@ class IioLink:
                 self._open()
         else:
             try:
-                self._add(self._stream.read())
+                self._receive(self._stream)
             except (ReadError, UserError) as error:
                 # After a time-out the stream is not reliable: everything is opened again.
                 self._error = str(error)
@@ -195,8 +206,9 @@ class IioLink:
         """Return how the device and the clock work."""
         level, text = self._condition()
         clock = self._stamper.statistics()
-        return LinkStatus(level, text, (Statistics(self._connections, self._repeated), clock),
-                          clock_events(clock))
+        buffer_s = self._stream.buffer_s if self._stream else 0.0
+        statistics = Statistics(self._connections, self._repeated, round(buffer_s * 1e3, 3))
+        return LinkStatus(level, text, (statistics, clock), clock_events(clock))
 
     def close(self) -> None:
         """Close the device."""
@@ -206,7 +218,8 @@ class IioLink:
 
     def _condition(self) -> tuple[Level, str]:
         """Return level and text of the status."""
-        uri, stream = self._settings.uri, self._stream
+        # The URI of this machine is only a kind and a colon.
+        uri, stream = self._settings.uri.removesuffix(':'), self._stream
         if self._error:
             return Level.ERROR, f'{uri}: {self._error}'
         if stream is None:
@@ -223,7 +236,7 @@ class IioLink:
         """Try to open the device; a new ADC begins a new clock."""
         try:
             stream = open_stream(self._settings.uri, self._settings.device, self._entries,
-                                 self._declared)
+                                 self._declared, self._settings)
         except (ReadError, UserError) as error:
             self._error = str(error)
             self._backoff.fail(slow=isinstance(error, UserError))
@@ -239,21 +252,35 @@ class IioLink:
             self._stamper.restart(1e9 / stream.adc.rate_hz)
             self._last_ns = None
 
+    def _receive(self, stream: Stream) -> None:
+        """Read a buffer; where two in a row have waited for the reader, those behind them, too."""
+        for _ in range(max(round(_BATCH_S / stream.buffer_s), 1)):
+            began_s = time.monotonic()
+            self._add(stream.read())
+            was_behind = self._is_behind
+            self._is_behind = time.monotonic() - began_s < _WAITING_SHARE * stream.buffer_s
+            if not (was_behind and self._is_behind):
+                return
+
     def _add(self, samples: BufferSamples) -> None:
         """Pass the samples of a buffer on, without those that came before."""
         arrived_ns = time.monotonic_ns()
         self._last_buffer_s = time.monotonic()
         self._backoff.reset()
-        device_ns, last_ns = samples.device_ns, self._last_ns
-        if last_ns is not None and device_ns[0] < last_ns - _BACK_NS:
+        device_ns, values = samples.device_ns, samples.values
+        newest_ns = -1 if self._last_ns is None else self._last_ns
+        if device_ns[0] < newest_ns - _BACK_NS:
             self._stamper.restart(self._stamper.period_ns)
-            last_ns = None
-        newest_ns = np.maximum.accumulate(device_ns)
-        before_ns = np.concatenate([[-1 if last_ns is None else last_ns], newest_ns[:-1]])
-        new = device_ns > before_ns
-        self._repeated += int((~new).sum())
-        if not new.any():
+            newest_ns = -1
+        new = []
+        for stamp_ns in device_ns.tolist():
+            new.append(stamp_ns > newest_ns)
+            newest_ns = max(newest_ns, stamp_ns)
+        self._repeated += len(new) - sum(new)
+        if not any(new):
             return
-        self._last_ns = int(newest_ns[-1])
-        values = {role: column[new] for role, column in samples.values.items()}
-        self._stamper.add(self._layout.block(device_ns[new], values), arrived_ns, None)
+        self._last_ns = newest_ns
+        if not all(new):
+            device_ns = device_ns[new]
+            values = {role: column[new] for role, column in values.items()}
+        self._stamper.add(self._layout.block(device_ns, values), arrived_ns, None)

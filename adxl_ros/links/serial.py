@@ -17,7 +17,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 import time
 from typing import NamedTuple
@@ -41,9 +41,12 @@ from adxl_ros.links.support.wire_format import (
     AFTER_RESET,
     BoardInfo,
     decode,
+    encode_command,
     import_cobs,
+    MAX_COUNT,
     RAIL,
     SampleFrame,
+    samples_that_fit,
     Splitter,
     VersionError,
     WireError,
@@ -61,6 +64,11 @@ _NO_FRAME_S = 1.0
 silences, so that silence is reported first."""
 _INFO_WAIT_S = 1.5
 """Longest time without an info frame after opening, s. Derived: a board sends one each second."""
+_COMMAND_PAUSE_S = 0.5
+"""Shortest time between two commands, s. Chosen: a board has answered by then."""
+_COMMANDS = 3
+"""Commands that a board gets before it counts as one that does not obey. Chosen: noise may damage
+one of them."""
 _SILENT_FRAMES = 3
 """A board also counts as silent only after this many times its longest frame."""
 _MAX_BYTES_PER_S = 4e6
@@ -131,6 +139,8 @@ class Statistics:
         Samples of frames that came twice or late.
     device_overruns
         Samples that the board itself dropped.
+    frame_ms
+        Duration of the newest frame, ms: its first sample waited for as long.
     rail_frames
         Frames with a code at a rail of the ADC.
     resets
@@ -147,9 +157,48 @@ class Statistics:
     held_back: int
     repeated: int
     device_overruns: int
+    frame_ms: float
     rail_frames: int
     resets: int
     connections: int
+
+
+@dataclass(frozen=True)
+class _Conversion:
+    """
+    How the codes of a board become samples.
+
+    Attributes
+    ----------
+    gain, offset
+        Value of a channel is gain · code + offset, V or degC, (m,).
+    axes
+        Channels of the axes of the sensor.
+    reference_channels
+        Channel of each reference by column; None where no channel has it.
+    steps_ns
+        Times of the samples of a frame after its first one, ns, int64, (256,).
+    max_code
+        Largest code.
+
+    """
+
+    gain: np.ndarray
+    offset: np.ndarray
+    axes: slice | list[int]
+    reference_channels: Mapping[str, int | None]
+    steps_ns: np.ndarray
+    max_code: int
+
+    def block(self, frame: SampleFrame) -> channels.Block:
+        """Return the samples of a frame."""
+        values = frame.codes.astype(float)
+        values *= self.gain
+        values += self.offset
+        references = {column: channels.absent(len(values)) if i is None else values[:, i]
+                      for column, i in self.reference_channels.items()}
+        return channels.Block(frame.time_us * 1000 + self.steps_ns[:len(values)],
+                              values[:, self.axes], references)
 
 
 class _Arrival(NamedTuple):
@@ -228,13 +277,18 @@ class SerialLink:
         self._splitter = Splitter()
         self._arrivals: deque[_Arrival] = deque()
         self._info: BoardInfo | None = None
+        self._conversion: _Conversion | None = None
         self._misfit = self._version_error = ''
         self._counter = FrameCounter()
         self._stamper = Stamper(ClockMap(settings.delay))
         self._frames = self._bad_frames = self._held_back = self._resets = self._rail_frames = 0
         self._last_frame_s = self._created_s = time.monotonic()
         self._longest_frame_s = 0.0
+        self._commands = self._ignored_commands = 0
+        self._command_due_s = 0.0
         self._busy_until_s = 0.0
+        self._unpaid = 0, 0
+        self._newest_count = 0
 
     def begin(self, now_ns: int) -> int:
         """Do nothing: samples before the beginning do not count as lost."""
@@ -242,6 +296,9 @@ class SerialLink:
 
     def read(self, now_ns: int) -> Samples:
         """Wait for bytes, at most 50 ms, and return the samples that they complete."""
+        # What need not precede the samples of the last call follows them.
+        self._throttle()
+        self._command()
         if not self._arrivals:
             self._receive()
         while self._arrivals:
@@ -266,8 +323,8 @@ class SerialLink:
             frames=self._frames, bad_frames=self._bad_frames, bytes=self._port.received_bytes,
             skipped_bytes=self._splitter.skipped, held_back=self._held_back,
             repeated=self._counter.repeated, device_overruns=self._counter.overruns,
-            rail_frames=self._rail_frames, resets=self._resets,
-            connections=self._port.connections)
+            frame_ms=round(self._longest_frame_s * 1e3, 3), rail_frames=self._rail_frames,
+            resets=self._resets, connections=self._port.connections)
         reset = Event('the device was reset or is another one: a new count begins', self._resets)
         return LinkStatus(level, text, (statistics, clock), (reset, *clock_events(clock)))
 
@@ -299,11 +356,29 @@ class SerialLink:
         return Level.OK, self._streaming(self._info)
 
     def _streaming(self, info: BoardInfo) -> str:
-        """Return the text of a working link, with the axes that it does not use."""
+        """Return the text of a working link, with frames that are long and axes without use."""
+        return '; '.join(filter(None, (
+            f'streaming{self._why_long(info)}', self._unused_channels(info))))
+
+    def _why_long(self, info: BoardInfo) -> str:
+        """Return why frames are longer than `link.latency_ms`; '' where they are not."""
+        settings = self._settings
+        wanted, possible = settings.samples_together(info.rate_hz), self._wanted_samples(info)
+        frame_ms = self._longest_frame_s * 1e3
+        if possible > wanted and frame_ms > settings.latency_ms:
+            possible_ms = min(possible / info.rate_hz * 1e3, frame_ms)
+            return (f' in frames of {possible_ms:.3g} ms: {settings.baud} Bd carry none of '
+                    f'{settings.latency_ms:g} ms')
+        if self._ignored_commands >= _COMMANDS and frame_ms > settings.latency_ms:
+            return f' in frames of {frame_ms:.3g} ms: the firmware does not obey link.latency_ms'
+        return ''
+
+    def _unused_channels(self, info: BoardInfo) -> str:
+        """Return which channels of a board are not read; '' where all are."""
         unused = [axis for axis in AXES[:info.channels] if axis not in self._declared.axes]
         if self._stated_roles or not unused:
-            return 'streaming'
-        return (f'streaming; the channel of {", ".join(unused)} is not used: sensor.axes is '
+            return ''
+        return (f'the channel of {", ".join(unused)} is not used: sensor.axes is '
                 f'{self._declared.axes} (link.channels can say that it is the supply)')
 
     def _receive(self) -> None:
@@ -313,6 +388,7 @@ class SerialLink:
             # The port opens again, perhaps on another board: an incomplete frame stays incomplete.
             self._splitter.restart()
             self._counter.reopened()
+            self._ignored_commands = 0
             return
         arrived_ns = time.monotonic_ns()
         samples = 0
@@ -321,7 +397,7 @@ class SerialLink:
             if frame is not None:
                 samples += len(frame.codes) if isinstance(frame, SampleFrame) else 1
                 self._arrivals.append(_Arrival(frame, arrived_ns))
-        self._throttle(len(chunk), samples)
+        self._unpaid = len(chunk), samples
 
     def _decoded(self, raw: bytes) -> BoardInfo | SampleFrame | None:
         """Decode and count a frame; None for one that cannot be read."""
@@ -340,18 +416,9 @@ class SerialLink:
         self._port.confirm()
         return frame
 
-    def _throttle(self, size: int, samples: int) -> None:
-        """
-        Pause so that bytes and samples stay below their largest rates (a leaky bucket).
-
-        Parameters
-        ----------
-        size
-            Bytes that were read.
-        samples
-            Samples in them.
-
-        """
+    def _throttle(self) -> None:
+        """Pause so that bytes and samples stay below their largest rates (a leaky bucket)."""
+        (size, samples), self._unpaid = self._unpaid, (0, 0)
         rate_hz = self._info.rate_hz if self._info else _UNSTATED_RATE_HZ
         now_s = time.monotonic()
         cost_s = size / _MAX_BYTES_PER_S + samples / (_MAX_RATE_RATIO * rate_hz)
@@ -365,8 +432,10 @@ class SerialLink:
         if not changed and not info.flags & AFTER_RESET:
             return
         self._info = info
+        self._ignored_commands = 0
         self._counter.restart(info.rate_hz)
         self._misfit = self._why_unfit(info)
+        self._conversion = None if self._misfit else self._make_conversion(info)
         if changed and not self._misfit:
             self.sensor = replace(self._declared, rate_hz=info.rate_hz, adc_bits=info.bits,
                                   adc_vref_v=info.vref_v,
@@ -395,10 +464,12 @@ class SerialLink:
         info = self._info
         rate_hz = info.rate_hz if info else _UNSTATED_RATE_HZ
         self._longest_frame_s = len(frame.codes) / rate_hz
-        if info is None or self._misfit:
+        self._newest_count = len(frame.codes)
+        conversion = self._conversion
+        if info is None or conversion is None:
             self._held_back += len(frame.codes)
             return
-        if frame.codes.shape[1] != info.channels or frame.codes.max() >= 2 ** info.bits:
+        if frame.codes.shape[1] != info.channels or _largest(frame.codes) > conversion.max_code:
             self._bad_frames += 1  # whole, but it contradicts the info frame
             return
         for accepted in self._counter.accept(frame, arrived_ns):
@@ -407,19 +478,63 @@ class SerialLink:
                 self._stamper.restart(1e9 / info.rate_hz)
             elif accepted.stepped:
                 self._stamper.step()
-            self._stamper.add(self._block(accepted.frame, info), arrived_ns, accepted.lost or 0)
+            self._rail_frames += accepted.frame.flags & RAIL
+            self._stamper.add(conversion.block(accepted.frame), arrived_ns, accepted.lost or 0)
 
-    def _block(self, frame: SampleFrame, info: BoardInfo) -> channels.Block:
-        """Convert the codes of a frame to volts by role, and number its samples by time."""
-        self._rail_frames += frame.flags & RAIL
-        volts = frame.codes * (info.vref_v / 2 ** info.bits)
-        values = {role: volts[:, i] for i, role in enumerate(self._roles(info))}
-        if channels.TEMPERATURE in values:
-            values[channels.TEMPERATURE] = (
-                values[channels.TEMPERATURE] - self._settings.temperature_zero_v
-            ) / self._settings.temperature_v_per_c
-        steps_ns = np.arange(len(volts)) * (1e9 / info.rate_hz)
-        device_ns = frame.time_us * 1000 + np.rint(steps_ns).astype(np.int64)
-        layout = channels.Layout(self._declared.axes, self.references,
-                                 self._settings.supply_scale)
-        return layout.block(device_ns, values)
+    def _wanted_samples(self, info: BoardInfo) -> int:
+        """Return how many samples a frame shall have."""
+        wanted = self._settings.samples_together(info.rate_hz)
+        return samples_that_fit(wanted, info, self._port.uart_bytes_per_s)
+
+    def _command(self) -> None:
+        """
+        Ask the board for small frames, unless it sends them or does not obey.
+
+        Only a device that has sent a frame gets bytes: another one could take them for its own
+        commands. A board answers with its info frame, so that the first samples need not wait.
+        """
+        count, self._newest_count = self._newest_count, 0
+        if not count:
+            return
+        latency_us = round(self._settings.latency_ms * 1e3)
+        if self._info is not None:
+            wanted = self._wanted_samples(self._info)
+            if count == wanted:
+                self._ignored_commands = 0
+                return
+            latency_us = max(latency_us, round(wanted / self._info.rate_hz * 1e6))
+        now_s = time.monotonic()
+        if self._ignored_commands < _COMMANDS and now_s >= self._command_due_s:
+            self._port.write(encode_command(self._commands, latency_us))
+            self._commands += 1
+            self._ignored_commands += 1
+            self._command_due_s = now_s + _COMMAND_PAUSE_S
+
+    def _make_conversion(self, info: BoardInfo) -> _Conversion:
+        """Return how the codes of a board become samples."""
+        roles, settings = self._roles(info), self._settings
+        gain, offset = np.full(info.channels, info.vref_v / 2 ** info.bits), np.zeros(
+            info.channels)
+        for i, role in enumerate(roles):
+            if role == channels.SUPPLY:
+                gain[i] *= settings.supply_scale
+            elif role == channels.TEMPERATURE:
+                gain[i] /= settings.temperature_v_per_c
+                offset[i] = -settings.temperature_zero_v / settings.temperature_v_per_c
+        return _Conversion(
+            gain, offset, _columns([roles.index(axis) for axis in self._declared.axes]),
+            {column: roles.index(role) if role in roles else None
+             for role, column in channels.COLUMNS.items() if column in self.references},
+            np.rint(np.arange(MAX_COUNT + 1) * (1e9 / info.rate_hz)).astype(np.int64),
+            2 ** info.bits - 1)
+
+
+def _columns(places: list[int]) -> slice | list[int]:
+    """Return what takes columns from an array; a slice, where it can be one, takes no copy."""
+    consecutive = range(places[0], places[-1] + 1)
+    return slice(consecutive.start, consecutive.stop) if places == list(consecutive) else places
+
+
+def _largest(codes: np.ndarray) -> int:
+    """Return the largest code; few numbers take Python half the time of numpy's first call."""
+    return max(map(max, codes.tolist()))

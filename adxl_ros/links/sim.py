@@ -20,16 +20,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from math import inf
-import time
 from typing import NamedTuple
 
 from adxl_ros.links.support.base import Level, LinkStatus, option, PacedSettings, Samples
+from adxl_ros.links.support.watchdog import Watchdog
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.simulate.motion import Motion
 from adxl_ros.simulate.response import Response
 from adxl_ros.simulate.simulated_stage import JOINTS
 import numpy as np
-import scipy.signal  # noqa: F401 (the simulator loads it at its first sample, which is late)
 
 _AHEAD_NS = 50_000_000
 """Length of a block of samples, ns. Chosen: a block costs less than its samples one by one."""
@@ -38,6 +37,8 @@ _MAX_BLOCK = 4096
 _LOST_S = 1.0
 """Silence after which a stage counts as lost, s of steady time. Chosen: a stage sends 100 poses a
 second."""
+_LONGEST_TURN_S = 0.1
+"""Longest time between two reads that counts as silence, s. Chosen: ten poses of a stage."""
 _FOREIGN_NS = 2_000_000_000
 """Largest distance between the stamps of stage and samples, ns. A larger one is another clock."""
 _GAP_NS = 50_000_000
@@ -140,9 +141,9 @@ class SimulatedSensor:
         self._seed = settings.seed
         self._knots = [_resting((settings.alpha_rad, settings.beta_rad, 0.0))]
         self._respond = self._settled_response()
-        self._last_motion_s = -inf
+        self._watchdog: Watchdog | None = None
         self._status = LinkStatus(Level.OK, 'at rest, no stage')
-        self._origin_ns = self._made = self._until_ns = 0
+        self._origin_ns = self._made = self._until_ns = self._next_ns = 0
         self._stamps = np.zeros(0, np.int64)
         self._volts = np.zeros((0, len(sensor.axes)))
 
@@ -179,14 +180,15 @@ class SimulatedSensor:
             stamp_ns,
             tuple(position.get(joint, previous[i]) for i, joint in enumerate(JOINTS)),
             tuple(velocity.get(joint, 0.0) for joint in JOINTS)))
-        self._last_motion_s = time.monotonic()
+        self._watchdog = self._watchdog or Watchdog(_LONGEST_TURN_S)
+        self._watchdog.feed()
         self._status = LinkStatus(Level.OK, 'on the stage')
 
     def begin(self, now_ns: int) -> int:
         """Make the next sample due now; return the number of samples that are skipped."""
         skipped = self._skipped(now_ns)
         self._origin_ns = -(-now_ns // _BEAT_NS) * _BEAT_NS
-        self._made, self._until_ns = 0, now_ns
+        self._made, self._until_ns, self._next_ns = 0, now_ns, self._origin_ns
         self._stamps, self._volts = self._stamps[:0], self._volts[:0]
         self._knots = [_resting(self._knots[-1].position)]
         self._respond = self._settled_response()
@@ -195,9 +197,9 @@ class SimulatedSensor:
     def read(self, now_ns: int) -> Samples:
         """Return the samples up to now, or up to the newest stamp of the stage's motion."""
         until_ns = max(self._until_ns, min(now_ns, self._motion_until_ns()))
-        while until_ns >= self._stamp(self._made):
+        while until_ns >= self._next_ns:
             self._make(until_ns)
-        due = int(np.searchsorted(self._stamps, until_ns, 'right'))
+        due = int(self._stamps.searchsorted(until_ns, 'right'))
         samples = Samples(self._stamps[:due], self._volts[:due], until_ns)
         self._stamps, self._volts = self._stamps[due:], self._volts[due:]
         self._until_ns = until_ns
@@ -221,11 +223,11 @@ class SimulatedSensor:
 
     def _motion_until_ns(self) -> int:
         """Return the time up to which the motion is known; it is unbounded without a stage."""
-        if self._last_motion_s == -inf:
+        if self._watchdog is None:
             return _FOREVER_NS
-        if time.monotonic() - self._last_motion_s < _LOST_S:
+        if self._watchdog.check() < _LOST_S:
             return self._knots[-1].stamp_ns
-        self._last_motion_s = -inf
+        self._watchdog = None
         self._status = LinkStatus(
             Level.WARN, f'stage lost: nothing on {self.joint_state_topic} for {_LOST_S:g} s, its '
             'last pose is held')
@@ -237,6 +239,7 @@ class SimulatedSensor:
         stamps = self._stamp(self._made + np.arange(_MAX_BLOCK, dtype=float))
         stamps = stamps[:np.searchsorted(stamps, ahead_ns, 'right')]
         self._made += len(stamps)
+        self._next_ns = int(self._stamp(self._made))
         volts = self._respond((stamps - self._origin_ns) * 1e-9)
         self._stamps = np.concatenate([self._stamps, stamps])
         self._volts = np.concatenate([self._volts, volts])

@@ -22,9 +22,10 @@
  * link.channels:=x,y,supply link.supply_scale:=2.0. For another ADC change read_adc() and the
  * constants of the ADC.
  *
- * A timer takes the samples, ten samples make a block, and the loop sends complete blocks. When
- * the host does not read, blocks are dropped and their samples are counted. So the driver knows
- * exactly how many samples are missing. */
+ * A timer takes the samples, and the loop sends them in blocks. A command of the host sets how many
+ * samples make a block, at most ten. Blocks grow to ten while others wait, so a slow wire gets
+ * longer frames. When the host does not read, blocks are dropped and their samples are counted. So
+ * the driver knows exactly how many samples are missing. */
 
 #include <SPI.h>
 
@@ -40,19 +41,21 @@ const float VREF_V = 5.0f;  /* reference voltage of the ADC, V */
 const uint8_t CS_PIN = 10;  /* chip select of the ADC */
 const SPISettings ADC_BUS(2000000, MSBFIRST, SPI_MODE0); /* the ADS8344 permits 2.4 MHz */
 
-const uint8_t BLOCK = 10; /* samples of a block */
+const uint8_t BLOCK = 10; /* most samples of a block, and those before the first command */
 const uint8_t BLOCKS = 8; /* blocks that wait for the host; 80 ms of samples */
 
 struct block {
     uint64_t t_us;
     uint32_t first_index;
     uint16_t overruns;
+    uint8_t samples;
     uint16_t codes[BLOCK * CHANNELS];
 };
 
 /* The timer writes blocks[made % BLOCKS], the loop sends blocks[sent % BLOCKS]. */
 static struct block blocks[BLOCKS];
 static volatile uint8_t made, sent;
+static volatile uint8_t wanted = BLOCK; /* samples of a block while no other one waits */
 static struct frame_counts counts = {0, FRAME_AFTER_RESET};
 static uint8_t frame[FRAME_ROOM(BLOCK, CHANNELS)];
 
@@ -100,7 +103,8 @@ static void take_sample() {
     }
     SPI.endTransaction();
     index++;
-    if (++filled == BLOCK) {
+    if (++filled == BLOCK || (filled >= wanted && made == sent)) {
+        b->samples = filled;
         filled = 0;
         made++;
     }
@@ -135,6 +139,23 @@ void setup() {
 static void send(size_t length) {
     /* Waits for room in the port; the timer goes on meanwhile. */
     Serial.write(frame, length);
+#if defined(TEENSYDUINO)
+    Serial.send_now(); /* or USB waits for more bytes */
+#endif
+}
+
+/* Take the commands of the host; return whether there was one. */
+static bool receive() {
+    static struct frame_receiver receiver;
+    bool commanded = false;
+    while (Serial.available() > 0) {
+        uint32_t latency_us;
+        if (frame_command(&receiver, (uint8_t)Serial.read(), &latency_us)) {
+            wanted = frame_samples(latency_us, RATE_HZ, BLOCK);
+            commanded = true;
+        }
+    }
+    return commanded;
 }
 
 void loop() {
@@ -143,6 +164,9 @@ void loop() {
     if (!Serial) { /* no host has opened the port: dropped samples are counted */
         return;
     }
+    if (receive()) {
+        informed = false; /* the info frame is the answer */
+    }
     if (!informed || millis() - informed_ms >= 1000) {
         send(frame_info(&counts, RATE_HZ, BITS, CHANNELS, VREF_V, SERIAL_NUMBER, frame));
         informed_ms = millis();
@@ -150,8 +174,8 @@ void loop() {
     }
     if (made != sent) {
         const struct block *b = &blocks[sent % BLOCKS];
-        send(frame_data(&counts, b->t_us, b->first_index, b->overruns, BLOCK, CHANNELS, b->codes,
-                        BITS, frame));
+        send(frame_data(&counts, b->t_us, b->first_index, b->overruns, b->samples, CHANNELS,
+                        b->codes, BITS, frame));
         sent++;
     }
 }

@@ -35,12 +35,17 @@ static void stuff(struct writer *w, uint8_t byte) {
     }
 }
 
-static void put(struct writer *w, uint8_t byte) {
+static uint32_t crc_step(uint32_t crc, uint8_t byte) {
     int bit;
-    w->crc ^= byte;
+    crc ^= byte;
     for (bit = 0; bit < 8; bit++) {
-        w->crc = (w->crc >> 1) ^ ((w->crc & 1) ? 0xEDB88320u : 0);
+        crc = (crc >> 1) ^ ((crc & 1) ? 0xEDB88320u : 0);
     }
+    return crc;
+}
+
+static void put(struct writer *w, uint8_t byte) {
+    w->crc = crc_step(w->crc, byte);
     stuff(w, byte);
 }
 
@@ -118,4 +123,61 @@ size_t frame_info(struct frame_counts *counts, float rate_hz, uint8_t bits, uint
         put(&w, ended ? 0 : (uint8_t)serial[i]);
     }
     return end(&w);
+}
+
+static uint32_t number(const uint8_t *raw) {
+    return raw[0] | (uint32_t)raw[1] << 8 | (uint32_t)raw[2] << 16 | (uint32_t)raw[3] << 24;
+}
+
+/* Undo COBS in place; return the length of what remains, 0 if it is not valid. */
+static uint8_t unstuff(uint8_t *raw, uint8_t length) {
+    uint8_t next = 0, made = 0;
+    while (next < length) {
+        const uint8_t code = raw[next++];
+        uint8_t i;
+        if (next + code - 1 > length) {
+            return 0;
+        }
+        for (i = 1; i < code; i++) {
+            raw[made++] = raw[next++];
+        }
+        if (next < length) {
+            raw[made++] = 0; /* no run of a command is so long that it ends without a 0 */
+        }
+    }
+    return made;
+}
+
+int frame_command(struct frame_receiver *receiver, uint8_t byte, uint32_t *latency_us) {
+    uint8_t *raw = receiver->raw;
+    uint8_t i, length = receiver->length;
+    uint32_t crc = 0xFFFFFFFFu;
+    if (byte) {
+        if (length < FRAME_COMMAND_ROOM) {
+            raw[length] = byte;
+        }
+        receiver->length = length > FRAME_COMMAND_ROOM ? length : (uint8_t)(length + 1);
+        return 0;
+    }
+    receiver->length = 0;
+    if (length != FRAME_COMMAND_ROOM || unstuff(raw, length) != FRAME_COMMAND_ROOM - 1) {
+        return 0;
+    }
+    for (i = 0; i < FRAME_COMMAND_ROOM - 5; i++) {
+        crc = crc_step(crc, raw[i]);
+    }
+    if (~crc != number(raw + FRAME_COMMAND_ROOM - 5) || raw[0] != 3 || raw[1] != 1) {
+        return 0;
+    }
+    *latency_us = number(raw + 8);
+    return 1;
+}
+
+uint8_t frame_samples(uint32_t latency_us, float rate_hz, uint8_t most) {
+    /* A product such as 2000 us * 1000 Hz may lack the last bit of a whole number. */
+    const float samples = (float)latency_us * 1e-6f * rate_hz + 1e-3f;
+    if (samples >= most) {
+        return most;
+    }
+    return samples < 1 ? 1 : (uint8_t)samples;
 }

@@ -36,6 +36,15 @@ struct frame_counts {
     uint16_t flags;     /* flags of the next frame */
 };
 
+/* Size of a command of the host in bytes, without its 0x00. */
+#define FRAME_COMMAND_ROOM 17
+
+/* A command of the host that has come in part. After a reset: all 0. */
+struct frame_receiver {
+    uint8_t raw[FRAME_COMMAND_ROOM]; /* bytes since the last 0x00 */
+    uint8_t length;                  /* their number; more than FRAME_COMMAND_ROOM: too many */
+};
+
 /* Largest size of a frame of n samples of m channels in bytes, its 0x00 included. */
 #define FRAME_ROOM(n, m) (24 + 2 * (n) * (m) + 4 + (28 + 2 * (n) * (m)) / 254 + 2)
 
@@ -53,6 +62,13 @@ size_t frame_data(struct frame_counts *counts, uint64_t t_dev_us, uint32_t first
  * channels. serial: up to 16 ASCII characters. out: 48 bytes. */
 size_t frame_info(struct frame_counts *counts, float rate_hz, uint8_t bits, uint8_t nch,
                   float vref_v, const char *serial, uint8_t *out);
+
+/* Take one byte from the host; return 1 if it completes a command, else 0.
+ * latency_us: gets the longest time over which the samples of a frame shall be collected. */
+int frame_command(struct frame_receiver *receiver, uint8_t byte, uint32_t *latency_us);
+
+/* Return how many samples are collected within latency_us: 1 to most. */
+uint8_t frame_samples(uint32_t latency_us, float rate_hz, uint8_t most);
 
 #ifdef __cplusplus
 }

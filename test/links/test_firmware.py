@@ -12,18 +12,41 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""The encoder of the firmware, compiled on the host, against the reference encoder."""
+"""The firmware, compiled on the host: its frames, its commands, its sketch on a terminal."""
 
+from contextlib import contextmanager
 import ctypes
+import os
+import pty
 import shutil
 import subprocess
+import time
+import tty
 
-from adxl_ros.links.support.wire_format import AFTER_RESET, BoardInfo, decode, Encoder, RAIL
+from adxl_ros.links import serial
+from adxl_ros.links.support.base import samples_within
+from adxl_ros.links.support.wire_format import (
+    AFTER_RESET,
+    BoardInfo,
+    decode,
+    encode_command,
+    Encoder,
+    RAIL,
+)
+from hypothesis import given, settings, strategies as st
 import numpy as np
 from processes import REPO
 import pytest
+from units import nominal
 
-SOURCE = REPO / 'firmware' / 'adxl_board' / 'frame.c'
+FOLDER = REPO / 'firmware' / 'adxl_board'
+SOURCE = FOLDER / 'frame.c'
+
+
+class Receiver(ctypes.Structure):
+    """`struct frame_receiver` of frame.h."""
+
+    _fields_ = [('raw', ctypes.c_uint8 * 17), ('length', ctypes.c_uint8)]
 
 
 class Counts(ctypes.Structure):
@@ -43,6 +66,7 @@ def library(tmp_path_factory):
                     '-fPIC', '-o', made, SOURCE], check=True)
     library = ctypes.CDLL(str(made))
     library.frame_data.restype = library.frame_info.restype = ctypes.c_size_t
+    library.frame_samples.restype = ctypes.c_uint8
     return library
 
 
@@ -93,3 +117,112 @@ def test_every_frame_equals_that_of_the_reference(library):
         assert decoded.check == decode(expected[:-1]).check
         assert np.array_equal(decoded.codes, codes)
         assert len(actual) - len(expected) in (0, 1), 'a last run of 254 may be closed twice'
+
+
+def received(library, raw, receiver=None):
+    """Return the latencies of the commands in some bytes, µs, as the firmware takes them."""
+    receiver, latency_us = receiver or Receiver(), ctypes.c_uint32()
+    return [latency_us.value for byte in raw
+            if library.frame_command(ctypes.byref(receiver), ctypes.c_uint8(byte),
+                                     ctypes.byref(latency_us))]
+
+
+@pytest.mark.parametrize('latency_us', [0, 1, 2000, 0x01010101, 0x00ff0000, 2 ** 32 - 1])
+def test_commands_are_taken_from_any_stream(library, latency_us):
+    command = encode_command(0x80000001, latency_us)
+    assert received(library, command) == [latency_us]
+    noise = np.random.default_rng(latency_us).integers(0, 256, 3000).astype(np.uint8).tobytes()
+    assert received(library, noise + command + b'AT\r\n' * 40 + command) == [latency_us] * 2
+    for k in range(1, len(command) - 1):
+        damaged = bytearray(command)
+        damaged[k] ^= 0x10
+        assert received(library, damaged) == []
+    assert received(library, Encoder(BoardInfo(1e3, 16, 2, 5.0, '')).info_frame()) == []
+
+
+@settings(deadline=None)
+@given(st.lists(st.one_of(st.binary(max_size=40), st.binary(min_size=17, max_size=17))))
+def test_no_stream_breaks_the_receiver(library, parts):
+    receiver = Receiver()
+    for part in parts:
+        received(library, part.replace(b'\0', b'\1') + b'\0', receiver)
+        assert receiver.length <= 18
+    assert received(library, encode_command(0, 7), receiver) == [7]
+
+
+@pytest.mark.parametrize('rate_hz', [10.0, 333.3, 1000.0, 2000.0, 8000.0])
+def test_the_firmware_and_the_emulated_board_take_as_many_samples(library, rate_hz):
+    for latency_us in (0, 100, 900, 1000, 1001, 2000, 3000, 5000, 7000, 9990, 10_000, 2 ** 31):
+        assert library.frame_samples(ctypes.c_uint32(latency_us), ctypes.c_float(rate_hz),
+                                     ctypes.c_uint8(10)) == \
+            min(samples_within(latency_us * 1e-6, rate_hz), 10)
+
+
+@pytest.fixture(scope='module')
+def sketch(tmp_path_factory):
+    """Compile the sketch for this machine."""
+    compiler = shutil.which('g++') or shutil.which('clang++')
+    if compiler is None:
+        pytest.skip('no C++ compiler: apt install g++')
+    made = tmp_path_factory.mktemp('sketch') / 'sketch'
+    subprocess.run([compiler, '-std=c++17', '-O1', '-Wall', '-Wextra', '-Werror', '-pthread',
+                    '-x', 'c++', '-I', REPO / 'test' / 'support' / 'arduino', '-I', FOLDER,
+                    FOLDER / 'adxl_board.ino', SOURCE, '-o', made], check=True)
+    return made
+
+
+@contextmanager
+def running_sketch(sketch, tmp_path, baud, **parameters):
+    """Give a link that reads the sketch on a terminal."""
+    board_fd, driver_fd = pty.openpty()
+    tty.setraw(driver_fd)
+    (tmp_path / 'port').symlink_to(os.ttyname(driver_fd))
+    board = subprocess.Popen([sketch, str(board_fd), str(baud)], pass_fds=[board_fd])
+    link = serial.open_link(nominal(), serial.Settings(
+        port=str(tmp_path / 'port'), channels='x,y,supply', **parameters))
+    try:
+        yield link
+    finally:
+        link.close()
+        board.kill()
+        board.wait()
+        os.close(board_fd)
+        os.close(driver_fd)
+
+
+def read_until(link, condition, timeout_s=10.0):
+    """Read a link until a condition holds; return volts, (n, m), and the number of lost ones."""
+    volts, missing, end_s = [], 0, time.monotonic() + timeout_s
+    while not condition():
+        samples = link.read(0)
+        volts.append(samples.volts)
+        missing += samples.missing
+        assert time.monotonic() < end_s, link.status()
+    return np.concatenate(volts), missing
+
+
+def value(link, name):
+    return link.status().values()[name]
+
+
+@pytest.mark.parametrize('latency_ms', [0.0, 2.0, 5.0, 100.0])
+def test_the_sketch_obeys(sketch, tmp_path, latency_ms):
+    with running_sketch(sketch, tmp_path, 0, latency_ms=latency_ms) as link:
+        frame_ms = min(max(latency_ms, 1.0), 10.0)
+        read_until(link, lambda: value(link, 'frame_ms') == frame_ms and link.sensor)
+        frames = value(link, 'frames')
+        read_until(link, lambda: value(link, 'frames') > frames + 30)
+        assert link.sensor.serial == 'adxl-0001'
+        assert link.status().text.startswith('streaming')
+        assert 'obey' not in link.status().text
+
+
+def test_the_sketch_sends_longer_frames_on_a_slow_uart(sketch, tmp_path):
+    """At 115200 Bd frames of 2 ms would take twice the time there is; none is lost."""
+    with running_sketch(sketch, tmp_path, 115200) as link:
+        read_until(link, lambda: value(link, 'frames') > 30)
+        volts, missing = read_until(link, lambda: value(link, 'frames') > 300)
+        assert 2 < value(link, 'frame_ms') <= 10
+        assert value(link, 'device_overruns') == missing == 0
+        codes = np.rint(volts / nominal().lsb_v)
+        assert (np.diff(codes[:, 0]) == 1).all()

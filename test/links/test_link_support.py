@@ -17,7 +17,7 @@
 from dataclasses import replace
 
 from adxl_ros.errors import UserError
-from adxl_ros.links.support import channels, clock_sync, emulated_board
+from adxl_ros.links.support import base, channels, clock_sync, emulated_board
 from adxl_ros.links.support.clock_sync import ClockMap, SystemClockMap
 from adxl_ros.links.support.frame_counter import FrameCounter
 from adxl_ros.links.support.wire_format import AFTER_RESET, SampleFrame
@@ -251,3 +251,13 @@ def test_slow_values_are_means_of_a_tenth_of_a_second():
 def test_a_sensor_beyond_the_wire_format_is_refused(change, reason):
     with pytest.raises(UserError, match=reason):
         emulated_board.check_sensor(replace(nominal(), **change))
+
+
+def test_samples_that_are_not_finite_are_missing():
+    samples = base.Samples(np.arange(3), np.array([[1.0, 2.0], [np.nan, 2.0], [1.0, np.inf]]), 3,
+                           missing=4, estimated=1, imu_fields={'orientation': np.eye(3)})
+    finite = samples.finite()
+    assert finite.stamp_ns.tolist() == [0] and finite.volts.tolist() == [[1.0, 2.0]]
+    assert (finite.missing, finite.estimated, finite.until_ns) == (6, 1, 3)
+    assert finite.imu_fields['orientation'].tolist() == [[1.0, 0.0, 0.0]]
+    assert finite.finite() is finite

@@ -21,11 +21,14 @@ from adxl_ros.links.support.wire_format import (
     AFTER_RESET,
     BoardInfo,
     decode,
+    decode_command,
+    encode_command,
     encode_payload,
     Encoder,
     MAX_FRAME_BYTES,
     RAIL,
     SampleFrame,
+    samples_that_fit,
     Splitter,
     VersionError,
     WireError,
@@ -48,6 +51,47 @@ def test_the_vector_is_encoded_and_decoded():
     assert (data.flags, data.sequence, data.time_us, data.index, data.overruns) == \
         (0, 7, 1_000_000, 70, 0)
     assert data.codes.tolist() == [[0x8000, 0], [0x1234, 0xffff]]
+
+
+def test_the_vector_of_a_command():
+    payload = bytes.fromhex('0301000007000000d0070000')
+    assert zlib.crc32(payload).to_bytes(4, 'little') == bytes.fromhex('5a6d1be4')
+    frame = bytes.fromhex('0003030101020701010' '3d00701055a6d1be400')
+    assert encode_command(7, 2000) == frame
+    assert decode_command(frame[1:-1]) == 2000
+
+
+@pytest.mark.parametrize('damage', range(1, 17))
+def test_a_damaged_command_is_refused(damage):
+    made = bytearray(encode_command(7, 2000)[1:-1])
+    made[damage] ^= 0x55
+    with pytest.raises(WireError):
+        decode_command(bytes(made))
+    with pytest.raises(WireError):
+        decode_command(FRAME[:-1])
+    with pytest.raises(WireError):
+        decode(encode_command(7, 2000)[1:-1])
+
+
+def frame_load(samples, info, baud):
+    """Return which share of the time of a UART frames take."""
+    frame = Encoder(info).sample_frame(0, 0, np.full((samples, info.channels), 257))
+    return 10 * len(frame) * info.rate_hz / samples / baud
+
+
+@pytest.mark.parametrize('channels', [1, 2, 4])
+@pytest.mark.parametrize('baud', [57600, 115200, 230400, 500000, 2000000])
+def test_the_wire_carries_the_chosen_frames_and_no_smaller_ones(channels, baud):
+    info = BoardInfo(1000.0, 16, channels, 5.0, '')
+    samples = samples_that_fit(2, info, baud / 10)
+    assert samples >= 2
+    if samples < 255:
+        assert frame_load(samples, info, baud) < 0.9
+    if 2 < samples < 255:
+        assert frame_load(samples - 1, info, baud) > 0.8
+    if samples == 255:
+        assert frame_load(254, info, baud) > 0.8
+    assert samples_that_fit(2, info, np.inf) == 2
 
 
 def test_the_encoder_makes_the_vector_and_sets_flags():

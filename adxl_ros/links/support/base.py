@@ -36,6 +36,8 @@ DEFAULT_LINK = 'sim'
 
 _LINKS = 'adxl_ros.links'
 """Package whose modules are the links; its folder `support` holds no link."""
+_MAX_SHARE = 1e-3
+"""Largest share of a sample that a latency may lack: a float32 of a firmware is not exact."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +95,27 @@ def options(settings: type) -> tuple[Option, ...]:
 
 
 @dataclass(frozen=True)
-class PacedSettings:
+class LatencySettings:
+    """
+    Settings of every link of this package.
+
+    Attributes
+    ----------
+    latency_ms
+        Longest time for which samples are collected before they are passed on, ms.
+
+    """
+
+    latency_ms: float = option(2.0, 'longest time for which samples are collected before they '
+                               'are passed on together; 0: each sample alone', 'ms', 0.0, 1000.0)
+
+    def samples_together(self, rate_hz: float) -> int:
+        """Return how many samples at a rate, Hz, are passed on together."""
+        return samples_within(self.latency_ms * 1e-3, rate_hz)
+
+
+@dataclass(frozen=True)
+class PacedSettings(LatencySettings):
     """
     Settings of a link that makes its own time.
 
@@ -109,7 +131,7 @@ class PacedSettings:
 
 
 @dataclass(frozen=True)
-class DeviceSettings:
+class DeviceSettings(LatencySettings):
     """
     Settings of a link that reads a device.
 
@@ -125,6 +147,36 @@ class DeviceSettings:
     delay: float = option(0.0, 'shortest time from a sample to its arrival', 's', 0.0, 1.0)
     supply_scale: float = option(1.0, 'supply voltage by the voltage of its channel: the ratio '
                                  'of its divider', 'V/V', 1e-3, 1e3)
+
+
+@dataclass(frozen=True)
+class SimulatorSettings:
+    """Settings of a link whose samples have the time of a simulator, the clock of the graph."""
+
+    @property
+    def turns_case(self) -> bool:
+        """Return whether the frame of the case is not that of the simulator's samples."""
+        return False
+
+
+def samples_within(latency_s: float, rate_hz: float) -> int:
+    """
+    Return how many samples are collected, at least one.
+
+    Parameters
+    ----------
+    latency_s
+        Longest time for which they are collected, s.
+    rate_hz
+        Sample rate, Hz.
+
+    Returns
+    -------
+    int
+        Number of samples.
+
+    """
+    return max(int(latency_s * rate_hz + _MAX_SHARE), 1)
 
 
 class Level(Enum):
@@ -205,6 +257,8 @@ class Samples:
         sampled.
     estimated
         Part of `missing` that is estimated from time, not counted.
+    imu_fields : mapping
+        Further fields of sensor_msgs/Imu by name, (n, k) each, such as `angular_velocity`.
 
     """
 
@@ -214,6 +268,18 @@ class Samples:
     missing: int = 0
     references: Mapping[str, np.ndarray] = field(default_factory=dict)
     estimated: int = 0
+    imu_fields: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+    def finite(self) -> Samples:
+        """Return the samples whose volts are finite, without references; others are missing."""
+        finite = np.isfinite(self.volts)
+        if finite.all():
+            return self
+        rows = finite.all(axis=1)
+        return Samples(
+            self.stamp_ns[rows], self.volts[rows], self.until_ns,
+            self.missing + int((~rows).sum()), estimated=self.estimated,
+            imu_fields={name: values[rows] for name, values in self.imu_fields.items()})
 
 
 def no_samples(sensor: Sensor, until_ns: int) -> Samples:
@@ -308,6 +374,43 @@ class StageLink(Protocol):
             Velocity by joint, rad/s or m/s.
 
         """
+
+
+@runtime_checkable
+class ImuLink(Protocol):
+    """
+    A link that gets the ideal samples of a simulator.
+
+    Attributes
+    ----------
+    imu_topic
+        Topic of the ideal sensor_msgs/Imu.
+    temperature_topic
+        Topic of the temperature of the sensor.
+
+    """
+
+    imu_topic: str
+    temperature_topic: str
+
+    def sense_imu(self, stamp_ns: np.ndarray, fields: Mapping[str, np.ndarray]) -> None:
+        """
+        Take ideal samples.
+
+        Parameters
+        ----------
+        stamp_ns
+            Their stamps, ns, (n,).
+        fields
+            Number fields of sensor_msgs/Imu by name, (n, k) each.
+
+        """
+
+    def sense_temperature(self, temperature_c: float) -> None:
+        """Use a temperature, °C, from the next sample on."""
+
+    def sense_silence(self, has_publisher: bool) -> None:
+        """Take that no sample has come, and whether the topic has a publisher."""
 
 
 class LinkModule(Protocol):

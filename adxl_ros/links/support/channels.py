@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 from adxl_ros.errors import UserError
 from adxl_ros.model.constants import AXES
@@ -36,6 +37,8 @@ COLUMNS = {SUPPLY: 'supply_v', TEMPERATURE: 'temperature_c'}
 
 _PERIOD_NS = 100_000_000
 """Period of the means of supply and temperature, ns. Chosen: both change slowly."""
+_KEPT_COUNTS = 8
+"""Numbers of samples for which absent values are kept. Chosen: a device has one or two."""
 
 
 def parse_channels(value: str | Sequence[str]) -> list[str]:
@@ -84,6 +87,14 @@ def check_roles(roles: Sequence[str], axes: str) -> None:
 def reference_columns(roles: Sequence[str]) -> tuple[str, ...]:
     """Return the columns of the references among the roles."""
     return tuple(column for role, column in COLUMNS.items() if role in roles)
+
+
+@lru_cache(_KEPT_COUNTS)
+def absent(count: int) -> np.ndarray:
+    """Return values that are not there: NaN, (count,), not to be written."""
+    values = np.full(count, np.nan)
+    values.flags.writeable = False
+    return values
 
 
 @dataclass(frozen=True)
@@ -144,8 +155,8 @@ class Layout:
             The samples.
 
         """
-        volts = np.column_stack([values[axis] for axis in self.axes])
-        references = {column: np.full(len(volts), np.nan) for column in self.columns}
+        volts = np.array([values[axis] for axis in self.axes]).T
+        references = {column: absent(len(device_ns)) for column in self.columns}
         if SUPPLY in values:
             references[COLUMNS[SUPPLY]] = values[SUPPLY] * self.supply_scale
         if TEMPERATURE in values:
@@ -153,32 +164,12 @@ class Layout:
         return Block(device_ns, volts, references)
 
 
-@dataclass
-class _RunningMean:
-    """Mean of the finite values since the last one that was taken."""
-
-    total: float = 0.0
-    count: int = 0
-
-    def add(self, values: np.ndarray) -> None:
-        """Add the finite values of an array, (n,)."""
-        finite = values[np.isfinite(values)]
-        self.total += float(finite.sum())
-        self.count += len(finite)
-
-    def take(self) -> float:
-        """Return the mean, NaN without a value, and begin a new mean."""
-        mean = self.total / self.count if self.count else np.nan
-        self.total, self.count = 0.0, 0
-        return mean
-
-
 class PeriodMeans:
     """Replaces slow references by their means over 0.1 s, each at the first sample after it."""
 
     def __init__(self) -> None:
         """Begin without values."""
-        self._running: dict[str, _RunningMean] = {}
+        self._parts: dict[str, list[np.ndarray]] = {}
         self._period = 0
 
     def thin(self, host_ns: np.ndarray, references: Mapping[str, np.ndarray]
@@ -199,16 +190,25 @@ class PeriodMeans:
             Means by column, (n,) each.
 
         """
-        periods = host_ns // _PERIOD_NS
-        begins = np.flatnonzero(np.diff(periods, prepend=self._period))
-        self._period = int(periods[-1])
+        begins: list[int] = []
+        if int(host_ns[-1]) // _PERIOD_NS != self._period:
+            periods = host_ns // _PERIOD_NS
+            begins = np.flatnonzero(np.diff(periods, prepend=self._period)).tolist()
+            self._period = int(periods[-1])
         means = {}
         for column, values in references.items():
-            running = self._running.setdefault(column, _RunningMean())
-            means[column] = np.full(len(host_ns), np.nan)
-            parts = np.split(values, begins)
-            running.add(parts[0])
-            for begin, part in zip(begins, parts[1:]):
-                means[column][begin] = running.take()
-                running.add(part)
+            means[column] = np.full(len(host_ns), np.nan) if begins else absent(len(host_ns))
+            parts = self._parts.setdefault(column, [])
+            stops = [*begins, len(values)]
+            parts.append(values[:stops[0]])
+            for begin, stop in zip(begins, stops[1:]):
+                means[column][begin] = _finite_mean(parts)
+                parts[:] = [values[begin:stop]]
         return means
+
+
+def _finite_mean(parts: list[np.ndarray]) -> float:
+    """Return the mean of the finite values of some arrays; NaN without any."""
+    values = np.concatenate([*parts, np.zeros(0)])
+    finite = values[np.isfinite(values)]
+    return float(finite.mean()) if len(finite) else np.nan

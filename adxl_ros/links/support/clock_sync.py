@@ -130,8 +130,19 @@ class ClockMap:
 
     """
 
-    def __init__(self, delay_s: float) -> None:
-        """Begin without arrivals; `delay_s` is the shortest time from sample to arrival, s."""
+    def __init__(self, delay_s: float, decision_s: float = _LATER_WAIT_S) -> None:
+        """
+        Begin without arrivals.
+
+        Parameters
+        ----------
+        delay_s
+            Shortest time from a sample to its arrival, s.
+        decision_s
+            Duration of late arrivals after which they show a clock that stopped, s.
+
+        """
+        self._decision_s = decision_s
         self.steps = 0
         self._delay_ns = round(delay_s * 1e9)
         self._newest_stamp_ns: int | None = None
@@ -184,7 +195,8 @@ class ClockMap:
     def ready(self, now_ns: int) -> bool:
         """Return whether samples can be stamped at a host time, ns."""
         late = self._late
-        if late is not None and late.count > 1 and now_ns - late.first_ns >= _LATER_WAIT_S * 1e9:
+        if late is not None and late.count > 1 \
+                and now_ns - late.first_ns >= self._decision_s * 1e9:
             self._resolve(late)
         if not self.settled and self._open is not None and self._first_arrived_ns is not None \
                 and now_ns - self._first_arrived_ns >= self._wait_s * 1e9:

@@ -17,7 +17,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 import os
 from pathlib import Path
 import pty
@@ -28,12 +28,21 @@ import tty
 
 from adxl_ros.errors import UserError
 from adxl_ros.links.support import channels
-from adxl_ros.links.support.wire_format import BoardInfo, Encoder
+from adxl_ros.links.support.base import samples_within
+from adxl_ros.links.support.wire_format import (
+    BoardInfo,
+    decode_command,
+    Encoder,
+    Splitter,
+    WireError,
+)
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
 _FRAME_SAMPLES = 10
-"""Samples of a frame, as the firmware sends them."""
+"""Most samples of a frame, and those of a frame before the first command, as in the firmware."""
+_READ_BYTES = 4096
+"""Most bytes from the host that are read at once."""
 _INFO_S = 1.0
 """Period of the info frames, s, as the firmware sends them."""
 _SUPPLY_SCALE = 2.0
@@ -53,7 +62,8 @@ class Board:
     """
     Sends the samples of a sensor.
 
-    Frames that nobody reads are dropped and counted, as on a board without a host.
+    Frames that nobody reads are dropped and counted, as on a board without a host. A command of
+    the host sets the samples of a frame, and an info frame answers it.
     """
 
     def __init__(self, sensor: Sensor, roles: list[str], fd: int) -> None:
@@ -77,6 +87,8 @@ class Board:
         self._index = self._overruns = 0
         self._informed_s = -_INFO_S
         self._unsent = b''
+        self._splitter = Splitter()
+        self._frame_samples = _FRAME_SAMPLES
 
     def send(self, columns: Mapping[str, np.ndarray]) -> None:
         """
@@ -96,8 +108,9 @@ class Board:
         codes = self._codes(columns)
         if self._began_s is None:
             self._began_s = time.monotonic()
-        for begin in range(0, len(codes), _FRAME_SAMPLES):
-            block = codes[begin:begin + _FRAME_SAMPLES]
+        while len(codes):
+            self._obey()
+            block, codes = codes[:self._frame_samples], codes[self._frame_samples:]
             first_s = self._index / self._sensor.rate_hz
             if first_s - self._informed_s >= _INFO_S and self._write(self._encoder.info_frame()):
                 self._informed_s = first_s
@@ -108,6 +121,19 @@ class Board:
             if not self._write(frame):
                 self._overruns += len(block)
             self._index += len(block)
+
+    def _obey(self) -> None:
+        """Take the commands that have come from the host."""
+        try:
+            received = os.read(self._fd, _READ_BYTES)
+        except OSError:
+            return  # nothing has come; a terminal that is gone shows in the next write
+        for raw in self._splitter.split(received):
+            with suppress(WireError):
+                latency_s = decode_command(raw) * 1e-6
+                self._frame_samples = min(samples_within(latency_s, self._sensor.rate_hz),
+                                          _FRAME_SAMPLES)
+                self._informed_s = -_INFO_S
 
     def _codes(self, columns: Mapping[str, np.ndarray]) -> np.ndarray:
         """Return the ADC codes of all channels, (n, m)."""

@@ -22,8 +22,8 @@ from typing import NamedTuple
 
 from adxl_ros.links.support.wire_format import AFTER_RESET, SampleFrame
 
-_REMEMBERED = 4096
-"""Frames that are recognised when they come twice. Chosen: 40 s of the firmware at 1 kHz."""
+_REMEMBERED = 20_000
+"""Frames that are recognised when they come twice. Chosen: 40 s of frames of 2 ms."""
 _TOLERANCE_US = 1000.0
 """Absolute tolerance between the device's clock and its count, µs."""
 _TOLERANCE = 0.002

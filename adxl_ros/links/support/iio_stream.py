@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from math import isfinite
+from math import ceil, isfinite
 import os
 import socket
 import time
@@ -27,14 +27,24 @@ from typing import Any, NamedTuple
 
 from adxl_ros.errors import install_hint, UserError
 from adxl_ros.links.support import channels
+from adxl_ros.links.support.base import LatencySettings
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
-_KERNEL_BUFFERS = 16
-"""Buffers that the kernel fills while nobody reads."""
-_BUFFER_S = 0.02
-"""Duration of a buffer, s. Chosen: a sample waits for its buffer, and a buffer costs CPU time."""
+_KEPT_S = 0.32
+"""Duration of the samples that the kernel keeps while nobody reads, s; chosen: a busy machine
+delays a read by less."""
+_MIN_KERNEL_BUFFERS = 4
+"""Fewest buffers of the kernel, the default of libiio."""
+_MAX_KERNEL_BUFFERS = 320
+"""Most buffers of the kernel; chosen: single samples at 1 kHz are kept as long as others, and its
+memory has a bound at high rates."""
+_ANSWERS = 20
+"""Answers of a device that are timed when it is opened."""
+_ROUND_TRIPS = 4.0
+"""Shortest duration of a buffer by the mean time of an answer. Chosen: each buffer needs one,
+so that the reads catch up with four times the sample rate after a delay."""
 _MAX_BUFFER = 2000
 """Most samples of a buffer."""
 _TIMEOUT_S = 1.0
@@ -160,7 +170,7 @@ class Stream:
     """
 
     def __init__(self, context: Any, device: Any, columns: Sequence[_Column], timestamp: Any,
-                 adc: AdcInfo, by_host_clock: bool) -> None:
+                 adc: AdcInfo, by_host_clock: bool, latency: LatencySettings) -> None:
         """
         Start the buffer.
 
@@ -172,6 +182,8 @@ class Stream:
             Channels that are read.
         adc, by_host_clock
             As the attributes.
+        latency
+            How long samples may wait for their buffer.
 
         Raises
         ------
@@ -180,7 +192,9 @@ class Stream:
 
         """
         self.name, self.adc, self.by_host_clock = device.name or device.id, adc, by_host_clock
-        count = int(min(max(adc.rate_hz * _BUFFER_S, 1), _MAX_BUFFER))
+        count = max(latency.samples_together(adc.rate_hz),
+                    ceil(_ROUND_TRIPS * _answer_s(columns[0].channel) * adc.rate_hz))
+        count = min(count, _MAX_BUFFER)
         self.buffer_s = count / adc.rate_hz
         self._context, self._device, self._timestamp = context, device, timestamp
         self._columns = [column for column in columns if column.buffered]
@@ -190,7 +204,8 @@ class Stream:
             channel.enabled = True
         # Some kernels cannot set this number; a network server cannot once its buffer runs.
         with suppress(OSError):
-            device.set_kernel_buffers_count(_KERNEL_BUFFERS)
+            device.set_kernel_buffers_count(
+                min(max(ceil(_KEPT_S / self.buffer_s), _MIN_KERNEL_BUFFERS), _MAX_KERNEL_BUFFERS))
         context.set_timeout(round((_TIMEOUT_S + 2 * self.buffer_s) * 1000))
         self._buffer = import_libiio().Buffer(device, count)
 
@@ -218,8 +233,8 @@ class Stream:
         except OSError as error:
             raise ReadError(f'{self.name}: lost: {_reason(error)}') from None
         lengths = {len(device_ns), *map(len, values.values())}
-        if len(lengths) != 1 or not len(device_ns) or not (
-                device_ns.min() >= 0 and device_ns.max() < _MAX_STAMP_NS):
+        if len(lengths) != 1 or not len(device_ns) or not all(
+                0 <= stamp_ns < _MAX_STAMP_NS for stamp_ns in device_ns.tolist()):
             raise ReadError(f'{self.name}: a buffer that makes no sense')
         return BufferSamples(device_ns, values)
 
@@ -242,7 +257,8 @@ class Stream:
         return values
 
 
-def open_stream(uri: str, device_name: str, entries: Sequence[str], sensor: Sensor) -> Stream:
+def open_stream(uri: str, device_name: str, entries: Sequence[str], sensor: Sensor,
+                latency: LatencySettings) -> Stream:
     """
     Open a device and start its buffer.
 
@@ -256,6 +272,8 @@ def open_stream(uri: str, device_name: str, entries: Sequence[str], sensor: Sens
         Entries of `link.channels`.
     sensor
         Sensor whose axes are read, at its sample rate.
+    latency
+        How long samples may wait for their buffer.
 
     Returns
     -------
@@ -286,7 +304,8 @@ def open_stream(uri: str, device_name: str, entries: Sequence[str], sensor: Sens
                             'lost samples cannot be counted')
         by_host_clock = _select_monotonic_clock(device) and uri.startswith('local:')
         rate_hz = _set_rate(context, device, columns, sensor.rate_hz)
-        return Stream(context, device, columns, timestamp, columns[0].adc(rate_hz), by_host_clock)
+        return Stream(context, device, columns, timestamp, columns[0].adc(rate_hz), by_host_clock,
+                      latency)
     except (OSError, ValueError) as error:
         raise ReadError(f'{device_name}: cannot be read: {_reason(error)}') from None
 
@@ -469,6 +488,14 @@ def _number(channel: Any, name: str) -> float:
     if not isfinite(value):
         raise UserError(f'{channel.id}: its attribute {name} is {text!r}, not a number')
     return value
+
+
+def _answer_s(channel: Any) -> float:
+    """Return how long a device takes for an answer, s: to what the scale of a channel is."""
+    began_s = time.perf_counter()
+    for _ in range(_ANSWERS):
+        _number(channel, 'scale')
+    return (time.perf_counter() - began_s) / _ANSWERS
 
 
 def _select_monotonic_clock(device: Any) -> bool:

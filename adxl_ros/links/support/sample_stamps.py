@@ -24,6 +24,9 @@ from adxl_ros.links.support.channels import Block, PeriodMeans
 from adxl_ros.links.support.clock_sync import ClockMap, IdentityMap, SystemClockMap
 import numpy as np
 
+_FOLLOW_NS = 10_000_000
+"""Time between two readings of the system clock, ns; chosen: a reading takes several microseconds,
+and nobody sees a clock that was set 10 ms later."""
 _FOREVER_NS = 2 ** 63 - 1
 """Largest time, ns: any waiting time is over by then."""
 
@@ -80,6 +83,7 @@ class Stamper:
         self.clock = clock
         self.period_ns = 0.0
         self._system_clock = SystemClockMap()
+        self._followed_ns = 0
         self._means = PeriodMeans()
         self._unstamped: list[Block] = []
         self._stamped: list[Samples] = []
@@ -152,6 +156,8 @@ class Stamper:
         if not self._stamped:
             return None
         parts, self._stamped = self._stamped, []
+        if len(parts) == 1:
+            return parts[0]
         return Samples(
             np.concatenate([part.stamp_ns for part in parts]),
             np.concatenate([part.volts for part in parts]),
@@ -169,7 +175,10 @@ class Stamper:
 
     def _stamp(self) -> None:
         """Stamp the waiting samples, with the number of samples that are missing before them."""
-        self._system_clock.update()
+        now_ns = time.monotonic_ns()
+        if now_ns - self._followed_ns >= _FOLLOW_NS:
+            self._followed_ns = now_ns
+            self._system_clock.update()
         for block in self._unstamped:
             host_ns = self.clock.host_ns(block.device_ns)
             if self._new_clock and self._last_ns is not None:
@@ -178,7 +187,7 @@ class Stamper:
             self._new_clock = False
             self._last_ns = int(host_ns[-1])
             self._stamped.append(Samples(
-                self._system_clock.ros_ns(host_ns), block.volts, 0,
+                self._system_clock.ros_ns(host_ns), block.volts, time.time_ns(),
                 self._counted + self._estimated, self._means.thin(host_ns, block.references),
                 self._estimated))
             self._counted = self._estimated = 0
@@ -187,5 +196,8 @@ class Stamper:
     def _gaps(self, device_ns: np.ndarray) -> int:
         """Count the samples that are missing by the device's stamps."""
         assert self._last_device_ns is not None, 'gaps are counted after a first block'
-        periods = np.rint(np.diff(device_ns, prepend=self._last_device_ns) / self.period_ns)
-        return int((periods - 1).clip(0).sum())
+        before_ns, missing = self._last_device_ns, 0
+        for stamp_ns in device_ns.tolist():
+            missing += max(round((stamp_ns - before_ns) / self.period_ns) - 1, 0)
+            before_ns = stamp_ns
+        return missing

@@ -18,7 +18,9 @@ from __future__ import annotations
 
 from contextlib import suppress
 import errno
+from math import inf
 import os
+from pathlib import Path
 import select
 import stat
 import termios
@@ -37,6 +39,12 @@ _MAX_READ = 65536
 """Most bytes of one read: more than a terminal or a socket usually holds."""
 _CHECK_S = 0.1
 """Period of the check of a silent port, s: its name may stand for another device by now."""
+_BITS_PER_BYTE = 10
+"""Bits of a byte on a UART: 8 and start and stop bit."""
+_SYSFS = Path('/sys/dev/char')
+"""Devices of the kernel by their numbers."""
+_USB_DRIVER = 'cdc_acm'
+"""Driver of boards that are USB devices themselves: they ignore the baud rate."""
 _RECONNECT_S = 3.0
 """Silence after which a network connection is made again, s: a lost peer sends no error."""
 
@@ -57,6 +65,8 @@ class SerialPort:
         Bytes so far.
     last_byte_s
         Monotonic time of the last bytes, s.
+    uart_bytes_per_s
+        Bytes that the open port carries per second; infinite where the baud rate has no meaning.
 
     """
 
@@ -79,6 +89,7 @@ class SerialPort:
         """
         self.connections = self.received_bytes = 0
         self.last_byte_s = self.opened_s = 0.0
+        self.uart_bytes_per_s = inf
         self._name, self._baud = name, baud
         self._pyserial = _import_pyserial()
         self._port: Any = None
@@ -107,6 +118,17 @@ class SerialPort:
             self._check_device(now_s)
         return chunk
 
+    def write(self, raw: bytes) -> None:
+        """Send bytes without waiting; what does not fit in the port's buffer is lost."""
+        if self._port is None:
+            return
+        # A port that is gone shows in the next read.
+        with suppress(OSError):
+            if self._poll is None:
+                self._port.write(raw)
+            else:
+                os.write(self._port.fileno(), raw)
+
     def confirm(self) -> None:
         """Take note that the bytes made sense: the next failure is retried soon."""
         self._backoff.reset()
@@ -131,12 +153,26 @@ class SerialPort:
         self.connections += 1
         self.opened_s = time.monotonic()
         self.error = ''
+        # An FTDI chip would keep bytes for 16 ms. Most other devices have no such setting.
+        with suppress(OSError, ValueError, AttributeError):
+            self._port.set_low_latency_mode(True)
+        self.uart_bytes_per_s = self._baud / _BITS_PER_BYTE if self._is_uart() else inf
         try:
             self._poll = select.poll()
             self._poll.register(self._port.fileno(), select.POLLIN)
         except (OSError, AttributeError):
             self._poll = None  # a URL without a file: pyserial's own time-out applies
-            self._port.timeout = _WAIT_MS * 1e-3
+            self._port.timeout = self._port.write_timeout = _WAIT_MS * 1e-3
+
+    def _is_uart(self) -> bool:
+        """Return whether the open port is a UART, on this machine or at the end of a USB cable."""
+        try:
+            number = os.fstat(self._port.fileno()).st_rdev
+            driver = (_SYSFS / f'{os.major(number)}:{os.minor(number)}' / 'device'
+                      / 'driver').resolve(strict=True)
+        except (OSError, AttributeError):
+            return False  # a pseudo-terminal or a network port
+        return driver.name != _USB_DRIVER
 
     def _read(self) -> bytes:
         """Wait for bytes; raises `OSError` where the device or the other side is gone."""

@@ -22,6 +22,7 @@ format is the contract with the board: docs/links.md has its table, firmware/ it
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cache
 from math import isfinite
 import struct
 from typing import Any
@@ -36,6 +37,8 @@ SAMPLES_TYPE = 1
 """Type of a frame with samples."""
 INFO_TYPE = 2
 """Type of a frame that describes the board."""
+COMMAND_TYPE = 3
+"""Type of a frame from the host to the board, which sets how many samples a frame has."""
 RAIL = 1
 """Flag of a frame with samples: a code is at a rail of the ADC."""
 AFTER_RESET = 2
@@ -49,14 +52,19 @@ _SAMPLES = struct.Struct('<BBHIQIHBB')
 """Fields of a payload with samples: the common ones, time, index, overruns, samples, channels."""
 _INFO = struct.Struct('<BBHIfBBf16s')
 """Fields of an info payload: the common ones, sample rate, bits, channels, vref, serial number."""
+_COMMAND = struct.Struct('<BBHII')
+"""Fields of a command: the common ones, latency in µs."""
 _CRC = struct.Struct('<I')
 """CRC-32 behind the payload, as zlib computes it."""
-_MAX_COUNT = 255
+MAX_COUNT = 255
 """Most samples of a frame: their number is a u8."""
-_MAX_PAYLOAD = _SAMPLES.size + _MAX_COUNT * MAX_CHANNELS * 2
+_MAX_PAYLOAD = _SAMPLES.size + MAX_COUNT * MAX_CHANNELS * 2
 """Most bytes of a payload."""
 MAX_FRAME_BYTES = _MAX_PAYLOAD + _CRC.size + 2 + _MAX_PAYLOAD // 254
 """Most bytes of a frame without its 0x00: COBS adds one byte for each 254."""
+_MAX_LOAD = 0.85
+"""Largest share of the time of a wire that frames take. Chosen: info frames and the tolerance of
+baud rates, 5 %, need the other part."""
 _MAX_TIME_US = 2 ** 53
 """Largest time of a device clock, µs: 285 years."""
 _MIN_RATE_HZ = 0.01
@@ -232,22 +240,104 @@ def decode(raw: bytes) -> BoardInfo | SampleFrame:
         The frame is damaged, or a field is out of range.
 
     """
+    payload, check = _checked_payload(raw)
+    kind = payload[0]
+    if kind == INFO_TYPE:
+        return _decode_info(payload)
+    if kind == SAMPLES_TYPE:
+        return _decode_samples(payload, check)
+    raise WireError(f'unknown type {kind}')
+
+
+def encode_command(sequence: int, latency_us: int) -> bytes:
+    """
+    Encode the frame by which the host asks for small frames.
+
+    Parameters
+    ----------
+    sequence
+        Number of the command.
+    latency_us
+        Longest time over which the board collects the samples of a frame, µs.
+
+    Returns
+    -------
+    bytes
+        The frame between two 0x00: what the board received before does not damage it.
+
+    """
+    payload = _COMMAND.pack(COMMAND_TYPE, VERSION, 0, sequence % 2 ** 32,
+                            min(latency_us, 2 ** 32 - 1))
+    return b'\0' + encode_payload(payload)
+
+
+def decode_command(raw: bytes) -> int:
+    """
+    Decode a frame from the host, as a board does.
+
+    Parameters
+    ----------
+    raw
+        The bytes between two 0x00.
+
+    Returns
+    -------
+    int
+        Longest time over which the board shall collect the samples of a frame, µs.
+
+    Raises
+    ------
+    WireError
+        The frame is damaged, or no command.
+
+    """
+    payload, _ = _checked_payload(raw)
+    if payload[0] != COMMAND_TYPE or len(payload) != _COMMAND.size:
+        raise WireError('no command')
+    return int(_COMMAND.unpack(payload)[-1])
+
+
+def samples_that_fit(count: int, info: BoardInfo, bytes_per_s: float) -> int:
+    """
+    Return the smallest number of samples of a frame that a wire carries with a margin.
+
+    Parameters
+    ----------
+    count
+        Number of samples that is wanted.
+    info
+        Description of the board.
+    bytes_per_s
+        Bytes that the wire carries per second.
+
+    Returns
+    -------
+    int
+        `count` or more; the most of a frame where the wire does not carry the samples at all.
+
+    """
+    for samples in range(count, MAX_COUNT):
+        payload = _SAMPLES.size + 2 * samples * info.channels + _CRC.size
+        frame_bytes = payload + 2 + payload // 254
+        if frame_bytes * info.rate_hz / samples <= _MAX_LOAD * bytes_per_s:
+            return samples
+    return MAX_COUNT
+
+
+def _checked_payload(raw: bytes) -> tuple[bytes, int]:
+    """Return payload and CRC of a frame; raise `WireError` unless whole and of this version."""
     cobs = import_cobs()
     try:
         decoded = cobs.decode(raw)
     except cobs.DecodeError as error:
         raise WireError(str(error)) from None
-    payload, check = decoded[:-_CRC.size], decoded[-_CRC.size:]
-    if len(payload) < _COMMON.size or check != _CRC.pack(zlib.crc32(payload)):
+    payload = decoded[:-_CRC.size]
+    check = zlib.crc32(payload)
+    if len(payload) < _COMMON.size or decoded[-_CRC.size:] != _CRC.pack(check):
         raise WireError('the CRC does not match')
-    kind, version = payload[:2]
-    if version != VERSION:
-        raise VersionError(f'wire format {version}')
-    if kind == INFO_TYPE:
-        return _decode_info(payload)
-    if kind == SAMPLES_TYPE:
-        return _decode_samples(payload, *_CRC.unpack(check))
-    raise WireError(f'unknown type {kind}')
+    if payload[1] != VERSION:
+        raise VersionError(f'wire format {payload[1]}')
+    return payload, check
 
 
 def _decode_info(payload: bytes) -> BoardInfo:
@@ -316,6 +406,7 @@ class Splitter:
         self._incomplete, self._skipping = b'', False
 
 
+@cache
 def import_cobs() -> Any:
     """Return the module cobs.cobs; raises `UserError` where it is not installed."""
     try:

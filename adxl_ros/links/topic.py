@@ -1,0 +1,497 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""A realistic sensor in another simulator: the signal chain on its ideal Imu stream."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from math import ceil, inf
+import time
+from typing import NamedTuple
+
+from adxl_ros.links.support.base import (
+    Event,
+    Level,
+    LinkStatus,
+    no_samples,
+    option,
+    Samples,
+    SimulatorSettings,
+)
+from adxl_ros.model.constants import NOMINAL_TEMPERATURE_C
+from adxl_ros.model.sensor import Sensor
+from adxl_ros.simulate.motion import Motion
+from adxl_ros.simulate.response import lagrange_weights, POINTS, Response
+from adxl_ros.simulate.sensor_model import SensorModel
+import numpy as np
+import scipy
+
+_SILENT_S = 3.0
+"""Steady time without samples after which the stream counts as silent, s; chosen: as for the
+samples of the calibration node."""
+_FIRST = 50
+"""Samples that determine the rate, before the first one is published; chosen: 0.25 s at 200 Hz,
+where a jitter of 20 % of the period leaves an error of 0.4 %."""
+_FIRST_NS = 1_000_000_000
+"""Simulated time after which fewer samples determine the rate, ns; chosen: for slow simulators."""
+_MIN_FIRST = 5
+"""Fewest samples that determine a rate; chosen: four differences survive one lost sample."""
+_BLOCK = 100
+"""Samples after which the rate is measured again; chosen."""
+_RATE_TOLERANCE = 0.03
+"""Largest relative change of the rate that is no change; chosen: far above the error of a rate."""
+_MAX_FILLED_NS = 1_000_000_000
+"""Longest gap of the stream through which the chain runs on, ns. Chosen: filter and resonance
+forget the past within it."""
+_ON_SAMPLE = 1e-4
+"""Distance of a time from a sample, in samples, that is rounding; chosen: far above that of
+floats."""
+_LATE_PERIODS = 10
+"""Periods by which a sample may be late; chosen: an older stamp is a simulation that was reset."""
+
+_NOT_MEASURED = np.array([-1.0, *[0.0] * 8])
+"""Covariance that says that there is no value (sensor_msgs/Imu)."""
+_ABSENT = {'orientation': np.array([0.0, 0.0, 0.0, 1.0]), 'angular_velocity': np.zeros(3)}
+"""Values in place of those that are no numbers."""
+
+
+@dataclass(frozen=True)
+class Settings(SimulatorSettings):
+    """
+    Settings of the link.
+
+    Attributes
+    ----------
+    topic
+        Topic of the ideal samples.
+    temperature_topic
+        Topic of the temperature of the sensor.
+    seed
+        Seed of the noise.
+    roll_rad, pitch_rad, yaw_rad
+        Orientation of the case in the frame of the ideal samples, rad.
+
+    """
+
+    topic: str = option('imu/ideal', 'topic of the ideal sensor_msgs/Imu of a simulator: specific '
+                        'force')
+    temperature_topic: str = option('temperature', 'topic of the temperature of the sensor, '
+                                    'sensor_msgs/Temperature; 25 °C until it comes')
+    seed: int = option(0, 'seed of the noise', '', 0, 2 ** 31 - 1)
+    roll_rad: float = option(0.0, 'roll of the case in the frame of the ideal samples', 'rad',
+                             -7.0, 7.0)
+    pitch_rad: float = option(0.0, 'pitch of the case in that frame', 'rad', -7.0, 7.0)
+    yaw_rad: float = option(0.0, 'yaw of the case in that frame', 'rad', -7.0, 7.0)
+
+    @property
+    def turns_case(self) -> bool:
+        """Return whether the frame of the case is not that of the simulator's samples."""
+        return any((self.roll_rad, self.pitch_rad, self.yaw_rad))
+
+
+@dataclass(frozen=True)
+class _Statistics:
+    """
+    Counts of the link.
+
+    Attributes
+    ----------
+    resets
+        How often simulated time has jumped backwards.
+    rate_changes
+        How often the rate of the stream has changed.
+    gaps
+        Gaps of more than a second.
+    late
+        Samples that came twice or late, and were not published.
+    not_finite
+        Samples whose force was no number.
+
+    """
+
+    resets: int = 0
+    rate_changes: int = 0
+    gaps: int = 0
+    late: int = 0
+    not_finite: int = 0
+
+
+class _Ideal(NamedTuple):
+    """One sample of the simulator: stamp, ns, and the fields of its message in the case frame."""
+
+    stamp_ns: int
+    fields: dict[str, np.ndarray]
+
+    @property
+    def force(self) -> np.ndarray:
+        """Return the specific force, m/s², (3,)."""
+        return self.fields['linear_acceleration']
+
+
+class _Chain:
+    """
+    The signal chain at the rate of the samples, as `simulate` runs it.
+
+    Parameters
+    ----------
+    sensor
+        The unit at that rate, with effects that need no stage.
+    seed
+        Seed of its noise.
+
+    """
+
+    def __init__(self, sensor: Sensor, seed: int) -> None:
+        self._rate_hz = sensor.rate_hz
+        delay_s = float(sensor.values.get('time_offset', {}).get('offset_s', 0.0))
+        self._kept = POINTS + ceil(delay_s * sensor.rate_hz)
+        self._force = np.zeros((0, 3))
+        self._first = self._count = 0
+        self._temperature_c = NOMINAL_TEMPERATURE_C
+        self._respond = Response(sensor, Motion(
+            inf, force=self._force_at, temperature_c=self._temperature_at,
+            internal_rate_hz=sensor.rate_hz), seed)
+
+    def __call__(self, force: np.ndarray, temperature_c: float) -> np.ndarray:
+        """
+        Advance over the next samples.
+
+        Parameters
+        ----------
+        force
+            Specific force in the case frame, m/s², (n, 3).
+        temperature_c
+            Temperature, °C.
+
+        Returns
+        -------
+        ndarray
+            Output of the sensor, V, (n, m).
+
+        """
+        if not self._count:
+            # Before its first sample the sensor has rested.
+            self._force = np.tile(force[0], (self._kept, 1))
+            self._first = -self._kept
+        self._force = np.concatenate([self._force, force])
+        self._temperature_c = temperature_c
+        index = self._count + np.arange(len(force))
+        self._count += len(force)
+        volts = self._respond(index / self._rate_hz)
+        surplus = len(self._force) - self._kept
+        self._force, self._first = self._force[surplus:], self._first + surplus
+        return volts
+
+    def _force_at(self, time_s: np.ndarray) -> list[np.ndarray]:
+        """Return the force at times, s, (n,); between samples by a polynomial."""
+        place = time_s * self._rate_hz - self._first
+        nearest = np.rint(place).astype(int)
+        if np.abs(place - nearest).max() < _ON_SAMPLE:
+            return list(self._force[nearest].T)
+        first = np.clip(place.astype(int) - POINTS // 2 + 1, 0, len(self._force) - POINTS)
+        weights = lagrange_weights(place - first)
+        return list(np.einsum('ij,ijk->ki', weights,
+                              self._force[first[:, None] + np.arange(POINTS)]))
+
+    def _temperature_at(self, time_s: np.ndarray, order: int = 0) -> np.ndarray:
+        """Return the temperature at times, s, (n,), °C."""
+        return np.full(len(time_s), 0.0 if order else self._temperature_c)
+
+
+def open_link(sensor: Sensor, settings: Settings) -> EmulatedSensor:
+    """
+    Open the link.
+
+    Parameters
+    ----------
+    sensor
+        Sensor that is emulated.
+    settings
+        Settings of the link.
+
+    Returns
+    -------
+    EmulatedSensor
+        The link, which waits for the simulator.
+
+    """
+    return EmulatedSensor(sensor, settings)
+
+
+class EmulatedSensor:
+    """
+    The signal chain behind the ideal samples of a simulator.
+
+    Stamps are those of the simulator, so that a pause and any real-time factor need nothing. The
+    chain runs at the rate of the stream, which its first samples determine. A reset of the
+    simulation and a new rate put the sensor at its power-on.
+    """
+
+    live = True
+    references = ()
+    waits_for_listener = False
+    start_ns = None
+
+    def __init__(self, sensor: Sensor, settings: Settings) -> None:
+        """
+        Wait for the first sample.
+
+        Parameters
+        ----------
+        sensor
+            Sensor that is emulated.
+        settings
+            Settings of the link.
+
+        Raises
+        ------
+        UserError
+            The effects of the sensor do not fit together.
+
+        """
+        self.sensor: Sensor | None = None
+        self.imu_topic, self.temperature_topic = settings.topic, settings.temperature_topic
+        self._seed = settings.seed
+        # Fixed axes (REP-103), as in a URDF joint.
+        self._case = scipy.spatial.transform.Rotation.from_euler(
+            'xyz', (settings.roll_rad, settings.pitch_rad, settings.yaw_rad)) \
+            if settings.turns_case else None
+        self._temperature_c = NOMINAL_TEMPERATURE_C
+        self._statistics = _Statistics()
+        left_out = SensorModel(sensor).left_out
+        self._left_out = '; '.join(f'{name} {reason}' for name, reason in left_out.items())
+        effects = tuple(name for name in sensor.effects if name not in left_out)
+        self._unit = replace(sensor, effects=effects,
+                             values={name: sensor.values[name] for name in effects})
+        self._has_publisher: bool | None = None
+        self._heard_s = time.monotonic()
+        self._newest_ns: int | None = None
+        self._made: list[tuple[_Ideal, np.ndarray]] = []
+        self._waiting: list[tuple[_Ideal | None, np.ndarray]] = []
+        self._missing = 0
+        self._chain: _Chain | None = None
+        self._restart()
+
+    def sense_temperature(self, temperature_c: float) -> None:
+        """Use a temperature, °C, from the next sample on; ignore NaN."""
+        if np.isfinite(temperature_c):
+            self._temperature_c = temperature_c
+
+    def sense_silence(self, has_publisher: bool) -> None:
+        """Take that no sample has come, and whether the topic has a publisher."""
+        self._has_publisher = has_publisher
+
+    def sense_imu(self, stamp_ns: np.ndarray, fields: Mapping[str, np.ndarray]) -> None:
+        """
+        Take ideal samples.
+
+        Parameters
+        ----------
+        stamp_ns
+            Their stamps, ns, (n,).
+        fields
+            Number fields of sensor_msgs/Imu by name, (n, k) each, in the simulator's frame.
+
+        """
+        self._heard_s = time.monotonic()
+        for i, stamp in enumerate(stamp_ns.tolist()):
+            self._sense(_Ideal(stamp, _in_case(
+                {name: values[i] for name, values in fields.items()}, self._case)))
+        self._run_chain()
+
+    def begin(self, now_ns: int) -> int:
+        """Return 0: stamps are those of the simulator, and no sample is lost."""
+        return 0
+
+    def read(self, now_ns: int) -> Samples:
+        """Return the samples since the last call."""
+        made, self._made = self._made, []
+        missing, self._missing = self._missing, 0
+        if not made:
+            empty = no_samples(self._unit, self._newest_ns or 0)
+            return replace(empty, missing=missing, estimated=missing)
+        passed = {name: np.array([ideal.fields[name] for ideal, _ in made])
+                  for name in made[0][0].fields if name != 'linear_acceleration'}
+        return Samples(np.array([ideal.stamp_ns for ideal, _ in made], np.int64),
+                       np.array([volts for _, volts in made]), made[-1][0].stamp_ns, missing,
+                       estimated=missing, imu_fields=passed)
+
+    def status(self) -> LinkStatus:
+        """Return whether the simulator sends samples."""
+        counts = self._statistics
+        events = (Event(f'not emulated: {self._left_out}', int(bool(self._left_out))),
+                  Event('the simulation was reset; the sensor is at its power-on', counts.resets),
+                  Event('the rate of the simulator changed; the sensor is at its power-on',
+                        counts.rate_changes),
+                  Event(f'{self.imu_topic}: a sample is not a number; check the simulation',
+                        counts.not_finite))
+        text = self._waits_for()
+        if text:
+            return LinkStatus(Level.WARN, text, (counts,), events)
+        rate_hz = self.sensor.rate_hz if self.sensor else 0.0
+        return LinkStatus(Level.OK, f'emulates {self._unit.serial} on {self.imu_topic} at '
+                          f'{rate_hz:.6g} Hz', (counts,), events)
+
+    def close(self) -> None:
+        """Do nothing: the link holds nothing open."""
+
+    def _waits_for(self) -> str:
+        """Return why no samples come; '' while they come."""
+        if self._newest_ns is None or time.monotonic() - self._heard_s > _SILENT_S:
+            if self._has_publisher is None:
+                return f'{self.imu_topic}: waiting for a sample'
+            return f'{self.imu_topic}: no samples; is the simulation paused?' \
+                if self._has_publisher else \
+                f'{self.imu_topic}: nobody publishes it; start the simulator, or set link.topic'
+        return '' if self._chain else f'{self.imu_topic}: measuring the rate'
+
+    def _restart(self) -> None:
+        """Put the sensor at its power-on, at a rate that the next samples determine."""
+        self._run_chain()
+        self._chain = None
+        self._held: list[_Ideal] = []
+        self._last: _Ideal | None = None
+        self._steps: deque[tuple[int, int]] = deque(maxlen=_BLOCK)
+        self._since = 0
+
+    def _count(self, name: str) -> None:
+        """Add one to a count of the statistics."""
+        self._statistics = replace(
+            self._statistics, **{name: getattr(self._statistics, name) + 1})
+
+    def _sense(self, ideal: _Ideal) -> None:
+        """Take one sample: drop it, hold it until the rate is known, or apply the chain."""
+        if self._newest_ns is not None and ideal.stamp_ns <= self._newest_ns:
+            if not self._is_reset(ideal.stamp_ns):
+                self._count('late')
+                return
+            self._count('resets')
+            self._restart()
+        if not np.isfinite(ideal.force).all():
+            self._count('not_finite')
+            return
+        self._newest_ns = ideal.stamp_ns
+        if self._chain is None:
+            self._hold(ideal)
+        else:
+            self._advance(ideal)
+
+    def _is_reset(self, stamp_ns: int) -> bool:
+        """Return whether a stamp that does not follow the newest one is of a new simulation."""
+        assert self._newest_ns is not None, 'an older stamp needs a newer one'
+        period_ns = 1e9 / self.sensor.rate_hz if self.sensor else 0.0
+        return stamp_ns < self._newest_ns - _LATE_PERIODS * period_ns
+
+    def _hold(self, ideal: _Ideal) -> None:
+        """Hold a sample; publish all that are held once they determine the rate."""
+        self._held.append(ideal)
+        span_ns = ideal.stamp_ns - self._held[0].stamp_ns
+        count = len(self._held)
+        if count < _FIRST and (span_ns < _FIRST_NS or count < _MIN_FIRST):
+            return
+        period_ns = _period_ns(np.array([held.stamp_ns for held in self._held]))
+        self.sensor = replace(self._unit, rate_hz=1e9 / period_ns)
+        self._chain = _Chain(self.sensor, self._seed)
+        self._seed += 1
+        held, self._held = self._held, []
+        for waiting in held:
+            self._advance(waiting)
+
+    def _advance(self, ideal: _Ideal) -> None:
+        """Let the chain run up to a sample, through those that were lost before it."""
+        assert self.sensor is not None, 'a chain has a rate'
+        period_ns = 1e9 / self.sensor.rate_hz
+        steps = 1
+        if self._last is not None:
+            step_ns = ideal.stamp_ns - self._last.stamp_ns
+            steps = max(round(step_ns / period_ns), 1)
+            self._missing += steps - 1
+            if step_ns > max(_MAX_FILLED_NS, _LATE_PERIODS * period_ns):
+                self._count('gaps')
+                self._restart()
+                self._hold(ideal)
+                return
+            for k in range(1, steps):
+                between = self._last.force + k / steps * (ideal.force - self._last.force)
+                self._waiting.append((None, between))
+            self._steps.append((step_ns, steps))
+        self._waiting.append((ideal, ideal.force))
+        self._last = ideal
+        self._check_rate(period_ns)
+
+    def _run_chain(self) -> None:
+        """Run the chain over the samples that wait for it."""
+        waiting, self._waiting = self._waiting, []
+        if waiting and self._chain is not None:
+            volts = self._chain(np.array([force for _, force in waiting]), self._temperature_c)
+            self._made += [(ideal, row) for (ideal, _), row in zip(waiting, volts)
+                           if ideal is not None]
+
+    def _check_rate(self, period_ns: float) -> None:
+        """Measure the rate of a block of samples; start again if the simulator has another one."""
+        self._since += 1
+        if self._since < _BLOCK or len(self._steps) < _BLOCK:
+            return
+        self._since = 0
+        step_ns, steps = np.array(self._steps).T
+        change = step_ns.sum() / steps.sum() / period_ns - 1
+        if abs(change) > _RATE_TOLERANCE or np.median(steps) > 1:
+            self._count('rate_changes')
+            self._restart()
+
+
+def _in_case(fields: dict[str, np.ndarray], case: scipy.spatial.transform.Rotation | None
+             ) -> dict[str, np.ndarray]:
+    """
+    Turn a message of the simulator into the frame of the case.
+
+    Parameters
+    ----------
+    fields
+        Number fields of the message by name.
+    case
+        Orientation of the case in the frame of the message; None where they are the same.
+
+    Returns
+    -------
+    dict
+        The fields. What is no number is marked as not measured, except for the force.
+
+    """
+    for name, value in _ABSENT.items():
+        if not np.isfinite([*fields[name], *fields[f'{name}_covariance']]).all():
+            fields |= {name: value, f'{name}_covariance': _NOT_MEASURED}
+    if case is None:
+        return fields
+    for name in ('linear_acceleration', 'angular_velocity'):
+        fields[name] = case.inv().apply(fields[name])
+    covariance = fields['angular_velocity_covariance']
+    if covariance[0] >= 0:
+        rotation = case.as_matrix()
+        fields['angular_velocity_covariance'] = (
+            rotation.T @ covariance.reshape(3, 3) @ rotation).ravel()
+    if fields['orientation'].any():
+        orientation = scipy.spatial.transform.Rotation.from_quat(fields['orientation'])
+        fields['orientation'] = (orientation * case).as_quat()
+    return fields
+
+
+def _period_ns(stamps_ns: np.ndarray) -> float:
+    """Return the period of stamps, ns, (n,), some of which may be lost."""
+    steps_ns = np.diff(stamps_ns)
+    periods = np.rint(steps_ns / np.median(steps_ns)).clip(1)
+    return float(steps_ns.sum() / periods.sum())
