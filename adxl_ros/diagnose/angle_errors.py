@@ -39,8 +39,7 @@ from adxl_ros.diagnose.noise_floor import gravity_slopes
 from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2
 import numpy as np
-from scipy.linalg.lapack import dtbtrs
-from scipy.signal import lfilter
+import scipy
 
 _LOWEST_NOISE_V = 1e-7
 """Smallest standard deviation of the noise, V, because the filter divides by it. Chosen: below
@@ -91,11 +90,13 @@ class AngleErrorFilter:
             changes = part.copy()
             changes[:, 1:] -= self.pole * part[:, :-1]
             changes[:, 0] = 0.0
-            estimates = dtbtrs(lower, (changes * self.gain).T, uplo='L', diag='U')[0].T
+            estimates = scipy.linalg.lapack.dtbtrs(lower, (changes * self.gain).T, uplo='L',
+                                                   diag='U')[0].T
             changes[:, 1:] -= self.weight[1:] * estimates[:, :-1]
             changes *= self.scale
             changes[:, 0] = part[:, 0]
-            filtered[first:first + _SERIES] = lfilter([1.0], [1.0, -self.pole], changes)
+            filtered[first:first + _SERIES] = scipy.signal.lfilter(
+                [1.0], [1.0, -self.pole], changes)
         return filtered
 
 

@@ -58,8 +58,9 @@ _REST_RATE = 1e-3
 """A joint rests below this rate, rad/s, and the shift below this acceleration, m/s². Chosen: the
 specific force then changes by less than the noise within a second."""
 _SETTLING_S = 0.3
-"""A sample rests if no joint moves within this time before it, s. Chosen: an RC filter of 15 Hz
-has settled."""
+"""A sample rests if no joint moves within this time before it, s. Where another simulator moves
+from its first sample on, samples of this time are not used. Chosen: an RC filter of 15 Hz has
+settled."""
 
 
 class Reference(Enum):
@@ -103,6 +104,9 @@ class BaselineComparison:
         reference is not known.
     notes : tuple of str
         What was corrected or left out before the comparison, one line each, for people.
+    fading_hz
+        Frequency above which the reference lacks half of the motion's power, Hz; None where it
+        does not.
     memo
         Signals that simulations of this recording share.
 
@@ -118,12 +122,22 @@ class BaselineComparison:
     at_rest: np.ndarray
     used: np.ndarray
     notes: tuple[str, ...] = ()
-    reference_fades: bool = False
+    fading_hz: float | None = None
     memo: ChainMemo = field(default_factory=ChainMemo, compare=False, repr=False)
 
     def __len__(self) -> int:
         """Return the number of samples."""
         return len(self.time_s)
+
+    @property
+    def reference_fades(self) -> bool:
+        """Whether the reference lacks fast motion."""
+        return self.fading_hz is not None
+
+    @property
+    def lacking_hz(self) -> float:
+        """Frequency above which the reference lacks a part of the motion, Hz."""
+        return np.inf if self.fading_hz is None else self.fading_hz / 2
 
     @property
     def dt_s(self) -> float:
@@ -257,7 +271,8 @@ def compare(recording: Recording, sensor: Sensor, sim: Motion | None = None
     Returns
     -------
     BaselineComparison
-        The comparison; all samples are used.
+        The comparison. All samples are used but the first ones of another simulator that moves:
+        the filter may still show what was before them.
 
     Raises
     ------
@@ -272,11 +287,14 @@ def compare(recording: Recording, sensor: Sensor, sim: Motion | None = None
         wanted_hz = max(_LOWEST_INTERNAL_RATE_HZ, sensor.rate_hz)
         motion = replace(motion, internal_rate_hz=min(wanted_hz, INTERNAL_RATE_HZ,
                                                       _highest_rate_hz(recording.time_s)))
-    motion = _cached(motion, reference)
+    motion, time_s = _cached(motion, reference), recording.time_s
+    at_rest = _at_rest(motion, time_s, reference, volts)
+    used = np.ones(len(recording), bool)
+    if reference is Reference.SIMULATOR:
+        used = at_rest | (time_s > time_s[0] + _SETTLING_S)
     return BaselineComparison(
-        recording.path, recording.time_s, volts, motion, sensor, reference,
-        'alpha_rad' in recording.columns, _at_rest(motion, recording.time_s, reference, volts),
-        np.ones(len(recording), bool))
+        recording.path, time_s, volts, motion, sensor, reference,
+        'alpha_rad' in recording.columns, at_rest, used)
 
 
 def _highest_rate_hz(time_s: np.ndarray) -> float:

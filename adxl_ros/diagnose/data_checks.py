@@ -177,9 +177,11 @@ def find_length_fault(comparisons: Sequence[BaselineComparison]) -> DataFault | 
     used_s = sum(c.span_s * float(c.used.mean()) for c in comparisons)
     if used_s >= SHORTEST_S or all(c.reference is Reference.NONE for c in comparisons):
         return None
-    remaining = '' if used_s == span_s else f', of which {used_s:.3g} s have a usable reference,'
-    return DataFault('too_short', 'insufficient', f'{span_s:.3g} s in all{remaining} are too '
-                     'short for a verdict; record at least one minute')
+    if span_s < SHORTEST_S:
+        return DataFault('too_short', 'insufficient', f'{span_s:.3g} s in all are too short for '
+                         'a verdict; record at least one minute')
+    return DataFault('too_short', 'insufficient', f'{used_s:.3g} of {span_s:.3g} s have a usable '
+                     'reference, which is too short for a verdict; the note says why')
 
 
 def find_data_fault(comparison: BaselineComparison, search_comparison: BaselineComparison

@@ -23,10 +23,10 @@ from typing import NamedTuple
 
 from adxl_ros.diagnose.decision_settings import DecisionSettings
 from adxl_ros.diagnose.hypothesis_fit import Hypothesis
+from adxl_ros.diagnose.linear_model import shows_in_lost_motion
 from adxl_ros.diagnose.noise_detectors import Detection, UNKNOWN
 from adxl_ros.diagnose.noise_whitening import drifts_among
 from adxl_ros.diagnose.posterior import WeighedHypothesis
-from adxl_ros.model.diagnosis_hints import Manoeuvre
 from adxl_ros.model.effects import effect_named
 import numpy as np
 
@@ -46,6 +46,13 @@ class WeightedHypothesis(NamedTuple):
 
     effects: tuple[str, ...]
     probability: float
+
+
+def normalised(weights: Mapping[tuple[str, ...], float]) -> tuple[WeightedHypothesis, ...]:
+    """Return hypotheses by falling probability, which sums to 1."""
+    total = sum(weights.values())
+    return tuple(sorted((WeightedHypothesis(effects, weight / total)
+                         for effects, weight in weights.items()), key=lambda h: -h.probability))
 
 
 @dataclass(frozen=True)
@@ -69,6 +76,9 @@ class Verdict:
         The most probable hypothesis.
     unknown_where
         Dimensions in which something unknown shows, the strongest first.
+    undescribed
+        The part of the probabilities that stands for verdicts that are wrong for a reason that no
+        hypothesis describes, and the hypothesis that has it.
 
     """
 
@@ -79,6 +89,20 @@ class Verdict:
     hypotheses: tuple[WeightedHypothesis, ...]
     best: Hypothesis
     unknown_where: tuple[str, ...] = ()
+    undescribed: WeightedHypothesis = WeightedHypothesis((), 0.0)
+
+    @property
+    def described(self) -> tuple[WeightedHypothesis, ...]:
+        """
+        Return the hypotheses without the undescribed part, by falling probability.
+
+        No sample changes that part, so that it cannot lead a choice of samples.
+        """
+        weights = {h.effects: h.probability for h in self.hypotheses}
+        effects, share = self.undescribed
+        if effects in weights:
+            weights[effects] = max(weights[effects] - share, 0.0)
+        return normalised(weights)
 
 
 @dataclass(frozen=True)
@@ -103,6 +127,8 @@ class Findings:
         Rms that the best hypothesis explains, m/s².
     unexplained_mps2
         Rms that neither the best hypothesis nor noise explains, m/s².
+    lost_motion_mps2
+        Rms of motion that a smooth reference lacks, m/s².
     code_step_mps2
         Rms of the rounding to codes of the ADC, m/s². It is not unknown, although it is not white
         where the rounding follows the signal.
@@ -116,6 +142,7 @@ class Findings:
     noise_mps2: float
     explained_mps2: float
     unexplained_mps2: float
+    lost_motion_mps2: float
     code_step_mps2: float
 
 
@@ -163,23 +190,27 @@ def decide(findings: Findings, settings: DecisionSettings) -> Verdict:
             weights[(effect,)] = weights.get((effect,), 0.0) + nothing * odds
         weights[()] = nothing
     weights[(UNKNOWN,)] = float(unknown * (1 - wrong))
+    rivals = _rivals(library_sets, settings)
     other = tuple(sorted(named if is_unknown else (*named, UNKNOWN)))
     weights[other] = weights.get(other, 0.0) + wrong
+    for others in (detected, (*detected, UNKNOWN)):
+        _share_among_imitations(weights, best.effects, rivals, others)
     weighted = sorted((WeightedHypothesis(*item) for item in weights.items()),
                       key=lambda w: -w.probability)
+    undescribed = WeightedHypothesis(other, wrong)
     if is_unknown:
         return Verdict('unknown', (), (), weights[(UNKNOWN,)], tuple(weighted), best.hypothesis,
-                       where)
-    rivals = _rivals(library_sets, settings)
+                       where, undescribed)
     effects = tuple(sorted((*(e for e in best.effects if len(rivals[e]) == 1), *detected)))
     groups = tuple(sorted({tuple(sorted(rivals[e])) for e in best.effects
                            if len(rivals[e]) > 1}))
     covered = {frozenset(effects) | set(choice) for choice in _choices(groups)}
     probability = float(sum(w.probability for w in weighted if frozenset(w.effects) in covered))
     if not best.effects and not detected:
-        return Verdict('no_gap', (), (), probability, tuple(weighted), best.hypothesis)
+        return Verdict('no_gap', (), (), probability, tuple(weighted), best.hypothesis,
+                       undescribed=undescribed)
     return Verdict('inseparable' if groups else 'explained', effects, groups, probability,
-                   tuple(weighted), best.hypothesis)
+                   tuple(weighted), best.hypothesis, undescribed=undescribed)
 
 
 def _dimensions(weighed: Sequence[WeighedHypothesis]) -> tuple[str, ...]:
@@ -202,6 +233,7 @@ def _unexplained(findings: Findings, best: WeighedHypothesis, settings: Decision
     # With a drift, the residual is the drift itself, so that its rms shows nothing unknown.
     limit_mps2 = max(settings.unexplained_share_of_noise * findings.noise_mps2,
                      settings.unexplained_share_of_explained * findings.explained_mps2,
+                     settings.smallest_share_of_lost_motion * findings.lost_motion_mps2,
                      findings.code_step_mps2)
     if (not drifts and findings.unexplained_mps2 > limit_mps2) \
             or any(d.effect == UNKNOWN for d in findings.detections):
@@ -218,8 +250,9 @@ def _rivals(library_sets: Sequence[WeighedHypothesis], settings: DecisionSetting
     effects is not tempered.
     """
     best = library_sets[0]
-    rivals = {effect: {effect} for effect in best.effects}
+    rivals = {effect: {effect, *_imitating(effect, best.effects)} for effect in best.effects}
     for w in library_sets[1:]:
+        _add_imitated(rivals, best, w, settings)
         share = w.probability / best.probability
         if all(effect_named(e).exact for e in best.effects | w.effects):
             share = np.exp(min(w.log_evidence - best.log_evidence, 0.0))
@@ -229,6 +262,34 @@ def _rivals(library_sets: Sequence[WeighedHypothesis], settings: DecisionSetting
         for effect in best.effects - w.effects:
             rivals[effect] |= new
     return rivals
+
+
+def _share_among_imitations(weights: dict[tuple[str, ...], float], best: frozenset[str],
+                            rivals: Mapping[str, set[str]], others: Sequence[str]) -> None:
+    """Give equal probability to sets that give the same samples, each beside other effects."""
+    same = [[effect, *(r for r in rivals[effect] - {effect}
+                       if effect in _imitating(r, ()) or r in _imitating(effect, ()))]
+            for effect in sorted(best)]
+    keys = [tuple(sorted((*choice, *others))) for choice in _choices(same)]
+    if len(keys) > 1:
+        total = sum(weights.get(key, 0.0) for key in keys)
+        weights.update(dict.fromkeys(keys, total / len(keys)))
+
+
+def _imitating(effect: str, present: Iterable[str]) -> set[str]:
+    """Return the effect of the sensor that gives the same samples as one of the reference."""
+    imitating = effect_named(effect).diagnosis.imitated_by
+    return {imitating} - {'', *present}
+
+
+def _add_imitated(rivals: dict[str, set[str]], best: WeighedHypothesis, other: WeighedHypothesis,
+                  settings: DecisionSettings) -> None:
+    """Add the effect of the reference that gives the same samples as one of the best set."""
+    new, replaced = other.effects - best.effects, best.effects - other.effects
+    if len(new) == len(replaced) == 1 \
+            and effect_named(next(iter(new))).diagnosis.imitated_by in replaced \
+            and best.log_evidence - other.log_evidence < settings.imitated_deficit:
+        rivals[next(iter(replaced))] |= new
 
 
 def _choices(groups: Sequence[Sequence[str]]) -> list[tuple[str, ...]]:
@@ -243,8 +304,7 @@ def without_fast_effects(verdict: Verdict) -> Verdict:
     """Return unknown where an effect is named that a reference without fast motion imitates."""
     def is_imitated(effects: Iterable[str]) -> bool:
         """Determine whether an effect shows in fast motion, or is unknown."""
-        return any(e == UNKNOWN or effect_named(e).diagnosis.revealed_by is Manoeuvre.SHAKE
-                   for e in effects)
+        return any(e == UNKNOWN or shows_in_lost_motion(effect_named(e)) for e in effects)
 
     if not is_imitated((*verdict.effects, *chain(*verdict.groups))):
         return verdict

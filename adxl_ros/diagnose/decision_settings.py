@@ -62,6 +62,10 @@ class DecisionSettings:
     smallest_share_of_gap
         An effect is immaterial below this share of the rms of all effects whose form is not
         exact. Between 1 and 15 % its value matters little.
+    smallest_share_of_lost_motion
+        An effect of the sensor whose form is not exact is immaterial below this share of the rms
+        of motion that a smooth reference lacks, and what is unknown or unexplained is then an
+        error of the reference. Chosen: such a reference has errors in slower motion, too.
     smallest_drift_share_of_gap
         The same for a drift, because what the form of an effect lacks comes and goes like a
         drift.
@@ -76,6 +80,9 @@ class DecisionSettings:
     smallest_rival_share
         Smallest probability of an inseparable rival, divided by that of the best set. Chosen:
         odds of 10 to 1.
+    imitated_deficit
+        Largest deficit of log evidence of an effect of the reference below the effect of the
+        sensor that gives the same samples. Chosen: their priors differ, the samples do not.
     certain
         Probability of something unknown from which the verdict is unknown. Chosen: more likely
         than not.
@@ -105,11 +112,13 @@ class DecisionSettings:
     with_unknown: int = 6
     smallest_share_of_noise: float = 0.03
     smallest_share_of_gap: float = 0.1
+    smallest_share_of_lost_motion: float = 0.5
     smallest_drift_share_of_gap: float = 0.3
     smallest_unknown_share: float = 0.3
     calibration_factor: float = 2.0
     healthy_factor: float = 3.0
     smallest_rival_share: float = 0.1
+    imitated_deficit: float = 50.0
     certain: float = 0.5
     wrong_by_count: tuple[float, ...] = (0.05, 0.2, 0.1, 0.6)
     wrong_unknown: float = 0.35

@@ -37,7 +37,7 @@ from adxl_ros.diagnose.hypothesis_fit import Hypothesis, residual_channels
 from adxl_ros.diagnose.input_checks import compare_checked
 from adxl_ros.diagnose.linear_model import build_linear_model, LinearModel
 from adxl_ros.diagnose.model_search import refit, search
-from adxl_ros.diagnose.next_experiment import NextExperiment, propose_next_experiment
+from adxl_ros.diagnose.next_experiment import NextExperiment, propose_next_experiment, Samples
 from adxl_ros.diagnose.noise_comparison import compare_noise, NoiseComparison
 from adxl_ros.diagnose.noise_detectors import Detection, NoiseSamples, UNKNOWN
 from adxl_ros.diagnose.noise_floor import NoiseFloor
@@ -118,11 +118,15 @@ class Diagnosis:
         Parameters of the effects of the hypotheses that the recordings do not determine.
     single_effect_tests
         Tests of each effect alone.
+    lost_motion_mps2
+        Rms of motion that a smooth reference lacks, m/s², which nothing simulates.
     noise_before, noise_after
         Recorded noise relative to simulated noise, recording by recording: with the baseline, and
         with the baseline and the effects that were found.
     sensor
         The baseline with the effects of the verdict, ready for `simulate`.
+    linear_model
+        The linear model of the recordings.
 
     """
 
@@ -141,9 +145,11 @@ class Diagnosis:
     contributions_mps2: dict[str, float] = field(default_factory=dict)
     not_determined: NotDetermined = field(default_factory=dict)
     single_effect_tests: dict[str, SingleEffectTest] = field(default_factory=dict)
+    lost_motion_mps2: float = 0.0
     noise_before: tuple[NoiseComparison, ...] = ()
     noise_after: tuple[NoiseComparison, ...] = ()
     sensor: Sensor | None = None
+    linear_model: LinearModel | None = None
 
 
 SETTINGS = DecisionSettings()
@@ -239,6 +245,8 @@ class _Explanation:
         The baseline with the best hypothesis and the detections.
     noise_before, noise_after
         Recorded noise relative to simulated noise, with the baseline and with `sensor`.
+    lost_motion_mps2
+        Rms of motion that a smooth reference lacks, m/s²; 0 unless the best hypothesis has one.
 
     """
 
@@ -251,6 +259,7 @@ class _Explanation:
     sensor: Sensor
     noise_before: tuple[NoiseComparison, ...]
     noise_after: tuple[NoiseComparison, ...]
+    lost_motion_mps2: float
 
 
 def _explain(checked: Sequence[CheckedRecording], linear_model: LinearModel,
@@ -276,7 +285,17 @@ def _explain(checked: Sequence[CheckedRecording], linear_model: LinearModel,
         noise_remainders(comparisons, best.sensor, named_sensor, detections, best.effects, seed),
         named_sensor,
         _noise_comparisons(comparisons, sensor, sensor, seed),
-        _noise_comparisons(comparisons, best.sensor, named_sensor, seed))
+        _noise_comparisons(comparisons, best.sensor, named_sensor, seed),
+        _lost_motion_mps2(comparisons, best))
+
+
+def _lost_motion_mps2(comparisons: Sequence[BaselineComparison], best: Hypothesis) -> float:
+    """Return the rms of motion that a smooth reference lacks, m/s²."""
+    if not any(effect_named(e).diagnosis.smooths_reference for e in best.effects):
+        return 0.0
+    return float(np.sqrt(np.average(
+        [gap_closure.lost_motion_mps2(c, best.sensor) ** 2 for c in comparisons],
+        weights=[c.used.sum() for c in comparisons])))
 
 
 def _at_baseline(linear_model: LinearModel, weighed: Sequence[WeighedHypothesis]
@@ -324,8 +343,9 @@ def _decide(linear_model: LinearModel, explanation: _Explanation, hidden: Mappin
         detections=explanation.detections,
         noise_mps2=explanation.noise_mps2,
         explained_mps2=closure.explained_mps2,
-        unexplained_mps2=gap_closure.unexplained_mps2(linear_model, best, closure,
-                                                      simulated_noise_mps2),
+        unexplained_mps2=gap_closure.unexplained_mps2(
+            linear_model, best, closure, simulated_noise_mps2, explanation.lost_motion_mps2),
+        lost_motion_mps2=explanation.lost_motion_mps2,
         code_step_mps2=max(map(_rounding_std_mps2, linear_model.comparisons))), SETTINGS)
     if verdict.status == 'no_gap' and not any(map(_could_show, linear_model.comparisons)):
         return replace(verdict, status='insufficient')
@@ -361,13 +381,16 @@ def _with_report(checked: Sequence[CheckedRecording], linear_model: LinearModel,
         residual_cells=tuple(residual_map(comparisons[0], checked[0].comparison,
                                           floor.rms_mps2, seed)),
         not_covered=tuple(lacking),
-        next_experiment=propose_next_experiment(verdict, lacking, seed),
+        next_experiment=propose_next_experiment(verdict, lacking, Samples(
+            sensor, linear_model, SETTINGS.evidence_factor, seed)),
         contributions_mps2=contributions_mps2,
         not_determined=not_determined(linear_model, hypotheses),
         single_effect_tests=single_effect_tests(linear_model, seed),
+        lost_motion_mps2=explanation.lost_motion_mps2,
         noise_before=explanation.noise_before,
         noise_after=explanation.noise_after,
-        sensor=explanation.sensor if named else sensor)
+        sensor=explanation.sensor if named else sensor,
+        linear_model=linear_model)
 
 
 def _without_noise_effects(explanation: _Explanation, sensor: Sensor, seed: int) -> GapClosure:
@@ -379,10 +402,21 @@ def _without_noise_effects(explanation: _Explanation, sensor: Sensor, seed: int)
     """
     at_rate = replace(sensor, rate_hz=explanation.sensor.rate_hz)
     stated = noise.sample_std_v(at_rate) / (at_rate.scale_v_per_g / G0_MPS2)
-    rms_mps2 = min(explanation.noise_floor.rms_mps2, explanation.closure.after_mps2)
-    floor_mps2 = floor_without(rms_mps2, explanation.noise_remainders,
-                               float(np.sqrt(np.mean(stated ** 2))))
-    return explanation.closure.at_floor(floor_mps2, seed)
+    stated_mps2 = float(np.sqrt(np.mean(stated ** 2)))
+
+    def floor_mps2(measured_mps2: float, after_mps2: float) -> float:
+        return floor_without(min(measured_mps2, after_mps2), explanation.noise_remainders,
+                             stated_mps2)
+
+    floor, closure = explanation.noise_floor, explanation.closure
+    middle_mps2 = floor_mps2(floor.rms_mps2, closure.after_mps2)
+    draws_mps2 = floor.draws_mps2(seed)
+    if draws_mps2 is None:
+        return closure.at_floor(middle_mps2, None, seed)
+    low_mps2, high_mps2 = np.quantile(
+        list(map(floor_mps2, draws_mps2, closure.after_draws_mps2(seed))), [0.05, 0.95])
+    return closure.at_floor(middle_mps2, (min(float(low_mps2), middle_mps2),
+                                          max(float(high_mps2), middle_mps2)), seed)
 
 
 def _confirmed(linear_model: LinearModel, comparisons: Sequence[BaselineComparison],
@@ -408,7 +442,9 @@ def _confirmed(linear_model: LinearModel, comparisons: Sequence[BaselineComparis
     def holds(best: Hypothesis, others: Sequence[Hypothesis]) -> bool:
         closure = closure_of(best)
         absorbed = all(effect_named(e).diagnosis.absorbed for e in best.effects)
-        if closure.harm or not (closure.log_likelihood_gain > 0 or absorbed):
+        # Motion that the reference lacks makes most of the squares, so that they say nothing.
+        harm = closure.harm and not any(c.reference_fades for c in comparisons)
+        if harm or not (closure.log_likelihood_gain > 0 or absorbed):
             return False
         without_drift = frozenset(best.effects) - frozenset(drifts_among(best.effects))
         steady = [h for h in others if 0 < len(h.effects) < len(best.effects)
@@ -443,8 +479,10 @@ def _detections(checked: Sequence[CheckedRecording], best: Hypothesis) -> list[D
         sensor = replace(best.sensor, rate_hz=comparison.sensor.rate_hz)
         residual_v = comparison.residual_v(best.sensor)
         spikes = c.possible_spikes
-        if spikes is not None and noise_detectors.residual_shows_spikes(spikes, residual_v, used,
-                                                                        sensor):
+        # In motion, a smooth reference lacks knocks that look like spikes.
+        regular = used | ~comparison.at_rest if comparison.reference_fades else used
+        if spikes is not None and noise_detectors.residual_shows_spikes(spikes, residual_v,
+                                                                        regular, sensor):
             detections.append(spikes)
         detections += noise_detectors.residual_detections(NoiseSamples(
             time_s=comparison.time_s, residual_v=bridged(residual_v, used),

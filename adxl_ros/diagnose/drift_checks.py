@@ -35,8 +35,7 @@ from adxl_ros.model.effects import effect_named
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals.runs import true_runs
 import numpy as np
-from scipy.optimize import minimize_scalar
-from scipy.signal import sosfreqz
+import scipy
 
 _OCTAVE_RATIO = 4.0
 """Power in a run of octaves, divided by that of the random walk, differs too much above this ratio
@@ -200,7 +199,7 @@ def _octaves(channel: ResidualChannel) -> tuple[np.ndarray, np.ndarray]:
     power = np.abs(np.fft.rfft(white * taper)) ** 2 \
         / (channel.used.sum() * channel.innovation_variance_v2)
     angle = 2 * np.pi * np.arange(len(power)) / len(white)
-    gain, healthy_gain = (np.abs(sosfreqz(f.sections, angle)[1]) ** 2
+    gain, healthy_gain = (np.abs(scipy.signal.sosfreqz(f.sections, angle)[1]) ** 2
                           for f in (channel.whitener, channel.weakest_walk))
     # Share of the whitened power that does not walk.
     share = np.zeros(len(power))
@@ -213,8 +212,8 @@ def _octaves(channel: ResidualChannel) -> tuple[np.ndarray, np.ndarray]:
         return float(np.sum(np.log(mean) + power[band] / mean))
 
     # The grid of filters is coarse, so that the power of the walk is fitted.
-    level = np.exp(minimize_scalar(negative_log_likelihood, method='bounded',
-                                   bounds=(-_LOG_LEVEL_RANGE, _LOG_LEVEL_RANGE)).x)
+    level = np.exp(scipy.optimize.minimize_scalar(negative_log_likelihood, method='bounded',
+                                                  bounds=(-_LOG_LEVEL_RANGE, _LOG_LEVEL_RANGE)).x)
     power = power / (share + level * (1 - share))
     edges = np.unique(np.minimum(2 ** np.arange(int(np.log2(max(top, 1))) + 2), top))
     return np.diff(edges), np.array([power[i:j].mean() for i, j in pairwise(edges)])

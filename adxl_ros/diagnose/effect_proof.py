@@ -35,7 +35,7 @@ from adxl_ros.model.filters import low_pass
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.sensor import Sensor
 import numpy as np
-from scipy.signal import welch
+import scipy
 
 _BINS = 10
 """Number of ranges of equal width, and of ranges of equal counts. Chosen: a curve is visible."""
@@ -314,8 +314,9 @@ def spectra(comparison: BaselineComparison, signal_v: np.ndarray, label: str) ->
 
     """
     signal_mg = bridged(signal_v, comparison.used) * 1e3 / (G0_MPS2 * comparison.scale_v_per_mps2)
-    frequency_hz, power = welch(np.nan_to_num(signal_mg), comparison.sensor.rate_hz, axis=0,
-                                nperseg=min(_SEGMENT, len(signal_mg)))
+    frequency_hz, power = scipy.signal.welch(
+        np.nan_to_num(signal_mg), comparison.sensor.rate_hz, axis=0,
+        nperseg=min(_SEGMENT, len(signal_mg)))
     frequency_hz, power = frequency_hz[1:], power[1:]
     place = np.floor(np.log2(frequency_hz / frequency_hz[0]) * _POINTS_PER_OCTAVE).astype(int)
     _, place = np.unique(place, return_inverse=True)

@@ -35,7 +35,7 @@ from adxl_ros.model.coefficients import get, neutral, parameter_of, with_neutral
 from adxl_ros.model.constants import G0_MPS2, Z_90
 from adxl_ros.model.diagnosis_hints import FormDimension
 from adxl_ros.model.effects import effect_named, library
-from adxl_ros.model.effects.base import Role
+from adxl_ros.model.effects.base import Concern, Role
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
@@ -94,7 +94,8 @@ def size_hypothesis(linear_model: LinearModel, hypothesis: Hypothesis, noise_mps
     An effect must be a visible part of the noise and of the gap. One that follows the pose must
     exceed the error of the encoder, which is the same each time a pose returns. One that changes
     with time must exceed the drift of a healthy unit. The interval of one of its sizes must
-    exclude zero. Beside another effect, zero-g and scale factor must exceed what the calibration
+    exclude zero. An effect of the sensor must stand out of the motion that a smooth reference
+    lacks. Beside another effect, zero-g and scale factor must exceed what the calibration
     can have taken up of it.
 
     Parameters
@@ -120,13 +121,21 @@ def size_hypothesis(linear_model: LinearModel, hypothesis: Hypothesis, noise_mps
         e for e, c in contributions.items()
         if c.rms_mps2 < _smallest_mps2(e, contributions, noise_mps2, settings)
         or (_follows_pose(e) and c.rms_mps2 < angle_mps2) or _may_be_zero(hypothesis, e)
-        or (_drifts_in_time(e) and c.varying_mps2 < _healthy_drift_mps2(linear_model))}
+        or (_drifts_in_time(e) and c.varying_mps2 < _healthy_drift_mps2(linear_model))
+        or (_is_of_sensor(e) and c.varying_mps2
+            < settings.smallest_share_of_lost_motion * linear_model.lost_motion_mps2)}
     material = set(hypothesis.effects) - immaterial
     if any(calibration_takes_up(e) and not effect_named(e).diagnosis.drift for e in material):
         beyond = _beyond_calibration(linear_model, hypothesis, contributions, settings)
         straight = {e for e in library() if effect_named(e).diagnosis.straight_line}
         material = (material - straight) | beyond
     return SizedHypothesis(hypothesis, contributions, frozenset(material))
+
+
+def _is_of_sensor(effect: str) -> bool:
+    """Determine whether an effect is an error of the sensor whose form is not exact."""
+    library_effect = effect_named(effect)
+    return library_effect.concern is Concern.SENSOR and not library_effect.exact
 
 
 def _smallest_mps2(effect: str, contributions: dict[str, Contribution], noise_mps2: float,

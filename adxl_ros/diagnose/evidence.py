@@ -29,7 +29,7 @@ from typing import NamedTuple
 
 from adxl_ros.diagnose.noise_whitening import before_filters, Series, Whitener
 import numpy as np
-from scipy.linalg import cho_solve
+import scipy
 
 BLOCKS = 48
 """Number of blocks of a recording, of which some are held out. Chosen: a multiple of the folds,
@@ -458,8 +458,8 @@ def _solution(precision: np.ndarray, information: np.ndarray
     size = 1 / np.sqrt(np.diag(precision))
     scaled = precision * size[:, None] * size + _RIDGE * np.eye(len(size))
     factor = np.linalg.cholesky(scaled)
-    values = size * cho_solve((factor, True), size * information)
-    covariance = cho_solve((factor, True), np.eye(len(size))) * size[:, None] * size
+    values = size * scipy.linalg.cho_solve((factor, True), size * information)
+    covariance = scipy.linalg.cho_solve((factor, True), np.eye(len(size))) * size[:, None] * size
     return values, covariance, float(np.log(np.diag(factor) / size).sum())
 
 

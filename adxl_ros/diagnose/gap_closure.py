@@ -43,6 +43,7 @@ from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import ActsOn
 from adxl_ros.model.sensor import Sensor
 import numpy as np
+import scipy
 
 _FOLDS = 4
 """Number of parts of a recording, each of which is held out once. Chosen: run time."""
@@ -94,6 +95,8 @@ class GapClosure:
         Held-out log likelihood with the effects minus that without.
     blocks
         Squares before and after, and samples, by block, (3, blocks).
+    floor_ci
+        90 % interval of the noise floor, m/s²; None where the floor is not measured.
 
     """
 
@@ -109,8 +112,14 @@ class GapClosure:
     fitted_rms_mps2: float
     log_likelihood_gain: float
     blocks: np.ndarray = field(repr=False)
+    floor_ci: tuple[float, float] | None = None
 
-    def at_floor(self, floor_mps2: float, seed: int) -> GapClosure:
+    def after_draws_mps2(self, seed: int) -> np.ndarray:
+        """Return the gap after from blocks drawn with replacement, rms, m/s², (n,)."""
+        return np.sqrt(_drawn_squares(self.blocks, seed)[1])
+
+    def at_floor(self, floor_mps2: float, floor_ci: tuple[float, float] | None, seed: int
+                 ) -> GapClosure:
         """
         Return the closure with another noise floor.
 
@@ -118,6 +127,8 @@ class GapClosure:
         ----------
         floor_mps2
             Noise floor, m/s².
+        floor_ci
+            Its 90 % interval, m/s²; None for none.
         seed
             Seed of the bootstrap.
 
@@ -128,7 +139,8 @@ class GapClosure:
 
         """
         closed, interval = _closed_share(self.blocks, floor_mps2, seed)
-        return replace(self, floor_mps2=floor_mps2, closed=closed, closed_ci=interval)
+        return replace(self, floor_mps2=floor_mps2, floor_ci=floor_ci, closed=closed,
+                       closed_ci=interval)
 
 
 @dataclass(frozen=True)
@@ -161,19 +173,22 @@ def estimate_noise_floor(comparisons: Sequence[BaselineComparison]) -> NoiseFloo
     is added.
     """
     baseline = comparisons[0].sensor
-    no_samples = SquareSum(np.zeros(len(baseline.axes)), 0)
-    total = sum((noise_floor.squares_at_rest(c.volts, c.at_rest & c.used, c.sensor)
-                 for c in comparisons), no_samples)
+    sums = [part for c in comparisons for part in noise_floor.squares_at_rest(
+        c.volts, c.at_rest & c.used, c.sensor)]
     source = 'still'
-    if total.count < FEWEST_SAMPLES:
-        total, source = sum(_repeat_squares(comparisons), no_samples), 'repeats'
-    if total.count < FEWEST_SAMPLES:
-        noise_v, source = noise.sample_std_v(baseline), 'assumed'
+    if sum(part.count for part in sums) < FEWEST_SAMPLES:
+        sums, source = _repeat_squares(comparisons), 'repeats'
+    count = sum(part.count for part in sums)
+    if count < FEWEST_SAMPLES:
+        sums, noise_v, source = [], noise.sample_std_v(baseline), 'assumed'
     else:
-        noise_v = np.sqrt(total.squares_v2 / total.count)
-    encoder = np.mean([_encoder_mean_square(c) for c in comparisons])
-    noise_mps2 = noise_v / comparisons[0].scale_v_per_mps2
-    return NoiseFloor(noise_v, float(np.sqrt(np.mean(noise_mps2 ** 2) + encoder)), source)
+        noise_v = np.sqrt(np.sum([part.squares_v2 for part in sums], axis=0) / count)
+    encoder = float(np.mean([_encoder_mean_square(c) for c in comparisons]))
+    scale_v_per_mps2 = comparisons[0].scale_v_per_mps2
+    parts = np.array([(np.mean(part.squares_v2 / scale_v_per_mps2 ** 2) + part.count * encoder,
+                       part.count) for part in sums]).reshape(-1, 2).T
+    noise_mps2 = noise_v / scale_v_per_mps2
+    return NoiseFloor(noise_v, float(np.sqrt(np.mean(noise_mps2 ** 2) + encoder)), source, parts)
 
 
 def _repeat_squares(comparisons: Sequence[BaselineComparison]) -> list[SquareSum]:
@@ -181,7 +196,7 @@ def _repeat_squares(comparisons: Sequence[BaselineComparison]) -> list[SquareSum
     staged = [c for c in comparisons if c.reference is Reference.STAGE]
     directions = [noise_floor.directions(c.motion.alpha(c.time_s), c.motion.beta(c.time_s))
                   for c in staged]
-    out = []
+    out: list[SquareSum] = []
     for i, first in enumerate(staged):
         for j, second in enumerate(staged[i:], i):
             rate_hz = first.sensor.rate_hz
@@ -191,9 +206,9 @@ def _repeat_squares(comparisons: Sequence[BaselineComparison]) -> list[SquareSum
                                              first.sensor.stage_resolution_rad, i == j)
             if repeat is not None:
                 used = first.used[repeat[0]] & second.used[repeat[1]]
-                out.append(noise_floor.squares_of_difference(
+                out += noise_floor.squares_of_difference(
                     first.residual_v(first.sensor)[repeat[0]][used],
-                    second.residual_v(second.sensor)[repeat[1]][used]))
+                    second.residual_v(second.sensor)[repeat[1]][used], rate_hz)
     return out
 
 
@@ -207,7 +222,7 @@ def _encoder_mean_square(comparison: BaselineComparison) -> float:
 
 
 def unexplained_mps2(linear_model: LinearModel, hypothesis: Hypothesis, closure: GapClosure,
-                     noise_mps2: float) -> float:
+                     noise_mps2: float, lost_mps2: float = 0.0) -> float:
     """
     Return the rms that neither the hypothesis nor noise nor a healthy drift explains.
 
@@ -221,6 +236,8 @@ def unexplained_mps2(linear_model: LinearModel, hypothesis: Hypothesis, closure:
         Its gap closure.
     noise_mps2
         Rms of the simulated noise, with lines, spikes and steps that were detected, m/s².
+    lost_mps2
+        Rms of the motion that a smooth reference lacks, m/s².
 
     Returns
     -------
@@ -230,7 +247,46 @@ def unexplained_mps2(linear_model: LinearModel, hypothesis: Hypothesis, closure:
     """
     floor = max(closure.floor_mps2, noise_mps2) ** 2 \
         + _DRIFT_QUANTILE * float(np.mean(_drift_squares(linear_model, hypothesis)))
-    return float(np.sqrt(max(closure.fitted_rms_mps2 ** 2 - floor, 0.0)))
+    return float(np.sqrt(max(closure.fitted_rms_mps2 ** 2 - lost_mps2 ** 2 - floor, 0.0)))
+
+
+def lost_motion_mps2(comparison: BaselineComparison, sensor: Sensor) -> float:
+    """
+    Return the rms of motion that the reference lacks, over all samples and axes, m/s².
+
+    It is the residual above the frequency from which the reference lacks a part, without the
+    noise.
+
+    Parameters
+    ----------
+    comparison
+        A recording, at its full rate.
+    sensor
+        The sensor with the effects of a hypothesis.
+
+    Returns
+    -------
+    float
+        Rms, m/s²; 0 where the reference does not fade.
+
+    """
+    if not comparison.reference_fades:
+        return 0.0
+    residual = evidence.bridged(comparison.residual_v(sensor), comparison.used) \
+        / comparison.scale_v_per_mps2
+    frequency_hz, density = scipy.signal.periodogram(residual, comparison.sensor.rate_hz, axis=0)
+    fast = frequency_hz > comparison.lacking_hz
+    resting = comparison.at_rest & comparison.used
+    noise_square = _fast_square(residual[resting], comparison) if resting.any() else 0.0
+    square = float(density[fast].sum() * frequency_hz[1]) / residual.shape[1]
+    return float(np.sqrt(max(square - noise_square, 0.0)))
+
+
+def _fast_square(resting: np.ndarray, comparison: BaselineComparison) -> float:
+    """Return the mean square of samples at rest, (n, m), above that frequency."""
+    frequency_hz, density = scipy.signal.periodogram(resting, comparison.sensor.rate_hz, axis=0)
+    fast = frequency_hz > comparison.lacking_hz
+    return float(density[fast].sum() * frequency_hz[1]) / resting.shape[1]
 
 
 def held_out_residual(linear_model: LinearModel, comparisons: Sequence[BaselineComparison],
@@ -348,15 +404,20 @@ def _closed_share(blocks: np.ndarray, floor_mps2: float, seed: int
     floor = floor_mps2 ** 2
     # The rms after can be below the floor by chance.
     lowest = min(floor, after / max(count, 1.0))
-    drawn = np.random.default_rng(seed).integers(0, BLOCKS, (_BOOTSTRAP_DRAWS, BLOCKS))
-    before_drawn, after_drawn = (row[drawn].sum(axis=1) / blocks[2][drawn].sum(axis=1)
-                                 for row in blocks[:2])
+    before_drawn, after_drawn = _drawn_squares(blocks, seed)
     with np.errstate(all='ignore'):
         closed = (before - after) / (before - count * lowest)
         shares = (before_drawn - after_drawn) / (before_drawn - lowest)
     low, high = np.quantile(np.clip(np.nan_to_num(shares), -1, 1), [0.05, 0.95])
     return (float(min(closed, 1.0)) if before > count * floor else float('nan'),
             (float(low), float(high)))
+
+
+def _drawn_squares(blocks: np.ndarray, seed: int) -> np.ndarray:
+    """Return mean squares before and after from blocks drawn with replacement, (2, n)."""
+    drawn = np.random.default_rng(seed).integers(0, BLOCKS, (_BOOTSTRAP_DRAWS, BLOCKS))
+    return np.array([row[drawn].sum(axis=1) / blocks[2][drawn].sum(axis=1)
+                     for row in blocks[:2]])
 
 
 def _residual_mps2(comparison: BaselineComparison, sensor: Sensor) -> np.ndarray:

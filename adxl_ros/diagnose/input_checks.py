@@ -106,7 +106,7 @@ def compare_checked(recording: Recording, sensor: Sensor, sim: Motion | None, ma
         notes.append(f'--sim is smoother than the sensor: above {fading_hz:.3g} Hz it lacks '
                      'motion that the recording has; effects that show in fast motion are not '
                      'named')
-    return replace(comparison, notes=tuple(notes), reference_fades=fading_hz is not None)
+    return replace(comparison, notes=tuple(notes), fading_hz=fading_hz)
 
 
 def _roughness(comparison: BaselineComparison) -> float:

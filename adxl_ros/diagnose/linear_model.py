@@ -34,15 +34,16 @@ from itertools import chain
 from typing import NamedTuple
 
 from adxl_ros.diagnose import evidence, noise_whitening
-from adxl_ros.diagnose.angle_errors import angle_error_filter
+from adxl_ros.diagnose.angle_errors import angle_error_filter, AngleErrorFilter
 from adxl_ros.diagnose.baseline_comparison import BaselineComparison, Reference
 from adxl_ros.diagnose.evidence import FlexibleColumns, LinearFit, WhitenedChannel
 from adxl_ros.diagnose.flexible_terms import Basis, flexible_bases
+from adxl_ros.diagnose.lost_motion import lost_motion_filter, LostMotionFilter
 from adxl_ros.diagnose.noise_whitening import drifts_among, Whitener
 from adxl_ros.diagnose.sensitivities import candidates, Variant, variants
-from adxl_ros.model.diagnosis_hints import DiagnosisHints, StraightLine
+from adxl_ros.model.diagnosis_hints import DiagnosisHints, Manoeuvre, StraightLine
 from adxl_ros.model.effects import effect_named, library
-from adxl_ros.model.effects.base import Coefficient
+from adxl_ros.model.effects.base import Coefficient, Concern, Effect
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
@@ -142,6 +143,15 @@ class LinearModel:
     def pose_known(self) -> bool:
         """Whether all recordings have a reference."""
         return all(c.reference is not Reference.NONE for c in self.comparisons)
+
+    @property
+    def lost_motion_mps2(self) -> float:
+        """Rms of the motion that smooth references lack, m/s²."""
+        scales = [scale for c in self.comparisons for scale in c.scale_v_per_mps2]
+        errors = [filters[0].angle_errors for filters in self.filters]
+        lost = [e.lost_rms_v / scale if isinstance(e, LostMotionFilter) else 0.0
+                for e, scale in zip(errors, scales)]
+        return float(np.sqrt(np.mean(np.square(lost))))
 
     @property
     def library_size(self) -> int:
@@ -287,9 +297,18 @@ def calibration_takes_up(effect: str) -> bool:
     """
     Determine whether a calibration can take a part of an effect for zero-g or scale factor.
 
-    Of one that zero-g and scale factor imitate completely, a calibration leaves nothing.
+    Of one that zero-g and scale factor imitate completely, a calibration leaves nothing. Errors
+    of the reference are not in a calibration without it.
     """
-    return not effect_named(effect).diagnosis.absorbed
+    library_effect = effect_named(effect)
+    return not library_effect.diagnosis.absorbed \
+        and library_effect.concern is not Concern.REFERENCE
+
+
+def shows_in_lost_motion(effect: Effect) -> bool:
+    """Determine whether an effect shows in the fast motion that a smooth reference lacks."""
+    return effect.diagnosis.revealed_by is Manoeuvre.SHAKE and not effect.exact \
+        and effect.concern is not Concern.REFERENCE
 
 
 def build_linear_model(comparisons: Sequence[BaselineComparison],
@@ -344,7 +363,7 @@ def build_linear_model(comparisons: Sequence[BaselineComparison],
     by_channel = list(chain(*columns))
     if filters is None:
         filters = [noise_whitening.whiteners(c.sensor, d, c.dt_s, c.span_s,
-                                             angle_error_filter(c, d))
+                                             _reference_errors(c, d))
                    for c in comparisons for d in range(len(c.sensor.axes))]
     channels = _whitened_channels(
         comparisons, by_channel, _filters_of(filters, comparisons[0].sensor.effects), flexible)
@@ -355,6 +374,13 @@ def build_linear_model(comparisons: Sequence[BaselineComparison],
     return LinearModel(list(comparisons), baseline_v, kept, column_ids, names,
                        np.array(prior_std), channels, list(filters), by_channel, nuisance_columns,
                        {names[i]: amounts for i, amounts in parts.items()})
+
+
+def _reference_errors(comparison: BaselineComparison, axis: int
+                      ) -> AngleErrorFilter | LostMotionFilter | None:
+    """Return the filter for the errors of the reference on one axis; None where it is exact."""
+    angle_errors = angle_error_filter(comparison, axis)
+    return lost_motion_filter(comparison, axis, angle_errors) or angle_errors
 
 
 def _empty_by_axis(comparison: BaselineComparison) -> list[list[NumberedColumn]]:
@@ -384,11 +410,16 @@ def _variants(comparisons: Sequence[BaselineComparison], baseline_v: Sequence[np
               show_progress: Callable[[float], None], only: Sequence[str] | None
               ) -> list[dict[int, Variant]]:
     """Return the variants of the library, each by the number of the recording."""
+    fades = any(c.reference_fades for c in comparisons)
     effects = [e for e in candidates()
-               if only is None or e.name in only or e.diagnosis.nuisance]
+               if (only is None or e.name in only or e.diagnosis.nuisance)
+               and not (fades and shows_in_lost_motion(e))]
     every: dict[tuple, dict[int, Variant]] = {}
     for i, (comparison, output_v) in enumerate(zip(comparisons, baseline_v)):
         for k, effect in enumerate(effects):
+            if effect.concern is Concern.REFERENCE \
+                    and comparison.reference is not Reference.SIMULATOR:
+                continue
             for variant in variants(comparison.simulated_v, comparison.sensor, effect, output_v,
                                     comparison.reference is not Reference.NONE):
                 key = (variant.effect, tuple(variant.shape.items()), variant.step)

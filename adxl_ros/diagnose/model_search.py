@@ -77,6 +77,9 @@ _OTHER_START_SHARE = 0.5
 _LARGEST_GAIN_RATIO = 5.0
 """What a fit in full may gain, divided by what the linear model promises. Chosen: large effects
 are not linear."""
+_NEAR_START = 1.4
+"""Largest ratio of the start of a size to the one at which the effect was simulated. Chosen: the
+starts differ by factors of two."""
 _LARGEST_UNEVENNESS = 1.4
 """Largest unevenness of the noise beside a drift. Tuned by hand on simulated
 recordings of the working seeds of the blind check."""
@@ -171,6 +174,7 @@ def search(linear_model: LinearModel, settings: DecisionSettings,
                   [pair for pair in pairs if pair.gain > smallest_gain][:_FURTHER], null_fit,
                   hypotheses)
     _remove_each_effect(linear_model, settings, hypotheses)
+    _replace_imitated(linear_model, settings, hypotheses)
     if _drift_shows(linear_model, _best(hypotheses), settings):
         _add_drifts(linear_model, settings, hypotheses)
     plan.show(FURTHER, 1.0)
@@ -336,10 +340,31 @@ def _best_of_each(linear_model: LinearModel, fits: Iterable[_RankedSet]) -> list
     for fit in sorted(fits, key=lambda f: -f.gain):
         by_effects.setdefault(
             frozenset(linear_model.variants[i].effect for i in fit.chosen), []).append(fit)
+    for same in by_effects.values():
+        same.sort(key=lambda f: _start_loss(linear_model, f) - f.gain)
     return [best._replace(others=tuple(
         f for f in others if f.gain > _OTHER_START_SHARE * best.gain
         and all(linear_model.variants[i].shape for i in f.chosen))[:_OTHER_STARTS])
         for best, *others in by_effects.values()]
+
+
+def _stepped(variant: Variant) -> dict[Coefficient, float]:
+    """Return the sizes at which an effect that is far from linear was simulated."""
+    return {Coefficient(variant.effect, p.name): variant.step * p.scale
+            for p in effect_named(variant.effect).parameters if p.starts and p.is_size}
+
+
+def _start_loss(linear_model: LinearModel, ranked: _RankedSet) -> float:
+    """Return what log likelihood a fit loses at the sizes at which its effects were simulated."""
+    loss = 0.0
+    for i in ranked.chosen:
+        stepped = _stepped(linear_model.variants[i])
+        for k in range(len(ranked.fit.values) if stepped else 0):
+            name = linear_model.names[ranked.fit.column_ids[k]]
+            if name in stepped:
+                loss += 0.5 * float((ranked.fit.values[k] - stepped[name]) ** 2
+                                    / ranked.fit.covariance[k, k])
+    return loss
 
 
 def _fit_added(linear_model: LinearModel, settings: DecisionSettings, about: LinearModel,
@@ -358,7 +383,7 @@ def _fit_added(linear_model: LinearModel, settings: DecisionSettings, about: Lin
             start = dict(zip(best.names, best.values))
             start |= {about.names[k]: value for k, value in zip(fit.column_ids, fit.values)
                       if k in about.column_ids[i]}
-            start |= _limit_start(added, start)
+            start |= _limit_start(added, start) | _size_start(added, start)
             hypothesis = _fit_or_none(linear_model, effects, start, _named_shape(added),
                                       _lowest(hypotheses, settings))
             _add(hypotheses, hypothesis)
@@ -375,6 +400,20 @@ def _remove_each_effect(linear_model: LinearModel, settings: DecisionSettings,
             _add(hypotheses, _fit_or_none(
                 linear_model, [e for e in best.effects if e != effect],
                 dict(zip(best.names, best.values)), {}, _lowest(hypotheses, settings)))
+
+
+def _replace_imitated(linear_model: LinearModel, settings: DecisionSettings,
+                      hypotheses: Hypotheses) -> None:
+    """Fit the best set with errors of the reference in place of effects that imitate them."""
+    best = _best(hypotheses)
+    for effect in dict.fromkeys(variant.effect for variant in linear_model.variants):
+        imitating = effect_named(effect).diagnosis.imitated_by
+        replaced = [effect if e == imitating else e for e in best.effects]
+        if imitating in best.effects and effect not in best.effects \
+                and frozenset(replaced) not in hypotheses:
+            _add(hypotheses, _fit_or_none(linear_model, replaced,
+                                          dict(zip(best.names, best.values)), {},
+                                          _lowest(hypotheses, settings)))
 
 
 def refit(linear_model: LinearModel, hypothesis: Hypothesis, effects: Sequence[str]
@@ -440,9 +479,15 @@ def _start(linear_model: LinearModel, ranked: _RankedSet
     start = dict(zip([linear_model.names[i] for i in ranked.fit.column_ids], ranked.fit.values))
     shapes: dict[Coefficient, float] = {}
     for variant in (linear_model.variants[i] for i in ranked.chosen):
-        start |= _limit_start(variant, start)
+        start |= _limit_start(variant, start) | _size_start(variant, start)
         shapes |= _named_shape(variant)
     return start, shapes
+
+
+def _size_start(variant: Variant, start: Mapping[Coefficient, float]) -> dict[Coefficient, float]:
+    """Return where the fit of a size starts in which the effect is far from linear."""
+    return {name: float(np.clip(start.get(name, size), size / _NEAR_START, size * _NEAR_START))
+            for name, size in _stepped(variant).items()}
 
 
 def _limit_start(variant: Variant, amounts: Mapping[Coefficient, float]

@@ -15,24 +15,21 @@
 """
 The next experiment: the manoeuvre that separates effects that the recordings cannot separate.
 
-Each manoeuvre is simulated with the best hypothesis, noise included, and the inseparable effects
-are fitted to the simulation. The worth of a manoeuvre is the log Bayes factor of the best effect
-over the second one, per minute.
+It is the manoeuvre of the menu with the largest expected information per minute, by the rule with
+which an investigation chooses (`expectation`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-from adxl_ros.diagnose.baseline_comparison import (
-    at_search_rate,
-    BaselineComparison,
-    Reference,
-)
+from adxl_ros.diagnose.baseline_comparison import Reference
 from adxl_ros.diagnose.decision import Verdict
-from adxl_ros.diagnose.linear_model import build_linear_model
+from adxl_ros.diagnose.expectation import leading, predict, rank_responses, unknown_dimensions
+from adxl_ros.diagnose.linear_model import LinearModel
 from adxl_ros.errors import UserError
 from adxl_ros.model.coefficients import with_neutral
 from adxl_ros.model.diagnosis_hints import Manoeuvre
@@ -40,13 +37,11 @@ from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.effects.base import Effect
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.simulate import trajectories
-from adxl_ros.simulate.response import Response
+from adxl_ros.simulate.motion import Motion
 import numpy as np
 
-_RATE_HZ = 62.5
-"""Sample rate of the simulated manoeuvres, Hz. Chosen: run time."""
-_SMALLEST_LOG_BAYES_FACTOR = 3.0
-"""Log Bayes factor below which a manoeuvre does not show an effect. Chosen: 20 to 1."""
+_OTHER_REFERENCE = 'ros2 run adxl_ros diagnose next.csv --sim next_simulated.csv -o next'
+"""Command for another recording beside another reference."""
 
 
 class ManoeuvreDescription(NamedTuple):
@@ -59,6 +54,8 @@ class ManoeuvreDescription(NamedTuple):
         What to do, for people.
     trajectory
         Name of the trajectory of `simulate`.
+    robot_text
+        What to do without a stage, for people.
     remounted
         Whether the sensor is remounted, turned by 180° about z.
 
@@ -66,25 +63,93 @@ class ManoeuvreDescription(NamedTuple):
 
     text: str
     trajectory: str
+    robot_text: str
     remounted: bool = False
 
 
 MENU = {
-    Manoeuvre.SHAKE: ManoeuvreDescription('shake along x from 2 to 40 Hz', 'shaker'),
+    Manoeuvre.SHAKE: ManoeuvreDescription(
+        'shake along x from 2 to 40 Hz', 'shaker', 'shake from 2 to 40 Hz'),
     Manoeuvre.SPEEDS: ManoeuvreDescription(
-        'turn two planes at two speeds, forth and back, with reversals', 'rich'),
-    Manoeuvre.PLANES: ManoeuvreDescription('sweep a second plane', 'tilt_both'),
+        'turn two planes at two speeds, forth and back, with reversals', 'rich',
+        'turn at two speeds, forth and back, with reversals'),
+    Manoeuvre.PLANES: ManoeuvreDescription(
+        'sweep a second plane', 'tilt_both', 'tilt slowly in all directions'),
     Manoeuvre.REMOUNT: ManoeuvreDescription(
-        'remount the sensor turned by 180 deg about z, and sweep again', 'tilt_both', True),
-    Manoeuvre.HEAT: ManoeuvreDescription('dwell, heat and cool', 'soak'),
-    Manoeuvre.SUPPLY: ManoeuvreDescription('step the supply at rest', 'soak'),
+        'remount the sensor turned by 180 deg about z, and sweep again', 'tilt_both',
+        'remount the sensor turned by 180 deg about z, and tilt in all directions', True),
+    Manoeuvre.HEAT: ManoeuvreDescription(
+        'dwell, heat and cool', 'soak', 'rest, heat and cool'),
+    Manoeuvre.SUPPLY: ManoeuvreDescription(
+        'step the supply at rest', 'soak', 'step the supply at rest'),
 }
 """All manoeuvres. An effect names the one that reveals it best in its own file."""
 
 
-class ManoeuvreWorth(NamedTuple):
+@dataclass(frozen=True)
+class MenuManoeuvre:
     """
-    What a manoeuvre is expected to show.
+    A manoeuvre of the menu.
+
+    Attributes
+    ----------
+    manoeuvre
+        Its place in the menu.
+    motion
+        Its motion, which begins at 0 s.
+    begin_s
+        Time at which it begins, s.
+
+    """
+
+    manoeuvre: Manoeuvre
+    motion: Motion
+    begin_s: float = 0.0
+
+    @property
+    def name(self) -> str:
+        """Return what to do, for people."""
+        return MENU[self.manoeuvre].text
+
+    @property
+    def minutes(self) -> float:
+        """Return the duration, min."""
+        return self.motion.duration_s / 60
+
+
+@dataclass(frozen=True)
+class Samples:
+    """
+    What recordings are compared with, and what they show.
+
+    Attributes
+    ----------
+    sensor
+        The baseline.
+    linear_model
+        Linear model of the recordings; None without any.
+    evidence_factor
+        Factor by which their evidence is tempered.
+    seed
+        Seed of the manoeuvres of the menu.
+
+    """
+
+    sensor: Sensor
+    linear_model: LinearModel | None
+    evidence_factor: float
+    seed: int
+
+    @property
+    def beside_simulator(self) -> bool:
+        """Return whether the motion is that of another simulator, without a stage."""
+        return self.linear_model is not None and all(
+            c.reference is Reference.SIMULATOR for c in self.linear_model.comparisons)
+
+
+class MenuWorth(NamedTuple):
+    """
+    What a manoeuvre of the menu is expected to tell.
 
     Attributes
     ----------
@@ -92,14 +157,14 @@ class ManoeuvreWorth(NamedTuple):
         What to do, for people.
     minutes
         Duration, min.
-    log_bayes_factor_per_minute
-        Log Bayes factor of the truth over its nearest rival, 1/min.
+    nats_per_minute
+        Expected information on the hypotheses, nat/min.
 
     """
 
     text: str
     minutes: float
-    log_bayes_factor_per_minute: float
+    nats_per_minute: float
 
 
 @dataclass(frozen=True)
@@ -114,22 +179,29 @@ class NextExperiment:
     why
         The reason, for people.
     command
-        Command that simulates the manoeuvre.
-    log_bayes_factor_per_minute
-        What it is expected to show; None where nothing has to be separated.
+        Command that simulates the manoeuvre, or that diagnoses its recording.
+    nats_per_minute
+        What it is expected to tell; None where nothing has to be separated.
     menu
-        All manoeuvres, the best first; empty where nothing has to be separated.
+        All manoeuvres that can be simulated, the best first; empty where nothing has to be
+        separated.
+    concerns_reference
+        Whether the reference has to change, so that nothing can be simulated.
+    beside_simulator
+        Whether another simulator makes its motion.
 
     """
 
     manoeuvre: str
     why: str
     command: str
-    log_bayes_factor_per_minute: float | None = None
-    menu: tuple[ManoeuvreWorth, ...] = ()
+    nats_per_minute: float | None = None
+    menu: tuple[MenuWorth, ...] = ()
+    concerns_reference: bool = False
+    beside_simulator: bool = False
 
 
-def propose_next_experiment(verdict: Verdict, not_covered: Sequence[str], seed: int
+def propose_next_experiment(verdict: Verdict, not_covered: Sequence[str], samples: Samples
                             ) -> NextExperiment | None:
     """
     Propose the manoeuvre that separates most of what is not separated.
@@ -140,8 +212,8 @@ def propose_next_experiment(verdict: Verdict, not_covered: Sequence[str], seed: 
         The verdict with its groups.
     not_covered
         What the recordings do not cover, for people.
-    seed
-        Seed of the simulated noise.
+    samples
+        What the recordings are compared with, and what they show.
 
     Returns
     -------
@@ -149,8 +221,20 @@ def propose_next_experiment(verdict: Verdict, not_covered: Sequence[str], seed: 
         None where nothing more is needed.
 
     """
+    same = next((group for group in verdict.groups if _give_same_samples(group)), None)
+    if same is not None:
+        return NextExperiment(
+            'another sensor beside the same reference',
+            f'because {" and ".join(same)} give the same samples, and what stays is of the '
+            'reference', _OTHER_REFERENCE, concerns_reference=True)
+    named = [effect_named(effect) for effect in verdict.effects]
+    if verdict.status == 'explained' and any(e.diagnosis.smooths_reference for e in named):
+        return NextExperiment(
+            'the motion with less smoothing of the reference',
+            'because it lacks motion that the sensor has', _OTHER_REFERENCE,
+            concerns_reference=True)
     if verdict.groups:
-        return _separating_experiment(verdict, seed)
+        return _separating_experiment(verdict, samples)
     if verdict.status == 'no_gap' and not not_covered:
         return None
     if verdict.status == 'unknown':
@@ -159,17 +243,46 @@ def propose_next_experiment(verdict: Verdict, not_covered: Sequence[str], seed: 
         why = f'because the recordings have no {", no ".join(not_covered)}'
     else:
         why = 'to confirm the verdict on another recording'
-    return _experiment(_revealing_manoeuvre(verdict, bool(not_covered)), why)
+    return _experiment(_revealing_manoeuvre(verdict, bool(not_covered)), why,
+                       samples.beside_simulator)
 
 
-def _separating_experiment(verdict: Verdict, seed: int) -> NextExperiment:
-    """Simulate the whole menu for the first group of the verdict; propose the best manoeuvre."""
-    group = verdict.groups[0]
-    worth = {m: _worth(m, verdict.best.sensor, group, seed) for m in MENU}
-    order = sorted(MENU, key=lambda m: -worth[m].log_bayes_factor_per_minute)
-    return replace(_experiment(order[0], f'to separate {", ".join(group[:-1])} and {group[-1]}'),
-                   log_bayes_factor_per_minute=worth[order[0]].log_bayes_factor_per_minute,
-                   menu=tuple(worth[m] for m in order))
+def _give_same_samples(group: Sequence[str]) -> bool:
+    """Determine whether a group has an error of the reference that another effect imitates."""
+    return any(effect_named(effect).diagnosis.imitated_by in group for effect in group)
+
+
+def _separating_experiment(verdict: Verdict, samples: Samples) -> NextExperiment:
+    """Rank the whole menu by its expected information; propose the best manoeuvre."""
+    hypotheses = leading(verdict.described)
+    effects = sorted({effect for h in hypotheses for effect in h.effects})
+    dimensions = unknown_dimensions(verdict)
+    responses = []
+    for planned in _menu(samples.seed):
+        # At rest the pose is unknown, so that a baseline with effects of the stage has no place.
+        with suppress(UserError):
+            responses.append(predict(
+                planned, _as_mounted(samples.sensor, planned.manoeuvre), effects, dimensions))
+    of_text = {described.text: manoeuvre for manoeuvre, described in MENU.items()}
+    ranked = [(worth, of_text[worth.manoeuvre.name]) for worth in rank_responses(
+        responses, hypotheses, samples.linear_model, dimensions, samples.evidence_factor)]
+    group, has_no_stage = verdict.groups[0], samples.beside_simulator
+    why = f'to separate {", ".join(group[:-1])} and {group[-1]}'
+    menu = tuple(MenuWorth(_text(manoeuvre, has_no_stage), float(worth.manoeuvre.minutes),
+                           float(worth.per_minute)) for worth, manoeuvre in ranked)
+    return replace(_experiment(ranked[0][1], why, has_no_stage), menu=menu,
+                   nats_per_minute=menu[0].nats_per_minute)
+
+
+def _menu(seed: int) -> list[MenuManoeuvre]:
+    """Return the manoeuvres of the menu with their motions."""
+    return [MenuManoeuvre(manoeuvre, trajectories.TRAJECTORIES[described.trajectory](
+        np.random.default_rng(seed))) for manoeuvre, described in MENU.items()]
+
+
+def _as_mounted(sensor: Sensor, manoeuvre: Manoeuvre) -> Sensor:
+    """Return the sensor as it is mounted in a manoeuvre."""
+    return _remounted(sensor) if MENU[manoeuvre].remounted else sensor
 
 
 def _revealing_manoeuvre(verdict: Verdict, lacks_coverage: bool) -> Manoeuvre:
@@ -182,9 +295,17 @@ def _revealing_manoeuvre(verdict: Verdict, lacks_coverage: bool) -> Manoeuvre:
         else Manoeuvre.PLANES
 
 
-def _experiment(manoeuvre: Manoeuvre, why: str) -> NextExperiment:
+def _text(manoeuvre: Manoeuvre, beside_simulator: bool) -> str:
+    """Return what to do in a manoeuvre, for people."""
+    described = MENU[manoeuvre]
+    return described.robot_text if beside_simulator else described.text
+
+
+def _experiment(manoeuvre: Manoeuvre, why: str, beside_simulator: bool) -> NextExperiment:
     """Describe a manoeuvre with its command."""
     described = MENU[manoeuvre]
+    if beside_simulator:
+        return NextExperiment(described.robot_text, why, _OTHER_REFERENCE, beside_simulator=True)
     option = ''
     if described.remounted:
         effect = _remounting_effect()
@@ -192,37 +313,6 @@ def _experiment(manoeuvre: Manoeuvre, why: str) -> NextExperiment:
     return NextExperiment(
         described.text, why,
         f'ros2 run adxl_ros simulate {described.trajectory}{option} -o next.csv')
-
-
-def _worth(manoeuvre: Manoeuvre, sensor: Sensor, group: Sequence[str], seed: int
-           ) -> ManoeuvreWorth:
-    """Simulate a manoeuvre, and fit each effect of a group to it."""
-    described = MENU[manoeuvre]
-    motion = trajectories.TRAJECTORIES[described.trajectory](np.random.default_rng(seed))
-    minutes = motion.duration_s / 60
-    truth = replace(sensor, rate_hz=_RATE_HZ)
-    baseline = replace(truth, effects=tuple(e for e in truth.effects if e not in group))
-    if described.remounted:
-        truth, baseline = _remounted(truth), _remounted(baseline)
-    time_s = np.arange(round(motion.duration_s * _RATE_HZ)) / _RATE_HZ
-    try:
-        volts = Response(truth, motion, seed)(time_s)
-    except UserError:
-        return ManoeuvreWorth(described.text, minutes, 0.0)
-    comparison = BaselineComparison(
-        described.text, time_s, volts, motion, baseline, Reference.STAGE, True,
-        np.zeros(len(time_s), bool), np.ones(len(time_s), bool))
-    linear_model = build_linear_model([at_search_rate(comparison)], only=group)
-    null_fit = linear_model.fit_variants([])
-    gains = []
-    for effect in group:
-        fits = [linear_model.fit_variants([i], null_fit)
-                for i, v in enumerate(linear_model.variants) if v.effect == effect]
-        gains.append(max((fit.log_evidence - null_fit.log_evidence for fit in fits),
-                         default=0.0))
-    *_, second, first = sorted(gains)
-    separated = first - max(second, 0.0) if first > _SMALLEST_LOG_BAYES_FACTOR else 0.0
-    return ManoeuvreWorth(described.text, minutes, separated / minutes)
 
 
 def _remounting_effect() -> Effect:

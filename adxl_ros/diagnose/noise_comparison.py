@@ -25,7 +25,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from scipy.signal import periodogram, welch
+import scipy
 
 _BANDS = 5
 """Number of bands of frequency. Chosen: some half a decade each."""
@@ -95,13 +95,13 @@ def compare_noise(residual_v: np.ndarray, simulated_v: np.ndarray, rate_hz: floa
     """
     recorded = (residual_v - residual_v.mean(axis=0)) / scale_v_per_mps2
     simulated = (simulated_v - simulated_v.mean(axis=0)) / scale_v_per_mps2
-    frequency_hz, power = periodogram(recorded, rate_hz, axis=0)
-    _, simulated_power = periodogram(simulated, rate_hz, axis=0)
+    frequency_hz, power = scipy.signal.periodogram(recorded, rate_hz, axis=0)
+    _, simulated_power = scipy.signal.periodogram(simulated, rate_hz, axis=0)
     edges_hz = np.geomspace(max(frequency_hz[1], _LOWEST_EDGE_HZ), rate_hz / 2, _BANDS + 1)
     edges_hz[0] = 0.0
     bands = [(frequency_hz > low) & (frequency_hz <= high) for low, high in pairwise(edges_hz)]
     length = min(round(_SEGMENT_S * rate_hz), len(simulated))
-    welch_hz, level = welch(simulated, rate_hz, nperseg=max(length, 8), axis=0)
+    welch_hz, level = scipy.signal.welch(simulated, rate_hz, nperseg=max(length, 8), axis=0)
     expected = np.column_stack([np.interp(frequency_hz[1:], welch_hz[1:], v[1:])
                                 for v in level.T])
     expected = np.maximum(expected, _LOWEST_POWER * expected.max())

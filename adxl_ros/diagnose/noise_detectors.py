@@ -23,12 +23,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from adxl_ros.model import noise
+from adxl_ros.model.constants import MAD_TO_STD
 from adxl_ros.model.diagnosis_hints import Detector
 from adxl_ros.model.effects import library
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals.runs import true_runs
 import numpy as np
-from scipy.signal import lfilter, periodogram
+import scipy
 
 UNKNOWN = 'unknown'
 """Name of what no effect of the library explains."""
@@ -67,8 +68,6 @@ _SPIKE_LOCAL_FEWEST = 9
 """Fewest samples of such a block. Chosen: a median of nine."""
 _SPIKE_LOG_BAYES_FACTOR = 10.0
 """Log Bayes factor of one isolated sample, rough: it only ranks detections."""
-_MAD_PER_STD = 0.6745
-"""Median absolute deviation of normal noise, divided by its standard deviation."""
 _NOISE_EXCESS = 1.2
 """Noise, divided by the stated noise, from which it is excessive. Chosen: units differ by less."""
 _COARSE_STEPS = 1.6
@@ -267,7 +266,7 @@ def _spikes(volts: np.ndarray, used: np.ndarray, sensor: Sensor
     # The first samples after repeated or missing ones may step, which is no spike.
     undisturbed = np.convolve(used, np.ones(4 * near + 1), 'same') > 4 * near
     for d, deviation in enumerate(deviation_v.T):
-        std_v = np.nanmedian(np.abs(deviation[used])) / _MAD_PER_STD
+        std_v = MAD_TO_STD * np.nanmedian(np.abs(deviation[used]))
         # Motion also deviates from the line, so that a spike must exceed its surroundings, too.
         local_v = _local_std(np.nan_to_num(deviation),
                              round(max(sensor.rate_hz * _SPIKE_LOCAL_S, _SPIKE_LOCAL_FEWEST)))
@@ -300,7 +299,7 @@ def _local_std(values: np.ndarray, width: int) -> np.ndarray:
     """Return a robust standard deviation around each value, interpolated between blocks."""
     count = max(len(values) // width, 1)
     blocks = np.abs(values[:count * width]).reshape(count, -1)
-    std = np.median(blocks, axis=1) / _MAD_PER_STD
+    std = MAD_TO_STD * np.median(blocks, axis=1)
     return np.interp(np.arange(len(values)), (np.arange(count) + 0.5) * width, std)
 
 
@@ -428,7 +427,8 @@ def _before_filter(volts: np.ndarray, sensor: Sensor) -> np.ndarray:
     """Undo the RC filter for noise: innovations of an AR(1) sequence, (n − 1, m)."""
     rc_s = noise.electronics(sensor).rc_s
     decay = np.exp(-1 / (sensor.rate_hz * np.where(rc_s > 0, rc_s, 1e-9)))
-    return np.column_stack([lfilter([1.0, -a], [1.0], v)[1:] for v, a in zip(volts.T, decay)])
+    return np.column_stack([scipy.signal.lfilter([1.0, -a], [1.0], v)[1:]
+                            for v, a in zip(volts.T, decay)])
 
 
 def _excess(white: np.ndarray, at_rest: np.ndarray, samples: NoiseSamples, sensor: Sensor
@@ -462,7 +462,7 @@ def _excess(white: np.ndarray, at_rest: np.ndarray, samples: NoiseSamples, senso
 
 def _spectral_level(white: np.ndarray, rate_hz: float) -> np.ndarray:
     """Return the root of the median of the power spectrum, (m,)."""
-    _, power = periodogram(white, rate_hz, 'hann', axis=0)
+    _, power = scipy.signal.periodogram(white, rate_hz, 'hann', axis=0)
     return np.sqrt(np.median(power, axis=0))
 
 
@@ -485,7 +485,7 @@ def _line(white: np.ndarray, at_rest: np.ndarray, samples: NoiseSamples, sensor:
 def _strongest_line(white: np.ndarray, samples: NoiseSamples, sensor: Sensor
                     ) -> Detection | None:
     """Return the strongest line of a spectrum, None where chance explains it."""
-    frequency_hz, power = periodogram(white, sensor.rate_hz, 'hann', axis=0)
+    frequency_hz, power = scipy.signal.periodogram(white, sensor.rate_hz, 'hann', axis=0)
     kept = frequency_hz > _LINE_LOWEST_HZ
     frequency_hz, power = frequency_hz[kept], power[kept]
     if len(frequency_hz) < _LINE_FEWEST_ORDINATES:
@@ -566,12 +566,12 @@ def white_noise_v(noise_v: np.ndarray, sensor: Sensor) -> np.ndarray:
 
     """
     innovations = _before_filter(noise_v, sensor)
-    frequency_hz, power = periodogram(innovations, sensor.rate_hz, 'hann', axis=0)
+    frequency_hz, power = scipy.signal.periodogram(innovations, sensor.rate_hz, 'hann', axis=0)
     level = np.median(power[frequency_hz > sensor.rate_hz / 4], axis=0) / np.log(2)
     rc_s = noise.electronics(sensor).rc_s
     decay = np.exp(-1 / (sensor.rate_hz * np.where(rc_s > 0, rc_s, 1e-9)))
     std = np.minimum(np.sqrt(level * sensor.rate_hz / 2),
-                     np.median(np.abs(innovations), axis=0) / _MAD_PER_STD)
+                     MAD_TO_STD * np.median(np.abs(innovations), axis=0))
     return std / np.sqrt(1 - decay ** 2)
 
 

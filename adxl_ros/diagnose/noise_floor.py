@@ -26,6 +26,15 @@ import numpy as np
 
 _REST_S = 1.0
 """Length of a rest whose mean is subtracted, s. Chosen: slower changes are part of the gap."""
+_PARTS_OF_REST = 4
+"""Parts into which a rest is divided for the interval of the noise. Chosen: a part is longer than
+the correlation of its samples."""
+_MOST_PARTS = 100
+"""Parts from which an interval is drawn at most. Chosen: 100 parts show their spread to 7 %."""
+_FEWEST_PARTS = 20
+"""Fewest parts of an interval. Chosen: 20 parts show their spread to 16 %."""
+_DRAWS = 400
+"""Number of draws of an interval. Chosen: the 5 % quantile has 20 draws below it."""
 FEWEST_SAMPLES = 200
 """Fewest samples of an estimate. Chosen: 5 % of the standard deviation."""
 _REPEAT_SHORTEST_S = 20.0
@@ -57,12 +66,39 @@ class NoiseFloor:
         Noise and the steps of the stage's encoder, m/s².
     source
         'still' for rests, 'repeats' of a trajectory, or 'assumed' from the parameter file.
+    parts
+        Sum of the squares of noise and steps, mean over axes, (m/s²)², and number of samples, by
+        part of the recordings, (2, k). Without columns where the floor is assumed.
 
     """
 
     noise_v: np.ndarray
     rms_mps2: float
     source: str
+    parts: np.ndarray
+
+    def draws_mps2(self, seed: int) -> np.ndarray | None:
+        """
+        Return the floor from parts drawn with replacement.
+
+        Parameters
+        ----------
+        seed
+            Seed of the draws.
+
+        Returns
+        -------
+        numpy.ndarray or None
+            Rms, m/s², (n,); None where the floor is assumed, or from a few parts.
+
+        """
+        count = self.parts.shape[1]
+        if count < _FEWEST_PARTS:
+            return None
+        edges = np.linspace(0, count, min(count, _MOST_PARTS) + 1).astype(int)[:-1]
+        squares, samples = np.add.reduceat(self.parts, edges, axis=1)
+        drawn = np.random.default_rng(seed).integers(0, len(edges), (_DRAWS, len(edges)))
+        return np.sqrt(squares[drawn].sum(axis=1) / samples[drawn].sum(axis=1))
 
 
 @dataclass(frozen=True)
@@ -82,12 +118,8 @@ class SquareSum:
     squares_v2: np.ndarray
     count: int
 
-    def __add__(self, other: SquareSum) -> SquareSum:
-        """Add the sums of two stretches."""
-        return SquareSum(self.squares_v2 + other.squares_v2, self.count + other.count)
 
-
-def squares_at_rest(volts: np.ndarray, at_rest: np.ndarray, sensor: Sensor) -> SquareSum:
+def squares_at_rest(volts: np.ndarray, at_rest: np.ndarray, sensor: Sensor) -> list[SquareSum]:
     """
     Sum the squares about the mean of each second at rest.
 
@@ -102,25 +134,26 @@ def squares_at_rest(volts: np.ndarray, at_rest: np.ndarray, sensor: Sensor) -> S
 
     Returns
     -------
-    SquareSum
-        Squares, corrected for the degree of freedom of the means.
+    list of SquareSum
+        Squares by part of a second, corrected for the degree of freedom of its mean.
 
     """
     length = max(round(_REST_S * sensor.rate_hz), 4)
     # The mean of correlated samples takes more out of their variance than one sample.
     independent = length / float(noise.effective_samples(length, 1 / sensor.rate_hz,
                                                          sensor.rc_s))
-    total = SquareSum(np.zeros(volts.shape[1]), 0)
+    squares = []
     for begin, end in true_runs(at_rest):
         for first in range(begin, end - length + 1, length):
             part = volts[first:first + length]
-            squares_v2 = ((part - part.mean(axis=0)) ** 2).sum(axis=0) \
-                * length / (length - independent)
-            total += SquareSum(squares_v2, length)
-    return total
+            squares_v2 = (part - part.mean(axis=0)) ** 2 * length / (length - independent)
+            squares += [SquareSum(piece.sum(axis=0), len(piece))
+                        for piece in np.array_split(squares_v2, _PARTS_OF_REST)]
+    return squares
 
 
-def squares_of_difference(first_v: np.ndarray, second_v: np.ndarray) -> SquareSum:
+def squares_of_difference(first_v: np.ndarray, second_v: np.ndarray, rate_hz: float
+                          ) -> list[SquareSum]:
     """
     Sum half of the squares of the difference between two repeats.
 
@@ -128,16 +161,20 @@ def squares_of_difference(first_v: np.ndarray, second_v: np.ndarray) -> SquareSu
     ----------
     first_v, second_v
         Residuals of the same trajectory, V, (n, m).
+    rate_hz
+        Sample rate, Hz.
 
     Returns
     -------
-    SquareSum
-        Squares about the mean difference, of one repeat.
+    list of SquareSum
+        Squares about the mean difference, of one repeat, by second.
 
     """
     difference_v = second_v - first_v
-    return SquareSum(((difference_v - difference_v.mean(axis=0)) ** 2).sum(axis=0) / 2,
-                     len(difference_v))
+    squares_v2 = (difference_v - difference_v.mean(axis=0)) ** 2 / 2
+    length = max(round(_REST_S * rate_hz), 1)
+    return [SquareSum(part.sum(axis=0), len(part))
+            for part in np.split(squares_v2, range(length, len(squares_v2), length))]
 
 
 def find_repeat(first: np.ndarray, second: np.ndarray, rate_hz: float, resolution_rad: float,

@@ -32,12 +32,13 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 from adxl_ros.diagnose.angle_errors import AngleErrorFilter
+from adxl_ros.diagnose.lost_motion import LostMotionFilter
 from adxl_ros.model import noise
 from adxl_ros.model.diagnosis_hints import DriftSpectrum
 from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.sensor import Sensor
 import numpy as np
-from scipy.signal import lfilter, sosfilt, sosfreqz, tf2sos, zpk2sos
+import scipy
 
 RANDOM_WALKS_G_PER_RTS = (1e-7, 3e-6, 1e-5, 3e-5, 3.8e-5, 5e-5, 8e-5, 1.3e-4, 2.1e-4,
                           3.5e-4, 6e-4, 1.1e-3, 2e-3)
@@ -95,7 +96,7 @@ class Whitener:
     density
         Density of the drift, in the unit of the effect's parameter.
     angle_errors
-        Filter for the errors of the followed angles, which comes first; None where the reference
+        Filter for the errors of the reference, which comes first; None where the reference
         is exact, or where the drift within a second exceeds these errors: they would take up a
         part of it.
 
@@ -105,7 +106,7 @@ class Whitener:
     log_prior: float
     effect: str
     density: float
-    angle_errors: AngleErrorFilter | None = None
+    angle_errors: AngleErrorFilter | LostMotionFilter | None = None
 
     @property
     def spectrum(self) -> DriftSpectrum:
@@ -137,7 +138,7 @@ class Whitener:
 
     def __call__(self, series: Series) -> np.ndarray:
         """Filter k series after `before_filters`, (k, n)."""
-        return sosfilt(self.sections, series[self.corrects_angles])
+        return scipy.signal.sosfilt(self.sections, series[self.corrects_angles])
 
     def continued(self, values: np.ndarray, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """
@@ -157,10 +158,10 @@ class Whitener:
 
         """
         if len(self.sections) > 1:
-            return sosfilt(self.sections, values, zi=state)
+            return scipy.signal.sosfilt(self.sections, values, zi=state)
         # The same recursion without a copy.
         numerator, denominator = self.sections[0, :3], self.sections[0, 3:]
-        filtered, after = lfilter(numerator, denominator, values, zi=state[0])
+        filtered, after = scipy.signal.lfilter(numerator, denominator, values, zi=state[0])
         return filtered, after[None]
 
 
@@ -187,7 +188,8 @@ def before_filters(filters: Sequence[Whitener], values: np.ndarray) -> Series:
 
 
 def whiteners(sensor: Sensor, axis: int, dt_s: float, span_s: float,
-              angle_errors: AngleErrorFilter | None = None) -> list[Whitener]:
+              angle_errors: AngleErrorFilter | LostMotionFilter | None = None
+              ) -> list[Whitener]:
     """
     Return the filters that are tried for the noise of one axis of a recording.
 
@@ -202,7 +204,7 @@ def whiteners(sensor: Sensor, axis: int, dt_s: float, span_s: float,
     span_s
         Length of the recording, s.
     angle_errors
-        Filter for the errors of the followed angles.
+        Filter for the errors of the reference.
 
     Returns
     -------
@@ -228,8 +230,8 @@ def whiteners(sensor: Sensor, axis: int, dt_s: float, span_s: float,
         top_hz = min(corner_hz, _TOP_OF_RATE / dt_s)
         decades = int(np.ceil(max(np.log10(top_hz * span_s), 0.0)))
         zeros, poles = _flicker_zeros_and_poles(top_hz, decades, dt_s)
-        flickers.append(_whitener(zpk2sos([a, *zeros], [healthy_zero, *poles], 1.0), flicker,
-                                  density))
+        sections = scipy.signal.zpk2sos([a, *zeros], [healthy_zero, *poles], 1.0)
+        flickers.append(_whitener(sections, flicker, density))
         if corner_hz > top_hz:
             break
     if a:
@@ -239,7 +241,7 @@ def whiteners(sensor: Sensor, axis: int, dt_s: float, span_s: float,
                                                 int(np.ceil(np.log10(span_s / dt_s))), dt_s)
         lowest = np.sqrt(white_v2_per_hz / (2 * np.pi * rc_s)) / scale
         healthy = effect_named(flicker).diagnosis.healthy_density
-        flickers.append(_whitener(zpk2sos(zeros, poles, 1.0), flicker,
+        flickers.append(_whitener(scipy.signal.zpk2sos(zeros, poles, 1.0), flicker,
                                   max(float(lowest), 2 * healthy)))
     largest = np.inf if angle_errors is None else angle_errors.rms_v / scale
     return [replace(f, angle_errors=angle_errors) if f.healthy or f.density < largest else f
@@ -256,8 +258,8 @@ def _walk_whiteners(a: float, std_v: float, step_std_v: float, scale_v_per_g: fl
         spectrum = (std_v ** 2 * (1 - a * a) * _power(difference, 2)
                     + step_std_v ** 2 * _power(np.convolve(pole, difference), 2)
                     + (density * scale_v_per_g) ** 2 * dt_s * _power(pole, 2))
-        out.append(_whitener(tf2sos(np.convolve(pole, difference),
-                                    _spectral_factor(spectrum, 2)), walk, density))
+        out.append(_whitener(scipy.signal.tf2sos(np.convolve(pole, difference),
+                                                 _spectral_factor(spectrum, 2)), walk, density))
     return out
 
 
@@ -304,7 +306,7 @@ def fitted_density(whitener: Whitener, variance_v2: float, dt_s: float, scale_v_
     """
     if whitener.spectrum is DriftSpectrum.RANDOM_WALK:
         return whitener.density
-    _, gain = sosfreqz(whitener.sections, [2 * np.pi * dt_s])
+    _, gain = scipy.signal.sosfreqz(whitener.sections, [2 * np.pi * dt_s])
     density_v_per_rthz = np.sqrt(2 * dt_s * variance_v2) / np.abs(gain[0])
     return float(density_v_per_rthz / scale_v_per_g)
 

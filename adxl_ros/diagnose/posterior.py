@@ -49,7 +49,7 @@ from adxl_ros.model.diagnosis_hints import FormDimension
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.noise import rounding
 import numpy as np
-from scipy.linalg.lapack import dposv
+import scipy
 
 _NOISE_ITERATIONS = 3
 """Iterations over coefficients, noise level and filter. Chosen: they no longer change then."""
@@ -179,15 +179,19 @@ def posterior(linear_model: LinearModel, sized: Sequence[SizedHypothesis],
     kept += [i for i, s in enumerate(sized) if not s.hypothesis.effects and i not in kept]
     for index in kept:
         for dimension in _dimensions(channels):
+            if dimension in _forms_of_smoothing(sized[index]):
+                continue
             values = [_log_evidence(channels, index, sized[index], by_form[index][1], dimension,
                                     amplitude)
                       for amplitude in settings.unknown_amplitudes_g]
             total = float(np.logaddexp.reduce(values) - np.log(len(values)))
             size_mps2 = G0_MPS2 * settings.unknown_amplitudes_g[int(np.argmax(values))]
             # What the recording does not make more probable is no finding. What is small beside
-            # the effects is an error of their form, and beside coarse rounding a part of it.
-            smallest_mps2 = max(rounding_mps2, settings.smallest_unknown_share
-                                * _inexact_mps2(sized[index]))
+            # the effects is an error of their form, and beside coarse rounding or the errors of
+            # a smooth reference a part of these.
+            smallest_mps2 = max(
+                rounding_mps2, settings.smallest_unknown_share * _inexact_mps2(sized[index]),
+                settings.smallest_share_of_lost_motion * linear_model.lost_motion_mps2)
             if total > by_form[index][0] and size_mps2 > smallest_mps2:
                 add(index, dimension, total, by_form[index][1])
     weights = np.array([e.log_weight for e in entries.values()])
@@ -254,6 +258,12 @@ def _log_prior(effects: frozenset[str], unknown: FormDimension | None, linear_mo
     prior = by_count[min(count, len(by_count) - 1)] / sets
     return float(np.log(prior if unknown is None else prior / len(FormDimension))) \
         - settings.evidence_factor * handicap
+
+
+def _forms_of_smoothing(sized: SizedHypothesis) -> set[FormDimension]:
+    """Return where the form of a smooth reference looks like something unknown."""
+    return {dimension for effect in map(effect_named, sized.hypothesis.effects)
+            if effect.diagnosis.smooths_reference for dimension in effect.diagnosis.form}
 
 
 def _dimensions(channels: Sequence[_Channel]) -> list[FormDimension]:
@@ -454,7 +464,8 @@ class _ChannelModel:
         scale = 1 / self._variance_v2[i]
         out, half_log_det = scale * design, 0.0
         if len(basis):
-            factor, solved, fault = dposv(scale * basis + np.eye(len(basis)), scale * cross.T)
+            factor, solved, fault = scipy.linalg.lapack.dposv(
+                scale * basis + np.eye(len(basis)), scale * cross.T)
             if fault:
                 raise np.linalg.LinAlgError('the flexible functions are singular')
             out = out - scale * (cross @ solved)

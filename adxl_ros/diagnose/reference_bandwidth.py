@@ -24,7 +24,7 @@ from __future__ import annotations
 from adxl_ros.diagnose.baseline_comparison import BaselineComparison, Reference
 from adxl_ros.model.noise import electronics
 import numpy as np
-from scipy.signal import detrend
+import scipy
 
 _WINDOW_S = 1.0
 """Length of the windows of the spectra, s. Chosen: it separates frequencies of 1 Hz."""
@@ -73,7 +73,8 @@ def fading_frequency_hz(comparison: BaselineComparison) -> float | None:
         return None
     rows = np.array(starts)[:, None] + np.arange(size)
     recorded, simulated = (
-        np.fft.rfft(detrend(v[rows], axis=1) * np.hanning(size)[None, :, None], axis=1)
+        np.fft.rfft(scipy.signal.detrend(v[rows], axis=1) * np.hanning(size)[None, :, None],
+                    axis=1)
         for v in (comparison.volts / sensor.scale_v_per_g,
                   comparison.simulated_v(sensor) / sensor.scale_v_per_g))
     power = np.sum(np.abs(recorded) ** 2, axis=2)

@@ -31,7 +31,7 @@ from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.signals.runs import true_runs
 from adxl_ros.simulate.smoothed_paths import BAND_LIMITED_DEGREE, ForcePath, KNOT_S
 import numpy as np
-from scipy.interpolate import CubicSpline
+import scipy
 
 LONGEST_BRIDGE_S = 0.1
 """Longest time without a reading of a joint, s, that is bridged. Chosen: an acceleration of
@@ -210,7 +210,8 @@ def too_coarse(recording: Recording, comparison: BaselineComparison) -> list[Lef
     limit_g = _LARGEST_ERROR * max(noise_g, float(np.min(sensor.lsb_v / sensor.scale_v_per_g)))
     left_out: list[LeftOut] = []
 
-    def leave_out(name: str, read_s: np.ndarray, error_g: np.ndarray, largest_g: float) -> None:
+    def leave_out(name: str, read_s: np.ndarray, error_g: np.ndarray, largest_g: float,
+                  advice: str = '') -> None:
         """Add the windows whose error exceeds a limit."""
         coarse = np.interp(time_s, read_s, error_g) > largest_g
         if coarse.any():
@@ -221,12 +222,13 @@ def too_coarse(recording: Recording, comparison: BaselineComparison) -> list[Lef
             coarse = np.convolve(coarse, np.ones(2 * margin + 1), 'same') > 0.5
             left_out.append(LeftOut(
                 coarse, f'{name} moves too fast for its {rate_hz:.4g} readings a second (error '
-                f'up to {1e3 * error_g.max():.2g} mg)'))
+                f'up to {1e3 * error_g.max():.2g} mg){advice}'))
 
     if comparison.reference is Reference.SIMULATOR and isinstance(force, ForcePath):
         squares = [_spline_error(force.time_s, f / G0_MPS2, 3, 0, 0.0) ** 2
                    for f in force(force.time_s)[:len(sensor.axes)]]
-        leave_out('--sim', force.time_s, np.sqrt(np.max(squares, axis=0)), limit_g)
+        leave_out('--sim', force.time_s, np.sqrt(np.max(squares, axis=0)), limit_g,
+                  '; write it at a higher rate, and switch off noise that the simulator adds')
     if comparison.reference is Reference.STAGE:
         step_rad = sensor.stage_resolution_rad
         for joint, name in JOINTS.items():
@@ -281,8 +283,8 @@ def _spline_error(read_s: np.ndarray, values: np.ndarray, degree: int, order: in
     for times_s, part in zip(np.split(read_s, wide), np.split(values, wide)):
         if len(part) > 1 and np.ptp(np.diff(times_s)) > _EVEN * step_s:
             even_s = np.arange(times_s[0], times_s[-1], step_s)
-            even = _windowed_error(CubicSpline(times_s, part)(even_s), step_s, spacing, degree,
-                                   order)
+            even = _windowed_error(scipy.interpolate.CubicSpline(times_s, part)(even_s), step_s,
+                                   spacing, degree, order)
             errors.append(np.interp(times_s, even_s, even))
         else:
             errors.append(_windowed_error(part, step_s, spacing, degree, order))

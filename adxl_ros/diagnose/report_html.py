@@ -26,6 +26,7 @@ from adxl_ros.diagnose.effect_proof import EffectProof, prove
 from adxl_ros.diagnose.report_json import as_json, notes, PROBABLE
 from adxl_ros.diagnose.report_text import badge, named_effects, parameter_label
 from adxl_ros.diagnose.report_wording import (
+    concern_text,
     gap_rows,
     headline,
     is_only_noise,
@@ -70,6 +71,8 @@ class Run:
         What to do next: purpose and command.
     parameters_text
         Text of the new parameter file; empty for none.
+    command
+        Command that makes the page; empty for that of this process.
 
     """
 
@@ -77,6 +80,7 @@ class Run:
     parameter_file: str
     steps: Sequence[tuple[str, str]]
     parameters_text: str
+    command: str = ''
 
 
 def page(diagnosis: Diagnosis, run: Run) -> str:
@@ -111,6 +115,8 @@ def page(diagnosis: Diagnosis, run: Run) -> str:
                   'sentence': _sentence(diagnosis, report)},
         'notes': notes(diagnosis), 'figures': {}, 'has_verdict': False,
         'download': run.parameters_text and html_page.download_url(run.parameters_text)}
+    if run.command:
+        values['command'] = run.command
     if diagnosis.data_fault is None and diagnosis.verdict is not None:
         values |= _contents(diagnosis, report) | {'steps': run.steps}
     return html_page.render('adxl_ros.diagnose', 'diagnosis.html', values)
@@ -123,12 +129,12 @@ def _sentence(diagnosis: Diagnosis, report: dict[str, Any]) -> str:
         return 'The recording agrees with its simulation within the noise.'
     if status != 'explained':
         return headline(diagnosis)
-    assert diagnosis.gap_closure is not None
+    assert diagnosis.gap_closure is not None and diagnosis.verdict is not None
     closure, effects = diagnosis.gap_closure, listed(report['verdict']['effects'], 'and')
     if is_only_noise(diagnosis):
         return f'{effects}. {NOISE_STAYS}'
     return (f'{effects}: the difference falls from {mg_text(closure.before_mps2)} '
-            f'to {mg_text(closure.after_mps2)} rms.')
+            f'to {mg_text(closure.after_mps2)} rms.{concern_text(diagnosis.verdict)}')
 
 
 def _contents(diagnosis: Diagnosis, report: dict[str, Any]) -> dict[str, Any]:
@@ -266,5 +272,5 @@ def _menu_rows(report: dict[str, Any]) -> list[list[str]]:
     """Return the manoeuvres that would separate hypotheses, the best first."""
     proposal = report['next_experiment']
     return [] if proposal is None else [
-        [m['manoeuvre'], f'{m["minutes"]:.1f}', f'{m["nats_per_minute"]:.1f}']
+        [m['manoeuvre'], f'{m["minutes"]:.1f}', f'{m["nats_per_minute"]:.2g}']
         for m in proposal['menu']]

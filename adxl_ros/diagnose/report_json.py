@@ -24,7 +24,7 @@ from adxl_ros.diagnose.decision import Verdict, WeightedHypothesis
 from adxl_ros.diagnose.diagnosis import Diagnosis
 from adxl_ros.diagnose.hypothesis_fit import Hypothesis
 from adxl_ros.diagnose.next_experiment import NextExperiment
-from adxl_ros.diagnose.report_wording import summary
+from adxl_ros.diagnose.report_wording import concern, summary
 from adxl_ros.diagnose.residual_map import ResidualCell, SIGNIFICANT_P
 from adxl_ros.model.coefficients import fitted_of, get, parameter_of
 from adxl_ros.model.constants import Z_90
@@ -48,7 +48,7 @@ def as_json(diagnosis: Diagnosis) -> dict[str, Any]:
     if fault is not None:
         return {'schema': 1, 'verdict': {
             'status': fault.status, 'effects': [], 'groups': [],
-            'data_fault': fault.name if fault.status == 'bad_data' else None,
+            'of': None, 'data_fault': fault.name if fault.status == 'bad_data' else None,
             'probability': 1.0}, 'hypotheses': [], 'gap': None, 'where': [], 'candidates': [],
             'notes': notes(diagnosis), 'next_experiment': None, 'summary': fault.message}
     assert diagnosis.verdict is not None
@@ -56,7 +56,8 @@ def as_json(diagnosis: Diagnosis) -> dict[str, Any]:
     return {
         'schema': 1,
         'verdict': {'status': verdict.status, 'effects': list(verdict.effects),
-                    'groups': [list(group) for group in verdict.groups], 'data_fault': None,
+                    'groups': [list(group) for group in verdict.groups],
+                    'of': concern(verdict), 'data_fault': None,
                     'probability': _rounded(verdict.probability)},
         'hypotheses': [{'effects': list(h.effects), 'probability': h.probability}
                        for h in _summing_to_one(verdict.hypotheses)],
@@ -88,9 +89,11 @@ def _gap(diagnosis: Diagnosis) -> dict[str, Any]:
     return {'unit': 'm/s^2', 'before': _rounded(closure.before_mps2),
             'zero_g': _rounded(closure.zero_g_mps2), 'drift': _rounded(closure.drift_mps2),
             'after': _rounded(closure.after_mps2), 'floor': _rounded(closure.floor_mps2),
+            'floor_ci': closure.floor_ci and [_rounded(c) for c in closure.floor_ci],
             'floor_source': diagnosis.noise_floor.source,
             'closed': _rounded(closure.closed) if has_gap else None,
             'closed_ci': [_rounded(c) for c in closure.closed_ci],
+            'not_in_reference': _rounded(diagnosis.lost_motion_mps2),
             'noise': _noise(diagnosis)}
 
 
@@ -106,11 +109,11 @@ def _next_experiment(proposal: NextExperiment | None) -> dict[str, Any] | None:
     """Return what to record next."""
     if proposal is None:
         return None
-    worth = proposal.log_bayes_factor_per_minute
+    worth = proposal.nats_per_minute
     return {'manoeuvre': proposal.manoeuvre, 'why': proposal.why, 'command': proposal.command,
             'nats_per_minute': worth and _rounded(worth),
             'menu': [{'manoeuvre': w.text, 'minutes': _rounded(w.minutes),
-                      'nats_per_minute': _rounded(w.log_bayes_factor_per_minute)}
+                      'nats_per_minute': _rounded(w.nats_per_minute)}
                      for w in proposal.menu]}
 
 
@@ -198,8 +201,9 @@ def _candidate(diagnosis: Diagnosis, effect: str, probability: float,
                       for p in effect_named(effect).parameters if p.name in detection.values}
         if test is None:
             p = float(np.exp(-detection.log_bayes_factor))
-    return {'effect': effect, 'probability': _rounded(min(probability, 1.0)), 'closed': closed,
-            'p': p, 'parameters': parameters,
+    return {'effect': effect, 'of': effect_named(effect).concern.value,
+            'probability': _rounded(min(probability, 1.0)), 'closed': closed, 'p': p,
+            'parameters': parameters,
             'share': None if share is None else _rounded(share),
             'visibility': _rounded(test.visibility) if test else 1.0,
             'inseparable_from': _rivals(effect, verdict), 'cause': effect_named(effect).cause}

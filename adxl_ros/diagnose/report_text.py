@@ -26,10 +26,12 @@ from adxl_ros.diagnose.report_json import as_json, notes, PROBABLE
 from adxl_ros.diagnose.report_wording import (
     closed_text,
     closes,
+    concern,
     floor_source,
     headline,
     is_only_noise,
     listed,
+    lost_text,
     mg,
     mg_text,
     NOISE_STAYS,
@@ -40,6 +42,7 @@ from adxl_ros.diagnose.report_wording import (
     remainder_rows,
     Row,
 )
+from adxl_ros.model.effects.base import Concern
 import numpy as np
 
 COLUMNS = 79
@@ -136,13 +139,17 @@ def _gap_lines(diagnosis: Diagnosis) -> list[str]:
     if closes(diagnosis):
         values = f'{mg_text(closure.before_mps2)} -> {mg_text(closure.after_mps2)} rms'
         further.append(f'{closed_text(diagnosis)} closed on held-out blocks')
+    if diagnosis.lost_motion_mps2:
+        further += wrap(f'the reference lacks {lost_text(diagnosis)}', COLUMNS - _BADGE_COLUMNS)
     parts = f'zero-g {mg_text(closure.zero_g_mps2)}, drift {mg_text(closure.drift_mps2)}; ' \
         if pose_is_compared(diagnosis) else 'the pose is unknown, so the mean is not compared; '
     further += wrap(f'{parts}floor {floor_source(diagnosis)}', COLUMNS - _BADGE_COLUMNS)
     lines = [f'{badge(diagnosis):{_BADGE_COLUMNS - 1}} {values:{_VALUE_COLUMNS - 1}} '
              f'noise floor {mg_text(closure.floor_mps2)}',
              *(f'{"":{_BADGE_COLUMNS}}{line}' for line in further)]
-    if diagnosis.verdict.status in ('inseparable', 'unknown', 'insufficient'):
+    concerns = concern(diagnosis.verdict) or ''
+    if diagnosis.verdict.status in ('inseparable', 'unknown', 'insufficient') \
+            or Concern.REFERENCE.value in concerns:
         lines += _wrapped(headline(diagnosis))
     if is_only_noise(diagnosis):
         lines += _wrapped(NOISE_STAYS)
@@ -165,6 +172,8 @@ def badge(diagnosis: Diagnosis) -> str:
         return f'UNKNOWN CAUSE ({sure})'
     if verdict.status == 'inseparable':
         return 'CAUSES NOT SEPARATED'
+    if concern(verdict) == Concern.REFERENCE.value:
+        return 'ERROR OF THE REFERENCE'
     return f'GAP EXPLAINED by {count} effect{"" if count == 1 else "s"}'
 
 

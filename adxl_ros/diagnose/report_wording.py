@@ -24,11 +24,12 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from adxl_ros.diagnose.baseline_comparison import Reference
+from adxl_ros.diagnose.decision import Verdict
 from adxl_ros.diagnose.diagnosis import Diagnosis
 from adxl_ros.diagnose.noise_remainder import NoiseRemainder
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects import effect_named
-from adxl_ros.model.effects.base import ActsOn
+from adxl_ros.model.effects.base import ActsOn, Concern
 import numpy as np
 
 _NEARLY_ALL = 0.995
@@ -85,7 +86,48 @@ def headline(diagnosis: Diagnosis) -> str:
     several = len(diagnosis.comparisons) > 1
     recordings = 'these recordings do' if several else 'this recording does'
     inseparable = f': {recordings} not separate them' if verdict.groups else ''
-    return f'Gap explained by {named}{inseparable} {probability}.'
+    return f'Gap explained by {named}{inseparable} {probability}.{concern_text(verdict)}'
+
+
+def concern(verdict: Verdict) -> str | None:
+    """
+    Return what a verdict is about: reference, stage or sensor.
+
+    Parameters
+    ----------
+    verdict
+        The verdict.
+
+    Returns
+    -------
+    str or None
+        Concerns of the effects, joined by 'and', and by 'or' where a group holds several; None
+        where no effect is named.
+
+    """
+    concerns = [_concerns([effect]) for effect in verdict.effects]
+    concerns += [_concerns(group) for group in verdict.groups]
+    return ' and '.join(sorted(dict.fromkeys(concerns))) or None
+
+
+def _concerns(effects: Sequence[str]) -> str:
+    """Return what one of some effects is an error of."""
+    return ' or '.join(sorted({effect_named(e).concern.value for e in effects}))
+
+
+def concern_text(verdict: Verdict) -> str:
+    """Return a sentence on what is the reference's in a verdict; empty where nothing is."""
+    concerns = concern(verdict)
+    reference = Concern.REFERENCE.value
+    if concerns == reference:
+        return f' This is an error of the {reference}, not of the sensor.'
+    certain = [e for e in verdict.effects if effect_named(e).concern is Concern.REFERENCE]
+    undecided = [group for group in verdict.groups
+                 if Concern.REFERENCE.value in _concerns(group)]
+    sentences = [f' {listed(certain, "and")} is of the {reference}.'] if certain else []
+    sentences += [f' The error is of the {_concerns(group).replace(" or ", " or of the ")}; both '
+                  'give the same samples.' for group in undecided]
+    return ''.join(sentences)
 
 
 def listed(names: Sequence[str], word: str) -> str:
@@ -125,9 +167,17 @@ def summary(diagnosis: Diagnosis) -> str:
                          f'{closed_text(diagnosis)} closed.')
     elif is_only_noise(diagnosis):
         sentences.append(NOISE_STAYS)
+    if diagnosis.lost_motion_mps2:
+        sentences.append(f'The reference lacks {lost_text(diagnosis)}.')
     sentences.append(f'The noise floor is {mg_text(closure.floor_mps2)}.')
     sentences += [f'{row.label}: {row.text}.' for row in remainder_rows(diagnosis)]
     return ' '.join(sentences)
+
+
+def lost_text(diagnosis: Diagnosis) -> str:
+    """Return how much motion a smooth reference lacks."""
+    lacking_hz = min(c.lacking_hz for c in diagnosis.comparisons)
+    return f'{mg_text(diagnosis.lost_motion_mps2)} rms of motion above {lacking_hz:.2g} Hz'
 
 
 NOISE_STAYS = 'The effects are noise, which no simulation repeats sample by sample.'
@@ -147,6 +197,8 @@ def gap_rows(diagnosis: Diagnosis) -> list[Row]:
                  Row('closed', closed_text(diagnosis))]
     elif is_only_noise(diagnosis):
         rows.append(Row('closed', NOISE_STAYS))
+    if diagnosis.lost_motion_mps2:
+        rows.append(Row('not in the reference', lost_text(diagnosis)))
     rows.append(Row('noise floor', f'{mg_text(closure.floor_mps2)} rms, '
                     f'{_FLOOR_SOURCES[diagnosis.noise_floor.source]}'))
     return rows

@@ -34,8 +34,7 @@ from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.sensor import Sensor
 import numpy as np
-from scipy.signal import periodogram
-from scipy.stats import gamma
+import scipy
 
 RANGES = 8
 """Number of ranges of a dimension, with equally many samples. Chosen: a row of the page."""
@@ -66,6 +65,8 @@ _COVERAGE = {
     'direction_beta': 'reversals',
 }
 """Dimensions that recordings should cover, and how the report names them."""
+_STAGE_ONLY = {'alpha_rad', 'beta_rad', 'rate_rad_s', 'direction_beta'}
+"""Dimensions of a stage, which another simulator does not have."""
 
 
 @dataclass(frozen=True)
@@ -150,6 +151,8 @@ def not_covered(comparisons: Sequence[BaselineComparison]) -> list[str]:
         if temperature is not None \
                 and np.ptp(temperature(comparison.time_s)) < SMALLEST_WARMING_C:
             covered -= {'temperature_c'}
+    if all(c.reference is Reference.SIMULATOR for c in comparisons):
+        covered |= _STAGE_ONLY
     return [text for name, text in _COVERAGE.items() if name not in covered]
 
 
@@ -240,7 +243,7 @@ def _cells_over_frequency(sensor: Sensor, residual: np.ndarray, floor_mps2: floa
                           ) -> Iterator[ResidualCell]:
     """Compare the power in bands with that of the stated noise (gamma, Bonferroni)."""
     rate_hz = sensor.rate_hz
-    frequency_hz, power = periodogram(residual, rate_hz, axis=0)
+    frequency_hz, power = scipy.signal.periodogram(residual, rate_hz, axis=0)
     stated = noise.density_v2_per_hz(sensor, frequency_hz) \
         / (sensor.scale_v_per_g / G0_MPS2) ** 2
     step_hz = float(frequency_hz[1])
@@ -253,7 +256,7 @@ def _cells_over_frequency(sensor: Sensor, residual: np.ndarray, floor_mps2: floa
             continue
         for d, axis in enumerate(sensor.axes):
             measured, expected = power[inside, d].sum(), stated[inside, d].sum()
-            p = float(gamma.sf(measured / expected * count, count)) * len(bands) \
+            p = float(scipy.stats.gamma.sf(measured / expected * count, count)) * len(bands) \
                 * residual.shape[1]
             excess = max(measured - expected, 0.0) * step_hz
             yield ResidualCell(

@@ -174,8 +174,10 @@ def variants(simulate: Simulate, sensor: Sensor, effect: Effect, baseline_v: np.
     # An effect with a shape parameter is nearly linear in its sizes. An effect of the baseline
     # keeps its shape.
     rough = not effect.smooth and not any(p.role is Role.SHAPE for p in effect.parameters)
+    steps = [start / p.scale for p in effect.parameters if p.is_size for start in p.starts] \
+        or list(_ROUGH_STEPS if rough else (_SMOOTH_STEP,))
     for shape, sizes in _tried(effect, modelled):
-        for step in _ROUGH_STEPS if rough else (_SMOOTH_STEP,):
+        for step in steps:
             try:
                 variant = _variant(simulate, sensor, replace(effect, parameters=sizes), shape,
                                    step, baseline_v, pose_known)

@@ -22,13 +22,14 @@ from adxl_ros.diagnose.baseline_comparison import compare
 from adxl_ros.diagnose.decision import Verdict, WeightedHypothesis, without_fast_effects
 from adxl_ros.diagnose.input_checks import compare_checked
 from adxl_ros.files import parameter_file, recording
-from adxl_ros.files.recording_columns import Recording
+from adxl_ros.files.recording_columns import ACCEL, Recording
 from adxl_ros.files.stream_info import sensor_info
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.simulate import trajectories
 from adxl_ros.simulate.from_recording import motion_from_force
 from adxl_ros.simulate.motion import Motion
+from adxl_ros.simulate.sensor_model import SensorModel
 from adxl_ros.simulate.simulator import simulate
 from adxl_ros.simulate.trajectories import shaker
 import numpy as np
@@ -146,6 +147,39 @@ def test_align_shifts_the_simulator(tmp_path, late_s):
     assert np.sqrt(np.mean(residual_g ** 2)) < (1e-3 if late_s > 0.1 else 1e-2)
     assert comparison.notes[0].startswith('--align')
     assert ('nothing is shifted' in comparison.notes[0]) == (late_s < 0.1)
+
+
+def in_a_loop(tmp_path, jerk_s=0.008, noise_mps2=0.0):
+    """Return a sensor in the loop of a simulator that begins with a jerk; write its force."""
+    sensor, time_s = unit(200.0), np.arange(8000) / 200.0
+    jerk = np.exp(-time_s / jerk_s)
+    force = np.column_stack([3 * np.sin(0.7 * time_s) - 4 * jerk,
+                             4 * np.cos(0.45 * time_s) + 6 * jerk, 9 + np.sin(0.3 * time_s)])
+    model = SensorModel(sensor, seed=1)
+    readings = np.array([model(row, 1 / 200.0) for row in force])
+    force += noise_mps2 * np.random.default_rng(2).standard_normal(force.shape)
+    np.savetxt(tmp_path / 'sim.csv', np.column_stack([time_s, force]), '%.6f', ',', comments='',
+               header='time_s,ax_mps2,ay_mps2,az_mps2')
+    return sensor, Recording('made', time_s, dict(zip(ACCEL, readings.T)), sensor_info(sensor))
+
+
+def test_a_simulator_that_begins_with_a_jerk_has_no_gap(run_tool, tmp_path):
+    """No effect is named for the filter, whose state before the first sample is unknown."""
+    sensor, recorded = in_a_loop(tmp_path)
+    report, run = report_of(run_tool, tmp_path, sensor, recorded, options=['--sim', 'sim.csv'])
+    assert (run.returncode, report['verdict']['status']) == (0, 'no_gap')
+    proposal = report['next_experiment']
+    assert '--sim' in proposal['command'], 'no stage makes the motion'
+    assert proposal['manoeuvre'] == 'tilt slowly in all directions'
+    assert report['not_covered'] == ['other temperatures', 'other supplies']
+
+
+def test_the_noise_of_a_simulator_is_to_be_switched_off(run_tool, tmp_path):
+    sensor, recorded = in_a_loop(tmp_path, noise_mps2=0.05)
+    report, run = report_of(run_tool, tmp_path, sensor, recorded, options=['--sim', 'sim.csv'])
+    assert (run.returncode, report['verdict']['status']) == (1, 'insufficient')
+    assert 'usable reference' in report['summary']
+    assert 'switch off noise that the simulator adds' in report['notes'][0]
 
 
 def test_a_simulator_of_another_motion_is_no_shift(run_tool, tmp_path):

@@ -16,27 +16,13 @@
 import json
 from subprocess import run
 
-from pages import layout_faults, NEEDS_CHROMIUM, opener, running_browser, wait_until_drawn, WIDTHS
+from pages import layout_faults, NEEDS_CHROMIUM, wait_until_drawn, WIDTHS
 from processes import executable
 import pytest
 
 pytestmark = [pytest.mark.long, NEEDS_CHROMIUM]
 
 EFFECTS = ('lever_arm', 'temperature_bias')
-
-
-@pytest.fixture(scope='module')
-def browser():
-    """Yield a headless Chromium."""
-    with running_browser() as launched:
-        yield launched
-
-
-@pytest.fixture
-def opened(browser):
-    """Give a function that opens a file, and returns the page and messages of the browser."""
-    with opener(browser) as begin:
-        yield begin
 
 
 @pytest.fixture(scope='module')

@@ -41,7 +41,7 @@ def test_starts_belong_to_shapes_and_lie_within_their_bounds(effect):
     """Starts rise, and every combination is tried."""
     tried = shapes(effect)
     for p in effect.parameters:
-        assert not p.starts or p.role is Role.SHAPE
+        assert not p.starts or p.role is Role.SHAPE or (p.is_size and not p.axes)
         assert list(p.starts) == sorted(set(p.starts))
         if p.role is Role.SHAPE and not p.held:
             values = {shape[p.name] for shape in tried}
