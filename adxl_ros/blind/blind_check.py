@@ -32,7 +32,6 @@ from adxl_ros.blind import (
     held_out_gap,
     label_commitment,
     negative_controls,
-    parallel_io,
     scores,
     trials,
 )
@@ -41,6 +40,8 @@ from adxl_ros.blind.label_commitment import Setup
 from adxl_ros.blind.scores import Trial
 from adxl_ros.blind.trials import Label
 from adxl_ros.errors import UserError
+from adxl_ros.jobs.run import for_each
+from adxl_ros.jobs.whole_files import make_folder, write
 
 OtherMethod = Callable[[Path, Executor, Callable[[float], None]], dict[str, Answer]]
 """Receives the folder of recordings and parameter files, a pool, and what receives the finished
@@ -165,18 +166,18 @@ def score(folder: Path, command: Sequence[str] | None, pool: Executor, show: Sho
 
 def _held_out(folder: Path, labels: Sequence[Label], results: dict[str, diagnosis_runs.Result],
               pool: Executor, show: Callable[[float], None]) -> dict[str, dict[str, Any] | None]:
-    done = parallel_io.make_folder(folder / 'labels' / 'held')
+    done = make_folder(folder / 'labels' / 'held')
 
     def keep(name: str, gap: dict[str, Any] | None) -> None:
-        parallel_io.write(done / f'{name}.json', json.dumps(gap).encode())
+        write(done / f'{name}.json', json.dumps(gap).encode())
 
     def job(label: Label) -> tuple:
         stated = (folder / 'recordings' / f'{label.name}.yaml').read_text()
         return label, stated, results[label.name]['parameters']
 
     todo = [label for label in labels if not (done / f'{label.name}.json').exists()]
-    parallel_io.for_each(pool, held_out_gap.evaluate, [partial(job, label) for label in todo],
-                         keep, show, len(labels) - len(todo))
+    for_each(pool, held_out_gap.evaluate, [partial(job, label) for label in todo],
+             keep, show, len(labels) - len(todo))
     return {label.name: json.loads((done / f'{label.name}.json').read_bytes())
             for label in labels}
 

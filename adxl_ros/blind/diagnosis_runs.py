@@ -16,14 +16,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Executor, ProcessPoolExecutor
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
 from functools import partial
 import hashlib
 from importlib.metadata import PackageNotFoundError, version
 import json
-from multiprocessing import get_context
 import os
 from pathlib import Path
 import signal
@@ -33,9 +31,9 @@ import tempfile
 import time
 from typing import Any
 
-from adxl_ros.blind import parallel_io
-from adxl_ros.errors import install_hint, UserError
-from ament_index_python.packages import get_package_prefix
+from adxl_ros.errors import UserError
+from adxl_ros.jobs.run import for_each
+from adxl_ros.jobs.whole_files import make_folder, write
 
 _ENVIRONMENT = ('PATH', 'LD_LIBRARY_PATH', 'PYTHONPATH', 'AMENT_PREFIX_PATH', 'VIRTUAL_ENV',
                 '_ROS_WHEELS_BOOTSTRAP_COMPLETE', 'ROS_DISTRO', 'LANG', 'SYSTEMROOT')
@@ -48,7 +46,8 @@ Result = dict[str, Any]
 
 def executable(name: str) -> list[str]:
     """Return the command line of an executable of the package."""
-    return [sys.executable, str(Path(get_package_prefix('adxl_ros'), 'lib', 'adxl_ros', name))]
+    return [sys.executable, '-c',
+            f'import sys; from adxl_ros.tools.{name} import main; sys.exit(main())']
 
 
 def call(command: Sequence[str], folder: Path) -> tuple[int, str]:
@@ -153,13 +152,13 @@ def diagnose_all(folder: Path, command: Sequence[str] | None, pool: Executor,
         Earlier results are of another version of the diagnosis.
 
     """
-    reports, code = parallel_io.make_folder(folder / 'reports'), code_version(command)
+    reports, code = make_folder(folder / 'reports'), code_version(command)
     stamp = reports / 'version.txt'
     if stamp.exists() and stamp.read_text() != code:
         raise UserError(f'{stamp}: earlier reports are of another version of the diagnosis '
                         f'({stamp.read_text()[:12]}, now {code[:12]}); draw a new check '
                         'into another folder')
-    parallel_io.write(stamp, code.encode())
+    write(stamp, code.encode())
     names = sorted(path.stem for path in (folder / 'recordings').glob('*.csv'))
     todo = [name for name in names if not (reports / f'{name}.json').exists()]
 
@@ -169,10 +168,10 @@ def diagnose_all(folder: Path, command: Sequence[str] | None, pool: Executor,
                 source.with_suffix('.yaml').read_bytes(), command)
 
     def keep(name: str, result: Result) -> None:
-        parallel_io.write(reports / f'{name}.json', json.dumps(result).encode())
+        write(reports / f'{name}.json', json.dumps(result).encode())
 
-    parallel_io.for_each(pool, diagnose, [partial(job, name) for name in todo], keep, show,
-                         len(names) - len(todo))
+    for_each(pool, diagnose, [partial(job, name) for name in todo], keep, show,
+             len(names) - len(todo))
     if code_version(command) != code:
         raise UserError('the code of the diagnosis changed while it ran; draw a new check into '
                         'another folder, and do not change the package meanwhile')
@@ -201,56 +200,3 @@ def package_version() -> str:
         return version('adxl_ros')
     except PackageNotFoundError:
         return 'unknown'
-
-
-@contextmanager
-def workers(scheduler: str | None) -> Iterator[Executor]:
-    """
-    Open a pool: a process for each core, or a Dask cluster.
-
-    Parameters
-    ----------
-    scheduler
-        Address of the cluster; None for processes.
-
-    Yields
-    ------
-    Executor
-        The pool.
-
-    Raises
-    ------
-    UserError
-        Dask is not installed, or its scheduler does not answer.
-
-    """
-    if scheduler is None:
-        # A new process reads this before it loads numpy; each uses one core.
-        os.environ['OPENBLAS_NUM_THREADS'] = '1'
-        pool = ProcessPoolExecutor(cores(), get_context('spawn'), _ignore_interrupts)
-        try:
-            yield pool
-        finally:
-            pool.shutdown(cancel_futures=True)
-        return
-    try:
-        from distributed import Client
-    except ImportError:
-        raise UserError(f'--scheduler needs Dask; {install_hint("distributed")}') from None
-    try:
-        client = Client(scheduler, timeout='20s')
-    except (OSError, ValueError) as error:
-        raise UserError(f'--scheduler {scheduler}: no scheduler answers: {error}') from None
-    with client, client.get_executor(pure=False) as pool:
-        yield pool
-
-
-def _ignore_interrupts() -> None:
-    """Leave Ctrl-C to the parent, which stops to submit jobs; running jobs finish."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
-def cores() -> int:
-    """Return the number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else \
-        os.cpu_count() or 1

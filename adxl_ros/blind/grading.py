@@ -25,7 +25,7 @@ from adxl_ros.blind import trials
 from adxl_ros.blind.trials import Label
 from adxl_ros.blind.world.unit import G0
 import numpy as np
-from scipy.stats import norm
+import scipy
 
 UNKNOWN = 'unknown'
 VISIBLE_POWER = 0.5
@@ -214,8 +214,8 @@ def ranks(answer: Answer, label: Label) -> dict[str, float]:
         if name in answer.parameters:
             value, low, high = answer.parameters[name]
             half_width = high - value if true > value else value - low
-            z = (true - value) * norm.ppf(0.95) / max(half_width, _SMALLEST_WIDTH)
-            rank_by_name[name] = float(norm.cdf(z))
+            z = (true - value) * scipy.stats.norm.ppf(0.95) / max(half_width, _SMALLEST_WIDTH)
+            rank_by_name[name] = float(scipy.stats.norm.cdf(z))
     return rank_by_name
 
 

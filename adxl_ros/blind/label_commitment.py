@@ -36,9 +36,11 @@ import secrets
 import shutil
 from typing import Any, NamedTuple
 
-from adxl_ros.blind import parallel_io, trials
+from adxl_ros.blind import trials
 from adxl_ros.blind.trials import Label, Plan
 from adxl_ros.errors import UserError
+from adxl_ros.jobs.run import for_each
+from adxl_ros.jobs.whole_files import make_folder, write
 
 
 class Drawn(NamedTuple):
@@ -126,27 +128,27 @@ def commit(folder: Path, setup: Setup, plans: list[Plan], pool: Executor,
         SHA-256 of salt and labels.
 
     """
-    recordings = parallel_io.make_folder(folder / 'recordings')
-    drawn = parallel_io.make_folder(_drawn(folder))
+    recordings = make_folder(folder / 'recordings')
+    drawn = make_folder(_drawn(folder))
 
     def keep(label: Label, recording: str, parameters: str) -> None:
         for suffix, text in (('csv', recording), ('yaml', parameters)):
             path = recordings / f'{label.name}.{suffix}'
-            parallel_io.write(path, text.encode('ascii'))
+            write(path, text.encode('ascii'))
             # The time of writing would show how long the label took to draw.
             os.utime(path, (0, 0))
         row = {**setup._asdict(), 'label': json.loads(trials.as_json([label]))[0]}
-        parallel_io.write(drawn / f'{label.name}.json', json.dumps(row).encode())
+        write(drawn / f'{label.name}.json', json.dumps(row).encode())
 
     todo = [plan for plan in plans if not (drawn / f'{plan.name}.json').exists()]
-    parallel_io.for_each(pool, make, [partial(_arguments, plan) for plan in todo], keep, show,
-                         len(plans) - len(todo))
+    for_each(pool, make, [partial(_arguments, plan) for plan in todo], keep, show,
+             len(plans) - len(todo))
     rows = [_read_drawn(drawn / f'{plan.name}.json')['label'] for plan in plans]
     text = json.dumps({'salt': secrets.token_hex(16), **setup._asdict(), 'labels': rows},
                       indent=1).encode()
     digest = hashlib.sha256(text).hexdigest()
-    parallel_io.write(_label_file(folder), text)
-    parallel_io.write(_seal(folder), json.dumps({
+    write(_label_file(folder), text)
+    write(_seal(folder), json.dumps({
         'sha256_of_salt_and_labels': digest, 'cases': len(plans), 'date': str(date.today()),
     }, indent=1).encode())
     remove_drawn(folder)

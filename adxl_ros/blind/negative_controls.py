@@ -24,7 +24,7 @@ from adxl_ros.blind import grading
 from adxl_ros.blind.grading import Answer
 from adxl_ros.blind.trials import Label
 import numpy as np
-from scipy.stats import fisher_exact, rankdata
+import scipy
 
 _CHANCE = 0.002
 """Chance that one control reports a leak of a check that has none; chosen."""
@@ -108,7 +108,7 @@ def metadata(recordings: Path, labels: Sequence[Label]) -> dict[str, Any]:
 
     """
     facts = np.array([_facts(recordings, label.name) for label in labels], float)
-    ranks = rankdata(np.column_stack([facts, np.arange(len(labels))]), axis=0)
+    ranks = scipy.stats.rankdata(np.column_stack([facts, np.arange(len(labels))]), axis=0)
     ranks -= ranks.mean(axis=0)
     groupings = [[label.group for label in labels],
                  ['+'.join(label.effects) for label in labels],
@@ -164,7 +164,7 @@ def strength_zero(labels: Sequence[Label], answers: Sequence[Answer]) -> dict[st
                 if label.group == 'zero')
     if not zero or not none:
         return {'score': None, 'chance': None, 'p': 1.0, 'leaks': False, 'named': named}
-    p = float(fisher_exact([[sum(zero), len(zero) - sum(zero)],
-                            [sum(none), len(none) - sum(none)]]).pvalue)
+    p = float(scipy.stats.fisher_exact([[sum(zero), len(zero) - sum(zero)],
+                                       [sum(none), len(none) - sum(none)]]).pvalue)
     return {'score': sum(zero) / len(zero), 'chance': sum(none) / len(none), 'p': p,
             'named': named, 'leaks': p < _CHANCE}

@@ -30,10 +30,11 @@ from pathlib import Path
 import tempfile
 from typing import Any
 
-from adxl_ros.blind import diagnosis_runs, grading, parallel_io
+from adxl_ros.blind import diagnosis_runs, grading
 from adxl_ros.errors import UserError
+from adxl_ros.jobs.run import for_each
 import numpy as np
-from scipy.signal import butter, sosfiltfilt
+import scipy
 import yaml
 
 _SMOOTH_HZ = 15.0
@@ -114,8 +115,8 @@ def _smoothed_force(arm: Arm, folder: Path) -> Path:
     columns = [lines[0].split(',').index(name) for name in names]
     rows = np.genfromtxt(lines[1:], delimiter=',', usecols=columns)
     rate = 1 / np.median(np.diff(rows[:, 0]))
-    smooth = butter(4, min(_SMOOTH_HZ, rate / 4), fs=rate, output='sos')
-    rows[:, 1:] = sosfiltfilt(smooth, np.nan_to_num(rows[:, 1:]), axis=0)
+    smooth = scipy.signal.butter(4, min(_SMOOTH_HZ, rate / 4), fs=rate, output='sos')
+    rows[:, 1:] = scipy.signal.sosfiltfilt(smooth, np.nan_to_num(rows[:, 1:]), axis=0)
     path = folder / 'sim.csv'
     np.savetxt(path, rows, delimiter=',', header=','.join(names), comments='', fmt='%.9g')
     return path
@@ -182,8 +183,8 @@ def put_back(arms: Sequence[Arm], command: Sequence[str] | None, pool: Executor,
 
     jobs = [(i, effect) for i, entry in enumerate(arms)
             for effect in (None, *entry.parameters['/**']['ros__parameters']['effects'])]
-    parallel_io.for_each(pool, _diagnose, [partial(_job, arms[i], i, effect, command)
-                                           for i, effect in jobs], keep, show)
+    for_each(pool, _diagnose, [partial(_job, arms[i], i, effect, command)
+                               for i, effect in jobs], keep, show)
     return [rows[job] for job in jobs]
 
 

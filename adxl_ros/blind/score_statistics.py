@@ -21,8 +21,7 @@ import math
 from typing import Any
 
 import numpy as np
-from scipy.optimize import minimize
-from scipy.stats import binomtest, kstwo
+import scipy
 
 LEVEL = 0.9
 """Probability of all intervals."""
@@ -37,7 +36,7 @@ def share(hits: Sequence[bool] | np.ndarray) -> dict[str, Any]:
     count, true = len(hits), int(np.sum(hits))
     if not count:
         return {'value': None, 'ci': None, 'count': 0}
-    ci = binomtest(true, count).proportion_ci(LEVEL, 'wilson')
+    ci = scipy.stats.binomtest(true, count).proportion_ci(LEVEL, 'wilson')
     return {'value': true / count, 'ci': [float(ci.low), float(ci.high)], 'count': count}
 
 
@@ -136,8 +135,9 @@ def _logistic(x: np.ndarray, y: np.ndarray, by_chance: float,
         chance = np.clip(detection(x, p[0], math.exp(p[1]), p[2], by_chance), 1e-6, 1 - 1e-6)
         return float(-np.sum(y * np.log(chance) + (1 - y) * np.log(1 - chance)))
 
-    best = min((minimize(cost, [middle, math.log(0.5), 0.02], method='L-BFGS-B', bounds=[
-        (x.min() - 2, x.max() + 2), (math.log(0.05), math.log(5)), (0, 0.5)])
+    best = min((scipy.optimize.minimize(
+        cost, [middle, math.log(0.5), 0.02], method='L-BFGS-B',
+        bounds=[(x.min() - 2, x.max() + 2), (math.log(0.05), math.log(5)), (0, 0.5)])
         for middle in starts), key=lambda fit: fit.fun)
     return float(best.x[0]), math.exp(best.x[1]), float(best.x[2])
 
@@ -221,4 +221,4 @@ def rank_histogram(groups: Sequence[Sequence[float]]) -> dict[str, Any]:
     above = np.cumsum(weights[order])
     distance = max(np.max(above - ranks[order]), np.max(ranks[order] - above + weights[order]))
     return {'bins': bins, 'count': len(ranks), 'trials': len(groups),
-            'distance': float(distance), 'p': float(kstwo.sf(distance, len(groups)))}
+            'distance': float(distance), 'p': float(scipy.stats.kstwo.sf(distance, len(groups)))}

@@ -39,6 +39,7 @@ from adxl_ros.blind.trials import Label
 from adxl_ros.blind.world import chain, fault, fault_table, ideal_observer, motion, unit
 from adxl_ros.errors import UserError
 from adxl_ros.files.plot_file import pyplot
+from adxl_ros.jobs.pools import open_pool
 import numpy as np
 import pytest
 import yaml
@@ -110,7 +111,7 @@ def pool():
 @pytest.fixture(scope='module')
 def committed_check(tmp_path_factory):
     folder = tmp_path_factory.mktemp('check') / 'blind'
-    with diagnosis_runs.workers(None) as pool:
+    with open_pool(None) as pool:
         label_commitment.commit(folder, Setup(SEED, TRIALS), trials.plans(SEED, TRIALS, SECONDS),
                                 pool, no_progress)
     return folder
@@ -461,7 +462,7 @@ def test_on_a_cluster(committed_check, null_check, tmp_path):
     folder = copied(committed_check, null_check, tmp_path)
     with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None,
                                   local_directory=str(tmp_path)) as cluster, \
-            diagnosis_runs.workers(cluster.scheduler_address) as pool:
+            open_pool(cluster.scheduler_address) as pool:
         results = diagnosis_runs.diagnose_all(folder, script(tmp_path, NOTHING), pool, no_progress)
     assert len(results) == TRIALS + 2 and all(result['report'] for result in results.values())
 

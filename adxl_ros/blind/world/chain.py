@@ -25,8 +25,7 @@ from adxl_ros.blind.world.run import Place, Run
 from adxl_ros.blind.world.signals import pink_noise
 from adxl_ros.blind.world.unit import ADC_BITS, G0, LSB_V, Unit
 import numpy as np
-from scipy.interpolate import CubicSpline
-from scipy.signal import lfilter
+import scipy
 
 FINE_HZ = 2000.0
 """Lowest rate of the simulation, Hz; chosen. Each sample has a whole number of its steps."""
@@ -96,7 +95,8 @@ def render(unit: Unit, manoeuvre: Manoeuvre, faults: Sequence[Fault], seed: int,
     run.volts = _low_pass(_low_pass(run.volts, run.corner_hz, step), run.second_hz, step)
     _act(faults, Place.WIRE, run)
     late = run.late + run.skew * (sampled + 8 * np.sin(sampled / 25))
-    run.volts = CubicSpline(t, run.volts, axis=1)(np.clip(sampled - late, t[0], t[-1]))
+    run.volts = scipy.interpolate.CubicSpline(t, run.volts, axis=1)(
+        np.clip(sampled - late, t[0], t[-1]))
     run.t = sampled
     _act(faults, Place.SAMPLES, run)
     if noise:
@@ -179,7 +179,7 @@ def _low_pass(values: np.ndarray, corner_hz: float, dt: float) -> np.ndarray:
     keep = math.exp(-x)
     now, before = 1 - (1 - keep) / x, (1 - keep) / x - keep
     first = values[..., :1]
-    return first + lfilter([now, before], [1, -keep], values - first)
+    return first + scipy.signal.lfilter([now, before], [1, -keep], values - first)
 
 
 def _sensor_noise(run: Run) -> np.ndarray:

@@ -32,7 +32,7 @@ from adxl_ros.blind.world.run import Place, Run
 from adxl_ros.blind.world.signals import low_pass
 from adxl_ros.blind.world.unit import G0, Unit
 import numpy as np
-from scipy.signal import butter, sosfilt
+import scipy
 
 _ZERO_C = 273.15
 """0 °C in K."""
@@ -122,8 +122,8 @@ def _warm_up(run: Run, size: float, shape: Shape) -> None:
 
 def _vibration_rectification(run: Run, size: float, shape: Shape) -> None:
     """Shift zero-g by the power of the vibration, with a limit, 1/g."""
-    fast = sosfilt(butter(2, 2.0, 'high', fs=1 / run.dt, output='sos'),
-                   run.u - run.u[:, :1])
+    fast = scipy.signal.sosfilt(scipy.signal.butter(2, 2.0, 'high', fs=1 / run.dt, output='sos'),
+                                run.u - run.u[:, :1])
     power = low_pass(fast ** 2, 0.4, run.dt)
     run.u += size * column(shape) * power / (1 + 4 * power)
 

@@ -25,8 +25,7 @@ from adxl_ros.blind.world.fault_table import KINDS, KNOWN
 from adxl_ros.blind.world.motion import Manoeuvre
 from adxl_ros.blind.world.unit import G0, LSB_V, SCALE_STD, STAGE_STD, Unit, ZERO_G_STD_G
 import numpy as np
-from scipy.optimize import lsq_linear, minimize_scalar
-from scipy.stats import chi2, ncx2, norm
+import scipy
 
 TEST_LEVEL = 0.05 / len(KNOWN)
 """Level of the test of one effect, so that the tests of all effects together have 5 %."""
@@ -116,7 +115,7 @@ def beyond_calibration(unit: Unit, change: np.ndarray, force: np.ndarray) -> np.
     for row, along, out in zip(change, force, rest):
         columns = np.stack([np.ones_like(along), along], axis=1)
         q, r = np.linalg.qr(columns)
-        out[:] = row - columns @ lsq_linear(r, q.T @ row, (-bounds, bounds)).x
+        out[:] = row - columns @ scipy.optimize.lsq_linear(r, q.T @ row, (-bounds, bounds)).x
     return rest
 
 
@@ -279,7 +278,8 @@ class IdealObserver:
             basis = _orthonormal(columns, len(rest))
             explained += float(np.sum((basis.T @ rest) ** 2))
             used += basis.shape[1]
-        return float(ncx2.sf(chi2.isf(_FLEXIBLE_LEVEL, used), used, explained))
+        threshold = scipy.stats.chi2.isf(_FLEXIBLE_LEVEL, used)
+        return float(scipy.stats.ncx2.sf(threshold, used, explained))
 
 
 def _parts(kind: FaultKind, change: np.ndarray) -> list[np.ndarray]:
@@ -319,12 +319,12 @@ def _hats(scene: Scene, force: np.ndarray) -> list[np.ndarray]:
 
 def power(strength: float) -> float:
     """Return the probability that a change of a squared visibility is detected."""
-    return float(ncx2.sf(chi2.isf(TEST_LEVEL, 1), 1, strength))
+    return float(scipy.stats.ncx2.sf(scipy.stats.chi2.isf(TEST_LEVEL, 1), 1, strength))
 
 
 def separation_probability(strength: float) -> float:
     """Return the probability that the truth beats a rival that leaves a squared visibility."""
-    return float(norm.cdf(0.5 * math.sqrt(max(strength, 0.0))))
+    return float(scipy.stats.norm.cdf(0.5 * math.sqrt(max(strength, 0.0))))
 
 
 def noise_visibility(observer: IdealObserver, kind: FaultKind, change: np.ndarray) -> float:
@@ -378,4 +378,4 @@ def _whittle(excess: np.ndarray) -> float:
     def misfit(level: float) -> float:
         ratio = (1 + excess) / (1 + level)
         return float(2 * np.sum(ratio - 1 - np.log(ratio)) + (level / (2 * _NOISE_STD)) ** 2)
-    return minimize_scalar(misfit, bounds=(-0.2, 0.2), method='bounded').fun
+    return scipy.optimize.minimize_scalar(misfit, bounds=(-0.2, 0.2), method='bounded').fun

@@ -31,8 +31,7 @@ from adxl_ros.blind.world.run import Place, Run
 from adxl_ros.blind.world.signals import pink_noise
 from adxl_ros.blind.world.unit import ADC_BITS, LSB_V, Unit
 import numpy as np
-from scipy.ndimage import gaussian_filter1d
-from scipy.signal import lfilter
+import scipy
 
 _HIGH_BITS = 5
 """Number of the bits whose weights are wrong, from the highest; chosen."""
@@ -55,7 +54,7 @@ def _bias_walk(run: Run, size: float, shape: Shape) -> None:
     """Add a random walk, V: a smoothed step every second."""
     rng, knots = run.random('walk'), np.arange(run.t[0] - 1, run.t[-1] + 2, 0.25)
     steps = rng.normal(size=(len(run.volts), len(knots))) * (np.arange(len(knots)) % 4 == 0)
-    walks = gaussian_filter1d(np.cumsum(steps, axis=1), 1.5, axis=1)
+    walks = scipy.ndimage.gaussian_filter1d(np.cumsum(steps, axis=1), 1.5, axis=1)
     run.volts += size * column(shape) * np.stack([
         np.interp(run.t, knots, walk - walk[0]) for walk in walks])
 
@@ -63,7 +62,7 @@ def _bias_walk(run: Run, size: float, shape: Shape) -> None:
 def _mains_hum(run: Run, size: float, shape: Shape) -> None:
     """Add mains hum, V: its frequency wanders, and it has two harmonics."""
     rng, slow = run.random('mains'), np.arange(run.t[0], run.t[-1] + 1, 0.5)
-    wander = gaussian_filter1d(rng.normal(size=len(slow)), 20)
+    wander = scipy.ndimage.gaussian_filter1d(rng.normal(size=len(slow)), 20)
     hertz = shape['hertz'] + 0.03 * wander / max(np.std(wander), 1e-9)
     phase = 2 * np.pi * np.cumsum(np.interp(run.t, slow, hertz)) * run.dt
     hum = np.sin(phase) + 0.3 * np.sin(3 * phase + 1.0) + 0.12 * np.sin(2 * phase)
@@ -75,7 +74,7 @@ def _spikes(run: Run, size: float, shape: Shape) -> None:
     rng = run.random('spikes')
     hits = rng.random(run.volts.shape) < shape['rate'] * run.dt
     heights = rng.choice([-1.0, 1.0], hits.shape) * rng.lognormal(0, 0.4, hits.shape)
-    run.volts += size * column(shape) * lfilter([1.0], [1.0, -0.25], hits * heights)
+    run.volts += size * column(shape) * scipy.signal.lfilter([1.0], [1.0, -0.25], hits * heights)
 
 
 def _stuck(run: Run, size: float, shape: Shape) -> None:

@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy.signal import lfilter
+import scipy
 
 
 def pink_noise(t: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -43,8 +43,8 @@ def pink_noise(t: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     dt = t[1] - t[0]
     for lag in dt * 10 ** np.arange(0.5, math.log10(2 * (t[-1] - t[0]) / dt), 0.5):
         keep = math.exp(-dt / lag)
-        noise += lfilter([math.sqrt(1 - keep * keep)], [1, -keep], rng.normal(size=len(t)),
-                         zi=[keep * rng.normal()])[0]
+        noise += scipy.signal.lfilter([math.sqrt(1 - keep * keep)], [1, -keep],
+                                      rng.normal(size=len(t)), zi=[keep * rng.normal()])[0]
     return noise
 
 
@@ -69,7 +69,7 @@ def low_pass(values: np.ndarray, lag: float, dt: float) -> np.ndarray:
     """
     keep = np.exp(-dt / lag)
     first = values[..., :1]
-    return first + lfilter([1 - keep], [1, -keep], values - first)
+    return first + scipy.signal.lfilter([1 - keep], [1, -keep], values - first)
 
 
 def travel_memory(x: np.ndarray, travel: float) -> np.ndarray:

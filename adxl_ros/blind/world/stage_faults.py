@@ -29,7 +29,7 @@ from adxl_ros.blind.world.run import Place, Run
 from adxl_ros.blind.world.signals import travel_memory
 from adxl_ros.blind.world.unit import G0, Unit
 import numpy as np
-from scipy.signal import bilinear, lfilter
+import scipy
 
 
 def _stage_offset(run: Run, size: float, shape: Shape) -> None:
@@ -84,9 +84,10 @@ def _clock_skew(run: Run, size: float, shape: Shape) -> None:
 def _mount_resonance(run: Run, size: float, shape: Shape) -> None:
     """Add one mode of the bracket; `size` is its share of the motion."""
     w0, zeta, fs = 2 * np.pi * shape['hertz'], shape['zeta'], 1 / run.dt
-    b, a = bilinear([-1.0, -2 * zeta * w0 * 0.2, 0.0], [1.0, 2 * zeta * w0, w0 * w0], fs)
+    b, a = scipy.signal.bilinear([-1.0, -2 * zeta * w0 * 0.2, 0.0],
+                                 [1.0, 2 * zeta * w0, w0 * w0], fs)
     moved = run.force - run.force[:, :1]
-    run.force += size * lfilter(b, a, moved)
+    run.force += size * scipy.signal.lfilter(b, a, moved)
 
 
 def _draw_resonance(rng: np.random.Generator, unit: Unit) -> Shape:

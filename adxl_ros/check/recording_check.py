@@ -1,0 +1,92 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The check of one recording, read in blocks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+from adxl_ros.check.findings import assess, Findings
+from adxl_ros.errors import one_line, UserError
+from adxl_ros.files import recording
+from adxl_ros.files.log_times import has_log_times, log_times
+from adxl_ros.files.reading_options import ReadingOptions
+from adxl_ros.files.recording_columns import Recording
+from adxl_ros.files.stream_unit import uncalibrated
+from adxl_ros.model.sensor import Sensor
+from adxl_ros.signals.recorded_sensor import load_sensor
+from adxl_ros.signals.recording_contents import examine, log_delay
+import numpy as np
+
+BLOCK_ROWS = 65536
+"""Samples that are read at a time (chosen: some MB)."""
+
+
+def check_recording(path: str, params: str | None, reading: ReadingOptions,
+                    show: Callable[[float], None] = lambda done: None) -> Findings:
+    """
+    Return the findings of a recording; one that cannot be read is not sound.
+
+    Parameters
+    ----------
+    path
+        The recording.
+    params
+        The parameter file of its sensor; None takes the nominal sensor.
+    reading
+        How it is to be read. Samples whose stamp does not increase must be left out.
+    show
+        Receives the fraction that has been read.
+
+    Returns
+    -------
+    Findings
+        Contents, faults, and what the tools can do with it.
+
+    """
+    try:
+        delay = None
+        if has_log_times(path) and reading.rate_hz is None:
+            delay = log_delay(log_times(path, reading.topic))
+        source = _Source(params)
+        blocks = recording.blocks(path, BLOCK_ROWS, reading)
+        contents = examine(_shown(blocks, show), source.accel_mps2, delay)
+    except UserError as error:
+        reason = one_line(error).removeprefix(f'{path}: ')
+        return Findings(path, None, (reason,), paste=error.paste)
+    return replace(assess(contents), path=path)
+
+
+def _shown(blocks: Iterator[Recording], show: Callable[[float], None]) -> Iterator[Recording]:
+    """Yield blocks, and show how much has been read."""
+    for block in blocks:
+        yield block
+        show(block.done)
+
+
+class _Source:
+    """Converts the samples of a recording by the nominal values of its sensor."""
+
+    def __init__(self, params: str | None) -> None:
+        self._params = params
+        self._unit: Sensor | None = None
+
+    def accel_mps2(self, block: Recording) -> np.ndarray:
+        """Return the specific force of a block, m/s², (n, m)."""
+        if self._unit is None:
+            sensor = load_sensor(self._params, block)
+            self._unit = uncalibrated(sensor, block.stream_info, block.axes, sensor.rate_hz)
+        return block.accel_mps2(self._unit)

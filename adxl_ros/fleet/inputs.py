@@ -1,0 +1,537 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The recordings of a fleet: files, folders, globs, URLs of fsspec, and manifests.
+
+A folder with a `metadata.yaml` is one recording, a bag. A manifest is a CSV or Parquet file with a
+column `url`, and optionally `serial`, `params` and `date`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
+import csv
+from dataclasses import dataclass, field, replace
+from datetime import datetime, timezone
+import hashlib
+import os
+from pathlib import Path, PurePosixPath
+from typing import Any, NamedTuple
+from urllib.parse import urlsplit
+
+from adxl_ros.errors import install_hint, one_line, UserError
+from adxl_ros.files import recording
+from adxl_ros.files.recording_columns import Recording
+from adxl_ros.files.tables import table_endings
+from adxl_ros.fleet.row import PAGE, POPULATION, TABLE, UNITS
+
+_ENDINGS = ('.csv', '.mcap', '.db3')
+"""Ends of the names of recordings in a folder, beside those of other tables."""
+_BAG = 'metadata.yaml'
+"""File that makes a folder a bag."""
+_GLOB = frozenset('*?[')
+"""Characters of a glob."""
+_STAMPS = ('ETag', 'etag', 'e_tag', 'md5Hash', 'Content-MD5', 'Digest', 'mtime', 'created', 'ino',
+           'LastModified', 'last_modified', 'Last-Modified', 'updated', 'modified')
+"""Properties of an object that change with its content, by the names of file systems."""
+_TIMES = ('mtime', 'LastModified', 'last_modified', 'updated', 'modified')
+"""Properties that are the time of the last change."""
+_THREADS = 32
+"""Objects of a manifest that are looked up at once. Chosen: a server answers in 0.1 s."""
+_HEAD_BYTES = 4096
+"""Begin of a CSV file that is read for serial number and date, byte. Chosen: its comments fit."""
+_DATES_S = (946684800.0, 4102444800.0)
+"""Stamps between these count from 1970, s: the years 2000 to 2100. Others count from a start."""
+NO_FILE = 'no such file'
+"""Fault of a recording that is not there."""
+_DELIMITERS = ',;\t'
+"""Characters between the columns of a manifest; the header has the one that it uses."""
+_MANIFEST_COLUMNS = ('serial', 'params', 'date')
+"""Columns of a manifest beside `url`."""
+
+
+class Unreachable(UserError):
+    """A server does not answer or refuses; it may answer later."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """
+    One recording, as it was found.
+
+    Attributes
+    ----------
+    url
+        Its address; an absolute path for a file of this machine.
+    size_bytes
+        Its size; None if unknown.
+    stamp
+        A text that changes with the content; empty if the server states nothing.
+    modified
+        Time of the last change, ISO 8601, UTC; empty if unknown.
+    serial, params, date
+        What a manifest states: serial number, parameter file, and begin of the recording, ISO
+        8601; empty for nothing.
+    fault
+        Why it cannot be read; empty if it was found.
+    password
+        Password of its server, which is not in its address; empty for none.
+
+    """
+
+    url: str
+    size_bytes: int | None = None
+    stamp: str = ''
+    modified: str = ''
+    serial: str = ''
+    params: str = ''
+    date: str = ''
+    fault: str = ''
+    password: str = field(default='', repr=False)
+
+
+def file_system(url: str, password: str = '') -> tuple[Any, str]:
+    """
+    Return the file system of a URL, and the path in it.
+
+    Parameters
+    ----------
+    url
+        The address.
+    password
+        Password of the server, where the address has none; empty for none.
+
+    Returns
+    -------
+    tuple
+        A file system of fsspec, and a path.
+
+    Raises
+    ------
+    UserError
+        The library for such URLs is not installed.
+    Unreachable
+        The server does not answer, or refuses.
+
+    """
+    try:
+        from fsspec.core import url_to_fs
+        from fsspec.implementations.local import LocalFileSystem
+    except ImportError:
+        raise UserError(f'fleet needs fsspec; {install_hint("adxl_ros[fleet]")}') from None
+    try:
+        fs, path = url_to_fs(url, **({'password': password} if password else {}))
+    except (ImportError, ValueError) as error:
+        raise UserError(f'{url}: {one_line(error)}') from None
+    except Exception as error:
+        raise Unreachable(f'{url}: cannot be opened: {one_line(error)}') from None
+    # One file has one address.
+    is_indirect = isinstance(fs, LocalFileSystem) and '..' in PurePosixPath(path).parts
+    return fs, os.path.realpath(path) if is_indirect else path
+
+
+def find_sources(inputs: Iterable[str]) -> list[Source]:
+    """
+    Find the recordings of a command line.
+
+    The files of a fleet's results, which lie beside its table, are no recordings.
+
+    Parameters
+    ----------
+    inputs
+        Files, folders, globs, URLs and manifests.
+
+    Returns
+    -------
+    list
+        Each recording once, by URL. Those that cannot be read have a `fault`.
+
+    Raises
+    ------
+    UserError
+        A folder or a glob has no recording, or a manifest is wrong.
+
+    """
+    sources = {source.url: source for text in inputs for source in _of_input(text)}
+    return [sources[url] for url in sorted(sources)]
+
+
+def _of_input(text: str) -> Iterator[Source]:
+    """Yield the recordings of one input."""
+    try:
+        fs, path = file_system(text)
+    except Unreachable as error:
+        if _is_glob(text) or not _is_recording_name(text):
+            raise
+        yield _unreachable(text, error)
+        return
+    if _is_glob(path) and not os.path.exists(path):
+        listed = _listed(text, lambda: fs.glob(path, detail=True))
+        names = [name for name in listed
+                 if PurePosixPath(name).name != _BAG and not _is_of_fleet(fs, name)]
+        if not names:
+            raise UserError(f'{text}: matches nothing')
+        for name in sorted(names):
+            info = listed[name]
+            if info['type'] == 'directory':
+                yield from _of_folder(fs, name, may_be_empty=True)
+            else:
+                yield _of_info(fs, name, info)
+    elif _is_recording_name(path) and not os.path.isdir(path):
+        rows = _manifest_rows(text, fs, path)
+        yield from [look_up(fs, path, text)] if rows is None else _of_manifest(text, rows)
+    elif _listed(text, lambda: fs.isdir(path)):
+        yield from _of_folder(fs, path)
+    else:
+        yield look_up(fs, path, text)
+
+
+def _unreachable(url: str, error: UserError) -> Source:
+    """Return a recording whose server cannot be reached."""
+    password = urlsplit(url).password
+    plain = url.replace(f':{password}@', '@', 1) if password else url
+    return Source(plain, fault=one_line(error).removeprefix(f'{url}: '))
+
+
+def _is_glob(path: str) -> bool:
+    """Return whether a path has characters of a glob; in a web address only * is one."""
+    return bool(set(path) & (set('*') if '://' in path else _GLOB))
+
+
+def file_name(path: str) -> str:
+    """Return the name of the file of a path; that of a web address ends before its query."""
+    return PurePosixPath(urlsplit(path).path if '://' in path else path).name
+
+
+def _listed(text: str, look: Any) -> Any:
+    """Look at a folder; report what goes wrong in one line."""
+    try:
+        return look()
+    except FileNotFoundError:
+        return {}
+    except Exception as error:
+        raise UserError(f'{text}: cannot be listed: {one_line(error)}') from None
+
+
+def _is_recording_name(path: str) -> bool:
+    """Return whether the name of a file is that of a recording, for folders and manifests."""
+    return PurePosixPath(file_name(path)).suffix.lower() in (*_ENDINGS, *table_endings())
+
+
+def _is_of_fleet(fs: Any, name: str) -> bool:
+    """Return whether a file is part of the results of a fleet."""
+    folder, _, file = name.rpartition('/')
+    return file in (PAGE, POPULATION, TABLE, UNITS) and bool(
+        _listed(folder, lambda: fs.exists(f'{folder}/{TABLE}')))
+
+
+def _of_folder(fs: Any, folder: str, may_be_empty: bool = False) -> Iterator[Source]:
+    """Yield the recordings in a folder, those of its folders too; a bag is one recording."""
+    files = _listed(folder, lambda: fs.find(folder, detail=True))
+    bags = {str(PurePosixPath(name).parent) for name in files
+            if PurePosixPath(name).name == _BAG}
+    by_bag: dict[str, dict[str, Any]] = {bag: {} for bag in sorted(bags)}
+    count = 0
+    for name in sorted(files):
+        path = PurePosixPath(name)
+        parent = next((str(p) for p in path.parents if str(p) in bags), None)
+        if parent is not None:
+            by_bag[parent][name] = files[name]
+        elif _is_recording_name(name) and not path.name.startswith('.') \
+                and not _is_of_fleet(fs, name):
+            count += 1
+            yield _of_info(fs, name, files[name])
+    for bag, content in by_bag.items():
+        count += 1
+        yield _of_bag(fs, bag, content)
+    if not count and not may_be_empty:
+        raise UserError(f'{folder}: has no recording (*{", *".join(_ENDINGS)}, a bag or a table)')
+
+
+def look_up(fs: Any, path: str, url: str) -> Source:
+    """
+    Look up one recording.
+
+    Parameters
+    ----------
+    fs
+        The file system.
+    path
+        The path in it.
+    url
+        The address for messages.
+
+    Returns
+    -------
+    Source
+        The recording; with a fault where it cannot be read.
+
+    """
+    try:
+        info = fs.info(path)
+        if info['type'] == 'directory':
+            files = fs.find(path, detail=True)
+            if not any(PurePosixPath(name).name == _BAG for name in files):
+                return Source(_url(fs, path), fault=f'is a folder without {_BAG}, not a recording')
+            return _of_bag(fs, path, files)
+        return _of_info(fs, path, info)
+    except Exception as error:
+        if not isinstance(error, FileNotFoundError):
+            # A connection that broke is not used again.
+            fs.clear_instance_cache()
+        return Source(_url(fs, path), fault=fault_of(error), password=_password(fs))
+
+
+def fault_of(error: BaseException) -> str:
+    """Return in words why a file cannot be read."""
+    cause = error.__cause__
+    # fsspec reports every failure of a web server as a file that is not found.
+    if isinstance(error, FileNotFoundError) and (
+            cause is None or getattr(cause, 'status', None) == 404):
+        return NO_FILE
+    reason = getattr(error, 'strerror', None) or one_line(cause or error) or type(error).__name__
+    return f'cannot be read: {reason}'
+
+
+def _url(fs: Any, path: str) -> str:
+    """Return the address of a path: the path itself on this machine."""
+    name = str(fs.unstrip_protocol(path))
+    scheme, _, rest = name.partition(':///')
+    options = fs.storage_options
+    if rest and options.get('host'):
+        # The path in a server does not name the server.
+        user = f'{options["username"]}@' if options.get('username') else ''
+        port = f':{options["port"]}' if options.get('port') else ''
+        name = f'{scheme}://{user}{options["host"]}{port}/{rest}'
+    # A name that is not UTF-8 has no place in a table.
+    name = name.encode('utf-8', 'backslashreplace').decode('utf-8')
+    return name.removeprefix('file://') if name.startswith('file:///') else name
+
+
+def _password(fs: Any) -> str:
+    """Return the password of a server; empty for none."""
+    return str(fs.storage_options.get('password') or '')
+
+
+def _of_info(fs: Any, path: str, info: Mapping[str, Any]) -> Source:
+    """Return the recording that a file system describes."""
+    if info['type'] not in ('file', 'link'):
+        return Source(_url(fs, path), fault='is no file')
+    return Source(_url(fs, path), info.get('size'), stamp_of(info), _modified(info),
+                  password=_password(fs))
+
+
+def _of_bag(fs: Any, folder: str, files: Mapping[str, Mapping[str, Any]]) -> Source:
+    """Return the recording of a bag's folder."""
+    sizes = [info.get('size') for info in files.values()]
+    stamps = [f'{name} {stamp_of(info)}' for name, info in sorted(files.items())]
+    stamp = hashlib.sha256('\n'.join(stamps).encode()).hexdigest() \
+        if all(stamp_of(info) for info in files.values()) else ''
+    return Source(_url(fs, folder), None if None in sizes else sum(filter(None, sizes)), stamp,
+                  max(map(_modified, files.values()), default=''), password=_password(fs))
+
+
+def stamp_of(info: Mapping[str, Any]) -> str:
+    """Return what changes with the content of a file; empty if the server states nothing."""
+    stated = {name: info[name] for name in _STAMPS if info.get(name)}
+    if not stated:
+        return ''
+    return ' '.join([f'size={info.get("size")}', *(
+        f'{name}={value}' for name, value in sorted(stated.items()))])
+
+
+def _modified(info: Mapping[str, Any]) -> str:
+    """Return the time of the last change, ISO 8601, UTC; empty if unknown."""
+    for name in _TIMES:
+        value = info.get(name)
+        if isinstance(value, (int, float)):
+            return datetime.fromtimestamp(value, timezone.utc).isoformat()
+        if isinstance(value, datetime):
+            return as_utc(value).isoformat()
+        if isinstance(value, str) and value:
+            return as_date(value) or ''
+    return ''
+
+
+def as_utc(date: datetime) -> datetime:
+    """Return a time in UTC; one without a zone counts as UTC."""
+    return date.astimezone(timezone.utc) if date.tzinfo else date.replace(tzinfo=timezone.utc)
+
+
+def as_date(text: str) -> str | None:
+    """Return a date of ISO 8601 in UTC, or None if the text is none."""
+    try:
+        return as_utc(datetime.fromisoformat(text.strip().replace('Z', '+00:00'))).isoformat()
+    except ValueError:
+        return None
+
+
+def _manifest_rows(text: str, fs: Any, path: str) -> dict[int, dict[str, str]] | None:
+    """
+    Return the rows of a manifest by their numbers, which are lines of a CSV file.
+
+    It is None for a recording, and where nothing can be read.
+    """
+    suffix = PurePosixPath(file_name(path)).suffix.lower()
+    try:
+        if suffix == '.csv':
+            with fs.open(path, 'r', encoding='utf-8-sig', newline='') as file:
+                begin, head = next(((number, line) for number, line in enumerate(file, 1)
+                                    if line.strip()), (0, ''))
+                delimiter = max(_DELIMITERS, key=head.count)
+                names = [name.strip().lower()
+                         for name in next(csv.reader([head], delimiter=delimiter), [])]
+                return _csv_rows(text, names, begin, csv.reader(file, delimiter=delimiter)) \
+                    if 'url' in names else None
+        if suffix in ('.parquet', '.pq'):
+            return _parquet_rows(fs, path)
+    except UserError:
+        raise
+    except Exception:
+        # Whatever it is, the task of this recording reports it.
+        return None
+    return None
+
+
+def _csv_rows(text: str, names: list[str], begin: int, rows: Any) -> dict[int, dict[str, str]]:
+    """Return the rows of a manifest below its header in line `begin`, by number and column."""
+    result = {}
+    for cells in rows:
+        if not any(map(str.strip, cells)):
+            continue
+        number = begin + rows.line_num
+        if len(cells) != len(names):
+            raise UserError(f'{text}: row {number}: {len(cells)} columns, expected {len(names)}')
+        result[number] = {name: cell.strip() for name, cell in zip(names, cells)}
+    return result
+
+
+def _parquet_rows(fs: Any, path: str) -> dict[int, dict[str, str]] | None:
+    """Return the rows of a manifest by number; None for a recording."""
+    from pyarrow import parquet
+    with fs.open(path, 'rb') as file:
+        content = parquet.ParquetFile(file)
+        if 'url' not in content.schema_arrow.names:
+            return None
+        names = [name for name in ('url', *_MANIFEST_COLUMNS)
+                 if name in content.schema_arrow.names]
+        rows = content.read(names).to_pylist()
+    return {number: {name: '' if value is None else _text(value) for name, value in row.items()}
+            for number, row in enumerate(rows, 1)}
+
+
+def _text(value: Any) -> str:
+    """Return a value of a manifest as text."""
+    return value.isoformat() if isinstance(value, datetime) else str(value)
+
+
+def _of_manifest(text: str, rows: dict[int, dict[str, str]]) -> list[Source]:
+    """Return the recordings that a manifest lists."""
+    folder = text.rpartition('/')[0]
+    if not rows:
+        raise UserError(f'{text}: the manifest has no row below its header')
+    for number, row in rows.items():
+        if not row['url']:
+            raise UserError(f'{text}: row {number}: url is empty')
+        if row.get('date') and as_date(row['date']) is None:
+            raise UserError(f'{text}: row {number}: date is {row["date"]!r}, expected ISO 8601, '
+                            'for example 2026-11-01T10:00:00Z')
+
+    def source(row: dict[str, str]) -> Source:
+        params = row.get('params', '')
+        if set(params) & set('/.'):
+            params = _beside(folder, params)
+        url = _beside(folder, row['url'])
+        try:
+            recorded = look_up(*file_system(url), row['url'])
+        except UserError as error:
+            recorded = _unreachable(url, error)
+        return replace(recorded, serial=row.get('serial', ''), params=params,
+                       date=as_date(row.get('date', '')) or '')
+
+    with ThreadPoolExecutor(_THREADS) as pool:
+        return list(pool.map(source, rows.values()))
+
+
+def is_manifest(path: Path) -> bool:
+    """Return whether a file of this machine is a manifest."""
+    try:
+        return _manifest_rows(str(path), *file_system(str(path))) is not None
+    except UserError:
+        return True
+
+
+class Stated(NamedTuple):
+    """
+    What a recording states of itself at its begin; empty for nothing.
+
+    Attributes
+    ----------
+    serial
+        Serial number of its unit.
+    date
+        Its begin, ISO 8601, UTC.
+
+    """
+
+    serial: str = ''
+    date: str = ''
+
+
+def stated_by(sources: Iterable[Source]) -> list[Stated]:
+    """Return what recordings state at their begin, as far as it takes a few bytes to see."""
+    with ThreadPoolExecutor(_THREADS) as pool:
+        return list(pool.map(_stated, sources))
+
+
+def _stated(source: Source) -> Stated:
+    """Return what a recording states: one of this machine, or a CSV file in its comments."""
+    try:
+        fs, path = file_system(source.url, source.password)
+        stated = Stated()
+        if path.lower().endswith('.csv'):
+            head = fs.cat_file(path, 0, _HEAD_BYTES).decode('utf-8', 'replace')
+            comments = dict(line[1:].partition(':')[::2] for line in head.splitlines()
+                            if line.startswith('#'))
+            texts = {name.strip(): text.strip() for name, text in comments.items()}
+            stated = Stated(texts.get('serial', ''), as_date(texts.get('date', '')) or '')
+        if not all(stated) and '://' not in source.url:
+            with closing(recording.blocks(path, 1)) as blocks:
+                first = next(blocks)
+            stated = Stated(first.stream_info.texts.get('serial', ''), begin_of(first)[0])
+        return stated
+    except Exception:
+        # Whatever it is, the task of this recording reports it.
+        return Stated()
+
+
+def begin_of(first: Recording) -> tuple[str, str]:
+    """Return the begin that a recording states, ISO 8601 in UTC, and where; empty for none."""
+    stated = as_date(first.info.get('date', ''))
+    if stated:
+        return stated, 'header'
+    begin_s = first.epoch_ns / 1e9 + float(first.time_s[0]) if len(first) else 0.0
+    if _DATES_S[0] < begin_s < _DATES_S[1]:
+        return datetime.fromtimestamp(begin_s, timezone.utc).isoformat(), 'stamps'
+    return '', ''
+
+
+def _beside(folder: str, url: str) -> str:
+    """Return an address of a manifest; one that is relative counts from the manifest's folder."""
+    if not url or '://' in url or Path(url).is_absolute() or not folder:
+        return url
+    return f'{folder}/{url}'

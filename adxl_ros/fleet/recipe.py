@@ -1,0 +1,304 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+What all tasks of a run share, and the calibration and key of each recording.
+
+The client sends it to each worker once, with the texts of all parameter files. A worker needs no
+access to them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from datetime import datetime
+from functools import lru_cache
+import hashlib
+import json
+from pathlib import Path
+from typing import NamedTuple
+
+from adxl_ros.errors import one_line, UserError
+from adxl_ros.files import calibration_store, parameter_file
+from adxl_ros.files.package_version import package_version
+from adxl_ros.files.reading_options import AS_IT_IS, ReadingOptions
+from adxl_ros.files.stream_info import NO_UNIT
+import yaml
+
+TASKS = ('check', 'noise', 'fit', 'diagnose')
+"""All tasks, in the order in which they run."""
+
+_NOT_OF_TASKS = ('blind', 'jobs', 'links', 'nodes', 'reproduction', 'tools', 'working')
+"""Folders of the package whose code changes no row."""
+_CODE_OF_TASKS = ('recipe', 'row', 'staging', 'task')
+"""Files of this folder whose code changes a row."""
+_CACHED_CALIBRATIONS = 8192
+"""Stored calibrations that are kept after they were read. Chosen: 200 units for years."""
+_SECONDS_PER_DAY = 86400.0
+"""Seconds of a day."""
+
+
+class ParameterText(NamedTuple):
+    """
+    A parameter file by its content.
+
+    Attributes
+    ----------
+    name
+        Its name, for messages.
+    text
+        Its content; empty for the nominal sensor.
+    calibration_id
+        Id of the calibration; empty for none.
+    date
+        Date of the calibration, ISO 8601, UTC; empty if unknown.
+
+    """
+
+    name: str
+    text: str
+    calibration_id: str = ''
+    date: str = ''
+
+
+_NOMINAL = ParameterText('the nominal sensor', '')
+"""Stands for the sensor that a tool takes without a parameter file."""
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """
+    What all tasks of a run share.
+
+    Attributes
+    ----------
+    tasks
+        Names of the tasks.
+    code
+        SHA-256 of the code.
+    params
+        Parameter file of all recordings; None takes the calibration of each.
+    stated
+        Parameter files that a manifest names, by their names there.
+    store
+        Names and texts of the calibrations, by the folder of the unit in the store.
+    reading
+        How recordings are to be read.
+
+    """
+
+    tasks: tuple[str, ...]
+    code: str
+    params: ParameterText | None
+    stated: dict[str, ParameterText]
+    store: dict[str, tuple[tuple[str, str], ...]]
+    reading: ReadingOptions = AS_IT_IS
+
+    def parameters_of(self, serial: str, date: str, stated: str) -> ParameterText:
+        """
+        Return the parameter file of a recording.
+
+        It is that of the manifest, else that of the command line, else the newest calibration of
+        the unit that is not younger than the recording, else the nominal sensor.
+
+        Parameters
+        ----------
+        serial
+            Serial number of the unit; empty if unknown.
+        date
+            Begin of the recording, ISO 8601, UTC; empty if unknown.
+        stated
+            Parameter file that a manifest names; empty for none.
+
+        Returns
+        -------
+        ParameterText
+            The parameter file.
+
+        """
+        if stated:
+            return self.stated[stated]
+        if self.params is not None:
+            return self.params
+        if not date:
+            return _NOMINAL
+        files = self.store.get(calibration_store.unit_folder('', serial).name, ()) \
+            if serial not in ('', NO_UNIT) else ()
+        read = [entry for name, text in files if (entry := _stored_parameters(name, text))]
+        valid = [parameters for unit, parameters in read
+                 if unit == serial and parameters.date and parameters.date <= date]
+        return max(valid, key=lambda parameters: parameters.date, default=_NOMINAL)
+
+    def digest(self, chosen: ParameterText, serial: str) -> str:
+        """
+        Return the SHA-256 of all that a row follows from, beside the content.
+
+        Parameters
+        ----------
+        chosen
+            The parameter file.
+        serial
+            Serial number that a manifest states; empty for none.
+
+        Returns
+        -------
+        str
+            Hexadecimal.
+
+        """
+        return _sha256([chosen.text, serial, self.tasks, repr(self.reading), self.code])
+
+
+def key_of(content: str, digest: str) -> str:
+    """
+    Return the key of a row.
+
+    Parameters
+    ----------
+    content
+        SHA-256 of the recording; where it could not be read, its address and stamp.
+    digest
+        See `Recipe.digest`.
+
+    Returns
+    -------
+    str
+        SHA-256, hexadecimal.
+
+    """
+    return _sha256([content, digest])
+
+
+def _sha256(values: Iterable[object]) -> str:
+    """Return the SHA-256 of values as JSON."""
+    return hashlib.sha256(json.dumps(list(values)).encode()).hexdigest()
+
+
+def age_days(chosen: ParameterText, date: str) -> float | None:
+    """
+    Return the age of a calibration at a date, days.
+
+    Parameters
+    ----------
+    chosen
+        The calibration.
+    date
+        ISO 8601, UTC; empty if unknown.
+
+    Returns
+    -------
+    float or None
+        Days; None where one of both dates is unknown.
+
+    """
+    if not (chosen.date and date):
+        return None
+    seconds = (datetime.fromisoformat(date) - datetime.fromisoformat(chosen.date)
+               ).total_seconds()
+    return seconds / _SECONDS_PER_DAY
+
+
+def task_names(text: str) -> tuple[str, ...]:
+    """Return the tasks that a text names with commas, in the order in which they run."""
+    chosen = [name.strip() for name in text.split(',')]
+    for name in chosen:
+        if name not in TASKS:
+            raise UserError(f'--do {text}: {name!r} is no task; tasks: {", ".join(TASKS)}')
+    return tuple(name for name in TASKS if name in chosen)
+
+
+def make_recipe(tasks: Iterable[str], params: str | None, stated: Iterable[str],
+                store: str | None, reading: ReadingOptions) -> Recipe:
+    """
+    Read all parameter files of a run.
+
+    Parameters
+    ----------
+    tasks
+        Names of the tasks.
+    params
+        Parameter file of all recordings; None for none.
+    stated
+        Parameter files that a manifest names.
+    store
+        Folder of the calibration store; None for none.
+    reading
+        How recordings are to be read.
+
+    Returns
+    -------
+    Recipe
+        What all tasks share.
+
+    Raises
+    ------
+    UserError
+        A parameter file is wrong.
+
+    """
+    return Recipe(tuple(tasks), code_version(),
+                  _read(params) if params else None,
+                  {name: _read(name) for name in set(stated) if name},
+                  _stored(store) if store else {}, reading)
+
+
+def _read(name: str) -> ParameterText:
+    """Read and check a parameter file."""
+    path = parameter_file.installed_path(name)
+    sensor = parameter_file.load(path, may_measure=True)
+    date = calibration_store.date_of(sensor)
+    return ParameterText(Path(name).name, Path(path).read_text(encoding='utf-8'),
+                         calibration_store.calibration_id(sensor) if sensor.effects else '',
+                         date.isoformat() if date else '')
+
+
+def _stored(folder: str) -> dict[str, tuple[tuple[str, str], ...]]:
+    """Return names and texts of all calibrations of a store, by the folder of the unit."""
+    root = Path(folder)
+    try:
+        return {unit.name: tuple((path.name, path.read_text(encoding='utf-8'))
+                                 for path in sorted(unit.glob('*.yaml')))
+                for unit in sorted(root.iterdir()) if unit.is_dir()} if root.is_dir() else {}
+    except (OSError, ValueError) as error:
+        raise UserError(f'{folder}: cannot be read: {one_line(error)}') from None
+
+
+@lru_cache(maxsize=_CACHED_CALIBRATIONS)
+def _stored_parameters(name: str, text: str) -> tuple[str, ParameterText] | None:
+    """Return serial number and content of a stored file; None for one that cannot be used."""
+    try:
+        keys = yaml.load(text, getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
+                         )['/**']['ros__parameters']
+        provenance = keys['provenance']
+        date = calibration_store.date_in(provenance['date'])
+        return keys['sensor']['serial'], ParameterText(
+            name, text, provenance['id'], date.isoformat() if date else '')
+    except (yaml.YAMLError, KeyError, TypeError, AttributeError):
+        return None
+
+
+@lru_cache(maxsize=1)
+def code_version() -> str:
+    """Return the SHA-256 of the version, the code and the parameter files that make a row."""
+    root = Path(__file__).resolve().parents[1]
+    hashed = hashlib.sha256(package_version().encode())
+    for path in sorted(root.rglob('*.py')):
+        folder = path.relative_to(root).parts[0]
+        if folder in _NOT_OF_TASKS or (folder == 'fleet' and path.stem not in _CODE_OF_TASKS):
+            continue
+        hashed.update(str(path.relative_to(root)).encode() + path.read_bytes())
+    for path in (parameter_file.nominal_path(), parameter_file.any_imu_path()):
+        hashed.update(path.read_bytes())
+    return hashed.hexdigest()

@@ -1,0 +1,282 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The table of a fleet as arrays, in the order of units and time, and the quantities in it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+import os
+from typing import Any
+
+from adxl_ros.errors import UserError
+from adxl_ros.fleet.report.trends import Recordings
+from adxl_ros.model.constants import AXES, G0_MPS2, Z_90
+import numpy as np
+
+_TEXTS = ('url', 'hash', 'serial', 'outcome', 'refusal', 'refused_by', 'calibration_id', 'status',
+          'report', 'version')
+"""Columns of texts that the page uses."""
+_LISTS = ('effects', 'groups')
+"""Columns of lists that the page uses."""
+_NUMBERS = ('duration_s', 'size_bytes', 'calibration_age_days', 'gap_before_mps2',
+            'gap_before_low_mps2', 'gap_before_high_mps2', 'gap_after_mps2', 'gap_floor_mps2',
+            'seconds', 'memory_mb')
+"""Columns of numbers that the page uses, beside those of the quantities."""
+_YEAR = np.timedelta64(31_557_600_000_000, 'us')
+"""A year of 365.25 days."""
+MG = 1e3 / G0_MPS2
+"""Milli-g in 1 m/s²."""
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """
+    A quantity of the table.
+
+    Attributes
+    ----------
+    column
+        Column of its value; the quantity is named by it.
+    label
+        Its name for people.
+    unit
+        Unit of the column.
+    std_column
+        Column of its standard deviation; empty where there is an interval.
+    interval_columns
+        Columns of both ends of its 90 % interval; empty where there is a standard deviation.
+    shown_unit
+        Unit on the page.
+    factor
+        Factor from the column's unit to that of the page.
+    is_coefficient
+        Whether the units of a fleet have a population of it.
+
+    """
+
+    column: str
+    label: str
+    unit: str
+    shown_unit: str
+    factor: float
+    std_column: str = ''
+    interval_columns: tuple[str, ...] = ()
+    is_coefficient: bool = True
+
+    @property
+    def is_force(self) -> bool:
+        """Whether the quantity is an error of specific force, which has a tolerance."""
+        return self.shown_unit.startswith('mg')
+
+
+@dataclass(frozen=True)
+class FleetTable:
+    """
+    The recordings of n rows, in the order of serial numbers and dates.
+
+    Attributes
+    ----------
+    columns
+        Values by column, (n,): numbers are float with NaN, texts are '' where there is none.
+    serials
+        Serial numbers of the units, (m,).
+    unit
+        Number of the unit of each row, (n,); −1 without a serial number.
+    years
+        Dates in years since 1970, (n,); NaN without a date.
+    period
+        Number of the period between calibrations, (n,), which rises along the rows.
+    first
+        Rows whose content the unit has not had before, (n,) bool.
+
+    """
+
+    columns: dict[str, np.ndarray]
+    serials: tuple[str, ...]
+    unit: np.ndarray
+    years: np.ndarray
+    period: np.ndarray
+    first: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.unit)
+
+    def __getitem__(self, column: str) -> np.ndarray:
+        return self.columns[column]
+
+    def rows_of(self, unit: int) -> np.ndarray:
+        """Return the numbers of the rows of a unit, in the order of time."""
+        begin, end = np.searchsorted(self.unit, [unit, unit + 1])
+        return np.arange(begin, end)
+
+    def recordings(self, quantity: Quantity) -> tuple[np.ndarray, Recordings]:
+        """
+        Return a quantity in the recordings that have it.
+
+        Parameters
+        ----------
+        quantity
+            The quantity.
+
+        Returns
+        -------
+        tuple
+            The numbers of their rows and the recordings, in the unit of the column; years are
+            their unit of time. Their units are numbered from 0 again.
+
+        """
+        value = self[quantity.column]
+        if quantity.std_column:
+            std = self[quantity.std_column]
+        else:
+            low, high = (self[name] for name in quantity.interval_columns)
+            std = (high - low) / (2 * Z_90)
+        used = np.isfinite(value) & np.isfinite(self.years) & (self.unit >= 0) & self.first
+        rows = np.flatnonzero(used & np.isfinite(std) & (std >= 0))
+        table = Recordings(self.unit, self.period, self.years, value, std)
+        return rows, table[rows]
+
+
+def read(path: str | os.PathLike) -> FleetTable:
+    """
+    Read the columns of a table that the page uses.
+
+    Parameters
+    ----------
+    path
+        A `fleet.parquet`.
+
+    Returns
+    -------
+    FleetTable
+        Its recordings.
+
+    Raises
+    ------
+    UserError
+        The file cannot be read, lacks a column, or pyarrow is not installed.
+
+    """
+    try:
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+    except ImportError:
+        raise UserError(f'{path}: Parquet needs pyarrow; pip install pyarrow') from None
+    names = [*_TEXTS, *_LISTS, *_NUMBERS, 'date', *_quantity_columns()]
+    try:
+        return from_arrow(pq.read_table(path, columns=list(dict.fromkeys(names))))
+    except (OSError, KeyError, pa.ArrowException) as error:
+        reason = str(error).splitlines()[0]
+        raise UserError(f'{path}: not a table of `fleet`: {reason}') from None
+
+
+def from_arrow(table: Any) -> FleetTable:
+    """Return the recordings of a table of pyarrow."""
+    columns: dict[str, np.ndarray] = {}
+    for name in _TEXTS:
+        columns[name] = np.array([text or '' for text in table[name].to_pylist()], object)
+    for name in _LISTS:
+        lists = table[name].to_pylist()
+        columns[name] = np.empty(len(lists), object)
+        columns[name][:] = [value or [] for value in lists]
+    for name in dict.fromkeys((*_NUMBERS, *_quantity_columns())):
+        columns[name] = np.asarray(table[name].to_numpy(zero_copy_only=False), float)
+    date = table['date'].to_numpy().astype('datetime64[us]')
+    serial = columns['serial'].astype(str) if len(table) else np.zeros(0, str)
+    order = np.lexsort((date, serial))
+    columns = {name: values[order] for name, values in columns.items()}
+    date, serial = date[order], serial[order]
+    serials, unit = np.unique(serial, return_inverse=True)
+    if len(serials) and not serials[0]:
+        serials, unit = serials[1:], unit - 1
+    years = np.where(np.isnat(date), np.nan, (date - np.datetime64(0, 'us')) / _YEAR)
+    return FleetTable(columns, tuple(map(str, serials)), unit, years,
+                      _periods(unit, columns['calibration_id']),
+                      _first_of_content(unit, columns['hash']))
+
+
+def _periods(unit: np.ndarray, calibration: np.ndarray) -> np.ndarray:
+    """Count the periods of units between changes of their calibration, (n,)."""
+    begins = np.zeros(len(unit), bool)
+    last_unit, last_calibration = -2, ''
+    for i, (number, name) in enumerate(zip(unit, calibration)):
+        begins[i] = number != last_unit or bool(name and last_calibration
+                                                and name != last_calibration)
+        if number != last_unit or name:
+            last_calibration = name
+        last_unit = number
+    return np.cumsum(begins) - 1
+
+
+def _first_of_content(unit: np.ndarray, content: np.ndarray) -> np.ndarray:
+    """Mark rows whose content is new to the unit, (n,) bool; a copy says nothing twice."""
+    seen: set[tuple[int, str]] = set()
+    result = np.ones(len(unit), bool)
+    for i, key in enumerate(zip(unit, content)):
+        result[i] = not key[1] or key not in seen
+        seen.add(key)
+    return result
+
+
+def _quantity_columns() -> Iterator[str]:
+    """Name the columns of all quantities."""
+    for quantity in quantities(None):
+        yield from filter(None, (quantity.column, quantity.std_column,
+                                 *quantity.interval_columns))
+
+
+def quantities(table: FleetTable | None) -> tuple[Quantity, ...]:
+    """
+    Return all quantities of a table.
+
+    Parameters
+    ----------
+    table
+        Its median scale factor converts volts into mg; None takes 1 V/g.
+
+    Returns
+    -------
+    tuple
+        The quantities, those of specific force first.
+
+    """
+    listed = [Quantity(
+        'gap_before_mps2', 'gap', 'm/s²', 'mg', MG, is_coefficient=False,
+        interval_columns=('gap_before_low_mps2', 'gap_before_high_mps2'))]
+    for axis in AXES:
+        mg_per_v = 1e3 / _median_scale(table, axis)
+        listed.append(Quantity(f'zero_g_{axis}_v', f'zero-g {axis}', 'V', 'mg', mg_per_v,
+                               f'zero_g_std_{axis}_v'))
+        listed.append(Quantity(f'scale_{axis}_v_per_g', f'scale factor {axis}', 'V/g', 'mg/g',
+                               mg_per_v, f'scale_std_{axis}_v_per_g'))
+    for axis in AXES:
+        listed.append(_noise_term('n', axis, f'white noise {axis}', 'mps2_per_rthz', '/√Hz'))
+        listed.append(_noise_term('b', axis, f'bias instability {axis}', 'mps2', ''))
+        listed.append(_noise_term('k', axis, f'random walk {axis}', 'mps2_per_rts', '/√s'))
+    return tuple(listed)
+
+
+def _median_scale(table: FleetTable | None, axis: str) -> float:
+    """Return the usual scale factor of an axis, V/g; 1 where no recording has one."""
+    values = np.zeros(0) if table is None else table[f'scale_{axis}_v_per_g']
+    values = values[values > 0]
+    return float(np.median(values)) if len(values) else 1.0
+
+
+def _noise_term(letter: str, axis: str, label: str, unit_name: str, per: str) -> Quantity:
+    interval = tuple(f'noise_{letter}_{end}_{axis}_{unit_name}' for end in ('low', 'high'))
+    return Quantity(f'noise_{letter}_{axis}_{unit_name}', label, f'm/s²{per}', f'µg{per}',
+                    1e6 / G0_MPS2, interval_columns=interval)

@@ -1,0 +1,241 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Random effects: the mean and the spread of a coefficient over units, and what they say of each.
+
+The estimate of unit u is y = μ + b + e. Its own error e has the known standard deviation v, and
+the unit's departure b from the mean has the standard deviation τ, the spread. The spread
+maximises the restricted likelihood (REML; Viechtbauer 2005), and its interval is that of the
+Q-profile (Viechtbauer 2007). Few units hardly determine the spread. The errors of the mean and of
+a further unit therefore are those over all spreads by their restricted likelihood, with all
+spreads equally likely before (Gelman 2006).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from adxl_ros.model.constants import MAD_TO_STD
+from adxl_ros.model.population import PooledCoefficient
+import numpy as np
+import scipy
+
+MIN_UNITS = 5
+"""Smallest count of units with a spread: with fewer, a further unit has no finite variance."""
+_GRID = (np.arange(400) + 0.5) / 400
+"""Shares x of the spreads s·x/(1 − x) over which the likelihood is integrated. Chosen: more change
+the integrals by less than 1e-3."""
+_OUTLIER_CHANCE = 0.05
+"""Probability that a page names a unit although all units are of one population. Chosen."""
+_MAX_ROUNDS = 10
+"""Largest count of rounds of spread and outliers; a round seldom changes after the second."""
+_MAX_OUTLIERS = 0.25
+"""Largest share of units that are far out. Chosen: more of them are a population of their own."""
+_FAR_MADS = 5.0
+"""Units further from the median do not count in the first round. Chosen: far beyond normal."""
+
+
+@dataclass(frozen=True)
+class RandomEffects:
+    """
+    A coefficient over n units.
+
+    Attributes
+    ----------
+    pooled
+        Mean and spread of the population.
+    estimates, std
+        The units' own estimates and their standard deviations, (n,).
+    is_far_out
+        Units that are not of this population, (n,) bool. They do not count.
+
+    """
+
+    pooled: PooledCoefficient
+    estimates: np.ndarray
+    std: np.ndarray
+    is_far_out: np.ndarray
+
+    def shrunken(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return estimates of the units that use the population, and their std, (n,) each."""
+        precision = 1 / np.maximum(self.std, np.finfo(float).tiny) ** 2
+        prior2 = max(self.pooled.spread, np.finfo(float).tiny) ** 2
+        share = 1 / (1 + precision * prior2)
+        value = share * self.pooled.mean + (1 - share) * self.estimates
+        std = np.sqrt((1 - share) * self.std ** 2 + (share * self.pooled.mean_std) ** 2)
+        return (np.where(self.is_far_out, self.estimates, value),
+                np.where(self.is_far_out, self.std, std))
+
+    def distances(self) -> np.ndarray:
+        """Return the distances of the units from the mean, in standard deviations, (n,)."""
+        pooled = self.pooled
+        return (self.estimates - pooled.mean) / np.sqrt(
+            pooled.spread ** 2 + pooled.mean_std ** 2 + self.std ** 2)
+
+
+def random_effects(estimates: np.ndarray, std: np.ndarray, tests: int | None = None
+                   ) -> RandomEffects:
+    """
+    Estimate mean and spread of a population, without the units that are not of it.
+
+    Parameters
+    ----------
+    estimates
+        Estimates of at least `MIN_UNITS` units, (n,).
+    std
+        Their standard deviations, (n,).
+    tests
+        Number of comparisons that share the chance of a false outlier: units times coefficients.
+        None takes the number of units.
+
+    Returns
+    -------
+    RandomEffects
+        The population.
+
+    """
+    chance = _OUTLIER_CHANCE / (2 * (tests or len(estimates)))
+    deviation = np.abs(estimates - np.median(estimates))
+    scale = MAD_TO_STD * np.median(deviation)
+    kept = _largest_dropped(deviation / np.hypot(max(scale, np.finfo(float).tiny), std), _FAR_MADS)
+    for _ in range(_MAX_ROUNDS):
+        population = _of_units(estimates, std, kept)
+        limit = -float(scipy.special.stdtrit(kept.sum() - 2, chance))
+        now = _largest_dropped(np.abs(population.distances()), limit)
+        if np.array_equal(now, kept):
+            break
+        kept = now
+    return population
+
+
+def _largest_dropped(distance: np.ndarray, limit: float) -> np.ndarray:
+    """Mark the units within a limit, (n,) bool; of too many others, the nearest count, too."""
+    count = len(distance)
+    limit_count = min(int(_MAX_OUTLIERS * count), count - MIN_UNITS)
+    farthest = np.argsort(-distance)[:limit_count]
+    kept = np.ones(count, bool)
+    kept[farthest[distance[farthest] > limit]] = False
+    return kept
+
+
+def _of_units(estimates: np.ndarray, std: np.ndarray, kept: np.ndarray) -> RandomEffects:
+    """Return the population of the units that count."""
+    y, variance = estimates[kept], std[kept] ** 2
+    unit = max(float(np.ptp(y)), float(std[kept].max()), np.finfo(float).tiny)
+    y, variance = (y - y.mean()) / unit, variance / unit ** 2
+    spread2 = reml_spread2(y, variance)
+    mean, _ = weighted_mean(y, variance, spread2)
+    mean_variance, prediction_variance = _variances(y, variance, mean)
+    low, high = _q_profile(y, variance)
+    pooled = PooledCoefficient(
+        mean=float(estimates[kept].mean() + unit * mean), mean_std=unit * mean_variance ** 0.5,
+        spread=unit * spread2 ** 0.5, spread_low=unit * low ** 0.5,
+        spread_high=unit * high ** 0.5, prediction_std=unit * prediction_variance ** 0.5,
+        units=int(kept.sum()))
+    return RandomEffects(pooled, estimates, std, is_far_out=~kept)
+
+
+def _variances(y: np.ndarray, variance: np.ndarray, mean: float) -> tuple[float, float]:
+    """Return the variances of mean and of a further unit, over all spreads."""
+    scale = float(np.sqrt(np.var(y) + variance.mean()))
+    if scale == 0:
+        return 0.0, 0.0
+    spread2 = (scale * _GRID / (1 - _GRID)) ** 2
+    weight = 1 / (variance + spread2[:, None])
+    total = weight.sum(axis=1)
+    means = weight @ y / total
+    squares = (weight * (y - means[:, None]) ** 2).sum(axis=1)
+    log_density = 0.5 * (np.log(weight).sum(axis=1) - np.log(total) - squares) \
+        - 2 * np.log1p(-_GRID)
+    density = np.exp(log_density - log_density.max())
+    density /= density.sum()
+    mean_variance = float(density @ (1 / total + (means - mean) ** 2))
+    return mean_variance, mean_variance + float(density @ spread2)
+
+
+def weighted_mean(y: np.ndarray, variance: np.ndarray, spread2: float) -> tuple[float, float]:
+    """
+    Return the mean of a population for a given spread.
+
+    Parameters
+    ----------
+    y
+        Estimates, (n,).
+    variance
+        Their own variances, (n,).
+    spread2
+        Variance between units.
+
+    Returns
+    -------
+    tuple
+        The weighted mean and its variance.
+
+    """
+    weight = 1 / (variance + spread2)
+    total = float(weight.sum())
+    return float(weight @ y) / total, 1 / total
+
+
+def reml_spread2(y: np.ndarray, variance: np.ndarray) -> float:
+    """
+    Return the variance between units that maximises the restricted likelihood.
+
+    Parameters
+    ----------
+    y
+        Estimates, (n,).
+    variance
+        Their own variances, (n,).
+
+    Returns
+    -------
+    float
+        The variance; 0 where the estimates differ by no more than their own errors.
+
+    """
+    def score(spread2: float) -> float:
+        weight = 1 / (variance + spread2)
+        mean, mean_variance = weighted_mean(y, variance, spread2)
+        squares = float(np.sum((weight * (y - mean)) ** 2))
+        return squares - float(weight.sum() - weight @ weight * mean_variance)
+
+    floor = 1e-12 * float(np.var(y) + variance.mean())
+    if floor == 0 or score(floor) <= 0:
+        return 0.0
+    high = float(np.var(y, ddof=1)) + floor
+    while score(high) > 0:
+        high *= 2
+    return float(scipy.optimize.brentq(score, floor, high, rtol=1e-12, xtol=1e-300))
+
+
+def _q_profile(y: np.ndarray, variance: np.ndarray) -> tuple[float, float]:
+    """Return the 90 % interval of the variance between units."""
+    freedom = len(y) - 1
+
+    def squares(spread2: float) -> float:
+        mean, _ = weighted_mean(y, variance, spread2)
+        return float(np.sum((y - mean) ** 2 / (variance + spread2)))
+
+    def solve(target: float) -> float:
+        floor = 1e-12 * float(np.var(y) + variance.mean())
+        if floor == 0 or squares(floor) <= target:
+            return 0.0
+        high = float(np.sum((y - y.mean()) ** 2)) / target + floor
+        return float(scipy.optimize.brentq(lambda spread2: squares(spread2) - target, floor, high,
+                                           rtol=1e-9, xtol=1e-300))
+
+    return (solve(float(scipy.special.chdtri(freedom, 0.05))),
+            solve(float(scipy.special.chdtri(freedom, 0.95))))

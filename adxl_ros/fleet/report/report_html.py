@@ -1,0 +1,331 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The page of a fleet and the files beside it: `fleet.html`, `population.yaml`, `units.csv`."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+import csv
+import io
+from pathlib import Path
+from typing import Any
+
+from adxl_ros.files import html_page, population_file
+from adxl_ros.files.atomic_write import write_text
+from adxl_ros.fleet.report import page_figures
+from adxl_ros.fleet.report.effect_matrix import effect_matrix
+from adxl_ros.fleet.report.fleet_table import FleetTable, MG, read
+from adxl_ros.fleet.report.page_figures import date_text
+from adxl_ros.fleet.report.trends import FALSE_DISCOVERY_RATE, Scatter
+from adxl_ros.fleet.report.unit_results import analyse, far_out, population_of, QuantityResult
+from adxl_ros.fleet.report.urgency import number, rank, State, TOLERANCE_MG, UnitState
+from adxl_ros.fleet.row import PAGE, POPULATION, reason_kind, TABLE, UNITS
+import numpy as np
+
+_SHOWN = 12
+"""Number of units in the first table and with a plot. Chosen: they fit on one screen."""
+_MOST_ROWS = 50
+"""Largest count of outliers and of reasons on the page; the table holds them all."""
+_SMALLEST_SCATTER = 1e-3
+"""Smallest scatter on the page, mg, mg/g or µg. Chosen: far below the noise of any recording."""
+_NOTHING = 0.05
+"""Smaller standard deviations are nothing beside another one. Chosen: 0.1 % of the variance."""
+_COLOURS = {State.OUT_OF_TOLERANCE: 'red', State.DRIFTS: 'amber', State.NOT_JUDGED: 'amber',
+            State.FAR_OUT: 'amber', State.OLD_CALIBRATION: 'grey', State.IN_ORDER: 'green'}
+"""Colour of the badge by the state of the most urgent unit."""
+_SENTENCES = {
+    State.OUT_OF_TOLERANCE: ('Recalibrate the unit at the head of the list.',
+                             'Recalibrate the units at the head of the list.'),
+    State.DRIFTS: ('No unit is out of tolerance, but one is on its way.',
+                   'No unit is out of tolerance, but some are on their way.'),
+    State.NOT_JUDGED: ('No unit is out of tolerance, but one gives no usable recordings.',
+                       'No unit is out of tolerance, but some give no usable recordings.'),
+    State.FAR_OUT: ('No unit is out of tolerance, but one differs from all others.',
+                    'No unit is out of tolerance, but some differ from all others.'),
+    State.OLD_CALIBRATION: ('No unit is out of tolerance, but one calibration is old.',
+                            'No unit is out of tolerance, but some calibrations are old.'),
+    State.IN_ORDER: ('The unit is within the tolerance.', 'All units are within the tolerance.')}
+"""What the most urgent state means for the user: of one unit, and of several."""
+
+
+def write(folder: Path) -> list[Path]:
+    """
+    Write page, population and estimates of a fleet beside its table.
+
+    Parameters
+    ----------
+    folder
+        Folder with the table.
+
+    Returns
+    -------
+    list
+        The files.
+
+    Raises
+    ------
+    UserError
+        The table cannot be read, a file cannot be written, or a library is missing.
+
+    """
+    html_page.check_libraries()
+    table = read(folder / TABLE)
+    results = analyse(table)
+    distant = far_out(results, table.serials)
+    population_file.write(folder / POPULATION, population_of(results, POPULATION), distant)
+    write_text(folder / UNITS, _units_csv(results, table.serials))
+    write_text(folder / PAGE, page(table, results, folder))
+    return [folder / name for name in (PAGE, POPULATION, UNITS)]
+
+
+def _units_csv(results: Sequence[QuantityResult], serials: Sequence[str]) -> str:
+    """Return the estimates of all units, with and without the population."""
+    text = io.StringIO()
+    rows = csv.writer(text, lineterminator='\n')
+    rows.writerow(['serial', 'coefficient', 'unit', 'estimate', 'std', 'shrunken',
+                   'shrunken_std', 'distance', 'is_far_out'])
+    for result in results:
+        population = result.population
+        if population is None:
+            continue
+        shrunken, shrunken_std = population.shrunken()
+        columns = (population.estimates, population.std, shrunken, shrunken_std,
+                   population.distances())
+        for i, unit in enumerate(result.units):
+            rows.writerow([serials[unit], result.quantity.column, result.quantity.unit,
+                           *(f'{values[i]:.9g}' for values in columns),
+                           str(bool(population.is_far_out[i])).lower()])
+    return text.getvalue()
+
+
+def page(table: FleetTable, results: Sequence[QuantityResult], folder: Path) -> str:
+    """
+    Return the page of a fleet.
+
+    Parameters
+    ----------
+    table
+        The recordings.
+    results
+        Results of the quantities.
+    folder
+        Folder of the page, from which it names single reports.
+
+    Returns
+    -------
+    str
+        HTML.
+
+    """
+    distant = far_out(results, table.serials)
+    units = rank(table, results, distant)
+    effects = effect_matrix(table)
+    # Units that drift come first, although others may be more urgent.
+    plotted = [(unit, result) for unit in sorted(units, key=lambda unit: not unit.drifts)
+               if (result := _plotted_quantity(unit, results)) is not None][:_SHOWN]
+    figures = {f'trend-{i}': page_figures.trend(table, result, unit.unit)
+               for i, (unit, result) in enumerate(plotted)}
+    if effects.effects:
+        figures['matrix'] = page_figures.matrix(table, effects)
+    counts = Counter(unit.state for unit in units)
+    return html_page.render('adxl_ros.fleet.report', 'fleet.html', {
+        'title': 'Fleet', 'about': _about(table), 'badge': _badge(units, counts),
+        'tiles': _tiles(table, units, counts), 'shown': _SHOWN, 'figures': figures,
+        'units': [_unit_row(unit, folder) for unit in units],
+        'without_unit': _rows_without_unit(table, folder),
+        'without_unit_count': int((table.unit < 0).sum()),
+        'trends': [_trend_caption(i, unit, result) for i, (unit, result) in enumerate(plotted)],
+        'findings': effects.findings, 'has_effects': bool(effects.effects),
+        'judged': len(effects.units), 'populations': _population_rows(results),
+        'far_out': _far_out_rows(distant, results),
+        'outliers': _outlier_rows(table, results, folder),
+        'outlier_count': sum(int(result.is_outlier.sum()) for result in results),
+        'refusals': _refusal_rows(table), 'most_rows': _MOST_ROWS,
+        'tolerance': number(TOLERANCE_MG), 'false_discovery': f'{FALSE_DISCOVERY_RATE:.0%}',
+        'drifts': sum(int(result.is_claimed.sum()) for result in results)})
+
+
+def _about(table: FleetTable) -> list[str]:
+    years = table.years[np.isfinite(table.years)]
+    dates = [f'{date_text(years.min())} to {date_text(years.max())}'] if len(years) else []
+    versions = sorted({str(text) for text in table['version'] if text})
+    return [f'{len(table)} recordings', f'{len(table.serials)} units', *dates,
+            *([f'rows made by version {", ".join(versions)}'] if versions else [])]
+
+
+def _badge(units: Sequence[UnitState], counts: Counter[State]) -> dict[str, str]:
+    if not units:
+        return {'colour': 'grey', 'word': 'NO UNITS',
+                'sentence': 'No recording states a serial number.'}
+    worst = units[0].state
+    word = 'IN ORDER' if worst is State.IN_ORDER else \
+        f'{counts[worst]} of {len(units)} {worst.words}'.upper()
+    return {'colour': _COLOURS[worst], 'word': word,
+            'sentence': _SENTENCES[worst][counts[worst] > 1]}
+
+
+def _tiles(table: FleetTable, units: Sequence[UnitState], counts: Counter[State]
+           ) -> list[dict[str, str]]:
+    outcome = table['outcome']
+    refused, crashed = (int((outcome == name).sum()) for name in ('refused', 'crashed'))
+    rows = [{'label': 'recordings', 'text': str(len(table)),
+             'note': f'{refused} refused, {crashed} crashed'}]
+    notes = {State.OUT_OF_TOLERANCE: f'gap above {number(TOLERANCE_MG)} mg',
+             State.DRIFTS: 'a slope beyond chance', State.NOT_JUDGED: 'last recording refused',
+             State.FAR_OUT: 'not of the population', State.OLD_CALIBRATION: 'older than a year',
+             State.IN_ORDER: 'nothing to do'}
+    # A unit that is out of tolerance may drift, too.
+    numbers = Counter({**counts, State.DRIFTS: sum(unit.is_drifting for unit in units)})
+    rows += [{'label': f'units: {state.words}', 'text': str(numbers[state]), 'note': notes[state]}
+             for state in State if counts[state] or state in (State.OUT_OF_TOLERANCE,
+                                                              State.DRIFTS, State.IN_ORDER)]
+    hours = float(np.nansum(table['seconds'])) / 3600
+    return [*rows, {'label': 'core hours', 'text': number(hours),
+                    'note': f'{number(3600 * hours / max(len(table), 1))} s a recording'}]
+
+
+def _unit_row(unit: UnitState, folder: Path) -> dict[str, Any]:
+    return {'serial': unit.serial, 'state': unit.state.words,
+            'colour': _COLOURS[unit.state], 'reason': unit.reason or 'Nothing to do.',
+            'gap': '-' if not np.isfinite(unit.gap_mg) else
+            f'{number(unit.gap_mg)} / {number(unit.floor_mg)}',
+            'age': '-' if not np.isfinite(unit.calibration_age_days) else
+            f'{unit.calibration_age_days:.0f}',
+            'recordings': f'{unit.recordings} ({unit.refused})',
+            'last': date_text(unit.last_year), 'report': _link(unit.report, folder)}
+
+
+def _rows_without_unit(table: FleetTable, folder: Path) -> list[dict[str, str]]:
+    """Return the recordings that state no serial number, the largest gap first."""
+    gap_mg, floor_mg = (MG * table[f'gap_{name}_mps2'] for name in ('before', 'floor'))
+    rows = np.flatnonzero(table.unit < 0)
+    rows = rows[np.argsort(-np.nan_to_num(gap_mg[rows]), kind='stable')]
+    return [{'url': str(table['url'][row]), 'date': date_text(table.years[row]),
+             'verdict': ': '.join(filter(None, [
+                 str(table['status'][row] or table['outcome'][row]).replace('_', ' '),
+                 ', '.join(table['effects'][row])])),
+             'gap': f'{number(gap_mg[row])} / {number(floor_mg[row])}'
+             if np.isfinite(gap_mg[row]) else '-',
+             'report': _link(str(table['report'][row]), folder)} for row in rows[:_MOST_ROWS]]
+
+
+def _link(report: str, folder: Path) -> str:
+    """Return the address of a single report: its page where there is one; empty for none."""
+    if not report:
+        return ''
+    for name in ('diagnose/report.html', 'report.html', 'fit/report.html', 'noise/report.html'):
+        if (folder / report / name).is_file():
+            return f'{report}/{name}'
+    return report if (folder / report).is_dir() else ''
+
+
+def _plotted_quantity(unit: UnitState, results: Sequence[QuantityResult]
+                      ) -> QuantityResult | None:
+    """Return what the plot of a unit shows: its drift, else the first quantity that it has."""
+    if unit.drifts:
+        return unit.drifts[0].result
+    return next((result for result in results if result.place_of(unit.unit) is not None), None)
+
+
+def _trend_caption(i: int, unit: UnitState, result: QuantityResult) -> dict[str, str]:
+    text = next((drift.text for drift in unit.drifts if drift.result is result), '')
+    return {'figure': f'trend-{i}', 'title': f'{unit.serial}: {result.quantity.label}',
+            'text': f'{text}.' if text else 'No slope is claimed.'}
+
+
+def _population_rows(results: Sequence[QuantityResult]) -> list[list[str]]:
+    rows = []
+    for result in results:
+        population, quantity = result.population, result.quantity
+        if population is None:
+            continue
+        pooled = population.pooled
+        factor = quantity.factor
+        unit = quantity.shown_unit
+        is_noise = quantity.unit.startswith('m/s')
+        mean, std = (factor * value if is_noise else value
+                     for value in (pooled.mean, pooled.mean_std))
+        rows.append([
+            quantity.label,
+            f'{_value(mean, std)} ± {number(std, digits=2)} {unit if is_noise else quantity.unit}',
+            f'{number(factor * pooled.spread)} ({number(factor * pooled.spread_low)} to '
+            f'{number(factor * pooled.spread_high)}) {unit}',
+            f'{_scatter(factor * result.trends.scatter.recording)} {unit}',
+            f'{_scatter(factor * _material(result.trends.scatter))} {unit}', str(pooled.units),
+            str(int(population.is_far_out.sum()))])
+    return rows
+
+
+def _scatter(value: float) -> str:
+    """Return a scatter; one that is too small to matter as its limit."""
+    return f'< {_SMALLEST_SCATTER:g}' if 0 < value < _SMALLEST_SCATTER else number(value)
+
+
+def _material(scatter: Scatter) -> float:
+    """Return the scatter by calibrations; 0 where it is nothing beside that of recordings."""
+    return scatter.calibration if scatter.calibration > _NOTHING * scatter.recording else 0.0
+
+
+def _value(value: float, std: float) -> str:
+    """Return a value with the digits that its uncertainty leaves."""
+    digits = int(np.clip(2 - np.floor(np.log10(std)) - 1, 0, 8)) if std > 0 else 4
+    return f'{value:.{digits}f}'
+
+
+def _far_out_rows(distant: Sequence[dict[str, str | float]], results: Sequence[QuantityResult]
+                  ) -> list[list[str]]:
+    by_column = {result.quantity.column: result.quantity for result in results}
+    rows = []
+    for item in distant[:_MOST_ROWS]:
+        quantity = by_column[str(item['coefficient'])]
+        rows.append([str(item['serial']), quantity.label,
+                     f'{float(item["value"]):.5g} {quantity.unit}'
+                     if not quantity.unit.startswith('m/s') else
+                     f'{number(float(item["value"]) * quantity.factor)} {quantity.shown_unit}',
+                     number(float(item['distance']), True)])
+    return rows
+
+
+def _outlier_rows(table: FleetTable, results: Sequence[QuantityResult], folder: Path
+                  ) -> list[dict[str, str]]:
+    """Return the recordings that are far from others of their unit, the farthest first."""
+    outliers = [(float(result.distance[i]), result, i) for result in results
+                for i in np.flatnonzero(result.is_outlier)]
+    outliers.sort(key=lambda item: -item[0])
+    rows = []
+    for distance, result, i in outliers[:_MOST_ROWS]:
+        row = result.rows[i]
+        rows.append({'serial': table.serials[table.unit[row]],
+                     'date': date_text(table.years[row]), 'quantity': result.quantity.label,
+                     'value': f'{number(result.quantity.factor * result.recordings.value[i])} '
+                     f'{result.quantity.shown_unit}', 'distance': number(distance),
+                     'url': str(table['url'][row]),
+                     'report': _link(str(table['report'][row]), folder)})
+    return rows
+
+
+def _refusal_rows(table: FleetTable) -> list[list[str]]:
+    """Return the reasons of refusals: how often, in how many units, and an example."""
+    rows = np.flatnonzero(table['outcome'] != 'done')
+    by_reason: dict[str, list[int]] = {}
+    for row in rows:
+        kind = reason_kind({name: str(table[name][row]) for name in ('refusal', 'outcome', 'url')})
+        by_reason.setdefault(kind, []).append(int(row))
+    ordered = sorted(by_reason.items(), key=lambda item: (-len(item[1]), item[0]))
+    # A recording without a serial number is of no unit.
+    return [[str(len(numbers)), str(len({*table.unit[numbers].tolist()} - {-1})), reason,
+             str(table['refused_by'][numbers[0]]) or '-', str(table['url'][numbers[0]])]
+            for reason, numbers in ordered[:_MOST_ROWS]]

@@ -1,0 +1,361 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Levels and slopes of a quantity by unit, from repeated recordings.
+
+The value of a recording is the level of its unit, a slope in time, a step that each calibration
+may cause, a scatter from recording to recording, and the stated error of the value. Scatter and
+steps have variances that all units share. They maximise the restricted likelihood of all
+recordings, with levels and slopes of the units free.
+
+A unit may scatter more than others. Its own scatter therefore moderates the shared one, and the
+slope of a unit has a t distribution with the degrees of freedom of both (`moderated_variance`).
+That makes a weak drift visible which the recordings of the unit alone would not show.
+
+Scatter may be correlated in time. The correlation ρ of neighbouring recordings, which the units
+share, decays as that of a first-order process. It multiplies the variances of levels and slopes
+by 1 + 2cρ/(1 − ρ), where c is the share of the scatter in the variance (Bartlett 1946).
+
+A slope is claimed only if it survives the control of the false discovery rate over all units
+(Benjamini and Hochberg 1995). The intervals of claims hold for that share of the claims
+(Benjamini and Yekutieli 2005).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from adxl_ros.fleet.report.moderated_variance import moderated
+import numpy as np
+import scipy
+
+FALSE_DISCOVERY_RATE = 0.05
+"""Share of the claimed slopes that may be false. Chosen: the usual value."""
+_INTERVAL = 0.9
+"""Probability of the intervals. Chosen: that of all intervals of the package."""
+_MIN_RECORDINGS = 3
+"""Fewest recordings with a slope: one more than level and slope."""
+_LARGEST_CORRELATION = 0.95
+"""Largest correlation of neighbours. Chosen: above it a scatter is a drift of its own."""
+_ROUNDS = 20
+"""Rounds of the factor by correlation; it changes by less than 1e-3 after ten."""
+_SMALLEST_SHARE = 1e-8
+"""Smallest variance beside the stated errors, relative to that of the values."""
+_FIT_TOLERANCE = 1e-3
+"""Tolerance of the logarithms of both variances."""
+
+
+@dataclass(frozen=True)
+class Recordings:
+    """
+    A quantity in n recordings, in the order of units and time.
+
+    Attributes
+    ----------
+    unit
+        Numbers of the units from 0, (n,).
+    period
+        Numbers of the periods between calibrations from 0, which rise along the array, (n,).
+    time
+        Times, in the unit of time of the slopes, (n,).
+    value
+        Values, (n,).
+    std
+        Stated standard deviations of the values, (n,).
+
+    """
+
+    unit: np.ndarray
+    period: np.ndarray
+    time: np.ndarray
+    value: np.ndarray
+    std: np.ndarray
+
+    def __getitem__(self, part: np.ndarray) -> Recordings:
+        return Recordings(_numbered(self.unit[part]), _numbered(self.period[part]),
+                          self.time[part], self.value[part], self.std[part])
+
+
+def _numbered(labels: np.ndarray) -> np.ndarray:
+    """Replace sorted labels by 0, 1, ..."""
+    return np.cumsum(np.diff(labels, prepend=labels[:1]) != 0)
+
+
+@dataclass(frozen=True)
+class Scatter:
+    """
+    What all units share.
+
+    Attributes
+    ----------
+    recording
+        Standard deviation from recording to recording, beyond the stated errors.
+    calibration
+        Standard deviation of the steps at calibrations.
+    widening
+        Factor of the variances of levels and slopes by correlation in time.
+
+    """
+
+    recording: float
+    calibration: float
+    widening: float = 1.0
+
+
+@dataclass(frozen=True)
+class Trends:
+    """
+    Levels and slopes of m units, and lines of k periods between their calibrations.
+
+    NaN stands for a slope that the recordings do not have.
+
+    Attributes
+    ----------
+    scatter
+        What the units share.
+    level, level_std
+        Mean of each unit over its recordings and its standard deviation, (m,).
+    slope, slope_std
+        Slope of each unit and its standard deviation, (m,).
+    freedom
+        Degrees of freedom of the slopes, (m,).
+    period_time, period_value, period_std
+        A point of the line in each period, and the standard deviation of its value, (k,). The
+        point does not depend on the slope: it is the same for a line without one.
+    noise_ratio
+        Variance of each unit's scatter relative to that of all, (m,).
+
+    """
+
+    scatter: Scatter
+    level: np.ndarray
+    level_std: np.ndarray
+    slope: np.ndarray
+    slope_std: np.ndarray
+    freedom: np.ndarray
+    period_time: np.ndarray
+    period_value: np.ndarray
+    period_std: np.ndarray
+    noise_ratio: np.ndarray
+
+    @property
+    def p_values(self) -> np.ndarray:
+        """Two-sided probability of each slope without a drift, (m,); NaN without a slope."""
+        with np.errstate(invalid='ignore'):
+            return 2 * scipy.special.stdtr(self.freedom, -np.abs(self.slope / self.slope_std))
+
+
+def fit_trends(recordings: Recordings) -> Trends:
+    """
+    Fit levels and slopes of all units.
+
+    Parameters
+    ----------
+    recordings
+        A quantity in the recordings of m units; each unit has one at least.
+
+    Returns
+    -------
+    Trends
+        The levels and slopes.
+
+    """
+    sums = _Sums.of(recordings)
+    scatter = _shared_scatter(sums)
+    fit = sums.fit(scatter)
+    widening = _widening(sums, fit, scatter)
+    scatter = replace(scatter, widening=widening)
+    # A line takes two independent recordings, which are so many of the correlated ones.
+    remaining = sums.counts - 2 * widening
+    own_freedom = np.maximum(remaining, 0.0) * sums.has_slope / widening
+    with np.errstate(invalid='ignore', divide='ignore'):
+        ratio = np.where(own_freedom > 0, fit.squares / remaining, np.nan)
+    variance, freedom = moderated(ratio, own_freedom)
+    factor = np.sqrt(variance * widening)
+    return Trends(
+        scatter=scatter, level=fit.level, level_std=factor * fit.level_std, slope=fit.slope,
+        slope_std=factor * fit.slope_std,
+        freedom=np.where(sums.has_slope, freedom, np.nan),
+        period_time=fit.period_time, period_value=fit.period_value,
+        period_std=factor[sums.unit_of_period] * fit.period_std, noise_ratio=ratio)
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """Lines of the units for given variances."""
+
+    slope: np.ndarray
+    slope_std: np.ndarray
+    level: np.ndarray
+    level_std: np.ndarray
+    period_time: np.ndarray
+    period_value: np.ndarray
+    period_std: np.ndarray
+    squares: np.ndarray
+    log_likelihood: float
+    residual: np.ndarray
+
+
+@dataclass(frozen=True)
+class _Sums:
+    """Recordings about the centre of their unit, with where units and periods begin."""
+
+    recordings: Recordings
+    time: np.ndarray
+    value: np.ndarray
+    centre_time: np.ndarray
+    centre_value: np.ndarray
+    counts: np.ndarray
+    period_starts: np.ndarray
+    unit_of_period: np.ndarray
+    unit_starts: np.ndarray
+    has_slope: np.ndarray
+
+    @classmethod
+    def of(cls, recordings: Recordings) -> _Sums:
+        """Prepare recordings."""
+        unit, period = recordings.unit, recordings.period
+        counts = np.bincount(unit)
+        starts = np.flatnonzero(np.diff(period, prepend=-1))
+        of_period = unit[starts]
+        centre_time = np.bincount(unit, recordings.time) / counts
+        centre_value = np.bincount(unit, recordings.value) / counts
+        time = recordings.time - centre_time[unit]
+        has_slope = (counts >= _MIN_RECORDINGS) & (np.bincount(unit, time ** 2) > 0)
+        return cls(recordings, time, recordings.value - centre_value[unit], centre_time,
+                   centre_value, counts, starts, of_period,
+                   np.flatnonzero(np.diff(of_period, prepend=-1)), has_slope)
+
+    def fit(self, scatter: Scatter) -> _Fit:
+        """Fit the lines of all units for given variances, by generalised least squares."""
+        step2, unit = scatter.calibration ** 2, self.recordings.unit
+        weight = 1 / (self.recordings.std ** 2 + scatter.recording ** 2)
+        t, y = self.time, self.value
+        w, wt, wy, wtt, wty, wyy = (np.add.reduceat(weight * part, self.period_starts)
+                                    for part in (np.ones_like(t), t, y, t * t, t * y, y * y))
+        # The step of a period has one common part in all of its recordings (Woodbury).
+        shared = step2 / (1 + step2 * w)
+        a, b, c, p, q, r = (np.add.reduceat(part, self.unit_starts) for part in (
+            w - shared * w * w, wt - shared * w * wt, wtt - shared * wt * wt,
+            wy - shared * w * wy, wty - shared * wt * wy, wyy - shared * wy * wy))
+        det = np.where(self.has_slope, a * c - b * b, 1.0)
+        det = np.maximum(det, np.finfo(float).tiny)
+        slope = np.where(self.has_slope, (a * q - b * p) / det, 0.0)
+        intercept = (p - b * slope) / a
+        squares = np.maximum(r - intercept * p - slope * q, 0.0)
+        log_det = np.add.reduceat(np.log1p(step2 * w), self.unit_starts).sum() \
+            - np.log(weight).sum()
+        log_likelihood = -0.5 * (log_det + np.log(np.where(self.has_slope, det, a)).sum()
+                                 + squares.sum())
+        residual = y - intercept[unit] - slope[unit] * t
+        step = shared * np.add.reduceat(weight * residual, self.period_starts)
+        residual = (residual - step[self.recordings.period]) * np.sqrt(weight)
+        nan = np.where(self.has_slope, 1.0, np.nan)
+        with np.errstate(invalid='ignore'):
+            slope_std = nan * np.sqrt(a / det)
+        # A period has a step as far as its recordings show one, else the line of its unit.
+        unit, share = self.unit_of_period, shared * w
+        return _Fit(nan * slope, slope_std, self.centre_value + p / a, a ** -0.5,
+                    self.centre_time[unit] + (1 - share) * (b / a)[unit] + share * wt / w,
+                    self.centre_value[unit] + (1 - share) * (p / a)[unit] + share * wy / w,
+                    np.sqrt(shared + (1 - share) ** 2 / a[unit]),
+                    squares, float(log_likelihood), residual)
+
+
+def _shared_scatter(sums: _Sums) -> Scatter:
+    """Estimate the variances that all units share."""
+    recordings = sums.recordings
+    spread2 = float(np.mean(sums.value ** 2)) + float(np.min(recordings.std)) ** 2
+    several = len(sums.period_starts) > len(sums.counts)
+    if spread2 == 0 or not (sums.counts >= _MIN_RECORDINGS).any():
+        return Scatter(0.0, 0.0) if recordings.std.min() > 0 else Scatter(1.0, 0.0)
+    floor = np.log(_SMALLEST_SHARE * spread2)
+
+    def scatter(logs: np.ndarray) -> Scatter:
+        variances = np.exp(np.maximum(logs, floor))
+        return Scatter(float(variances[0] ** 0.5),
+                       float(variances[1] ** 0.5) if several else 0.0)
+
+    start = np.log(spread2) - np.array([1.0, 2.0])[:1 + several]
+    best = scipy.optimize.minimize(
+        lambda logs: -sums.fit(scatter(logs)).log_likelihood, start, method='Nelder-Mead',
+        options={'xatol': _FIT_TOLERANCE, 'fatol': _FIT_TOLERANCE})
+    return scatter(best.x)
+
+
+def _widening(sums: _Sums, fit: _Fit, scatter: Scatter) -> float:
+    """Estimate the factor of the variances of levels and slopes by correlation in time."""
+    unit, residual = sums.recordings.unit, fit.residual
+    used = sums.has_slope & (sums.counts > 2 * _MIN_RECORDINGS)
+    same = (unit[1:] == unit[:-1]) & used[unit[1:]]
+    if not same.any() or scatter.recording == 0:
+        return 1.0
+    variance = scatter.recording ** 2
+    share = float(np.mean((variance / (variance + sums.recordings.std ** 2))[used[unit]]))
+    products = float((residual[1:] * residual[:-1])[same].sum())
+    squares, count = float((residual ** 2)[used[unit]].sum()), int(sums.counts[used].sum())
+    lines, widening = 2 * int(used.sum()), 1.0
+    for _ in range(_ROUNDS):
+        # A line removes as much from squares and products of its residuals.
+        removed = lines * widening
+        neighbours = (products * max(count - removed, 1.0) / squares + removed) / same.sum()
+        correlation = float(np.clip(neighbours / share, 0.0, _LARGEST_CORRELATION))
+        widening = 1 + 2 * share * correlation / (1 - correlation)
+    return widening
+
+
+def claimed(p_values: np.ndarray) -> np.ndarray:
+    """
+    Mark the slopes that survive the control of the false discovery rate.
+
+    Parameters
+    ----------
+    p_values
+        Probabilities without a drift, of any shape; NaN counts as no slope.
+
+    Returns
+    -------
+    numpy.ndarray
+        Whether each slope is claimed, of the same shape.
+
+    """
+    tested = np.isfinite(p_values)
+    result = np.zeros(p_values.shape, bool)
+    if tested.any():
+        adjusted = scipy.stats.false_discovery_control(p_values[tested])
+        result[tested] = adjusted <= FALSE_DISCOVERY_RATE
+    return result
+
+
+def interval_factor(freedom: np.ndarray, is_claimed: np.ndarray) -> np.ndarray:
+    """
+    Return half the width of the intervals of slopes, in standard deviations.
+
+    Parameters
+    ----------
+    freedom
+        Degrees of freedom, of any shape; NaN without a slope.
+    is_claimed
+        Whether each slope is claimed. The intervals of claims hold for that share of the claims.
+
+    Returns
+    -------
+    numpy.ndarray
+        The factor, of the same shape.
+
+    """
+    share = is_claimed.sum() / max(np.isfinite(freedom).sum(), 1)
+    outside = (1 - _INTERVAL) * np.where(is_claimed, share, 1.0)
+    return -scipy.special.stdtrit(freedom, outside / 2)

@@ -1,0 +1,164 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What the recordings of a fleet say of each quantity: trends, population and outliers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from adxl_ros.fleet.report import outliers
+from adxl_ros.fleet.report.fleet_table import FleetTable, quantities, Quantity
+from adxl_ros.fleet.report.random_effects import MIN_UNITS, random_effects, RandomEffects
+from adxl_ros.fleet.report.trends import (
+    claimed,
+    fit_trends,
+    interval_factor,
+    Recordings,
+    Trends,
+)
+from adxl_ros.model.population import Population
+import numpy as np
+
+
+@dataclass(frozen=True)
+class QuantityResult:
+    """
+    A quantity over the k units that have it, in n recordings.
+
+    Attributes
+    ----------
+    quantity
+        The quantity.
+    rows
+        Rows of the recordings in the table, (n,).
+    recordings
+        Its values in the unit of its column.
+    distance
+        Distance of each recording from those of its unit, robust standard deviations, (n,).
+    is_outlier
+        Recordings that are too far from the others of their unit, (n,) bool. They do not count.
+    units
+        Numbers of the units, (k,).
+    trends
+        Levels and slopes of the units.
+    is_claimed
+        Slopes that survive the control of the false discovery rate over all units and
+        quantities, (k,) bool.
+    half_width
+        Half of the interval of each slope, (k,).
+    population
+        Mean and spread over the units; None where they are too few.
+
+    """
+
+    quantity: Quantity
+    rows: np.ndarray
+    recordings: Recordings
+    distance: np.ndarray
+    is_outlier: np.ndarray
+    units: np.ndarray
+    trends: Trends
+    is_claimed: np.ndarray
+    half_width: np.ndarray
+    population: RandomEffects | None
+
+    def place_of(self, unit: int) -> int | None:
+        """Return where a unit stands among those of the quantity; None if it is not there."""
+        place = int(np.searchsorted(self.units, unit))
+        return place if place < len(self.units) and self.units[place] == unit else None
+
+
+def analyse(table: FleetTable) -> list[QuantityResult]:
+    """Return the results of all quantities that the table has."""
+    measured = [(quantity, *table.recordings(quantity)) for quantity in quantities(table)]
+    measured = [item for item in measured if len(item[1])]
+    values = sum(len(rows) for _, rows, _ in measured)
+    # Each unit has each coefficient: the chance of a false outlier is shared by them all.
+    coefficients = sum(item[0].is_coefficient for item in measured) * len(table.serials)
+    results = []
+    for quantity, rows, recordings in measured:
+        distance, freedom = outliers.outlier_distances(recordings)
+        is_outlier = outliers.are_outliers(distance, freedom, values)
+        kept = recordings[~is_outlier]
+        trends, units = fit_trends(kept), np.unique(table.unit[rows[~is_outlier]])
+        population = random_effects(trends.level, trends.level_std, coefficients) \
+            if quantity.is_coefficient and len(units) >= MIN_UNITS else None
+        none = np.zeros(len(units), bool)
+        results.append(QuantityResult(quantity, rows, recordings, distance, is_outlier, units,
+                                      trends, none, np.zeros(len(units)), population))
+    return _with_claims(results)
+
+
+def _with_claims(results: Sequence[QuantityResult]) -> list[QuantityResult]:
+    """Control the false discovery rate over all slopes together."""
+    if not results:
+        return []
+    splits = np.cumsum([len(result.units) for result in results])[:-1]
+    is_claimed = claimed(np.concatenate([result.trends.p_values for result in results]))
+    factor = interval_factor(np.concatenate([r.trends.freedom for r in results]), is_claimed)
+    return [replace(result, is_claimed=claims, half_width=factors * result.trends.slope_std)
+            for result, claims, factors in zip(results, np.split(is_claimed, splits),
+                                               np.split(factor, splits))]
+
+
+def population_of(results: Sequence[QuantityResult], name: str) -> Population:
+    """
+    Return what the units of a fleet are like.
+
+    Parameters
+    ----------
+    results
+        The results of the quantities.
+    name
+        What messages call the population.
+
+    Returns
+    -------
+    Population
+        The coefficients that enough units have.
+
+    """
+    return Population(name, {
+        result.quantity.column: result.population.pooled for result in results
+        if result.population is not None and result.population.pooled.prediction_std > 0})
+
+
+def far_out(results: Sequence[QuantityResult], serials: Sequence[str]
+            ) -> list[dict[str, str | float]]:
+    """
+    Return the units that are not of the population, the farthest first.
+
+    Parameters
+    ----------
+    results
+        The results of the quantities.
+    serials
+        Serial numbers of the units, (m,).
+
+    Returns
+    -------
+    list
+        Serial number, coefficient, value in the unit of the column and distance in standard
+        deviations.
+
+    """
+    units: list[dict[str, str | float]] = [
+        {'serial': serials[result.units[i]], 'coefficient': result.quantity.column,
+         'value': float(result.population.estimates[i]),
+         'distance': float(result.population.distances()[i])}
+        for result in results if result.population is not None
+        for i in np.flatnonzero(result.population.is_far_out)]
+    return sorted(units, key=lambda unit: -abs(float(unit['distance'])))

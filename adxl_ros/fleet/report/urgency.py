@@ -1,0 +1,293 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The order of units by urgency.
+
+The rule is that of the table in docs/fleet.md. A unit has the first state that fits:
+
+1. Out of tolerance: its gap exceeds the tolerance now, or without a gap its drift since the
+   calibration. The largest comes first.
+2. Drifts: a claimed slope takes it out of the tolerance. The nearest date comes first.
+3. Not judged: its last recordings are refused. The longest series comes first.
+4. Far out: a coefficient is not that of the population. The farthest comes first.
+5. Old calibration: its calibration is older than a year, or it has none.
+6. In order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+
+from adxl_ros.fleet.report.fleet_table import FleetTable, MG
+from adxl_ros.fleet.report.unit_results import QuantityResult
+import numpy as np
+
+TOLERANCE_MG = 3.5
+"""Largest gap of a unit that is in order, mg. Chosen: an error of 0.2° in tilt."""
+RECENT = 5
+"""Number of recordings whose median is the gap of a unit now. Chosen: one odd one is no gap."""
+MAX_AGE_DAYS = 365.0
+"""Largest age of a calibration, days. Chosen: a year."""
+_DAYS_PER_YEAR = 365.25
+_FARTHEST_DAYS = 10 * _DAYS_PER_YEAR
+"""A drift that needs longer is no matter of urgency. Chosen: the life of a robot."""
+
+
+class State(IntEnum):
+    """State of a unit; the most urgent is the least."""
+
+    OUT_OF_TOLERANCE = 1
+    DRIFTS = 2
+    NOT_JUDGED = 3
+    FAR_OUT = 4
+    OLD_CALIBRATION = 5
+    IN_ORDER = 6
+
+    @property
+    def words(self) -> str:
+        """Return the state for people."""
+        return self.name.replace('_', ' ').lower()
+
+
+@dataclass(frozen=True)
+class Drift:
+    """
+    A claimed slope of a unit.
+
+    Attributes
+    ----------
+    result
+        Its quantity.
+    place
+        Where the unit stands among those of the quantity.
+    days
+        Days until the unit is out of its tolerance; infinite for a quantity without one.
+    reached_mg
+        Gap now, or the drift since the calibration where there is no gap; NaN for a quantity
+        without a tolerance.
+
+    """
+
+    result: QuantityResult
+    place: int
+    days: float
+    reached_mg: float
+
+    @property
+    def text(self) -> str:
+        """Return the slope with its interval, for people."""
+        factor, unit = self.result.quantity.factor, self.result.quantity.shown_unit
+        slope, half = (factor * float(values[self.place]) for values in (
+            self.result.trends.slope, self.result.half_width))
+        return (f'{self.result.quantity.label} {number(slope, True)} '
+                f'({number(slope - half, True)} to {number(slope + half, True)}) {unit} per year')
+
+
+@dataclass(frozen=True)
+class UnitState:
+    """
+    One unit.
+
+    Attributes
+    ----------
+    unit
+        Its number.
+    serial
+        Its serial number.
+    state
+        Its state.
+    reason
+        Why it has this state, in one sentence.
+    gap_mg, floor_mg
+        Median of its last gaps and of their noise floors; NaN without any.
+    drifts
+        Its claimed slopes, the most urgent first.
+    recordings, refused
+        Number of its recordings, and of those that are refused or crashed.
+    calibration_age_days
+        Age of its calibration at the last recording; NaN without one.
+    last_year
+        Date of its last recording, years since 1970; NaN without a date.
+    report
+        Folder of the single reports of its last recording; empty for none.
+
+    """
+
+    unit: int
+    serial: str
+    state: State
+    reason: str
+    gap_mg: float
+    floor_mg: float
+    drifts: tuple[Drift, ...]
+    recordings: int
+    refused: int
+    calibration_age_days: float
+    last_year: float
+    report: str
+
+    @property
+    def is_drifting(self) -> bool:
+        """Return whether a claimed slope takes the unit out of its tolerance soon enough."""
+        return bool(self.drifts) and self.drifts[0].days < _FARTHEST_DAYS
+
+
+def number(value: float, signed: bool = False, digits: int = 3) -> str:
+    """
+    Return a number with a few digits and no exponent.
+
+    Parameters
+    ----------
+    value
+        The number.
+    signed
+        Whether a positive one has a sign.
+    digits
+        Significant digits.
+
+    Returns
+    -------
+    str
+        The number; '-' for NaN.
+
+    """
+    if not np.isfinite(value):
+        return '-'
+    rounded = float(f'{value:.{digits}g}')
+    text = f'{abs(rounded):.0f}' if abs(rounded) >= 100 else \
+        np.format_float_positional(abs(rounded), trim='-')
+    sign = '\N{MINUS SIGN}' if rounded < 0 else '+' if signed and rounded > 0 else ''
+    return sign + text
+
+
+def rank(table: FleetTable, results: Sequence[QuantityResult],
+         far_out: Sequence[dict[str, str | float]], tolerance_mg: float = TOLERANCE_MG
+         ) -> list[UnitState]:
+    """
+    Return all units, the most urgent first.
+
+    Parameters
+    ----------
+    table
+        The recordings.
+    results
+        Results of the quantities.
+    far_out
+        Units that are not of the population, the farthest first.
+    tolerance_mg
+        Largest gap of a unit that is in order, mg.
+
+    Returns
+    -------
+    list
+        The states of the units.
+
+    """
+    labels = {result.quantity.column: result.quantity.label for result in results}
+    distant: dict[str, tuple[float, str]] = {}
+    for item in far_out:
+        distance = abs(float(item['distance']))
+        distant.setdefault(str(item['serial']), (
+            distance, f'{labels[str(item["coefficient"])]} is {distance:.1f} standard deviations '
+            'from the mean of the fleet.'))
+    ranked = [_state_of(unit, table, results, distant.get(serial), tolerance_mg)
+              for unit, serial in enumerate(table.serials)]
+    return [state for _, state in sorted(ranked, key=lambda item: (
+        item[1].state, item[0], item[1].serial))]
+
+
+def _state_of(unit: int, table: FleetTable, results: Sequence[QuantityResult],
+              distant: tuple[float, str] | None, tolerance_mg: float
+              ) -> tuple[float, UnitState]:
+    """Return a unit and its rank among those of its state, the most urgent least."""
+    rows = table.rows_of(unit)
+    gap_mg, floor_mg, over_mg = _gap_now(table, rows)
+    age_days = _age_now(table, rows)
+    drifts = _drifts(unit, results, tolerance_mg, over_mg, age_days)
+    refused = table['outcome'][rows] != 'done'
+    series = len(refused) if refused.all() else int(np.argmin(refused[::-1]))
+    state, urgency, reason = State.IN_ORDER, 0.0, ''
+    if over_mg > tolerance_mg:
+        state, urgency = State.OUT_OF_TOLERANCE, -over_mg
+        reason = f'Gap {number(gap_mg)} mg, noise {number(floor_mg)} mg; the tolerance is ' \
+            f'{number(tolerance_mg)} mg.' + (f' It drifts: {drifts[0].text}.' if drifts else '')
+    elif drifts and drifts[0].days == 0:
+        state, urgency = State.OUT_OF_TOLERANCE, -drifts[0].reached_mg
+        reason = f'{_capital(drifts[0].text)}, or {number(drifts[0].reached_mg, digits=2)} mg ' \
+            f'since its calibration; the tolerance is {number(tolerance_mg)} mg.'
+    elif drifts and drifts[0].days < _FARTHEST_DAYS:
+        state, urgency = State.DRIFTS, drifts[0].days
+        reason = f'{_capital(drifts[0].text)}: out of tolerance in ' \
+            f'{number(drifts[0].days, digits=2)} days.'
+    elif series:
+        state, urgency = State.NOT_JUDGED, -series
+        last = table['refusal'][rows[-1]] or table['outcome'][rows[-1]]
+        reason = f'The last {series} recordings are refused: {last}' if series > 1 else \
+            f'The last recording is refused: {last}'
+    elif distant is not None:
+        state, urgency, reason = State.FAR_OUT, -distant[0], _capital(distant[1])
+    elif not age_days <= MAX_AGE_DAYS:
+        state, urgency = State.OLD_CALIBRATION, -age_days if age_days > 0 else -np.inf
+        reason = f'Its calibration is {age_days:.0f} days old.' if age_days > 0 else \
+            'It has no calibration with a date.'
+    return urgency, UnitState(
+        unit, table.serials[unit], state, reason, gap_mg, floor_mg, drifts, len(rows),
+        int(refused.sum()), age_days, float(table.years[rows[-1]]),
+        next((str(text) for text in table['report'][rows[::-1]] if text), ''))
+
+
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:]
+
+
+def _gap_now(table: FleetTable, rows: np.ndarray) -> tuple[float, float, float]:
+    """Return the last gap, its noise floor and the gap beyond the floor, mg; NaN without any."""
+    rows = rows[table.period[rows] == table.period[rows[-1]]]
+    rows = rows[np.isfinite(table['gap_before_mps2'][rows])][-RECENT:]
+    if not len(rows):
+        return np.nan, np.nan, np.nan
+    gap = float(np.median(table['gap_before_mps2'][rows])) * MG
+    floors = table['gap_floor_mps2'][rows]
+    floor = float(np.median(floors[np.isfinite(floors)])) * MG if np.isfinite(floors).any() \
+        else 0.0
+    return gap, floor, float(np.sqrt(max(gap ** 2 - floor ** 2, 0.0)))
+
+
+def _age_now(table: FleetTable, rows: np.ndarray) -> float:
+    """Return the age of the calibration at the last recording that has one, days."""
+    ages = table['calibration_age_days'][rows]
+    dated = np.flatnonzero(np.isfinite(ages))
+    return float(ages[dated[-1]]) if len(dated) else np.nan
+
+
+def _drifts(unit: int, results: Sequence[QuantityResult], tolerance_mg: float, over_mg: float,
+            age_days: float) -> tuple[Drift, ...]:
+    """Return the claimed slopes of a unit, the most urgent first."""
+    drifts = []
+    for result in results:
+        place = result.place_of(unit)
+        if place is None or not result.is_claimed[place]:
+            continue
+        days, reached_mg, quantity = np.inf, np.nan, result.quantity
+        slope_mg = float(result.trends.slope[place]) * quantity.factor
+        if quantity.is_force and (quantity.is_coefficient or slope_mg > 0):
+            # A coefficient is right at its calibration, and the gap shows what it is now.
+            since_mg = abs(slope_mg) * np.nan_to_num(age_days) / _DAYS_PER_YEAR
+            reached_mg = over_mg if np.isfinite(over_mg) else since_mg
+            days = max(tolerance_mg - reached_mg, 0.0) / abs(slope_mg) * _DAYS_PER_YEAR
+        drifts.append(Drift(result, place, days, reached_mg))
+    return tuple(sorted(drifts, key=lambda drift: drift.days))

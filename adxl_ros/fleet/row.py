@@ -1,0 +1,222 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The columns of a fleet's table: name, kind, unit and meaning, and the file that holds them.
+
+A row is a dict with a value for each column; None stands for what is not known. Columns with
+`_x_`, `_y_` or `_z_` in their name are of one axis of the sensor.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from datetime import datetime
+from functools import lru_cache
+from itertools import chain
+import math
+import re
+from typing import Any
+
+from adxl_ros.model.constants import AXES
+
+Row = dict[str, Any]
+"""The values of one recording by column."""
+
+TABLE = 'fleet.parquet'
+"""Name of the table."""
+PAGE = 'fleet.html'
+"""Name of the page beside the table."""
+POPULATION = 'population.yaml'
+"""Name of the file of the population beside the table."""
+UNITS = 'units.csv'
+"""Name of the file with the estimates of each unit, beside the table."""
+
+OUTCOMES = ('done', 'refused', 'crashed')
+"""Values of `outcome`: the tasks gave results; the recording was refused, and `refusal` has the
+reason; the worker ended or failed at each attempt."""
+
+COEFFICIENT_FIELDS = {'name': 'text', 'unit': 'text', 'value': 'float', 'std': 'float',
+                      'source': 'text'}
+"""Types of the fields of one coefficient, by their names. `name` is `effect.parameter.axis` or
+`effect.parameter`; `source` is the task, `fit` or `diagnose`; `std` is a standard deviation."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """
+    One column of the table.
+
+    Attributes
+    ----------
+    name
+        Its name, which ends in the unit where there is one.
+    kind
+        `text`, `float`, `integer`, `flag`, `time` (UTC), `texts`, `groups` (lists of texts) or
+        `coefficients` (see `COEFFICIENT_FIELDS`).
+    meaning
+        What it holds, for people.
+    unit
+        Its unit; empty for none.
+    is_timing
+        Whether it depends on where and when the task ran, and not on the recording.
+
+    """
+
+    name: str
+    kind: str
+    meaning: str
+    unit: str = ''
+    is_timing: bool = False
+
+
+def _by_axis(name: str, unit_name: str, meaning: str, unit: str) -> list[Column]:
+    """Return a column of numbers for each axis: `name` + axis + `unit_name`."""
+    return [Column(f'{name}_{axis}_{unit_name}', 'float', f'{meaning}, axis {axis}', unit)
+            for axis in AXES]
+
+
+def _noise_term(letter: str, meaning: str, unit_name: str, unit: str) -> list[Column]:
+    """Return the columns of a noise term: estimate and 90 % interval by axis."""
+    return list(chain(
+        _by_axis(f'noise_{letter}', unit_name, meaning, unit),
+        _by_axis(f'noise_{letter}_low', unit_name, f'{meaning}: lower end of the 90 % interval',
+                 unit),
+        _by_axis(f'noise_{letter}_high', unit_name, f'{meaning}: upper end of the 90 % interval',
+                 unit)))
+
+
+COLUMNS: tuple[Column, ...] = (
+    Column('url', 'text', 'the recording, as it was found'),
+    Column('hash', 'text', 'SHA-256 of its content; as sha256sum for a single file'),
+    Column('key', 'text', 'SHA-256 of content, parameters, options and code version'),
+    Column('size_bytes', 'integer', 'size of the recording', 'byte'),
+    Column('serial', 'text', 'serial number of the unit'),
+    Column('date', 'time', 'begin of the recording'),
+    Column('date_source', 'text', 'where the date is from: manifest, stamps, header or file'),
+    Column('tasks', 'texts', 'the tasks that were asked for: check, noise, fit, diagnose'),
+    Column('outcome', 'text', f'one of {", ".join(OUTCOMES)}'),
+    Column('refusal', 'text', 'why there is no result, in one line'),
+    Column('refused_by', 'text', 'the task that refused; stage or read before the first one'),
+    Column('skipped', 'texts', 'tasks that do not fit the recording, with the reason'),
+    Column('axes', 'text', 'measured axes: x, xy or xyz'),
+    Column('duration_s', 'float', 'time from the first to the last sample', 's'),
+    Column('samples', 'integer', 'samples in the recording'),
+    Column('rate_hz', 'float', 'usual sample rate', 'Hz'),
+    Column('jitter_s', 'float', 'rms deviation of the steps of the stamps, without gaps', 's'),
+    Column('missing', 'integer', 'missing samples'),
+    Column('longest_gap_s', 'float', 'longest gap; 0 for none', 's'),
+    Column('temperature_c', 'float', 'mean temperature', '°C'),
+    Column('temperature_low_c', 'float', 'lowest temperature', '°C'),
+    Column('temperature_high_c', 'float', 'highest temperature', '°C'),
+    Column('is_sound', 'flag', 'whether check finds no fault'),
+    Column('faults', 'texts', 'what check finds wrong, one line each'),
+    Column('calibration_id', 'text', 'calibration that was valid at the date'),
+    Column('calibration_age_days', 'float', 'its age at the date', 'day'),
+    Column('validity', 'text', 'valid, or why the calibration is not known to be valid'),
+    *_noise_term('n', 'white noise N', 'mps2_per_rthz', 'm/s²/√Hz'),
+    *_noise_term('b', 'bias instability B', 'mps2', 'm/s²'),
+    *_noise_term('k', 'random walk K', 'mps2_per_rts', 'm/s²/√s'),
+    *_by_axis('zero_g', 'v', 'fitted zero-g', 'V'),
+    *_by_axis('zero_g_std', 'v', 'standard deviation of the zero-g', 'V'),
+    *_by_axis('scale', 'v_per_g', 'fitted scale factor', 'V/g'),
+    *_by_axis('scale_std', 'v_per_g', 'standard deviation of the scale factor', 'V/g'),
+    Column('fit_model', 'text', 'model that was fitted'),
+    Column('fit_poses', 'integer', 'poses that were fitted'),
+    Column('gap_before_mps2', 'float', 'rms of recording minus simulation', 'm/s²'),
+    Column('gap_before_low_mps2', 'float', 'lower end of its 90 % interval', 'm/s²'),
+    Column('gap_before_high_mps2', 'float', 'upper end of its 90 % interval', 'm/s²'),
+    Column('gap_after_mps2', 'float', 'rms with the named effects, on held-out blocks', 'm/s²'),
+    Column('gap_after_low_mps2', 'float', 'lower end of its 90 % interval', 'm/s²'),
+    Column('gap_after_high_mps2', 'float', 'upper end of its 90 % interval', 'm/s²'),
+    Column('gap_floor_mps2', 'float', 'noise floor', 'm/s²'),
+    Column('gap_floor_low_mps2', 'float', 'lower end of its 90 % interval; none if assumed',
+           'm/s²'),
+    Column('gap_floor_high_mps2', 'float', 'upper end of its 90 % interval; none if assumed',
+           'm/s²'),
+    Column('gap_floor_source', 'text', 'where the floor is from: still, repeats or assumed'),
+    Column('gap_closed', 'float', 'closed share of the squared gap above the floor'),
+    Column('gap_closed_low', 'float', 'lower end of its 90 % interval'),
+    Column('gap_closed_high', 'float', 'upper end of its 90 % interval'),
+    Column('status', 'text', 'no_gap, explained, inseparable, unknown, insufficient or bad_data'),
+    Column('effects', 'texts', 'effects that are named for certain'),
+    Column('groups', 'groups', 'sets of inseparable effects, one of each acts'),
+    Column('probability', 'float', 'probability of the verdict'),
+    Column('data_fault', 'text', 'name of the fault of the data, with the status bad_data'),
+    Column('coefficients', 'coefficients',
+           'estimates of fit and diagnose with standard deviations, baseline included'),
+    Column('report', 'text', "folder of the recording's single reports, relative to the table"),
+    Column('version', 'text', 'version of the package'),
+    Column('code', 'text', 'SHA-256 of the code that made the row'),
+    Column('seconds', 'float', 'run time of the tasks', 's', is_timing=True),
+    Column('memory_mb', 'float', 'largest memory of the worker meanwhile', 'MB', is_timing=True),
+    Column('worker', 'text', 'host and process of the worker', is_timing=True),
+    Column('attempts', 'integer', 'attempts until the row was made', is_timing=True),
+    Column('written', 'time', 'when the row was made', is_timing=True),
+)
+"""All columns, in the order of the table."""
+
+TIMING = tuple(column.name for column in COLUMNS if column.is_timing)
+"""Columns that differ from run to run."""
+
+
+_TIMES = tuple(column.name for column in COLUMNS if column.kind == 'time')
+"""Columns of times."""
+
+
+def empty_row() -> Row:
+    """Return a row without any value."""
+    return {column.name: [] if column.kind in ('texts', 'groups', 'coefficients') else None
+            for column in COLUMNS}
+
+
+def finite(value: Any) -> float | None:
+    """Return a number as a float; None for NaN, infinity and None."""
+    return float(value) if value is not None and math.isfinite(value) else None
+
+
+def reason_kind(row: Row) -> str:
+    """Return a refusal without the name of its recording and without numbers."""
+    text = row['refusal'] or row['outcome']
+    for part in (row['url'], row['url'].rpartition('/')[2]):
+        text = text.replace(part, 'FILE') if part else text
+    return re.sub(r'[-+]?\d[\d.,]*', '#', text)
+
+
+@lru_cache(maxsize=1)
+def arrow_schema() -> Any:
+    """Return the columns as a schema of pyarrow, with unit and meaning as metadata."""
+    import pyarrow as pa
+    coefficient = pa.struct([(name, pa.float64() if kind == 'float' else pa.string())
+                             for name, kind in COEFFICIENT_FIELDS.items()])
+    types = {'text': pa.string(), 'float': pa.float64(), 'integer': pa.int64(),
+             'flag': pa.bool_(), 'time': pa.timestamp('us', 'UTC'),
+             'texts': pa.list_(pa.string()), 'groups': pa.list_(pa.list_(pa.string())),
+             'coefficients': pa.list_(coefficient)}
+    return pa.schema([
+        pa.field(column.name, types[column.kind],
+                 metadata={'unit': column.unit, 'meaning': column.meaning})
+        for column in COLUMNS])
+
+
+def as_table(rows: Iterable[Row]) -> Any:
+    """Return rows, whose times are texts of ISO 8601 with an offset, as a table of pyarrow."""
+    import pyarrow as pa
+    return pa.Table.from_pylist([_with_times(row) for row in rows], arrow_schema())
+
+
+def _with_times(row: Row) -> Row:
+    """Return a row with `datetime` in place of texts."""
+    return {**row, **{name: datetime.fromisoformat(row[name]) for name in _TIMES if row[name]}}

@@ -1,0 +1,285 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""A fleet from end to end: which recordings are to be worked on, the work, and what it costs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass
+import os
+import random
+from typing import NamedTuple
+
+from adxl_ros.errors import one_line, UserError
+from adxl_ros.fleet.inputs import as_date, Source, stated_by
+from adxl_ros.fleet.recipe import Recipe
+from adxl_ros.fleet.results import Entry, Results
+from adxl_ros.fleet.row import Row
+from adxl_ros.fleet.staging import StagingError
+from adxl_ros.fleet.task import make_row, refused, Result, TaskCrashed
+from adxl_ros.jobs.run import Finished, finished_tasks
+
+_SECONDS = {'check': (0.02, 30.0), 'noise': (0.05, 60.0), 'fit': (1.0, 100.0),
+            'diagnose': (10.0, 500.0)}
+"""Usual run time of each task: of any recording, s, and for each GB, s. Measured on one core with
+CSV files of 416 s at 250 Hz; replaced by the run times of earlier rows where there are some."""
+_IDENTITY = ('url', 'serial', 'date', 'date_source', 'calibration_id', 'calibration_age_days',
+             'seconds', 'memory_mb', 'worker')
+"""Columns of a recording whose content is that of another one."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """
+    What a run has to do.
+
+    Attributes
+    ----------
+    todo
+        Recordings to work on.
+    done
+        Number of recordings that have their row.
+    outside
+        Number of recordings that --since, --limit or --only-failed leave out.
+    serials
+        Serial numbers of the recordings to work on as far as they are known before; else empty.
+    size_bytes
+        Size of the recordings to work on.
+    core_hours
+        Expected run time on one core, h.
+
+    """
+
+    todo: tuple[Source, ...]
+    done: int
+    outside: int
+    serials: tuple[str, ...]
+    size_bytes: int
+    core_hours: float
+
+
+class Selection(NamedTuple):
+    """
+    Which recordings a run works on.
+
+    Attributes
+    ----------
+    only_failed
+        Whether only those whose row is a refusal or a crash.
+    since
+        Begin of the period, ISO 8601, UTC; empty for all.
+    limit
+        Largest number; None for all.
+
+    """
+
+    only_failed: bool = False
+    since: str = ''
+    limit: int | None = None
+
+
+def plan(sources: Sequence[Source], recipe: Recipe, results: Results,
+         selection: Selection) -> Plan:
+    """
+    Decide which recordings are to be worked on.
+
+    Parameters
+    ----------
+    sources
+        All recordings.
+    recipe
+        What all tasks share.
+    results
+        The rows of earlier runs.
+    selection
+        Which of them.
+
+    Returns
+    -------
+    Plan
+        The recordings, by URL, and what they cost.
+
+    """
+    todo, done = [], 0
+    chosen = _since(sources, selection.since, results) if selection.since else sources
+    outside = len(sources) - len(chosen)
+    for source in chosen:
+        entry = results.newest.get(source.url)
+        if selection.only_failed:
+            if entry is not None and entry.outcome != 'done':
+                todo.append(source)
+            else:
+                outside += 1
+        elif entry is not None and is_done(source, entry, recipe):
+            done += 1
+        else:
+            todo.append(source)
+    if selection.limit is not None:
+        outside += max(len(todo) - selection.limit, 0)
+        todo = todo[:selection.limit]
+    serials = [source.serial or _serial(source, results) for source in todo]
+    size_bytes = sum(source.size_bytes or 0 for source in todo)
+    return Plan(tuple(todo), done, outside, tuple(serials), size_bytes,
+                _expected_s(len(todo), size_bytes, recipe, results) / 3600)
+
+
+def _since(sources: Sequence[Source], since: str, results: Results) -> list[Source]:
+    """Return the recordings that began at a date or later, and those without a date."""
+    dates = {url: entry.date for url, entry in results.newest.items()}
+    # The server of an object states truly when it was written, which is after it began.
+    unread = [source for source in sources if not (source.date or dates.get(source.url))
+              and ('://' not in source.url or (source.modified or since) >= since)]
+    dates |= {source.url: stated.date for source, stated in zip(unread, stated_by(unread))}
+    return [source for source in sources
+            if (source.date or dates.get(source.url) or source.modified or since) >= since]
+
+
+def _serial(source: Source, results: Results) -> str:
+    """Return the serial number that an earlier row of a recording has; empty for none."""
+    entry = results.newest.get(source.url)
+    return entry.serial if entry else ''
+
+
+def is_done(source: Source, entry: Entry, recipe: Recipe) -> bool:
+    """
+    Return whether a row is that of a recording as it is now, by the present recipe.
+
+    Parameters
+    ----------
+    source
+        The recording as it is now.
+    entry
+        Its newest row.
+    recipe
+        What all tasks share.
+
+    Returns
+    -------
+    bool
+        Whether nothing is to be done. A recording whose server states no change is read again.
+
+    """
+    if source.stamp != entry.stamp or not (source.stamp or source.fault):
+        return False
+    if source.date != (entry.date if entry.date_source == 'manifest' else ''):
+        return False
+    parameters = recipe.parameters_of(source.serial or entry.serial, source.date or entry.date,
+                                      source.params)
+    return recipe.digest(parameters, source.serial) == entry.digest
+
+
+def _expected_s(count: int, size_bytes: int, recipe: Recipe, results: Results) -> float:
+    """Return the expected run time on one core, s: by earlier rows, else by usual times."""
+    earlier = [entry for entry in results.newest.values()
+               if entry.tasks == recipe.tasks and entry.outcome == 'done' and entry.size_bytes]
+    read = sum(entry.size_bytes for entry in earlier)
+    if read:
+        return size_bytes * sum(entry.seconds for entry in earlier) / read
+    return sum(_SECONDS[name][0] * count + _SECONDS[name][1] * size_bytes / 1e9
+               for name in recipe.tasks)
+
+
+def work(pool: Executor, sources: Sequence[Source], recipe: Recipe, results: Results,
+         retries: int, show: Callable[[float], None]) -> Iterator[Row]:
+    """
+    Work on recordings, and write each row as soon as it is there.
+
+    Parameters
+    ----------
+    pool
+        Where the tasks run. Their first arguments are the recipe and `Results.keys_of`.
+    sources
+        The recordings.
+    recipe
+        What all tasks share.
+    results
+        Gets the rows.
+    retries
+        Further attempts of a task that crashes.
+    show
+        Receives the fraction that is finished.
+
+    Yields
+    ------
+    Row
+        Each row that was written.
+
+    Raises
+    ------
+    UserError
+        The folder cannot be written, or a worker has another version of the package.
+
+    """
+    # Two clients on one folder begin at different recordings.
+    order = random.Random(os.getpid()).sample(sources, len(sources))
+    count = 0
+    tasks = finished_tasks(pool, make_row, _arguments(order, recipe, results), retries)
+    try:
+        for end in tasks:
+            row = _written(end, recipe, results)
+            count += 1
+            show(count / len(order))
+            if row is not None:
+                yield row
+    finally:
+        tasks.close()
+
+
+def _arguments(sources: Iterable[Source], recipe: Recipe, results: Results) -> Iterator[tuple]:
+    """Yield the arguments of the tasks, without recordings that another client has done."""
+    before = dict(results.newest)
+    for source in sources:
+        results.look()
+        entry = results.newest.get(source.url)
+        if entry is not None and entry is not before.get(source.url) \
+                and is_done(source, entry, recipe):
+            continue
+        yield source, entry is not None and entry.outcome != 'done'
+
+
+def _written(end: Finished, recipe: Recipe, results: Results) -> Row | None:
+    """Write the row of a task that ended; None where its content has a row no longer."""
+    source: Source = end.arguments[0]
+    error = end.error
+    if isinstance(error, UserError):
+        raise error
+    if isinstance(error, TaskCrashed):
+        result = error.result
+    elif isinstance(error, StagingError):
+        result = refused(recipe, source, one_line(error).removeprefix(f'{source.url}: '))
+    elif error is not None:
+        reason = f'{type(error).__name__}: {one_line(error)}'
+        result = refused(recipe, source, f'{reason} ({end.attempts} attempts)', 'crashed')
+    else:
+        result = _with_known(end.value, results)
+    return results.put(result, end.attempts)
+
+
+def _with_known(result: Result, results: Results) -> Result:
+    """Return a result; one whose content has a row already gets the values of that row."""
+    if not result.is_known:
+        return result
+    row = results.row_with_key(result.row['key'])
+    assert row is not None, 'rows are never removed'
+    return result._replace(row={**row, **{name: result.row[name] for name in _IDENTITY}})
+
+
+def since_text(text: str) -> str:
+    """Return the date of --since, ISO 8601 in UTC; raise `UserError` for another text."""
+    date = as_date(text)
+    if date is None:
+        raise UserError(f'--since {text}: expected a date, for example 2026-11-01')
+    return date

@@ -1,0 +1,188 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The page of a made-up fleet in a real browser: what it names, its layout, and its size."""
+
+import csv
+
+from adxl_ros.errors import UserError
+from adxl_ros.files import population_file
+from adxl_ros.fleet.report import report_html
+from made_up_fleet import MadeUpFleet
+from pages import layout_faults, NEEDS_CHROMIUM, wait_until_drawn, WIDTHS
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+pytestmark = pytest.mark.long
+
+FLEETS = {
+    'bad': MadeUpFleet(units=60, per_unit=12, batch=12, drifting_mg=2.5, refused=0.05,
+                       stage_fault=True),
+    'sound': MadeUpFleet(units=8, per_unit=6),
+    'drift': MadeUpFleet(units=8, per_unit=12, drifting_mg=2.5),
+    'single': MadeUpFleet(units=1, per_unit=1),
+    'refused': MadeUpFleet(units=3, per_unit=2, refused=1.0),
+}
+
+
+@pytest.fixture(scope='module')
+def folders(tmp_path_factory):
+    """Return the folders of fleets with their pages, by name."""
+    made = {}
+    for name, fleet in FLEETS.items():
+        made[name] = tmp_path_factory.mktemp(name)
+        # A fleet without faults has a claim or an outlier in 15 % of draws; this one has none.
+        fleet.write(made[name], seed=1)
+        report_html.write(made[name])
+    return made
+
+
+@pytest.fixture
+def page(opened, folders):
+    """Return the page of the bad fleet, drawn."""
+    drawn, _ = opened(folders['bad'] / 'fleet.html', 1280)
+    wait_until_drawn(drawn)
+    return drawn
+
+
+@NEEDS_CHROMIUM
+def test_the_page_names_what_is_wrong(page):
+    """Counts come first, then the drifting unit; batch and stage are sentences."""
+    assert page.locator('.tile').first.inner_text().split()[1] == '720'
+    first = page.locator('#urgent tbody tr').first.inner_text()
+    assert 'A-0003' in first and 'drifts' in first and 'out of tolerance in' in first
+    text = page.locator('body').inner_text()
+    assert '12 of 12 units with a serial number B… have temperature_bias, and 0 of the 48 ' \
+        'others: a bad batch.' in text
+    assert 'recorded in /data/stage2 have stage_eccentricity' in text
+    assert page.locator('.multiples figure').first.locator('h3').inner_text().startswith('A-0003')
+    trace = page.locator('[data-figure=trend-0]').evaluate('plot => plot.data.map(t => t.name)')
+    assert 'recording' in trace and 'line' in trace
+    assert page.locator('[data-figure=trend-0]').evaluate(
+        'plot => (plot.layout.shapes || []).length') == 1
+    # The unit was calibrated once meanwhile, where its line may have a step.
+    assert trace.count('line') == 2
+
+
+@NEEDS_CHROMIUM
+def test_search(page):
+    """The table of all units shows those whose text has all words."""
+    page.get_by_role('tab', name='all units').click()
+    rows = page.locator('#all-units tbody tr')
+    assert rows.filter(visible=True).count() == 60
+    page.locator('input.search').fill('b-005')
+    assert rows.filter(visible=True).count() == 10
+    assert page.locator('#matches').inner_text() == '10 units'
+    page.locator('input.search').fill('A-0003 drifts')
+    assert rows.filter(visible=True).count() == 1
+
+
+@NEEDS_CHROMIUM
+def test_reasons_are_counted_without_names_and_numbers(page):
+    page.get_by_role('tab', name='refusals').click()
+    cells = page.locator('.panel[data-tab=refusals] tbody td').all_inner_texts()
+    assert len(cells) == 5 and cells[2] == 'FILE: line #: no time stamp'
+
+
+@NEEDS_CHROMIUM
+@pytest.mark.parametrize('name, width', [
+    *(('bad', width) for width in WIDTHS), ('sound', 1280), ('single', 480), ('refused', 480)])
+def test_layout(opened, folders, name, width):
+    path = folders[name] / 'fleet.html'
+    page, messages = opened(path, width)
+    assert layout_faults(page) == []
+    assert messages == []
+
+
+@NEEDS_CHROMIUM
+def test_print(page, tmp_path):
+    """The paper holds all tabs, and nothing is wider than it."""
+    page.emulate_media(media='print')
+    page.set_viewport_size({'width': 703, 'height': 1000})
+    assert page.locator('.panel').filter(visible=True).count() == 6
+    assert page.evaluate('document.documentElement.scrollWidth') <= 703
+    page.pdf(path=tmp_path / 'page.pdf', format='A4')
+    assert (tmp_path / 'page.pdf').stat().st_size > 50_000
+
+
+def test_a_sound_fleet_is_in_order(folders):
+    text = (folders['sound'] / 'fleet.html').read_text()
+    assert 'OF 8 OLD CALIBRATION' in text and 'bad batch.' not in text
+    assert text.count('in order</span>') > 2 * 2
+
+
+def test_a_single_unit_that_drifts_is_singular(folders):
+    text = (folders['drift'] / 'fleet.html').read_text()
+    assert '1 OF 8 DRIFTS' in text and 'but one is on its way.' in text
+
+
+def test_a_drift_without_gaps_leaves_the_tolerance(tmp_path):
+    """A fleet that is only fitted has no gap; its drift since the calibration counts."""
+    path = MadeUpFleet(units=8, per_unit=12, drifting_mg=25.0).write(tmp_path)
+    table = pq.read_table(path)
+    pq.write_table(pa.Table.from_pylist(
+        [row | {'gap_before_mps2': None} for row in table.to_pylist()], table.schema), path)
+    report_html.write(tmp_path)
+    text = (tmp_path / 'fleet.html').read_text()
+    assert '1 OF 8 OUT OF TOLERANCE' in text
+    assert 'mg since its calibration; the tolerance is 3.5 mg.' in text
+    assert 'in 0 days' not in text
+
+
+def test_recordings_without_a_serial_number_are_listed(tmp_path):
+    path = MadeUpFleet(units=1, per_unit=6, refused=0.5).write(tmp_path)
+    table = pq.read_table(path)
+    pq.write_table(pa.Table.from_pylist(
+        [row | {'serial': None} for row in table.to_pylist()], table.schema), path)
+    report_html.write(tmp_path)
+    text = (tmp_path / 'fleet.html').read_text()
+    assert 'NO UNITS' in text and 'Units by urgency' not in text
+    listed = text[text.index('Recordings without a unit'):text.index('role="tablist"')]
+    assert listed.count('data-label="recording"') == 6
+    assert 'data-label="verdict">no gap' in listed and 'data-label="verdict">refused' in listed
+
+
+def test_files_beside_the_page(folders):
+    """The population can be read, and units.csv has each unit's shrunken estimate."""
+    population = population_file.read(folders['bad'] / 'population.yaml')
+    pooled = population.coefficients['zero_g_y_v']
+    assert pooled.units == 60
+    assert abs(pooled.mean - 2.5) < 4 * pooled.mean_std
+    assert pooled.spread_low < 0.02 < pooled.spread_high
+    with open(folders['bad'] / 'units.csv', encoding='utf-8') as file:
+        rows = [row for row in csv.DictReader(file) if row['coefficient'] == 'zero_g_y_v']
+    assert len(rows) == 60
+    assert all(min(float(row['estimate']), pooled.mean) - 1e-9 <= float(row['shrunken'])
+               <= max(float(row['estimate']), pooled.mean) + 1e-9 for row in rows)
+    assert population_file.read(folders['single'] / 'population.yaml').coefficients == {}
+
+
+@NEEDS_CHROMIUM
+def test_a_year_of_200_units(opened, tmp_path):
+    """A page of 73 000 recordings is small, and has a row for each unit."""
+    MadeUpFleet(units=200, per_unit=365, batch=40, refused=0.02).write(tmp_path)
+    report_html.write(tmp_path)
+    path = tmp_path / 'fleet.html'
+    assert path.stat().st_size < 5_000_000
+    page, messages = opened(path, 1280)
+    wait_until_drawn(page)
+    assert page.locator('#all-units tbody tr').count() == 200 and messages == []
+
+
+def test_a_file_that_is_no_table(tmp_path):
+    for contents in (b'', b'not parquet'):
+        (tmp_path / 'fleet.parquet').write_bytes(contents)
+        with pytest.raises(UserError, match='fleet.parquet: not a table of `fleet`'):
+            report_html.write(tmp_path)
+    assert list(tmp_path.iterdir()) == [tmp_path / 'fleet.parquet']

@@ -1,0 +1,107 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Random effects: a published example, a closed form, and how often intervals hold the truth."""
+
+from adxl_ros.fleet.report.random_effects import random_effects, weighted_mean
+import numpy as np
+import pytest
+
+BCG = np.array([
+    (4, 119, 11, 128), (6, 300, 29, 274), (3, 228, 11, 209), (62, 13536, 248, 12619),
+    (33, 5036, 47, 5761), (180, 1361, 372, 1079), (8, 2537, 10, 619), (505, 87886, 499, 87892),
+    (29, 7470, 45, 7232), (17, 1699, 65, 1600), (186, 50448, 141, 27197), (5, 2493, 3, 2338),
+    (27, 16886, 29, 17825)], float)
+"""Thirteen trials of the BCG vaccine (Colditz 1994): ill and healthy, with it or not."""
+
+
+def holds(hits, share):
+    """Return whether a share of hits is that of an interval, within three standard deviations."""
+    return abs(np.mean(hits) - share) < 3 * np.sqrt(share * (1 - share) / len(hits))
+
+
+def test_a_published_example():
+    """The logarithm of the relative risk is that of Viechtbauer (2010), by REML."""
+    a, b, c, d = BCG.T
+    y = np.log(a / (a + b)) - np.log(c / (c + d))
+    std = np.sqrt(1 / a - 1 / (a + b) + 1 / c - 1 / (c + d))
+    result = random_effects(y, std)
+    assert not result.is_far_out.any() and result.pooled.units == 13
+    pooled = result.pooled
+    assert (pooled.mean, pooled.spread ** 2) == pytest.approx((-0.7145, 0.3132), abs=5e-5)
+    _, mean_variance = weighted_mean(y, std ** 2, result.pooled.spread ** 2)
+    assert mean_variance ** 0.5 == pytest.approx(0.1798, abs=5e-5)
+    # The spread is uncertain, too.
+    assert 1 < result.pooled.mean_std / mean_variance ** 0.5 < 1.3
+
+
+def test_the_closed_form_of_equal_errors():
+    y = np.array([1.0, 2.0, 4.0, 5.0, 8.0])
+    result = random_effects(y, np.full(5, 0.5))
+    assert result.pooled.mean == pytest.approx(4.0)
+    assert result.pooled.spread ** 2 == pytest.approx(np.var(y, ddof=1) - 0.25)
+    _, mean_variance = weighted_mean(y, np.full(5, 0.25), result.pooled.spread ** 2)
+    assert mean_variance == pytest.approx(np.var(y, ddof=1) / 5)
+    shrunken, std = result.shrunken()
+    share = 0.25 / (0.25 + result.pooled.spread ** 2)
+    np.testing.assert_allclose(shrunken, share * 4 + (1 - share) * y)
+    assert np.all(std < 0.5)
+
+
+def test_units_that_differ_by_their_errors_alone_have_no_spread():
+    result = random_effects(np.array([1.0, 1.1, 0.9, 1.05, 0.95, 1.0]), np.full(6, 0.3))
+    assert result.pooled.spread == result.pooled.spread_low == 0.0
+    np.testing.assert_allclose(result.shrunken()[0], 1.0)
+
+
+@pytest.mark.parametrize('count', [6, 25, 200])
+def test_intervals_hold_the_truth(count):
+    """Mean, spread and a further unit are inside their 90 % intervals in 90 % of fleets."""
+    rng = np.random.default_rng(count)
+    spreads, means, further, false = [], [], [], []
+    for _ in range(300):
+        std = rng.uniform(0.2, 2.0, count)
+        result = random_effects(5 + rng.normal(size=count) + std * rng.normal(size=count), std)
+        pooled = result.pooled
+        spreads.append(pooled.spread_low <= 1 <= pooled.spread_high)
+        means.append(abs(pooled.mean - 5) < 1.645 * pooled.mean_std)
+        further.append(abs(5 + rng.normal() - pooled.mean) < 1.645 * pooled.prediction_std)
+        false.append(result.is_far_out.any())
+    assert holds(spreads, 0.9)
+    # Few units give wider intervals, because their spread is uncertain.
+    assert min(np.mean(means), np.mean(further)) > 0.9 - 3 * np.sqrt(0.09 / 300)
+    assert count < 200 or (holds(means, 0.9) and holds(further, 0.9))
+    assert np.mean(false) < 0.05 + 3 * np.sqrt(0.05 / 300)
+
+
+def test_shrunken_estimates_are_nearer_to_the_truth():
+    rng = np.random.default_rng(1)
+    truth = rng.normal(size=200)
+    std = np.full(200, 0.8)
+    result = random_effects(truth + std * rng.normal(size=200), std)
+    shrunken, shrunken_std = result.shrunken()
+    error = shrunken - truth
+    assert np.std(error) < 0.85 * np.std(result.estimates - truth)
+    assert holds(np.abs(error) < 1.645 * shrunken_std, 0.9)
+
+
+def test_a_unit_far_out_is_named_and_does_not_count():
+    rng = np.random.default_rng(2)
+    y, std = rng.normal(size=60), np.full(60, 0.1)
+    y[17] = 12.0
+    result = random_effects(y, std)
+    assert np.flatnonzero(result.is_far_out).tolist() == [17]
+    others = np.delete(y, 17)
+    assert result.pooled.spread == pytest.approx(random_effects(others, std[1:]).pooled.spread)
+    # It has no population to shrink to.
+    assert result.shrunken()[0][17] == 12.0

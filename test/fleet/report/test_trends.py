@@ -1,0 +1,155 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Slopes of units: least squares, the share of false claims, weak drifts, and recalibrations."""
+
+from adxl_ros.fleet.report.outliers import are_outliers, outlier_distances
+from adxl_ros.fleet.report.trends import claimed, fit_trends, interval_factor, Recordings
+import numpy as np
+import pytest
+from scipy.stats import false_discovery_control, linregress, t
+
+FLEETS = 40
+
+
+def fleet(rng, counts=(5, 60), units=200, scatter=1.0, stated=0.3, correlation=0.0, step=0.0,
+          unequal=0.0, drift=None):
+    """Draw recordings of units over a year; `step` is that of two calibrations of each unit."""
+    parts, periods = [], 0
+    for unit in range(units):
+        n = int(rng.integers(*counts))
+        time = np.sort(rng.uniform(size=n))
+        noise = rng.normal(size=n)
+        for i in range(1, n):
+            noise[i] = correlation * noise[i - 1] + np.sqrt(1 - correlation ** 2) * noise[i]
+        period = np.searchsorted(np.sort(rng.uniform(size=2)) if step else [], time)
+        std = stated * rng.lognormal(0, 0.3, n)
+        value = rng.normal(0, 5) + scatter * rng.lognormal(0, unequal) * noise \
+            + step * rng.normal(size=3)[period] + std * rng.normal(size=n)
+        value += 0.0 if drift is None else drift[unit] * time
+        numbers = np.unique(period, return_inverse=True)[1]
+        parts.append((np.full(n, unit), periods + numbers, time, value, std))
+        periods += numbers[-1] + 1
+    return Recordings(*map(np.concatenate, zip(*parts)))
+
+
+def test_one_unit_has_the_slope_of_least_squares():
+    """Without others and without stated errors, line and error are those of a regression."""
+    rng = np.random.default_rng(0)
+    time = np.sort(rng.uniform(size=30))
+    value = 3 + 2 * time + rng.normal(size=30)
+    zeros = np.zeros(30, int)
+    trends = fit_trends(Recordings(zeros, zeros, time, value, np.zeros(30)))
+    expected = linregress(time, value)
+    widening = trends.scatter.widening
+    assert trends.slope[0] == pytest.approx(expected.slope)
+    assert trends.slope_std[0] == pytest.approx(expected.stderr * np.sqrt(
+        widening * 28 / (30 - 2 * widening)), rel=1e-3)
+    assert trends.level[0] == pytest.approx(value.mean())
+
+
+@pytest.mark.parametrize('changes', [
+    {}, {'counts': (3, 6)}, {'counts': (60, 150), 'correlation': 0.8}, {'step': 3.0},
+    {'unequal': 0.5}, {'units': 8}], ids=str)
+def test_the_share_of_false_claims(changes):
+    """Among the claimed slopes 5 % or less are false, whatever the scatter is like."""
+    rng = np.random.default_rng(1)
+    shares, hits, inside = [], [], []
+    for _ in range(FLEETS):
+        units = changes.get('units', 200)
+        drift = np.where(np.arange(units) < max(units // 10, 1), 6.0, 0.0)
+        trends = fit_trends(fleet(rng, drift=drift, **changes))
+        claims = claimed(trends.p_values)
+        shares.append((claims & (drift == 0)).sum() / max(claims.sum(), 1))
+        hits.append(claims[drift > 0].mean())
+        half = trends.slope_std * interval_factor(trends.freedom, np.zeros(units, bool))
+        inside.append(np.nanmean(np.abs(trends.slope - drift) < half))
+    error = np.std(shares) / np.sqrt(FLEETS)
+    assert np.mean(shares) < 0.05 + 3 * max(error, 0.002)
+    assert np.mean(inside) > 0.9 - 3 * np.std(inside) / np.sqrt(FLEETS) - 0.005
+    assert np.mean(hits) > 0.2
+
+
+def test_a_fleet_without_drifts_seldom_has_a_claim():
+    rng = np.random.default_rng(2)
+    claims = [claimed(fit_trends(fleet(rng)).p_values).any() for _ in range(100)]
+    assert np.mean(claims) < 0.05 + 3 * np.sqrt(0.05 * 0.95 / 100)
+
+
+def test_others_make_a_weak_drift_visible():
+    """A drift in five recordings shows by the scatter of all units, and seldom by its own."""
+    rng = np.random.default_rng(3)
+    pooled, single = [], []
+    for _ in range(FLEETS):
+        drift = np.where(np.arange(200) == 0, 7.0, 0.0)
+        recordings = fleet(rng, counts=(5, 6), drift=drift)
+        pooled.append(claimed(fit_trends(recordings).p_values)[0])
+        p_values = []
+        for unit in range(200):
+            part = recordings.unit == unit
+            line = linregress(recordings.time[part], recordings.value[part])
+            p_values.append(2 * t.sf(abs(line.slope / line.stderr), 3))
+        single.append(false_discovery_control(p_values)[0] <= 0.05)
+    assert np.mean(pooled) > 0.4 and np.mean(single) < 0.15
+
+
+def test_a_recalibration_is_no_drift():
+    """Steps at calibrations give no claim, and the drift between them is still claimed."""
+    rng = np.random.default_rng(4)
+    drift = np.where(np.arange(60) == 7, 8.0, 0.0)
+    recordings = fleet(rng, counts=(40, 60), units=60, step=5.0, drift=drift)
+    trends = fit_trends(recordings)
+    assert np.flatnonzero(claimed(trends.p_values)).tolist() == [7]
+    assert trends.scatter.calibration == pytest.approx(5.0, rel=0.3)
+    # A line through all recordings of a unit would call most steps a drift.
+    lines = [linregress(recordings.time[part], recordings.value[part]).pvalue
+             for part in (recordings.unit == unit for unit in range(60))]
+    assert (false_discovery_control(lines) < 0.05).sum() > 30
+
+
+def test_intervals_of_claims_hold_for_the_claims():
+    """Selection makes claims too large; their intervals are wider so that 90 % hold."""
+    rng = np.random.default_rng(5)
+    inside = []
+    for _ in range(FLEETS):
+        drift = rng.normal(0, 2.0, 200)
+        trends = fit_trends(fleet(rng, counts=(5, 15), drift=drift))
+        claims = claimed(trends.p_values)
+        half = trends.slope_std * interval_factor(trends.freedom, claims)
+        inside += (np.abs(trends.slope - drift) < half)[claims].tolist()
+    assert np.mean(inside) > 0.9 - 3 * np.sqrt(0.09 / len(inside))
+
+
+def test_few_recordings_have_no_slope():
+    trends = fit_trends(Recordings(np.array([0, 0, 1]), np.array([0, 0, 1]),
+                                   np.array([0.0, 1.0, 0.0]), np.array([1.0, 2.0, 5.0]),
+                                   np.full(3, 0.1)))
+    assert np.isnan(trends.slope).all() and np.isfinite(trends.level).all()
+    assert not claimed(trends.p_values).any()
+
+
+@pytest.mark.parametrize('changes', [{}, {'counts': (5, 8)}, {'unequal': 0.7}], ids=str)
+def test_the_rate_of_false_outliers(changes):
+    rng = np.random.default_rng(6)
+    false = []
+    for _ in range(100):
+        distance, freedom = outlier_distances(fleet(rng, **changes))
+        false.append(are_outliers(distance, freedom, len(distance)).any())
+    assert np.mean(false) < 0.05 + 3 * np.sqrt(0.05 * 0.95 / 100)
+
+
+def test_an_outlier_is_named():
+    recordings = fleet(np.random.default_rng(7), counts=(20, 40))
+    recordings.value[[50, 51, 900]] += 12.0
+    distance, freedom = outlier_distances(recordings)
+    assert np.flatnonzero(are_outliers(distance, freedom, len(distance))).tolist() == [50, 51, 900]

@@ -1,0 +1,43 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The table of a fleet: types, units and times of its columns."""
+
+from datetime import datetime, timezone
+
+from adxl_ros.fleet.row import arrow_schema, as_table, COLUMNS, empty_row, finite, TIMING
+import pytest
+
+
+def test_a_row_keeps_every_type():
+    pytest.importorskip('pyarrow')
+    row = {**empty_row(), 'url': 's3://bucket/a.csv', 'date': '2026-11-01T10:00:00+01:00',
+           'is_sound': True, 'samples': 3, 'faults': ['one'], 'groups': [['a', 'b']],
+           'noise_n_x_mps2_per_rthz': 1e-3, 'coefficients': [
+               {'name': 'bias.offset_v.x', 'unit': 'V', 'value': 0.1, 'std': 0.01,
+                'source': 'fit'}]}
+    back = as_table([row, empty_row()]).to_pylist()
+    assert back[0] == {**row, 'date': datetime(2026, 11, 1, 9, tzinfo=timezone.utc)}
+    assert back[1] == empty_row()
+
+
+def test_names_are_unique_and_units_stand_in_the_schema():
+    pytest.importorskip('pyarrow')
+    names = [column.name for column in COLUMNS]
+    assert len(set(names)) == len(names) and set(TIMING) < set(names)
+    assert arrow_schema().field('gap_before_mps2').metadata[b'unit'].decode() == 'm/s²'
+
+
+def test_nan_is_no_value():
+    assert finite(float('nan')) is None and finite(float('inf')) is None and finite(2) == 2.0

@@ -1,0 +1,203 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Pools of workers that end, raise, or lose their scheduler or their parent."""
+
+from concurrent.futures import Executor
+from contextlib import suppress
+import os
+import random
+import signal
+import subprocess
+import sys
+from threading import Event, Thread
+import time
+
+from adxl_ros.errors import UserError
+from adxl_ros.jobs import pools
+from adxl_ros.jobs.pools import open_pool, TaskFuture, TaskLost, WorkerDied
+from adxl_ros.jobs.run import finished_tasks
+from adxl_ros.jobs.whole_files import write
+from job_tasks import children, dask_cluster, deadly, half_sent, numbered, SUPPORT
+import pytest
+
+_LONG_WAIT_S = 300.0
+"""Longest wait of a test for something, s."""
+
+
+def wait_for(condition):
+    end_s = time.monotonic() + _LONG_WAIT_S
+    while not condition():
+        assert time.monotonic() < end_s, 'waited too long'
+        time.sleep(0.02)
+
+
+def is_alive(pid):
+    try:
+        with open(f'/proc/{pid}/stat', encoding='utf-8') as file:
+            return file.read().rpartition(')')[2].split()[0] != 'Z'
+    except OSError:
+        return False
+
+
+def test_only_the_task_that_ends_its_worker_fails():
+    with open_pool(None, 2) as pool:
+        results = {end.arguments[0]: end for end in finished_tasks(
+            pool, deadly, ((number, 3, 5) for number in range(12)), retries=1)}
+    assert set(results) == set(range(12))
+    assert isinstance(results[3].error, WorkerDied) and isinstance(results[5].error, ValueError)
+    assert results[3].attempts == results[5].attempts == 2
+    for number, end in results.items():
+        if number not in (3, 5):
+            assert (end.value, end.error, end.attempts) == (number, None, 1)
+
+
+def test_a_worker_that_ends_while_it_sends_its_result():
+    with open_pool(None, 1) as pool:
+        error = pool.submit(half_sent, 1_000_000).exception(timeout=_LONG_WAIT_S)
+        assert isinstance(error, WorkerDied)
+        assert pool.submit(numbered, 4).result(timeout=_LONG_WAIT_S) == 4
+
+
+def test_a_worker_that_ends_without_a_task_costs_none():
+    with open_pool(None, 1) as pool:
+        assert pool.submit(numbered, 1).result(timeout=_LONG_WAIT_S) == 1
+        pid, = children(os.getpid())
+        os.kill(pid, signal.SIGKILL)
+        # The next task is refused by the executor, and not only lost by it.
+        wait_for(lambda: pool._workers[0]._executor._broken)
+        end, = finished_tasks(pool, numbered, [(2,)])
+    assert (end.value, end.error) == (2, None)
+
+
+def test_an_error_of_the_user_is_not_repeated(tmp_path):
+    with open_pool(None, 1) as pool:
+        end, = finished_tasks(pool, write, [(tmp_path / 'no' / 'file', b'')])
+    assert isinstance(end.error, UserError) and end.attempts == 1
+
+
+def test_no_task_is_lost_while_workers_are_killed():
+    chance, stop = random.Random(3), Event()
+
+    def kill():
+        while not stop.wait(chance.uniform(0.1, 0.4)):
+            for pid in children(os.getpid())[:1]:
+                with suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGKILL)
+
+    killer = Thread(target=kill)
+    killer.start()
+    try:
+        with open_pool(None, 2) as pool:
+            results = list(finished_tasks(pool, numbered, ((n,) for n in range(200)), retries=20))
+    finally:
+        stop.set()
+        killer.join()
+    assert sorted(end.value for end in results) == list(range(200))
+
+
+@pytest.mark.parametrize('sent', [signal.SIGKILL, signal.SIGINT])
+def test_workers_end_with_their_parent_and_tidy_up(tmp_path, sent):
+    program = f"""
+import sys
+sys.path.append({str(SUPPORT)!r})
+from adxl_ros.jobs import pools
+from adxl_ros.jobs.pools import open_pool
+from adxl_ros.jobs.run import finished_tasks
+from job_tasks import long_with_file
+if __name__ == '__main__':
+    with open_pool(None, 2) as pool:
+        list(finished_tasks(pool, long_with_file, [({str(tmp_path)!r},)] * 4))
+"""
+    (tmp_path / 'program').mkdir()
+    script = tmp_path / 'program' / 'parent.py'
+    script.write_text(program)
+    environment = os.environ | {'PYTHONPATH': os.pathsep.join(sys.path)}
+    with subprocess.Popen([sys.executable, str(script)], env=environment,
+                          stderr=subprocess.DEVNULL) as parent:
+        wait_for(lambda: len(list(tmp_path.iterdir())) == 3)
+        pids = [int(path.name) for path in tmp_path.iterdir() if path.name.isdigit()]
+        parent.send_signal(sent)
+    wait_for(lambda: not any(map(is_alive, pids)))
+    assert [path.name for path in tmp_path.iterdir()] == ['program']
+
+
+def test_a_cluster_loses_workers_and_its_scheduler(tmp_path):
+    pytest.importorskip('distributed', reason='distributed is not installed: '
+                        'pip install distributed')
+    results = []
+    with dask_cluster(tmp_path) as cluster, \
+            open_pool(cluster.address, shared=(7,)) as pool:
+        for end in finished_tasks(pool, max, ((number,) for number in range(400)), retries=20):
+            results.append(end)
+            if len(results) in (50, 150):
+                cluster.kill_worker(len(results) % 2)
+            if len(results) == 250:
+                cluster.kill_scheduler()
+    assert not [end.error for end in results if end.error]
+    assert sorted(end.value for end in results) == sorted(max(7, n) for n in range(400))
+    assert {end.arguments[0] for end in results} == set(range(400))
+
+
+def test_a_cluster_blames_no_task_that_only_waits(tmp_path):
+    """Dask blames all that a worker holds; the task that ends its worker each time is one."""
+    pytest.importorskip('distributed', reason='distributed is not installed: '
+                        'pip install distributed')
+    with dask_cluster(tmp_path, workers=1, failures=0) as cluster, cluster.kept(), \
+            open_pool(cluster.address) as pool:
+        results = {end.arguments[0]: end for end in finished_tasks(
+            pool, deadly, ((number, 3, 5) for number in range(12)), retries=0)}
+    assert set(results) == set(range(12))
+    assert isinstance(results[3].error, WorkerDied) and isinstance(results[5].error, ValueError)
+    for number, end in results.items():
+        if number not in (3, 5):
+            assert (end.value, end.error, end.attempts) == (number, None, 1)
+
+
+class DeadlyPool(Executor):
+    """Ends a share of the attempts, and each one of task 7, with their worker."""
+
+    def __init__(self, share):
+        self.chance, self.share = random.Random(2), share
+
+    def submit(self, fn, /, number):
+        """Return a task that has ended."""
+        future = TaskFuture()
+        if number == 7 or self.chance.random() < self.share:
+            future.deaths = 1
+            future.set_exception(WorkerDied())
+        elif self.chance.random() < self.share:
+            future.set_exception(TaskLost())
+        else:
+            future.set_result(fn(number))
+        return future
+
+
+@pytest.mark.parametrize('share', [0.0, 0.05, 0.2])
+def test_workers_that_end_at_random_blame_no_task(share):
+    results = list(finished_tasks(DeadlyPool(share), int, ((n,) for n in range(5000)), retries=1))
+    assert sorted(end.arguments[0] for end in results) == list(range(5000))
+    failed, = (end for end in results if end.error is not None)
+    assert failed.arguments == (7,) and isinstance(failed.error, WorkerDied)
+    assert failed.attempts < 10 if share else failed.attempts == 2
+
+
+def test_a_scheduler_that_is_not_there_is_one_line(monkeypatch):
+    monkeypatch.setattr(pools, '_CONNECT_S', 1.0)
+    pytest.importorskip('distributed', reason='distributed is not installed: '
+                        'pip install distributed')
+    with pytest.raises(UserError, match='no scheduler answers') as raised, \
+            open_pool('tcp://127.0.0.1:9'):
+        pass
+    assert '\n' not in str(raised.value)
