@@ -1,0 +1,352 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The manoeuvres that an investigation can command, one function each.
+
+A manoeuvre begins in the pose of the stage and keeps the limits of the stage: each pose is moved
+to the nearest one within them, and no joint turns faster than the limit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from adxl_ros.investigate.stage_limits import Pose, StageLimits
+from adxl_ros.simulate.motion import Motion
+from adxl_ros.simulate.trajectories import RUN_UP_S, Script
+import numpy as np
+
+_REST_S = 4.0
+"""Time at rest in a pose, s. Chosen: the mean of its samples is then a tenth of their noise."""
+_LONG_REST_S = 30.0
+"""Time at rest in a pose where drifts are to show, s. Chosen: two of them are one minute."""
+_SLOW_SHARE = 1 / 3
+"""Rate of a slow turn, as a share of the limit. Chosen: an effect of the rate's square is then
+nine times smaller."""
+_SWING_RAD = np.radians(15.0)
+"""Amplitude of swings and of reversals, rad. Chosen: far beyond every backlash."""
+_APPROACH_RAD = np.radians(20.0)
+"""Distance from which a pose is approached, rad. Chosen: beyond every backlash."""
+_SWINGS = 4
+"""Number of swings forth and back. Chosen: their reversals are averaged."""
+
+
+class Path:
+    """
+    A path of the stage within its limits, move by move.
+
+    Attributes
+    ----------
+    limits
+        The limits.
+
+    """
+
+    def __init__(self, limits: StageLimits, pose: Pose, begin_s: float) -> None:
+        """
+        Begin at rest in a pose.
+
+        Parameters
+        ----------
+        limits
+            Limits of the stage.
+        pose
+            Pose at the beginning.
+        begin_s
+            Time at the beginning, s.
+
+        """
+        self.limits = limits
+        self._begin_s = begin_s
+        self._script = Script(*limits.nearest(*pose), now=begin_s, slew_rad_s=limits.rate_rad_s)
+        self._script.rest(0.5)
+
+    def rest(self, alpha_deg: float, beta_deg: float, seconds: float = _REST_S) -> None:
+        """
+        Move to a pose and rest there.
+
+        Parameters
+        ----------
+        alpha_deg, beta_deg
+            Angles of the pose, degrees.
+        seconds
+            Time at rest, s.
+
+        """
+        pose = self.limits.nearest(np.radians(alpha_deg), np.radians(beta_deg))
+        if max(abs(pose.alpha_rad - self._script.alpha),
+               abs(pose.beta_rad - self._script.beta)) > 0:
+            self._script.go(*pose)
+        self._script.rest(seconds)
+
+    def turn(self, joint: str, to_rad: float, share: float = 1.0) -> None:
+        """
+        Turn one joint at a constant rate, and rest for a second.
+
+        Parameters
+        ----------
+        joint
+            Name of the joint: alpha or beta.
+        to_rad
+            Angle at the end, rad.
+        share
+            Rate, as a share of the limit.
+
+        """
+        angles = {'alpha': self._script.alpha, 'beta': self._script.beta, joint: to_rad}
+        pose = self.limits.nearest(angles['alpha'], angles['beta'])
+        to_rad = pose.alpha_rad if joint == 'alpha' else pose.beta_rad
+        rate_rad_s = share * self.limits.rate_rad_s
+        distance_rad = abs(to_rad - getattr(self._script, joint))
+        if distance_rad > rate_rad_s * RUN_UP_S:
+            self._script.run(joint, to_rad, rate_rad_s)
+        elif distance_rad > 0:
+            self._script.go(*pose)
+        self._script.rest(1.0)
+
+    def swing(self, joint: str, share: float = 1.0) -> None:
+        """
+        Turn one joint about its angle, forth and back.
+
+        Parameters
+        ----------
+        joint
+            Name of the joint: alpha or beta.
+        share
+            Rate, as a share of the limit.
+
+        """
+        middle_rad = getattr(self._script, joint)
+        low_rad, high_rad = self.limits.alpha_rad if joint == 'alpha' else self.limits.beta_rad
+        # A joint at its limit swings to the inner side.
+        middle_rad = min(max(middle_rad, min(low_rad + _SWING_RAD, high_rad)),
+                         max(high_rad - _SWING_RAD, low_rad))
+        for _ in range(_SWINGS):
+            for side in (1.0, -1.0):
+                self.turn(joint, middle_rad + side * _SWING_RAD, share)
+        self.turn(joint, middle_rad, share)
+
+    def motion(self) -> Motion:
+        """Return the path as a motion that begins at its own time."""
+        alpha, beta = self._script.joints()
+        return Motion(self._script.now - self._begin_s, alpha, beta)
+
+    def end(self) -> Pose:
+        """Return the pose at the end."""
+        return Pose(self._script.alpha, self._script.beta)
+
+
+def rests_upright(path: Path) -> None:
+    """Rest in steps of 60° of beta, with x and y upright."""
+    for beta_deg in range(0, 360, 60):
+        path.rest(90, beta_deg)
+
+
+def rests_on_sphere(path: Path) -> None:
+    """Rest in poses that spread gravity over the sphere."""
+    for alpha_deg, beta_deg in ((0, 0), (45, 0), (45, 120), (45, 240), (135, 240), (135, 120),
+                                (135, 0), (180, 0)):
+        path.rest(alpha_deg, beta_deg)
+
+
+def slow_turn_of_beta(path: Path) -> None:
+    """Turn beta once, forth and back, slowly."""
+    _turn_of_beta(path, 90.0, _SLOW_SHARE)
+
+
+def fast_turn_of_beta(path: Path) -> None:
+    """Turn beta once, forth and back, at the limit of rate."""
+    _turn_of_beta(path, 90.0, 1.0)
+
+
+def inclined_turn_of_beta(path: Path) -> None:
+    """Turn beta once at alpha 45°, forth and back, at the limit of rate."""
+    _turn_of_beta(path, 45.0, 1.0)
+
+
+def level_turn_of_beta(path: Path) -> None:
+    """Turn beta once with z upright, at the limit of rate."""
+    _turn_of_beta(path, 0.0, 1.0)
+
+
+def slow_turn_of_alpha(path: Path) -> None:
+    """Turn alpha over its range, forth and back, slowly."""
+    _turn_of_alpha(path, (45.0,), _SLOW_SHARE)
+
+
+def fast_turns_of_alpha(path: Path) -> None:
+    """Turn alpha over its range at two angles beta, at the limit of rate."""
+    _turn_of_alpha(path, (0.0, 90.0), 1.0)
+
+
+def two_rates_of_beta(path: Path) -> None:
+    """Turn beta over half a turn at three rates, forth and back."""
+    path.rest(90, 0, 1.0)
+    for share in (1.0, 0.5, 0.25):
+        path.turn('beta', np.pi, share)
+        path.turn('beta', 0.0, share)
+
+
+def swings_of_beta(path: Path) -> None:
+    """Swing beta about a pose, with reversals."""
+    path.rest(90, 45, 1.0)
+    path.swing('beta')
+    path.swing('beta', 0.5)
+
+
+def swings_of_alpha(path: Path) -> None:
+    """Swing alpha about a pose, with reversals."""
+    path.rest(45, 45, 1.0)
+    path.swing('alpha')
+    path.swing('alpha', 0.5)
+
+
+def poses_from_both_sides(path: Path) -> None:
+    """Approach the same poses from both sides of each joint."""
+    approach_deg = np.degrees(_APPROACH_RAD)
+    for alpha_deg, beta_deg in ((60, 45), (60, 225)):
+        for side in (-1, 1):
+            path.rest(alpha_deg, beta_deg + side * approach_deg, 0.5)
+            path.rest(alpha_deg, beta_deg, 3.0)
+        for side in (-1, 1):
+            path.rest(alpha_deg + side * approach_deg, beta_deg, 0.5)
+            path.rest(alpha_deg, beta_deg, 3.0)
+
+
+def long_rests(path: Path) -> None:
+    """Rest for a minute in two opposite poses."""
+    path.rest(90, 45, _LONG_REST_S)
+    path.rest(90, 225, _LONG_REST_S)
+
+
+def rests_on_axes(path: Path) -> None:
+    """Rest with each axis up and down."""
+    for beta_deg in (0, 90, 180, 270):
+        path.rest(90, beta_deg, 2.0)
+
+
+def _turn_of_beta(path: Path, alpha_deg: float, share: float) -> None:
+    """Turn beta over its range, a turn at most, forth and back."""
+    low_rad, high_rad = path.limits.beta_rad
+    high_rad = min(high_rad, low_rad + 2 * np.pi)
+    path.rest(alpha_deg, np.degrees(low_rad), 1.0)
+    path.turn('beta', high_rad, share)
+    path.turn('beta', low_rad, share)
+
+
+def _turn_of_alpha(path: Path, betas_deg: Sequence[float], share: float) -> None:
+    """Turn alpha over its range, a turn at most, forth and back at some angles beta."""
+    low_rad, high_rad = path.limits.alpha_rad
+    high_rad = min(high_rad, low_rad + 2 * np.pi)
+    for beta_deg in betas_deg:
+        path.rest(np.degrees(low_rad), beta_deg, 1.0)
+        path.turn('alpha', high_rad, share)
+        path.turn('alpha', low_rad, share)
+
+
+CATALOGUE: dict[str, Callable[[Path], None]] = {f.__name__: f for f in (
+    rests_upright, rests_on_sphere, slow_turn_of_beta, fast_turn_of_beta, inclined_turn_of_beta,
+    level_turn_of_beta, slow_turn_of_alpha, fast_turns_of_alpha, two_rates_of_beta,
+    swings_of_beta, swings_of_alpha, poses_from_both_sides, long_rests, rests_on_axes)}
+"""Manoeuvres by name."""
+
+
+@dataclass(frozen=True)
+class PlannedManoeuvre:
+    """
+    A manoeuvre from the pose of the stage on.
+
+    Attributes
+    ----------
+    name
+        Its name in the catalogue.
+    begin_s
+        Time at which it begins, s.
+    motion
+        The motion; its joints count the time from the same origin.
+    end
+        Pose at its end.
+
+    """
+
+    name: str
+    begin_s: float
+    motion: Motion
+    end: Pose
+
+    @property
+    def minutes(self) -> float:
+        """Return the duration, min."""
+        return self.motion.duration_s / 60
+
+    @property
+    def text(self) -> str:
+        """Return what it does, for people."""
+        return description(self.name)
+
+
+def description(name: str) -> str:
+    """Return what a manoeuvre does, for people."""
+    first_line = (CATALOGUE[name].__doc__ or name).strip().splitlines()[0]
+    return first_line[0].lower() + first_line[1:].rstrip('.')
+
+
+def plan(name: str, limits: StageLimits, pose: Pose, begin_s: float = 0.0) -> PlannedManoeuvre:
+    """
+    Plan a manoeuvre.
+
+    Parameters
+    ----------
+    name
+        Its name in the catalogue.
+    limits
+        Limits of the stage.
+    pose
+        Pose of the stage.
+    begin_s
+        Time at which it begins, s.
+
+    Returns
+    -------
+    PlannedManoeuvre
+        The manoeuvre, which begins and ends at rest.
+
+    """
+    path = Path(limits, pose, begin_s)
+    CATALOGUE[name](path)
+    return PlannedManoeuvre(name, begin_s, path.motion(), path.end())
+
+
+def plan_all(limits: StageLimits, pose: Pose, begin_s: float = 0.0) -> list[PlannedManoeuvre]:
+    """
+    Plan all manoeuvres of the catalogue.
+
+    Parameters
+    ----------
+    limits
+        Limits of the stage.
+    pose
+        Pose of the stage.
+    begin_s
+        Time at which they begin, s.
+
+    Returns
+    -------
+    list of PlannedManoeuvre
+        The manoeuvres.
+
+    """
+    return [plan(name, limits, pose, begin_s) for name in CATALOGUE]

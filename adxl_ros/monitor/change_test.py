@@ -1,0 +1,238 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+A sequential test whether the mean of a series has changed, with a stated rate of false alarms.
+
+The mean of the newest blocks is compared with the mean of the blocks before, at many lengths. Such
+a difference is stationary for white noise, for flicker and for a random walk, as the Allan
+deviation is. So each length learns the usual size of its difference from the series itself, and
+correlated samples need no model.
+
+The difference over its usual size follows Student's t. Its limit divides the permitted false
+alarms among all comparisons of a day (Bonferroni), so the rate is at most the stated one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import scipy
+
+_DAY_S = 86400.0
+"""One day, s."""
+_LENGTHS = 10
+"""Number of lengths, each twice the one before. Chosen: of blocks of 1 s, 1 s to 8.5 minutes."""
+_BEFORE = 4
+"""Length of the mean before, divided by that of the newest mean. Chosen: white noise of a longer
+one adds less than an eighth; flicker grows with it."""
+_PER_LENGTH = 4
+"""Comparisons within a length of the newest mean. Chosen: more find a change a few percent
+earlier, and share the false alarms."""
+_INDEPENDENT = 2.0
+"""Distance of independent differences, in lengths of the newest mean. Chosen: their correlation
+ends at one length for white noise; twice that covers flicker."""
+_FEWEST = 4
+"""Fewest independent differences that give a usual size. Chosen: Student's t has a variance from
+three on."""
+_MOST = 400
+"""Largest number of independent differences in memory. Chosen: 5 % of the limit, and a slow change
+of the noise is followed."""
+_NEVER = 1e300
+"""Limit that no difference reaches."""
+_RESERVE = 0.5
+"""Share of the permitted false alarms that the limits use. Chosen: usual sizes are estimates, and
+noise is not quite normal."""
+_KINDS = 2
+"""Kinds of windows: at rest throughout, and with motion. Like is compared with like."""
+
+
+@dataclass(frozen=True)
+class Change:
+    """
+    A change of the mean.
+
+    Attributes
+    ----------
+    channel
+        Number of the series.
+    blocks
+        Number of blocks since the change.
+    size
+        Mean after the change minus mean before.
+    std
+        Usual size of such a difference.
+
+    """
+
+    channel: int
+    blocks: int
+    size: float
+    std: float
+
+
+@dataclass(frozen=True)
+class ChangeSettings:
+    """
+    Settings of the test.
+
+    Attributes
+    ----------
+    channels
+        Number of series.
+    false_alarms_per_day
+        Largest permitted rate, of all series together.
+    block_s
+        Length of a block, s.
+    smallest
+        Smallest usual size of a difference, in the unit of the series; a series without noise has
+        none of its own.
+
+    """
+
+    channels: int
+    false_alarms_per_day: float
+    block_s: float = 1.0
+    smallest: float = 1e-6
+
+    @cached_property
+    def p(self) -> float:
+        """Return the permitted probability of a false alarm in one comparison."""
+        comparisons = sum(_DAY_S / self.block_s / _stride(2 ** j) for j in range(_LENGTHS))
+        return min(_RESERVE * self.false_alarms_per_day / (comparisons * self.channels), 0.5)
+
+    @cached_property
+    def limits(self) -> np.ndarray:
+        """Return the limit of Student's t by degrees of freedom, (401,); huge for too few."""
+        limits = np.full(_MOST + 1, _NEVER)
+        limits[_FEWEST:] = -scipy.special.stdtrit(np.arange(_FEWEST, _MOST + 1), self.p / 2)
+        return limits
+
+
+def _stride(length: int) -> int:
+    """Return the number of blocks from one comparison of a length to the next."""
+    return max(1, length // _PER_LENGTH)
+
+
+class ChangeTest:
+    """
+    Tests several series, block by block.
+
+    Attributes
+    ----------
+    settings
+        Settings of the test.
+
+    """
+
+    def __init__(self, settings: ChangeSettings) -> None:
+        self.settings = settings
+        self._size = (1 + _BEFORE) * 2 ** (_LENGTHS - 1) + 1
+        n = settings.channels
+        # Sums up to each block; the place of a block is its number modulo the size.
+        self._sums = np.zeros((self._size, n))
+        self._moves = np.zeros(self._size, int)
+        self._count = 0
+        self._since = np.zeros(n, int)
+        self._squares = np.zeros((_KINDS, _LENGTHS, n))
+        self._weights = np.zeros((_KINDS, _LENGTHS, n))
+        # Differences that are not learnt yet, in the order of their blocks.
+        self._waiting: list[list[tuple[int, int, np.ndarray, np.ndarray]]] = [
+            [] for _ in range(_LENGTHS)]
+
+    def add(self, values: np.ndarray, moves: bool) -> list[Change]:
+        """
+        Test the next block.
+
+        Parameters
+        ----------
+        values
+            Means of the block, (channels,).
+        moves
+            Whether the reference moves within the block.
+
+        Returns
+        -------
+        list of Change
+            One change for each series that has changed. The series begins again after it.
+
+        """
+        last = self._count % self._size
+        self._count += 1
+        place = self._count % self._size
+        self._sums[place] = self._sums[last] + values
+        self._moves[place] = self._moves[last] + moves
+        alarms: dict[int, tuple[int, float]] = {}
+        for j in range(_LENGTHS):
+            length = 2 ** j
+            if self._count % _stride(length) or self._count < (1 + _BEFORE) * length:
+                continue
+            for channel, std in self._compare(j, length):
+                alarms.setdefault(channel, (length, std))
+        return [self._located(channel, *alarm) for channel, alarm in alarms.items()]
+
+    def restart(self) -> None:
+        """Compare no block to come with a block before, but keep the usual sizes."""
+        self._begin_again(np.arange(self.settings.channels), self._count)
+
+    def _compare(self, j: int, length: int) -> list[tuple[int, float]]:
+        """Compare one length, and learn; return channels that have changed, with usual sizes."""
+        begin = self._count - (1 + _BEFORE) * length
+        now, middle, first = (k % self._size for k in (self._count, self._count - length, begin))
+        difference = (self._sums[now] - self._sums[middle]) / length \
+            - (self._sums[middle] - self._sums[first]) / (_BEFORE * length)
+        kind = int(self._moves[now] > self._moves[first])
+        valid = self._since <= begin
+        self._learn(j, length)
+        weights = self._weights[kind, j]
+        freedom = (weights * _stride(length) / (_INDEPENDENT * length)).astype(int)
+        std = np.maximum(np.sqrt(self._squares[kind, j] / np.maximum(weights, 1.0)),
+                         self.settings.smallest)
+        limit = self.settings.limits[np.minimum(freedom, _MOST)] * std
+        changed = np.flatnonzero(valid & (np.abs(difference) > limit))
+        usable = valid.copy()
+        usable[changed] = False
+        self._waiting[j].append((self._count, kind, difference, usable))
+        return [(int(channel), float(std[channel])) for channel in changed]
+
+    def _learn(self, j: int, length: int) -> None:
+        """Add the differences that are so old that no change can be in them unseen."""
+        memory = _MOST * _INDEPENDENT * length / _stride(length)
+        waiting = self._waiting[j]
+        while waiting and waiting[0][0] <= self._count - (1 + _BEFORE) * length:
+            _, kind, difference, usable = waiting.pop(0)
+            kept = np.where(usable, 1 - 1 / memory, 1.0)
+            self._squares[kind, j] = self._squares[kind, j] * kept + usable * difference ** 2
+            self._weights[kind, j] = self._weights[kind, j] * kept + usable
+
+    def _located(self, channel: int, length: int, std: float) -> Change:
+        """Find where a mean has changed in the compared blocks; the series begins again there."""
+        begin = max(int(self._since[channel]), self._count - (1 + _BEFORE) * length)
+        places = np.arange(begin, self._count + 1) % self._size
+        sums = self._sums[places, channel] - self._sums[places[0], channel]
+        total = len(sums) - 1
+        before = np.arange(1, total)
+        change = (sums[-1] - sums[1:-1]) / (total - before) - sums[1:-1] / before
+        best = int(np.argmax(change ** 2 * before * (total - before)))
+        self._begin_again(np.array([channel]), begin + int(before[best]))
+        return Change(channel, total - int(before[best]), float(change[best]), std)
+
+    def _begin_again(self, channels: np.ndarray, block: int) -> None:
+        """Let series begin at a block; no waiting difference of them is learnt."""
+        self._since[channels] = block
+        for waiting in self._waiting:
+            for _, _, _, usable in waiting:
+                usable[channels] = False

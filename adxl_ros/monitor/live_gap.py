@@ -1,0 +1,478 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The gap of a running sensor: samples and reference go in, gap, floor and changes come out."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, replace
+
+from adxl_ros.files.recording_columns import ACCEL, JOINTS, Recording
+from adxl_ros.files.reference_alignment import Track
+from adxl_ros.files.stream_info import sensor_info
+from adxl_ros.model import noise
+from adxl_ros.model.constants import G0_MPS2
+from adxl_ros.model.sensor import Sensor
+from adxl_ros.monitor.block_residuals import Block, Prediction
+from adxl_ros.monitor.change_test import ChangeSettings, ChangeTest
+from adxl_ros.monitor.reference_stream import AFTER_NS, ReferenceKind, ReferenceStream
+from adxl_ros.monitor.stream_buffer import StreamBuffer
+import numpy as np
+import scipy
+
+BLOCK_NS = 1_000_000_000
+"""Length of a block, ns: one second, as the reports."""
+_LATE_NS = 5_000_000_000
+"""Time that a block waits for its reference, ns. Chosen: longer than a busy network delays."""
+_BREAK_NS = 10_000_000_000
+"""Longest time without a block over which blocks are compared, ns. Chosen: the drift within it is
+small beside the noise of a second."""
+_JUMP_NS = 1_000_000_000
+"""Step of the stamps backwards from which the clock has jumped, ns; chosen: no network reorders
+samples so far."""
+_FEWEST_SAMPLES = 4
+"""Fewest samples of a block; chosen: a variance needs some."""
+_RATE_TOLERANCE = 0.02
+"""Largest relative difference of the measured rate from the stated one. Chosen: above the errors
+of clocks, below those of a wrong file."""
+_BATCHES = 10
+"""Batches of blocks whose scatter gives an interval. Chosen: they are long enough to be
+independent, and Student's t is then near the normal."""
+_FEWEST_BLOCKS = 5
+"""Fewest blocks of a report; chosen: an interval needs some."""
+_CONFIDENCE = 0.9
+"""Probability of the intervals, as in all reports of the package."""
+_MG = 1e-3 * G0_MPS2
+"""One mg, m/s²."""
+_MEMORY = 4096
+"""Blocks whose stamps are known; chosen: more than the longest comparison of the test."""
+_MOST_CHANGES = 100
+"""Changes in memory; chosen: the record on disk has all."""
+_OPEN = 1.1
+"""Rms of the gap, divided by the floor, from which it is open. Chosen: the intervals alone would
+call every twentieth closed gap open."""
+_EXPLAINED_LEAST = 1.1
+"""Rms of the difference to the datasheet, divided by the floor, from which there is something to
+explain. Chosen: an added effect of half the noise."""
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A value with its 90 % interval."""
+
+    value: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class AxisGap:
+    """
+    The gap of one axis over the window; rms, mg.
+
+    Attributes
+    ----------
+    axis
+        x, y or z.
+    gap
+        Samples minus prediction.
+    floor
+        Noise about the mean of each second at rest, and the steps of the encoder.
+    floor_source
+        `rest` where it was measured, `parameters` where nothing has rested yet.
+    offset_mg
+        Mean of samples minus prediction.
+    explained
+        Share of the squares of the gap to the datasheet, above the floor, that the parameters
+        remove, 0 to 1; None where that gap is no larger than the floor.
+
+    """
+
+    axis: str
+    gap: Interval
+    floor: Interval
+    floor_source: str
+    offset_mg: float
+    explained: float | None
+
+    @property
+    def is_open(self) -> bool:
+        """Return whether the gap exceeds the floor by more than chance."""
+        return self.gap.low > _OPEN * self.floor.high
+
+
+@dataclass(frozen=True)
+class GapChange:
+    """
+    A change of the residual.
+
+    Attributes
+    ----------
+    axis
+        x, y or z.
+    quantity
+        `mean`, or `noise` for the standard deviation within a second.
+    since_ns
+        Stamp of the change, ns.
+    detected_ns
+        Stamp of its detection, ns.
+    size
+        Change of the mean, mg; ratio of the standard deviations.
+
+    """
+
+    axis: str
+    quantity: str
+    since_ns: int
+    detected_ns: int
+    size: float
+
+    def text(self) -> str:
+        """Return the change in words."""
+        if self.quantity == 'mean':
+            return f'{self.axis} by {self.size:+.3g} mg'
+        return f'noise of {self.axis} by a factor of {self.size:.3g}'
+
+
+@dataclass(frozen=True)
+class GapSettings:
+    """
+    Settings of the comparison.
+
+    Attributes
+    ----------
+    window_s
+        Time over which the gap is taken, s.
+    false_alarms_per_day
+        Largest rate of changes that are none.
+    history_s
+        Time that is kept for a diagnosis, s.
+
+    """
+
+    window_s: float = 60.0
+    false_alarms_per_day: float = 1 / 30
+    history_s: float = 600.0
+
+
+@dataclass(frozen=True)
+class Counts:
+    """
+    Counts since the start.
+
+    Attributes
+    ----------
+    samples
+        Samples that came.
+    missing
+        Samples that are missing between others, by their stamps.
+    dropped
+        Samples that came twice or late, or are no numbers.
+    jumps
+        How often the stamps have jumped.
+    blocks
+        Compared seconds.
+    skipped
+        Seconds that were not compared, for want of samples or reference.
+
+    """
+
+    samples: int = 0
+    missing: int = 0
+    dropped: int = 0
+    jumps: int = 0
+    blocks: int = 0
+    skipped: int = 0
+
+
+class LiveGap:
+    """
+    Compares a stream with the prediction of its parameters, second by second.
+
+    Parameters
+    ----------
+    sensor
+        The unit with its effects; its rate is that of the stream, or is measured.
+    kind
+        What the sensor is compared with.
+    settings
+        Settings of the comparison.
+
+    Attributes
+    ----------
+    sensor
+        The unit at the rate of the stream.
+    reference
+        The reference, which takes its messages itself.
+    counts
+        Counts since the start.
+    obstacle
+        Why the newest second was not compared; empty if it was.
+    changes
+        Changes so far, the newest last.
+
+    """
+
+    def __init__(self, sensor: Sensor, kind: ReferenceKind, settings: GapSettings) -> None:
+        self.sensor, self._settings = sensor, settings
+        span_ns = round(settings.history_s * 1e9)
+        self.reference = ReferenceStream(kind, sensor, span_ns)
+        self._samples = StreamBuffer(len(sensor.axes), span_ns)
+        self.counts = Counts()
+        self.obstacle = 'no samples yet'
+        self.changes: list[GapChange] = []
+        self._blocks: deque[Block] = deque(
+            maxlen=max(round(settings.window_s * 1e9 / BLOCK_NS), _FEWEST_BLOCKS))
+        self._ends_ns: deque[int] = deque(maxlen=_MEMORY)
+        self._test = ChangeTest(ChangeSettings(2 * len(sensor.axes),
+                                               settings.false_alarms_per_day, BLOCK_NS * 1e-9))
+        self._prediction = Prediction(sensor, self.reference)
+        self._next_ns: int | None = None
+        self._compared_ns: int | None = None
+
+    @property
+    def left_out(self) -> tuple[str, ...]:
+        """Return the effects that the reference cannot drive."""
+        return self._prediction.left_out
+
+    @property
+    def newest_ns(self) -> int | None:
+        """Return the stamp of the newest sample, ns."""
+        return self._samples.newest_ns
+
+    def add_samples(self, stamp_ns: np.ndarray, accel_mps2: np.ndarray) -> None:
+        """
+        Add samples.
+
+        Parameters
+        ----------
+        stamp_ns
+            Stamps, ns, (n,).
+        accel_mps2
+            Specific force by nominal conversion, m/s², (n, m) or with further columns.
+
+        """
+        accel_mps2 = accel_mps2[:, :len(self.sensor.axes)]
+        finite = np.isfinite(accel_mps2).all(axis=1)
+        self._count(samples=len(stamp_ns), dropped=int((~finite).sum()))
+        stamp_ns, accel_mps2 = stamp_ns[finite], accel_mps2[finite]
+        if not len(stamp_ns):
+            return
+        newest_ns = self._samples.newest_ns
+        steps_ns = np.diff(stamp_ns, prepend=stamp_ns[0] if newest_ns is None else newest_ns)
+        jumps = np.flatnonzero((steps_ns < -_JUMP_NS) | (steps_ns > _BREAK_NS))
+        if len(jumps):
+            first = int(jumps[0])
+            self._append(stamp_ns[:first], accel_mps2[:first])
+            self._restart()
+            self._count(jumps=1, samples=first - len(stamp_ns))
+            self.add_samples(stamp_ns[first:], accel_mps2[first:])
+            return
+        self._append(stamp_ns, accel_mps2)
+
+    def advance(self) -> list[GapChange]:
+        """Compare all seconds whose reference is known; return the changes in them."""
+        changes: list[GapChange] = []
+        while self._next_ns is not None or self._begin():
+            assert self._next_ns is not None, 'a comparison that has begun has a next second'
+            end_ns = self._next_ns + BLOCK_NS
+            newest_ns = self._samples.newest_ns or 0
+            if newest_ns < end_ns or self._waits(end_ns, newest_ns):
+                break
+            block = self._compared(self._next_ns, end_ns)
+            self._next_ns = end_ns
+            if block is not None:
+                changes += self._take(block)
+        return changes
+
+    def report(self) -> tuple[AxisGap, ...]:
+        """Return the gap of each axis over the window; nothing before the first seconds."""
+        blocks = list(self._blocks)
+        if len(blocks) < _FEWEST_BLOCKS:
+            return ()
+        return tuple(self._axis_gap(d, axis, blocks) for d, axis in enumerate(self.sensor.axes))
+
+    def recording(self, begin_ns: int = 0) -> Recording:
+        """Return the samples since a stamp, ns, at most those of the history, for a diagnosis."""
+        newest_ns = self._samples.newest_ns or 0
+        begin_ns = max(begin_ns, newest_ns - round(self._settings.history_s * 1e9))
+        stamps_ns, accel_mps2 = self._samples.between(begin_ns, newest_ns + 1)
+        columns = dict(zip(ACCEL, accel_mps2.T))
+        around = begin_ns - BLOCK_NS, newest_ns + BLOCK_NS
+        if self.reference.kind is ReferenceKind.STAGE:
+            at_ns, readings = self.reference.readings.between(*around)
+            for name, values in zip(JOINTS.values(), readings.T):
+                columns[name] = _aligned(at_ns, values, stamps_ns)
+        for name, buffer in self.reference.surroundings.items():
+            at_ns, readings = buffer.between(*around)
+            if len(at_ns) > 1:
+                columns[name] = _aligned(at_ns, readings[:, 0], stamps_ns)
+        origin_ns = int(stamps_ns[0]) if len(stamps_ns) else 0
+        return Recording('the running stream', (stamps_ns - origin_ns) * 1e-9, columns,
+                         sensor_info(self.sensor))
+
+    def force(self, begin_ns: int = 0) -> tuple[np.ndarray, np.ndarray]:
+        """
+        Return the force of the simulator on the time of `recording`.
+
+        Parameters
+        ----------
+        begin_ns
+            As of `recording`.
+
+        Returns
+        -------
+        tuple
+            Times, s, (k,), and force, m/s², (k, 3).
+
+        """
+        newest_ns = self._samples.newest_ns or 0
+        begin_ns = max(begin_ns, newest_ns - round(self._settings.history_s * 1e9))
+        stamps_ns, _ = self._samples.between(begin_ns, newest_ns + 1)
+        at_ns, force_mps2 = self.reference.readings.between(begin_ns - BLOCK_NS,
+                                                            newest_ns + BLOCK_NS)
+        origin_ns = int(stamps_ns[0]) if len(stamps_ns) else 0
+        return (at_ns - origin_ns) * 1e-9, force_mps2
+
+    def span_s(self, begin_ns: int = 0) -> float:
+        """Return the time of the samples since a stamp, ns, that are kept, s."""
+        stamps_ns, _ = self._samples.between(begin_ns, (self._samples.newest_ns or 0) + 1)
+        return float(stamps_ns[-1] - stamps_ns[0]) * 1e-9 if len(stamps_ns) else 0.0
+
+    def _count(self, **added: int) -> None:
+        """Add to counts."""
+        self.counts = replace(self.counts, **{
+            name: getattr(self.counts, name) + number for name, number in added.items()})
+
+    def _append(self, stamp_ns: np.ndarray, accel_mps2: np.ndarray) -> None:
+        """Keep samples, and count what is missing before them."""
+        newest_ns = self._samples.newest_ns
+        dropped = self._samples.add(stamp_ns, accel_mps2)
+        ascending = np.unique(stamp_ns if newest_ns is None else
+                              np.maximum(np.append(newest_ns, stamp_ns), newest_ns))
+        periods = np.rint(np.diff(ascending) * 1e-9 * self.sensor.rate_hz)
+        self._count(dropped=dropped, missing=int((periods - 1).clip(0).sum()))
+
+    def _restart(self) -> None:
+        """Begin again after a jump of the stamps; what was learnt of the noise is kept."""
+        self._samples.clear()
+        self._next_ns = None
+        self._prediction.restart()
+        self._test.restart()
+        self._blocks.clear()
+
+    def _begin(self) -> bool:
+        """Begin with the first whole second, at the measured rate; return whether it has come."""
+        newest_ns = self._samples.newest_ns
+        if newest_ns is None:
+            return False
+        stamps_ns, _ = self._samples.between(newest_ns - 2 * BLOCK_NS, newest_ns + 1)
+        if len(stamps_ns) < _FEWEST_SAMPLES or newest_ns - stamps_ns[0] < BLOCK_NS:
+            return False
+        measured_hz = 1e9 / float(np.median(np.diff(stamps_ns)))
+        if abs(measured_hz / self.sensor.rate_hz - 1) > _RATE_TOLERANCE:
+            self.sensor = replace(self.sensor, rate_hz=measured_hz)
+            self._prediction = Prediction(self.sensor, self.reference)
+        self._next_ns = -(-int(stamps_ns[0]) // BLOCK_NS) * BLOCK_NS
+        return True
+
+    def _waits(self, end_ns: int, newest_ns: int) -> bool:
+        """Return whether a block waits for its reference; set the obstacle where it does long."""
+        reference_ns = self.reference.readings.newest_ns
+        if reference_ns is not None and reference_ns >= end_ns + AFTER_NS:
+            return False
+        waits = newest_ns - end_ns < _LATE_NS
+        if not waits or reference_ns is None:
+            away_s = ((reference_ns or 0) - newest_ns) * 1e-9
+            self.obstacle = 'no reference has come' if reference_ns is None else \
+                f'the reference is {-away_s:.1f} s behind the samples: it is late, or has stopped'
+        return waits
+
+    def _compared(self, begin_ns: int, end_ns: int) -> Block | None:
+        """Compare one second; None where samples or reference are missing."""
+        stamps_ns, accel_mps2 = self._samples.between(begin_ns, end_ns)
+        if self._compared_ns is not None and begin_ns - self._compared_ns > _BREAK_NS:
+            self._prediction.restart()
+            self._test.restart()
+        is_first = not self._prediction.is_running
+        if is_first:
+            self._prediction.start(begin_ns)
+        motion = self.reference.prepare(begin_ns, end_ns)
+        if motion is None or len(stamps_ns) < _FEWEST_SAMPLES:
+            self._count(skipped=1)
+            if motion is None and not self.obstacle.startswith(('no ref', 'the ref')):
+                self.obstacle = 'the reference does not cover the samples; is its clock another?'
+            elif motion is not None:
+                self.obstacle = 'no samples'
+            return None
+        block = self._prediction.block(stamps_ns, accel_mps2, motion, end_ns)
+        self._compared_ns = end_ns
+        self.obstacle = ''
+        # The filter of the sensor settles within the first second.
+        return None if is_first else block
+
+    def _take(self, block: Block) -> list[GapChange]:
+        """Add a block to the window, and test it."""
+        self._count(blocks=1)
+        self._blocks.append(block)
+        self._ends_ns.append(block.end_ns)
+        changes = []
+        for change in self._test.add(np.concatenate([block.mean_mps2, block.log_noise]),
+                                     block.moves):
+            quantity, axis = divmod(change.channel, len(self.sensor.axes))
+            begun = max(len(self._ends_ns) - 1 - change.blocks, 0)
+            changes.append(GapChange(
+                self.sensor.axes[axis], 'noise' if quantity else 'mean', self._ends_ns[begun],
+                block.end_ns, float(np.exp(change.size)) if quantity else change.size / _MG))
+        self.changes = (self.changes + changes)[-_MOST_CHANGES:]
+        return changes
+
+    def _axis_gap(self, d: int, axis: str, blocks: list[Block]) -> AxisGap:
+        """Return the gap of one axis."""
+        gap = _rms_interval(np.array([block.square[d] for block in blocks]))
+        still = [block for block in blocks if not block.moves]
+        encoder = np.array([block.reference_square[d] for block in blocks]).mean()
+        if len(still) >= _FEWEST_BLOCKS:
+            floor = _rms_interval(np.array([block.noise_square[d] for block in still]) + encoder)
+            source = 'rest'
+        else:
+            noise_g = noise.sample_std_v(self.sensor)[d] / self.sensor.nominal_scale_v_per_g[d]
+            std_mg = float(np.sqrt((noise_g * G0_MPS2) ** 2 + encoder)) / _MG
+            floor, source = Interval(std_mg, std_mg, std_mg), 'parameters'
+        datasheet = _rms_interval(np.array([block.datasheet_square[d] for block in blocks]))
+        explained = None
+        if datasheet.value > _EXPLAINED_LEAST * floor.value:
+            explained = float(np.clip((datasheet.value ** 2 - gap.value ** 2) / (
+                datasheet.value ** 2 - floor.value ** 2), 0.0, 1.0))
+        offset_mg = float(np.mean([block.mean_mps2[d] for block in blocks])) / _MG
+        return AxisGap(axis, gap, floor, source, offset_mg, explained)
+
+
+def _rms_interval(squares: np.ndarray) -> Interval:
+    """Return the rms, mg, of the mean squares of blocks, (m/s²)², (n,), with its interval."""
+    batches = np.array([part.mean() for part in np.array_split(
+        squares, min(_BATCHES, len(squares)))])
+    mean = float(squares.mean())
+    half = float(scipy.special.stdtrit(len(batches) - 1, 0.5 + _CONFIDENCE / 2)
+                 * batches.std(ddof=1) / np.sqrt(len(batches)))
+    value, low, high = np.sqrt(np.maximum([mean, mean - half, mean + half], 0.0)) / _MG
+    return Interval(float(value), float(low), float(high))
+
+
+def _aligned(at_ns: np.ndarray, values: np.ndarray, stamps_ns: np.ndarray) -> np.ndarray:
+    """Return readings, (k,), at the stamps of samples, ns, (n,); NaN where they are unknown."""
+    track = Track('the reference')
+    track.add(at_ns, values)
+    return track.interpolate(stamps_ns)

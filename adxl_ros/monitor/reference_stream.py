@@ -1,0 +1,292 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The reference of a running comparison: the motion of the stage, or the force of a simulator."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import Enum
+
+from adxl_ros.files.recording_columns import JOINTS
+from adxl_ros.model.constants import NOMINAL_SUPPLY_V, NOMINAL_TEMPERATURE_C
+from adxl_ros.model.kinematics import specific_force
+from adxl_ros.model.sensor import Sensor
+from adxl_ros.monitor.stream_buffer import StreamBuffer
+from adxl_ros.simulate.motion import Held, INTERNAL_RATE_HZ, Motion, Path
+from adxl_ros.simulate.smoothed_paths import ForcePath, SmoothedPath
+import numpy as np
+
+BEFORE_NS = 2_000_000_000
+"""Readings before a block that its path follows, ns. Chosen: many knots of the spline."""
+AFTER_NS = 250_000_000
+"""Readings after a block that its path needs, ns. Chosen: some knots of the spline, and more than
+the delay of a sensor."""
+_LONGEST_GAP_NS = 500_000_000
+"""Longest time between readings that a path bridges, ns. Chosen: five readings at 10 Hz."""
+_FEWEST = 6
+"""Fewest readings of a path; a quintic spline needs them."""
+_STILL_STEPS = 1.5
+"""Change of a reading, in steps of the encoder, by which a resting joint may change. Chosen: a
+reading between two steps changes by one."""
+_STILL_RAD = 1e-4
+"""The same for an exact encoder, rad and m. Chosen: 0.1 mg, as the noise of a mean of 1 s."""
+_SURROUNDINGS_NS = 20_000_000_000
+"""Time around a block whose temperatures and supplies count, ns. Chosen: slow thermometers."""
+_STILL_MPS2 = 0.05
+"""Range of the force of a simulator at rest, m/s². Chosen: noise of a simulator that adds some."""
+
+
+class ReferenceKind(Enum):
+    """What the sensor is compared with."""
+
+    STAGE = 'stage'
+    IMU = 'imu'
+
+
+@dataclass(frozen=True)
+class BlockMotion:
+    """
+    What the reference shows of one block.
+
+    Attributes
+    ----------
+    moves
+        Whether it moves.
+    error_mps2
+        Standard deviation of the force by the steps of an encoder, m/s², (3,).
+
+    """
+
+    moves: bool
+    error_mps2: np.ndarray
+
+
+class ReferenceStream:
+    """
+    Follows the reference and the surroundings; `motion` is that of the newest prepared block.
+
+    Parameters
+    ----------
+    kind
+        What the sensor is compared with.
+    sensor
+        The unit, with the resolution of its stage.
+    span_ns
+        Time that is kept, ns.
+
+    Attributes
+    ----------
+    kind
+        As given.
+    readings
+        Joints in the order of `JOINTS`, rad and m, or force, m/s².
+
+    """
+
+    def __init__(self, kind: ReferenceKind, sensor: Sensor, span_ns: int) -> None:
+        self.kind = kind
+        self._sensor = sensor
+        self.readings = StreamBuffer(3, span_ns)
+        self.surroundings = {'temperature_c': StreamBuffer(1, span_ns),
+                             'supply_v': StreamBuffer(1, span_ns)}
+        self._held = np.zeros(3)
+        self._origin_ns = 0
+        self._paths: list[Path] = [Held(), Held(), Held()]
+        self._force: ForcePath | None = None
+
+    def add_joints(self, stamp_ns: int, positions: Mapping[str, float]) -> None:
+        """
+        Add one message of the stage.
+
+        Parameters
+        ----------
+        stamp_ns
+            Its stamp, ns.
+        positions
+            Positions by joint, rad or m; a joint that is not named stays.
+
+        """
+        values = np.array([positions.get(joint, held)
+                           for joint, held in zip(JOINTS, self._held.tolist())])
+        if np.isfinite(values).all():
+            self._held = values
+            self.add_readings(np.array([stamp_ns]), values[None])
+
+    def add_readings(self, stamp_ns: np.ndarray, readings: np.ndarray) -> None:
+        """
+        Add readings; stamps that jump back begin a new reference.
+
+        Parameters
+        ----------
+        stamp_ns
+            Stamps, ns, (n,).
+        readings
+            Joints, rad and m, or force, m/s², (n, 3).
+
+        """
+        finite = np.isfinite(readings).all(axis=1)
+        stamp_ns, readings = stamp_ns[finite], readings[finite]
+        newest_ns = self.readings.newest_ns
+        if len(stamp_ns) and newest_ns is not None \
+                and stamp_ns[-1] < newest_ns - _LONGEST_GAP_NS:
+            self.readings.clear()
+        self.readings.add(stamp_ns, readings)
+
+    def add_surroundings(self, name: str, stamp_ns: int, value: float) -> None:
+        """
+        Add a temperature or a supply.
+
+        Parameters
+        ----------
+        name
+            `temperature_c` or `supply_v`.
+        stamp_ns
+            Stamp, ns.
+        value
+            °C or V; NaN is ignored.
+
+        """
+        if np.isfinite(value):
+            buffer = self.surroundings[name]
+            newest_ns = buffer.newest_ns
+            if newest_ns is not None and stamp_ns < newest_ns - BEFORE_NS:
+                buffer.clear()
+            buffer.add(np.array([stamp_ns]), np.array([[value]]))
+
+    def motion(self, origin_ns: int) -> Motion:
+        """Return the motion whose time begins at a stamp, ns; it follows the prepared blocks."""
+        self._origin_ns = origin_ns
+        temperature_c = _Surrounding(self, 'temperature_c', NOMINAL_TEMPERATURE_C)
+        supply_v = _Surrounding(self, 'supply_v', NOMINAL_SUPPLY_V)
+        if self.kind is ReferenceKind.IMU:
+            return Motion(np.inf, force=self._force_at, internal_rate_hz=max(
+                INTERNAL_RATE_HZ, self._sensor.rate_hz), temperature_c=temperature_c,
+                          supply_v=supply_v)
+        alpha, beta, shift = (_Joint(self, joint) for joint in range(3))
+        return Motion(np.inf, alpha, beta, shift, temperature_c=temperature_c, supply_v=supply_v)
+
+    def prepare(self, begin_ns: int, end_ns: int) -> BlockMotion | None:
+        """
+        Make the paths of a block.
+
+        Parameters
+        ----------
+        begin_ns, end_ns
+            Begin and end of the block, ns.
+
+        Returns
+        -------
+        BlockMotion or None
+            What the reference shows; None where it does not cover the block.
+
+        """
+        stamps_ns, readings = self.readings.between(begin_ns - BEFORE_NS, end_ns + AFTER_NS)
+        first = max(int(np.searchsorted(stamps_ns, begin_ns, 'right')) - 1, 0)
+        gaps_ns = np.diff([begin_ns, *stamps_ns[first:], end_ns])
+        if len(stamps_ns) < _FEWEST or gaps_ns.max() > _LONGEST_GAP_NS:
+            return None
+        time_s = (stamps_ns - self._origin_ns) * 1e-9
+        changes = np.ptp(readings[first:], axis=0)
+        if self.kind is ReferenceKind.IMU:
+            self._force = ForcePath(time_s, readings)
+            return BlockMotion(bool((changes > _STILL_MPS2).any()), np.zeros(3))
+        step_rad = self._sensor.stage_resolution_rad
+        self._paths = [SmoothedPath(time_s, values, step)
+                       for values, step in zip(readings.T, (step_rad, step_rad, 0.0))]
+        largest = max(_STILL_STEPS * step_rad, _STILL_RAD)
+        return BlockMotion(bool((changes > largest).any()), self._encoder_error_mps2(
+            (begin_ns - self._origin_ns) * 1e-9, (end_ns - self._origin_ns) * 1e-9))
+
+    def path(self, joint: int) -> Path:
+        """Return the path of a joint in the newest prepared block."""
+        return self._paths[joint]
+
+    def _encoder_error_mps2(self, begin_s: float, end_s: float) -> np.ndarray:
+        """Return what the steps of the encoder make of the force in a block, m/s², (3,)."""
+        time_s = np.linspace(begin_s, end_s, 3)
+        gravity_mps2 = self._sensor.local_gravity_mps2
+        alpha, beta = (path(time_s) for path in self._paths[:2])
+        alpha_std, beta_std = (_path_std(path, time_s) for path in self._paths[:2])
+        force = np.array(specific_force(alpha, beta, gravity_mps2))
+        by_alpha = np.array(specific_force(alpha + alpha_std, beta, gravity_mps2)) - force
+        by_beta = np.array(specific_force(alpha, beta + beta_std, gravity_mps2)) - force
+        return np.asarray(np.sqrt((by_alpha ** 2 + by_beta ** 2).mean(axis=1)))
+
+    def _force_at(self, time_s: np.ndarray) -> list[np.ndarray]:
+        """Return the force of a simulator at times, s, (n,): three components, m/s²."""
+        assert self._force is not None, 'a block is prepared before it is simulated'
+        return list(self._force(time_s))
+
+    def surrounding(self, name: str, time_s: np.ndarray, default: float) -> np.ndarray:
+        """
+        Return the temperature or the supply at times.
+
+        Parameters
+        ----------
+        name
+            `temperature_c` or `supply_v`.
+        time_s
+            Times of the motion, s, (n,).
+        default
+            Value before the first reading, °C or V.
+
+        Returns
+        -------
+        ndarray
+            Values, (n,).
+
+        """
+        buffer = self.surroundings[name]
+        if not len(buffer):
+            return np.full(len(time_s), default)
+        at_ns = self._origin_ns + time_s * 1e9
+        stamps_ns, values = buffer.between(int(at_ns[0]) - _SURROUNDINGS_NS,
+                                           int(at_ns[-1]) + _SURROUNDINGS_NS)
+        if not len(stamps_ns):
+            newest_ns = buffer.newest_ns or 0
+            stamps_ns, values = buffer.between(newest_ns, newest_ns + 1)
+        return np.interp(at_ns, stamps_ns, values[:, 0])
+
+
+def _path_std(path: Path, time_s: np.ndarray) -> np.ndarray:
+    """Return the standard deviation of a path at times, s, (n,), by the steps of its encoder."""
+    errors = path.errors(time_s) if isinstance(path, SmoothedPath) else None
+    return np.zeros(len(time_s)) if errors is None else errors.std
+
+
+@dataclass(frozen=True)
+class _Surrounding:
+    """Temperature or supply over time."""
+
+    stream: ReferenceStream
+    name: str
+    default: float
+
+    def __call__(self, time_s: np.ndarray, order: int = 0) -> np.ndarray:
+        """Return the values at times, s, (n,)."""
+        return self.stream.surrounding(self.name, time_s, self.default)
+
+
+@dataclass(frozen=True)
+class _Joint:
+    """The path of one joint, which changes from block to block."""
+
+    stream: ReferenceStream
+    joint: int
+
+    def __call__(self, time_s: np.ndarray, order: int = 0) -> np.ndarray:
+        """Return a derivative; see `simulate.motion.Path`."""
+        return self.stream.path(self.joint)(time_s, order)

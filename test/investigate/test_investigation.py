@@ -1,0 +1,147 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The states of an investigation, with answers that the test gives."""
+
+from adxl_ros.diagnose.decision import WeightedHypothesis
+from adxl_ros.errors import UserError
+from adxl_ros.investigate.diagnosis_round import Answer
+from adxl_ros.investigate.investigation import Investigation, State
+from adxl_ros.investigate.stage_limits import Pose, StageLimits
+from adxl_ros.investigate.stop_rule import Outcome
+import numpy as np
+import pytest
+
+LIMITS = StageLimits((0.0, np.pi), (0.0, 2 * np.pi), 0.5)
+GO_ON = Answer((WeightedHypothesis((), 0.6),), Outcome.GO_ON, manoeuvre='rests_upright')
+CERTAIN = Answer((WeightedHypothesis(('lever_arm',), 0.97),), Outcome.CERTAIN, 'It is lever_arm.')
+TIME_OVER = Answer((WeightedHypothesis((), 0.6),), Outcome.TIME_OVER, 'The time is over.')
+
+
+class Answers:
+    """A diagnosis that answers what it is given, after a while."""
+
+    def __init__(self, *answers):
+        self.answers, self.questions, self.wait, self.is_cancelled = list(answers), [], 0, False
+
+    def ask(self, question):
+        self.questions.append(question)
+        self.wait = 50
+
+    def answer(self):
+        self.wait -= 1
+        if self.wait > 0:
+            return None
+        answer = self.answers.pop(0)
+        if isinstance(answer, UserError):
+            raise answer
+        return answer
+
+    def cancel(self):
+        self.is_cancelled = True
+
+
+class Stage:
+    """A stage that follows its command within a time step, unless it is stuck."""
+
+    def __init__(self, investigation):
+        self.investigation, self.pose, self.now_s, self.commands = \
+            investigation, Pose(0.0, 0.0), 1000.0, []
+        self.is_stuck = False
+
+    def run(self, until, longest_s=2000.0):
+        end_s = self.now_s + longest_s
+        while not until():
+            assert self.now_s < end_s, self.investigation.status()
+            self.now_s += 0.02
+            command = self.investigation.step(self.now_s, self.pose)
+            if command is not None:
+                self.commands.append(command)
+                self.pose = self.pose if self.is_stuck else command
+
+
+def started(*answers, minutes=10.0):
+    diagnoser = Answers(*answers)
+    investigation = Investigation(LIMITS, minutes, diagnoser)
+    return investigation, Stage(investigation), diagnoser
+
+
+def test_it_diagnoses_and_moves_in_turn_until_a_hypothesis_is_certain():
+    investigation, stage, diagnoser = started(GO_ON, GO_ON, CERTAIN)
+    states = []
+
+    def has_ended():
+        if not states or states[-1] is not investigation.state:
+            states.append(investigation.state)
+        return investigation.has_ended
+    stage.run(has_ended)
+    assert states == [State.RECORDING, State.DIAGNOSING, State.MOVING, State.DIAGNOSING,
+                      State.MOVING, State.DIAGNOSING, State.FINISHED]
+    assert investigation.has_verdict
+    assert [q.has_samples for q in diagnoser.questions] == [False, True, True]
+    assert diagnoser.questions[1].minutes > diagnoser.questions[0].minutes
+    assert diagnoser.questions[1].remaining_minutes < 10
+    assert max(LIMITS.excess_rad(c) for c in stage.commands) == 0
+
+
+def test_a_stop_holds_the_pose_of_the_stage():
+    investigation, stage, diagnoser = started(GO_ON, CERTAIN)
+    stage.run(lambda: investigation.state is State.MOVING and stage.now_s > 1010)
+    stage.is_stuck, stage.pose = True, Pose(0.3, 0.4)
+    stage.run(lambda: stage.now_s > 1012)
+    assert investigation.stop('Ctrl-C') == (0.3, 0.4)
+    assert investigation.step(stage.now_s + 1, Pose(0.31, 0.41)) == (0.3, 0.4)
+    assert diagnoser.is_cancelled
+    assert not investigation.has_verdict
+    assert 'Ctrl-C' in investigation.status().text
+
+
+def test_a_stage_that_does_not_follow_is_left_alone():
+    investigation, stage, _ = started(GO_ON, CERTAIN)
+    stage.is_stuck = True
+    stage.run(lambda: investigation.has_ended, 60)
+    assert investigation.state is State.STOPPED
+    assert 'has not followed' in investigation.reason
+    assert stage.commands[-1] == stage.pose
+
+
+def test_the_time_is_a_limit():
+    investigation, stage, diagnoser = started(GO_ON, GO_ON, TIME_OVER, minutes=1.0)
+    stage.run(lambda: investigation.has_ended)
+    assert investigation.state is State.FINISHED
+    assert not investigation.has_verdict
+    assert diagnoser.questions[-1].remaining_minutes == 0
+    assert sum(d > 0 for d in np.abs(np.diff(stage.commands, axis=0)).max(axis=1)) < 60 / 0.02
+
+
+def test_a_stage_outside_its_limits_is_not_moved():
+    investigation, stage, _ = started(GO_ON)
+    stage.pose = Pose(-0.5, 0.0)
+    stage.run(lambda: investigation.has_ended)
+    assert 'limits.alpha_deg' in investigation.reason
+    assert not stage.commands
+
+
+@pytest.mark.parametrize('answer', [UserError('the bag is gone'), Answer(
+    (), Outcome.INSEPARABLE, fault='axis x is inverted')])
+def test_a_failed_diagnosis_stops_it(answer):
+    investigation, stage, _ = started(GO_ON, answer)
+    stage.run(lambda: investigation.has_ended)
+    assert investigation.state is State.STOPPED
+    assert investigation.reason in ('the bag is gone', 'axis x is inverted')
+
+
+def test_an_answer_survives_its_file():
+    assert Answer.from_json(GO_ON.as_json()) == GO_ON
+    assert Answer.from_json(CERTAIN.as_json()) == CERTAIN

@@ -1,0 +1,80 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Manoeuvres and their commands keep the limits of the stage."""
+
+from adxl_ros.investigate.command_stream import CommandStream, LONGEST_STEP_S
+from adxl_ros.investigate.manoeuvres import CATALOGUE, description, plan
+from adxl_ros.investigate.stage_limits import Pose, StageLimits
+import numpy as np
+import pytest
+
+FULL = StageLimits((0.0, np.pi), (0.0, 2 * np.pi), 0.3)
+NARROW = StageLimits((0.2, 0.3), (-0.1, 0.05), 0.02)
+ODD = StageLimits((-2.0, 0.4), (3.0, 3.5), 2.0)
+
+
+def times_of(manoeuvre, step_s=0.02):
+    return manoeuvre.begin_s + np.arange(0, manoeuvre.motion.duration_s + step_s, step_s)
+
+
+@pytest.mark.parametrize('name', CATALOGUE)
+@pytest.mark.parametrize('limits', [FULL, NARROW, ODD])
+def test_a_manoeuvre_keeps_angle_and_rate_and_begins_and_ends_at_rest(name, limits):
+    pose = limits.nearest(0.1, 0.2)
+    manoeuvre = plan(name, limits, pose, 100.0)
+    time_s = times_of(manoeuvre)
+    for path, (low, high), start, end in zip(
+            (manoeuvre.motion.alpha, manoeuvre.motion.beta), (limits.alpha_rad, limits.beta_rad),
+            pose, manoeuvre.end):
+        angle = path(time_s)
+        assert low - 1e-9 <= angle.min() <= angle.max() <= high + 1e-9
+        assert np.abs(path(time_s, 1)).max() <= limits.rate_rad_s * (1 + 1e-9)
+        assert (angle[0], angle[-1]) == pytest.approx((start, end))
+        assert path(time_s[[0, -1]], 1) == pytest.approx(0)
+    assert manoeuvre.minutes == pytest.approx((time_s[-1] - 100) / 60, abs=0.001)
+
+
+@pytest.mark.parametrize('name', CATALOGUE)
+def test_a_manoeuvre_moves_a_stage_that_can_turn(name):
+    manoeuvre = plan(name, FULL, Pose(0.0, 0.0))
+    time_s = times_of(manoeuvre, 0.1)
+    assert max(np.ptp(manoeuvre.motion.alpha(time_s)), np.ptp(manoeuvre.motion.beta(time_s))) > 0.2
+    assert len(description(name)) > 10
+
+
+@pytest.mark.parametrize('name', CATALOGUE)
+@pytest.mark.parametrize('limits', [FULL, NARROW, ODD])
+def test_commands_keep_the_limits_however_late_the_calls_are(name, limits):
+    rng = np.random.default_rng(3)
+    pose = limits.nearest(0.1, 0.2)
+    stream = CommandStream(limits, plan(name, limits, pose), pose)
+    last = pose
+    while not stream.is_done:
+        elapsed_s = rng.choice([0.001, 0.02, 0.1, 3.0])
+        command = stream.advance(elapsed_s, last)
+        assert limits.excess_rad(command) == 0
+        largest = limits.rate_rad_s * min(elapsed_s, LONGEST_STEP_S) + 1e-12
+        assert max(abs(c - p) for c, p in zip(command, last)) <= largest
+        last = command
+    assert last == pytest.approx(plan(name, limits, pose).end, abs=1e-6)
+
+
+def test_a_command_waits_for_a_stage_that_stands_still():
+    stream = CommandStream(FULL, plan('fast_turn_of_beta', FULL, Pose(0.0, 0.0)), Pose(0.0, 0.0))
+    for _ in range(2000):
+        command = stream.advance(0.02, Pose(0.0, 0.0))
+    assert stream.waited_s > 10
+    assert max(command) < 0.2
+    assert not stream.is_done

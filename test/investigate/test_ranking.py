@@ -1,0 +1,108 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The manoeuvre that is chosen separates what remains."""
+
+from functools import cache
+
+from adxl_ros.diagnose.decision import WeightedHypothesis
+from adxl_ros.investigate.assessment import Assessment
+from adxl_ros.investigate.diagnosis_round import Question, run_round
+from adxl_ros.investigate.manoeuvres import plan, plan_all
+from adxl_ros.investigate.ranking import ManoeuvreWorth, rank, Ranking
+from adxl_ros.investigate.stage_limits import Pose, StageLimits
+from adxl_ros.investigate.stop_rule import decide, Outcome
+import numpy as np
+import pytest
+from units import nominal
+
+LIMITS = StageLimits((0.0, np.pi), (0.0, 2 * np.pi), 0.5)
+SENSOR = nominal(rate_hz=62.5)
+
+
+BEYOND = ('saturation',)
+"""An effect that acts beyond the force that a stage gives: it predicts what no gap predicts."""
+
+
+def between(*hypotheses):
+    return Assessment(tuple(WeightedHypothesis(h, 1 / len(hypotheses)) for h in hypotheses))
+
+
+def planned(*names):
+    return [plan(name, LIMITS, Pose(1.5, 0.0)) for name in names]
+
+
+def told_nothing(information=0.0):
+    return ManoeuvreWorth(*planned('rests_upright'), information)
+
+
+@cache
+def first_round():
+    """Return answer and diagnosis of a round of ten minutes without samples."""
+    return run_round(Question(Pose(0.0, 0.0), 0.0, 10.0, False), [], SENSOR, LIMITS)
+
+
+def worth(ranking):
+    return {w.manoeuvre.name: w.information for w in ranking.worth}
+
+
+def test_fast_turns_show_an_arm_better_than_rests_and_slow_turns():
+    names = ('rests_on_axes', 'fast_turn_of_beta', 'slow_turn_of_beta')
+    information = worth(rank(between(BEYOND, ('lever_arm',)), SENSOR, planned(*names)))
+    assert information['fast_turn_of_beta'] > information['rests_on_axes']
+    assert information['fast_turn_of_beta'] > information['slow_turn_of_beta']
+
+
+def test_a_level_turn_of_beta_does_not_show_the_force_along_the_axes():
+    names = ('level_turn_of_beta', 'rests_upright')
+    information = worth(rank(between(BEYOND, ('nonlinearity',)), SENSOR, planned(*names)))
+    assert information['rests_upright'] > 3 * information['level_turn_of_beta']
+
+
+def test_equal_hypotheses_cannot_be_separated():
+    ranking = Ranking(between((), ('saturation',)), (told_nothing(),), ())
+    decision = decide(ranking, True)
+    assert decision.outcome is Outcome.NO_VISIBLE_GAP
+    assert decision.sentence == 'There is no gap that this stage can show: 100 %.'
+
+
+@pytest.mark.xdist_group('first_round')
+def test_a_manoeuvre_that_does_not_fit_in_the_time_is_not_chosen():
+    pose = Pose(0.0, 0.0)
+    minutes = {m.name: m.minutes for m in plan_all(LIMITS, pose)}
+    shortest = min(minutes, key=minutes.get)
+    assert shortest != first_round()[0].manoeuvre
+    answer, _ = run_round(Question(pose, 0.0, minutes[shortest] + 1e-6, False), [], SENSOR, LIMITS)
+    assert answer.manoeuvre == shortest
+    assert decide(Ranking(between((), ('hysteresis',)), (told_nothing(1.0),), ()),
+                  False).outcome is Outcome.TIME_OVER
+
+
+@pytest.mark.parametrize('probability, outcome', [(0.96, Outcome.CERTAIN), (0.9, Outcome.GO_ON)])
+def test_95_percent_of_a_hypothesis_is_a_verdict(probability, outcome):
+    assessment = Assessment((WeightedHypothesis(('hysteresis',), probability),
+                             WeightedHypothesis((), 1 - probability)))
+    decision = decide(Ranking(assessment, (told_nothing(1.0),), ()), True)
+    assert decision.outcome is outcome
+    if outcome is Outcome.CERTAIN:
+        assert decision.sentence == 'The recording shows hysteresis: 96 %.'
+
+
+@pytest.mark.xdist_group('first_round')
+def test_the_first_round_needs_no_samples():
+    answer, diagnosis = first_round()
+    assert diagnosis is None
+    assert answer.outcome is Outcome.GO_ON
+    assert 'temperature_bias' in answer.hidden
+    assert sum(h.probability for h in answer.hypotheses) == pytest.approx(1)

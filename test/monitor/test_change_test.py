@@ -1,0 +1,90 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The sequential test: its rate of false alarms on drifting noise, its delay, and its restarts."""
+
+from __future__ import annotations
+
+from adxl_ros.monitor.change_test import Change, ChangeSettings, ChangeTest
+import numpy as np
+import pytest
+from scipy.stats import poisson
+from still_noise import flicker
+
+DAY_S = 86400
+
+
+def series(kind: str, blocks: int, channels: int, seed: int) -> np.ndarray:
+    """Return means of seconds, µg, (blocks, channels), of an ADXL203 with drift of a kind."""
+    rng = np.random.default_rng(seed)
+    values = 78 * rng.standard_normal((blocks, channels))
+    if kind in ('flicker', 'all'):
+        values += np.column_stack([177 * flicker(rng, blocks) for _ in range(channels)])
+    if kind in ('walk', 'all'):
+        values += np.cumsum(rng.standard_normal((blocks, channels)), axis=0)
+    if kind == 'all':
+        values += 300 * np.sin(2 * np.pi * (np.arange(blocks)[:, None] / DAY_S
+                                            + rng.random(channels)))
+    return values
+
+
+def run(test: ChangeTest, values: np.ndarray, moves: bool = False) -> list[tuple[int, Change]]:
+    """Return the changes that a test reports, each with the number of its block."""
+    return [(i, change) for i, row in enumerate(values) for change in test.add(row, moves)]
+
+
+@pytest.mark.parametrize('kind', ['white', 'flicker', 'walk', 'all'])
+def test_false_alarms_are_no_more_than_stated(kind: str) -> None:
+    """Ten sensors of four series for six hours, with one false alarm a day each."""
+    hours, sensors, rate = 6, 10, 1.0
+    test = ChangeTest(ChangeSettings(4 * sensors, rate * sensors))
+    alarms = run(test, series(kind, hours * 3600, 4 * sensors, 3))
+    assert len(alarms) <= poisson.isf(1e-3, rate * sensors * hours / 24)
+
+
+@pytest.mark.parametrize('kind, size, delay_s', [
+    ('white', 1000.0, 2), ('white', 300.0, 20), ('white', 100.0, 200), ('all', 3000.0, 5)])
+def test_a_step_is_found_in_time(kind: str, size: float, delay_s: int) -> None:
+    test = ChangeTest(ChangeSettings(6, 1 / 30))
+    values = series(kind, 9000, 6, 5)
+    values[7200:, 2] += size
+    (block, change), *others = run(test, values)
+    assert not others
+    assert (change.channel, 7200 <= block < 7200 + delay_s) == (2, True)
+    assert change.size == pytest.approx(size, abs=500 if kind == 'all' else 150)
+    assert abs(block + 1 - change.blocks - 7200) < 0.3 * delay_s + 2
+
+
+def test_motion_is_compared_with_motion() -> None:
+    """A first move with errors of its own is no change of the sensor."""
+    rng = np.random.default_rng(1)
+    test = ChangeTest(ChangeSettings(1, 1 / 30))
+    assert not run(test, rng.standard_normal((3000, 1)))
+    assert not run(test, 30 * rng.standard_normal((40, 1)), moves=True)
+    assert not run(test, rng.standard_normal((3000, 1)))
+
+
+def test_a_series_without_noise() -> None:
+    test = ChangeTest(ChangeSettings(1, 1 / 30))
+    assert not run(test, np.full((200, 1), 0.3))
+    assert len(run(test, np.full((200, 1), 0.4))) == 1
+
+
+def test_nothing_is_compared_over_a_restart() -> None:
+    rng = np.random.default_rng(1)
+    test = ChangeTest(ChangeSettings(1, 1 / 30))
+    assert not run(test, rng.standard_normal((2000, 1)))
+    test.restart()
+    assert not run(test, 1000 + rng.standard_normal((500, 1)))
+    assert len(run(test, 1020 + rng.standard_normal((500, 1)))) == 1

@@ -1,0 +1,224 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The live comparison without ROS: residual, floor, changes, and faults of the streams."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from adxl_ros.model.sensor import Sensor, to_nominal_mps2
+from adxl_ros.monitor.live_gap import AxisGap, GapChange, GapSettings, LiveGap
+from adxl_ros.monitor.reference_stream import ReferenceKind
+from adxl_ros.simulate.motion import Held, Motion
+from adxl_ros.simulate.response import Response
+from adxl_ros.tools.effect_option import with_effects
+import numpy as np
+import pytest
+from units import nominal
+
+RATE_HZ = 200.0
+UNIT = nominal('xyz', rate_hz=RATE_HZ, stage_resolution_rad=0.0)
+ORIGIN_NS = 1_700_000_000 * 10 ** 9
+EFFECTS = ('misalignment', 'temperature_bias', 'hysteresis')
+
+
+class Swing:
+    """A joint that swings; or rests where the amplitude is 0."""
+
+    def __init__(self, amplitude: float, rate: float) -> None:
+        self._amplitude, self._rate = amplitude, rate
+
+    def __call__(self, time_s: np.ndarray, order: int = 0) -> np.ndarray:
+        """Return a derivative of the angle, rad."""
+        phase = self._rate * time_s + order * np.pi / 2
+        return (0.7 if not order else 0.0) + self._amplitude * self._rate ** order * np.sin(phase)
+
+
+class World:
+    """A sensor on a stage, or beside a simulator, whose samples a comparison gets."""
+
+    def __init__(self, truth: Sensor, params: Sensor, kind: ReferenceKind = ReferenceKind.STAGE,
+                 amplitude: float = 0.5, step_rad: float = 0.0) -> None:
+        self._truth, self._kind, self._step_rad = truth, kind, step_rad
+        self._joints = Swing(amplitude, 0.6), Swing(2 * amplitude, 0.37)
+        self._respond = self._response(truth)
+        self.live = LiveGap(params, kind, GapSettings(window_s=20.0))
+        self.step = 0
+        self.offset_ns = 0
+        self.reference_until = np.inf
+
+    def _response(self, sensor: Sensor) -> Response:
+        motion = Motion(np.inf, *self._joints, Held(), force=self._force) \
+            if self._kind is ReferenceKind.IMU else Motion(np.inf, *self._joints, Held())
+        return Response(sensor, motion, 3)
+
+    @staticmethod
+    def _force(time_s: np.ndarray) -> list[np.ndarray]:
+        return [3 * np.sin(time_s), 2 * np.cos(0.7 * time_s), 9 + np.sin(0.3 * time_s)]
+
+    def run(self, seconds: int, change: Callable[[np.ndarray], np.ndarray] = lambda a: a
+            ) -> list[GapChange]:
+        """Send some seconds of samples, changed by a function; return what is reported."""
+        changes = []
+        for _ in range(seconds * 10):
+            time_s = (self.step + np.arange(20)) / RATE_HZ
+            stamps = ORIGIN_NS + self.offset_ns + np.rint(time_s * 1e9).astype(np.int64)
+            accel = change(to_nominal_mps2(self._respond(time_s), self._truth))
+            self.live.add_samples(stamps, accel)
+            if self.step / RATE_HZ < self.reference_until:
+                self._refer(time_s[::2], stamps[::2])
+            changes += self.live.advance()
+            self.step += 20
+        return changes
+
+    def _refer(self, time_s: np.ndarray, stamps: np.ndarray) -> None:
+        reference = self.live.reference
+        if self._kind is ReferenceKind.IMU:
+            reference.add_readings(stamps, np.column_stack(self._force(time_s)))
+            return
+        for i, stamp in enumerate(stamps.tolist()):
+            angles = [float(joint(time_s[i:i + 1])[0]) for joint in self._joints]
+            if self._step_rad:
+                angles = [round(angle / self._step_rad) * self._step_rad for angle in angles]
+            reference.add_joints(stamp, dict(zip(('alpha', 'beta'), angles)))
+
+
+def gaps(world: World) -> list[float]:
+    """Return the gaps by axis, mg."""
+    return [axis.gap.value for axis in world.live.report()]
+
+
+@pytest.mark.parametrize('kind', list(ReferenceKind))
+@pytest.mark.parametrize('amplitude', [0.0, 0.5])
+def test_the_gap_of_the_right_parameters_is_the_floor(kind: ReferenceKind, amplitude: float
+                                                      ) -> None:
+    sensor = with_effects(UNIT, EFFECTS)
+    world = World(sensor, sensor, kind, amplitude)
+    assert not world.run(40)
+    for axis in world.live.report():
+        assert axis.gap.value == pytest.approx(axis.floor.value, rel=0.1)
+        assert axis.gap.low <= axis.gap.value <= axis.gap.high
+        assert not axis.is_open
+    assert world.live.obstacle == ''
+
+
+def test_the_share_that_the_parameters_explain() -> None:
+    def explained(params: Sensor) -> list[float | None]:
+        world = World(with_effects(UNIT, ['bias:offset_v.x=0.02']), params)
+        world.run(30)
+        return [axis.explained for axis in world.live.report()]
+
+    assert explained(UNIT)[0] == 0
+    assert explained(UNIT)[1] is None, 'there is nothing to explain'
+    assert explained(with_effects(UNIT, ['bias:offset_v.x=0.02']))[0] == pytest.approx(1, abs=0.01)
+    assert explained(with_effects(UNIT, ['bias:offset_v.x=0.01']))[0] == pytest.approx(
+        0.75, abs=0.02)
+
+
+def test_the_steps_of_the_encoder_belong_to_the_floor() -> None:
+    unit = nominal('xyz', rate_hz=RATE_HZ, stage_resolution_rad=0.02)
+    world = World(unit, unit, amplitude=0.0, step_rad=0.02)
+    world.run(20)
+    axes = world.live.report()
+    assert max(axis.floor.value for axis in axes) > 4
+    assert not any(axis.is_open for axis in axes)
+
+
+def test_a_change_of_the_mean_and_of_the_noise() -> None:
+    world = World(UNIT, UNIT)
+    rng = np.random.default_rng(1)
+    assert not world.run(80)
+    step, = world.run(20, lambda a: a + [0.0, 0.05, 0.0])
+    assert (step.axis, step.quantity) == ('y', 'mean')
+    assert step.size == pytest.approx(0.05 / 9.80665e-3, rel=0.1)
+    assert (step.since_ns - ORIGIN_NS) * 1e-9 == pytest.approx(80, abs=1)
+    noise = world.run(60, lambda a: a + [0.0, 0.05, 0.0] + 0.03 * rng.standard_normal(a.shape))
+    assert {(change.axis, change.quantity) for change in noise} >= {('z', 'noise')}
+    assert all(change.size > 2 for change in noise if change.quantity == 'noise')
+
+
+def test_faults_of_the_samples_are_counted() -> None:
+    world = World(UNIT, UNIT)
+    world.run(20)
+
+    def broken(accel: np.ndarray) -> np.ndarray:
+        accel[3] = np.nan
+        return accel
+
+    world.run(1, broken)
+    assert world.live.counts.dropped == 10
+    world.step += 7
+    world.run(2)
+    assert world.live.counts.missing == 10 + 7
+    world.offset_ns -= 300 * 10 ** 9
+    world.run(30)
+    assert world.live.counts.jumps == 1
+    assert np.isfinite(gaps(world)).all() and len(gaps(world)) == 3
+    world.offset_ns += 300 * 10 ** 9
+    world.run(30)
+    assert world.live.counts.jumps == 2
+    assert not any(axis.is_open for axis in world.live.report())
+
+
+def test_a_reference_that_stops_is_named_and_comes_back() -> None:
+    world = World(UNIT, UNIT)
+    world.reference_until = 20
+    world.run(40)
+    assert 'behind the samples' in world.live.obstacle
+    assert world.live.counts.skipped > 10
+    world.reference_until = np.inf
+    assert not world.run(20)
+    assert world.live.obstacle == ''
+
+
+def test_no_reference() -> None:
+    world = World(UNIT, UNIT)
+    world.reference_until = 0
+    world.run(10)
+    assert world.live.report() == ()
+    assert world.live.obstacle == 'no reference has come'
+
+
+def test_the_rate_is_measured_where_it_is_not_stated() -> None:
+    wrong = nominal('xyz', rate_hz=1000.0)
+    world = World(UNIT, wrong)
+    world.run(20)
+    assert world.live.sensor.rate_hz == pytest.approx(RATE_HZ)
+    assert not any(axis.is_open for axis in world.live.report())
+
+
+def test_memory_is_bounded_and_the_recording_has_the_newest_samples() -> None:
+    world = World(UNIT, UNIT)
+    world.live = LiveGap(UNIT, ReferenceKind.STAGE, GapSettings(history_s=60.0))
+    world.run(200)
+    recording = world.live.recording()
+    assert recording.time_s[-1] == pytest.approx(60, abs=0.1)
+    assert {'ax_mps2', 'alpha_rad', 'beta_rad'} <= set(recording.columns)
+    assert np.isfinite(recording.columns['alpha_rad'][100:-100]).all()
+    assert len(world.live._samples._stamps) < 5 * 60 * RATE_HZ
+
+
+def test_effects_of_the_stage_are_left_out_beside_a_simulator() -> None:
+    sensor = with_effects(UNIT, ['lever_arm', 'misalignment'])
+    live = LiveGap(sensor, ReferenceKind.IMU, GapSettings())
+    assert live.left_out == ('lever_arm',)
+
+
+def test_an_axis_of_the_report_is_complete() -> None:
+    world = World(UNIT, UNIT)
+    world.run(10)
+    axis = world.live.report()[0]
+    assert isinstance(axis, AxisGap)
+    assert (axis.axis, axis.floor_source) == ('x', 'parameters')
