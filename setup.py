@@ -37,9 +37,12 @@ def scripts(package: str, names: tuple[str, ...]) -> list[str]:
 setup(
     name=PACKAGE,
     version='0.1.0',
-    packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*']),
+    # The parameter files are part of the package, too: a cluster node has no ROS to locate them.
+    packages=[*find_packages(include=[PACKAGE, f'{PACKAGE}.*']), f'{PACKAGE}.params'],
+    package_dir={f'{PACKAGE}.params': 'params'},
     package_data={PACKAGE: ['calibrate/report/*.html', 'calibrate/report/*.js', 'diagnose/*.html',
-                            'files/page_templates/*', 'tools/*.html']},
+                            'files/page_templates/*', 'fleet/report/*.html', 'tools/*.html'],
+                  f'{PACKAGE}.params': ['*.yaml']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
         (f'share/{PACKAGE}', ['package.xml']),
@@ -49,7 +52,7 @@ setup(
     ],
     python_requires='>=3.10',
     install_requires=['setuptools', *requirements('core')],
-    extras_require={name: requirements(name) for name in ('extras', 'blind', 'test')},
+    extras_require={name: requirements(name) for name in ('extras', 'blind', 'fleet', 'test')},
     zip_safe=True,
     maintainer='the adxl_ros authors',
     maintainer_email='maintainers@example.org',
@@ -58,10 +61,10 @@ setup(
     entry_points={
         'console_scripts': [
             *scripts('nodes', ('driver', 'stage', 'calibration', 'screen', 'compensation',
-                               'demo')),
+                               'investigate', 'monitor', 'demo')),
             f'bench = {PACKAGE}.nodes.benchmark:main',
             *scripts('tools', ('simulate', 'fit', 'apply', 'noise', 'check', 'diagnose', 'export',
-                               'blind', 'working', 'reproduce')),
+                               'fleet', 'blind', 'working', 'reproduce')),
         ],
     },
 )

@@ -18,7 +18,8 @@ from pathlib import Path
 import signal
 import sys
 
-_EXECUTABLES = ('driver', 'stage', 'calibration', 'compensation', 'screen')
+_EXECUTABLES = ('driver', 'stage', 'calibration', 'compensation', 'investigate',
+                'monitor', 'screen')
 """Executables that set a handler of their own once they have loaded."""
 
 

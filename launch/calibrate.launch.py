@@ -34,30 +34,23 @@ from typing import Any
 
 from adxl_ros.errors import UserError
 from adxl_ros.nodes.support import launch_nodes
-from adxl_ros.nodes.support.launch_nodes import Argument, given_anywhere, make_node, text
+from adxl_ros.nodes.support.launch_nodes import (
+    Argument,
+    BRIDGE,
+    given_anywhere,
+    LINK_TYPE,
+    make_node,
+    SPEED,
+    STAGE_TYPE,
+    text,
+)
 from launch import LaunchContext, LaunchDescription
 from launch.action import Action
 from launch.actions import DeclareLaunchArgument, LogInfo
 
-LINK_TYPE = launch_nodes.LINK[0]
-STAGE_TYPE = Argument('stage_type', 'stage.type', 'the simulated stage, or the type of command '
-                      'that the controller of a real stage takes', str,
-                      ('simulated', 'joint_state', 'trajectory'))
 STAGE_MODE = Argument('stage_mode', 'stage.mode', 'who turns the stage: commanded turns itself, '
                       'encoder and manual are turned by hand', str,
                       ('commanded', 'encoder', 'manual'))
-BRIDGE = (
-    Argument('bridge_joint_states', 'bridge.joint_states', "topic of the controller's joint "
-             'states'),
-    Argument('bridge_command', 'bridge.command', 'topic on which the controller listens'),
-    Argument('bridge_speed_rad_s', 'bridge.speed_rad_s', 'speed of the real stage, rad/s', float),
-    *(argument for joint in ('alpha', 'beta') for argument in (
-        Argument(f'bridge_{joint}_joint', f'bridge.{joint}.joint',
-                 f"the controller's name of the joint {joint}"),
-        Argument(f'bridge_{joint}_sign', f'bridge.{joint}.sign',
-                 f'direction in which it counts {joint}: 1 or -1', int),
-        Argument(f'bridge_{joint}_offset_rad', f'bridge.{joint}.offset_rad',
-                 f"{joint} where the controller's joint is at 0, rad", float))))
 SWEEP = (
     Argument('report', 'report', 'directory for the report, a page of plots'),
     Argument('resume', 'resume', 'what to do with an interrupted calibration', str,
@@ -72,8 +65,6 @@ SWEEP = (
     Argument('sweep_tilt_error_deg', 'sweep.tilt_error_deg', 'rms tilt error that the plan quick '
              'is to reach, deg', float),
 )
-SPEED = Argument('speed', 'link.speed', 'simulated sensor: its time by real time, such as 10',
-                 float)
 RESUMES = 'its line above says why; accepted poses are kept, and the same command resumes'
 
 
@@ -110,8 +101,8 @@ def make_nodes(context: LaunchContext) -> list[Action]:
     sweep: dict[str, Any] = launch_nodes.given_parameters(context, [STAGE_MODE, *SWEEP])
     return [
         show_screen(context, shows_screen),
-        make_node(context, 'driver', simulated(context, speed) | sim_time, **respawn,
-                  on_exit=launch_nodes.GiveUp()),
+        make_node(context, 'driver', launch_nodes.simulated_link(context, speed) | sim_time,
+                  **respawn, on_exit=launch_nodes.GiveUp()),
         *stage,
         make_node(context, 'calibration', {
             **sim_time, **sweep, 'autostart': True, 'exit_when_done': True, 'screen': False,
@@ -126,12 +117,6 @@ def show_screen(context: LaunchContext, is_here: bool) -> Action:
         return make_node(context, 'screen', {'node': name})
     return LogInfo(msg='its screen, in a second terminal: ros2 run adxl_ros screen --ros-args -p '
                    f'node:={name}')
-
-
-def simulated(context: LaunchContext, speed: dict[str, Any]) -> dict[str, Any]:
-    """Return the parameters of a driver with a speed; a sensor without a link is simulated."""
-    link = given_anywhere(context, LINK_TYPE, 'driver')
-    return {'link.type': link or 'sim', **speed} if speed else {}
 
 
 def has_stage(context: LaunchContext) -> bool:

@@ -34,6 +34,7 @@ import sys
 
 from domain import BY_UDP, own_domain
 from hypothesis import settings
+from pages import opener, running_browser
 from processes import executable, REPO, Started
 import pytest
 
@@ -68,6 +69,20 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     if reasons:
         terminalreporter.write_line(f'skipped {reasons.total()} tests: ' + '; '.join(
             f'{count} × {reason}' for reason, count in reasons.most_common()))
+
+
+@pytest.fixture(scope='module')
+def browser() -> Iterator[object]:
+    """Yield a headless Chromium."""
+    with running_browser() as launched:
+        yield launched
+
+
+@pytest.fixture
+def opened(browser: object) -> Iterator[Callable]:
+    """Give a function that opens a file, and returns the page and messages of the browser."""
+    with opener(browser) as begin:
+        yield begin
 
 
 @pytest.fixture(autouse=True)
@@ -108,8 +123,11 @@ def start(ros_env: dict[str, str], tmp_path: Path) -> Iterator[Callable[..., Sta
         return started[-1]
 
     yield begin
+    # They end at the same time, and the wait is that of the slowest.
+    for process in started:
+        process.interrupt()
     for process in reversed(started):
-        process.stop()
+        process.end()
         print(f'--- {process.name}:\n{process.output()}')
 
 

@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+import math
 import os
 
 from adxl_ros.calibrate.guided.controller import (
@@ -35,15 +36,16 @@ from adxl_ros.nodes.support.diagnostics import DiagnosticsReporter, Level, Statu
 from adxl_ros.nodes.support.display_publisher import DisplayPublisher
 from adxl_ros.nodes.support.given_parameters import check_given_parameters
 from adxl_ros.nodes.support.imu_subscription import Samples
+from adxl_ros.nodes.support.joint_states import joint_readings
 from adxl_ros.nodes.support.link_parameters import given_link
 from adxl_ros.nodes.support.next_pose import Announcer
 from adxl_ros.nodes.support.node_help import NodeHelp
 from adxl_ros.nodes.support.parameters import declare
+from adxl_ros.nodes.support.polled_subscription import PolledSubscription
 from adxl_ros.nodes.support.run_node import run
 from adxl_ros.nodes.support.sensor_parameters import anonymous_sensor, declare_sensor, make_sensor
 from adxl_ros.nodes.support.topics import create_subscription
 from diagnostic_msgs.msg import DiagnosticStatus
-import numpy as np
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
@@ -51,8 +53,11 @@ from rclpy.task import Future
 from sensor_msgs.msg import BatteryState, JointState, Temperature
 from std_srvs.srv import Trigger
 
-_POLL_S = 0.05
-"""Time between two steps of the controller, s; chosen: short beside a dwell of seconds."""
+_POLL_S = 0.02
+"""Time between two steps of the controller, s; chosen: short beside a dwell of seconds, also where
+sensor time is many times real time."""
+_NOTICE_S = 0.05
+"""Time between two looks at the level of the diagnostics, s; chosen: short for people."""
 _FAREWELL_NS = 2_500_000_000
 """Time from the end of a calibration to that of the node, ns; chosen: two reports come within."""
 _QUEUE = 100
@@ -149,7 +154,7 @@ class Calibration(Node):
         """Make diagnostics, subscriptions, services and the timer."""
         self._diagnostics = DiagnosticsReporter(self, {'calibration': self._status})
         create_subscription(self, DiagnosticStatus, 'sensor_info', self._on_info, 1, latched=True)
-        create_subscription(self, JointState, 'stage/joint_states', self._on_stage, _STAGE_QUEUE)
+        self._stage = PolledSubscription(self, JointState, 'stage/joint_states', _STAGE_QUEUE)
         create_subscription(self, JointState, 'stage/command', self._on_command, _QUEUE)
         create_subscription(self, Temperature, 'temperature', self._on_temperature, _QUEUE)
         create_subscription(self, BatteryState, 'supply', self._on_supply, _QUEUE)
@@ -166,18 +171,24 @@ class Calibration(Node):
                             callback_group=ReentrantCallbackGroup())
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(_POLL_S, self._poll, clock=self._steady)
+        self.create_timer(_NOTICE_S, self._notice, clock=self._steady)
 
     def _poll(self) -> None:
+        self._read_stage()
+        # A poll may begin a calibration and end it at once.
+        self._has_run |= self._controller.state is not ControllerState.IDLE
         self._controller.poll()
-        self._diagnostics.notice('calibration', _level(self._controller.status().late))
         if self._exits:
             self._exit_when_done()
+
+    def _notice(self) -> None:
+        self._diagnostics.notice('calibration', _level(self._controller.status().late))
 
     def _exit_when_done(self) -> None:
         """End the node after a calibration, when its last report has been received."""
         now_ns = self._steady.now().nanoseconds
         if self._controller.state is not ControllerState.IDLE:
-            self._has_run, self._idle_since_ns = True, None
+            self._idle_since_ns = None
         elif self._has_run and self._idle_since_ns is None:
             self._idle_since_ns = now_ns
         elif self._idle_since_ns is not None and now_ns - self._idle_since_ns > _FAREWELL_NS:
@@ -192,13 +203,15 @@ class Calibration(Node):
         texts = {pair.key: pair.value for pair in message.values}
         self._controller.read_sensor_info(StreamInfo(texts, 'sensor_info'))
 
-    def _on_stage(self, message: JointState) -> None:
-        alpha_rad, beta_rad = _angles(message)
-        if np.isfinite([alpha_rad, beta_rad]).all():
-            self._controller.read_stage(_stamp_ns(message), alpha_rad, beta_rad)
+    def _read_stage(self) -> None:
+        """Give the angles of the stage that have come to the controller."""
+        for reading in joint_readings(self._stage.take()):
+            alpha_rad, beta_rad = _angles(reading.position)
+            if math.isfinite(alpha_rad) and math.isfinite(beta_rad):
+                self._controller.read_stage(reading.stamp_ns, alpha_rad, beta_rad)
 
     def _on_command(self, message: JointState) -> None:
-        self._controller.read_command(*_angles(message))
+        self._controller.read_command(*_angles(dict(zip(message.name, message.position))))
 
     def _on_temperature(self, message: Temperature) -> None:
         self._controller.read_temperature(_stamp_ns(message), message.temperature)
@@ -209,6 +222,7 @@ class Calibration(Node):
     def _service(self, request: Callable[[], Answer]) -> Callable[..., Trigger.Response]:
         """Make the callback of a service that calls a request of the controller."""
         def respond(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+            self._read_stage()
             response.success, response.message = request()
             self._display.update()
             return response
@@ -216,6 +230,7 @@ class Calibration(Node):
 
     async def _on_capture(self, _: Trigger.Request,
                           response: Trigger.Response) -> Trigger.Response:
+        self._read_stage()
         answer = self._controller.capture()
         if answer.success:
             future = Future()
@@ -229,13 +244,12 @@ def _level(late: bool) -> Level:
     return Level.WARN if late else Level.OK
 
 
-def _angles(message: JointState) -> tuple[float, float]:
-    """Return the angles alpha and beta, rad; NaN for a joint that is not in the message."""
-    angles_rad = dict(zip(message.name, message.position))
-    return angles_rad.get('alpha', np.nan), angles_rad.get('beta', np.nan)
+def _angles(position_rad: dict[str, float]) -> tuple[float, float]:
+    """Return the angles alpha and beta, rad; NaN for a joint that is not named."""
+    return position_rad.get('alpha', math.nan), position_rad.get('beta', math.nan)
 
 
-def _stamp_ns(message: JointState | Temperature | BatteryState) -> int:
+def _stamp_ns(message: Temperature | BatteryState) -> int:
     return message.header.stamp.sec * 10 ** 9 + message.header.stamp.nanosec
 
 

@@ -24,7 +24,7 @@ from adxl_ros.compensate import filter_inversion
 from adxl_ros.compensate.compensation_policy import CompensationPolicy, Interval, State, Topics
 from adxl_ros.compensate.live_stream import COUNTS, LiveStream
 from adxl_ros.errors import UserError
-from adxl_ros.files import calibration_store
+from adxl_ros.files import calibration_store, imu_message
 from adxl_ros.files.stream_info import StreamInfo
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.nodes.support.diagnostics import DiagnosticsReporter, Level, Status
@@ -36,6 +36,7 @@ from adxl_ros.nodes.support.node_help import NodeHelp
 from adxl_ros.nodes.support.parameters import declare
 from adxl_ros.nodes.support.receive_thread import ReceiveTurn, RepeatingThread
 from adxl_ros.nodes.support.run_node import run
+from adxl_ros.nodes.support.sample_ages import SampleAges
 from adxl_ros.nodes.support.sensor_parameters import is_from_file
 from adxl_ros.nodes.support.topics import create_publisher, create_subscription
 from adxl_ros.signals.measured_values import unit_of_stream
@@ -92,14 +93,15 @@ class Compensation(Node):
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._reported_ns = self._steady.now().nanoseconds
         self._diagnostics = DiagnosticsReporter(self, {'compensation': self._status})
-        data = create_publisher(self, Imu, 'imu/data', _DEPTH)
+        self._ages = SampleAges()
+        self._data = create_publisher(self, Imu, 'imu/data', _DEPTH)
         tilt = create_publisher(self, Vector3Stamped, 'tilt', _DEPTH)
         publishes_free = declare(
             self, 'free_acceleration', False, 'publish imu/linear_acceleration_free: the '
             'acceleration without gravity of samples that state an orientation')
         free = create_publisher(self, Vector3Stamped, 'imu/linear_acceleration_free', _DEPTH) \
             if publishes_free else None
-        self._stream = LiveStream(paper, self._undo_filter, data.publish, tilt.publish,
+        self._stream = LiveStream(paper, self._undo_filter, self._publish, tilt.publish,
                                   keeps_orientation, free.publish if free else None)
         self._policy = CompensationPolicy(paper, store, Topics(
             data_raw=self.resolve_topic_name('imu/data_raw'),
@@ -118,6 +120,12 @@ class Compensation(Node):
     def close(self) -> None:
         """End the thread that receives."""
         self._thread.close()
+
+    def _publish(self, raw: bytes) -> None:
+        """Publish a corrected sample, and take note of its age."""
+        self._data.publish(raw)
+        stamp_s, _ = imu_message.read(raw)
+        self._ages.add((self.get_clock().now().nanoseconds * 1e-9 - stamp_s,))
 
     def _use(self, sensor: Sensor, source: str) -> None:
         """Correct samples by a sensor from the next one on; `source` says where it is from."""
@@ -212,7 +220,7 @@ class Compensation(Node):
             'rate_in_hz': round(counts['received'] / duration_s, 1),
             'rate_out_hz': round(counts['published'] / duration_s, 1),
             **{name: self._reported[name] for name in COUNTS},
-            'delay_s': delay_s, **self._policy.values(interval, newer)}
+            'delay_s': delay_s, **self._ages.report(), **self._policy.values(interval, newer)}
         return Status(_LEVELS.get(state, Level.WARN), text, self._policy.sensor.serial, values)
 
     def _interval(self) -> Interval:

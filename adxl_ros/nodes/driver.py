@@ -36,10 +36,14 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 
 _SIMULATED = f'SIMULATED sensor (link.type: {base.DEFAULT_LINK})'
 """Words of log and diagnostics where no sensor is read."""
+_FRAME = 'imu_link'
+"""Frame of the case, unless a parameter or a simulator states it."""
 _EXAMPLES = {
     'a simulated sensor': '',
     'a board on a serial port': '--ros-args -p link.type:=serial -p link.port:=/dev/ttyACM0',
     'an ADC of the kernel': '--ros-args -p link.type:=iio -p link.device:=ads8688',
+    "a realistic sensor on a simulator's ideal one": '--ros-args -p link.type:=topic -p '
+    'link.topic:=/imu -p use_sim_time:=true --params-file gap/params.yaml',
 }
 """Examples of arguments, by their purpose."""
 
@@ -56,23 +60,27 @@ class Driver(LifecycleNode):
         super().__init__('driver')
         check_given_parameters(self)
         self._sensor = make_sensor(declare_sensor(self))
-        self._frame_id = declare(self, 'frame_id', 'imu_link', 'frame of the case')
         self._delay_ns = round(1e9 * declare(
             self, 'stamp_offset', 0.0, 'delay of the sensor, such as that of its RC filter, that '
             'is taken out of the stamps: they are earlier by this', 's', -10.0, 10.0))
         self._link = declare_link(self, self._sensor.serial)
         settings = self._link.settings
+        has_frame = isinstance(settings, base.SimulatorSettings) and not settings.turns_case
+        self._frame_id = declare(
+            self, 'frame_id', '' if has_frame else _FRAME, "frame of the case; '': that of the "
+            "simulator's samples") or ('' if has_frame else _FRAME)
         autostart = declare(
             self, 'autostart', True, 'configure and activate at the start; else a system manager '
             'does')
         paced = isinstance(settings, base.PacedSettings)
-        self._speed = settings.speed if paced else 1.0
         # All nodes must share a sensor time that is not real time: this node then publishes it,
         # unless another node does.
-        self._is_clock = self._speed != 1 or (paced and self.get_parameter('use_sim_time').value)
+        self._is_clock = paced and (settings.speed != 1
+                                    or self.get_parameter('use_sim_time').value)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         # A real device lives in real time, whatever the clock of the graph is.
-        self._stamp_clock = self.get_clock() if paced else Clock(clock_type=ClockType.SYSTEM_TIME)
+        self._stamp_clock = self.get_clock() if paced or isinstance(
+            settings, base.SimulatorSettings) else Clock(clock_type=ClockType.SYSTEM_TIME)
         self._tally = Tally(self._steady.now().nanoseconds)
         self._fault = ''
         self._announces = not autostart
@@ -152,13 +160,13 @@ class Driver(LifecycleNode):
     def _configure(self) -> None:
         self._fault = ''
         self._output = SampleOutput(self, self._sensor, self._frame_id, self._delay_ns,
-                                    self._is_clock, self._tally)
+                                    self._is_clock, self._stamp_clock, self._tally)
 
     def _activate(self) -> None:
         assert self._output is not None, 'the life cycle configures a node before it activates it'
         self._fault = ''
         link = self._link.module.open_link(self._sensor, self._link.settings)
-        self._reader = LinkReader(self, link, self._output, self._speed, self._fail,
+        self._reader = LinkReader(self, link, self._output, self._link.settings, self._fail,
                                   self._on_level)
 
     def _clean_up(self) -> None:
@@ -183,7 +191,8 @@ class Driver(LifecycleNode):
         link = self._link_status()
         sensor_ns = self._tally.now_ns or 0
         if sensor_ns and not (self._output and self._output.is_clock):
-            sensor_ns = self._stamp_clock.now().nanoseconds
+            # A simulator may publish no /clock, although the node waits for one.
+            sensor_ns = self._stamp_clock.now().nanoseconds or sensor_ns
         values, warning = self._tally.report(self._steady.now().nanoseconds, sensor_ns)
         level = self._level()
         if warning and level is Level.OK:

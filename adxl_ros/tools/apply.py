@@ -17,25 +17,29 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 import itertools
 from pathlib import Path
 
+from adxl_ros.compensate.imu_fields import ImuFields
 from adxl_ros.compensate.recordings import effects_left, Estimates, RecordingEstimator
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.csv_writer import CsvWriter
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.stream_unit import check_unit
+from adxl_ros.files.tilt_bag import TiltBag
 from adxl_ros.model.constants import AXES
+from adxl_ros.model.covariance import UNMEASURED_VARIANCE
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import NOMINAL_ENVIRONMENT
 from adxl_ros.model.sensor import Sensor, with_axes
+from adxl_ros.signals.recorded_sensor import BeyondRange, listed, load_sensor, measure_unstated
 from adxl_ros.tools.closing_lines import print_end, quoted
 from adxl_ros.tools.command_line import argument_parser, command
 from adxl_ros.tools.common import note, progress, report_reading, run
-from adxl_ros.tools.recorded_sensor import BeyondRange, listed, load_sensor, measure_unstated
 from adxl_ros.tools.recording_options import (
     add_recording_options,
     reading_options,
@@ -43,14 +47,15 @@ from adxl_ros.tools.recording_options import (
 )
 import numpy as np
 
-_BLOCK_ROWS = 16384
-"""Samples that are corrected at a time (chosen: some MB)."""
+_BLOCK_ROWS = 8192
+"""Samples that are corrected at a time (chosen: their arrays stay in the cache)."""
 
 _DIGITS = 12
 """Significant digits of an estimate (chosen: rounding is below a millionth of the noise)."""
 
 _EXAMPLES = {
     'acceleration and tilt by a calibration': 'recording.csv --params unit.yaml -o tilt.csv',
+    'a bag with imu/data and tilt': 'recording.mcap --params unit.yaml -o tilt.mcap',
     'a moving sensor, without the lag of its filter':
         'fast.csv --params unit.yaml --undo-filter -o a.csv',
 }
@@ -68,8 +73,9 @@ def parser() -> argparse.ArgumentParser:
                             'equations 14 to 21')
     parse.add_argument('--undo-filter', action='store_true',
                        help='undo the RC filter, amplitude and phase, for a sensor that moves')
-    parse.add_argument('-o', dest='output', metavar='OUT.csv', required=True,
-                       help='acceleration and tilt, with standard deviations')
+    parse.add_argument('-o', dest='output', metavar='OUT', required=True,
+                       help='acceleration and tilt, with standard deviations: OUT.csv is a table; '
+                            'OUT.mcap, or a folder OUT, is a bag with imu/data and tilt')
     add_recording_options(parse)
     return parse
 
@@ -83,26 +89,46 @@ def apply(options: argparse.Namespace) -> int:
     blocks = recording.blocks(options.recording, _BLOCK_ROWS, reading_options(options))
     first = next(blocks, None)
     sensor, measured = _sensor(options.params, first)
-    with CsvWriter(options.output, _DIGITS) as out, progress('apply') as show:
+    is_table = Path(options.output).suffix == '.csv'
+    with (_table if is_table else _bag)(options.output) as write, progress('apply') as show:
         for block, estimates in _estimated(options, sensor, first, blocks):
-            out.write({'time_s': block.epoch_ns * 1e-9 + block.time_s, **_columns(estimates)})
+            write(block, estimates)
             explained = ~(estimates.unsolved | estimates.at_rail)
-            beyond.add(block.volts(sensor)[explained], sensor)
+            beyond.add(estimates.volts[explained], sensor)
             rows += len(block)
             unsolved += int(estimates.unsolved.sum())
             outside += int(estimates.outside.sum())
             at_rail += int(estimates.at_rail.sum())
             show(block.done)
-    _report(unsolved, rows, 'have no solution: their cells are empty')
+    _report(unsolved, rows, 'have no solution: ' + (
+        'their cells are empty' if is_table else 'they are left out'))
     _report(outside, rows, 'lie outside of the validity range (temperature or force): their '
             'standard deviations are raised')
-    _report(at_rail, rows, 'have the ADC at its rail: their standard deviations are inf')
+    _report(at_rail, rows, 'have the ADC at its rail: their ' + (
+        'standard deviations are inf' if is_table else f'variances are {UNMEASURED_VARIANCE:g}'))
     if beyond.describe(sensor):
         note(f'apply: {beyond.describe(sensor)}')
     if block is not None:
         report_reading('apply', block)
     _print_end(options, sensor, rows, measured)
     return 0
+
+
+@contextmanager
+def _table(path: str) -> Iterator[Callable[[Recording, Estimates], None]]:
+    """Open a CSV file, and yield a function that appends a block with its estimates."""
+    with CsvWriter(path, _DIGITS) as table:
+        yield lambda block, estimates: table.write(
+            {'time_s': block.epoch_ns * 1e-9 + block.time_s, **_columns(estimates)})
+
+
+@contextmanager
+def _bag(path: str) -> Iterator[Callable[[Recording, Estimates], None]]:
+    """Open a bag, and yield a function that appends a block with its estimates."""
+    fields = ImuFields()
+    with TiltBag(path) as bag:
+        yield lambda block, estimates: bag.write(block.stamp_ns[~estimates.unsolved],
+                                                 *fields(estimates))
 
 
 def _sensor(params: str | None, first: Recording | None) -> tuple[Sensor, list[str]]:

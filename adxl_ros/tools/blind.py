@@ -20,10 +20,11 @@ import argparse
 import json
 from pathlib import Path
 
-from adxl_ros.blind import blind_check, diagnosis_runs, real_recordings, report_html
+from adxl_ros.blind import blind_check, real_recordings, report_html
 from adxl_ros.errors import UserError
 from adxl_ros.files.atomic_write import write_text
 from adxl_ros.files.plot_file import pyplot
+from adxl_ros.jobs.pools import open_pool
 from adxl_ros.tools import blind_forest
 from adxl_ros.tools.closing_lines import print_end, quoted
 from adxl_ros.tools.command_line import argument_parser, command
@@ -52,7 +53,10 @@ def parser() -> argparse.ArgumentParser:
     parse.add_argument('--forest', action='store_true',
                        help='compare with a random forest that is trained on recordings of '
                             "the package's own simulator (needs scikit-learn; 6 min of one core)")
-    parse.add_argument('--scheduler', metavar='ADDRESS', help='of a Dask cluster to run on')
+    pool = parse.add_mutually_exclusive_group()
+    pool.add_argument('--scheduler', metavar='ADDRESS', help='of a Dask cluster to run on')
+    pool.add_argument('--jobs', metavar='N', type=int,
+                      help='processes of this machine (default: one for each core)')
     where = parse.add_mutually_exclusive_group(required=True)
     where.add_argument('-o', dest='output', metavar='DIR', help='draw, diagnose and score')
     where.add_argument('--seal', metavar='DIR',
@@ -66,6 +70,8 @@ def blind(options: argparse.Namespace) -> int:
     """Run the tool; see `parser`."""
     if options.trials < 1:
         raise UserError(f'--trials {options.trials}: at least 1 is needed')
+    if options.jobs is not None and options.jobs < 1:
+        raise UserError(f'--jobs {options.jobs}: at least 1 is needed')
     if options.seed is not None and options.seed < 0:
         raise UserError(f'--seed {options.seed}: must not be negative')
     arms = [real_recordings.read_arm(option) for option in options.real]
@@ -86,7 +92,7 @@ def _check(options: argparse.Namespace, folder: Path, arms: list[real_recordings
         others['random forest'] = blind_forest.answers
     if not options.open:
         make_folder(folder)
-    with diagnosis_runs.workers(options.scheduler) as pool:
+    with open_pool(options.scheduler, options.jobs) as pool:
         if not options.open:
             with progress('draw') as show:
                 digest = blind_check.draw(folder, options.seed, options.trials, pool, show)

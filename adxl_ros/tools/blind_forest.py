@@ -31,11 +31,12 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from adxl_ros.blind import parallel_io
 from adxl_ros.blind.grading import Answer, UNKNOWN
 from adxl_ros.errors import install_hint, UserError
 from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.recording_columns import Recording
+from adxl_ros.jobs.run import for_each
+from adxl_ros.jobs.whole_files import write
 from adxl_ros.model import coefficients
 from adxl_ros.model.constants import G0_MPS2, NOMINAL_SUPPLY_V, NOMINAL_TEMPERATURE_C
 from adxl_ros.model.effects import effect_named, library
@@ -47,8 +48,7 @@ from adxl_ros.simulate.motion import Held, Motion, Path as JointPath
 from adxl_ros.simulate.response import Response
 from adxl_ros.simulate.trajectories import Script, Sine, Steps
 import numpy as np
-from scipy.signal import welch
-from scipy.stats import kurtosis, skew
+import scipy
 
 TRAINING_RECORDINGS = 1200
 """Number of recordings to train on; chosen: 25 of each effect take five minutes on two cores."""
@@ -117,7 +117,7 @@ def answers(recordings: Path, pool: Executor, show: Callable[[float], None]) -> 
         features_by_name[name] = row
 
     jobs = [partial(tuple, [path]) for path in sorted(recordings.glob('*.csv'))]
-    parallel_io.for_each(pool, recorded_row, jobs, keep, lambda done: show(0.9 + 0.1 * done))
+    for_each(pool, recorded_row, jobs, keep, lambda done: show(0.9 + 0.1 * done))
     return {name: _answer(forest.classes_, forest.predict_proba(row[None])[0], lowest)
             for name, row in features_by_name.items()}
 
@@ -154,13 +154,13 @@ def train(folder: Path, pool: Executor, show: Callable[[float], None]
         rows[name] = effect, row
 
     jobs = [partial(tuple, [number]) for number in range(TRAINING_RECORDINGS)]
-    parallel_io.for_each(pool, training_row, jobs, keep, show)
+    for_each(pool, training_row, jobs, keep, show)
     training = [rows[name] for name in sorted(rows)]
     effects = np.array([effect for effect, _ in training])
     matrix = np.stack([row for _, row in training])
     content = BytesIO()
     np.savez_compressed(content, version=version, effects=effects, features=matrix)
-    parallel_io.write(path, content.getvalue())
+    write(path, content.getvalue())
     return effects, matrix
 
 
@@ -369,14 +369,15 @@ def _statistics(gap: np.ndarray, codes: np.ndarray) -> np.ndarray:
     step = np.diff(gap)
     isolated = np.abs(gap[1:-1] - (gap[:-2] + gap[2:]) / 2) > 6 * np.std(step)
     return np.array([
-        np.log(std), np.mean(gap), skew(gap), kurtosis(gap), np.log(np.max(np.abs(gap)) / std),
+        np.log(std), np.mean(gap), scipy.stats.skew(gap), scipy.stats.kurtosis(gap),
+        np.log(np.max(np.abs(gap)) / std),
         np.log(np.std(step) + 1e-9), np.mean(np.diff(codes) == 0), np.sum(isolated),
         *(np.mean(codes % 2 ** k == 0) for k in (1, 2, 3, 4))])
 
 
 def _bands(gap: np.ndarray, rate_hz: float) -> np.ndarray:
     """Return the logarithms of power in bands, and frequency and height of the largest line."""
-    hertz, power = welch(gap, rate_hz, nperseg=min(len(gap), int(40 * rate_hz)))
+    hertz, power = scipy.signal.welch(gap, rate_hz, nperseg=min(len(gap), int(40 * rate_hz)))
     parts = [(hertz >= low) & (hertz < high) for low, high in pairwise(_BAND_EDGES_HZ)]
     levels = [np.mean(power[part]) if part.any() else np.nan for part in parts]
     ratio = power / np.median(power)

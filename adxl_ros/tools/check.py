@@ -17,37 +17,26 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
 from dataclasses import asdict, replace
 import json
 from pathlib import Path
 from typing import Any
 
-from adxl_ros.errors import one_line, UserError
-from adxl_ros.files import html_page, recording
+from adxl_ros.check.findings import Findings
+from adxl_ros.check.recording_check import check_recording
+from adxl_ros.files import html_page
 from adxl_ros.files.atomic_write import write_text
-from adxl_ros.files.log_times import has_log_times, log_times
-from adxl_ros.files.reading_options import ReadingOptions
-from adxl_ros.files.recording_columns import Recording
-from adxl_ros.files.stream_unit import uncalibrated
-from adxl_ros.model.sensor import Sensor
-from adxl_ros.signals.recording_contents import examine, log_delay
 from adxl_ros.tools import check_text
-from adxl_ros.tools.check_findings import assess, Findings
 from adxl_ros.tools.closing_lines import print_end, quoted
 from adxl_ros.tools.command_line import argument_parser, command
 from adxl_ros.tools.common import make_folder, progress, run, ShowDone
-from adxl_ros.tools.recorded_sensor import load_sensor
 from adxl_ros.tools.recording_options import (
     add_recording_options,
     reading_options,
     reading_text,
     RECORDING_HELP,
 )
-import numpy as np
 
-_BLOCK_ROWS = 65536
-"""Samples that are read at a time (chosen: some MB)."""
 _EXAMPLES = {
     'all recordings of a day, with a page': '*.mcap --report check',
     'a log of other software':
@@ -77,7 +66,7 @@ def check(options: argparse.Namespace) -> int:
     with progress('check') as show:
         for i, path in enumerate(options.recording):
             step = _Step(show, i, len(options.recording), Path(path).name)
-            results.append(_checked(path, options.params, reading, step))
+            results.append(check_recording(path, options.params, reading, step))
     page = []
     if options.report:
         make_folder(Path(options.report))
@@ -100,43 +89,6 @@ class _Step:
     def __call__(self, done: float) -> None:
         """Show the fraction of this recording that is done."""
         self._show((self._number + done) / self._count, self._name)
-
-
-def _checked(path: str, params: str | None, reading: ReadingOptions, show: _Step) -> Findings:
-    """Return the findings of a recording; one that cannot be read is not sound."""
-    try:
-        delay = None
-        if has_log_times(path) and reading.rate_hz is None:
-            delay = log_delay(log_times(path, reading.topic))
-        source = _Source(params)
-        blocks = recording.blocks(path, _BLOCK_ROWS, reading)
-        contents = examine(_shown(blocks, show), source.accel_mps2, delay)
-    except UserError as error:
-        reason = one_line(error).removeprefix(f'{path}: ')
-        return Findings(path, None, (reason,), paste=error.paste)
-    return replace(assess(contents), path=path)
-
-
-def _shown(blocks: Iterator[Recording], show: _Step) -> Iterator[Recording]:
-    """Yield blocks, and show how much has been read."""
-    for block in blocks:
-        yield block
-        show(block.done)
-
-
-class _Source:
-    """Converts the samples of a recording by the nominal values of its sensor."""
-
-    def __init__(self, params: str | None) -> None:
-        self._params = params
-        self._unit: Sensor | None = None
-
-    def accel_mps2(self, block: Recording) -> np.ndarray:
-        """Return the specific force of a block, m/s², (n, m)."""
-        if self._unit is None:
-            sensor = load_sensor(self._params, block)
-            self._unit = uncalibrated(sensor, block.stream_info, block.axes, sensor.rate_hz)
-        return block.accel_mps2(self._unit)
 
 
 def _next_command(results: list[Findings], options: argparse.Namespace) -> str:

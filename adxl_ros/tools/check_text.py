@@ -19,11 +19,11 @@ from __future__ import annotations
 from pathlib import Path
 import textwrap
 
+from adxl_ros.calibrate.value_text import duration
+from adxl_ros.check.findings import Findings
 from adxl_ros.files import html_page
 from adxl_ros.signals.recording_contents import RecordingContents
-from adxl_ros.tools.check_findings import Findings
 from adxl_ros.tools.command_line import COLUMNS
-from adxl_ros.tools.noise_text import duration
 
 _NAME_COLUMNS = 21
 """Columns of the name of a recording."""

@@ -62,8 +62,23 @@ class NextStep(NamedTuple):
     command: str
 
 
-def _wrapped(text: str, indent: int = 0) -> list[str]:
-    """Wrap a text between words; further lines have an indent."""
+def wrapped(text: str, indent: int = 0) -> list[str]:
+    """
+    Wrap a text between words.
+
+    Parameters
+    ----------
+    text
+        The text.
+    indent
+        Columns before further lines.
+
+    Returns
+    -------
+    list
+        Lines of 79 columns at most.
+
+    """
     return textwrap.wrap(text, COLUMNS, subsequent_indent=indent * ' ', break_long_words=False,
                          break_on_hyphens=False)
 
@@ -85,11 +100,11 @@ def print_end(result: Sequence[str], files: Iterable[str | os.PathLike],
         Run time of the tool, s; None where it is of no interest.
 
     """
-    lines = [part for line in result for part in _wrapped(line, 2) or ['']]
+    lines = [part for line in result for part in wrapped(line, 2) or ['']]
     written = '  '.join(str(path) for path in files if Path(path).exists())
     if written:
         written += _duration_text(took_s)
-        lines += _wrapped(f' {"wrote":{_LABEL_COLUMNS - 1}}{written}', _LABEL_COLUMNS)
+        lines += wrapped(f' {"wrote":{_LABEL_COLUMNS - 1}}{written}', _LABEL_COLUMNS)
     if isinstance(following, str):
         lines += _command_lines(following, f' {"next":{_LABEL_COLUMNS - 1}}')
     else:
@@ -115,7 +130,7 @@ def _step_lines(steps: Sequence[NextStep]) -> list[str]:
     lines = []
     for number, step in enumerate(steps, 1):
         label = '' if number > 1 else 'next'
-        lines += _wrapped(f' {label:{_LABEL_COLUMNS - 1}}{number}  {step.purpose}', _STEP_COLUMNS)
+        lines += wrapped(f' {label:{_LABEL_COLUMNS - 1}}{number}  {step.purpose}', _STEP_COLUMNS)
         lines += _command_lines(step.command, _STEP_COLUMNS * ' ')
     return lines
 

@@ -19,7 +19,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-import os
 from pathlib import Path
 import signal
 import sys
@@ -28,6 +27,7 @@ from time import monotonic
 from types import FrameType
 from typing import Protocol
 
+from adxl_ros.closed_output import ended_by_closed_output
 from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.tools.command_line import COLUMNS
@@ -40,6 +40,7 @@ _BAR_COLUMNS = 24
 """Columns of a progress bar: names of stages and times stand beside it in 80 columns."""
 
 
+@ended_by_closed_output()
 def run(parser: argparse.ArgumentParser, command: Callable[[argparse.Namespace], int]) -> int:
     """
     Parse the command line and run a tool.
@@ -60,21 +61,13 @@ def run(parser: argparse.ArgumentParser, command: Callable[[argparse.Namespace],
     """
     signal.signal(signal.SIGTERM, _terminated)
     try:
-        try:
-            status = command(parser.parse_args())
-        finally:
-            sys.stdout.flush()
+        return command(parser.parse_args())
     except UserError as error:
         note(f'{parser.prog}: {" ".join(str(error).split())}', error.paste)
         return 1
     except KeyboardInterrupt:
         note(f'{parser.prog}: interrupted; nothing was written')
         return 130
-    except BrokenPipeError:
-        # The reader of stdout has ended; Python must not report that when it flushes at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 1
-    return status
 
 
 def note(text: str, paste: str = '') -> None:

@@ -25,18 +25,19 @@ from typing import Any
 from adxl_ros.diagnose import report_html, report_json, report_text
 from adxl_ros.diagnose.diagnosis import diagnose as diagnose_recordings, Diagnosis
 from adxl_ros.errors import UserError
-from adxl_ros.files import html_page, parameter_file, recording
+from adxl_ros.files import html_page, parameter_file, population_file, recording
 from adxl_ros.files.atomic_write import write_text
 from adxl_ros.files.reading_options import ReadingOptions
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.stream_info import NO_UNIT
 from adxl_ros.model.effects import library
+from adxl_ros.model.population import posterior
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.signals.recorded_sensor import load_sensor, measure_unstated
 from adxl_ros.simulate.from_recording import motion_from_force
 from adxl_ros.tools.closing_lines import NextStep, print_end, quoted
 from adxl_ros.tools.command_line import argument_parser, command, effect_list
 from adxl_ros.tools.common import make_folder, note, progress, report_reading, run
-from adxl_ros.tools.recorded_sensor import load_sensor, measure_unstated
 from adxl_ros.tools.recording_options import (
     add_recording_options,
     reading_options,
@@ -64,6 +65,8 @@ def parser() -> argparse.ArgumentParser:
                        help=f'{RECORDING_HELP}; all of one unit')
     parse.add_argument('--params', metavar='FILE', default=None,
                        help='what the simulator models (default: the nominal sensor)')
+    parse.add_argument('--prior', metavar='FILE',
+                       help='the population.yaml of a fleet, as prior of zero-g and scale factor')
     parse.add_argument('--sim', metavar='RECORDING',
                        help='ideal specific force of the same manoeuvre by another simulator')
     parse.add_argument('--align', action='store_true',
@@ -94,16 +97,21 @@ def diagnose(options: argparse.Namespace) -> int:
     if options.align and not options.sim:
         raise UserError('--align: shifts --sim, which is not given')
     reading = reading_options(options)
+    population = population_file.read(options.prior) if options.prior else None
     html_page.check_libraries()
     with progress('reading') as show:
         recordings = [_read(path, reading) for path in options.recording]
         sim = motion_from_force(options.sim, False, recordings[0].epoch_ns)[0] if options.sim \
             else None
         sensor, _ = measure_unstated(load_sensor(options.params, recordings[0]), recordings[0])
+        prior_lines: list[str] = []
+        if population is not None:
+            sensor, line, _ = posterior(sensor, population)
+            prior_lines = ['', f' prior: {line}']
         diagnosis = diagnose_recordings(recordings, sensor, sim, options.seed,
                                         lambda stage, done: show(done, stage), options.align)
         subject = _subject(recordings, sensor, options.sim)
-        lines = report_text.screen_lines(diagnosis, subject)
+        lines = [*report_text.screen_lines(diagnosis, subject), *prior_lines]
         report = _write(options, diagnosis, subject, lines)
     if options.json:
         print(json.dumps(report, indent=1, allow_nan=False))
@@ -166,15 +174,23 @@ def _next_steps(options: argparse.Namespace, diagnosis: Diagnosis) -> str | list
     if diagnosis.next_experiment is None:
         return simulate
     proposal = diagnosis.next_experiment
-    steps = [NextStep(f'record next.csv: {proposal.manoeuvre}, {proposal.why}; simulated, it is',
-                      proposal.command)]
+    if proposal.concerns_reference:
+        return [NextStep(f'record next.csv: {proposal.manoeuvre}, {proposal.why}',
+                         proposal.command),
+                NextStep('simulate the sensor without the errors of the reference', simulate)]
+    steps, then = [NextStep(f'record next.csv: {proposal.manoeuvre}, {proposal.why}; simulated, '
+                            'it is', proposal.command)], ''
+    if proposal.beside_simulator:
+        steps, then = [], (f'record next.csv, and next_simulated.csv in the simulator: '
+                           f'{proposal.manoeuvre}, {proposal.why}; then ')
     if verdict.status == 'explained':
-        steps += [NextStep('diagnose the recording: the effects should close its gap, too',
+        steps += [NextStep(f'{then}diagnose the recording: the effects should close its gap, too',
                            _diagnose_command(options, params, [])),
                   NextStep('simulate with the effects', simulate)]
     else:
         given = options.params and quoted(options.params)
-        steps.append(NextStep('diagnose it' + ('' if options.sim else ' together with this one'),
+        together = '' if options.sim else ' together with this one'
+        steps.append(NextStep(f'{then}diagnose it{together}',
                               _diagnose_command(options, given, options.recording)))
     return steps
 

@@ -106,11 +106,12 @@ def _result_lines(exported: base.Export, format_name: str, held: list[str]) -> l
     lines = [f'Sensor {exported.sensor.serial} for {format_name}. '
              f'The file holds: {", ".join(held)}.']
     if lost:
-        named = [f'{name} {base.size_text(exported.sizes_mg[name])} mg'
+        named = [f'{name} {base.size_text(exported.sizes_mg[name])}'
                  for name in lost[:_NAMED_PARTS]]
         further = f' and {len(lost) - _NAMED_PARTS} more' if len(lost) > _NAMED_PARTS else ''
-        lines.append(f'It cannot hold: {", ".join(named)}{further} (rms in the manoeuvre rich). '
-                     f'Together {base.size_text(exported.remaining_mg)} mg.')
+        lines += [f'Its model lacks, mg rms in the manoeuvre rich: {", ".join(named)}{further}.',
+                  f'Together {base.size_text(exported.remaining_mg)} mg rms, without noise and '
+                  'steps of the ADC.']
     return lines
 
 

@@ -27,7 +27,13 @@ from adxl_ros.calibrate.poses import Poses
 from adxl_ros.calibrate.report import acceptance, report_html, text_tables
 from adxl_ros.calibrate.report.unit_errors import errors_in_words
 from adxl_ros.errors import UserError
-from adxl_ros.files import calibration_store, html_page, recording, sweep_journal
+from adxl_ros.files import (
+    calibration_store,
+    html_page,
+    population_file,
+    recording,
+    sweep_journal,
+)
 from adxl_ros.files.checksum import sha256
 from adxl_ros.files.pose_table import read_pose_table
 from adxl_ros.files.recording_columns import Recording
@@ -35,10 +41,10 @@ from adxl_ros.files.stream_unit import recorded_unit
 from adxl_ros.model.effects import library
 from adxl_ros.model.effects.base import Place
 from adxl_ros.model.sensor import Sensor, with_axes
+from adxl_ros.signals.recorded_sensor import BeyondRange, listed, load_sensor, measure_unstated
 from adxl_ros.tools.closing_lines import print_end, quoted
 from adxl_ros.tools.command_line import argument_parser, command, effect_list
 from adxl_ros.tools.common import make_folder, note, report_reading, run, staged_progress
-from adxl_ros.tools.recorded_sensor import BeyondRange, listed, load_sensor, measure_unstated
 from adxl_ros.tools.recording_options import (
     add_recording_options,
     reading_options,
@@ -79,6 +85,9 @@ def parser() -> argparse.ArgumentParser:
                             'calibrated against gravity')
     parse.add_argument('--effect', metavar='NAME', action='append', default=[],
                        help='a further effect that the full model fits; see the list below')
+    parse.add_argument('--prior', metavar='FILE',
+                       help='the population.yaml of a fleet: few poses then give a smaller '
+                            'uncertainty; a unit that is not of the fleet is named')
     parse.add_argument('--journal', metavar='FILE',
                        help='use the rests that the journal of this sweep names')
     parse.add_argument('--poses', metavar='FILE',
@@ -111,6 +120,7 @@ def fit(options: argparse.Namespace) -> int:
         html_page.check_libraries()
     if options.poses and (options.journal or len(options.recording) != 1):
         raise UserError(f'--poses {options.poses}: goes with one recording, and without --journal')
+    population = population_file.read(options.prior) if options.prior else None
     records = _records(options.journal)
     unit: Sensor | None = None
     base: Sensor | None = None
@@ -131,6 +141,9 @@ def fit(options: argparse.Namespace) -> int:
             show('reading', (number + 0.5) / len(options.recording))
             thermal = _thermal_blocks(options, read, unit)
             if thermal is not None:
+                if population is not None:
+                    raise UserError(f'--prior {options.prior}: a fit over temperature takes '
+                                    'none; leave it out')
                 break
             poses = pose_extraction.extract_poses(read, unit, records)
             if options.poses:
@@ -140,7 +153,8 @@ def fit(options: argparse.Namespace) -> int:
         assert unit is not None and base is not None, 'argparse asks for a recording'
         show('fit', 0.0)
         sha = sha256(options.recording)
-        result = calibration.calibrate(unit, recordings, options.model, options.effect, sha) \
+        result = calibration.calibrate(unit, recordings, options.model, options.effect, sha,
+                                       population) \
             if thermal is None else thermal_calibration.calibrate(
                 with_axes(base, unit.axes), thermal, Path(options.recording[0]).name, sha)
         result = replace(result, report_lines=[*result.report_lines, *measured])

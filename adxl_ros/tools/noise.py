@@ -28,12 +28,12 @@ from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.stream_unit import unit_of
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals.axis_noise import recording_noise, RecordingNoise, with_noise
+from adxl_ros.signals.recorded_sensor import load_sensor
 from adxl_ros.signals.still_stretch import longest_rest
 from adxl_ros.tools import noise_page, noise_text
 from adxl_ros.tools.closing_lines import print_end, quoted
 from adxl_ros.tools.command_line import argument_parser, command
 from adxl_ros.tools.common import make_folder, progress, report_reading, run, ShowDone
-from adxl_ros.tools.recorded_sensor import load_sensor
 from adxl_ros.tools.recording_options import (
     add_recording_options,
     reading_options,

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from adxl_ros.calibrate.value_text import duration
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.signals.axis_noise import AxisNoise, density_g_per_rthz, RecordingNoise, TERMS
 from adxl_ros.signals.noise_drift import Drift, DriftKind
@@ -44,16 +45,6 @@ NAMES = {'white': 'white noise N', 'instability': 'bias instability B', 'walk': 
 
 _UNITS = {'white': 'm/s^2/sqrt(Hz)', 'instability': 'm/s^2', 'walk': 'm/s^2/sqrt(s)'}
 """Units of the terms in JSON."""
-
-
-def duration(seconds: float) -> str:
-    """Return a time with two units at most, for people."""
-    seconds = round(seconds, 3)
-    for unit_s, unit, smaller_s, smaller in ((86400, 'd', 3600, 'h'), (3600, 'h', 60, 'min')):
-        if round(seconds) >= unit_s:
-            count, rest = divmod(round(seconds / smaller_s), round(unit_s / smaller_s))
-            return f'{count} {unit} {rest} {smaller}' if rest else f'{count} {unit}'
-    return f'{seconds / 60:.3g} min' if seconds >= 120 else f'{seconds:.3g} s'
 
 
 def head(result: RecordingNoise) -> list[str]:

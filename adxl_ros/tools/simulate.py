@@ -29,7 +29,8 @@ from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.stream_info import sensor_info
 from adxl_ros.links.support import emulated_board
-from adxl_ros.model.effects import library
+from adxl_ros.model.effects import effect_named, library
+from adxl_ros.model.effects.base import Concern
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.simulate import simulator
 from adxl_ros.simulate.from_recording import motion_from_force, motion_from_references
@@ -119,7 +120,9 @@ def simulate(options: argparse.Namespace) -> int:
     sensor = parameter_file.load(options.params or parameter_file.nominal_path())
     if options.rate is not None:
         sensor = replace(sensor, rate_hz=options.rate)
-    simulation = _run(with_effects(sensor, options.effect), options)
+    sensor = with_effects(sensor, options.effect)
+    _check_reference(sensor, options)
+    simulation = _run(sensor, options)
     with ExitStack() as stack:
         outputs: list[Output] = []
         if options.port:
@@ -134,6 +137,18 @@ def simulate(options: argparse.Namespace) -> int:
             show(min(elapsed_s / max(simulation.duration_s, _SHORTEST_S), 1.0))
     _print_end(options, simulation)
     return 0
+
+
+def _check_reference(sensor: Sensor, options: argparse.Namespace) -> None:
+    """Refuse errors of a reference where no recorded force is the reference."""
+    stated = {text.partition(':')[0] for text in options.effect}
+    for name in sensor.effects:
+        if effect_named(name).concern is Concern.REFERENCE and not options.force:
+            if name in stated:
+                raise UserError(f'--effect {name} acts on the specific force of a recording: say '
+                                'simulate imu --force RECORDING, or leave the effect out')
+            print(f'{name} is an error of the reference that the sensor was compared with, and '
+                  'is left out', file=sys.stderr)
 
 
 def _print_end(options: argparse.Namespace, simulation: _Run) -> None:

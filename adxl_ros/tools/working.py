@@ -17,16 +17,17 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
-from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import Executor, ThreadPoolExecutor
 from functools import partial
 import json
-from multiprocessing import get_context
 from pathlib import Path
 import sys
 
-from adxl_ros.blind import diagnosis_runs, grading, parallel_io
+from adxl_ros.blind import diagnosis_runs, grading
 from adxl_ros.errors import UserError
 from adxl_ros.files.atomic_write import write_text
+from adxl_ros.jobs.pools import open_pool
+from adxl_ros.jobs.run import for_each
 from adxl_ros.tools.closing_lines import print_end
 from adxl_ros.tools.command_line import argument_parser
 from adxl_ros.tools.common import make_folder, progress, run
@@ -34,9 +35,6 @@ from adxl_ros.working import cases, scores
 
 PROG = 'working'
 """Name of the command, for messages."""
-_DIAGNOSE = [sys.executable, '-c',
-             'from adxl_ros.tools.diagnose import main; raise SystemExit(main())']
-"""Command line of the diagnosis: that of the package which this process imports."""
 _TAG_DIGITS = 10
 """Digits of the hash that names the reports of one version of the diagnosis; chosen."""
 
@@ -68,15 +66,15 @@ def working(options: argparse.Namespace) -> int:
     names = {cases.name_of(options.seed, number): number for number in numbers}
     if options.only in (None, 'draw'):
         make_folder(folder)
-        with _processes(options.jobs) as pool, progress('draw') as show:
+        with open_pool(None, options.jobs) as pool, progress('draw') as show:
             todo = [number for name, number in names.items()
                     if not (folder / name / f'{name}.json').exists()]
-            parallel_io.for_each(pool, _draw, [partial(_case, folder, options.seed, number)
-                                               for number in todo],
-                                 lambda name: None, show, len(names) - len(todo))
+            for_each(pool, _draw, [partial(_case, folder, options.seed, number)
+                                   for number in todo],
+                     lambda name: None, show, len(names) - len(todo))
     drawn = [name for name in names if (folder / name / f'{name}.json').exists()]
     if options.only in (None, 'diagnose'):
-        parallel_io.make_folder(reports)
+        make_folder(reports)
         with ThreadPoolExecutor(options.jobs) as pool, progress('diagnose') as show:
             _diagnose(folder, reports, drawn, pool, show)
     if options.only in (None, 'score'):
@@ -84,11 +82,6 @@ def working(options: argparse.Namespace) -> int:
         print(_scored(folder, reports, drawn), end='')
     print_end([], [reports])
     return 0
-
-
-def _processes(count: int) -> Executor:
-    """Return a pool of processes; a new one reads the number of threads before numpy."""
-    return ProcessPoolExecutor(count, get_context('spawn'))
 
 
 def _case(folder: Path, seed: int, number: int) -> tuple:
@@ -107,14 +100,14 @@ def _diagnose(folder: Path, reports: Path, names: list[str], pool: Executor,
     def job(name: str) -> tuple:
         place = folder / name / name
         return (name, place.with_suffix('.csv').read_bytes(),
-                place.with_suffix('.yaml').read_bytes(), _DIAGNOSE)
+                place.with_suffix('.yaml').read_bytes(), None)
 
     def keep(name: str, result: diagnosis_runs.Result) -> None:
         write_text(reports / f'{name}.json', json.dumps(result))
 
     todo = [name for name in names if not (reports / f'{name}.json').exists()]
-    parallel_io.for_each(pool, diagnosis_runs.diagnose, [partial(job, name) for name in todo],
-                         keep, show, len(names) - len(todo))
+    for_each(pool, diagnosis_runs.diagnose, [partial(job, name) for name in todo],
+             keep, show, len(names) - len(todo))
 
 
 def _scored(folder: Path, reports: Path, names: list[str]) -> str:

@@ -64,6 +64,7 @@ class ScriptedPort:
     error = ''
     received_bytes = connections = 0
     last_byte_s = opened_s = 0.0
+    uart_bytes_per_s = 960.0
 
     def __init__(self, chunks):
         self.chunks = chunks
@@ -71,6 +72,10 @@ class ScriptedPort:
     def read(self):
         """Return the next chunk."""
         return self.chunks.pop(0) if self.chunks else b''
+
+    def write(self, raw):
+        """Check that the host writes a command and nothing else."""
+        wire_format.decode_command(raw[1:-1])
 
     def confirm(self):
         """Do nothing: this port never fails."""

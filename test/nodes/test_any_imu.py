@@ -159,7 +159,7 @@ def test_a_mounted_sensor_is_turned_into_the_frame_of_the_robot(camera: Camera, 
     np.testing.assert_allclose([w.x, w.y, w.z], [0.25, 0, 0.5], atol=1e-12)
     assert tilt[-1].vector.x == pytest.approx(-0.1, abs=0.02)
     client = graph.node.create_client(Trigger, 'compensation/level')
-    assert client.wait_for_service(20)
+    assert client.wait_for_service(100)
     answer = client.call_async(Trigger.Request())
     until(answer.done, 'the answer of ~/level')
     assert answer.result().success, answer.result().message
@@ -183,7 +183,7 @@ def test_a_moving_sensor_is_not_level(camera: Camera, start: Start) -> None:
         return bool(data)
     graph.spin_until(published, 40, 'corrected samples')
     client = graph.node.create_client(Trigger, 'compensation/level')
-    assert client.wait_for_service(20)
+    assert client.wait_for_service(100)
     answer = client.call_async(Trigger.Request())
 
     def moved() -> bool:

@@ -532,8 +532,8 @@ def test_a_bad_file_ends_it_with_one_line(start: Start, tmp_path: Path, right: s
     text = path.read_text()
     assert right in text
     path.write_text(text.replace(right, wrong))
-    for arguments in (('--params-file', path), ('-p', f'calibration:={path}')):
-        process = start(NODE, '--ros-args', *arguments)
+    for process in [start(NODE, '--ros-args', *arguments) for arguments in (
+            ('--params-file', path), ('-p', f'calibration:={path}'))]:
         assert process.wait() == 1
         assert process.output().count('\n') == 1
         assert f'{path}:' in process.output()

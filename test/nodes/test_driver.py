@@ -37,6 +37,8 @@ from units import NOMINAL, nominal
 
 ROS = '--ros-args'
 SIMULATED = 'SIMULATED sensor (link.type: sim)'
+QUEUE = 100000
+"""Samples that wait for a busy listener."""
 
 
 def written(path, rows=400, columns=('ax_mps2', 'ay_mps2', 'az_mps2'), dt_s=0.005):
@@ -57,7 +59,7 @@ def test_serialized_samples_are_what_rclpy_serializes(axes):
     volts = np.linspace(1.1, 3.9, 5 * len(axes)).reshape(5, -1)
     stamps = 1_700_000_000_999_999_990 + 5 * np.arange(5)
     template = imu_message(sensor, 'imu_link')
-    for message, stamp, a in zip(ImuWriter(sensor, 'imu_link').messages(stamps, volts), stamps,
+    for message, stamp, a in zip(ImuWriter(sensor, 'imu_link').messages(stamps, volts, {}), stamps,
                                  to_nominal_mps2(volts, sensor)):
         template.header.stamp.sec, template.header.stamp.nanosec = map(
             int, divmod(stamp, 10 ** 9))
@@ -79,22 +81,23 @@ def test_saturation_is_reported_at_the_rails_and_beyond_the_range():
 
 def test_sim_publishes_every_sample_as_documented(start):
     driver = start('driver', ROS, '-p', 'link.type:=sim', '-p',
-                   'link.alpha_rad:=1.5707963267948966', '-p',
-                   'frame_id:=case', '-p', 'sensor.serial:=A7')
+                   'link.alpha_rad:=1.5707963267948966', '-p', 'frame_id:=case', '-p',
+                   'sensor.serial:=A7', '-p',
+                   f'qos_overrides./imu/data_raw.publisher.depth:={QUEUE}')
     sensor = nominal()
     with Graph() as graph:
-        samples = graph.listen(Imu, 'imu/data_raw')
+        samples = graph.listen(Imu, 'imu/data_raw', QUEUE)
         info = graph.listen(DiagnosticStatus, 'sensor_info', latched=True)
         graph.spin_until(lambda: len(samples) >= 3000 and info, 30, '3000 samples')
         # On a busy machine the driver may miss the samples of a second, but recovers.
         graph.spin_until(lambda: 'driver' in graph.diagnostics and abs(
-            float(graph.value('driver', 'rate_hz')) - 1000) < 100, 15, 'the rate')
+            float(graph.value('driver', 'rate_hz')) - 1000) < 100
+            and 0 <= float(graph.value('driver', 'age_s')) < 1, 15, 'the rate')
         status = graph.diagnostics['driver']
         assert status.level == DiagnosticStatus.WARN
         assert SIMULATED in status.message
         assert status.hardware_id == 'A7'
         assert graph.value('driver', 'missing') == graph.value('driver', 'saturated') == '0'
-        assert 0 <= float(graph.value('driver', 'age_s')) < 1
     stamps = np.array([stamp_ns(message) for message in samples])
     assert (np.diff(stamps) == 1_000_000).all()
     first = samples[0]
@@ -154,17 +157,15 @@ def test_beside_another_clock_the_driver_follows_it(start, option):
     def tick():
         now_s = 50 + time.monotonic() - begin_s
         clock.publish(Clock(clock=Time(sec=int(now_s), nanosec=int(now_s % 1 * 1e9))))
-        return len(samples) > 500
+        return len(samples) > 500 and graph.node.count_publishers('/clock') == 1 \
+            and abs(stamp_ns(samples[-1]) - 1e9 * now_s) < 2e9
 
     with Graph() as graph:
         clock = graph.node.create_publisher(Clock, '/clock', 10)
         begin_s = time.monotonic()
         samples = graph.listen(Imu, 'imu/data_raw')
         driver = start('driver', ROS, '-p', 'link.type:=sim', '-p', option)
-        graph.spin_until(tick, 30, '500 samples')
-        assert graph.node.count_publishers('/clock') == 1
-        now_ns = 1e9 * (50 + time.monotonic() - begin_s)
-        assert abs(stamp_ns(samples[-1]) - now_ns) < 2e9
+        graph.spin_until(tick, 30, '500 samples by the one clock')
     assert '/clock comes from /tester: this driver follows it' in driver.output()
 
 
@@ -174,10 +175,10 @@ def test_replay_in_real_time_is_stamped_now(start, tmp_path):
         samples = graph.listen(Imu, 'imu/data_raw')
         start('driver', ROS, '-p', 'link.type:=replay', '-p', 'link.recording:=r.csv', '-p',
               'link.loop:=true')
-        graph.spin_until(lambda: len(samples) >= 200, 30, '200 samples')
-        now = graph.node.get_clock().now().nanoseconds
+        graph.spin_until(lambda: len(samples) >= 200 and abs(
+            stamp_ns(samples[-1]) - graph.node.get_clock().now().nanoseconds) < 1e9, 30,
+            '200 samples, the newest of now')
     stamps = np.array([stamp_ns(message) for message in samples])
-    assert abs(stamps[-1] - now) < 1e9
     assert np.diff(stamps) == pytest.approx(5e6, abs=2)
 
 

@@ -31,7 +31,7 @@ from units import drawn, NOMINAL, nominal
 
 ROS = '--ros-args'
 SIMULATED = 'SIMULATED sensor (link.type: sim)'
-CHOICES = 'set it to iio, replay, serial, or to sim for a simulated sensor'
+CHOICES = 'set it to iio, replay, serial, topic, or to sim for a simulated sensor'
 
 
 @pytest.fixture
@@ -125,24 +125,14 @@ def test_an_error_in_the_parameters_of_a_launch_file_names_no_temporary_file(sta
     assert line.startswith("driver: parameters of the launch file: link.type: 'seral' is not one")
 
 
-@pytest.mark.parametrize('node', ['stage', 'calibration', 'compensation'])
+@pytest.mark.parametrize('node', [
+    'stage', 'calibration', 'compensation', 'investigate', 'monitor'])
 def test_an_unknown_parameter_of_a_file_is_refused_at_its_line(start, tmp_path, node):
     text = NOMINAL.read_text() + '    sweep: {dwel_s: 2.0}\n'
     (tmp_path / 'own.yaml').write_text(text)
     line = refusal(start, node, '--params-file', 'own.yaml')
     assert f'own.yaml:{text.count(chr(10))}:' in line
     assert 'sweep.dwel_s: no node has a parameter of this name; did you mean sweep.dwell_s' in line
-
-
-def test_parameters_of_other_nodes_are_no_error(start, tmp_path):
-    """One file serves all nodes of a launch."""
-    (tmp_path / 'all.yaml').write_text(NOMINAL.read_text() + (
-        '    stage.mode: manual\n    slew_rate_rad_s: 1.0\n    undo_filter: true\n'
-        '    link.type: sim\n    link.seed: 3\n'))
-    nodes = [start(name, ROS, '--params-file', 'all.yaml') for name in OWN_PARAMETERS]
-    with Graph() as graph:
-        graph.spin_until(lambda: set(OWN_PARAMETERS) <= set(graph.diagnostics), 40, 'all nodes')
-    assert all(node.popen.poll() is None for node in nodes)
 
 
 @pytest.mark.parametrize('node', ['driver', 'compensation'])
@@ -167,35 +157,48 @@ def test_the_sections_of_a_file_are_those_of_ros(start, tmp_path, section):
     assert driver.popen.poll() is None
 
 
-def test_the_table_of_parameters_is_what_the_nodes_declare(start, tmp_path):
-    joints = ('-p', 'stage.type:=trajectory', '-p', 'bridge.alpha.joint:=a', '-p',
-              'bridge.beta.joint:=b')
-    for name in OWN_PARAMETERS:
-        start(name)
-    start('stage', ROS, *joints, '-r', '__node:=bridge')
-    ignored = sensor_keys() | {'use_sim_time', 'start_type_description_service'}
+def test_all_nodes_with_one_file(start, tmp_path):
+    """
+    One file serves all nodes of a launch, and parameters of other nodes are no error.
+
+    Each node declares the parameters of the table. `ros2 param dump` gets the values of all of
+    them: it asks for all at once, and gets none where one has no value.
+    """
+    (tmp_path / 'all.yaml').write_text(NOMINAL.read_text() + (
+        '    stage.mode: manual\n    slew_rate_rad_s: 1.0\n    undo_filter: true\n'
+        '    link.type: sim\n    link.seed: 3\n'))
+    nodes = [start(name, ROS, '--params-file', 'all.yaml') for name in OWN_PARAMETERS]
+    nodes.append(start('stage', ROS, '-p', 'stage.type:=trajectory', '-p',
+                       'bridge.alpha.joint:=a', '-p', 'bridge.beta.joint:=b', '-r',
+                       '__node:=bridge'))
     with Graph() as graph:
-        names = {node: {name for name in listed(graph, node)
-                        if name not in ignored and not name.startswith('qos_overrides.')}
-                 for node in (*OWN_PARAMETERS, 'bridge')}
+        graph.spin_until(lambda: set(OWN_PARAMETERS) <= set(graph.diagnostics), 40, 'all nodes')
+        declared = {node: listed(graph, node) for node in (*OWN_PARAMETERS, 'bridge')}
+        for node in OWN_PARAMETERS:
+            check_dump(graph, node, declared[node])
+    assert all(node.popen.poll() is None for node in nodes)
+    names = {node: set(own_parameters(declared[node])) for node in declared}
     names['stage'] |= names.pop('bridge')
     names['driver'] = {name for name in names['driver']
                        if name == 'link.type' or not name.startswith('link.')}
     assert names == {node: set(table) for node, table in OWN_PARAMETERS.items()}
 
 
-@pytest.mark.parametrize('node', list(OWN_PARAMETERS))
-def test_all_parameters_of_a_node_can_be_dumped(start, tmp_path, node):
-    """`ros2 param dump` asks for all values at once, and gets none where one has no value."""
-    start(node, ROS, '--params-file', NOMINAL)
-    with Graph() as graph:
-        names = listed(graph, node)
-        assert len(names) > 10
-        values = graph.call(GetParameters, f'{node}/get_parameters',
-                            GetParameters.Request(names=names)).values
+def own_parameters(names: list[str]) -> list[str]:
+    """Return the parameters that are neither of the sensor nor of all nodes."""
+    ignored = sensor_keys() | {'use_sim_time', 'start_type_description_service'}
+    return [name for name in names
+            if name not in ignored and not name.startswith('qos_overrides.')]
+
+
+def check_dump(graph: Graph, node: str, names: list[str]) -> None:
+    """Check that a node gives the values of all its parameters at once."""
+    assert len(names) > 10, node
+    values = graph.call(GetParameters, f'{node}/get_parameters',
+                        GetParameters.Request(names=names)).values
     dumped = {name: parameter_value_to_python(value) for name, value in zip(names, values)}
-    assert dumped.keys() == set(names)
-    assert None not in dumped.values()
+    assert dumped.keys() == set(names), node
+    assert None not in dumped.values(), node
     if node != 'stage':
         assert dumped['sensor.rate_hz'] == 1000.0
         assert dumped['format'] == 1

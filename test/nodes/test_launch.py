@@ -60,8 +60,12 @@ def launch(ros_env: dict[str, str], tmp_path: Path) -> Iterator[Callable[..., St
     ('robot', 'log_level:=loud', '"loud" is not valid'),
     ('calibrate', 'screen:=maybe', '"maybe" is not valid'),
     ('robot', 'mounting_xyz_m:=0.1', 'mounting_xyz_m:=0.1: expected three numbers'),
+    ('emulate', 'rpy_rad:=0.1', 'rpy_rad:=0.1: expected three numbers'),
+    ('emulate', 'seed:=odd', 'seed:=odd: expected a whole number'),
     ('calibrate', 'sweep_planes_deg:=flat', 'sweep_planes_deg:=flat: expected numbers'),
     ('calibrate', 'link_type:=serial', 'link_type is serial, but the stage would be simulated'),
+    ('investigate', 'link_type:=serial', 'link_type is serial, but the stage would be simulated'),
+    ('investigate', 'limits_beta_deg:=wide', 'limits_beta_deg:=wide: expected numbers'),
     ('calibrate', 'params_file:=serial.yaml', 'link_type is serial, but the stage would be')])
 def test_a_launch_refuses_bad_arguments(launch, tmp_path, name, argument, words):
     text = NOMINAL.read_text()
@@ -115,6 +119,14 @@ def test_the_arguments_count_before_the_file(launch, tmp_path):
     launched.wait_for('active: link sim, unit nominal')
 
 
+def test_a_launch_puts_a_sensor_behind_a_simulator(launch, tmp_path):
+    parameter_file.save(tmp_path / 'unit.yaml', nominal(serial='17'))
+    launched = launch('emulate', 'params_file:=unit.yaml', 'in_topic:=/sim/imu',
+                      'out_topic:=/robot/imu', 'seed:=3')
+    launched.wait_for('active: link topic, unit 17, 1000 Hz, topic /robot/imu', 30)
+    launched.wait_for('/sim/imu: nobody publishes it', 30)
+
+
 @pytest.mark.parametrize('output, status', [('unit.yaml', 0), ('none/unit.yaml', 1)])
 def test_the_launch_of_a_calibration_ends_with_it(launch, tmp_path, output, status):
     launched = launch('calibrate', f'output:={output}', 'speed:=20', 'sweep_planes_deg:=30,60,90',
@@ -139,7 +151,7 @@ def test_a_launch_shows_the_screen_in_its_terminal(ros_env, tmp_path):
                      'sweep_check_poses:=3'], ros_env, tmp_path)
     seen.wait_for('redo', timeout_s=60)
     assert '[INFO]' not in seen.text()
-    assert seen.popen.wait(120) == 0
+    assert seen.wait(120) == 0
     assert parameter_file.load(tmp_path / 'unit.yaml').model != 'nominal'
     seen.wait_for('wrote unit.yaml')
     assert 'Traceback' not in seen.raw.decode()

@@ -14,7 +14,10 @@
 
 """`--help` and `--version` of the nodes: what each declares, seen by no graph."""
 
+from functools import cache
+import os
 import re
+import subprocess
 
 from adxl_ros.links.support import base
 from adxl_ros.nodes.support.given_parameters import OWN_PARAMETERS
@@ -23,13 +26,20 @@ from processes import executable, run_executable
 import pytest
 from terminal import Terminal
 
-NODES = ('driver', 'stage', 'calibration', 'compensation')
+NODES = ('driver', 'stage', 'calibration', 'compensation', 'investigate', 'monitor')
 PROGRAMS = (*NODES, 'screen', 'demo', 'bench')
 
 
 def parts_of(text: str) -> dict[str, str]:
     """Return the parts of a help text by their first lines."""
     return {part.split('\n')[0]: part for part in text.split('\n\n')}
+
+
+@cache
+def help_of(name: str) -> subprocess.CompletedProcess:
+    """Run `--help` of a program once for all tests."""
+    # A path has no place to wrap at; no file of this one is written.
+    return run_executable(name, '--help', env=os.environ | {'ROS_HOME': '/ros'})
 
 
 @pytest.mark.parametrize('name', PROGRAMS)
@@ -41,8 +51,7 @@ def test_version(name: str, ros_env: dict[str, str]) -> None:
 
 @pytest.mark.parametrize('name', PROGRAMS)
 def test_help_has_examples_within_a_terminal(name: str, ros_env: dict[str, str]) -> None:
-    # A path has no place to wrap at; no file of this one is written.
-    done = run_executable(name, '--help', env=ros_env | {'ROS_HOME': '/ros'})
+    done = help_of(name)
     assert (done.returncode, done.stderr) == (0, '')
     assert f'    ros2 run adxl_ros {name}' in done.stdout.split('examples:')[1]
     assert max(map(len, done.stdout.splitlines())) <= 79 and '\x1b' not in done.stdout
@@ -51,7 +60,7 @@ def test_help_has_examples_within_a_terminal(name: str, ros_env: dict[str, str])
 @pytest.mark.parametrize('name', NODES)
 def test_help_lists_each_parameter_with_type_default_and_meaning(
         name: str, ros_env: dict[str, str]) -> None:
-    text = run_executable(name, '--help', env=ros_env).stdout
+    text = help_of(name).stdout
     entries = re.findall(r'^  ([\w.]+)  (float|floats|int|bool|text|texts)(?:, .+)?\n {6}\S',
                          text, re.MULTILINE)
     listed = {entry[0] for entry in entries}
@@ -61,7 +70,7 @@ def test_help_lists_each_parameter_with_type_default_and_meaning(
 
 
 def test_help_of_the_driver_has_links_sensor_and_topics(ros_env: dict[str, str]) -> None:
-    parts = parts_of(run_executable('driver', '--help', env=ros_env).stdout)
+    parts = parts_of(help_of('driver').stdout)
     for link in base.link_names():
         for option in base.options(base.link_module(link).Settings):
             assert f'\n  link.{option.name}  ' in parts[f'with link.type:={link}']

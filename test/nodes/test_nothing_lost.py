@@ -27,20 +27,22 @@ from std_srvs.srv import Trigger
 from units import drawn, nominal, pose_record
 
 FAST = ('-p', 'use_sim_time:=true')
+RATE_HZ = 200.0
+SPEED = ('-p', 'link.speed:=10.0')
 PLAN = ('-p', 'sweep.planes_rad:=[0.785, 1.5707963267948966, 2.356]', '-p',
         'sweep.step_rad:=0.7853981633974483', '-p', 'sweep.dwell_s:=1.0', '-p',
         'sweep.check_poses:=4', '-p', 'output:=unit.yaml', '-p', 'autostart:=true', *RELIABLE)
 
 
 def _driver(start, tmp_path, serial='N1'):
-    base = nominal(serial=serial)
+    base = nominal(serial=serial, rate_hz=RATE_HZ)
     parameter_file.save(tmp_path / f'{serial}.yaml', drawn(np.random.default_rng(3), base))
     return start('driver', '--ros-args', '--params-file', tmp_path / f'{serial}.yaml', '-p',
-                 'link.type:=sim', '-p', 'link.speed:=4.0', *FAST)
+                 'link.type:=sim', *SPEED, *FAST)
 
 
 def _stage(start, tmp_path):
-    parameter_file.save(tmp_path / 'bare.yaml', nominal())
+    parameter_file.save(tmp_path / 'bare.yaml', nominal(rate_hz=RATE_HZ))
     return start('stage', '--ros-args', '--params-file', tmp_path / 'bare.yaml', *FAST, '-p',
                  'slew_rate_rad_s:=3.0')
 
@@ -105,7 +107,7 @@ def test_a_restarted_driver_is_accepted_and_another_unit_is_not(start, tmp_path)
 
 def test_a_failed_fit_waits_for_a_decision_and_another_unit_ends_the_session(start, tmp_path):
     """Redo, finish and abort are possible. The journal has no pose of the other unit."""
-    base = nominal(serial='N1')
+    base = nominal(serial='N1', rate_hz=RATE_HZ)
     parameter_file.save(tmp_path / 'bare.yaml', base)
     capture = CaptureSettings(0.5, np.radians(0.2), 60.0, StageMode.MANUAL, np.radians(2))
     settings = SessionSettings(
@@ -114,7 +116,7 @@ def test_a_failed_fit_waits_for_a_decision_and_another_unit_ends_the_session(sta
     interrupted = sweep_journal.Journal(settings.journal, settings.head(base))
     for i, target in enumerate(settings.targets(base)):
         interrupted.append(pose_record(
-            i, alpha_rad=target.alpha_rad, beta_rad=target.beta_rad, samples=500,
+            i, alpha_rad=target.alpha_rad, beta_rad=target.beta_rad, samples=100,
             # No fit accepts an inverted unit.
             mean_v=(2.5 - np.cos(target.beta_rad), 2.5 - np.sin(target.beta_rad))))
     interrupted.close()
@@ -185,7 +187,7 @@ def test_another_mounting_stops_before_a_pose_is_taken(start, tmp_path):
         unit.values['misalignment']['beta_rad'] += np.radians([-2.0, 2.0])
         parameter_file.save(tmp_path / 'N1.yaml', unit)
         start('driver', '--ros-args', '--params-file', tmp_path / 'N1.yaml', '-p',
-              'link.type:=sim', '-p', 'link.speed:=4.0', *FAST)
+              'link.type:=sim', *SPEED, *FAST)
         again = _calibration(start, tmp_path)
         again.wait_for(f'mounting changed: in pose {len(poses)} ', 60)
         assert 'before the interruption' in again.output()

@@ -83,7 +83,7 @@ def test_a_screen_drives_the_sweep_of_a_node_without_a_terminal(start, screen, t
     seen.wait_for('wrote unit.yaml', 'held out: tilt', timeout_s=60.0)
     assert parameter_file.load(tmp_path / 'unit.yaml').serial == 'T1'
     seen.press('q')
-    assert seen.popen.wait(20) == 0
+    assert seen.wait() == 0
     assert seen.restored()
     assert '/calibration goes on; show it again: ros2 run adxl_ros screen' in seen.text()
     _, entries = sweep_journal.read(tmp_path / 'unit.yaml.journal')
@@ -121,7 +121,7 @@ def test_a_screen_waits_for_its_node_and_survives_it(start, screen):
     assert node.stop() == 0
     seen.wait_for('/bench/bridge has ended; waiting until it is started again')
     seen.press('\x03')
-    assert seen.popen.wait(20) == 0
+    assert seen.wait() == 0
     assert seen.restored()
 
 
@@ -131,7 +131,7 @@ def test_a_signal_ends_a_screen_and_restores_its_terminal(screen, number):
     seen = screen()
     seen.wait_for('waiting for /calibration')
     subprocess.run(['kill', f'-{number}', str(seen.popen.pid)], check=True)
-    assert seen.popen.wait(20) == 0
+    assert seen.wait() == 0
     assert seen.restored()
 
 
@@ -141,7 +141,7 @@ def test_a_screen_finds_the_terminal_of_a_launch(ros_env, tmp_path):
                     tmp_path)
     seen.wait_for('waiting for /calibration', 'q  quit')
     seen.press('q')
-    assert seen.popen.wait(20) == 0
+    assert seen.wait() == 0
     assert seen.restored()
     assert (tmp_path / 'output.txt').read_text() == ''
     seen.close()

@@ -9,7 +9,7 @@ from processes import wait_until
 import pytest
 
 
-@pytest.mark.parametrize('name', ['driver', 'stage', 'calibration', 'compensation'])
+@pytest.mark.parametrize('name', ['driver', 'stage', 'calibration', 'compensation', 'monitor'])
 def test_interrupted_twice_a_node_ends_cleanly(start, name):
     """The second signal, whenever it comes, changes neither the status nor the output."""
     with Graph() as graph:
@@ -25,7 +25,7 @@ def test_interrupted_twice_a_node_ends_cleanly(start, name):
 
 
 @pytest.mark.parametrize('library', ['_multiarray_umath', '_rclpy_pybind11', 'libfastrtps'])
-@pytest.mark.parametrize('name', ['driver', 'compensation'])
+@pytest.mark.parametrize('name', ['driver', 'compensation', 'monitor'])
 def test_interrupted_while_it_starts_a_node_prints_no_traceback(start, name, library):
     """The signal comes while a node loads numpy, loads rclpy, or makes its first topics."""
     node = start(name)

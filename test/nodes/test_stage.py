@@ -90,8 +90,9 @@ BAD_COMMANDS = {
 def test_a_command_without_meaning_is_refused(start):
     stage = start('stage')
     with Commander() as graph:
-        graph.spin_until(lambda: graph.states, 20, 'the stage')
-        graph.spin(1)
+        graph.spin_until(lambda: graph.states and graph.command.get_subscription_count(), 20,
+                         'the stage')
+        graph.go(alpha=0.0)
         for reason, command in BAD_COMMANDS.items():
             graph.command.publish(command)
             graph.spin_until(partial(graph.reports, 'stage', reason), 20, f'refusal: {reason}')

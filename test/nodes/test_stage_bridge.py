@@ -68,6 +68,15 @@ class Controller(Graph):
         """Command the stage to angles, rad."""
         self.command.publish(JointState(name=['alpha', 'beta'], position=[alpha, beta]))
 
+    def command_until(self, alpha, beta, condition, purpose):
+        """Repeat a command until a condition holds, because the first ones may be lost."""
+        def holds():
+            if condition():
+                return True
+            self.send_command(alpha, beta)
+            return False
+        self.spin_until(holds, 20, purpose)
+
     def at(self):
         """Return the newest published angles of the stage, rad, by joint."""
         if not self.stage_states:
@@ -82,8 +91,7 @@ def test_commands_and_states_pass_with_names_signs_and_offsets(start, kind):
         start('stage', '--ros-args', '-p', f'stage.type:={kind}', *NAMES, *MOUNTED)
         graph.spin_until(graph.at, 30, 'the stage')
         assert graph.at() == {'alpha': 0.5, 'beta': 0.0}
-        graph.send_command(0.7, 0.3)
-        graph.spin_until(lambda: graph.commands, 10, 'a command')
+        graph.command_until(0.7, 0.3, lambda: graph.commands, 'a command')
         assert graph.goal() == pytest.approx({'tilt': 0.2, 'turn': -0.3})
         if kind == 'trajectory':
             point = graph.commands[0].points[0]
@@ -117,9 +125,9 @@ def test_a_stage_that_begins_beyond_half_a_turn_arrives(start):
         start('stage', '--ros-args', '-p', 'stage.type:=trajectory', *NAMES, '-p',
               'bridge.speed_rad_s:=10.0')
         graph.spin_until(graph.at, 30, 'the stage')
-        graph.send_command(0.0, np.radians(330))
-        graph.spin_until(lambda: graph.at()['beta'] == pytest.approx(np.radians(330)), 20,
-                         'beta 330')
+        graph.command_until(
+            0.0, np.radians(330), lambda: graph.at()['beta'] == pytest.approx(np.radians(330)),
+            'beta 330')
         graph.angles['turn'] = np.radians(300)
         graph.spin_until(lambda: graph.at()['beta'] == pytest.approx(np.radians(300)), 20,
                          'beta 300, counted on')

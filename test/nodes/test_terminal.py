@@ -22,7 +22,7 @@ import signal
 from adxl_ros.files import parameter_file, sweep_journal
 from graph import Graph, RELIABLE
 import numpy as np
-from processes import executable
+from processes import children, executable
 import pytest
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
@@ -157,7 +157,7 @@ def test_the_screen_guides_an_operator_through_a_sweep(start, terminal, tmp_path
         seen.press('b')
         seen.wait_for('unit.yaml.journal holds 5 poses of an interrupted calibration', 'y  go on')
         seen.press('q')
-        assert seen.popen.wait(20) == 0
+        assert seen.wait() == 0
         assert seen.restored()
         assert 'pose 6 is on disk' in seen.raw.decode().split('\x1b[?1049l')[-1]
     assert parameter_file.load(tmp_path / 'unit.yaml').serial == 'T1'
@@ -172,12 +172,6 @@ def test_the_screen_guides_an_operator_through_a_sweep(start, terminal, tmp_path
 def _tilt(screen):
     line = next(line for line in screen.splitlines() if line.startswith('tilt error'))
     return float(line.split()[2].rstrip('°'))
-
-
-def children(pid):
-    """Return the processes that a process has started."""
-    return [int(n) for task in Path(f'/proc/{pid}/task').iterdir()
-            for n in (task / 'children').read_text().split()]
 
 
 @pytest.mark.kills
@@ -196,7 +190,7 @@ def test_the_terminal_is_restored(terminal, how):
         seen.press('\x03')
     else:
         os.kill(seen.popen.pid, SIGNALS[how])
-    assert seen.popen.wait(20) == (-SIGNALS[how] if how in ('hup', 'kill') else 0)
+    assert seen.wait() == (-SIGNALS[how] if how in ('hup', 'kill') else 0)
     with Graph() as graph:
         graph.spin_until(lambda: seen.restored() and not Path(f'/proc/{screen}').exists(), 20,
                          'the terminal as it was')
@@ -212,7 +206,7 @@ def test_a_terminal_of_another_process_has_a_screen(terminal):
     seen.press('a')
     seen.wait_for('aborted', 'b  begin')
     seen.press('q')
-    assert seen.popen.wait(20) == 0
+    assert seen.wait() == 0
     assert seen.restored()
 
 

@@ -27,7 +27,8 @@ import pytest
 SCRIPTS = [entry for entry in distribution('adxl_ros').entry_points
            if entry.group == 'console_scripts']
 EXECUTABLES = [entry.name for entry in SCRIPTS]
-LAUNCH_FILES = ('calibrate.launch.py', 'robot.launch.py')
+LAUNCH_FILES = ('calibrate.launch.py', 'emulate.launch.py', 'investigate.launch.py',
+                'robot.launch.py')
 
 
 def run(*args: str, **options: object) -> subprocess.CompletedProcess:

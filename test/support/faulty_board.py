@@ -30,8 +30,12 @@ when it is done:
     unplug S            close the terminal and open it again after S seconds
     reset S             stop, and begin with count and clock at 0 after S seconds
     halt S              stop for S seconds with clock and count, then continue
+
+It obeys the commands of the host unless its options have "obeys": false. With "keeps": true it
+keeps what does not fit in the terminal, however long the driver is held up; else it loses that.
 """
 
+from contextlib import suppress
 import json
 import os
 from pathlib import Path
@@ -42,13 +46,20 @@ import sys
 import time
 import tty
 
-from adxl_ros.links.support.wire_format import BoardInfo, Encoder
+from adxl_ros.links.support.base import samples_within
+from adxl_ros.links.support.wire_format import (
+    BoardInfo,
+    decode_command,
+    Encoder,
+    Splitter,
+    WireError,
+)
 import numpy as np
 
 CODES = 65534
 """Number of codes between the rails of a 16 bit ADC."""
 BLOCK = 10
-"""Samples of a frame, as the firmware sends them."""
+"""Most samples of a frame, and those before the first command, as the firmware sends them."""
 BANNER = b'\r\nets Jun  8 2016 00:22:57\r\nrst:0x1 (POWERON_RESET)\0\r\nboot\r\n'
 """What an ESP32 prints when it starts."""
 
@@ -76,6 +87,9 @@ class FaultyBoard:
         self.encoder = Encoder(self.info)
         self.informed_ns = 0
         self.unsent = b''
+        self.block = BLOCK
+        self.obeys, self.keeps = options.get('obeys', True), options.get('keeps', False)
+        self.received = Splitter()
         self.plug()
         if options.get('banner'):
             self.write(BANNER)
@@ -105,40 +119,56 @@ class FaultyBoard:
 
     def turn(self):
         """Send what is due; return the time until the next frame, s."""
+        self.take_commands()
         now = time.monotonic_ns()
         if now - self.informed_ns > 1e9 and self.write(self.encoder.info_frame()):
             self.informed_ns = now
-        while self.time_ns(self.next_sample + BLOCK - 1) <= time.monotonic_ns():
+        while self.time_ns(self.next_sample + self.block - 1) <= time.monotonic_ns():
             self.send_frame()
-        due_ns = self.time_ns(self.next_sample + BLOCK - 1)
+        due_ns = self.time_ns(self.next_sample + self.block - 1)
         return max(min((due_ns - time.monotonic_ns()) * 1e-9, 0.02), 0)
+
+    def take_commands(self):
+        """Obey the commands of the host, as the firmware does."""
+        try:
+            received = os.read(self.board_fd, 4096)
+        except (BlockingIOError, OSError):
+            return
+        for raw in self.received.split(received):
+            with suppress(WireError):
+                latency_s = decode_command(raw) * 1e-6
+                if self.obeys:
+                    self.block = min(samples_within(latency_s, self.rate), BLOCK)
+                    self.informed_ns = 0
 
     def send_frame(self):
         """Send the next frame of samples."""
-        k = np.arange(self.next_sample, self.next_sample + BLOCK)
-        codes = np.full((BLOCK, self.channels), 32768)
+        k = np.arange(self.next_sample, self.next_sample + self.block)
+        codes = np.full((self.block, self.channels), 32768)
         codes[:, 0], codes[:, 1] = k % CODES + 1, mark(k)
         index = self.next_sample - self.first_sample
         raw = self.encoder.sample_frame(round(index * 1e6 / self.rate), index,
                                         codes.astype(np.uint16), self.overruns)
         if not self.write(raw):
-            self.overruns += BLOCK
-        self.next_sample += BLOCK
+            self.overruns += self.block
+        self.next_sample += self.block
 
     def write(self, raw):
         """Write bytes with the present fault; return whether there was room."""
         if self.board_fd is None:
             return False
-        try:
+        self.flush()
+        if self.unsent and not self.keeps:
+            return False
+        self.unsent += self.damage(raw)
+        self.flush()
+        return True
+
+    def flush(self):
+        """Send the bytes that wait, as far as there is room."""
+        with suppress(BlockingIOError):
             if self.unsent:
                 self.unsent = self.unsent[os.write(self.board_fd, self.unsent):]
-            if self.unsent:
-                return False
-            damaged = self.damage(raw)
-            self.unsent = damaged[os.write(self.board_fd, damaged):] if damaged else b''
-        except BlockingIOError:
-            return False
-        return True
 
     def damage(self, raw):
         """Return bytes with the present fault."""
@@ -196,6 +226,7 @@ class FaultyBoard:
             time.sleep(number)
             self.skip()
             self.first_sample, self.overruns = self.next_sample, 0
+            self.block = BLOCK
             self.encoder, self.informed_ns = Encoder(self.info), 0
         elif name == 'halt':
             time.sleep(number)
@@ -203,9 +234,9 @@ class FaultyBoard:
 
     def skip(self):
         """Lose the frames that were due in the meantime."""
-        while self.time_ns(self.next_sample + BLOCK - 1) <= time.monotonic_ns():
-            self.next_sample += BLOCK
-            self.overruns += BLOCK
+        while self.time_ns(self.next_sample + self.block - 1) <= time.monotonic_ns():
+            self.next_sample += self.block
+            self.overruns += self.block
 
 
 def main():

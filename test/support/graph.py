@@ -22,6 +22,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 import numpy as np
+from processes import PATIENCE
 import pytest
 import rclpy
 from rclpy.context import Context
@@ -95,12 +96,13 @@ class Graph:
         return kept
 
     def spin_until(self, condition, timeout_s, purpose):
-        """Listen until a condition holds; fail with the purpose after the time."""
-        end_s = time.monotonic() + timeout_s
+        """Listen until a condition holds; fail with the purpose after a multiple of the time."""
+        end_s = time.monotonic() + PATIENCE * timeout_s
         while not condition():
             self._executor.spin_once(timeout_sec=0.05)
             if time.monotonic() > end_s:
-                pytest.fail(f'{purpose}: not after {timeout_s} s; diagnostics: {self.diagnostics}')
+                pytest.fail(f'{purpose}: not after {PATIENCE} times {timeout_s} s; '
+                            f'diagnostics: {self.diagnostics}')
 
     def spin(self, seconds):
         """Listen for some seconds."""
@@ -114,7 +116,7 @@ class Graph:
         client = self._clients.get(service)
         if client is None:
             client = self._clients[service] = self.node.create_client(kind, service)
-        assert client.wait_for_service(timeout_s), f'no service {service}'
+        assert client.wait_for_service(PATIENCE * timeout_s), f'no service {service}'
         future = client.call_async(request)
         self.spin_until(future.done, timeout_s, f'answer of {service}')
         return future.result()

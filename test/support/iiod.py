@@ -101,8 +101,12 @@ class Adc:
         self.queue = deque()
 
     def sample_count(self):
-        """Return how many samples have been taken."""
-        return int((time.monotonic_ns() - self.began_ns) * self.drift * self.rate * 1e-9)
+        """Return how many samples have been taken, the one of the first instant included."""
+        return int((time.monotonic_ns() - self.began_ns) * self.drift * self.rate * 1e-9) + 1
+
+    def until_s(self, k):
+        """Return the time until sample k is taken, s."""
+        return (self.began_ns - time.monotonic_ns()) * 1e-9 + k / self.rate / self.drift
 
     def stamp(self, k):
         """Return the time stamp of sample k, ns."""
@@ -128,7 +132,7 @@ class Adc:
                 numbers.append(self.next_sample)
                 self.next_sample += 1
             if len(numbers) < count:
-                time.sleep(0.001)
+                time.sleep(max(self.until_s(self.next_sample + count - len(numbers) - 1), 0))
         return numbers
 
     def packed(self, k):
@@ -221,6 +225,7 @@ class Client(socketserver.StreamRequestHandler):
     def obey(self, command, rest):
         """Answer one command."""
         adc = self.server.adc
+        time.sleep(adc.options.get('answer_s', 0.0))
         if command == 'VERSION':
             self.wfile.write(b'0.24.v0.24  \n')
         elif command == 'PRINT':

@@ -99,7 +99,7 @@ class Sweeps:
         for process in self._others:
             process.send_signal(signal.SIGINT)
         for process in self._others:
-            process.wait(20)
+            process.wait(100)
 
     def kill_once(self):
         """Run the sweep until a moment or the end, kill the node, and check its files."""

@@ -126,6 +126,16 @@ class DriverRig:
         self.errors = np.zeros(0)
         self.wrong = self._counted_before = self._estimated_before = 0
 
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.end()
+
+    def end(self):
+        """End the device."""
+        raise NotImplementedError
+
     def identify(self, codes, stamps):
         """Return the numbers of samples by codes and stamps, and how many codes are wrong."""
         raise NotImplementedError

@@ -24,6 +24,7 @@ import termios
 import threading
 import time
 
+from processes import PATIENCE
 import pyte
 import pytest
 
@@ -78,8 +79,8 @@ class Terminal:
         os.write(self._master, key.encode())
 
     def wait_for(self, *texts, timeout_s=30.0):
-        """Wait until the screen shows all of some texts, and return it."""
-        end_s = time.monotonic() + timeout_s
+        """Return the screen when it shows all of some texts; wait for a multiple of the time."""
+        end_s = time.monotonic() + PATIENCE * timeout_s
         # The terminal folds long lines.
         expected = [' '.join(text.split()) for text in texts]
         while True:
@@ -88,13 +89,19 @@ class Terminal:
             if all(text in unfolded for text in expected):
                 return screen
             if time.monotonic() > end_s:
-                pytest.fail(f'no {texts} on the screen after {timeout_s} s:\n{screen}')
+                pytest.fail(f'no {texts} on the screen after {PATIENCE} times {timeout_s} s:\n'
+                            f'{screen}')
             time.sleep(0.05)
+
+    def wait(self, timeout_s=20.0):
+        """Wait until the program ends by itself and return its exit status."""
+        return self.popen.wait(PATIENCE * timeout_s)
 
     def restored(self):
         """Return whether settings, screen and cursor are as before the program."""
         with self._lock:
-            left_alternate = self.raw.count(b'\x1b[?1049h') == self.raw.count(b'\x1b[?1049l')
+            # On a busy machine the node leaves it, too, while the screen still ends.
+            left_alternate = self.raw.count(b'\x1b[?1049h') <= self.raw.count(b'\x1b[?1049l')
             hidden = self.screen.cursor.hidden
         return left_alternate and not hidden and termios.tcgetattr(self.slave) == self.before
 

@@ -226,13 +226,16 @@ def test_an_output_that_cannot_be_written_is_refused(run_tool: RunTool, tmp_path
                                     '-o', tmp_path / 'out.csv')
 
 
-@pytest.mark.parametrize(('number', 'status'), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_an_interruption_leaves_no_output(tmp_path: Path, number: int, status: int) -> None:
+@pytest.mark.parametrize(('number', 'status', 'output'), [
+    (signal.SIGINT, 130, 'out.csv'), (signal.SIGTERM, 143, 'out.csv'),
+    (signal.SIGINT, 130, 'out.mcap'), (signal.SIGINT, 130, 'out')])
+def test_an_interruption_leaves_no_output(tmp_path: Path, number: int, status: int, output: str
+                                          ) -> None:
     sensor = unit()
     path = record(tmp_path, sensor, volts_of(sensor, *np.full((2, 500000), 0.5)))
     process = subprocess.Popen(
         [executable('apply'), path, '--params', tmp_path / 'unit.yaml', '-o',
-         tmp_path / 'out.csv'], stderr=subprocess.PIPE, text=True)
+         tmp_path / output], stderr=subprocess.PIPE, text=True)
     wait_until(lambda: [p for p in tmp_path.iterdir() if p.name.startswith('.out')], 20.0,
                'output begun')
     process.send_signal(number)
@@ -268,3 +271,79 @@ def test_a_bag_has_the_same_result(run_tool: RunTool, tmp_path: Path) -> None:
     names = [name for name in COLUMNS if name != 'time_s']
     np.testing.assert_allclose(numbers(from_bag, *names), numbers(from_csv, *names), rtol=1e-9)
     np.testing.assert_allclose(numbers(from_bag, 'time_s'), numbers(from_csv, 'time_s'))
+
+
+def messages_of(path: Path, kinds: dict[str, str]) -> dict[str, list]:
+    """Return the messages of a bag by topic, which must have these topics and types only."""
+    reader = pytest.importorskip('rosbags.rosbag2').Reader(path)
+    typesys = pytest.importorskip('rosbags.typesys')
+    store = typesys.get_typestore(typesys.Stores.ROS2_JAZZY)
+    messages: dict[str, list] = {topic: [] for topic in kinds}
+    with reader as bag:
+        assert {c.topic: c.msgtype for c in bag.connections} == kinds
+        for connection, stamp_ns, raw in bag.messages():
+            message = store.deserialize_cdr(raw, connection.msgtype)
+            stamp = message.header.stamp
+            assert stamp.sec * 10 ** 9 + stamp.nanosec == stamp_ns
+            assert message.header.frame_id == 'imu_link'
+            messages[connection.topic].append(message)
+    return messages
+
+
+def test_a_bag_holds_the_estimates_of_the_table(run_tool: RunTool, tmp_path: Path) -> None:
+    """A sample without a solution is left out, and an angle that is not shown keeps its value."""
+    sensor = unit()
+    volts = np.vstack([volts_of(sensor), [[20.0, 2.0]], [[0.0, 2.5]], volts_of(
+        sensor, np.array([np.pi / 2, 0.4]), np.array([0.2, 0.3]))])
+    path = record(tmp_path, sensor, volts)
+    table, _ = applied(run_tool, path)
+    recording.write(tmp_path / 'made.mcap', recording.read(path), sensor)
+    kept = [i for i in range(len(volts)) if i != 4]
+    for source, output in (('made.csv', 'out.mcap'), ('made.csv', 'folder'),
+                           ('made.mcap', 'again.mcap')):
+        done = run_tool('apply', tmp_path / source, '--params', tmp_path / 'unit.yaml', '-o',
+                        tmp_path / output)
+        assert done.returncode == 0, done.stderr
+        assert '1 of 8 samples have no solution: they are left out' in done.stderr
+        assert '1 of 8 samples have the ADC at its rail: their variances are 1e+06' in done.stderr
+        assert str(tmp_path / output) in done.stdout
+        topics = messages_of(tmp_path / output, {
+            '/imu/data': 'sensor_msgs/msg/Imu', '/tilt': 'geometry_msgs/msg/Vector3Stamped'})
+        imu, tilt = topics['/imu/data'], topics['/tilt']
+        stamps_s = [m.header.stamp.sec + m.header.stamp.nanosec * 1e-9 for m in imu]
+        np.testing.assert_allclose(stamps_s, numbers(table, 'time_s')[0, kept], atol=1e-9)
+        force = [(m.linear_acceleration.x, m.linear_acceleration.y, m.linear_acceleration.z)
+                 for m in imu]
+        np.testing.assert_allclose(force, numbers(
+            table, 'ax_mps2', 'ay_mps2', 'az_mps2').T[kept], rtol=1e-9, atol=1e-9)
+        variance = np.array([m.linear_acceleration_covariance.reshape(3, 3).diagonal()
+                             for m in imu])
+        std = numbers(table, 'ax_std_mps2', 'ay_std_mps2', 'az_std_mps2').T[kept]
+        expected = np.where(np.isfinite(std), std ** 2, 1e6)
+        np.testing.assert_allclose(variance, expected, rtol=1e-9)
+        angles = numbers(table, 'roll_rad', 'pitch_rad', 'inclination_rad').T[kept]
+        for row in range(1, len(angles)):
+            angles[row] = np.where(np.isnan(angles[row]), angles[row - 1], angles[row])
+        vectors = [(m.vector.x, m.vector.y, m.vector.z) for m in tilt]
+        np.testing.assert_allclose(vectors, angles, rtol=1e-9)
+        is_shown = np.isfinite(numbers(table, 'roll_std_rad')[0, kept])
+        assert 0 < is_shown.sum() < len(imu)
+        assert [m.orientation_covariance[0] < 1 for m in imu] == is_shown.tolist()
+        for message, (roll, pitch, _) in zip(imu, angles):
+            assert message.angular_velocity_covariance[0] == -1
+            assert np.isfinite(message.orientation_covariance).all()
+            assert message.orientation_covariance[8] == 1e6
+            q = message.orientation
+            assert 2 * np.arctan2(q.x, q.w) == pytest.approx(roll, abs=1e-9)
+            assert 2 * (q.w * q.y - q.x * q.z) == pytest.approx(np.sin(pitch), abs=1e-9)
+
+
+def test_bad_input_leaves_the_earlier_bag(run_tool: RunTool, tmp_path: Path) -> None:
+    sensor = unit()
+    path = record(tmp_path, sensor, volts_of(sensor, *np.full((2, 30000), 0.5)))
+    (tmp_path / 'out.mcap').write_bytes(b'earlier')
+    with open(path, 'a', encoding='utf-8') as file:
+        file.write('99.0,nan,2.5\n')
+    reason = refused(run_tool, path, '--params', tmp_path / 'unit.yaml', '-o',
+                     tmp_path / 'out.mcap')
+    assert 'x_v is nan' in reason

@@ -15,7 +15,10 @@
 """A sensor in the formats of other software: each file is read by its reader and compared."""
 
 from dataclasses import replace
+from glob import glob
 import json
+import os
+from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from xml.etree import ElementTree
 
@@ -106,6 +109,46 @@ def test_sdf(exported):
         walk = unit().values['bias_walk']['density_g_per_rts'][d] * G0_MPS2
         assert values['dynamic_bias_stddev'] == pytest.approx(walk)
         assert (values['bias_mean'], values['bias_stddev']) == (0.0, 0.0)
+
+
+def check_described(element, description, folder):
+    """
+    Check an element of an SDF file against the description of SDFormat, and all in it.
+
+    Parameters
+    ----------
+    element
+        The element.
+    description
+        Its description.
+    folder
+        Folder of the descriptions.
+
+    """
+    children = {d.get('name'): d for d in description.findall('element')}
+    required = {name for name, d in children.items() if d.get('required') in ('1', '+')}
+    for include in description.findall('include'):
+        name = include.get('filename').removesuffix('.sdf')
+        required |= {name} if include.get('required') in ('1', '+') else set()
+        if element.find(name) is not None:
+            children[name] = ElementTree.parse(folder / include.get('filename')).getroot()
+    assert set(element.attrib) <= {a.get('name') for a in description.findall('attribute')}
+    tags = {child.tag for child in element}
+    assert required <= tags <= set(children), element.tag
+    if description.get('type') == 'double':
+        float(element.text)
+    for child in element:
+        check_described(child, children[child.tag], folder)
+
+
+def test_sdf_is_as_sdformat_describes_it(exported):
+    """Elements, attributes and numbers are those of the specification that sdformat installs."""
+    folders = [Path(folder) for folder in (os.environ.get('SDF_PATH', ''), *sorted(
+        glob('/usr/share/sdformat*/1.9'), reverse=True)) if folder]
+    if not folders:
+        pytest.skip('no specification of SDFormat: apt install sdformat-sdf')
+    check_described(ElementTree.fromstring(exported['sdf'].text),
+                    ElementTree.parse(folders[0] / 'root.sdf').getroot(), folders[0])
 
 
 def test_mujoco(exported):

@@ -14,6 +14,7 @@
 
 """What the tools print for people: help texts, version, and the end of a run."""
 
+from functools import cache
 import os
 from pathlib import Path
 import re
@@ -23,10 +24,16 @@ from processes import executable, run_executable
 import pytest
 from terminal import Terminal
 
-TOOLS = ('apply', 'blind', 'check', 'diagnose', 'export', 'fit', 'noise', 'reproduce', 'simulate',
-         'working')
+TOOLS = ('apply', 'blind', 'check', 'diagnose', 'export', 'fit', 'fleet', 'noise', 'reproduce',
+         'simulate', 'working')
 COLUMNS = 79
 COLOUR = '\x1b['
+
+
+@cache
+def help_of(name: str) -> str:
+    """Return the help text of a tool."""
+    return run_executable(name, '--help').stdout
 
 
 @pytest.mark.parametrize('name', TOOLS)
@@ -38,14 +45,14 @@ def test_version(name: str) -> None:
 
 @pytest.mark.parametrize('name', TOOLS)
 def test_help_has_examples_within_a_terminal(name: str) -> None:
-    text = run_executable(name, '--help').stdout
+    text = help_of(name)
     assert f'    ros2 run adxl_ros {name} ' in text.split('examples:')[1]
     assert max(map(len, text.splitlines())) <= COLUMNS
 
 
 @pytest.mark.parametrize('name', ['diagnose', 'fit', 'simulate'])
 def test_help_lists_the_effects(name: str) -> None:
-    listed = run_executable(name, '--help').stdout.split('\neffects:\n')[1]
+    listed = help_of(name).split('\neffects:\n')[1]
     names = set(re.findall(r'^  ([a-z_]+) ', listed, re.MULTILINE))
     assert names <= set(library())
     assert {'bias', 'temperature_bias', 'stage_offset'} <= names
@@ -85,8 +92,8 @@ def test_outcomes_are_coloured_in_a_terminal_only(tmp_path: Path) -> None:
     run_executable('simulate', 'sweep', '--rate', '50', '-o', 'sweep.csv', cwd=tmp_path)
     raw = {}
     for name, environment in (('coloured', {}), ('plain', {'NO_COLOR': '1'})):
-        terminal = Terminal([executable('fit'), 'sweep.csv', '-o', 'unit.yaml', '--store', ''],
-                            {**os.environ, **environment}, tmp_path)
+        terminal = Terminal([executable('fit'), 'sweep.csv', '--model', 'linear', '-o',
+                             'unit.yaml', '--store', ''], {**os.environ, **environment}, tmp_path)
         try:
             terminal.wait_for('next ros2 run')
             raw[name] = terminal.raw.decode()
@@ -103,7 +110,7 @@ def test_diagnose_in_a_terminal_of_80_columns(tmp_path: Path) -> None:
                         tmp_path, lines=60, columns=80)
     try:
         screen = terminal.wait_for('next', 'ros2 run adxl_ros simulate', timeout_s=120.0)
-        assert terminal.popen.wait(30.0) == 0
+        assert terminal.wait(30.0) == 0
         raw = terminal.raw.decode()
     finally:
         terminal.close()
@@ -128,7 +135,7 @@ def test_an_error_wraps_between_words_in_a_terminal_only(tmp_path: Path) -> None
                         columns=80)
     try:
         screen = terminal.wait_for(' '.join(done.stderr.split()))
-        assert terminal.popen.wait(30.0) == 1
+        assert terminal.wait(30.0) == 1
     finally:
         terminal.close()
     assert max(map(len, screen.splitlines())) <= COLUMNS

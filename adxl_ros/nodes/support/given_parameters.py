@@ -41,6 +41,12 @@ OWN_PARAMETERS = {
     'compensation': (
         'calibration', 'free_acceleration', 'inverse', 'mounting.frame_id', 'mounting.rpy_rad',
         'orientation', 'store', 'undo_filter'),
+    'investigate': (
+        'limits.alpha_deg', 'limits.beta_deg', 'limits.minutes', 'limits.rate_deg_s', 'output',
+        'seed'),
+    'monitor': (
+        'diagnose.automatic', 'diagnose.budget_s', 'diagnose.wait_s', 'false_alarms_per_day',
+        'history_s', 'output', 'reference', 'reference_topic', 'window_s'),
 }
 """Parameters by node, those of sensor and link aside. One file may serve all nodes: a node
 ignores what another one has."""

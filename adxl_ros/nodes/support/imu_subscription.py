@@ -19,7 +19,7 @@ from __future__ import annotations
 from adxl_ros.compensate.live_stream import UNKNOWN_ANGLE_RAD2
 from adxl_ros.files import cdr
 from adxl_ros.model.sensor import Sensor, to_volts
-from adxl_ros.nodes.support.topics import create_subscription
+from adxl_ros.nodes.support.polled_subscription import PolledSubscription
 import numpy as np
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
@@ -37,7 +37,7 @@ _QUEUE = 20000
 
 class Samples:
     """
-    Takes serialized messages as they come, and decodes many at once.
+    Takes the serialized messages that wait, and decodes many at once.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ class Samples:
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.fault = ''
         self.restart_silence()
-        create_subscription(node, Imu, _TOPIC, self._raw.append, _QUEUE, raw=True)
+        self._subscription = PolledSubscription(node, Imu, _TOPIC, _QUEUE)
 
     def restart_silence(self) -> None:
         """Restart the time without samples."""
@@ -65,20 +65,23 @@ class Samples:
 
     def clear(self) -> None:
         """Forget all samples so far."""
+        self._receive()
         self._raw.clear()
 
     def keep_newest(self) -> None:
         """Forget all samples but the newest, as many as the queue holds."""
+        self._receive()
         del self._raw[:-_QUEUE]
 
     def waiting(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the samples that wait: stamps, ns, (n,), and m/s², (n, 3), finite; keep them."""
-        return finite_samples(self._raw[:])
+        self._receive()
+        return finite_samples(self._raw)
 
     def take(self, unit: Sensor) -> tuple[np.ndarray, np.ndarray]:
         """Return the samples since the last call: stamps, ns, (n,), and volts, (n, m), finite."""
-        batch = self._raw[:]
-        self._raw.clear()
+        self._receive()
+        batch, self._raw = self._raw, []
         stamps, accel, yaw_rad2 = _decoded(batch)
         if batch:
             self.restart_silence()
@@ -88,6 +91,10 @@ class Samples:
             self.fault = self._why_compensated(yaw_rad2) or _why_not_finite(finite, unit)
         complete = finite.all(axis=1)
         return stamps[complete], to_volts(accel[complete], unit)
+
+    def _receive(self) -> None:
+        """Take the messages that have come since the last call."""
+        self._raw += self._subscription.take()
 
     def _why_compensated(self, yaw_rad2: np.ndarray) -> str:
         """Return that a stream with these variances of yaw is compensated, or ''."""

@@ -121,6 +121,28 @@ LINK = (
     Argument('link_recording', 'link.recording', 'replay: the recording to play'),
 )
 """Arguments of the link."""
+LINK_TYPE = LINK[0]
+"""Type of the link."""
+STAGE_TYPE = Argument('stage_type', 'stage.type', 'the simulated stage, or the type of command '
+                      'that the controller of a real stage takes', str,
+                      ('simulated', 'joint_state', 'trajectory'))
+"""Argument of the stage."""
+BRIDGE = (
+    Argument('bridge_joint_states', 'bridge.joint_states', "topic of the controller's joint "
+             'states'),
+    Argument('bridge_command', 'bridge.command', 'topic on which the controller listens'),
+    Argument('bridge_speed_rad_s', 'bridge.speed_rad_s', 'speed of the real stage, rad/s', float),
+    *(argument for joint in ('alpha', 'beta') for argument in (
+        Argument(f'bridge_{joint}_joint', f'bridge.{joint}.joint',
+                 f"the controller's name of the joint {joint}"),
+        Argument(f'bridge_{joint}_sign', f'bridge.{joint}.sign',
+                 f'direction in which it counts {joint}: 1 or -1', int),
+        Argument(f'bridge_{joint}_offset_rad', f'bridge.{joint}.offset_rad',
+                 f"{joint} where the controller's joint is at 0, rad", float))))
+"""Arguments of the bridge to a real stage."""
+SPEED = Argument('speed', 'link.speed', 'simulated sensor: its time by real time, such as 10',
+                 float)
+"""Speed of a simulated sensor."""
 
 
 TRANSFORM = (
@@ -135,18 +157,35 @@ TRANSFORM = (
 """Arguments of the static transform."""
 
 
-def common_arguments() -> list[DeclareLaunchArgument]:
-    """Return the arguments that all launch files have."""
+def common_arguments(link: Sequence[Argument] = LINK, frame_id: str = 'imu_link'
+                     ) -> list[DeclareLaunchArgument]:
+    """
+    Return the arguments that all launch files have.
+
+    Parameters
+    ----------
+    link
+        Arguments of the link.
+    frame_id
+        Default of the frame of the case; '' for that of a simulator's samples.
+
+    Returns
+    -------
+    list
+        The arguments.
+
+    """
     return [
         DeclareLaunchArgument('params_file', default_value=str(parameter_file.nominal_path()),
                               description='parameter file of the sensor, its link and the nodes'),
         DeclareLaunchArgument('namespace', default_value='',
                               description='namespace of the nodes and their topics'),
-        DeclareLaunchArgument('frame_id', default_value='imu_link',
-                              description='frame of the case'),
+        DeclareLaunchArgument('frame_id', default_value=frame_id,
+                              description='frame of the case'
+                              + ("; '': that of the ideal samples" if not frame_id else '')),
         DeclareLaunchArgument('log_level', default_value='info', choices=_LOG_LEVELS,
                               description='log level'),
-        *(argument.declared() for argument in LINK)]
+        *(argument.declared() for argument in link)]
 
 
 def describe(arguments: Sequence[DeclareLaunchArgument],
@@ -187,7 +226,7 @@ def _warn_of_misspelt(context: LaunchContext, names: Sequence[str]) -> None:
 
 
 def make_node(context: LaunchContext, executable: str, overrides: Mapping[str, Any],
-              **options: Any) -> Node:
+              params_file: str = '', **options: Any) -> Node:
     """
     Make a node of this package with the parameter file of the launch.
 
@@ -199,6 +238,8 @@ def make_node(context: LaunchContext, executable: str, overrides: Mapping[str, A
         Its executable, which is its name, too.
     overrides
         Parameters in place of those of the file.
+    params_file
+        Parameter file in place of that of the launch; empty for that of the launch.
     options
         Further options of the action.
 
@@ -213,13 +254,14 @@ def make_node(context: LaunchContext, executable: str, overrides: Mapping[str, A
         The parameter file cannot be read, or it names other nodes than the driver.
 
     """
-    path, namespace = text(context, 'params_file'), text(context, 'namespace')
-    name = node_name(context, executable)
+    path = params_file or text(context, 'params_file')
+    namespace, name = text(context, 'namespace'), node_name(context, executable)
     is_named = has_section(path, name)
     if executable == 'driver' and not is_named:
         raise UserError(f'{path}: has no parameters of the node {name}; begin the file with /**: '
                         f'or {name}:')
-    given = {'frame_id': text(context, 'frame_id'), **given_parameters(context, LINK),
+    link = [argument for argument in LINK if argument.name in context.launch_configurations]
+    given = {'frame_id': text(context, 'frame_id'), **given_parameters(context, link),
              **overrides}
     # The last argument counts. rcl takes the name of a node without its namespace.
     node = '' if namespace.strip('/') else f'{executable}:'
@@ -249,15 +291,36 @@ def static_transform(context: LaunchContext) -> list[Action]:
     base_frame = text(context, 'base_frame')
     if not base_frame:
         return []
-    values = [*_three_numbers(context, 'mounting_xyz_m'),
-              *_three_numbers(context, 'mounting_rpy_rad')]
+    values = [*three_numbers(context, 'mounting_xyz_m'),
+              *three_numbers(context, 'mounting_rpy_rad')]
     options = zip(('x', 'y', 'z', 'roll', 'pitch', 'yaw'), values)
     return [Node(package='tf2_ros', executable='static_transform_publisher', arguments=[
         *(part for name, value in options for part in (f'--{name}', repr(value))),
         '--frame-id', base_frame, '--child-frame-id', text(context, 'frame_id')])]
 
 
-def _three_numbers(context: LaunchContext, name: str) -> list[float]:
+def three_numbers(context: LaunchContext, name: str) -> list[float]:
+    """
+    Return the three numbers of an argument.
+
+    Parameters
+    ----------
+    context
+        The launch.
+    name
+        Name of the argument.
+
+    Returns
+    -------
+    list
+        The numbers.
+
+    Raises
+    ------
+    UserError
+        The argument has no three numbers.
+
+    """
     given = text(context, name)
     values: list[float] = Argument(name, '', '', list).value(given)
     if len(values) != 3:
@@ -353,6 +416,27 @@ def given_anywhere(context: LaunchContext, argument: Argument, executable: str) 
     """
     return text(context, argument.name) or given_text(
         text(context, 'params_file'), node_name(context, executable), argument.parameter)
+
+
+def simulated_link(context: LaunchContext, speed: Mapping[str, Any]) -> dict[str, Any]:
+    """
+    Return the parameters of a driver with a speed; a sensor without a link is simulated.
+
+    Parameters
+    ----------
+    context
+        The launch.
+    speed
+        The parameter of the speed; empty for real time.
+
+    Returns
+    -------
+    dict
+        Values by name of the parameter.
+
+    """
+    link = given_anywhere(context, LINK_TYPE, 'driver')
+    return {'link.type': link or 'sim', **speed} if speed else {}
 
 
 class GiveUp:

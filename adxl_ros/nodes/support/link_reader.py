@@ -19,14 +19,17 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import ExitStack
 import time
+from typing import Any
 
 from adxl_ros.errors import UserError
-from adxl_ros.links.support.base import Level, Link, LinkStatus, StageLink
+from adxl_ros.links.support.base import ImuLink, Level, Link, LinkStatus, StageLink
+from adxl_ros.nodes.support.joint_states import joint_readings
 from adxl_ros.nodes.support.rclpy_internals import NotForExecutors, take_messages
-from adxl_ros.nodes.support.receive_thread import PeriodicTurn, RepeatingThread
+from adxl_ros.nodes.support.receive_thread import RepeatingThread
 from adxl_ros.nodes.support.references import References
 from adxl_ros.nodes.support.sample_output import SampleOutput
-from rclpy.clock import Clock, ClockType
+from adxl_ros.nodes.support.simulator_input import SimulatorInput
+from rclpy.clock import ROSClock
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
@@ -34,13 +37,19 @@ from rclpy.subscription import Subscription
 from sensor_msgs.msg import JointState
 
 _PERIOD_S = 0.004
-"""Time between two reads of a link that gives what is due, s. A wake-up costs as much as ten
-samples; at 1 kHz it publishes four of them."""
+"""Time between two reads where sensor time is not real time, s; chosen: a wake-up costs as much as
+ten samples."""
+_LONGEST_PAUSE_S = 0.05
+"""Longest time between two reads in real time, s; chosen: the thread sees that it shall end."""
+_SHORTEST_PAUSE_S = 0.0005
+"""Shortest time between two reads in real time, s; chosen: a link that has nothing although a
+sample is due keeps no core busy."""
 _LONGEST_STEP_NS = 20_000_000
 """Longest step of real time that is caught up where sensor time is the graph's clock, ns; chosen:
 a clock that leaps after a late wake-up would flood the other nodes."""
-_JUMP_NS = 2_000_000_000
-"""Smallest step of the clock that counts as a jump, ns; chosen."""
+_JUMP_NS = 5_000_000_000
+"""Smallest step of the clock that counts as a jump, ns; chosen: a driver that was held up for less
+makes up its samples, and the queue of imu/data_raw holds them at 1 kHz."""
 _DISCOVERY_NS = 300_000_000
 """Time after which a new subscriber is sure to receive, ns; chosen."""
 _CLOCK_SEARCH_NS = 1_000_000_000
@@ -64,8 +73,8 @@ class LinkReader:
         The open link; it is closed with the reader, and where the reader cannot start.
     output
         Publishes and counts the samples.
-    speed
-        Sensor time per real time, for a link that gives what is due.
+    settings
+        Settings of the link.
     on_error
         Called when the link can give no more samples.
     on_level
@@ -73,18 +82,22 @@ class LinkReader:
 
     """
 
-    def __init__(self, node: Node, link: Link, output: SampleOutput, speed: float,
+    def __init__(self, node: Node, link: Link, output: SampleOutput, settings: Any,
                  on_error: Callable[[UserError], None], on_level: Callable[[Level], None]) -> None:
-        self._node, self._link, self._output, self._speed = node, link, output, speed
+        self._node, self._link, self._output, self._settings = node, link, output, settings
         self._on_error, self._on_level = on_error, on_level
-        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._ros = node.get_clock()
-        self._failed = self._clock_is_searched = False
+        ros = node.get_clock()
+        assert isinstance(ros, ROSClock), 'the clock of a node is that of ROS'
+        self._ros = ros
+        self._failed = self._clock_is_searched = self._is_real_time = False
         self._now_ns: int | None = None
         self._subscribed_ns = 0
-        self._ticked_ns = self._searched_ns = self._steady.now().nanoseconds
+        self._ticked_ns = self._searched_ns = time.monotonic_ns()
+        self._due_s = time.monotonic()
+        self._newest_ns: int | None = None
         self._stage: Subscription | None = None
         self._stage_link: StageLink | None = None
+        self._simulator: SimulatorInput | None = None
         with ExitStack() as on_close:
             on_close.callback(link.close)
             self._start(on_close)
@@ -93,7 +106,10 @@ class LinkReader:
     def _start(self, on_close: ExitStack) -> None:
         """Make the topics and the thread; `on_close` gets what ends them."""
         node, link = self._node, self._link
-        if link.live and node.get_parameter('use_sim_time').value:
+        if isinstance(link, ImuLink):
+            self._simulator = SimulatorInput(node, link)
+            on_close.callback(self._simulator.destroy)
+        elif link.live and node.get_parameter('use_sim_time').value:
             node.get_logger().warning('use_sim_time: a real device lives in real time; its '
                                       'samples are stamped by the system clock')
         self._references = References(node, self._output.frame_id, link.references)
@@ -106,10 +122,10 @@ class LinkReader:
         if isinstance(link, StageLink):
             self._stage_link = link
             self._stage = node.create_subscription(
-                JointState, link.joint_state_topic, self._sense_stage, QoSProfile(depth=_QUEUE),
-                callback_group=NotForExecutors())
+                JointState, link.joint_state_topic, lambda _: None, QoSProfile(depth=_QUEUE),
+                raw=True, callback_group=NotForExecutors())
             on_close.callback(node.destroy_subscription, self._stage)
-        turn = self._live_turn if link.live else PeriodicTurn(self._tick, _PERIOD_S)
+        turn = self._live_turn if link.live else self._paced_turn
         on_close.callback(RepeatingThread(node, turn, 'link').close)
 
     def close(self) -> None:
@@ -132,6 +148,9 @@ class LinkReader:
             time.sleep(_PERIOD_S)
             return
         try:
+            if self._simulator is not None:
+                self._simulator.wait()
+                self._output.follow_frame(self._simulator.frame_id)
             samples = self._link.read(time.time_ns())
         except UserError as error:
             self._fail(error)
@@ -141,7 +160,7 @@ class LinkReader:
         sensor = self._link.sensor
         if sensor is not None and sensor is not self._output.sensor:
             self._output.use(sensor)
-        if self._now_ns is None:
+        if self._now_ns is None or samples.until_ns < self._now_ns:
             self._output.tally.begin(samples.until_ns)
         self._now_ns = samples.until_ns
         self._output.publish(samples, self._references)
@@ -153,26 +172,52 @@ class LinkReader:
             self._on_level(status.level)
         self._level = status.level
 
+    def _paced_turn(self) -> None:
+        """Wait until samples are due, and publish them."""
+        self._is_real_time = not (self._output.is_clock or self._ros.ros_time_is_active)
+        if self._is_real_time:
+            # Samples that are due would wait for it. Motion is known some time ahead.
+            self._take_motion()
+        pause_s = self._due_s - time.monotonic()
+        time.sleep(min(max(pause_s, 0.0), _LONGEST_PAUSE_S))
+        if pause_s <= _LONGEST_PAUSE_S:
+            if not self._is_real_time:
+                # The stage moves on with the clock of the last tick.
+                self._take_motion()
+            self._tick()
+            self._due_s = self._next_due_s()
+
+    def _next_due_s(self) -> float:
+        """Return the steady time of the next tick, s."""
+        now_s = time.monotonic()
+        if not self._is_real_time or self._newest_ns is None:
+            return max(self._due_s + _PERIOD_S, now_s)
+        assert self._link.sensor is not None, 'a link that makes its own time has its sensor'
+        rate_hz = self._link.sensor.rate_hz
+        together_s = self._settings.samples_together(rate_hz) / rate_hz
+        # As a board sends a frame: at the time of its last sample.
+        pause_s = together_s - (time.time_ns() - self._newest_ns) * 1e-9
+        return now_s + min(max(pause_s, _SHORTEST_PAUSE_S), together_s)
+
     def _tick(self) -> None:
         """Publish the samples that are due."""
         if self._failed:
             return
-        steady_ns = self._steady.now().nanoseconds
+        steady_ns = time.monotonic_ns()
         step_ns, self._ticked_ns = steady_ns - self._ticked_ns, steady_ns
         is_searched = self._search_clock(steady_ns)
         if self._now_ns is None:
             if not is_searched or not self._may_begin(step_ns):
                 return
             self._now_ns = self._begin()
-        if self._stage is not None:
-            for message in take_messages(self._stage, JointState, False, _QUEUE):
-                self._sense_stage(message)
         try:
             samples = self._link.read(self._due_ns(self._now_ns, step_ns))
         except UserError as error:
             self._fail(error)
             return
         self._now_ns = samples.until_ns
+        if len(samples.stamp_ns):
+            self._newest_ns = int(samples.stamp_ns[-1])
         self._output.publish(samples, self._references)
         if samples.missing:
             self._on_level(Level.WARN)
@@ -208,8 +253,8 @@ class LinkReader:
     def _due_ns(self, now_ns: int, step_ns: int) -> int:
         """Return the sensor time up to which samples are due, ns."""
         if self._output.is_clock:
-            return now_ns + round(min(step_ns, _LONGEST_STEP_NS) * self._speed)
-        ros_ns = self._ros.now().nanoseconds
+            return now_ns + round(min(step_ns, _LONGEST_STEP_NS) * self._settings.speed)
+        ros_ns = time.time_ns() if self._is_real_time else self._ros.now().nanoseconds
         jump_ns = ros_ns - now_ns
         if not -_PERIOD_S * 1e9 < jump_ns < _JUMP_NS:
             self._output.tally.missing += self._link.begin(ros_ns)
@@ -218,13 +263,13 @@ class LinkReader:
                                             'the samples go on from there')
         return ros_ns
 
-    def _sense_stage(self, message: JointState) -> None:
-        """Give the motion of the stage to a simulated sensor."""
-        assert self._stage_link is not None, 'a stage link subscribes'
-        stamp = message.header.stamp
-        self._stage_link.sense_stage(stamp.sec * 10 ** 9 + stamp.nanosec,
-                                     dict(zip(message.name, message.position)),
-                                     dict(zip(message.name, message.velocity)))
+    def _take_motion(self) -> None:
+        """Give the motion that has come to a link on the stage."""
+        if self._stage is None or self._stage_link is None or self._now_ns is None:
+            return
+        messages = list(take_messages(self._stage, JointState, True, _QUEUE))
+        for reading in joint_readings(messages):
+            self._stage_link.sense_stage(*reading)
 
     def _fail(self, error: UserError) -> None:
         """Read no more, and report why."""

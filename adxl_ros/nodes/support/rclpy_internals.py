@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 import re
+import sys
 from typing import Any
 
 from adxl_ros.errors import one_line
@@ -27,7 +28,12 @@ from rclpy.callback_groups import CallbackGroup
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.service import Service
 from rclpy.subscription import Subscription
+
+# The package of each message imports the generator of Python from .msg files, with its parser and
+# templates: a tenth of the time in which a node starts. The package can do without it.
+sys.modules.setdefault('rosidl_generator_py.generate_py_impl', None)  # type: ignore[arg-type]
 
 _LONGEST_WAIT_NS = 100_000_000
 """Longest wait for a message, ns; chosen: a thread that waits sees within it that it shall end."""
@@ -83,6 +89,30 @@ def take_messages(subscription: Subscription, kind: Any, raw: bool, limit: int) 
             if message_and_info is None:
                 return
             yield message_and_info[0]
+
+
+def take_request(service: Service, kind: Any) -> tuple[Any, Any] | None:
+    """
+    Take a request that waits in a service, to answer it later by `Service.send_response`.
+
+    An executor wants the answer at once, and polls a coroutine that waits without a pause.
+
+    Parameters
+    ----------
+    service
+        The service, in a group that is `NotForExecutors`.
+    kind
+        Its type.
+
+    Returns
+    -------
+    tuple or None
+        The request, and the header that its answer needs; None without a request.
+
+    """
+    with service.handle:
+        request, header = service.handle.service_take_request(kind.Request)
+    return None if header is None else (request, header)
 
 
 class MessageWait:

@@ -23,7 +23,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 import threading
-import time
 from typing import Any
 
 from adxl_ros.nodes.support.rclpy_internals import MessageWait, NotForExecutors
@@ -71,31 +70,6 @@ class RepeatingThread:
                 self._context.try_shutdown()
 
 
-class PeriodicTurn:
-    """
-    A turn of a thread: calls a function, and waits until it is due again.
-
-    Parameters
-    ----------
-    function
-        The function.
-    period_s
-        Time between two calls, s. After a late call the next ones follow from there.
-
-    """
-
-    def __init__(self, function: Callable[[], None], period_s: float) -> None:
-        self._function, self._period_s = function, period_s
-        self._due_s = time.monotonic()
-
-    def __call__(self) -> None:
-        """Call the function and wait."""
-        self._function()
-        now_s = time.monotonic()
-        self._due_s = max(self._due_s + self._period_s, now_s)
-        time.sleep(self._due_s - now_s)
-
-
 class ReceiveTurn:
     """
     A turn of a thread: waits for the messages of one topic, and gives each to a callback.
@@ -119,11 +93,16 @@ class ReceiveTurn:
 
     def __init__(self, node: Node, kind: Any, topic: str, callback: Callable[[bytes], None],
                  depth: int) -> None:
-        subscription = create_subscription(node, kind, topic, callback, depth, raw=True,
-                                           group=NotForExecutors())
-        self._wait = MessageWait(subscription, node)
+        self._node = node
+        self._subscription = create_subscription(node, kind, topic, callback, depth, raw=True,
+                                                 group=NotForExecutors())
+        self._wait = MessageWait(self._subscription, node)
         self._kind, self._callback, self._depth = kind, callback, depth
 
     def __call__(self) -> None:
         """Wait for a message, and take all that have come."""
         self._wait(self._kind, self._callback, self._depth)
+
+    def destroy(self) -> None:
+        """Remove the subscription; the thread must have ended."""
+        self._node.destroy_subscription(self._subscription)

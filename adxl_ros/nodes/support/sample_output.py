@@ -16,11 +16,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+import struct
+
 from adxl_ros.files import cdr
 from adxl_ros.files.stream_info import sensor_info
 from adxl_ros.links.support.base import Samples
 from adxl_ros.model import noise
-from adxl_ros.model.constants import AXES, G0_MPS2
+from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.covariance import UNMEASURED_VARIANCE
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
 from adxl_ros.nodes.support.diagnostics import Level, Status, status_message
@@ -29,6 +32,7 @@ from adxl_ros.nodes.support.sample_tally import Tally
 from adxl_ros.nodes.support.topics import create_publisher, stamp
 from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
+from rclpy.clock import Clock as StampClock
 from rclpy.node import Node
 from rclpy.serialization import serialize_message
 from rosgraph_msgs.msg import Clock
@@ -36,11 +40,16 @@ from sensor_msgs.msg import Imu
 
 _QUEUE = 5000
 """Samples that are kept for a slow subscriber: 5 s at 1 kHz."""
+_UNKNOWN_NODE = '_NODE_NAME_UNKNOWN_'
+"""Name that the middleware gives a node that it has not discovered yet (rmw_dds_common)."""
 
 
 class ImuWriter:
     """
-    Makes serialized messages; forty at once take half the time of filling messages.
+    Makes serialized messages, by replacing numbers in the bytes of a template.
+
+    A sample is one of two or few that have just come, after a pause of the processor. Calls of
+    numpy are slow then: these messages would take twice the time.
 
     Parameters
     ----------
@@ -53,11 +62,17 @@ class ImuWriter:
 
     def __init__(self, sensor: Sensor, frame_id: str) -> None:
         self._sensor = sensor
-        self._axes = [AXES.index(axis) for axis in sensor.axes]
         self._template = serialize_message(imu_message(sensor, frame_id))
-        self._layout = cdr.imu(self._template)
+        layout = cdr.imu(self._template)
+        self._stamp = struct.Struct(f'{layout.order}iI')
+        self._stamp_offset = layout.fields['sec'].offset
+        counts = {name: field.count for name, field in layout.fields.items()
+                  if field.code == 'f8'} | {'linear_acceleration': len(sensor.axes)}
+        self._fields = {name: (struct.Struct(f'{layout.order}{count}d'),
+                               layout.fields[name].offset) for name, count in counts.items()}
 
-    def messages(self, stamp_ns: np.ndarray, volts: np.ndarray) -> list[bytes]:
+    def messages(self, stamp_ns: np.ndarray, volts: np.ndarray,
+                 imu_fields: Mapping[str, np.ndarray]) -> list[bytes]:
         """
         Serialize samples.
 
@@ -67,6 +82,8 @@ class ImuWriter:
             Stamps, ns, (n,).
         volts
             Output by axis, V, (n, m).
+        imu_fields
+            Further fields of the messages by name, (n, k) each.
 
         Returns
         -------
@@ -74,11 +91,16 @@ class ImuWriter:
             One serialized sensor_msgs/Imu a sample.
 
         """
-        accel = np.zeros((len(stamp_ns), 3))
-        accel[:, self._axes] = to_nominal_mps2(volts, self._sensor)
-        data = cdr.fill(self._template, self._layout, stamp_ns, {'linear_acceleration': accel})
-        size = len(self._template)
-        return [data[i:i + size] for i in range(0, len(data), size)]
+        values = {**imu_fields, 'linear_acceleration': to_nominal_mps2(volts, self._sensor)}
+        columns = [(*self._fields[name], rows.tolist()) for name, rows in values.items()]
+        messages = []
+        for i, time_ns in enumerate(stamp_ns.tolist()):
+            message = bytearray(self._template)
+            self._stamp.pack_into(message, self._stamp_offset, *divmod(time_ns, 10 ** 9))
+            for packer, offset, rows in columns:
+                packer.pack_into(message, offset, *rows[i])
+            messages.append(bytes(message))
+        return messages
 
     def saturated(self, volts: np.ndarray) -> np.ndarray:
         """Return which samples, V, (n, m), are at a rail of the ADC or beyond the range, (n,)."""
@@ -123,25 +145,29 @@ class SampleOutput:
     sensor
         Its nominal values convert the samples, until a link states others.
     frame_id
-        Frame of the samples.
+        Frame of the samples; '' until the samples of a simulator state it.
     delay_ns
         Delay of the sensor, which is taken out of the stamps, ns.
     is_clock
         Whether sensor time is the clock of the graph.
+    clock
+        Clock of the stamps, where sensor time is not the clock of the graph.
     tally
         Counts the samples.
 
     Attributes
     ----------
     sensor, frame_id, is_clock, tally
-        As given; `sensor` may be replaced, and `is_clock` ends beside another clock.
+        As given; `sensor` may be replaced, `frame_id` may follow that of a simulator, and
+        `is_clock` ends beside another clock.
 
     """
 
     def __init__(self, node: Node, sensor: Sensor, frame_id: str, delay_ns: int, is_clock: bool,
-                 tally: Tally) -> None:
-        self._node, self._delay_ns = node, delay_ns
+                 clock: StampClock, tally: Tally) -> None:
+        self._node, self._delay_ns, self._stamp_clock = node, delay_ns, clock
         self.sensor, self.frame_id, self.is_clock, self.tally = sensor, frame_id, is_clock, tally
+        self._follows_frame = not frame_id
         self._writer = ImuWriter(sensor, frame_id)
         self._data = create_publisher(node, Imu, 'imu/data_raw', _QUEUE)
         self._info = create_publisher(node, DiagnosticStatus, 'sensor_info', 1, latched=True)
@@ -165,8 +191,10 @@ class SampleOutput:
         if self._clock is None:
             return ''
         own_name = self._node.get_fully_qualified_name()
+        # A publisher may be discovered before the name of its node; the next search has it.
         names = [f'{info.node_namespace.rstrip("/")}/{info.node_name}'
-                 for info in self._node.get_publishers_info_by_topic(self._clock.topic_name)]
+                 for info in self._node.get_publishers_info_by_topic(self._clock.topic_name)
+                 if info.node_name != _UNKNOWN_NODE]
         others = [name for name in names if name != own_name
                   and (name.split('/')[-1] != self._node.get_name() or name < own_name)]
         if not others:
@@ -181,6 +209,12 @@ class SampleOutput:
         self._writer = ImuWriter(sensor, self.frame_id)
         self._info.publish(status_message('sensor_info', Status(
             Level.OK, '', sensor.serial, sensor_info(sensor))))
+
+    def follow_frame(self, frame_id: str) -> None:
+        """Publish in the frame of a simulator's samples, unless a frame was given."""
+        if self._follows_frame and frame_id != self.frame_id:
+            self.frame_id = frame_id
+            self._writer = ImuWriter(self.sensor, frame_id)
 
     def subscribed(self) -> bool:
         """Return whether the samples have a subscriber."""
@@ -198,13 +232,16 @@ class SampleOutput:
             Publishes what was recorded beside the sensor.
 
         """
-        finite = np.isfinite(samples.volts).all(axis=1)
-        stamps_ns, volts = samples.stamp_ns[finite], samples.volts[finite]
-        references.publish(samples.stamp_ns, samples.references)
-        for message in self._writer.messages(stamps_ns - self._delay_ns, volts):
+        finite = samples.finite()
+        published_ns = finite.stamp_ns - self._delay_ns
+        for message in self._writer.messages(published_ns, finite.volts, finite.imu_fields):
             self._data.publish(message)
-        self.tally.count(stamps_ns, int(self._writer.saturated(volts).sum()),
-                         samples.missing + int((~finite).sum()), samples.estimated)
+        # The age of a sample is the time until here: all that can wait comes after it.
+        now_ns = samples.until_ns if self.is_clock else self._stamp_clock.now().nanoseconds
+        references.publish(samples.stamp_ns, samples.references)
+        self.tally.ages.add(((now_ns - published_ns) * 1e-9).tolist())
+        self.tally.count(finite.stamp_ns, int(self._writer.saturated(finite.volts).sum()),
+                         finite.missing, finite.estimated)
         self.tally.now_ns = samples.until_ns
         if self._clock is not None:
             self._clock.publish(Clock(clock=stamp(samples.until_ns)))

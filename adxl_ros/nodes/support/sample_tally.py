@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+from adxl_ros.nodes.support.sample_ages import SampleAges
 import numpy as np
 
 
@@ -53,12 +54,15 @@ class Tally:
         Part of `missing` that is estimated by time, not counted.
     saturated
         Samples at a rail of the ADC or beyond the sensor's range.
+    ages
+        Ages of the samples on publication.
 
     """
 
     def __init__(self, steady_ns: int) -> None:
         self.now_ns: int | None = None
         self.samples = self.missing = self.estimated = self.saturated = 0
+        self.ages = SampleAges()
         self._newest_ns: int | None = None
         self._reported = _Totals(steady_ns, 0, 0, 0, 0, 0)
 
@@ -117,6 +121,7 @@ class Tally:
                   'speed': round(new.sensor_ns / new.steady_ns, 3) if new.steady_ns > 0 else 0.0}
         if self._newest_ns is not None:
             values['age_s'] = round((sensor_ns - self._newest_ns) * 1e-9, 6)
+        values |= self.ages.report()
         estimated = f', {new.estimated} of them estimated' if new.estimated else ''
         warnings = [f'{new.missing} samples missing{estimated}'] if new.missing else []
         warnings += [f'{new.saturated} samples saturated'] if new.saturated else []

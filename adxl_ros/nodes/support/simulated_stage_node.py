@@ -21,8 +21,9 @@ from collections import deque
 from adxl_ros.errors import UserError
 from adxl_ros.files.parameter_file import SENSOR_FIELDS
 from adxl_ros.nodes.support.diagnostics import DiagnosticsReporter, Level, Status
+from adxl_ros.nodes.support.joint_states import JointStateWriter
 from adxl_ros.nodes.support.parameters import declare
-from adxl_ros.nodes.support.topics import create_publisher, create_subscription, stamp
+from adxl_ros.nodes.support.topics import create_publisher, create_subscription
 from adxl_ros.simulate.simulated_stage import JOINTS, SimulatedStage
 import numpy as np
 from rclpy.node import Node
@@ -66,7 +67,8 @@ class SimulatedStageNode:
         self._stage = _declare_stage(node)
         self._delay_ns = round(1e9 * declare(node, 'delay_s', 0.1, 'time from a command to its '
                                              'effect', 's', 0.02, 1.0))
-        self._unshown: deque[tuple[int, JointState]] = deque()
+        self._unshown: deque[tuple[int, bytes]] = deque()
+        self._writer = JointStateWriter(JOINTS)
         self._simulated_ns = 0
         self._refusal_count = 0
         self._refusal = ''
@@ -99,19 +101,25 @@ class SimulatedStageNode:
         if not -_JUMP_NS < now_ns + self._delay_ns - self._simulated_ns < _JUMP_NS:
             self._simulated_ns = now_ns // _STEP_NS * _STEP_NS
             self._unshown.clear()
-        while self._simulated_ns + _STEP_NS <= now_ns + self._delay_ns:
-            self._simulated_ns += _STEP_NS
-            self._stage.step(_STEP_NS * 1e-9)
-            self._true.publish(self._message(self._stage.position))
-            self._unshown.append((self._simulated_ns, self._message(self._stage.encoder())))
+        self._simulate(now_ns + self._delay_ns)
         while self._unshown and self._unshown[0][0] <= now_ns:
             self._encoders.publish(self._unshown.popleft()[1])
 
-    def _message(self, position: np.ndarray) -> JointState:
-        """Make the message of joint positions, rad and m, (3,), at the simulated time."""
-        message = JointState(name=JOINTS, position=position, velocity=self._stage.velocity)
-        message.header.stamp = stamp(self._simulated_ns)
-        return message
+    def _simulate(self, until_ns: int) -> None:
+        """Simulate the steps up to a ROS time, ns; publish the true motion, keep the encoders."""
+        stamps_ns = np.arange(self._simulated_ns + _STEP_NS, until_ns + 1, _STEP_NS)
+        if not len(stamps_ns):
+            return
+        self._simulated_ns = int(stamps_ns[-1])
+        position, velocity, encoder = (np.empty((len(stamps_ns), len(JOINTS))) for _ in range(3))
+        for i in range(len(stamps_ns)):
+            self._stage.step(_STEP_NS * 1e-9)
+            position[i], velocity[i] = self._stage.position, self._stage.velocity
+            encoder[i] = self._stage.encoder()
+        for message in self._writer.messages(stamps_ns, position, velocity):
+            self._true.publish(message)
+        self._unshown.extend(zip(stamps_ns.tolist(),
+                                 self._writer.messages(stamps_ns, encoder, velocity)))
 
     def _status(self) -> Status:
         level, text = Level.OK, 'moving' if self._stage.moving() else 'at rest'

@@ -1,0 +1,288 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Compare a running sensor with its prediction: gap, noise floor, changes, likely cause."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from datetime import datetime, UTC
+from pathlib import Path
+import time
+
+from adxl_ros.errors import UserError
+from adxl_ros.files import calibration_store
+from adxl_ros.files.stream_info import NO_UNIT, StreamInfo
+from adxl_ros.files.stream_unit import check_unit, unit_of
+from adxl_ros.model.sensor import Sensor
+from adxl_ros.monitor import change_record
+from adxl_ros.monitor.diagnosis_run import DiagnosisInput, DiagnosisResult, DiagnosisRun
+from adxl_ros.monitor.live_gap import GapSettings, LiveGap
+from adxl_ros.monitor.reference_stream import ReferenceKind
+from adxl_ros.nodes.support.diagnostics import DiagnosticsReporter, Level, Status
+from adxl_ros.nodes.support.gap_messages import axis_values, GapState
+from adxl_ros.nodes.support.given_parameters import check_given_parameters
+from adxl_ros.nodes.support.monitor_streams import MonitorStreams
+from adxl_ros.nodes.support.node_help import NodeHelp
+from adxl_ros.nodes.support.parameters import declare
+from adxl_ros.nodes.support.processes import executable
+from adxl_ros.nodes.support.rclpy_internals import NotForExecutors, take_request
+from adxl_ros.nodes.support.run_node import run
+from adxl_ros.nodes.support.sensor_parameters import declare_sensor, make_sensor
+from adxl_ros.nodes.support.topics import create_publisher, create_subscription
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+from std_srvs.srv import Trigger
+
+_TURN_S = 0.05
+"""Time between two looks at the topics, s; chosen: a turn costs as much as ten messages."""
+_PERIOD_S = 1.0
+"""Time between two messages on `gap`, s."""
+_QUEUE = 10
+"""Messages that are kept for a slow subscriber; chosen: 10 s."""
+_INFO_S = 3.0
+"""Time that samples wait for `sensor_info`, s; chosen: a latched message comes within 1 s."""
+_SILENT_S = 3.0
+"""Time without messages after which a topic is silent, s; chosen."""
+_SHORTEST_S = 20.0
+"""Shortest time of samples that is diagnosed, s; chosen: `diagnose` needs some rests or moves."""
+_PAUSE_S = 600.0
+"""Shortest time between two automatic diagnoses, s; chosen: each may cost minutes of a core."""
+_EXAMPLES = {
+    'a sensor on a stage': '--ros-args --params-file unit.yaml',
+    'a sensor beside its simulation': '--ros-args --params-file unit.yaml -p reference:=imu '
+    '-p reference_topic:=/sim/imu',
+    'one false alarm a year at most': '--ros-args -p false_alarms_per_day:=0.0027',
+}
+"""Examples of arguments, by their purpose."""
+
+
+class Monitor(Node):
+    """
+    The node of the live gap.
+
+    It connects topics and parameters to the package `monitor`, which compares and tests.
+    """
+
+    def __init__(self) -> None:
+        super().__init__('monitor')
+        check_given_parameters(self)
+        self._file_sensor = make_sensor(declare_sensor(self))
+        self._kind = ReferenceKind(declare(
+            self, 'reference', 'stage', 'what the sensor is compared with: the joints of a stage, '
+            'or the ideal Imu of a simulator', choices=[kind.value for kind in ReferenceKind]))
+        default_topic = 'stage/joint_states' if self._kind is ReferenceKind.STAGE else 'imu/ideal'
+        self._reference_topic = declare(
+            self, 'reference_topic', default_topic, 'topic of the reference')
+        self._settings = GapSettings(
+            window_s=declare(self, 'window_s', 60.0, 'time over which gap and floor are taken',
+                             's', 5.0, 3600.0),
+            false_alarms_per_day=declare(
+                self, 'false_alarms_per_day', round(1 / 30, 4), 'largest rate of reported changes '
+                'that are none', '1/day', 1e-5, 10.0),
+            history_s=declare(self, 'history_s', 600.0, 'time that is kept for a diagnosis', 's',
+                              60.0, 3600.0))
+        self._output = Path(declare(
+            self, 'output', str(calibration_store.default_folder().with_name('monitor')),
+            'folder of the record of changes and of the diagnoses')).expanduser()
+        self._automatic = declare(
+            self, 'diagnose.automatic', True, 'diagnose a change, or a gap, once enough is seen')
+        self._wait_s = declare(self, 'diagnose.wait_s', 120.0, 'time of samples that an automatic '
+                               'diagnosis needs', 's', _SHORTEST_S, 3600.0)
+        self._budget_s = declare(self, 'diagnose.budget_s', 300.0, 'longest time of a diagnosis',
+                                 's', 1.0, 3600.0)
+        self._live: LiveGap | None = None
+        self._info: StreamInfo | None = None
+        self._refusal = ''
+        self._run: DiagnosisRun | None = None
+        self._result: DiagnosisResult | None = None
+        self._headers: list[object] = []
+        self._due_ns: int | None = 0
+        self._diagnosed_s = -_PAUSE_S
+        self._begun_s = self._sampled_s = self._referenced_s = self._heard_s = 0.0
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._streams = MonitorStreams(self, self._kind, self._reference_topic)
+        self._publisher = create_publisher(self, DiagnosticArray, 'gap', _QUEUE)
+        self._service = self.create_service(Trigger, '~/diagnose', lambda _, answer: answer,
+                                            callback_group=NotForExecutors())
+        self._diagnostics = DiagnosticsReporter(self, {'gap': self._status})
+        create_subscription(self, DiagnosticStatus, 'sensor_info', self._on_info, 1, latched=True)
+        self.create_timer(_TURN_S, self._turn, clock=self._steady)
+        self.create_timer(_PERIOD_S, self._publish, clock=self._steady)
+
+    def close(self) -> None:
+        """End a diagnosis that runs."""
+        if self._run is not None:
+            self._run.close()
+
+    def _on_info(self, message: DiagnosticStatus) -> None:
+        """Compare by what the stream states of its sensor; begin again if that has changed."""
+        texts = {pair.key: pair.value for pair in message.values}
+        if self._info is not None and self._info.texts == texts:
+            return
+        self._info = StreamInfo(texts, self.resolve_topic_name('sensor_info'))
+        self._compare_by(self._info)
+
+    def _compare_by(self, info: StreamInfo) -> None:
+        """Begin a comparison with the parameters, as far as they fit the stream."""
+        sensor = self._file_sensor
+        try:
+            if sensor.effects or sensor.serial != NO_UNIT:
+                check_unit(info, info.axes or sensor.axes, sensor)
+                sensor = replace(sensor, rate_hz=info.rate_hz or sensor.rate_hz)
+            else:
+                sensor = unit_of(sensor, info)
+            self._use(sensor)
+        except UserError as error:
+            self._live, self._refusal = None, str(error)
+            self.get_logger().error(self._refusal)
+
+    def _use(self, sensor: Sensor) -> None:
+        """Begin a comparison with a sensor."""
+        self._live, self._refusal = LiveGap(sensor, self._kind, self._settings), ''
+        self._due_ns, self._result = 0, None
+        effects = ', '.join(sensor.effects) or 'no effects'
+        self.get_logger().info(
+            f'comparing {self.resolve_topic_name("imu/data_raw")} of {sensor.serial} ({effects}) '
+            f'with {self.resolve_topic_name(self._reference_topic)}')
+        if self._live.left_out:
+            self.get_logger().warning(f'not predicted, for want of stage angles: '
+                                      f'{", ".join(self._live.left_out)}')
+
+    def _turn(self) -> None:
+        """Take what has come, compare, and serve."""
+        now_s = time.monotonic()
+        stamps_ns, accel_mps2 = self._streams.take_samples()
+        if len(stamps_ns):
+            self._begun_s = self._begun_s or now_s
+            self._sampled_s = now_s
+        if self._live is None and not self._refusal and self._begun_s \
+                and now_s - self._begun_s > _INFO_S:
+            self._compare_by(StreamInfo({}, self.resolve_topic_name('sensor_info')))
+        if self._live is not None:
+            self._live.add_samples(stamps_ns, accel_mps2)
+            if self._streams.take_others(self._live):
+                self._referenced_s = now_s
+            self._advance(self._live)
+        self._serve()
+
+    def _advance(self, live: LiveGap) -> None:
+        """Compare, and put changes on disk before they are published."""
+        changes = live.advance()
+        for change in changes:
+            self.get_logger().warning(
+                f'changed since {change_record.iso_time(change.since_ns)}: {change.text()}')
+            try:
+                self._output.mkdir(parents=True, exist_ok=True)
+                change_record.append(self._output, change, live.sensor.serial)
+            except (UserError, OSError) as error:
+                self.get_logger().error(f'{self._output}: the change is not on disk: {error}')
+        if changes:
+            self._due_ns = min(change.since_ns for change in changes)
+            self._diagnostics.notice('gap', Level.WARN)
+        if self._automatic and self._run is None:
+            self._diagnose_if_due(live)
+
+    def _diagnose_if_due(self, live: LiveGap) -> None:
+        """Diagnose a change, or a gap from the start, once there are enough samples."""
+        if self._due_ns is None or time.monotonic() - self._diagnosed_s < _PAUSE_S \
+                or live.span_s(self._due_ns) < self._wait_s:
+            return
+        begin_ns, self._due_ns = self._due_ns, None
+        if live.changes or any(gap.is_open for gap in live.report()):
+            self._diagnosed_s = time.monotonic()
+            self._begin_diagnosis(live, begin_ns)
+
+    def _begin_diagnosis(self, live: LiveGap, begin_ns: int) -> None:
+        """Begin a diagnosis of the samples since a stamp, ns."""
+        given = DiagnosisInput(live.recording(begin_ns), live.sensor, live.force(begin_ns)
+                               if self._kind is ReferenceKind.IMU else None)
+        name = datetime.now(UTC).strftime('diagnosis_%Y%m%dT%H%M%S_%fZ')
+        self._run = DiagnosisRun(self._output / name, given, [executable('diagnose')],
+                                 self._budget_s)
+
+    def _serve(self) -> None:
+        """Take requests of ~/diagnose, and answer them when the diagnosis ends."""
+        while (request := take_request(self._service, Trigger)) is not None:
+            self._headers.append(request[1])
+            live = self._live
+            if self._run is None and live is not None and live.span_s() >= _SHORTEST_S:
+                self._begin_diagnosis(live, 0)
+            elif self._run is None:
+                self._answer(DiagnosisResult(False, f'less than {_SHORTEST_S:g} s of samples; '
+                                             'ask again later'))
+        if self._run is None or self._run.result is None:
+            return
+        result, self._run = self._run.result, None
+        if result.is_done:
+            self._result = result
+        self.get_logger().info(f'diagnosis: {result.text}; {result.report}'.rstrip('; '))
+        self._answer(result)
+
+    def _answer(self, result: DiagnosisResult) -> None:
+        """Answer all requests that wait."""
+        text = f'{result.text}; report: {result.report}' if result.report else result.text
+        for header in self._headers:
+            self._service.send_response(Trigger.Response(success=result.is_done, message=text),
+                                        header)
+        self._headers.clear()
+
+    def _obstacle(self) -> str:
+        """Return why nothing is compared; empty where samples are."""
+        now_s = time.monotonic()
+        if self._refusal:
+            return self._refusal
+        if now_s - self._sampled_s > _SILENT_S:
+            return self._silence('imu/data_raw')
+        if self._live is None:
+            return 'waiting for sensor_info'
+        if now_s - self._referenced_s > _SILENT_S:
+            return f'{self._silence(self._reference_topic)}: no reference'
+        return self._live.obstacle
+
+    def _silence(self, topic: str) -> str:
+        """Return that a topic is silent, and whether it has a publisher."""
+        name = self.resolve_topic_name(topic)
+        return f'nothing on {name}' + ('' if self.count_publishers(name) else
+                                       ', and nobody publishes it')
+
+    def _state(self) -> GapState:
+        """Return what is known now."""
+        live = self._live
+        sensor = live.sensor if live else self._file_sensor
+        return GapState(sensor.serial, (live.newest_ns or 0) if live else 0, self._obstacle(),
+                        live.report() if live else (), live.changes if live else (),
+                        self._result, self._settings.window_s)
+
+    def _publish(self) -> None:
+        self._publisher.publish(self._state().message())
+
+    def _status(self) -> Status:
+        """Return the state for /diagnostics, with counts."""
+        state = self._state()
+        values = state.values()
+        for gap in () if state.obstacle else state.axes:
+            values |= {f'{gap.axis}_{key}': value for key, value in axis_values(gap).items()}
+        if self._live is not None:
+            values |= vars(self._live.counts)
+        values |= {'false_alarms_per_day': self._settings.false_alarms_per_day,
+                   'diagnosis_runs': self._run is not None}
+        level = Level.ERROR if self._refusal else state.level
+        return Status(level, state.text(), state.serial, values)
+
+
+def main() -> int:
+    """Run the node."""
+    return run(Monitor, NodeHelp(__doc__, _EXAMPLES))

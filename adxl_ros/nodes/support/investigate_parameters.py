@@ -1,0 +1,95 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The parameters of the node `investigate`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+from adxl_ros.investigate.stage_limits import StageLimits
+from adxl_ros.nodes.support.parameters import declare, parameter_error
+import numpy as np
+from rclpy.node import Node
+
+_ALPHA_DEG = (0.0, 180.0)
+"""Default limits of alpha, degrees; chosen: gravity then reaches every direction."""
+_BETA_DEG = (0.0, 360.0)
+"""Default limits of beta, degrees; chosen: one turn, as in a calibration."""
+_RATE_DEG_S = 17.0
+"""Default limit of rate, degrees/s; chosen: the default speed of the bridge, 0.3 rad/s."""
+
+
+class InvestigateSettings(NamedTuple):
+    """
+    Settings of an investigation.
+
+    Attributes
+    ----------
+    output
+        Folder of bag and report.
+    limits
+        Limits of the stage.
+    minutes
+        Largest time of all manoeuvres together, min.
+    seed
+        Seed of the diagnosis.
+
+    """
+
+    output: Path
+    limits: StageLimits
+    minutes: float
+    seed: int
+
+
+def declare_settings(node: Node) -> InvestigateSettings:
+    """
+    Declare the parameters and return the settings.
+
+    Raises
+    ------
+    UserError
+        A parameter is out of range.
+
+    """
+    output = Path(declare(node, 'output', 'investigation',
+                          'folder of bag, report and parameters; a number is added where it '
+                          'exists'))
+    rate_deg_s = declare(node, 'limits.rate_deg_s', _RATE_DEG_S, 'largest rate of each joint',
+                         'deg/s', 0.1, 180.0)
+    minutes = declare(node, 'limits.minutes', 15.0, 'largest time of all manoeuvres together',
+                      'min', 0.5, 240.0)
+    limits = StageLimits(_declare_range(node, 'alpha', _ALPHA_DEG),
+                         _declare_range(node, 'beta', _BETA_DEG), float(np.radians(rate_deg_s)))
+    return InvestigateSettings(output, limits, minutes, declare(
+        node, 'seed', 0, 'seed of the diagnosis', '', 0, 2 ** 31 - 1))
+
+
+def _declare_range(node: Node, joint: str, default_deg: tuple[float, float]
+                   ) -> tuple[float, float]:
+    """Declare the limits of one joint, and return them in rad."""
+    name = f'limits.{joint}_deg'
+    given = declare(node, name, (), f'lowest and highest angle of {joint}, a list of numbers; '
+                    f'empty: {default_deg[0]:g} to {default_deg[1]:g}', 'deg') or default_deg
+    try:
+        low_deg, high_deg = (float(value) for value in given)
+    except (TypeError, ValueError):
+        raise parameter_error(name, f'{given!r} is no list of two degrees; write [0.0, 90.0]'
+                              ) from None
+    if not -3600 <= low_deg < high_deg <= 3600:
+        raise parameter_error(name, f'[{low_deg:g}, {high_deg:g}] is no lowest and highest angle '
+                              'within 10 turns; write [0.0, 90.0]')
+    return float(np.radians(low_deg)), float(np.radians(high_deg))

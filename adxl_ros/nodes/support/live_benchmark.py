@@ -1,0 +1,384 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The part of the benchmark on a graph: age, loss and processor time of nodes at 1 kHz."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, ExitStack, suppress
+from dataclasses import dataclass
+import os
+from pathlib import Path
+import subprocess
+import sys
+import tempfile
+import time
+from typing import NamedTuple
+
+from adxl_ros.errors import UserError
+from adxl_ros.files import cdr
+from adxl_ros.nodes.support import rival_driver
+from adxl_ros.nodes.support.processes import cpu_time_s, executable, running
+from adxl_ros.nodes.support.rclpy_internals import MessageWait, NotForExecutors
+import numpy as np
+import rclpy
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import qos_profile_sensor_data, QoSProfile
+from sensor_msgs.msg import Imu
+
+RATE_HZ = 1000.0
+"""Sample rate of all measurements, Hz."""
+_START_S = 20.0
+"""Longest time until the first messages, s; chosen: a busy machine starts a node in 10 s."""
+_FIRST_MESSAGES = 50
+"""Messages after which a stream has begun."""
+_WARM_UP_S = 2.0
+"""Time between the begin of a stream and its measurement, s; chosen."""
+_READ_BYTES = 65536
+"""Most bytes of one read of the bare reader, as the serial link reads them."""
+_QUEUE = 1000
+"""Messages that the listener keeps while it is busy; chosen: 1 s."""
+BARE_QUEUE = 10
+"""Messages that a bare node keeps, the usual depth of ROS examples."""
+_RELAY = 'bare publisher and relay'
+"""The subject that driver and compensation are compared with."""
+
+
+class Listener(Node):
+    """
+    Keeps the arrival time and the bytes of each message.
+
+    Attributes
+    ----------
+    raw
+        Serialized messages.
+    arrived_ns
+        Their arrival times, ns.
+
+    """
+
+    def __init__(self, topic: str) -> None:
+        super().__init__('listener')
+        self.raw: list[bytes] = []
+        self.arrived_ns: list[int] = []
+        subscription = self.create_subscription(
+            Imu, topic, self._on_message,
+            QoSProfile(depth=_QUEUE, reliability=qos_profile_sensor_data.reliability), raw=True,
+            callback_group=NotForExecutors())
+        # An executor of rclpy would take as much of a core as the nodes that are measured.
+        self._wait = MessageWait(subscription, self)
+
+    def _on_message(self, raw: bytes) -> None:
+        self.arrived_ns.append(time.time_ns())
+        self.raw.append(raw)
+
+    def listen(self, seconds: float, limit: float = np.inf) -> None:
+        """
+        Keep the messages of some time.
+
+        Parameters
+        ----------
+        seconds
+            Duration, s.
+        limit
+            Number of messages after which it ends early.
+
+        Raises
+        ------
+        UserError
+            There is no message.
+
+        """
+        end_s = time.monotonic() + seconds
+        while time.monotonic() < end_s and len(self.raw) < limit:
+            self._wait(Imu, self._on_message, _QUEUE)
+        if not self.raw:
+            raise UserError(f'no messages for {seconds:g} s')
+
+    def clear(self) -> None:
+        """Forget the messages so far."""
+        self.raw.clear()
+        self.arrived_ns.clear()
+
+
+@contextmanager
+def _listening(topic: str) -> Iterator[Listener]:
+    """Yield a listener of a topic."""
+    rclpy.init(args=[])
+    listener = Listener(topic)
+    try:
+        yield listener
+    finally:
+        listener.destroy_node()
+        rclpy.try_shutdown()
+
+
+class BarePublisher(Node):
+    """The smallest node that publishes Imu at 1 kHz: a timer and one message."""
+
+    def __init__(self) -> None:
+        super().__init__('bare_publisher')
+        self._message = Imu()
+        self._publisher = self.create_publisher(Imu, 'bare', BARE_QUEUE)
+        self.create_timer(1 / RATE_HZ, self._publish)
+
+    def _publish(self) -> None:
+        self._message.header.stamp = self.get_clock().now().to_msg()
+        self._publisher.publish(self._message)
+
+
+class BareRelay(Node):
+    """The smallest node that passes Imu on."""
+
+    def __init__(self) -> None:
+        super().__init__('bare_relay')
+        publisher = self.create_publisher(Imu, 'relayed', BARE_QUEUE)
+        self.create_subscription(Imu, 'bare', publisher.publish, qos_profile_sensor_data)
+
+
+BARE_NODES = {'publisher': BarePublisher, 'relay': BareRelay}
+"""Bare nodes by the value of the hidden option `--bare`, which runs one in its own process."""
+
+
+def run_bare_node(make: Callable[[], Node]) -> int:
+    """Spin a node until a signal ends it."""
+    rclpy.init()
+    executor = SingleThreadedExecutor()
+    executor.add_node(make())
+    with suppress(KeyboardInterrupt, ExternalShutdownException):
+        executor.spin()
+    return 0
+
+
+def run_bare_reader(port: str) -> int:
+    """Read what a board sends, and do nothing with it."""
+    with open(port, 'rb', buffering=0) as file, suppress(KeyboardInterrupt, OSError):
+        while file.read(_READ_BYTES):
+            pass
+    return 0
+
+
+class _Subject(NamedTuple):
+    """
+    What is measured.
+
+    Attributes
+    ----------
+    label
+        Its name in the table.
+    topic
+        Topic of its last node; '' for a process that publishes nothing.
+    commands
+        Commands of its processes.
+    may_fail
+        Whether a measurement without messages is left out, and not an error.
+
+    """
+
+    label: str
+    topic: str
+    commands: Sequence[Sequence[str]]
+    may_fail: bool = False
+
+
+@dataclass(frozen=True)
+class _Result:
+    """
+    One measurement of a subject.
+
+    Attributes
+    ----------
+    rate_hz
+        Messages by time, Hz; NaN without a topic.
+    missing
+        Samples that did not come.
+    p50_ms, p99_ms
+        Age of the samples on arrival, ms; NaN without a topic.
+    loads
+        Processor time by time, one for each process.
+
+    """
+
+    rate_hz: float
+    missing: float
+    p50_ms: float
+    p99_ms: float
+    loads: tuple[float, ...]
+
+
+def measure_live(seconds: float, rounds: int, iiod: str | None) -> None:
+    """
+    Print a row for each subject: rate, loss, age on arrival, processor time.
+
+    Parameters
+    ----------
+    seconds
+        Duration of one measurement, s.
+    rounds
+        Measurements of each subject, which take turns. A row has their medians.
+    iiod
+        Path of the tests' IIOD, a Python file that prints its port; None for no row of it.
+
+    Raises
+    ------
+    UserError
+        A subject does not publish.
+
+    """
+    print(f'{RATE_HZ:g} Hz, {rounds} x {seconds:g} s: medians (range). '
+          f'Load of the machine before: {os.getloadavg()[0]:.1f}')
+    print(f'{"":27} {"Hz":>6} {"lost":>4} {"p50 ms":>16} {"p99 ms":>17}  CPU, %', flush=True)
+    with ExitStack() as stack:
+        subjects = _subjects(stack, iiod)
+        results: dict[str, list[_Result]] = {subject.label: [] for subject in subjects}
+        for _ in range(rounds):
+            for subject in subjects:
+                try:
+                    results[subject.label].append(_measure(subject, seconds))
+                except UserError as error:
+                    if not subject.may_fail:
+                        raise
+                    print(f'{error}; left out', flush=True)
+    for label, measured in results.items():
+        if measured:
+            print(_row(label, measured))
+    bare = np.median([sum(result.loads) for result in results[_RELAY]])
+    for label, measured in results.items():
+        if 'compensation' in label:
+            load = np.median([sum(result.loads) for result in measured])
+            print(f'CPU of {label} by that of the {_RELAY}: {load / bare:.2f}')
+    driver, compensation = [executable('driver')], [executable('compensation')]
+    for label, topic, command, before in (('driver, sim', 'imu/data_raw', driver, []),
+                                          ('compensation', 'imu/data', compensation, [driver])):
+        firsts_s = [_first_sample_s(topic, command, before) for _ in range(rounds)]
+        print(f'First sample of {label}: {_spread(firsts_s)} s after its start')
+    print(f'Load of the machine after: {os.getloadavg()[0]:.1f}', flush=True)
+
+
+def _subjects(stack: ExitStack, iiod: str | None) -> list[_Subject]:
+    """Return what is measured; `stack` ends the devices."""
+    bare = [[sys.executable, sys.argv[0], '--bare', kind] for kind in BARE_NODES]
+    port = stack.enter_context(_emulated_board([executable('simulate'), 'soak', '--port']))
+    driver, compensation = executable('driver'), executable('compensation')
+    drivers = {'sim': [driver], 'serial': [
+        driver, '--ros-args', '-p', 'link.type:=serial', '-p', f'link.port:={port}', '-p',
+        'link.channels:=x,y,supply,temperature']}
+    if iiod is not None:
+        uri = stack.enter_context(_iio_server(iiod))
+        drivers['iio'] = [driver, '--ros-args', '-p', 'link.type:=iio', '-p', f'link.uri:={uri}']
+    rivals = []
+    if rival_driver.is_installed():
+        bench = [sys.executable, sys.argv[0]]
+        rival_port = stack.enter_context(_emulated_board([*bench, '--rival-board']))
+        rivals.append(_Subject('driver of another project', rival_driver.TOPIC,
+                               [[*bench, '--rival-driver', rival_port]], may_fail=True))
+    return [
+        _Subject('bare publisher', 'bare', bare[:1]), _Subject(_RELAY, 'relayed', bare),
+        _Subject('bare reader of the port', '',
+                 [[sys.executable, sys.argv[0], '--read', port]]),
+        *rivals,
+        *(_Subject(f'driver, {link}', 'imu/data_raw', [command])
+          for link, command in drivers.items()),
+        *(_Subject(f'driver, {link}, compensation', 'imu/data', [command, [compensation]])
+          for link, command in drivers.items())]
+
+
+@contextmanager
+def _emulated_board(command: Sequence[str]) -> Iterator[str]:
+    """Give the port of a board, which a command makes where its last argument says."""
+    with tempfile.TemporaryDirectory() as folder:
+        port = Path(folder, 'board')
+        with running([[*command, str(port)]]):
+            end_s = time.monotonic() + _START_S
+            while not port.exists():
+                if time.monotonic() > end_s:
+                    raise UserError(f'{port}: the emulated board has not begun after '
+                                    f'{_START_S:g} s')
+                time.sleep(0.05)
+            yield str(port)
+
+
+@contextmanager
+def _iio_server(iiod: str) -> Iterator[str]:
+    """Give the URI of an IIOD with two axes and supply."""
+    with subprocess.Popen([sys.executable, iiod], stdout=subprocess.PIPE, text=True) as server:
+        assert server.stdout is not None, 'Popen makes the pipe'
+        try:
+            yield f'ip:127.0.0.1:{server.stdout.readline().strip()}'
+        finally:
+            server.kill()
+
+
+def _measure(subject: _Subject, seconds: float) -> _Result:
+    """Measure a subject once, for a time, s."""
+    with running(subject.commands) as processes:
+        def cpu_times_s() -> np.ndarray:
+            return np.array([cpu_time_s(process.pid) for process in processes])
+
+        if not subject.topic:
+            time.sleep(_WARM_UP_S)
+            before_s = cpu_times_s()
+            time.sleep(seconds)
+            loads = (cpu_times_s() - before_s) / seconds
+            return _Result(np.nan, 0, np.nan, np.nan, tuple(loads))
+        try:
+            with _listening(subject.topic) as listener:
+                listener.listen(_START_S, _FIRST_MESSAGES)
+                listener.listen(_WARM_UP_S)
+                listener.clear()
+                before_s, began_s = cpu_times_s(), time.monotonic()
+                listener.listen(seconds)
+                duration_s = time.monotonic() - began_s
+                loads = (cpu_times_s() - before_s) / duration_s
+        except UserError as error:
+            raise UserError(f'{subject.label}: {error}') from None
+    stamps_ns = np.concatenate([table.stamp_ns() for table in cdr.tables(listener.raw, cdr.imu)])
+    age_ms = (np.array(listener.arrived_ns) - stamps_ns) * 1e-6
+    periods = np.rint(np.diff(np.sort(stamps_ns)) * 1e-9 * RATE_HZ)
+    # The stamps of a bare timer wander: only steps of two periods and more are a loss.
+    missing = int(np.sum(np.maximum(periods - 1, 0)))
+    p50_ms, p99_ms = np.percentile(age_ms, [50, 99])
+    return _Result(len(stamps_ns) / duration_s, missing, p50_ms, p99_ms, tuple(loads))
+
+
+def _first_sample_s(topic: str, command: Sequence[str], before: Sequence[Sequence[str]]) -> float:
+    """Return the time from the start of a node to the arrival of its first sample, s."""
+    with running(before):
+        if before:
+            with _listening('imu/data_raw') as listener:
+                listener.listen(_START_S, _FIRST_MESSAGES)
+        with _listening(topic) as listener:
+            began_ns = time.time_ns()
+            with running([command]):
+                listener.listen(_START_S, 1)
+            return (listener.arrived_ns[0] - began_ns) * 1e-9
+
+
+def _row(label: str, results: Sequence[_Result]) -> str:
+    """Return the row of a subject."""
+    loads = ' + '.join(f'{100 * load:.1f}'
+                       for load in np.median([result.loads for result in results], axis=0))
+    if np.isnan(results[0].rate_hz):
+        return f'{label:27} {"":46}  {loads}'
+    return (f'{label:27} {np.median([result.rate_hz for result in results]):6.0f} '
+            f'{np.median([result.missing for result in results]):4.0f} '
+            f'{_spread([result.p50_ms for result in results]):>16} '
+            f'{_spread([result.p99_ms for result in results]):>17}  {loads}')
+
+
+def _spread(values: Sequence[float]) -> str:
+    """Return the median of some values, and their range."""
+    return f'{np.median(values):.2f} ({min(values):.2f}-{max(values):.2f})'

@@ -1,0 +1,115 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The topics of a simulator, for a link that emulates a sensor on them."""
+
+from __future__ import annotations
+
+import time
+
+from adxl_ros.files import cdr
+from adxl_ros.links.support.base import ImuLink
+from adxl_ros.nodes.support.receive_thread import ReceiveTurn
+from adxl_ros.nodes.support.topics import create_subscription
+import numpy as np
+from rclpy.node import Node
+from sensor_msgs.msg import Imu, Temperature
+
+_QUEUE = 1000
+"""Samples that are kept while the node is busy: 1 s at 1 kHz."""
+_FIELDS = ('orientation', 'orientation_covariance', 'angular_velocity',
+           'angular_velocity_covariance', 'linear_acceleration')
+"""Number fields of sensor_msgs/Imu."""
+_PAUSE_S = 0.004
+"""Time between two looks at the samples, s. At 1 kHz four of them then share a run of the chain,
+which costs as much as ten samples."""
+_FOREIGN_NS = 60_000_000_000
+"""Largest distance of stamps from the clock of the node, ns; chosen: a larger one is another
+clock."""
+
+_CLOCK_WAIT_S = 3.0
+"""Time for which samples may come before the first message of /clock, s; chosen: nodes find each
+other within it."""
+
+
+class SimulatorInput:
+    """
+    Gives the messages of a simulator to a link.
+
+    Parameters
+    ----------
+    node
+        The node that subscribes.
+    link
+        The link.
+
+    Attributes
+    ----------
+    frame_id
+        Frame of the newest samples.
+
+    """
+
+    def __init__(self, node: Node, link: ImuLink) -> None:
+        self._node, self._link = node, link
+        self._raw: list[bytes] = []
+        self.frame_id = ''
+        self._begun_s: float | None = None
+        self._is_warned = False
+        self._due_s = time.monotonic()
+        self._turn = ReceiveTurn(node, Imu, link.imu_topic, self._raw.append, _QUEUE)
+        self._temperature = create_subscription(
+            node, Temperature, link.temperature_topic,
+            lambda message: link.sense_temperature(message.temperature), 1)
+
+    def destroy(self) -> None:
+        """Remove the subscriptions; the thread that waits must have ended."""
+        self._turn.destroy()
+        self._node.destroy_subscription(self._temperature)
+
+    def wait(self) -> None:
+        """Pause after the last samples, wait for others for up to 0.1 s, give all to the link."""
+        time.sleep(max(self._due_s - time.monotonic(), 0))
+        self._turn()
+        self._due_s = time.monotonic() + _PAUSE_S
+        raws = self._raw[:]
+        self._raw.clear()
+        if not raws:
+            topic = self._node.resolve_topic_name(self._link.imu_topic)
+            self._link.sense_silence(self._node.count_publishers(topic) > 0)
+            return
+        stamps_ns = np.empty(len(raws), np.int64)
+        fields: dict[str, np.ndarray] = {}
+        for table in cdr.tables(raws, cdr.imu):
+            stamps_ns[table.rows] = table.stamp_ns()
+            for name in _FIELDS:
+                numbers = table.numbers(name)
+                fields.setdefault(name, np.empty((len(raws), numbers.shape[1])))[table.rows] = \
+                    numbers
+            self.frame_id = table.layout.texts['frame_id']
+        self._warn_of_clock(int(stamps_ns[-1]))
+        self._link.sense_imu(stamps_ns, fields)
+
+    def _warn_of_clock(self, stamp_ns: int) -> None:
+        """Warn once of samples that belong to another clock than the node's."""
+        now_ns, now_s = self._node.get_clock().now().nanoseconds, time.monotonic()
+        self._begun_s = self._begun_s or now_s
+        if not now_ns and now_s - self._begun_s < _CLOCK_WAIT_S:
+            return
+        away_ns = now_ns - stamp_ns
+        if not self._is_warned and abs(away_ns) > _FOREIGN_NS:
+            self._is_warned = True
+            self._node.get_logger().warning(
+                f'{self._link.imu_topic}: stamps are {away_ns * 1e-9:+.0f} s from the clock of '
+                'this node; set use_sim_time:=true, and let the simulator publish /clock')

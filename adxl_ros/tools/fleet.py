@@ -1,0 +1,253 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Check, fit and diagnose many recordings of many units, on this machine or a Dask cluster."""
+
+from __future__ import annotations
+
+import argparse
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+import shlex
+from time import monotonic
+
+from adxl_ros.calibrate.value_text import counted, duration
+from adxl_ros.errors import install_hint, UserError
+from adxl_ros.files import calibration_store
+from adxl_ros.files.stream_info import NO_UNIT
+from adxl_ros.fleet.inputs import find_sources, stated_by
+from adxl_ros.fleet.recipe import make_recipe, task_names, TASKS
+from adxl_ros.fleet.results import Results
+from adxl_ros.fleet.row import reason_kind, Row
+from adxl_ros.fleet.run import Plan, plan, Selection, since_text, work
+from adxl_ros.jobs.pools import open_pool
+from adxl_ros.jobs.run import RETRIES
+from adxl_ros.tools.closing_lines import print_end, wrapped
+from adxl_ros.tools.command_line import argument_parser, command
+from adxl_ros.tools.common import make_folder, note, progress, run
+from adxl_ros.tools.recording_options import (
+    add_recording_options,
+    reading_options,
+    reading_text,
+)
+
+PROG = 'fleet'
+"""Name of the command, for messages."""
+_EXAMPLES = {
+    'all recordings of a folder': 'recordings -o results',
+    'a bucket, on a Dask cluster':
+        "'s3://robots/**/*.mcap' \\\n        --scheduler tcp://head:8786 -o results",
+    'what it would cost': 'manifest.csv -o results --dry-run',
+}
+"""Examples of arguments, by their purpose."""
+_UNITS = 5
+"""Units that a plan names. Chosen: one or two lines."""
+_REASON_COLUMNS = 12
+"""Columns before a reason."""
+_MOST_REASONS = 3
+"""Reasons of refusals on the screen. Chosen: the page has all."""
+
+
+def parser() -> argparse.ArgumentParser:
+    """Describe the command line."""
+    parse = argument_parser(PROG, __doc__, _EXAMPLES)
+    parse.add_argument('input', nargs='+', metavar='INPUT',
+                       help='file, folder, glob, URL of fsspec (s3://, gs://, https://, sftp://), '
+                            'or a manifest: CSV or Parquet with url, serial, params, date')
+    parse.add_argument('--do', metavar='TASKS', default=','.join(TASKS),
+                       help='tasks, with commas (default: %(default)s)')
+    parse.add_argument('-o', dest='output', metavar='DIR', required=True,
+                       help='rows, table, page and single reports; an interrupted run continues')
+    parse.add_argument('--params', metavar='FILE', default=None,
+                       help='parameter file of all recordings (default: the calibration of each '
+                            'unit at the date of the recording, else the nominal sensor)')
+    parse.add_argument('--store', metavar='DIR', default=str(calibration_store.default_folder()),
+                       help='the calibration store (default: %(default)s); empty for none')
+    pool = parse.add_mutually_exclusive_group()
+    pool.add_argument('--scheduler', metavar='ADDRESS', help='of a Dask cluster to run on')
+    pool.add_argument('--jobs', metavar='N', type=int,
+                      help='processes of this machine (default: one for each core)')
+    parse.add_argument('--retries', metavar='N', type=int, default=RETRIES,
+                       help='further attempts where a task crashes or its worker ends; more '
+                            'where workers end at random (default: %(default)s)')
+    parse.add_argument('--only-failed', action='store_true',
+                       help='repeat the recordings that were refused or crashed, no others')
+    parse.add_argument('--since', metavar='DATE', default='',
+                       help='leave out earlier recordings, by the date that they or a manifest '
+                            'state, else by the last change of the file')
+    parse.add_argument('--limit', metavar='N', type=int,
+                       help='work on N recordings at most')
+    parse.add_argument('--dry-run', action='store_true', help='only show what there is to do')
+    add_recording_options(parse)
+    return parse
+
+
+def fleet(options: argparse.Namespace) -> int:
+    """Run the tool; see `parser`."""
+    _check(options)
+    begin_s = monotonic()
+    selection = Selection(options.only_failed, options.since and since_text(options.since),
+                          options.limit)
+    tasks = task_names(options.do)
+    sources = find_sources(options.input)
+    recipe = make_recipe(tasks, options.params, (source.params for source in sources),
+                         options.store, reading_options(options))
+    folder = Path(options.output)
+    results = Results(folder)
+    to_do = plan(sources, recipe, results, selection)
+    if options.dry_run:
+        print_end(_plan_lines(to_do, len(sources)), [], _command(options, options.only_failed))
+        return 0
+    make_folder(folder)
+    rows: list[Row] = []
+    reason = ''
+    try:
+        if to_do.todo:
+            shared = (recipe, results.keys_of(to_do.todo))
+            with open_pool(options.scheduler, options.jobs, shared) as pool, \
+                    progress(PROG) as show:
+                for row in work(pool, to_do.todo, recipe, results, options.retries, show):
+                    rows.append(_short(row))
+    except KeyboardInterrupt:
+        reason = 'interrupted; the same command continues'
+    files = _written(folder, results)
+    if reason:
+        note(f'{PROG}: {reason}')
+        return 130
+    took_s = monotonic() - begin_s
+    print_end([*_result_lines(rows, to_do, took_s), ''], files, _next(options, rows), took_s)
+    return 1 if rows and not any(row['outcome'] == 'done' for row in rows) else 0
+
+
+def _check(options: argparse.Namespace) -> None:
+    """Refuse numbers that make no sense, and missing libraries."""
+    for name, lowest in (('jobs', 1), ('retries', 0), ('limit', 1)):
+        value = getattr(options, name)
+        if value is not None and value < lowest:
+            raise UserError(f'--{name} {value}: at least {lowest} is needed')
+    try:
+        import fsspec  # noqa: F401
+        import pyarrow  # noqa: F401
+    except ImportError as error:
+        raise UserError(f'{PROG} needs {error.name}; {install_hint(str(error.name))}') from None
+
+
+def _written(folder: Path, results: Results) -> list[Path]:
+    """Write table and page, and return their files; a page that is not possible is reported."""
+    from adxl_ros.fleet.report import report_html  # only the end of a run needs it
+    files = [results.write_table()]
+    try:
+        files = [*report_html.write(folder), *files]
+    except UserError as error:
+        note(f'{PROG}: no page: {error}')
+    return [*files, folder / 'reports']
+
+
+def _short(row: Row) -> Row:
+    """Return what the screen needs of a row."""
+    return {name: row[name] for name in ('url', 'outcome', 'refusal', 'refused_by', 'serial',
+                                         'status', 'seconds', 'is_sound', 'duration_s')}
+
+
+def _size(count: int) -> str:
+    """Return a number of bytes with its prefix."""
+    for factor, unit in ((1e9, 'GB'), (1e6, 'MB'), (1e3, 'kB')):
+        if count >= factor:
+            return f'{count / factor:.3g} {unit}'
+    return f'{count} B'
+
+
+def _plan_lines(to_do: Plan, count: int) -> list[str]:
+    """Return what there is to do."""
+    stated = iter(stated_by([source for source, serial in zip(to_do.todo, to_do.serials)
+                             if not serial]))
+    by_unit = Counter(serial or next(stated).serial for serial in to_do.serials)
+    unknown = by_unit.pop('', 0) + by_unit.pop(NO_UNIT, 0)
+    largest = ', '.join(f'{serial} ({number})' for serial, number in by_unit.most_common(_UNITS))
+    rows = {'found': f'{counted(count, "recording")}', 'done already': f'{to_do.done}',
+            'left out': _left_out(to_do),
+            'core hours': f'{to_do.core_hours:.3g}',
+            'units': f'{len(by_unit)}{":" if by_unit else ""} {largest}'
+            f'{", ..." if len(by_unit) > _UNITS else ""}',
+            'unknown unit': f'{counted(unknown, "recording")}' if unknown else ''}
+    return [f'{counted(len(to_do.todo), "recording")} to do, {_size(to_do.size_bytes)}, about '
+            f'{duration(3600 * to_do.core_hours)} of one core', '',
+            *(f' {name:13}{text}' for name, text in rows.items() if text), '']
+
+
+def _left_out(to_do: Plan) -> str:
+    """Return how many recordings a run leaves out; empty for none."""
+    return f'{to_do.outside} by --since, --limit or --only-failed' if to_do.outside else ''
+
+
+def _result_lines(rows: Sequence[Row], to_do: Plan, took_s: float) -> list[str]:
+    """Return the answer, the figures, and why recordings have no result."""
+    outcomes = Counter(row['outcome'] for row in rows)
+    parts = [f'{outcomes[name]} {name}' for name in ('done', 'refused', 'crashed')
+             if outcomes[name] or name == 'done']
+    if not rows:
+        return [f'Nothing to do: {counted(to_do.done, "recording")} had a row before',
+                *([f' left out  {_left_out(to_do)}'] if to_do.outside else [])]
+    lines = [f'{counted(len(rows), "recording")}: {", ".join(parts)}'
+             + (f'; {to_do.done} had their row before' if to_do.done else ''), '']
+    worked_s = sum(row['seconds'] or 0.0 for row in rows)
+    statuses = Counter(row['status'] for row in rows if row['status'])
+    unsound = sum(row['is_sound'] is False for row in rows)
+    figures = {
+        'units': str(len({row['serial'] for row in rows if row['serial']})),
+        'recorded': duration(sum(row['duration_s'] or 0.0 for row in rows)),
+        'not sound': str(unsound),
+        'left out': _left_out(to_do),
+        'verdicts': ', '.join(f'{count} {name}' for name, count in statuses.most_common()),
+        'computed': f'{duration(worked_s)} of workers in {duration(took_s)}'}
+    lines += [f' {name:11}{value}' for name, value in figures.items() if value]
+    return lines + _reason_lines(rows)
+
+
+def _reason_lines(rows: Iterable[Row]) -> list[str]:
+    """Return the most frequent kinds of refusals, each by an example."""
+    kinds: dict[tuple[str, str], list[str]] = {}
+    for row in rows:
+        if row['refusal']:
+            kinds.setdefault((row['refused_by'], reason_kind(row)), []).append(row['refusal'])
+    ordered = sorted(kinds.items(), key=lambda item: -len(item[1]))
+    lines = [line for (task, _), texts in ordered[:_MOST_REASONS]
+             for line in wrapped(f' {len(texts):>9}  {task}: {texts[0]}', _REASON_COLUMNS)]
+    others = len(ordered) - _MOST_REASONS
+    lines += [f'{"":{_REASON_COLUMNS}}and {counted(others, "other reason")}'] \
+        if others > 0 else []
+    return ['', ' refused by', *lines] if lines else []
+
+
+def _command(options: argparse.Namespace, only_failed: bool) -> str:
+    """Return the command that does what --dry-run shows, or that repeats what failed."""
+    words = [*options.input, '--do', options.do, '-o', options.output]
+    for name in ('params', 'store', 'scheduler', 'jobs', 'retries', 'since', 'limit'):
+        value = getattr(options, name)
+        words += [f'--{name}', str(value)] if value != parser().get_default(name) else []
+    words += ['--only-failed'] if only_failed else []
+    return command(PROG, shlex.join(words) + reading_text(options))
+
+
+def _next(options: argparse.Namespace, rows: Sequence[Row]) -> str:
+    """Return how to repeat what failed."""
+    if any(row['outcome'] == 'crashed' or row['refused_by'] == 'stage' for row in rows):
+        return _command(options, True)
+    return ''
+
+
+def main() -> int:
+    """Run the tool on the command line."""
+    return run(parser(), fleet)

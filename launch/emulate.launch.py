@@ -1,0 +1,63 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Start a realistic sensor in another simulator: the driver on its ideal Imu.
+
+    ros2 launch adxl_ros emulate.launch.py in_topic:=/imu params_file:=gap/params.yaml
+
+    ros2 launch adxl_ros emulate.launch.py in_topic:=/imu out_topic:=/robot/imu/data_raw \
+        params_file:=unit_17.yaml seed:=3 frame_id:=imu_link rpy_rad:=3.14159,0,0
+
+The simulator publishes sensor_msgs/Imu with specific force, and /clock. The sensor of the
+parameter file appears on imu/data_raw with the stamps of the simulator. A driver that ends is
+started again. The launch ends with an error when the driver refuses to start three times.
+"""
+
+from adxl_ros.nodes.support import launch_nodes
+from adxl_ros.nodes.support.launch_nodes import Argument, text
+from launch import LaunchContext, LaunchDescription
+from launch.action import Action
+from launch.actions import DeclareLaunchArgument
+
+LINK = (
+    Argument('in_topic', 'link.topic', 'topic of the ideal sensor_msgs/Imu'),
+    Argument('temperature_topic', 'link.temperature_topic', 'topic of the temperature'),
+    Argument('seed', 'link.seed', 'seed of the noise', int),
+)
+
+
+def generate_launch_description() -> LaunchDescription:
+    return launch_nodes.describe([
+        *launch_nodes.common_arguments(link=(), frame_id=''),
+        *(argument.declared() for argument in LINK),
+        DeclareLaunchArgument('rpy_rad', default_value='0,0,0',
+                              description='roll, pitch and yaw of the case in the frame of the '
+                              'ideal samples, rad'),
+        DeclareLaunchArgument('out_topic', default_value='imu/data_raw',
+                              description='topic of the realistic samples'),
+        DeclareLaunchArgument('use_sim_time', default_value='true', choices=['true', 'false'],
+                              description='follow the clock of the simulator')], make_nodes)
+
+
+def make_nodes(context: LaunchContext) -> list[Action]:
+    """Return the driver."""
+    angles = launch_nodes.three_numbers(context, 'rpy_rad')
+    rotation = {f'link.{name}_rad': angle for name, angle in zip(('roll', 'pitch', 'yaw'), angles)}
+    return [launch_nodes.make_node(
+        context, 'driver', {
+            'link.type': 'topic', **rotation, **launch_nodes.given_parameters(context, LINK),
+            'use_sim_time': text(context, 'use_sim_time') == 'true'},
+        remappings=[('imu/data_raw', text(context, 'out_topic'))], respawn=True,
+        respawn_delay=2.0, on_exit=launch_nodes.GiveUp())]

@@ -1,0 +1,91 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Investigate the gap of a unit on a stage: start driver, stage and investigation, end with it.
+
+    ros2 launch adxl_ros investigate.launch.py
+    ros2 launch adxl_ros investigate.launch.py params_file:=unit_17.yaml link_type:=serial \
+        link_port:=/dev/ttyACM0 stage_type:=trajectory bridge_alpha_joint:=tilt_joint \
+        bridge_beta_joint:=turn_joint limits_rate_deg_s:=10
+
+Without arguments, sensor and stage are simulated. `unit_file` names another unit for the
+simulated sensor, whose gap to `params_file` is then found. The launch ends with the
+investigation: status 0 with a verdict, else 1. Ctrl-C leaves the stage at rest.
+"""
+
+from adxl_ros.errors import UserError
+from adxl_ros.nodes.support import launch_nodes
+from adxl_ros.nodes.support.launch_nodes import (
+    Argument,
+    BRIDGE,
+    given_anywhere,
+    given_parameters,
+    LINK_TYPE,
+    make_node,
+    SPEED,
+    STAGE_TYPE,
+    text,
+)
+from launch import LaunchContext, LaunchDescription
+from launch.action import Action
+from launch.actions import DeclareLaunchArgument
+
+INVESTIGATION = (
+    Argument('output', 'output', 'folder of bag, report and parameters'),
+    Argument('limits_alpha_deg', 'limits.alpha_deg', 'lowest and highest angle alpha, deg, with '
+             'a comma', list),
+    Argument('limits_beta_deg', 'limits.beta_deg', 'lowest and highest angle beta, deg, with a '
+             'comma', list),
+    Argument('limits_rate_deg_s', 'limits.rate_deg_s', 'largest rate of each joint, deg/s', float),
+    Argument('limits_minutes', 'limits.minutes', 'largest time of all manoeuvres together, min',
+             float),
+)
+RESULT = 'the lines above have the result'
+
+
+def generate_launch_description() -> LaunchDescription:
+    return launch_nodes.describe([
+        *launch_nodes.common_arguments(),
+        DeclareLaunchArgument('unit_file', default_value='',
+                              description='parameter file of the unit that the driver simulates; '
+                              'empty: params_file'),
+        *(argument.declared() for argument in (
+            STAGE_TYPE, *BRIDGE, *INVESTIGATION, SPEED))], make_nodes)
+
+
+def make_nodes(context: LaunchContext) -> list[Action]:
+    """Return the nodes."""
+    speed = given_parameters(context, [SPEED])
+    sim_time = {'use_sim_time': True} if speed else {}
+    respawn = {'respawn': True, 'respawn_delay': 2.0}
+    check_stage(context)
+    return [
+        make_node(context, 'driver', launch_nodes.simulated_link(context, speed) | sim_time,
+                  params_file=text(context, 'unit_file'), **respawn,
+                  on_exit=launch_nodes.GiveUp()),
+        make_node(context, 'stage', sim_time | given_parameters(context, [STAGE_TYPE, *BRIDGE]),
+                  **respawn, on_exit=launch_nodes.GiveUp()),
+        make_node(context, 'investigate', sim_time | given_parameters(context, INVESTIGATION),
+                  on_exit=launch_nodes.end_with(RESULT, RESULT))]
+
+
+def check_stage(context: LaunchContext) -> None:
+    """Refuse a simulated stage beside a real sensor, unless it is asked for."""
+    link = given_anywhere(context, LINK_TYPE, 'driver')
+    if link not in ('', 'sim') and not given_anywhere(context, STAGE_TYPE, 'stage'):
+        raise UserError(
+            f'link_type is {link}, but the stage would be simulated; set stage_type:=trajectory '
+            'or joint_state with bridge_alpha_joint and bridge_beta_joint, or '
+            'stage_type:=simulated')

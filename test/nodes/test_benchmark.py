@@ -1,0 +1,87 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The table of the benchmark: ratios of processor time, measured in turns, and a rival."""
+
+from functools import partial
+import re
+import sys
+import time
+
+from adxl_ros.errors import UserError
+from adxl_ros.files import cdr
+from adxl_ros.nodes.support import offline_jobs, rival_driver
+from adxl_ros.nodes.support.benchmark_table import Job, rows_of
+from graph import Graph
+from processes import executable
+import pytest
+from sensor_msgs.msg import Imu
+from units import nominal
+
+
+def missing() -> None:
+    raise ModuleNotFoundError('no such library')
+
+
+def test_rows_state_the_ratio_to_each_rival_and_what_is_not_installed() -> None:
+    spent_s = 0.0
+
+    def work(seconds: float) -> None:
+        nonlocal spent_s
+        spent_s += seconds
+
+    make = partial(Job, clock=lambda: spent_s)
+    job = make('count', lambda: work(0.3), 1.5,
+               {'rival': lambda: work(0.2), 'other': missing, 'slow': lambda: work(3.0)})
+    first, second, third = rows_of(job, 2)
+    assert first == '| count | 0.3 (0.3–0.3) | rival | 1.5 (1.5–1.5) | 1.5 |'
+    assert second == '| count | 0.3 (0.3–0.3) | other | not installed | – |'
+    assert third == '| count | 0.3 (0.3–0.3) | slow | 0.1 (0.1–0.1) | – |'
+    assert rows_of(make('alone', lambda: work(2.0), 5.0), 1) == [
+        '| alone | 2 (2–2) | – | – | 5 s |']
+
+
+@pytest.mark.parametrize('kind', ['csv', 'mcap'])
+def test_a_long_recording_is_applied_with_its_memory_and_leaves_no_file(
+        monkeypatch, tmp_path, kind):
+    # The other executables stand beside the running one.
+    monkeypatch.setattr(sys, 'argv', [executable('bench')])
+    jobs = offline_jobs._long_applying(tmp_path, nominal(), kind, 0.01)
+    row, = rows_of(next(jobs), 1)
+    format_ = kind.upper()
+    assert re.match(rf'\| apply, 0.01 h at 1 kHz, {format_} to {format_} '
+                    r'\(\d+ s elapsed, [1-9]\d+ MB\) \| .* \| 0.075 s \|', row)
+    assert list(jobs) == []
+    assert [path.name for path in tmp_path.iterdir()] == ['unit.yaml']
+    # More than any disk holds.
+    with pytest.raises(UserError, match='GB free; recordings of 1e.09 h need .* set TMPDIR'):
+        next(offline_jobs._long_applying(tmp_path, nominal(), kind, 1e9))
+
+
+@pytest.mark.skipif(not rival_driver.is_installed(), reason='witmotion is not installed')
+def test_the_driver_of_another_project_publishes_samples_with_their_own_time(start, tmp_path):
+    port = tmp_path / 'board'
+    start('bench', '--rival-board', port)
+    with Graph() as graph:
+        graph.spin_until(port.exists, 20, 'the board')
+        start('bench', '--rival-driver', port)
+        raws = graph.listen(Imu, rival_driver.TOPIC, raw=True)
+        graph.spin_until(lambda: len(raws) > 500, 30, 'samples')
+        now_ns = time.time_ns()
+    table, = cdr.tables(raws, cdr.imu)
+    stamps_ns = table.stamp_ns()
+    assert now_ns - 20e9 < stamps_ns[0] and stamps_ns[-1] < now_ns
+    assert (stamps_ns[1:] > stamps_ns[:-1]).all()
+    # The time is in the values, whose g is that of the library.
+    assert (abs(table.numbers('linear_acceleration')) < 16 * 9.81).all()

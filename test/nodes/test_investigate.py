@@ -1,0 +1,244 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""An investigation on a simulated stage: verdict, limits, bag, and how it leaves the stage."""
+
+from dataclasses import replace
+import json
+import os
+import signal
+import time
+
+from adxl_ros.files import parameter_file, recording
+from adxl_ros.files.bag_messages import open_bag
+from adxl_ros.model.coefficients import with_neutral
+from graph import Graph
+import numpy as np
+from processes import executable, wait_until
+import pytest
+from sensor_msgs.msg import JointState
+from std_srvs.srv import Trigger
+from terminal import Terminal
+from units import nominal
+
+pytestmark = pytest.mark.long
+SIM = ('-p', 'use_sim_time:=true')
+FAST = ('-p', 'limits.rate_deg_s:=60.0', '-p', 'limits.beta_deg:=[-90.0,90.0]', '-p',
+        'qos_overrides./imu/data_raw.subscription.reliability:=reliable', '-p',
+        'qos_overrides./imu/data_raw.subscription.depth:=100000')
+RATE_RAD_S = np.radians(60)
+LONG = '-p', 'limits.rate_deg_s:=10.0', '-p', 'limits.minutes:=0.9'
+"""Manoeuvres that take long enough to be seen and ended."""
+LONG_RATE_RAD_S = np.radians(10)
+BETA_RAD = np.radians(90)
+HELD_UP_S = 4.0
+"""Longer than a topic may be silent."""
+
+
+class Laboratory(Graph):
+    """A driver and a stage, and what is commanded and measured there."""
+
+    def __init__(self, start, folder):
+        super().__init__()
+        base = nominal(rate_hz=200.0)
+        parameter_file.save(folder / 'nominal.yaml', base)
+        unit = with_neutral(base, ['hysteresis'])
+        values = unit.values['hysteresis'] | {'half_width_g': np.array([0.004, 0.003])}
+        parameter_file.save(folder / 'unit.yaml', replace(
+            unit, values={**unit.values, 'hysteresis': values}))
+        self.folder, self._start = folder, start
+        self.driver = start('driver', '--ros-args', '--params-file', 'unit.yaml', *SIM, '-p',
+                            'link.type:=sim', '-p', 'link.speed:=6.0', '-p',
+                            'qos_overrides./imu/data_raw.publisher.depth:=100000')
+        self.stage = start('stage', '--ros-args', *SIM, '-p', 'slew_rate_rad_s:=3.0')
+
+    def __enter__(self):
+        super().__enter__()
+        self.states = self.listen(JointState, 'stage/joint_states')
+        self.commands = self.listen(JointState, 'stage/command')
+        return self
+
+    def investigate(self, *options):
+        return self._start('investigate', '--ros-args', '--params-file', 'nominal.yaml', *SIM,
+                           *FAST, *options)
+
+    def wait_for_motion(self):
+        """Wait until the stage is some degrees from where it is now."""
+        del self.states[:]
+        self.spin_until(lambda: self.states and np.abs(np.subtract(
+            self.states[-1].position, self.states[0].position)).max() > 0.1, 90, 'motion')
+
+    def wait_for_rest(self):
+        """Wait until the stage rests; its last second must be still."""
+        def rests():
+            newest = self.states[-100:]
+            return len(self.states) > 100 \
+                and max(np.abs(s.velocity).max() for s in newest) < 1e-6
+        del self.states[:]
+        self.spin_until(rests, 20, 'rest')
+        return np.array(self.states[-1].position[:2])
+
+    def check_commands(self, stops=0):
+        """Check all commands; each stop commands the measured pose, which lags."""
+        commands = np.array([c.position for c in self.commands])
+        assert len(commands) > 10
+        assert commands[:, 0].min() > -1e-9
+        assert commands[:, 0].max() < np.pi + 1e-9
+        assert np.abs(commands[:, 1]).max() < BETA_RAD + 1e-9
+        # No step is longer than the limit of rate allows for the longest step in time.
+        steps_rad = np.abs(np.diff(commands, axis=0)).max(axis=1)
+        assert (steps_rad > 0.2 * RATE_RAD_S + 1e-9).sum() <= 2 * stops
+
+
+@pytest.fixture
+def laboratory(start, tmp_path):
+    with Laboratory(start, tmp_path) as made:
+        yield made
+
+
+def messages_of(bag):
+    with open_bag(bag) as opened:
+        return sum(1 for _ in opened.messages(('/imu/data_raw',)))
+
+
+def test_an_investigation_ends_with_the_effect_of_the_unit(laboratory, tmp_path):
+    node = laboratory.investigate('-p', 'output:=found')
+    laboratory.spin_until(lambda: node.popen.poll() is not None, 150, 'the verdict')
+    output = node.output()
+    assert node.popen.returncode == 0, output
+    assert 'The recording shows hysteresis: 9' in output or 'hysteresis: 100 %' in output
+    assert '  0.0 min  no gap' in output
+    assert 'next: ' in output
+    assert max(map(len, output.splitlines())) < 80
+    laboratory.check_commands()
+    laboratory.wait_for_rest()
+    folder = tmp_path / 'found'
+    read = recording.read(folder / 'bag')
+    assert not read.cut
+    assert np.diff(read.time_s).max() == pytest.approx(0.005, abs=1e-6)
+    assert {'alpha_rad', 'beta_rad', 'alpha_command_rad'} <= set(read.columns)
+    report = json.loads((folder / 'report.json').read_text())
+    assert report['verdict']['effects'] == ['hysteresis']
+    assert 'hysteresis' in parameter_file.load(folder / 'params.yaml').effects
+    for path in ('found/report.html', 'found/params.yaml', 'found/bag'):
+        assert path in output
+        assert (tmp_path / path).exists()
+    page = (folder / 'report.html').read_text()
+    assert 'ros2 run adxl_ros diagnose found/bag --params found/baseline.yaml -o' in page
+
+
+@pytest.mark.kills
+def test_whatever_ends_an_investigation_leaves_the_stage_at_rest_and_the_bag_whole(
+        laboratory, tmp_path):
+    """The stage would move on for many seconds; it comes to rest near its pose at the end."""
+    def killed(node):
+        os.kill(node.popen.pid, signal.SIGKILL)
+
+    def interrupted(node):
+        os.kill(node.popen.pid, signal.SIGINT)
+
+    def terminated(node):
+        os.kill(node.popen.pid, signal.SIGTERM)
+
+    def aborted(_):
+        assert laboratory.call(Trigger, '/investigate/abort', Trigger.Request()).success
+
+    for number, end in enumerate((killed, interrupted, terminated, aborted)):
+        node = laboratory.investigate('-p', f'output:=run{number}', *LONG)
+        laboratory.wait_for_motion()
+        before = np.array(laboratory.states[-1].position[:2])
+        end(node)
+        rest = laboratory.wait_for_rest()
+        # The topics are delayed by 1.5 s of real time at most: 9 s of the stage.
+        assert np.abs(rest - before).max() < 9 * LONG_RATE_RAD_S, end.__name__
+        wait_until(lambda node=node: node.popen.poll() is not None, 20, 'the end')
+        bag = tmp_path / f'run{number}' / 'bag'
+        if end is killed:
+            assert node.popen.returncode == -signal.SIGKILL
+        else:
+            assert node.popen.returncode == 1
+            assert 'Stopped without a verdict' in node.output()
+        read = recording.read(bag)
+        assert bool(read.cut) is (end is killed)
+        assert len(read) == messages_of(bag) > 1000
+        assert np.diff(read.time_s).max() == pytest.approx(0.005, abs=1e-6)
+    laboratory.check_commands(4)
+
+
+@pytest.mark.kills
+def test_a_machine_that_is_held_up_for_seconds_is_no_silent_topic(laboratory, tmp_path):
+    node = laboratory.investigate(*LONG)
+    laboratory.wait_for_motion()
+    held_up = (node, laboratory.driver, laboratory.stage)
+    for process in held_up:
+        os.kill(process.popen.pid, signal.SIGSTOP)
+    time.sleep(HELD_UP_S)
+    for process in reversed(held_up):
+        os.kill(process.popen.pid, signal.SIGCONT)
+    # The last command is repeated for half a second only.
+    commanded = len(laboratory.commands)
+    laboratory.spin_until(lambda: len(laboratory.commands) > commanded + 100, 20, 'commands')
+    assert laboratory.call(Trigger, '/investigate/abort', Trigger.Request()).success
+    assert node.wait() == 1
+    assert 'Stopped without a verdict: ~/abort was called' in ' '.join(node.output().split())
+    read = recording.read(tmp_path / 'investigation' / 'bag')
+    assert np.diff(read.time_s).max() == pytest.approx(0.005, abs=1e-6)
+
+
+@pytest.mark.kills
+def test_without_samples_the_stage_comes_to_rest(laboratory, tmp_path):
+    node = laboratory.investigate(*LONG, '-p', 'use_sim_time:=false')
+    laboratory.wait_for_motion()
+    os.kill(laboratory.driver.popen.pid, signal.SIGKILL)
+    assert node.wait(30) == 1
+    assert 'nothing on /imu/data_raw' in node.output()
+    assert len(recording.read(tmp_path / 'investigation' / 'bag')) > 1000
+
+
+@pytest.mark.kills
+def test_a_terminal_shows_what_the_stage_does_until_ctrl_c(laboratory, ros_env, tmp_path):
+    terminal = Terminal(
+        [executable('investigate'), '--ros-args', '--params-file', 'nominal.yaml', *SIM, *FAST,
+         *LONG], ros_env, tmp_path, columns=80)
+    try:
+        terminal.wait_for('no gap 35 %', 'next: ', timeout_s=90)
+        laboratory.wait_for_motion()
+        terminal.wait_for(' s left')
+        terminal.press('\x03')
+        terminal.wait_for('Stopped without a verdict: Ctrl-C', 'Bag  ')
+        assert terminal.wait() == 1
+        assert ' s left' not in terminal.text()
+        assert max(map(len, terminal.text().splitlines())) < 80
+        laboratory.wait_for_rest()
+    finally:
+        terminal.close()
+
+
+@pytest.mark.parametrize('setting, reason', [
+    ('limits.alpha_deg:=[90.0,10.0]', 'limits.alpha_deg: [90, 10] is no lowest and highest'),
+    ('limits.beta_deg:=[0.0]', 'is no list of two degrees'),
+    ('limits.rate_deg_s:=0.0', 'limits.rate_deg_s: 0.0 is out of range')])
+def test_limits_without_meaning_are_refused(start, setting, reason):
+    node = start('investigate', '--ros-args', '-p', setting)
+    assert node.wait() == 1
+    assert reason in node.output()
+    assert len(node.output().splitlines()) == 1
+
+
+def test_a_stage_outside_its_limits_is_not_moved(start, tmp_path):
+    start('driver', '--ros-args', '-p', 'link.type:=sim')
+    start('stage', '--ros-args', '-p', 'alpha_rad:=0.5')
+    node = start('investigate', '--ros-args', '-p', 'limits.alpha_deg:=[-10.0,10.0]')
+    assert node.wait(40) == 1
+    assert 'the stage is at alpha 28.7°' in ' '.join(node.output().split())

@@ -1,0 +1,160 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Tasks for tests of pools; worker processes import this module."""
+
+from contextlib import contextmanager
+from multiprocessing.connection import Connection
+import os
+from pathlib import Path
+import signal
+import socket
+import subprocess
+import sys
+from threading import Event, Thread
+import time
+
+SUPPORT = Path(__file__).resolve().parent
+_PART_BYTES = 1000
+"""Part of a result that is sent, byte; more than its length has."""
+
+
+def numbered(number, pause_s=0.01):
+    """Take a while, and return the number."""
+    time.sleep(pause_s)
+    return number
+
+
+def deadly(number, fatal, faulty):
+    """End the worker at one number, and raise at another."""
+    if number == fatal:
+        os.kill(os.getpid(), signal.SIGKILL)
+    if number == faulty:
+        raise ValueError('faulty')
+    return number
+
+
+def long_with_file(folder):
+    """Keep a file for the time of a long task."""
+    path = Path(folder) / str(os.getpid())
+    path.write_text('')
+    try:
+        time.sleep(600)
+    finally:
+        path.unlink()
+
+
+def half_sent(number):
+    """End the worker while it sends the result."""
+    def send(self, buffer):
+        os.write(self.fileno(), bytes(buffer[:_PART_BYTES]))
+        if len(buffer) > _PART_BYTES:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    Connection._send = send
+    return bytes(number)
+
+
+def children(pid):
+    """Return the worker processes of a process."""
+    listed = subprocess.run(['pgrep', '-P', str(pid), '-f', 'spawn_main'], capture_output=True,
+                            text=True, check=False).stdout.split()
+    return [int(word) for word in listed]
+
+
+def free_port():
+    """Return a port that nothing listens on."""
+    with socket.socket() as probe:
+        probe.bind(('127.0.0.1', 0))
+        return probe.getsockname()[1]
+
+
+class DaskCluster:
+    """A scheduler and workers, each a process that a test may kill."""
+
+    def __init__(self, folder, workers=2, failures=3):
+        self.address = f'tcp://127.0.0.1:{free_port()}'
+        self._log = (Path(folder) / 'dask.log').open('ab')
+        self._folder = folder
+        self._failures = failures
+        self.scheduler = self._scheduler()
+        self.workers = [self._worker() for _ in range(workers)]
+
+    def _start(self, module, *words):
+        environment = os.environ | {
+            'PYTHONPATH': os.pathsep.join([str(SUPPORT), *sys.path]),
+            'DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES': str(self._failures)}
+        return subprocess.Popen([sys.executable, '-m', f'distributed.cli.{module}', *words,
+                                 '--no-dashboard'], env=environment, cwd=self._folder,
+                                stdout=self._log, stderr=self._log)
+
+    def _scheduler(self):
+        port = self.address.rpartition(':')[2]
+        return self._start('dask_scheduler', '--host', '127.0.0.1', '--port', port)
+
+    def _worker(self):
+        return self._start('dask_worker', self.address, '--nthreads', '1', '--no-nanny',
+                           '--local-directory', str(self._folder))
+
+    def kill_worker(self, number):
+        """Kill a worker, and start another one."""
+        self._end(self.workers[number])
+        self.workers[number] = self._worker()
+
+    def kill_scheduler(self):
+        """Kill the scheduler, and start another one; workers that ended start again."""
+        self._end(self.scheduler)
+        self.scheduler = self._scheduler()
+        for number in range(len(self.workers)):
+            self.kill_worker(number)
+
+    @contextmanager
+    def kept(self):
+        """Start another worker for each that ends, until the block ends."""
+        stop = Event()
+
+        def keep():
+            while not stop.wait(0.02):
+                for number, process in enumerate(self.workers):
+                    if process.poll() is not None:
+                        self.workers[number] = self._worker()
+
+        keeper = Thread(target=keep)
+        keeper.start()
+        try:
+            yield
+        finally:
+            stop.set()
+            keeper.join()
+
+    @staticmethod
+    def _end(process):
+        process.kill()
+        process.wait()
+
+    def close(self):
+        """End all processes."""
+        for process in (*self.workers, self.scheduler):
+            self._end(process)
+        self._log.close()
+
+
+@contextmanager
+def dask_cluster(folder, workers=2, failures=3):
+    """Yield a cluster of this machine that repeats a task after some deaths of its worker."""
+    cluster = DaskCluster(folder, workers, failures)
+    try:
+        yield cluster
+    finally:
+        cluster.close()

@@ -1,0 +1,157 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""`--prior`: few poses with the population of a fleet, and units that are not of it."""
+
+from dataclasses import replace
+import json
+
+from adxl_ros.calibrate.calibration import calibrate, RecordedPoses
+from adxl_ros.calibrate.guided.pose_plan import sweep
+from adxl_ros.diagnose.linear_model import LinearModel
+from adxl_ros.files import parameter_file, population_file
+from adxl_ros.model.coefficients import get, put, with_neutral
+from adxl_ros.model.effects.base import Coefficient
+from adxl_ros.model.population import PooledCoefficient, Population, posterior
+import numpy as np
+import pytest
+from units import nominal, swept
+
+NAMES = [Coefficient(*effect, axis) for effect in (('bias', 'offset_v'), (
+    'scale_factor', 'offset_v_per_g')) for axis in 'xy']
+STD = np.array([2e-3, 2e-3, 1e-3, 1e-3])
+MEAN = np.array([0.02, -0.01, 0.01, 0.0])
+
+
+def pooled(mean, std):
+    return PooledCoefficient(mean, 1e-5, std, 0.8 * std, 1.2 * std, std, 50)
+
+
+def population(shift_v=0.0):
+    """Return the population of the drawn units; `shift_v` makes its zero-g wrong."""
+    return Population('population.yaml', {
+        **{f'zero_g_{axis}_v': pooled(2.5 + mean + shift_v, 2e-3)
+           for axis, mean in zip('xy', MEAN)},
+        **{f'scale_{axis}_v_per_g': pooled(1 + mean, 1e-3)
+           for axis, mean in zip('xy', MEAN[2:])}})
+
+
+def drawn(rng):
+    """Draw a unit of the population."""
+    return put(with_neutral(nominal(), ['bias', 'scale_factor']), NAMES,
+               MEAN + STD * rng.normal(size=4))
+
+
+def test_few_poses_give_smaller_intervals_that_hold():
+    """Over 60 units that are turned by hand, intervals shrink and hold 90 % of the truths."""
+    rng = np.random.default_rng(0)
+    poses = sweep(np.radians([60, 120]), np.radians(60), 0)[:10]
+    by_hand = nominal(stage_resolution_rad=np.radians(2.0))
+    widths, inside = [], []
+    for _ in range(60):
+        truth = replace(drawn(rng), stage_resolution_rad=by_hand.stage_resolution_rad)
+        few = [RecordedPoses('few', swept(rng, truth, targets=poses))]
+        fits = [calibrate(by_hand, few, 'linear', population=prior).fitted
+                for prior in (None, population())]
+        stds = [np.sqrt(np.diag(fit.covariance)) for fit in fits]
+        widths.append(stds[1] / stds[0])
+        error = get(fits[1], NAMES) - get(truth, NAMES)
+        inside += (np.abs(error) < 1.645 * stds[1]).tolist()
+    assert np.mean(widths) < 0.6 and np.max(widths) < 1
+    assert abs(np.mean(inside) - 0.9) < 3 * np.sqrt(0.09 / len(inside)) + 0.03
+
+
+def test_an_open_axis_takes_the_population(run_tool, tmp_path):
+    """Poses about one axis do not determine the other one, unless a fleet does."""
+    truth = replace(drawn(np.random.default_rng(1)), serial='N1')
+    parameter_file.save(tmp_path / 'truth.yaml', truth)
+    population_file.write(tmp_path / 'population.yaml', population(), [])
+    run_tool('simulate', 'tilt_alpha', '--params', 'truth.yaml', '--rate', 100, '-o', 'one.csv')
+    done = run_tool('fit', 'one.csv', '-o', 'unit.yaml')
+    assert done.returncode == 1 and 'y: its reference spans 0.00 g' in done.stderr
+    done = run_tool('fit', 'one.csv', '--prior', 'population.yaml', '-o', 'unit.yaml')
+    assert done.returncode == 0, done.stderr
+    assert 'prior: population.yaml is the prior of 4 coefficients' in done.stdout
+    unit = parameter_file.load(tmp_path / 'unit.yaml')
+    std = dict(zip(unit.covariance_names, np.sqrt(np.diag(unit.covariance))))
+    assert std[NAMES[3]] == pytest.approx(1e-3, rel=0.01)
+    assert std[NAMES[2]] < 0.97e-3
+    assert np.all(np.abs(get(unit, NAMES) - get(truth, NAMES)) < 4 * STD)
+    assert unit.provenance['prior'] == 'population.yaml'
+
+
+def test_a_stranger_is_named_by_fit(run_tool, tmp_path):
+    """A wrong prior is said and not used: the fit is that without it, or is refused."""
+    truth = drawn(np.random.default_rng(2))
+    parameter_file.save(tmp_path / 'truth.yaml', truth)
+    population_file.write(tmp_path / 'wrong.yaml', population(0.1), [])
+    for name in ('tilt_alpha', 'sweep'):
+        run_tool('simulate', name, '--params', 'truth.yaml', '--rate', 50, '-o', f'{name}.csv')
+    done = run_tool('fit', 'tilt_alpha.csv', '--prior', 'wrong.yaml', '-o', 'a.yaml')
+    assert done.returncode == 1 and not (tmp_path / 'a.yaml').exists()
+    assert 'is not of wrong.yaml: χ²' in done.stderr and 'does not determine' in done.stderr
+    for arguments in (['--prior', 'wrong.yaml', '-o', 'a.yaml'], ['-o', 'b.yaml']):
+        done = run_tool('fit', 'sweep.csv', '--model', 'linear', *arguments)
+        assert done.returncode == 0, done.stderr
+        assert ('The prior is not' in done.stdout) == ('--prior' in arguments)
+    a, b = (parameter_file.load(tmp_path / f'{name}.yaml') for name in 'ab')
+    np.testing.assert_array_equal(get(a, NAMES), get(b, NAMES))
+
+
+def test_the_prior_of_a_diagnosis_is_narrower():
+    """The tolerance of zero-g and scale factor about a poor calibration shrinks to the fleet."""
+    poor = replace(drawn(np.random.default_rng(3)), covariance=np.diag(100 * STD ** 2),
+                   covariance_names=tuple(NAMES))
+    sensors = poor, posterior(poor, population()).sensor
+    models = [LinearModel([], [], [], [], [], np.zeros(0), [], [], [], [], {})
+              for _ in sensors]
+    wide, narrow = ([_tolerance(model, sensor, name) for name in NAMES]
+                    for model, sensor in zip(models, sensors))
+    assert np.all(np.array(narrow) < 0.2 * np.array(wide))
+
+
+def _tolerance(model, sensor, name):
+    """Return the tolerance of a coefficient about a baseline with a reference."""
+    class AtBaseline(LinearModel):
+        baseline, pose_known = sensor, True
+    return AtBaseline(**vars(model)).tolerance(name)
+
+
+@pytest.mark.long
+def test_diagnose_takes_a_population(run_tool, tmp_path):
+    """Without a prior a unit of the fleet has a bias; with it the unit is healthy."""
+    parameter_file.save(tmp_path / 'truth.yaml', drawn(np.random.default_rng(4)))
+    population_file.write(tmp_path / 'right.yaml', population(), [])
+    population_file.write(tmp_path / 'wrong.yaml', population(0.1), [])
+    done = run_tool('simulate', 'tilt_both', '--params', 'truth.yaml', '--rate', 50,
+                    '-o', 'run.csv')
+    assert done.returncode == 0, done.stderr
+    named = {}
+    for name in ('none', 'right', 'wrong'):
+        prior = [] if name == 'none' else ['--prior', f'{name}.yaml']
+        done = run_tool('diagnose', 'run.csv', *prior, '-o', name)
+        assert done.returncode == 0, done.stderr
+        report = json.loads((tmp_path / name / 'report.json').read_text())
+        named[name] = set(report['verdict']['effects'])
+        assert (f'prior: zero-g and scale factor are those of {name}.yaml' in ' '.join(
+            done.stdout.split())) == bool(prior)
+    assert 'bias' in named['none'] and 'bias' not in named['right']
+    assert 'bias' in named['wrong']
+
+
+def test_a_prior_that_is_none(run_tool, tmp_path):
+    (tmp_path / 'p.yaml').write_text('format: 9\n')
+    for tool in ('fit', 'diagnose'):
+        done = run_tool(tool, 'none.csv', '--prior', 'p.yaml', '-o', 'out')
+        assert done.returncode == 1
+        assert done.stderr.count('\n') == 1 and 'p.yaml: no population of format 1' in done.stderr
