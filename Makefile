@@ -1,9 +1,9 @@
 # make build    ROS 2 Jazzy (the sourced one, else its wheels in .venv) and the package in install/
 # make demo     the main job on a simulated sensor: a table, and plots in demo_output/
-# make check    linters, types and unit tests: what a change needs, in two minutes
-# make test     every test, in twelve minutes        (make test ARGS='-k fit')
+# make check    linters, types and unit tests: what a change needs, in four minutes
+# make test     every test, in 18 minutes        (make test ARGS='-k fit')
 # make perf     limits of processor time, for a quiet machine
-# make bench    rate, missing samples, latency and CPU of the live nodes
+# make bench    latency and CPU of the live nodes, and each job beside its rivals
 # make gallery  docs/effects.md and its plots, from the library of effects
 # make screenshots  docs/screenshots: terminals and pages from real runs, six minutes
 # make reproduction  docs/reproduction.md and its plots: the paper's experiments on simulated units
@@ -11,15 +11,16 @@
 # make faults   the links under every fault, as a table
 # make soak     half an hour of random faults, and 200 kills of a sweep
 # make fuzz     the decoder and the serial link, two minutes of hostile bytes
-# make long     an 8-hour recording through apply: memory and time
 # make noise    how often the intervals of noise hold the truth: docs/noise.md
+# make investigate  minutes to a verdict of `investigate` over 60 simulated units: docs/investigate.md, an hour
 # make nulls    recordings without any effect through diagnose: docs/nulls.md, 90 minutes
+# make fleet    10 000 recordings while workers, scheduler and client are killed: docs/fleet.md
 # make blind    the blind check of diagnose, 600 trials, into blind_output/ (make blind ARGS='--seed 1')
 # make working  working cases of diagnose, drawn, diagnosed and scored, into working_output/
 # make lint     the linters alone
 # make clean    remove what these made
 
-.PHONY: build help demo check test perf bench gallery screenshots reproduction coverage long faults soak fuzz noise nulls blind working lint clean \
+.PHONY: build help demo check test perf bench gallery screenshots reproduction coverage faults soak fuzz noise nulls investigate blind working lint clean \
     FORCE
 .DEFAULT_GOAL := build
 
@@ -84,9 +85,11 @@ help:
 	@sed -n 's/^# \(make .*\)/\1/p' Makefile
 
 # Made from nothing, so that a module that is gone from the sources is gone from install/.
+# Modules are compiled even where PYTHONDONTWRITEBYTECODE forbids it at the start of each tool.
 install/.built: .venv/.ready $(sources)
 	@rm -rf build install
 	@.venv/bin/python -m colcon build --paths .
+	@.venv/bin/python -m compileall -q install/adxl_ros/lib
 	@test -e install/adxl_ros/share/adxl_ros/hook/ament_prefix_path.sh || { echo 'make: colcon' \
 	    'did not build an ament package: does package.xml validate?' >&2; exit 1; }
 	@touch $@
@@ -103,8 +106,9 @@ pytest = cd test && OPENBLAS_NUM_THREADS=1 ../run --exec python -m pytest -q
 check: build
 	$(pytest) -n 2 --dist loadgroup -m 'not (live or long or perf)' $(ARGS)
 
+# A test of live nodes waits for half of its time: three share two cores.
 test: build
-	$(pytest) -n 2 --dist loadgroup -m 'not perf' $(ARGS)
+	$(pytest) -n 3 --dist loadgroup -m 'not perf' $(ARGS)
 
 perf: build
 	$(pytest) -m perf $(ARGS)
@@ -112,7 +116,10 @@ perf: build
 lint: build
 	$(pytest) project/test_linters.py project/test_layering.py project/test_language.py
 
+# Rivals that do not install are left out of the table.
 bench: build
+	-.venv/bin/python -m pip install --quiet --disable-pip-version-check \
+	    --requirement requirements/bench.txt
 	./run bench --iiod test/support/iiod.py $(ARGS)
 
 # Each of the next takes long: its table goes into docs/links.md, docs/guided.md or docs/recordings.md.
@@ -146,15 +153,19 @@ reproduction: build
 coverage: build
 	OPENBLAS_NUM_THREADS=1 ./run reproduce --units 0 --draws 300 -o coverage_output $(ARGS)
 
-# Its executables are found as `ros2 run` finds them.
-long: export PATH := $(CURDIR)/install/adxl_ros/lib/adxl_ros:$(PATH)
-long: build
-	$(python_in_test) long/long_recording.py $(ARGS)
+# Goes on where it was cut short.
+investigate: build
+	OPENBLAS_NUM_THREADS=1; export OPENBLAS_NUM_THREADS; \
+	$(python_in_test) long/investigate_units.py -o ../investigate_units.jsonl $(ARGS)
 
 # Goes on where it was cut short.
 nulls: build
 	OPENBLAS_NUM_THREADS=1; export OPENBLAS_NUM_THREADS; \
 	$(python_in_test) long/nulls.py ../docs/nulls.md $(ARGS)
+
+fleet: build
+	OPENBLAS_NUM_THREADS=1; export OPENBLAS_NUM_THREADS; \
+	$(python_in_test) long/fleet_kills.py $(ARGS)
 
 # Goes on where it was cut short; with a seed of its own in ARGS, into another folder.
 blind: build

@@ -27,6 +27,7 @@ from adxl_ros.model.effects.base import Coefficient, Effect, Need, Place
 from adxl_ros.model.sensor import Sensor, with_axes
 from adxl_ros.simulate.motion import Held, Knots, Motion
 from adxl_ros.simulate.simulator import Columns, simulate
+from adxl_ros.simulate.smoothed_paths import ForcePath
 from adxl_ros.simulate.trajectories import Steps, SweptSine
 import matplotlib
 
@@ -148,6 +149,10 @@ CYCLE = replace(WARM, temperature_c=Knots([0, 600, 1200], [5.0, 65.0, 5.0],
 SUPPLY = replace(REST, duration_s=60.0, supply_v=Steps(5.0, ((15, 4.8), (30, 5.2), (45, 5.0)), 1))
 TILTING = Scene(Motion(18.0, turning(0.0).beta, Held(np.radians(30))), 'alpha_rad',
                 'alpha at beta = 30°, deg', 180 / np.pi)
+CARRIED_S = np.arange(0.0, 4.0, 0.01)
+CARRIED = Motion(4.0, force=ForcePath(CARRIED_S, 9.80665 * np.column_stack([
+    0.2 * np.sin(2 * CARRIED_S) + 0.05 * np.sin(25 * CARRIED_S),
+    0.3 * np.sin(3 * CARRIED_S) + 0.02 * np.sin(50 * CARRIED_S), np.ones(len(CARRIED_S))])))
 OVER_TIME = Scene(REST, noisy=True, axes='x')
 SCENES = {
     'misalignment': plane(90), 'cross_axis_z': TILTING, 'scale_factor_z': plane(30),
@@ -159,7 +164,8 @@ SCENES = {
     'vibration_rectification': Scene(SHAKE, axes='x'), 'temperature_bias': Scene(WARM),
     'temperature_scale': Scene(WARM), 'warm_up': Scene(WARM), 'thermal_lag': Scene(WARM),
     'thermal_hysteresis': Scene(CYCLE, 'temperature_c', 'temperature, °C'),
-    'supply': Scene(SUPPLY),
+    'supply': Scene(SUPPLY), 'reference_filter': Scene(CARRIED),
+    'reference_delay': Scene(CARRIED), 'reference_frame': Scene(CARRIED),
     'bias_walk': Scene(replace(REST, duration_s=1200.0)), 'spikes': replace(
         OVER_TIME, motion=replace(REST, duration_s=20.0)),
     'stuck': Scene(replace(SWING, duration_s=6.0), noisy=True, axes='x'),
@@ -192,7 +198,8 @@ def main(output: Path) -> None:
     (output / 'effects.md').write_text('\n'.join(lines), encoding='utf-8')
 
 
-TITLES = {Place.STAGE: 'Stage', Place.FORCE: 'Specific force', Place.MOUNTING: 'Mounting',
+TITLES = {Place.REFERENCE: 'Reference', Place.STAGE: 'Stage',
+          Place.FORCE: 'Specific force', Place.MOUNTING: 'Mounting',
           Place.ELEMENT: 'Sensing element', Place.ELECTRONICS: 'Electronics and RC filter',
           Place.ADC: 'Input of the ADC', Place.CODE: 'Codes and link', Place.CLOCK: 'Clock'}
 

@@ -174,6 +174,19 @@ def calibration_screen(folder: Path, picture: Path) -> None:
             terminal.close()
 
 
+def record_fleet(folder: Path) -> None:
+    """Simulate four sweeps of each of eight units, one of which drifts; write a manifest."""
+    lines = ['url,serial,date']
+    for unit in range(8):
+        for month in range(4):
+            offset_v = 0.02 * (unit * 0.61 % 1 - 0.5) + 0.004 * month * (unit == 2)
+            name = f'R{unit:02d}_{month}.csv'
+            run(['simulate', 'sweep', '--rate', '25', '--effect', f'bias:offset_v={offset_v:.4f}',
+                 '--seed', str(10 * unit + month), '-o', name], folder)
+            lines.append(f'{name},R{unit:02d},2026-{2 * month + 1:02d}-{unit + 1:02d}')
+    (folder / 'manifest.csv').write_text('\n'.join(lines) + '\n')
+
+
 def page(report: Path, picture: Path) -> None:
     """Write the first screen of a page as a picture."""
     from playwright.sync_api import sync_playwright
@@ -197,7 +210,7 @@ def main() -> None:
     target = Path(docs) / 'screenshots'
     target.mkdir(exist_ok=True)
     target = target.resolve()
-    wanted = set(names) or {'demo', 'diagnose', 'calibration'}
+    wanted = set(names) or {'demo', 'diagnose', 'calibration', 'fleet'}
     folder = Path(tempfile.mkdtemp())
     try:
         if 'diagnose' in wanted:
@@ -207,6 +220,10 @@ def main() -> None:
             page(folder / 'gap' / 'report.html', target / 'diagnose_page.png')
         if 'calibration' in wanted:
             calibration_screen(folder, target / 'calibration.svg')
+        if 'fleet' in wanted:
+            record_fleet(folder)
+            run(['fleet', 'manifest.csv', '--do', 'check,fit', '-o', 'results'], folder)
+            page(folder / 'results' / 'fleet.html', target / 'fleet_page.png')
         if 'demo' in wanted:
             run(['demo'], folder, target / 'demo.svg')
             page(folder / 'demo_output' / 'sweep' / 'report.html',
