@@ -37,7 +37,11 @@ from adxl_ros.diagnose.hypothesis_fit import Hypothesis, residual_channels
 from adxl_ros.diagnose.input_checks import compare_checked
 from adxl_ros.diagnose.linear_model import build_linear_model, LinearModel
 from adxl_ros.diagnose.model_search import refit, search
-from adxl_ros.diagnose.next_experiment import NextExperiment, propose_next_experiment, Samples
+from adxl_ros.diagnose.next_experiment import (
+    NextExperiment,
+    propose_next_experiment,
+    RecordedEvidence,
+)
 from adxl_ros.diagnose.noise_comparison import compare_noise, NoiseComparison
 from adxl_ros.diagnose.noise_detectors import Detection, NoiseSamples, UNKNOWN
 from adxl_ros.diagnose.noise_floor import NoiseFloor
@@ -381,7 +385,7 @@ def _with_report(checked: Sequence[CheckedRecording], linear_model: LinearModel,
         residual_cells=tuple(residual_map(comparisons[0], checked[0].comparison,
                                           floor.rms_mps2, seed)),
         not_covered=tuple(lacking),
-        next_experiment=propose_next_experiment(verdict, lacking, Samples(
+        next_experiment=propose_next_experiment(verdict, lacking, RecordedEvidence(
             sensor, linear_model, SETTINGS.evidence_factor, seed)),
         contributions_mps2=contributions_mps2,
         not_determined=not_determined(linear_model, hypotheses),

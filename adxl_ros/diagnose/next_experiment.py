@@ -118,7 +118,7 @@ class MenuManoeuvre:
 
 
 @dataclass(frozen=True)
-class Samples:
+class RecordedEvidence:
     """
     What recordings are compared with, and what they show.
 
@@ -127,7 +127,7 @@ class Samples:
     sensor
         The baseline.
     linear_model
-        Linear model of the recordings; None without any.
+        Linear model of the recordings.
     evidence_factor
         Factor by which their evidence is tempered.
     seed
@@ -136,15 +136,14 @@ class Samples:
     """
 
     sensor: Sensor
-    linear_model: LinearModel | None
+    linear_model: LinearModel
     evidence_factor: float
     seed: int
 
     @property
     def beside_simulator(self) -> bool:
         """Return whether the motion is that of another simulator, without a stage."""
-        return self.linear_model is not None and all(
-            c.reference is Reference.SIMULATOR for c in self.linear_model.comparisons)
+        return all(c.reference is Reference.SIMULATOR for c in self.linear_model.comparisons)
 
 
 class MenuWorth(NamedTuple):
@@ -201,8 +200,8 @@ class NextExperiment:
     beside_simulator: bool = False
 
 
-def propose_next_experiment(verdict: Verdict, not_covered: Sequence[str], samples: Samples
-                            ) -> NextExperiment | None:
+def propose_next_experiment(verdict: Verdict, not_covered: Sequence[str],
+                            evidence: RecordedEvidence) -> NextExperiment | None:
     """
     Propose the manoeuvre that separates most of what is not separated.
 
@@ -212,7 +211,7 @@ def propose_next_experiment(verdict: Verdict, not_covered: Sequence[str], sample
         The verdict with its groups.
     not_covered
         What the recordings do not cover, for people.
-    samples
+    evidence
         What the recordings are compared with, and what they show.
 
     Returns
@@ -234,7 +233,7 @@ def propose_next_experiment(verdict: Verdict, not_covered: Sequence[str], sample
             'because it lacks motion that the sensor has', _OTHER_REFERENCE,
             concerns_reference=True)
     if verdict.groups:
-        return _separating_experiment(verdict, samples)
+        return _separating_experiment(verdict, evidence)
     if verdict.status == 'no_gap' and not not_covered:
         return None
     if verdict.status == 'unknown':
@@ -244,7 +243,7 @@ def propose_next_experiment(verdict: Verdict, not_covered: Sequence[str], sample
     else:
         why = 'to confirm the verdict on another recording'
     return _experiment(_revealing_manoeuvre(verdict, bool(not_covered)), why,
-                       samples.beside_simulator)
+                       evidence.beside_simulator)
 
 
 def _give_same_samples(group: Sequence[str]) -> bool:
@@ -252,21 +251,21 @@ def _give_same_samples(group: Sequence[str]) -> bool:
     return any(effect_named(effect).diagnosis.imitated_by in group for effect in group)
 
 
-def _separating_experiment(verdict: Verdict, samples: Samples) -> NextExperiment:
+def _separating_experiment(verdict: Verdict, evidence: RecordedEvidence) -> NextExperiment:
     """Rank the whole menu by its expected information; propose the best manoeuvre."""
     hypotheses = leading(verdict.described)
     effects = sorted({effect for h in hypotheses for effect in h.effects})
     dimensions = unknown_dimensions(verdict)
     responses = []
-    for planned in _menu(samples.seed):
+    for planned in _menu(evidence.seed):
         # At rest the pose is unknown, so that a baseline with effects of the stage has no place.
         with suppress(UserError):
             responses.append(predict(
-                planned, _as_mounted(samples.sensor, planned.manoeuvre), effects, dimensions))
+                planned, _as_mounted(evidence.sensor, planned.manoeuvre), effects, dimensions))
     of_text = {described.text: manoeuvre for manoeuvre, described in MENU.items()}
     ranked = [(worth, of_text[worth.manoeuvre.name]) for worth in rank_responses(
-        responses, hypotheses, samples.linear_model, dimensions, samples.evidence_factor)]
-    group, has_no_stage = verdict.groups[0], samples.beside_simulator
+        responses, hypotheses, evidence.linear_model, dimensions, evidence.evidence_factor)]
+    group, has_no_stage = verdict.groups[0], evidence.beside_simulator
     why = f'to separate {", ".join(group[:-1])} and {group[-1]}'
     menu = tuple(MenuWorth(_text(manoeuvre, has_no_stage), float(worth.manoeuvre.minutes),
                            float(worth.per_minute)) for worth, manoeuvre in ranked)

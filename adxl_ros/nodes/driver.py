@@ -66,9 +66,10 @@ class Driver(LifecycleNode):
         self._link = declare_link(self, self._sensor.serial)
         settings = self._link.settings
         has_frame = isinstance(settings, base.SimulatorSettings) and not settings.turns_case
+        frame_id = '' if has_frame else _FRAME
         self._frame_id = declare(
-            self, 'frame_id', '' if has_frame else _FRAME, "frame of the case; '': that of the "
-            "simulator's samples") or ('' if has_frame else _FRAME)
+            self, 'frame_id', frame_id, "frame of the case; '': that of the simulator's samples"
+            ) or frame_id
         autostart = declare(
             self, 'autostart', True, 'configure and activate at the start; else a system manager '
             'does')

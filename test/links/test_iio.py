@@ -23,7 +23,7 @@ from adxl_ros.links.support import iio_stream
 from adxl_ros.links.support.base import Level
 import iiod
 import numpy as np
-from processes import in_real_time
+from processes import REPEATED
 import pytest
 from rig import ScriptProcess
 from units import nominal
@@ -170,7 +170,7 @@ def test_a_misfit_is_reported_and_no_value_invented(served, adc, settings, reaso
     assert reason in status.text, status.text
 
 
-@in_real_time
+@REPEATED
 def test_a_buffer_is_as_long_as_the_latency(served):
     durations_ms = []
     for latency_ms in (2.0, 100.0):
@@ -182,7 +182,7 @@ def test_a_buffer_is_as_long_as_the_latency(served):
     assert 2.0 <= durations_ms[0] < 100.0 <= durations_ms[1]
 
 
-@in_real_time
+@REPEATED
 def test_a_device_far_away_has_longer_buffers_and_loses_nothing(served):
     """With 8 ms for each answer, buffers of 2 ms would lose three of four samples."""
     _, link = served(adc={'answer_s': 0.008}, latency_ms=2.0)
@@ -191,7 +191,7 @@ def test_a_device_far_away_has_longer_buffers_and_loses_nothing(served):
     assert sum(part.missing for part in parts) == 0
 
 
-@in_real_time
+@REPEATED
 def test_short_buffers_outlast_a_pause_of_the_reader(served):
     _, link = served(latency_ms=0.0)
     parts = read_samples(link, 100)

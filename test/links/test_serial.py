@@ -33,7 +33,7 @@ from adxl_ros.links.support.wire_format import (
     Splitter,
 )
 import numpy as np
-from processes import in_real_time
+from processes import REPEATED
 import pytest
 from units import nominal
 
@@ -328,7 +328,7 @@ def test_another_version_of_the_format_is_reported(connect):
     assert board.link.status().text == 'streaming'
 
 
-@in_real_time
+@REPEATED
 def test_silence_and_bytes_without_a_frame_are_distinguished(connect):
     board = connect()
     board.send_info()
@@ -365,7 +365,7 @@ def test_frames_far_above_the_stated_rate_wait(connect):
     assert (np.diff(stamps_of(parts)) > 0).all()
 
 
-@in_real_time
+@REPEATED
 def test_a_port_comes_back_and_the_count_goes_on(connect):
     board = connect()
     board.send_info()

@@ -149,5 +149,7 @@ def test_a_simulator_of_another_clock_is_reported(start) -> None:
         simulator = Simulator(graph)
         samples = graph.listen(Imu, 'imu/data_raw')
         driver = start('driver', '--ros-args', '-p', 'link.type:=topic')
-        simulator.run_until(lambda: len(samples) > 10, 'samples')
+        simulator.run_until(lambda: 'set use_sim_time:=true' in driver.output(), 'the warning')
+        count = len(samples)
+        simulator.run_until(lambda: len(samples) > count + 100, 'samples')
     assert driver.output().count('set use_sim_time:=true') == 1

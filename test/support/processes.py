@@ -19,7 +19,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import wraps
 import os
 from pathlib import Path
 import signal
@@ -34,16 +33,8 @@ REPO = Path(__file__).resolve().parents[2]
 PATIENCE = 5
 """How many times longer than on a quiet machine any action may take on a busy one."""
 
-
-def in_real_time(test: Callable[..., None]) -> Callable[..., None]:
-    """Repeat a test that fails, twice: a busy machine may have held up one of its processes."""
-    @wraps(test)
-    def repeated(**fixtures: object) -> None:
-        for _ in range(2):
-            with suppress(AssertionError):
-                return test(**fixtures)
-        return test(**fixtures)
-    return repeated
+REPEATED = pytest.mark.flaky(reruns=2)
+"""For a test in real time that a busy machine may hold up: it may fail twice."""
 
 
 def wait_until(condition: Callable[[], object], timeout_s: float, purpose: str) -> None:

@@ -20,6 +20,7 @@ import time
 
 from adxl_ros.files import cdr
 from adxl_ros.links.support.base import ImuLink
+from adxl_ros.links.support.watchdog import Watchdog
 from adxl_ros.nodes.support.receive_thread import ReceiveTurn
 from adxl_ros.nodes.support.topics import create_subscription
 import numpy as np
@@ -37,10 +38,11 @@ which costs as much as ten samples."""
 _FOREIGN_NS = 60_000_000_000
 """Largest distance of stamps from the clock of the node, ns; chosen: a larger one is another
 clock."""
-
-_CLOCK_WAIT_S = 3.0
-"""Time for which samples may come before the first message of /clock, s; chosen: nodes find each
-other within it."""
+_CLOCK_WAIT_S = 5.0
+"""Time for which samples may be of another clock before a warning, s; chosen: nodes find each other
+within it, and a reset of the simulator reaches samples and /clock."""
+_LONGEST_TURN_S = 0.25
+"""Longest time that counts from one look at the samples to the next, s."""
 
 
 class SimulatorInput:
@@ -65,7 +67,7 @@ class SimulatorInput:
         self._node, self._link = node, link
         self._raw: list[bytes] = []
         self.frame_id = ''
-        self._begun_s: float | None = None
+        self._foreign = Watchdog(_LONGEST_TURN_S)
         self._is_warned = False
         self._due_s = time.monotonic()
         self._turn = ReceiveTurn(node, Imu, link.imu_topic, self._raw.append, _QUEUE)
@@ -102,13 +104,11 @@ class SimulatorInput:
         self._link.sense_imu(stamps_ns, fields)
 
     def _warn_of_clock(self, stamp_ns: int) -> None:
-        """Warn once of samples that belong to another clock than the node's."""
-        now_ns, now_s = self._node.get_clock().now().nanoseconds, time.monotonic()
-        self._begun_s = self._begun_s or now_s
-        if not now_ns and now_s - self._begun_s < _CLOCK_WAIT_S:
-            return
-        away_ns = now_ns - stamp_ns
-        if not self._is_warned and abs(away_ns) > _FOREIGN_NS:
+        """Warn once of samples that belong to another clock than the node's and go on to."""
+        away_ns = self._node.get_clock().now().nanoseconds - stamp_ns
+        if abs(away_ns) <= _FOREIGN_NS:
+            self._foreign.feed()
+        if self._foreign.check() > _CLOCK_WAIT_S and not self._is_warned:
             self._is_warned = True
             self._node.get_logger().warning(
                 f'{self._link.imu_topic}: stamps are {away_ns * 1e-9:+.0f} s from the clock of '

@@ -48,6 +48,16 @@ def folders(tmp_path_factory):
     return made
 
 
+def page_without(column, fleet, folder):
+    """Return the text of the page of a fleet whose table lacks the values of a column."""
+    path = fleet.write(folder)
+    table = pq.read_table(path)
+    pq.write_table(pa.Table.from_pylist(
+        [row | {column: None} for row in table.to_pylist()], table.schema), path)
+    report_html.write(folder)
+    return (folder / 'fleet.html').read_text()
+
+
 @pytest.fixture
 def page(opened, folders):
     """Return the page of the bad fleet, drawn."""
@@ -129,24 +139,15 @@ def test_a_single_unit_that_drifts_is_singular(folders):
 
 def test_a_drift_without_gaps_leaves_the_tolerance(tmp_path):
     """A fleet that is only fitted has no gap; its drift since the calibration counts."""
-    path = MadeUpFleet(units=8, per_unit=12, drifting_mg=25.0).write(tmp_path)
-    table = pq.read_table(path)
-    pq.write_table(pa.Table.from_pylist(
-        [row | {'gap_before_mps2': None} for row in table.to_pylist()], table.schema), path)
-    report_html.write(tmp_path)
-    text = (tmp_path / 'fleet.html').read_text()
+    fleet = MadeUpFleet(units=8, per_unit=12, drifting_mg=25.0)
+    text = page_without('gap_before_mps2', fleet, tmp_path)
     assert '1 OF 8 OUT OF TOLERANCE' in text
     assert 'mg since its calibration; the tolerance is 3.5 mg.' in text
     assert 'in 0 days' not in text
 
 
 def test_recordings_without_a_serial_number_are_listed(tmp_path):
-    path = MadeUpFleet(units=1, per_unit=6, refused=0.5).write(tmp_path)
-    table = pq.read_table(path)
-    pq.write_table(pa.Table.from_pylist(
-        [row | {'serial': None} for row in table.to_pylist()], table.schema), path)
-    report_html.write(tmp_path)
-    text = (tmp_path / 'fleet.html').read_text()
+    text = page_without('serial', MadeUpFleet(units=1, per_unit=6, refused=0.5), tmp_path)
     assert 'NO UNITS' in text and 'Units by urgency' not in text
     listed = text[text.index('Recordings without a unit'):text.index('role="tablist"')]
     assert listed.count('data-label="recording"') == 6
