@@ -39,8 +39,8 @@ _FOREIGN_NS = 60_000_000_000
 """Largest distance of stamps from the clock of the node, ns; chosen: a larger one is another
 clock."""
 _CLOCK_WAIT_S = 5.0
-"""Time for which samples may be of another clock before a warning, s; chosen: nodes find each other
-within it, and a reset of the simulator reaches samples and /clock."""
+"""Time for which samples may be of another clock before a warning, s; chosen: within it nodes find
+each other, and a reset of the simulator reaches samples and /clock."""
 _LONGEST_TURN_S = 0.25
 """Longest time that counts from one look at the samples to the next, s."""
 
