@@ -36,6 +36,7 @@ from adxl_ros.files.bag_topics import (
     typestore,
 )
 from adxl_ros.files.mcap_chunks import Batch, write_messages
+from adxl_ros.files.page_cache import release_written
 from adxl_ros.files.recording_columns import COMMANDS, JOINTS, Recording
 from adxl_ros.files.stream_info import converted_info
 from adxl_ros.model.constants import G0_MPS2
@@ -148,6 +149,7 @@ class OpenBag:
 
         """
         write_messages(self._writer, stamp_ns, batches)
+        release_written(self._writer.storage.bio)
 
 
 class BagWriter(OpenBag):

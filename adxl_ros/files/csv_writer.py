@@ -24,6 +24,7 @@ from typing import BinaryIO
 
 from adxl_ros.files.atomic_write import atomic_path
 from adxl_ros.files.csv_text import exact_rows, rounded_rows
+from adxl_ros.files.page_cache import release_written
 from adxl_ros.files.recording_columns import Recording, TIME
 import numpy as np
 
@@ -92,6 +93,7 @@ class CsvWriter:
             part = [array[start:start + rows] for array in arrays]
             self._file.write(exact_rows(part) if self._digits is None else
                              rounded_rows(part, self._digits))
+        release_written(self._file)
 
 
 def recording_info(recording: Recording) -> dict[str, str]:
