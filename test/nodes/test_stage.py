@@ -120,6 +120,9 @@ def test_the_simulated_sensor_senses_the_true_angles(start, speed):
         del samples[:]
         graph.go(alpha=0.8, beta=-0.5)
         graph.go(alpha=1.5, beta=0.7)
+        arrival_ns = stamp_ns(graph.states[-1])
+        graph.spin_until(lambda: imu_table(samples[-1:])[0][0] >= arrival_ns, 20,
+                         'the samples of the arrival')
         assert graph.value('driver', 'missing') == '0'
     stamps, measured = imu_table(samples)
     assert (np.diff(stamps) == 1_000_000).all()

@@ -48,11 +48,11 @@ def deadly(number, fatal, faulty):
 def long_with_file(folder):
     """Keep a file for the time of a long task."""
     path = Path(folder) / str(os.getpid())
-    path.write_text('')
     try:
+        path.write_text('')
         time.sleep(600)
     finally:
-        path.unlink()
+        path.unlink(missing_ok=True)
 
 
 def half_sent(number):
