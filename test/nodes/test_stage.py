@@ -138,7 +138,7 @@ def test_the_simulated_sensor_senses_the_true_angles(start, speed):
 
 @pytest.mark.kills
 def test_sensor_time_continues_without_the_stage_and_waits_for_it_again(start):
-    start('driver', *SIM_TIME, '-p', 'link.type:=sim', '-p', 'link.speed:=5.0', *IDEAL)
+    start('driver', *SIM_TIME, '-p', 'link.type:=sim', '-p', 'link.speed:=2.0', *IDEAL)
     with Commander() as graph:
         samples = graph.listen(Imu, 'imu/data_raw', raw=True)
         clock = graph.listen(Clock, '/clock')
