@@ -107,6 +107,7 @@ def fleet(options: argparse.Namespace) -> int:
     folder = Path(options.output)
     results = Results(folder)
     to_do = plan(sources, recipe, results, selection)
+    _warn_of_replaced(to_do, results, tasks)
     if options.dry_run:
         print_end(_plan_lines(to_do, len(sources)), [], _command(options, options.only_failed))
         return 0
@@ -142,6 +143,19 @@ def _check(options: argparse.Namespace) -> None:
         import pyarrow  # noqa: F401
     except ImportError as error:
         raise UserError(f'{PROG} needs {error.name}; {install_hint(str(error.name))}') from None
+
+
+def _warn_of_replaced(to_do: Plan, results: Results, tasks: Sequence[str]) -> None:
+    """Warn where rows of other tasks leave table and page, as a recording has one row there."""
+    before = [results.newest[source.url].tasks for source in to_do.todo
+              if source.url in results.newest]
+    missing = [name for name in TASKS
+               if name not in tasks and any(name in earlier for earlier in before)]
+    if missing:
+        together = ','.join(name for name in TASKS if name in {*tasks, *missing})
+        count = sum(not set(missing).isdisjoint(earlier) for earlier in before)
+        note(f'{PROG}: {counted(count, "recording")} will lose {" and ".join(missing)} in table '
+             f'and page; --do {together} keeps them, or name another folder')
 
 
 def _written(folder: Path, results: Results) -> list[Path]:
