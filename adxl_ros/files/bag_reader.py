@@ -34,7 +34,7 @@ from adxl_ros.files.recording_columns import (
     LIMIT,
     Recording,
 )
-from adxl_ros.files.reference_alignment import Command, seconds, Track
+from adxl_ros.files.reference_alignment import Command, LONGEST_MOVE_NS, seconds, Track
 from adxl_ros.files.stamp_bursts import describe_bursts
 from adxl_ros.model.constants import AXES, MEASURED_AXES
 import numpy as np
@@ -316,7 +316,8 @@ def _tracks(bag: Bag, topics: Topics) -> dict[str, Track]:
     """Return a track for each reference column that the bag can fill."""
     columns: dict[str, str | None] = dict.fromkeys(JOINTS.values(), topics.joints)
     columns.update(temperature_c=topics.temperature, supply_v=topics.supply)
-    return {column: Track(f'{bag.path}: topic {topic}')
+    return {column: Track(f'{bag.path}: topic {topic}',
+                          LONGEST_MOVE_NS if topic == topics.joints else np.inf)
             for column, topic in columns.items() if topic}
 
 

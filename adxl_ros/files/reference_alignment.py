@@ -20,6 +20,15 @@ from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import Alignment
 import numpy as np
 
+LONGEST_MOVE_NS = 1e8
+"""Longest time between two messages in which a joint moves, ns, that is interpolated. Chosen: as
+`diagnose` bridges empty cells."""
+_USUAL_GAPS = 3.0
+"""Gap between messages, in usual ones, that is bridged, however long. Chosen: a slow reference
+loses single messages."""
+_LEARNT_STEPS = 1000
+"""Steps between messages whose median is the usual one. Chosen: enough for a median."""
+
 
 def seconds(stamp_ns: int) -> str:
     """Return a stamp, ns, as text in seconds with all nanoseconds."""
@@ -33,7 +42,8 @@ class Track:
 
     Between two messages the value is on the straight line between theirs; angles are not
     wrapped. Before the first and after the last message their value is held for one period of the
-    reference; beyond that the reference is NaN.
+    reference; beyond that the reference is NaN. So it is in a long gap over which it has changed:
+    nobody knows how.
 
     Attributes
     ----------
@@ -43,10 +53,22 @@ class Track:
 
     """
 
-    def __init__(self, where: str) -> None:
-        """Start with no message; `where` names the topic in error messages."""
+    def __init__(self, where: str, longest_ns: float = np.inf) -> None:
+        """
+        Start with no message.
+
+        Parameters
+        ----------
+        where
+            Names the topic in error messages.
+        longest_ns
+            Longest gap between two messages that is bridged although the value changes, ns. Three
+            usual ones are bridged in any case.
+
+        """
         self.known_until_ns = -1
-        self._where = where
+        self._where, self._longest_ns = where, longest_ns
+        self._steps_ns = np.zeros(0, np.int64)
         self._message_count = 0
         self._stamp_ns = np.zeros(0, np.int64)
         self._value = np.zeros(0)
@@ -86,6 +108,9 @@ class Track:
             i = int((step < 0).argmax())
             raise UserError(f'{self._where}: time runs backwards: {seconds(stamps[i + 1])} comes '
                             f'after {seconds(stamps[i])}')
+        new = max(len(self._stamp_ns) - 1, 0)
+        self._steps_ns = np.concatenate([self._steps_ns, step[new:][step[new:] > 0]])[
+            :_LEARNT_STEPS]
         is_last = np.append(step > 0, True)[:len(stamps)]
         self._stamp_ns, self._value = stamps[is_last], values[is_last]
         if len(self._stamp_ns) > 1:
@@ -112,10 +137,20 @@ class Track:
         value = np.interp(sample_ns, message_ns, self._value)
         is_known = ((sample_ns >= -self._period_ns)
                     & (sample_ns <= message_ns[-1] + self._period_ns))
-        value[~is_known] = np.nan
+        value[~is_known | self._in_long_gap(sample_ns, message_ns)] = np.nan
         if is_known.any():
             self._gap_ns = max(self._gap_ns, _largest_gap_ns(sample_ns[is_known], message_ns))
         return value
+
+    def _in_long_gap(self, sample_ns: np.ndarray, message_ns: np.ndarray) -> np.ndarray:
+        """Return which samples, ns, (n,), lie in a gap that no line bridges, (n,)."""
+        if len(message_ns) < 2:
+            return np.zeros(len(sample_ns), bool)
+        limit_ns = max(self._longest_ns, _USUAL_GAPS * float(np.median(self._steps_ns)))
+        is_long = (np.diff(message_ns) > limit_ns) & (np.diff(self._value) != 0)
+        after = np.searchsorted(message_ns, sample_ns).clip(max=len(message_ns) - 1)
+        inside = (sample_ns > message_ns[0]) & (sample_ns < message_ns[after])
+        return inside & is_long[np.maximum(after - 1, 0)]
 
     def forget(self, stamp_ns: int) -> None:
         """Drop the messages that no sample from `stamp_ns` on needs."""

@@ -20,7 +20,7 @@ from collections import deque
 from dataclasses import dataclass, replace
 
 from adxl_ros.files.recording_columns import ACCEL, JOINTS, Recording
-from adxl_ros.files.reference_alignment import Track
+from adxl_ros.files.reference_alignment import LONGEST_MOVE_NS, Track
 from adxl_ros.files.stream_info import sensor_info
 from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2
@@ -314,7 +314,7 @@ class LiveGap:
         if self.reference.kind is ReferenceKind.STAGE:
             at_ns, readings = self.reference.readings.between(*around)
             for name, values in zip(JOINTS.values(), readings.T):
-                columns[name] = _aligned(at_ns, values, stamps_ns)
+                columns[name] = _aligned(at_ns, values, stamps_ns, LONGEST_MOVE_NS)
         for name, buffer in self.reference.surroundings.items():
             at_ns, readings = buffer.between(*around)
             if len(at_ns) > 1:
@@ -471,8 +471,9 @@ def _rms_interval(squares: np.ndarray) -> Interval:
     return Interval(float(value), float(low), float(high))
 
 
-def _aligned(at_ns: np.ndarray, values: np.ndarray, stamps_ns: np.ndarray) -> np.ndarray:
+def _aligned(at_ns: np.ndarray, values: np.ndarray, stamps_ns: np.ndarray,
+             longest_ns: float = np.inf) -> np.ndarray:
     """Return readings, (k,), at the stamps of samples, ns, (n,); NaN where they are unknown."""
-    track = Track('the reference')
+    track = Track('the reference', longest_ns)
     track.add(at_ns, values)
     return track.interpolate(stamps_ns)

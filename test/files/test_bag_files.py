@@ -240,6 +240,27 @@ def test_references_at_another_rate_are_interpolated(tmp_path: Path) -> None:
         assert blocks[-1].done == 1.0
 
 
+def test_a_move_in_a_gap_of_the_messages_is_unknown(tmp_path: Path) -> None:
+    """A line over half a second is not the motion. A joint at rest and a short gap are bridged."""
+    times = np.array(stamps(4000))
+    s = (times - times[0]) * 1e-9
+    assert s[-1] > 3
+    kept = np.arange(len(times)) % 10 == 0
+    lost, short = (s > 1.0) & (s < 1.5), (s > 2.0) & (s < 2.08)
+    messages = [imu(int(t)) for t in times]
+    messages += [joints(int(t), alpha=1.0, beta=float(np.sin(2 * np.pi * at)))
+                 for t, at in zip(times[kept & ~lost & ~short], s[kept & ~lost & ~short])]
+    path = bags.bag_of(tmp_path / 'run', sorted(messages, key=lambda sent: sent.stamp_ns))
+    got = recording.read(path)
+    unknown = np.isnan(got.columns['beta_rad'])
+    assert unknown[(s > 1.02) & (s < 1.48)].all()
+    assert not unknown[(s < 0.98) | (s > 1.52) & (s < 2.9)].any()
+    assert (got.columns['alpha_rad'][s < 2.9] == 1.0).all()
+    for rows in (100, 1000):
+        parts = [b.columns['beta_rad'] for b in recording.blocks(path, rows)]
+        assert np.array_equal(np.concatenate(parts), got.columns['beta_rad'], equal_nan=True)
+
+
 def test_a_command_is_in_force_until_the_next_one(tmp_path: Path) -> None:
     """Its stamp counts, or the time of its record without a stamp. No sample waits for it."""
     times = stamps(1000)
