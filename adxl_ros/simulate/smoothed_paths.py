@@ -98,6 +98,10 @@ _FINER = 0.03
 """Largest step of a finer reference, in stated steps; chosen: readings between which an encoder
 was interpolated have 0.08."""
 
+_READING_QUANTILE = 0.9
+"""Quantile of the distances between bends that is the distance of two readings. Chosen: a reading
+between two samples bends the line at both of them, so that half of the distances are 1."""
+
 _FIFTH_DIFFERENCE = 252.0
 """Variance of a fifth difference, divided by that of independent readings: 1² + 5² + 10² + …"""
 
@@ -293,7 +297,8 @@ def visible_step(reading: np.ndarray, step: float) -> float:
 
     An encoder changes by whole steps. Readings that do not, and whose noise is far below that of
     the steps, are those of a finer reference. The noise is taken from fifth differences, because
-    motion hardly shows in them.
+    motion hardly shows in them. Where lines connect the readings of a slow encoder, it is taken
+    at the distance of these readings: there is no noise on a line.
 
     Parameters
     ----------
@@ -316,12 +321,23 @@ def visible_step(reading: np.ndarray, step: float) -> float:
     by_steps = (np.abs(steps - np.rint(steps)) < _WHOLE) & (steps > 0.5)
     if by_steps.mean() > 0.5:
         return step
-    fifth = np.diff(reading, 5)
-    moving = fifth[changes[4:] > _SMALLEST_CHANGE * step]
-    finer = float(np.sqrt(12 * np.mean(moving ** 2) / _FIFTH_DIFFERENCE))
-    if finer > _FINER * step:
+    thinned = reading[::_samples_per_reading(reading, _SMALLEST_CHANGE * step)]
+    if _noise_step(thinned, _SMALLEST_CHANGE * step) > _FINER * step:
         return step
+    finer = _noise_step(reading, _SMALLEST_CHANGE * step)
     return finer if finer > _SMALLEST_CHANGE * step else 0.0
+
+
+def _noise_step(reading: np.ndarray, smallest: float) -> float:
+    """Return the encoder step that has as much noise as readings in motion, (n,), have."""
+    moving = np.diff(reading, 5)[np.abs(np.diff(reading))[4:] > smallest]
+    return float(np.sqrt(12 * np.mean(moving ** 2) / _FIFTH_DIFFERENCE)) if len(moving) else 0.0
+
+
+def _samples_per_reading(reading: np.ndarray, smallest: float) -> int:
+    """Return the usual distance of the samples at which lines through readings, (n,), bend."""
+    bends = np.flatnonzero(np.abs(np.diff(reading, 2)) > smallest)
+    return int(np.quantile(np.diff(bends), _READING_QUANTILE)) if len(bends) > 1 else 1
 
 
 def matched_strength(time_s: np.ndarray, reading: np.ndarray, step: float) -> float:

@@ -100,6 +100,17 @@ def test_a_joint_that_rests_for_most_of_the_time_is_followed():
     assert np.abs(path(time_s) - true).max() < STEP
 
 
+@pytest.mark.parametrize('offset', [0, 0.4])
+@pytest.mark.parametrize('samples', [5, 10, 40])
+def test_lines_between_the_readings_of_an_encoder_are_no_finer_reference(samples, offset):
+    """Samples at 1 kHz beside an encoder at 200, 100 or 25 Hz, at their stamps and between."""
+    time_s = np.arange(60_000) / 1000
+    read_s = (np.arange(0, 60_000, samples) + offset) / 1000
+    path = tumble(np.random.default_rng(3)).beta
+    lines = np.interp(time_s, read_s, np.rint(path(read_s) / STEP) * STEP)
+    assert visible_step(lines, STEP) == STEP
+
+
 @pytest.mark.parametrize('rate_hz', [100, 500])
 def test_a_reference_finer_than_the_stated_step_is_followed_exactly(rate_hz):
     """A finer reference counts as such, and an encoder does not, even where interpolated."""
