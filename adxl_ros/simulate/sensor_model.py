@@ -125,16 +125,17 @@ class SensorModel:
         Raises
         ------
         UserError
-            The shape or the time step is wrong, or changes, or the force is not finite.
+            The shape or the time step is wrong, or changes, or a value is not finite.
 
         """
         force = np.asarray(specific_force, float)
         self._check(force, dt)
-        rows = self._delayed(force.reshape(-1, 3))
-        count = len(rows)
+        count = force.size // 3
         # Time is the first axis of the components, as in a recording; sensors are the second.
-        now = Environment(*(np.broadcast_to(np.asarray(values, float), (1, count)) for values in (
-            self._steps * self._dt_s, temperature, supply)))
+        now = Environment(*(_of_each(name, values, count) for name, values in (
+            ('time', self._steps * self._dt_s), ('temperature', temperature),
+            ('supply', supply))))
+        rows = self._delayed(force.reshape(-1, 3))
         volts = self._digital_v(self._analog(now, [rows[None, :, c] for c in range(3)]))
         self._steps += 1
         readings = np.zeros((count, 3))
@@ -227,6 +228,16 @@ class SensorModel:
         self._noise = drawn if self._noise is None else \
             decay * self._noise + np.sqrt(1 - decay ** 2) * drawn
         return self._noise * self._std_v
+
+
+def _of_each(name: str, values: float | np.ndarray, count: int) -> np.ndarray:
+    """Return a number, or a number for each sensor, as (1, n)."""
+    numbers = np.asarray(values, float)
+    if numbers.shape not in ((), (count,)):
+        raise UserError(f'{name} has the shape {numbers.shape}; expected a number or ({count},)')
+    if not np.isfinite(numbers).all():
+        raise UserError(f'{name} is not finite; check the simulation')
+    return np.broadcast_to(numbers, (1, count))
 
 
 def _reason_to_leave_out(effect: Effect, delay_s: float) -> str:

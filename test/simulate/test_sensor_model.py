@@ -153,6 +153,22 @@ def test_wrong_calls_are_refused(force, dt_s, words):
     assert words in str(error.value)
 
 
+@pytest.mark.parametrize(('surroundings', 'words'), [
+    ({'temperature': np.zeros(3)}, 'temperature has the shape (3,)'),
+    ({'temperature': np.zeros((4, 1))}, 'expected a number or (4,)'),
+    ({'temperature': np.nan}, 'temperature is not finite'),
+    ({'supply': np.array([5.0, np.inf, 5.0, 5.0])}, 'supply is not finite')])
+def test_wrong_surroundings_are_refused_and_leave_no_trace(surroundings, words):
+    force = np.tile([0.0, 0.0, 9.8], (4, 1))
+    model, other = (SensorModel(unit('time_offset:offset_s=0.02', 'temperature_bias'))
+                    for _ in range(2))
+    for _ in range(2):
+        with pytest.raises(UserError) as error:
+            model(2 * force, 0.005, **surroundings)
+        assert words in str(error.value)
+        assert np.array_equal(model(force, 0.005), other(force, 0.005))
+
+
 @pytest.mark.perf
 def test_4096_sensors_run_in_real_time(capsys):
     """Without noise-like effects, on one core; the ratio to a Gaussian is printed."""
