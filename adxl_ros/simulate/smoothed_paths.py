@@ -138,6 +138,8 @@ class SmoothedPath:
     these bounds say more than squares of deviations do. The error in motion becomes smaller by a
     third on average.
 
+    Lines between the readings of a slow encoder say nothing new: only their ends count.
+
     Windows of the recording are fitted when they are needed.
     """
 
@@ -162,6 +164,9 @@ class SmoothedPath:
         self._time_s, self._reading = time_s[sampled], reading[sampled]
         self._windows: dict[int, scipy.interpolate.BSpline | scipy.interpolate.PPoly] = {}
         self._step = visible_step(self._reading, step)
+        if self._step == step and _is_interpolated(self._reading, step):
+            kept = _places_of_readings(self._reading, _SMALLEST_CHANGE * step)
+            self._time_s, self._reading = self._time_s[kept], self._reading[kept]
         self._strength = self._matched_strength(self._step)
         self._degree = degree
 
@@ -317,15 +322,34 @@ def visible_step(reading: np.ndarray, step: float) -> float:
     changed = changes[changes > _SMALLEST_CHANGE * step] if step else changes[:0]
     if len(changed) < _MIN_MOVING:
         return step
-    steps = changed / step
-    by_steps = (np.abs(steps - np.rint(steps)) < _WHOLE) & (steps > 0.5)
-    if by_steps.mean() > 0.5:
+    if not _is_interpolated(reading, step):
         return step
     thinned = reading[::_samples_per_reading(reading, _SMALLEST_CHANGE * step)]
     if _noise_step(thinned, _SMALLEST_CHANGE * step) > _FINER * step:
         return step
     finer = _noise_step(reading, _SMALLEST_CHANGE * step)
     return finer if finer > _SMALLEST_CHANGE * step else 0.0
+
+
+def _is_interpolated(reading: np.ndarray, step: float) -> bool:
+    """Return whether readings, (n,), change often, and not by whole steps."""
+    changes = np.abs(np.diff(reading))
+    steps = changes[changes > _SMALLEST_CHANGE * step] / step if step else changes[:0]
+    by_steps = (np.abs(steps - np.rint(steps)) < _WHOLE) & (steps > 0.5)
+    return len(steps) >= _MIN_MOVING and by_steps.mean() <= 0.5
+
+
+def _places_of_readings(reading: np.ndarray, smallest: float) -> np.ndarray:
+    """Return where the readings are that lines connect: at the bends, and evenly between them."""
+    bends = np.flatnonzero(np.abs(np.diff(reading, 2)) > smallest) + 1
+    bends = bends[np.diff(bends, prepend=-1) > 1]
+    if len(bends) < 2:
+        return np.arange(len(reading))
+    distance = max(int(np.quantile(np.diff(bends), 1 - _READING_QUANTILE)), 1)
+    ends = np.unique([0, *bends, len(reading) - 1])
+    return np.unique(np.concatenate([
+        np.linspace(a, b, max(round((b - a) / distance), 1) + 1).round().astype(int)
+        for a, b in pairwise(ends.tolist())]))
 
 
 def _noise_step(reading: np.ndarray, smallest: float) -> float:

@@ -111,6 +111,23 @@ def test_lines_between_the_readings_of_an_encoder_are_no_finer_reference(samples
     assert visible_step(lines, STEP) == STEP
 
 
+@pytest.mark.parametrize('offset', [0, 0.4])
+@pytest.mark.parametrize('speed', [1.0, 0.1])
+def test_a_path_along_lines_is_as_good_as_one_through_the_readings(speed, offset):
+    """Samples at 1 kHz, an encoder at 100 Hz; a part of a sample costs a part of a step."""
+    def true(at_s):
+        return 0.8 * np.sin(speed * at_s) + 0.3 * np.sin(2.3 * speed * at_s)
+
+    time_s = np.arange(60_000) / 1000
+    read_s = (np.arange(0, 60_000, 10) + offset) / 1000
+    readings = np.rint(true(read_s) / STEP) * STEP
+    inside_s = time_s[1000:-1000]
+    along, through = (
+        np.std(SmoothedPath(at_s, values, STEP)(inside_s) - true(inside_s))
+        for at_s, values in ((time_s, np.interp(time_s, read_s, readings)), (read_s, readings)))
+    assert along < 1.2 * through + 0.025 * offset * STEP
+
+
 @pytest.mark.parametrize('rate_hz', [100, 500])
 def test_a_reference_finer_than_the_stated_step_is_followed_exactly(rate_hz):
     """A finer reference counts as such, and an encoder does not, even where interpolated."""
