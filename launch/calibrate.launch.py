@@ -112,7 +112,7 @@ def make_nodes(context: LaunchContext) -> list[Action]:
 
 def show_screen(context: LaunchContext, is_here: bool) -> Action:
     """Show the screen in the terminal of the launch, or say how to show it in another one."""
-    name = launch_nodes.node_name(context, 'calibration')
+    name = launch_nodes.full_name(context, 'calibration')
     if is_here:
         return make_node(context, 'screen', {'node': name})
     return LogInfo(msg='its screen, in a second terminal: ros2 run adxl_ros screen --ros-args -p '

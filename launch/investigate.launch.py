@@ -77,8 +77,15 @@ def make_nodes(context: LaunchContext) -> list[Action]:
                   on_exit=launch_nodes.GiveUp()),
         make_node(context, 'stage', sim_time | given_parameters(context, [STAGE_TYPE, *BRIDGE]),
                   **respawn, on_exit=launch_nodes.GiveUp()),
-        make_node(context, 'investigate', sim_time | given_parameters(context, INVESTIGATION),
+        make_node(context, 'investigate',
+                  sim_time | loses_nothing(context) | given_parameters(context, INVESTIGATION),
                   on_exit=launch_nodes.end_with(RESULT, RESULT))]
+
+
+def loses_nothing(context: LaunchContext) -> dict[str, str]:
+    """Return QoS of the recorded topics: driver and stage repeat what a busy machine misses."""
+    return {f'qos_overrides.{launch_nodes.full_name(context, topic)}.subscription.reliability':
+            'reliable' for topic in ('imu/data_raw', 'stage/joint_states')}
 
 
 def check_stage(context: LaunchContext) -> None:

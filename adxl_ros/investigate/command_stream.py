@@ -28,6 +28,11 @@ import numpy as np
 LONGEST_STEP_S = 0.2
 """Longest time of a manoeuvre between two commands, s. Chosen: the stage then comes to rest within
 a fifth of a second at the limit of rate where the commands end."""
+_FIRST_STEP_S = 0.02
+"""Time that a step may have after a shorter one, s. Chosen: that of the node."""
+_GROWTH = 2.0
+"""Largest ratio of the times of two steps. Chosen: a stage that was not commanded for a while then
+starts again within some steps, and not by a jump."""
 LARGEST_LAG_RAD = 0.15
 """Distance of the stage from its command, rad, at which the command waits. Chosen: a controller
 lags by some tenths of a second."""
@@ -64,6 +69,7 @@ class CommandStream:
         self.waited_s = 0.0
         self._limits, self._manoeuvre = limits, manoeuvre
         self._elapsed_s = 0.0
+        self._step_s = _FIRST_STEP_S
 
     @property
     def is_done(self) -> bool:
@@ -79,7 +85,8 @@ class CommandStream:
         """
         Return the next command.
 
-        A late call does not catch up: the manoeuvre then takes longer.
+        A late call does not catch up: the manoeuvre then takes longer. The step after it is at
+        most twice as long as the last one, so that the stage does not jump.
 
         Parameters
         ----------
@@ -101,6 +108,8 @@ class CommandStream:
             self.waited_s += elapsed_s
             return self.command
         self.waited_s = 0.0
+        elapsed_s = min(elapsed_s, _GROWTH * self._step_s)
+        self._step_s = max(elapsed_s, _FIRST_STEP_S)
         self._elapsed_s += elapsed_s
         time_s = np.array([self._manoeuvre.begin_s + self._elapsed_s])
         motion = self._manoeuvre.motion

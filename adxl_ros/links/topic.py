@@ -277,7 +277,7 @@ class EmulatedSensor:
         effects = tuple(name for name in sensor.effects if name not in left_out)
         self._unit = replace(sensor, effects=effects,
                              values={name: sensor.values[name] for name in effects})
-        self._has_publisher: bool | None = None
+        self._publishers: int | None = None
         self._heard_s = time.monotonic()
         self._newest_ns: int | None = None
         self._made: list[tuple[_Ideal, np.ndarray]] = []
@@ -291,9 +291,9 @@ class EmulatedSensor:
         if np.isfinite(temperature_c):
             self._temperature_c = temperature_c
 
-    def sense_silence(self, has_publisher: bool) -> None:
-        """Take that no sample has come, and whether the topic has a publisher."""
-        self._has_publisher = has_publisher
+    def sense_publishers(self, count: int) -> None:
+        """Take how many nodes publish the ideal samples."""
+        self._publishers = count
 
     def sense_imu(self, stamp_ns: np.ndarray, fields: Mapping[str, np.ndarray]) -> None:
         """
@@ -339,7 +339,7 @@ class EmulatedSensor:
                         counts.rate_changes),
                   Event(f'{self.imu_topic}: a sample is not a number; check the simulation',
                         counts.not_finite))
-        text = self._waits_for()
+        text = self._fault()
         if text:
             return LinkStatus(Level.WARN, text, (counts,), events)
         rate_hz = self.sensor.rate_hz if self.sensor else 0.0
@@ -349,14 +349,17 @@ class EmulatedSensor:
     def close(self) -> None:
         """Do nothing: the link holds nothing open."""
 
-    def _waits_for(self) -> str:
-        """Return why no samples come; '' while they come."""
+    def _fault(self) -> str:
+        """Return why no samples come, or not those of one simulator; '' while all is well."""
         if self._newest_ns is None or time.monotonic() - self._heard_s > _SILENT_S:
-            if self._has_publisher is None:
+            if self._publishers is None:
                 return f'{self.imu_topic}: waiting for a sample'
             return f'{self.imu_topic}: no samples; is the simulation paused?' \
-                if self._has_publisher else \
+                if self._publishers else \
                 f'{self.imu_topic}: nobody publishes it; start the simulator, or set link.topic'
+        if self._publishers is not None and self._publishers > 1:
+            return f'{self.imu_topic}: {self._publishers} nodes publish it, and their samples ' \
+                'mix; end all but one'
         return '' if self._chain else f'{self.imu_topic}: measuring the rate'
 
     def _restart(self) -> None:

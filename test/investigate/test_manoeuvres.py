@@ -71,6 +71,16 @@ def test_commands_keep_the_limits_however_late_the_calls_are(name, limits):
     assert last == pytest.approx(plan(name, limits, pose).end, abs=1e-6)
 
 
+def test_the_step_after_a_late_call_is_no_jump():
+    stream = CommandStream(FULL, plan('fast_turn_of_beta', FULL, Pose(0.0, 0.0)), Pose(0.0, 0.0))
+    last = Pose(0.0, 0.0)
+    for _ in range(100):
+        before, last = last, stream.advance(0.02, last)
+    late = stream.advance(0.28, last)
+    assert abs(late.beta_rad - last.beta_rad) == pytest.approx(
+        2 * abs(last.beta_rad - before.beta_rad), rel=0.1)
+
+
 def test_a_command_waits_for_a_stage_that_stands_still():
     stream = CommandStream(FULL, plan('fast_turn_of_beta', FULL, Pose(0.0, 0.0)), Pose(0.0, 0.0))
     for _ in range(2000):

@@ -195,13 +195,15 @@ def test_a_rotation_turns_the_whole_message() -> None:
 def test_the_status_names_what_is_missing() -> None:
     link = topic.open_link(unit('lever_arm'), topic.Settings())
     assert 'waiting for a sample' in link.status().text
-    link.sense_silence(False)
+    link.sense_publishers(0)
     assert 'nobody publishes it' in link.status().text
-    link.sense_silence(True)
+    link.sense_publishers(1)
     assert 'paused' in link.status().text
     assert link.status().level is Level.WARN
     feed(link, START_NS + STEP_NS * np.arange(3))
     assert 'measuring the rate' in link.status().text
     feed(link, START_NS + STEP_NS * np.arange(3, 60))
     assert 'at 200 Hz' in link.status().text
+    link.sense_publishers(2)
+    assert '2 nodes publish it' in link.status().text and link.status().level is Level.WARN
     assert 'lever_arm' in link.status().events[0].message and link.status().events[0].count == 1

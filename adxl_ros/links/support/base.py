@@ -409,8 +409,8 @@ class ImuLink(Protocol):
     def sense_temperature(self, temperature_c: float) -> None:
         """Use a temperature, °C, from the next sample on."""
 
-    def sense_silence(self, has_publisher: bool) -> None:
-        """Take that no sample has come, and whether the topic has a publisher."""
+    def sense_publishers(self, count: int) -> None:
+        """Take how many nodes publish the ideal samples."""
 
 
 class LinkModule(Protocol):

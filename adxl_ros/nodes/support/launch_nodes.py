@@ -255,7 +255,7 @@ def make_node(context: LaunchContext, executable: str, overrides: Mapping[str, A
 
     """
     path = params_file or text(context, 'params_file')
-    namespace, name = text(context, 'namespace'), node_name(context, executable)
+    namespace, name = text(context, 'namespace'), full_name(context, executable)
     is_named = has_section(path, name)
     if executable == 'driver' and not is_named:
         raise UserError(f'{path}: has no parameters of the node {name}; begin the file with /**: '
@@ -375,16 +375,16 @@ def given_parameters(context: LaunchContext, arguments: Sequence[Argument]) -> d
             if given}
 
 
-def node_name(context: LaunchContext, executable: str) -> str:
+def full_name(context: LaunchContext, name: str) -> str:
     """
-    Return the fully qualified name of a node.
+    Return the fully qualified name of a node or topic.
 
     Parameters
     ----------
     context
         The launch.
-    executable
-        Executable of the node.
+    name
+        The executable of the node, or the topic without its namespace.
 
     Returns
     -------
@@ -392,7 +392,7 @@ def node_name(context: LaunchContext, executable: str) -> str:
         The name, with a slash first.
 
     """
-    return '/'.join(('', *filter(None, text(context, 'namespace').split('/')), executable))
+    return '/'.join(('', *filter(None, text(context, 'namespace').split('/')), name))
 
 
 def given_anywhere(context: LaunchContext, argument: Argument, executable: str) -> str:
@@ -415,7 +415,7 @@ def given_anywhere(context: LaunchContext, argument: Argument, executable: str) 
 
     """
     return text(context, argument.name) or given_text(
-        text(context, 'params_file'), node_name(context, executable), argument.parameter)
+        text(context, 'params_file'), full_name(context, executable), argument.parameter)
 
 
 def simulated_link(context: LaunchContext, speed: Mapping[str, Any]) -> dict[str, Any]:

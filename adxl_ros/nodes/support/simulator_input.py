@@ -41,6 +41,8 @@ clock."""
 _CLOCK_WAIT_S = 5.0
 """Time for which samples may be of another clock before a warning, s; chosen: within it nodes find
 each other, and a reset of the simulator reaches samples and /clock."""
+_COUNT_S = 1.0
+"""Time after which the publishers of the samples are counted again, s; chosen."""
 _LONGEST_TURN_S = 0.25
 """Longest time that counts from one look at the samples to the next, s."""
 
@@ -69,7 +71,7 @@ class SimulatorInput:
         self.frame_id = ''
         self._foreign = Watchdog(_LONGEST_TURN_S)
         self._is_warned = False
-        self._due_s = time.monotonic()
+        self._due_s = self._counted_s = time.monotonic()
         self._turn = ReceiveTurn(node, Imu, link.imu_topic, self._raw.append, _QUEUE)
         self._temperature = create_subscription(
             node, Temperature, link.temperature_topic,
@@ -87,9 +89,11 @@ class SimulatorInput:
         self._due_s = time.monotonic() + _PAUSE_S
         raws = self._raw[:]
         self._raw.clear()
-        if not raws:
+        if not raws or self._due_s > self._counted_s + _COUNT_S:
             topic = self._node.resolve_topic_name(self._link.imu_topic)
-            self._link.sense_silence(self._node.count_publishers(topic) > 0)
+            self._link.sense_publishers(self._node.count_publishers(topic))
+            self._counted_s = self._due_s
+        if not raws:
             return
         stamps_ns = np.empty(len(raws), np.int64)
         fields: dict[str, np.ndarray] = {}
