@@ -127,7 +127,7 @@ class RecordedEvidence:
     sensor
         The baseline.
     linear_model
-        Linear model of the recordings.
+        Linear model of the recordings; None without any.
     evidence_factor
         Factor by which their evidence is tempered.
     seed
@@ -136,14 +136,15 @@ class RecordedEvidence:
     """
 
     sensor: Sensor
-    linear_model: LinearModel
+    linear_model: LinearModel | None
     evidence_factor: float
     seed: int
 
     @property
     def beside_simulator(self) -> bool:
         """Return whether the motion is that of another simulator, without a stage."""
-        return all(c.reference is Reference.SIMULATOR for c in self.linear_model.comparisons)
+        return self.linear_model is not None and all(
+            c.reference is Reference.SIMULATOR for c in self.linear_model.comparisons)
 
 
 class MenuWorth(NamedTuple):

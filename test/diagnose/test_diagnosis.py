@@ -25,7 +25,7 @@ from adxl_ros.diagnose.diagnosis import diagnose, SETTINGS
 from adxl_ros.diagnose.gap_closure import held_out_residual
 from adxl_ros.diagnose.hypothesis_fit import fit_hypothesis, Hypothesis
 from adxl_ros.diagnose.linear_model import build_linear_model
-from adxl_ros.diagnose.next_experiment import propose_next_experiment, Samples
+from adxl_ros.diagnose.next_experiment import propose_next_experiment, RecordedEvidence
 from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.stream_info import sensor_info
@@ -490,7 +490,7 @@ def test_next_experiment_separates_most():
     verdict = Verdict('inseparable', (), (rivals,), 0.9,
                       tuple(WeightedHypothesis((effect,), 0.5) for effect in rivals), best)
     proposal = propose_next_experiment(
-        verdict, [], Samples(sensor, None, SETTINGS.evidence_factor, 0))
+        verdict, [], RecordedEvidence(sensor, None, SETTINGS.evidence_factor, 0))
     worth = {m.text: m.nats_per_minute for m in proposal.menu}
     assert proposal.nats_per_minute == max(worth.values()) == worth[proposal.manoeuvre] > 0.05
     assert worth['dwell, heat and cool'] > 0.01
