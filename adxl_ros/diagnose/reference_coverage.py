@@ -28,6 +28,7 @@ from adxl_ros.diagnose.noise_detectors import code_step_v
 from adxl_ros.files.recording_columns import JOINTS, Recording
 from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2
+from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals.runs import true_runs
 from adxl_ros.simulate.smoothed_paths import BAND_LIMITED_DEGREE, ForcePath, KNOT_S
 import numpy as np
@@ -68,6 +69,19 @@ _EVEN = 0.02
 rounding errors."""
 _MOVES = 3.0
 """Motion, divided by the noise, from which an alias is looked for. Chosen: noise alone has 1."""
+_ABRUPT = 10.0
+"""Fourth difference of a force, divided by its median around, of a jump. Chosen: vibrations and
+noise stay below 8."""
+_LARGEST_JUMP = 0.03
+"""Error of a jump, divided by the noise, up to which it is used. Chosen: a tenth of that of a
+window, because the errors of jumps have one sign."""
+_AROUND_S = 0.5
+"""Time whose fourth differences are usual, s. Chosen: a move is longer."""
+_JUMP_DIFFERENCE = 6.0
+"""Fourth difference of a jump, divided by the largest error of its time. Chosen: a jump of 1 has a
+difference of 3, and half of it may be on the other side of a reading."""
+_SETTLED_TAU = 5.0
+"""Time constants of the sensor that are left out after a jump. Chosen: 1 % of the error stays."""
 _IMAGES = np.arange(-8, 9)
 """Orders of the images of a spline that are summed. Chosen: the rest is below 1e-6."""
 
@@ -225,7 +239,12 @@ def too_coarse(recording: Recording, comparison: BaselineComparison) -> list[Lef
                 f'up to {1e3 * error_g.max():.2g} mg){advice}'))
 
     if comparison.reference is Reference.SIMULATOR and isinstance(force, ForcePath):
-        squares = [_spline_error(force.time_s, f / G0_MPS2, 3, 0, 0.0) ** 2
+        jumps, jump_g = _jumps(sensor, force, _LARGEST_JUMP * noise_g)
+        if jumps.any():
+            left_out.append(LeftOut(
+                _after_jumps(time_s, sensor, force.time_s, jumps), '--sim jumps between its '
+                f'readings (error up to {1e3 * jump_g:.2g} mg); write it at a higher rate'))
+        squares = [_spline_error(force.time_s, f / G0_MPS2, 3, 0, 0.0, jumps) ** 2
                    for f in force(force.time_s)[:len(sensor.axes)]]
         leave_out('--sim', force.time_s, np.sqrt(np.max(squares, axis=0)), limit_g,
                   '; write it at a higher rate, and switch off noise that the simulator adds')
@@ -248,8 +267,60 @@ def too_coarse(recording: Recording, comparison: BaselineComparison) -> list[Lef
     return left_out
 
 
-def _spline_error(read_s: np.ndarray, values: np.ndarray, degree: int, order: int, knots_s: float
-                  ) -> np.ndarray:
+def _jumps(sensor: Sensor, force: ForcePath, largest_g: float) -> tuple[np.ndarray, float]:
+    """
+    Find jumps of a simulator's force, whose exact time is unknown.
+
+    Parameters
+    ----------
+    sensor
+        The sensor.
+    force
+        The force.
+    largest_g
+        Error from which a jump counts, g.
+
+    Returns
+    -------
+    numpy.ndarray
+        Which of the readings are those of a jump, (k,) bool.
+    float
+        Largest error of a jump, g.
+
+    """
+    step_s = float(np.median(np.diff(force.time_s)))
+    around = max(round(_AROUND_S / step_s), 2) // 2 * 2 + 1
+    # The filter of the sensor averages what is uncertain for a part of a step.
+    tau_s = float(np.max(noise.electronics(sensor)[0]))
+    error_per_difference = step_s / (step_s + 2 * tau_s) / _JUMP_DIFFERENCE
+    jumps, largest = np.zeros(len(force.time_s), bool), 0.0
+    for values in force(force.time_s)[:len(sensor.axes)]:
+        fourth = np.abs(_fourth_differences(values / G0_MPS2))
+        error_g = error_per_difference * fourth
+        abrupt = (error_g > largest_g) & (
+            fourth > _ABRUPT * scipy.ndimage.median_filter(fourth, around))
+        largest = max(largest, float(np.max(error_g[abrupt], initial=0.0)))
+        jumps |= scipy.ndimage.binary_dilation(abrupt, iterations=2)
+    return jumps, largest
+
+
+def _after_jumps(time_s: np.ndarray, sensor: Sensor, read_s: np.ndarray, jumps: np.ndarray
+                 ) -> np.ndarray:
+    """Return which samples, s, (n,), follow jumps among readings, s, (k,), before they settle."""
+    settling_s = _SETTLED_TAU * float(np.max(noise.electronics(sensor)[0]))
+    rows = np.zeros(len(time_s), bool)
+    for begin, end in true_runs(jumps):
+        rows |= (time_s >= read_s[begin]) & (time_s <= read_s[end - 1] + settling_s)
+    return rows
+
+
+def _fourth_differences(values: np.ndarray) -> np.ndarray:
+    """Return fourth differences around readings, (k,)."""
+    return np.diff(values, 4, prepend=values[:2], append=values[-2:])[:len(values)]
+
+
+def _spline_error(read_s: np.ndarray, values: np.ndarray, degree: int, order: int, knots_s: float,
+                  jumps: np.ndarray | None = None) -> np.ndarray:
     """
     Return how much a spline through readings may differ from what was read, by its spectrum.
 
@@ -268,6 +339,8 @@ def _spline_error(read_s: np.ndarray, values: np.ndarray, degree: int, order: in
         Order of the derivative that is used.
     knots_s
         Distance of the knots, s, where it exceeds that of the readings.
+    jumps
+        Even readings that do not count, (k,) bool; None for none.
 
     Returns
     -------
@@ -279,20 +352,22 @@ def _spline_error(read_s: np.ndarray, values: np.ndarray, degree: int, order: in
     step_s = float(np.median(gaps_s))
     wide = np.flatnonzero(gaps_s > max(LONGEST_BRIDGE_S, _USUAL_GAPS * step_s)) + 1
     spacing = max(knots_s, float(np.quantile(gaps_s, _USUAL_QUANTILE))) / step_s
+    left_out = np.zeros(len(values), bool) if jumps is None else jumps
     errors = []
-    for times_s, part in zip(np.split(read_s, wide), np.split(values, wide)):
+    for times_s, part, ignored in zip(*(np.split(array, wide)
+                                        for array in (read_s, values, left_out))):
         if len(part) > 1 and np.ptp(np.diff(times_s)) > _EVEN * step_s:
             even_s = np.arange(times_s[0], times_s[-1], step_s)
             even = _windowed_error(scipy.interpolate.CubicSpline(times_s, part)(even_s), step_s,
-                                   spacing, degree, order)
+                                   np.zeros(len(even_s), bool), spacing, degree, order)
             errors.append(np.interp(times_s, even_s, even))
         else:
-            errors.append(_windowed_error(part, step_s, spacing, degree, order))
+            errors.append(_windowed_error(part, step_s, ignored, spacing, degree, order))
     return np.concatenate(errors)
 
 
-def _windowed_error(values: np.ndarray, step_s: float, spacing: float, degree: int, order: int
-                    ) -> np.ndarray:
+def _windowed_error(values: np.ndarray, step_s: float, ignored: np.ndarray, spacing: float,
+                    degree: int, order: int) -> np.ndarray:
     """
     Return the error of a spline in windows of even readings.
 
@@ -302,6 +377,8 @@ def _windowed_error(values: np.ndarray, step_s: float, spacing: float, degree: i
         The readings, (k,).
     step_s
         Time between them, s.
+    ignored
+        Readings whose fourth differences do not count, (k,) bool.
     spacing
         Distance of the knots in readings.
     degree
@@ -319,7 +396,7 @@ def _windowed_error(values: np.ndarray, step_s: float, spacing: float, degree: i
     if len(values) < size:
         return np.zeros(len(values))
     # Differences keep slow motion from leaking into high frequencies.
-    differences = np.diff(values, 4, prepend=values[:2], append=values[-2:])[:len(values)]
+    differences = np.where(ignored, 0.0, _fourth_differences(values))
     cycles = np.fft.rfftfreq(size)[1:]
     gain = _error_gain(cycles * spacing, degree, order) \
         * (2 * np.pi * cycles / step_s) ** order / (2 * np.sin(np.pi * cycles)) ** 4

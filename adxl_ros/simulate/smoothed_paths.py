@@ -346,10 +346,10 @@ def _places_of_readings(reading: np.ndarray, smallest: float) -> np.ndarray:
     if len(bends) < 2:
         return np.arange(len(reading))
     distance = max(int(np.quantile(np.diff(bends), 1 - _READING_QUANTILE)), 1)
-    ends = np.unique([0, *bends, len(reading) - 1])
+    corners = np.unique([0, *bends, len(reading) - 1])
     return np.unique(np.concatenate([
         np.linspace(a, b, max(round((b - a) / distance), 1) + 1).round().astype(int)
-        for a, b in pairwise(ends.tolist())]))
+        for a, b in pairwise(corners.tolist())]))
 
 
 def _noise_step(reading: np.ndarray, smallest: float) -> float:

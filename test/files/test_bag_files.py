@@ -248,8 +248,8 @@ def test_a_move_in_a_gap_of_the_messages_is_unknown(tmp_path: Path) -> None:
     kept = np.arange(len(times)) % 10 == 0
     lost, short = (s > 1.0) & (s < 1.5), (s > 2.0) & (s < 2.08)
     messages = [imu(int(t)) for t in times]
-    messages += [joints(int(t), alpha=1.0, beta=float(np.sin(2 * np.pi * at)))
-                 for t, at in zip(times[kept & ~lost & ~short], s[kept & ~lost & ~short])]
+    messages += [joints(int(t), alpha=1.0, beta=float(np.sin(2 * np.pi * time_s)))
+                 for t, time_s in zip(times[kept & ~lost & ~short], s[kept & ~lost & ~short])]
     path = bags.bag_of(tmp_path / 'run', sorted(messages, key=lambda sent: sent.stamp_ns))
     got = recording.read(path)
     unknown = np.isnan(got.columns['beta_rad'])

@@ -107,10 +107,10 @@ def test_a_run_with_fewer_tasks_warns_of_what_it_takes_away(run_tool, tmp_path):
     write_fleet(tmp_path / 'day', 1, 2)
     words = ('fleet', 'day', '-o', 'out', '--jobs', 1, '--do')
     assert run_tool(*words, 'check,noise').stderr == ''
-    fewer = run_tool(*words, 'check')
-    assert fewer.returncode == 0
+    check_only = run_tool(*words, 'check')
+    assert check_only.returncode == 0
     assert '2 recordings will lose noise in table and page; --do check,noise keeps them' in \
-        ' '.join(fewer.stderr.split())
+        ' '.join(check_only.stderr.split())
     assert table_of(tmp_path / 'out')[0]['noise_n_x_mps2_per_rthz'] is None
     # Both rows are on disk, and the wider run shows its own again.
     again = run_tool(*words, 'check,noise')
