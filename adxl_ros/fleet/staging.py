@@ -150,9 +150,9 @@ def stage(source: Source, folder: Path, largest_bytes: int = LARGEST_BYTES) -> S
         raise error(f'{source.url}: {before.fault}')
     _check_size(source.url, before.size_bytes, folder, largest_bytes)
     budget = _Budget(source.url, before.size_bytes, largest_bytes)
-    is_folder = fs.isdir(path)
     try:
-        if is_folder:
+        # A web server answers `isdir` with the whole file.
+        if fs.info(path)['type'] == 'directory':
             target, content = _copy_folder(fs, path, source.url, folder, budget)
         else:
             target = folder / _safe_name(file_name(path), source.url)

@@ -1,0 +1,66 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Recordings of web servers that state no type of their content."""
+
+from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from threading import Thread
+
+import pytest
+
+pytest.importorskip('aiohttp', reason='aiohttp is not installed')
+pytest.importorskip('fsspec', reason='fsspec is not installed')
+from adxl_ros.fleet.inputs import Source
+from adxl_ros.fleet.staging import stage
+
+_PART = b'0.0,2.5\n' * 1000
+
+
+@contextmanager
+def web_server(parts):
+    """Serve `parts` pieces of a file; yield its address and the reads."""
+    reads = []
+
+    class Handler(BaseHTTPRequestHandler):
+
+        def do_HEAD(self):
+            self.send_response(200)
+            self.send_header('Content-Length', str(parts * len(_PART)))
+            self.send_header('ETag', '"1"')
+            self.end_headers()
+
+        def do_GET(self):
+            reads.append(self.path)
+            self.do_HEAD()
+            for _ in range(parts):
+                self.wfile.write(_PART)
+
+        def log_message(self, *_):
+            pass
+
+    with ThreadingHTTPServer(('127.0.0.1', 0), Handler) as server:
+        server.block_on_close = False
+        server.handle_error = lambda *_: None
+        Thread(target=server.serve_forever, daemon=True).start()
+        yield f'http://127.0.0.1:{server.server_address[1]}/run.csv', reads
+        server.shutdown()
+
+
+def test_a_recording_is_read_once(tmp_path):
+    """The server states no type of the content, as for a suffix that it does not know."""
+    with web_server(3) as (url, reads):
+        staged = stage(Source(url), tmp_path)
+    assert staged.path.read_bytes() == 3 * _PART
+    assert reads == ['/run.csv']
