@@ -52,6 +52,11 @@ _TIMES = ('mtime', 'LastModified', 'last_modified', 'updated', 'modified')
 """Properties that are the time of the last change."""
 _THREADS = 32
 """Objects of a manifest that are looked up at once. Chosen: a server answers in 0.1 s."""
+_SILENCE_S = 60.0
+"""Time in which a web server must send something, s. Chosen: the whole may take as long as it
+likes, where aiohttp would stop after five minutes."""
+_CONNECT_S = 30.0
+"""Time in which a web server must accept a connection, s: that of aiohttp."""
 _HEAD_BYTES = 4096
 """Begin of a CSV file that is read for serial number and date, byte. Chosen: its comments fit."""
 _DATES_S = (946684800.0, 4102444800.0)
@@ -134,7 +139,8 @@ def file_system(url: str, password: str = '') -> tuple[Any, str]:
     except ImportError:
         raise UserError(f'fleet needs fsspec; {install_hint("adxl_ros[fleet]")}') from None
     try:
-        fs, path = url_to_fs(url, **({'password': password} if password else {}))
+        options = {'password': password} if password else _web_options(url)
+        fs, path = url_to_fs(url, **options)
     except (ImportError, ValueError) as error:
         raise UserError(f'{url}: {one_line(error)}') from None
     except Exception as error:
@@ -142,6 +148,15 @@ def file_system(url: str, password: str = '') -> tuple[Any, str]:
     # One file has one address.
     is_indirect = isinstance(fs, LocalFileSystem) and '..' in PurePosixPath(path).parts
     return fs, os.path.realpath(path) if is_indirect else path
+
+
+def _web_options(url: str) -> dict[str, Any]:
+    """Return how a web server is read: as long as it sends; empty for another address."""
+    if not url.lower().startswith(('http://', 'https://')):
+        return {}
+    from aiohttp import ClientTimeout
+    return {'client_kwargs': {'timeout': ClientTimeout(
+        total=None, sock_connect=_CONNECT_S, sock_read=_SILENCE_S)}}
 
 
 def find_sources(inputs: Iterable[str]) -> list[Source]:

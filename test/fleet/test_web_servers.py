@@ -12,25 +12,28 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Recordings of web servers that state no type of their content."""
+"""Recordings of web servers that are slow, silent, or state no type of their content."""
 
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from threading import Thread
+import time
 
 import pytest
 
-pytest.importorskip('aiohttp', reason='aiohttp is not installed')
+aiohttp = pytest.importorskip('aiohttp', reason='aiohttp is not installed')
 pytest.importorskip('fsspec', reason='fsspec is not installed')
-from adxl_ros.fleet.inputs import Source
-from adxl_ros.fleet.staging import stage
+from adxl_ros.fleet import inputs  # noqa: E402 (its libraries were looked for before)
+from adxl_ros.fleet.inputs import Source  # noqa: E402
+from adxl_ros.fleet.staging import stage, StagingError  # noqa: E402
+from fsspec.implementations.http import HTTPFileSystem  # noqa: E402
 
 _PART = b'0.0,2.5\n' * 1000
 
 
 @contextmanager
-def web_server(parts):
-    """Serve `parts` pieces of a file; yield its address and the reads."""
+def web_server(parts, wait_s=0.0):
+    """Serve `parts` pieces of a file with a wait before each; yield its address and the reads."""
     reads = []
 
     class Handler(BaseHTTPRequestHandler):
@@ -45,6 +48,7 @@ def web_server(parts):
             reads.append(self.path)
             self.do_HEAD()
             for _ in range(parts):
+                time.sleep(wait_s)
                 self.wfile.write(_PART)
 
         def log_message(self, *_):
@@ -64,3 +68,16 @@ def test_a_recording_is_read_once(tmp_path):
         staged = stage(Source(url), tmp_path)
     assert staged.path.read_bytes() == 3 * _PART
     assert reads == ['/run.csv']
+
+
+def test_a_slow_line_may_take_its_time(tmp_path, monkeypatch):
+    HTTPFileSystem.clear_instance_cache()
+    monkeypatch.setattr(aiohttp.client, 'DEFAULT_TIMEOUT', aiohttp.ClientTimeout(total=0.5))
+    with web_server(10, 0.2) as (url, _):
+        assert stage(Source(url), tmp_path).size_bytes == 10 * len(_PART)
+
+
+def test_a_silent_server_is_given_up(tmp_path, monkeypatch):
+    monkeypatch.setattr(inputs, '_SILENCE_S', 0.2)
+    with web_server(2, 2.0) as (url, _), pytest.raises(StagingError, match='cannot be read'):
+        stage(Source(url), tmp_path)
