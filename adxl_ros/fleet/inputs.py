@@ -206,6 +206,8 @@ def _of_input(text: str) -> Iterator[Source]:
                 yield from _of_folder(fs, name, may_be_empty=True)
             else:
                 yield _of_info(fs, name, info)
+    elif _is_special(path):
+        yield look_up(fs, path, text)
     elif _is_recording_name(path) and not os.path.isdir(path):
         rows = _manifest_rows(text, fs, path)
         yield from [look_up(fs, path, text)] if rows is None else _of_manifest(text, rows)
@@ -213,6 +215,11 @@ def _of_input(text: str) -> Iterator[Source]:
         yield from _of_folder(fs, path)
     else:
         yield look_up(fs, path, text)
+
+
+def _is_special(path: str) -> bool:
+    """Return whether a path of this machine is a pipe or a device, which may never end."""
+    return os.path.exists(path) and not (os.path.isfile(path) or os.path.isdir(path))
 
 
 def _unreachable(url: str, error: UserError) -> Source:
@@ -515,6 +522,9 @@ def stated_by(sources: Iterable[Source]) -> list[Stated]:
 
 def _stated(source: Source) -> Stated:
     """Return what a recording states: one of this machine, or a CSV file in its comments."""
+    if source.fault:
+        # A pipe would be waited for.
+        return Stated()
     try:
         fs, path = file_system(source.url, source.password)
         stated = Stated()

@@ -254,6 +254,17 @@ def test_what_cannot_be_reached_or_read_is_a_row(run_tool, tmp_path):
     assert rows['u0000_0000.csv']['serial'] == 'U0'
 
 
+def test_a_pipe_is_not_waited_for(tmp_path):
+    write_fleet(tmp_path / 'day', 1, 1)
+    os.mkfifo(tmp_path / 'day' / 'pipe.csv')
+    for name in ('day', 'day/pipe.csv'):
+        with start_fleet(tmp_path, name, '--do', 'check', '-o', 'out', '--dry-run') as dry:
+            try:
+                assert 'core hours' in dry.communicate(timeout=30)[0]
+            finally:
+                dry.kill()
+
+
 def test_copies_of_killed_workers_are_removed(run_tool, tmp_path, monkeypatch):
     """A worker was killed while it made its folder, and another one with a copy in it."""
     write_fleet(tmp_path / 'day', 1, 1)
