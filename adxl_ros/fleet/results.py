@@ -148,9 +148,11 @@ class Results:
         sizes = {source.size_bytes or 0 for source in sources}
         return frozenset(key for size in sizes for key in self._by_size.get(size, ()))
 
-    def row_with_key(self, key: str) -> Row | None:
-        """Return a row with a key; None where its file is gone."""
-        for path in sorted((self.folder / _ROWS).glob(f'{key}-*.json')):
+    def row_with_key(self, key: str, url: str) -> Row | None:
+        """Return a row with a key, that of an address first; None where its file is gone."""
+        own = _row_name(key, url)
+        for path in sorted((self.folder / _ROWS).glob(f'{key}-*.json'),
+                           key=lambda path: (path.name != own, path.name)):
             content = _read(path)
             if content is not None:
                 return content['row']
@@ -186,8 +188,7 @@ class Results:
             for file, data in result.files.items():
                 write(folder / file, data)
             row['report'] = name
-        url = hashlib.sha256(row['url'].encode()).hexdigest()[:_NAME_DIGITS]
-        name = f'{row["key"]}-{url}.json'
+        name = _row_name(row['key'], row['url'])
         content = {'stamp': result.stamp, 'digest': result.digest, 'row': row}
         write(make_folder(self.folder / _ROWS) / name,
               json.dumps(content, allow_nan=False, ensure_ascii=False).encode())
@@ -228,6 +229,11 @@ class Results:
         except ArrowException as error:
             raise UserError(f'{path}: cannot be written: {one_line(error)}') from None
         return path
+
+
+def _row_name(key: str, url: str) -> str:
+    """Return the name of the file of a row."""
+    return f'{key}-{hashlib.sha256(url.encode()).hexdigest()[:_NAME_DIGITS]}.json'
 
 
 def _batches(rows: Iterable[Row]) -> Iterator[list[Row]]:

@@ -36,9 +36,11 @@ _SECONDS = {'check': (0.02, 30.0), 'noise': (0.05, 60.0), 'fit': (1.0, 100.0),
             'diagnose': (10.0, 500.0)}
 """Usual run time of each task: of any recording, s, and for each GB, s. Measured on one core with
 CSV files of 416 s at 250 Hz; replaced by the run times of earlier rows where there are some."""
-_IDENTITY = ('url', 'serial', 'date', 'date_source', 'calibration_id', 'calibration_age_days',
-             'seconds', 'memory_mb', 'worker')
-"""Columns of a recording whose content is that of another one."""
+_IDENTITY = ('url', 'serial', 'date', 'date_source', 'calibration_id', 'calibration_age_days')
+"""Columns of a recording whose content is that of another row."""
+_COST = ('seconds', 'memory_mb', 'worker')
+"""Columns of what a row costs. A copy costs next to nothing; a file that is read again has the
+cost of its tasks, by which a further run is estimated."""
 
 
 @dataclass(frozen=True)
@@ -215,7 +217,7 @@ def work(pool: Executor, sources: Sequence[Source], recipe: Recipe, results: Res
     Yields
     ------
     Row
-        Each row that was written.
+        Each row that was written, with its cost in this run.
 
     Raises
     ------
@@ -264,17 +266,21 @@ def _written(end: Finished, recipe: Recipe, results: Results) -> Row | None:
         reason = f'{type(error).__name__}: {one_line(error)}'
         result = refused(recipe, source, f'{reason} ({end.attempts} attempts)', 'crashed')
     else:
-        result = _with_known(end.value, results)
-    return results.put(result, end.attempts)
+        result = end.value
+    # What a row costs in this run need not be what its tasks took.
+    spent = {name: result.row[name] for name in _COST}
+    return {**results.put(_with_known(result, results), end.attempts), **spent}
 
 
 def _with_known(result: Result, results: Results) -> Result:
     """Return a result; one whose content has a row already gets the values of that row."""
     if not result.is_known:
         return result
-    row = results.row_with_key(result.row['key'])
+    row = results.row_with_key(result.row['key'], result.row['url'])
     assert row is not None, 'rows are never removed'
-    return result._replace(row={**row, **{name: result.row[name] for name in _IDENTITY}})
+    is_copy = row['url'] != result.row['url']
+    own = (*_IDENTITY, *_COST) if is_copy else _IDENTITY
+    return result._replace(row={**row, **{name: result.row[name] for name in own}})
 
 
 def since_text(text: str) -> str:

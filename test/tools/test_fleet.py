@@ -118,6 +118,22 @@ def test_a_run_with_fewer_tasks_warns_of_what_it_takes_away(run_tool, tmp_path):
     assert table_of(tmp_path / 'out')[0]['noise_n_x_mps2_per_rthz'] is not None
 
 
+def test_a_recording_that_is_read_again_keeps_its_cost(run_tool, tmp_path):
+    """It costs what its tasks took, and not the time to see that nothing changed."""
+    path, = write_fleet(tmp_path / 'day', 1, 1)
+    words = ('fleet', 'day', '--do', 'check,noise', '-o', 'out', '--jobs', 1)
+    run_tool(*words)
+    before, = table_of(tmp_path / 'out')
+    for name in 'abcd':
+        shutil.copy(path, path.with_name(f'{name}.csv'))
+    run_tool(*words)
+    os.utime(path, (1e9, 1e9))
+    run_tool(*words)
+    after = by_name(table_of(tmp_path / 'out'))[path.name]
+    assert after['written'] > before['written'] and after['key'] == before['key']
+    assert after['seconds'] == before['seconds'] and after['worker'] == before['worker']
+
+
 def test_one_file_is_one_recording(run_tool, tmp_path):
     """Another way to a file, and the results of a fleet, are no further recordings."""
     write_fleet(tmp_path / 'day', 2, 1)
