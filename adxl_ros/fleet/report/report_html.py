@@ -33,6 +33,7 @@ from adxl_ros.fleet.report.trends import FALSE_DISCOVERY_RATE, Scatter
 from adxl_ros.fleet.report.unit_results import analyse, far_out, population_of, QuantityResult
 from adxl_ros.fleet.report.urgency import number, rank, State, TOLERANCE_MG, UnitState
 from adxl_ros.fleet.row import PAGE, POPULATION, reason_kind, TABLE, UNITS
+from adxl_ros.model.constants import AXES
 import numpy as np
 
 _SHOWN = 12
@@ -46,6 +47,8 @@ _NOTHING = 0.05
 _COLOURS = {State.OUT_OF_TOLERANCE: 'red', State.DRIFTS: 'amber', State.NOT_JUDGED: 'amber',
             State.FAR_OUT: 'amber', State.OLD_CALIBRATION: 'grey', State.IN_ORDER: 'green'}
 """Colour of the badge by the state of the most urgent unit."""
+_MEASURES = ('gap_before_mps2', *(f'zero_g_{axis}_v' for axis in AXES))
+"""Columns that tell whether a unit is within the tolerance."""
 _SENTENCES = {
     State.OUT_OF_TOLERANCE: ('Recalibrate the unit at the head of the list.',
                              'Recalibrate the units at the head of the list.'),
@@ -142,7 +145,7 @@ def page(table: FleetTable, results: Sequence[QuantityResult], folder: Path) -> 
         figures['matrix'] = page_figures.matrix(table, effects)
     counts = Counter(unit.state for unit in units)
     return html_page.render('adxl_ros.fleet.report', 'fleet.html', {
-        'title': 'Fleet', 'about': _about(table), 'badge': _badge(units, counts),
+        'title': 'Fleet', 'about': _about(table), 'badge': _badge(table, units, counts),
         'tiles': _tiles(table, units, counts), 'shown': _SHOWN, 'figures': figures,
         'units': [_unit_row(unit, folder) for unit in units],
         'without_unit': _rows_without_unit(table, folder),
@@ -166,11 +169,17 @@ def _about(table: FleetTable) -> list[str]:
             *([f'rows made by version {", ".join(versions)}'] if versions else [])]
 
 
-def _badge(units: Sequence[UnitState], counts: Counter[State]) -> dict[str, str]:
+def _badge(table: FleetTable, units: Sequence[UnitState], counts: Counter[State]
+           ) -> dict[str, str]:
     if not units:
         return {'colour': 'grey', 'word': 'NO UNITS',
                 'sentence': 'No recording states a serial number.'}
     worst = units[0].state
+    if worst >= State.FAR_OUT and not any(
+            np.isfinite(table[column]).any() for column in _MEASURES):
+        # What was not measured is not within the tolerance.
+        return {'colour': 'grey', 'word': 'NOT MEASURED',
+                'sentence': 'No gap and no zero-g were measured; they need diagnose and fit.'}
     word = 'IN ORDER' if worst is State.IN_ORDER else \
         f'{counts[worst]} of {len(units)} {worst.words}'.upper()
     return {'colour': _COLOURS[worst], 'word': word,
@@ -185,7 +194,7 @@ def _tiles(table: FleetTable, units: Sequence[UnitState], counts: Counter[State]
              'note': f'{refused} refused, {crashed} crashed'}]
     notes = {State.OUT_OF_TOLERANCE: f'gap above {number(TOLERANCE_MG)} mg',
              State.DRIFTS: 'a slope beyond chance', State.NOT_JUDGED: 'last recording refused',
-             State.FAR_OUT: 'not of the population', State.OLD_CALIBRATION: 'older than a year',
+             State.FAR_OUT: 'not of the population', State.OLD_CALIBRATION: 'over a year, or none',
              State.IN_ORDER: 'nothing to do'}
     # A unit that is out of tolerance may drift, too.
     numbers = Counter({**counts, State.DRIFTS: sum(unit.is_drifting for unit in units)})

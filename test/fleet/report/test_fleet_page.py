@@ -132,6 +132,19 @@ def test_a_sound_fleet_is_in_order(folders):
     assert text.count('in order</span>') > 2 * 2
 
 
+def test_what_was_not_measured_is_not_within_the_tolerance(tmp_path):
+    """As of a fleet that is only checked."""
+    path = FLEETS['sound'].write(tmp_path)
+    table = pq.read_table(path)
+    dropped = {name: None for name in table.column_names
+               if name.startswith(('gap_', 'zero_g_', 'scale_'))}
+    pq.write_table(pa.Table.from_pylist(
+        [row | dropped for row in table.to_pylist()], table.schema), path)
+    report_html.write(tmp_path)
+    text = (tmp_path / 'fleet.html').read_text()
+    assert 'NOT MEASURED' in text and 'tolerance, but' not in text
+
+
 def test_a_single_unit_that_drifts_is_singular(folders):
     text = (folders['drift'] / 'fleet.html').read_text()
     assert '1 OF 8 DRIFTS' in text and 'but one is on its way.' in text
