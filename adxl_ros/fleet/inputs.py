@@ -36,6 +36,7 @@ from urllib.parse import urlsplit
 from adxl_ros.errors import install_hint, one_line, UserError
 from adxl_ros.files import recording
 from adxl_ros.files.recording_columns import Recording
+from adxl_ros.files.stream_info import NO_UNIT
 from adxl_ros.files.tables import table_endings
 from adxl_ros.fleet.row import PAGE, POPULATION, TABLE, UNITS
 
@@ -482,7 +483,8 @@ def _of_manifest(text: str, rows: dict[int, dict[str, str]]) -> list[Source]:
             recorded = look_up(*file_system(url), row['url'])
         except UserError as error:
             recorded = _unreachable(url, error)
-        return replace(recorded, serial=row.get('serial', ''), params=params,
+        serial = row.get('serial', '')
+        return replace(recorded, serial='' if serial == NO_UNIT else serial, params=params,
                        date=as_date(row.get('date', '')) or '')
 
     with ThreadPoolExecutor(_THREADS) as pool:

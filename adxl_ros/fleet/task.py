@@ -189,11 +189,14 @@ def _in_folder(recipe: Recipe, source: Source, earlier: frozenset[str], folder: 
     (folder / 'recording').mkdir()
     staged = stage(source, folder / 'recording')
     first, fault = _first_block(staged.path, recipe)
-    serial = source.serial or (first.stream_info.serial if first else '')
+    own = first.stream_info.serial if first else NO_UNIT
+    is_other = bool(source.serial) and own not in (NO_UNIT, '', source.serial)
+    serial = source.serial or own
     date = _date(source, first)
     parameters = recipe.parameters_of(serial, date[0], source.params)
     digest = recipe.digest(parameters, source.serial)
-    row = _identity(recipe, source, staged, serial, date, parameters)
+    # Which of both units it is of is not known.
+    row = _identity(recipe, source, staged, '' if is_other else serial, date, parameters)
     row['key'] = key_of(staged.content, digest)
     if row['key'] in earlier:
         return Result(row, {}, source.stamp, digest, is_known=True)
@@ -201,6 +204,8 @@ def _in_folder(recipe: Recipe, source: Source, earlier: frozenset[str], folder: 
     if fault:
         job.refuse('read', 'is a manifest; name it itself, not its folder'
                    if is_manifest(staged.path) else job.plain(fault))
+    elif is_other:
+        job.refuse('read', f'states the serial {own}, but the manifest says {source.serial}')
     else:
         job.run()
     return Result(job.row, job.files, source.stamp, digest)

@@ -1,0 +1,51 @@
+# Copyright 2026 the adxl_ros authors
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Manifests: the recordings that they list, and what they state of them."""
+
+from adxl_ros.files.reading_options import AS_IT_IS
+from fleets import recording_text
+import pytest
+
+pytest.importorskip('fsspec', reason='fsspec is not installed')
+from adxl_ros.fleet.inputs import find_sources
+from adxl_ros.fleet.recipe import make_recipe
+from adxl_ros.fleet.task import make_row
+
+
+def write(path, *lines):
+    path.write_text('\n'.join([*lines, '']), encoding='utf-8')
+    return str(path)
+
+
+def rows_of(*inputs):
+    """Return the rows of the recordings of a command line by name, after a check."""
+    recipe = make_recipe(('check',), None, (), None, AS_IT_IS)
+    rows = [make_row(recipe, frozenset(), source, False).row for source in find_sources(inputs)]
+    return {row['url'].rpartition('/')[2]: row for row in rows}
+
+
+def test_a_serial_number_that_contradicts_the_recording_is_refused(tmp_path):
+    """A recording that states no unit has that of the manifest, and the other way round."""
+    for name, own in (('other', 'S2'), ('same', 'S3'), ('silent', 'nominal'), ('open', 'S4'),
+                      ('unsaid', 'S5')):
+        write(tmp_path / f'{name}.csv', *recording_text(own, '2026-10-01', 1).splitlines())
+    rows = rows_of(write(tmp_path / 'list.csv', 'url,serial', 'other.csv,WRONG', 'same.csv,S3',
+                         'silent.csv,S6', 'open.csv,', 'unsaid.csv,nominal'))
+    other = rows.pop('other.csv')
+    assert (other['outcome'], other['refused_by'], other['serial']) == ('refused', 'read', None)
+    assert other['refusal'] == 'states the serial S2, but the manifest says WRONG'
+    assert {name: row['serial'] for name, row in rows.items()} == {
+        'same.csv': 'S3', 'silent.csv': 'S6', 'open.csv': 'S4', 'unsaid.csv': 'S5'}
+    assert {row['outcome'] for row in rows.values()} == {'done'}
