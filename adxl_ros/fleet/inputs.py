@@ -146,9 +146,11 @@ def file_system(url: str, password: str = '') -> tuple[Any, str]:
         raise UserError(f'{url}: {one_line(error)}') from None
     except Exception as error:
         raise Unreachable(f'{url}: cannot be opened: {one_line(error)}') from None
+    if not isinstance(fs, LocalFileSystem):
+        return fs, path
     # One file has one address.
-    is_indirect = isinstance(fs, LocalFileSystem) and '..' in PurePosixPath(path).parts
-    return fs, os.path.realpath(path) if is_indirect else path
+    pure = PurePosixPath(path)
+    return fs, os.path.realpath(path) if '..' in pure.parts else str(pure)
 
 
 def _web_options(url: str) -> dict[str, Any]:
@@ -488,7 +490,21 @@ def _of_manifest(text: str, rows: dict[int, dict[str, str]]) -> list[Source]:
                        date=as_date(row.get('date', '')) or '')
 
     with ThreadPoolExecutor(_THREADS) as pool:
-        return list(pool.map(source, rows.values()))
+        return _once(text, zip(rows, pool.map(source, rows.values())))
+
+
+def _once(text: str, sources: Iterable[tuple[int, Source]]) -> list[Source]:
+    """Return the recordings of a manifest's rows, each once, with what any row states of it."""
+    first: dict[str, tuple[int, Source]] = {}
+    for number, source in sources:
+        before, known = first.get(source.url, (number, source))
+        if known.serial and source.serial not in ('', known.serial):
+            raise UserError(f'{text}: rows {before} and {number}: the serial of {source.url} is '
+                            f'{known.serial} and {source.serial}, expected one')
+        first[source.url] = (before if known.serial else number, replace(
+            source, serial=source.serial or known.serial, params=source.params or known.params,
+            date=source.date or known.date))
+    return [source for _, source in first.values()]
 
 
 def is_manifest(path: Path) -> bool:

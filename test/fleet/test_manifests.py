@@ -14,6 +14,7 @@
 
 """Manifests: the recordings that they list, and what they state of them."""
 
+from adxl_ros.errors import UserError
 from adxl_ros.files.reading_options import AS_IT_IS
 from fleets import recording_text
 import pytest
@@ -49,3 +50,16 @@ def test_a_serial_number_that_contradicts_the_recording_is_refused(tmp_path):
     assert {name: row['serial'] for name, row in rows.items()} == {
         'same.csv': 'S3', 'silent.csv': 'S6', 'open.csv': 'S4', 'unsaid.csv': 'S5'}
     assert {row['outcome'] for row in rows.values()} == {'done'}
+
+
+def test_a_recording_has_one_serial_number(tmp_path):
+    """Two rows may name one recording in two ways; a row without a serial number says nothing."""
+    write(tmp_path / 'run.csv', 'time_s,x_v')
+    path = write(tmp_path / 'list.csv', 'url,serial', 'run.csv,S1', '', f'{tmp_path}/run.csv,S2')
+    with pytest.raises(UserError) as error:
+        find_sources([path])
+    assert str(error.value) == (f'{path}: rows 2 and 4: the serial of {tmp_path}/run.csv is S1 '
+                                'and S2, expected one')
+    source, = find_sources([write(tmp_path / 'list.csv', 'url,serial', 'run.csv,S1', 'run.csv,',
+                                  './run.csv,S1')])
+    assert source.serial == 'S1'
