@@ -26,18 +26,16 @@ from datetime import datetime
 import gzip
 from io import BytesIO
 from pathlib import Path
-import re
 import shlex
 import sys
 from typing import Any
 
 from adxl_ros.errors import UserError
 from adxl_ros.files.package_version import package_version
+from adxl_ros.files.plain_address import without_secrets
 
 _DPI = 100
 """Resolution of pictures, dots per inch (chosen: sharp at the page's width)."""
-_PASSWORD = re.compile(r'(?<=://)([^/@:]*):[^/@]*@')
-"""User and password of a URL."""
 _GZIP_LEVEL = 6
 """Level of compression (chosen: 0.3 s for plotly.js; level 9 takes three times as long)."""
 
@@ -99,8 +97,8 @@ def render(package: str, template: str, values: Mapping[str, Any]) -> str:
 
 
 def command_of_this_process() -> str:
-    """Return the command line that started this executable, without the passwords of URLs."""
-    words = [_PASSWORD.sub(r'\1@', word) for word in sys.argv[1:]]
+    """Return the command line that started this executable, without the secrets of URLs."""
+    words = map(without_secrets, sys.argv[1:])
     return shlex.join(['ros2', 'run', 'adxl_ros', Path(sys.argv[0]).name, *words])
 
 

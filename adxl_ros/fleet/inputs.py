@@ -35,6 +35,7 @@ from urllib.parse import urlsplit
 
 from adxl_ros.errors import install_hint, one_line, UserError
 from adxl_ros.files import recording
+from adxl_ros.files.plain_address import without_secrets
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.stream_info import NO_UNIT
 from adxl_ros.files.tables import table_endings
@@ -94,8 +95,9 @@ class Source:
         8601; empty for nothing.
     fault
         Why it cannot be read; empty if it was found.
-    password
-        Password of its server, which is not in its address; empty for none.
+    secret
+        What its address leaves out: the password of its server, or the whole address of a web
+        server; empty for nothing.
 
     """
 
@@ -107,10 +109,10 @@ class Source:
     params: str = ''
     date: str = ''
     fault: str = ''
-    password: str = field(default='', repr=False)
+    secret: str = field(default='', repr=False)
 
 
-def file_system(url: str, password: str = '') -> tuple[Any, str]:
+def file_system(url: str, secret: str = '') -> tuple[Any, str]:
     """
     Return the file system of a URL, and the path in it.
 
@@ -118,8 +120,8 @@ def file_system(url: str, password: str = '') -> tuple[Any, str]:
     ----------
     url
         The address.
-    password
-        Password of the server, where the address has none; empty for none.
+    secret
+        See `Source.secret`.
 
     Returns
     -------
@@ -140,12 +142,14 @@ def file_system(url: str, password: str = '') -> tuple[Any, str]:
     except ImportError:
         raise UserError(f'fleet needs fsspec; {install_hint("adxl_ros[fleet]")}') from None
     try:
-        options = {'password': password} if password else _web_options(url)
-        fs, path = url_to_fs(url, **options)
+        whole = secret if _is_web(secret) else url
+        options = {'password': secret} if secret and whole == url else _web_options(whole)
+        fs, path = url_to_fs(whole, **options)
     except (ImportError, ValueError) as error:
-        raise UserError(f'{url}: {one_line(error)}') from None
+        raise UserError(without_secrets(f'{url}: {one_line(error)}')) from None
     except Exception as error:
-        raise Unreachable(f'{url}: cannot be opened: {one_line(error)}') from None
+        raise Unreachable(
+            without_secrets(f'{url}: cannot be opened: {one_line(error)}')) from None
     if not isinstance(fs, LocalFileSystem):
         return fs, path
     # One file has one address.
@@ -155,11 +159,16 @@ def file_system(url: str, password: str = '') -> tuple[Any, str]:
 
 def _web_options(url: str) -> dict[str, Any]:
     """Return how a web server is read: as long as it sends; empty for another address."""
-    if not url.lower().startswith(('http://', 'https://')):
+    if not _is_web(url):
         return {}
     from aiohttp import ClientTimeout
     return {'client_kwargs': {'timeout': ClientTimeout(
         total=None, sock_connect=_CONNECT_S, sock_read=_SILENCE_S)}}
+
+
+def _is_web(url: str) -> bool:
+    """Return whether an address is that of a web server."""
+    return url.lower().startswith(('http://', 'https://'))
 
 
 def find_sources(inputs: Iterable[str]) -> list[Source]:
@@ -184,7 +193,10 @@ def find_sources(inputs: Iterable[str]) -> list[Source]:
         A folder or a glob has no recording, or a manifest is wrong.
 
     """
-    sources = {source.url: source for text in inputs for source in _of_input(text)}
+    try:
+        sources = {source.url: source for text in inputs for source in _of_input(text)}
+    except UserError as error:
+        raise UserError(without_secrets(str(error))) from None
     return [sources[url] for url in sorted(sources)]
 
 
@@ -227,9 +239,8 @@ def _is_special(path: str) -> bool:
 
 def _unreachable(url: str, error: UserError) -> Source:
     """Return a recording whose server cannot be reached."""
-    password = urlsplit(url).password
-    plain = url.replace(f':{password}@', '@', 1) if password else url
-    return Source(plain, fault=one_line(error).removeprefix(f'{url}: '))
+    plain = without_secrets(url)
+    return Source(plain, fault=one_line(error).removeprefix(f'{plain}: '))
 
 
 def _is_glob(path: str) -> bool:
@@ -318,7 +329,7 @@ def look_up(fs: Any, path: str, url: str) -> Source:
         if not isinstance(error, FileNotFoundError):
             # A connection that broke is not used again.
             fs.clear_instance_cache()
-        return Source(_url(fs, path), fault=fault_of(error), password=_password(fs))
+        return Source(_url(fs, path), fault=fault_of(error), secret=_secret(fs, path))
 
 
 def fault_of(error: BaseException) -> str:
@@ -329,7 +340,7 @@ def fault_of(error: BaseException) -> str:
             cause is None or getattr(cause, 'status', None) == 404):
         return NO_FILE
     reason = getattr(error, 'strerror', None) or one_line(cause or error) or type(error).__name__
-    return f'cannot be read: {reason}'
+    return f'cannot be read: {without_secrets(reason)}'
 
 
 def _url(fs: Any, path: str) -> str:
@@ -343,12 +354,14 @@ def _url(fs: Any, path: str) -> str:
         port = f':{options["port"]}' if options.get('port') else ''
         name = f'{scheme}://{user}{options["host"]}{port}/{rest}'
     # A name that is not UTF-8 has no place in a table.
-    name = name.encode('utf-8', 'backslashreplace').decode('utf-8')
+    name = without_secrets(name.encode('utf-8', 'backslashreplace').decode('utf-8'))
     return name.removeprefix('file://') if name.startswith('file:///') else name
 
 
-def _password(fs: Any) -> str:
-    """Return the password of a server; empty for none."""
+def _secret(fs: Any, path: str) -> str:
+    """Return what an address leaves out; see `Source`."""
+    if _is_web(path):
+        return path if without_secrets(path) != path else ''
     return str(fs.storage_options.get('password') or '')
 
 
@@ -357,7 +370,7 @@ def _of_info(fs: Any, path: str, info: Mapping[str, Any]) -> Source:
     if info['type'] not in ('file', 'link'):
         return Source(_url(fs, path), fault='is no file')
     return Source(_url(fs, path), info.get('size'), stamp_of(info), _modified(info),
-                  password=_password(fs))
+                  secret=_secret(fs, path))
 
 
 def _of_bag(fs: Any, folder: str, files: Mapping[str, Mapping[str, Any]]) -> Source:
@@ -367,7 +380,7 @@ def _of_bag(fs: Any, folder: str, files: Mapping[str, Mapping[str, Any]]) -> Sou
     stamp = hashlib.sha256('\n'.join(stamps).encode()).hexdigest() \
         if all(stamp_of(info) for info in files.values()) else ''
     return Source(_url(fs, folder), None if None in sizes else sum(filter(None, sizes)), stamp,
-                  max(map(_modified, files.values()), default=''), password=_password(fs))
+                  max(map(_modified, files.values()), default=''), secret=_secret(fs, folder))
 
 
 def stamp_of(info: Mapping[str, Any]) -> str:
@@ -544,7 +557,7 @@ def _stated(source: Source) -> Stated:
         # A pipe would be waited for.
         return Stated()
     try:
-        fs, path = file_system(source.url, source.password)
+        fs, path = file_system(source.url, source.secret)
         stated = Stated()
         if path.lower().endswith('.csv'):
             head = fs.cat_file(path, 0, _HEAD_BYTES).decode('utf-8', 'replace')

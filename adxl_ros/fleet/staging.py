@@ -141,7 +141,7 @@ def stage(source: Source, folder: Path, largest_bytes: int = LARGEST_BYTES) -> S
 
     """
     try:
-        fs, path = file_system(source.url, source.password)
+        fs, path = file_system(source.url, source.secret)
     except Unreachable as reason:
         raise StagingError(one_line(reason)) from None
     before = look_up(fs, path, source.url)

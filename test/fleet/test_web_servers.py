@@ -15,16 +15,18 @@
 """Recordings of web servers that are slow, silent, or state no type of their content."""
 
 from contextlib import contextmanager
+from dataclasses import replace
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from threading import Thread
 import time
 
+from adxl_ros.errors import UserError
 import pytest
 
 aiohttp = pytest.importorskip('aiohttp', reason='aiohttp is not installed')
 pytest.importorskip('fsspec', reason='fsspec is not installed')
 from adxl_ros.fleet import inputs  # noqa: E402 (its libraries were looked for before)
-from adxl_ros.fleet.inputs import Source  # noqa: E402
+from adxl_ros.fleet.inputs import find_sources, Source  # noqa: E402
 from adxl_ros.fleet.staging import stage, StagingError  # noqa: E402
 from fsspec.implementations.http import HTTPFileSystem  # noqa: E402
 
@@ -32,14 +34,18 @@ _PART = b'0.0,2.5\n' * 1000
 
 
 @contextmanager
-def web_server(parts, wait_s=0.0):
-    """Serve `parts` pieces of a file with a wait before each; yield its address and the reads."""
+def web_server(parts, wait_s=0.0, needs=''):
+    """
+    Serve `parts` pieces of a file with a wait before each; yield its address and the reads.
+
+    It answers only addresses with the text `needs`.
+    """
     reads = []
 
     class Handler(BaseHTTPRequestHandler):
 
         def do_HEAD(self):
-            self.send_response(200)
+            self.send_response(200 if needs in self.path else 403)
             self.send_header('Content-Length', str(parts * len(_PART)))
             self.send_header('ETag', '"1"')
             self.end_headers()
@@ -81,3 +87,21 @@ def test_a_silent_server_is_given_up(tmp_path, monkeypatch):
     monkeypatch.setattr(inputs, '_SILENCE_S', 0.2)
     with web_server(2, 2.0) as (url, _), pytest.raises(StagingError, match='cannot be read'):
         stage(Source(url), tmp_path)
+
+
+def test_a_token_opens_a_recording_and_stays_out_of_its_row(tmp_path):
+    """The server refuses a token that is no longer valid; another parameter is another file."""
+    with web_server(1, needs='token=SECRET2') as (url, _):
+        first, second = (find_sources([f'{url}?x={x}&token=SECRET2'])[0] for x in (1, 2))
+        old, = find_sources([f'{url}?token=SECRET1&x=1'])
+        assert stage(first, tmp_path).path.read_bytes() == _PART
+        with pytest.raises(StagingError, match='Forbidden') as error:
+            stage(replace(first, secret=f'{url}?token=SECRET1&x=1'), tmp_path)
+    assert (first.url, second.url, old.url) == (f'{url}?x=1', f'{url}?x=2', f'{url}?x=1')
+    assert 'SECRET' not in f'{first} {old} {error.value}'
+
+
+def test_a_message_has_no_token():
+    with pytest.raises(UserError, match='gs2:') as error:
+        find_sources(['gs2://user:SECRET@bucket/*.csv?sig=SECRET'])
+    assert 'SECRET' not in str(error.value)

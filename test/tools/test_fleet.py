@@ -516,6 +516,7 @@ def test_a_web_server_without_parts_of_files(run_tool, tmp_path):
             assert time.monotonic() < end_s and server.poll() is None
             time.sleep(0.05)
         run_tool('fleet', f'{url}/', f'{url}/u0000_0000.csv?signed=yes', f'{url}/gone.csv',
+                 f'{url}/u0000_0000.csv?token=SECRET&x=1',
                  f'http://127.0.0.1:{free_port()}/a.csv', '--do', 'check', '-o', 'out',
                  '--jobs', 1)
         server.kill()
@@ -524,6 +525,10 @@ def test_a_web_server_without_parts_of_files(run_tool, tmp_path):
     assert rows['u0000_0001.csv']['outcome'] == 'done'
     assert rows['gone.csv']['refusal'] == 'no such file'
     assert rows['a.csv']['refusal'].startswith('cannot be read: Cannot connect')
+    # An address with a token is the recording without it.
+    assert rows['u0000_0000.csv?x=1']['outcome'] == 'done'
+    assert not [path for path in tmp_path.rglob('*') if path.is_file()
+                and b'SECRET' in path.read_bytes()]
 
 
 def test_a_worker_needs_no_ros(tmp_path):
