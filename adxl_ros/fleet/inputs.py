@@ -65,6 +65,8 @@ _DATES_S = (946684800.0, 4102444800.0)
 """Stamps between these count from 1970, s: the years 2000 to 2100. Others count from a start."""
 NO_FILE = 'no such file'
 """Fault of a recording that is not there."""
+_WEB_BAG = 'is a bag on a web server, which cannot be read as a whole; name a copy or its file'
+"""Fault of a bag whose address begins with http."""
 _DELIMITERS = ',;\t'
 """Characters between the columns of a manifest; the header has the one that it uses."""
 _MANIFEST_COLUMNS = ('serial', 'params', 'date')
@@ -278,24 +280,30 @@ def _is_of_fleet(fs: Any, name: str) -> bool:
 def _of_folder(fs: Any, folder: str, may_be_empty: bool = False) -> Iterator[Source]:
     """Yield the recordings in a folder, those of its folders too; a bag is one recording."""
     files = _listed(folder, lambda: fs.find(folder, detail=True))
-    bags = {str(PurePosixPath(name).parent) for name in files
-            if PurePosixPath(name).name == _BAG}
+    bags = {name.rpartition('/')[0] for name in files if PurePosixPath(name).name == _BAG}
     by_bag: dict[str, dict[str, Any]] = {bag: {} for bag in sorted(bags)}
     count = 0
     for name in sorted(files):
-        path = PurePosixPath(name)
-        parent = next((str(p) for p in path.parents if str(p) in bags), None)
+        parent = next((folder for folder in _folders(name) if folder in bags), None)
         if parent is not None:
             by_bag[parent][name] = files[name]
-        elif _is_recording_name(name) and not path.name.startswith('.') \
+        elif _is_recording_name(name) and not PurePosixPath(name).name.startswith('.') \
                 and not _is_of_fleet(fs, name):
             count += 1
             yield _of_info(fs, name, files[name])
     for bag, content in by_bag.items():
         count += 1
-        yield _of_bag(fs, bag, content)
+        # A web server does not say that this is a folder.
+        yield Source(_url(fs, bag), fault=_WEB_BAG) if _is_web(bag) else _of_bag(fs, bag, content)
     if not count and not may_be_empty:
         raise UserError(f'{folder}: has no recording (*{", *".join(_ENDINGS)}, a bag or a table)')
+
+
+def _folders(name: str) -> Iterator[str]:
+    """Yield the folders of a file, the nearest first; `//` of an address stays."""
+    while name:
+        name = name.rpartition('/')[0]
+        yield name
 
 
 def look_up(fs: Any, path: str, url: str) -> Source:

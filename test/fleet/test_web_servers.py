@@ -16,7 +16,8 @@
 
 from contextlib import contextmanager
 from dataclasses import replace
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from functools import partial
+from http.server import BaseHTTPRequestHandler, SimpleHTTPRequestHandler, ThreadingHTTPServer
 from threading import Thread
 import time
 
@@ -105,3 +106,21 @@ def test_a_message_has_no_token():
     with pytest.raises(UserError, match='gs2:') as error:
         find_sources(['gs2://user:SECRET@bucket/*.csv?sig=SECRET'])
     assert 'SECRET' not in str(error.value)
+
+
+def test_a_bag_is_refused_by_its_own_address(tmp_path):
+    """Recordings beside it are found."""
+    for name in ('bag/metadata.yaml', 'bag/bag_0.mcap', 'run.csv'):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text('')
+    handler = partial(SimpleHTTPRequestHandler, directory=tmp_path)
+    with ThreadingHTTPServer(('127.0.0.1', 0), handler) as server:
+        Thread(target=server.serve_forever, daemon=True).start()
+        url = f'http://127.0.0.1:{server.server_address[1]}'
+        found = {source.url: source.fault for source in find_sources([url])}
+        bag, = find_sources([f'{url}/bag'])
+        file, = find_sources([f'{url}/bag/bag_0.mcap'])
+        server.shutdown()
+    assert set(found) == {f'{url}/bag', f'{url}/run.csv'} and not found[f'{url}/run.csv']
+    assert bag.fault == found[bag.url] and bag.fault.startswith('is a bag on a web server')
+    assert not file.fault
