@@ -192,7 +192,8 @@ def _check_size(url: str, size_bytes: int | None, folder: Path, largest_bytes: i
                         f'{largest_bytes / 1e9:.3g} GB at most; split it')
     free = shutil.disk_usage(folder).free
     if size_bytes + _SPARE_BYTES > free:
-        raise StagingError(f'{url}: needs {size_bytes / 1e6:.3g} MB, but '
+        raise StagingError(f'{url}: needs {size_bytes / 1e6:.3g} MB beside '
+                           f'{_SPARE_BYTES / 1e6:.3g} MB that stay free, but '
                            f'{tempfile.gettempdir()} has {free / 1e6:.3g} MB free; set TMPDIR to '
                            'a larger disk')
 

@@ -354,6 +354,7 @@ def test_a_full_disk_is_one_line(tmp_path):
     assert staged.returncode == 1, staged.stderr
     rows = table_of(tmp_path / 'out')
     assert len(rows) == 4 and all('free; set TMPDIR' in row['refusal'] for row in rows)
+    assert all('MB beside 67.1 MB that stay free, but' in row['refusal'] for row in rows)
     assert written.returncode == 1
     assert len(written.stderr.splitlines()) == 1, written.stderr
     line, = written.stderr.splitlines()
