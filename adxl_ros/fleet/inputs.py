@@ -437,7 +437,7 @@ def _manifest_rows(text: str, fs: Any, path: str) -> dict[int, dict[str, str]] |
         if suffix == '.csv':
             with fs.open(path, 'r', encoding='utf-8-sig', newline='') as file:
                 begin, head = next(((number, line) for number, line in enumerate(file, 1)
-                                    if line.strip()), (0, ''))
+                                    if line.strip() and not _is_comment(line)), (0, ''))
                 delimiter = max(_DELIMITERS, key=head.count)
                 names = [name.strip().lower()
                          for name in next(csv.reader([head], delimiter=delimiter), [])]
@@ -453,11 +453,16 @@ def _manifest_rows(text: str, fs: Any, path: str) -> dict[int, dict[str, str]] |
     return None
 
 
+def _is_comment(line: str) -> bool:
+    """Return whether a line of a manifest is a comment."""
+    return line.lstrip().startswith('#')
+
+
 def _csv_rows(text: str, names: list[str], begin: int, rows: Any) -> dict[int, dict[str, str]]:
     """Return the rows of a manifest below its header in line `begin`, by number and column."""
     result = {}
     for cells in rows:
-        if not any(map(str.strip, cells)):
+        if not any(map(str.strip, cells)) or _is_comment(cells[0]):
             continue
         number = begin + rows.line_num
         if len(cells) != len(names):

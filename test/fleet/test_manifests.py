@@ -63,3 +63,27 @@ def test_a_recording_has_one_serial_number(tmp_path):
     source, = find_sources([write(tmp_path / 'list.csv', 'url,serial', 'run.csv,S1', 'run.csv,',
                                   './run.csv,S1')])
     assert source.serial == 'S1'
+
+
+def test_comments_of_a_manifest_are_skipped(tmp_path):
+    for name in 'ab':
+        write(tmp_path / f'{name}.csv', 'time_s,x_v')
+    path = write(tmp_path / 'list.csv', '# by hand, url', ' # twice', 'url,serial', 'a.csv,S1',
+                 '# later: c.csv', 'b.csv,S2')
+    assert [source.serial for source in find_sources([path])] == ['S1', 'S2']
+    path = write(tmp_path / 'list.csv', '# by hand', 'url,serial', '# later', 'a.csv')
+    with pytest.raises(UserError, match='row 4: 1 columns, expected 2'):
+        find_sources([path])
+
+
+def test_a_manifest_without_a_column_url_says_so(tmp_path):
+    """It may be a recording without numbers as well."""
+    parquet = pytest.importorskip('pyarrow.parquet')
+    from pyarrow import table
+    parquet.write_table(table({'file': ['a.csv'], 'serial': ['S1']}), tmp_path / 'list.parquet')
+    rows = rows_of(write(tmp_path / 'list.csv', 'file,serial', 'a.csv,S1'),
+                   str(tmp_path / 'list.parquet'))
+    assert rows['list.csv']['refusal'].startswith('the first 200 lines hold no row of numbers')
+    assert rows['list.parquet']['refusal'].startswith('has no column of numbers')
+    assert all(row['refusal'].endswith('; a manifest needs a column url')
+               for row in rows.values())

@@ -20,10 +20,15 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Protocol
 
+from adxl_ros.errors import UserError
 import numpy as np
 
 BLOCK_ROWS = 65536
 """Rows that are read at a time (chosen: some MB)."""
+
+
+class NoNumbers(UserError):
+    """A table holds no numbers; it may be a list of something."""
 
 
 @dataclass(frozen=True)

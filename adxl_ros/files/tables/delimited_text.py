@@ -33,7 +33,7 @@ from adxl_ros.errors import UserError
 from adxl_ros.files import csv_lines
 from adxl_ros.files.csv_lines import Lines
 from adxl_ros.files.csv_numbers import Layout, parse_numbers
-from adxl_ros.files.tables.base import TableBlock
+from adxl_ros.files.tables.base import NoNumbers, TableBlock
 import numpy as np
 
 NAME = 'delimited_text'
@@ -170,7 +170,7 @@ def open_table(path: str, topic: str = '') -> DelimitedText:
         raise UserError(f'{path}: is empty')
     form = find_form(head)
     if form is None:
-        raise UserError(f'{path}: the first {_HEAD_LINES} lines hold no row of numbers; expected '
+        raise NoNumbers(f'{path}: the first {_HEAD_LINES} lines hold no row of numbers; expected '
                         'a header, and a line of numbers for each sample')
     return DelimitedText(path, form)
 

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from adxl_ros.errors import install_hint, one_line, UserError
-from adxl_ros.files.tables.base import BLOCK_ROWS, RowPlaces, TableBlock
+from adxl_ros.files.tables.base import BLOCK_ROWS, NoNumbers, RowPlaces, TableBlock
 import numpy as np
 
 ENDINGS = ('.parquet', '.pq')
@@ -107,7 +107,7 @@ def open_table(path: str, topic: str = '') -> ParquetTable:
         times = {field.name: 'ns' for field in fields
                  if kinds.is_timestamp(field.type) or kinds.is_duration(field.type)}
     if not fields:
-        raise UserError(f'{path}: has no column of numbers')
+        raise NoNumbers(f'{path}: has no column of numbers')
     return ParquetTable(path, tuple(field.name for field in fields), times)
 
 
