@@ -32,7 +32,7 @@ from typing import Any
 
 from adxl_ros.errors import UserError
 from adxl_ros.files.package_version import package_version
-from adxl_ros.files.plain_address import without_secrets
+from adxl_ros.files.plain_address import as_utf_8, without_secrets
 
 _DPI = 100
 """Resolution of pictures, dots per inch (chosen: sharp at the page's width)."""
@@ -98,7 +98,7 @@ def render(package: str, template: str, values: Mapping[str, Any]) -> str:
 
 def command_of_this_process() -> str:
     """Return the command line that started this executable, without the secrets of URLs."""
-    words = map(without_secrets, sys.argv[1:])
+    words = [without_secrets(as_utf_8(word)) for word in sys.argv[1:]]
     return shlex.join(['ros2', 'run', 'adxl_ros', Path(sys.argv[0]).name, *words])
 
 

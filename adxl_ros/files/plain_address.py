@@ -60,6 +60,11 @@ def without_secrets(text: str) -> str:
     return _QUERY.sub(_plain_query, _PASSWORD.sub(r'\1@', text))
 
 
+def as_utf_8(name: str) -> str:
+    """Return the name of a file with escapes in place of what is not UTF-8."""
+    return name.encode('utf-8', 'backslashreplace').decode('utf-8')
+
+
 def _plain_query(match: re.Match[str]) -> str:
     """Return the place of an address with the parameters that are not secret."""
     place, query = match.groups()

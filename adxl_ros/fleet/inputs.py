@@ -35,7 +35,7 @@ from urllib.parse import urlsplit
 
 from adxl_ros.errors import install_hint, one_line, UserError
 from adxl_ros.files import recording
-from adxl_ros.files.plain_address import without_secrets
+from adxl_ros.files.plain_address import as_utf_8, without_secrets
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.stream_info import NO_UNIT
 from adxl_ros.files.tables import table_endings
@@ -144,9 +144,11 @@ def file_system(url: str, secret: str = '') -> tuple[Any, str]:
     except ImportError:
         raise UserError(f'fleet needs fsspec; {install_hint("adxl_ros[fleet]")}') from None
     try:
-        whole = secret if _is_web(secret) else url
-        options = {'password': secret} if secret and whole == url else _web_options(whole)
-        fs, path = url_to_fs(whole, **options)
+        address = secret if _is_web(secret) else url
+        options = {'password': secret} if secret and address == url else _web_options(address)
+        # A path of this machine may have two colons, which join addresses.
+        fs, path = url_to_fs(address, **options) if '://' in address else \
+            (LocalFileSystem(), LocalFileSystem._strip_protocol(address))
     except (ImportError, ValueError) as error:
         raise UserError(without_secrets(f'{url}: {one_line(error)}')) from None
     except Exception as error:
@@ -362,7 +364,7 @@ def _url(fs: Any, path: str) -> str:
         port = f':{options["port"]}' if options.get('port') else ''
         name = f'{scheme}://{user}{options["host"]}{port}/{rest}'
     # A name that is not UTF-8 has no place in a table.
-    name = without_secrets(name.encode('utf-8', 'backslashreplace').decode('utf-8'))
+    name = without_secrets(as_utf_8(name))
     return name.removeprefix('file://') if name.startswith('file:///') else name
 
 
@@ -377,6 +379,8 @@ def _of_info(fs: Any, path: str, info: Mapping[str, Any]) -> Source:
     """Return the recording that a file system describes."""
     if info['type'] not in ('file', 'link'):
         return Source(_url(fs, path), fault='is no file')
+    if as_utf_8(path) != path:
+        return Source(_url(fs, path), fault='its name is not UTF-8; rename it')
     return Source(_url(fs, path), info.get('size'), stamp_of(info), _modified(info),
                   secret=_secret(fs, path))
 

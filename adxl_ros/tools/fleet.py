@@ -26,7 +26,7 @@ from time import monotonic
 from adxl_ros.calibrate.value_text import counted, duration
 from adxl_ros.errors import install_hint, UserError
 from adxl_ros.files import calibration_store
-from adxl_ros.files.plain_address import without_secrets
+from adxl_ros.files.plain_address import as_utf_8, without_secrets
 from adxl_ros.files.stream_info import NO_UNIT
 from adxl_ros.fleet.inputs import find_sources, stated_by
 from adxl_ros.fleet.recipe import make_recipe, task_names, TASKS
@@ -248,7 +248,8 @@ def _reason_lines(rows: Iterable[Row]) -> list[str]:
 
 def _command(options: argparse.Namespace, only_failed: bool) -> str:
     """Return the command that does what --dry-run shows, or that repeats what failed."""
-    words = [*map(without_secrets, options.input), '--do', options.do, '-o', options.output]
+    inputs = [without_secrets(as_utf_8(word)) for word in options.input]
+    words = [*inputs, '--do', options.do, '-o', options.output]
     for name in ('params', 'store', 'scheduler', 'jobs', 'retries', 'since', 'limit'):
         value = getattr(options, name)
         words += [f'--{name}', str(value)] if value != parser().get_default(name) else []

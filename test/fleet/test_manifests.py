@@ -14,6 +14,8 @@
 
 """Manifests: the recordings that they list, and what they state of them."""
 
+import os
+
 from adxl_ros.errors import UserError
 from adxl_ros.files.reading_options import AS_IT_IS
 from fleets import recording_text
@@ -87,3 +89,27 @@ def test_a_manifest_without_a_column_url_says_so(tmp_path):
     assert rows['list.parquet']['refusal'].startswith('has no column of numbers')
     assert all(row['refusal'].endswith('; a manifest needs a column url')
                for row in rows.values())
+
+
+def test_a_path_with_colons_is_a_path(tmp_path, monkeypatch):
+    """Two colons join addresses only where there is an address."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'day::1').mkdir()
+    path = tmp_path / 'day::1' / 'a::b.csv'
+    write(path, *recording_text('S1', '2026-10-01', 1).splitlines())
+    for name in ('day::1/a::b.csv', 'day::1', 'day::1/*.csv', str(path)):
+        row, = rows_of(name).values()
+        assert (row['url'], row['refusal']) == (str(path), None)
+    source, = find_sources(['gone::1.csv'])
+    assert (source.url, source.fault) == (str(tmp_path / 'gone::1.csv'), 'no such file')
+
+
+def test_a_name_that_is_not_utf_8_is_refused_by_its_name(tmp_path):
+    name = os.fsdecode(os.fsencode(tmp_path) + b'/b\xe9.csv')
+    write(tmp_path / 'a.csv', *recording_text('S1', '2026-10-01', 1).splitlines())
+    with open(name, 'w', encoding='utf-8') as file:
+        file.write(recording_text('S2', '2026-10-01', 1))
+    for inputs in ([str(tmp_path)], [str(tmp_path / 'a.csv'), name]):
+        rows = rows_of(*inputs)
+        assert rows['a.csv']['refusal'] is None
+        assert rows['b\\udce9.csv']['refusal'] == 'its name is not UTF-8; rename it'

@@ -270,6 +270,17 @@ def test_what_cannot_be_reached_or_read_is_a_row(run_tool, tmp_path):
     assert rows['u0000_0000.csv']['serial'] == 'U0'
 
 
+def test_a_name_that_is_not_utf_8_stops_nothing(tmp_path):
+    path, = write_fleet(tmp_path / 'day', 1, 1)
+    name = os.fsdecode(b'b\xe9.csv')
+    shutil.copy(path, tmp_path / 'day' / name)
+    words = ('fleet', path, path.with_name(name), '--do', 'check', '-o', 'out', '--jobs', 1)
+    dry, done = (run_executable(*words, *more, cwd=tmp_path) for more in (['--dry-run'], []))
+    assert (dry.returncode, done.returncode) == (0, 0), dry.stderr + done.stderr
+    assert done.stdout.startswith('2 recordings: 1 done, 1 refused')
+    assert 'its name is not UTF-8; rename it' in done.stdout
+
+
 def test_a_pipe_is_not_waited_for(tmp_path):
     write_fleet(tmp_path / 'day', 1, 1)
     os.mkfifo(tmp_path / 'day' / 'pipe.csv')
