@@ -28,6 +28,7 @@ import csv
 from dataclasses import dataclass, field, replace
 from datetime import datetime, timezone
 import hashlib
+import math
 import os
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
@@ -490,7 +491,9 @@ def _parquet_rows(fs: Any, path: str) -> dict[int, dict[str, str]] | None:
 
 
 def _text(value: Any) -> str:
-    """Return a value of a manifest as text."""
+    """Return a value of a manifest as text; a column with empty cells has floats."""
+    if isinstance(value, float):
+        return '' if math.isnan(value) else str(int(value)) if value.is_integer() else str(value)
     return value.isoformat() if isinstance(value, datetime) else str(value)
 
 

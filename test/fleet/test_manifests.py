@@ -113,3 +113,16 @@ def test_a_name_that_is_not_utf_8_is_refused_by_its_name(tmp_path):
         rows = rows_of(*inputs)
         assert rows['a.csv']['refusal'] is None
         assert rows['b\\udce9.csv']['refusal'] == 'its name is not UTF-8; rename it'
+
+
+def test_serial_numbers_of_parquet_are_whole_numbers(tmp_path):
+    """A column of numbers with an empty cell comes as floats."""
+    parquet = pytest.importorskip('pyarrow.parquet')
+    from pyarrow import table
+    parquet.write_table(table({'url': ['a.csv', 'b.csv', 'c.csv'], 'serial': [12.0, None, 1.5]}),
+                        tmp_path / 'list.parquet')
+    assert [source.serial for source in find_sources([str(tmp_path / 'list.parquet')])] == [
+        '12', '', '1.5']
+    parquet.write_table(table({'url': ['a.csv'], 'serial': [float('nan')]}),
+                        tmp_path / 'list.parquet')
+    assert [source.serial for source in find_sources([str(tmp_path / 'list.parquet')])] == ['']
