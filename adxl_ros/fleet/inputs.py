@@ -217,7 +217,8 @@ def _of_input(text: str) -> Iterator[Source]:
     if _is_glob(path) and not os.path.exists(path):
         listed = _listed(text, lambda: fs.glob(path, detail=True))
         names = [name for name in listed
-                 if PurePosixPath(name).name != _BAG and not _is_of_fleet(fs, name)]
+                 if PurePosixPath(name).name != _BAG and not _is_hidden_to(path, name)
+                 and not _is_of_fleet(fs, name)]
         if not names:
             raise UserError(f'{text}: matches nothing')
         for name in sorted(names):
@@ -283,14 +284,15 @@ def _is_of_fleet(fs: Any, name: str) -> bool:
 def _of_folder(fs: Any, folder: str, may_be_empty: bool = False) -> Iterator[Source]:
     """Yield the recordings in a folder, those of its folders too; a bag is one recording."""
     files = _listed(folder, lambda: fs.find(folder, detail=True))
-    bags = {name.rpartition('/')[0] for name in files if PurePosixPath(name).name == _BAG}
+    bags = {name.rpartition('/')[0] for name in files
+            if PurePosixPath(name).name == _BAG and not _is_hidden(name, folder)}
     by_bag: dict[str, dict[str, Any]] = {bag: {} for bag in sorted(bags)}
     count = 0
     for name in sorted(files):
-        parent = next((folder for folder in _folders(name) if folder in bags), None)
+        parent = next((above for above in _folders(name) if above in bags), None)
         if parent is not None:
             by_bag[parent][name] = files[name]
-        elif _is_recording_name(name) and not PurePosixPath(name).name.startswith('.') \
+        elif _is_recording_name(name) and not _is_hidden(name, folder) \
                 and not _is_of_fleet(fs, name):
             count += 1
             yield _of_info(fs, name, files[name])
@@ -300,6 +302,20 @@ def _of_folder(fs: Any, folder: str, may_be_empty: bool = False) -> Iterator[Sou
         yield Source(_url(fs, bag), fault=_WEB_BAG) if _is_web(bag) else _of_bag(fs, bag, content)
     if not count and not may_be_empty:
         raise UserError(f'{folder}: has no recording (*{", *".join(_ENDINGS)}, a bag or a table)')
+
+
+def _is_hidden(name: str, folder: str) -> bool:
+    """Return whether a file lies in a hidden folder below a folder, or is hidden itself."""
+    below = name.removeprefix(folder.rstrip('/'))
+    return any(part.startswith('.') for part in below.split('/'))
+
+
+def _is_hidden_to(glob: str, name: str) -> bool:
+    """Return whether a file is hidden to a glob, which may ask for hidden ones."""
+    parts = glob.split('/')
+    wild = next(i for i, part in enumerate(parts) if _is_glob(part))
+    return not any(part.startswith('.') for part in parts[wild:]) and \
+        _is_hidden(name, '/'.join(parts[:wild]))
 
 
 def _folders(name: str) -> Iterator[str]:

@@ -126,3 +126,23 @@ def test_serial_numbers_of_parquet_are_whole_numbers(tmp_path):
     parquet.write_table(table({'url': ['a.csv'], 'serial': [float('nan')]}),
                         tmp_path / 'list.parquet')
     assert [source.serial for source in find_sources([str(tmp_path / 'list.parquet')])] == ['']
+
+
+def test_hidden_folders_are_not_searched(tmp_path, monkeypatch):
+    """One that is named, or lies above the searched folder, is searched."""
+    monkeypatch.chdir(tmp_path)
+    names = ('day/a.csv', 'day/.ipynb_checkpoints/a-checkpoint.csv', 'day/.old/bag/metadata.yaml',
+             'day/.old/bag/0.mcap', 'bag/metadata.yaml', 'bag/.hidden',
+             'day/sub/.x/b.csv', '.top/c.csv')
+    for name in names:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        write(tmp_path / name, 'time_s,x_v')
+
+    def found(name):
+        return [source.url.removeprefix(f'{tmp_path}/') for source in find_sources([name])]
+
+    assert found('day') == found('day/*') == found('day/**/*.csv') == ['day/a.csv']
+    assert found('.top') == found('.top/*') == found('.t*/*.csv') == ['.top/c.csv']
+    assert found('day/.old') == ['day/.old/bag']
+    # A bag is read as a whole.
+    assert find_sources(['bag'])[0].size_bytes == 2 * len('time_s,x_v\n')
