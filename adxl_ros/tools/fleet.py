@@ -53,6 +53,8 @@ _EXAMPLES = {
     'what it would cost': 'manifest.csv -o results --dry-run',
 }
 """Examples of arguments, by their purpose."""
+_FEWEST_HOURS = 0.1
+"""Core hours below which a plan has seconds or minutes, h. Chosen: six minutes."""
 _UNITS = 5
 """Units that a plan names. Chosen: one or two lines."""
 _REASON_COLUMNS = 12
@@ -193,13 +195,19 @@ def _plan_lines(to_do: Plan, count: int) -> list[str]:
     largest = ', '.join(f'{serial} ({number})' for serial, number in by_unit.most_common(_UNITS))
     rows = {'found': f'{counted(count, "recording")}', 'done already': f'{to_do.done}',
             'left out': _left_out(to_do),
-            'core hours': f'{to_do.core_hours:.3g}',
+            'core hours': _hours(to_do.core_hours),
             'units': f'{len(by_unit)}{":" if by_unit else ""} {largest}'
             f'{", ..." if len(by_unit) > _UNITS else ""}',
             'unknown unit': f'{counted(unknown, "recording")}' if unknown else ''}
     return [f'{counted(len(to_do.todo), "recording")} to do, {_size(to_do.size_bytes)}, about '
             f'{duration(3600 * to_do.core_hours)} of one core', '',
             *(f' {name:13}{text}' for name, text in rows.items() if text), '']
+
+
+def _hours(hours: float) -> str:
+    """Return core hours, in shorter units where they are few."""
+    few = 0 < hours < _FEWEST_HOURS
+    return f'below {_FEWEST_HOURS}: {duration(3600 * hours)}' if few else f'{hours:.3g}'
 
 
 def _left_out(to_do: Plan) -> str:

@@ -19,6 +19,7 @@ from dataclasses import replace
 import json
 import os
 import random
+import re
 import shutil
 import signal
 import subprocess
@@ -58,6 +59,8 @@ def test_every_recording_has_one_row(run_tool, tmp_path):
                    '--store', 'my store', '--retries', 0)
     assert dry.returncode == 0 and dry.stdout.startswith('6 recordings to do')
     assert 'core hours' in dry.stdout and 'U0 (2), U1 (2)' in dry.stdout
+    took, = re.findall(r'about (.* s) of one core', dry.stdout)
+    assert f' core hours   below 0.1: {took}\n' in dry.stdout
     following = ' '.join(dry.stdout.partition(' next ')[2].replace('\\\n', '').split())
     assert following.endswith("gone.csv --do check,noise -o out --store 'my store' --retries 0")
     assert not (tmp_path / 'out').exists()
