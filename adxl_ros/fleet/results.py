@@ -149,7 +149,22 @@ class Results:
         return frozenset(key for size in sizes for key in self._by_size.get(size, ()))
 
     def row_with_key(self, key: str, url: str) -> Row | None:
-        """Return a row with a key, that of an address first; None where its file is gone."""
+        """
+        Return a row with a key.
+
+        Parameters
+        ----------
+        key
+            The key.
+        url
+            Address of the recording whose row comes first.
+
+        Returns
+        -------
+        dict or None
+            The row; None where its file is gone.
+
+        """
         own = _row_name(key, url)
         for path in sorted((self.folder / _ROWS).glob(f'{key}-*.json'),
                            key=lambda path: (path.name != own, path.name)):
