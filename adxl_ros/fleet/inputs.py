@@ -546,13 +546,13 @@ def _once(text: str, sources: Iterable[tuple[int, Source]]) -> list[Source]:
     """Return the recordings of a manifest's rows, each once, with what any row states of it."""
     first: dict[str, tuple[int, Source]] = {}
     for number, source in sources:
-        before, known = first.get(source.url, (number, source))
-        if known.serial and source.serial not in ('', known.serial):
+        before, earlier = first.get(source.url, (number, source))
+        if earlier.serial and source.serial not in ('', earlier.serial):
             raise UserError(f'{text}: rows {before} and {number}: the serial of {source.url} is '
-                            f'{known.serial} and {source.serial}, expected one')
-        first[source.url] = (before if known.serial else number, replace(
-            source, serial=source.serial or known.serial, params=source.params or known.params,
-            date=source.date or known.date))
+                            f'{earlier.serial} and {source.serial}, expected one')
+        first[source.url] = (before if earlier.serial else number, replace(
+            source, serial=source.serial or earlier.serial, params=source.params or earlier.params,
+            date=source.date or earlier.date))
     return [source for _, source in first.values()]
 
 

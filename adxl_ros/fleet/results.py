@@ -165,9 +165,9 @@ class Results:
             The row; None where its file is gone.
 
         """
-        own = _row_name(key, url)
+        of_url = _row_name(key, url)
         for path in sorted((self.folder / _ROWS).glob(f'{key}-*.json'),
-                           key=lambda path: (path.name != own, path.name)):
+                           key=lambda path: (path.name != of_url, path.name)):
             content = _read(path)
             if content is not None:
                 return content['row']

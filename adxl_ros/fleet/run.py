@@ -279,8 +279,8 @@ def _with_known(result: Result, results: Results) -> Result:
     row = results.row_with_key(result.row['key'], result.row['url'])
     assert row is not None, 'rows are never removed'
     is_copy = row['url'] != result.row['url']
-    own = (*_IDENTITY, *_COST) if is_copy else _IDENTITY
-    return result._replace(row={**row, **{name: result.row[name] for name in own}})
+    names = (*_IDENTITY, *_COST) if is_copy else _IDENTITY
+    return result._replace(row={**row, **{name: result.row[name] for name in names}})
 
 
 def since_text(text: str) -> str:

@@ -190,9 +190,9 @@ def _in_folder(recipe: Recipe, source: Source, earlier: frozenset[str], folder: 
     (folder / 'recording').mkdir()
     staged = stage(source, folder / 'recording')
     first, fault = _first_block(staged.path, recipe)
-    own = first.stream_info.serial if first else NO_UNIT
-    is_other = bool(source.serial) and own not in (NO_UNIT, '', source.serial)
-    serial = source.serial or own
+    recorded = first.stream_info.serial if first else NO_UNIT
+    is_other = bool(source.serial) and recorded not in (NO_UNIT, '', source.serial)
+    serial = source.serial or recorded
     date = _date(source, first)
     parameters = recipe.parameters_of(serial, date[0], source.params)
     digest = recipe.digest(parameters, source.serial)
@@ -206,7 +206,7 @@ def _in_folder(recipe: Recipe, source: Source, earlier: frozenset[str], folder: 
         job.refuse('read', 'is a manifest; name it itself, not its folder'
                    if is_manifest(staged.path) else job.plain(fault))
     elif is_other:
-        job.refuse('read', f'states the serial {own}, but the manifest says {source.serial}')
+        job.refuse('read', f'states the serial {recorded}, but the manifest says {source.serial}')
     else:
         job.run()
     return Result(job.row, job.files, source.stamp, digest)

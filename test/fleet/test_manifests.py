@@ -41,9 +41,9 @@ def rows_of(*inputs):
 
 def test_a_serial_number_that_contradicts_the_recording_is_refused(tmp_path):
     """A recording that states no unit has that of the manifest, and the other way round."""
-    for name, own in (('other', 'S2'), ('same', 'S3'), ('silent', 'nominal'), ('open', 'S4'),
+    for name, serial in (('other', 'S2'), ('same', 'S3'), ('silent', 'nominal'), ('open', 'S4'),
                       ('unsaid', 'S5')):
-        write(tmp_path / f'{name}.csv', *recording_text(own, '2026-10-01', 1).splitlines())
+        write(tmp_path / f'{name}.csv', *recording_text(serial, '2026-10-01', 1).splitlines())
     rows = rows_of(write(tmp_path / 'list.csv', 'url,serial', 'other.csv,WRONG', 'same.csv,S3',
                          'silent.csv,S6', 'open.csv,', 'unsaid.csv,nominal'))
     other = rows.pop('other.csv')

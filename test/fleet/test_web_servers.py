@@ -117,10 +117,10 @@ def test_a_bag_is_refused_by_its_own_address(tmp_path):
     with ThreadingHTTPServer(('127.0.0.1', 0), handler) as server:
         Thread(target=server.serve_forever, daemon=True).start()
         url = f'http://127.0.0.1:{server.server_address[1]}'
-        found = {source.url: source.fault for source in find_sources([url])}
+        faults = {source.url: source.fault for source in find_sources([url])}
         bag, = find_sources([f'{url}/bag'])
         file, = find_sources([f'{url}/bag/bag_0.mcap'])
         server.shutdown()
-    assert set(found) == {f'{url}/bag', f'{url}/run.csv'} and not found[f'{url}/run.csv']
-    assert bag.fault == found[bag.url] and bag.fault.startswith('is a bag on a web server')
+    assert set(faults) == {f'{url}/bag', f'{url}/run.csv'} and not faults[f'{url}/run.csv']
+    assert bag.fault == faults[bag.url] and bag.fault.startswith('is a bag on a web server')
     assert not file.fault

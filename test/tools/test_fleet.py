@@ -278,7 +278,7 @@ def test_a_name_that_is_not_utf_8_stops_nothing(tmp_path):
     name = os.fsdecode(b'b\xe9.csv')
     shutil.copy(path, tmp_path / 'day' / name)
     words = ('fleet', path, path.with_name(name), '--do', 'check', '-o', 'out', '--jobs', 1)
-    dry, done = (run_executable(*words, *more, cwd=tmp_path) for more in (['--dry-run'], []))
+    dry, done = (run_executable(*words, *option, cwd=tmp_path) for option in (['--dry-run'], []))
     assert (dry.returncode, done.returncode) == (0, 0), dry.stderr + done.stderr
     assert done.stdout.startswith('2 recordings: 1 done, 1 refused')
     assert 'its name is not UTF-8; rename it' in done.stdout
