@@ -16,7 +16,8 @@
 Addresses without what opens them: passwords, and the signatures and tokens of queries.
 
 A parameter of a query is secret if a word of its name says so, as in `access_token` and
-`AWSAccessKeyId`, or if it is part of a signature. The others tell apart what the address names.
+`AWSAccessKeyId`, or if it is part of a signature. The others tell apart what the address names:
+so does a plain `key`, which object stores use for a name.
 """
 
 import re
@@ -80,5 +81,5 @@ def _plain_query(match: re.Match[str]) -> str:
 def _is_secret(name: str, is_signed: bool) -> bool:
     """Return whether a parameter of a query is secret; `is_signed` says of a signature in it."""
     lower = name.lower()
-    return (lower.startswith(_SCHEMES) or (is_signed and lower in _SIGNED)
-            or any(word.lower() in _SECRET for word in _WORD.findall(name)))
+    return (lower.startswith(_SCHEMES) or (is_signed and lower in _SIGNED) or (
+        lower != 'key' and any(word.lower() in _SECRET for word in _WORD.findall(name))))
