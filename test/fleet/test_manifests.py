@@ -18,13 +18,13 @@ import os
 
 from adxl_ros.errors import UserError
 from adxl_ros.files.reading_options import AS_IT_IS
+from adxl_ros.fleet.inputs import find_sources
+from adxl_ros.fleet.recipe import make_recipe
+from adxl_ros.fleet.task import make_row
 from fleets import recording_text
 import pytest
 
 pytest.importorskip('fsspec', reason='fsspec is not installed')
-from adxl_ros.fleet.inputs import find_sources
-from adxl_ros.fleet.recipe import make_recipe
-from adxl_ros.fleet.task import make_row
 
 
 def write(path, *lines):
@@ -41,8 +41,8 @@ def rows_of(*inputs):
 
 def test_a_serial_number_that_contradicts_the_recording_is_refused(tmp_path):
     """A recording that states no unit has that of the manifest, and the other way round."""
-    for name, serial in (('other', 'S2'), ('same', 'S3'), ('silent', 'nominal'), ('open', 'S4'),
-                      ('unsaid', 'S5')):
+    serials = {'other': 'S2', 'same': 'S3', 'silent': 'nominal', 'open': 'S4', 'unsaid': 'S5'}
+    for name, serial in serials.items():
         write(tmp_path / f'{name}.csv', *recording_text(serial, '2026-10-01', 1).splitlines())
     rows = rows_of(write(tmp_path / 'list.csv', 'url,serial', 'other.csv,WRONG', 'same.csv,S3',
                          'silent.csv,S6', 'open.csv,', 'unsaid.csv,nominal'))

@@ -22,14 +22,13 @@ from threading import Thread
 import time
 
 from adxl_ros.errors import UserError
+from adxl_ros.fleet import inputs
+from adxl_ros.fleet.inputs import find_sources, Source
+from adxl_ros.fleet.staging import stage, StagingError
 import pytest
 
 aiohttp = pytest.importorskip('aiohttp', reason='aiohttp is not installed')
-pytest.importorskip('fsspec', reason='fsspec is not installed')
-from adxl_ros.fleet import inputs  # noqa: E402 (its libraries were looked for before)
-from adxl_ros.fleet.inputs import find_sources, Source  # noqa: E402
-from adxl_ros.fleet.staging import stage, StagingError  # noqa: E402
-from fsspec.implementations.http import HTTPFileSystem  # noqa: E402
+http = pytest.importorskip('fsspec.implementations.http', reason='fsspec is not installed')
 
 _PART = b'0.0,2.5\n' * 1000
 
@@ -78,7 +77,7 @@ def test_a_recording_is_read_once(tmp_path):
 
 
 def test_a_slow_line_may_take_its_time(tmp_path, monkeypatch):
-    HTTPFileSystem.clear_instance_cache()
+    http.HTTPFileSystem.clear_instance_cache()
     monkeypatch.setattr(aiohttp.client, 'DEFAULT_TIMEOUT', aiohttp.ClientTimeout(total=0.5))
     with web_server(10, 0.2) as (url, _):
         assert stage(Source(url), tmp_path).size_bytes == 10 * len(_PART)
