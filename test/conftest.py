@@ -49,6 +49,8 @@ def pytest_configure(config: pytest.Config) -> None:
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     # A background job of a shell ignores SIGINT, and its processes would inherit this.
     signal.signal(signal.SIGINT, signal.default_int_handler)
+    # And nohup ignores SIGHUP.
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
 @pytest.hookimpl(tryfirst=True)

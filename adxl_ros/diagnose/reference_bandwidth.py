@@ -30,6 +30,8 @@ _WINDOW_S = 1.0
 """Length of the windows of the spectra, s. Chosen: it separates frequencies of 1 Hz."""
 _SHORTEST_WINDOW = 64
 """Fewest samples of a window. Chosen: 33 frequencies."""
+_USED = 0.9
+"""Share of the samples of a window that are compared. Chosen: jumps of the force take a few."""
 _FEWEST_WINDOWS = 20
 """Fewest windows. Chosen: noise then has a coherence of 0.05."""
 _QUIET = 0.1
@@ -67,16 +69,18 @@ def fading_frequency_hz(comparison: BaselineComparison) -> float | None:
         return None
     sensor = comparison.sensor
     size = max(round(_WINDOW_S * sensor.rate_hz), _SHORTEST_WINDOW) // 2 * 2
-    used = comparison.used & np.isfinite(comparison.volts).all(axis=1)
-    starts = [i for i in range(0, len(used) - size + 1, size // 2) if used[i:i + size].all()]
+    recorded_g, simulated_g = (v / sensor.scale_v_per_g for v in (
+        comparison.volts, comparison.simulated_v(sensor)))
+    known = np.isfinite(recorded_g + simulated_g).all(axis=1)
+    starts = [i for i in range(0, len(known) - size + 1, size // 2)
+              if known[i:i + size].all() and comparison.used[i:i + size].mean() > _USED]
     if len(starts) < _FEWEST_WINDOWS:
         return None
     rows = np.array(starts)[:, None] + np.arange(size)
     recorded, simulated = (
-        np.fft.rfft(scipy.signal.detrend(v[rows], axis=1) * np.hanning(size)[None, :, None],
+        np.fft.rfft(scipy.signal.detrend(g[rows], axis=1) * np.hanning(size)[None, :, None],
                     axis=1)
-        for v in (comparison.volts / sensor.scale_v_per_g,
-                  comparison.simulated_v(sensor) / sensor.scale_v_per_g))
+        for g in (recorded_g, simulated_g))
     power = np.sum(np.abs(recorded) ** 2, axis=2)
     quiet = np.argsort(power.sum(axis=1))[:max(round(_QUIET * len(starts)), 2)]
     noise = _bands(power[quiet].mean(axis=0))
