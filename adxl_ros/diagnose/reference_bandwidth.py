@@ -71,16 +71,16 @@ def fading_frequency_hz(comparison: BaselineComparison) -> float | None:
     size = max(round(_WINDOW_S * sensor.rate_hz), _SHORTEST_WINDOW) // 2 * 2
     recorded_g, simulated_g = (v / sensor.scale_v_per_g for v in (
         comparison.volts, comparison.simulated_v(sensor)))
-    known = np.isfinite(recorded_g + simulated_g).all(axis=1)
-    starts = [i for i in range(0, len(known) - size + 1, size // 2)
-              if known[i:i + size].all() and comparison.used[i:i + size].mean() > _USED]
+    is_finite = np.isfinite(recorded_g + simulated_g).all(axis=1)
+    starts = [i for i in range(0, len(is_finite) - size + 1, size // 2)
+              if is_finite[i:i + size].all() and comparison.used[i:i + size].mean() > _USED]
     if len(starts) < _FEWEST_WINDOWS:
         return None
     rows = np.array(starts)[:, None] + np.arange(size)
     recorded, simulated = (
-        np.fft.rfft(scipy.signal.detrend(g[rows], axis=1) * np.hanning(size)[None, :, None],
+        np.fft.rfft(scipy.signal.detrend(accel_g[rows], axis=1) * np.hanning(size)[None, :, None],
                     axis=1)
-        for g in (recorded_g, simulated_g))
+        for accel_g in (recorded_g, simulated_g))
     power = np.sum(np.abs(recorded) ** 2, axis=2)
     quiet = np.argsort(power.sum(axis=1))[:max(round(_QUIET * len(starts)), 2)]
     noise = _bands(power[quiet].mean(axis=0))
