@@ -28,6 +28,7 @@ from typing import Any, NamedTuple
 
 from adxl_ros.files.cdr import Raws
 from adxl_ros.files.message_pieces import collected, Piece
+from adxl_ros.files.page_cache import release_read
 import numpy as np
 
 _MESSAGE = 5
@@ -161,6 +162,7 @@ def read_chunk(file: Any, chunk: Any, topics: Mapping[int, str]) -> Piece:
                   + len(chunk.compression))
         data = np.frombuffer(decompress(file.read(chunk.compressed_size), chunk.compression,
                                         chunk.uncompressed_size, crc), np.uint8)
+        release_read(file)
         return _ordered({topic: _messages(data, channel, _index(file, chunk, channel))
                          for channel, topic in _channels(chunk, topics).items()})
     except IndexFault:
