@@ -26,6 +26,7 @@ from dataclasses import dataclass
 from adxl_ros.diagnose.baseline_comparison import BaselineComparison, Reference
 from adxl_ros.diagnose.noise_detectors import code_step_v
 from adxl_ros.files.recording_columns import JOINTS, Recording
+from adxl_ros.files.reference_alignment import LONGEST_MOVE_NS, USUAL_GAPS
 from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.sensor import Sensor
@@ -34,14 +35,10 @@ from adxl_ros.simulate.smoothed_paths import BAND_LIMITED_DEGREE, ForcePath, KNO
 import numpy as np
 import scipy
 
-LONGEST_BRIDGE_S = 0.1
-"""Longest time without a reading of a joint, s, that is bridged. Chosen: an acceleration of
-1 rad/s² then bends the path by 1 mrad, which is the noise of an ADXL203."""
+LONGEST_BRIDGE_S = LONGEST_MOVE_NS / 1e9
+"""Longest time without a reading of a joint, s, that is bridged: as between messages of a bag."""
 LONGEST_SLOW_BRIDGE_S = 10.0
 """The same for temperature and supply. Chosen: a board warms by less than 0.1 K."""
-_USUAL_GAPS = 3.0
-"""A gap of this many usual ones is bridged, however long. Chosen: a reference of a lower rate
-loses single messages."""
 _BEFORE_S, _AFTER_S = 0.1, 0.3
 """Times that are left out beside a gap in which a joint moves, s. Chosen: the spline is uncertain
 before it, and an RC filter of 15 Hz has settled after it."""
@@ -185,7 +182,7 @@ def _in_gaps(time_s: np.ndarray, name: str, read_s: np.ndarray, values: np.ndarr
         One entry or none.
 
     """
-    limit_s = max(longest_s, _USUAL_GAPS * float(np.median(np.diff(read_s)))
+    limit_s = max(longest_s, USUAL_GAPS * float(np.median(np.diff(read_s)))
                   if len(read_s) > 1 else 0.0)
     rows = np.zeros(len(time_s), bool)
     if time_s[0] < read_s[0] - limit_s:
@@ -350,7 +347,7 @@ def _spline_error(read_s: np.ndarray, values: np.ndarray, degree: int, order: in
     """
     gaps_s = np.diff(read_s)
     step_s = float(np.median(gaps_s))
-    wide = np.flatnonzero(gaps_s > max(LONGEST_BRIDGE_S, _USUAL_GAPS * step_s)) + 1
+    wide = np.flatnonzero(gaps_s > max(LONGEST_BRIDGE_S, USUAL_GAPS * step_s)) + 1
     spacing = max(knots_s, float(np.quantile(gaps_s, _USUAL_QUANTILE))) / step_s
     left_out = np.zeros(len(values), bool) if jumps is None else jumps
     errors = []

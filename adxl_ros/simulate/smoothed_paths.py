@@ -318,10 +318,6 @@ def visible_step(reading: np.ndarray, step: float) -> float:
         The stated step, or a finer one; 0 for exact readings.
 
     """
-    changes = np.abs(np.diff(reading))
-    changed = changes[changes > _SMALLEST_CHANGE * step] if step else changes[:0]
-    if len(changed) < _MIN_MOVING:
-        return step
     if not _is_interpolated(reading, step):
         return step
     thinned = reading[::_samples_per_reading(reading, _SMALLEST_CHANGE * step)]
