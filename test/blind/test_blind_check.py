@@ -1,17 +1,4 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
-
+# SPDX-License-Identifier: Apache-2.0
 """`blind` on small checks, with diagnoses that cheat or name no effect."""
 
 from concurrent.futures import ThreadPoolExecutor
@@ -23,26 +10,22 @@ from pathlib import Path
 import shutil
 import sys
 
-from adxl_ros.blind import (
-    blind_check,
+from adxl_ros.errors import UserError
+from adxl_ros.files.plot_file import pyplot
+from adxl_ros.jobs.pools import open_pool
+from adxl_ros_validation.blind import (
+    check,
     diagnosis_runs,
     grading,
-    label_commitment,
-    negative_controls,
-    real_recordings,
+    real_sensors,
     report_html,
     scores,
     trials,
 )
-from adxl_ros.blind.label_commitment import Setup
-from adxl_ros.blind.trials import Label
-from adxl_ros.blind.world import chain, fault, fault_table, ideal_observer, motion, unit
-from adxl_ros.errors import UserError
-from adxl_ros.files.plot_file import pyplot
-from adxl_ros.jobs.pools import open_pool
+from adxl_ros_validation.blind.trials import Label, Setup
+from adxl_ros_validation.blind.world import fault_table, ideal_observer, motion, simulator
 import numpy as np
 import pytest
-import yaml
 
 pytestmark = pytest.mark.long
 
@@ -112,8 +95,8 @@ def pool():
 def committed_check(tmp_path_factory):
     folder = tmp_path_factory.mktemp('check') / 'blind'
     with open_pool(None) as pool:
-        label_commitment.commit(folder, Setup(SEED, TRIALS), trials.plans(SEED, TRIALS, SECONDS),
-                                pool, no_progress)
+        trials.commit(folder, Setup(SEED, TRIALS), trials.plans(SEED, TRIALS, SECONDS),
+                      pool, no_progress)
     return folder
 
 
@@ -122,8 +105,8 @@ def null_check(committed_check, tmp_path_factory, pool):
     """Score a diagnosis that names no effect, once for all tests that use it."""
     folder = tmp_path_factory.mktemp('nothing')
     shutil.copytree(committed_check, folder / 'blind')
-    return folder / 'blind', blind_check.score(folder / 'blind', script(folder, NOTHING), pool,
-                                               show)
+    return folder / 'blind', check.score(folder / 'blind', script(folder, NOTHING), pool,
+                                         show)
 
 
 def copied(committed_check, null_check, folder):
@@ -155,15 +138,15 @@ def test_labels_have_the_committed_hash(committed_check, null_check, tmp_path, p
     text = (folder / 'labels' / 'labels.json').read_bytes()
     digest = json.loads((committed_check / 'seal.json').read_bytes())['sha256_of_salt_and_labels']
     assert hashlib.sha256(text).hexdigest() == digest == made['hash']
-    drawn = [trials.draw(plan) for plan in trials.plans(SEED, TRIALS, SECONDS)[:1]]
-    opened = label_commitment.committed_labels(folder).labels[:1]
+    drawn = [trials.draw_label(plan) for plan in trials.plans(SEED, TRIALS, SECONDS)[:1]]
+    opened = trials.committed_labels(folder).labels[:1]
     assert [label.effects for label in drawn] == [label.effects for label in opened]
     assert [fault['size'] for label in drawn for fault in label.faults] == pytest.approx(
         [fault['size'] for label in opened for fault in label.faults])
     other = copied(committed_check, null_check, tmp_path)
     (other / 'labels' / 'labels.json').write_bytes(text.replace(b'"single"', b'"pair"'))
     with pytest.raises(UserError, match='not the labels whose hash'):
-        blind_check.score(other, script(tmp_path, NOTHING), pool, show)
+        check.score(other, script(tmp_path, NOTHING), pool, show)
 
 
 def test_a_folder_of_an_older_version_is_refused_in_one_line(committed_check, tmp_path, pool):
@@ -172,13 +155,13 @@ def test_a_folder_of_an_older_version_is_refused_in_one_line(committed_check, tm
     labels = tmp_path / 'encrypted' / 'labels'
     (labels / 'labels.json').rename(labels / 'labels.sealed')
     with pytest.raises(UserError, match='an older version encrypted these labels'):
-        blind_check.score(tmp_path / 'encrypted', None, pool, show)
+        check.score(tmp_path / 'encrypted', None, pool, show)
     drawn = tmp_path / 'drawn' / 'labels' / 'drawn'
     drawn.mkdir(parents=True)
     for text in ('{"seed": 1, "trials": 2}', '[]', '', '{"seed": 1, "trials": 2, "label": {}}'):
         (drawn / 'r0000.json').write_text(text)
         with pytest.raises(UserError, match='of another version'):
-            blind_check.draw(tmp_path / 'drawn', 1, 2, pool, no_progress)
+            check.draw(tmp_path / 'drawn', 1, 2, pool, no_progress)
 
 
 def test_scores_of_a_diagnosis_without_effects(null_check):
@@ -196,19 +179,19 @@ def test_scores_of_a_diagnosis_without_effects(null_check):
 def test_a_diagnosis_cannot_reach_the_labels(committed_check, null_check, tmp_path, pool):
     """Working directory, arguments and environment of a diagnosis do not lead to a label."""
     folder = copied(committed_check, null_check, tmp_path)
-    blindfolded = blind_check.score(folder, script(tmp_path, CHEAT.format(folder='.')), pool, show)
+    blindfolded = check.score(folder, script(tmp_path, CHEAT.format(folder='.')), pool, show)
     assert not any(row['named'] for row in blindfolded['rows'])
     # The same diagnosis names the labels if it has the folder.
     shutil.rmtree(folder / 'reports')
-    opened = blind_check.score(folder, script(tmp_path, CHEAT.format(folder=str(folder))), pool,
-                               show)
+    opened = check.score(folder, script(tmp_path, CHEAT.format(folder=str(folder))), pool,
+                         show)
     assert all(sorted(row['named']) == sorted(row['effects']) for row in opened['rows']
                if row['group'] != 'zero')
 
 
 def test_scores_of_a_diagnosis_with_a_constant_effect(committed_check, null_check, tmp_path, pool):
     folder = copied(committed_check, null_check, tmp_path)
-    made = blind_check.score(folder, script(tmp_path, ALWAYS), pool, show)
+    made = check.score(folder, script(tmp_path, ALWAYS), pool, show)
     score = made['scores']
     assert score['false_alarms']['value'] == 1
     singles = [row for row in made['rows'] if row['group'] == 'single']
@@ -269,15 +252,15 @@ def test_drawing_resumes(tmp_path, pool):
     def twice(plan):
         if plan.name == 'r0002' and not (tmp_path / 'again').exists():
             raise KeyboardInterrupt
-        return label_commitment.draw(plan)
+        return trials.draw_trial(plan)
 
     with pytest.raises(KeyboardInterrupt):
-        label_commitment.commit(tmp_path / 'blind', Setup(3, 2), plans, pool, no_progress, twice)
+        trials.commit(tmp_path / 'blind', Setup(3, 2), plans, pool, no_progress, twice)
     (tmp_path / 'again').touch()
-    digest = label_commitment.commit(tmp_path / 'blind', Setup(3, 2), plans, pool, no_progress,
-                                     twice)
-    opened = label_commitment.committed_labels(tmp_path / 'blind')
-    assert digest == label_commitment.published_hash(tmp_path / 'blind')
+    digest = trials.commit(tmp_path / 'blind', Setup(3, 2), plans, pool, no_progress,
+                           twice)
+    opened = trials.committed_labels(tmp_path / 'blind')
+    assert digest == trials.published_hash(tmp_path / 'blind')
     assert [label.name for label in opened.labels] == ['r0000', 'r0001', 'r0002']
 
 
@@ -304,19 +287,19 @@ def answer(recording, parameters):
 
 def test_a_generator_that_leaks_labels_is_detected(null_check, tmp_path, pool):
     """The length of the recordings reveals which trials have an effect."""
-    folder, labels = tmp_path / 'blind', label_commitment.committed_labels(null_check[0]).labels
+    folder, labels = tmp_path / 'blind', trials.committed_labels(null_check[0]).labels
     recordings = null_check[0] / 'recordings'
 
     def leaking(plan):
         label = next(label for label in labels if label.name == plan.name)
         text, parameters = ((recordings / f'{plan.name}.{suffix}').read_text()
                             for suffix in ('csv', 'yaml'))
-        return label_commitment.Drawn(label, padded(label, text), parameters)
+        return trials.Drawn(label, padded(label, text), parameters)
 
-    label_commitment.commit(folder, Setup(SEED, TRIALS), trials.plans(SEED, TRIALS, SECONDS),
-                            pool, no_progress, leaking)
+    trials.commit(folder, Setup(SEED, TRIALS), trials.plans(SEED, TRIALS, SECONDS),
+                  pool, no_progress, leaking)
     shutil.copytree(null_check[0] / 'labels' / 'held', folder / 'labels' / 'held')
-    made = blind_check.score(folder, script(tmp_path, PADDED), pool, show)
+    made = check.score(folder, script(tmp_path, PADDED), pool, show)
     assert made['controls']['metadata_only']['leaks'] and made['leaks']
     assert 'LEAKS' in report_html.summary(made) and 'LEAKS' in report_html.page(made, pyplot())
 
@@ -328,7 +311,7 @@ def test_an_answer_at_strength_zero_is_a_leak(tmp_path):
         text = padded(label, 'time_s,x_v\n0.0,2.5\n')
         answers.append(grading.answer(diagnosis_runs.diagnose(
             label.name, text.encode(), b'', script(tmp_path, PADDED))[1]))
-    assert negative_controls.strength_zero(labels, answers)['leaks']
+    assert check.strength_zero(labels, answers)['leaks']
 
 
 def drawn_labels():
@@ -391,7 +374,7 @@ def test_the_detection_curve_contains_the_true_strength():
     rng = np.random.default_rng(0)
     strength = np.exp(rng.uniform(-7, -1, 600))
     seen = rng.random(600) < 1 / (1 + np.exp(-(np.log(strength) + 4) / 0.5))
-    curve = scores.score_statistics.curve(strength, seen, 0.0)
+    curve = scores.curve(strength, seen, 0.0)
     assert curve['at_50']['ci'][0] < np.exp(-4) < curve['at_50']['ci'][1]
     assert curve['at_90']['ci'][0] < np.exp(-4 + 0.5 * np.log(9)) < curve['at_90']['ci'][1]
 
@@ -399,14 +382,14 @@ def test_the_detection_curve_contains_the_true_strength():
 @pytest.mark.parametrize('name', fault_table.KINDS)
 def test_every_fault_changes_a_recording(name):
     """The change grows with the size, and is zero at size zero."""
-    scene = ideal_observer.Scene(unit.draw(np.random.default_rng(0)), motion.draw(
+    scene = ideal_observer.Scene(simulator.draw_unit(np.random.default_rng(0)), motion.draw(
         np.random.default_rng(2), (60.0, 62.0), 125.0, 'rich'), 1)
     kind = fault_table.KINDS[name]
     shape = kind.draw(np.random.default_rng(1), scene.unit)
 
     def size(times):
         return ideal_observer.rms(scene.response(
-            [fault.Fault(kind, times * kind.start, shape)], True))
+            [simulator.Fault(kind, times * kind.start, shape)], True))
 
     assert size(0.0) == pytest.approx(0, abs=1e-9)
     assert 0 < size(1.0) < size(2.0)
@@ -415,45 +398,85 @@ def test_every_fault_changes_a_recording(name):
 
 def test_ideal_observer():
     """The observer detects a strong offset of alpha, and not a weak one."""
-    scene = ideal_observer.Scene(unit.draw(np.random.default_rng(0)), motion.draw(
+    scene = ideal_observer.Scene(simulator.draw_unit(np.random.default_rng(0)), motion.draw(
         np.random.default_rng(2), (60.0, 62.0), 125.0, 'one_plane'), 1)
     observer = ideal_observer.IdealObserver(scene)
     kind = fault_table.KINDS['stage_offset']
-    seen = [ideal_observer.power(float(np.sum(observer.project(scene.response([fault.Fault(
+    seen = [ideal_observer.power(float(np.sum(observer.project(scene.response([simulator.Fault(
         kind, size, {'w': [0.0, 1.0]})])) ** 2))) for size in (1e-7, 3e-3)]
     assert seen[0] < 0.05 and seen[1] > 0.99
     clean = observer.project(np.zeros_like(observer.force))
     assert np.allclose(clean, 0)
-    noise = chain.render(scene.unit, scene.manoeuvre, [], 3) - chain.render(
+    noise = simulator.render(scene.unit, scene.manoeuvre, [], 3) - simulator.render(
         scene.unit, scene.manoeuvre, [], 3, noise=False)
     spread = observer.project(noise * scene.unit.volts_to_mps2)
     # Whitened noise has variance 1, because the oracle uses the spectrum of the noise.
     assert np.var(spread) == pytest.approx(1, abs=0.05)
 
 
-def test_a_removed_effect_of_a_real_sensor_is_named(committed_check, tmp_path, pool):
-    """A diagnosis names the effect that its parameters do not contain."""
-    keys = yaml.safe_load((committed_check / 'recordings' / 'r0000.yaml').read_text())
-    (tmp_path / 'unit.yaml').write_text(yaml.safe_dump(keys))
-    body = """
-def answer(recording, parameters):
-    missing = [name for name in ('bias', 'scale_factor') if name + ':' not in
-               parameters.read_text()]
-    return ('explained', [[missing, 1.0]]) if missing else ('no_gap', [[[], 1.0]])
-"""
-    csv = committed_check / 'recordings' / 'r0000.csv'
-    rows = real_recordings.put_back([real_recordings.read_arm(f'{csv}:{tmp_path / "unit.yaml"}')],
-                                    script(tmp_path, body), pool, no_progress)
-    assert [(row['deleted'], row['put_back']) for row in rows] == [
-        (None, None), ('bias', True), ('scale_factor', True)]
-    remaining = real_recordings.without(keys, 'bias')['/**']['ros__parameters']
-    count = len(remaining['sensor']['axes'])
-    assert remaining['effects'] == ['scale_factor'] and 'bias' not in remaining
-    assert len(remaining['covariance']) == count ** 2
-    assert remaining['covariance_names'] == [f'scale_factor.offset_v_per_g.{axis}'
-                                             for axis in remaining['sensor']['axes']]
-    with pytest.raises(UserError, match='no such file'):
-        real_recordings.read_arm(f'{csv}:nowhere.yaml')
+@pytest.fixture
+def real_rest():
+    """Return the later part of a recording with a simulator: 60 s at 50 Hz, 5 mg of noise."""
+    rng, t = np.random.default_rng(0), np.arange(3000) / 50
+    force = 9.8 * np.stack([np.sin(t), np.cos(t), 0.1 * np.sin(3 * t)])
+    names = [f'a{d}_mps2' for d in 'xyz']
+    noisy = dict(zip(names, force + 0.05 * rng.normal(size=force.shape)))
+    half = real_sensors.Half('unit', 'simulator', {'time_s': t, **noisy},
+                             dict.fromkeys(['time_s', *names], 5), 'parameters: 1\n',
+                             {'time_s': t, **dict(zip(names, force))}, 0.0)
+    return replace(half, noise_mps2=real_sensors._noise(half))
+
+
+def test_a_defect_in_a_real_recording_has_the_strength_of_its_label(real_rest):
+    """Every kind that is offered acts; nothing else of the recording changes."""
+    assert real_rest.noise_mps2 == pytest.approx(0.05, rel=0.3)
+    kinds = real_rest.kinds(fault_table.KINDS)
+    assert {'bias', 'time_offset', 'jump', 'spikes'} <= set(kinds)
+    assert not {'temperature_bias', 'lever_arm', 'supply', 'cogging'} & set(kinds)
+    for i, name in enumerate(kinds):
+        drawn = real_sensors.draw([real_rest], fault_table.KINDS, trials.Plan(
+            'r0', 'single', (name,), (1, 2, i, 0)))
+        strength = drawn.label.faults[0]['strength_mps2']
+        assert 0 < strength < 25 * real_rest.noise_mps2, name
+    plain = real_sensors.draw([real_rest], fault_table.KINDS, trials.Plan(
+        'r0', 'none', (), (1, 2, 3, 0)))
+    rows = np.loadtxt(plain.recording.splitlines()[1:], delimiter=',')
+    assert rows[:, 1].tolist() == [round(v, 5) for v in real_rest.columns['ax_mps2']
+                                   if round(v, 5) in rows[:, 1]][:len(rows)]
+    assert plain.sim and plain.parameters == 'parameters: 1\n'
+
+
+def test_only_what_was_put_in_may_be_new():
+    """What the verdict of the untouched part names is there already."""
+    base = said('explained', 'gravity')
+    for status, named, group, right in (
+            ('explained', ['gravity'], 'none', True), ('no_gap', [], 'none', True),
+            ('explained', ['gravity', 'supply'], 'none', False),
+            ('explained', ['gravity', 'bias'], 'single', True),
+            ('explained', ['gravity'], 'single', False),
+            ('partly', ['bias'], 'single', True),
+            ('unknown', ['unknown'], 'outside', True),
+            ('explained', ['supply'], 'outside', False)):
+        label = trials.Label('r0', group, ('bias',) if group != 'none' else (), (1,), (1.0, 2.0),
+                             'unit by stage', 'xyz', 0.05, [] if group == 'none' else [
+                                 {'effect': 'bias', 'strength_mps2': 0.1}])
+        assert real_sensors.right(said(status, *named), base, label)[0] == right
+
+
+def said(status, *effects):
+    """Return an answer that names effects for certain."""
+    return grading.Answer(status, frozenset(effects), (), 0.8, ((frozenset(effects), 0.8),), {},
+                          1.0)
+
+
+def test_recordings_that_cannot_take_part_are_named(tmp_path):
+    (tmp_path / 'short.csv').write_text('time_s,ax_mps2\n0.0,1.0\n1.0,1.0\n')
+    (tmp_path / 'other.csv').write_text('a,b\n0,1\n1,2\n')
+    (tmp_path / 'list.yaml').write_text('recordings: [{file: gone.csv, address: http://x}]')
+    with pytest.raises(UserError, match='other.csv: is no recording.*short.csv: has 1 s'):
+        real_sensors.prepare(tmp_path)
+    with pytest.raises(UserError, match='gone.csv: no such file; the manifest has its address'):
+        real_sensors.prepare(tmp_path / 'list.yaml')
 
 
 def test_on_a_cluster(committed_check, null_check, tmp_path):
@@ -486,7 +509,7 @@ def test_the_command_commits_and_scores(run_tool, tmp_path):
 @pytest.mark.parametrize('words, status, says', [
     (['--trials', 3], 2, 'required'), (['-o', 'a', '--open', 'b'], 2, 'not allowed'),
     (['--trials', 0, '-o', 'a'], 1, 'at least 1'), (['--open', 'none'], 1, '--seal none'),
-    (['-o', 'a', '--real', 'x:y'], 1, 'x: no such file')])
+    (['-o', 'a', '--real', 'x'], 1, 'x: no such file or folder')])
 def test_wrong_usage(run_tool, tmp_path, words, status, says):
     failed = run_tool('blind', *words)
     assert failed.returncode == status and says in failed.stderr

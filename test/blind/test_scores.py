@@ -1,24 +1,10 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-License-Identifier: Apache-2.0
+"""Scores of the blind check: the competition's utility, rank histograms, and what counts."""
 
-"""Scores of the blind check: the competition's utility, rank histograms, and the fourth run."""
-
-from adxl_ros.blind import diagnostic_utility, reference_methods, report_html, scores
-from adxl_ros.blind.diagnostic_utility import COMPONENTS, pair_utility, utility
-from adxl_ros.blind.grading import Answer
-from adxl_ros.blind.score_statistics import rank_histogram
-from adxl_ros.blind.trials import Label
+from adxl_ros_validation.blind import grading, report_html, scores
+from adxl_ros_validation.blind.grading import Answer, COMPONENTS, pair_utility, utility
+from adxl_ros_validation.blind.scores import rank_histogram
+from adxl_ros_validation.blind.trials import Label
 import numpy as np
 import pytest
 from scipy.stats import norm
@@ -63,34 +49,34 @@ def test_utility_of_ambiguity_groups():
 
 def test_true_group_has_what_the_ideal_observer_cannot_separate():
     single = label('single', ['bias'], inseparable=['gravity', 'supply'])
-    assert diagnostic_utility.true_group(single) == diagnoses('bias', 'gravity', 'supply')
-    assert diagnostic_utility.true_group(label('single', ['bias'], 0.1)) == diagnoses('')
-    assert diagnostic_utility.true_group(label('zero', ['bias'])) == diagnoses('')
-    assert diagnostic_utility.true_group(label('outside', ['creep'])) == diagnoses('unknown')
+    assert grading.true_group(single) == diagnoses('bias', 'gravity', 'supply')
+    assert grading.true_group(label('single', ['bias'], 0.1)) == diagnoses('')
+    assert grading.true_group(label('zero', ['bias'])) == diagnoses('')
+    assert grading.true_group(label('outside', ['creep'])) == diagnoses('unknown')
     pair = label('pair', ['bias', 'gravity'], inseparable=['supply'])
-    assert diagnostic_utility.true_group(pair) == diagnoses(
+    assert grading.true_group(pair) == diagnoses(
         'bias gravity', 'bias supply', 'supply gravity')
 
 
 def test_answered_group():
     answer = Answer('inseparable', frozenset({'bias'}), (frozenset({'gravity', 'supply'}),),
                     0.9, ((frozenset(), 1.0),), {}, 1.0)
-    assert diagnostic_utility.answered_group(answer) == diagnoses('bias gravity', 'bias supply')
+    assert grading.answered_group(answer) == diagnoses('bias gravity', 'bias supply')
     failed = Answer('failed', frozenset(), (), 0.0, ((frozenset(), 0.0),), {}, 1.0)
-    assert diagnostic_utility.answered_group(failed) == set()
+    assert grading.answered_group(failed) == set()
 
 
 def test_reference_methods_are_ordered():
     """The truth has utility 1, and the worst answer 0 where a component is faulty."""
     labels = [label('single', [name]) for name in COMPONENTS[:-1]] + [label('none')] * 20
-    answers = reference_methods.answers(labels)
-    perfect = [reference_methods.certain(frozenset(row.true)) for row in labels]
+    answers = grading.answers(labels)
+    perfect = [grading.certain(frozenset(row.true)) for row in labels]
     made = scores.scores([scores.Trial(row, answer, None) for row, answer in zip(
-        labels, perfect)], {'perfect': perfect})
+        labels, perfect)])
     value = {name: row['utility']['value'] for name, row in made['comparison'].items()}
-    assert value['perfect'] == made['utility']['value'] == 1
-    assert value['perfect'] > value['Random'] > value['Worst']
-    assert value['perfect'] > value['Null'] > value['Worst']
+    assert made['utility']['value'] == 1
+    assert 1 > value['Random'] > value['Worst']
+    assert 1 > value['Null'] > value['Worst']
     assert value['Worst'] < 0.03
     assert made['comparison']['Null']['false_alarms']['value'] == 0
     assert made['comparison']['Worst']['false_alarms']['value'] == 1
@@ -118,19 +104,43 @@ def test_ranks_of_one_trial_count_as_one():
     assert rank_histogram([[0.9]] * 10)['p'] < 1e-6
 
 
-@pytest.mark.parametrize('name, value, ci, no_worse', [
-    ('false_alarms', 0.0, (0.0, 0.05), 'yes'), ('false_alarms', 0.02, (0.0, 0.05), 'open'),
-    ('false_alarms', 0.1, (0.04, 0.2), 'no'), ('top_1', 0.8, (0.7, 0.9), 'yes'),
-    ('top_1', 0.7, (0.6, 0.8), 'open'), ('top_1', 0.5, (0.4, 0.6), 'no'),
-    ('coverage', 0.93, (0.9, 0.95), 'yes'), ('coverage', 0.95, (0.9, 0.99), 'open'),
-    ('coverage', 0.7, (0.6, 0.8), 'no'), ('coverage', 0.99, (0.95, 1.0), 'no')])
-def test_comparison_with_the_fourth_run(name, value, ci, no_worse):
-    bar = next(bar for bar in scores.BARS if bar.name == name)
-    made = {bar.name: {'value': None, 'ci': None, 'count': 0} for bar in scores.BARS}
-    made[name] = {'value': value, 'ci': list(ci), 'count': 10}
-    rows = {row['name']: row['no_worse'] for row in scores.bars(made)}
-    assert rows.pop(bar.name) == no_worse
-    assert set(rows.values()) == {None}
+def said(status, *effects, **words):
+    """Return an answer that names effects for certain."""
+    return Answer(status, frozenset(effects), (), 0.8, ((frozenset(effects), 0.8),), {}, 1.0,
+                  **words)
+
+
+def test_an_effect_below_the_material_amplitude_is_no_gap_if_the_limit_holds_it():
+    """Its strength is 0.01 m/s²; a verdict may name it, and must not name another."""
+    row = label('single', ['bias'])
+    for material, limit, right in ((0.02, 0.015, True), (0.02, None, True),
+                                   (0.02, 0.005, False), (0.001, 0.015, False)):
+        assert grading.verdict_right(said('no_gap', material_mps2=material, limit_mps2=limit),
+                                     row) == right
+    assert grading.verdict_right(said('explained', 'bias', material_mps2=0.02), row)
+    assert not grading.verdict_right(said('explained', 'supply', material_mps2=0.02), row)
+    assert grading.limit_holds(said('no_gap', limit_mps2=0.005), row) is False
+    assert grading.limit_holds(said('no_gap', limit_mps2=0.005), label('none')) is True
+    made = scores.scores([scores.Trial(row, said('no_gap', material_mps2=0.02, limit_mps2=0.015),
+                                       None)])
+    assert made['set_recall']['count'] == 0 and made['limit_held']['value'] == 1
+
+
+def test_partly_is_right_with_the_true_effects():
+    pair, outside = label('pair', ['bias', 'gravity']), label('outside', ['creep'])
+    assert grading.verdict_right(said('partly', 'bias', 'gravity'), pair)
+    assert not grading.verdict_right(said('partly', 'bias'), pair)
+    assert not grading.verdict_right(said('partly', 'bias'), outside)
+    assert said('partly', 'bias').gap
+
+
+def test_a_report_states_its_material_amplitude_and_its_limit():
+    report = {'verdict': {'status': 'no_gap', 'effects': [], 'groups': [], 'probability': 0.9},
+              'hypotheses': [], 'candidates': [], 'gap': {'upper_limit': 4e-4}, 'material': 2e-3}
+    made = grading.answer({'report': report, 'seconds': 1.0})
+    assert (made.material_mps2, made.limit_mps2) == (2e-3, 4e-4)
+    made = grading.answer({'report': {**report, 'material': None, 'gap': {}}, 'seconds': 1.0})
+    assert (made.material_mps2, made.limit_mps2) == (grading.MATERIAL_MPS2, None)
 
 
 @pytest.mark.parametrize('name, value, ci, count, words', [
@@ -153,14 +163,14 @@ def test_a_bar_is_met_not_refuted_or_refuted(name, value, ci, count, words):
 
 def test_result_is_one_table_with_all_methods():
     labels = [label('single', ['bias']), label('none'), label('outside', ['creep'])]
-    answers = [reference_methods.certain(frozenset(row.true)) for row in labels]
+    answers = [grading.certain(frozenset(row.true)) for row in labels]
     made = scores.scores([scores.Trial(row, answer, None) for row, answer in zip(
         labels, answers)])
     text = report_html.markdown_result({
         'trials': 3, 'cases': 3, 'seed': 1, 'date': 'today', 'hash': 'h', 'version': 'v',
         'diagnose_code': 'c', 'controls': {}, 'bars': scores.bars(made), 'scores': made})
     head = next(line for line in text.splitlines() if line.startswith('| score'))
-    for name in ('fourth run', 'no worse', 'Null', 'Random', 'Worst', 'BIC, white noise'):
+    for name in ('bar', 'met', 'Null', 'Random', 'Worst', 'BIC, white noise'):
         assert f'| {name} ' in head
     rows = [line for line in text.splitlines() if line.startswith('|')]
     assert len(rows) == len(scores.BARS) + 5
@@ -169,7 +179,7 @@ def test_result_is_one_table_with_all_methods():
 
 def test_the_summary_fits_a_terminal():
     labels = [label('single', ['bias']), label('none'), label('outside', ['creep'])] * 50
-    made = scores.scores([scores.Trial(row, reference_methods.certain(frozenset(row.true)), None)
+    made = scores.scores([scores.Trial(row, grading.certain(frozenset(row.true)), None)
                           for row in labels])
     text = report_html.summary({
         'trials': 150, 'cases': 150, 'seed': 1, 'date': '2026-01-01', 'hash': 'h' * 64,

@@ -1,22 +1,9 @@
-# Copyright 2026 the adxl_ros authors
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
-
+# SPDX-License-Identifier: Apache-2.0
 """`reproduce`: the paper's experiments, each figure that is to be reached."""
 
 from adxl_ros.files import parameter_file
 from adxl_ros.model.constants import Z_90
-from adxl_ros.reproduction import error_statistics, experiments, report_page, units
+from adxl_ros_validation import experiments, reproduction_report
 import numpy as np
 import pytest
 from units import NOMINAL
@@ -30,8 +17,8 @@ _UNITS = {'perfect': 8, 'paper': 16}
 def evaluations():
     """Evaluate units on each stage; their number is larger where poses share stage errors."""
     nominal = parameter_file.load(NOMINAL)
-    return {name: [units.evaluate(nominal, stage, seed) for seed in range(_UNITS[name])]
-            for name, stage in units.STAGES.items()}
+    return {name: [experiments.evaluate(nominal, stage, seed) for seed in range(_UNITS[name])]
+            for name, stage in experiments.STAGES.items()}
 
 
 def angles_of(evaluated, model):
@@ -63,7 +50,7 @@ def test_alpha_errors_are_below_those_of_the_linear_model(evaluations, stage):
 def test_motion_error_reaches_the_noise_floor(evaluations):
     """With the filter time constant of the noise the error is at most 1.05 of 5.08 mm/s²."""
     nominal = parameter_file.load(NOMINAL)
-    bound = error_statistics.motion_bound_mmps2(nominal)
+    bound = experiments.motion_bound_mmps2(nominal)
     assert bound == pytest.approx(5.08, abs=0.01)
     error_mmps2 = [unit.models['full'].motion.rmse_mmps2
                    for evaluated in evaluations.values() for unit in evaluated]
@@ -101,8 +88,9 @@ def test_the_command_writes_the_page_and_its_plots(run_tool, tmp_path):
 
 
 def test_the_same_seed_gives_the_same_results(evaluations):
-    repeated = units.evaluate(parameter_file.load(NOMINAL), units.STAGES['paper'], 0)
-    page, again = (report_page.page({'perfect': evaluations['perfect'], 'paper': [unit]}, 5.08, '')
+    repeated = experiments.evaluate(parameter_file.load(NOMINAL), experiments.STAGES['paper'], 0)
+    page, again = (reproduction_report.page(
+        {'perfect': evaluations['perfect'], 'paper': [unit]}, 5.08, '')
                    for unit in (evaluations['paper'][0], repeated))
     assert page == again
 

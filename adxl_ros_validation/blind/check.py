@@ -1,0 +1,210 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A whole check: trials are drawn and committed, diagnosed and scored, with negative controls."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
+from contextlib import AbstractContextManager
+from datetime import date
+from functools import partial
+import json
+from pathlib import Path
+import secrets
+from typing import Any
+
+from adxl_ros.errors import UserError
+from adxl_ros.jobs.run import for_each
+from adxl_ros.jobs.whole_files import make_folder, write
+from adxl_ros_validation.blind import diagnosis_runs, grading, scores, trials
+from adxl_ros_validation.blind.grading import Answer
+from adxl_ros_validation.blind.scores import Trial
+from adxl_ros_validation.blind.trials import Label, Setup
+import numpy as np
+import scipy
+
+Show = Callable[[str], AbstractContextManager[Callable[[float], None]]]
+"""Receives the name of a stage; gives a context with what receives the finished fraction."""
+
+
+def draw(folder: Path, seed: int | None, count: int, pool: Executor,
+         show: Callable[[float], None]) -> str:
+    """Draw a check and commit to its labels, or continue the check of the folder."""
+    digest = trials.published_hash(folder)
+    if digest is not None:
+        existing: Setup | None = trials.committed_labels(folder).setup
+    else:
+        existing = trials.interrupted_setup(folder)
+        if existing is None and any(folder.glob('*')):
+            raise UserError(f'{folder}: is not empty and has no check; choose another folder')
+    if seed is None:
+        seed = existing.seed if existing else secrets.randbelow(2 ** 31)
+    setup = Setup(seed, count)
+    if existing not in (None, setup):
+        raise UserError(f'{folder}: has a check of another seed or number of trials; repeat the '
+                        'same options to continue it, or choose another folder')
+    if digest is not None:
+        return digest
+    return trials.commit(folder, setup, trials.plans(seed, count), pool, show)
+
+
+def score(folder: Path, command: Sequence[str] | None, pool: Executor, show: Show
+          ) -> dict[str, Any]:
+    """Diagnose all recordings that have no report yet, read the labels and score."""
+    digest = trials.published_hash(folder)
+    if digest is None:
+        raise UserError(f'{folder}: no labels are committed there; use --seal {folder} first')
+    trials.remove_drawn(folder)
+    trials.refuse_encrypted(folder)
+    # Labels may be on another machine: the diagnosis does not need them.
+    with show('diagnose') as advance:
+        results = diagnosis_runs.diagnose_all(folder, command, pool, advance)
+    version = (folder / 'reports' / 'version.txt').read_text()
+    committed = trials.committed_labels(folder)
+    labels = committed.labels
+    missing = [label.name for label in labels if label.name not in results]
+    if missing:
+        raise UserError(f'{folder / "recordings"}: {missing[0]}.csv is missing, {len(missing)} '
+                        'of the committed recordings in all; a check needs all of them')
+    with show('held out') as advance:
+        held_out = _held_out(folder, labels, results, pool, advance)
+    answers = [grading.answer(results[label.name]) for label in labels]
+    graded = [Trial(label, answer, held_out[label.name])
+              for label, answer in zip(labels, answers)]
+    made = scores.scores(graded)
+    negative = controls(folder, labels, answers)
+    return {
+        'schema': 1, 'hash': digest, 'seed': committed.setup.seed,
+        'trials': committed.setup.trials, 'cases': len(labels), 'date': str(date.today()),
+        'version': diagnosis_runs.package_version(), 'diagnose_code': version,
+        'failed': {label.name: results[label.name]['error'] for label, answer
+                   in zip(labels, answers) if answer.status == 'failed'},
+        'bars': scores.bars(made), 'controls': negative,
+        'leaks': any(control['leaks'] for control in negative.values()),
+        'scores': made, 'rows': [_row(trial) for trial in graded]}
+
+
+def _held_out(folder: Path, labels: Sequence[Label], results: dict[str, diagnosis_runs.Result],
+              pool: Executor, show: Callable[[float], None]) -> dict[str, dict[str, Any] | None]:
+    done = make_folder(folder / 'labels' / 'held')
+
+    def keep(name: str, gap: dict[str, Any] | None) -> None:
+        write(done / f'{name}.json', json.dumps(gap).encode())
+
+    def job(label: Label) -> tuple:
+        stated = (folder / 'recordings' / f'{label.name}.yaml').read_text()
+        return label, stated, results[label.name]['parameters']
+
+    todo = [label for label in labels if not (done / f'{label.name}.json').exists()]
+    for_each(pool, diagnosis_runs.evaluate, [partial(job, label) for label in todo],
+             keep, show, len(labels) - len(todo))
+    return {label.name: json.loads((done / f'{label.name}.json').read_bytes())
+            for label in labels}
+
+
+def _row(trial: Trial) -> dict[str, Any]:
+    """Return the data of one trial from which the scores follow."""
+    label, answer = trial.label, trial.answer
+    return {'name': label.name, 'group': label.group, 'effects': list(label.effects),
+            'strength_mps2': [fault['strength_mps2'] for fault in label.faults],
+            'power': [fault['power'] for fault in label.faults],
+            'told': [fault['told'] for fault in label.faults],
+            'inseparable': [fault['inseparable'] for fault in label.faults],
+            'flexible': label.flexible, 'manoeuvre': label.manoeuvre, 'axes': label.axes,
+            'status': answer.status, 'top': sorted(answer.top), 'named': sorted(answer.named),
+            'probability': answer.probability,
+            'right': grading.verdict_right(answer, label), 'seconds': answer.seconds,
+            'ranks': grading.ranks(answer, label),
+            'held': trial.held_out}
+
+
+_CHANCE = 0.002
+"""Chance that one control reports a leak of a check that has none; chosen."""
+_SHUFFLES = 2000
+"""Number of permutations of the labels; chosen."""
+
+
+def controls(folder: Path, labels: Sequence[Label],
+             answers: Sequence[Answer]) -> dict[str, dict[str, Any]]:
+    """Run all controls; `leaks` states whether a control is not at chance."""
+    return {'labels_permuted': permuted(labels, answers),
+            'metadata_only': metadata(folder / 'recordings', labels),
+            'strength_zero': strength_zero(labels, answers)}
+
+
+def permuted(labels: Sequence[Label], answers: Sequence[Answer]) -> dict[str, Any]:
+    """
+    Score the answers against the labels of other trials.
+
+    The score by chance follows from the frequencies of answers and labels. A higher score uses
+    something besides the answers.
+    """
+    real = [(label, answer) for label, answer in zip(labels, answers) if label.group != 'zero']
+    right = np.array([[answer.top in grading.right(label) for label, _ in real]
+                      for _, answer in real], float)
+    rng, n = np.random.default_rng(0), len(real)
+    shuffled = np.array([right[np.arange(n), rng.permutation(n)].mean()
+                         for _ in range(_SHUFFLES)]) if n else np.zeros(1)
+    chance = float(right.mean()) if n else 0.0
+    in_place = float(np.trace(right)) / max(n, 1)
+    low, high = (float(q) for q in np.quantile(shuffled, (_CHANCE / 2, 1 - _CHANCE / 2)))
+    return {'score': float(shuffled.mean()), 'chance': chance, 'labels_in_place': in_place,
+            'by_chance_between': [low, high], 'leaks': not low <= chance <= high}
+
+
+def metadata(recordings: Path, labels: Sequence[Label]) -> dict[str, Any]:
+    """
+    Guess labels from sizes, lengths, times and names of files only.
+
+    The score is the share of the variance of a quantity's ranks that the labels explain (Kruskal
+    and Wallis), for the quantity that they explain best. At chance is the same with permuted
+    labels. Labels count in three ways: by group, by effect, and as some effect or none.
+    """
+    facts = np.array([_facts(recordings, label.name) for label in labels], float)
+    ranks = scipy.stats.rankdata(np.column_stack([facts, np.arange(len(labels))]), axis=0)
+    ranks -= ranks.mean(axis=0)
+    groupings = [[label.group for label in labels],
+                 ['+'.join(label.effects) for label in labels],
+                 ['something' if label.effects else 'nothing' for label in labels]]
+    rng, count = np.random.default_rng(0), len(labels)
+    explained, chance = [], []
+    for grouping in groupings:
+        index = np.unique(grouping, return_inverse=True)[1]
+        members = np.eye(index.max() + 1)[index]
+        explained.append(_explained(members, ranks))
+        chance.append([_explained(members[rng.permutation(count)], ranks)
+                       for _ in range(_SHUFFLES)])
+    above = np.sum(np.array(chance) >= np.array(explained)[:, None] - 1e-12, axis=1)
+    p = float((1 + above.min()) / (1 + _SHUFFLES))
+    return {'score': explained[0], 'chance': float(np.mean(chance[0])), 'p': p,
+            'leaks': p < _CHANCE}
+
+
+def _explained(members: np.ndarray, ranks: np.ndarray) -> float:
+    """Return the largest share of a quantity's variance of ranks that is between groups."""
+    sums = members.T @ ranks
+    between = np.sum(sums ** 2 / members.sum(axis=0)[:, None], axis=0)
+    return float(np.max(between / np.maximum(np.sum(ranks ** 2, axis=0), 1e-12)))
+
+
+def _facts(recordings: Path, name: str) -> tuple[float, ...]:
+    csv, yaml = recordings / f'{name}.csv', recordings / f'{name}.yaml'
+    data, about = csv.read_bytes(), csv.stat()
+    rows, last = data.count(b'\n'), data.rstrip().rsplit(b'\n', 1)[-1]
+    return (about.st_size, rows, about.st_size - rows * len(last), about.st_mtime,
+            yaml.stat().st_size, yaml.stat().st_mtime, float(last.split(b',')[0]))
+
+
+def strength_zero(labels: Sequence[Label], answers: Sequence[Answer]) -> dict[str, Any]:
+    """Compare trials whose effect has strength zero with trials without an effect."""
+    pairs = list(zip(labels, answers))
+    zero, none = ([answer.gap for label, answer in pairs if label.group == group]
+                  for group in ('zero', 'none'))
+    named = sum(label.effects[0] in answer.named for label, answer in pairs
+                if label.group == 'zero')
+    if not zero or not none:
+        return {'score': None, 'chance': None, 'p': 1.0, 'leaks': False, 'named': named}
+    p = float(scipy.stats.fisher_exact([[sum(zero), len(zero) - sum(zero)],
+                                       [sum(none), len(none) - sum(none)]]).pvalue)
+    return {'score': sum(zero) / len(zero), 'chance': sum(none) / len(none), 'p': p,
+            'named': named, 'leaks': p < _CHANCE}

@@ -1,0 +1,286 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The ideal observer of this world: the power of detection, and what it cannot separate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import math
+
+from adxl_ros_validation.blind.world.fault_table import KINDS, KNOWN
+from adxl_ros_validation.blind.world.simulator import (
+    Fault,
+    FaultKind,
+    FINE_HZ,
+    G0,
+    LSB_V,
+    Motion,
+    references,
+    render,
+    SCALE_STD,
+    STAGE_STD,
+    stamps,
+    Unit,
+    ZERO_G_STD_G,
+)
+import numpy as np
+import scipy
+
+TEST_LEVEL = 0.05 / len(KNOWN)
+"""Level of the test of one effect, so that the tests of all effects together have 5 %."""
+INSEPARABLE_BELOW = 9.0
+"""A rival is inseparable where its fit leaves less than this of the squared visibility.
+
+These are three standard deviations; chosen.
+"""
+_COARSE_HZ = 400.0
+"""Lowest rate of the simulation of responses, Hz; chosen: eight times the filter's corner."""
+_NOISE_STD = 0.02
+"""Uncertainty of the stated noise density, a share; that of units is 0.015."""
+_FLEXIBLE_LEVEL = 0.001
+"""Level of the test by a flexible model; chosen."""
+_RECOGNISABLE_SAMPLE = 7.0
+"""Squared visibility of one repeated sample; chosen."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A unit in a manoeuvre."""
+
+    unit: Unit  # the unit and its motion
+    manoeuvre: Motion
+    seed: int  # seed of all random numbers
+
+    def response(self, faults: list[Fault], coarse: bool = False) -> np.ndarray:
+        """Return the change of the output by faults."""
+        noise = any(fault.kind.random for fault in faults)
+        fine = _COARSE_HZ if coarse else FINE_HZ
+        with_faults, without = (render(self.unit, self.manoeuvre, acting, self.seed, noise=noise,
+                                       fine_hz=fine) for acting in (faults, []))
+        return (with_faults - without) * self.unit.volts_to_mps2
+
+    def force(self) -> np.ndarray:
+        """Return the specific force along each axis without faults, m/s², (m, n)."""
+        volts = render(self.unit, self.manoeuvre, [], self.seed, noise=False)
+        return (volts - self.unit.zero_v[:, None]) * self.unit.volts_to_mps2
+
+
+def beyond_calibration(unit: Unit, change: np.ndarray, force: np.ndarray) -> np.ndarray:
+    """Remove what zero-g and scale factor explain within two standard deviations of the file."""
+    rest = np.empty_like(change)
+    bounds = 2 * np.array([ZERO_G_STD_G * G0, SCALE_STD])
+    for row, along, out in zip(change, force, rest):
+        columns = np.stack([np.ones_like(along), along], axis=1)
+        q, r = np.linalg.qr(columns)
+        out[:] = row - columns @ scipy.optimize.lsq_linear(r, q.T @ row, (-bounds, bounds)).x
+    return rest
+
+
+def rms(values: np.ndarray) -> float:
+    """Return the rms over samples and axes."""
+    return float(np.sqrt(np.mean(values ** 2)))
+
+
+def _spectrum(unit: Unit, count: int) -> np.ndarray:
+    """Return the one-sided spectrum of a recording without faults, (m/s²)²/Hz, (m, f)."""
+    rate = unit.rate_hz
+    f = np.fft.rfftfreq(count, 1 / rate)
+    f[0] = f[1]
+    power = np.zeros((len(unit.axes), len(f)))
+    for fold in range(-8, 9):
+        power += unit.noise_g_per_rthz[:, None] ** 2 / (
+            1 + ((f + fold * rate) / unit.corner_hz) ** 2)
+    w = 2 * np.pi * f
+    power += 2 * (unit.walk_g_per_rts[:, None] / w) ** 2
+    lags = 0.1 * 10 ** np.arange(0.5, math.log10(20 * count / rate), 0.5)
+    power += unit.flicker_g[:, None] ** 2 * sum(4 * lag / (1 + (w * lag) ** 2) for lag in lags)
+    # The rounding of the encoder stays for the length of a pose; that of the ADC is white.
+    power += unit.resolution_rad ** 2 / 24 * 4 * 2.0 / (1 + (w * 2.0) ** 2)
+    power += ((LSB_V / unit.scale_v_per_g) ** 2 / 12 * 2 / rate)[:, None]
+    return G0 ** 2 * power
+
+
+class IdealObserver:
+    """
+    It knows the form of every effect and the noise, and the calibration as far as it is stated.
+
+    Its vectors are whitened responses, axis after axis, with a row for each stated value. Sums of
+    their squares are twice a log likelihood ratio.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
+        self.force = scene.force()
+        self.axes, self.count = self.force.shape
+        self.weight = 1 / np.sqrt(_spectrum(scene.unit, self.count) * scene.unit.rate_hz / 2)
+        stated = []
+        for i, change in enumerate(self._stage()):
+            prior = np.zeros(2 * self.axes + 6)
+            prior[2 * self.axes + i] = 1.0
+            stated.append(np.concatenate([self.whiten(change), prior]))
+        for d in range(self.axes):
+            for response, std in ((np.ones_like(self.force[d]), ZERO_G_STD_G * G0),
+                                  (self.force[d], SCALE_STD)):
+                rows = np.zeros_like(self.force)
+                rows[d] = response
+                prior = np.zeros(2 * self.axes + 6)
+                prior[len(stated) - 6] = 1 / std
+                stated.append(np.concatenate([self.whiten(rows), prior]))
+        self.stated = np.linalg.qr(np.stack(stated, axis=1))[0]
+
+    def _stage(self) -> list[np.ndarray]:
+        """Return the response to each error of the stage at its standard deviation."""
+        unit = self.scene.unit
+        size = STAGE_STD * unit.resolution_rad
+        errors = [('stage_offset', [0]), ('stage_eccentricity', [2]), ('stage_eccentricity', [3]),
+                  ('stage_offset', [1]), ('stage_eccentricity', [0]), ('stage_eccentricity', [1])]
+        return [self.scene.response([Fault(KINDS[name], size, {
+            'w': np.isin(np.arange(4), weights).astype(float)})], coarse=True)
+            for name, weights in errors]
+
+    def whiten(self, change: np.ndarray) -> np.ndarray:
+        """Whiten a change, m/s², (m, n), into one vector."""
+        return np.fft.irfft(np.fft.rfft(change) * self.weight, self.count).ravel()
+
+    def project(self, change: np.ndarray) -> np.ndarray:
+        """Whiten a change and remove what the uncertainty of the calibration explains."""
+        vector = np.concatenate([self.whiten(change), np.zeros(2 * self.axes + 6)])
+        return vector - self.stated @ (self.stated.T @ vector)
+
+    def responses(self) -> dict[str, list[np.ndarray]]:
+        """Return the responses of each effect that is not like noise, m/s², (m, n) each."""
+        responses = {}
+        for name in KNOWN:
+            kind = KINDS[name]
+            if not kind.random or name == 'adc_inl':
+                faults = [Fault(kind, multiple * kind.start, shape)
+                          for shape in kind.spread(self.scene.unit) for multiple in kind.sizes]
+                responses[name] = [part for fault in faults for part in _parts(
+                    kind, self.scene.response([fault], coarse=True))]
+        return responses
+
+    def span(self, responses: list[np.ndarray]) -> np.ndarray:
+        """Return orthonormal columns that span whitened responses, (v, k)."""
+        return _orthonormal([self.project(change) for change in responses], self.stated.shape[0])
+
+    def simple_choices(self, residual: np.ndarray,
+                       responses: dict[str, list[np.ndarray]]) -> dict[str, str]:
+        """Choose an effect by two common methods: smallest RMSE, and BIC with white noise."""
+        axes = range(self.axes)
+        affine = _orthonormal([(response * (np.arange(self.axes) == d)[:, None]).ravel()
+                               for response in (np.ones_like(self.force), self.force)
+                               for d in axes], residual.size)
+
+        def beyond(rows: np.ndarray) -> np.ndarray:
+            return rows.ravel() - affine @ (affine.T @ rows.ravel())
+
+        rest = beyond(residual)
+        total, cost = float(rest @ rest), math.log(rest.size)
+        squares, criterion = {}, {'': rest.size * math.log(total)}
+        for name, changes in responses.items():
+            columns = _orthonormal([beyond(change) for change in changes], rest.size)
+            squares[name] = total - float(np.sum((columns.T @ rest) ** 2))
+            criterion[name] = rest.size * math.log(squares[name]) + columns.shape[1] * cost
+        return {'rmse': min(squares, key=squares.__getitem__),
+                'bic': min(criterion, key=criterion.__getitem__)}
+
+    def flexible_power(self, reserved: np.ndarray, vector: np.ndarray) -> float:
+        """Return the power of a flexible model of force, rate, angle, temperature and time."""
+        scene, explained, used = self.scene, 0.0, 0
+        rest = vector - reserved @ (reserved.T @ vector)
+        hats = _hats(scene, self.force)
+        for d in range(self.axes):
+            columns = []
+            for hat in hats:
+                rows = np.zeros_like(self.force)
+                rows[d] = hat
+                column = self.project(rows)
+                columns.append(column - reserved @ (reserved.T @ column))
+            basis = _orthonormal(columns, len(rest))
+            explained += float(np.sum((basis.T @ rest) ** 2))
+            used += basis.shape[1]
+        threshold = scipy.stats.chi2.isf(_FLEXIBLE_LEVEL, used)
+        return float(scipy.stats.ncx2.sf(threshold, used, explained))
+
+
+def _parts(kind: FaultKind, change: np.ndarray) -> list[np.ndarray]:
+    if not kind.per_axis:
+        return [change]
+    return [change * (np.arange(len(change)) == d)[:, None] for d in range(len(change))
+            if change[d].any()]
+
+
+def _orthonormal(columns: list[np.ndarray], length: int) -> np.ndarray:
+    """Return an orthonormal basis of the span of columns of any size, (length, k)."""
+    sizes = [float(np.linalg.norm(column)) for column in columns]
+    kept = [column / size for column, size in zip(columns, sizes) if size > 1e-6]
+    if not kept:
+        return np.zeros((length, 0))
+    stack = np.stack(kept, axis=1)
+    values, vectors = np.linalg.eigh(stack.T @ stack)
+    significant = values > 1e-8 * values[-1]
+    return stack @ (vectors[:, significant] / np.sqrt(values[significant]))
+
+
+def _hats(scene: Scene, force: np.ndarray) -> list[np.ndarray]:
+    """Return the hat functions of the flexible model, (n,) each."""
+    t = stamps(scene.unit, scene.manoeuvre)
+    measured = references(scene.unit, scene.manoeuvre, scene.seed)
+    rates = [np.gradient(scene.manoeuvre.joints(t)[name], t) for name in ('alpha', 'beta')]
+    over = [(along, 7) for along in force] + [(np.tanh(2 * rate), 5) for rate in rates]
+    over += [(np.sin(measured['beta_rad']), 5), (np.cos(measured['beta_rad']), 5),
+             (measured['temperature_c'], 4), (t, 8)]
+    hats = []
+    for values, count in over:
+        centres = np.linspace(values.min(), values.max(), count)
+        width = max(centres[1] - centres[0], 1e-9)
+        hats += [np.clip(1 - np.abs(values - centre) / width, 0, None) for centre in centres]
+    return hats
+
+
+def power(strength: float) -> float:
+    """Return the probability that a change of a squared visibility is detected."""
+    return float(scipy.stats.ncx2.sf(scipy.stats.chi2.isf(TEST_LEVEL, 1), 1, strength))
+
+
+def separation_probability(strength: float) -> float:
+    """Return the probability that the truth beats a rival that leaves a squared visibility."""
+    return float(scipy.stats.norm.cdf(0.5 * math.sqrt(max(strength, 0.0))))
+
+
+def noise_visibility(observer: IdealObserver, kind: FaultKind, change: np.ndarray) -> float:
+    """
+    Return the squared visibility of a fault that differs from run to run.
+
+    It follows from the spectrum (Whittle), with an uncertainty of the stated noise of 2 %. Spikes
+    also show one by one, and repeated or missing codes by their number.
+    """
+    if kind.name in ('mains_hum', 'adc_inl'):
+        return float(np.sum(observer.project(change) ** 2))
+    white = observer.weight ** 2 * np.abs(np.fft.rfft(change)) ** 2 / observer.count
+    excess = np.stack([_smooth(row) for row in white])[:, 1:]
+    visibility = sum(_whittle(row) for row in excess)
+    if kind.name == 'spikes':
+        samples = (observer.whiten(change)) ** 2
+        outstanding = np.clip(samples - 2 * math.log(samples.size), 0, None)
+        visibility = max(visibility, float(np.sum(outstanding)))
+    elif kind.name == 'stuck':
+        repeated = np.count_nonzero(np.any(np.abs(change) > 0, axis=0))
+        visibility = max(visibility, _RECOGNISABLE_SAMPLE * repeated)
+    elif kind.name == 'quantisation' and np.abs(change).max() > 2 * G0 * LSB_V:
+        visibility = max(visibility, float(observer.count))
+    return float(visibility)
+
+
+def _smooth(power: np.ndarray) -> np.ndarray:
+    """Average over bands that widen with frequency."""
+    edges = np.unique(np.geomspace(1, len(power), 60).astype(int))
+    means = np.add.reduceat(power, edges[:-1])[:len(edges) - 1] / np.diff(edges)
+    return np.concatenate([power[:1], np.repeat(means, np.diff(edges))])
+
+
+def _whittle(excess: np.ndarray) -> float:
+    """Return the squared visibility of an excess of the spectrum by the Whittle likelihood."""
+    def misfit(level: float) -> float:
+        ratio = (1 + excess) / (1 + level)
+        return float(2 * np.sum(ratio - 1 - np.log(ratio)) + (level / (2 * _NOISE_STD)) ** 2)
+    return scipy.optimize.minimize_scalar(misfit, bounds=(-0.2, 0.2), method='bounded').fun

@@ -1,0 +1,229 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Manoeuvres of this world: sequences of moves, rich or poor, with temperature and supply."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+POOR = ('one_way', 'crawl', 'few_poses', 'together', 'one_plane')
+"""Kinds of manoeuvres that cannot separate all effects."""
+_FASTEST_HZ = 22.0
+"""Highest frequency of the shaker, Hz; chosen: below the 50 Hz of the filter."""
+
+
+@dataclass
+class Script:
+    """Knots of the joints, with swings and bursts of the shaker added to them."""
+
+    time: list[float] = field(default_factory=lambda: [0.0])  # instants of the knots, s
+    # joint angles at the knots, rad
+    alpha: list[float] = field(default_factory=lambda: [np.pi / 2])
+    beta: list[float] = field(default_factory=lambda: [0.0])
+    # joint, amplitude (rad or m), frequency (Hz), start and end (s) of each swing
+    swings: list[tuple[str, float, float, float, float]] = field(default_factory=list)
+    fastest_hz: float = _FASTEST_HZ  # highest frequency of the shaker, Hz
+
+    @property
+    def end(self) -> float:
+        """Return the instant of the last knot, s."""
+        return self.time[-1]
+
+    def rest(self, seconds: float) -> None:
+        """Stay for some seconds."""
+        self.go(self.alpha[-1], self.beta[-1], seconds)
+
+    def go(self, alpha: float, beta: float, seconds: float) -> None:
+        """Move without a jump of velocity or acceleration at either end."""
+        self.time.append(self.end + seconds)
+        self.alpha.append(alpha)
+        self.beta.append(beta)
+
+    def swing(self, joint: str, size: float, hertz: float, seconds: float) -> None:
+        """Swing a joint about its position."""
+        self.swings.append((joint, size, hertz, self.end, self.end + seconds))
+        self.rest(seconds)
+
+
+@dataclass(frozen=True)
+class Manoeuvre:
+    """One manoeuvre and its environment."""
+
+    kind: str  # 'rich' or one of `POOR`
+    script: Script  # motion of the joints
+    temperature: tuple[np.ndarray, np.ndarray]  # instants, s, and values, °C or V
+    supply: tuple[np.ndarray, np.ndarray]
+
+    @property
+    def seconds(self) -> float:
+        """Return the duration, s."""
+        return self.script.end
+
+    def joints(self, t: np.ndarray) -> dict[str, np.ndarray]:
+        """Return alpha and beta (rad) and shift (m) at instants t (s)."""
+        knots = np.asarray(self.script.time)
+        i = np.clip(np.searchsorted(knots, t, 'right') - 1, 0, len(knots) - 2)
+        x = np.clip((t - knots[i]) / (knots[i + 1] - knots[i]), 0, 1)
+        blend = x ** 3 * (10 - 15 * x + 6 * x * x)
+        joints = {'shift': np.zeros_like(t)}
+        for name in ('alpha', 'beta'):
+            angles = np.asarray(getattr(self.script, name))
+            joints[name] = angles[i] + (angles[i + 1] - angles[i]) * blend
+        for joint, size, hertz, start, stop in self.script.swings:
+            a, b = np.searchsorted(t, [start, stop])
+            u = (t[a:b] - start) / (stop - start)
+            # Each swing fades in and out over a fifth of its duration, with three derivatives.
+            edge = np.clip(np.minimum(u, 1 - u) / 0.2, 0, 1)
+            fade = edge ** 4 * (35 - 84 * edge + 70 * edge ** 2 - 20 * edge ** 3)
+            joints[joint][a:b] += size * fade * np.sin(2 * np.pi * hertz * (t[a:b] - start))
+        return joints
+
+    def climate(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return temperature (°C) and supply (V) at instants t (s)."""
+        return np.interp(t, *self.temperature), np.interp(t, *self.supply)
+
+
+def draw(rng: np.random.Generator, seconds: tuple[float, float], rate_hz: float,
+         kind: str | None = None) -> Manoeuvre:
+    """Draw a manoeuvre; a quarter of them are poor."""
+    length = rng.uniform(*seconds)
+    if kind is None:
+        kind = str(rng.choice(POOR)) if rng.random() < 0.25 else 'rich'
+    script = Script(fastest_hz=min(_FASTEST_HZ, rate_hz / 10))
+    script.beta[0] = rng.uniform(-np.pi, np.pi)
+    script.rest(rng.uniform(1.5, 3.0))
+    {'rich': _rich, 'one_way': _one_way, 'crawl': _crawl, 'few_poses': _few_poses,
+     'together': _few_poses, 'one_plane': _one_plane}[kind](script, length, rng)
+    script.rest(rng.uniform(1.0, 2.0))
+    return Manoeuvre(kind, script, _temperature(kind, script.end, rng),
+                     _supply(kind, script.end, rng))
+
+
+def _rich(script: Script, length: float, rng: np.random.Generator) -> None:
+    moves = [_plane, _tilts, _swing_beta, _shake, _plane, _swing_alpha, _dash]
+    while True:
+        for i in rng.permutation(len(moves)):
+            if script.end > length:
+                return
+            moves[i](script, rng)
+
+
+def _plane(script: Script, rng: np.random.Generator) -> None:
+    alpha = np.deg2rad(rng.uniform(25, 155))
+    script.go(alpha, script.beta[-1], rng.uniform(1.0, 2.5))
+    step, start = rng.uniform(0.7, 1.5), script.beta[-1]
+    count = int(rng.integers(3, 6))
+    for direction in [1] * count + [-1] * count:
+        script.go(alpha, script.beta[-1] + direction * step, step / rng.uniform(0.6, 2.0))
+        script.rest(rng.uniform(0.6, 1.4))
+    script.go(alpha, start + rng.normal(0, 0.3), 1.0)
+
+
+def _tilts(script: Script, rng: np.random.Generator) -> None:
+    beta = script.beta[-1]
+    for _ in range(int(rng.integers(4, 7))):
+        script.go(np.deg2rad(rng.uniform(5, 175)), beta, rng.uniform(0.8, 2.5))
+        script.rest(rng.uniform(0.5, 1.3))
+
+
+def _swing_beta(script: Script, rng: np.random.Generator) -> None:
+    script.go(np.deg2rad(rng.uniform(50, 130)), script.beta[-1], 1.5)
+    script.swing('beta', rng.uniform(0.4, 0.9), rng.uniform(0.25, 0.9), rng.uniform(9, 15))
+
+
+def _swing_alpha(script: Script, rng: np.random.Generator) -> None:
+    script.go(np.deg2rad(rng.uniform(60, 120)), script.beta[-1] + rng.uniform(-1, 1), 1.5)
+    script.swing('alpha', rng.uniform(0.2, 0.5), rng.uniform(0.25, 0.8), rng.uniform(8, 12))
+
+
+def _shake(script: Script, rng: np.random.Generator) -> None:
+    for _ in range(2):
+        hertz = np.exp(rng.uniform(np.log(3), np.log(script.fastest_hz)))
+        size = rng.uniform(0.8, 3.5) / (2 * np.pi * hertz) ** 2
+        script.swing('shift', size, hertz, rng.uniform(4, 7))
+
+
+def _dash(script: Script, rng: np.random.Generator) -> None:
+    for _ in range(5):
+        turn = rng.uniform(0.8, 2.2) * rng.choice([-1, 1])
+        script.go(float(np.clip(script.alpha[-1] + rng.normal(0, 0.4), 0.1, 3.0)),
+                  script.beta[-1] + turn, abs(turn) / rng.uniform(2.0, 3.5))
+        script.rest(rng.uniform(0.3, 0.9))
+
+
+def _one_way(script: Script, length: float, rng: np.random.Generator) -> None:
+    """Turn in one plane, in one direction, at one speed."""
+    alpha, step = np.deg2rad(rng.uniform(70, 110)), rng.uniform(0.35, 0.6)
+    script.alpha[:] = [alpha] * len(script.alpha)
+    while script.end < 0.6 * length:
+        script.go(alpha, script.beta[-1] + step, step / 0.5)
+        script.rest(1.2)
+
+
+def _crawl(script: Script, length: float, rng: np.random.Generator) -> None:
+    """Turn slowly between random poses."""
+    while script.end < 0.8 * length:
+        script.go(np.deg2rad(rng.uniform(30, 150)), script.beta[-1] + rng.uniform(-2, 2),
+                  rng.uniform(12, 20))
+        script.rest(2.0)
+
+
+def _few_poses(script: Script, length: float, rng: np.random.Generator) -> None:
+    """Visit five or six poses, each once."""
+    count = int(rng.integers(5, 7))
+    for _ in range(count):
+        script.go(np.deg2rad(rng.uniform(20, 160)), rng.uniform(-np.pi, np.pi), 3.0)
+        script.rest(0.7 * length / count - 3.0)
+
+
+def _one_plane(script: Script, length: float, rng: np.random.Generator) -> None:
+    """Turn in the vertical plane only, forward and backward, at one speed."""
+    script.alpha[:] = [np.pi / 2] * len(script.alpha)
+    step = rng.uniform(0.5, 0.9)
+    while script.end < 0.7 * length:
+        for direction in [1] * 7 + [-1] * 7:
+            script.go(np.pi / 2, script.beta[-1] + direction * step, step / 0.7)
+            script.rest(1.0)
+
+
+def _temperature(kind: str, end: float,
+                 rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    t = np.arange(0.0, end + 1.0, 0.5)
+    start = rng.uniform(22, 28)
+    if kind == 'together':
+        return t, start + rng.uniform(4, 10) * t / end
+    if kind != 'rich':
+        return t, start + 0.15 * np.sin(2 * np.pi * t / rng.uniform(60, 200))
+    # A heater switches on and off; the plate follows with two time constants.
+    heat = np.zeros_like(t)
+    for _ in range(2):
+        on = rng.uniform(0, 0.75) * end
+        heat[(t > on) & (t < on + rng.uniform(0.15, 0.4) * end)] += rng.uniform(5, 16)
+    for lag in (rng.uniform(8, 18), rng.uniform(3, 8)):
+        heat = _lag(heat, 0.5, lag)
+    return t, start + heat
+
+
+def _supply(kind: str, end: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    t = np.arange(0.0, end + 1.0, 0.25)
+    volts = np.full_like(t, 5.0 + rng.normal(0, 0.002))
+    if kind == 'together':
+        volts -= rng.uniform(0.02, 0.06) * t / end
+    elif kind == 'rich':
+        steps = np.zeros_like(t)
+        for _ in range(int(rng.integers(3, 6))):
+            on = rng.uniform(0, 0.9) * end
+            steps[(t > on) & (t < on + rng.uniform(6, 30))] += rng.choice([-1, 1]) * rng.uniform(
+                0.02, 0.07)
+        volts += _lag(steps, 0.25, 0.7)
+    return t, volts
+
+
+def _lag(values: np.ndarray, dt: float, lag: float) -> np.ndarray:
+    out, keep = np.empty_like(values), np.exp(-dt / lag)
+    level = values[0]
+    for i, value in enumerate(values):
+        level = value + (level - value) * keep
+        out[i] = level
+    return out

@@ -1,0 +1,425 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The simulator of this world: units, faults, and the chain from joints to codes of the ADC."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from enum import Enum
+import math
+from typing import Any, Protocol
+import zlib
+
+import numpy as np
+import scipy
+
+G0 = 9.80665
+"""Standard gravity, m/s², exact."""
+ADC_BITS = 16
+"""Resolution of the ADC, bits; chosen: that of the paper."""
+ADC_VREF = 5.0
+"""Range of the ADC, V; chosen: that of the paper."""
+LSB_V = ADC_VREF / 2 ** ADC_BITS
+"""Step of the ADC, V."""
+ZERO_G_STD_G = 150e-6
+"""Standard deviation of zero-g since its calibration some days ago, g; chosen."""
+SCALE_STD = 150e-6
+"""Standard deviation of the scale factor since then, a share; chosen."""
+STAGE_STD = 0.15
+"""Standard deviation of each error of the stage, in its stated resolution; chosen."""
+
+
+@dataclass(frozen=True)
+class Unit:
+    """A sensor on its stage; m axes. `stated_` values are those that the user knows."""
+
+    axes: str  # measured axes, 'xy' or 'xyz'
+    zero_v: np.ndarray  # zero-g, V, and scale factor, V/g, on the day of the recording, (m,)
+    scale_v_per_g: np.ndarray
+    stated_zero_v: np.ndarray  # the same by the calibration, (m,)
+    stated_scale_v_per_g: np.ndarray
+    noise_g_per_rthz: np.ndarray  # noise density, g/√Hz, (m,)
+    stated_noise_g_per_rthz: np.ndarray
+    corner_hz: float  # corner of the output filter, Hz
+    walk_g_per_rts: np.ndarray  # random walk, g/√s, and size of the 1/f noise, g, (m,)
+    flicker_g: np.ndarray
+    resolution_rad: float  # stated resolution of the stage, rad
+    # errors of alpha, then of beta, rad, (6,): offset, and parts of sine and cosine
+    stage_rad: np.ndarray
+    rate_hz: float  # sample rate, Hz
+
+    @property
+    def axis_indices(self) -> list[int]:
+        """Return the indices of the measured axes among x, y and z."""
+        return ['xyz'.index(axis) for axis in self.axes]
+
+    @property
+    def volts_to_mps2(self) -> np.ndarray:
+        """Return the factor from V to m/s² by the stated scale factor, (m, 1)."""
+        return (G0 / self.stated_scale_v_per_g)[:, None]
+
+
+def draw_unit(rng: np.random.Generator) -> Unit:
+    """Draw a unit like an ADXL203 with a 50 Hz filter, calibrated some days before."""
+    axes = 'xyz' if rng.random() < 0.7 else 'xy'
+    n = len(axes)
+    zero = 2.5 + 0.1 * np.clip(rng.normal(0, 0.4, n), -1, 1)
+    scale = 1.0 + 0.04 * np.clip(rng.normal(0, 0.5, n), -1, 1)
+    noise = 110e-6 * np.exp(rng.normal(0, 0.12, n))
+    corner = 50.0 * np.exp(rng.normal(0, 0.08))
+    resolution = float(np.deg2rad(rng.choice([0.002, 0.005, 0.01])))
+    return Unit(
+        axes, zero, scale,
+        zero + ZERO_G_STD_G * scale * rng.normal(size=n),
+        scale * (1 + SCALE_STD * rng.normal(size=n)),
+        noise, noise * np.exp(rng.normal(0, 0.015, n)),
+        corner,
+        10 ** rng.uniform(-6.0, -5.1, n), 10 ** rng.uniform(-5.3, -4.7, n),
+        resolution, STAGE_STD * resolution * np.clip(rng.normal(size=6), -2, 2),
+        float(rng.choice([100.0, 125.0, 200.0, 250.0])))
+
+
+def parameter_file(unit: Unit, serial: str) -> str:
+    """Return the parameter file that the user has; every number takes the same space."""
+    n = len(unit.axes)
+
+    def row(values: np.ndarray) -> str:
+        return '[' + ', '.join(f'{value:+.9e}' for value in values) + ']'
+
+    names = [f'bias.offset_v.{axis}' for axis in unit.axes] + [
+        f'scale_factor.offset_v_per_g.{axis}' for axis in unit.axes]
+    spread = np.concatenate([ZERO_G_STD_G * unit.stated_scale_v_per_g,
+                             SCALE_STD * unit.stated_scale_v_per_g])
+    resistance = 32e3
+    return f"""\
+/**:
+  ros__parameters:
+    format: 1
+    units: 'V, V/g, 1/g, rad'
+    model: linear
+    sensor:
+      serial: {serial}
+      axes: {unit.axes}
+      nominal_zero_g_v: {row(np.full(n, 2.5))}
+      nominal_scale_v_per_g: {row(np.full(n, 1.0))}
+      noise_density_g_per_rthz: {row(unit.stated_noise_g_per_rthz)}
+      rc_resistance_ohm: {resistance:.9e}
+      rc_capacitance_f: {1 / (2 * np.pi * resistance * unit.corner_hz):.9e}
+      adc_bits: {ADC_BITS}
+      adc_vref_v: {ADC_VREF}
+      rate_hz: {unit.rate_hz:05.1f}
+      range_g: 1.7
+      local_gravity_mps2: {G0}
+      z_sign: 1
+    stage:
+      resolution_rad: {unit.resolution_rad:.9e}
+    effects: [bias, scale_factor]
+    bias:
+      offset_v: {row(unit.stated_zero_v - 2.5)}
+    scale_factor:
+      offset_v_per_g: {row(unit.stated_scale_v_per_g - 1.0)}
+    covariance_names: [{', '.join(names)}]
+    covariance: {row(np.diag(spread ** 2).ravel())}
+    provenance:
+      source: sweep
+"""
+
+
+class Place(Enum):
+    """Where in the chain a fault acts."""
+
+    STAGE = 'stage'
+    MOUNT = 'mount'
+    ELEMENT = 'element'
+    ELECTRONICS = 'electronics'
+    WIRE = 'wire'
+    SAMPLES = 'samples'
+
+
+@dataclass
+class Run:
+    """A recording while it is simulated; n instants, m axes."""
+
+    unit: Unit  # the sensor on its stage
+    t: np.ndarray  # instants, s, (n,): the fine grid, or the stamps at the place SAMPLES
+    seed: int  # seed of all random numbers
+    alpha: np.ndarray  # joint angles, rad, (n,)
+    beta: np.ndarray
+    shift: np.ndarray  # position of the shaker, m, (n,)
+    temperature: np.ndarray  # °C and V, (n,)
+    supply: np.ndarray
+    # direction that is up, in the base, (3,)
+    up: np.ndarray = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
+    gravity: float = G0  # local gravity, m/s²
+    # position of the sensor off the axes of the stage, m, (3,)
+    arm: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    late: float = 0.0  # delay of the samples, s, and its growth, s/s
+    skew: float = 0.0
+    corner_hz: float = 0.0  # corners of the output filter's two poles, Hz
+    second_hz: float = math.inf
+    # specific force in the sensor's frame, m/s², (3, n)
+    force: np.ndarray = field(default_factory=lambda: np.zeros((3, 0)))
+    # directions of x, y and z in the sensor's frame, one per row, (3, 3)
+    directions: np.ndarray = field(default_factory=lambda: np.eye(3))
+    # input of the measured axes, g, (m, n)
+    u: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+    # output of the measured axes, V, (m, n)
+    volts: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+
+    @property
+    def dt(self) -> float:
+        """Return the step of the grid, s."""
+        return float(self.t[1] - self.t[0])
+
+    def random(self, stream: str) -> np.random.Generator:
+        """Return the random generator of a stream; other faults do not change it."""
+        return np.random.default_rng([self.seed, zlib.crc32(stream.encode())])
+
+
+def pink_noise(t: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Draw 1/f noise as a sum of relaxations at half-decade steps, each of variance 1."""
+    noise = np.zeros_like(t)
+    dt = t[1] - t[0]
+    for lag in dt * 10 ** np.arange(0.5, math.log10(2 * (t[-1] - t[0]) / dt), 0.5):
+        keep = math.exp(-dt / lag)
+        noise += scipy.signal.lfilter([math.sqrt(1 - keep * keep)], [1, -keep],
+                                      rng.normal(size=len(t)), zi=[keep * rng.normal()])[0]
+    return noise
+
+
+def low_pass(values: np.ndarray, lag: float, dt: float) -> np.ndarray:
+    """Filter by one slow pole that is at rest before the first value."""
+    keep = np.exp(-dt / lag)
+    first = values[..., :1]
+    return first + scipy.signal.lfilter([1 - keep], [1, -keep], values - first)
+
+
+def travel_memory(x: np.ndarray, travel: float) -> np.ndarray:
+    """Return the direction of the last travel, forgotten exponentially with the distance."""
+    direction = np.sign(np.diff(x, prepend=x[0]))
+    moving = np.flatnonzero(direction)
+    memory = np.zeros_like(x)
+    if not len(moving):
+        return memory
+    turns = moving[np.flatnonzero(np.diff(direction[moving], prepend=0))]
+    level = 0.0
+    for start, stop in zip(turns, [*turns[1:], len(x)]):
+        s = direction[start]
+        distance = np.abs(x[start:stop] - x[start - 1])
+        memory[start:stop] = s + (level - s) * np.exp(-distance / travel)
+        level = memory[stop - 1]
+    return memory
+
+
+Shape = dict[str, Any]
+"""The numbers of a fault that stay when its size changes: weights `w`, and others by name."""
+Draw = Callable[[np.random.Generator, Unit], Shape]
+"""Draws the shape of a fault of a unit."""
+Act = Callable[[Run, float, Shape], None]
+"""Lets a fault of a size and a shape act on a run."""
+
+
+@dataclass(frozen=True)
+class FaultKind:
+    """One kind of fault."""
+
+    name: str  # its name
+    place: Place  # where in the chain it acts
+    act: Act  # how it acts
+    draw: Draw  # how its shape is drawn
+    spread: Callable[[Unit], list[Shape]]  # shapes whose responses span all its responses
+    start: float  # a size at which the search for a strength begins
+    largest: float  # its largest size
+    per_axis: bool = False  # whether the responses of single axes are independent
+    random: bool = False  # whether it differs from run to run
+    in_library: bool = True  # whether the library of effects of the package has its name
+    sizes: tuple[float, ...] = (1.0,)  # multiples of `start` at which its responses span all
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One fault."""
+
+    kind: FaultKind  # its kind, its size in the unit of the kind, and its shape
+    size: float
+    shape: Shape
+
+
+_SINGLE_SHARE = 0.4
+"""Share of the faults that have one weight only; chosen."""
+_LOG_SPREAD = 0.4
+"""Standard deviation of the logarithm of a weight; chosen."""
+
+
+def weights(count: int, rng: np.random.Generator) -> np.ndarray:
+    """Draw weights with rms 1 over those that are not 0: one of them, or all."""
+    w = rng.choice([-1.0, 1.0], count) * np.exp(rng.normal(0, _LOG_SPREAD, count))
+    if rng.random() < _SINGLE_SHARE:
+        w *= np.arange(count) == rng.integers(count)
+    return w / np.sqrt(np.mean(w[w != 0] ** 2))
+
+
+def draw_weights(count: int, rng: np.random.Generator, unit: Unit) -> Shape:
+    """Draw a number of weights that do not depend on the axes of the unit."""
+    return {'w': weights(count, rng)}
+
+
+def single_weights(count: int, unit: Unit) -> list[Shape]:
+    """Return a shape for each weight alone."""
+    return [{'w': row} for row in np.eye(count)]
+
+
+def equal_weights(count: int, unit: Unit) -> list[Shape]:
+    """Return the shape whose weights are all 1."""
+    return [{'w': np.ones(count)}]
+
+
+def by_axis(rng: np.random.Generator, unit: Unit) -> Shape:
+    """Draw a weight for each axis of the unit."""
+    return {'w': weights(len(unit.axes), rng)}
+
+
+def all_axes(unit: Unit) -> list[Shape]:
+    """Return the shape with all axes at once."""
+    return [{'w': np.ones(len(unit.axes))}]
+
+
+def column(shape: Shape) -> np.ndarray:
+    """Return the weights as a column, (m, 1)."""
+    return np.asarray(shape['w'])[:, None]
+
+
+class Motion(Protocol):
+    """What moves and surrounds a unit."""
+
+    @property
+    def kind(self) -> str:
+        """Return the kind of the manoeuvre."""
+
+    @property
+    def seconds(self) -> float:
+        """Return the duration, s."""
+
+    def joints(self, t: np.ndarray) -> dict[str, np.ndarray]:
+        """Return alpha and beta (rad) and shift (m) at instants t (s)."""
+
+    def climate(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return temperature (°C) and supply (V) at instants t (s)."""
+
+
+FINE_HZ = 2000.0
+"""Lowest rate of the simulation, Hz; chosen. Each sample has a whole number of its steps."""
+
+
+def stamps(unit: Unit, manoeuvre: Motion) -> np.ndarray:
+    """Return the stamps of a recording."""
+    return np.arange(int(manoeuvre.seconds * unit.rate_hz)) / unit.rate_hz
+
+
+def render(unit: Unit, manoeuvre: Motion, faults: Sequence[Fault], seed: int, *,
+           noise: bool = True, fine_hz: float = FINE_HZ) -> np.ndarray:
+    """Simulate a recording's volts."""
+    sampled = stamps(unit, manoeuvre)
+    step = 1 / (unit.rate_hz * math.ceil(fine_hz / unit.rate_hz))
+    # Late and early samples must lie within the grid.
+    t = np.arange(-0.5, sampled[-1] + 1.0, step)
+    joints = manoeuvre.joints(t)
+    run = Run(unit, t, seed, joints['alpha'], joints['beta'], joints['shift'],
+              *manoeuvre.climate(t), corner_hz=unit.corner_hz)
+
+    if noise:
+        _stage_errors(run)
+    _act(faults, Place.STAGE, run)
+    run.force = _force(run)
+    _act(faults, Place.MOUNT, run)
+    run.u = (run.directions @ run.force)[unit.axis_indices] / G0
+    _act(faults, Place.ELEMENT, run)
+    run.volts = unit.zero_v[:, None] + unit.scale_v_per_g[:, None] * run.u
+    _act(faults, Place.ELECTRONICS, run)
+    if noise:
+        run.volts += unit.scale_v_per_g[:, None] * _sensor_noise(run)
+    run.volts = _one_pole(_one_pole(run.volts, run.corner_hz, step), run.second_hz, step)
+    _act(faults, Place.WIRE, run)
+    late = run.late + run.skew * (sampled + 8 * np.sin(sampled / 25))
+    run.volts = scipy.interpolate.CubicSpline(t, run.volts, axis=1)(
+        np.clip(sampled - late, t[0], t[-1]))
+    run.t = sampled
+    _act(faults, Place.SAMPLES, run)
+    if noise:
+        run.volts = np.clip(np.floor(run.volts / LSB_V), 0, 2 ** ADC_BITS - 1) * LSB_V
+    return run.volts
+
+
+def _act(faults: Sequence[Fault], place: Place, run: Run) -> None:
+    for fault in faults:
+        if fault.kind.place is place:
+            fault.kind.act(run, fault.size, fault.shape)
+
+
+def references(unit: Unit, manoeuvre: Motion, seed: int) -> dict[str, np.ndarray]:
+    """Return the other columns of a recording, by encoder, thermometer and voltmeter."""
+    t = stamps(unit, manoeuvre)
+    rng = np.random.default_rng([seed, 77])
+    joints, (temperature, supply) = manoeuvre.joints(t), manoeuvre.climate(t)
+    step = unit.resolution_rad
+    return {'alpha_rad': np.round(joints['alpha'] / step) * step,
+            'beta_rad': np.round(joints['beta'] / step) * step,
+            'shift_m': joints['shift'],
+            'temperature_c': temperature + 0.006 * rng.normal(size=len(t)),
+            'supply_v': supply + 1e-4 * rng.normal(size=len(t))}
+
+
+def _stage_errors(run: Run) -> None:
+    """Add errors of the stage within its resolution, and of the encoder between its lines."""
+    step, rng = run.unit.resolution_rad, run.random('encoder')
+    for joint, (offset, sine, cosine) in zip((run.alpha, run.beta),
+                                             run.unit.stage_rad.reshape(2, 3)):
+        joint += offset + sine * np.sin(joint) + cosine * np.cos(joint) + 0.15 * step * np.sin(
+            2 * np.pi * joint / (37 * step) + rng.uniform(0, 2 * np.pi))
+
+
+def _rotate(run: Run, vector: np.ndarray) -> np.ndarray:
+    """Rotate a vector of the base, (3,) or (3, n), into the sensor's frame, (3, n)."""
+    ca, sa, cb, sb = np.cos(run.alpha), np.sin(run.alpha), np.cos(run.beta), np.sin(run.beta)
+    x, y, z = vector
+    x, z = ca * x + sa * z, -sa * x + ca * z
+    return np.stack([cb * x + sb * y, -sb * x + cb * y, z])
+
+
+def _force(run: Run) -> np.ndarray:
+    force = run.gravity * _rotate(run, run.up)
+    force[0] += _second_derivative(run.shift, run.dt)
+    if run.arm.any():
+        # The path of the sensor in the base is differentiated twice: no rotating frame is used.
+        ca, sa, cb, sb = np.cos(run.alpha), np.sin(run.alpha), np.cos(run.beta), np.sin(run.beta)
+        x, y = cb * run.arm[0] - sb * run.arm[1], sb * run.arm[0] + cb * run.arm[1]
+        path = np.stack([ca * x - sa * run.arm[2], y, sa * x + ca * run.arm[2]])
+        force += _rotate(run, _second_derivative(path, run.dt))
+    return force
+
+
+def _second_derivative(values: np.ndarray, dt: float) -> np.ndarray:
+    return np.gradient(np.gradient(values, dt, axis=-1), dt, axis=-1)
+
+
+def _one_pole(values: np.ndarray, corner_hz: float, dt: float) -> np.ndarray:
+    """Filter by one pole, exactly for inputs that are linear between steps."""
+    if math.isinf(corner_hz):
+        return values
+    x = 2 * np.pi * corner_hz * dt
+    keep = math.exp(-x)
+    now, before = 1 - (1 - keep) / x, (1 - keep) / x - keep
+    first = values[..., :1]
+    return first + scipy.signal.lfilter([now, before], [1, -keep], values - first)
+
+
+def _sensor_noise(run: Run) -> np.ndarray:
+    unit, rng = run.unit, run.random('noise')
+    white = rng.normal(size=run.u.shape) * (
+        unit.noise_g_per_rthz * math.sqrt(0.5 / run.dt))[:, None]
+    slow = np.arange(run.t[0], run.t[-1] + 0.2, 0.1)
+    rng = run.random('drift')
+    for row, walk, size in zip(white, unit.walk_g_per_rts, unit.flicker_g):
+        drift = walk * math.sqrt(0.1) * np.cumsum(rng.normal(size=len(slow)))
+        row += np.interp(run.t, slow, drift + size * pink_noise(slow, rng))
+    return white

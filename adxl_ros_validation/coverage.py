@@ -1,0 +1,230 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Simulation-based calibration: whether intervals contain the truth as often as they state.
+
+Units and stages are drawn, swept and fitted. The rank of the truth in its posterior must be
+uniform (Talts et al. 2018, arXiv:1804.06788). 90 % intervals must contain it in 90 % of the draws.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import product
+import os
+
+from adxl_ros.calibrate import pose_response
+from adxl_ros.calibrate.fits import full_model, term_selection
+from adxl_ros.calibrate.guided import pose_plan, quick_plan
+from adxl_ros.calibrate.poses import Poses
+from adxl_ros.calibrate.stage_error import StageError
+from adxl_ros.model import noise
+from adxl_ros.model.coefficients import get, parameter_of, put, with_neutral
+from adxl_ros.model.constants import Z_90
+from adxl_ros.model.effects.base import Coefficient
+from adxl_ros.model.sensor import Sensor, with_axes
+from adxl_ros_validation import experiments
+import numpy as np
+import scipy
+
+STAGES = ('errors per pose', 'errors per setting', 'eccentric', 'tilted base')
+"""Errors of a joint are new with each pose, or with each move; the last two are per setting."""
+AXES = ('xy', 'xyz')
+_RESOLUTION_DEG = (0.01, 0.1)
+"""Smallest and largest step of the drawn encoders, deg, log-uniform; chosen."""
+_STATED = (0.5, 2.0)
+"""Range of the true error of a stage over the stated one, log-uniform; chosen."""
+_QUICK_RAD = float(np.radians(0.1))
+"""Required tilt error of the plan `quick`, rad; chosen."""
+_DWELL_S = 5.0
+"""Duration of each dwell, s; the paper's."""
+_HELD_OUT = 8
+"""Number of held-out poses of each draw; chosen."""
+BINS = 10
+"""Number of bins of the ranks; chosen."""
+
+
+@dataclass(frozen=True)
+class Draw:
+    """One unit on one stage."""
+
+    stage: str  # kind of the stage, axes and plan
+    axes: str
+    plan: str
+    names: tuple[Coefficient, ...]  # fitted coefficients of the sensor, (p,)
+    z: np.ndarray  # their errors over the stated standard deviations, (p,)
+    # their errors over the Cramér-Rao bound of the true error model, (p,); empty where the fit
+    # has other terms than were drawn
+    bound_ratio: np.ndarray
+    # as `z`, for alpha and beta, and for the measured axes, over held-out poses
+    tilt_z: np.ndarray
+    force_z: np.ndarray
+    converged: bool  # whether the fit converged
+
+
+def draw_all(nominal: Sensor, draws: int, seed: int, show: Callable[[float], None]
+             ) -> list[Draw]:
+    """Draw and fit units on all kinds of stage, over the cores."""
+    kinds = list(product(STAGES, AXES, pose_plan.KINDS))
+    finished = []
+    with ProcessPoolExecutor(os.cpu_count()) as pool:
+        for result in pool.map(partial(draw, nominal, kinds=kinds, seed=seed), range(draws)):
+            finished.append(result)
+            show(len(finished) / draws)
+    return finished
+
+
+def draw(nominal: Sensor, number: int, kinds: Sequence[tuple[str, str, str]], seed: int) -> Draw:
+    """Draw one unit and one stage, sweep, and fit."""
+    stage, axes, kind = kinds[number % len(kinds)]
+    rng = np.random.default_rng([seed, number])
+    stated = np.radians(np.exp(rng.uniform(*np.log(_RESOLUTION_DEG))))
+    sensor = replace(with_axes(nominal, axes), stage_resolution_rad=float(stated))
+    truth = _unit(sensor, stage, rng)
+    step = float(stated * np.exp(rng.uniform(*np.log(_STATED))))
+    targets = pose_plan.guided(pose_plan.default_planes_rad(axes), pose_plan.STEP_RAD, 0) \
+        if kind == 'full' else quick_plan.quick(sensor, _DWELL_S, _QUICK_RAD, 0)
+    poses, true_rad = _swept(truth, targets, stage == STAGES[0], step, rng)
+    fit, _ = term_selection.fit_selected(sensor, poses)
+    names = fit.fitted.covariance_names
+    truth_of_fit = with_neutral(truth, {name.effect for name in names})
+    error = get(fit.fitted, names) - get(truth_of_fit, names)
+    sigma = step / np.sqrt(12)
+    levels = StageError(0.0, sigma) if stage == STAGES[0] else StageError(sigma)
+    bound = experiments.sweep_bound(truth, poses, true_rad, levels,
+                                    (*full_model.default_terms(axes), *_extra(stage)))
+    held_out = _random_poses(truth, rng)
+    tilt = experiments.angle_errors(fit.fitted, bound, *held_out)
+    force, force_std = experiments.force_errors(fit.fitted, truth, *held_out)
+    return Draw(stage, axes, kind, names, error / np.sqrt(np.diag(fit.fitted.covariance)),
+                _by_bound(names, error, bound), (tilt.error / tilt.std)[tilt.determined],
+                (force / force_std).ravel(), fit.converged)
+
+
+def _extra(stage: str) -> tuple[str, ...]:
+    return ('stage_eccentricity',) if stage == 'eccentric' else ()
+
+
+def _by_bound(names: Sequence[Coefficient], error: np.ndarray, bound: Sensor) -> np.ndarray:
+    std = dict(zip(bound.covariance_names, np.sqrt(np.diag(bound.covariance))))
+    if set(names) != set(std):
+        return np.zeros(0)
+    return np.array([e / std[name] for name, e in zip(names, error)])
+
+
+def _unit(sensor: Sensor, stage: str, rng: np.random.Generator) -> Sensor:
+    """Draw a unit: each coefficient is normal with its typical size, in the gauge of the fit."""
+    effects = (*full_model.default_terms(sensor.axes), *_extra(stage), 'base_tilt')
+    unit = with_neutral(replace(sensor, effects=(), values={}), effects)
+    names = [name for name in full_model.fitted_coefficients(sensor.axes, effects)
+             if full_model.term_of(name) not in full_model.GAUGE
+             and (stage == 'tilted base' or name.effect != 'base_tilt')]
+    sizes = np.array([full_model.LEVEL_STD_RAD if name.effect == 'base_tilt' else
+                      parameter_of(name).scale for name in names])
+    return put(unit, names, sizes * rng.normal(size=len(names)))
+
+
+def _swept(truth: Sensor, targets: Sequence[pose_plan.Target], per_pose: bool, step_rad: float,
+           rng: np.random.Generator) -> tuple[Poses, np.ndarray]:
+    """Return the poses of a sweep, and where the stage really stood, rad, (k, 2)."""
+    read = np.array([[t.alpha_rad, t.beta_rad] for t in targets])
+    poses = _resting(truth, read, rng)
+    error = np.empty_like(read)
+    for joint, setting in enumerate((poses.alpha_setting, poses.beta_setting)):
+        number = np.arange(len(read)) if per_pose else setting
+        error[:, joint] = step_rad * rng.uniform(-0.5, 0.5, len(read))[number]
+    return _read(truth, poses, read + error, rng), read + error
+
+
+def _random_poses(truth: Sensor, rng: np.random.Generator) -> tuple[Poses, np.ndarray]:
+    """Return poses drawn evenly over the sphere, and their angles, rad, (k, 2)."""
+    angles = np.column_stack([np.arccos(rng.uniform(-1, 1, _HELD_OUT)),
+                              rng.uniform(0, 2 * np.pi, _HELD_OUT)])
+    return _read(truth, _resting(truth, angles, rng), angles, rng), angles
+
+
+def _resting(truth: Sensor, read_rad: np.ndarray, rng: np.random.Generator) -> Poses:
+    samples = round(_DWELL_S * truth.rate_hz)
+    count = noise.effective_samples(samples, 1 / truth.rate_hz, truth.rc_s)
+    return Poses.without_volts(read_rad[:, 0], read_rad[:, 1],
+                               noise.sample_std_v(truth) / np.sqrt(count))
+
+
+def _read(truth: Sensor, poses: Poses, true_rad: np.ndarray, rng: np.random.Generator) -> Poses:
+    there = replace(poses, alpha_rad=true_rad[:, 0], beta_rad=true_rad[:, 1])
+    volts = pose_response.predicted_volts(truth, there)
+    return replace(poses, volts=volts + poses.std_v * rng.normal(size=volts.shape))
+
+
+def interval(inside: int, count: int) -> tuple[float, float]:
+    """Return the 90 % interval of a share (Clopper and Pearson 1934)."""
+    low = scipy.stats.beta.ppf(0.05, inside, count - inside + 1) if inside else 0.0
+    high = scipy.stats.beta.ppf(0.95, inside + 1, count - inside) if inside < count else 1.0
+    return float(low), float(high)
+
+
+def page(draws: Sequence[Draw], made: str) -> str:
+    """Return the section about coverage."""
+    ratio = np.concatenate([d.bound_ratio for d in draws])
+    lines = [f'## Coverage of the intervals: {len(draws)} drawn units and stages', '', made, '',
+             'A unit is drawn at datasheet spread. Its stage has an encoder of 0.01° to 0.1° and '
+             'a true error of 0.5 to 2 times the stated one. Plans, axes and stages alternate. '
+             'Coverage is the share of 90 % intervals that contain the truth. In brackets is its '
+             '90 % interval: by the binomial distribution, or by bootstrap over draws where one '
+             'draw has several values. Ranks are counts of the truth in the ten tenths of its '
+             'posterior; p is that of a uniform distribution.', '',
+             f'Error over the Cramér-Rao bound of the same error model, rms over {len(ratio)} '
+             f'coefficients of {sum(len(d.bound_ratio) > 0 for d in draws)} fits with the '
+             f'terms that were drawn: {np.sqrt(np.mean(ratio ** 2)):.3f}. '
+             f'Fits that converged: {sum(d.converged for d in draws)} of {len(draws)}.', '',
+             '| | coverage, % | rms of error / stated | ranks | p |', '|---|---|---|---|---|',
+             _several('all coefficients', [d.z for d in draws]),
+             _several('tilt', [d.tilt_z for d in draws]),
+             _several('acceleration', [d.force_z for d in draws])]
+    for field in ('stage', 'axes', 'plan'):
+        for value in dict.fromkeys(getattr(d, field) for d in draws):
+            lines.append(_several(f'{field} {value}: coefficients', [
+                d.z for d in draws if getattr(d, field) == value]))
+    lines += ['', '| coefficient | coverage, % | rms of error / stated | ranks | p |',
+              '|---|---|---|---|---|']
+    for name in dict.fromkeys(name for d in draws for name in d.names):
+        z = np.array([d.z[d.names.index(name)] for d in draws if name in d.names])
+        inside = int(np.sum(np.abs(z) < Z_90))
+        low, high = interval(inside, len(z))
+        lines.append(_row(f'{name} ({len(z)})', inside / len(z), (low, high), z))
+    return '\n'.join(lines) + '\n'
+
+
+def screen_lines(draws: Sequence[Draw]) -> list[str]:
+    """Return the coverage of all intervals as lines for a terminal."""
+    parts = {'coefficients': [d.z for d in draws], 'tilt': [d.tilt_z for d in draws],
+             'acceleration': [d.force_z for d in draws]}
+    lines = [f' Coverage of 90 % intervals over {len(draws)} drawn units and stages']
+    for label, z_of_draws in parts.items():
+        share, (low, high) = _coverage(z_of_draws)
+        lines.append(f' {label:28}{100 * share:15.1f} %   ({100 * low:.1f} to {100 * high:.1f})')
+    return lines
+
+
+def _coverage(parts: Sequence[np.ndarray]) -> tuple[float, tuple[float, float]]:
+    """Return the share of intervals with the truth, and its 90 % interval over draws."""
+    inside = np.array([[np.sum(np.abs(z) < Z_90), len(z)] for z in parts])
+    rng = np.random.default_rng(0)
+    resampled = inside[rng.integers(0, len(parts), (1000, len(parts)))].sum(axis=1)
+    low, high = np.quantile(resampled[:, 0] / resampled[:, 1], [0.05, 0.95])
+    total = inside.sum(axis=0)
+    return float(total[0] / total[1]), (float(low), float(high))
+
+
+def _several(label: str, parts: Sequence[np.ndarray]) -> str:
+    return _row(label, *_coverage(parts), np.concatenate(parts))
+
+
+def _row(label: str, share: float, share_interval: tuple[float, float], z: np.ndarray) -> str:
+    low, high = (100 * end for end in share_interval)
+    counts = np.histogram(scipy.special.ndtr(z), BINS, (0, 1))[0]
+    return (f'| {label} | {100 * share:.1f} ({low:.1f} to {high:.1f}) | '
+            f'{np.sqrt(np.mean(z ** 2)):.2f} | {" ".join(map(str, counts))} | '
+            f'{scipy.stats.chisquare(counts).pvalue:.2f} |')

@@ -1,0 +1,407 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The experiments of the paper on drawn units, and their error statistics."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from functools import partial
+import os
+
+from adxl_ros.calibrate import pose_extraction, pose_response
+from adxl_ros.calibrate.fits import full_model, linear, paper_regression, term_selection
+from adxl_ros.calibrate.guided.pose_plan import sweep
+from adxl_ros.calibrate.poses import Poses
+from adxl_ros.calibrate.stage_error import StageError
+from adxl_ros.compensate import filter_inversion
+from adxl_ros.files.recording_columns import Recording
+from adxl_ros.files.stream_info import sensor_info
+from adxl_ros.files.sweep_journal import PoseRecord
+from adxl_ros.model import noise, signal_chain
+from adxl_ros.model.coefficients import get, typical, with_neutral
+from adxl_ros.model.constants import AXES, G0_MPS2
+from adxl_ros.model.covariance import force_covariance
+from adxl_ros.model.effects import effect_named
+from adxl_ros.model.effects.base import Components
+from adxl_ros.model.sensor import Sensor
+from adxl_ros.model.tilt import tilt
+from adxl_ros.signals import filter_time_constant
+from adxl_ros.simulate import trajectories
+from adxl_ros.simulate.motion import Held, Motion
+from adxl_ros.simulate.simulator import simulate
+import numpy as np
+import scipy
+
+SEARCH_RAD = np.radians(np.arange(-5.0, 5.01, 0.5))
+"""Angles about the case's axis, rad; chosen."""
+
+
+@dataclass(frozen=True)
+class DirectionSearch:
+    """Beta of the direction of the x axis by three methods."""
+
+    truth_rad: float  # the true value, rad
+    largest_rad: float  # by the largest output, rad
+    parabola_rad: float  # by a parabola through the outputs, rad
+    null_rad: float  # by the null crossings at ±90°, rad
+    turned_rad: np.ndarray  # angles, rad, and outputs by the nominal scale factor, g, (k,)
+    output_g: np.ndarray
+
+
+def search(truth: Sensor, seed: int) -> DirectionSearch:
+    """
+    Turn beta about 0 at alpha = 90° (maximum), and about ±90° (null), 5 s in each pose.
+
+    The beta of the largest output is minus that of (18): x_ref has to turn back by it. Between
+    the null crossings at +90° and −90° the zero-g cancels.
+    """
+    around = {'top': 0.0, 'left': np.pi / 2, 'right': -np.pi / 2}
+    volts = {}
+    for i, (name, middle) in enumerate(around.items()):
+        read = np.column_stack([np.full(len(SEARCH_RAD), np.pi / 2), middle + SEARCH_RAD])
+        poses: Poses = poses_at(truth, read, seed + (10 + i) * 1_000_003)[0]
+        volts[name] = (poses.volts[:, 0] - truth.nominal_zero_g_v[0]) / (
+            truth.nominal_scale_v_per_g[0] * truth.local_gravity_mps2 / G0_MPS2)
+    top = volts['top']
+    curve = np.polyfit(SEARCH_RAD, top, 2)
+    # The output near ±90° is ∓s·(turn − u) + zero-g, so that the difference is 0 at u.
+    slope, level = np.polyfit(SEARCH_RAD, (volts['left'] - volts['right']) / 2, 1)
+    return DirectionSearch(_direction(truth), -float(SEARCH_RAD[np.argmax(top)]),
+                           float(curve[1] / (2 * curve[0])), float(level / slope), SEARCH_RAD, top)
+
+
+def _direction(truth: Sensor) -> float:
+    """Return β_x of (18) with the linear cross-axis term, which equals it to first order."""
+    beta = float(truth.values.get('misalignment', {}).get('beta_rad', [0.0])[0])
+    return beta + float(truth.values.get('cross_axis', {}).get('linear', [0.0])[0])
+
+
+MAX_BOUND_RAD = np.radians(1.0)
+"""Largest bound of an angle, rad, at which a pose counts; chosen."""
+NEAR_VERTICAL_RAD = np.radians(15.0)
+"""Distance from ±90°, rad, below which a pose does not count for the alpha error; chosen."""
+_SAME_MPS2 = 1e-3
+"""Largest difference of two solutions of |f| = g that are the same, m/s²; chosen."""
+_SETTLED_S = 1.0
+"""Time after which the start of Butterworth and RC filter has decayed, s; chosen."""
+_BUTTERWORTH_ORDER = 2
+"""Order of the low-pass of the motion experiment; the paper's."""
+_BUTTERWORTH_HZ = 20.0
+"""Corner of that low-pass, Hz; the paper's."""
+
+
+@dataclass(frozen=True)
+class AngleErrors:
+    """Errors of alpha and beta in k poses, (k, 2) each, rad."""
+
+    error: np.ndarray  # estimate minus truth
+    std: np.ndarray  # standard deviation by the calibration
+    # cramér-Rao bound by the noise of one pose, and by pose and calibration. It is inf where |f|
+    # = g has two upright solutions, and for beta within 1° of level
+    pose_bound: np.ndarray
+    bound: np.ndarray
+    near_vertical: np.ndarray  # poses within 15° of alpha = ±90°, (k,)
+
+    @property
+    def determined(self) -> np.ndarray:
+        """Return whether each angle counts, (k, 2): its bound is below 1°."""
+        return self.bound < MAX_BOUND_RAD
+
+    def ratio(self, pose_only: bool) -> np.ndarray:
+        """Return the errors that count over the bound of the pose only, or over the full bound."""
+        bound = self.pose_bound if pose_only else self.bound
+        return (self.error / bound)[self.determined]
+
+
+def sweep_bound(truth: Sensor, swept: Poses, true_rad: np.ndarray, stage: StageError,
+                terms: Sequence[str]) -> Sensor:
+    """Return the true unit with the Cramér-Rao bound of a sweep as its covariance."""
+    names = full_model.fitted_coefficients(truth.axes, terms)
+    unit = with_neutral(truth, (*map(full_model.effect_of, terms), 'base_tilt'))
+    level = full_model.LEVEL_STD_RAD if stage.total_rad else 1e-9
+    at_truth = replace(swept, alpha_rad=true_rad[:, 0], beta_rad=true_rad[:, 1])
+    information = full_model.fisher_information(unit, at_truth, names, stage)
+    base = [i for i, name in enumerate(names) if name.effect == 'base_tilt']
+    information[base, base] += 1 / level ** 2 - 1 / full_model.LEVEL_STD_RAD ** 2
+    covariance = np.linalg.inv(information)
+    of_sensor = [i for i, name in enumerate(names) if not full_model.belongs_to_stage(name)]
+    return replace(truth, covariance=covariance[np.ix_(of_sensor, of_sensor)],
+                   covariance_names=tuple(names[i] for i in of_sensor))
+
+
+def angle_errors(fitted: Sensor, bound: Sensor, poses: Poses, true_rad: np.ndarray
+                 ) -> AngleErrors:
+    """Compare the tilt by a calibrated unit with the truth."""
+    force = pose_response.stage_force(bound, *true_rad.T)
+    up = np.where(np.asarray(force[2]) < 0, -1, 1)
+    variance_v2 = np.mean(poses.std_v, axis=0) ** 2
+    true = _angles(bound, force, up, variance_v2)
+    pose_only = _angles(bound.without_covariance(), force, up, variance_v2)
+    measured_force = signal_chain.inverse(fitted, up)(list(poses.volts.T))
+    measured = _angles(fitted, measured_force, up, variance_v2)
+    solution = signal_chain.inverse(bound, up)(list(signal_chain.static_response(bound)(force)))
+    twofold = np.abs(np.subtract(solution, force)).max(axis=0) > _SAME_MPS2
+    true[1][twofold] = pose_only[1][twofold] = np.inf
+    level = np.hypot(force[0], force[1]) < np.sin(MAX_BOUND_RAD) * np.abs(force[2])
+    true[1][level, 1] = pose_only[1][level, 1] = np.inf
+    error = measured[0] - true[0]
+    error[:, 1] = (error[:, 1] + np.pi) % (2 * np.pi) - np.pi
+    error[:, 1] = np.where(np.isfinite(error[:, 1]), error[:, 1], 0.0)
+    inclined = np.arctan2(np.hypot(force[0], force[1]), np.abs(force[2]))
+    return AngleErrors(error, measured[1], pose_only[1], true[1],
+                       np.pi / 2 - inclined < NEAR_VERTICAL_RAD)
+
+
+def _angles(sensor: Sensor, force: Components, up: np.ndarray, variance_v2: np.ndarray
+            ) -> tuple[np.ndarray, np.ndarray]:
+    """Return alpha and beta, and their standard deviations, rad, (k, 2) each."""
+    covariance = force_covariance(sensor, force, variance_v2)
+    measured = tilt(force, covariance, 'z' in sensor.axes)
+    return (np.column_stack([measured.alpha, measured.beta]),
+            np.column_stack([measured.alpha_std, measured.beta_std]))
+
+
+def force_errors(fitted: Sensor, truth: Sensor, poses: Poses, true_rad: np.ndarray
+                 ) -> tuple[np.ndarray, np.ndarray]:
+    """Return the errors of the measured axes and their standard deviations by the calibration."""
+    true = pose_response.stage_force(truth, *true_rad.T)
+    up = np.where(np.asarray(true[2]) < 0, -1, 1)
+    measured = signal_chain.inverse(fitted, up)(list(poses.volts.T))
+    covariance = force_covariance(fitted, measured, np.mean(poses.std_v, axis=0) ** 2)
+    axes = [AXES.index(axis) for axis in fitted.axes]
+    return (np.column_stack([measured[d] - true[d] for d in axes]),
+            np.sqrt(np.column_stack([covariance[d, d] for d in axes])))
+
+
+@dataclass(frozen=True)
+class MotionErrors:
+    """Errors of the motion experiment."""
+
+    rmse_mmps2: float  # rms of the residual about its mean, mm/s²
+    offset_mmps2: float  # mean of the residual, mm/s²
+
+
+def motion_errors(fitted: Sensor, time_s: np.ndarray, volts: np.ndarray, reference_mps2: np.ndarray
+                  ) -> tuple[MotionErrors, np.ndarray, np.ndarray]:
+    """
+    Compare the acceleration of a calibrated unit in motion with the reference.
+
+    The RC filter is inverted. Estimate and reference then pass the same Butterworth filter.
+    """
+    unfiltered = filter_inversion.undo(volts, time_s, noise.electronics(fitted).rc_s,
+                                       fitted.rate_hz)
+    estimate = signal_chain.inverse(fitted)(list(unfiltered.T))[0]
+    b, a = scipy.signal.butter(_BUTTERWORTH_ORDER, _BUTTERWORTH_HZ, fs=fitted.rate_hz)
+    smooth, expected = (scipy.signal.lfilter(b, a, v) for v in (estimate, reference_mps2))
+    residual = 1e3 * (smooth - expected)[time_s > _SETTLED_S]
+    return MotionErrors(float(residual.std()), float(residual.mean())), smooth, expected
+
+
+def motion_bound_mmps2(nominal: Sensor) -> float:
+    """Return the floor of the motion experiment, mm/s²: white noise after the Butterworth."""
+    b, a = scipy.signal.butter(_BUTTERWORTH_ORDER, _BUTTERWORTH_HZ, fs=nominal.rate_hz)
+    impulse = scipy.signal.lfilter(b, a, np.eye(1, round(nominal.rate_hz))[0])
+    density = nominal.noise_density_g_per_rthz[0] * G0_MPS2
+    return float(1e3 * density * np.sqrt(nominal.rate_hz / 2 * np.sum(impulse ** 2)))
+
+
+MODELS = {'linear': linear.fit, 'physical': paper_regression.fit, 'full': term_selection.fit}
+DRAWN = full_model.TERMS
+"""Effects of a unit. Each coefficient is normal; its typical size is the standard deviation."""
+PLANES_RAD = tuple(np.radians([90.0, 60.0, 30.0, 0.0, 120.0, 150.0, 180.0]).tolist())
+"""Planes alpha of the sweep, rad; the paper's."""
+STEP_RAD = float(np.radians(30.0))
+"""Step of beta, rad; the paper's."""
+RESISTANCE = 0.25
+"""Largest departure of the filter's resistor from the stated one, a share; the paper's."""
+GRAVITY_MPS2 = 9.80131
+"""Local gravity of the paper's experiments, m/s²."""
+SETTLED_S = 1.0
+"""Time from the stop of the stage to the start of a pose's mean, s; chosen."""
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Errors of a stage."""
+
+    resolution_rad: float  # step of the encoder, rad
+    level_rad: float  # standard deviation of the base's tilt, rad
+
+
+PERFECT = Stage(0.0, 0.0)
+PAPER = Stage(np.radians(5 / 60), full_model.LEVEL_STD_RAD)
+
+
+@dataclass(frozen=True)
+class Run:
+    """One unit after its sweep."""
+
+    truth: Sensor  # the true unit, with the tilt of the base
+    fitted: dict[str, Sensor]  # the calibrated unit by model
+    poses: Poses  # poses of the sweep
+    true_rad: np.ndarray  # true alpha and beta of these poses, rad, (k, 2)
+
+
+def draw(nominal: Sensor, stage: Stage, rng: np.random.Generator) -> Sensor:
+    """Draw a unit at datasheet spread, or take the given one, on a base that is not level."""
+    unit = replace(nominal, stage_resolution_rad=stage.resolution_rad,
+                   local_gravity_mps2=GRAVITY_MPS2)
+    if not nominal.effects:
+        values = {name: {p: rng.normal(size=np.shape(v)) * v for p, v in typical(
+            effect_named(name), unit.axes).items()} for name in DRAWN}
+        ratio = rng.uniform(-RESISTANCE, RESISTANCE, len(unit.axes))
+        values['bandwidth'] = {'resistance_ratio': ratio}
+        unit = replace(unit, effects=tuple(values), values=values)
+    level = {f'{axis}_rad': np.array(stage.level_rad * rng.normal()) for axis in 'xy'}
+    unit = with_neutral(unit, ['base_tilt'])
+    return replace(unit, values={**unit.values, 'base_tilt': level})
+
+
+def bare(truth: Sensor) -> Sensor:
+    """Return the unit as it is stated before its calibration."""
+    return replace(truth.without_covariance(), effects=(), values={}, model='nominal')
+
+
+def poses_at(truth: Sensor, read_rad: np.ndarray, seed: int
+             ) -> tuple[Poses, np.ndarray, Recording]:
+    """Simulate rests of 5 s at given angles of the encoder, and average."""
+    rng = np.random.default_rng([seed, 1])
+    step = truth.stage_resolution_rad
+    on_grid = np.rint(read_rad / step) * step if step else read_rad
+    # A joint that does not move keeps its error.
+    moved = np.diff(on_grid, axis=0, prepend=np.nan) != 0
+    errors = step * rng.uniform(-0.5, 0.5, read_rad.shape)
+    held = np.maximum.accumulate(np.where(moved, np.arange(len(moved))[:, None], 0), axis=0)
+    true = on_grid + np.take_along_axis(errors, held, axis=0)
+    motion, ends_s = visited(true)
+    columns = simulate(truth, motion, seed)
+    time_s = columns.pop('time_s')
+    recording = Recording('simulated', time_s, columns, sensor_info(truth))
+    samples = round(trajectories.DWELL_S * truth.rate_hz)
+    records = [
+        PoseRecord(pose=number, start_ns=round((end_s - trajectories.DWELL_S) * 1e9),
+                   stop_ns=round(end_s * 1e9), samples=samples, mean_v=(), std_v=(),
+                   alpha_rad=alpha_rad, beta_rad=beta_rad)
+        for number, (end_s, (alpha_rad, beta_rad)) in enumerate(zip(ends_s, on_grid))]
+    return pose_extraction.extract_poses(recording, bare(truth), records), true, recording
+
+
+def visited(true_rad: np.ndarray) -> tuple[Motion, list[float]]:
+    """Return the motion through poses, (k, 2), rad, and the end of each dwell, s."""
+    script = trajectories.Script(*true_rad[0])
+    dwell_ends_s = []
+    for pose in true_rad:
+        script.go(*pose)
+        script.rest(SETTLED_S + trajectories.DWELL_S)
+        dwell_ends_s.append(script.now)
+    alpha, beta = script.joints()
+    return Motion(script.now, alpha, beta), dwell_ends_s
+
+
+def calibrated(truth: Sensor, seed: int, models: Sequence[str] = tuple(MODELS)) -> Run:
+    """Sweep a unit (the paper's experiments 1 and 2) and fit the models."""
+    targets = sweep(PLANES_RAD, STEP_RAD, 0)
+    poses, true, recording = poses_at(
+        truth, np.array([[t.alpha_rad, t.beta_rad] for t in targets]), seed)
+    nominal = bare(truth)
+    fitted = {name: MODELS[name](nominal, poses) for name in models}
+    if 'full' in fitted:
+        noise = pose_extraction.estimate_filters(recording, nominal, poses)
+        fitted['full'], _ = filter_time_constant.with_filter(fitted['full'], [noise])
+    return Run(truth, fitted, poses, true)
+
+
+def shaken(truth: Sensor, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Shake a unit as in the paper's motion experiment."""
+    rng = np.random.default_rng([seed, 2])
+    nominal_motion = trajectories.motion(rng)
+    joint_error_rad = truth.stage_resolution_rad * rng.uniform(-0.5, 0.5, 2)
+    at_rest = np.zeros(1)
+    alpha_rad, beta_rad = (
+        float(joint(at_rest)[0] + error) for joint, error in zip(
+            (nominal_motion.alpha, nominal_motion.beta), joint_error_rad))
+    motion = replace(nominal_motion, alpha=Held(alpha_rad), beta=Held(beta_rad))
+    columns = simulate(truth, motion, seed)
+    volts = np.column_stack([columns[f'{axis}_v'] for axis in truth.axes])
+    return columns['time_s'], volts, motion.shift(columns['time_s'], 2)
+
+
+RUNS = {
+    'alpha': np.array([(a, 0) for a in range(-180, 181, 30)]),
+    'beta': np.array([(90, a) for a in range(-180, 181, 30)]),
+    'both': np.array([(a, a) for a in range(-180, 181, 30)]),
+}
+"""Alpha and beta of figure 10, deg; (b) at alpha = 90°, as beta has no effect at 0."""
+RANDOM_POSES = 40
+"""Number of poses in random directions; chosen."""
+STAGES = {'perfect': PERFECT, 'paper': PAPER}
+
+
+@dataclass(frozen=True)
+class ModelErrors:
+    """Errors of one model of one unit."""
+
+    # angle errors in random poses, and in each of the paper's tilt experiments
+    random: AngleErrors
+    runs: dict[str, AngleErrors]
+    # errors of the measured axes over their standard deviation in the random poses, (k, m)
+    force_z: np.ndarray
+    # errors of the coefficients over their standard deviation, (p,). Empty where the truth is
+    # not in the gauge of the fit
+    coefficient_z: np.ndarray
+    motion: MotionErrors  # errors of the motion experiment
+
+
+@dataclass(frozen=True)
+class Unit:
+    """One unit on one stage."""
+
+    models: dict[str, ModelErrors]  # errors by model
+    directions: DirectionSearch  # the search for its misalignment
+
+
+def evaluate(nominal: Sensor, stage: Stage, seed: int) -> Unit:
+    """Draw, sweep and calibrate one unit, and run the experiments."""
+    rng = np.random.default_rng([seed, 0])
+    truth = draw(nominal, stage, rng)
+    run = calibrated(truth, seed)
+    bound = sweep_bound(
+        truth, run.poses, run.true_rad, StageError(truth.stage_std_rad),
+        (*full_model.default_terms(truth.axes), *full_model.GAUGE))
+    random_rad = np.column_stack([np.arccos(rng.uniform(-1, 1, RANDOM_POSES)),
+                                 rng.uniform(0, 2 * np.pi, RANDOM_POSES)])
+    angles_rad = {'random': random_rad, **{name: np.radians(deg) for name, deg in RUNS.items()}}
+    poses_of = {name: poses_at(truth, rad, seed + (i + 1) * 1_000_003)[:2]
+                for i, (name, rad) in enumerate(angles_rad.items())}
+    motion = shaken(truth, seed)
+    models = {}
+    for name, fitted in run.fitted.items():
+        angles = {key: angle_errors(fitted, bound, *poses)
+                  for key, poses in poses_of.items()}
+        error, std = force_errors(fitted, truth, *poses_of['random'])
+        models[name] = ModelErrors(angles.pop('random'), angles, error / std,
+                                   _coefficients(fitted, truth),
+                                   motion_errors(fitted, *motion)[0])
+    return Unit(models, search(truth, seed))
+
+
+def _coefficients(fitted: Sensor, truth: Sensor) -> np.ndarray:
+    if not all(name.effect in truth.effects for name in fitted.covariance_names):
+        return np.zeros(0)
+    error = get(fitted, fitted.covariance_names) - get(truth, fitted.covariance_names)
+    return error / np.sqrt(np.diag(fitted.covariance))
+
+
+def evaluate_all(nominal: Sensor, units: int, seed: int, show: Callable[[float], None]
+                 ) -> dict[str, list[Unit]]:
+    """Evaluate several units on each stage, in parallel."""
+    results: dict[str, list[Unit]] = {}
+    with ProcessPoolExecutor(os.cpu_count()) as pool:
+        for i, (name, stage) in enumerate(STAGES.items()):
+            seeds: Sequence[int] = [1000 * seed + k for k in range(units)]
+            results[name] = []
+            for unit in pool.map(partial(evaluate, nominal, stage), seeds):
+                results[name].append(unit)
+                show((i + len(results[name]) / units) / len(STAGES))
+    return results

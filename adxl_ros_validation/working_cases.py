@@ -1,0 +1,306 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Working cases: draw recordings with known causes, diagnose them, and score the verdicts.
+
+    make working ARGS='--count 40 --seed 7'         one line as each case ends, then the scores
+    make working ARGS='--count 20 --only single'    one group only
+    make working ARGS='--real ../shared/real'       defects put into recordings of real sensors
+
+A case that has been looked at is a development case: draw a fresh seed for a score that counts.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+import json
+import math
+from pathlib import Path
+import sys
+from typing import Any, NamedTuple
+
+from adxl_ros.errors import UserError
+from adxl_ros.jobs.pools import open_pool
+from adxl_ros.jobs.run import for_each
+from adxl_ros.jobs.whole_files import make_folder, write
+from adxl_ros.tools.command_line import argument_parser
+from adxl_ros.tools.common import run
+from adxl_ros_validation import working_world as world
+from adxl_ros_validation.blind import diagnosis_runs, grading, real_sensors, scores, trials
+from adxl_ros_validation.blind.grading import Answer
+from adxl_ros_validation.blind.trials import Label
+from adxl_ros_validation.blind.world import ideal_observer
+from adxl_ros_validation.blind.world.ideal_observer import Scene
+from adxl_ros_validation.blind.world.simulator import (
+    Fault,
+    G0,
+    parameter_file,
+    references,
+    render,
+    stamps,
+)
+import numpy as np
+
+GROUPS = ('null', 'single', 'pair', 'outside')
+_SHARES = (0.2, 0.4, 0.2, 0.2)
+"""Shares of the groups."""
+_STRENGTHS_MG = (0.5, 8.0)
+"""Lowest and highest strength, mg rms beyond zero-g and scale factor; log-uniform."""
+_AT_REST_SHARE = 0.5
+"""Share of the faults that were there when the unit was calibrated, of those that show at rest."""
+_COLOUR = (0.03, 0.12)
+"""Smallest and largest share of coloured noise, of the rms of the noise."""
+_SHIFT_STEP_M = 1e-8
+"""Resolution of the displacement, m."""
+_NOTICED = 1.05
+"""Ratio of true and stated noise from which a verdict may name the noise, too."""
+_HARM = 0.01
+"""Smallest harm, as a share of the mean square before."""
+
+
+class Case(NamedTuple):
+    """A drawn case."""
+
+    label: Label
+    scene: Scene
+    faults: list[Fault]
+    recording: str
+    parameters: str
+
+
+def draw(seed: int, number: int, only: str | None = None) -> Case:
+    """Draw a case; singles take the kinds in turn."""
+    rng = np.random.default_rng([7_000_001, seed, number])
+    group = only or str(rng.choice(GROUPS, p=_SHARES))
+    turn = np.random.default_rng([7_000_001, seed, number // len(world.LISTED)]).permutation(
+        world.LISTED)
+    first = str(turn[number % len(turn)])
+    names = {'null': [], 'single': [first], 'outside': [str(rng.choice(world.UNLISTED))],
+             'pair': [first, str(rng.choice([n for n in world.LISTED if n != first]))]}[group]
+    kinds = [world.KINDS[name] for name in names]
+    unit = world.draw_unit(rng)
+    moves = world.draw_motion(rng, unit, {kind.needs for kind in kinds if kind.needs})
+    scene = Scene(unit, moves, int(rng.integers(2 ** 31)))
+    force = scene.force()
+    noise_g = float(np.mean(unit.noise_g_per_rthz)) * math.sqrt(
+        min(unit.corner_hz * math.pi / 2, unit.rate_hz / 2))
+    background = Fault(world.COLOUR, noise_g * rng.uniform(*_COLOUR),
+                       world.COLOUR.draw(rng, unit))
+    faults, rows, at_rest = [], [], []
+    for kind in kinds:
+        strength = 1e-3 * G0 * math.exp(rng.uniform(*np.log(_STRENGTHS_MG)))
+        fault, change = trials.sized(partial(trials.measured, scene, force),
+                                     Fault(kind, kind.start, kind.draw(rng, unit)), strength)
+        calibrated = kind.at_rest and bool(rng.random() < _AT_REST_SHARE)
+        if calibrated:
+            left = _strength(unit, world.recalibrated(unit, [fault]), change, force)
+            fault = replace(fault, size=min(fault.size * min(strength / left, 5.0),
+                                            kind.largest))
+            change = scene.response([fault], coarse=True)
+            at_rest.append(fault)
+        stated = world.recalibrated(unit, [fault]) if calibrated else unit
+        faults.append(fault)
+        rows.append({'effect': kind.name, 'noise_like': kind.random, 'size': fault.size,
+                     'shape': {key: np.asarray(value).tolist()
+                               for key, value in fault.shape.items()},
+                     'strength_mps2': _strength(unit, stated, change, force), 'power': 1.0,
+                     'told': 1.0, 'inseparable': [], 'calibrated': calibrated})
+    if at_rest:
+        scene = replace(scene, unit=world.recalibrated(unit, at_rest))
+    label = Label(f'w{seed}_{number:04d}', {'null': 'none'}.get(group, group), tuple(names),
+                  (seed, number), (moves.seconds, moves.seconds), moves.kind, unit.axes,
+                  noise_g * G0, rows)
+    acting = [background, *faults]
+    return Case(label, scene, acting, _recording(scene, acting), parameter_file(
+        scene.unit, label.name))
+
+
+def _strength(unit: world.Unit, stated: world.Unit, change: np.ndarray, force: np.ndarray
+              ) -> float:
+    """Return the rms of a change, m/s², beyond what a calibration has taken up of it."""
+    zero = (stated.stated_zero_v - unit.stated_zero_v) / unit.stated_scale_v_per_g
+    scale = stated.stated_scale_v_per_g / unit.stated_scale_v_per_g - 1
+    left = change - zero[:, None] * G0 - scale[:, None] * force
+    return ideal_observer.rms(ideal_observer.beyond_calibration(unit, left, force))
+
+
+def _volts(scene: Scene, faults: Sequence[Fault]) -> np.ndarray:
+    return render(scene.unit, scene.manoeuvre, faults, scene.seed)
+
+
+def _recording(scene: Scene, faults: Sequence[Fault]) -> str:
+    """Return the recording as CSV; encoder and shaker are read at the recording's own rate."""
+    columns = {'time_s': stamps(scene.unit, scene.manoeuvre)}
+    columns |= {f'{axis}_v': row for axis, row in zip(scene.unit.axes, _volts(scene, faults))}
+    columns |= references(scene.unit, scene.manoeuvre, scene.seed)
+    columns['shift_m'] = np.round(columns['shift_m'] / _SHIFT_STEP_M) * _SHIFT_STEP_M
+    return trials.csv_text(columns)
+
+
+def _harm(case: Case, fitted: str | None) -> bool:
+    """Return whether another recording of the unit is simulated worse than before."""
+    if not diagnosis_runs.changed(case.parameters, fitted):
+        return False
+    rng = np.random.default_rng([7_000_002, *case.label.seed])
+    needs = {world.KINDS[name].needs for name in case.label.effects} - {''}
+    scene = replace(case.scene, seed=case.scene.seed + 1,
+                    manoeuvre=world.draw_motion(rng, case.scene.unit, needs))
+    compared = diagnosis_runs.Comparison(scene, scene.force(), _volts(scene, case.faults),
+                                         _recording(scene, case.faults))
+    before = compared.squares(diagnosis_runs.simulated(compared.csv, case.parameters))
+    after = compared.after(before, case.parameters, fitted)[0]
+    return compared.interval(after - before)[0] > _HARM * float(before.mean())
+
+
+class Row(NamedTuple):
+    """A diagnosed case."""
+
+    label: Label
+    result: dict[str, Any]
+    tolerated: frozenset[str]  # effects that a verdict may name, too
+    harm: bool
+
+    @property
+    def answer(self) -> Answer:
+        """Return the answer without the effects that it may name, too."""
+        given = grading.answer(self.result)
+        certain = given.certain - self.tolerated
+        status = 'no_gap' if given.certain and not certain and not given.groups \
+            and given.status in ('explained', 'partly') else given.status
+        return replace(given, certain=certain, status=status, limit_mps2=given.limit_mps2
+                       if status == given.status else None)
+
+
+def diagnosed(seed: int, number: int, only: str | None, folder: Path) -> tuple[Row]:
+    """Draw a case, keep its files, diagnose it and measure the harm."""
+    case = draw(seed, number, only)
+    place = make_folder(folder / case.label.name)
+    for suffix, text in (('csv', case.recording), ('yaml', case.parameters),
+                         ('json', trials.as_json([case.label]))):
+        write(place / f'{case.label.name}.{suffix}', text.encode())
+    result = diagnosis_runs.diagnose(case.label.name, case.recording.encode(),
+                                     case.parameters.encode(), None)[1]
+    write(place / 'result.json', json.dumps(result).encode())
+    unit = case.scene.unit
+    noisy = bool(np.any(unit.noise_g_per_rthz > _NOTICED * unit.stated_noise_g_per_rthz))
+    return (Row(case.label, result, frozenset(['noise_excess'] if noisy else []) - frozenset(
+        case.label.effects), _harm(case, result['parameters'])),)
+
+
+def line(row: Row) -> str:
+    """Return truth, verdict, figures and time of a case in one line."""
+    answer, label = row.answer, row.label
+    report = row.result['report'] or {}
+    gap = report.get('gap') or {}
+    figures = ' '.join(
+        f'{name} {1e3 * gap[key] / G0:.3f}' for name, key in (
+            ('gap', 'before'), ('left', 'after'), ('floor', 'floor'), ('P', 'explained'),
+            ('U', 'rest'), ('limit', 'upper_limit')) if isinstance(gap.get(key), (int, float)))
+    truth = ' + '.join(f'{fault["effect"]} {1e3 * fault["strength_mps2"] / G0:.2f} mg'
+                       f'{" calibrated" if fault.get("calibrated") else ""}'
+                       for fault in label.faults) or 'nothing'
+    said = ', '.join([*sorted(grading.answer(row.result).certain),
+                      *(f'({" | ".join(sorted(group))})' for group in answer.groups)])
+    mark = 'ok  ' if right(row) else 'set ' if in_set(row) else 'MISS'
+    return f'{mark} {label.name} {label.axes:3} {label.manoeuvre:6} {truth}: {answer.status} ' \
+           f'{answer.probability:.2f} {said or row.result["error"] or "-"}; {figures} mg; ' \
+           f'{row.result["cpu_s"]:.1f} s{" HARM" if row.harm else ""}'
+
+
+def right(row: Row) -> bool:
+    """Return whether a verdict is exact; one `partly` or unknown is, outside the library."""
+    if row.label.group == 'outside' and row.answer.status == 'partly':
+        return True
+    return not row.answer.groups and grading.verdict_right(row.answer, row.label)
+
+
+def in_set(row: Row) -> bool:
+    """Return whether a verdict names every true effect, perhaps in groups."""
+    return right(row) or any(effects and effects <= row.answer.named for effects in grading.right(
+        row.label, row.answer.material_mps2))
+
+
+def table(rows: Sequence[Row]) -> str:
+    """Return the scores with Wilson's intervals, and how often verdicts of a probability hold."""
+    def group(name: str) -> list[Row]:
+        return [row for row in rows if row.label.group == name]
+
+    cells: list[tuple[str, Sequence[bool]]] = [
+        ('no gap where there is none', [right(row) for row in group('none')]),
+        ('single effect, exactly', [right(row) for row in group('single')]),
+        ('single effect, in the named set', [in_set(row) for row in group('single')]),
+        ('pair, exactly', [right(row) for row in group('pair')]),
+        ('outside the library: unknown or partly', [right(row) for row in group('outside')]),
+        ('upper limit of no gap holds', [held for held in (
+            grading.limit_holds(row.answer, row.label) for row in rows) if held is not None]),
+        ('harm: another recording made worse', [row.harm for row in rows]),
+        ('no verdict', [row.answer.status == 'failed' for row in rows]),
+        ('tracebacks', [str(row.result['error']).startswith('traceback') for row in rows])]
+    lines = [f'{name:40} {scores.in_words(scores.share(hits))}' for name, hits in cells if hits]
+    cpu = [row.result['cpu_s'] for row in rows]
+    lines += [f'{"processor time, s":40} median {np.median(cpu):.1f}, longest {max(cpu):.1f}', '',
+              'probability     mean   right']
+    lines += [f'{part["bin"][0]:.2f} to {part["bin"][1]:.2f}   {part["confidence"]:.2f}   '
+              f'{100 * part["right"]:3.0f} % ({100 * part["ci"][0]:.0f} to '
+              f'{100 * part["ci"][1]:.0f}), n = {part["count"]}' for part in scores.reliability(
+                  [(row.answer.probability, grading.verdict_right(row.answer, row.label))
+                   for row in rows])]
+    return '\n'.join(lines)
+
+
+def parser() -> argparse.ArgumentParser:
+    """Describe the command line."""
+    parse = argument_parser('working', __doc__, {
+        'a development loop of one group': '--count 20 --seed 3 --only pair'})
+    parse.add_argument('-o', dest='output', metavar='DIR', default='working_output',
+                       help='files of the cases (default: working_output)')
+    parse.add_argument('--count', type=int, default=80, help='number of cases (default 80)')
+    parse.add_argument('--first', type=int, default=0, metavar='N',
+                       help='number of the first case (default 0)')
+    parse.add_argument('--seed', type=int, default=1, help='seed of the cases (default 1)')
+    parse.add_argument('--only', choices=GROUPS, help='cases of one group only')
+    parse.add_argument('--jobs', type=int, default=2, help='processes at once (default 2)')
+    parse.add_argument('--real', metavar='FOLDER',
+                       help='put defects into these recordings of real sensors instead')
+    return parse
+
+
+def working(options: argparse.Namespace) -> int:
+    """Run the tool; see `parser`."""
+    if min(options.count, options.jobs) < 1 or min(options.first, options.seed) < 0:
+        raise UserError('--count and --jobs must be at least 1, --first and --seed at least 0')
+    folder, rows = make_folder(Path(options.output)), []
+    numbers = range(options.first, options.first + options.count)
+
+    def keep(row: Row) -> None:
+        rows.append(row)
+        print(line(row), flush=True)
+
+    with open_pool(None, options.jobs) as pool:
+        if options.real:
+            print(real_sensors.working(Path(options.real), options.seed, options.count,
+                                       world.KINDS, pool, partial(print, flush=True)))
+            return 0
+        for_each(pool, diagnosed, [partial(_job, options.seed, number, options.only, folder)
+                                   for number in numbers], keep, _show_nothing)
+    print(f'\n{table(rows)}')
+    return 0
+
+
+def _job(*arguments: Any) -> tuple:
+    return arguments
+
+
+def _show_nothing(done: float) -> None:
+    """Show no progress: each case has its line."""
+
+
+def main() -> int:
+    """Run the tool on the command line."""
+    return run(parser(), working)
+
+
+if __name__ == '__main__':
+    sys.exit(main())
